@@ -1,0 +1,50 @@
+"""The errors slatprep raises on purpose, each saying what is wrong, what is allowed and what to do."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+
+class SlatprepError(Exception):
+    """Base of every error that slatprep raises on purpose."""
+
+
+class InputError(SlatprepError):
+    """A source file that cannot be used.
+
+    Parameters
+    ----------
+    path : str or Path
+        The file (or dataset inside a file) at fault.
+    fault : str
+        What is wrong with it, with the value at fault.
+    expected : str
+        What is allowed, or what to do.
+    """
+
+    def __init__(self, path: str | Path, fault: str, expected: str) -> None:
+        super().__init__(f"{path}: {fault}; expected {expected}")
+        self.path = str(path)
+        self.fault = fault
+        self.expected = expected
+
+    def __reduce__(self) -> tuple[type, tuple[str, str, str]]:
+        # An exception with its own signature must say how to rebuild itself
+        # to travel from a worker process back to the parent.
+        return (type(self), (self.path, self.fault, self.expected))
+
+
+class MissingPartnerError(InputError):
+    """One side of a pair (PixieVerse field or SLAT) does not exist."""
+
+
+class ConfigError(SlatprepError):
+    """A dataset definition or option that makes no sense."""
+
+
+class AlignmentError(SlatprepError):
+    """Two voxel sets that no engine can align, for a reason worth naming."""
+
+
+class StoreError(SlatprepError):
+    """A store that cannot be read, written or trusted."""

@@ -1,0 +1,152 @@
+"""The parameters of a build, in a handful of typed groups with defaults.
+
+These are plain dataclasses: `slatprep.config` fills and checks them from a
+TOML file and options, the stages take the group that concerns them, and the
+provenance records them with each result.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import ClassVar, Literal
+
+_FORBID_UNKNOWN: dict[str, str] = {"extra": "forbid"}
+
+
+@dataclass(frozen=True)
+class PixieverseSource:
+    """Where the PixieVerse side lies.
+
+    Patterns are relative to `root` and name ``{id}`` (one path component) and
+    optionally ``{sample}``; the first grid pattern that matches anything for
+    an object is used. `sample` chooses among several samples of an object;
+    left empty, an object with more than one sample is a fault.
+    """
+
+    __pydantic_config__: ClassVar[dict[str, str]] = _FORBID_UNKNOWN
+
+    root: Path
+    grid: tuple[str, ...] = (
+        "{id}/sample_{sample}/material_grid.npy",
+        "{id}/sample_{sample}_pred.npy",
+    )
+    mask: tuple[str, ...] = ("{id}/clip_features_mask.npy", "{id}/sample_{sample}_mask.npy")
+    bounds: tuple[str, ...] = ("{id}/clip_features.npz",)
+    sample: str = ""
+
+
+@dataclass(frozen=True)
+class SlatSource:
+    """Where the SLAT side lies.
+
+    Patterns are relative to `root` and name ``{id}`` and optionally
+    ``{view}``. Where `root` is an HDF5 file, or a pattern names no ``{id}``,
+    the file holds one group an asset, named by `group`.
+    """
+
+    __pydantic_config__: ClassVar[dict[str, str]] = _FORBID_UNKNOWN
+
+    root: Path
+    pattern: tuple[str, ...] = (
+        "{id}.npz",
+        "{id}.h5",
+        "{id}.hdf5",
+        "{id}/{view}.npz",
+        "{id}/{view}.h5",
+        "{id}/{view}.hdf5",
+    )
+    group: str = "{id}"
+
+
+@dataclass(frozen=True)
+class PairingParameters:
+    """How names of the two sides are joined, where they differ.
+
+    `map` is a CSV with columns ``object_id`` and ``slat_id`` (and optionally
+    ``view``), or TRELLIS's ``metadata.csv`` (``sha256``, ``file_identifier``);
+    `categories` is Pixie's ``obj_ids_metadata.json``.
+    """
+
+    __pydantic_config__: ClassVar[dict[str, str]] = _FORBID_UNKNOWN
+
+    map: Path | None = None
+    categories: Path | None = None
+
+
+@dataclass(frozen=True)
+class AlignParameters:
+    """How the transform between the frames is found.
+
+    `model` is ``rigid`` (the paper's SE(3)), ``similarity`` (one scale more)
+    or ``auto`` (the simplest that the data support). Scale stays within
+    `scale_bounds`; `radius` is the correspondence radius of quality figures,
+    in voxels. `seed` feeds whatever an engine draws at random.
+    """
+
+    __pydantic_config__: ClassVar[dict[str, str]] = _FORBID_UNKNOWN
+
+    engine: Literal["field", "open3d", "small_gicp"] = "field"
+    model: Literal["auto", "rigid", "similarity"] = "auto"
+    scale_bounds: tuple[float, float] = (0.6, 1.6)
+    radius: float = 1.0
+    icp_radius: float = 3.2
+    icp_iterations: int = 60
+    seed: int = 0
+
+
+@dataclass(frozen=True)
+class SampleParameters:
+    """How annotations are looked up at SLAT voxels.
+
+    Beyond `max_distance` (voxels of the PixieVerse frame) from the nearest
+    annotated voxel a SLAT voxel is not valid.
+    """
+
+    __pydantic_config__: ClassVar[dict[str, str]] = _FORBID_UNKNOWN
+
+    max_distance: float = 3.0
+
+
+@dataclass(frozen=True)
+class NormalizeParameters:
+    """Where the ranges come from: ``dataset``, ``pixie``, or the path of a TOML or JSON file."""
+
+    __pydantic_config__: ClassVar[dict[str, str]] = _FORBID_UNKNOWN
+
+    ranges: str = "dataset"
+
+
+@dataclass(frozen=True)
+class StoreParameters:
+    """Chunks and shards of the store, in rows (voxel arrays) and assets (grid arrays)."""
+
+    __pydantic_config__: ClassVar[dict[str, str]] = _FORBID_UNKNOWN
+
+    voxel_chunk: int = 16_384
+    voxel_chunks_per_shard: int = 64
+    grid_assets_per_shard: int = 32
+    compression_level: int = 1
+
+
+@dataclass(frozen=True)
+class BuildParameters:
+    """Everything that decides the content of a store."""
+
+    __pydantic_config__: ClassVar[dict[str, str]] = _FORBID_UNKNOWN
+
+    pixieverse: PixieverseSource
+    slat: SlatSource
+    name: str = ""
+    pairing: PairingParameters = field(default_factory=PairingParameters)
+    align: AlignParameters = field(default_factory=AlignParameters)
+    sample: SampleParameters = field(default_factory=SampleParameters)
+    normalize: NormalizeParameters = field(default_factory=NormalizeParameters)
+    store: StoreParameters = field(default_factory=StoreParameters)
+
+
+PRESETS: dict[str, AlignParameters] = {
+    "default": AlignParameters(),
+    "paper": AlignParameters(engine="open3d", model="rigid"),
+}
+"""Named alignment parameters; ``paper`` is the protocol of SLAT-Phys."""

@@ -1,0 +1,312 @@
+"""The typed records that travel between the stages.
+
+Two source files become rows of the store through read, align, sample,
+normalise and pack. Each stage takes the records of the one before it and
+returns its own; none of these classes touches a disk.
+
+Frames: the *PixieVerse frame* and the *SLAT frame* are both the unit cube
+[-0.5, 0.5]^3 with voxel ``i`` centred at ``(i + 0.5) / 64 - 0.5`` on each axis.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from enum import StrEnum
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+RESOLUTION = 64
+"""Voxels along each axis of both frames."""
+
+MATERIAL_CLASSES = (
+    "jelly",
+    "metal",
+    "sand",
+    "visplas",
+    "fluid",
+    "snow",
+    "stationary",
+    "background",
+)
+"""PhysGaussian's material classes, by id."""
+
+BACKGROUND = 7
+"""Material id of an empty voxel."""
+
+UNANNOTATED = 255
+"""Material id of an occupied voxel that carries no annotation (-1 in raw grids)."""
+
+PROPERTY_COLUMNS = ("youngs_modulus", "density", "poissons_ratio")
+"""Order of the property columns everywhere in slatprep; SI units are Pa, kg/m^3, none."""
+
+
+class Verdict(StrEnum):
+    """What an alignment is worth, in one word."""
+
+    GOOD = "good"
+    DOUBTFUL = "doubtful"
+    FAILED = "failed"
+
+
+class Status(StrEnum):
+    """What became of an asset in a build."""
+
+    OK = "ok"
+    FAILED = "failed"
+    SKIPPED = "skipped"
+
+
+@dataclass(frozen=True)
+class SourceFile:
+    """A file that was read, as the provenance remembers it.
+
+    ``path`` is relative to the root of its source, with forward slashes;
+    ``role`` is one of ``grid``, ``mask``, ``bounds``, ``slat``.
+    """
+
+    role: str
+    path: str
+    size: int
+    sha256: str
+
+
+@dataclass(frozen=True)
+class AssetPair:
+    """Where the two sides of one row of the store lie; nothing has been read yet.
+
+    Attributes
+    ----------
+    asset_id : str
+        Unique id of the row: the object id, or ``<object_id>.<view>`` where
+        one object has several SLATs.
+    object_id : str
+        PixieVerse id of the object.
+    view : str
+        The image or seed the SLAT was made from; empty where there is one only.
+    category : str
+        PixieVerse category; empty where unknown.
+    pixieverse_root, slat_root : Path
+        The roots below which the files must lie.
+    grid, mask, bounds : Path or None
+        PixieVerse files, absolute; ``grid`` is None where the partner is missing.
+    slat : Path or None
+        SLAT file, absolute; None where the partner is missing.
+    slat_group : str
+        Group inside an HDF5 file that holds many assets; empty otherwise.
+    problem : str
+        Why the pair cannot be used (missing partner, two files for one id);
+        empty where all is well.
+    """
+
+    asset_id: str
+    object_id: str
+    view: str
+    category: str
+    pixieverse_root: Path
+    slat_root: Path
+    grid: Path | None
+    mask: Path | None
+    bounds: Path | None
+    slat: Path | None
+    slat_group: str = ""
+    problem: str = ""
+
+
+@dataclass(frozen=True)
+class MaterialField:
+    """A PixieVerse field: what occupies the grid and what it is made of, in SI units.
+
+    Attributes
+    ----------
+    occupancy : ndarray of bool, shape (64, 64, 64)
+        Occupied voxels, axes x, y, z of the PixieVerse frame.
+    voxels : ndarray of uint8, shape (K, 3)
+        The annotated voxels (occupied, class 0..6), in C order of the grid.
+    material : ndarray of uint8, shape (K,)
+        Class of each annotated voxel, 0..6.
+    properties : ndarray of float32, shape (K, 3)
+        Young's modulus [Pa], density [kg/m^3] and Poisson's ratio of each.
+    bounds : dict or None
+        World bounds as ``clip_features.npz`` states them, JSON-ready.
+    sources : tuple of SourceFile
+        The files read.
+    warnings : tuple of str
+        What a person should know about this field.
+    """
+
+    occupancy: NDArray[np.bool_]
+    voxels: NDArray[np.uint8]
+    material: NDArray[np.uint8]
+    properties: NDArray[np.float32]
+    bounds: dict[str, object] | None = None
+    sources: tuple[SourceFile, ...] = ()
+    warnings: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class StructuredLatents:
+    """A TRELLIS SLAT: occupied surface voxels and their latents.
+
+    ``coords`` is (N, 3) uint8 in 0..63 in the order of the source file,
+    ``feats`` is (N, 8) float32.
+    """
+
+    coords: NDArray[np.uint8]
+    feats: NDArray[np.float32]
+    sources: tuple[SourceFile, ...] = ()
+    warnings: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """One start orientation and how well it fitted.
+
+    ``euler_degrees`` names the start where the protocol does (x, y, z turns);
+    ``same_as`` is the index of the candidate with the same rotation that was
+    computed in its stead, or None. Fitness is in 0..1, rmse in voxels.
+    """
+
+    index: int
+    euler_degrees: tuple[float, float, float] | None
+    fitness: float
+    inlier_rmse: float
+    same_as: int | None = None
+
+
+@dataclass(frozen=True)
+class Quality:
+    """How well two voxel sets lie on each other under a transform.
+
+    Forward is PixieVerse boundary to SLAT, backward SLAT to PixieVerse
+    boundary. Fitness is the share of voxels with a partner within ``radius``,
+    rmse the root mean square distance over those; distances in voxels of the
+    SLAT frame.
+    """
+
+    fitness: float
+    inlier_rmse: float
+    fitness_backward: float
+    inlier_rmse_backward: float
+    overlap: float
+    radius: float
+
+
+@dataclass(frozen=True)
+class Placement:
+    """A distinct placement that fits about as well as the best one."""
+
+    transform: NDArray[np.float64]
+    score: float
+    displacement: float
+
+
+@dataclass(frozen=True)
+class Ambiguity:
+    """What distinct, about equally good placements mean for the supervision.
+
+    ``material_share`` is the share of SLAT voxels whose class differs in any
+    of them from the best placement's; ``property_change`` is the largest mean
+    absolute change of each normalised property (Young's modulus, density,
+    Poisson's ratio). ``margin`` is the score's distance to the next distinct
+    placement, tied or not. Both are 0 where nothing is tied.
+    """
+
+    material_share: float
+    property_change: tuple[float, float, float]
+    margin: float
+    placements: tuple[Placement, ...] = ()
+
+
+@dataclass(frozen=True)
+class Alignment:
+    """The transform from the PixieVerse frame to the SLAT frame, and how it was found.
+
+    Attributes
+    ----------
+    transform : ndarray of float64, shape (4, 4)
+        Homogeneous, PixieVerse frame to SLAT frame (a column vector is
+        multiplied from the left).
+    engine : str
+        Name of the engine that found it.
+    model : str
+        ``rigid`` or ``similarity``.
+    search : str
+        ``euler64`` or ``so3``: the starts that were needed.
+    quality : Quality
+        How well the two voxel sets lie on each other.
+    candidates : tuple of Candidate
+        Every start and its score.
+    margin : float
+        Distance in score from the best placement to the next distinct one.
+    placements : tuple of Placement
+        Distinct placements that fit about as well.
+    """
+
+    transform: NDArray[np.float64]
+    engine: str
+    model: str
+    search: str
+    quality: Quality
+    candidates: tuple[Candidate, ...] = ()
+    margin: float = float("nan")
+    placements: tuple[Placement, ...] = ()
+
+
+@dataclass(frozen=True)
+class Annotation:
+    """Material and properties looked up at every SLAT voxel, in SI units.
+
+    ``properties`` is (N, 3) float32 (Young's modulus [Pa], density [kg/m^3],
+    Poisson's ratio), NaN where not valid; ``material`` (N,) uint8, 255 where
+    not valid; ``valid`` (N,) bool; ``distance`` (N,) float32, in voxels of the
+    PixieVerse frame, to the annotation used.
+    """
+
+    properties: NDArray[np.float32]
+    material: NDArray[np.uint8]
+    valid: NDArray[np.bool_]
+    distance: NDArray[np.float32]
+
+
+@dataclass(frozen=True)
+class PropertyRange:
+    """How one property is mapped to [-1, 1].
+
+    ``lo`` and ``hi`` are in the mapped unit: log10 of the SI value where
+    ``log10`` is true, the SI value itself otherwise.
+    """
+
+    name: str
+    log10: bool
+    lo: float
+    hi: float
+
+
+@dataclass(frozen=True)
+class Normalization:
+    """The three property ranges, in the order of ``PROPERTY_COLUMNS``, and where they come from.
+
+    ``source`` is ``dataset``, ``pixie`` or the name of a file.
+    """
+
+    ranges: tuple[PropertyRange, PropertyRange, PropertyRange]
+    source: str
+
+
+@dataclass(frozen=True)
+class AssetResult:
+    """What one asset's task hands to the packing stage.
+
+    Arrays are None where ``status`` is not ``ok``; ``record`` is the asset's
+    provenance, JSON-ready.
+    """
+
+    pair: AssetPair
+    status: Status
+    record: dict[str, object] = field(default_factory=dict)
+    field: MaterialField | None = None
+    latents: StructuredLatents | None = None
+    alignment: Alignment | None = None
+    annotation: Annotation | None = None
