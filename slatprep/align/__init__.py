@@ -1,0 +1,60 @@
+"""Find the transform from the PixieVerse frame to the SLAT frame."""
+
+from __future__ import annotations
+
+from importlib import import_module, metadata
+from typing import Protocol, cast
+
+from slatprep.parameters import AlignParameters
+from slatprep.records import Alignment, MaterialField, StructuredLatents
+
+# Engines are imported when first used: Open3D alone takes seconds.
+_ENGINES = {
+    "field": ("slatprep.align.field", ("numpy", "scipy", "numba", "edt")),
+    "open3d": ("slatprep.align.open3d_icp", ("numpy", "open3d-cpu", "open3d")),
+    "small_gicp": ("slatprep.align.gicp", ("numpy", "small_gicp")),
+}
+
+
+class Engine(Protocol):
+    """What a module of this package offers to be an engine."""
+
+    def align(
+        self, field: MaterialField, latents: StructuredLatents, parameters: AlignParameters
+    ) -> Alignment:
+        """Return the alignment of one asset."""
+        ...
+
+
+def align(
+    field: MaterialField, latents: StructuredLatents, parameters: AlignParameters
+) -> Alignment:
+    """Find the transform that lays a PixieVerse field on a SLAT.
+
+    Parameters
+    ----------
+    field : MaterialField
+        The PixieVerse side; only its geometry is used.
+    latents : StructuredLatents
+        The SLAT side; only its voxels are used.
+    parameters : AlignParameters
+        Which engine, and how.
+
+    Returns
+    -------
+    Alignment
+        The transform with its quality and every candidate's score.
+    """
+    module, _ = _ENGINES[parameters.engine]
+    return cast(Engine, import_module(module)).align(field, latents, parameters)
+
+
+def engine_versions(parameters: AlignParameters) -> dict[str, str]:
+    """Return the versions of the libraries that make an engine's numbers."""
+    versions = {}
+    for package in _ENGINES[parameters.engine][1]:
+        try:
+            versions[package] = metadata.version(package)
+        except metadata.PackageNotFoundError:
+            continue  # Open3D goes by two names; one of them is installed.
+    return versions

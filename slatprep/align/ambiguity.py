@@ -1,0 +1,52 @@
+"""What distinct, about equally good placements mean for the supervision."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from slatprep.normalize import to_mapped
+from slatprep.parameters import SampleParameters
+from slatprep.records import Alignment, Ambiguity, MaterialField, StructuredLatents
+from slatprep.sample import sample
+
+
+def measure_ambiguity(
+    field: MaterialField,
+    latents: StructuredLatents,
+    alignment: Alignment,
+    parameters: SampleParameters,
+) -> Ambiguity:
+    """Measure how the labels change between placements that fit about equally well.
+
+    Parameters
+    ----------
+    field, latents : MaterialField, StructuredLatents
+        The two sides of the asset.
+    alignment : Alignment
+        Its alignment; ``placements`` are the ones that tie with the best.
+    parameters : SampleParameters
+        How annotations are looked up.
+
+    Returns
+    -------
+    Ambiguity
+        The share of SLAT voxels whose class differs in any of the placements,
+        and the largest mean absolute change of log10 Young's modulus, log10
+        density and Poisson's ratio over the voxels valid in both.
+    """
+    best = sample(field, latents.coords, alignment.transform, parameters)
+    differs = np.zeros(len(latents.coords), dtype=bool)
+    change = np.zeros(3)
+    for placement in alignment.placements:
+        other = sample(field, latents.coords, placement.transform, parameters)
+        differs |= other.material != best.material
+        both = best.valid & other.valid
+        if both.any():
+            delta = to_mapped(best.properties[both]) - to_mapped(other.properties[both])
+            change = np.maximum(change, np.abs(delta).mean(axis=0))
+    return Ambiguity(
+        material_share=float(differs.mean()),
+        property_change=(float(change[0]), float(change[1]), float(change[2])),
+        margin=alignment.margin,
+        placements=alignment.placements,
+    )

@@ -1,0 +1,87 @@
+"""The paper's protocol: point-to-point ICP on Open3D from 64 start orientations.
+
+SLAT-Phys, "Physics-to-SLAT Annotation Alignment": the boundary voxels of the
+PixieVerse occupancy are the source, the SLAT voxels the target; the start
+whose ICP reaches the highest fitness wins, a final ICP gives T in SE(3). The
+correspondence radius that lets ICP converge saturates the fitness of many
+starts, so the candidates are compared at a tight one, rmse breaking ties.
+"""
+
+from __future__ import annotations
+
+import sys
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from slatprep.align.quality import measure_quality
+from slatprep.align.starts import distinct_starts, euler_starts
+from slatprep.geometry import VOXEL_SIZE, boundary, make_transform, voxel_centres, voxels_of
+from slatprep.parameters import AlignParameters
+from slatprep.records import Alignment, Candidate, MaterialField, StructuredLatents
+
+
+def align(
+    field: MaterialField, latents: StructuredLatents, parameters: AlignParameters
+) -> Alignment:
+    """Align by the paper's protocol; see `slatprep.align.align`."""
+    o3d = load_open3d()
+    registration = o3d.pipelines.registration
+    method = registration.TransformationEstimationPointToPoint()
+    criteria = registration.ICPConvergenceCriteria(max_iteration=parameters.icp_iterations)
+    source = _cloud(o3d, voxel_centres(voxels_of(boundary(field.occupancy))))
+    target = _cloud(o3d, voxel_centres(latents.coords))
+    wide = parameters.icp_radius * VOXEL_SIZE
+    tight = parameters.radius * VOXEL_SIZE
+
+    def icp(radius: float, start: NDArray[np.float64]) -> NDArray[np.float64]:
+        fit = registration.registration_icp(source, target, radius, start, method, criteria)
+        return np.array(fit.transformation)
+
+    fits: dict[int, tuple[float, float, NDArray[np.float64]]] = {}
+    for start in distinct_starts():
+        transform = icp(wide, make_transform(start.rotation))
+        score = registration.evaluate_registration(source, target, tight, transform)
+        fits[start.index] = (score.fitness, score.inlier_rmse / VOXEL_SIZE, transform)
+    best = max(fits, key=lambda index: (fits[index][0], -fits[index][1], -index))
+    transform = icp(wide, fits[best][2])
+
+    candidates = []
+    for start in euler_starts():
+        fitness, rmse, _ = fits[start.index if start.same_as is None else start.same_as]
+        candidates.append(Candidate(start.index, start.euler_degrees, fitness, rmse, start.same_as))
+    return Alignment(
+        transform=transform,
+        engine="open3d",
+        model="rigid",
+        search="euler64",
+        quality=measure_quality(field, latents, transform, parameters.radius),
+        candidates=tuple(candidates),
+    )
+
+
+def load_open3d() -> Any:
+    """Import Open3D, from wheels alone.
+
+    Since 0.20 Open3D needs the system's libusb, though nothing here uses it; a
+    copy that a wheel carries, loaded first, satisfies the dynamic linker.
+    """
+    if sys.platform == "linux" and sys.version_info >= (3, 13):
+        import ctypes
+
+        import libusb_package
+
+        library = libusb_package.get_library_path()
+        if library is not None:
+            ctypes.CDLL(str(library), mode=ctypes.RTLD_GLOBAL)
+    import open3d
+
+    open3d.utility.set_verbosity_level(open3d.utility.VerbosityLevel.Error)
+    return open3d
+
+
+def _cloud(o3d: Any, points: NDArray[np.float64]) -> Any:
+    cloud = o3d.geometry.PointCloud()
+    cloud.points = o3d.utility.Vector3dVector(points)
+    return cloud

@@ -1,0 +1,56 @@
+"""Start orientations of the alignment."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+from itertools import product
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+@dataclass(frozen=True)
+class Start:
+    """One of the 64 Euler triples, its rotation, and the earlier one it repeats."""
+
+    index: int
+    euler_degrees: tuple[float, float, float]
+    rotation: NDArray[np.float64]
+    same_as: int | None
+
+
+@lru_cache(maxsize=1)
+def euler_starts() -> tuple[Start, ...]:
+    """Return the 64 starts: turns by 0, 90, 180 and 270 degrees about x, then y, then z.
+
+    Only 24 of them are different rotations; the others name, in `same_as`, the
+    first start that has the same one.
+
+    Notes
+    -----
+    SLAT-Phys, "Physics-to-SLAT Annotation Alignment".
+    """
+    cos, sin = (1, 0, -1, 0), (0, 1, 0, -1)
+    starts: list[Start] = []
+    first: dict[bytes, int] = {}
+    for index, (i, j, k) in enumerate(product(range(4), repeat=3)):
+        turn_x = np.array([[1, 0, 0], [0, cos[i], -sin[i]], [0, sin[i], cos[i]]])
+        turn_y = np.array([[cos[j], 0, sin[j]], [0, 1, 0], [-sin[j], 0, cos[j]]])
+        turn_z = np.array([[cos[k], -sin[k], 0], [sin[k], cos[k], 0], [0, 0, 1]])
+        rotation = turn_z @ turn_y @ turn_x  # integers, hence exact
+        same_as = first.setdefault(rotation.tobytes(), index)
+        starts.append(
+            Start(
+                index,
+                (90.0 * i, 90.0 * j, 90.0 * k),
+                rotation.astype(np.float64),
+                None if same_as == index else same_as,
+            )
+        )
+    return tuple(starts)
+
+
+def distinct_starts() -> tuple[Start, ...]:
+    """Return the 24 starts that are different rotations."""
+    return tuple(start for start in euler_starts() if start.same_as is None)
