@@ -1,4 +1,4 @@
-"""The errors slatprep raises on purpose, each saying what is wrong, what is allowed and what to do."""
+"""The errors slatprep raises on purpose: what is wrong, what is allowed, what to do."""
 
 from __future__ import annotations
 

@@ -54,7 +54,8 @@ def apply_transform(transform: ArrayLike, points: ArrayLike) -> NDArray[np.float
 
     Examples
     --------
-    >>> apply_transform([[0, -1, 0, 1], [1, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]], [[2, 3, 4]]).tolist()
+    >>> quarter_turn = [[0, -1, 0, 1], [1, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
+    >>> apply_transform(quarter_turn, [[2, 3, 4]]).tolist()
     [[-2.0, 2.0, 4.0]]
     """
     matrix = np.asarray(transform, dtype=np.float64)
@@ -136,7 +137,8 @@ def boundary(occupancy: NDArray[np.bool_]) -> NDArray[np.bool_]:
         & padded[1:-1, 1:-1, :-2]
         & padded[1:-1, 1:-1, 2:]
     )
-    return inner & ~buried
+    surface: NDArray[np.bool_] = inner & ~buried
+    return surface
 
 
 def voxels_of(occupancy: NDArray[np.bool_]) -> NDArray[np.uint8]:

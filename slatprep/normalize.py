@@ -10,6 +10,7 @@ from __future__ import annotations
 import json
 import tomllib
 from pathlib import Path
+from typing import TypeGuard
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -116,8 +117,7 @@ def read_ranges(path: Path) -> Normalization:
     for name, log10 in zip(PROPERTY_COLUMNS, LOG10, strict=True):
         entry = table.get(name) if isinstance(table, dict) else None
         lo, hi = (entry.get(k) if isinstance(entry, dict) else None for k in ("lo", "hi"))
-        numbers = isinstance(lo, int | float) and isinstance(hi, int | float)
-        if not numbers or not np.isfinite([lo, hi]).all() or lo >= hi:
+        if not _is_number(lo) or not _is_number(hi) or lo >= hi:
             raise ConfigError(
                 f"{path}: {name} has lo = {lo!r} and hi = {hi!r}; expected a table [{name}] with "
                 f"finite lo < hi{' in log10 of the SI value' if log10 else ''}"
@@ -183,6 +183,10 @@ def normalize_change(change: ArrayLike, normalization: Normalization) -> NDArray
     """Scale differences of mapped properties to differences of normalised ones."""
     lo, hi = _limits(normalization)
     return np.asarray(change, dtype=np.float64) * 2.0 / (hi - lo)
+
+
+def _is_number(value: object) -> TypeGuard[float]:
+    return isinstance(value, int | float) and bool(np.isfinite(value))
 
 
 def _limits(normalization: Normalization) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

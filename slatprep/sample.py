@@ -42,7 +42,7 @@ def sample(
 
     points = apply_transform(invert_transform(transform), voxel_centres(coords))
     tree = cKDTree(voxel_centres(field.voxels))
-    distance, nearest = tree.query(points / 1.0)
+    distance, nearest = tree.query(points)
     distance = distance / VOXEL_SIZE
     valid = distance <= parameters.max_distance
     properties = np.where(valid[:, None], field.properties[nearest], np.float32(np.nan))
