@@ -148,8 +148,8 @@ def normalize(
     Examples
     --------
     >>> values, clipped = normalize([[1e7, 1000.0, 0.3]], PIXIE_RANGES)
-    >>> values.round(4).tolist(), clipped.tolist()
-    ([[0.0127, 0.1962, -0.2492]], [0, 0, 0])
+    >>> [round(float(v), 4) for v in values[0]], clipped.tolist()
+    ([0.0127, 0.1962, -0.2492], [0, 0, 0])
     """
     lo, hi = _limits(normalization)
     values = (2.0 * (to_mapped(properties) - lo) / (hi - lo) - 1.0).astype(np.float32)
