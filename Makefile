@@ -1,0 +1,80 @@
+# `make` alone lists what there is; every target sets up what it needs.
+.DEFAULT_GOAL := help
+.DELETE_ON_ERROR:
+.PHONY: help align test lint clean
+
+PYTHON ?= python3
+VENV   ?= .venv
+JOBS   ?= $(shell nproc 2>/dev/null || echo 1)
+DATA   ?= manifests/demo.toml
+ASSETS ?= 25
+SEED   ?= 0
+PRESET ?= default
+
+NAME      := $(notdir $(basename $(DATA)))
+STORE     ?= data/$(NAME).zarr
+MANIFESTS ?= manifests/build
+DEMO      := data/demo
+BIN       := $(VENV)/bin
+
+help:
+	@echo "slatprep: aligned, normalised physics supervision for TRELLIS latents"
+	@echo
+	@echo "  make align            make demo data, align it, build the store, say how good it is"
+	@echo "  make align DATA=FILE  the same on your own data (see manifests/mine.example.toml)"
+	@echo "  make test             linter, type checker and tests"
+	@echo "  make lint             linter and type checker alone"
+	@echo "  make clean            remove the environment, the demo data and caches; never your stores"
+	@echo
+	@echo "Settings, as in 'make align JOBS=4':"
+	@echo "  JOBS=$(JOBS)            assets aligned at a time"
+	@echo "  PRESET=$(PRESET)     alignment parameters: default, or paper (the protocol of SLAT-Phys)"
+	@echo "  ASSETS=$(ASSETS) SEED=$(SEED)  size and seed of the demo data"
+	@echo "  PYTHON=$(PYTHON)    Python 3.11 or newer, from which $(VENV) is made"
+
+# -- what it is for ---------------------------------------------------------
+
+ifeq ($(DATA),manifests/demo.toml)
+align: $(VENV)/.installed $(DEMO)/.assets-$(ASSETS)-seed-$(SEED)
+else
+align: $(VENV)/.installed
+endif
+	$(BIN)/slatprep build-store --config $(DATA) --out $(STORE) --manifests $(MANIFESTS) \
+	    --jobs $(JOBS) $(if $(filter-out default,$(PRESET)),--preset $(PRESET))
+ifeq ($(DATA),manifests/demo.toml)
+	@$(BIN)/slatprep score $(STORE) $(DEMO)/truth
+endif
+	@echo "store:   $(STORE)"
+	@echo "records: $(MANIFESTS)"
+
+$(DEMO)/.assets-$(ASSETS)-seed-$(SEED): | $(VENV)/.installed
+	rm -rf $(DEMO)
+	$(BIN)/slatprep make-demo $(DEMO) --assets $(ASSETS) --seed $(SEED) --quiet
+	@touch $@
+
+# -- development ------------------------------------------------------------
+
+test: lint
+	$(BIN)/python -m pytest -n $(JOBS)
+
+lint: $(VENV)/.installed-dev
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+
+clean:
+	rm -rf $(VENV) $(DEMO) data/demo.zarr build slatprep.egg-info
+	rm -rf .pytest_cache .hypothesis .ruff_cache .mypy_cache
+
+# -- environment ------------------------------------------------------------
+
+$(BIN)/python:
+	@sh tools/make-venv.sh $(PYTHON) $(VENV)
+
+$(VENV)/.installed: pyproject.toml | $(BIN)/python
+	$(BIN)/python -m pip install --disable-pip-version-check --quiet --editable .
+	@touch $@
+
+$(VENV)/.installed-dev: pyproject.toml | $(BIN)/python
+	$(BIN)/python -m pip install --disable-pip-version-check --quiet --editable '.[dev]'
+	@touch $@ $(VENV)/.installed

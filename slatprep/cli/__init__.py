@@ -1,0 +1,27 @@
+"""The command line: it parses and prints, and leaves the work to the stages."""
+
+from __future__ import annotations
+
+import os
+
+# One process is one job and computes on one thread: `--jobs` alone decides how
+# many cores are busy, and the numbers do not depend on a thread count. The
+# libraries read these once, when they are loaded; workers inherit them.
+_THREAD_VARIABLES = (
+    "OMP_NUM_THREADS",
+    "OPENBLAS_NUM_THREADS",
+    "MKL_NUM_THREADS",
+    "BLIS_NUM_THREADS",
+    "VECLIB_MAXIMUM_THREADS",
+    "NUMEXPR_NUM_THREADS",
+    "NUMBA_NUM_THREADS",
+)
+
+
+def main() -> None:
+    """Run `slatprep`; the entry point of the console script."""
+    for variable in _THREAD_VARIABLES:
+        os.environ[variable] = "1"
+    from slatprep.cli.commands import slatprep
+
+    slatprep(prog_name="slatprep")

@@ -1,0 +1,5 @@
+"""Allow `python -m slatprep.cli`."""
+
+from slatprep.cli import main
+
+main()

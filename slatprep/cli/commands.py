@@ -1,0 +1,79 @@
+"""The table of commands, and the group that loads each when it is used."""
+
+from __future__ import annotations
+
+import importlib
+from typing import Any
+
+import click
+
+from slatprep import __version__
+from slatprep.errors import ConfigError, SlatprepError
+
+COMMANDS = {
+    "make-demo": "slatprep.cli.demo:make_demo",
+    "build-store": "slatprep.cli.build:build_store",
+    "align": "slatprep.cli.build:align",
+    "check-alignment": "slatprep.cli.check:check_alignment",
+    "info": "slatprep.cli.info:info",
+    "score": "slatprep.cli.score:score",
+}
+"""Name of each command and where it lives; to add one, add its line here.
+
+The modules are loaded by `slatprep --help`, so they import nothing heavy
+before a command runs.
+"""
+
+EXIT_INCOMPLETE = 1
+EXIT_USAGE = 2
+EXIT_INTERRUPTED = 130
+
+
+class LazyGroup(click.Group):
+    """A group that imports a command when it is asked for, and prints errors in one line."""
+
+    def list_commands(self, ctx: click.Context) -> list[str]:
+        """Return the names in the order of the table, which is the order of use."""
+        return list(COMMANDS)
+
+    def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
+        """Import the command of that name."""
+        if cmd_name not in COMMANDS:
+            return None
+        module, _, attribute = COMMANDS[cmd_name].partition(":")
+        command = getattr(importlib.import_module(module), attribute)
+        if not isinstance(command, click.Command):
+            raise TypeError(f"{COMMANDS[cmd_name]} is no click command")
+        return command
+
+    def invoke(self, ctx: click.Context) -> Any:
+        """Run the command; an error made on purpose is one line and an exit code."""
+        try:
+            return super().invoke(ctx)
+        except SlatprepError as error:
+            click.echo(f"slatprep: error: {error}", err=True)
+            ctx.exit(EXIT_USAGE if isinstance(error, ConfigError) else EXIT_INCOMPLETE)
+        except KeyboardInterrupt:
+            click.echo("\nslatprep: stopped; nothing was replaced", err=True)
+            ctx.exit(EXIT_INTERRUPTED)
+
+
+@click.command(
+    cls=LazyGroup,
+    context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100},
+    epilog="""\b
+Exit codes:
+  0    all went in, or the check passed
+  1    something did not go in, or a check failed
+  2    wrong use: an option, a dataset definition or a name
+  130  stopped with Ctrl-C; nothing was replaced
+
+\b
+Example:
+  slatprep make-demo demo --assets 12 --seed 0
+  slatprep build-store --pixieverse demo/pixieverse --slat demo/slat --out demo.zarr
+""",
+)
+@click.version_option(__version__, prog_name="slatprep")
+def slatprep() -> None:
+    """Turn PixieVerse grids and TRELLIS latents into one store of aligned supervision."""

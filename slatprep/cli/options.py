@@ -1,0 +1,93 @@
+"""The options that say where the data are, shared by `build-store` and `align`."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypeVar
+
+import click
+
+if TYPE_CHECKING:
+    from slatprep.parameters import BuildParameters
+
+_Command = TypeVar("_Command", bound=Callable[..., object])
+
+_FILE = click.Path(path_type=Path, exists=True, dir_okay=False)
+
+
+def source_options(command: _Command) -> _Command:
+    """Add the options that decide the parameters of a build."""
+    options = (
+        click.option(
+            "--config",
+            type=_FILE,
+            help="Dataset definition (TOML); options win over it.",
+        ),
+        click.option(
+            "--pixieverse",
+            type=click.Path(path_type=Path),
+            metavar="DIR",
+            help="Root of the PixieVerse grids or predictions.",
+        ),
+        click.option(
+            "--slat",
+            type=click.Path(path_type=Path),
+            metavar="DIR",
+            help="Root of the TRELLIS latents, or one HDF5 file.",
+        ),
+        click.option(
+            "--map",
+            "pairing_map",
+            type=click.Path(path_type=Path),
+            metavar="CSV",
+            help="CSV that joins the ids of the two sides, or TRELLIS's metadata.csv.",
+        ),
+        click.option(
+            "--ranges",
+            metavar="dataset|pixie|FILE",
+            help="Where the normalisation ranges come from.  [default: dataset]",
+        ),
+        click.option(
+            "--preset",
+            type=click.Choice(["default", "paper"]),
+            help="Named alignment parameters; 'paper' is the protocol of SLAT-Phys.",
+        ),
+    )
+    for option in reversed(options):
+        command = option(command)
+    return command
+
+
+jobs_option = click.option(
+    "--jobs",
+    type=click.IntRange(min=1),
+    default=1,
+    show_default=True,
+    help="Assets computed at a time, each in a process of one thread.",
+)
+
+
+def parameters_of(
+    *,
+    config: Path | None,
+    pixieverse: Path | None,
+    slat: Path | None,
+    pairing_map: Path | None,
+    ranges: str | None,
+    preset: str | None,
+    **_other: Any,
+) -> BuildParameters:
+    """Return the parameters that the options of `source_options` ask for."""
+    from slatprep.config import load_parameters
+
+    given: dict[str, dict[str, object]] = {}
+    for group, key, value in (
+        ("pixieverse", "root", pixieverse),
+        ("slat", "root", slat),
+        ("pairing", "map", pairing_map),
+        ("normalize", "ranges", ranges),
+    ):
+        if value is not None:
+            given[group] = {key: str(value)}
+    return load_parameters(config, given, preset)

@@ -1,0 +1,201 @@
+"""What every command prints with: tables, notes, JSON and a progress bar.
+
+Results go to standard output, all else to standard error. On a terminal
+tables are drawn with rich, which respects NO_COLOR; in a pipe they are plain
+aligned columns; with ``--json`` standard output is one JSON document.
+"""
+
+from __future__ import annotations
+
+import functools
+import json
+import math
+import sys
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from typing import Any, TypeVar
+
+import click
+
+Cell = str | int | float | bool | None
+ProgressCallback = Callable[[int, int], None]
+"""Called with the assets done and the assets in all."""
+
+_Command = TypeVar("_Command", bound=Callable[..., object])
+
+_SECONDS_BETWEEN_LINES = 30.0
+
+
+class Output:
+    """Prints the results of one command in the form that was asked for.
+
+    Parameters
+    ----------
+    as_json : bool
+        One JSON document on standard output instead of tables.
+    verbosity : int
+        -1 prints errors and results alone, 1 prints more than the usual.
+    """
+
+    def __init__(self, as_json: bool = False, verbosity: int = 0) -> None:
+        self.as_json = as_json
+        self.verbosity = verbosity
+
+    def result(self, document: object, show: Callable[[], None]) -> None:
+        """Print a result: the document as JSON, or what `show` prints for people."""
+        if self.as_json:
+            click.echo(json.dumps(plain(document), indent=2, ensure_ascii=False, allow_nan=False))
+        else:
+            show()
+
+    def note(self, message: str) -> None:
+        """Tell a person something on standard error, unless quiet."""
+        if self.verbosity >= 0:
+            click.echo(message, err=True)
+
+    def detail(self, message: str) -> None:
+        """Tell a person more on standard error, where ``-v`` asks for it."""
+        if self.verbosity > 0:
+            click.echo(message, err=True)
+
+    def problem(self, message: str) -> None:
+        """Print one line on standard error about something that did not go in."""
+        click.echo(message, err=True)
+
+    def table(self, title: str, columns: Sequence[str], rows: Sequence[Sequence[Cell]]) -> None:
+        """Print a table; columns of numbers are aligned to the right."""
+        numeric = [
+            bool(rows) and all(row[k] is None or isinstance(row[k], int | float) for row in rows)
+            for k in range(len(columns))
+        ]
+        cells = [[_text(cell) for cell in row] for row in rows]
+        if sys.stdout.isatty():
+            _rich_table(title, columns, cells, numeric)
+        else:
+            _plain_table(title, columns, cells, numeric)
+
+    @contextmanager
+    def progress(self, label: str) -> Iterator[ProgressCallback]:
+        """Show how far a job is, on standard error, and how long it will still take.
+
+        The time left comes from the assets that are done, none of which is
+        forgotten. Where standard error is no terminal, a line is printed
+        every half minute instead of a bar.
+        """
+        if self.verbosity < 0:
+            yield lambda done, total: None
+        elif not sys.stderr.isatty():
+            yield _progress_lines(label)
+        else:
+            with _progress_bar(label) as update:
+                yield update
+
+
+def output_options(command: _Command) -> _Command:
+    """Add ``--json``, ``-q`` and ``-v``; the command gets an `Output` as its first argument."""
+
+    @click.option("--json", "as_json", is_flag=True, help="Print one JSON document instead of tables.")
+    @click.option("-q", "--quiet", is_flag=True, help="Print errors and results alone.")
+    @click.option("-v", "--verbose", is_flag=True, help="Print more than the usual.")
+    @functools.wraps(command)
+    def with_output(*, as_json: bool, quiet: bool, verbose: bool, **options: Any) -> object:
+        return command(Output(as_json, int(verbose) - int(quiet)), **options)
+
+    return with_output  # type: ignore[return-value]
+
+
+def plain(value: Any) -> Any:
+    """Return a value as JSON has it: paths as strings, not-a-number as null."""
+    if isinstance(value, dict):
+        return {str(key): plain(item) for key, item in value.items()}
+    if isinstance(value, list | tuple | set):
+        return [plain(item) for item in value]
+    if hasattr(value, "tolist"):
+        return plain(value.tolist())
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    return value if value is None or isinstance(value, bool | int | str) else str(value)
+
+
+def _text(cell: Cell) -> str:
+    if cell is None or (isinstance(cell, float) and math.isnan(cell)):
+        return "-"
+    if isinstance(cell, bool):
+        return "yes" if cell else "no"
+    if isinstance(cell, int):
+        return f"{cell:,}"
+    return f"{cell:.3f}" if isinstance(cell, float) else str(cell)
+
+
+def _rich_table(
+    title: str, columns: Sequence[str], cells: list[list[str]], numeric: list[bool]
+) -> None:
+    from rich import box
+    from rich.console import Console
+    from rich.markup import escape
+    from rich.table import Table
+
+    table = Table(title=escape(title), title_justify="left", box=box.SIMPLE_HEAD, title_style="bold")
+    for column, right in zip(columns, numeric, strict=True):
+        table.add_column(escape(column), justify="right" if right else "left")
+    for row in cells:
+        table.add_row(*map(escape, row))
+    Console(file=sys.stdout, highlight=False).print(table)
+
+
+def _plain_table(
+    title: str, columns: Sequence[str], cells: list[list[str]], numeric: list[bool]
+) -> None:
+    lines = [list(columns), *cells]
+    widths = [max(len(line[k]) for line in lines) for k in range(len(columns))]
+    click.echo(title)
+    for line in lines:
+        padded = (
+            text.rjust(width) if right else text.ljust(width)
+            for text, width, right in zip(line, widths, numeric, strict=True)
+        )
+        click.echo("  ".join(padded).rstrip())
+    click.echo()
+
+
+def _progress_lines(label: str) -> ProgressCallback:
+    start = last = time.monotonic()
+
+    def update(done: int, total: int) -> None:
+        nonlocal last
+        now = time.monotonic()
+        if done and now - last >= _SECONDS_BETWEEN_LINES:
+            left = (now - start) / done * (total - done)
+            click.echo(f"{label}: {done:,} of {total:,} assets, {left:,.0f} s left", err=True)
+            last = now
+
+    return update
+
+
+@contextmanager
+def _progress_bar(label: str) -> Iterator[ProgressCallback]:
+    from rich.console import Console
+    from rich.progress import (
+        BarColumn,
+        MofNCompleteColumn,
+        Progress,
+        TextColumn,
+        TimeElapsedColumn,
+        TimeRemainingColumn,
+    )
+
+    with Progress(
+        TextColumn("{task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeElapsedColumn(),
+        TextColumn("left"),
+        TimeRemainingColumn(),
+        console=Console(stderr=True),
+        # Assets differ in size by ten times, so a short memory would make the
+        # estimate jump; this one remembers all of them.
+        speed_estimate_period=math.inf,
+    ) as progress:
+        task = progress.add_task(label, total=None)
+        yield lambda done, total: progress.update(task, completed=done, total=total)

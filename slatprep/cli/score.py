@@ -1,0 +1,60 @@
+"""`slatprep score`: a store against known truth."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+import click
+
+from slatprep.cli.output import Output, output_options
+
+
+@click.command(
+    epilog="""\b
+Example:
+  slatprep score demo.zarr demo/truth
+"""
+)
+@click.argument("store", type=click.Path(path_type=Path, exists=True, file_okay=False))
+@click.argument("truth_dir", type=click.Path(path_type=Path, exists=True, file_okay=False))
+@output_options
+def score(output: Output, store: Path, truth_dir: Path) -> None:
+    """Score STORE against the truth in TRUTH_DIR, as make-demo writes it.
+
+    Each level's figures are over assets that have one right placement only;
+    success is a mean displacement below 1.5 voxels. Exit code 1 says that an
+    asset with a truth is not in the store.
+    """
+    from slatprep.truth import score_against_truth
+
+    report = score_against_truth(store, truth_dir)
+
+    def show() -> None:
+        if output.verbosity > 0:
+            output.table(
+                "Assets against truth",
+                ("asset", "name", "level", "symmetric", "displacement", "label accuracy",
+                 "truth's own", "valid"),
+                [
+                    (s.asset_id, s.name, s.level, s.symmetric, s.displacement, s.label_accuracy,
+                     s.truth_own, s.valid_share)
+                    for s in report.assets
+                ],
+            )  # fmt: skip
+        output.table(
+            "Against truth (non-symmetric assets; displacement in voxels)",
+            ("level", "assets", "success", "median displacement", "p90", "label accuracy",
+             "truth's own", "valid"),
+            [
+                (f"L{s.level}", s.assets, s.success, s.displacement_median, s.displacement_p90,
+                 s.label_accuracy, s.truth_own, s.valid_share)
+                for s in report.levels
+            ],
+        )  # fmt: skip
+
+    output.result(dataclasses.asdict(report), show)
+    for asset_id in report.missing:
+        output.problem(f"{truth_dir / asset_id}.npz: its asset is not in {store}")
+    if report.missing:
+        raise SystemExit(1)

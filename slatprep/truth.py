@@ -1,0 +1,206 @@
+"""Score a store against known truth, as demo data has it.
+
+The truth of an asset is ``<truth_dir>/<asset id>.npz`` with ``transform``
+(4, 4), ``material`` (N,), ``name``, ``level`` and ``symmetric``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from slatprep.errors import InputError, StoreError
+from slatprep.geometry import apply_transform, displacement, invert_transform, voxel_centres
+from slatprep.records import BACKGROUND, RESOLUTION
+
+if TYPE_CHECKING:
+    import zarr
+
+SUCCESS_DISPLACEMENT = 1.5
+"""An asset is placed right where its mean displacement [voxel] is below this."""
+
+ANSWERABLE_DISTANCE = 2.0
+"""A SLAT voxel has a true answer where an annotation lies within this distance [voxel]."""
+
+_TRUTH_KEYS = ("transform", "material", "name", "level", "symmetric")
+
+
+@dataclass(frozen=True)
+class TruthScore:
+    """How one asset of a store compares with its truth.
+
+    Attributes
+    ----------
+    asset_id, name, level, symmetric
+        As the truth states them.
+    displacement : float
+        Mean distance [voxel] over the SLAT voxels between where the estimated
+        and the true inverse transform put them in the PixieVerse frame.
+    label_accuracy : float
+        Share of the answerable voxels whose class is right; a voxel without
+        a label is wrong.
+    truth_own : float
+        The same share for the nearest annotated voxel under the true
+        transform: what is left to lose by the lookup alone.
+    valid_share : float
+        Share of the SLAT voxels that carry a label.
+    """
+
+    asset_id: str
+    name: str
+    level: int
+    symmetric: bool
+    displacement: float
+    label_accuracy: float
+    truth_own: float
+    valid_share: float
+
+
+@dataclass(frozen=True)
+class LevelScore:
+    """The non-symmetric assets of one level: shares, means and medians of their scores."""
+
+    level: int
+    assets: int
+    success: float
+    displacement_median: float
+    displacement_p90: float
+    label_accuracy: float
+    truth_own: float
+    valid_share: float
+
+
+@dataclass(frozen=True)
+class TruthReport:
+    """Scores of a store: one an asset, one a level; `missing` has a truth but no row."""
+
+    assets: tuple[TruthScore, ...]
+    levels: tuple[LevelScore, ...]
+    missing: tuple[str, ...]
+
+
+def score_against_truth(store: Path, truth_dir: Path) -> TruthReport:
+    """Compare every asset of a store with its truth.
+
+    Parameters
+    ----------
+    store : Path
+        A store of `slatprep build-store`; only its published layout is read.
+    truth_dir : Path
+        Folder of truth files; assets of the store without one are left out.
+
+    Returns
+    -------
+    TruthReport
+
+    Raises
+    ------
+    StoreError
+        If the store cannot be opened.
+    InputError
+        If there is no truth in the folder, or a truth does not fit its asset.
+    """
+    truths = {path.stem: path for path in sorted(truth_dir.glob("*.npz"))}
+    if not truths:
+        raise InputError(truth_dir, "no truth in it", "a folder with one <asset id>.npz an asset")
+    group = _open(store)
+    ids = [str(asset_id) for asset_id in _array(group, "asset/id")]
+    offsets = _array(group, "asset/offset")
+    scores = tuple(
+        _score_asset(group, row, slice(int(offsets[row]), int(offsets[row + 1])), truths[asset_id])
+        for row, asset_id in enumerate(ids)
+        if asset_id in truths
+    )
+    return TruthReport(scores, summarise(scores), tuple(sorted(set(truths) - set(ids))))
+
+
+def summarise(scores: Sequence[TruthScore]) -> tuple[LevelScore, ...]:
+    """Return the score of each level over its assets that have one right placement only."""
+    levels = sorted({score.level for score in scores if not score.symmetric})
+    return tuple(
+        _summarise_level(level, [s for s in scores if s.level == level and not s.symmetric])
+        for level in levels
+    )
+
+
+def _summarise_level(level: int, scores: Sequence[TruthScore]) -> LevelScore:
+    displacements = np.array([score.displacement for score in scores])
+    return LevelScore(
+        level=level,
+        assets=len(scores),
+        success=float(np.mean(displacements < SUCCESS_DISPLACEMENT)),
+        displacement_median=float(np.median(displacements)),
+        displacement_p90=float(np.percentile(displacements, 90)),
+        label_accuracy=float(np.mean([score.label_accuracy for score in scores])),
+        truth_own=float(np.mean([score.truth_own for score in scores])),
+        valid_share=float(np.mean([score.valid_share for score in scores])),
+    )
+
+
+def _score_asset(group: zarr.Group, row: int, voxels: slice, path: Path) -> TruthScore:
+    from scipy.spatial import cKDTree
+
+    truth = _read_truth(path)
+    coords = _array(group, "voxel/coords", voxels)
+    material = _array(group, "voxel/material", voxels)
+    valid = _array(group, "voxel/valid", voxels)
+    grid = _array(group, "grid/material", row)
+    true_material = truth["material"]
+    if true_material.shape != material.shape:
+        raise InputError(
+            path, f"material of {true_material.shape[0]} voxels", f"the {len(material)} of the store"
+        )
+    true_points = apply_transform(invert_transform(truth["transform"]), voxel_centres(coords))
+    annotated = np.argwhere(grid < BACKGROUND)
+    distance, nearest = cKDTree(voxel_centres(annotated)).query(true_points)
+    answerable = distance * RESOLUTION <= ANSWERABLE_DISTANCE
+    own_material = grid[tuple(annotated[nearest].T)]
+    return TruthScore(
+        asset_id=path.stem,
+        name=str(truth["name"]),
+        level=int(truth["level"]),
+        symmetric=bool(truth["symmetric"]),
+        displacement=displacement(
+            _array(group, "asset/transform", row), truth["transform"], coords
+        ),
+        label_accuracy=_share(((material == true_material) & valid)[answerable]),
+        truth_own=_share((own_material == true_material)[answerable]),
+        valid_share=_share(valid),
+    )
+
+
+def _share(flags: NDArray[np.bool_]) -> float:
+    return float(flags.mean()) if flags.size else float("nan")
+
+
+def _read_truth(path: Path) -> dict[str, NDArray[np.generic]]:
+    with np.load(path, allow_pickle=False) as file:
+        missing = [key for key in _TRUTH_KEYS if key not in file]
+        if missing:
+            raise InputError(path, f"no {', '.join(missing)}", f"keys {', '.join(_TRUTH_KEYS)}")
+        return {key: file[key] for key in _TRUTH_KEYS}
+
+
+def _open(path: Path) -> zarr.Group:
+    import zarr
+
+    try:
+        return zarr.open_group(path, mode="r")
+    except (OSError, ValueError) as error:
+        raise StoreError(f"{path}: cannot be opened as a store: {error}") from error
+
+
+def _array(
+    group: zarr.Group, name: str, selection: int | slice = slice(None)
+) -> NDArray[np.generic]:
+    import zarr
+
+    array = group[name]
+    if not isinstance(array, zarr.Array):
+        raise StoreError(f"{name}: expected an array")
+    return np.asarray(array[selection])
