@@ -13,7 +13,7 @@ PRESET ?= default
 
 NAME      := $(notdir $(basename $(DATA)))
 STORE     ?= data/$(NAME).zarr
-MANIFESTS ?= manifests/build
+MANIFESTS ?= manifests/build/$(NAME)
 DEMO      := data/demo
 BIN       := $(VENV)/bin
 

@@ -141,8 +141,9 @@ def line_of(text: str, keys: tuple[str, ...]) -> int | None:
             here = table + _split_key(stripped.partition("=")[0])
         else:
             continue
-        if len(here) > best_length and here == keys[: len(here)]:
-            best_length, best_line = len(here), number
+        common = min(len(here), len(keys))
+        if common > best_length and here[:common] == keys[:common]:
+            best_length, best_line = common, number
     return best_line
 
 

@@ -1,0 +1,194 @@
+"""Dataset definitions: what is read from them, and what is said of a wrong one."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from slatprep.config import line_of, load_parameters
+from slatprep.errors import ConfigError
+from slatprep.parameters import PRESETS, AlignParameters
+
+MINIMAL = """name = "mine"
+
+[pixieverse]
+root = "grids"
+
+[slat]
+root = "latents"
+"""
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    (tmp_path / "grids").mkdir()
+    (tmp_path / "latents").mkdir()
+    return tmp_path
+
+
+def write(folder: Path, text: str) -> Path:
+    path = folder / "mine.toml"
+    path.write_text(text, encoding="utf-8")
+    return path
+
+
+def message_of(path: Path | None, **arguments: object) -> str:
+    with pytest.raises(ConfigError) as caught:
+        load_parameters(path, **arguments)  # type: ignore[arg-type]
+    return str(caught.value)
+
+
+def test_minimal_file_leaves_everything_else_at_its_default(folder: Path) -> None:
+    parameters = load_parameters(write(folder, MINIMAL))
+    assert parameters.name == "mine"
+    assert parameters.align == AlignParameters()
+    assert parameters.normalize.ranges == "dataset"
+
+
+def test_paths_are_relative_to_the_file_and_not_to_the_working_directory(
+    folder: Path, tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (folder / "map.csv").touch()
+    (folder / "ranges.toml").touch()
+    path = write(
+        folder, MINIMAL + '[pairing]\nmap = "map.csv"\n[normalize]\nranges = "./ranges.toml"\n'
+    )
+    monkeypatch.chdir(tmp_path_factory.mktemp("elsewhere"))
+    parameters = load_parameters(path)
+    assert parameters.pixieverse.root == folder / "grids"
+    assert parameters.pairing.map == folder / "map.csv"
+    assert parameters.normalize.ranges == str(folder / "ranges.toml")
+
+
+def test_options_win_over_the_file(folder: Path) -> None:
+    (folder / "other").mkdir()
+    path = write(folder, MINIMAL + '[normalize]\nranges = "dataset"\n')
+    other = str(folder / "other")
+    parameters = load_parameters(
+        path, {"pixieverse": {"root": other}, "normalize": {"ranges": "pixie"}}
+    )
+    assert parameters.pixieverse.root == folder / "other"
+    assert parameters.slat.root == folder / "latents"
+    assert parameters.normalize.ranges == "pixie"
+
+
+def test_options_alone_are_enough(folder: Path) -> None:
+    parameters = load_parameters(
+        None,
+        {
+            "pixieverse": {"root": str(folder / "grids")},
+            "slat": {"root": str(folder / "latents")},
+        },
+    )
+    assert parameters.slat.root == folder / "latents"
+
+
+def test_preset_replaces_the_align_table(folder: Path) -> None:
+    path = write(folder, MINIMAL + '[align]\nengine = "small_gicp"\nradius = 2.5\n')
+    assert load_parameters(path).align.radius == 2.5
+    assert load_parameters(path, preset="paper").align == PRESETS["paper"]
+
+
+def test_patterns_are_lists(folder: Path) -> None:
+    path = write(folder, MINIMAL + 'pattern = ["a/{id}.npz", "b/{id}.npz"]\n')
+    assert load_parameters(path).slat.pattern == ("a/{id}.npz", "b/{id}.npz")
+
+
+@pytest.mark.parametrize(
+    ("addition", "line", "words"),
+    [
+        ('[align]\nengin = "field"\n', 9, ("align.engin", "did you mean 'engine'", "seed")),
+        ('[align]\nengine = "magic"\n', 9, ("align.engine", "'magic'", "'open3d'")),
+        ("[align]\nradius = true\n", 9, ("align.radius", "True", "number")),
+        ('[align]\nradius = "3"\n', 9, ("align.radius", "'3'", "number")),
+        ("[align]\nradius = -1.0\n", 9, ("align.radius", "-1.0", "above 0")),
+        ("[align]\nradius = nan\n", 9, ("align.radius", "nan", "above 0")),
+        ("[align]\n\nscale_bounds = [1.2, 1.6]\n", 10, ("align.scale_bounds", "low <= 1")),
+        ("align.seed = 1.5\n", 8, ("slat.align", "unknown key")),
+        ("[alingment]\n", 8, ("alingment", "unknown key", "did you mean 'align'")),
+        ("[store]\ncompression_level = 23\n", 9, ("store.compression_level", "0 to 22")),
+        ('[pairing]\nmap = "absent.csv"\n', 9, ("pairing.map", "absent.csv", "does not exist")),
+        ('[normalize]\nranges = "pixi"\n', 9, ("normalize.ranges", "pixi", "dataset, pixie")),
+        ('pattern = "{id}.npz"\n', 8, ("slat.pattern", "'{id}.npz'", "array")),
+        ('"group" = 3\n', 8, ("slat.group", "3", "string")),
+    ],
+)
+def test_fault_is_reported_with_file_line_key_and_what_is_allowed(
+    folder: Path, addition: str, line: int, words: tuple[str, ...]
+) -> None:
+    path = write(folder, MINIMAL + addition)
+    message = message_of(path)
+    assert message.startswith(f"{path}:{line}: ")
+    assert "\n" not in message
+    for word in words:
+        assert word in message
+
+
+def test_missing_root_says_both_ways_to_give_it(folder: Path) -> None:
+    path = write(folder, '[pixieverse]\nroot = "grids"\n')
+    message = message_of(path)
+    assert "slat.root: not given" in message
+    assert "--slat" in message and "[slat]" in message
+    assert "--pixieverse" in message_of(None)
+
+
+def test_missing_root_inside_its_table_names_the_line_of_the_table(folder: Path) -> None:
+    path = write(folder, '[pixieverse]\nsample = "0"\n[slat]\nroot = "latents"\n')
+    assert message_of(path).startswith(f"{path}:1: pixieverse.root: not given")
+
+
+def test_fault_in_an_option_names_the_option(folder: Path) -> None:
+    path = write(folder, MINIMAL)
+    message = message_of(path, overrides={"slat": {"root": str(folder / "nowhere")}})
+    assert message.startswith("option --slat: slat.root: ")
+    assert "nowhere does not exist" in message
+
+
+def test_group_that_is_no_table_is_named(folder: Path) -> None:
+    path = write(folder, "slat = 3\n")
+    message = message_of(path, overrides={"slat": {"root": "x"}})
+    assert message.startswith(f"{path}:1: slat: ") and "table" in message
+
+
+def test_invalid_toml_names_file_and_line(folder: Path) -> None:
+    path = write(folder, MINIMAL + "[align\n")
+    message = message_of(path)
+    assert message.startswith(f"{path}: not valid TOML") and "line 8" in message
+
+
+def test_unreadable_file_is_a_config_error(folder: Path) -> None:
+    assert "absent.toml" in message_of(folder / "absent.toml")
+    path = folder / "binary.toml"
+    path.write_bytes(b"\xff\xfe\x00")
+    assert "binary.toml" in message_of(path)
+
+
+def test_unknown_preset_lists_those_there_are(folder: Path) -> None:
+    message = message_of(write(folder, MINIMAL), preset="papr")
+    assert "papr" in message and "paper" in message
+
+
+KEYS = st.text(alphabet="abcdefghijklmnopqrstuvwxyz_", min_size=1, max_size=8)
+
+
+@given(
+    tables=st.dictionaries(
+        KEYS, st.dictionaries(KEYS, st.integers(), min_size=1, max_size=4), min_size=1, max_size=4
+    ),
+    blank=st.integers(0, 3),
+)
+def test_line_of_finds_every_key_where_it_was_written(
+    tables: dict[str, dict[str, int]], blank: int
+) -> None:
+    lines: list[str] = []
+    where = {}
+    for table, entries in tables.items():
+        lines += ["# comment = 1"] * blank + [f"[{table}]"]
+        for key, value in entries.items():
+            lines += [""] * blank + [f"{key} = {value}  # note"]
+            where[table, key] = len(lines)
+    text = "\n".join(lines)
+    assert {keys: line_of(text, keys) for keys in where} == where
