@@ -299,14 +299,19 @@ class Normalization:
 class AssetResult:
     """What one asset's task hands to the packing stage.
 
-    Arrays are None where ``status`` is not ``ok``; ``record`` is the asset's
-    provenance, JSON-ready.
+    Everything from `field` on is None where ``status`` is not ``ok``; then
+    ``reason`` says in one line why. ``record`` is the asset's provenance,
+    JSON-ready.
     """
 
     pair: AssetPair
     status: Status
+    reason: str = ""
     record: dict[str, object] = field(default_factory=dict)
     field: MaterialField | None = None
     latents: StructuredLatents | None = None
     alignment: Alignment | None = None
     annotation: Annotation | None = None
+    ambiguity: Ambiguity | None = None
+    verdict: Verdict | None = None
+    verdict_reasons: tuple[str, ...] = ()

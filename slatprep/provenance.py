@@ -1,0 +1,279 @@
+"""Provenance: what each row of a store was made from, by what, and how well.
+
+One JSON record an asset, as lines of one file, and one record of the build
+over them; both follow the JSON Schemas in ``slatprep/schema``.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+import os
+import platform
+import tempfile
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import fields, is_dataclass
+from datetime import UTC, datetime
+from enum import Enum
+from importlib import metadata, resources
+from pathlib import Path
+from typing import Any, cast
+
+import numpy as np
+
+from slatprep import __version__
+from slatprep.align import engine_versions
+from slatprep.geometry import boundary
+from slatprep.parameters import AlignParameters, BuildParameters
+from slatprep.records import PROPERTY_COLUMNS, AssetResult, Normalization
+from slatprep.summary import BuildSummary
+
+ASSET_RECORD = "slatprep-asset-record"
+BUILD_RECORD = "slatprep-build-record"
+RECORD_VERSION = 1
+
+# These differ between runs, machines or folders without the content differing,
+# so a build's id leaves them out.
+_NOT_CONTENT = ("duration_s", "reason", "traceback")
+
+
+def library_versions(parameters: AlignParameters) -> dict[str, str]:
+    """Return the versions of everything that makes an asset's numbers."""
+    return {
+        "slatprep": __version__,
+        "python": platform.python_version(),
+        "numpy": metadata.version("numpy"),
+        "scipy": metadata.version("scipy"),
+        **engine_versions(parameters),
+    }
+
+
+def content_parameters(parameters: BuildParameters) -> dict[str, Any]:
+    """Return the parameters that decide an asset's row, without where its files lie."""
+    return {"align": jsonable(parameters.align), "sample": jsonable(parameters.sample)}
+
+
+def asset_record(
+    result: AssetResult, parameters: BuildParameters, duration: float, traceback: str = ""
+) -> dict[str, Any]:
+    """Return the record of one asset.
+
+    Parameters
+    ----------
+    result : AssetResult
+        What became of it.
+    parameters : BuildParameters
+        The build's parameters.
+    duration : float
+        Seconds spent on it.
+    traceback : str
+        Where an error of slatprep's own arose; empty otherwise.
+
+    Returns
+    -------
+    dict
+        JSON-ready; ``normalization`` and the clipped counts are filled in by
+        `complete_record` once the whole dataset is known.
+    """
+    pair, field, latents = result.pair, result.field, result.latents
+    sources = (field.sources if field else ()) + (latents.sources if latents else ())
+    warnings = (field.warnings if field else ()) + (latents.warnings if latents else ())
+    return {
+        "format": ASSET_RECORD,
+        "format_version": RECORD_VERSION,
+        "asset_id": pair.asset_id,
+        "object_id": pair.object_id,
+        "view": pair.view,
+        "category": pair.category,
+        "status": str(result.status),
+        "reason": result.reason,
+        "traceback": traceback,
+        "sources": jsonable(sources),
+        "bounds": jsonable(field.bounds) if field else None,
+        "parameters": content_parameters(parameters),
+        "versions": library_versions(parameters.align),
+        "alignment": _alignment(result),
+        "normalization": None,
+        "counts": _counts(result),
+        "warnings": list(warnings),
+        "duration_s": round(duration, 4),
+    }
+
+
+def complete_record(
+    record: dict[str, Any],
+    normalization: Normalization,
+    clipped_voxels: Iterable[int],
+    clipped_grid: Iterable[int],
+) -> dict[str, Any]:
+    """Return a record with what only the whole dataset could tell: ranges and clipped values."""
+    clipped = {
+        "voxel": dict(zip(PROPERTY_COLUMNS, map(int, clipped_voxels), strict=True)),
+        "grid": dict(zip(PROPERTY_COLUMNS, map(int, clipped_grid), strict=True)),
+    }
+    return {
+        **record,
+        "normalization": jsonable(normalization),
+        "counts": {**record["counts"], "clipped": clipped},
+    }
+
+
+def write_build_record(path: Path, summary: BuildSummary, parameters: BuildParameters) -> None:
+    """Write the record of a build as one JSON document."""
+    record = {
+        "format": BUILD_RECORD,
+        "format_version": RECORD_VERSION,
+        "id": summary.manifest,
+        "name": parameters.name,
+        "created": datetime.now(UTC).isoformat(timespec="seconds"),
+        "duration_s": round(summary.seconds, 3),
+        "platform": platform.platform(),
+        "store": summary.store.name if summary.store else None,
+        "records": summary.records.name,
+        "parameters": jsonable(parameters),
+        "versions": origin(parameters)["versions"],
+        "normalization": jsonable(summary.normalization),
+        "statuses": summary.statuses,
+        "verdicts": summary.verdicts,
+        "counts": {
+            "voxels": summary.n_voxels,
+            "valid": summary.n_valid,
+            "clipped": dict(summary.clipped),
+        },
+    }
+    path.write_text(
+        json.dumps(record, indent=2, allow_nan=False, ensure_ascii=False) + "\n", encoding="utf-8"
+    )
+
+
+def origin(parameters: BuildParameters) -> dict[str, Any]:
+    """Return the parameters and versions that decide a store's bytes, without where files lie."""
+    return {
+        "name": parameters.name,
+        "parameters": {
+            **content_parameters(parameters),
+            "normalize": jsonable(parameters.normalize),
+            "store": jsonable(parameters.store),
+        },
+        "versions": {
+            **library_versions(parameters.align),
+            "zarr": metadata.version("zarr"),
+            "joblib": metadata.version("joblib"),
+        },
+    }
+
+
+def write_records(path: Path, records: Iterable[Mapping[str, Any]]) -> str:
+    """Write records as JSON Lines and return the id of their content.
+
+    Parameters
+    ----------
+    path : Path
+        The file; use one from `staged` so that no half of it is ever seen.
+    records : iterable of mapping
+        In the order of their asset ids.
+
+    Returns
+    -------
+    str
+        SHA-256, in hex, of all that the records say except how long things
+        took and in what words they failed.
+    """
+    digest = hashlib.sha256()
+    with path.open("w", encoding="utf-8") as file:
+        for record in records:
+            file.write(json.dumps(record, allow_nan=False, ensure_ascii=False) + "\n")
+            content = {k: v for k, v in record.items() if k not in _NOT_CONTENT}
+            digest.update(json.dumps(content, sort_keys=True, allow_nan=False).encode() + b"\n")
+    return digest.hexdigest()
+
+
+@contextmanager
+def staged(path: Path) -> Iterator[Path]:
+    """Yield a file beside `path` that takes its place, whole and on disk, when all went well."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    descriptor, name = tempfile.mkstemp(prefix=f".{path.name}.", dir=path.parent)
+    os.close(descriptor)
+    temporary = Path(name)
+    try:
+        yield temporary
+        with temporary.open("rb+") as file:
+            os.fsync(file.fileno())
+        temporary.chmod(0o666 & ~_umask())
+        temporary.replace(path)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def load_schema(name: str) -> dict[str, Any]:
+    """Return a published JSON Schema, ``asset_record`` or ``build_record``."""
+    text = resources.files("slatprep").joinpath("schema", f"{name}.schema.json").read_text("utf-8")
+    return cast(dict[str, Any], json.loads(text))
+
+
+def jsonable(value: object) -> Any:
+    """Return a value as JSON can hold it: NaN and infinity become None."""
+    if is_dataclass(value) and not isinstance(value, type):
+        return {f.name: jsonable(getattr(value, f.name)) for f in fields(value)}
+    if isinstance(value, np.ndarray | np.generic):
+        return jsonable(value.tolist())
+    if isinstance(value, Mapping):
+        return {str(key): jsonable(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [jsonable(item) for item in value]
+    if isinstance(value, Enum):
+        return value.value
+    if isinstance(value, Path):
+        return value.as_posix()
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    if value is None or isinstance(value, bool | int | float | str):
+        return value
+    raise TypeError(f"a record cannot hold {type(value).__name__} {value!r}")
+
+
+def _alignment(result: AssetResult) -> dict[str, Any] | None:
+    alignment, ambiguity = result.alignment, result.ambiguity
+    if alignment is None or ambiguity is None:
+        return None
+    return {
+        "transform": jsonable(alignment.transform),
+        "engine": alignment.engine,
+        "model": alignment.model,
+        "search": alignment.search,
+        "quality": jsonable(alignment.quality),
+        "candidates": jsonable(alignment.candidates),
+        "placements": jsonable(alignment.placements),
+        "ambiguity": {
+            "material_share": jsonable(ambiguity.material_share),
+            "property_change": jsonable(ambiguity.property_change),
+            "margin": jsonable(ambiguity.margin),
+        },
+        "verdict": str(result.verdict),
+        "verdict_reasons": list(result.verdict_reasons),
+    }
+
+
+def _counts(result: AssetResult) -> dict[str, Any] | None:
+    field, latents, annotation = result.field, result.latents, result.annotation
+    if field is None or latents is None or annotation is None:
+        return None
+    occupied = int(field.occupancy.sum())
+    return {
+        "occupied": occupied,
+        "annotated": len(field.voxels),
+        "unannotated": occupied - len(field.voxels),
+        "boundary": int(boundary(field.occupancy).sum()),
+        "slat_voxels": len(latents.coords),
+        "valid": int(annotation.valid.sum()),
+        "clipped": None,
+    }
+
+
+def _umask() -> int:
+    # The only portable way to read the umask is to set it.
+    mask = os.umask(0)
+    os.umask(mask)
+    return mask

@@ -1,0 +1,272 @@
+"""What lies where in the store: arrays, chunks, shards, attributes.
+
+The one table of arrays is `ARRAYS`; writer and reader take names, types and
+shapes from it. Rows of ``voxel/*`` and ``grid/*`` are cut into shards by
+`row_ranges`, and `overlaps` says which assets lie in one.
+"""
+
+from __future__ import annotations
+
+from bisect import bisect_right
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+from slatprep.parameters import StoreParameters
+from slatprep.records import (
+    BACKGROUND,
+    MATERIAL_CLASSES,
+    PROPERTY_COLUMNS,
+    RESOLUTION,
+    UNANNOTATED,
+    Normalization,
+)
+
+if TYPE_CHECKING:
+    import zarr
+
+FORMAT = "slatprep-store"
+FORMAT_VERSION = 1
+
+ASSET_CHUNK = 65_536
+"""Assets in one chunk of the ``asset/*`` arrays."""
+
+NAN = float("nan")
+
+
+@dataclass(frozen=True)
+class ArrayLayout:
+    """One array of the store: its type, its dimensions and what it means."""
+
+    name: str
+    dtype: str
+    dimensions: tuple[str, ...]
+    fill_value: float | bool | str
+    description: str
+    unit: str = ""
+
+
+_XYZ = ("x", "y", "z")
+
+ARRAYS = (
+    ArrayLayout("asset/id", "str", ("asset",), "", "id of the row, sorted ascending"),
+    ArrayLayout("asset/object_id", "str", ("asset",), "", "PixieVerse id of the object"),
+    ArrayLayout("asset/view", "str", ("asset",), "", "image or seed the SLAT was made from"),
+    ArrayLayout("asset/category", "str", ("asset",), "", "PixieVerse category, empty if unknown"),
+    ArrayLayout(
+        "asset/offset",
+        "int64",
+        ("asset_edge",),
+        0,
+        "asset a owns rows offset[a]:offset[a+1] of voxel/*",
+    ),
+    ArrayLayout(
+        "asset/transform",
+        "float64",
+        ("asset", "row", "column"),
+        NAN,
+        "PixieVerse frame to SLAT frame, both the unit cube [-0.5, 0.5]^3",
+    ),
+    ArrayLayout("asset/engine", "str", ("asset",), "", "alignment engine"),
+    ArrayLayout("asset/model", "str", ("asset",), "", "rigid or similarity"),
+    ArrayLayout("asset/search", "str", ("asset",), "", "starts that were needed"),
+    ArrayLayout(
+        "asset/fitness",
+        "float64",
+        ("asset",),
+        NAN,
+        "share of PixieVerse boundary voxels with a SLAT voxel within the radius",
+    ),
+    ArrayLayout("asset/inlier_rmse", "float64", ("asset",), NAN, "rms distance of those", "voxel"),
+    ArrayLayout(
+        "asset/fitness_backward",
+        "float64",
+        ("asset",),
+        NAN,
+        "share of SLAT voxels with a PixieVerse boundary voxel within the radius",
+    ),
+    ArrayLayout(
+        "asset/inlier_rmse_backward", "float64", ("asset",), NAN, "rms distance of those", "voxel"
+    ),
+    ArrayLayout("asset/overlap", "float64", ("asset",), NAN, "overlap of the two voxel surfaces"),
+    ArrayLayout(
+        "asset/margin", "float64", ("asset",), NAN, "score above the next distinct placement"
+    ),
+    ArrayLayout(
+        "asset/ambiguity",
+        "float64",
+        ("asset",),
+        NAN,
+        "share of SLAT voxels whose class differs between placements that fit about as well",
+    ),
+    ArrayLayout(
+        "asset/property_ambiguity",
+        "float64",
+        ("asset", "property"),
+        NAN,
+        "mean change of each normalised property between placements that fit about as well",
+    ),
+    ArrayLayout("asset/valid_share", "float64", ("asset",), NAN, "share of valid SLAT voxels"),
+    ArrayLayout("asset/verdict", "str", ("asset",), "", "good, doubtful or failed"),
+    ArrayLayout("voxel/coords", "uint8", ("voxel", "axis"), 0, "SLAT coordinate, source order"),
+    ArrayLayout("voxel/feats", "float32", ("voxel", "latent"), 0.0, "SLAT latents, unchanged"),
+    ArrayLayout(
+        "voxel/properties",
+        "float32",
+        ("voxel", "property"),
+        NAN,
+        "normalised properties in [-1, 1], NaN where not valid",
+    ),
+    ArrayLayout(
+        "voxel/material", "uint8", ("voxel",), UNANNOTATED, "class 0..6, 255 where not valid"
+    ),
+    ArrayLayout("voxel/valid", "bool", ("voxel",), False, "an annotation was found near enough"),
+    ArrayLayout(
+        "voxel/distance", "float32", ("voxel",), NAN, "distance to the annotation used", "voxel"
+    ),
+    ArrayLayout(
+        "grid/properties",
+        "float32",
+        ("asset", "property", *_XYZ),
+        NAN,
+        "normalised PixieVerse field in [-1, 1], NaN where not annotated",
+    ),
+    ArrayLayout(
+        "grid/material",
+        "uint8",
+        ("asset", *_XYZ),
+        BACKGROUND,
+        "class 0..6, 7 background, 255 occupied but not annotated",
+    ),
+)
+"""Every array of the store."""
+
+_FIXED_SIZES = {
+    "row": 4,
+    "column": 4,
+    "axis": 3,
+    "property": len(PROPERTY_COLUMNS),
+    "latent": 8,
+    **dict.fromkeys(_XYZ, RESOLUTION),
+}
+
+
+def rows_per_shard(parameters: StoreParameters) -> int:
+    """Return how many voxel rows one shard holds."""
+    return parameters.voxel_chunk * parameters.voxel_chunks_per_shard
+
+
+def row_ranges(total: int, per_shard: int) -> Iterator[tuple[int, int]]:
+    """Yield the rows ``(start, stop)`` of each shard, in order.
+
+    Examples
+    --------
+    >>> list(row_ranges(5, 2))
+    [(0, 2), (2, 4), (4, 5)]
+    """
+    for start in range(0, total, per_shard):
+        yield start, min(start + per_shard, total)
+
+
+def overlaps(offsets: Sequence[int], start: int, stop: int) -> Iterator[tuple[int, slice, slice]]:
+    """Yield which assets own the rows ``start:stop``.
+
+    Parameters
+    ----------
+    offsets : sequence of int, length A+1
+        Asset a owns rows ``offsets[a]:offsets[a+1]``.
+    start, stop : int
+        The rows asked for.
+
+    Yields
+    ------
+    asset : int
+        Index of the asset.
+    source : slice
+        Its rows that fall into the range, counted from its own first row.
+    target : slice
+        The same rows, counted from `start`.
+
+    Examples
+    --------
+    >>> list(overlaps([0, 3, 5], 2, 4))
+    [(0, slice(2, 3, None), slice(0, 1, None)), (1, slice(0, 1, None), slice(1, 2, None))]
+    """
+    asset = max(bisect_right(offsets, start) - 1, 0)
+    while asset + 1 < len(offsets) and offsets[asset] < stop:
+        first, last = max(offsets[asset], start), min(offsets[asset + 1], stop)
+        if first < last:
+            own = slice(first - offsets[asset], last - offsets[asset])
+            yield asset, own, slice(first - start, last - start)
+        asset += 1
+
+
+def create_arrays(
+    root: zarr.Group, n_assets: int, n_voxels: int, parameters: StoreParameters
+) -> None:
+    """Create every array of the store, empty.
+
+    Parameters
+    ----------
+    root : zarr.Group
+        The new store's root, format 3.
+    n_assets, n_voxels : int
+        A and N.
+    parameters : StoreParameters
+        Sizes of chunks and shards, and the compression level.
+    """
+    from zarr.codecs import ZstdCodec
+
+    sizes = {"asset": n_assets, "asset_edge": n_assets + 1, "voxel": n_voxels, **_FIXED_SIZES}
+    chunk_and_shard = {
+        "asset": (ASSET_CHUNK, None),
+        "voxel": (parameters.voxel_chunk, rows_per_shard(parameters)),
+        "grid": (1, parameters.grid_assets_per_shard),
+    }
+    for layout in ARRAYS:
+        shape = tuple(sizes[dimension] for dimension in layout.dimensions)
+        chunk, shard = chunk_and_shard[layout.name.partition("/")[0]]
+        if shard is None:
+            chunk = min(chunk, shape[0])
+        attributes: dict[str, Any] = {"description": layout.description}
+        if layout.unit:
+            attributes["units"] = layout.unit
+        root.create_array(
+            layout.name,
+            shape=shape,
+            dtype=str if layout.dtype == "str" else layout.dtype,
+            chunks=(chunk, *shape[1:]),
+            shards=None if shard is None else (shard, *shape[1:]),
+            compressors=ZstdCodec(level=parameters.compression_level),
+            fill_value=layout.fill_value,
+            dimension_names=layout.dimensions,
+            attributes=attributes,
+        )
+
+
+def root_attributes(
+    normalization: Normalization, manifest: str, build: Mapping[str, object]
+) -> dict[str, Any]:
+    """Return the attributes of the store's root.
+
+    `build` holds the parameters and versions that made the content, so that
+    the store explains itself without its manifests.
+    """
+    return {
+        "format": FORMAT,
+        "format_version": FORMAT_VERSION,
+        "resolution": RESOLUTION,
+        "material_classes": list(MATERIAL_CLASSES),
+        "property_columns": list(PROPERTY_COLUMNS),
+        "normalization": normalization_attribute(normalization),
+        "manifest": manifest,
+        "build": dict(build),
+    }
+
+
+def normalization_attribute(normalization: Normalization) -> dict[str, dict[str, object]]:
+    """Return ranges as the store's attributes and the records hold them."""
+    return {
+        r.name: {"log10": r.log10, "lo": r.lo, "hi": r.hi, "source": normalization.source}
+        for r in normalization.ranges
+    }

@@ -1,0 +1,187 @@
+"""Write the store: one task a shard, each shard by exactly one task.
+
+Two writers of one shard lose data, because a shard is rewritten as a whole.
+So `shards` cuts the store into tasks that share none, and `write_shard` does
+one; what is small the parent writes itself.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from slatprep.normalize import normalize, normalize_change
+from slatprep.parameters import StoreParameters
+from slatprep.records import RESOLUTION, Normalization
+from slatprep.store.layout import (
+    ARRAYS,
+    create_arrays,
+    overlaps,
+    root_attributes,
+    row_ranges,
+    rows_per_shard,
+)
+from slatprep.store.spool import Spool, SpooledAsset
+
+Rows = tuple[dict[str, NDArray[Any]], NDArray[np.int64]]
+"""Rows of the arrays of a group, and the values clipped of each asset and property."""
+
+
+@dataclass(frozen=True)
+class Shard:
+    """One shard of every array of a group: a single task's work.
+
+    Attributes
+    ----------
+    group : str
+        ``voxel`` or ``grid``.
+    rows : (int, int)
+        First row and end in the store.
+    first : int
+        Index of the first asset that has rows in it.
+    ids : sequence of str
+        The assets that have rows in it.
+    offsets : sequence of int
+        ``voxel`` alone: first row of each of them in the store, and the last
+        one's end.
+    """
+
+    group: str
+    rows: tuple[int, int]
+    first: int
+    ids: Sequence[str]
+    offsets: Sequence[int] = ()
+
+
+def create_store(path: Path, n_assets: int, n_voxels: int, parameters: StoreParameters) -> None:
+    """Create an empty store with every array in place."""
+    import zarr
+
+    root = zarr.create_group(path, zarr_format=3)
+    create_arrays(root, n_assets, n_voxels, parameters)
+
+
+def shards(
+    ids: Sequence[str], offsets: Sequence[int], parameters: StoreParameters
+) -> Iterator[Shard]:
+    """Yield every shard of a store whose assets `ids` begin at rows `offsets`."""
+    for start, stop in row_ranges(len(ids), parameters.grid_assets_per_shard):
+        yield Shard("grid", (start, stop), start, ids[start:stop])
+    for start, stop in row_ranges(offsets[-1], rows_per_shard(parameters)):
+        owners = [asset for asset, _, _ in overlaps(offsets, start, stop)]
+        first, last = owners[0], owners[-1] + 1
+        yield Shard("voxel", (start, stop), first, ids[first:last], offsets[first : last + 1])
+
+
+def write_shard(
+    path: Path, spool: Spool, shard: Shard, normalization: Normalization
+) -> tuple[Shard, NDArray[np.int64]]:
+    """Normalise and write one shard of every array of its group.
+
+    Parameters
+    ----------
+    path : Path
+        The store, made by `create_store`.
+    spool : Spool
+        Where the assets lie.
+    shard : Shard
+        What to write; no other task may have it.
+    normalization : Normalization
+        Ranges of the properties.
+
+    Returns
+    -------
+    shard : Shard
+        The same.
+    clipped : ndarray of int64, shape (len(shard.ids), 3)
+        How many of the values written lay outside the range, by property.
+    """
+    import zarr
+
+    read = _grid_rows if shard.group == "grid" else _voxel_rows
+    arrays, clipped = read(spool, shard, normalization)
+    start, stop = shard.rows
+    # Workers are the parallelism; zarr's own thread pool would oversubscribe.
+    with zarr.config.set({"async.concurrency": 1, "threading.max_workers": 1}):
+        group = _open(path)[shard.group]
+        for name, rows in arrays.items():
+            group[name][start:stop] = rows
+    return shard, clipped
+
+
+def _voxel_rows(spool: Spool, shard: Shard, normalization: Normalization) -> Rows:
+    parts: dict[str, list[NDArray[Any]]] = {}
+    clipped = np.zeros((len(shard.ids), 3), dtype=np.int64)
+    for asset, own, _ in overlaps(shard.offsets, *shard.rows):
+        arrays = {name: array[own] for name, array in spool.voxels(shard.ids[asset]).items()}
+        arrays["properties"], clipped[asset] = normalize(arrays["properties"], normalization)
+        for name, array in arrays.items():
+            parts.setdefault(name, []).append(array)
+    return {name: np.concatenate(arrays) for name, arrays in parts.items()}, clipped
+
+
+def _grid_rows(spool: Spool, shard: Shard, normalization: Normalization) -> Rows:
+    shape = (RESOLUTION,) * 3
+    material = np.empty((len(shard.ids), *shape), dtype=np.uint8)
+    properties = np.full((len(shard.ids), 3, *shape), np.nan, dtype=np.float32)
+    clipped = np.zeros((len(shard.ids), 3), dtype=np.int64)
+    for asset, asset_id in enumerate(shard.ids):
+        material[asset], voxels, values = spool.grid(asset_id)
+        normalized, clipped[asset] = normalize(values, normalization)
+        properties[(asset, slice(None), *voxels.T)] = normalized
+    return {"material": material, "properties": properties}, clipped
+
+
+def write_assets(
+    path: Path, assets: Sequence[SpooledAsset], offsets: Sequence[int], normalization: Normalization
+) -> None:
+    """Write every ``asset/*`` array."""
+    rows = [asset.columns or {} for asset in assets]
+    columns: dict[str, Any] = {name: [row[name] for row in rows] for name in rows[0]}
+    columns["id"] = [asset.asset_id for asset in assets]
+    columns["offset"] = offsets
+    columns["property_ambiguity"] = normalize_change(columns["property_ambiguity"], normalization)
+    group = _open(path)["asset"]
+    for layout in ARRAYS:
+        where, _, name = layout.name.partition("/")
+        if where == "asset":
+            dtype = object if layout.dtype == "str" else layout.dtype
+            group[name][:] = np.array(columns[name], dtype=dtype)
+
+
+def finish_store(
+    path: Path, normalization: Normalization, manifest: str, build: Mapping[str, object]
+) -> None:
+    """Write the root's attributes and gather all metadata in one file.
+
+    Parameters
+    ----------
+    path : Path
+        The store.
+    normalization : Normalization
+        Ranges of the properties.
+    manifest : str
+        Id of the build.
+    build : mapping
+        Parameters and versions that made the content.
+    """
+    import zarr
+
+    _open(path).attrs.update(root_attributes(normalization, manifest, build))
+    with warnings.catch_warnings():
+        # Zarr says that consolidated metadata are not in format 3's text yet.
+        # They only save reads: a reader that ignores them finds every array.
+        warnings.filterwarnings("ignore", message="Consolidated metadata", category=UserWarning)
+        zarr.consolidate_metadata(str(path), zarr_format=3)
+
+
+def _open(path: Path) -> Any:
+    import zarr
+
+    return zarr.open_group(path, mode="r+", zarr_format=3, use_consolidated=False)
