@@ -1,0 +1,353 @@
+"""Safe reading of source files: one read gives an array, its size and its hash.
+
+Source files come from strangers. Nothing here unpickles, follows a path out of
+its root, or allocates what a header merely claims: shape and dtype are held
+against what is expected, and sizes against the bytes that are really there,
+before any array is made.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import math
+import stat
+import tokenize
+import zipfile
+import zlib
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import IO, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from slatprep.errors import InputError, MissingPartnerError
+from slatprep.records import RESOLUTION, AssetPair, SourceFile
+
+MAX_FILE_BYTES = 128 * 2**20
+"""No file of one asset is larger; the largest form, an 11-channel float64 grid, takes 22 MiB."""
+
+MAX_MEMBERS = 256
+"""An npz with more members is refused: each costs memory before it is looked at."""
+
+_MAX_HEADER_BYTES = 4096
+
+_KIND_NAMES = {
+    "b": "boolean",
+    "i": "integer",
+    "u": "unsigned integer",
+    "f": "floating-point",
+    "U": "text",
+}
+
+# What numpy's header parser lets through for text that is no header.
+_HEADER_ERRORS = (
+    ValueError,
+    TypeError,
+    KeyError,
+    IndexError,
+    AttributeError,
+    OverflowError,
+    SyntaxError,
+    tokenize.TokenError,
+    RecursionError,
+    MemoryError,
+)
+
+# What zipfile raises for archives that are damaged, encrypted or of another make.
+_ZIP_ERRORS = (
+    zipfile.BadZipFile,
+    zlib.error,
+    EOFError,
+    OSError,
+    ValueError,
+    RuntimeError,
+    OverflowError,
+)
+
+
+@dataclass(frozen=True)
+class ArraySpec:
+    """What an array in a source file may look like.
+
+    Attributes
+    ----------
+    shapes : tuple of shapes
+        Allowed shapes; None in a shape stands for 0 to 64^3 rows. Empty: any
+        shape of at most `max_items` items.
+    kinds : str
+        Allowed numpy dtype kinds.
+    max_items : int
+        Bound on the number of items where `shapes` is empty.
+    """
+
+    shapes: tuple[tuple[int | None, ...], ...]
+    kinds: str
+    max_items: int = 64
+
+    def check(self, where: str | Path, shape: tuple[int, ...], dtype: np.dtype[Any]) -> None:
+        """Raise InputError, naming `where`, unless shape and dtype are allowed."""
+        if dtype.hasobject:
+            raise InputError(
+                where,
+                "holds Python objects, which only pickle could read, and pickle can run code",
+                "a plain numeric array; save it again with allow_pickle=False",
+            )
+        if dtype.kind not in self.kinds or not 0 < dtype.itemsize <= 512:
+            kinds = " or ".join(_KIND_NAMES[kind] for kind in self.kinds)
+            raise InputError(where, f"has dtype {dtype.str}", f"a {kinds} array")
+        if self.shapes and not any(_fits(shape, allowed) for allowed in self.shapes):
+            allowed_text = " or ".join(_shape_text(allowed) for allowed in self.shapes)
+            raise InputError(where, f"has shape {_shape_text(shape)}", f"shape {allowed_text}")
+        if not self.shapes and (len(shape) > 8 or not 0 < math.prod(shape) <= self.max_items):
+            raise InputError(
+                where, f"has shape {_shape_text(shape)}", f"1 to {self.max_items} values"
+            )
+
+
+def _fits(shape: tuple[int, ...], allowed: tuple[int | None, ...]) -> bool:
+    return len(shape) == len(allowed) and all(
+        0 <= n <= RESOLUTION**3 if m is None else n == m
+        for n, m in zip(shape, allowed, strict=True)
+    )
+
+
+def _shape_text(shape: tuple[int | None, ...]) -> str:
+    text = ", ".join(f"N <= {RESOLUTION**3}" if n is None else str(n) for n in shape)
+    return f"({text},)" if len(shape) == 1 else f"({text})"
+
+
+def require_complete(pair: AssetPair) -> tuple[Path, Path]:
+    """Return the paths of grid and SLAT.
+
+    Raises
+    ------
+    MissingPartnerError
+        If one side does not exist.
+    InputError
+        If the pair has another problem, such as two files for one id.
+    """
+    if pair.grid is None or pair.slat is None:
+        root = pair.pixieverse_root if pair.grid is None else pair.slat_root
+        raise MissingPartnerError(
+            root, pair.problem or f"nothing for id {pair.asset_id!r}", "a grid and a SLAT per id"
+        )
+    if pair.problem:
+        raise InputError(pair.slat, pair.problem, "one grid and one SLAT per id")
+    return pair.grid, pair.slat
+
+
+def resolve_inside(path: Path, root: Path) -> tuple[Path, str]:
+    """Resolve a path and make sure that the file lies below its root.
+
+    Parameters
+    ----------
+    path : Path
+        A file, named by way of `root`.
+    root : Path
+        Folder that the file must not leave, by ``..`` or by a link.
+
+    Returns
+    -------
+    tuple of Path and str
+        The resolved file, and its name relative to `root` with forward slashes.
+
+    Raises
+    ------
+    InputError
+        If the path leaves the root, does not exist, or is not a regular file.
+    """
+    try:
+        relative = path.relative_to(root)
+        resolved = path.resolve(strict=True)
+        inside = ".." not in relative.parts and resolved.is_relative_to(root.resolve())
+        regular = stat.S_ISREG(resolved.stat().st_mode)
+    except FileNotFoundError:
+        raise InputError(path, "does not exist", "a readable file") from None
+    except (OSError, RuntimeError, ValueError) as error:  # link loops, NUL, other roots
+        raise InputError(path, f"cannot be opened ({error})", f"a file below {root}") from None
+    if not inside:
+        raise InputError(
+            path, f"leads to {resolved}, out of its root", f"a file below {root.resolve()}"
+        )
+    if not regular:
+        raise InputError(path, "is not a regular file", "a readable file")
+    return resolved, relative.as_posix()
+
+
+def load_source(path: Path, root: Path, role: str) -> tuple[bytes, SourceFile]:
+    """Read a whole file once; return its bytes and what the provenance keeps of it.
+
+    Parameters
+    ----------
+    path : Path
+        File to read, below `root`.
+    root : Path
+        Folder that it must not leave.
+    role : str
+        Role of the file in the pair: ``grid``, ``mask``, ``bounds`` or ``slat``.
+
+    Raises
+    ------
+    InputError
+        If the file cannot be read, is empty, or is larger than `MAX_FILE_BYTES`.
+    """
+    resolved, name = resolve_inside(path, root)
+    try:
+        with resolved.open("rb") as file:
+            data = file.read(MAX_FILE_BYTES + 1)
+    except OSError as error:
+        raise InputError(path, f"cannot be read ({error.strerror})", "a readable file") from None
+    if not data:
+        raise InputError(path, "has zero bytes", "a complete file; copy or make it again")
+    if len(data) > MAX_FILE_BYTES:
+        raise InputError(
+            path,
+            f"is larger than {MAX_FILE_BYTES >> 20} MiB",
+            "the files of one asset, which are smaller",
+        )
+    return data, SourceFile(role, name, len(data), hashlib.sha256(data).hexdigest())
+
+
+def npy_array(data: bytes, where: str | Path, spec: ArraySpec) -> NDArray[Any]:
+    """Read the bytes of an npy file, in native byte order.
+
+    Parameters
+    ----------
+    data : bytes
+        The whole file.
+    where : str or Path
+        What errors call it.
+    spec : ArraySpec
+        What the array may look like.
+
+    Returns
+    -------
+    ndarray
+        A read-only array of the shape and kind that `spec` allows.
+
+    Raises
+    ------
+    InputError
+        If the bytes are no such array.
+    """
+    return _read_npy(io.BytesIO(data), len(data), where, spec)
+
+
+def npz_arrays(
+    data: bytes, where: str | Path, specs: Mapping[str, ArraySpec]
+) -> dict[str, NDArray[Any]]:
+    """Read the named arrays from the bytes of an npz file.
+
+    Parameters
+    ----------
+    data : bytes
+        The whole file.
+    where : str or Path
+        What errors call it.
+    specs : mapping of str to ArraySpec
+        The arrays wanted and what they may look like.
+
+    Returns
+    -------
+    dict of str to ndarray
+        The arrays, each in native byte order.
+
+    Raises
+    ------
+    InputError
+        If the archive is damaged, an array is missing, or one is not as its
+        spec wants it. What is decompressed never exceeds what `specs` allow.
+    """
+    with _open_zip(data, where) as archive:
+        present = [info.filename.removesuffix(".npy") for info in archive.infolist()]
+        for name in specs:
+            if present.count(name) != 1:
+                found = ", ".join(sorted(present)[:8]) or "nothing"
+                raise InputError(
+                    where,
+                    f"has {present.count(name)} arrays named {name!r} (it holds {found})",
+                    f"one array each of {', '.join(specs)}",
+                )
+        return {
+            name: _read_member(archive, archive.infolist()[present.index(name)], where, name, spec)
+            for name, spec in specs.items()
+        }
+
+
+def npz_names(data: bytes, where: str | Path) -> tuple[str, ...]:
+    """Return the names of the arrays in the bytes of an npz file."""
+    with _open_zip(data, where) as archive:
+        return tuple(info.filename.removesuffix(".npy") for info in archive.infolist())
+
+
+def _open_zip(data: bytes, where: str | Path) -> zipfile.ZipFile:
+    expected = "an intact npz archive, as numpy.savez writes it; copy or make it again"
+    # zipfile makes an object for every directory entry before one can ask how many there are.
+    if data.count(b"PK\x01\x02") > MAX_MEMBERS:
+        raise InputError(where, f"has more than {MAX_MEMBERS} members", expected)
+    try:
+        return zipfile.ZipFile(io.BytesIO(data))
+    except _ZIP_ERRORS as error:
+        raise InputError(where, f"is no readable npz archive ({error})", expected) from None
+
+
+def _read_member(
+    archive: zipfile.ZipFile,
+    info: zipfile.ZipInfo,
+    where: str | Path,
+    name: str,
+    spec: ArraySpec,
+) -> NDArray[Any]:
+    member = f"{where} [{name}]"
+    # zipfile bounds its output for these two alone.
+    if info.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
+        raise InputError(
+            member,
+            f"uses zip compression {info.compress_type}",
+            "stored or deflated members, as numpy.savez and numpy.savez_compressed write",
+        )
+    try:
+        with archive.open(info) as stream:
+            return _read_npy(stream, info.file_size, member, spec)
+    except _ZIP_ERRORS as error:
+        raise InputError(
+            member, f"is damaged ({error})", "an intact npz archive; copy or make it again"
+        ) from None
+
+
+def _read_npy(stream: IO[bytes], size: int, where: str | Path, spec: ArraySpec) -> NDArray[Any]:
+    # The header is parsed from a bounded prefix: its own length field may claim 4 GB.
+    prefix = io.BytesIO(stream.read(_MAX_HEADER_BYTES))
+    try:
+        version = np.lib.format.read_magic(prefix)
+        if version == (1, 0):
+            shape, fortran, dtype = np.lib.format.read_array_header_1_0(prefix)
+        else:
+            shape, fortran, dtype = np.lib.format.read_array_header_2_0(prefix)
+    except _HEADER_ERRORS as error:
+        reason = str(error).splitlines()[0][:120] if str(error) else type(error).__name__
+        raise InputError(
+            where, f"is no readable npy array ({reason})", "an array as numpy.save writes it"
+        ) from None
+    spec.check(where, shape, dtype)
+    wanted = math.prod(shape) * dtype.itemsize
+    held = size - prefix.tell()
+    if held != wanted:
+        raise InputError(
+            where,
+            f"is truncated or damaged: its header announces {wanted} bytes of data, it has {held}",
+            "a complete file; copy or make it again",
+        )
+    body = prefix.read()
+    body += stream.read(wanted - len(body))
+    if len(body) != wanted:
+        raise InputError(
+            where,
+            f"is truncated: {len(body)} of {wanted} bytes of data",
+            "a complete file; copy or make it again",
+        )
+    array = np.frombuffer(body, dtype).reshape(shape, order="F" if fortran else "C")
+    return array.astype(dtype.newbyteorder("="), copy=False)

@@ -1,0 +1,96 @@
+"""Reading what joins names of the two sides: maps of ids, and categories of objects."""
+
+from __future__ import annotations
+
+import csv
+import json
+import re
+from collections.abc import Collection
+from pathlib import Path
+
+from slatprep.errors import ConfigError
+
+_UID = re.compile(r"([0-9a-f]{32})/?$")
+
+
+def read_map(
+    path: Path, objects: Collection[str], slats: Collection[str]
+) -> dict[str, list[tuple[str, str]]]:
+    """Read which SLATs belong to which object.
+
+    Parameters
+    ----------
+    path : Path
+        CSV with columns ``object_id``, ``slat_id`` and optionally ``view``; or
+        TRELLIS's ``metadata.csv``, whose ``sha256`` names the SLAT and whose
+        ``file_identifier`` is a URL that ends in the object's uid.
+    objects, slats : collection of str
+        Ids that were found. Of TRELLIS's metadata, which describes a whole
+        collection, only rows that name one of them are kept.
+
+    Returns
+    -------
+    dict of str to list of (str, str)
+        For each object, its SLAT ids, each with a view or an empty string.
+
+    Raises
+    ------
+    ConfigError
+        If the file cannot be read or is neither form.
+    """
+    claims: dict[str, dict[tuple[str, str], None]] = {}
+    try:
+        with path.open(newline="", encoding="utf-8-sig") as file:
+            reader = csv.DictReader(file)
+            columns = set(reader.fieldnames or ())
+            if {"object_id", "slat_id"} <= columns:
+                form = ("object_id", "slat_id")
+            elif {"sha256", "file_identifier"} <= columns:
+                form = ("file_identifier", "sha256")
+            else:
+                raise ConfigError(
+                    f"{path}: columns {', '.join(sorted(columns)) or 'none'}; expected object_id "
+                    "and slat_id, or TRELLIS's sha256 and file_identifier"
+                )
+            own = form[0] == "object_id"
+            for row in reader:
+                object_id, slat_id = row[form[0]] or "", row[form[1]] or ""
+                if own and not (object_id and slat_id):
+                    raise ConfigError(f"{path}, line {reader.line_num}: empty object_id or slat_id")
+                if not own:
+                    object_id = _object_of(object_id)
+                if own or (object_id and (object_id in objects or slat_id in slats)):
+                    view = (row.get("view") or "") if own else ""
+                    claims.setdefault(object_id, {})[slat_id, view] = None
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        raise ConfigError(f"{path}: cannot be read as a map of ids ({error})") from None
+    return {object_id: list(named) for object_id, named in claims.items()}
+
+
+def read_categories(path: Path) -> dict[str, str]:
+    """Read the category of each object from Pixie's ``obj_ids_metadata.json``.
+
+    Raises
+    ------
+    ConfigError
+        If the file cannot be read or an entry has no ``obj_class``.
+    """
+    try:
+        entries = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError, RecursionError) as error:
+        raise ConfigError(f"{path}: cannot be read as JSON ({error})") from None
+    if not isinstance(entries, dict):
+        raise ConfigError(f'{path}: expected an object {{uid: {{"obj_class": category}}}}')
+    categories = {}
+    for object_id, entry in entries.items():
+        category = entry.get("obj_class") if isinstance(entry, dict) else None
+        if not isinstance(category, str):
+            raise ConfigError(f"{path}: {object_id!r} has no obj_class; expected a category")
+        categories[object_id] = category
+    return categories
+
+
+def _object_of(file_identifier: str) -> str:
+    """Return the object's uid from TRELLIS's file identifier, or its last path component."""
+    uid = _UID.search(file_identifier)
+    return uid.group(1) if uid else file_identifier.rstrip("/").rpartition("/")[2]

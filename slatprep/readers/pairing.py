@@ -1,0 +1,313 @@
+"""Finding the two sides of every row of the store, by name alone; no content is read.
+
+Only names are held: an entry per object and per SLAT, never an array.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass
+from itertools import groupby
+from pathlib import Path
+from urllib.parse import quote
+
+from slatprep.errors import ConfigError, InputError
+from slatprep.parameters import BuildParameters, PixieverseSource, SlatSource
+from slatprep.readers.joins import read_categories, read_map
+from slatprep.readers.patterns import NAME, fill, find_files
+from slatprep.records import AssetPair
+
+
+@dataclass(frozen=True, slots=True)
+class _Grid:
+    """A grid file of an object, found by the pattern of that rank."""
+
+    rank: int
+    sample: str
+    path: str
+
+
+@dataclass(frozen=True, slots=True)
+class _Slat:
+    """A SLAT by its own names; `path` is empty where a map names one that does not exist."""
+
+    slat_id: str
+    view: str
+    path: str
+    group: str = ""
+    problem: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class _Row:
+    """What will be one row: an object and the SLATs that bear this label (one, if all is well)."""
+
+    asset_id: str
+    object_id: str
+    view: str
+    slats: tuple[_Slat, ...]
+
+
+def discover(parameters: BuildParameters) -> Iterator[AssetPair]:
+    """Find the pairs of a dataset.
+
+    Parameters
+    ----------
+    parameters : BuildParameters
+        Roots, patterns and maps; the other groups do not matter here.
+
+    Returns
+    -------
+    iterator of AssetPair
+        Sorted by `asset_id`, each id once. A pair that cannot be used is
+        returned too, and says why in `problem`. Masks and bounds are looked
+        up as the iterator proceeds.
+
+    Raises
+    ------
+    ConfigError
+        If a root does not exist, a pattern or map makes no sense, or nothing
+        is found on one side.
+    """
+    pixieverse, slat, pairing = parameters.pixieverse, parameters.slat, parameters.pairing
+    if not pixieverse.root.is_dir():
+        raise ConfigError(f"{pixieverse.root}: no such folder; expected the PixieVerse root")
+    if not slat.root.exists():
+        raise ConfigError(
+            f"{slat.root}: does not exist; expected a folder of SLATs or an HDF5 file"
+        )
+    grids = _find_grids(pixieverse)
+    slats = _find_slats(slat)
+    claims = {} if pairing.map is None else read_map(pairing.map, grids, slats)
+    categories = {} if pairing.categories is None else read_categories(pairing.categories)
+    rows = sorted(_rows(grids, slats, claims), key=lambda row: (row.asset_id, row.object_id))
+    return _pairs(rows, grids, categories, parameters)
+
+
+def _find_grids(source: PixieverseSource) -> dict[str, list[_Grid]]:
+    """Return the grids of each object, all found by the first pattern that matches any."""
+    chosen = {"sample": source.sample} if source.sample else {}
+    grids: dict[str, list[_Grid]] = {}
+    for rank, pattern in enumerate(source.grid):
+        if "{id}" not in pattern:
+            raise ConfigError(f"grid pattern {pattern!r} names no {{id}}")
+        for fields, path in find_files(source.root, pattern, chosen):
+            found = grids.setdefault(fields["id"], [])
+            if not found or found[0].rank == rank:
+                found.append(_Grid(rank, fields.get("sample", ""), path))
+    if not grids:
+        raise ConfigError(f"{source.root}: no grid found; looked for {_tried(source.grid, chosen)}")
+    return grids
+
+
+def _find_slats(source: SlatSource) -> dict[str, list[_Slat]]:
+    slats: dict[str, list[_Slat]] = {}
+    for slat in _each_slat(source):
+        slats.setdefault(slat.slat_id, []).append(slat)
+    if not slats:
+        tried = f"groups {source.group}" if source.root.is_file() else _tried(source.pattern, {})
+        raise ConfigError(f"{source.root}: no SLAT found; looked for {tried}")
+    return slats
+
+
+def _each_slat(source: SlatSource) -> Iterator[_Slat]:
+    if source.root.is_file():
+        yield from _each_group(source, source.root.name)
+        return
+    for pattern in source.pattern:
+        for fields, path in find_files(source.root, pattern, {}):
+            if "id" in fields:
+                yield _Slat(fields["id"], fields.get("view", ""), path)
+            else:
+                yield from _each_group(source, path, fields)
+
+
+def _each_group(
+    source: SlatSource, path: str, known: Mapping[str, str] | None = None
+) -> Iterator[_Slat]:
+    """Return the SLATs that lie as groups in one HDF5 file."""
+    from slatprep.readers.hdf5 import find_groups
+
+    if "{id}" not in source.group:
+        raise ConfigError(f"group pattern {source.group!r} names no {{id}}")
+    root = _slat_root(source)
+    try:
+        for fields, group in find_groups(root / path, root, source.group, known or {}):
+            yield _Slat(fields["id"], fields.get("view", ""), path, group)
+    except InputError as error:
+        yield _Slat(path, "", path, problem=str(error))
+
+
+def _slat_root(source: SlatSource) -> Path:
+    return source.root.parent if source.root.is_file() else source.root
+
+
+def _rows(
+    grids: Mapping[str, list[_Grid]],
+    slats: Mapping[str, list[_Slat]],
+    claims: Mapping[str, list[tuple[str, str]]],
+) -> Iterator[_Row]:
+    """Join objects and SLATs: by the map where it names them, by equal id otherwise."""
+    claimed = {slat_id for named in claims.values() for slat_id, _ in named}
+    for object_id in {*grids, *claims, *(slats.keys() - claimed)}:
+        labelled: dict[str, list[_Slat]] = {}
+        for label, slat in _slats_of(object_id, slats, claims, claimed):
+            labelled.setdefault(label, []).append(slat)
+        if len(labelled) <= 1:
+            found = [slat for group in labelled.values() for slat in group]
+            yield _Row(_safe(object_id), object_id, "", _ordered(found))
+            continue
+        for label, group in labelled.items():
+            asset_id = f"{object_id}.{label}" if label else object_id
+            yield _Row(_safe(asset_id), object_id, label, _ordered(group))
+
+
+def _slats_of(
+    object_id: str,
+    slats: Mapping[str, list[_Slat]],
+    claims: Mapping[str, list[tuple[str, str]]],
+    claimed: set[str],
+) -> Iterator[tuple[str, _Slat]]:
+    """Return the SLATs of an object, each with the label that tells it from the others."""
+    if object_id not in claims:
+        if object_id not in claimed:
+            for slat in slats.get(object_id, ()):
+                yield slat.view, slat
+        return
+    several = len({slat_id for slat_id, _ in claims[object_id]}) > 1
+    for slat_id, view in claims[object_id]:
+        found = slats.get(slat_id, [])
+        if view and any(slat.view for slat in found):
+            found = [slat for slat in found if slat.view == view]
+        for slat in found or [_Slat(slat_id, view, "")]:
+            parts = (slat_id if several else "", slat.view)
+            yield view or ".".join(part for part in parts if part), slat
+
+
+def _ordered(slats: Iterable[_Slat]) -> tuple[_Slat, ...]:
+    return tuple(sorted(slats, key=lambda slat: (slat.path, slat.group, slat.slat_id)))
+
+
+def _safe(name: str) -> str:
+    """Return a name as it is where it is a valid id, percent-encoded where it is not."""
+    return quote(name.encode(errors="surrogateescape"), safe="").replace("~", "%7E")
+
+
+def _pairs(
+    rows: list[_Row],
+    grids: Mapping[str, list[_Grid]],
+    categories: Mapping[str, str],
+    parameters: BuildParameters,
+) -> Iterator[AssetPair]:
+    for asset_id, group in groupby(rows, key=lambda row: row.asset_id):
+        same = list(group)
+        shared = ""
+        if len(same) > 1:
+            names = " and ".join(
+                f"object {row.object_id!r}" + (f" view {row.view!r}" if row.view else "")
+                for row in same
+            )
+            shared = f"asset id {asset_id!r} would stand for {names}; rename one"
+        row = same[0]
+        yield _pair(row, grids.get(row.object_id, []), categories, parameters, shared)
+
+
+def _pair(
+    row: _Row,
+    grids: list[_Grid],
+    categories: Mapping[str, str],
+    parameters: BuildParameters,
+    shared: str,
+) -> AssetPair:
+    source, slat_source = parameters.pixieverse, parameters.slat
+    problems = [shared, *_name_problems(row), *(slat.problem for slat in row.slats)]
+    grid = mask = bounds = None
+    if grids:
+        grids = sorted(grids, key=lambda found: found.path)
+        grid = source.root / grids[0].path
+        if len(grids) > 1:
+            problems.append(_several_grids(row.object_id, grids))
+        if NAME.fullmatch(row.object_id):
+            known = {"id": row.object_id}
+            sample = grids[0].sample or source.sample
+            if sample:
+                known["sample"] = sample
+            mask, problem = _find_one(source.root, source.mask, known, "mask")
+            problems.append(problem)
+            bounds, problem = _find_one(source.root, source.bounds, known, "bounds")
+            problems.append(problem)
+    else:
+        chosen = {"id": row.object_id}
+        if source.sample:
+            chosen["sample"] = source.sample
+        problems.append(
+            f"no grid for id {row.object_id!r}; looked for {_tried(source.grid, chosen)} "
+            f"below {source.root}"
+        )
+    found = [slat for slat in row.slats if slat.path]
+    if not found:
+        problems.append(_no_slat(row, slat_source))
+    elif len(found) > 1:
+        files = ", ".join(slat.path + (f" [{slat.group}]" if slat.group else "") for slat in found)
+        problems.append(
+            f"{len(found)} SLATs for one id {row.asset_id!r} ({files}); expected one, "
+            "or a pattern with {view}"
+        )
+    slat_root = _slat_root(slat_source)
+    return AssetPair(
+        asset_id=row.asset_id,
+        object_id=_safe(row.object_id),
+        view=_safe(row.view),
+        category=categories.get(row.object_id, ""),
+        pixieverse_root=source.root,
+        slat_root=slat_root,
+        grid=grid,
+        mask=mask,
+        bounds=bounds,
+        slat=slat_root / found[0].path if found else None,
+        slat_group=found[0].group if found else "",
+        problem="; ".join(problem for problem in problems if problem),
+    )
+
+
+def _name_problems(row: _Row) -> Iterator[str]:
+    for kind, name in (("id", row.object_id), ("view", row.view)):
+        if name and not NAME.fullmatch(name):
+            yield (
+                f"{kind} {name!r} is not allowed; expected letters, digits, '.', '_' and '-', "
+                "not beginning with '.'"
+            )
+
+
+def _several_grids(object_id: str, grids: list[_Grid]) -> str:
+    files = ", ".join(grid.path for grid in grids)
+    if len({grid.sample for grid in grids}) > 1:
+        return f"id {object_id!r} has {len(grids)} samples ({files}); choose one with `sample`"
+    return f"{len(grids)} grids for one id {object_id!r} ({files}); expected one"
+
+
+def _no_slat(row: _Row, source: SlatSource) -> str:
+    names = {slat.slat_id for slat in row.slats} or {row.object_id}
+    if source.root.is_file():
+        tried = " or ".join(f"group {fill(source.group, {'id': name})}" for name in sorted(names))
+        return f"no SLAT for id {row.object_id!r}; looked for {tried} in {source.root}"
+    tried = "; ".join(_tried(source.pattern, {"id": name}) for name in sorted(names))
+    return f"no SLAT for id {row.object_id!r}; looked for {tried} below {source.root}"
+
+
+def _find_one(
+    root: Path, patterns: Iterable[str], known: Mapping[str, str], role: str
+) -> tuple[Path | None, str]:
+    """Return the file that the first matching pattern finds, and what is wrong if it finds more."""
+    for pattern in patterns:
+        paths = sorted(path for _, path in find_files(root, pattern, known))
+        if paths:
+            problem = ""
+            if len(paths) > 1:
+                problem = f"{len(paths)} {role} files for one id ({', '.join(paths)}); expected one"
+            return root / paths[0], problem
+    return None, ""
+
+
+def _tried(patterns: Iterable[str], known: Mapping[str, str]) -> str:
+    return ", ".join(fill(pattern, known) for pattern in patterns)

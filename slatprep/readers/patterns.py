@@ -1,0 +1,117 @@
+"""Patterns of file and group names: ``{id}``, ``{sample}``, ``{view}`` and ``*``.
+
+A pattern is a relative path; its fields and ``*`` match within one component.
+Component by component only the folders that can match are listed.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+from collections.abc import Iterator, Mapping
+from functools import lru_cache
+from pathlib import Path
+
+from slatprep.errors import ConfigError
+
+FIELDS = ("id", "sample", "view")
+
+NAME = re.compile(r"[A-Za-z0-9_-][A-Za-z0-9._-]*")
+"""What an id or a view may be: one plain path component that is not hidden."""
+
+
+def find_files(
+    root: Path, pattern: str, known: Mapping[str, str]
+) -> Iterator[tuple[dict[str, str], str]]:
+    """Find the files below a folder that match a pattern.
+
+    Parameters
+    ----------
+    root : Path
+        Folder to search.
+    pattern : str
+        Relative path with fields, such as ``{id}/sample_{sample}/material_grid.npy``.
+    known : mapping of str to str
+        Fields that are settled already; they match their value alone.
+
+    Yields
+    ------
+    tuple of dict and str
+        The fields of a match (names are not checked against `NAME`), and its
+        path relative to `root`. In no particular order.
+
+    Raises
+    ------
+    ConfigError
+        If the pattern makes no sense or a folder cannot be listed.
+    """
+    components = pattern.split("/")
+    if pattern.startswith("/") or any(part in ("", ".", "..") for part in components):
+        raise ConfigError(
+            f"pattern {pattern!r} is not a path below its root; write it relative, without '..'"
+        )
+    yield from _walk(root, "", components, dict(known))
+
+
+def fill(pattern: str, known: Mapping[str, str]) -> str:
+    """Return a pattern with its known fields filled in and a ``*`` for the others."""
+    for field in FIELDS:
+        pattern = pattern.replace(f"{{{field}}}", known.get(field, "*"))
+    return pattern
+
+
+def component_regex(component: str, known: Mapping[str, str]) -> re.Pattern[str]:
+    """Compile one component of a pattern; a field already known matches its value."""
+    return _compile(component, tuple(sorted(known.items())) if "{" in component else ())
+
+
+@lru_cache(maxsize=256)
+def _compile(component: str, known: tuple[tuple[str, str], ...]) -> re.Pattern[str]:
+    values = dict(known)
+    regex = ""
+    for part in re.split(r"(\{[^{}]*\}|\*)", component):
+        field = part[1:-1]
+        if part == "*":
+            regex += ".*"
+        elif not part.startswith("{"):
+            regex += re.escape(part)
+        elif field in values:
+            regex += re.escape(values[field])
+        elif f"(?P<{field}>" in regex:
+            regex += f"(?P={field})"
+        elif field in FIELDS:
+            regex += f"(?P<{field}>.+)"
+        else:
+            raise ConfigError(
+                f"pattern component {component!r} names {part}; "
+                f"fields are {', '.join(f'{{{name}}}' for name in FIELDS)}"
+            )
+    return re.compile(regex, re.DOTALL)
+
+
+def _walk(
+    root: Path, prefix: str, components: list[str], known: dict[str, str]
+) -> Iterator[tuple[dict[str, str], str]]:
+    component, rest = components[0], components[1:]
+    regex = component_regex(component, known)
+    literal = fill(component, known)
+    names = [literal] if "*" not in literal else _names(root / prefix)
+    for name in names:
+        match = regex.fullmatch(name)
+        if match is None:
+            continue
+        path = prefix + name
+        if rest:
+            yield from _walk(root, path + "/", rest, known | match.groupdict())
+        elif os.path.isfile(os.path.join(root, path)):  # noqa: PTH113, PTH118 - half a million times
+            yield known | match.groupdict(), path
+
+
+def _names(folder: Path) -> list[str]:
+    try:
+        with os.scandir(folder) as entries:
+            return [entry.name for entry in entries]
+    except (FileNotFoundError, NotADirectoryError):
+        return []
+    except OSError as error:
+        raise ConfigError(f"{folder}: cannot be listed ({error.strerror})") from None

@@ -1,0 +1,286 @@
+"""Reading a PixieVerse field: raw grids and the network's predictions.
+
+Both forms end as the same `MaterialField` in SI units. Raw grids and
+predictions order their channels density, Young's modulus, Poisson's ratio;
+slatprep orders them as `PROPERTY_COLUMNS` does, Young's modulus first.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from slatprep.errors import InputError
+from slatprep.normalize import PIXIE_RANGES, denormalize
+from slatprep.readers.files import (
+    ArraySpec,
+    load_source,
+    npy_array,
+    npz_arrays,
+    npz_names,
+    require_complete,
+)
+from slatprep.records import (
+    BACKGROUND,
+    MATERIAL_CLASSES,
+    PROPERTY_COLUMNS,
+    RESOLUTION,
+    AssetPair,
+    MaterialField,
+    SourceFile,
+)
+
+_CUBE = (RESOLUTION,) * 3
+_RAW_SHAPE = (*_CUBE, 4)
+_SCORES_SHAPE = (3 + len(MATERIAL_CLASSES), *_CUBE)
+_IDS_SHAPE = (4, *_CUBE)
+
+GRID = ArraySpec(shapes=(_RAW_SHAPE, _SCORES_SHAPE, _IDS_SHAPE), kinds="f")
+MASK = ArraySpec(shapes=(_CUBE,), kinds="bfiu")
+BOUND = ArraySpec(shapes=(), kinds="biufU")
+
+UNLABELLED = -1
+"""Class id of an occupied voxel that Pixie's labelling set aside."""
+
+# Source channel of each of PROPERTY_COLUMNS; the files begin with density.
+_CHANNEL_ORDER = (1, 0, 2)
+
+
+def read_field(pair: AssetPair) -> MaterialField:
+    """Read the PixieVerse side of a pair, whichever form it has.
+
+    Parameters
+    ----------
+    pair : AssetPair
+        A pair without a problem. Its grid is (64, 64, 64, 4) float: density
+        [kg/m^3], Young's modulus [Pa], Poisson's ratio, class id; or a
+        prediction, (11, 64, 64, 64) or (4, 64, 64, 64) float: the same three
+        normalised to [-1, 1] by Pixie's published ranges, then eight class
+        scores or one class id. Its mask, if any, is (64, 64, 64).
+
+    Returns
+    -------
+    MaterialField
+        Occupancy, and material and SI properties of the annotated voxels.
+        Occupied is what the mask says or, without a mask, what is not
+        background; annotated is an occupied voxel of class 0 to 6.
+
+    Raises
+    ------
+    InputError
+        If a file cannot be used; the message names file, value and voxel.
+    """
+    path, _ = require_complete(pair)
+    data, source = load_source(path, pair.pixieverse_root, "grid")
+    grid = npy_array(data, path, GRID)
+    sources = [source]
+    warnings: list[str] = []
+
+    mask = None
+    if pair.mask is not None:
+        data, source = load_source(pair.mask, pair.pixieverse_root, "mask")
+        sources.append(source)
+        mask = _read_mask(npy_array(data, pair.mask, MASK), pair.mask, warnings)
+
+    raw = grid.shape == _RAW_SHAPE
+    channels = np.moveaxis(grid, -1, 0) if raw else grid
+    if grid.shape == _SCORES_SHAPE:
+        material = _classes_of_scores(channels[3:], mask, path, warnings)
+    else:
+        material = _classes_of_ids(channels[3], path)
+    occupancy = material != BACKGROUND if mask is None else mask
+    if not occupancy.any():
+        raise InputError(path, "no voxel is occupied: all are background", "an occupied voxel")
+    annotated = _annotated(occupancy, material, mask is not None, path, warnings)
+
+    voxels = np.argwhere(annotated)
+    properties = _gather(channels, annotated)
+    _require_finite(_gather(channels, occupancy), occupancy, path)
+    if raw:
+        _require_physical(properties, voxels, path)
+    else:
+        properties = _to_si(properties, warnings)
+
+    bounds = None
+    if pair.bounds is not None:
+        bounds = _read_bounds(pair.bounds, pair.pixieverse_root, sources, warnings)
+    return MaterialField(
+        occupancy=occupancy,
+        voxels=voxels.astype(np.uint8),
+        material=material[annotated].astype(np.uint8),
+        properties=properties,
+        bounds=bounds,
+        sources=tuple(sources),
+        warnings=tuple(warnings),
+    )
+
+
+def _read_mask(values: NDArray[Any], path: Path, warnings: list[str]) -> NDArray[np.bool_]:
+    bad = ~((values >= 0) & (values <= 1))  # NaN is bad as well
+    if bad.any():
+        voxel = _first(bad)
+        raise InputError(
+            path, f"value {values[voxel]} at voxel {voxel}", "0 (empty) or 1 (occupied), or a bool"
+        )
+    mask = np.ascontiguousarray(values > 0.5)
+    if not mask.any():
+        raise InputError(path, "the mask is empty", "an occupied voxel (a value above 0.5)")
+    between = int(np.count_nonzero((values != 0) & (values != 1)))
+    if between:
+        warnings.append(f"mask: {between} voxels lie between 0 and 1; above 0.5 is occupied")
+    return mask
+
+
+def _classes_of_ids(ids: NDArray[Any], path: Path) -> NDArray[np.int8]:
+    known = (ids >= UNLABELLED) & (ids <= BACKGROUND) & (ids == np.rint(ids))
+    if not known.all():
+        voxel = _first(~known)
+        raise InputError(
+            path,
+            f"unknown class {ids[voxel]:g} at voxel {voxel}",
+            f"whole class ids from {UNLABELLED} to {BACKGROUND}",
+        )
+    return np.ascontiguousarray(ids).astype(np.int8)
+
+
+def _classes_of_scores(
+    scores: NDArray[Any],
+    mask: NDArray[np.bool_] | None,
+    path: Path,
+    warnings: list[str],
+) -> NDArray[np.int8]:
+    """Return the class of the highest score; voxels outside the mask do not matter."""
+    where = np.ones(_CUBE, dtype=bool) if mask is None else mask
+    inside = scores[:, where]
+    finite = np.isfinite(inside).all(axis=0)
+    if not finite.all():
+        voxel = tuple(int(i) for i in np.argwhere(where)[np.argmin(finite)])
+        raise InputError(
+            path, f"a class score is NaN or infinite at voxel {voxel}", "finite scores"
+        )
+    top = inside.max(axis=0)
+    best = inside.argmax(axis=0).astype(np.int8)
+    # Where several classes share the highest score (all zero, say), taking the
+    # first would label the voxel jelly for no reason.
+    tied = (inside == top).sum(axis=0) > 1
+    best[tied] = np.where(inside[BACKGROUND, tied] == top[tied], BACKGROUND, UNLABELLED)
+    count = int(np.count_nonzero(tied & (best == UNLABELLED)))
+    if count:
+        warnings.append(f"{count} voxels have no single highest class score; not annotated")
+    material = np.full(_CUBE, BACKGROUND, dtype=np.int8)
+    material[where] = best
+    return material
+
+
+def _annotated(
+    occupancy: NDArray[np.bool_],
+    material: NDArray[np.int8],
+    masked: bool,
+    path: Path,
+    warnings: list[str],
+) -> NDArray[np.bool_]:
+    background = material == BACKGROUND
+    unlabelled = occupancy & (material == UNLABELLED)
+    annotated: NDArray[np.bool_] = occupancy & ~background & ~unlabelled
+    if not annotated.any():
+        raise InputError(
+            path,
+            f"none of the {np.count_nonzero(occupancy)} occupied voxels is annotated",
+            "an occupied voxel of class 0 to 6",
+        )
+    if unlabelled.any():
+        warnings.append(
+            f"{np.count_nonzero(unlabelled)} occupied voxels have no class (-1); not annotated"
+        )
+    if masked:
+        empty = int(np.count_nonzero(occupancy & background))
+        outside = int(np.count_nonzero(~occupancy & ~background))
+        if empty:
+            warnings.append(f"{empty} voxels of the mask are background; not annotated")
+        if outside:
+            warnings.append(f"{outside} voxels with a class lie outside the mask; left out")
+    return annotated
+
+
+def _gather(channels: NDArray[Any], where: NDArray[np.bool_]) -> NDArray[np.float32]:
+    """Return the properties (K, 3) at the voxels of a mask, ordered as PROPERTY_COLUMNS."""
+    with np.errstate(over="ignore"):  # what float32 cannot hold becomes infinite, and a fault
+        columns = [channels[k][where].astype(np.float32) for k in _CHANNEL_ORDER]
+    return np.stack(columns, axis=1)
+
+
+def _require_finite(
+    properties: NDArray[np.float32], occupancy: NDArray[np.bool_], path: Path
+) -> None:
+    if not np.isfinite(properties).all():
+        row, column = _first(~np.isfinite(properties))
+        voxel = tuple(int(i) for i in np.argwhere(occupancy)[row])
+        raise InputError(
+            path,
+            f"{PROPERTY_COLUMNS[column]} is {properties[row, column]} at occupied voxel {voxel}",
+            "a finite value that float32 can hold",
+        )
+
+
+def _require_physical(
+    properties: NDArray[np.float32], voxels: NDArray[np.intp], path: Path
+) -> None:
+    youngs_modulus, density, poissons_ratio = properties.T
+    for name, values, good, expected in (
+        ("density", density, density > 0, "a density above 0 kg/m^3"),
+        ("Young's modulus", youngs_modulus, youngs_modulus > 0, "a Young's modulus above 0 Pa"),
+        (
+            "Poisson's ratio",
+            poissons_ratio,
+            (poissons_ratio >= -1) & (poissons_ratio <= 0.5),
+            "a Poisson's ratio in [-1, 0.5]",
+        ),
+    ):
+        if not good.all():
+            row = int(np.argmin(good))
+            voxel = tuple(int(i) for i in voxels[row])
+            raise InputError(path, f"{name} {values[row]:g} at annotated voxel {voxel}", expected)
+
+
+def _to_si(values: NDArray[np.float32], warnings: list[str]) -> NDArray[np.float32]:
+    outside = np.count_nonzero(np.abs(values) > 1, axis=0)
+    for name, count in zip(PROPERTY_COLUMNS, outside, strict=True):
+        if count:
+            warnings.append(f"prediction: {count} values of {name} clipped to [-1, 1]")
+    return denormalize(np.clip(values, -1, 1), PIXIE_RANGES)
+
+
+def _read_bounds(
+    path: Path, root: Path, sources: list[SourceFile], warnings: list[str]
+) -> dict[str, object] | None:
+    """Return what ``clip_features.npz`` says, JSON-ready; a fault is a warning only.
+
+    Bounds serve exports to world coordinates; the supervision does without.
+    """
+    bounds: dict[str, object] = {}
+    try:
+        data, source = load_source(path, root, "bounds")
+        sources.append(source)
+        names = npz_names(data, path)
+    except InputError as error:
+        warnings.append(f"bounds not read: {error}")
+        return None
+    for name in names:
+        try:
+            value = npz_arrays(data, path, {name: BOUND})[name]
+        except InputError as error:
+            warnings.append(f"bounds: {error}")
+            continue
+        if value.dtype.kind == "f" and not np.isfinite(value).all():
+            warnings.append(f"bounds: {path} [{name}]: not finite, left out")
+            continue
+        bounds[name] = value.tolist()
+    return bounds
+
+
+def _first(bad: NDArray[np.bool_]) -> tuple[int, ...]:
+    """Return the index of the first true entry, in C order."""
+    return tuple(int(i) for i in np.unravel_index(int(np.argmax(bad)), bad.shape))

@@ -1,0 +1,119 @@
+"""Reading structured latents (SLAT) as TRELLIS and its users save them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from slatprep.errors import InputError
+from slatprep.readers.files import ArraySpec, load_source, npz_arrays, require_complete
+from slatprep.readers.hdf5 import SUFFIXES, load_datasets
+from slatprep.records import RESOLUTION, AssetPair, StructuredLatents
+
+LATENT_CHANNELS = 8
+
+SPECS = {
+    "coords": ArraySpec(shapes=((None, 3), (None, 4)), kinds="iu"),
+    "feats": ArraySpec(shapes=((None, LATENT_CHANNELS),), kinds="f"),
+}
+
+
+def read_latents(pair: AssetPair) -> StructuredLatents:
+    """Read the SLAT side of a pair, from npz or HDF5.
+
+    Parameters
+    ----------
+    pair : AssetPair
+        A pair without a problem. Its SLAT holds ``coords``, (N, 3) integers or
+        (N, 4) with a leading batch column of zeros, and ``feats``, (N, 8)
+        float: in an npz, at the top of an HDF5 file, or in a group of one.
+
+    Returns
+    -------
+    StructuredLatents
+        Coordinates and latents in the order of the file.
+
+    Raises
+    ------
+    InputError
+        If the file cannot be used; the message names file, value and row.
+    """
+    _, path = require_complete(pair)
+    if pair.slat_group or path.suffix.lower() in SUFFIXES:
+        arrays, source = load_datasets(path, pair.slat_root, pair.slat_group, SPECS)
+    else:
+        data, source = load_source(path, pair.slat_root, "slat")
+        arrays = npz_arrays(data, path, SPECS)
+    where = f"{path} [{pair.slat_group}]" if pair.slat_group else path
+    coords, feats = arrays["coords"], arrays["feats"]
+    if len(coords) != len(feats):
+        raise InputError(
+            where, f"{len(coords)} rows of coords but {len(feats)} of feats", "one latent per voxel"
+        )
+    if len(coords) == 0:
+        raise InputError(where, "the SLAT is empty", "at least one voxel")
+    warnings: list[str] = []
+    return StructuredLatents(
+        coords=_check_coords(coords, where),
+        feats=_check_feats(feats, where, warnings),
+        sources=(source,),
+        warnings=tuple(warnings),
+    )
+
+
+def _check_coords(coords: NDArray[Any], where: str | Path) -> NDArray[np.uint8]:
+    if coords.shape[1] == 4:
+        batch = coords[:, 0]
+        if batch.any():
+            row = int(np.argmax(batch != 0))
+            raise InputError(
+                where,
+                f"batch index {batch[row]} in row {row}: more than one asset, or not the first",
+                "one asset per file, batch index 0 throughout",
+            )
+        coords = coords[:, 1:]
+    outside = ((coords < 0) | (coords >= RESOLUTION)).any(axis=1)
+    if outside.any():
+        row = int(np.argmax(outside))
+        raise InputError(
+            where,
+            f"coordinate {_triple(coords[row])} in row {row} is out of range",
+            f"coordinates in 0..{RESOLUTION - 1}",
+        )
+    voxels = np.ascontiguousarray(coords).astype(np.uint8)
+    flat = np.ravel_multi_index(tuple(voxels.T.astype(np.intp)), (RESOLUTION,) * 3)
+    counts = np.bincount(flat, minlength=RESOLUTION**3)
+    if counts.max() > 1:
+        rows = np.flatnonzero(counts[flat] > 1)
+        first, second = np.flatnonzero(flat == flat[rows[0]])[:2]
+        raise InputError(
+            where,
+            f"coordinate {_triple(voxels[first])} occurs twice, in rows {first} and {second}",
+            "each coordinate once",
+        )
+    return voxels
+
+
+def _check_feats(
+    feats: NDArray[Any], where: str | Path, warnings: list[str]
+) -> NDArray[np.float32]:
+    if feats.dtype.itemsize > 4:
+        warnings.append(f"feats: {feats.dtype.name} rounded to float32")
+    with np.errstate(over="ignore"):  # what float32 cannot hold becomes infinite, and a fault
+        latents = np.ascontiguousarray(feats, dtype=np.float32)
+    finite = np.isfinite(latents)
+    if not finite.all():
+        row, column = (int(i) for i in np.unravel_index(int(np.argmin(finite)), finite.shape))
+        raise InputError(
+            where,
+            f"feats is {feats[row, column]} in row {row}, channel {column}",
+            "finite latents that float32 can hold",
+        )
+    return latents
+
+
+def _triple(coordinate: NDArray[Any]) -> tuple[int, ...]:
+    return tuple(int(i) for i in coordinate)
