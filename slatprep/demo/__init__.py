@@ -1,0 +1,248 @@
+"""Demo data: procedural assets with exactly known truth, in the layouts of real ones.
+
+`shapes` and `materials` are what objects are built of, `catalogue` lists the
+objects, `voxelise` and `difficulty` are how two pipelines see them, `asset`
+puts both sides and the truth together, `write` lays them out on disk.
+"""
+
+from __future__ import annotations
+
+import json
+from collections import Counter
+from collections.abc import Callable, Iterator
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from slatprep.demo.asset import DemoAsset, make_asset
+from slatprep.demo.difficulty import LEVELS
+from slatprep.demo.latents import LatentKind
+from slatprep.demo.write import (
+    GridForm,
+    SlatForm,
+    SlatNames,
+    row_id,
+    slat_name,
+    write_categories,
+    write_pixieverse,
+    write_slat,
+    write_trellis_metadata,
+    write_truth,
+)
+from slatprep.errors import ConfigError
+
+__all__ = ["DemoAsset", "DemoSummary", "make_asset", "make_demo"]
+
+
+@dataclass(frozen=True)
+class DemoSummary:
+    """What was made: where it lies, and how many rows of each category and level."""
+
+    directory: Path
+    config: Path
+    assets: int
+    rows: int
+    categories: dict[str, int]
+    levels: dict[int, int]
+
+
+@dataclass(frozen=True)
+class _Recipe:
+    """Everything that decides the content of a demo dataset."""
+
+    assets: int
+    seed: int
+    levels: tuple[int, ...]
+    views: int
+    latents: LatentKind
+    habitual_share: float
+    grid_form: GridForm
+    slat_form: SlatForm
+    slat_names: SlatNames
+
+
+def make_demo(
+    directory: str | Path,
+    assets: int,
+    seed: int,
+    *,
+    levels: tuple[int, ...] = tuple(LEVELS),
+    views: int = 1,
+    latents: LatentKind = "placeholder",
+    habitual_share: float = 0.0,
+    grid_form: GridForm = "raw",
+    slat_form: SlatForm = "npz",
+    slat_names: SlatNames = "id",
+    jobs: int = 1,
+    progress: Callable[[int, int], None] | None = None,
+) -> DemoSummary:
+    """Make a demo dataset.
+
+    The same arguments give the same bytes, whatever `jobs`; asset number i
+    does not depend on how many assets there are. Fourteen assets hold every
+    category once.
+
+    Parameters
+    ----------
+    directory : str or Path
+        Where to write ``pixieverse/``, ``slat/``, ``truth/``,
+        ``obj_ids_metadata.json``, ``dataset.toml`` (the dataset's definition
+        for `slatprep build-store --config`) and ``demo.json`` (what was made).
+        It is made if missing; it must be empty or hold the same demo.
+    assets, seed : int
+        Number of objects, and the seed of everything random.
+    levels : tuple of int
+        Levels of difficulty, gone through in turn; see `slatprep.demo.difficulty`.
+    views : int
+        SLATs of each object; with several, rows are named ``<object id>.<view>``.
+    latents : {"placeholder", "material"}
+        What the latents are made of; see `slatprep.demo.latents`.
+    habitual_share : float
+        Share of assets with the dataset's one quarter turn between the sides,
+        in 0..1; the others have any of the 24.
+    grid_form : {"raw", "prediction", "prediction-ids"}
+        Material grids, or predictions of 11 or of 4 channels.
+    slat_form : {"npz", "npz-batch", "hdf5", "hdf5-groups"}
+        Coordinates (N, 3) uint8 or (N, 4) int32 in an npz, or HDF5, a file or
+        a group an asset.
+    slat_names : {"id", "sha256"}
+        Name the SLATs by object id, or by sha256 with TRELLIS's ``metadata.csv``.
+    jobs : int
+        Processes.
+    progress : callable, optional
+        Called with the number of assets done and of all, after each.
+
+    Returns
+    -------
+    DemoSummary
+        Where it lies and what it holds.
+
+    Raises
+    ------
+    ConfigError
+        If an argument makes no sense or the directory holds something else.
+    """
+    recipe = _Recipe(
+        assets, seed, tuple(levels), views, latents, habitual_share,
+        grid_form, slat_form, slat_names,
+    )  # fmt: skip
+    _check(recipe)
+    root = Path(directory)
+    _claim(root, recipe)
+    entries = []
+    for entry in _made(root, recipe, jobs):
+        entries.append(entry)
+        if progress is not None:
+            progress(len(entries), assets)
+    _write_definition(root, recipe, entries)
+    _write_json(root / "demo.json", {"recipe": asdict(recipe), "assets": entries})
+    return DemoSummary(
+        directory=root,
+        config=root / "dataset.toml",
+        assets=len(entries),
+        rows=len(entries) * views,
+        categories=dict(Counter(entry["category"] for entry in entries)),
+        levels=dict(sorted(Counter(entry["level"] for entry in entries).items())),
+    )
+
+
+def _check(recipe: _Recipe) -> None:
+    for name, value, allowed in (
+        ("assets", recipe.assets, recipe.assets >= 1),
+        ("seed", recipe.seed, recipe.seed >= 0),
+        ("views", recipe.views, recipe.views >= 1),
+        ("habitual_share", recipe.habitual_share, 0.0 <= recipe.habitual_share <= 1.0),
+        ("levels", recipe.levels, recipe.levels and set(recipe.levels) <= set(LEVELS)),
+    ):
+        if not allowed:
+            raise ConfigError(
+                f"{name} = {value!r} makes no demo: assets and views are at least 1, seed at least "
+                f"0, habitual_share in 0..1, levels some of {', '.join(map(str, LEVELS))}"
+            )
+    if recipe.slat_form == "hdf5-groups" and recipe.views > 1:
+        raise ConfigError("slat_form 'hdf5-groups' holds one view an object: use 'hdf5', or 1 view")
+
+
+def _claim(root: Path, recipe: _Recipe) -> None:
+    """Take a directory that is new, empty, or holds the same demo, and mark it."""
+    mark = root / "demo.json"
+    plain = json.loads(json.dumps(asdict(recipe)))
+    if root.exists() and any(root.iterdir()):
+        if not mark.is_file() or json.loads(mark.read_text("utf-8"))["recipe"] != plain:
+            raise ConfigError(
+                f"{root} holds something else than this demo: choose an empty directory"
+            )
+    else:
+        root.mkdir(parents=True, exist_ok=True)
+        _write_json(mark, {"recipe": plain, "assets": []})
+    (root / "slat" / "latents.h5").unlink(missing_ok=True)  # this one is added to
+
+
+def _made(root: Path, recipe: _Recipe, jobs: int) -> Iterator[dict[str, Any]]:
+    """Make and write every asset, in order."""
+    # One file for all assets has one writer.
+    if jobs == 1 or recipe.slat_form == "hdf5-groups":
+        yield from (_make_one(root, recipe, index) for index in range(recipe.assets))
+    else:
+        from joblib import Parallel, delayed
+
+        yield from Parallel(n_jobs=jobs, return_as="generator")(
+            delayed(_make_one)(root, recipe, index) for index in range(recipe.assets)
+        )
+
+
+def _make_one(root: Path, recipe: _Recipe, index: int) -> dict[str, Any]:
+    asset = make_asset(
+        recipe.seed,
+        index,
+        levels=recipe.levels,
+        views=recipe.views,
+        latents=recipe.latents,
+        habitual_share=recipe.habitual_share,
+    )
+    write_pixieverse(root / "pixieverse", asset, recipe.grid_form)
+    write_slat(root / "slat", asset, recipe.slat_form, recipe.slat_names)
+    write_truth(root / "truth", asset)
+    return {
+        "id": asset.object_id,
+        "name": asset.name,
+        "category": asset.category,
+        "level": asset.level,
+        "symmetric": asset.symmetric,
+        "slat": slat_name(asset, recipe.slat_names),
+        "rows": [
+            {
+                "id": row_id(asset, view),
+                "voxels": len(view.coords),
+                "transform": view.transform.tolist(),
+            }
+            for view in asset.views
+        ],
+    }
+
+
+def _write_definition(root: Path, recipe: _Recipe, entries: list[dict[str, Any]]) -> None:
+    write_categories(root / "obj_ids_metadata.json", ((e["id"], e["category"]) for e in entries))
+    slat_root = "slat/latents.h5" if recipe.slat_form == "hdf5-groups" else "slat"
+    lines = [
+        "# A demo dataset; roots are relative to this file.",
+        f'name = "demo-{recipe.seed}"',
+        "",
+        "[pixieverse]",
+        'root = "pixieverse"',
+        "",
+        "[slat]",
+        f'root = "{slat_root}"',
+        "",
+        "[pairing]",
+        'categories = "obj_ids_metadata.json"',
+    ]
+    if recipe.slat_names == "sha256":
+        rows = ((e["slat"], e["id"], e["rows"][0]["voxels"]) for e in entries)
+        write_trellis_metadata(root / "metadata.csv", rows)
+        lines.append('map = "metadata.csv"')
+    (root / "dataset.toml").write_text("\n".join(lines) + "\n", encoding="utf-8")
+
+
+def _write_json(path: Path, value: object) -> None:
+    path.write_text(json.dumps(value, indent=1) + "\n", encoding="utf-8")

@@ -1,0 +1,179 @@
+"""One demo asset: an object, seen from both sides, with the truth."""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from slatprep.demo.catalogue import CATALOGUE
+from slatprep.demo.difficulty import (
+    LEVELS,
+    QUARTER_TURNS,
+    UNLABELLED,
+    Frames,
+    damage,
+    draw_frames,
+)
+from slatprep.demo.latents import LatentKind, make_latents
+from slatprep.demo.shapes import Solid
+from slatprep.demo.voxelise import voxelise
+from slatprep.geometry import voxel_centres
+from slatprep.records import BACKGROUND, RESOLUTION
+
+# Each random choice has a stream of its own, so that one option of the demo
+# does not change what another one draws.
+_SHAPE, _FRAME, _DAMAGE, _LATENTS, _HABIT = range(5)
+
+
+@dataclass(frozen=True)
+class DemoView:
+    """A SLAT of an object, with the truth.
+
+    Attributes
+    ----------
+    view : str
+        Name of the view; empty where the object has one only.
+    coords : ndarray of uint8, shape (N, 3)
+        SLAT voxels in C order.
+    feats : ndarray of float32, shape (N, 8)
+        Latents.
+    transform : ndarray of float64, shape (4, 4)
+        PixieVerse frame to SLAT frame.
+    material : ndarray of uint8, shape (N,)
+        True class of each SLAT voxel.
+    properties : ndarray of float32, shape (N, 3)
+        True Young's modulus, density and Poisson's ratio of each, SI.
+    """
+
+    view: str
+    coords: NDArray[np.uint8]
+    feats: NDArray[np.float32]
+    transform: NDArray[np.float64]
+    material: NDArray[np.uint8]
+    properties: NDArray[np.float32]
+
+
+@dataclass(frozen=True)
+class DemoAsset:
+    """An object of the demo; ``grid`` is (64, 64, 64, 4) float32 as PixieVerse stores it."""
+
+    object_id: str
+    name: str
+    category: str
+    level: int
+    symmetric: bool
+    grid: NDArray[np.float32]
+    occupancy: NDArray[np.bool_]
+    views: tuple[DemoView, ...]
+
+
+def object_id(seed: int, index: int) -> str:
+    """Return the id of an object: 32 hex digits, as Objaverse's are."""
+    return hashlib.sha256(f"slatprep demo {seed} {index}".encode()).hexdigest()[:32]
+
+
+def make_asset(
+    seed: int,
+    index: int,
+    *,
+    levels: tuple[int, ...] = tuple(LEVELS),
+    views: int = 1,
+    latents: LatentKind = "placeholder",
+    habitual_share: float = 0.0,
+) -> DemoAsset:
+    """Make asset number `index` of a demo dataset.
+
+    It depends on these arguments alone, not on how many others are made.
+
+    Parameters
+    ----------
+    seed, index : int
+        Seed of the dataset and number of the asset in it.
+    levels : tuple of int
+        The levels that the dataset goes through in turn.
+    views : int
+        SLATs of the object; from the second on the SLAT side is turned about z.
+    latents : {"placeholder", "material"}
+        What the latents are made of.
+    habitual_share : float
+        Share of assets whose PixieVerse side has the dataset's one quarter
+        turn; the others have any of the 24.
+
+    Returns
+    -------
+    DemoAsset
+        The object as both pipelines would give it, with the truth.
+    """
+    categories = tuple(CATALOGUE)
+    turn, place = divmod(index, len(categories))
+    category = categories[place]
+    # The added turn keeps a category from meeting one level only.
+    level = levels[(index + turn) % len(levels)]
+    model = CATALOGUE[category](np.random.default_rng([seed, index, _SHAPE]), turn)
+    solid = Solid(model.parts)
+
+    rng = np.random.default_rng([seed, index, _FRAME])
+    quarter = int(rng.integers(len(QUARTER_TURNS)))
+    if rng.uniform() < habitual_share:
+        quarter = int(np.random.default_rng([seed, _HABIT]).integers(len(QUARTER_TURNS)))
+    frames = draw_frames(rng, solid, LEVELS[level], QUARTER_TURNS[quarter])
+    stuff = _pixieverse_side(solid, frames)
+    if LEVELS[level].damaged:
+        rng = np.random.default_rng([seed, index, _DAMAGE])
+        stuff = damage(rng, stuff, frames.pixieverse_distance(solid), len(solid.stuffs))
+    made = []
+    for v in range(views):
+        seen = replace(frames, slat=replace(frames.slat, rotation=_heading(v)))
+        rng = np.random.default_rng([seed, index, _LATENTS, v])
+        made.append(_slat_side(rng, f"view_{v}" if views > 1 else "", solid, seen, latents))
+    return DemoAsset(
+        object_id(seed, index),
+        model.name,
+        category,
+        level,
+        model.symmetric,
+        _material_grid(solid, stuff),
+        stuff != -1,
+        tuple(made),
+    )
+
+
+def _heading(view: int) -> NDArray[np.float64]:
+    """Return the quarter turn about z of a view."""
+    cos, sin = ((1, 0), (0, 1), (-1, 0), (0, -1))[view % 4]
+    return np.array([[cos, -sin, 0], [sin, cos, 0], [0, 0, 1]], dtype=np.float64)
+
+
+def _pixieverse_side(solid: Solid, frames: Frames) -> NDArray[np.int16]:
+    """Return the index of the stuff of each voxel (64, 64, 64), -1 where empty."""
+    filled = np.argwhere(voxelise(frames.pixieverse_distance(solid))[1])
+    stuff = np.full((RESOLUTION,) * 3, -1, dtype=np.int16)
+    centres = frames.pixieverse.to_object(voxel_centres(filled))
+    stuff[tuple(filled.T)] = solid.stuff_at(centres)
+    return stuff
+
+
+def _material_grid(solid: Solid, stuff: NDArray[np.int16]) -> NDArray[np.float32]:
+    """Return density, Young's modulus, Poisson's ratio and class (64, 64, 64, 4)."""
+    material, properties = solid.table()
+    grid = np.zeros((*stuff.shape, 4), dtype=np.float32)
+    grid[..., 3] = BACKGROUND
+    grid[stuff == UNLABELLED, 3] = -1
+    known = stuff >= 0
+    grid[known, :3] = properties[stuff[known]][:, [1, 0, 2]]
+    grid[known, 3] = material[stuff[known]]
+    return grid
+
+
+def _slat_side(
+    rng: np.random.Generator, view: str, solid: Solid, frames: Frames, latents: LatentKind
+) -> DemoView:
+    surface = voxelise(frames.slat_distance(solid))[0]
+    coords = np.argwhere(surface).astype(np.uint8)
+    material, properties = solid.table()
+    stuff = solid.stuff_at(frames.slat_to_object(voxel_centres(coords)))
+    feats = make_latents(rng, latents, coords, material[stuff], properties[stuff])
+    return DemoView(view, coords, feats, frames.transform(), material[stuff], properties[stuff])

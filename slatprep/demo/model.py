@@ -1,0 +1,102 @@
+"""An object of the demo, and the pieces that several objects share.
+
+z is up and units are arbitrary; proportions and positions come from the
+generator.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from slatprep.demo.materials import draw
+from slatprep.demo.shapes import (
+    Part,
+    Shape,
+    Stuff,
+    capsule,
+    carve,
+    cone,
+    polytope,
+)
+
+Rng = np.random.Generator
+Vector = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Model:
+    """An object of the demo.
+
+    ``symmetric`` is true where its geometry cannot tell several placements
+    apart, whatever its materials.
+    """
+
+    name: str
+    parts: tuple[Part, ...]
+    symmetric: bool = False
+
+
+def vec(*values: float) -> Vector:
+    """Return a vector of float64."""
+    return np.array(values, dtype=np.float64)
+
+
+def around(angle: float, radius: float, z: float) -> Vector:
+    """Return a point in cylindrical coordinates (angle in radians)."""
+    return vec(radius * np.cos(angle), radius * np.sin(angle), z)
+
+
+def orient(angle: float, tilt: float = 0.0) -> Vector:
+    """Return a rotation (3, 3) about z by `angle` after tilting about y by `tilt` (radians)."""
+    c, s, ct, st = np.cos(angle), np.sin(angle), np.cos(tilt), np.sin(tilt)
+    heading = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
+    lean: Vector = heading @ np.array([[ct, 0, st], [0, 1, 0], [-st, 0, ct]])
+    return lean
+
+
+def direction(rng: Rng) -> Vector:
+    """Draw a unit vector uniformly."""
+    vector = rng.normal(size=3)
+    unit: Vector = vector / np.linalg.norm(vector)
+    return unit
+
+
+def curve(points: ArrayLike, radii: ArrayLike, stuff: Stuff) -> list[Part]:
+    """Return capsules along a polyline of points (K, 3), one radius a segment."""
+    p = np.asarray(points, dtype=np.float64)
+    r = np.asarray(radii, dtype=np.float64)
+    return [Part(capsule(a, b, k), stuff) for a, b, k in zip(p[:-1], p[1:], r, strict=True)]
+
+
+def rock(rng: Rng, centre: ArrayLike, radii: ArrayLike) -> Shape:
+    """Return a rounded convex stone with irregular faces."""
+    faces = 13
+    k = np.arange(faces) + 0.5  # evenly spread directions (a spherical Fibonacci lattice)
+    z, angle = 1.0 - 2.0 * k / faces, np.pi * (1.0 + 5.0**0.5) * k
+    ring = np.sqrt(1.0 - z * z)
+    normals = np.stack([ring * np.cos(angle), ring * np.sin(angle), z], axis=1)
+    normals = normals + rng.normal(0.0, 0.18, normals.shape)
+    # A plane of the scaled unit ball: normal n / r, moved to the centre.
+    normals = normals / np.asarray(radii)
+    length = np.linalg.norm(normals, axis=1)
+    normals /= length[:, None]
+    rounding = 0.12 * float(np.min(radii))
+    offsets = rng.uniform(0.8, 1.0, faces) / length + normals @ np.asarray(centre) - rounding
+    return polytope(normals, offsets, rounding)
+
+
+def pot(rng: Rng, radius: float, height: float, filled: str) -> list[Part]:
+    """Return a pot standing on z = 0, filled up to four fifths."""
+    foot = radius * rng.uniform(0.65, 0.8)
+    wall = 0.13 * radius
+    outer = cone(vec(0, 0, 0), vec(0, 0, height), foot, radius)
+    hollow = cone(vec(0, 0, 1.5 * wall), vec(0, 0, 1.01 * height), foot - wall, radius - wall)
+    level = 0.8 * height
+    inner = foot + (radius - foot) * level / height - 0.5 * wall
+    return [
+        Part(carve(outer, hollow), draw(rng, "ceramic")),
+        Part(cone(vec(0, 0, wall), vec(0, 0, level), foot - 0.5 * wall, inner), draw(rng, filled)),
+    ]

@@ -1,0 +1,284 @@
+"""Primitive solids as signed distance bounds, and what they are made of.
+
+Every shape gives, at any point, a number that is negative inside, positive
+outside and never larger in magnitude than the distance to its surface; the
+voxelisation relies on that bound. It also gives its support function, from
+which exact bounding boxes follow in any orientation.
+
+The distance functions follow Inigo Quilez, "Distance functions"
+(https://iquilezles.org/articles/distfunctions/).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from itertools import combinations
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+Points = NDArray[np.float64]
+Region = Callable[[Points], Points]
+
+
+@dataclass(frozen=True)
+class Shape:
+    """A solid: a signed distance bound and a support function.
+
+    ``distance`` maps points (P, 3) to (P,); ``support`` maps a unit direction
+    (3,) to the largest projection of the solid on it.
+    """
+
+    distance: Region
+    support: Callable[[Points], float]
+
+    def box(self) -> NDArray[np.float64]:
+        """Return the bounding box as (2, 3): lower and upper corner."""
+        return bounding_box([self], np.eye(3))
+
+
+def bounding_box(shapes: Sequence[Shape], rotation: Points) -> NDArray[np.float64]:
+    """Return the bounding box (2, 3) of the union of shapes after a rotation (3, 3)."""
+    upper = [max(shape.support(axis) for shape in shapes) for axis in rotation]
+    lower = [-max(shape.support(-axis) for shape in shapes) for axis in rotation]
+    return np.array([lower, upper])
+
+
+def _vector(value: ArrayLike) -> Points:
+    return np.asarray(value, dtype=np.float64)
+
+
+def _lengths(vectors: Points) -> Points:
+    lengths: Points = np.sqrt(np.einsum("ij,ij->i", vectors, vectors))
+    return lengths
+
+
+def sphere(centre: ArrayLike, radius: float) -> Shape:
+    """Return a ball."""
+    c = _vector(centre)
+    return Shape(
+        lambda p: _lengths(p - c) - radius,
+        lambda d: float(c @ d) + radius,
+    )
+
+
+def ellipsoid(centre: ArrayLike, radii: ArrayLike, rotation: ArrayLike | None = None) -> Shape:
+    """Return an ellipsoid; the columns of `rotation` are its axes."""
+    c, r = _vector(centre), _vector(radii)
+    axes = np.eye(3) if rotation is None else _vector(rotation)
+    return Shape(
+        lambda p: (_lengths((p - c) @ (axes / r)) - 1.0) * r.min(),
+        lambda d: float(c @ d + np.linalg.norm(r * (d @ axes))),
+    )
+
+
+def dome(centre: ArrayLike, radii: ArrayLike) -> Shape:
+    """Return the upper half of an axis-parallel ellipsoid, standing on z = centre z."""
+    c, r = _vector(centre), _vector(radii)
+    whole = ellipsoid(c, r)
+
+    def support(d: Points) -> float:
+        return whole.support(d) if d[2] >= 0 else float(c @ d + np.hypot(*(r * d)[:2]))
+
+    return Shape(lambda p: np.maximum(whole.distance(p), c[2] - p[:, 2]), support)
+
+
+def capsule(start: ArrayLike, end: ArrayLike, radius: float) -> Shape:
+    """Return all points within `radius` of a segment."""
+    a, b = _vector(start), _vector(end)
+    axis = b - a
+
+    def distance(p: Points) -> Points:
+        along = np.clip((p - a) @ axis / (axis @ axis), 0.0, 1.0)
+        return _lengths(p - a - along[:, None] * axis) - radius
+
+    return Shape(distance, lambda d: float(max(a @ d, b @ d)) + radius)
+
+
+def cone(start: ArrayLike, end: ArrayLike, radius: float, end_radius: float) -> Shape:
+    """Return a frustum with flat ends, of `radius` at `start` and `end_radius` at `end`."""
+    a, b = _vector(start), _vector(end)
+    length = float(np.linalg.norm(b - a))
+    axis = (b - a) / length
+    slope = (end_radius - radius) / length
+
+    def distance(p: Points) -> Points:
+        along = (p - a) @ axis
+        around = _lengths(p - a - along[:, None] * axis)
+        side = (around - radius - slope * along) / np.hypot(1.0, slope)
+        bound: Points = np.maximum(side, np.maximum(-along, along - length))
+        return bound
+
+    def support(d: Points) -> float:
+        across = float(np.sin(np.arccos(np.clip(axis @ d, -1.0, 1.0))))
+        return float(max(a @ d + radius * across, b @ d + end_radius * across))
+
+    return Shape(distance, support)
+
+
+def cylinder(start: ArrayLike, end: ArrayLike, radius: float) -> Shape:
+    """Return a cylinder with flat ends."""
+    return cone(start, end, radius, radius)
+
+
+def box(
+    centre: ArrayLike, half: ArrayLike, rotation: ArrayLike | None = None, rounding: float = 0.0
+) -> Shape:
+    """Return a box of half edges `half` (rounding included) with rounded edges."""
+    c, h = _vector(centre), _vector(half) - rounding
+    axes = np.eye(3) if rotation is None else _vector(rotation)
+
+    def distance(p: Points) -> Points:
+        beyond = np.abs((p - c) @ axes) - h
+        outside = _lengths(np.maximum(beyond, 0.0))
+        bound: Points = outside + np.minimum(beyond.max(axis=1), 0.0) - rounding
+        return bound
+
+    return Shape(distance, lambda d: float(c @ d + h @ np.abs(d @ axes)) + rounding)
+
+
+def torus(centre: ArrayLike, axis: ArrayLike, radius: float, thickness: float) -> Shape:
+    """Return a ring of tube radius `thickness` around `axis`."""
+    c = _vector(centre)
+    n = _vector(axis) / np.linalg.norm(_vector(axis))
+
+    def distance(p: Points) -> Points:
+        along = (p - c) @ n
+        around = _lengths(p - c - along[:, None] * n)
+        bound: Points = np.hypot(around - radius, along) - thickness
+        return bound
+
+    def support(d: Points) -> float:
+        across = float(np.sin(np.arccos(np.clip(n @ d, -1.0, 1.0))))
+        return float(c @ d) + radius * across + thickness
+
+    return Shape(distance, support)
+
+
+def polytope(normals: ArrayLike, offsets: ArrayLike, rounding: float = 0.0) -> Shape:
+    """Return the bounded intersection of half-spaces ``normal @ p <= offset``, grown by `rounding`.
+
+    Parameters
+    ----------
+    normals : array_like, shape (F, 3)
+        Unit normals that point outwards.
+    offsets : array_like, shape (F,)
+        Distance of each plane from the origin.
+    rounding : float
+        How far the solid is grown.
+    """
+    n, o = _vector(normals), _vector(offsets)
+    corners = []
+    for triple in combinations(range(len(n)), 3):
+        planes = n[list(triple)]
+        if abs(np.linalg.det(planes)) > 1e-6:
+            corner = np.linalg.solve(planes, o[list(triple)])
+            if np.all(n @ corner <= o + 1e-9):
+                corners.append(corner)
+    vertices = np.array(corners)
+    # The greatest plane distance is no greater than the distance to the solid.
+    return Shape(
+        lambda p: (p @ n.T - o).max(axis=1) - rounding,
+        lambda d: float((vertices @ d).max()) + rounding,
+    )
+
+
+def carve(solid: Shape, tool: Shape) -> Shape:
+    """Return `solid` less `tool`; the tool must leave the solid's bounding box as it is."""
+    return Shape(lambda p: np.maximum(solid.distance(p), -tool.distance(p)), solid.support)
+
+
+def half_space(point: ArrayLike, normal: ArrayLike) -> Region:
+    """Return a region that is negative on the side of a plane that `normal` points to."""
+    q, n = _vector(point), _vector(normal)
+    return lambda p: -((p - q) @ n)
+
+
+@dataclass(frozen=True)
+class Stuff:
+    """What a part is made of, in SI units: class 0..6, Pa, kg/m^3, no unit."""
+
+    material: int
+    youngs_modulus: float
+    density: float
+    poissons_ratio: float
+
+
+@dataclass(frozen=True)
+class Part:
+    """A shape of one stuff; each coat replaces the stuff where its region is negative."""
+
+    shape: Shape
+    stuff: Stuff
+    coats: tuple[tuple[Region, Stuff], ...] = ()
+
+
+class Solid:
+    """The union of parts: where it is, and which stuff is at a point.
+
+    A point belongs to the part whose distance there is smallest.
+
+    Parameters
+    ----------
+    parts : sequence of Part
+        At least one.
+    """
+
+    def __init__(self, parts: Sequence[Part]) -> None:
+        self.parts = tuple(parts)
+        self.shapes = tuple(part.shape for part in self.parts)
+        self.extent = bounding_box(self.shapes, np.eye(3))
+        # A part is looked at only near its own box; elsewhere it is at least
+        # this far, which is all that the voxelisation has to know.
+        self.reach = 0.08 * float((self.extent[1] - self.extent[0]).max())
+        self._boxes = [shape.box() for shape in self.shapes]
+        self.stuffs: list[Stuff] = []
+        self._first_stuff: list[int] = []
+        for part in self.parts:
+            self._first_stuff.append(len(self.stuffs))
+            self.stuffs += [part.stuff, *(stuff for _, stuff in part.coats)]
+
+    def evaluate(self, points: Points) -> tuple[Points, NDArray[np.intp]]:
+        """Return the signed distance bound (P,), at most `reach`, and the part (P,), -1 beyond."""
+        best = np.full(len(points), self.reach)
+        owner = np.full(len(points), -1, dtype=np.intp)
+        x, y, z = np.ascontiguousarray(points.T)
+        for k, (shape, (lo, hi)) in enumerate(zip(self.shapes, self._boxes, strict=True)):
+            lo, hi = lo - self.reach, hi + self.reach
+            near = np.flatnonzero((x > lo[0]) & (x < hi[0]))
+            near = near[(y[near] > lo[1]) & (y[near] < hi[1])]
+            near = near[(z[near] > lo[2]) & (z[near] < hi[2])]
+            if near.size:
+                distance = shape.distance(points[near])
+                closer = distance < best[near]
+                best[near[closer]] = distance[closer]
+                owner[near[closer]] = k
+        return best, owner
+
+    def distance(self, points: Points) -> Points:
+        """Return the signed distance bound (P,) alone."""
+        return self.evaluate(points)[0]
+
+    def stuff_at(self, points: Points) -> NDArray[np.intp]:
+        """Return the index into `stuffs` (P,) at points inside or near the surface."""
+        owner = self.evaluate(points)[1]
+        if np.any(owner < 0):
+            raise ValueError("a point too far from the solid has no part")
+        stuff = np.array(self._first_stuff)[owner]
+        for k, part in enumerate(self.parts):
+            if part.coats:
+                mine = np.flatnonzero(owner == k)
+                for c, (region, _) in enumerate(part.coats):
+                    painted = mine[region(points[mine]) < 0]
+                    stuff[painted] = self._first_stuff[k] + 1 + c
+        return stuff
+
+    def table(self) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
+        """Return class (S,) uint8 and Young's modulus, density, Poisson's ratio (S, 3) float32."""
+        material = np.array([s.material for s in self.stuffs], dtype=np.uint8)
+        properties = np.array(
+            [(s.youngs_modulus, s.density, s.poissons_ratio) for s in self.stuffs],
+            dtype=np.float32,
+        )
+        return material, properties

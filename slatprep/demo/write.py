@@ -1,0 +1,131 @@
+"""Demo data on disk, in the layouts of PixieVerse and TRELLIS."""
+
+from __future__ import annotations
+
+import csv
+import hashlib
+import json
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from slatprep.demo.asset import DemoAsset, DemoView
+from slatprep.geometry import VOXEL_SIZE
+from slatprep.records import BACKGROUND, RESOLUTION
+
+GridForm = Literal["raw", "prediction", "prediction-ids"]
+SlatForm = Literal["npz", "npz-batch", "hdf5", "hdf5-groups"]
+SlatNames = Literal["id", "sha256"]
+
+# Pixie's published ranges (its normalization_ranges.yaml): log10 density,
+# log10 Young's modulus, Poisson's ratio; the order of its channels.
+_PIXIE_LO = np.array([1.7031893730163574, 3.0183002948760986, 0.21027633547782898])
+_PIXIE_HI = np.array([3.871432304382324, 10.881680488586426, 0.4492689371109009])
+
+
+def row_id(asset: DemoAsset, view: DemoView) -> str:
+    """Return the id of an asset's row: the object's, with the view where there are several."""
+    return f"{asset.object_id}.{view.view}" if view.view else asset.object_id
+
+
+def slat_name(asset: DemoAsset, names: SlatNames) -> str:
+    """Return what the SLAT side calls an object: its id, or a sha256 as TRELLIS does."""
+    if names == "sha256":
+        return hashlib.sha256(f"asset file of {asset.object_id}".encode()).hexdigest()
+    return asset.object_id
+
+
+def write_pixieverse(root: Path, asset: DemoAsset, form: GridForm) -> None:
+    """Write grid or prediction, mask and bounds of an asset below `root`."""
+    folder = root / asset.object_id
+    mask = asset.occupancy.astype(np.float32)
+    if form == "raw":
+        (folder / "sample_0").mkdir(parents=True, exist_ok=True)
+        np.save(folder / "sample_0" / "material_grid.npy", asset.grid)
+        np.save(folder / "clip_features_mask.npy", mask)
+        np.savez(
+            folder / "clip_features.npz",
+            min_bounds=np.full(3, -0.5),
+            max_bounds=np.full(3, 0.5),
+            voxel_size=np.float64(VOXEL_SIZE),
+            feature_dim=np.int64(768),
+            grid_shape=np.full(3, RESOLUTION, dtype=np.int64),
+            alpha_weighted=np.bool_(True),
+            alpha_threshold_for_mask=np.float64(0.01),
+        )
+        return
+    folder.mkdir(parents=True, exist_ok=True)
+    np.save(folder / "sample_0_pred.npy", _prediction(asset.grid, form))
+    np.save(folder / "sample_0_mask.npy", mask)
+
+
+def _prediction(grid: NDArray[np.float32], form: GridForm) -> NDArray[np.float32]:
+    """Return a grid as Pixie's network would predict it: channels first, normalised."""
+    values = grid[..., :3].astype(np.float64)
+    values[..., :2] = np.log10(values[..., :2] + 1e-6)
+    values = 2.0 * (np.clip(values, _PIXIE_LO, _PIXIE_HI) - _PIXIE_LO) / (_PIXIE_HI - _PIXIE_LO) - 1
+    # A prediction knows no -1: a voxel without a label is background in it.
+    ids = np.where(grid[..., 3] < 0, BACKGROUND, grid[..., 3])
+    classes = ids[..., None] if form == "prediction-ids" else ids[..., None] == np.arange(8)
+    channels = np.concatenate([values, classes], axis=-1)
+    return np.ascontiguousarray(np.moveaxis(channels, -1, 0), dtype=np.float32)
+
+
+def write_slat(root: Path, asset: DemoAsset, form: SlatForm, names: SlatNames) -> None:
+    """Write the SLATs of an asset below `root`: a file each, or a group each of ``latents.h5``."""
+    name = slat_name(asset, names)
+    root.mkdir(parents=True, exist_ok=True)
+    for view in asset.views:
+        stem = root / name / view.view if view.view else root / name
+        stem.parent.mkdir(parents=True, exist_ok=True)
+        if form == "npz":
+            np.savez(stem.with_suffix(".npz"), coords=view.coords, feats=view.feats)
+        elif form == "npz-batch":
+            coords = np.pad(view.coords.astype(np.int32), ((0, 0), (1, 0)))
+            np.savez(stem.with_suffix(".npz"), coords=coords, feats=view.feats)
+        else:
+            import h5py
+
+            grouped = form == "hdf5-groups"
+            path = root / "latents.h5" if grouped else stem.with_suffix(".h5")
+            with h5py.File(path, "a" if grouped else "w") as file:
+                group = file.require_group(name) if grouped else file
+                for key, value in (("coords", view.coords), ("feats", view.feats)):
+                    group.create_dataset(key, data=value, track_times=False)
+
+
+def write_truth(root: Path, asset: DemoAsset) -> None:
+    """Write what is true of each row of an asset to ``<root>/<row id>.npz``."""
+    root.mkdir(parents=True, exist_ok=True)
+    for view in asset.views:
+        np.savez(
+            root / f"{row_id(asset, view)}.npz",
+            transform=view.transform,
+            material=view.material,
+            properties=view.properties,
+            symmetric=np.bool_(asset.symmetric),
+            name=np.str_(asset.name),
+            level=np.int64(asset.level),
+        )
+
+
+def write_categories(path: Path, entries: Iterable[tuple[str, str]]) -> None:
+    """Write Pixie's ``obj_ids_metadata.json`` from pairs of object id and category."""
+    metadata = {
+        object_id: {"obj_class": category, "vlm_filtering": {"is_appropriate": True}}
+        for object_id, category in entries
+    }
+    path.write_text(json.dumps(metadata, indent=1) + "\n", encoding="utf-8")
+
+
+def write_trellis_metadata(path: Path, entries: Iterable[tuple[str, str, int]]) -> None:
+    """Write TRELLIS's ``metadata.csv`` from sha256, object id and number of voxels."""
+    with path.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow(["sha256", "file_identifier", "aesthetic_score", "num_voxels"])
+        for sha256, object_id, voxels in entries:
+            url = f"https://sketchfab.com/3d-models/{object_id}"
+            writer.writerow([sha256, url, "6.0", voxels])
