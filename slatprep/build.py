@@ -24,7 +24,7 @@ from slatprep import provenance
 from slatprep.align import align
 from slatprep.align.ambiguity import measure_ambiguity
 from slatprep.align.quality import judge
-from slatprep.errors import InputError, MissingPartnerError, SlatprepError, StoreError
+from slatprep.errors import MissingPartnerError, SlatprepError, StoreError
 from slatprep.normalize import PIXIE_RANGES, ranges_from_extents, read_ranges
 from slatprep.parallel import run_unordered
 from slatprep.parameters import BuildParameters, NormalizeParameters, StoreParameters
@@ -68,10 +68,8 @@ def process_asset(pair: AssetPair, parameters: BuildParameters) -> AssetResult:
     Raises
     ------
     InputError
-        If a source cannot be used.
+        If a source cannot be used or a partner is missing.
     """
-    if pair.problem:
-        raise _problem(pair)
     field = read_field(pair)
     latents = read_latents(pair)
     alignment = align(field, latents, parameters.align)
@@ -303,11 +301,6 @@ def _completed_records(
         if asset.status is Status.OK:
             record = provenance.complete_record(record, normalization, *next(counts))
         yield record
-
-
-def _problem(pair: AssetPair) -> InputError:
-    side = MissingPartnerError if pair.grid is None or pair.slat is None else InputError
-    return side(pair.asset_id, pair.problem, "one PixieVerse grid and one SLAT for each id")
 
 
 def _line(error: Exception) -> str:

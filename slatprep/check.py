@@ -1,0 +1,185 @@
+"""Is an asset's alignment good? The answer from what the store holds, computed anew."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from slatprep.align.quality import judge, measure_quality
+from slatprep.errors import StoreError
+from slatprep.normalize import denormalize, normalize
+from slatprep.parameters import SampleParameters
+from slatprep.records import (
+    BACKGROUND,
+    Ambiguity,
+    MaterialField,
+    Normalization,
+    StructuredLatents,
+    Verdict,
+)
+from slatprep.sample import sample
+from slatprep.store.reader import Store, StoredAsset
+
+QUALITY_TOLERANCE = 1e-3
+"""Quality computed anew differs less than this; one voxel at the radius may round either way."""
+
+PROPERTY_TOLERANCE = 1e-5
+"""Normalised properties computed anew differ less than this: float32 through SI and back."""
+
+DISTANCE_TOLERANCE = 1e-3
+"""Distances [voxel] computed anew differ less than this."""
+
+
+@dataclass(frozen=True)
+class Figure:
+    """One number of a check.
+
+    ``value`` was computed now, ``stored`` is what the store says; ``limit`` is
+    the largest allowed difference of the two.
+    """
+
+    name: str
+    value: float
+    stored: float
+    limit: float
+
+    @property
+    def ok(self) -> bool:
+        """Whether the two agree."""
+        return bool(abs(self.value - self.stored) <= self.limit)
+
+
+@dataclass(frozen=True)
+class AlignmentCheck:
+    """What a check found.
+
+    Attributes
+    ----------
+    asset_id : str
+        The asset.
+    verdict : Verdict
+        The verdict on the quality computed now.
+    reasons : tuple of str
+        Why the verdict is not better.
+    stored_verdict : str
+        The verdict that the store holds.
+    figures : tuple of Figure
+        Every number, computed now and as stored.
+    """
+
+    asset_id: str
+    verdict: Verdict
+    reasons: tuple[str, ...]
+    stored_verdict: str
+    figures: tuple[Figure, ...]
+
+    @property
+    def consistent(self) -> bool:
+        """Whether the store holds what its own grid, voxels and transform give."""
+        return self.verdict == self.stored_verdict and all(figure.ok for figure in self.figures)
+
+    @property
+    def ok(self) -> bool:
+        """Whether the alignment is good and the store consistent."""
+        return self.verdict is Verdict.GOOD and self.consistent
+
+
+def check_alignment(store: Store, asset_id: str) -> AlignmentCheck:
+    """Recompute an alignment's quality, and the annotation it gives, from the store alone.
+
+    Parameters
+    ----------
+    store : Store
+        From `slatprep.store.open_store`.
+    asset_id : str
+        Which asset.
+
+    Returns
+    -------
+    AlignmentCheck
+        Quality and annotation as computed now beside those stored. The
+        ambiguity is taken from the store: its placements are not there.
+
+    Raises
+    ------
+    StoreError
+        If the store has no such asset, or does not say how it was made.
+    """
+    asset = store.asset(asset_id)
+    parameters = _parameters(store)
+    field = stored_field(asset, store.normalization)
+    latents = StructuredLatents(asset.coords, asset.feats)
+    quality = measure_quality(field, latents, asset.transform, float(parameters["align"]["radius"]))
+    annotation = sample(
+        field, asset.coords, asset.transform, SampleParameters(**parameters["sample"])
+    )
+    properties, _ = normalize(annotation.properties, store.normalization)
+    columns = asset.columns
+    change = columns["property_ambiguity"]
+    ambiguity = Ambiguity(
+        material_share=float(columns["ambiguity"]),
+        property_change=(float(change[0]), float(change[1]), float(change[2])),
+        margin=float(columns["margin"]),
+    )
+    valid_share = float(annotation.valid.mean())
+    verdict, reasons = judge(quality, valid_share, ambiguity)
+    both = annotation.valid & asset.valid
+    figures = [
+        Figure(name, getattr(quality, name), float(columns[name]), QUALITY_TOLERANCE)
+        for name in (
+            "fitness",
+            "inlier_rmse",
+            "fitness_backward",
+            "inlier_rmse_backward",
+            "overlap",
+        )
+    ]
+    figures += [
+        Figure("valid_share", valid_share, float(columns["valid_share"]), QUALITY_TOLERANCE),
+        Figure("voxels with another valid", _count(annotation.valid != asset.valid), 0, 0),
+        Figure("voxels with another material", _count(annotation.material != asset.material), 0, 0),
+        Figure(
+            "largest difference of a property",
+            _largest(properties[both] - asset.properties[both]),
+            0,
+            PROPERTY_TOLERANCE,
+        ),
+        Figure(
+            "largest difference of a distance",
+            _largest(annotation.distance - asset.distance),
+            0,
+            DISTANCE_TOLERANCE,
+        ),
+    ]
+    return AlignmentCheck(asset_id, verdict, reasons, str(columns["verdict"]), tuple(figures))
+
+
+def stored_field(asset: StoredAsset, normalization: Normalization) -> MaterialField:
+    """Return the PixieVerse field that a store holds, in SI units again."""
+    annotated = asset.grid_material < BACKGROUND
+    return MaterialField(
+        occupancy=asset.grid_material != BACKGROUND,
+        voxels=np.argwhere(annotated).astype(np.uint8),
+        material=asset.grid_material[annotated],
+        properties=denormalize(asset.grid_properties[:, annotated].T, normalization),
+    )
+
+
+def _parameters(store: Store) -> dict[str, Any]:
+    try:
+        parameters: dict[str, Any] = store.attributes["build"]["parameters"]
+    except (KeyError, TypeError):
+        raise StoreError(
+            f"{store.path} does not say with what parameters it was built; build it again"
+        ) from None
+    return parameters
+
+
+def _count(differs: np.ndarray) -> float:
+    return float(differs.sum())
+
+
+def _largest(difference: np.ndarray) -> float:
+    return float(np.abs(difference).max(initial=0.0))
