@@ -11,7 +11,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from slatprep.demo.materials import draw
 from slatprep.demo.shapes import (
     Part,
     Shape,
@@ -88,15 +87,31 @@ def rock(rng: Rng, centre: ArrayLike, radii: ArrayLike) -> Shape:
     return polytope(normals, offsets, rounding)
 
 
-def pot(rng: Rng, radius: float, height: float, filled: str) -> list[Part]:
+def vessel(
+    bottom: float, top: float, radius: float, top_radius: float, wall: float, floor: float = 0.0
+) -> Shape:
+    """Return an upright hollow frustum, with a floor where `floor` is not 0.
+
+    The hollow goes on well beyond the ends, so that the distance bound is not
+    near zero where only the ends' planes are near.
+    """
+    slope = (top_radius - radius) / (top - bottom)
+    low, high = bottom + (floor or -0.2), top + 0.2
+    hollow = cone(
+        vec(0, 0, low),
+        vec(0, 0, high),
+        radius + slope * (low - bottom) - wall,
+        top_radius + slope * 0.2 - wall,
+    )
+    return carve(cone(vec(0, 0, bottom), vec(0, 0, top), radius, top_radius), hollow)
+
+
+def pot(rng: Rng, radius: float, height: float, outside: Stuff, filling: Stuff) -> list[Part]:
     """Return a pot standing on z = 0, filled up to four fifths."""
     foot = radius * rng.uniform(0.65, 0.8)
     wall = 0.13 * radius
-    outer = cone(vec(0, 0, 0), vec(0, 0, height), foot, radius)
-    hollow = cone(vec(0, 0, 1.5 * wall), vec(0, 0, 1.01 * height), foot - wall, radius - wall)
     level = 0.8 * height
     inner = foot + (radius - foot) * level / height - 0.5 * wall
-    return [
-        Part(carve(outer, hollow), draw(rng, "ceramic")),
-        Part(cone(vec(0, 0, wall), vec(0, 0, level), foot - 0.5 * wall, inner), draw(rng, filled)),
-    ]
+    content = cone(vec(0, 0, wall), vec(0, 0, level), foot - 0.5 * wall, inner)
+    shell = vessel(0.0, height, foot, radius, wall, floor=1.5 * wall)
+    return [Part(shell, outside), Part(content, filling)]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from slatprep.demo.materials import draw
-from slatprep.demo.model import Model, Rng, around, curve, orient, pot, rock, vec
+from slatprep.demo.model import Model, Rng, around, curve, orient, pot, rock, vec, vessel
 from slatprep.demo.shapes import (
     Part,
     box,
@@ -21,7 +21,7 @@ from slatprep.demo.shapes import (
 def tree(rng: Rng, variant: int) -> Model:
     """Return a tree in a pot."""
     radius, height = rng.uniform(0.3, 0.4), rng.uniform(0.3, 0.42)
-    parts = pot(rng, radius, height, "soil")
+    parts = pot(rng, radius, height, draw(rng, "ceramic"), draw(rng, "soil"))
     bend = rng.normal(0.0, 0.06, (4, 2))
     spine = np.column_stack([np.cumsum(bend, axis=0), np.linspace(0.7 * height, 1.25, 4)])
     wood, leaf = draw(rng, "wood"), draw(rng, "leaf")
@@ -44,15 +44,9 @@ def flowers(rng: Rng, variant: int) -> Model:
     belly, neck, height = rng.uniform(0.26, 0.33), rng.uniform(0.13, 0.17), rng.uniform(0.6, 0.75)
     wall = 0.045
     vase = [
-        carve(
-            cone(vec(0, 0, a), vec(0, 0, b), r, s),
-            cone(vec(0, 0, c), vec(0, 0, b + 0.001), r - wall, s - wall),
-        )
-        for a, b, c, r, s in (
-            (0.0, 0.4 * height, 1.5 * wall, 0.7 * belly, belly),
-            (0.4 * height, 0.8 * height, 0.4 * height - 0.001, belly, neck),
-            (0.8 * height, height, 0.8 * height - 0.001, neck, 1.25 * neck),
-        )
+        vessel(0.0, 0.4 * height, 0.7 * belly, belly, wall, floor=1.5 * wall),
+        vessel(0.4 * height, 0.8 * height, belly, neck, wall),
+        vessel(0.8 * height, height, neck, 1.25 * neck, wall),
     ]
     ceramic, stem, petal, core = (draw(rng, k) for k in ("ceramic", "stem", "petal", "flesh"))
     parts = [Part(shape, ceramic) for shape in vase]

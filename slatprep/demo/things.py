@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from slatprep.demo.materials import draw
-from slatprep.demo.model import Model, Rng, around, curve, direction, orient, pot, rock, vec
+from slatprep.demo.model import Model, Rng, around, curve, direction, orient, pot, rock, vec, vessel
 from slatprep.demo.shapes import (
     Part,
     box,
@@ -129,8 +129,7 @@ def sand(rng: Rng, variant: int) -> Model:
     """Return, in turn, a sand castle or a bucket of sand with a shovel."""
     dry, plastic = draw(rng, "sand"), draw(rng, "plastic")
     if variant % 2 == 1:
-        parts = pot(rng, rng.uniform(0.42, 0.48), rng.uniform(0.6, 0.7), "sand")
-        parts[0] = Part(parts[0].shape, plastic)
+        parts = pot(rng, rng.uniform(0.42, 0.48), rng.uniform(0.6, 0.7), plastic, draw(rng, "sand"))
         top = 0.48
         parts.append(Part(dome(vec(0.03, 0, top), vec(0.36, 0.33, 0.2)), dry))
         lean = orient(rng.uniform(0.0, 2.0 * np.pi), rng.uniform(0.3, 0.5))
@@ -197,10 +196,7 @@ def jello(rng: Rng, variant: int) -> Model:
     flesh, plate = draw(rng, "jello"), draw(rng, "ceramic")
     side = rng.uniform(0.27, 0.33)
     height = rng.uniform(0.16, 0.22)
-    dish = carve(
-        cone(vec(0, 0, 0), vec(0, 0, 0.12), 0.4, 0.62),
-        cone(vec(0, 0, 0.06), vec(0, 0, 0.1201), 0.4, 0.56),
-    )
+    dish = vessel(0.0, 0.12, 0.4, 0.62, 0.06, floor=0.06)
     block = box(vec(0, 0, 0.04 + height), vec(side, side, height), rounding=0.06)
     parts = [Part(dish, plate), Part(block, flesh)]
     if variant % 2 == 1:
@@ -234,12 +230,10 @@ def water(rng: Rng, variant: int) -> Model:
     glass, wet = draw(rng, "glass"), draw(rng, "water")
     foot, rim, h = rng.uniform(0.22, 0.27), rng.uniform(0.3, 0.36), rng.uniform(0.8, 0.95)
     wall = 0.045
-    outer = cone(vec(0, 0, 0), vec(0, 0, h), foot, rim)
-    inner = cone(vec(0, 0, 1.6 * wall), vec(0, 0, h + 0.001), foot - wall, rim - wall)
     level = rng.uniform(0.6, 0.75) * h
     radius = foot + (rim - foot) * level / h - 0.5 * wall
     body = cone(vec(0, 0, wall), vec(0, 0, level), foot - 0.5 * wall, radius)
-    parts = [Part(carve(outer, inner), glass), Part(body, wet)]
+    parts = [Part(vessel(0.0, h, foot, rim, wall, floor=1.6 * wall), glass), Part(body, wet)]
     if variant % 2 == 1:
         return Model("glass of water", tuple(parts), symmetric=True)
     angle = rng.uniform(0.0, 2.0 * np.pi)
