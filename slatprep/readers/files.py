@@ -11,6 +11,7 @@ from __future__ import annotations
 import hashlib
 import io
 import math
+import os
 import stat
 import tokenize
 import zipfile
@@ -197,17 +198,19 @@ def load_source(path: Path, root: Path, role: str) -> tuple[bytes, SourceFile]:
     resolved, name = resolve_inside(path, root)
     try:
         with resolved.open("rb") as file:
-            data = file.read(MAX_FILE_BYTES + 1)
+            size = os.fstat(file.fileno()).st_size
+            # read() would set aside all that it is allowed to return.
+            data = b"" if size > MAX_FILE_BYTES else file.read(size)
     except OSError as error:
         raise InputError(path, f"cannot be read ({error.strerror})", "a readable file") from None
-    if not data:
-        raise InputError(path, "has zero bytes", "a complete file; copy or make it again")
-    if len(data) > MAX_FILE_BYTES:
+    if size > MAX_FILE_BYTES:
         raise InputError(
             path,
             f"is larger than {MAX_FILE_BYTES >> 20} MiB",
             "the files of one asset, which are smaller",
         )
+    if not data:
+        raise InputError(path, "has zero bytes", "a complete file; copy or make it again")
     return data, SourceFile(role, name, len(data), hashlib.sha256(data).hexdigest())
 
 

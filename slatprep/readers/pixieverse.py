@@ -96,9 +96,9 @@ def read_field(pair: AssetPair) -> MaterialField:
         raise InputError(path, "no voxel is occupied: all are background", "an occupied voxel")
     annotated = _annotated(occupancy, material, mask is not None, path, warnings)
 
+    _require_finite(channels, occupancy, path)
     voxels = np.argwhere(annotated)
     properties = _gather(channels, annotated)
-    _require_finite(_gather(channels, occupancy), occupancy, path)
     if raw:
         _require_physical(properties, voxels, path)
     else:
@@ -212,15 +212,15 @@ def _gather(channels: NDArray[Any], where: NDArray[np.bool_]) -> NDArray[np.floa
     return np.stack(columns, axis=1)
 
 
-def _require_finite(
-    properties: NDArray[np.float32], occupancy: NDArray[np.bool_], path: Path
-) -> None:
+def _require_finite(channels: NDArray[Any], occupancy: NDArray[np.bool_], path: Path) -> None:
+    properties = _gather(channels, occupancy)
     if not np.isfinite(properties).all():
         row, column = _first(~np.isfinite(properties))
         voxel = tuple(int(i) for i in np.argwhere(occupancy)[row])
+        value = channels[_CHANNEL_ORDER[column]][voxel]
         raise InputError(
             path,
-            f"{PROPERTY_COLUMNS[column]} is {properties[row, column]} at occupied voxel {voxel}",
+            f"{PROPERTY_COLUMNS[column]} is {value} at occupied voxel {voxel}",
             "a finite value that float32 can hold",
         )
 

@@ -1,0 +1,347 @@
+"""Finding pairs by name; the files themselves are never opened, so they may be empty."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+
+from slatprep.errors import ConfigError, InputError, MissingPartnerError
+from slatprep.parameters import (
+    BuildParameters,
+    PairingParameters,
+    PixieverseSource,
+    SlatSource,
+)
+from slatprep.readers import discover, read_field, read_latents
+
+from .conftest import COORDS, FEATS, raw_grid
+
+UID = "0123456789abcdef0123456789abcdef"
+SHA = "ab" * 32
+
+
+def touch(root: Path, *names: str) -> None:
+    for name in names:
+        (root / name).parent.mkdir(parents=True, exist_ok=True)
+        (root / name).touch()
+
+
+@pytest.fixture
+def find(tmp_path):
+    """Make empty files on both sides, and return what discover says of them."""
+
+    def run(grids=(), slats=(), *, pixieverse=None, slat=None, **pairing):
+        for side, names in (("pixie", grids), ("slat", slats)):
+            (tmp_path / side).mkdir(exist_ok=True)
+            touch(tmp_path / side, *names)
+        parameters = BuildParameters(
+            pixieverse=PixieverseSource(**{"root": tmp_path / "pixie", **(pixieverse or {})}),
+            slat=SlatSource(**{"root": tmp_path / "slat", **(slat or {})}),
+            pairing=PairingParameters(**pairing),
+        )
+        return list(discover(parameters))
+
+    return run
+
+
+def grid(name: str) -> str:
+    return f"{name}/sample_0/material_grid.npy"
+
+
+def test_default_layout(find, tmp_path):
+    extra = ["a/clip_features_mask.npy", "a/clip_features.npz", "b/other.npy", "readme.txt"]
+    pairs = find([grid("b"), grid("a"), *extra], ["a.npz", "b.h5", "notes.txt"])
+
+    assert [pair.asset_id for pair in pairs] == ["a", "b"]
+    first, second = pairs
+    assert first.problem == second.problem == ""
+    assert first.object_id == "a"
+    assert first.view == first.category == first.slat_group == ""
+    assert first.pixieverse_root == tmp_path / "pixie"
+    assert first.slat_root == tmp_path / "slat"
+    assert first.grid == tmp_path / "pixie/a/sample_0/material_grid.npy"
+    assert first.mask == tmp_path / "pixie/a/clip_features_mask.npy"
+    assert first.bounds == tmp_path / "pixie/a/clip_features.npz"
+    assert first.slat == tmp_path / "slat/a.npz"
+    assert second.mask is None
+    assert second.bounds is None
+    assert second.slat == tmp_path / "slat/b.h5"
+
+
+def test_predictions_and_their_masks(find, tmp_path):
+    (pair,) = find(["a/sample_2_pred.npy", "a/sample_2_mask.npy"], ["a.npz"])
+    assert pair.problem == ""
+    assert pair.grid == tmp_path / "pixie/a/sample_2_pred.npy"
+    assert pair.mask == tmp_path / "pixie/a/sample_2_mask.npy"
+
+
+def test_first_grid_pattern_wins(find):
+    (pair,) = find([grid("a"), "a/sample_0_pred.npy"], ["a.npz"])
+    assert pair.problem == ""
+    assert pair.grid.name == "material_grid.npy"
+
+
+def test_several_samples_need_a_choice(find):
+    files = ["a/sample_0/material_grid.npy", "a/sample_1/material_grid.npy"]
+    (pair,) = find(files, ["a.npz"])
+    assert "2 samples" in pair.problem
+    assert all(file in pair.problem for file in files)
+    assert "choose one" in pair.problem
+
+    (pair,) = find(pixieverse={"sample": "1"})
+    assert pair.problem == ""
+    assert pair.grid.parent.name == "sample_1"
+
+    (pair,) = find([grid("b")], ["b.npz"], pixieverse={"sample": "1"})[1:]
+    assert "looked for b/sample_1/material_grid.npy" in pair.problem
+
+
+def test_missing_partners_are_yielded_with_what_was_looked_for(find, tmp_path):
+    no_slat, no_grid = find([grid("a")], ["b.npz"])
+    assert no_slat.asset_id == "a"
+    assert no_slat.slat is None
+    assert "no SLAT for id 'a'; looked for a.npz, a.h5" in no_slat.problem
+    assert str(tmp_path / "slat") in no_slat.problem
+    assert no_grid.asset_id == "b"
+    assert no_grid.grid is None
+    assert "no grid for id 'b'; looked for b/sample_*/material_grid.npy" in no_grid.problem
+    assert str(tmp_path / "pixie") in no_grid.problem
+    for pair in (no_slat, no_grid):
+        for read in (read_field, read_latents):
+            with pytest.raises(MissingPartnerError, match=f"for id '{pair.asset_id}'; looked for"):
+                read(pair)
+
+
+@pytest.mark.parametrize("files", [("a.npz", "a.h5"), ("a/v.npz", "a/v.h5")])
+def test_two_slats_for_one_id(find, files):
+    (pair,) = find([grid("a")], files)
+    assert "2 SLATs for one id 'a'" in pair.problem
+    assert all(file in pair.problem for file in files)
+    with pytest.raises(InputError, match="2 SLATs for one id"):
+        read_latents(pair)
+
+
+def test_two_grids_for_one_id(find):
+    files = ("x/a.npy", "y/a.npy")
+    (pair,) = find(files, ["a.npz"], pixieverse={"grid": ("*/{id}.npy",)})
+    assert "2 grids for one id 'a' (x/a.npy, y/a.npy)" in pair.problem
+
+
+def test_two_masks_for_one_id(find):
+    files = [grid("a"), "m/x/a.npy", "m/y/a.npy"]
+    (pair,) = find(files, ["a.npz"], pixieverse={"mask": ("m/*/{id}.npy",)})
+    assert "2 mask files for one id (m/x/a.npy, m/y/a.npy)" in pair.problem
+
+
+def test_several_views_are_several_rows(find):
+    pairs = find([grid("a"), grid("b")], ["a/2.npz", "a/1.npz", "b/1.npz"])
+    assert [(p.asset_id, p.object_id, p.view) for p in pairs] == [
+        ("a.1", "a", "1"),
+        ("a.2", "a", "2"),
+        ("b", "b", ""),
+    ]
+    assert [p.slat.parent.name + p.slat.name for p in pairs] == ["a1.npz", "a2.npz", "b1.npz"]
+    assert not any(p.problem for p in pairs)
+
+
+def test_pairs_are_sorted_by_asset_id(find):
+    # "-" sorts before ".", so a-b comes between a and its views.
+    pairs = find([grid("a"), grid("a-b")], ["a/1.npz", "a/2.npz", "a-b.npz"])
+    assert [p.asset_id for p in pairs] == ["a-b", "a.1", "a.2"]
+
+
+def test_one_asset_id_for_two_objects(find):
+    pairs = find([grid("a"), grid("a.1")], ["a/1.npz", "a/2.npz", "a.1.npz"])
+    assert [p.asset_id for p in pairs] == ["a.1", "a.2"]
+    assert "asset id 'a.1' would stand for" in pairs[0].problem
+    assert "object 'a.1'" in pairs[0].problem
+    assert pairs[1].problem == ""
+
+
+@pytest.mark.parametrize("name", ["a b", ".a", "ä", "a\nb", "~a", "a%20", "a;b"])
+def test_ids_that_are_no_plain_name(find, name):
+    (pair,) = find([grid(name)], [f"{name}.npz"])
+    assert "is not allowed" in pair.problem
+    assert repr(name) in pair.problem
+    assert "\n" not in pair.problem
+    assert pair.mask is None
+    assert all(c.isascii() and (c.isalnum() or c in "%._-") for c in pair.asset_id)
+
+
+def test_id_that_is_not_unicode(find, tmp_path):
+    pairs = find([grid("a")], ["a.npz", "b\udcff.npz"])
+    assert [pair.asset_id for pair in pairs] == ["a", "b%FF"]
+    assert "is not allowed" in pairs[1].problem
+
+
+def test_map_by_object_and_slat_id(find, tmp_path):
+    table = tmp_path / "map.csv"
+    table.write_text("object_id,slat_id\na,s1\nb,s2\nb,s3\nc,gone\n")
+    pairs = find(
+        [grid(name) for name in "abcd"], ["s1.npz", "s2.npz", "s3.npz", "d.npz", "e.npz"], map=table
+    )
+    found = {p.asset_id: p for p in pairs}
+    assert list(found) == ["a", "b.s2", "b.s3", "c", "d", "e"]
+    assert [found[i].slat.name for i in ("a", "b.s2", "b.s3", "d")] == [
+        "s1.npz",
+        "s2.npz",
+        "s3.npz",
+        "d.npz",
+    ]
+    assert "looked for gone.npz" in found["c"].problem
+    assert "no grid for id 'e'" in found["e"].problem
+    assert [i for i, p in found.items() if p.problem] == ["c", "e"]
+
+
+def test_map_with_views(find, tmp_path):
+    table = tmp_path / "map.csv"
+    table.write_text("object_id,slat_id,view\na,s1,front\na,s2,back\nb,s3,v1\nb,s3,v2\n")
+    pairs = find([grid("a"), grid("b")], ["s1.npz", "s2.npz", "s3/v1.npz", "s3/v2.npz"], map=table)
+    assert [(p.asset_id, p.view, p.slat.name) for p in pairs] == [
+        ("a.back", "back", "s2.npz"),
+        ("a.front", "front", "s1.npz"),
+        ("b.v1", "v1", "v1.npz"),
+        ("b.v2", "v2", "v2.npz"),
+    ]
+    assert not any(p.problem for p in pairs)
+
+
+def test_trellis_metadata(find, tmp_path):
+    table = tmp_path / "metadata.csv"
+    table.write_text(
+        "sha256,file_identifier,aesthetic_score\n"
+        f"{SHA},https://example.org/3d-models/a-chair-{UID},5.5\n"
+        f"{'cd' * 32},https://example.org/3d-models/{'f' * 32},5.5\n"
+        f"{'ef' * 32},,4\n"
+    )
+    (pair,) = find([grid(UID)], [f"{SHA}.npz"], map=table)
+    assert (pair.asset_id, pair.object_id, pair.view) == (UID, UID, "")
+    assert pair.slat.name == f"{SHA}.npz"
+    assert pair.problem == ""
+
+
+def test_ids_in_a_map_cannot_leave_the_folder(find, tmp_path):
+    touch(tmp_path, "secret.npz")
+    table = tmp_path / "map.csv"
+    table.write_text("object_id,slat_id\na,../secret\n../x,s\n")
+    pairs = find([grid("a")], ["s.npz"], map=table)
+    assert [pair.asset_id for pair in pairs] == ["..%2Fx", "a"]
+    assert "'../x' is not allowed" in pairs[0].problem
+    assert pairs[1].slat is None
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("id,other\na,b\n", "expected object_id and slat_id"),
+        ("", "columns none"),
+        ("object_id,slat_id\na,\n", "line 2: empty"),
+        ("object_id,slat_id\n\x80", "cannot be read"),
+    ],
+)
+def test_bad_maps(find, tmp_path, text, message):
+    table = tmp_path / "map.csv"
+    table.write_bytes(text.encode("latin-1"))
+    with pytest.raises(ConfigError, match=message) as caught:
+        find([grid("a")], ["a.npz"], map=table)
+    assert str(table) in str(caught.value)
+    with pytest.raises(ConfigError, match="cannot be read"):
+        find(map=tmp_path / "none.csv")
+
+
+def test_categories(find, tmp_path):
+    table = tmp_path / "obj_ids_metadata.json"
+    entry = {"obj_class": "soda_cans", "vlm_filtering": {"is_appropriate": True}}
+    table.write_text(json.dumps({"a": entry}))
+    pairs = find([grid("a"), grid("b")], ["a.npz", "b.npz"], categories=table)
+    assert [pair.category for pair in pairs] == ["soda_cans", ""]
+
+    for text, message in (("{", "JSON"), ("[]", "expected an object"), ('{"a": 1}', "'a' has no")):
+        table.write_text(text)
+        with pytest.raises(ConfigError, match=message):
+            find(categories=table)
+
+
+def hdf5(path: Path, *groups: str) -> None:
+    with h5py.File(path, "w") as file:
+        for group in groups:
+            file[f"{group}/coords"] = COORDS
+            file[f"{group}/feats"] = FEATS
+
+
+def test_hdf5_with_a_group_per_asset(find, tmp_path):
+    hdf5(tmp_path / "all.h5", "a", "c", "bad id")
+    with h5py.File(tmp_path / "all.h5", "a") as file:
+        file["count"] = 3
+        file["b"] = h5py.SoftLink("/a")
+        file["d"] = h5py.ExternalLink("other.h5", "/")
+    pairs = find([grid("a"), grid("b")], slat={"root": tmp_path / "all.h5"})
+    found = {p.asset_id: p for p in pairs}
+    assert list(found) == ["a", "b", "bad%20id", "c"]
+    assert found["a"].problem == ""
+    assert found["a"].slat == tmp_path / "all.h5"
+    assert found["a"].slat_group == "a"
+    assert f"looked for group b in {tmp_path / 'all.h5'}" in found["b"].problem
+
+    np.save(found["a"].grid, raw_grid())
+    np.testing.assert_array_equal(read_latents(found["a"]).coords, COORDS)
+    assert read_field(found["a"]).material.tolist() == [0, 1, 6]
+
+
+def test_hdf5_groups_by_view_in_several_files(find, tmp_path):
+    (tmp_path / "slat").mkdir()
+    hdf5(tmp_path / "slat" / "part_0.h5", "slats/a/v1", "slats/a/v2")
+    hdf5(tmp_path / "slat" / "part_1.h5", "slats/b/v1")
+    (tmp_path / "slat" / "part_2.h5").write_bytes(b"\x89HDF\r\n\x1a\n broken")
+    pairs = find(
+        [grid("a"), grid("b")], slat={"pattern": ("part_*.h5",), "group": "slats/{id}/{view}"}
+    )
+    found = {p.asset_id: p for p in pairs}
+    assert list(found) == ["a.v1", "a.v2", "b", "part_2.h5"]
+    assert found["a.v2"].slat_group == "slats/a/v2"
+    assert found["b"].slat.name == "part_1.h5"
+    assert "part_2.h5: is no readable HDF5 file" in found["part_2.h5"].problem
+    np.testing.assert_array_equal(read_latents(found["b"]).feats, FEATS)
+
+
+def test_patterns_of_deeper_layouts(find):
+    (pair,) = find(
+        ["set/a/a_grid.npy"],
+        ["latents/model/a.npz"],
+        pixieverse={"grid": ("set/{id}/{id}_grid.npy",)},
+        slat={"pattern": ("latents/*/{id}.npz",)},
+    )
+    assert pair.problem == ""
+    assert pair.slat.parts[-3:] == ("latents", "model", "a.npz")
+
+
+@pytest.mark.parametrize("pattern", ["/{id}.npz", "../{id}.npz", "a//{id}.npz", "{name}.npz"])
+def test_bad_patterns(find, pattern):
+    with pytest.raises(ConfigError, match="pattern"):
+        find([grid("a")], ["a.npz"], slat={"pattern": (pattern,)})
+
+
+def test_missing_roots_and_empty_roots(find, tmp_path):
+    with pytest.raises(ConfigError, match="pixie: no grid found; looked for") as caught:
+        find()
+    assert "{id}" not in str(caught.value)
+    assert "*/sample_*/material_grid.npy" in str(caught.value)
+    with pytest.raises(ConfigError, match=r"slat: no SLAT found; looked for \*\.npz"):
+        find([grid("a")])
+    with pytest.raises(ConfigError, match="nowhere: no such folder"):
+        find(pixieverse={"root": tmp_path / "nowhere"})
+    with pytest.raises(ConfigError, match="nowhere: does not exist"):
+        find(slat={"root": tmp_path / "nowhere"})
+
+
+def test_link_out_of_the_root_is_found_but_not_read(find, tmp_path):
+    touch(tmp_path, "outside/secret.npz")
+    (tmp_path / "slat").mkdir()
+    (tmp_path / "slat" / "a.npz").symlink_to(tmp_path / "outside" / "secret.npz")
+    (pair,) = find([grid("a")])
+    with pytest.raises(InputError, match="out of its root"):
+        read_latents(pair)

@@ -1,0 +1,261 @@
+"""Files as such: paths that leave, headers that lie, archives that explode."""
+
+from __future__ import annotations
+
+import io
+import os
+import struct
+import tracemalloc
+import zipfile
+from dataclasses import replace
+
+import h5py
+import numpy as np
+import pytest
+
+from slatprep.errors import InputError
+from slatprep.readers import read_field, read_latents
+from slatprep.readers.files import ArraySpec, load_source, npy_array, npz_arrays, resolve_inside
+
+from .conftest import COORDS, FEATS, raw_grid
+
+ROWS = {"feats": ArraySpec(shapes=((None, 8),), kinds="f")}
+
+
+def npy_header(text: str, version: int = 1) -> bytes:
+    length = struct.pack("<H" if version == 1 else "<I", len(text))
+    return b"\x93NUMPY" + bytes([version, 0]) + length + text.encode("latin-1")
+
+
+def npy_bytes(array: np.ndarray) -> bytes:
+    file = io.BytesIO()
+    np.save(file, array)
+    return file.getvalue()
+
+
+def npz_bytes(compression: int = zipfile.ZIP_DEFLATED, **members: bytes) -> bytes:
+    file = io.BytesIO()
+    with zipfile.ZipFile(file, "w", compression) as archive:
+        for name, data in members.items():
+            archive.writestr(f"{name}.npy", data)
+    return file.getvalue()
+
+
+def peak_megabytes(action) -> float:
+    tracemalloc.start()
+    try:
+        action()
+        return tracemalloc.get_traced_memory()[1] / 2**20
+    finally:
+        tracemalloc.stop()
+
+
+@pytest.mark.parametrize(
+    "name", ["../outside.npy", "sub/../../outside.npy", "link.npy", "folder_link/outside.npy"]
+)
+def test_paths_that_leave_the_root(tmp_path, name):
+    root = tmp_path / "root"
+    (root / "sub").mkdir(parents=True)
+    np.save(tmp_path / "outside.npy", COORDS)
+    (root / "link.npy").symlink_to(tmp_path / "outside.npy")
+    (root / "folder_link").symlink_to(tmp_path)
+    with pytest.raises(InputError, match="out of its root"):
+        load_source(root / name, root, "grid")
+
+
+def test_paths_that_are_no_file_of_the_root(tmp_path):
+    (tmp_path / "folder").mkdir()
+    (tmp_path / "loop").symlink_to("loop")
+    os.mkfifo(tmp_path / "pipe")
+    (tmp_path / "inside").write_bytes(b"x")
+    (tmp_path / "link").symlink_to("inside")
+    for name, fault in (
+        ("folder", "not a regular file"),
+        ("pipe", "not a regular file"),
+        ("loop", "cannot be opened"),
+        ("a\0b", "cannot be opened"),
+        ("none", "does not exist"),
+        ("", "not a regular file"),
+    ):
+        with pytest.raises(InputError, match=fault):
+            load_source(tmp_path / name, tmp_path, "grid")
+    with pytest.raises(InputError, match="cannot be opened"):
+        resolve_inside(tmp_path / "inside", tmp_path / "folder")
+    assert resolve_inside(tmp_path / "link", tmp_path)[1] == "link"
+
+
+def test_file_that_is_too_large_is_not_read(tmp_path):
+    with (tmp_path / "big.npy").open("wb") as file:
+        file.truncate(2**40)  # sparse: a terabyte that takes no room
+    with pytest.raises(InputError, match="larger than 128 MiB"):
+        load_source(tmp_path / "big.npy", tmp_path, "grid")
+
+
+@pytest.mark.parametrize("keep", [0, 5, 10, 127, 128, 1000, -1])
+def test_truncated_npy(make_pair, keep):
+    pair = make_pair()
+    pair.grid.write_bytes(pair.grid.read_bytes()[:keep])
+    with pytest.raises(InputError) as caught:
+        read_field(pair)
+    assert caught.value.path == str(pair.grid)
+    assert ("zero bytes" in caught.value.fault) == (keep == 0)
+
+
+def test_bytes_after_the_array_are_a_fault(make_pair):
+    pair = make_pair()
+    pair.grid.write_bytes(pair.grid.read_bytes() + b"\0")
+    with pytest.raises(InputError, match="announces 4194304 bytes of data, it has 4194305"):
+        read_field(pair)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "{'descr': '<f4', 'fortran_order': False, 'shape': (1000000000000, 8)}",
+        "{'descr': '<f4', 'fortran_order': False, 'shape': (200000, 8)}",
+        "{'descr': '<f4', 'fortran_order': False, 'shape': (-1, 8)}",
+        "{'descr': '<f4', 'fortran_order': False, 'shape': (3.0, 8)}",
+        "{'descr': '<f4', 'fortran_order': False, 'shape': (0, 10**30)}",
+        "{'descr': '<f4', 'fortran_order': False, 'shape': (3, 8)",
+        "{'descr': '<f4', 'fortran_order': False}",
+        "{'descr': '<f999', 'fortran_order': False, 'shape': (3, 8)}",
+        "{'descr': '|V1000000000', 'fortran_order': False, 'shape': (3, 8)}",
+        "{'descr': [('a', '<f4')], 'fortran_order': False, 'shape': (3, 8)}",
+        "{'descr': {'a': 1}, 'fortran_order': False, 'shape': (3, 8)}",
+        "{'descr': '|O', 'fortran_order': False, 'shape': (3, 8)}",
+        "[" * 3000,
+        "-" * 4000,
+        "(" * 90 + ")" * 90,
+        "[]",
+        "7",
+        "'",
+        "\xff\x00",
+        "",
+    ],
+)
+@pytest.mark.parametrize("version", [1, 2])
+def test_npy_headers_that_lie(text, version):
+    data = npy_header(text, version) + FEATS.tobytes()
+
+    def read():
+        with pytest.raises(InputError, match=r"^x\.npy: "):
+            npy_array(data, "x.npy", ROWS["feats"])
+
+    assert peak_megabytes(read) < 8
+
+
+def test_npy_header_that_claims_four_gigabytes():
+    header = b"\x93NUMPY\x02\x00" + struct.pack("<I", 2**32 - 1) + b" " * 100
+    bomb = npz_bytes(feats=header + b" " * 2**26)
+    assert len(bomb) < 2**20
+
+    def read():
+        with pytest.raises(InputError, match=r"x\.npz \[feats\]"):
+            npz_arrays(bomb, "x.npz", ROWS)
+
+    assert peak_megabytes(read) < 8
+
+
+def test_npz_that_claims_ten_gigabytes_costs_nothing():
+    header = npy_header("{'descr': '<f4', 'fortran_order': False, 'shape': (335544320, 8)}\n")
+    honest = npz_bytes(feats=header + b"\0" * 1000)
+    # The same claim in the archive's own directory, so that both agree.
+    size = struct.pack("<I", len(header) + 1000)
+    claimed = honest.replace(size, struct.pack("<I", 2**32 - 2))
+    for data in (honest, claimed):
+
+        def read(data=data):
+            with pytest.raises(InputError, match=r"x\.npz \[feats\].*335544320, 8"):
+                npz_arrays(data, "x.npz", ROWS)
+
+        assert peak_megabytes(read) < 4
+
+
+def test_npz_bomb_is_not_inflated():
+    # 64 MiB of zeros behind the header of a small array.
+    bomb = npz_bytes(feats=npy_bytes(FEATS) + b"\0" * 2**26)
+
+    def read():
+        with pytest.raises(InputError, match="announces 96 bytes of data"):
+            npz_arrays(bomb, "x.npz", ROWS)
+
+    assert peak_megabytes(read) < 4
+
+
+def test_npz_whose_directory_understates_a_bomb():
+    bomb = npz_bytes(feats=npy_bytes(FEATS) + b"\0" * 2**26)
+    real = struct.pack("<I", len(npy_bytes(FEATS)) + 2**26)
+    lie = bomb.replace(real, struct.pack("<I", len(npy_bytes(FEATS))))
+    assert lie != bomb
+
+    def read():
+        with pytest.raises(InputError, match=r"x\.npz \[feats\]: is damaged \(Bad CRC"):
+            npz_arrays(lie, "x.npz", ROWS)
+
+    assert peak_megabytes(read) < 4
+
+
+def test_npz_with_flipped_data_fails_its_checksum():
+    data = bytearray(npz_bytes(zipfile.ZIP_STORED, feats=npy_bytes(FEATS)))
+    at = data.index(FEATS.tobytes())
+    data[at] ^= 1
+    with pytest.raises(InputError, match=r"x\.npz \[feats\]: is damaged \(Bad CRC"):
+        npz_arrays(bytes(data), "x.npz", ROWS)
+
+
+@pytest.mark.parametrize("compression", [zipfile.ZIP_BZIP2, zipfile.ZIP_LZMA])
+def test_npz_of_other_compression_is_refused(compression):
+    with pytest.raises(InputError, match="uses zip compression"):
+        npz_arrays(npz_bytes(compression, feats=npy_bytes(FEATS)), "x.npz", ROWS)
+
+
+def test_npz_with_two_arrays_of_one_name():
+    file = io.BytesIO()
+    with zipfile.ZipFile(file, "w") as archive, pytest.warns(UserWarning, match="Duplicate"):
+        archive.writestr("feats.npy", npy_bytes(FEATS))
+        archive.writestr("feats.npy", npy_bytes(FEATS))
+    with pytest.raises(InputError, match="has 2 arrays named 'feats'"):
+        npz_arrays(file.getvalue(), "x.npz", ROWS)
+
+
+def test_npz_with_very_many_members():
+    many = npz_bytes(**{f"m{i}": b"" for i in range(300)})
+    with pytest.raises(InputError, match="more than 256 members"):
+        npz_arrays(many, "x.npz", ROWS)
+
+
+def test_hdf5_chunk_that_inflates_beyond_its_size(make_pair):
+    import zlib
+
+    pair = make_pair()
+    path = pair.slat.with_name("a.h5")
+    with h5py.File(path, "w") as file:
+        file["coords"] = COORDS
+        feats = file.create_dataset("feats", (3, 8), "<f4", chunks=(3, 8), compression="gzip")
+        feats.id.write_direct_chunk((0, 0), zlib.compress(b"\0" * 2**24))
+    with pytest.raises(InputError, match="inflates beyond its 96 bytes"):
+        read_latents(replace(pair, slat=path))
+
+
+def test_hdf5_that_claims_gigabytes_costs_nothing(make_pair):
+    pair = make_pair()
+    path = pair.slat.with_name("a.h5")
+    with h5py.File(path, "w") as file:
+        file["coords"] = COORDS
+        file.create_dataset("feats", (2**28, 8), "<f4", chunks=(2**20, 8), compression="gzip")
+
+    def read():
+        with pytest.raises(InputError, match="has shape"):
+            read_latents(replace(pair, slat=path))
+
+    assert peak_megabytes(read) < 8
+
+
+def test_fortran_and_big_endian_arrays_read_alike(make_pair):
+    spec = ArraySpec(shapes=((64, 64, 64, 4),), kinds="f")
+    grid = raw_grid()
+    for variant in (np.asfortranarray(grid), grid.astype(">f4"), grid.astype("<f4")):
+        array = npy_array(npy_bytes(variant), "x.npy", spec)
+        assert array.dtype == np.float32
+        assert array.dtype.isnative
+        np.testing.assert_array_equal(array, grid)
