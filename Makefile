@@ -44,8 +44,6 @@ endif
 ifeq ($(DATA),manifests/demo.toml)
 	@$(BIN)/slatprep score $(STORE) $(DEMO)/truth
 endif
-	@echo "store:   $(STORE)"
-	@echo "records: $(MANIFESTS)"
 
 $(DEMO)/.assets-$(ASSETS)-seed-$(SEED): | $(VENV)/.installed
 	rm -rf $(DEMO)

@@ -29,6 +29,8 @@ Overrides = Mapping[str, "Mapping[str, object] | str"]
 NAMED_RANGES = ("dataset", "pixie")
 """What `normalize.ranges` may be besides the path of a file."""
 
+_UNKNOWN_KEY = "unexpected_keyword_argument"
+
 _OPTIONS = {
     "pixieverse.root": "--pixieverse",
     "slat.root": "--slat",
@@ -121,13 +123,13 @@ class _Source:
 
 
 def line_of(text: str, keys: tuple[str, ...]) -> int | None:
-    """Return the line (from 1) of a TOML text that sets a key, or opens its table.
+    r"""Return the line (from 1) of a TOML text that sets a key, or opens its table.
 
     Examples
     --------
-    >>> line_of("name = 'a'\\n[align]\\nengine = 'x'\\n", ("align", "engine"))
+    >>> line_of("name = 'a'\n[align]\nengine = 'x'\n", ("align", "engine"))
     3
-    >>> line_of("name = 'a'\\n", ("align",)) is None
+    >>> line_of("name = 'a'\n", ("align",)) is None
     True
     """
     table: tuple[str, ...] = ()
@@ -171,8 +173,9 @@ def _validate(data: dict[str, Any], source: _Source) -> BuildParameters:
     try:
         return adapter.validate_json(json.dumps(data, default=str), strict=True)
     except ValidationError as error:
-        # The first fault is enough: one line, one repair.
-        raise ConfigError(_explain(error.errors()[0], source)) from None
+        # One line, one repair: a misspelt key first, for it makes another one missing.
+        faults = sorted(error.errors(), key=lambda fault: fault["type"] != _UNKNOWN_KEY)
+        raise ConfigError(_explain(faults[0], source)) from None
 
 
 def _explain(error: ErrorDetails, source: _Source) -> str:
@@ -180,7 +183,7 @@ def _explain(error: ErrorDetails, source: _Source) -> str:
     keys = tuple(str(part) for part in error["loc"])
     name = ".".join(keys)
     where = source.where(keys)
-    if error["type"] == "unexpected_keyword_argument":
+    if error["type"] == _UNKNOWN_KEY:
         allowed = _keys_of(keys[:-1])
         close = difflib.get_close_matches(keys[-1], allowed, n=1)
         hint = f"did you mean {close[0]!r}? " if close else ""
@@ -198,7 +201,7 @@ def _explain(error: ErrorDetails, source: _Source) -> str:
 
 def _keys_of(groups: tuple[str, ...]) -> list[str]:
     """Return the keys that a table of the file may have."""
-    owner: type = BuildParameters
+    owner: Any = BuildParameters
     for group in groups:
         hint = get_type_hints(owner)[group]
         owner = next((t for t in (hint, *get_args(hint)) if is_dataclass(t)), owner)

@@ -6,20 +6,25 @@ The truth of an asset is ``<truth_dir>/<asset id>.npz`` with ``transform``
 
 from __future__ import annotations
 
+import zipfile
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from slatprep.errors import InputError, StoreError
-from slatprep.geometry import apply_transform, displacement, invert_transform, voxel_centres
-from slatprep.records import BACKGROUND, RESOLUTION
-
-if TYPE_CHECKING:
-    import zarr
+from slatprep.errors import InputError
+from slatprep.geometry import (
+    VOXEL_SIZE,
+    apply_transform,
+    displacement,
+    invert_transform,
+    voxel_centres,
+)
+from slatprep.records import BACKGROUND
+from slatprep.store import StoredAsset, open_store
 
 SUCCESS_DISPLACEMENT = 1.5
 """An asset is placed right where its mean displacement [voxel] is below this."""
@@ -108,15 +113,13 @@ def score_against_truth(store: Path, truth_dir: Path) -> TruthReport:
     truths = {path.stem: path for path in sorted(truth_dir.glob("*.npz"))}
     if not truths:
         raise InputError(truth_dir, "no truth in it", "a folder with one <asset id>.npz an asset")
-    group = _open(store)
-    ids = [str(asset_id) for asset_id in _array(group, "asset/id")]
-    offsets = _array(group, "asset/offset")
+    opened = open_store(store)
     scores = tuple(
-        _score_asset(group, row, slice(int(offsets[row]), int(offsets[row + 1])), truths[asset_id])
-        for row, asset_id in enumerate(ids)
+        _score_asset(opened.asset(asset_id), truths[asset_id])
+        for asset_id in opened.ids
         if asset_id in truths
     )
-    return TruthReport(scores, summarise(scores), tuple(sorted(set(truths) - set(ids))))
+    return TruthReport(scores, summarise(scores), tuple(sorted(set(truths) - set(opened.ids))))
 
 
 def summarise(scores: Sequence[TruthScore]) -> tuple[LevelScore, ...]:
@@ -142,35 +145,32 @@ def _summarise_level(level: int, scores: Sequence[TruthScore]) -> LevelScore:
     )
 
 
-def _score_asset(group: zarr.Group, row: int, voxels: slice, path: Path) -> TruthScore:
+def _score_asset(asset: StoredAsset, path: Path) -> TruthScore:
     from scipy.spatial import cKDTree
 
     truth = _read_truth(path)
-    coords = _array(group, "voxel/coords", voxels)
-    material = _array(group, "voxel/material", voxels)
-    valid = _array(group, "voxel/valid", voxels)
-    grid = _array(group, "grid/material", row)
     true_material = truth["material"]
-    if true_material.shape != material.shape:
+    if true_material.shape != asset.material.shape:
         raise InputError(
-            path, f"material of {true_material.shape[0]} voxels", f"the {len(material)} of the store"
+            path,
+            f"material has shape {true_material.shape}",
+            f"{asset.material.shape}, one class for each SLAT voxel of the store",
         )
-    true_points = apply_transform(invert_transform(truth["transform"]), voxel_centres(coords))
-    annotated = np.argwhere(grid < BACKGROUND)
-    distance, nearest = cKDTree(voxel_centres(annotated)).query(true_points)
-    answerable = distance * RESOLUTION <= ANSWERABLE_DISTANCE
-    own_material = grid[tuple(annotated[nearest].T)]
+    true_transform = truth["transform"].astype(np.float64)
+    looked_up = apply_transform(invert_transform(true_transform), voxel_centres(asset.coords))
+    annotated = np.argwhere(asset.grid_material < BACKGROUND)
+    distance, nearest = cKDTree(voxel_centres(annotated)).query(looked_up)
+    answerable = distance / VOXEL_SIZE <= ANSWERABLE_DISTANCE
+    own_material = asset.grid_material[tuple(annotated[nearest].T)]
     return TruthScore(
-        asset_id=path.stem,
+        asset_id=asset.asset_id,
         name=str(truth["name"]),
         level=int(truth["level"]),
         symmetric=bool(truth["symmetric"]),
-        displacement=displacement(
-            _array(group, "asset/transform", row), truth["transform"], coords
-        ),
-        label_accuracy=_share(((material == true_material) & valid)[answerable]),
+        displacement=displacement(asset.transform, true_transform, asset.coords),
+        label_accuracy=_share(((asset.material == true_material) & asset.valid)[answerable]),
         truth_own=_share((own_material == true_material)[answerable]),
-        valid_share=_share(valid),
+        valid_share=_share(asset.valid),
     )
 
 
@@ -178,29 +178,12 @@ def _share(flags: NDArray[np.bool_]) -> float:
     return float(flags.mean()) if flags.size else float("nan")
 
 
-def _read_truth(path: Path) -> dict[str, NDArray[np.generic]]:
-    with np.load(path, allow_pickle=False) as file:
-        missing = [key for key in _TRUTH_KEYS if key not in file]
-        if missing:
-            raise InputError(path, f"no {', '.join(missing)}", f"keys {', '.join(_TRUTH_KEYS)}")
-        return {key: file[key] for key in _TRUTH_KEYS}
-
-
-def _open(path: Path) -> zarr.Group:
-    import zarr
-
+def _read_truth(path: Path) -> dict[str, NDArray[Any]]:
+    expected = f"an npz with {', '.join(_TRUTH_KEYS)}"
     try:
-        return zarr.open_group(path, mode="r")
-    except (OSError, ValueError) as error:
-        raise StoreError(f"{path}: cannot be opened as a store: {error}") from error
-
-
-def _array(
-    group: zarr.Group, name: str, selection: int | slice = slice(None)
-) -> NDArray[np.generic]:
-    import zarr
-
-    array = group[name]
-    if not isinstance(array, zarr.Array):
-        raise StoreError(f"{name}: expected an array")
-    return np.asarray(array[selection])
+        with np.load(path, allow_pickle=False) as file:
+            return {key: file[key] for key in _TRUTH_KEYS}
+    except KeyError as error:
+        raise InputError(path, str(error.args[0]), expected) from error
+    except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
+        raise InputError(path, f"cannot be read ({error})", expected) from error

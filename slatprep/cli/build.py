@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import dataclasses
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
 from slatprep.cli.options import jobs_option, parameters_of, source_options
-from slatprep.cli.output import Output, output_options
+from slatprep.cli.output import EXIT_INCOMPLETE, Output, output_options
+from slatprep.cli.overview import show_quality
 
 if TYPE_CHECKING:
     from slatprep.build import BuildSummary
@@ -59,7 +61,7 @@ def build_store(
         summary = build.build_store(
             parameters, out, manifests=manifests, jobs=jobs, strict=strict, progress=progress
         )
-    _report(output, summary, out)
+    _report(output, summary)
 
 
 @click.command(
@@ -86,8 +88,30 @@ def align(output: Output, out: Path, jobs: int, strict: bool, **sources: Any) ->
 
     with output.progress("align") as progress:
         summary = build.align_pairs(parameters, out, jobs=jobs, strict=strict, progress=progress)
-    _report(output, summary, out)
+    _report(output, summary)
 
 
-def _report(output: Output, summary: BuildSummary, out: Path) -> None:
-    raise NotImplementedError
+def _report(output: Output, summary: BuildSummary) -> None:
+    """Print what became of the assets, name those that did not go in, and set the exit code."""
+    for asset_id, reason in summary.problems:
+        output.problem(f"{asset_id}: {reason}")
+    total, good = sum(summary.statuses.values()), summary.statuses["ok"]
+    unlisted = total - good - len(summary.problems)
+    if unlisted:
+        output.problem(f"and {unlisted:,} more: see {summary.records}")
+
+    def show() -> None:
+        if summary.store is not None:
+            from slatprep.overview import describe_store
+            from slatprep.store import open_store
+
+            show_quality(output, describe_store(open_store(summary.store)))
+        others = ", ".join(f"{count:,} {status}" for status, count in summary.statuses.items())
+        click.echo(f"assets:  {total:,} ({others}) in {summary.seconds:,.1f} s")
+        if summary.store is not None:
+            click.echo(f"store:   {summary.store}")
+        click.echo(f"records: {summary.records}")
+
+    output.result({**dataclasses.asdict(summary), "complete": summary.complete}, show)
+    if not summary.complete:
+        click.get_current_context().exit(EXIT_INCOMPLETE)

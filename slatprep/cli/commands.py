@@ -8,6 +8,7 @@ from typing import Any
 import click
 
 from slatprep import __version__
+from slatprep.cli.output import EXIT_INCOMPLETE, EXIT_INTERRUPTED, EXIT_USAGE
 from slatprep.errors import ConfigError, SlatprepError
 
 COMMANDS = {
@@ -23,10 +24,6 @@ COMMANDS = {
 The modules are loaded by `slatprep --help`, so they import nothing heavy
 before a command runs.
 """
-
-EXIT_INCOMPLETE = 1
-EXIT_USAGE = 2
-EXIT_INTERRUPTED = 130
 
 
 class LazyGroup(click.Group):

@@ -59,6 +59,28 @@ def source_options(command: _Command) -> _Command:
     return command
 
 
+store_argument = click.argument(
+    "store", required=False, type=click.Path(path_type=Path, exists=True, file_okay=False)
+)
+
+store_option = click.option(
+    "--store",
+    type=click.Path(path_type=Path, exists=True, file_okay=False),
+    metavar="STORE.zarr",
+    help="The store.  [default: the one built last under data/]",
+)
+
+
+def chosen_store(store: Path | None) -> Path:
+    """Return the store that was named, else the one that `make align` built last."""
+    if store is not None:
+        return store
+    built = sorted(Path("data").glob("*.zarr"), key=lambda path: path.stat().st_mtime)
+    if not built:
+        raise click.UsageError("there is no store under data/; name one, or run `make align`")
+    return built[-1]
+
+
 jobs_option = click.option(
     "--jobs",
     type=click.IntRange(min=1),

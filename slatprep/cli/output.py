@@ -18,11 +18,17 @@ from typing import Any, TypeVar
 
 import click
 
+EXIT_INCOMPLETE = 1
+EXIT_USAGE = 2
+EXIT_INTERRUPTED = 130
+
 Cell = str | int | float | bool | None
 ProgressCallback = Callable[[int, int], None]
 """Called with the assets done and the assets in all."""
 
 _Command = TypeVar("_Command", bound=Callable[..., object])
+
+_STYLES = {"good": "green", "doubtful": "yellow", "failed": "red"}
 
 _SECONDS_BETWEEN_LINES = 30.0
 
@@ -66,7 +72,7 @@ class Output:
     def table(self, title: str, columns: Sequence[str], rows: Sequence[Sequence[Cell]]) -> None:
         """Print a table; columns of numbers are aligned to the right."""
         numeric = [
-            bool(rows) and all(row[k] is None or isinstance(row[k], int | float) for row in rows)
+            bool(rows) and all(row[k] is None or _is_number(row[k]) for row in rows)
             for k in range(len(columns))
         ]
         cells = [[_text(cell) for cell in row] for row in rows]
@@ -95,7 +101,9 @@ class Output:
 def output_options(command: _Command) -> _Command:
     """Add ``--json``, ``-q`` and ``-v``; the command gets an `Output` as its first argument."""
 
-    @click.option("--json", "as_json", is_flag=True, help="Print one JSON document instead of tables.")
+    @click.option(
+        "--json", "as_json", is_flag=True, help="Print one JSON document instead of tables."
+    )
     @click.option("-q", "--quiet", is_flag=True, help="Print errors and results alone.")
     @click.option("-v", "--verbose", is_flag=True, help="Print more than the usual.")
     @functools.wraps(command)
@@ -118,6 +126,10 @@ def plain(value: Any) -> Any:
     return value if value is None or isinstance(value, bool | int | str) else str(value)
 
 
+def _is_number(cell: Cell) -> bool:
+    return isinstance(cell, int | float) and not isinstance(cell, bool)
+
+
 def _text(cell: Cell) -> str:
     if cell is None or (isinstance(cell, float) and math.isnan(cell)):
         return "-"
@@ -135,12 +147,15 @@ def _rich_table(
     from rich.console import Console
     from rich.markup import escape
     from rich.table import Table
+    from rich.text import Text
 
-    table = Table(title=escape(title), title_justify="left", box=box.SIMPLE_HEAD, title_style="bold")
+    table = Table(
+        title=escape(title), title_justify="left", box=box.SIMPLE_HEAD, title_style="bold"
+    )
     for column, right in zip(columns, numeric, strict=True):
         table.add_column(escape(column), justify="right" if right else "left")
     for row in cells:
-        table.add_row(*map(escape, row))
+        table.add_row(*(Text(text, style=_STYLES.get(text, "")) for text in row))
     Console(file=sys.stdout, highlight=False).print(table)
 
 

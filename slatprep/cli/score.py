@@ -7,7 +7,7 @@ from pathlib import Path
 
 import click
 
-from slatprep.cli.output import Output, output_options
+from slatprep.cli.output import EXIT_INCOMPLETE, Output, output_options
 
 
 @click.command(
@@ -57,4 +57,4 @@ def score(output: Output, store: Path, truth_dir: Path) -> None:
     for asset_id in report.missing:
         output.problem(f"{truth_dir / asset_id}.npz: its asset is not in {store}")
     if report.missing:
-        raise SystemExit(1)
+        click.get_current_context().exit(EXIT_INCOMPLETE)

@@ -1,0 +1,46 @@
+"""The tables about a store that `info` and `build-store` print."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from slatprep.cli.output import Cell, Output
+
+if TYPE_CHECKING:
+    from slatprep.overview import GroupOverview, StoreOverview
+
+
+def show_quality(output: Output, overview: StoreOverview) -> None:
+    """Print how good the alignments of a store are, by category and in all."""
+    output.table(
+        "Alignments (medians; rmse in voxels)",
+        ("category", "assets", "good", "doubtful", "failed", "fitness", "rmse",
+         "fitness back", "overlap", "valid", "ambiguous"),
+        [_quality_row(group) for group in (*overview.categories, overview.total)],
+    )  # fmt: skip
+
+
+def show_normalization(output: Output, overview: StoreOverview) -> None:
+    """Print the ranges that properties are normalised with."""
+    output.table(
+        f"Normalisation to [-1, 1] (ranges: {overview.normalization.source})",
+        ("property", "scale", "lo", "hi"),
+        [
+            (entry.name, "log10" if entry.log10 else "linear", entry.lo, entry.hi)
+            for entry in overview.normalization.ranges
+        ],
+    )
+
+
+def _quality_row(group: GroupOverview) -> tuple[Cell, ...]:
+    return (
+        group.name,
+        group.assets,
+        *group.verdicts.values(),
+        group.fitness,
+        group.inlier_rmse,
+        group.fitness_backward,
+        group.overlap,
+        group.valid_share,
+        group.ambiguous,
+    )

@@ -1,0 +1,244 @@
+"""The commands as a user calls them: help, exit codes, JSON, errors."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import shlex
+import subprocess
+import sys
+from pathlib import Path
+
+import click
+import numpy as np
+import pytest
+import zarr
+from click.testing import CliRunner, Result
+
+from slatprep.cli.commands import COMMANDS, slatprep
+
+# Two, because each takes seconds by the paper's protocol.
+TWO_ASSETS = ("--assets", "2", "--seed", "3", "--level", "0")
+
+
+def run(*arguments: str | Path) -> Result:
+    return CliRunner().invoke(slatprep, [str(argument) for argument in arguments])
+
+
+@pytest.fixture(scope="module")
+def demo(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Two easy demo assets and the store that `build-store` makes of them."""
+    folder = tmp_path_factory.mktemp("cli")
+    made = run("make-demo", folder / "demo", *TWO_ASSETS, "-q")
+    assert made.exit_code == 0, made.output
+    built = run(
+        "build-store", "--config", folder / "demo" / "dataset.toml", "--preset", "paper",
+        "--out", folder / "demo.zarr", "-q",
+    )  # fmt: skip
+    assert built.exit_code == 0, built.output
+    return folder
+
+
+def ids_of(store: Path) -> list[str]:
+    return [str(asset_id) for asset_id in zarr.open_group(store, mode="r")["asset/id"][:]]
+
+
+# -- help ---------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_help_has_an_example_that_parses(name: str) -> None:
+    result = run(name, "--help")
+    assert result.exit_code == 0
+    examples = re.findall(r"^ +(slatprep .+)$", result.output.partition("Example:")[2], re.M)
+    assert examples
+    for example in examples:
+        words = shlex.split(example)
+        assert words[1] == name
+        command = slatprep.get_command(click.Context(slatprep), name)
+        assert command is not None
+        command.make_parser(click.Context(command)).parse_args(words[2:])
+
+
+def test_help_lists_every_command_and_the_exit_codes() -> None:
+    output = run("--help").output
+    for name in COMMANDS:
+        assert re.search(rf"^  {name} +\S", output, re.M), name
+    assert re.search(r"0 +all went in", output) and re.search(r"2 +wrong use", output)
+
+
+def test_help_imports_nothing_heavy() -> None:
+    script = (
+        "import sys, runpy\n"
+        "sys.argv = ['slatprep', '--help']\n"
+        "try:\n    from slatprep.cli import main; main()\n"
+        "except SystemExit: pass\n"
+        "print(sorted({name.partition('.')[0] for name in sys.modules}), file=sys.stderr)\n"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", script], capture_output=True, text=True, check=True
+    )
+    assert "build-store" in done.stdout
+    heavy = ("numpy", "zarr", "scipy", "open3d", "h5py", "joblib", "pydantic", "rich", "numba")
+    for module in heavy:
+        assert f"'{module}'" not in done.stderr
+
+
+def test_entry_holds_libraries_to_one_thread() -> None:
+    script = (
+        "import sys, os\n"
+        "sys.argv = ['slatprep', '--version']\n"
+        "try:\n    from slatprep.cli import main; main()\n"
+        "except SystemExit: pass\n"
+        "import numpy, threadpoolctl\n"
+        "print([pool['num_threads'] for pool in threadpoolctl.threadpool_info()])\n"
+        "print(os.environ['NUMBA_NUM_THREADS'], os.environ['OMP_NUM_THREADS'])\n"
+    )
+    environment = os.environ | {"OMP_NUM_THREADS": "2", "OPENBLAS_NUM_THREADS": "2"}
+    done = subprocess.run(
+        [sys.executable, "-c", script], capture_output=True, text=True, check=True, env=environment
+    )
+    *_, pools, variables = done.stdout.splitlines()
+    assert set(json.loads(pools)) == {1}
+    assert variables == "1 1"
+
+
+# -- end to end ---------------------------------------------------------------
+
+
+def test_what_one_command_writes_the_others_read(demo: Path) -> None:
+    store = demo / "demo.zarr"
+    ids = ids_of(store)
+    assert len(ids) == 2
+    described = json.loads(run("info", store, "--json", "-q").stdout)
+    assert described["total"]["assets"] == 2
+    offsets = zarr.open_group(store, mode="r")["asset/offset"][:]
+    assert described["total"]["voxels"] == int(offsets[-1])
+    assert sum(group["assets"] for group in described["categories"]) == 2
+
+    scored = json.loads(run("score", store, demo / "demo" / "truth", "--json").stdout)
+    assert [row["asset_id"] for row in scored["assets"]] == ids
+    assert scored["missing"] == []
+
+    checked = run("check-alignment", "--asset", ids[0], "--store", store)
+    assert checked.exit_code == 0, checked.output
+
+
+def test_align_writes_one_record_an_asset(demo: Path) -> None:
+    out = demo / "alignments.jsonl"
+    result = run(
+        "align", "--pixieverse", demo / "demo" / "pixieverse", "--slat", demo / "demo" / "slat",
+        "--preset", "paper", "--out", out, "--json", "-q",
+    )  # fmt: skip
+    assert result.exit_code == 0, result.output
+    assert json.loads(result.stdout)["statuses"]["ok"] == 2
+    records = [json.loads(line) for line in out.read_text().splitlines()]
+    assert [record["asset_id"] for record in records] == ids_of(demo / "demo.zarr")
+    stored = zarr.open_group(demo / "demo.zarr", mode="r")["asset/transform"][:]
+    np.testing.assert_array_equal([r["alignment"]["transform"] for r in records], stored)
+
+
+def test_options_win_over_the_dataset_definition(demo: Path) -> None:
+    (demo / "empty").mkdir()
+    arguments = ("align", "--config", demo / "demo" / "dataset.toml", "--out", demo / "no.jsonl")
+    for name, said in (("empty", str(demo / "empty")), ("absent", "option --pixieverse: ")):
+        result = run(*arguments, "--pixieverse", demo / name)
+        assert result.exit_code == 2
+        assert result.stderr.startswith("slatprep: error: ") and said in result.stderr
+        assert len(result.stderr.splitlines()) == 1
+
+
+def test_asset_that_cannot_go_in_is_named_and_exit_code_is_one(demo: Path, tmp_path: Path) -> None:
+    assert run("make-demo", tmp_path / "demo", *TWO_ASSETS, "-q").exit_code == 0
+    broken = sorted((tmp_path / "demo" / "slat").glob("*.npz"))[0]
+    broken.write_bytes(broken.read_bytes()[:100])
+    arguments = ("build-store", "--config", tmp_path / "demo" / "dataset.toml",
+                 "--preset", "paper", "--out", tmp_path / "demo.zarr", "--json")  # fmt: skip
+    result = run(*arguments)
+    assert result.exit_code == 1
+    document = json.loads(result.stdout)
+    assert document["statuses"] == {"ok": 1, "failed": 1, "skipped": 0}
+    assert document["complete"] is False
+    (line,) = [line for line in result.stderr.splitlines() if line]
+    assert line.startswith(f"{broken.stem}: ") and broken.name in line and "expected" in line
+    assert broken.stem not in ids_of(tmp_path / "demo.zarr")
+
+    strict = run(*arguments, "--strict")
+    assert strict.exit_code == 1
+    assert strict.stdout == ""
+    assert "slatprep: error: " in strict.stderr and broken.name in strict.stderr
+    assert "Traceback" not in strict.stderr
+    assert len(ids_of(tmp_path / "demo.zarr")) == 1  # the store that was there is still there
+
+    missing = run("score", tmp_path / "demo.zarr", tmp_path / "demo" / "truth", "--json")
+    assert missing.exit_code == 1
+    assert json.loads(missing.stdout)["missing"] == [broken.stem]
+
+
+# -- wrong use ----------------------------------------------------------------
+
+
+def test_config_error_is_one_line_and_exit_code_two(tmp_path: Path) -> None:
+    config = tmp_path / "mine.toml"
+    config.write_text('[pixieverse]\nrot = "x"\n')
+    result = run("build-store", "--config", config, "--out", tmp_path / "s.zarr")
+    assert result.exit_code == 2
+    assert result.stderr.startswith(f"slatprep: error: {config}:2: pixieverse.rot: unknown key")
+    assert "did you mean 'root'" in result.stderr
+    assert len(result.stderr.splitlines()) == 1
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ("no-such-command",),
+        ("build-store", "--no-such-option"),
+        ("build-store", "--pixieverse", ".", "--slat", "."),  # no --out
+        ("align", "--out", "x.jsonl"),  # no sources
+        ("make-demo", "x", "--assets", "0"),
+        ("make-demo", "x", "--level", "5"),
+        ("info", "no-such-store.zarr"),
+        ("check-alignment", "--store", "."),  # no --asset
+    ],
+)
+def test_wrong_use_is_exit_code_two(
+    arguments: tuple[str, ...], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    result = run(*arguments)
+    assert result.exit_code == 2, result.output
+    assert "rror: " in result.stderr
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_unknown_asset_is_wrong_use_and_gets_a_suggestion(demo: Path) -> None:
+    asset_id = ids_of(demo / "demo.zarr")[0]
+    result = run("check-alignment", "--asset", asset_id[:-1] + "_", "--store", demo / "demo.zarr")
+    assert result.exit_code == 2
+    assert "did you mean" in result.stderr and asset_id in result.stderr
+
+
+def test_store_built_last_is_the_default(demo: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    elsewhere = demo / "elsewhere"
+    (elsewhere / "data").mkdir(parents=True)
+    monkeypatch.chdir(elsewhere)
+    result = run("info")
+    assert result.exit_code == 2
+    assert "make align" in result.stderr
+    (elsewhere / "data" / "demo.zarr").symlink_to(demo / "demo.zarr")
+    assert run("info", "--json").exit_code == 0
+    assert run("check-alignment", "--asset", ids_of(demo / "demo.zarr")[0]).exit_code == 0
+
+
+def test_interrupt_is_clean_and_says_that_nothing_was_replaced(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def interrupted(*_: object, **__: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("slatprep.demo.make_demo", interrupted)
+    result = run("make-demo", tmp_path / "demo")
+    assert result.exit_code == 130
+    assert "nothing was replaced" in result.stderr
+    assert "Traceback" not in result.stderr

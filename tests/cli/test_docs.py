@@ -1,0 +1,122 @@
+"""What the documentation says is so."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import re
+import shlex
+import shutil
+import subprocess
+import tomllib
+from pathlib import Path
+from typing import get_type_hints
+
+import click
+import pytest
+
+from slatprep.cli.commands import slatprep
+from slatprep.config import load_parameters
+from slatprep.parameters import BuildParameters
+from slatprep.store.layout import ARRAYS
+
+ROOT = Path(__file__).parents[2]
+PAGES = sorted([*ROOT.glob("*.md"), *ROOT.glob("docs/*.md"), *ROOT.glob("manifests/*.md")])
+
+
+def code_lines(language: str) -> list[tuple[str, str]]:
+    """Return every line of the code blocks of a language, with the page's name."""
+    return [
+        (page.name, line.partition("#")[0].strip())
+        for page in PAGES
+        for block in re.findall(rf"```{language}\n(.*?)```", page.read_text("utf-8"), re.S)
+        for line in block.splitlines()
+    ]
+
+
+COMMANDS_SHOWN = [(page, line) for page, line in code_lines("sh") if line.startswith("slatprep ")]
+TARGETS_SHOWN = [(page, line) for page, line in code_lines("sh") if line.startswith("make ")]
+
+
+def test_the_readme_shows_commands() -> None:
+    shown = {line.split()[1] for page, line in COMMANDS_SHOWN if page == "README.md"}
+    assert {"make-demo", "build-store", "info", "check-alignment", "align"} <= shown
+    assert {line for page, line in TARGETS_SHOWN if page == "README.md"} >= {
+        "make align",
+        "make test",
+    }
+
+
+@pytest.mark.parametrize(("page", "line"), COMMANDS_SHOWN)
+def test_command_shown_parses(page: str, line: str) -> None:
+    _, name, *words = shlex.split(line)
+    command = slatprep.get_command(click.Context(slatprep), name)
+    assert command is not None, f"{page}: {line}"
+    context = click.Context(command)
+    given, rest, _ = command.make_parser(context).parse_args(words)
+    assert rest == []
+    for parameter in command.params:
+        assert not parameter.required or parameter.name in given, f"{page}: {line}"
+
+
+@pytest.mark.skipif(shutil.which("make") is None, reason="make is not installed")
+@pytest.mark.parametrize("line", sorted({line for _, line in TARGETS_SHOWN}))
+def test_make_target_shown_exists(line: str) -> None:
+    done = subprocess.run(
+        ["make", "--dry-run", *line.split()[1:]], cwd=ROOT, capture_output=True, text=True
+    )
+    assert done.returncode == 0, done.stderr
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_links_between_files_lead_somewhere(page: Path) -> None:
+    for target in re.findall(r"\]\(([^)#]+)[^)]*\)", page.read_text("utf-8")):
+        if "://" not in target:
+            assert (page.parent / target).exists(), f"{page.name}: {target}"
+
+
+def test_configuration_lists_every_key_with_its_default() -> None:
+    text = (ROOT / "docs" / "configuration.md").read_text("utf-8")
+    rows = re.findall(r"^\| `(\w+)` \| (.+?) \| ", text, re.M)
+    documented = iter(rows)
+    hints = get_type_hints(BuildParameters)
+    assert next(documented) == ("name", '`""`')
+    for group in dataclasses.fields(BuildParameters):
+        if group.name == "name":
+            continue
+        for field in dataclasses.fields(hints[group.name]):
+            assert next(documented) == (field.name, default_of(field)), group.name
+    assert list(documented) == []
+
+
+def default_of(field: dataclasses.Field[object]) -> str:
+    if field.default is dataclasses.MISSING:
+        return "required"
+    return "none" if field.default is None else f"`{json.dumps(field.default)}`"
+
+
+def test_formats_describes_every_array() -> None:
+    text = (ROOT / "docs" / "formats.md").read_text("utf-8")
+    rows = re.findall(r"^\| `((?:asset|voxel|grid)/\w+)` \| \(([^)]*)\) \| (\w+) \|", text, re.M)
+    documented = {name: (len(re.findall(r"\w+", shape)), dtype) for name, shape, dtype in rows}
+    expected = {array.name: (len(array.dimensions), array.dtype) for array in ARRAYS}
+    # (A+1,) counts as two words; it is one dimension.
+    documented["asset/offset"] = (1, documented["asset/offset"][1])
+    assert documented == expected
+
+
+@pytest.mark.parametrize("name", ["demo.toml", "mine.example.toml"])
+def test_example_definitions_are_valid(name: str, tmp_path: Path) -> None:
+    text = (ROOT / "manifests" / name).read_text("utf-8")
+    # Every example key that is commented out counts as well.
+    full = re.sub(r"^# (?=\[|\w+ = )", "", text, flags=re.M)
+    for variant in (text, full):
+        data = tomllib.loads(variant)
+        for group, key in (("pixieverse", "root"), ("slat", "root"), ("pairing", "map"),
+                           ("pairing", "categories")):  # fmt: skip
+            if key in data.get(group, {}):
+                (tmp_path / f"{group}.{key}").touch()
+                variant = variant.replace(data[group][key], str(tmp_path / f"{group}.{key}"))
+        path = tmp_path / name
+        path.write_text(variant, encoding="utf-8")
+        assert load_parameters(path).name == name.split(".")[0]

@@ -1,0 +1,130 @@
+"""What commands print, and where."""
+
+from __future__ import annotations
+
+import io
+import json
+import sys
+
+import pytest
+
+from slatprep.cli import output as module
+from slatprep.cli.output import Output, plain
+
+
+class Terminal(io.StringIO):
+    """A stream that says it is a terminal."""
+
+    def isatty(self) -> bool:
+        return True
+
+
+ROWS = [("spot", 3, 0.98765, None), ("bunny [bold]", 12345, float("nan"), True)]
+
+
+def test_plain_table_is_aligned_and_has_no_ornament(capsys: pytest.CaptureFixture[str]) -> None:
+    Output().table("Assets", ("name", "voxels", "fitness", "right"), ROWS)
+    assert capsys.readouterr().out.splitlines() == [
+        "Assets",
+        "name          voxels  fitness  right",
+        "spot               3    0.988  -",
+        "bunny [bold]  12,345        -  yes",
+        "",
+    ]
+
+
+def test_table_on_a_terminal_is_drawn_and_keeps_square_brackets(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setenv("TERM", "xterm-256color")
+    monkeypatch.delenv("NO_COLOR", raising=False)
+    monkeypatch.setattr(sys, "stdout", Terminal())
+    Output().table("Assets", ("name", "voxels", "fitness", "right"), ROWS)
+    text = sys.stdout.getvalue()  # type: ignore[attr-defined]
+    assert "bunny [bold]" in text
+    assert "─" in text and "\x1b[" in text
+
+
+@pytest.mark.parametrize("no_color", [False, True])
+def test_verdicts_are_coloured_unless_no_color_says_otherwise(
+    monkeypatch: pytest.MonkeyPatch, no_color: bool
+) -> None:
+    monkeypatch.setenv("TERM", "xterm-256color")
+    monkeypatch.delenv("NO_COLOR", raising=False)
+    if no_color:
+        monkeypatch.setenv("NO_COLOR", "1")
+    monkeypatch.setattr(sys, "stdout", Terminal())
+    Output().table("Assets", ("name", "verdict"), [("spot", "good")])
+    text = sys.stdout.getvalue()  # type: ignore[attr-defined]
+    green = "\x1b[32m"
+    assert "good" in text
+    assert (green in text) is not no_color
+
+
+def test_json_is_the_only_thing_on_standard_output(capsys: pytest.CaptureFixture[str]) -> None:
+    printer = Output(as_json=True)
+    printer.note("a note")
+    printer.result({"value": float("nan"), "pair": (1, 2)}, lambda: pytest.fail("not for people"))
+    captured = capsys.readouterr()
+    assert json.loads(captured.out) == {"value": None, "pair": [1, 2]}
+    assert captured.err == "a note\n"
+
+
+def test_verbosity(capsys: pytest.CaptureFixture[str]) -> None:
+    for verbosity in (-1, 0, 1):
+        printer = Output(verbosity=verbosity)
+        printer.note(f"note {verbosity}")
+        printer.detail(f"detail {verbosity}")
+        printer.problem(f"problem {verbosity}")
+    assert capsys.readouterr().err.split("\n")[:-1] == [
+        "problem -1",
+        "note 0",
+        "problem 0",
+        "note 1",
+        "detail 1",
+        "problem 1",
+    ]
+
+
+def test_plain_refuses_nothing_that_results_hold(tmp_path: object) -> None:
+    import numpy as np
+
+    assert plain({"a": np.float32(0.5), "b": np.arange(2), 3: {"c": float("inf")}}) == {
+        "a": 0.5,
+        "b": [0, 1],
+        "3": {"c": None},
+    }
+    assert plain(tmp_path) == str(tmp_path)
+
+
+def test_time_left_in_a_log_comes_from_all_assets_done(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    clock = iter([0.0, 10.0, 60.0, 61.0, 120.0])
+    monkeypatch.setattr(module.time, "monotonic", lambda: next(clock))
+    with Output().progress("build") as update:
+        update(1, 100)
+        update(6, 100)
+        update(7, 100)
+        update(50, 100)
+    assert capsys.readouterr().err.splitlines() == [
+        "build: 6 of 100 assets, 940 s left",
+        "build: 50 of 100 assets, 120 s left",
+    ]
+
+
+def test_quiet_shows_no_progress(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(module.time, "monotonic", iter(range(0, 1000, 100)).__next__)
+    with Output(verbosity=-1).progress("build") as update:
+        update(1, 2)
+    assert capsys.readouterr().err == ""
+
+
+def test_bar_on_a_terminal_counts_assets(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("TERM", "xterm-256color")
+    monkeypatch.setattr(sys, "stderr", Terminal())
+    with Output().progress("build") as update:
+        update(3, 8)
+    assert "3/8" in sys.stderr.getvalue()  # type: ignore[attr-defined]
