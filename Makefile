@@ -44,6 +44,8 @@ endif
 ifeq ($(DATA),manifests/demo.toml)
 	@$(BIN)/slatprep score $(STORE) $(DEMO)/truth
 endif
+	@echo "results: $(STORE) (the store), $(MANIFESTS) (a record of every asset)"
+	@echo "next:    $(BIN)/slatprep info $(STORE)"
 
 $(DEMO)/.assets-$(ASSETS)-seed-$(SEED): | $(VENV)/.installed
 	rm -rf $(DEMO)

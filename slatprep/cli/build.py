@@ -82,7 +82,11 @@ Example:
 @_STRICT
 @output_options
 def align(output: Output, out: Path, jobs: int, strict: bool, **sources: Any) -> None:
-    """Align alone: the transforms and their quality to a file of JSON Lines."""
+    """Align without building a store.
+
+    Writes one JSON record an asset: the transform, its quality, and the score
+    of every candidate.
+    """
     parameters = parameters_of(**sources)
     from slatprep import build
 

@@ -30,6 +30,7 @@ _Command = TypeVar("_Command", bound=Callable[..., object])
 
 _STYLES = {"good": "green", "doubtful": "yellow", "failed": "red"}
 
+_NO_LIMIT = 10_000
 _SECONDS_BETWEEN_LINES = 30.0
 
 
@@ -145,18 +146,19 @@ def _rich_table(
 ) -> None:
     from rich import box
     from rich.console import Console
-    from rich.markup import escape
     from rich.table import Table
     from rich.text import Text
 
-    table = Table(
-        title=escape(title), title_justify="left", box=box.SIMPLE_HEAD, title_style="bold"
-    )
+    table = Table(box=box.SIMPLE_HEAD, collapse_padding=True, pad_edge=False, show_edge=False)
     for column, right in zip(columns, numeric, strict=True):
-        table.add_column(escape(column), justify="right" if right else "left")
+        table.add_column(Text(column), justify="right" if right else "left", no_wrap=True)
     for row in cells:
         table.add_row(*(Text(text, style=_STYLES.get(text, "")) for text in row))
-    Console(file=sys.stdout, highlight=False).print(table)
+    console = Console(file=sys.stdout, highlight=False)
+    # On a narrow terminal a line may wrap, but an id or a number is never cut.
+    boundless = console.options.update(width=_NO_LIMIT)
+    console.width = max(console.width, console.measure(table, options=boundless).maximum)
+    console.print(Text(title, style="bold"), table, "", sep="\n")
 
 
 def _plain_table(

@@ -11,11 +11,15 @@ if TYPE_CHECKING:
 
 
 def show_quality(output: Output, overview: StoreOverview) -> None:
-    """Print how good the alignments of a store are, by category and in all."""
+    """Print how good the alignments of a store are, by category and in all.
+
+    ``back`` is the fitness from SLAT to PixieVerse; ``tied`` counts assets
+    whose tied placements differ in class somewhere.
+    """
     output.table(
         "Alignments (medians; rmse in voxels)",
-        ("category", "assets", "good", "doubtful", "failed", "fitness", "rmse",
-         "fitness back", "overlap", "valid", "ambiguous"),
+        ("category", "assets", "good", "doubtful", "failed", "fitness", "back",
+         "rmse", "valid", "tied"),
         [_quality_row(group) for group in (*overview.categories, overview.total)],
     )  # fmt: skip
 
@@ -38,9 +42,8 @@ def _quality_row(group: GroupOverview) -> tuple[Cell, ...]:
         group.assets,
         *group.verdicts.values(),
         group.fitness,
-        group.inlier_rmse,
         group.fitness_backward,
-        group.overlap,
+        group.inlier_rmse,
         group.valid_share,
         group.ambiguous,
     )

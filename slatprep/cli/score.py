@@ -20,11 +20,14 @@ Example:
 @click.argument("truth_dir", type=click.Path(path_type=Path, exists=True, file_okay=False))
 @output_options
 def score(output: Output, store: Path, truth_dir: Path) -> None:
-    """Score STORE against the truth in TRUTH_DIR, as make-demo writes it.
+    """Score STORE against known truth.
 
-    Each level's figures are over assets that have one right placement only;
-    success is a mean displacement below 1.5 voxels. Exit code 1 says that an
-    asset with a truth is not in the store.
+    TRUTH_DIR holds an npz an asset, as make-demo writes it. Each level's
+    figures are over assets that have one right placement only: success is a
+    mean displacement below 1.5 voxels; displacement is the median, p90 the
+    90th percentile; labels is the share of right classes, beside what the
+    truth's own transform would give. Exit code 1 says that an asset with a
+    truth is not in the store.
     """
     from slatprep.truth import score_against_truth
 
@@ -34,7 +37,7 @@ def score(output: Output, store: Path, truth_dir: Path) -> None:
         if output.verbosity > 0:
             output.table(
                 "Assets against truth",
-                ("asset", "name", "level", "symmetric", "displacement", "label accuracy",
+                ("asset", "name", "level", "symmetric", "displacement", "labels",
                  "truth's own", "valid"),
                 [
                     (s.asset_id, s.name, s.level, s.symmetric, s.displacement, s.label_accuracy,
@@ -44,8 +47,8 @@ def score(output: Output, store: Path, truth_dir: Path) -> None:
             )  # fmt: skip
         output.table(
             "Against truth (non-symmetric assets; displacement in voxels)",
-            ("level", "assets", "success", "median displacement", "p90", "label accuracy",
-             "truth's own", "valid"),
+            ("level", "assets", "success", "displacement", "p90", "labels", "truth's own",
+             "valid"),
             [
                 (f"L{s.level}", s.assets, s.success, s.displacement_median, s.displacement_p90,
                  s.label_accuracy, s.truth_own, s.valid_share)

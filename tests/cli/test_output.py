@@ -45,6 +45,16 @@ def test_table_on_a_terminal_is_drawn_and_keeps_square_brackets(
     assert "─" in text and "\x1b[" in text
 
 
+def test_narrow_terminal_cuts_no_id_and_no_number(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("TERM", "xterm-256color")
+    monkeypatch.setenv("COLUMNS", "30")
+    monkeypatch.setattr(sys, "stdout", Terminal())
+    asset_id = "0123456789abcdef0123456789abcdef"
+    Output().table("Assets", ("asset", "voxels"), [(asset_id, 12345)])
+    text = sys.stdout.getvalue()  # type: ignore[attr-defined]
+    assert asset_id in text and "12,345" in text
+
+
 @pytest.mark.parametrize("no_color", [False, True])
 def test_verdicts_are_coloured_unless_no_color_says_otherwise(
     monkeypatch: pytest.MonkeyPatch, no_color: bool
