@@ -168,7 +168,7 @@ def _claim(root: Path, recipe: _Recipe) -> None:
     mark = root / "demo.json"
     plain = json.loads(json.dumps(asdict(recipe)))
     if root.exists() and any(root.iterdir()):
-        if not mark.is_file() or json.loads(mark.read_text("utf-8"))["recipe"] != plain:
+        if _recipe_in(mark) != plain:
             raise ConfigError(
                 f"{root} holds something else than this demo: choose an empty directory"
             )
@@ -176,6 +176,14 @@ def _claim(root: Path, recipe: _Recipe) -> None:
         root.mkdir(parents=True, exist_ok=True)
         _write_json(mark, {"recipe": plain, "assets": []})
     (root / "slat" / "latents.h5").unlink(missing_ok=True)  # this one is added to
+
+
+def _recipe_in(mark: Path) -> object:
+    """Return the recipe that a directory was marked with; None where it was not."""
+    try:
+        return json.loads(mark.read_text("utf-8"))["recipe"]
+    except (OSError, ValueError, KeyError, TypeError):
+        return None
 
 
 def _made(root: Path, recipe: _Recipe, jobs: int) -> Iterator[dict[str, Any]]:

@@ -71,7 +71,7 @@ def curve(points: ArrayLike, radii: ArrayLike, stuff: Stuff) -> list[Part]:
 
 
 def rock(rng: Rng, centre: ArrayLike, radii: ArrayLike) -> Shape:
-    """Return a rounded convex stone with irregular faces."""
+    """Return a convex stone with irregular faces."""
     faces = 13
     k = np.arange(faces) + 0.5  # evenly spread directions (a spherical Fibonacci lattice)
     z, angle = 1.0 - 2.0 * k / faces, np.pi * (1.0 + 5.0**0.5) * k
@@ -82,9 +82,8 @@ def rock(rng: Rng, centre: ArrayLike, radii: ArrayLike) -> Shape:
     normals = normals / np.asarray(radii)
     length = np.linalg.norm(normals, axis=1)
     normals /= length[:, None]
-    rounding = 0.12 * float(np.min(radii))
-    offsets = rng.uniform(0.8, 1.0, faces) / length + normals @ np.asarray(centre) - rounding
-    return polytope(normals, offsets, rounding)
+    offsets = rng.uniform(0.8, 1.0, faces) / length + normals @ np.asarray(centre)
+    return polytope(normals, offsets)
 
 
 def vessel(

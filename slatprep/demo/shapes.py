@@ -156,8 +156,8 @@ def torus(centre: ArrayLike, axis: ArrayLike, radius: float, thickness: float) -
     return Shape(distance, support)
 
 
-def polytope(normals: ArrayLike, offsets: ArrayLike, rounding: float = 0.0) -> Shape:
-    """Return the bounded intersection of half-spaces ``normal @ p <= offset``, grown by `rounding`.
+def polytope(normals: ArrayLike, offsets: ArrayLike) -> Shape:
+    """Return the intersection of half-spaces ``normal @ p <= offset``; it must be bounded.
 
     Parameters
     ----------
@@ -165,8 +165,6 @@ def polytope(normals: ArrayLike, offsets: ArrayLike, rounding: float = 0.0) -> S
         Unit normals that point outwards.
     offsets : array_like, shape (F,)
         Distance of each plane from the origin.
-    rounding : float
-        How far the solid is grown.
     """
     n, o = _vector(normals), _vector(offsets)
     corners = []
@@ -179,8 +177,8 @@ def polytope(normals: ArrayLike, offsets: ArrayLike, rounding: float = 0.0) -> S
     vertices = np.array(corners)
     # The greatest plane distance is no greater than the distance to the solid.
     return Shape(
-        lambda p: (p @ n.T - o).max(axis=1) - rounding,
-        lambda d: float((vertices @ d).max()) + rounding,
+        lambda p: (p @ n.T - o).max(axis=1),
+        lambda d: float((vertices @ d).max()),
     )
 
 

@@ -44,8 +44,8 @@ def voxelise(distance: Distance) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
     A cube whose centre is farther from the surface than half the cube's
     diagonal is certainly not met; one in which two points lie on different
     sides certainly is. What is left is halved three times. Only a surface
-    that enters a cube by less than about a sixteenth of a voxel, between the
-    points looked at, can be missed.
+    that enters a cube by less than a tenth of a voxel, between the points looked
+    at, can be missed.
     """
     near, inside = _near_voxels(distance)
     candidates = np.argwhere(near)

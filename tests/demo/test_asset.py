@@ -1,0 +1,239 @@
+"""The truth of demo assets, proven from the voxels themselves."""
+
+from functools import cache
+
+import numpy as np
+import pytest
+from scipy.ndimage import label
+from scipy.spatial import cKDTree
+
+from slatprep.demo.asset import make_asset, object_id
+from slatprep.demo.catalogue import CATALOGUE
+from slatprep.demo.difficulty import LEVELS, QUARTER_TURNS, draw_frames
+from slatprep.demo.latents import MEAN, STD
+from slatprep.demo.materials import MATERIALS
+from slatprep.demo.shapes import Solid
+
+KINDS = range(2 * len(CATALOGUE))
+"""Two turns through the categories: the first two kinds of each."""
+
+
+@cache
+def asset(index, level, **options):
+    return make_asset(11, index, levels=(level,), **options)
+
+
+def looked_up(made, view=0):
+    """Map SLAT voxel centres into the grid's frame by the inverse of the true transform."""
+    centres = (made.views[view].coords + 0.5) / 64 - 0.5
+    inverse = np.linalg.inv(made.views[view].transform)
+    return centres @ inverse[:3, :3].T + inverse[:3, 3]
+
+
+def label_share(made):
+    ids = made.grid[..., 3]
+    annotated = np.argwhere((ids >= 0) & (ids < 7))
+    distance, nearest = cKDTree((annotated + 0.5) / 64 - 0.5).query(looked_up(made))
+    voxels = tuple(annotated[nearest].T)
+    near = distance * 64 <= 2
+    right = ids[voxels] == made.views[0].material
+    return right[near].mean(), near.mean()
+
+
+@pytest.mark.parametrize("index", KINDS)
+def test_quarter_turn_is_an_exact_permutation_of_the_axes(index):
+    made = asset(index, 0)
+    turn = made.views[0].transform[:3, :3]
+    assert any(np.allclose(turn, quarter, atol=1e-12) for quarter in QUARTER_TURNS)
+    assert np.allclose(made.views[0].transform[:3, 3], 0, atol=1e-12)
+    voxels = np.rint((looked_up(made) + 0.5) * 64 - 0.5).astype(int)
+    surface = np.zeros((64,) * 3, dtype=bool)
+    surface[tuple(voxels.T)] = True
+    filled = made.occupancy
+    # The filled grid holds every surface voxel, and whatever of it is not one
+    # lies inside: no face of it is bare.
+    assert not np.any(surface & ~filled)
+    padded = np.pad(filled, 1)
+    bare = np.zeros_like(filled)
+    for axis in range(3):
+        for step in (-1, 1):
+            bare |= ~np.roll(padded, step, axis)[1:-1, 1:-1, 1:-1]
+    assert not np.any(filled & bare & ~surface)
+
+
+@pytest.mark.parametrize("index", KINDS)
+def test_object_fills_the_cube_on_both_sides(index):
+    made = asset(index, 0)
+    for voxels in (made.views[0].coords, np.argwhere(made.occupancy)):
+        low, high = voxels.min(axis=0), voxels.max(axis=0)
+        assert (high - low).max() == 63
+        assert np.all(np.abs(low + high.astype(int) - 63) <= 1)
+
+
+@pytest.mark.parametrize("level", [0, 1])
+@pytest.mark.parametrize("index", KINDS)
+def test_true_transform_lands_on_the_object_and_on_its_material(index, level):
+    made = asset(index, level)
+    occupied = (np.argwhere(made.occupancy) + 0.5) / 64 - 0.5
+    distance = cKDTree(occupied).query(looked_up(made))[0] * 64
+    # A SLAT voxel's centre is within half a diagonal of the surface, and the
+    # surface within another half of the centre of a voxel that it meets.
+    assert distance.max() <= 3**0.5
+    assert np.quantile(distance, 0.98) <= 1.0
+    right, near = label_share(made)
+    assert right > 0.97
+    assert near == 1.0
+
+
+@pytest.mark.parametrize(("level", "least"), [(2, 0.95), (3, 0.95), (4, 0.93)])
+@pytest.mark.parametrize("index", range(len(CATALOGUE)))
+def test_true_transform_of_harder_levels_finds_the_material(index, level, least):
+    right, near = label_share(asset(index, level))
+    assert right > least
+    assert near > 0.9
+
+
+@pytest.mark.parametrize("index", KINDS)
+def test_properties_follow_the_material_and_stay_in_the_published_span(index):
+    made = asset(index, 1)
+    for material, (modulus, density, poisson) in [
+        *zip(made.views[0].material, made.views[0].properties, strict=True)
+    ][::97]:
+        assert any(
+            cls == material
+            and e[0] * 0.99 <= modulus <= e[1] * 1.01
+            and d[0] * 0.99 <= density <= d[1] * 1.01
+            and nu[0] - 0.01 <= poisson <= nu[1] + 0.001
+            for cls, e, d, nu in MATERIALS.values()
+        )
+    grid = made.grid[made.grid[..., 3] < 7].astype(float)
+    assert 1.7031894 <= np.log10(grid[:, 0]).min() <= np.log10(grid[:, 0]).max() <= 3.8714323
+    assert 3.0183003 <= np.log10(grid[:, 1]).min() <= np.log10(grid[:, 1]).max() <= 10.8816805
+    assert 0.2102763 <= grid[:, 2].min() <= grid[:, 2].max() <= 0.4492689
+    # Both sides know the same stuffs, in their own column orders.
+    sides = grid[:, [1, 0, 2]], made.views[0].properties
+    known = [{tuple(row) for row in np.unique(side.astype(np.float32), axis=0)} for side in sides]
+    assert known[1] <= known[0]
+
+
+@pytest.mark.parametrize("index", KINDS)
+def test_symmetric_says_whether_another_quarter_turn_fits_as_well(index):
+    made = asset(index, 0)
+    voxels = made.views[0].coords.astype(int)
+    surface = np.zeros((64,) * 3, dtype=bool)
+    surface[tuple(voxels.T)] = True
+    overlaps = []
+    for turn in QUARTER_TURNS:
+        if not np.array_equal(turn, np.eye(3)):
+            turned = np.rint((voxels - 31.5) @ turn.T + 31.5).astype(int)
+            both = surface[tuple(turned.T)].sum()
+            overlaps.append(both / (2 * len(voxels) - both))
+    assert max(overlaps) > 0.99 if made.symmetric else max(overlaps) < 0.85
+
+
+def test_half_painted_ball_is_symmetric_in_shape_but_not_in_material():
+    index = list(CATALOGUE).index("sport_balls")
+    made = asset(index, 0)
+    assert made.symmetric
+    share = np.bincount(made.views[0].material) / len(made.views[0].coords)
+    assert sorted(share[share > 0]) == pytest.approx([0.5, 0.5], abs=0.02)
+
+
+@pytest.mark.parametrize("index", range(0, len(CATALOGUE), 3))
+def test_damage_bites_and_adds_floaters_one_without_a_label(index):
+    made, whole = asset(index, 2), asset(index, 1)
+    pieces = label(made.occupancy, np.ones((3, 3, 3)))[1]
+    assert pieces > label(whole.occupancy, np.ones((3, 3, 3)))[1]
+    unlabelled = made.grid[..., 3] == -1
+    assert 0 < unlabelled.sum() < 0.01 * made.occupancy.sum()
+    assert not made.grid[unlabelled, :3].any()
+    assert np.array_equal(made.occupancy, made.grid[..., 3] != 7)
+
+
+@pytest.mark.parametrize("index", range(len(CATALOGUE)))
+def test_scale_of_each_level(index):
+    scales = [np.cbrt(np.linalg.det(asset(index, k).views[0].transform[:3, :3])) for k in LEVELS]
+    assert scales[0] == pytest.approx(1.0, abs=1e-12)
+    assert scales[1] == pytest.approx(1.0, abs=1e-12)
+    assert 0.0199 <= abs(scales[2] - 1.0) <= 0.1001
+    assert scales[4] == pytest.approx(1.0, abs=1e-12)
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_frames_agree_with_their_transform(seed):
+    rng = np.random.default_rng(seed)
+    solid = Solid(CATALOGUE["tree"](rng, 0).parts)
+    frames = draw_frames(rng, solid, LEVELS[seed % 4], QUARTER_TURNS[seed])
+    points = rng.uniform(-0.5, 0.5, (100, 3))
+    matrix = frames.transform()
+    moved = points @ matrix[:3, :3].T + matrix[:3, 3]
+    assert np.allclose(frames.slat_to_object(moved), frames.pixieverse.to_object(points))
+    tilt = matrix[:3, :3].T @ QUARTER_TURNS[seed].T
+    if seed % 4 in (1, 2):
+        cosine = (np.trace(tilt / np.cbrt(np.linalg.det(tilt))) - 1) / 2
+        assert np.degrees(np.arccos(min(1.0, cosine))) <= 15.0
+
+
+def test_warp_is_smooth_and_about_a_voxel():
+    rng = np.random.default_rng(3)
+    solid = Solid(CATALOGUE["rocks"](rng, 0).parts)
+    rms = []
+    for _ in range(20):
+        warp = draw_frames(rng, solid, LEVELS[4], np.eye(3)).warp
+        points = rng.uniform(-0.5, 0.5, (2_000, 3))
+        away = np.linalg.norm(warp(points) - points, axis=1)
+        assert away.max() <= warp.reach
+        rms.append(np.sqrt((away**2).mean()) * 64)
+        step = rng.normal(0.0, 0.01, points.shape)
+        stretch = np.linalg.norm(warp(points + step) - warp(points), axis=1)
+        assert np.all(stretch <= warp.stretch * np.linalg.norm(step, axis=1))
+    assert 0.8 < np.mean(rms) < 1.2
+
+
+def test_views_turn_the_slat_side_about_z():
+    made = asset(0, 1, views=3)
+    first, second, third = made.views
+    assert [view.view for view in made.views] == ["view_0", "view_1", "view_2"]
+    quarter = second.transform[:3, :3] @ first.transform[:3, :3].T
+    assert np.allclose(quarter, [[0, -1, 0], [1, 0, 0], [0, 0, 1]])
+    turned = {(63 - y, x, z) for x, y, z in first.coords.tolist()}
+    assert turned == set(map(tuple, second.coords.tolist()))
+    assert np.allclose(third.transform[:3, :3] @ first.transform[:3, :3].T, np.diag([-1, -1, 1]))
+
+
+def test_habitual_share_gives_most_assets_one_quarter_turn():
+    turns = [
+        make_asset(4, 20 + 14 * 3 * k, levels=(0,), habitual_share=0.8).views[0].transform[:3, :3]
+        for k in range(20)
+    ]
+    counts = np.unique(np.rint(turns).reshape(20, 9), axis=0, return_counts=True)[1]
+    assert 12 <= counts.max() <= 19
+
+
+@pytest.mark.parametrize("kind", ["placeholder", "material"])
+def test_latents_have_the_published_statistics_or_tell_materials_apart(kind):
+    made = asset(10, 0, latents=kind)
+    feats, material = made.views[0].feats, made.views[0].material
+    assert feats.dtype == np.float32
+    centred = (feats - MEAN) / STD
+    if kind == "placeholder":
+        assert np.allclose(centred.mean(axis=0), 0, atol=0.05)
+        assert np.allclose(centred.std(axis=0), 1, atol=0.05)
+        return
+    # The nearest class mean names the class of nearly all, which noise cannot.
+    present = np.unique(material)
+    means = np.stack([centred[material == m].mean(axis=0) for m in present])
+    named = present[cKDTree(means).query(centred)[1]]
+    assert (named == material).mean() > 0.9
+
+
+def test_every_category_has_a_builder_and_every_object_an_id():
+    names = {asset(k, 0).category for k in range(len(CATALOGUE))}
+    assert names == {
+        "tree", "flowers", "shrubs", "grass", "fruit", "rubber_ducks_and_toys", "sport_balls",
+        "soda_cans", "metal_crates", "sand", "snow_and_mud", "jello_block", "rocks",
+        "water-like_bodies",
+    }  # fmt: skip
+    ids = [object_id(0, k) for k in range(100)] + [object_id(1, k) for k in range(100)]
+    assert len(set(ids)) == 200
+    assert all(len(i) == 32 and set(i) <= set("0123456789abcdef") for i in ids)

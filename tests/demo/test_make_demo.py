@@ -1,0 +1,214 @@
+"""Demo datasets on disk: layouts, and the same bytes for the same arguments."""
+
+import csv
+import hashlib
+import json
+import tomllib
+import zipfile
+
+import h5py
+import numpy as np
+import pytest
+
+from slatprep.demo import make_asset, make_demo
+from slatprep.errors import ConfigError
+
+
+def digests(root):
+    return {
+        path.relative_to(root).as_posix(): hashlib.sha256(path.read_bytes()).hexdigest()
+        for path in sorted(root.rglob("*"))
+        if path.is_file()
+    }
+
+
+@pytest.fixture(scope="module")
+def demo(tmp_path_factory):
+    root = tmp_path_factory.mktemp("demo")
+    seen = []
+    summary = make_demo(root, 4, 7, progress=lambda done, of: seen.append((done, of)))
+    assert seen == [(1, 4), (2, 4), (3, 4), (4, 4)]
+    return summary
+
+
+def test_layout_is_that_of_the_real_data(demo):
+    root = demo.directory
+    metadata = json.loads((root / "obj_ids_metadata.json").read_text())
+    listed = json.loads((root / "demo.json").read_text())["assets"]
+    assert len(metadata) == demo.assets == demo.rows == len(listed) == 4
+    for entry in listed:
+        uid = entry["id"]
+        folder = root / "pixieverse" / uid
+        grid = np.load(folder / "sample_0" / "material_grid.npy")
+        mask = np.load(folder / "clip_features_mask.npy")
+        assert grid.shape == (64, 64, 64, 4)
+        assert grid.dtype == mask.dtype == np.float32
+        assert np.array_equal(mask > 0, grid[..., 3] != 7)
+        assert grid[mask == 0].min(axis=0).tolist() == [0, 0, 0, 7]
+        with np.load(folder / "clip_features.npz") as bounds:
+            assert bounds["min_bounds"].tolist() == [-0.5] * 3
+            assert bounds["grid_shape"].tolist() == [64] * 3
+        with np.load(root / "slat" / f"{uid}.npz") as slat:
+            coords, feats = slat["coords"], slat["feats"]
+        assert coords.dtype == np.uint8
+        assert feats.dtype == np.float32
+        assert coords.shape == (len(coords), 3)
+        assert feats.shape == (len(coords), 8)
+        assert len(np.unique(coords, axis=0)) == len(coords) <= 32_768
+        assert coords.max() <= 63
+        with np.load(root / "truth" / f"{uid}.npz") as truth:
+            assert truth["transform"].shape == (4, 4)
+            assert truth["transform"].dtype == np.float64
+            assert np.array_equal(truth["transform"], entry["rows"][0]["transform"])
+            assert truth["material"].shape == (len(coords),)
+            assert truth["material"].dtype == np.uint8
+            assert truth["properties"].shape == (len(coords), 3)
+            assert truth["properties"].dtype == np.float32
+            assert str(truth["name"]) == entry["name"]
+            assert int(truth["level"]) == entry["level"]
+            assert bool(truth["symmetric"]) == entry["symmetric"]
+        assert metadata[uid] == {
+            "obj_class": entry["category"],
+            "vlm_filtering": {"is_appropriate": True},
+        }
+
+
+def test_definition_names_the_roots(demo):
+    definition = tomllib.loads(demo.config.read_text())
+    assert definition == {
+        "name": "demo-7",
+        "pixieverse": {"root": "pixieverse"},
+        "slat": {"root": "slat"},
+        "pairing": {"categories": "obj_ids_metadata.json"},
+    }
+
+
+def test_same_bytes_again_with_any_number_of_jobs(demo, tmp_path):
+    first = digests(demo.directory)
+    make_demo(tmp_path / "again", 4, 7, jobs=2)
+    assert digests(tmp_path / "again") == first
+    make_demo(tmp_path / "again", 4, 7)  # over itself
+    assert digests(tmp_path / "again") == first
+
+
+def test_zip_members_carry_no_time_of_writing(demo):
+    for path in demo.directory.rglob("*.npz"):
+        with zipfile.ZipFile(path) as archive:
+            assert {info.date_time for info in archive.infolist()} == {(1980, 1, 1, 0, 0, 0)}
+
+
+def test_an_asset_does_not_depend_on_how_many_there_are(demo, tmp_path):
+    make_demo(tmp_path, 2, 7)
+    shared = {
+        name: digest
+        for name, digest in digests(tmp_path).items()
+        if name.split("/")[0] in ("pixieverse", "slat", "truth")
+    }
+    assert shared.items() <= digests(demo.directory).items()
+
+
+def test_another_seed_makes_other_assets(demo, tmp_path):
+    make_demo(tmp_path, 1, 8)
+    assert not set(digests(tmp_path / "truth")) & set(digests(demo.directory / "truth"))
+
+
+@pytest.mark.parametrize("form", ["prediction", "prediction-ids"])
+def test_predictions_hold_the_grid_normalised(tmp_path, form):
+    make_demo(tmp_path, 1, 7, levels=(2,), grid_form=form)
+    made = make_asset(7, 0, levels=(2,))
+    folder = tmp_path / "pixieverse" / made.object_id
+    prediction = np.load(folder / "sample_0_pred.npy")
+    assert prediction.dtype == np.float32
+    assert prediction.shape == ((11 if form == "prediction" else 4), 64, 64, 64)
+    assert np.array_equal(np.load(folder / "sample_0_mask.npy") > 0, made.occupancy)
+    ids = prediction[3:].argmax(axis=0) if form == "prediction" else prediction[3]
+    known = (made.grid[..., 3] >= 0) & (made.grid[..., 3] < 7)
+    assert np.array_equal(ids, np.where(known, made.grid[..., 3], 7))
+    # By hand, for one voxel: (log10 v - lo) / (hi - lo), spread over -1..1.
+    x, y, z = np.argwhere(known)[100]
+    density, modulus, poisson, _ = made.grid[x, y, z].astype(float)
+    expected = [
+        2 * (np.log10(density) - 1.7031893730163574) / (3.871432304382324 - 1.7031893730163574) - 1,
+        2 * (np.log10(modulus) - 3.0183002948760986) / (10.881680488586426 - 3.0183002948760986)
+        - 1,
+        2 * (poisson - 0.21027633547782898) / (0.4492689371109009 - 0.21027633547782898) - 1,
+    ]
+    assert prediction[:3, x, y, z] == pytest.approx(expected, abs=1e-6)
+    assert np.abs(prediction[:3]).max() <= 1.0
+
+
+def test_slat_forms_hold_the_same_voxels(tmp_path):
+    view = make_asset(7, 0).views[0]
+    uid = make_asset(7, 0).object_id
+    for form in ("npz-batch", "hdf5", "hdf5-groups"):
+        make_demo(tmp_path / form, 2, 7, slat_form=form)
+    with np.load(tmp_path / "npz-batch" / "slat" / f"{uid}.npz") as slat:
+        assert slat["coords"].dtype == np.int32
+        assert not slat["coords"][:, 0].any()
+        assert np.array_equal(slat["coords"][:, 1:], view.coords)
+    with h5py.File(tmp_path / "hdf5" / "slat" / f"{uid}.h5") as file:
+        assert np.array_equal(file["coords"], view.coords)
+        assert np.array_equal(file["feats"], view.feats)
+    with h5py.File(tmp_path / "hdf5-groups" / "slat" / "latents.h5") as file:
+        assert len(file) == 2
+        assert np.array_equal(file[uid]["coords"], view.coords)
+    root = tmp_path / "hdf5-groups"
+    first = digests(root)
+    assert tomllib.loads((root / "dataset.toml").read_text())["slat"]["root"] == "slat/latents.h5"
+    make_demo(root, 2, 7, slat_form="hdf5-groups")
+    assert digests(root) == first
+
+
+def test_several_views_are_several_rows_of_one_object(tmp_path):
+    summary = make_demo(tmp_path, 1, 7, views=2)
+    uid = make_asset(7, 0).object_id
+    assert (summary.assets, summary.rows) == (1, 2)
+    assert sorted(p.name for p in (tmp_path / "slat" / uid).iterdir()) == [
+        "view_0.npz",
+        "view_1.npz",
+    ]
+    assert sorted(p.stem for p in (tmp_path / "truth").iterdir()) == [
+        f"{uid}.view_0",
+        f"{uid}.view_1",
+    ]
+
+
+def test_names_by_sha256_come_with_trellis_metadata(tmp_path):
+    make_demo(tmp_path, 2, 7, slat_names="sha256")
+    with (tmp_path / "metadata.csv").open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    files = {p.stem for p in (tmp_path / "slat").iterdir()}
+    assert {row["sha256"] for row in rows} == files
+    assert all(len(name) == 64 for name in files)
+    ids = {row["file_identifier"].rsplit("/", 1)[1] for row in rows}
+    assert ids == {p.name for p in (tmp_path / "pixieverse").iterdir()}
+    assert tomllib.loads((tmp_path / "dataset.toml").read_text())["pairing"]["map"]
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"assets": 0},
+        {"seed": -1},
+        {"levels": ()},
+        {"levels": (0, 9)},
+        {"views": 0},
+        {"habitual_share": 1.5},
+        {"views": 2, "slat_form": "hdf5-groups"},
+    ],
+)
+def test_senseless_arguments_are_refused(tmp_path, wrong):
+    arguments = {"assets": 1, "seed": 0} | wrong
+    with pytest.raises(ConfigError, match=next(iter(wrong)) if len(wrong) == 1 else "hdf5"):
+        make_demo(tmp_path / "demo", **arguments)
+    assert not (tmp_path / "demo").exists()
+
+
+def test_a_directory_with_other_content_is_left_alone(tmp_path):
+    (tmp_path / "thesis.txt").write_text("mine")
+    with pytest.raises(ConfigError, match="empty directory"):
+        make_demo(tmp_path, 1, 0)
+    assert [p.name for p in tmp_path.iterdir()] == ["thesis.txt"]
+    make_demo(tmp_path / "demo", 1, 0)
+    with pytest.raises(ConfigError, match="empty directory"):
+        make_demo(tmp_path / "demo", 1, 1)
