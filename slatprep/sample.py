@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from slatprep.geometry import VOXEL_SIZE, apply_transform, invert_transform, voxel_centres
+from slatprep.geometry import apply_transform, invert_transform, voxel_centres
 from slatprep.parameters import SampleParameters
 from slatprep.records import UNANNOTATED, Annotation, MaterialField
 
@@ -38,12 +38,10 @@ def sample(
     Annotation
         In SI units; NaN and 255 where not valid.
     """
-    from scipy.spatial import cKDTree
+    from slatprep.lattice import nearest_voxel
 
     points = apply_transform(invert_transform(transform), voxel_centres(coords))
-    tree = cKDTree(voxel_centres(field.voxels))
-    distance, nearest = tree.query(points)
-    distance = distance / VOXEL_SIZE
+    distance, nearest = nearest_voxel(points, field.voxels)
     valid = distance <= parameters.max_distance
     properties = np.where(valid[:, None], field.properties[nearest], np.float32(np.nan))
     material = np.where(valid, field.material[nearest], np.uint8(UNANNOTATED))

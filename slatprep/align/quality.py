@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from slatprep.geometry import (
-    VOXEL_SIZE,
     apply_transform,
     boundary,
+    invert_transform,
+    split_transform,
     voxel_centres,
     voxels_of,
 )
@@ -42,12 +43,22 @@ def measure_quality(
         intersection over union of the SLAT voxels and the voxels that the
         carried boundary falls into, one voxel of slack on either side.
     """
-    from scipy.spatial import cKDTree
+    from slatprep.lattice import nearest_voxel
 
-    carried = apply_transform(transform, voxel_centres(voxels_of(boundary(field.occupancy))))
-    slat = voxel_centres(latents.coords)
-    forward = cKDTree(slat).query(carried, distance_upper_bound=4.0 * VOXEL_SIZE)[0] / VOXEL_SIZE
-    backward = cKDTree(carried).query(slat, distance_upper_bound=4.0 * VOXEL_SIZE)[0] / VOXEL_SIZE
+    # Both ways the points are carried to the other side's lattice, where the
+    # nearest voxel is found without a tree; a scale turns the way back's
+    # distances into voxels of the SLAT frame.
+    _, _, scale = split_transform(transform)
+    surface = voxels_of(boundary(field.occupancy))
+    forward, _ = nearest_voxel(
+        apply_transform(transform, voxel_centres(surface)), latents.coords, limit=radius
+    )
+    backward, _ = nearest_voxel(
+        apply_transform(invert_transform(transform), voxel_centres(latents.coords)),
+        surface,
+        limit=radius / scale,
+    )
+    backward = backward * scale
     fitness, rmse = _inliers(forward, radius)
     fitness_backward, rmse_backward = _inliers(backward, radius)
     matched = (forward <= radius).sum() + (backward <= radius).sum()
@@ -72,7 +83,7 @@ def judge(
     return Verdict.GOOD, ()
 
 
-def _inliers(distance: np.ndarray, radius: float) -> tuple[float, float]:
+def _inliers(distance: NDArray[np.float64], radius: float) -> tuple[float, float]:
     near = distance[distance <= radius]
     if len(near) == 0:
         return 0.0, 0.0

@@ -54,3 +54,31 @@ def euler_starts() -> tuple[Start, ...]:
 def distinct_starts() -> tuple[Start, ...]:
     """Return the 24 starts that are different rotations."""
     return tuple(start for start in euler_starts() if start.same_as is None)
+
+
+@lru_cache(maxsize=4)
+def so3_starts(count: int) -> NDArray[np.float64]:
+    """Return `count` rotations (count, 3, 3) spread evenly over all orientations.
+
+    Notes
+    -----
+    Super-Fibonacci spirals on the unit quaternions: M. Alexa, "Super-Fibonacci
+    Spirals: Fast, Low-Discrepancy Sampling of SO(3)", CVPR 2022.
+    """
+    from scipy.spatial.transform import Rotation
+
+    phi, psi = np.sqrt(2.0), 1.533751168755204288118041
+    s = np.arange(count) + 0.5
+    inner, outer = np.sqrt(s / count), np.sqrt(1.0 - s / count)
+    alpha, beta = 2.0 * np.pi * s / phi, 2.0 * np.pi * s / psi
+    quaternions = np.stack(
+        [
+            inner * np.sin(alpha),
+            inner * np.cos(alpha),
+            outer * np.sin(beta),
+            outer * np.cos(beta),
+        ],
+        axis=1,
+    )
+    rotations: NDArray[np.float64] = Rotation.from_quat(quaternions).as_matrix()
+    return rotations

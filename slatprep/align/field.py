@@ -1,0 +1,229 @@
+"""The default engine: two filled voxel sets laid on each other by their distance fields.
+
+The method in five steps (docs/method.md has the equations):
+
+1. Fill both voxel sets and measure the signed distance to their surfaces.
+2. From each of the 24 distinct start rotations, centroid on centroid and size
+   on size, a few robust Gauss-Newton steps on a few hundred samples.
+3. Polish the distinct survivors on more samples; where the best one fits
+   poorly, search all orientations the same way.
+4. Refine what is left on all samples, choose the best, list the ties.
+5. Keep the scale at one where the data do not ask for another.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from slatprep.align.quality import measure_quality
+from slatprep.align.starts import distinct_starts, euler_starts, so3_starts
+from slatprep.align.surface import Surface, surface_of
+from slatprep.geometry import VOXEL_SIZE, make_transform, occupancy_of
+from slatprep.parameters import AlignParameters
+from slatprep.records import (
+    Alignment,
+    Candidate,
+    MaterialField,
+    Placement,
+    StructuredLatents,
+)
+
+COARSE_SAMPLES, POLISH_SAMPLES, FINE_SAMPLES = 100, 400, 4_000
+"""Samples a side used from the starts, on the survivors, and at the end."""
+
+COARSE_TAUS = (8.0, 8.0, 6.0, 6.0, 4.0, 4.0, 3.0, 3.0, 2.0, 2.0)
+POLISH_TAUS = (2.0,) * 5 + (1.0,) * 5
+FINE_TAUS = (1.0,) * 10
+"""Width of the robust kernel at each step, in voxels."""
+
+SURVIVORS, MOST_SURVIVORS = 4, 24
+"""Distinct placements that are polished: at least, whatever they score, and at most."""
+
+TIE = 0.03
+"""Placements that score less than this below the best one fit about as well."""
+
+DISTINCT = 1.5
+"""Voxels, rms over the SLAT's surface, from which on two placements are two."""
+
+WIDEN_BELOW = 0.8
+"""Score below which the 24 starts are not trusted and all orientations searched."""
+
+SO3_STARTS = 240
+
+RIGID_IF_SCALE_WITHIN = 0.02
+RIGID_LOSS = 0.002
+"""A scale this near to one is kept only if it raises the score by more than this."""
+
+
+@dataclass(frozen=True)
+class Pose:
+    """A similarity from the PixieVerse frame to the SLAT frame, and how well it fits.
+
+    ``shift`` and ``offset`` are in voxels, positions relative to the cube's
+    centre; ``score`` is the mean robust kernel over the samples of both sides,
+    1 for a perfect fit; ``fitness`` the share of samples within one voxel.
+    """
+
+    rotation: NDArray[np.float64]
+    shift: NDArray[np.float64]
+    scale: float
+    offset: float = 0.0
+    score: float = 0.0
+    fitness: float = 0.0
+    rmse: float = 0.0
+
+    @property
+    def transform(self) -> NDArray[np.float64]:
+        """The pose as a 4x4 matrix between the unit cubes."""
+        u, _, v = np.linalg.svd(self.rotation)
+        return make_transform(u @ v, self.shift * VOXEL_SIZE, self.scale)
+
+
+def align(
+    field: MaterialField, latents: StructuredLatents, parameters: AlignParameters
+) -> Alignment:
+    """Align by distance fields; see `slatprep.align.align`."""
+    pair = _Pair(surface_of(occupancy_of(latents.coords)), surface_of(field.occupancy), parameters)
+
+    starts = distinct_starts()
+    fits = pair.refine(pair.poses(s.rotation for s in starts), COARSE_SAMPLES, COARSE_TAUS, 0.02)
+    poses = pair.polish(fits)
+    search = "euler64"
+    if poses[0].score < WIDEN_BELOW:
+        search = "so3"
+        wide = pair.poses(so3_starts(SO3_STARTS))
+        poses += pair.polish(pair.refine(wide, COARSE_SAMPLES, COARSE_TAUS, 0.02))
+        poses = pair.distinct(poses)
+
+    tied = [pose for pose in poses if pose.score > poses[0].score - TIE]
+    tied = pair.distinct(pair.refine(tied, FINE_SAMPLES, FINE_TAUS, 0.002))
+    best, model = pair.simplest(tied[0])
+    others = pair.distinct([best, *tied[1:], *poses])[1:]
+
+    by_start = {start.index: fit for start, fit in zip(starts, fits, strict=True)}
+    candidates = []
+    for start in euler_starts():
+        fit = by_start[start.index if start.same_as is None else start.same_as]
+        candidates.append(
+            Candidate(start.index, start.euler_degrees, fit.fitness, fit.rmse, start.same_as)
+        )
+    transform = best.transform
+    return Alignment(
+        transform=transform,
+        engine="field",
+        model=model,
+        search=search,
+        quality=measure_quality(field, latents, transform, parameters.radius),
+        candidates=tuple(candidates),
+        margin=best.score - others[0].score if others else 1.0,
+        placements=tuple(
+            Placement(pose.transform, pose.score, float(pair.apart([pose], best)[0]))
+            for pose in others
+            if pose.score > best.score - TIE
+        ),
+    )
+
+
+class _Pair:
+    """Two surfaces and what the search asks of them."""
+
+    def __init__(self, slat: Surface, pixie: Surface, parameters: AlignParameters) -> None:
+        self.slat, self.pixie = slat, pixie
+        self.parameters = parameters
+        self._cache: dict[int, tuple[Surface, Surface]] = {}
+        self.free_scale = parameters.model != "rigid"
+        points = slat.points
+        self._mean = points.mean(axis=0)
+        self._covariance = np.cov(points.T, bias=True) if len(points) > 1 else np.zeros((3, 3))
+
+    def poses(self, rotations: Iterable[NDArray[np.float64]]) -> list[Pose]:
+        """Start poses that lay centroid on centroid and, where scale is free, size on size."""
+        scale = 1.0
+        if self.free_scale and self.pixie.size > 0:
+            low, high = self.parameters.scale_bounds
+            scale = float(np.clip(self.slat.size / self.pixie.size, low, high))
+        here, there = self.slat.centroid, self.pixie.centroid
+        return [Pose(r, here - scale * (r @ there), scale) for r in rotations]
+
+    def refine(
+        self,
+        poses: Sequence[Pose],
+        samples: int,
+        taus: Sequence[float],
+        tolerance: float,
+        free_scale: bool | None = None,
+    ) -> list[Pose]:
+        """Refine each pose on an even subset of the samples."""
+        from slatprep.align.solver import solve
+
+        slat, pixie = self._subsets(samples)
+        low, high = self.parameters.scale_bounds
+        refined = []
+        for pose in poses:
+            rotation, shift, scale, offset, here, back, fitness, rmse = solve(
+                slat.points, slat.values, slat.distance, slat.origin,
+                pixie.points, pixie.values, pixie.distance, pixie.origin,
+                np.ascontiguousarray(pose.rotation), pose.shift, pose.scale, pose.offset,
+                np.array(taus), self.free_scale if free_scale is None else free_scale,
+                low, high, tolerance,
+            )  # fmt: skip
+            score = 0.5 * (here + back)
+            refined.append(Pose(rotation, shift, scale, offset, score, fitness, rmse))
+        return refined
+
+    def _subsets(self, samples: int) -> tuple[Surface, Surface]:
+        if samples not in self._cache:
+            self._cache[samples] = self.slat.subset(samples), self.pixie.subset(samples)
+        return self._cache[samples]
+
+    def polish(self, poses: Sequence[Pose]) -> list[Pose]:
+        """Refine the best distinct poses further; best first."""
+        survivors = self.distinct(poses)
+        likely = [p for p in survivors if p.score > survivors[0].score - 2 * TIE]
+        survivors = survivors[: min(max(SURVIVORS, len(likely)), MOST_SURVIVORS)]
+        return self.distinct(self.refine(survivors, POLISH_SAMPLES, POLISH_TAUS, 0.01))
+
+    def simplest(self, pose: Pose) -> tuple[Pose, str]:
+        """Return the pose with its scale set to one where that fits as well, and the model."""
+        model = self.parameters.model
+        if model != "auto":
+            return pose, model
+        if abs(pose.scale - 1.0) < RIGID_IF_SCALE_WITHIN:
+            start = Pose(pose.rotation, self._rescaled_shift(pose), 1.0, pose.offset)
+            (rigid,) = self.refine([start], FINE_SAMPLES, FINE_TAUS, 0.002, free_scale=False)
+            if rigid.score >= pose.score - RIGID_LOSS:
+                return rigid, "rigid"
+        return pose, "similarity"
+
+    def _rescaled_shift(self, pose: Pose) -> NDArray[np.float64]:
+        centre = self._mean
+        return centre + (pose.shift - centre) / pose.scale
+
+    def apart(self, poses: Sequence[Pose], other: Pose) -> NDArray[np.float64]:
+        """Rms distance, in voxels, between where poses and another look the SLAT's surface up.
+
+        Over samples of mean m and covariance C, the mean square of A x + b is
+        trace(A C A^T) + |A m + b|^2.
+        """
+        inverse = np.stack([pose.rotation.T / pose.scale for pose in (*poses, other)])
+        shift = -np.stack(
+            [m @ pose.shift for m, pose in zip(inverse, (*poses, other), strict=True)]
+        )
+        linear, shift = inverse[:-1] - inverse[-1], shift[:-1] - shift[-1]
+        spread = np.einsum("nij,jk,nik->n", linear, self._covariance, linear)
+        square = spread + ((linear @ self._mean + shift) ** 2).sum(axis=1)
+        return np.asarray(np.sqrt(np.maximum(square, 0.0)), dtype=np.float64)
+
+    def distinct(self, poses: Sequence[Pose]) -> list[Pose]:
+        """Return the poses best first, without those that repeat a better one."""
+        kept: list[Pose] = []
+        rest = sorted(poses, key=lambda pose: -pose.score)
+        while rest:
+            kept.append(rest[0])
+            apart = self.apart(rest, rest[0])
+            rest = [pose for pose, a in zip(rest[1:], apart[1:], strict=True) if a >= DISTINCT]
+        return kept

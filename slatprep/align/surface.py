@@ -1,0 +1,127 @@
+"""A voxel set as the signed distance to its surface.
+
+The two sides show one object differently: PixieVerse as a filled solid, TRELLIS
+as the voxels that the surface passes through. Filling the SLAT makes them the
+same kind of thing, so that neither a missing inside nor half a voxel of
+thickness pulls the alignment to one side.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from slatprep.records import RESOLUTION
+
+CENTRE = (RESOLUTION - 1) / 2
+"""Index of the cube's centre; positions below are in voxels relative to it."""
+
+DILATION = 0.5
+"""How far, in voxels, the outer faces of a voxelised surface stand off the surface.
+
+A voxel belongs to the set if the surface passes through it anywhere, so the set
+is thicker than the object by half a voxel on average on a face along the grid,
+somewhat more on slanted ones. It matters where the two sides have different
+scales: half a voxel is then not the same length on both.
+"""
+
+BAND = 1.0
+"""Lattice points this close (voxels) to the outer faces are the surface's samples."""
+
+_MARGIN = 4
+
+
+@dataclass(frozen=True)
+class Surface:
+    """Signed distance to the surface of a voxel set, and samples of it near the surface.
+
+    Attributes
+    ----------
+    distance : ndarray of float32, shape (a, b, c)
+        Signed distance in voxels, negative inside, on a box around the set.
+    origin : ndarray of float64, shape (3,)
+        Position of ``distance[0, 0, 0]``, in voxels from the cube's centre.
+    points : ndarray of float64, shape (M, 3)
+        Lattice points near the surface, in voxels from the cube's centre.
+    values : ndarray of float64, shape (M,)
+        The signed distance at `points`.
+    """
+
+    distance: NDArray[np.float32]
+    origin: NDArray[np.float64]
+    points: NDArray[np.float64]
+    values: NDArray[np.float64]
+
+    @property
+    def centroid(self) -> NDArray[np.float64]:
+        """Mean of the surface's samples, in voxels from the cube's centre."""
+        centroid: NDArray[np.float64] = self.points.mean(axis=0)
+        return centroid
+
+    @property
+    def size(self) -> float:
+        """Root mean square distance of the surface's samples from their centroid, in voxels."""
+        return float(np.sqrt(((self.points - self.centroid) ** 2).sum(axis=1).mean()))
+
+    def subset(self, count: int) -> Surface:
+        """Return the same surface with at most `count` evenly chosen samples."""
+        if len(self.points) <= count:
+            return self
+        # Multiples of the golden ratio fill an interval evenly without the
+        # regular steps that would beat with the lattice.
+        fraction = (np.arange(count) * 0.618033988749895) % 1.0
+        chosen = np.unique((fraction * len(self.points)).astype(np.intp))
+        return Surface(self.distance, self.origin, self.points[chosen], self.values[chosen])
+
+
+def surface_of(occupancy: NDArray[np.bool_]) -> Surface:
+    """Fill a voxel set and measure the signed distance to its surface.
+
+    Parameters
+    ----------
+    occupancy : ndarray of bool, shape (64, 64, 64)
+        A solid or a shell; at least one voxel.
+
+    Returns
+    -------
+    Surface
+        Of the solid: the set and all empty voxels that no path over faces
+        joins with the outside.
+
+    Notes
+    -----
+    The distance transform is exact and Euclidean (Felzenszwalb and Huttenlocher,
+    2012, as the package edt computes it), taken to the nearest voxel centre of
+    the other kind, less half a voxel to the face between the two.
+    """
+    import edt
+    from scipy import ndimage
+
+    low, high = _bounding_box(occupancy)
+    box = np.pad(occupancy[tuple(slice(a, b) for a, b in zip(low, high, strict=True))], _MARGIN)
+    regions, _ = ndimage.label(~box)
+    solid = regions != regions[0, 0, 0]
+    # With two labels one transform measures the inside and the outside at once.
+    distance: NDArray[np.float32] = edt.edt(solid + np.uint8(1), parallel=1)
+    distance -= np.float32(0.5)
+    near = np.argwhere(distance <= BAND)
+    np.negative(distance, out=distance, where=solid)
+    distance += np.float32(DILATION)
+    origin = (low - _MARGIN).astype(np.float64) - CENTRE
+    return Surface(
+        distance=distance,
+        origin=origin,
+        points=near + origin,
+        values=distance[tuple(near.T)].astype(np.float64),
+    )
+
+
+def _bounding_box(occupancy: NDArray[np.bool_]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    low, high = np.empty(3, dtype=np.intp), np.empty(3, dtype=np.intp)
+    for axis in range(3):
+        others = tuple(a for a in range(3) if a != axis)
+        filled = np.flatnonzero(occupancy.any(axis=others))
+        low[axis], high[axis] = filled[0], filled[-1] + 1
+    return low, high
