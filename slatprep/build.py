@@ -133,13 +133,14 @@ def build_store(
     out = Path(out)
     manifests = default_manifests(out) if manifests is None else Path(manifests)
     _refuse_other_targets(out)
+    given = _given_ranges(parameters.normalize)
     with _work_directory(out) as work:
         spool = Spool(work / "spool")
         assets = _process_all(parameters, spool, jobs, strict, progress)
         usable = [asset for asset in assets if asset.status is Status.OK]
         if not usable:
             raise StoreError(_nothing_usable(assets, parameters))
-        normalization = _normalization(parameters.normalize, usable)
+        normalization = given or _dataset_ranges(usable)
         new = work / "store.zarr"
         clipped = _pack(new, spool, usable, normalization, parameters.store, jobs)
         with (
@@ -255,14 +256,15 @@ def _spool_asset(
     return spool.put(replace(result, record=record))
 
 
-def _normalization(
-    parameters: NormalizeParameters, usable: Sequence[SpooledAsset]
-) -> Normalization:
-    if parameters.ranges == "pixie":
-        return PIXIE_RANGES
+def _given_ranges(parameters: NormalizeParameters) -> Normalization | None:
+    """Return ranges that do not depend on the dataset, or None; read first, to fail early."""
     if parameters.ranges == "dataset":
-        return ranges_from_extents([a.extent for a in usable if a.extent is not None])
-    return read_ranges(Path(parameters.ranges))
+        return None
+    return PIXIE_RANGES if parameters.ranges == "pixie" else read_ranges(Path(parameters.ranges))
+
+
+def _dataset_ranges(usable: Sequence[SpooledAsset]) -> Normalization:
+    return ranges_from_extents([asset.extent for asset in usable if asset.extent is not None])
 
 
 def _pack(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import warnings
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from typing import Any, TypeVar
@@ -54,13 +55,20 @@ def run_unordered(
         return
     with parallel_config("loky", n_jobs=jobs, inner_max_num_threads=1):
         parallel = Parallel(return_as="generator_unordered")
+    results = parallel(calls)
     try:
-        yield from parallel(calls)
+        for result in results:  # noqa: UP028 - "yield from" would close it before `finally` does
+            yield result
     except BrokenProcessPool as error:
         raise SlatprepError(
             "a worker process was killed, probably because memory ran out; nothing was replaced. "
             "Run again with fewer jobs"
         ) from error
+    finally:
+        with warnings.catch_warnings():
+            # Whoever stops early, as a strict build does, means to waste the rest.
+            warnings.filterwarnings("ignore", message=".*but not used", category=UserWarning)
+            results.close()
 
 
 @contextmanager

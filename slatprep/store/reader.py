@@ -125,7 +125,9 @@ class Store:
         if index is None:
             views = [known for known in self.ids if known.startswith(f"{asset_id}.")]
             close = views or difflib.get_close_matches(asset_id, self.ids)
-            hint = f"did you mean {' or '.join(close[:5])}?" if close else f"it has {len(self)}"
+            hint = (
+                f"did you mean {' or '.join(close[:5])}?" if close else f"it has {len(self)} assets"
+            )
             raise StoreError(f"{self.path} has no asset {asset_id!r}; {hint}")
         return index
 

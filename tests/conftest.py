@@ -1,0 +1,46 @@
+"""Datasets of small made assets, and a build of one."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from synthetic import Dataset, make_asset
+
+from slatprep.build import BuildSummary, build_store
+
+
+@pytest.fixture
+def make_dataset(tmp_path: Path) -> Callable[..., Dataset]:
+    """Make a dataset of good assets: ``make_dataset("a", "b")``."""
+
+    def make(*ids: str) -> Dataset:
+        dataset = Dataset(tmp_path / "sources")
+        for seed, object_id in enumerate(ids):
+            dataset.add(object_id, seed)
+        return dataset
+
+    return make
+
+
+@pytest.fixture(scope="session")
+def mixed(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
+    """Make five good rows, one of an object with two views, one bad file and one lone grid."""
+    dataset = Dataset(tmp_path_factory.mktemp("mixed"))
+    dataset.add("cup", seed=0)
+    dataset.add("bear", seed=1, views=("front", "side"))
+    dataset.add("ant", seed=2)
+    dataset.add("dog", seed=3)
+    dataset.write_grid("lone", make_asset(4).grid)
+    dataset.write_grid("torn", make_asset(5).grid)
+    dataset.write_slat("torn.npz", np.empty((0, 3), np.uint8), np.empty((0, 8), np.float32))
+    return dataset
+
+
+@pytest.fixture(scope="session")
+def mixed_build(mixed: Dataset, tmp_path_factory: pytest.TempPathFactory) -> BuildSummary:
+    """Build `mixed` on one core; nobody may change the store."""
+    out = tmp_path_factory.mktemp("built") / "mixed.zarr"
+    return build_store(mixed.parameters(), out)

@@ -1,0 +1,130 @@
+"""The store as plain zarr-python reads it, against numbers worked out here."""
+
+import json
+import warnings
+from collections.abc import Iterator
+from math import log10
+from pathlib import Path
+
+import numpy as np
+import pytest
+import zarr
+from synthetic import JELLY, METAL, QUARTER_TURN, SMALL_SHARDS, Dataset
+
+from slatprep.build import BuildSummary
+
+IDS = ["ant", "bear.front", "bear.side", "cup", "dog"]
+
+
+@pytest.fixture
+def root(mixed_build: BuildSummary) -> Iterator[zarr.Group]:
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")  # A reader must not be warned by what we wrote.
+        yield zarr.open_group(mixed_build.store, mode="r")
+
+
+def by_hand(stuff: tuple[float, ...]) -> list[float]:
+    """Normalise E, density and nu by the range of the only two materials there are."""
+    values = []
+    for column, mapped in ((1, log10), (2, log10), (3, float)):
+        lo, hi = sorted((mapped(JELLY[column]), mapped(METAL[column])))
+        values.append(2 * (mapped(stuff[column]) - lo) / (hi - lo) - 1)
+    return values
+
+
+def test_ids_and_what_belongs_to_them(root: zarr.Group) -> None:
+    assert [str(i) for i in root["asset/id"][:]] == IDS
+    assert [str(i) for i in root["asset/object_id"][:]] == ["ant", "bear", "bear", "cup", "dog"]
+    assert [str(i) for i in root["asset/view"][:]] == ["", "front", "side", "", ""]
+
+
+def test_offsets_and_voxels_are_the_source_files(root: zarr.Group, mixed: Dataset) -> None:
+    offset = root["asset/offset"][:]
+    assert offset.dtype == np.int64
+    assert offset[0] == 0
+    assert offset[-1] == root["voxel/coords"].shape[0]
+    for row, asset_id in enumerate(IDS):
+        rows = slice(offset[row], offset[row + 1])
+        assert np.array_equal(root["voxel/coords"][rows], mixed.assets[asset_id].coords)
+        assert np.array_equal(root["voxel/feats"][rows], mixed.assets[asset_id].feats)
+
+
+def test_supervision_is_the_material_at_the_place_the_voxel_was_turned_from(
+    root: zarr.Group, mixed: Dataset
+) -> None:
+    offset = root["asset/offset"][:]
+    for row, asset_id in enumerate(IDS):
+        assert np.allclose(root["asset/transform"][row], QUARTER_TURN, atol=1e-3)
+        rows = slice(offset[row], offset[row + 1])
+        x, y, z = mixed.assets[asset_id].coords.astype(int).T
+        true_material = mixed.assets[asset_id].grid[y, 63 - x, z, 3]
+        assert np.array_equal(root["voxel/material"][rows], true_material)
+        assert root["voxel/valid"][rows].all()
+        assert root["voxel/distance"][rows].max() < 0.1
+        expected = np.where((true_material == 0)[:, None], by_hand(JELLY), by_hand(METAL))
+        assert np.allclose(root["voxel/properties"][rows], expected, atol=1e-6)
+
+
+def test_grid_is_the_normalised_field(root: zarr.Group, mixed: Dataset) -> None:
+    for row, asset_id in enumerate(IDS):
+        material = mixed.assets[asset_id].grid[..., 3]
+        stored = root["grid/properties"][row]
+        assert np.array_equal(root["grid/material"][row], material)
+        assert np.isnan(stored[:, material == 7]).all()
+        assert np.allclose(stored[:, material == 0].T, by_hand(JELLY), atol=1e-6)
+        assert np.allclose(stored[:, material == 1].T, by_hand(METAL), atol=1e-6)
+
+
+def test_attributes_explain_the_store(root: zarr.Group, mixed_build: BuildSummary) -> None:
+    attributes = dict(root.attrs)
+    assert attributes["format"] == "slatprep-store"
+    assert attributes["format_version"] == 1
+    assert attributes["resolution"] == 64
+    assert attributes["material_classes"][6:] == ["stationary", "background"]
+    assert attributes["property_columns"] == ["youngs_modulus", "density", "poissons_ratio"]
+    assert attributes["manifest"] == mixed_build.manifest
+    modulus = attributes["normalization"]["youngs_modulus"]
+    assert modulus["log10"] is True
+    assert modulus["source"] == "dataset"
+    assert modulus["lo"] == pytest.approx(5.0)
+    assert modulus["hi"] == pytest.approx(log10(2.0e11))
+    assert attributes["normalization"]["poissons_ratio"]["log10"] is False
+
+
+def test_arrays_have_the_contracts_types_and_names_of_dimensions(root: zarr.Group) -> None:
+    dtypes = {
+        "asset/transform": "float64",
+        "voxel/coords": "uint8",
+        "voxel/feats": "float32",
+        "voxel/properties": "float32",
+        "voxel/material": "uint8",
+        "voxel/valid": "bool",
+        "voxel/distance": "float32",
+        "grid/properties": "float32",
+        "grid/material": "uint8",
+    }
+    for name, dtype in dtypes.items():
+        assert root[name].dtype == dtype
+    for _, array in root["asset"].arrays():
+        assert array.metadata.dimension_names[0] in ("asset", "asset_edge")
+    assert root["voxel/properties"].metadata.dimension_names == ("voxel", "property")
+    assert root["grid/material"].metadata.dimension_names == ("asset", "x", "y", "z")
+
+
+def test_one_file_a_shard_and_one_read_to_open(root: zarr.Group, mixed_build: BuildSummary) -> None:
+    store = mixed_build.store
+    assert store is not None
+    n_voxels = root["voxel/coords"].shape[0]
+    shards = -(-n_voxels // (SMALL_SHARDS.voxel_chunk * SMALL_SHARDS.voxel_chunks_per_shard))
+    assert shards > len(IDS)  # Assets are cut by shards, or this would show little.
+    for array in ("coords", "feats", "properties", "material", "valid", "distance"):
+        assert len(list((store / "voxel" / array / "c").rglob("0"))) >= 1
+        assert _files(store / "voxel" / array / "c") == shards
+    assert _files(store / "grid" / "material" / "c") == 3
+    assert _files(store / "grid" / "properties" / "c") == 3
+    document = json.loads((store / "zarr.json").read_text())
+    assert "voxel/coords" in document["consolidated_metadata"]["metadata"]
+
+
+def _files(directory: Path) -> int:
+    return sum(path.is_file() for path in directory.rglob("*"))

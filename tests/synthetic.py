@@ -1,0 +1,106 @@
+"""Small assets made of numpy alone, with everything about them known by construction."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from slatprep.parameters import (
+    PRESETS,
+    BuildParameters,
+    NormalizeParameters,
+    PixieverseSource,
+    SlatSource,
+    StoreParameters,
+)
+
+SMALL_SHARDS = StoreParameters(
+    voxel_chunk=128, voxel_chunks_per_shard=4, grid_assets_per_shard=2, compression_level=1
+)
+
+# What the two parts of every asset are made of: class, then E, density, nu.
+JELLY = (0, 1.0e5, 1.0e3, 0.30)
+METAL = (1, 2.0e11, 8.0e3, 0.28)
+
+# A quarter turn about z, (x, y, z) -> (-y, x, z), PixieVerse frame to SLAT frame.
+QUARTER_TURN = np.array(
+    [[0.0, -1.0, 0.0, 0.0], [1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, 0.0, 0.0, 1.0]]
+)
+
+
+@dataclass
+class Asset:
+    """One made asset: the grid as Pixie writes it, the SLAT as TRELLIS writes it."""
+
+    grid: np.ndarray
+    coords: np.ndarray
+    feats: np.ndarray
+
+
+def make_asset(seed: int = 0) -> Asset:
+    """Make an L of two materials, and its surface voxels turned by `QUARTER_TURN`."""
+    rng = np.random.default_rng(seed)
+    length, width, height = 24 + 2 * (seed % 4), 14, 8
+    grid = np.zeros((64, 64, 64, 4), dtype=np.float32)
+    grid[..., 3] = 7
+
+    def fill(part: tuple[slice, slice, slice], stuff: tuple[float, ...]) -> None:
+        material, modulus, density, ratio = stuff
+        grid[part] = (density, modulus, ratio, material)
+
+    fill(np.s_[20 : 20 + length, 22 : 22 + width, 26 : 26 + height], JELLY)
+    fill(np.s_[20:26, 22 : 22 + width, 26 : 26 + height + 10], METAL)
+    fill(np.s_[20:24, 22:28, 40 : 40 + height], METAL)
+
+    occupied = grid[..., 3] != 7
+    buried = np.ones_like(occupied)
+    for axis in range(3):
+        for step in (-1, 1):
+            buried &= np.roll(occupied, step, axis)
+    surface = np.argwhere(occupied & ~buried)
+    turned = np.stack([63 - surface[:, 1], surface[:, 0], surface[:, 2]], axis=1)
+    turned = turned[rng.permutation(len(turned))]
+    feats = rng.normal(size=(len(turned), 8)).astype(np.float32)
+    return Asset(grid, turned.astype(np.uint8), feats)
+
+
+@dataclass
+class Dataset:
+    """A folder of sources, and the parameters that build it."""
+
+    root: Path
+    assets: dict[str, Asset] = field(default_factory=dict)
+
+    def add(self, object_id: str, seed: int, views: tuple[str, ...] = ("",)) -> None:
+        """Write an object's grid and one SLAT a view."""
+        for number, view in enumerate(views):
+            asset = make_asset(seed)
+            asset.feats += number
+            self.write_grid(object_id, asset.grid)
+            name = f"{object_id}/{view}.npz" if view else f"{object_id}.npz"
+            self.write_slat(name, asset.coords, asset.feats)
+            self.assets[f"{object_id}.{view}" if view else object_id] = asset
+
+    def write_grid(self, object_id: str, grid: np.ndarray) -> None:
+        """Write a grid as PixieVerse lays it out."""
+        path = self.root / "pixieverse" / object_id / "sample_0" / "material_grid.npy"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        np.save(path, grid)
+
+    def write_slat(self, name: str, coords: np.ndarray, feats: np.ndarray) -> None:
+        """Write a SLAT as TRELLIS's toolkit does."""
+        path = self.root / "slat" / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        np.savez(path, coords=coords, feats=feats)
+
+    def parameters(self, ranges: str = "dataset") -> BuildParameters:
+        """Return the parameters of a build with many small shards."""
+        return BuildParameters(
+            PixieverseSource(self.root / "pixieverse"),
+            SlatSource(self.root / "slat"),
+            align=PRESETS["paper"],
+            normalize=NormalizeParameters(ranges),
+            store=SMALL_SHARDS,
+        )
