@@ -6,8 +6,11 @@ import json
 import os
 import re
 import shlex
+import shutil
+import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import click
@@ -242,3 +245,25 @@ def test_interrupt_is_clean_and_says_that_nothing_was_replaced(
     assert result.exit_code == 130
     assert "nothing was replaced" in result.stderr
     assert "Traceback" not in result.stderr
+
+
+@pytest.mark.parametrize("signal_number", [signal.SIGINT, signal.SIGTERM])
+def test_stopped_build_leaves_the_older_store_and_nothing_else(
+    demo: Path, tmp_path: Path, signal_number: signal.Signals
+) -> None:
+    store = tmp_path / "demo.zarr"
+    shutil.copytree(demo / "demo.zarr", store)
+    before = {path: path.read_bytes() for path in store.rglob("*") if path.is_file()}
+    build = subprocess.Popen(
+        [sys.executable, "-m", "slatprep.cli", "build-store", "--config",
+         demo / "demo" / "dataset.toml", "--preset", "paper", "--out", store, "--jobs", "2"],
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True,
+    )  # fmt: skip
+    while len(list(tmp_path.iterdir())) == 1 and build.poll() is None:
+        time.sleep(0.05)
+    build.send_signal(signal_number)
+    _, said = build.communicate(timeout=60)
+    assert build.returncode == 130, said
+    assert "stopped; nothing was replaced" in said and "Traceback" not in said
+    assert list(tmp_path.iterdir()) == [store]
+    assert {path: path.read_bytes() for path in store.rglob("*") if path.is_file()} == before
