@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from slatprep.parameters import (
-    PRESETS,
+    AlignParameters,
     BuildParameters,
     NormalizeParameters,
     PixieverseSource,
@@ -100,7 +100,7 @@ class Dataset:
         return BuildParameters(
             PixieverseSource(self.root / "pixieverse"),
             SlatSource(self.root / "slat"),
-            align=PRESETS["paper"],
+            align=AlignParameters(),
             normalize=NormalizeParameters(ranges),
             store=SMALL_SHARDS,
         )

@@ -146,7 +146,7 @@ if when == "packing": build.create_store = kill
 if when == "replacing": build.replace_directory = kill
 parameters = BuildParameters(
     PixieverseSource(Path(root) / "pixieverse"), SlatSource(Path(root) / "slat"),
-    align=PRESETS["paper"], normalize=NormalizeParameters("pixie"),
+    normalize=NormalizeParameters("pixie"),
 )
 build.build_store(parameters, Path(out), progress=progress)
 """
