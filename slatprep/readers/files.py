@@ -19,7 +19,7 @@ import zlib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import IO, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -236,7 +236,7 @@ def npy_array(data: bytes, where: str | Path, spec: ArraySpec) -> NDArray[Any]:
     InputError
         If the bytes are no such array.
     """
-    return _read_npy(io.BytesIO(data), len(data), where, spec)
+    return _array(data, len(data), where, spec)
 
 
 def npz_arrays(
@@ -280,10 +280,30 @@ def npz_arrays(
         }
 
 
-def npz_names(data: bytes, where: str | Path) -> tuple[str, ...]:
-    """Return the names of the arrays in the bytes of an npz file."""
+def npz_small_arrays(
+    data: bytes, where: str | Path, spec: ArraySpec
+) -> tuple[dict[str, NDArray[Any]], list[InputError]]:
+    """Read whatever arrays of an npz file are as `spec` wants them.
+
+    Returns
+    -------
+    tuple of dict and list
+        The arrays by name, and the faults of the others.
+
+    Raises
+    ------
+    InputError
+        If the archive itself cannot be read.
+    """
+    arrays, faults = {}, []
     with _open_zip(data, where) as archive:
-        return tuple(info.filename.removesuffix(".npy") for info in archive.infolist())
+        for info in archive.infolist():
+            name = info.filename.removesuffix(".npy")
+            try:
+                arrays[name] = _read_member(archive, info, where, name, spec)
+            except InputError as error:
+                faults.append(error)
+    return arrays, faults
 
 
 def _open_zip(data: bytes, where: str | Path) -> zipfile.ZipFile:
@@ -314,22 +334,48 @@ def _read_member(
         )
     try:
         with archive.open(info) as stream:
-            return _read_npy(stream, info.file_size, member, spec)
+            prefix = stream.read(_MAX_HEADER_BYTES)
+            _header(prefix, info.file_size, member, spec)
+            # Now that the size is known to be what spec allows, the rest may be inflated.
+            data = prefix + stream.read(max(0, info.file_size - len(prefix)))
+        return _array(data, info.file_size, member, spec)
     except _ZIP_ERRORS as error:
         raise InputError(
             member, f"is damaged ({error})", "an intact npz archive; copy or make it again"
         ) from None
 
 
-def _read_npy(stream: IO[bytes], size: int, where: str | Path, spec: ArraySpec) -> NDArray[Any]:
-    # The header is parsed from a bounded prefix: its own length field may claim 4 GB.
-    prefix = io.BytesIO(stream.read(_MAX_HEADER_BYTES))
+def _array(data: bytes, size: int, where: str | Path, spec: ArraySpec) -> NDArray[Any]:
+    """Return the array whose npy header and values `data` holds."""
+    shape, fortran, dtype, offset = _header(data, size, where, spec)
+    wanted = math.prod(shape)
+    if len(data) - offset != wanted * dtype.itemsize:
+        raise InputError(
+            where,
+            f"is truncated: {len(data) - offset} of {wanted * dtype.itemsize} bytes of data",
+            "a complete file; copy or make it again",
+        )
+    array = np.frombuffer(data, dtype, wanted, offset).reshape(shape, order="F" if fortran else "C")
+    return array.astype(dtype.newbyteorder("="), copy=False)
+
+
+def _header(
+    prefix: bytes, size: int, where: str | Path, spec: ArraySpec
+) -> tuple[tuple[int, ...], bool, np.dtype[Any], int]:
+    """Check an npy header before its data is read; return shape, order, dtype and its length.
+
+    `prefix` holds the header, `size` is that of header and data together.
+    """
+    # No more than a bounded prefix is parsed: the header's length field may claim 4 GB.
+    start = io.BytesIO(prefix[:_MAX_HEADER_BYTES])
     try:
-        version = np.lib.format.read_magic(prefix)
+        version = np.lib.format.read_magic(start)
         if version == (1, 0):
-            shape, fortran, dtype = np.lib.format.read_array_header_1_0(prefix)
-        else:
-            shape, fortran, dtype = np.lib.format.read_array_header_2_0(prefix)
+            shape, fortran, dtype = np.lib.format.read_array_header_1_0(start)
+        elif version == (2, 0):
+            shape, fortran, dtype = np.lib.format.read_array_header_2_0(start)
+        else:  # 3.0 is for field names, which no plain array has
+            raise ValueError(f"format version {version}")
     except _HEADER_ERRORS as error:
         reason = str(error).splitlines()[0][:120] if str(error) else type(error).__name__
         raise InputError(
@@ -337,20 +383,11 @@ def _read_npy(stream: IO[bytes], size: int, where: str | Path, spec: ArraySpec) 
         ) from None
     spec.check(where, shape, dtype)
     wanted = math.prod(shape) * dtype.itemsize
-    held = size - prefix.tell()
+    held = size - start.tell()
     if held != wanted:
         raise InputError(
             where,
             f"is truncated or damaged: its header announces {wanted} bytes of data, it has {held}",
             "a complete file; copy or make it again",
         )
-    body = prefix.read()
-    body += stream.read(wanted - len(body))
-    if len(body) != wanted:
-        raise InputError(
-            where,
-            f"is truncated: {len(body)} of {wanted} bytes of data",
-            "a complete file; copy or make it again",
-        )
-    array = np.frombuffer(body, dtype).reshape(shape, order="F" if fortran else "C")
-    return array.astype(dtype.newbyteorder("="), copy=False)
+    return shape, fortran, dtype, start.tell()

@@ -1,8 +1,8 @@
 """Safe reading of HDF5: nothing outside the file, nothing before its size is known.
 
 An HDF5 file can point elsewhere in several ways: soft and external links,
-virtual datasets, external raw storage. All are refused, as are filters that
-would inflate without bound.
+virtual datasets, external raw storage. All are refused, as are filters other
+than those that are undone here with a bound.
 """
 
 from __future__ import annotations
@@ -12,9 +12,11 @@ import math
 import zlib
 from collections.abc import Iterator, Mapping
 from functools import lru_cache
+from itertools import product
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
 from numpy.typing import NDArray
 
 from slatprep.errors import InputError
@@ -27,13 +29,15 @@ if TYPE_CHECKING:
 
 SUFFIXES = (".h5", ".hdf5")
 
-_DEFLATE, _SHUFFLE, _FLETCHER32, _LZF = 1, 2, 3, 32000
+_DEFLATE, _SHUFFLE, _FLETCHER32 = 1, 2, 3
+_FILTER_NAMES = {_DEFLATE: "gzip", _SHUFFLE: "shuffle", _FLETCHER32: "fletcher32"}
+_WRITTEN = "a completely written dataset; make it again"
 _MAX_CHUNKS = 65_536
 _MAX_CHUNK_BYTES = 2**26
-_MAX_LZF_CHUNK_BYTES = 2**21  # LZF inflates 90 times at most
 
-# What h5py raises for files that are damaged.
+# What h5py and zlib raise for files that are damaged.
 HDF5_ERRORS = (
+    zlib.error,
     OSError,
     RuntimeError,
     KeyError,
@@ -173,61 +177,90 @@ def _read_dataset(dataset: h5py.Dataset, where: str, spec: ArraySpec) -> NDArray
         raise InputError(where, "is a virtual dataset, which reads other files", expected)
     if dataset.id.get_create_plist().get_external_count():
         raise InputError(where, "keeps its values in another file", expected)
-    if dataset.chunks is None:
-        stored = dataset.id.get_storage_size()
-        wanted = math.prod(dataset.shape) * dataset.dtype.itemsize
-        if stored != wanted:
-            raise InputError(
-                where,
-                f"holds {stored} of {wanted} bytes",
-                "a completely written dataset; make it again",
-            )
-    else:
-        _check_chunks(dataset, where)
+    if dataset.chunks is not None:
+        return _read_chunks(dataset, where)
+    stored = dataset.id.get_storage_size()
+    wanted = math.prod(dataset.shape) * dataset.dtype.itemsize
+    if stored != wanted:
+        # HDF5 would fill in zeros, which are values as good as any.
+        raise InputError(where, f"holds {stored} of {wanted} bytes", _WRITTEN)
     array: NDArray[Any] = dataset[()]
     return array.astype(array.dtype.newbyteorder("="), copy=False)
 
 
-def _check_chunks(dataset: h5py.Dataset, where: str) -> None:
-    """Raise InputError unless every chunk is there and inflates to a chunk's size."""
+def _read_chunks(dataset: h5py.Dataset, where: str) -> NDArray[Any]:
+    """Read a chunked dataset chunk by chunk.
+
+    The filters are undone here, not by HDF5's own pipeline, which inflates
+    without bound and crashes the process on some damaged chunks.
+    """
+    import h5py
+
     properties = dataset.id.get_create_plist()
     filters = [properties.get_filter(i)[0] for i in range(properties.get_nfilters())]
-    packing = [code for code in filters if code in (_DEFLATE, _LZF)]
-    if set(filters) - {_DEFLATE, _SHUFFLE, _FLETCHER32, _LZF} or len(packing) > 1:
+    if set(filters) - _FILTER_NAMES.keys() or len(set(filters)) < len(filters):
         raise InputError(
             where,
             f"uses HDF5 filters {filters}",
-            "gzip or lzf, with or without shuffle and fletcher32",
+            f"each at most once of {', '.join(_FILTER_NAMES.values())}; "
+            "h5repack -f GZIP=1 rewrites a file",
         )
-    chunk_bytes = math.prod(dataset.chunks) * dataset.dtype.itemsize
-    wanted = math.prod(-(-n // c) for n, c in zip(dataset.shape, dataset.chunks, strict=True))
+    dtype, steps = dataset.dtype, dataset.chunks
+    if not dataset.id.get_type().equal(h5py.h5t.py_create(dtype)):
+        raise InputError(where, "stores a number format of its own", "IEEE floats or integers")
+    chunk_bytes = math.prod(steps) * dtype.itemsize
+    offsets = [range(0, n, step) for n, step in zip(dataset.shape, steps, strict=True)]
+    wanted = math.prod(map(len, offsets))
     if chunk_bytes > _MAX_CHUNK_BYTES or wanted > _MAX_CHUNKS:
         raise InputError(
             where,
             f"has {wanted} chunks of {chunk_bytes} bytes",
             f"at most {_MAX_CHUNKS} chunks of at most {_MAX_CHUNK_BYTES} bytes",
         )
-    chunks: list[Any] = []
-    dataset.id.chunk_iter(lambda info: chunks.append(info) if len(chunks) <= wanted else True)
-    if len(chunks) != wanted:
+    chunks: dict[tuple[int, ...], Any] = {}
+    dataset.id.chunk_iter(lambda info: chunks.update({info.chunk_offset: info}))
+    if chunks.keys() != set(product(*offsets)):
         raise InputError(
-            where,
-            f"holds {len(chunks)} of {wanted} chunks",
-            "a completely written dataset; make it again",
+            where, f"its {len(chunks)} chunks are not the {wanted} that cover it", _WRITTEN
         )
-    # A chunk that did not shrink is at most a little larger than its values.
-    for chunk in chunks:
-        inflated = chunk.size
-        if packing == [_DEFLATE] and chunk.size <= chunk_bytes + 65_536:
-            skipped, raw = dataset.id.read_direct_chunk(chunk.chunk_offset)
-            if not skipped & (1 << filters.index(_DEFLATE)):
-                inflated = len(zlib.decompressobj().decompress(raw, chunk_bytes + 5))
-        if inflated > chunk_bytes + 4 or (packing == [_LZF] and chunk.size > _MAX_LZF_CHUNK_BYTES):
+
+    array = np.empty(dataset.shape, dtype.newbyteorder("="))
+    for corner, chunk in chunks.items():
+        # A chunk that did not shrink is only a little larger than its values.
+        data = b""
+        if chunk.size <= chunk_bytes + 65_536:
+            skipped, raw = dataset.id.read_direct_chunk(corner)
+            applied = [code for bit, code in enumerate(filters) if not skipped >> bit & 1]
+            data = _undo(applied, raw, chunk_bytes, dtype.itemsize)
+        if len(data) != chunk_bytes:
             raise InputError(
                 where,
-                f"the chunk at {chunk.chunk_offset} inflates beyond its {chunk_bytes} bytes",
-                "chunks of the size that the dataset states",
+                f"the chunk at {corner} is damaged: it does not unpack to {chunk_bytes} bytes",
+                "chunks of the size that the dataset states; copy or make the file again",
             )
+        block = np.frombuffer(data, dtype).reshape(steps)
+        region = tuple(
+            slice(start, min(start + step, n))
+            for start, step, n in zip(corner, steps, dataset.shape, strict=True)
+        )
+        array[region] = block[tuple(slice(part.stop - part.start) for part in region)]
+    return array
+
+
+def _undo(filters: list[int], data: bytes, chunk_bytes: int, itemsize: int) -> bytes:
+    """Undo HDF5 filters, last first, without inflating beyond a chunk; empty if it cannot be."""
+    from numcodecs import Fletcher32, Shuffle
+
+    for code in reversed(filters):
+        if code == _DEFLATE:
+            data = zlib.decompressobj().decompress(data, chunk_bytes + 5)
+        elif code == _FLETCHER32 and len(data) > 4:
+            data = bytes(Fletcher32().decode(data))
+        elif code == _SHUFFLE and len(data) % itemsize == 0:
+            data = bytes(Shuffle(itemsize).decode(data))
+        else:
+            return b""
+    return data
 
 
 def _reason(error: BaseException) -> str:

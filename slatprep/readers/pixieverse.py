@@ -19,8 +19,7 @@ from slatprep.readers.files import (
     ArraySpec,
     load_source,
     npy_array,
-    npz_arrays,
-    npz_names,
+    npz_small_arrays,
     require_complete,
 )
 from slatprep.records import (
@@ -260,24 +259,20 @@ def _read_bounds(
 
     Bounds serve exports to world coordinates; the supervision does without.
     """
-    bounds: dict[str, object] = {}
     try:
         data, source = load_source(path, root, "bounds")
         sources.append(source)
-        names = npz_names(data, path)
+        arrays, faults = npz_small_arrays(data, path, BOUND)
     except InputError as error:
         warnings.append(f"bounds not read: {error}")
         return None
-    for name in names:
-        try:
-            value = npz_arrays(data, path, {name: BOUND})[name]
-        except InputError as error:
-            warnings.append(f"bounds: {error}")
-            continue
+    warnings += [f"bounds: {fault}" for fault in faults]
+    bounds: dict[str, object] = {}
+    for name, value in arrays.items():
         if value.dtype.kind == "f" and not np.isfinite(value).all():
-            warnings.append(f"bounds: {path} [{name}]: not finite, left out")
-            continue
-        bounds[name] = value.tolist()
+            warnings.append(f"bounds: {path} [{name}] is not finite; left out")
+        else:
+            bounds[name] = value.tolist()
     return bounds
 
 

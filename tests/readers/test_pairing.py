@@ -336,6 +336,9 @@ def test_missing_roots_and_empty_roots(find, tmp_path):
         find(pixieverse={"root": tmp_path / "nowhere"})
     with pytest.raises(ConfigError, match="nowhere: does not exist"):
         find(slat={"root": tmp_path / "nowhere"})
+    touch(tmp_path, "all.h5")
+    with pytest.raises(ConfigError, match=r"all\.h5: is no readable HDF5 file"):
+        find(slat={"root": tmp_path / "all.h5"})
 
 
 def test_link_out_of_the_root_is_found_but_not_read(find, tmp_path):

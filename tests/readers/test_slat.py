@@ -79,7 +79,8 @@ def test_hdf5(make_pair, group, coords):
     "options",
     [
         {"compression": "gzip"},
-        {"compression": "lzf"},
+        {"compression": "gzip", "shuffle": True},
+        {"fletcher32": True, "chunks": (2, 5)},
         {"compression": "gzip", "shuffle": True, "fletcher32": True, "chunks": (2, 8)},
         {"chunks": (1, 3)},
     ],
@@ -267,5 +268,21 @@ def test_hdf5_that_was_never_filled_is_refused(make_pair):
             coords=COORDS,
             feats={"shape": (3, 8), "dtype": np.float32, "chunks": chunks},
         )
-        with pytest.raises(InputError, match=r"holds 0 of (96 bytes|2 chunks)"):
+        with pytest.raises(InputError, match=r"holds 0 of 96 bytes|its 0 chunks are not the 2"):
             read_latents(pair)
+
+
+def test_hdf5_filters_that_are_not_known_are_refused(make_pair):
+    pair = hdf5_pair(make_pair(), coords=COORDS, feats={"data": FEATS, "compression": "lzf"})
+    with pytest.raises(InputError, match=r"\[feats\]: uses HDF5 filters \[32000\].*h5repack"):
+        read_latents(pair)
+
+
+def test_hdf5_chunk_that_fails_its_checksum_is_refused(make_pair):
+    feats = {"data": FEATS, "fletcher32": True, "chunks": (3, 8)}
+    pair = hdf5_pair(make_pair(), coords=COORDS, feats=feats)
+    data = bytearray(pair.slat.read_bytes())
+    data[data.index(FEATS.tobytes())] ^= 1
+    pair.slat.write_bytes(data)
+    with pytest.raises(InputError, match="checksum"):
+        read_latents(pair)
