@@ -38,9 +38,6 @@ class _Slat:
     problem: str = ""
 
 
-_NO_SLAT = _Slat("", "", "")
-
-
 @dataclass(frozen=True, slots=True)
 class _Row:
     """What will be one row: an object and the SLATs that bear this label (one, if all is well)."""
@@ -110,8 +107,9 @@ def _find_slats(source: SlatSource) -> dict[str, list[_Slat]]:
     if not slats:
         tried = f"groups {source.group}" if source.root.is_file() else _tried(source.pattern, {})
         raise ConfigError(f"{source.root}: no SLAT found; looked for {tried}")
-    if source.root.is_file() and (problem := slats.get(source.root.name, [_NO_SLAT])[0].problem):
-        raise ConfigError(problem)
+    problems = [slat.problem for found in slats.values() for slat in found if slat.problem]
+    if source.root.is_file() and problems:
+        raise ConfigError(problems[0])
     return slats
 
 
