@@ -5,7 +5,8 @@
 
 PYTHON ?= python3
 VENV   ?= .venv
-JOBS   ?= $(shell nproc 2>/dev/null || echo 1)
+# OMP_NUM_THREADS would lower what nproc says; it means threads, not processes.
+JOBS   ?= $(shell env -u OMP_NUM_THREADS nproc 2>/dev/null || getconf _NPROCESSORS_ONLN)
 DATA   ?= manifests/demo.toml
 ASSETS ?= 25
 SEED   ?= 0
