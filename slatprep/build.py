@@ -131,10 +131,11 @@ def build_store(
     """
     begin = time.perf_counter()
     out = Path(out)
-    manifests = default_manifests(out) if manifests is None else Path(manifests)
     _refuse_other_targets(out)
+    target = out.resolve()  # What a link points to is replaced, not the link.
+    manifests = default_manifests(out) if manifests is None else Path(manifests)
     given = _given_ranges(parameters.normalize)
-    with _work_directory(out) as work:
+    with _work_directory(target) as work:
         spool = Spool(work / "spool")
         assets = _process_all(parameters, spool, jobs, strict, progress)
         usable = [asset for asset in assets if asset.status is Status.OK]
@@ -162,7 +163,7 @@ def build_store(
                 seconds=time.perf_counter() - begin,
             )
             provenance.write_build_record(build_file, summary, parameters)
-            replace_directory(new, out)
+            replace_directory(new, target)
     return summary
 
 
@@ -331,9 +332,15 @@ def _refuse_other_targets(out: Path) -> None:
 @contextmanager
 def _work_directory(out: Path) -> Iterator[Path]:
     """Make a directory beside `out`, on its file system, and remove it afterwards."""
-    out.parent.mkdir(parents=True, exist_ok=True)
-    # A name of its own for each build: what a killed one left is never taken for this one's.
-    work = Path(tempfile.mkdtemp(prefix=f".{out.name}.work-", dir=out.parent))
+    try:
+        out.parent.mkdir(parents=True, exist_ok=True)
+        # A name of its own for each build: what a killed one left is never taken for this one's.
+        work = Path(tempfile.mkdtemp(prefix=f".{out.name}.work-", dir=out.parent))
+    except OSError as error:
+        raise StoreError(
+            f"{out.parent}: cannot write there ({error.strerror}); "
+            "expected a folder for the result and for temporary files"
+        ) from error
     try:
         yield work
     finally:

@@ -54,7 +54,8 @@ def run_unordered(
             yield from Parallel(n_jobs=1, return_as="generator")(calls)
         return
     with parallel_config("loky", n_jobs=jobs, inner_max_num_threads=1):
-        parallel = Parallel(return_as="generator_unordered")
+        # Our tasks take long enough to travel alone; in batches progress would jump.
+        parallel = Parallel(return_as="generator_unordered", batch_size=1)
     results = parallel(calls)
     try:
         for result in results:  # noqa: UP028 - "yield from" would close it before `finally` does

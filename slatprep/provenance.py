@@ -17,6 +17,7 @@ from contextlib import contextmanager
 from dataclasses import fields, is_dataclass
 from datetime import UTC, datetime
 from enum import Enum
+from functools import lru_cache
 from importlib import metadata, resources
 from pathlib import Path
 from typing import Any, cast
@@ -39,8 +40,10 @@ RECORD_VERSION = 1
 _NOT_CONTENT = ("duration_s", "reason", "traceback")
 
 
+@lru_cache(maxsize=8)
 def library_versions(parameters: AlignParameters) -> dict[str, str]:
     """Return the versions of everything that makes an asset's numbers."""
+    # Cached: asking for them takes longer than reading an asset.
     return {
         "slatprep": __version__,
         "python": platform.python_version(),

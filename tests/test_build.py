@@ -184,6 +184,23 @@ def test_what_is_not_a_store_is_never_replaced(make_dataset: MakeDataset, tmp_pa
     assert build_store(make_dataset("a").parameters(), tmp_path / "empty").complete
 
 
+def test_a_link_stays_a_link(make_dataset: MakeDataset, tmp_path: Path) -> None:
+    parameters, link = make_dataset("a").parameters(), tmp_path / "link.zarr"
+    (tmp_path / "disk").mkdir()
+    link.symlink_to(tmp_path / "disk" / "real.zarr")
+    for _ in range(2):
+        build_store(parameters, link)
+        assert link.is_symlink()
+        assert [path.name for path in (tmp_path / "disk").iterdir()] == ["real.zarr"]
+        assert open_store(link).ids == ["a"]
+
+
+def test_a_place_that_cannot_be_written_is_named(make_dataset: MakeDataset, tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    with pytest.raises(StoreError, match=r"file: cannot write there \("):
+        build_store(make_dataset("a").parameters(), tmp_path / "file" / "s.zarr")
+
+
 def test_ranges_by_name_clip_and_count(make_dataset: MakeDataset, tmp_path: Path) -> None:
     dataset = make_dataset("a")
     summary = build_store(dataset.parameters("pixie"), tmp_path / "s.zarr")

@@ -168,8 +168,8 @@ def row_ranges(total: int, per_shard: int) -> Iterator[tuple[int, int]]:
         yield start, min(start + per_shard, total)
 
 
-def overlaps(offsets: Sequence[int], start: int, stop: int) -> Iterator[tuple[int, slice, slice]]:
-    """Yield which assets own the rows ``start:stop``.
+def overlaps(offsets: Sequence[int], start: int, stop: int) -> Iterator[tuple[int, slice]]:
+    """Yield which assets own the rows ``start:stop``, in order.
 
     Parameters
     ----------
@@ -182,22 +182,19 @@ def overlaps(offsets: Sequence[int], start: int, stop: int) -> Iterator[tuple[in
     ------
     asset : int
         Index of the asset.
-    source : slice
+    rows : slice
         Its rows that fall into the range, counted from its own first row.
-    target : slice
-        The same rows, counted from `start`.
 
     Examples
     --------
     >>> list(overlaps([0, 3, 5], 2, 4))
-    [(0, slice(2, 3, None), slice(0, 1, None)), (1, slice(0, 1, None), slice(1, 2, None))]
+    [(0, slice(2, 3, None)), (1, slice(0, 1, None))]
     """
     asset = max(bisect_right(offsets, start) - 1, 0)
     while asset + 1 < len(offsets) and offsets[asset] < stop:
         first, last = max(offsets[asset], start), min(offsets[asset + 1], stop)
         if first < last:
-            own = slice(first - offsets[asset], last - offsets[asset])
-            yield asset, own, slice(first - start, last - start)
+            yield asset, slice(first - offsets[asset], last - offsets[asset])
         asset += 1
 
 

@@ -74,7 +74,7 @@ def shards(
     for start, stop in row_ranges(len(ids), parameters.grid_assets_per_shard):
         yield Shard("grid", (start, stop), start, ids[start:stop])
     for start, stop in row_ranges(offsets[-1], rows_per_shard(parameters)):
-        owners = [asset for asset, _, _ in overlaps(offsets, start, stop)]
+        owners = [asset for asset, _ in overlaps(offsets, start, stop)]
         first, last = owners[0], owners[-1] + 1
         yield Shard("voxel", (start, stop), first, ids[first:last], offsets[first : last + 1])
 
@@ -118,7 +118,7 @@ def write_shard(
 def _voxel_rows(spool: Spool, shard: Shard, normalization: Normalization) -> Rows:
     parts: dict[str, list[NDArray[Any]]] = {}
     clipped = np.zeros((len(shard.ids), 3), dtype=np.int64)
-    for asset, own, _ in overlaps(shard.offsets, *shard.rows):
+    for asset, own in overlaps(shard.offsets, *shard.rows):
         arrays = {name: array[own] for name, array in spool.voxels(shard.ids[asset]).items()}
         arrays["properties"], clipped[asset] = normalize(arrays["properties"], normalization)
         for name, array in arrays.items():

@@ -24,11 +24,10 @@ def test_shards_take_every_row_of_every_asset_once_and_in_place(
         assert start % per_shard == 0
         assert 0 < stop - start <= per_shard
         end = stop
-        rows = np.full((stop - start, 2), -1)
-        for asset, source, target in overlaps(offsets, start, stop):
-            assert (rows[target] == -1).all()
-            rows[target, 0] = asset
-            rows[target, 1] = np.arange(sizes[asset])[source]
-        assert np.array_equal(rows[:, 0], owner[start:stop])
-        assert np.array_equal(rows[:, 1], within[start:stop])
+        found = [
+            (asset, row)
+            for asset, rows in overlaps(offsets, start, stop)
+            for row in range(sizes[asset])[rows]
+        ]
+        assert found == [*zip(owner[start:stop], within[start:stop], strict=True)]
     assert end == offsets[-1]
