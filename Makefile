@@ -55,8 +55,12 @@ $(DEMO)/.assets-$(ASSETS)-seed-$(SEED): | $(VENV)/.installed
 
 # -- development ------------------------------------------------------------
 
-test: lint
-	$(BIN)/python -m pytest -n $(JOBS)
+# The tests run whatever the linters say, and their closing line comes last.
+test: $(VENV)/.installed-dev
+	@status=0; \
+	$(MAKE) --no-print-directory lint || status=1; \
+	$(BIN)/python -m pytest -n $(JOBS) || status=1; \
+	exit $$status
 
 lint: $(VENV)/.installed-dev
 	$(BIN)/ruff check .
