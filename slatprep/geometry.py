@@ -141,6 +141,47 @@ def boundary(occupancy: NDArray[np.bool_]) -> NDArray[np.bool_]:
     return surface
 
 
+def bounding_box(occupancy: NDArray[np.bool_]) -> tuple[slice, slice, slice]:
+    """Return the slices of the smallest box that holds all occupied voxels.
+
+    Raises
+    ------
+    ValueError
+        If no voxel is occupied.
+    """
+    slices = []
+    for axis in range(3):
+        others = tuple(a for a in range(3) if a != axis)
+        occupied = np.flatnonzero(occupancy.any(axis=others))
+        if len(occupied) == 0:
+            raise ValueError("an empty voxel set has no bounding box")
+        slices.append(slice(int(occupied[0]), int(occupied[-1]) + 1))
+    return slices[0], slices[1], slices[2]
+
+
+def filled(occupancy: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Return a voxel set with its inside filled.
+
+    Parameters
+    ----------
+    occupancy : ndarray of bool, shape (n, n, n)
+        A shell or a solid; at least one voxel.
+
+    Returns
+    -------
+    ndarray of bool, shape (n, n, n)
+        The set and every empty voxel that no path over faces joins with the
+        outside of the grid.
+    """
+    from scipy import ndimage
+
+    box = bounding_box(occupancy)
+    regions, _ = ndimage.label(~np.pad(occupancy[box], 1))
+    solid = np.zeros_like(occupancy)
+    solid[box] = (regions != regions[0, 0, 0])[1:-1, 1:-1, 1:-1]
+    return solid
+
+
 def voxels_of(occupancy: NDArray[np.bool_]) -> NDArray[np.uint8]:
     """Return the indices (N, 3) uint8 of the occupied voxels, in C order."""
     return np.argwhere(occupancy).astype(np.uint8)

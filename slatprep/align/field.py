@@ -19,7 +19,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from slatprep.align.quality import measure_quality
+from slatprep.align.quality import compare
 from slatprep.align.starts import distinct_starts, euler_starts, so3_starts
 from slatprep.align.surface import Surface, surface_of
 from slatprep.geometry import VOXEL_SIZE, make_transform, occupancy_of
@@ -117,7 +117,7 @@ def align(
         engine="field",
         model=model,
         search=search,
-        quality=measure_quality(field, latents, transform, parameters.radius),
+        quality=compare(pair.pixie.boundary, pair.slat.boundary, transform, parameters.radius),
         candidates=tuple(candidates),
         margin=best.score - others[0].score if others else 1.0,
         placements=tuple(
@@ -216,7 +216,8 @@ class _Pair:
         linear, shift = inverse[:-1] - inverse[-1], shift[:-1] - shift[-1]
         spread = np.einsum("nij,jk,nik->n", linear, self._covariance, linear)
         square = spread + ((linear @ self._mean + shift) ** 2).sum(axis=1)
-        return np.asarray(np.sqrt(np.maximum(square, 0.0)), dtype=np.float64)
+        distance: NDArray[np.float64] = np.sqrt(np.maximum(square, 0.0))
+        return distance
 
     def distinct(self, poses: Sequence[Pose]) -> list[Pose]:
         """Return the poses best first, without those that repeat a better one."""

@@ -2,30 +2,54 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from slatprep.geometry import (
     apply_transform,
     boundary,
+    filled,
     invert_transform,
+    occupancy_of,
     split_transform,
     voxel_centres,
     voxels_of,
 )
-from slatprep.records import (
-    Ambiguity,
-    MaterialField,
-    Quality,
-    StructuredLatents,
-    Verdict,
-)
+from slatprep.records import Ambiguity, MaterialField, Quality, StructuredLatents, Verdict
+
+
+@dataclass(frozen=True)
+class Thresholds:
+    """Where the verdicts part; docs/quality.md says how the numbers were chosen.
+
+    Attributes
+    ----------
+    good_fitness, failed_fitness : float
+        The lower one of the two fitnesses: at least the first is good, below
+        the second is failed.
+    good_valid_share : float
+        Share of SLAT voxels with an annotation; below it the asset is doubtful.
+    good_ambiguity : float
+        Share of SLAT voxels whose class depends on the choice among placements
+        that fit equally well; above it the asset is doubtful.
+    """
+
+    good_fitness: float = 0.8
+    failed_fitness: float = 0.65
+    good_valid_share: float = 0.9
+    good_ambiguity: float = 0.05
+
+
+THRESHOLDS = Thresholds()
+"""The thresholds of `judge`."""
 
 
 def measure_quality(
     field: MaterialField, latents: StructuredLatents, transform: ArrayLike, radius: float
 ) -> Quality:
-    """Measure how well two voxel surfaces lie on each other.
+    """Measure how well the outer surfaces of the two sides lie on each other.
 
     Parameters
     ----------
@@ -34,40 +58,61 @@ def measure_quality(
     transform : array_like, shape (4, 4)
         PixieVerse frame to SLAT frame.
     radius : float
-        Voxels; partners farther apart do not count as inliers.
+        Voxels of the SLAT frame; partners farther apart are no inliers.
 
     Returns
     -------
     Quality
-        Fitness and inlier rmse both ways, and the overlap of the two surfaces:
-        intersection over union of the SLAT voxels and the voxels that the
-        carried boundary falls into, one voxel of slack on either side.
+        See `compare`.
+    """
+    return compare(
+        voxels_of(boundary(filled(field.occupancy))),
+        voxels_of(boundary(filled(occupancy_of(latents.coords)))),
+        transform,
+        radius,
+    )
+
+
+def compare(
+    pixieverse: NDArray[np.uint8], slat: NDArray[np.uint8], transform: ArrayLike, radius: float
+) -> Quality:
+    """Compare two boundaries under a transform.
+
+    Both are boundaries of filled sets: a SLAT has voxels inside the object
+    wherever its parts meet, which a solid's boundary cannot have.
+
+    Parameters
+    ----------
+    pixieverse, slat : ndarray of uint8, shapes (K, 3) and (N, 3)
+        Boundary voxels, each in its own frame.
+    transform : array_like, shape (4, 4)
+        PixieVerse frame to SLAT frame.
+    radius : float
+        Voxels of the SLAT frame; partners farther apart are no inliers.
+
+    Returns
+    -------
+    Quality
+        Fitness and inlier rmse both ways; overlap is the share of both
+        boundaries' voxels together that have a partner.
     """
     from slatprep.lattice import nearest_voxel
 
     # Both ways the points are carried to the other side's lattice, where the
-    # nearest voxel is found without a tree; a scale turns the way back's
-    # distances into voxels of the SLAT frame.
+    # nearest voxel is found without a tree; the scale turns distances in the
+    # PixieVerse frame into voxels of the SLAT frame.
     _, _, scale = split_transform(transform)
-    surface = voxels_of(boundary(field.occupancy))
-    forward, _ = nearest_voxel(
-        apply_transform(transform, voxel_centres(surface)), latents.coords, limit=radius
-    )
-    backward, _ = nearest_voxel(
-        apply_transform(invert_transform(transform), voxel_centres(latents.coords)),
-        surface,
-        limit=radius / scale,
-    )
-    backward = backward * scale
-    fitness, rmse = _inliers(forward, radius)
-    fitness_backward, rmse_backward = _inliers(backward, radius)
-    matched = (forward <= radius).sum() + (backward <= radius).sum()
+    carried = apply_transform(transform, voxel_centres(pixieverse))
+    forward, _ = nearest_voxel(carried, slat, limit=radius)
+    carried = apply_transform(invert_transform(transform), voxel_centres(slat))
+    backward, _ = nearest_voxel(carried, pixieverse, limit=radius / scale)
+    near, near_back = np.isfinite(forward), np.isfinite(backward)
     return Quality(
-        fitness=fitness,
-        inlier_rmse=rmse,
-        fitness_backward=fitness_backward,
-        inlier_rmse_backward=rmse_backward,
-        overlap=float(matched / (len(forward) + len(backward))),
+        fitness=float(near.mean()),
+        inlier_rmse=_rms(forward[near]),
+        fitness_backward=float(near_back.mean()),
+        inlier_rmse_backward=_rms(backward[near_back] * scale),
+        overlap=float((near.sum() + near_back.sum()) / (len(near) + len(near_back))),
         radius=radius,
     )
 
@@ -75,16 +120,53 @@ def measure_quality(
 def judge(
     quality: Quality, valid_share: float, ambiguity: Ambiguity | None
 ) -> tuple[Verdict, tuple[str, ...]]:
-    """Return the verdict on an alignment and the reasons for it."""
+    """Say what an alignment is worth, and why.
+
+    Parameters
+    ----------
+    quality : Quality
+        How well the two surfaces lie on each other.
+    valid_share : float
+        Share of SLAT voxels that got an annotation, 0..1.
+    ambiguity : Ambiguity or None
+        What tied placements would change; None where it was not measured.
+
+    Returns
+    -------
+    verdict : Verdict
+        ``good``, ``doubtful`` or ``failed``.
+    reasons : tuple of str
+        What kept it from being good; empty where it is.
+    """
+    limits = THRESHOLDS
     reasons = []
-    if quality.fitness_backward < 0.5:
-        reasons.append(f"only {quality.fitness_backward:.0%} of the SLAT voxels have a partner")
+    failed = False
+    sides = (
+        ("PixieVerse boundary", quality.fitness),
+        ("SLAT boundary", quality.fitness_backward),
+    )
+    for name, fitness in sides:
+        if fitness < limits.good_fitness:
+            reasons.append(
+                f"only {fitness:.1%} of the {name} lies within {quality.radius:g} voxel of the "
+                f"other side (good: {limits.good_fitness:.0%})"
+            )
+            failed = failed or fitness < limits.failed_fitness
+    if valid_share < limits.good_valid_share:
+        reasons.append(
+            f"only {valid_share:.1%} of the SLAT voxels found an annotation "
+            f"(good: {limits.good_valid_share:.0%})"
+        )
+    if ambiguity is not None and ambiguity.material_share > limits.good_ambiguity:
+        reasons.append(
+            f"{len(ambiguity.placements)} other placements fit about as well and would change the "
+            f"class of {ambiguity.material_share:.1%} of the voxels "
+            f"(good: {limits.good_ambiguity:.0%})"
+        )
+    if failed:
         return Verdict.FAILED, tuple(reasons)
-    return Verdict.GOOD, ()
+    return (Verdict.DOUBTFUL if reasons else Verdict.GOOD), tuple(reasons)
 
 
-def _inliers(distance: NDArray[np.float64], radius: float) -> tuple[float, float]:
-    near = distance[distance <= radius]
-    if len(near) == 0:
-        return 0.0, 0.0
-    return float(len(near) / len(distance)), float(np.sqrt(np.mean(near**2)))
+def _rms(distance: NDArray[np.float64]) -> float:
+    return float(np.sqrt(np.mean(distance**2))) if len(distance) else 0.0

@@ -8,11 +8,12 @@ thickness pulls the alignment to one side.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
+from slatprep.geometry import boundary, bounding_box, filled, voxels_of
 from slatprep.records import RESOLUTION
 
 CENTRE = (RESOLUTION - 1) / 2
@@ -47,12 +48,15 @@ class Surface:
         Lattice points near the surface, in voxels from the cube's centre.
     values : ndarray of float64, shape (M,)
         The signed distance at `points`.
+    boundary : ndarray of uint8, shape (B, 3)
+        The boundary voxels of the filled set.
     """
 
     distance: NDArray[np.float32]
     origin: NDArray[np.float64]
     points: NDArray[np.float64]
     values: NDArray[np.float64]
+    boundary: NDArray[np.uint8]
 
     @property
     def centroid(self) -> NDArray[np.float64]:
@@ -73,7 +77,7 @@ class Surface:
         # regular steps that would beat with the lattice.
         fraction = (np.arange(count) * 0.618033988749895) % 1.0
         chosen = np.unique((fraction * len(self.points)).astype(np.intp))
-        return Surface(self.distance, self.origin, self.points[chosen], self.values[chosen])
+        return replace(self, points=self.points[chosen], values=self.values[chosen])
 
 
 def surface_of(occupancy: NDArray[np.bool_]) -> Surface:
@@ -97,31 +101,21 @@ def surface_of(occupancy: NDArray[np.bool_]) -> Surface:
     the other kind, less half a voxel to the face between the two.
     """
     import edt
-    from scipy import ndimage
 
-    low, high = _bounding_box(occupancy)
-    box = np.pad(occupancy[tuple(slice(a, b) for a, b in zip(low, high, strict=True))], _MARGIN)
-    regions, _ = ndimage.label(~box)
-    solid = regions != regions[0, 0, 0]
+    full = filled(occupancy)
+    box = bounding_box(full)
+    solid = np.pad(full[box], _MARGIN)
     # With two labels one transform measures the inside and the outside at once.
     distance: NDArray[np.float32] = edt.edt(solid + np.uint8(1), parallel=1)
     distance -= np.float32(0.5)
     near = np.argwhere(distance <= BAND)
     np.negative(distance, out=distance, where=solid)
     distance += np.float32(DILATION)
-    origin = (low - _MARGIN).astype(np.float64) - CENTRE
+    origin = np.array([side.start for side in box], dtype=np.float64) - _MARGIN - CENTRE
     return Surface(
         distance=distance,
         origin=origin,
         points=near + origin,
         values=distance[tuple(near.T)].astype(np.float64),
+        boundary=voxels_of(boundary(full)),
     )
-
-
-def _bounding_box(occupancy: NDArray[np.bool_]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    low, high = np.empty(3, dtype=np.intp), np.empty(3, dtype=np.intp)
-    for axis in range(3):
-        others = tuple(a for a in range(3) if a != axis)
-        filled = np.flatnonzero(occupancy.any(axis=others))
-        low[axis], high[axis] = filled[0], filled[-1] + 1
-    return low, high
