@@ -13,7 +13,6 @@ fail() {
     exit 1
 }
 
-# BSD and old shells lack `command -v` options, not `command -v` itself.
 command -v "$python" >/dev/null 2>&1 ||
     fail "there is no '$python'; install Python 3.11 or newer, or name one: make PYTHON=/path/to/python3"
 
