@@ -20,13 +20,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slatprep.align.quality import compare
-from slatprep.align.starts import distinct_starts, euler_starts, so3_starts
+from slatprep.align.starts import candidates_of, distinct_starts, so3_starts
 from slatprep.align.surface import Surface, surface_of
 from slatprep.geometry import VOXEL_SIZE, make_transform, occupancy_of
 from slatprep.parameters import AlignParameters
 from slatprep.records import (
     Alignment,
-    Candidate,
     MaterialField,
     Placement,
     StructuredLatents,
@@ -104,13 +103,7 @@ def align(
     best, model = pair.simplest(tied[0])
     others = pair.distinct([best, *tied[1:], *poses])[1:]
 
-    by_start = {start.index: fit for start, fit in zip(starts, fits, strict=True)}
-    candidates = []
-    for start in euler_starts():
-        fit = by_start[start.index if start.same_as is None else start.same_as]
-        candidates.append(
-            Candidate(start.index, start.euler_degrees, fit.fitness, fit.rmse, start.same_as)
-        )
+    fitted = {s.index: (fit.fitness, fit.rmse) for s, fit in zip(starts, fits, strict=True)}
     transform = best.transform
     return Alignment(
         transform=transform,
@@ -118,7 +111,7 @@ def align(
         model=model,
         search=search,
         quality=compare(pair.pixie.boundary, pair.slat.boundary, transform, parameters.radius),
-        candidates=tuple(candidates),
+        candidates=candidates_of(fitted),
         margin=best.score - others[0].score if others else 1.0,
         placements=tuple(
             Placement(pose.transform, pose.score, float(pair.apart([pose], best)[0]))
@@ -137,7 +130,7 @@ class _Pair:
         self._cache: dict[int, tuple[Surface, Surface]] = {}
         self.free_scale = parameters.model != "rigid"
         points = slat.points
-        self._mean = points.mean(axis=0)
+        self._mean: NDArray[np.float64] = points.mean(axis=0)
         self._covariance = np.cov(points.T, bias=True) if len(points) > 1 else np.zeros((3, 3))
 
     def poses(self, rotations: Iterable[NDArray[np.float64]]) -> list[Pose]:

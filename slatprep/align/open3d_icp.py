@@ -16,10 +16,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slatprep.align.quality import measure_quality
-from slatprep.align.starts import distinct_starts, euler_starts
+from slatprep.align.starts import candidates_of, distinct_starts
 from slatprep.geometry import VOXEL_SIZE, boundary, make_transform, voxel_centres, voxels_of
 from slatprep.parameters import AlignParameters
-from slatprep.records import Alignment, Candidate, MaterialField, StructuredLatents
+from slatprep.records import Alignment, MaterialField, StructuredLatents
 
 
 def align(
@@ -47,17 +47,13 @@ def align(
     best = max(fits, key=lambda index: (fits[index][0], -fits[index][1], -index))
     transform = icp(wide, fits[best][2])
 
-    candidates = []
-    for start in euler_starts():
-        fitness, rmse, _ = fits[start.index if start.same_as is None else start.same_as]
-        candidates.append(Candidate(start.index, start.euler_degrees, fitness, rmse, start.same_as))
     return Alignment(
         transform=transform,
         engine="open3d",
         model="rigid",
         search="euler64",
         quality=measure_quality(field, latents, transform, parameters.radius),
-        candidates=tuple(candidates),
+        candidates=candidates_of({index: fit[:2] for index, fit in fits.items()}),
     )
 
 

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import lru_cache
 from itertools import product
 
 import numpy as np
 from numpy.typing import NDArray
+
+from slatprep.records import Candidate
 
 
 @dataclass(frozen=True)
@@ -54,6 +57,25 @@ def euler_starts() -> tuple[Start, ...]:
 def distinct_starts() -> tuple[Start, ...]:
     """Return the 24 starts that are different rotations."""
     return tuple(start for start in euler_starts() if start.same_as is None)
+
+
+def candidates_of(fits: Mapping[int, tuple[float, float]]) -> tuple[Candidate, ...]:
+    """Return all 64 candidates from the fits of the distinct ones.
+
+    Parameters
+    ----------
+    fits : mapping of int to (float, float)
+        Fitness and inlier rmse (voxels) by the index of a distinct start.
+    """
+    return tuple(
+        Candidate(
+            start.index,
+            start.euler_degrees,
+            *fits[start.index if start.same_as is None else start.same_as],
+            same_as=start.same_as,
+        )
+        for start in euler_starts()
+    )
 
 
 @lru_cache(maxsize=4)
