@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import click
 
 from slatprep.cli.options import chosen_store, store_option
-from slatprep.cli.output import EXIT_INCOMPLETE, Output, output_options
+from slatprep.cli.output import EXIT_INCOMPLETE, Cell, Output, output_options
 from slatprep.errors import ConfigError, StoreError
 
 if TYPE_CHECKING:
@@ -53,25 +53,47 @@ def check_alignment(output: Output, asset_ids: tuple[str, ...], store: Path | No
         # A name that is not there is a wrong call, not a failed check.
         raise ConfigError(str(error)) from None
     checks = [check.check_alignment(opened, asset_id) for asset_id in asset_ids]
+    ambiguity = opened.column("ambiguity")
+    ambiguities = [float(ambiguity[opened.find(asset_id)]) for asset_id in asset_ids]
 
     def show() -> None:
-        for one in checks:
-            _show(output, one)
+        for one, ambiguous in zip(checks, ambiguities, strict=True):
+            _show(output, one, ambiguous)
         output.note(f"store: {path}")
 
-    output.result([_document(one) for one in checks], show)
+    documents = [
+        {**_document(one), "ambiguity": ambiguous}
+        for one, ambiguous in zip(checks, ambiguities, strict=True)
+    ]
+    output.result(documents, show)
     if not all(one.ok for one in checks):
         click.get_current_context().exit(EXIT_INCOMPLETE)
 
 
-def _show(output: Output, check: AlignmentCheck) -> None:
+def _show(output: Output, check: AlignmentCheck, ambiguity: float) -> None:
+    from slatprep.align.quality import THRESHOLDS
+
+    good = {
+        "fitness": f">= {THRESHOLDS.good_fitness:g}",
+        "fitness_backward": f">= {THRESHOLDS.good_fitness:g}",
+        "valid_share": f">= {THRESHOLDS.good_valid_share:g}",
+    }
+    rows: list[tuple[Cell, ...]] = [
+        (
+            figure.name,
+            float(figure.value),
+            good.get(figure.name, ""),
+            float(figure.stored),
+            f"{figure.limit:g}",
+            figure.ok,
+        )
+        for figure in check.figures
+    ]
+    rows.append(("ambiguity", None, f"<= {THRESHOLDS.good_ambiguity:g}", ambiguity, "", None))
     output.table(
         f"{check.asset_id}: alignment {check.verdict}",
-        ("figure", "computed", "stored", "may differ by", "agrees"),
-        [
-            (figure.name, float(figure.value), float(figure.stored), f"{figure.limit:g}", figure.ok)
-            for figure in check.figures
-        ],
+        ("figure", "computed", "good", "stored", "may differ by", "agrees"),
+        rows,
     )
     for reason in check.reasons:
         click.echo(f"  {reason}")
