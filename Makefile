@@ -55,17 +55,17 @@ $(DEMO)/.assets-$(ASSETS)-seed-$(SEED): | $(VENV)/.installed
 
 # -- development ------------------------------------------------------------
 
+LINT = $(BIN)/ruff check . && $(BIN)/ruff format --check . && $(BIN)/mypy
+
 # The tests run whatever the linters say, and their closing line comes last.
 test: $(VENV)/.installed-dev
 	@status=0; \
-	$(MAKE) --no-print-directory lint || status=1; \
+	$(LINT) || status=1; \
 	$(BIN)/python -m pytest -n $(JOBS) || status=1; \
 	exit $$status
 
 lint: $(VENV)/.installed-dev
-	$(BIN)/ruff check .
-	$(BIN)/ruff format --check .
-	$(BIN)/mypy
+	$(LINT)
 
 clean:
 	rm -rf $(VENV) $(DEMO) data/demo.zarr build slatprep.egg-info
