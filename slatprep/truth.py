@@ -36,6 +36,18 @@ _TRUTH_KEYS = ("transform", "material", "name", "level", "symmetric")
 
 
 @dataclass(frozen=True)
+class Truth:
+    """What is known of one asset: transform (4, 4), class of each SLAT voxel (N,), and names."""
+
+    path: Path
+    transform: NDArray[np.float64]
+    material: NDArray[np.uint8]
+    name: str
+    level: int
+    symmetric: bool
+
+
+@dataclass(frozen=True)
 class TruthScore:
     """How one asset of a store compares with its truth.
 
@@ -146,31 +158,74 @@ def _summarise_level(level: int, scores: Sequence[TruthScore]) -> LevelScore:
 
 
 def _score_asset(asset: StoredAsset, path: Path) -> TruthScore:
+    annotated = np.argwhere(asset.grid_material < BACKGROUND)
+    return compare_with_truth(
+        asset.asset_id,
+        read_truth(path),
+        coords=asset.coords,
+        transform=asset.transform,
+        material=asset.material,
+        valid=asset.valid,
+        annotated=annotated,
+        annotated_material=asset.grid_material[tuple(annotated.T)],
+    )
+
+
+def compare_with_truth(
+    asset_id: str,
+    truth: Truth,
+    *,
+    coords: NDArray[np.uint8],
+    transform: NDArray[np.float64],
+    material: NDArray[np.uint8],
+    valid: NDArray[np.bool_],
+    annotated: NDArray[np.integer[Any]],
+    annotated_material: NDArray[np.uint8],
+) -> TruthScore:
+    """Compare one asset's transform and labels with its truth.
+
+    Parameters
+    ----------
+    asset_id : str
+        For the score's name.
+    truth : Truth
+        What `read_truth` gave.
+    coords, transform, material, valid : ndarray
+        SLAT voxels (N, 3), the estimated transform (4, 4), and what was looked
+        up at the voxels (N,).
+    annotated, annotated_material : ndarray
+        Annotated voxels (K, 3) of the PixieVerse frame and their classes (K,).
+
+    Returns
+    -------
+    TruthScore
+
+    Raises
+    ------
+    InputError
+        If the truth does not have one class for each SLAT voxel.
+    """
     from scipy.spatial import cKDTree
 
-    truth = _read_truth(path)
-    true_material = truth["material"]
-    if true_material.shape != asset.material.shape:
+    if truth.material.shape != material.shape:
         raise InputError(
-            path,
-            f"material has shape {true_material.shape}",
-            f"{asset.material.shape}, one class for each SLAT voxel of the store",
+            truth.path,
+            f"material has shape {truth.material.shape}",
+            f"{material.shape}, one class for each SLAT voxel of the asset",
         )
-    true_transform = truth["transform"].astype(np.float64)
-    looked_up = apply_transform(invert_transform(true_transform), voxel_centres(asset.coords))
-    annotated = np.argwhere(asset.grid_material < BACKGROUND)
+    looked_up = apply_transform(invert_transform(truth.transform), voxel_centres(coords))
     distance, nearest = cKDTree(voxel_centres(annotated)).query(looked_up)
     answerable = distance / VOXEL_SIZE <= ANSWERABLE_DISTANCE
-    own_material = asset.grid_material[tuple(annotated[nearest].T)]
+    own_material = annotated_material[nearest]
     return TruthScore(
-        asset_id=asset.asset_id,
-        name=str(truth["name"]),
-        level=int(truth["level"]),
-        symmetric=bool(truth["symmetric"]),
-        displacement=displacement(asset.transform, true_transform, asset.coords),
-        label_accuracy=_share(((asset.material == true_material) & asset.valid)[answerable]),
-        truth_own=_share((own_material == true_material)[answerable]),
-        valid_share=_share(asset.valid),
+        asset_id=asset_id,
+        name=truth.name,
+        level=truth.level,
+        symmetric=truth.symmetric,
+        displacement=displacement(transform, truth.transform, coords),
+        label_accuracy=_share(((material == truth.material) & valid)[answerable]),
+        truth_own=_share((own_material == truth.material)[answerable]),
+        valid_share=_share(valid),
     )
 
 
@@ -178,11 +233,25 @@ def _share(flags: NDArray[np.bool_]) -> float:
     return float(flags.mean()) if flags.size else float("nan")
 
 
-def _read_truth(path: Path) -> dict[str, NDArray[Any]]:
+def read_truth(path: Path) -> Truth:
+    """Read one asset's truth.
+
+    Raises
+    ------
+    InputError
+        If the file cannot be read or lacks something.
+    """
     expected = f"an npz with {', '.join(_TRUTH_KEYS)}"
     try:
         with np.load(path, allow_pickle=False) as file:
-            return {key: file[key] for key in _TRUTH_KEYS}
+            return Truth(
+                path=path,
+                transform=file["transform"].astype(np.float64),
+                material=file["material"],
+                name=str(file["name"]),
+                level=int(file["level"]),
+                symmetric=bool(file["symmetric"]),
+            )
     except KeyError as error:
         raise InputError(path, str(error.args[0]), expected) from error
     except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:

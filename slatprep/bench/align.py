@@ -1,0 +1,280 @@
+"""Alignment engines side by side: right or wrong, how exact, how fast.
+
+Every engine aligns every asset in turn, so that a machine that slows down
+slows all of them; times are processor seconds of one thread.
+"""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from slatprep.align import align
+from slatprep.align.starts import euler_starts
+from slatprep.align.surface import surface_of
+from slatprep.errors import ConfigError
+from slatprep.geometry import occupancy_of
+from slatprep.parallel import single_threaded
+from slatprep.parameters import (
+    PRESETS,
+    AlignParameters,
+    BuildParameters,
+    PixieverseSource,
+    SampleParameters,
+    SlatSource,
+)
+from slatprep.readers import discover, read_field, read_latents
+from slatprep.records import Alignment, AssetPair, MaterialField, StructuredLatents
+from slatprep.sample import sample
+from slatprep.truth import LevelScore, TruthScore, compare_with_truth, read_truth, summarise
+
+ENGINES = ("field", "small_gicp", "open3d", "open3d-64")
+"""The default engine, GICP from the same 24 rotations, the paper's protocol
+without repeated rotations (``--preset paper``), and as published."""
+
+REFERENCE = "field"
+
+Progress = Callable[[int, int], None]
+
+
+@dataclass(frozen=True)
+class EngineResult:
+    """What one engine did with all assets.
+
+    Attributes
+    ----------
+    engine : str
+        One of `ENGINES`.
+    seconds : float
+        Median processor seconds an asset, over assets and repeats.
+    seconds_low, seconds_high : float
+        5th and 95th percentile of the same.
+    ratio, ratio_low, ratio_high : float
+        Median, 5th and 95th percentile of the engine's time over the default
+        engine's, pair by pair on the same asset in the same repeat.
+    start_up, compiling : float
+        Wall seconds of import and first alignment in a new process, with
+        compiled code at hand, and what compiling it the first time adds.
+    levels : tuple of LevelScore
+        Accuracy over the assets that have one right placement only.
+    """
+
+    engine: str
+    seconds: float
+    seconds_low: float
+    seconds_high: float
+    ratio: float
+    ratio_low: float
+    ratio_high: float
+    start_up: float
+    compiling: float
+    levels: tuple[LevelScore, ...]
+
+
+@dataclass(frozen=True)
+class AlignBench:
+    """Result of `bench_align`; `reading` and `fields` are the floor of any method.
+
+    Median processor seconds an asset: to read and check both files, and to
+    fill both voxel sets and measure their distance fields.
+    """
+
+    assets: int
+    repeats: int
+    reading: float
+    fields: float
+    engines: tuple[EngineResult, ...]
+
+
+def bench_align(
+    folder: Path,
+    *,
+    engines: Sequence[str] = ENGINES,
+    repeats: int = 3,
+    limit: int | None = None,
+    progress: Progress | None = None,
+) -> AlignBench:
+    """Align all assets of a dataset with truth by each engine.
+
+    Parameters
+    ----------
+    folder : Path
+        Holds ``pixieverse/``, ``slat/`` and ``truth/``, as `make_demo` writes
+        them, or several such folders.
+    engines : sequence of str
+        Some of `ENGINES`; the first one of them that is timed is the default
+        engine, whatever the order given.
+    repeats : int
+        How often each asset is aligned by each engine.
+    limit : int, optional
+        At most so many assets of each folder.
+    progress : callable, optional
+        Called with alignments done and in all.
+
+    Raises
+    ------
+    ConfigError
+        If there is no asset with truth, or an engine is unknown.
+    """
+    unknown = set(engines) - set(ENGINES)
+    if unknown:
+        raise ConfigError(f"no engine {sorted(unknown)}; expected some of {', '.join(ENGINES)}")
+    chosen = [REFERENCE, *(e for e in ENGINES if e in engines and e != REFERENCE)]
+    pairs = [(pair, truth) for pair, truth in _pairs(folder, limit)]
+    if not pairs:
+        raise ConfigError(
+            f"{folder}: no asset with truth; expected pixieverse/, slat/ and truth/ in it, "
+            "or folders that have them"
+        )
+    start_up = {engine: _start_up(engine) for engine in chosen}
+    seconds: dict[str, list[float]] = {engine: [] for engine in chosen}
+    scores: dict[str, list[TruthScore]] = {engine: [] for engine in chosen}
+    reading: list[float] = []
+    fields: list[float] = []
+    with single_threaded():
+        _warm_up(chosen)
+        for number, (pair, truth_path) in enumerate(pairs):
+            truth = read_truth(truth_path)
+            for repeat in range(repeats):
+                begin = time.process_time()
+                field, latents = read_field(pair), read_latents(pair)
+                reading.append(time.process_time() - begin)
+                begin = time.process_time()
+                surface_of(field.occupancy)
+                surface_of(occupancy_of(latents.coords))
+                fields.append(time.process_time() - begin)
+                for position, engine in enumerate(chosen):
+                    begin = time.process_time()
+                    alignment = _align(engine, field, latents)
+                    seconds[engine].append(time.process_time() - begin)
+                    if repeat == 0:
+                        annotation = sample(
+                            field, latents.coords, alignment.transform, SampleParameters()
+                        )
+                        scores[engine].append(
+                            compare_with_truth(
+                                pair.asset_id,
+                                truth,
+                                coords=latents.coords,
+                                transform=alignment.transform,
+                                material=annotation.material,
+                                valid=annotation.valid,
+                                annotated=field.voxels,
+                                annotated_material=field.material,
+                            )
+                        )
+                    if progress:
+                        done = (number * repeats + repeat) * len(chosen) + position + 1
+                        progress(done, len(pairs) * repeats * len(chosen))
+    return AlignBench(
+        assets=len(pairs),
+        repeats=repeats,
+        reading=float(np.median(reading)),
+        fields=float(np.median(fields)),
+        engines=tuple(
+            _result(e, seconds[e], seconds[REFERENCE], scores[e], start_up[e]) for e in chosen
+        ),
+    )
+
+
+def _pairs(folder: Path, limit: int | None) -> Iterator[tuple[AssetPair, Path]]:
+    folders = [folder, *sorted(path for path in folder.iterdir() if path.is_dir())]
+    for root in folders:
+        if not (root / "truth").is_dir():
+            continue
+        parameters = BuildParameters(
+            pixieverse=PixieverseSource(root=root / "pixieverse"),
+            slat=SlatSource(root=root / "slat"),
+        )
+        count = 0
+        for pair in discover(parameters):
+            truth = root / "truth" / f"{pair.asset_id}.npz"
+            if truth.exists() and not pair.problem and count != limit:
+                count += 1
+                yield pair, truth
+
+
+def _align(engine: str, field: MaterialField, latents: StructuredLatents) -> Alignment:
+    if engine == "open3d-64":
+        from slatprep.align import open3d_icp
+
+        return open3d_icp.align(field, latents, PRESETS["paper"], starts=euler_starts())
+    if engine == "open3d":
+        return align(field, latents, PRESETS["paper"])
+    if engine == "small_gicp":
+        return align(field, latents, AlignParameters(engine="small_gicp", model="rigid"))
+    return align(field, latents, PRESETS["default"])
+
+
+def _small_asset() -> tuple[MaterialField, StructuredLatents]:
+    occupancy = np.zeros((64, 64, 64), dtype=bool)
+    occupancy[20:40, 24:36, 28:40] = True
+    voxels = np.argwhere(occupancy).astype(np.uint8)
+    field = MaterialField(
+        occupancy,
+        voxels,
+        np.zeros(len(voxels), dtype=np.uint8),
+        np.ones((len(voxels), 3), dtype=np.float32),
+    )
+    return field, StructuredLatents(voxels, np.zeros((len(voxels), 8), dtype=np.float32))
+
+
+def _warm_up(engines: Sequence[str]) -> None:
+    field, latents = _small_asset()
+    for engine in engines:
+        _align(engine, field, latents)
+
+
+def _start_up(engine: str) -> tuple[float, float]:
+    """Wall seconds of import and first alignment in a new process, and of compiling besides."""
+    code = (
+        "import time; begin = time.perf_counter()\n"
+        "from slatprep.bench import align as bench\n"
+        f"bench._align({engine!r}, *bench._small_asset())\n"
+        "print(time.perf_counter() - begin)"
+    )
+    times = []
+    with tempfile.TemporaryDirectory() as cache:
+        for _ in range(2):
+            done = subprocess.run(
+                [sys.executable, "-c", code],
+                env={**os.environ, "NUMBA_CACHE_DIR": cache, "OMP_NUM_THREADS": "1"},
+                check=True,
+                capture_output=True,
+                text=True,
+            )
+            times.append(float(done.stdout.splitlines()[-1]))
+    cold, warm = times
+    return warm, max(cold - warm, 0.0)
+
+
+def _result(
+    engine: str,
+    seconds: list[float],
+    reference: list[float],
+    scores: list[TruthScore],
+    start_up: tuple[float, float],
+) -> EngineResult:
+    low, middle, high = np.percentile(seconds, [5, 50, 95])
+    ratios = np.array(seconds) / np.array(reference)
+    ratio_low, ratio, ratio_high = np.percentile(ratios, [5, 50, 95])
+    return EngineResult(
+        engine=engine,
+        seconds=float(middle),
+        seconds_low=float(low),
+        seconds_high=float(high),
+        ratio=float(ratio),
+        ratio_low=float(ratio_low),
+        ratio_high=float(ratio_high),
+        start_up=start_up[0],
+        compiling=start_up[1],
+        levels=summarise(scores),
+    )
