@@ -158,8 +158,10 @@ def judge(
             f"(good: {limits.good_valid_share:.0%})"
         )
     if ambiguity is not None and ambiguity.material_share > limits.good_ambiguity:
+        # A store holds the ambiguity without the placements it comes from.
+        count = f"{len(ambiguity.placements)} other" if ambiguity.placements else "other"
         reasons.append(
-            f"{len(ambiguity.placements)} other placements fit about as well and would change the "
+            f"{count} placements fit about as well and would change the "
             f"class of {ambiguity.material_share:.1%} of the voxels "
             f"(good: {limits.good_ambiguity:.0%})"
         )
