@@ -9,9 +9,7 @@ from __future__ import annotations
 import hashlib
 import json
 import math
-import os
 import platform
-import tempfile
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import fields, is_dataclass
@@ -29,6 +27,7 @@ from slatprep.align import engine_versions
 from slatprep.geometry import boundary
 from slatprep.parameters import AlignParameters, BuildParameters
 from slatprep.records import PROPERTY_COLUMNS, AssetResult, Normalization
+from slatprep.store.replace import flush
 from slatprep.summary import BuildSummary
 
 ASSET_RECORD = "slatprep-asset-record"
@@ -40,13 +39,20 @@ RECORD_VERSION = 1
 _NOT_CONTENT = ("duration_s", "reason", "traceback")
 
 
-@lru_cache(maxsize=8)
 def library_versions(parameters: AlignParameters) -> dict[str, str]:
     """Return the versions of everything that makes an asset's numbers."""
-    # Cached: asking for them takes longer than reading an asset.
     return {
         "slatprep": __version__,
         "python": platform.python_version(),
+        **numeric_versions(parameters),
+    }
+
+
+@lru_cache(maxsize=8)
+def numeric_versions(parameters: AlignParameters) -> dict[str, str]:
+    """Return the versions of the libraries that make an asset's numbers."""
+    # Cached: asking for them takes longer than reading an asset.
+    return {
         "numpy": metadata.version("numpy"),
         "scipy": metadata.version("scipy"),
         **engine_versions(parameters),
@@ -59,7 +65,14 @@ def content_parameters(parameters: BuildParameters) -> dict[str, Any]:
 
 
 def asset_record(
-    result: AssetResult, parameters: BuildParameters, duration: float, traceback: str = ""
+    result: AssetResult,
+    parameters: BuildParameters,
+    duration: float,
+    *,
+    traceback: str = "",
+    code: str = "",
+    key: str = "",
+    alignment: Mapping[str, Any] | None = None,
 ) -> dict[str, Any]:
     """Return the record of one asset.
 
@@ -73,6 +86,13 @@ def asset_record(
         Seconds spent on it.
     traceback : str
         Where an error of slatprep's own arose; empty otherwise.
+    code : str
+        Fingerprint of the code that made the numbers.
+    key : str
+        What the asset was made from and how, see `slatprep.reuse`; empty
+        where there is no result.
+    alignment : mapping, optional
+        What an older record of the same key says of the alignment.
 
     Returns
     -------
@@ -97,7 +117,9 @@ def asset_record(
         "bounds": jsonable(field.bounds) if field else None,
         "parameters": content_parameters(parameters),
         "versions": library_versions(parameters.align),
-        "alignment": _alignment(result),
+        "code": code,
+        "key": key,
+        "alignment": _alignment(result) if alignment is None else dict(alignment),
         "normalization": None,
         "counts": _counts(result),
         "warnings": list(warnings),
@@ -195,17 +217,18 @@ def write_records(path: Path, records: Iterable[Mapping[str, Any]]) -> str:
 
 @contextmanager
 def staged(path: Path) -> Iterator[Path]:
-    """Yield a file beside `path` that takes its place, whole and on disk, when all went well."""
+    """Yield a file beside `path` that takes its place, whole and on disk, when all went well.
+
+    Its name is the same each time, so what a killed process leaves is
+    overwritten by the next; two processes must not stage one path at a time.
+    """
     path.parent.mkdir(parents=True, exist_ok=True)
-    descriptor, name = tempfile.mkstemp(prefix=f".{path.name}.", dir=path.parent)
-    os.close(descriptor)
-    temporary = Path(name)
+    temporary = path.with_name(f".{path.name}.partial")
     try:
         yield temporary
-        with temporary.open("rb+") as file:
-            os.fsync(file.fileno())
-        temporary.chmod(0o666 & ~_umask())
+        flush(temporary)
         temporary.replace(path)
+        flush(path.parent)
     finally:
         temporary.unlink(missing_ok=True)
 
@@ -248,7 +271,9 @@ def _alignment(result: AssetResult) -> dict[str, Any] | None:
         "search": alignment.search,
         "quality": jsonable(alignment.quality),
         "candidates": jsonable(alignment.candidates),
+        "score": jsonable(alignment.score),
         "placements": jsonable(alignment.placements),
+        "settled_by": jsonable(alignment.settled_by),
         "ambiguity": {
             "material_share": jsonable(ambiguity.material_share),
             "property_change": jsonable(ambiguity.property_change),
@@ -273,10 +298,3 @@ def _counts(result: AssetResult) -> dict[str, Any] | None:
         "valid": int(annotation.valid.sum()),
         "clipped": None,
     }
-
-
-def _umask() -> int:
-    # The only portable way to read the umask is to set it.
-    mask = os.umask(0)
-    os.umask(mask)
-    return mask

@@ -220,6 +220,15 @@ class Ambiguity:
 
 
 @dataclass(frozen=True)
+class Consensus:
+    """The rotation (3, 3) that `agreeing` of `winners` assets without a tie have in common."""
+
+    rotation: NDArray[np.float64]
+    winners: int
+    agreeing: int
+
+
+@dataclass(frozen=True)
 class Alignment:
     """The transform from the PixieVerse frame to the SLAT frame, and how it was found.
 
@@ -242,6 +251,11 @@ class Alignment:
         Distance in score from the best placement to the next distinct one.
     placements : tuple of Placement
         Distinct placements that fit about as well.
+    score : float
+        What the engine ranks placements by, 1 for a perfect fit; NaN where it
+        ranks by fitness alone.
+    settled_by : Consensus or None
+        The dataset's common rotation, where it chose among tied placements.
     """
 
     transform: NDArray[np.float64]
@@ -252,6 +266,8 @@ class Alignment:
     candidates: tuple[Candidate, ...] = ()
     margin: float = float("nan")
     placements: tuple[Placement, ...] = ()
+    score: float = float("nan")
+    settled_by: Consensus | None = None
 
 
 @dataclass(frozen=True)

@@ -48,13 +48,16 @@ TIE = 0.03
 DISTINCT = 1.5
 """Voxels, rms over the SLAT's surface, from which on two placements are two."""
 
-WIDEN_BELOW = 0.8
-"""Score below which the 24 starts are not trusted and all orientations searched."""
+POOR, FAIR, CLEAR = 0.8, 0.9, 0.1
+"""All orientations are searched if the best score from the 24 starts is poor, or if it is
+no better than fair and not clearly above that of the next distinct placement."""
 
 SO3_STARTS = 240
+WIDER_GAIN = 0.02
+"""By so much a placement far from the quarter turns must score above the best near them."""
 
-RIGID_IF_SCALE_WITHIN = 0.02
-RIGID_LOSS = 0.002
+RIGID_IF_SCALE_WITHIN = 0.04
+RIGID_LOSS = 0.004
 """A scale this near to one is kept only if it raises the score by more than this."""
 
 
@@ -92,11 +95,14 @@ def align(
     fits = pair.refine(pair.poses(s.rotation for s in starts), COARSE_SAMPLES, COARSE_TAUS, 0.02)
     poses = pair.polish(fits)
     search = "euler64"
-    if poses[0].score < WIDEN_BELOW:
+    if _is_poor(poses):
         search = "so3"
-        wide = pair.poses(so3_starts(SO3_STARTS))
-        poses += pair.polish(pair.refine(wide, COARSE_SAMPLES, COARSE_TAUS, 0.02))
-        poses = pair.distinct(poses)
+        fits_wide = pair.refine(
+            pair.poses(so3_starts(SO3_STARTS)), COARSE_SAMPLES, COARSE_TAUS, 0.02
+        )
+        wide = pair.polish(fits_wide)
+        if wide[0].score > poses[0].score + WIDER_GAIN:
+            poses = pair.distinct([*poses, *wide])
 
     tied = [pose for pose in poses if pose.score > poses[0].score - TIE]
     tied = pair.distinct(pair.refine(tied, FINE_SAMPLES, FINE_TAUS, 0.002))
@@ -112,13 +118,21 @@ def align(
         search=search,
         quality=compare(pair.pixie.boundary, pair.slat.boundary, transform, parameters.radius),
         candidates=candidates_of(fitted),
-        margin=best.score - others[0].score if others else 1.0,
+        # The next one's score may come from fewer samples and exceed by a hair.
+        margin=max(best.score - others[0].score, 0.0) if others else 1.0,
         placements=tuple(
             Placement(pose.transform, pose.score, float(pair.apart([pose], best)[0]))
-            for pose in others
+            for pose in others[:MOST_SURVIVORS]
             if pose.score > best.score - TIE
         ),
+        score=best.score,
     )
+
+
+def _is_poor(poses: Sequence[Pose]) -> bool:
+    score = poses[0].score
+    unclear = len(poses) > 1 and score - poses[1].score < CLEAR
+    return score < POOR or (score < FAIR and unclear)
 
 
 class _Pair:
