@@ -18,6 +18,7 @@ COMMANDS = {
     "check-alignment": "slatprep.cli.check:check_alignment",
     "info": "slatprep.cli.info:info",
     "score": "slatprep.cli.score:score",
+    "export": "slatprep.cli.export:export",
     "bench": "slatprep.cli.bench:bench",
 }
 """Name of each command and where it lives; to add one, add its line here.

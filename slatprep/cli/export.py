@@ -1,0 +1,115 @@
+"""`slatprep export`: a store's assets in the formats of other tools."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+from typing import Any
+
+import click
+
+from slatprep.cli.options import jobs_option
+from slatprep.cli.output import Output, output_options
+from slatprep.errors import ConfigError
+
+# Which options belong to which format; an option without effect is a mistake.
+_ONLY_FOR = {"points": "ply", "frame": "ply", "records": "ply", "shard_size": "webdataset"}
+
+
+def _complete_asset(
+    context: click.Context, parameter: click.Parameter, incomplete: str
+) -> list[str]:
+    """Offer the store's asset ids to the shell."""
+    from slatprep.errors import StoreError
+    from slatprep.store import open_store
+
+    try:
+        ids = open_store(context.params["store"]).ids
+    except (StoreError, KeyError, TypeError):
+        return []  # No store was named yet: there is nothing to offer.
+    return [asset_id for asset_id in ids if asset_id.startswith(incomplete)]
+
+
+@click.command(
+    epilog="""\b
+Example:
+  slatprep export demo.zarr --format ply --out demo.ply.d --verdict good
+  slatprep export demo.zarr --format ply --out world --points grid --frame pixieverse
+  slatprep export demo.zarr --format hdf5 --out demo.h5 --asset 0a1b2c --asset 3d4e5f
+  slatprep export demo.zarr --format webdataset --out shards --shard-size 128 --jobs 2
+  slatprep export demo.zarr --format npz --out latents
+"""
+)
+@click.argument("store", type=click.Path(path_type=Path, exists=True, file_okay=False))
+@click.option("--format", "kind", required=True,
+              type=click.Choice(["ply", "hdf5", "webdataset", "npz"]),
+              help="Point clouds with Pixie's fields, one HDF5 file, tar shards, or TRELLIS's "
+              "npz with the targets added.")  # fmt: skip
+@click.option("--out", required=True, type=click.Path(path_type=Path), metavar="PATH",
+              help="The file (hdf5) or folder (all others); an export that is there is replaced "
+              "when the new one is complete.")  # fmt: skip
+@click.option("--asset", "assets", multiple=True, metavar="ID", shell_complete=_complete_asset,
+              help="The asset; may be repeated.  [default: all]")  # fmt: skip
+@click.option("--verdict", "verdicts", multiple=True,
+              type=click.Choice(["good", "doubtful", "failed"]),
+              help="Only assets with this verdict; may be repeated.  [default: all]")  # fmt: skip
+@click.option("--points", type=click.Choice(["slat", "grid"]),
+              help="ply: SLAT voxels, or the voxels of the PixieVerse field."
+              "  [default: slat]")  # fmt: skip
+@click.option("--frame", type=click.Choice(["slat", "pixieverse"]),
+              help="ply: the SLAT's unit cube, or PixieVerse's world."
+              "  [default: slat]")  # fmt: skip
+@click.option("--records", type=click.Path(path_type=Path, exists=True, file_okay=False),
+              metavar="DIR", help="ply --frame pixieverse: folder of the build's records."
+              "  [default: the one beside the store]")  # fmt: skip
+@click.option("--shard-size", type=click.IntRange(min=1), metavar="N",
+              help="webdataset: assets in one shard.  [default: 256]")  # fmt: skip
+@jobs_option
+@output_options
+def export(
+    output: Output,
+    store: Path,
+    kind: Any,
+    out: Path,
+    assets: tuple[str, ...],
+    verdicts: tuple[str, ...],
+    jobs: int,
+    **given: Any,
+) -> None:
+    """Write assets of STORE in a format of other tools.
+
+    Properties are in SI units in PLY, normalised in WebDataset and npz, and
+    both in HDF5. Every folder gets an index.json that says what is in it.
+    """
+    options = {name: value for name, value in given.items() if value is not None}
+    for name in options:
+        if _ONLY_FOR[name] != kind:
+            option = f"--{name.replace('_', '-')}"
+            raise ConfigError(f"{option} is for --format {_ONLY_FOR[name]}, not {kind}")
+    if "records" in options and options.get("frame") != "pixieverse":
+        raise ConfigError("--records is for --frame pixieverse, whose bounds it holds")
+    from slatprep.export import ExportOptions, export_store
+
+    with output.progress("export") as progress:
+        summary = export_store(
+            store,
+            out,
+            kind,
+            assets=assets,
+            verdicts=verdicts,
+            options=ExportOptions(**options),
+            jobs=jobs,
+            progress=progress,
+        )
+
+    def show() -> None:
+        output.table(
+            f"Exported to {summary.path}",
+            ("format", "assets", "points", "files", "MB", "seconds"),
+            [(summary.format, summary.assets, summary.points, summary.files,
+              summary.size / 1e6, summary.seconds)],
+        )  # fmt: skip
+
+    for note in summary.notes:
+        output.note(note)
+    output.result(dataclasses.asdict(summary), show)

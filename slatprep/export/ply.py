@@ -1,0 +1,152 @@
+"""One PLY point cloud an asset, with the fields of Pixie's material fields.
+
+Fields, their order and types are those of Pixie's ``map_pred_to_coords.py``,
+which its fork of PhysGaussian's solver loads (``load_point_cloud``).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from slatprep.export.assets import ExportedAsset
+from slatprep.export.bounds import LAST, UNIT_CUBE, Bounds
+from slatprep.geometry import apply_transform, invert_transform, voxel_centres
+from slatprep.pictures.palette import MATERIAL_COLOURS
+from slatprep.records import RESOLUTION
+
+Points = Literal["slat", "grid"]
+Frame = Literal["slat", "pixieverse"]
+
+VERTEX = np.dtype(
+    [
+        ("x", "<f4"), ("y", "<f4"), ("z", "<f4"),
+        ("red", "u1"), ("green", "u1"), ("blue", "u1"), ("alpha", "u1"),
+        ("part_label", "<i4"), ("density", "<f4"), ("E", "<f4"), ("nu", "<f4"),
+        ("material_id", "<i4"), ("conf", "<f4"),
+    ]
+)  # fmt: skip
+"""A point as Pixie lays it out; density in kg/m^3, E in Pa."""
+
+_TYPE_NAMES = {"<f4": "float", "<i4": "int", "|u1": "uchar"}
+
+_COMMENTS = {
+    "slat": "frame SLAT, unit cube -0.5..0.5, z up",
+    "pixieverse": "frame PixieVerse, world coordinates of its bounds",
+}
+
+
+def write_asset(
+    path: Path,
+    asset: ExportedAsset,
+    *,
+    points: Points,
+    frame: Frame,
+    bounds: Mapping[str, Bounds],
+    max_distance: float,
+) -> int:
+    """Write an asset's annotated points; return how many there are.
+
+    Parameters
+    ----------
+    path : Path
+        The file.
+    asset : ExportedAsset
+        The asset; with its grid where `points` is ``grid``.
+    points : {"slat", "grid"}
+        Which points.
+    frame : {"slat", "pixieverse"}
+        Where they lie.
+    bounds : mapping
+        World bounds by asset id, for the PixieVerse frame.
+    max_distance : float
+        Voxels to an annotation at which ``conf`` is 0.
+
+    Notes
+    -----
+    ``conf`` falls from 1 to 0 with the distance to the annotation used; a
+    point of the grid is its own annotation and has 1. ``part_label`` is the
+    class, as it is in what Pixie itself predicts.
+    """
+    if points == "grid":
+        material, values = asset.grid_material, asset.grid_properties_si
+        if asset.grid_voxels is None or material is None or values is None:
+            raise ValueError(f"{asset.asset_id}: points of the grid need the grid")
+        in_pixieverse = voxel_centres(asset.grid_voxels)
+        conf = np.ones(len(material), dtype=np.float32)
+        in_slat = apply_transform(asset.transform, in_pixieverse)
+    else:
+        valid = asset.valid
+        material, values = asset.material[valid], asset.properties_si[valid]
+        in_slat = voxel_centres(asset.coords[valid])
+        conf = np.clip(1.0 - asset.distance[valid] / max_distance, 0.0, 1.0)
+        in_pixieverse = apply_transform(invert_transform(asset.transform), in_slat)
+    if frame == "pixieverse":
+        positions = to_world(in_pixieverse, bounds.get(asset.asset_id, UNIT_CUBE))
+    else:
+        positions = in_slat
+    vertices = np.zeros(len(material), dtype=VERTEX)
+    for axis, name in enumerate("xyz"):
+        vertices[name] = positions[:, axis]
+    colours = _colours()
+    for channel, name in enumerate(("red", "green", "blue")):
+        vertices[name] = colours[material, channel]
+    vertices["alpha"] = 255
+    vertices["E"], vertices["density"], vertices["nu"] = values.T
+    vertices["material_id"] = vertices["part_label"] = material
+    vertices["conf"] = conf
+    _write(path, vertices, (_COMMENTS[frame], "density kg/m^3, E Pa, nu 1"))
+    return len(vertices)
+
+
+def to_world(points: ArrayLike, bounds: Bounds) -> NDArray[np.float64]:
+    """Carry points of the PixieVerse frame to world coordinates.
+
+    Parameters
+    ----------
+    points : array_like, shape (N, 3)
+        Points of the unit cube in which voxel i is centred at (i + 0.5)/64 - 0.5.
+    bounds : Bounds
+        What ``clip_features.npz`` states.
+
+    Returns
+    -------
+    ndarray of float64, shape (N, 3)
+        Voxel i lies at ``linspace(min_bounds, max_bounds, 64)[i]``, where
+        Pixie's ``map_pred_to_coords.py`` puts it.
+
+    Examples
+    --------
+    >>> to_world(voxel_centres([[0, 63, 21]]), ((0, 0, 0), (63, 63, 63))).round(6).tolist()
+    [[0.0, 63.0, 21.0]]
+    """
+    lo, hi = np.asarray(bounds, dtype=np.float64)
+    index = (np.asarray(points, dtype=np.float64) + 0.5) * RESOLUTION - 0.5
+    world: NDArray[np.float64] = lo + index * (hi - lo) / LAST
+    return world
+
+
+def _colours() -> NDArray[np.uint8]:
+    """Return the red, green and blue of every material id, (256, 3)."""
+    colours = np.zeros((256, 3), dtype=np.uint8)
+    for material, colour in MATERIAL_COLOURS.items():
+        colours[material] = tuple(bytes.fromhex(colour[1:]))
+    return colours
+
+
+def _write(path: Path, vertices: NDArray[np.void], comments: tuple[str, ...]) -> None:
+    # A header and the rows as they lie in memory: the format is no more than that.
+    fields = vertices.dtype
+    lines = [
+        "ply",
+        "format binary_little_endian 1.0",
+        *(f"comment {comment}" for comment in comments),
+        f"element vertex {len(vertices)}",
+        *(f"property {_TYPE_NAMES[fields[name].str]} {name}" for name in fields.names or ()),
+        "end_header",
+    ]
+    path.write_bytes("\n".join(lines).encode("ascii") + b"\n" + vertices.tobytes())

@@ -1,0 +1,102 @@
+"""Where an export goes: complete, or not at all, and never over something else."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import tempfile
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from slatprep import provenance
+from slatprep.errors import ConfigError, SlatprepError
+from slatprep.store.replace import replace_directory
+
+FORMAT = "slatprep-export"
+FORMAT_VERSION = 1
+INDEX = "index.json"
+"""Name of the file that says what is in an exported directory."""
+
+
+@contextmanager
+def directory(out: Path) -> Iterator[Path]:
+    """Yield a new directory that takes the place of `out` when all went well.
+
+    Raises
+    ------
+    ConfigError
+        If `out` is there and is neither empty nor an export.
+    SlatprepError
+        If nothing can be written there.
+    """
+    if out.exists() and not _may_be_replaced(out):
+        raise ConfigError(
+            f"{out} exists and is not an export of slatprep; expected an export to replace, "
+            "or a new path"
+        )
+    with _writable(out):
+        out.parent.mkdir(parents=True, exist_ok=True)
+        work = Path(tempfile.mkdtemp(prefix=f".{out.name}.", dir=out.parent))
+    try:
+        new = work / "export"
+        new.mkdir()
+        with _writable(out):
+            yield new
+            replace_directory(new, out)
+    finally:
+        shutil.rmtree(work, ignore_errors=True)
+
+
+@contextmanager
+def file(out: Path, is_export: Callable[[Path], bool]) -> Iterator[Path]:
+    """Yield a new file that takes the place of `out` when all went well.
+
+    Raises
+    ------
+    ConfigError
+        If `out` is there and is no export.
+    SlatprepError
+        If nothing can be written there.
+    """
+    if out.exists() and not (out.is_file() and is_export(out)):
+        raise ConfigError(
+            f"{out} exists and is not an export of slatprep; expected an export to replace, "
+            "or a new path"
+        )
+    with _writable(out), provenance.staged(out) as path:
+        yield path
+
+
+def write_index(path: Path, about: dict[str, Any], entries: Sequence[dict[str, Any]]) -> None:
+    """Write what an exported directory holds, one asset a line."""
+    head = json.dumps(provenance.jsonable(about), indent=1, ensure_ascii=False)
+    rows = ",\n  ".join(
+        json.dumps(provenance.jsonable(entry), allow_nan=False, ensure_ascii=False)
+        for entry in entries
+    )
+    text = f'{head[:-2]},\n "assets": [\n  {rows}\n ]\n}}\n'
+    (path / INDEX).write_text(text, encoding="utf-8")
+
+
+def _may_be_replaced(out: Path) -> bool:
+    if not out.is_dir():
+        return False
+    if not any(out.iterdir()):
+        return True
+    try:
+        index = json.loads((out / INDEX).read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return False
+    return isinstance(index, dict) and index.get("format") == FORMAT
+
+
+@contextmanager
+def _writable(out: Path) -> Iterator[None]:
+    try:
+        yield
+    except OSError as error:
+        raise SlatprepError(
+            f"{out}: cannot write there ({error.strerror or error}); nothing was replaced"
+        ) from error

@@ -1,0 +1,351 @@
+"""Every export is read back by the library that its users use."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import tarfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from synthetic import JELLY, METAL, QUARTER_TURN, Dataset
+
+from slatprep.build import BuildSummary, build_store
+from slatprep.errors import ConfigError, SlatprepError
+from slatprep.export import FORMATS, ExportOptions, export_store
+from slatprep.export.assets import file_name
+from slatprep.export.ply import VERTEX
+from slatprep.parameters import PixieverseSource, SlatSource
+from slatprep.readers import discover, read_latents
+
+# What an asset's points may be: material id to E, density, nu.
+TRUTH = {stuff[0]: stuff[1:] for stuff in (JELLY, METAL)}
+
+# As `map_pred_to_coords.py` of Pixie declares the rows of its files.
+PIXIE_VERTEX = [
+    ("x", "f4"), ("y", "f4"), ("z", "f4"),
+    ("red", "u1"), ("green", "u1"), ("blue", "u1"), ("alpha", "u1"),
+    ("part_label", "i4"), ("density", "f4"), ("E", "f4"), ("nu", "f4"),
+    ("material_id", "i4"),
+    ("conf", "f4"),
+]  # fmt: skip
+
+
+@pytest.fixture
+def store(mixed_build: BuildSummary) -> Path:
+    assert mixed_build.store is not None
+    return mixed_build.store
+
+
+def index_of(directory: Path) -> list[dict[str, Any]]:
+    return json.loads((directory / "index.json").read_text("utf-8"))["assets"]
+
+
+def bytes_of(path: Path) -> dict[str, bytes]:
+    if path.is_file():
+        return {"": path.read_bytes()}
+    return {file.name: file.read_bytes() for file in path.iterdir()}
+
+
+# -- PLY --------------------------------------------------------------------
+
+
+def test_ply_is_read_by_plyfile_as_pixie_writes_it(
+    store: Path, mixed: Dataset, tmp_path: Path
+) -> None:
+    import plyfile
+
+    export_store(store, tmp_path / "ply", "ply")
+    assert np.dtype(PIXIE_VERTEX).newbyteorder("<") == VERTEX
+    for entry in index_of(tmp_path / "ply"):
+        asset = mixed.assets[entry["asset_id"]]
+        vertex = plyfile.PlyData.read(tmp_path / "ply" / entry["file"])["vertex"]
+        assert vertex.data.dtype == np.dtype(PIXIE_VERTEX)
+        assert len(vertex.data) == entry["points"] == len(asset.coords)
+        # TRELLIS's frame: voxel i is centred at (i + 0.5)/64 - 0.5.
+        positions = np.column_stack([vertex[axis] for axis in "xyz"])
+        np.testing.assert_allclose((positions + 0.5) * 64 - 0.5, asset.coords, atol=1e-5)
+        assert (vertex["part_label"] == vertex["material_id"]).all()
+        assert set(np.unique(vertex["material_id"])) == set(TRUTH)
+        for material, (modulus, density, ratio) in TRUTH.items():
+            here = vertex["material_id"] == material
+            np.testing.assert_allclose(vertex["E"][here], modulus, rtol=1e-4)
+            np.testing.assert_allclose(vertex["density"][here], density, rtol=1e-4)
+            np.testing.assert_allclose(vertex["nu"][here], ratio, rtol=1e-4)
+        # These assets are placed exactly, so every annotation is the voxel's own.
+        np.testing.assert_allclose(vertex["conf"], 1.0, atol=1e-3)
+
+
+def test_ply_passes_through_the_loader_of_physgaussian(store: Path, tmp_path: Path) -> None:
+    import plyfile
+
+    export_store(store, tmp_path / "ply", "ply", assets=["cup"])
+    vertex = plyfile.PlyData.read(tmp_path / "ply" / "cup.ply")["vertex"]
+    # What `load_point_cloud` and `apply_material_field_to_simulation` ask of a file.
+    names = {one.name for one in vertex.properties}
+    assert {"x", "y", "z", "part_label", "density", "E", "nu", "material_id", "conf"} <= names
+    for name in ("density", "E", "nu", "conf"):
+        assert np.isfinite(vertex[name]).all() and (vertex[name] > 0).all()
+    assert set(vertex["material_id"].tolist()) <= set(range(7))
+
+
+def test_ply_is_read_by_open3d(store: Path, mixed: Dataset, tmp_path: Path) -> None:
+    import open3d
+
+    export_store(store, tmp_path / "ply", "ply", assets=["ant"])
+    cloud = open3d.t.io.read_point_cloud(str(tmp_path / "ply" / "ant.ply"))
+    assert cloud.point.positions.shape == (len(mixed.assets["ant"].coords), 3)
+    modulus = np.unique(np.round(np.log10(cloud.point["E"].numpy()), 3))
+    np.testing.assert_allclose(modulus, np.log10([JELLY[1], METAL[1]]), atol=2e-3)
+
+
+def test_grid_points_are_the_field_itself_in_either_frame(
+    store: Path, mixed: Dataset, tmp_path: Path
+) -> None:
+    import plyfile
+
+    grid = mixed.assets["cup"].grid
+    voxels = np.argwhere(grid[..., 3] != 7)
+    for frame in ("slat", "pixieverse"):
+        options = ExportOptions(points="grid", frame=frame)
+        export_store(store, tmp_path / frame, "ply", assets=["cup"], options=options)
+    world, slat = (
+        plyfile.PlyData.read(tmp_path / frame / "cup.ply")["vertex"]
+        for frame in ("pixieverse", "slat")
+    )
+    # Where Pixie's `map_pred_to_coords.py` puts voxels of a field without bounds of its own.
+    expected = np.linspace(-0.5, 0.5, 64)[voxels]
+    np.testing.assert_allclose(
+        np.column_stack([world[axis] for axis in "xyz"]), expected, atol=1e-6
+    )
+    centres = (voxels + 0.5) / 64 - 0.5
+    np.testing.assert_allclose(
+        np.column_stack([slat[axis] for axis in "xyz"]),
+        centres @ QUARTER_TURN[:3, :3].T,
+        atol=2e-3,
+    )
+    truth = grid[tuple(voxels.T)]
+    for vertex in (world, slat):
+        np.testing.assert_array_equal(vertex["material_id"], truth[:, 3])
+        np.testing.assert_allclose(vertex["density"], truth[:, 0], rtol=1e-4)
+
+
+def test_world_bounds_of_the_records_are_used(tmp_path: Path) -> None:
+    import plyfile
+
+    dataset = Dataset(tmp_path / "sources")
+    dataset.add("cup", seed=0)
+    lo, hi = np.array([1.0, 2.0, 3.0]), np.array([2.0, 4.0, 7.0])
+    np.savez(
+        tmp_path / "sources" / "pixieverse" / "cup" / "clip_features.npz",
+        min_bounds=lo, max_bounds=hi, grid_shape=(64, 64, 64),
+    )  # fmt: skip
+    summary = build_store(dataset.parameters(), tmp_path / "s.zarr", manifests=tmp_path / "m")
+    assert summary.store is not None
+    options = ExportOptions(points="grid", frame="pixieverse", records=tmp_path / "m")
+    done = export_store(summary.store, tmp_path / "ply", "ply", options=options)
+    assert done.notes == ()
+    vertex = plyfile.PlyData.read(tmp_path / "ply" / "cup.ply")["vertex"]
+    voxels = np.argwhere(dataset.assets["cup"].grid[..., 3] != 7)
+    for axis, name in enumerate("xyz"):
+        expected = np.linspace(lo[axis], hi[axis], 64)[voxels[:, axis]]
+        np.testing.assert_allclose(vertex[name], expected, atol=1e-5)
+
+
+def test_records_that_are_missing_or_of_another_build_are_refused(
+    store: Path, mixed_build: BuildSummary, tmp_path: Path
+) -> None:
+    (tmp_path / "none").mkdir()
+    other = tmp_path / "other"
+    shutil.copytree(mixed_build.records.parent, other)
+    build = json.loads((other / "build.json").read_text())
+    (other / "build.json").write_text(json.dumps({**build, "id": "0" * 64}))
+    for folder, said in ((tmp_path / "none", "no records"), (other, "of another build")):
+        options = ExportOptions(frame="pixieverse", records=folder)
+        with pytest.raises(ConfigError, match=said):
+            export_store(store, tmp_path / "ply", "ply", options=options)
+    assert not (tmp_path / "ply").exists()
+    done = export_store(store, tmp_path / "ply", "ply", options=ExportOptions(frame="pixieverse"))
+    assert "5 assets have no world bounds" in done.notes[0]
+
+
+# -- HDF5, WebDataset, npz --------------------------------------------------
+
+
+def test_hdf5_is_read_by_h5py(store: Path, mixed: Dataset, tmp_path: Path) -> None:
+    import h5py
+
+    out = tmp_path / "all.h5"
+    export_store(store, out, "hdf5")
+    with h5py.File(out) as file:
+        assert sorted(file) == sorted(mixed.assets)
+        assert json.loads(file.attrs["normalization"])["density"]["log10"] is True
+        for asset_id, asset in mixed.assets.items():
+            group = file[asset_id]
+            assert group.attrs["asset_id"] == asset_id and group.attrs["verdict"] == "good"
+            np.testing.assert_array_equal(group["coords"][:], asset.coords)
+            np.testing.assert_array_equal(group["feats"][:], asset.feats)
+            np.testing.assert_allclose(group["transform"][:], QUARTER_TURN, atol=2e-3)
+            assert group["valid"][:].all() and (group["distance"][:] < 0.01).all()
+            assert list(group["properties_si"].attrs["units"]) == ["Pa", "kg/m^3", "1"]
+            for material, values in TRUTH.items():
+                here = group["material"][:] == material
+                np.testing.assert_allclose(
+                    group["properties_si"][:][here], [values] * here.sum(), rtol=1e-4
+                )
+            assert (np.abs(group["properties"][:]) <= 1).all()
+
+
+def test_hdf5_is_itself_a_source_of_latents(store: Path, mixed: Dataset, tmp_path: Path) -> None:
+    export_store(store, tmp_path / "slat.h5", "hdf5", assets=["cup", "ant"])
+    parameters = mixed.parameters()
+    parameters = type(parameters)(
+        PixieverseSource(parameters.pixieverse.root), SlatSource(tmp_path / "slat.h5")
+    )
+    pairs = {pair.asset_id: pair for pair in discover(parameters) if not pair.problem}
+    assert sorted(pairs) == ["ant", "cup"]
+    np.testing.assert_array_equal(read_latents(pairs["cup"]).feats, mixed.assets["cup"].feats)
+
+
+def test_shards_are_read_by_webdataset(store: Path, mixed: Dataset, tmp_path: Path) -> None:
+    import webdataset
+
+    out = tmp_path / "shards"
+    export_store(store, out, "webdataset", options=ExportOptions(shard_size=2))
+    shards = sorted(str(path) for path in out.glob("*.tar"))
+    assert len(shards) == 3
+    samples = list(webdataset.WebDataset(shards, shardshuffle=False).decode())
+    assert [sample["json"]["asset_id"] for sample in samples] == sorted(mixed.assets)
+    for sample in samples:
+        asset = mixed.assets[sample["json"]["asset_id"]]
+        arrays = sample["npz"]
+        np.testing.assert_array_equal(arrays["coords"], asset.coords)
+        np.testing.assert_array_equal(arrays["feats"], asset.feats)
+        assert arrays["properties"].shape == (len(asset.coords), 3)
+        assert set(np.unique(arrays["material"])) == set(TRUTH)
+        np.testing.assert_allclose(sample["json"]["transform"], QUARTER_TURN, atol=2e-3)
+
+
+def test_npz_is_read_as_trellis_reads_latents(store: Path, mixed: Dataset, tmp_path: Path) -> None:
+    export_store(store, tmp_path / "npz", "npz")
+    for asset_id, asset in mixed.assets.items():
+        with np.load(tmp_path / "npz" / f"{asset_id}.npz") as data:
+            assert sorted(data) == ["coords", "feats", "material", "properties", "valid"]
+            np.testing.assert_array_equal(data["coords"], asset.coords)
+            np.testing.assert_array_equal(data["feats"], asset.feats)
+            assert data["coords"].dtype == np.uint8 and data["feats"].dtype == np.float32
+            # Two materials in the dataset: they are the two ends of both log scales.
+            for material, ends in ((JELLY[0], (-1, -1, 1)), (METAL[0], (1, 1, -1))):
+                here = data["material"] == material
+                np.testing.assert_allclose(data["properties"][here], [ends] * here.sum())
+
+
+# -- all of them ------------------------------------------------------------
+
+
+@pytest.mark.parametrize("format", FORMATS)
+def test_bytes_repeat_whatever_the_jobs(format: Any, store: Path, tmp_path: Path) -> None:
+    options = ExportOptions(shard_size=2)
+    progress: list[tuple[int, int]] = []
+    for name, jobs in (("one", 1), ("two", 2)):
+        out = tmp_path / name / "export"
+        export_store(
+            store, out, format, options=options, jobs=jobs,
+            progress=lambda done, total: progress.append((done, total)),
+        )  # fmt: skip
+        assert progress[-1] == (5, 5)
+    one, two = bytes_of(tmp_path / "one" / "export"), bytes_of(tmp_path / "two" / "export")
+    assert one == two and len(one) >= 1
+    # And once more over what is there.
+    export_store(store, tmp_path / "one" / "export", format, options=options)
+    assert bytes_of(tmp_path / "one" / "export") == one
+    assert [path.name for path in (tmp_path / "one").iterdir()] == ["export"]
+
+
+@pytest.mark.parametrize("format", FORMATS)
+def test_what_is_no_export_is_never_replaced(format: Any, store: Path, tmp_path: Path) -> None:
+    folder, file = tmp_path / "mine", tmp_path / "mine.txt"
+    folder.mkdir()
+    (folder / "thesis.txt").write_text("years of work")
+    file.write_text("years of work")
+    for out in (folder, file):
+        with pytest.raises(ConfigError, match="exists and is not an export"):
+            export_store(store, out, format)
+    assert (folder / "thesis.txt").read_text() == file.read_text() == "years of work"
+
+
+@pytest.mark.parametrize("format", FORMATS)
+def test_a_failed_export_leaves_the_old_one(
+    format: Any, store: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from slatprep.export import assets
+
+    out = tmp_path / "export"
+    export_store(store, out, format, assets=["cup"])
+    before = bytes_of(out)
+
+    def fail(*_: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(assets, "denormalize", fail)
+    with pytest.raises(SlatprepError, match=r"cannot write there \(No space left"):
+        export_store(store, out, format)
+    assert bytes_of(out) == before
+    assert list(tmp_path.iterdir()) == [out]
+
+
+def test_assets_are_chosen_by_id_and_verdict(store: Path, tmp_path: Path) -> None:
+    export_store(store, tmp_path / "two", "npz", assets=["dog", "cup", "dog"], verdicts=["good"])
+    assert [entry["asset_id"] for entry in index_of(tmp_path / "two")] == ["cup", "dog"]
+    for arguments, said in (
+        ({"assets": ["cuo"]}, r"did you mean cup\?"),
+        ({"verdicts": ["failed"]}, r"no asset has the verdict failed; .* are 5 good"),
+        ({"verdicts": ["fine"]}, r"'fine'; expected one of good, doubtful, failed"),
+    ):
+        with pytest.raises(ConfigError, match=said):
+            export_store(store, tmp_path / "none", "npz", **arguments)
+
+
+HOSTILE = ["..", "../../etc/passwd", "a b", "-rf", "~", "__key__", "x" * 300, "häß", "a/b", "."]
+
+
+def test_hostile_ids_become_file_names(tmp_path: Path) -> None:
+    for dots in (True, False):
+        names = [file_name(asset_id, dots=dots) for asset_id in [*HOSTILE, "a.b", "a%2Eb"]]
+        assert len({name.casefold() for name in names}) == len(names)
+        for name in names:
+            (tmp_path / name).write_text("x")
+            assert (tmp_path / name).resolve().parent == tmp_path.resolve()
+            assert name.isascii() and name[0] not in ".-_~" and (dots or "." not in name)
+
+
+@pytest.mark.parametrize("format", FORMATS)
+def test_hostile_ids_stay_inside_every_export(format: Any, store: Path, tmp_path: Path) -> None:
+    import zarr
+
+    hostile = tmp_path / "hostile.zarr"
+    shutil.copytree(store, hostile)
+    names = np.array(["", "../../up", ".", "a/b.c", "__meta__"], dtype=object)
+    names[0] = "x" * 300
+    zarr.open_group(hostile, mode="r+", use_consolidated=False)["asset/id"][:] = names
+    out = tmp_path / "deep" / "export"
+    export_store(hostile, out, format)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["deep", "hostile.zarr"]
+    assert [path.name for path in (tmp_path / "deep").iterdir()] == ["export"]
+    if format == "hdf5":
+        import h5py
+
+        with h5py.File(out) as file:
+            assert {group.attrs["asset_id"] for group in file.values()} == set(names)
+    else:
+        assert {entry["asset_id"] for entry in index_of(out)} == set(names)
+    if format == "webdataset":
+        with tarfile.open(next(out.glob("*.tar"))) as tar:
+            assert all("/" not in name for name in tar.getnames())
+        import webdataset
+
+        shards = [str(path) for path in out.glob("*.tar")]
+        samples = webdataset.WebDataset(shards, shardshuffle=False).decode()
+        assert {sample["json"]["asset_id"] for sample in samples} == set(names)
