@@ -123,8 +123,8 @@ class StoreParameters:
 
     __pydantic_config__: ClassVar[dict[str, str]] = _FORBID_UNKNOWN
 
-    voxel_chunk: int = 16_384
-    voxel_chunks_per_shard: int = 64
+    voxel_chunk: int = 4_096
+    voxel_chunks_per_shard: int = 256
     grid_assets_per_shard: int = 32
     compression_level: int = 1
 

@@ -36,7 +36,12 @@ NAN = float("nan")
 
 @dataclass(frozen=True)
 class ArrayLayout:
-    """One array of the store: its type, its dimensions and what it means."""
+    """One array of the store: its type, its dimensions, what it means and how it is packed.
+
+    `packing` is ``zstd``, the smallest, or what unpacks fastest: ``repeats``
+    for values that recur, ``columns`` for rows of three bytes of which two
+    recur, ``exponents`` for floats of which little else recurs.
+    """
 
     name: str
     dtype: str
@@ -44,6 +49,7 @@ class ArrayLayout:
     fill_value: float | bool | str
     description: str
     unit: str = ""
+    packing: str = "zstd"
 
 
 _XYZ = ("x", "y", "z")
@@ -108,21 +114,54 @@ ARRAYS = (
     ),
     ArrayLayout("asset/valid_share", "float64", ("asset",), NAN, "share of valid SLAT voxels"),
     ArrayLayout("asset/verdict", "str", ("asset",), "", "good, doubtful or failed"),
-    ArrayLayout("voxel/coords", "uint8", ("voxel", "axis"), 0, "SLAT coordinate, source order"),
-    ArrayLayout("voxel/feats", "float32", ("voxel", "latent"), 0.0, "SLAT latents, unchanged"),
+    ArrayLayout(
+        "voxel/coords",
+        "uint8",
+        ("voxel", "axis"),
+        0,
+        "SLAT coordinate, source order",
+        packing="columns",
+    ),
+    ArrayLayout(
+        "voxel/feats",
+        "float32",
+        ("voxel", "latent"),
+        0.0,
+        "SLAT latents, unchanged",
+        packing="exponents",
+    ),
     ArrayLayout(
         "voxel/properties",
         "float32",
         ("voxel", "property"),
         NAN,
         "normalised properties in [-1, 1], NaN where not valid",
+        packing="repeats",
     ),
     ArrayLayout(
-        "voxel/material", "uint8", ("voxel",), UNANNOTATED, "class 0..6, 255 where not valid"
+        "voxel/material",
+        "uint8",
+        ("voxel",),
+        UNANNOTATED,
+        "class 0..6, 255 where not valid",
+        packing="repeats",
     ),
-    ArrayLayout("voxel/valid", "bool", ("voxel",), False, "an annotation was found near enough"),
     ArrayLayout(
-        "voxel/distance", "float32", ("voxel",), NAN, "distance to the annotation used", "voxel"
+        "voxel/valid",
+        "bool",
+        ("voxel",),
+        False,
+        "an annotation was found near enough",
+        packing="repeats",
+    ),
+    ArrayLayout(
+        "voxel/distance",
+        "float32",
+        ("voxel",),
+        NAN,
+        "distance to the annotation used",
+        "voxel",
+        packing="exponents",
     ),
     ArrayLayout(
         "grid/properties",
@@ -212,8 +251,6 @@ def create_arrays(
     parameters : StoreParameters
         Sizes of chunks and shards, and the compression level.
     """
-    from zarr.codecs import ZstdCodec
-
     sizes = {"asset": n_assets, "asset_edge": n_assets + 1, "voxel": n_voxels, **_FIXED_SIZES}
     chunk_and_shard = {
         "asset": (ASSET_CHUNK, None),
@@ -234,11 +271,24 @@ def create_arrays(
             dtype=str if layout.dtype == "str" else layout.dtype,
             chunks=(chunk, *shape[1:]),
             shards=None if shard is None else (shard, *shape[1:]),
-            compressors=ZstdCodec(level=parameters.compression_level),
+            **_codecs(layout, parameters.compression_level),
             fill_value=layout.fill_value,
             dimension_names=layout.dimensions,
             attributes=attributes,
         )
+
+
+def _codecs(layout: ArrayLayout, level: int) -> dict[str, Any]:
+    """Return the codecs of an array, chosen by measurement; each chunk ends with a checksum."""
+    from zarr.codecs import BloscCodec, Crc32cCodec, ZstdCodec
+
+    compressors = {
+        "zstd": ZstdCodec(level=level),
+        "repeats": BloscCodec(typesize=1, cname="lz4hc", clevel=5, shuffle="noshuffle"),
+        "columns": BloscCodec(typesize=3, cname="lz4hc", clevel=5, shuffle="shuffle"),
+        "exponents": BloscCodec(typesize=4, cname="lz4hc", clevel=1, shuffle="shuffle"),
+    }
+    return {"compressors": (compressors[layout.packing], Crc32cCodec())}
 
 
 def root_attributes(

@@ -1,0 +1,161 @@
+"""Undo the codecs of one chunk, into memory that is already there.
+
+Only what the metadata promise is ever written: a chunk that claims to hold
+more, or less, is refused before anything is inflated.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cache, cached_property
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from slatprep.errors import StoreError
+
+# CRC32C of any bytes followed by their own CRC32C, little-endian.
+_CRC32C_RESIDUE = 0x48674BC7
+
+_ZSTD_MAGIC = 0xFD2FB528
+_BLOSC_HEADER = 16
+
+
+@dataclass(frozen=True)
+class ChunkDecoder:
+    """The codecs of an array's chunks, as far as this module knows them.
+
+    Attributes
+    ----------
+    dtype : numpy.dtype
+        Little-endian, as stored.
+    shape : tuple of int
+        Shape of a chunk.
+    order : tuple of int or None
+        Order in which a ``transpose`` codec stored the dimensions.
+    compressor : str
+        ``blosc``, ``zstd`` or empty.
+    crc32c : bool
+        Whether a checksum ends each chunk.
+    """
+
+    dtype: np.dtype[Any]
+    shape: tuple[int, ...]
+    order: tuple[int, ...] | None
+    compressor: str
+    crc32c: bool
+
+    @classmethod
+    def of(
+        cls, dtype: np.dtype[Any], shape: tuple[int, ...], codecs: Sequence[Mapping[str, Any]]
+    ) -> ChunkDecoder | None:
+        """Return the decoder for a list of codecs as ``zarr.json`` has it, or None."""
+        rest = list(codecs)
+        order = None
+        if rest and rest[0].get("name") == "transpose":
+            order = tuple(rest.pop(0).get("configuration", {}).get("order", ()))
+            if sorted(order) != list(range(len(shape))):
+                return None
+        if not rest or rest[0].get("name") != "bytes":
+            return None
+        if rest.pop(0).get("configuration", {}).get("endian", "little") != "little":
+            return None
+        names = [codec.get("name") for codec in rest]
+        crc32c = bool(names) and names[-1] == "crc32c"
+        compressors = names[:-1] if crc32c else names
+        if compressors not in ([], ["blosc"], ["zstd"]):
+            return None
+        compressor = compressors[0] if compressors else ""
+        return cls(dtype, shape, order, compressor, crc32c)
+
+    @cached_property
+    def nbytes(self) -> int:
+        """Bytes of a decoded chunk."""
+        return int(np.prod(self.shape, dtype=np.int64)) * self.dtype.itemsize
+
+    def decode(self, data: bytes, out: NDArray[Any]) -> None:
+        """Decode a chunk.
+
+        Parameters
+        ----------
+        data : bytes
+            The chunk as stored.
+        out : ndarray, C order, of the chunk's shape and dtype
+            Where it goes.
+
+        Raises
+        ------
+        StoreError
+            If the checksum is wrong or the chunk does not hold what the metadata say.
+        """
+        if self.order is None:
+            self._undo(data, out)
+            return
+        stored = np.empty(tuple(self.shape[k] for k in self.order), self.dtype)
+        self._undo(data, stored)
+        out[...] = stored.transpose(np.argsort(self.order))
+
+    def _undo(self, data: bytes, out: NDArray[Any]) -> None:
+        payload = memoryview(data)
+        if self.crc32c:
+            if not crc32c_holds(data):
+                raise StoreError("its checksum (CRC32C) is wrong")
+            payload = payload[:-4]
+        held = content_size(payload, self.compressor)
+        if held != out.nbytes:
+            raise StoreError(f"it holds {held} bytes; expected {out.nbytes}")
+        try:
+            if self.compressor == "blosc":
+                _blosc().decompress(payload, out)
+            elif self.compressor == "zstd":
+                from numcodecs import zstd
+
+                zstd.decompress(payload, out)
+            else:
+                out.reshape(-1).view(np.uint8)[:] = np.frombuffer(payload, np.uint8)
+        except (RuntimeError, ValueError) as error:
+            raise StoreError(f"it cannot be decompressed ({error})") from None
+
+
+def crc32c_holds(data: bytes) -> bool:
+    """Whether bytes end with the CRC32C of what comes before."""
+    import google_crc32c
+
+    return len(data) >= 4 and int(google_crc32c.value(data)) == _CRC32C_RESIDUE
+
+
+def content_size(data: memoryview | bytes, compressor: str) -> int:
+    """Return how many bytes a compressed chunk says it holds; -1 if it does not say.
+
+    Zstandard's frame header is RFC 8878, section 3.1.1.1; blosc's is of 16
+    bytes with the content's size in bytes 4 to 7.
+    """
+    try:
+        if compressor == "blosc":
+            nbytes, _, nbytes_packed = struct.unpack_from("<III", data, 4)
+            # blosc reads as much as its header says, not as much as there is.
+            return int(nbytes) if _BLOSC_HEADER <= nbytes_packed <= len(data) else -1
+        if compressor == "zstd":
+            magic, descriptor = struct.unpack_from("<IB", data)
+            single, flag = bool(descriptor & 0x20), descriptor >> 6
+            if magic != _ZSTD_MAGIC or (flag == 0 and not single):
+                return -1
+            at = 5 + (not single) + (0, 1, 2, 4)[descriptor & 3]
+            size = int(struct.unpack_from("<" + "BHIQ"[flag], data, at)[0])
+            return size + 256 if flag == 1 else size
+    except struct.error:
+        return -1
+    return len(data)
+
+
+@cache
+def _blosc() -> Any:
+    from numcodecs import blosc
+
+    # Training loaders read in many processes and threads; a pool of threads
+    # in each would only get in their way, and does not survive a fork.
+    blosc.use_threads = False
+    return blosc

@@ -1,0 +1,262 @@
+"""Rows of an array, read straight from its shards.
+
+A shard is a file of chunks with an index at its end (Zarr format 3,
+"sharding_indexed" codec): for each chunk where it begins and how long it is,
+as little-endian uint64, then a CRC32C of the index. The chunks of one asset
+lie side by side, so this reader asks the file for them and for nothing else;
+zarr-python reads the same bytes with far more work around them.
+"""
+
+from __future__ import annotations
+
+import os
+import threading
+from collections.abc import Mapping
+from dataclasses import dataclass
+from io import FileIO
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from slatprep.errors import StoreError
+from slatprep.store.chunks import ChunkDecoder, crc32c_holds
+
+MISSING = 2**64 - 1
+"""Offset and length of a chunk that was never written: it holds the fill value."""
+
+OPEN_SHARDS = 32
+"""Shards of one array that stay open at a time."""
+
+_INDEX_CODECS = ["bytes", "crc32c"]
+
+
+class Folder:
+    """An open directory: what is read below it stays of one store, even if that is replaced."""
+
+    def __init__(self, path: str | os.PathLike[str]) -> None:
+        self.path = os.fspath(path)
+        self._descriptor = os.open(self.path, os.O_RDONLY) if _AT else None
+
+    def open(self, name: str) -> FileIO:
+        """Open a file for reading, without buffer."""
+        if self._descriptor is None:
+            return FileIO(os.path.join(self.path, name))  # noqa: PTH118 - the hot path
+        return FileIO(name, opener=self._open_at)
+
+    def _open_at(self, name: str, flags: int) -> int:
+        return os.open(name, flags, dir_fd=self._descriptor)
+
+    def __del__(self) -> None:
+        if getattr(self, "_descriptor", None) is not None:
+            os.close(self._descriptor)  # type: ignore[arg-type]
+
+
+_AT = os.open in os.supports_dir_fd
+
+
+@dataclass(frozen=True, slots=True)
+class _Shard:
+    """An open shard and its index: offset and length of each chunk."""
+
+    file: FileIO
+    index: NDArray[np.uint64]
+
+
+class RowReader:
+    """Reads rows of one array; safe to share between threads and across a fork.
+
+    Parameters
+    ----------
+    folder : Folder
+        The store.
+    name : str
+        Name of the array, such as ``voxel/feats``.
+    shape : tuple of int
+        Shape of the array.
+    shard_rows : int
+        Rows of one file.
+    sharded : bool
+        Whether the file has an index, or is one chunk.
+    decoder : ChunkDecoder
+        For its chunks.
+    fill_value : object
+        What a chunk that was never written holds.
+    """
+
+    def __init__(
+        self,
+        folder: Folder,
+        name: str,
+        shape: tuple[int, ...],
+        shard_rows: int,
+        sharded: bool,
+        decoder: ChunkDecoder,
+        fill_value: Any,
+    ) -> None:
+        self.folder = folder
+        self.name = name
+        self.shape = shape
+        self.dtype = decoder.dtype
+        self.shard_rows = shard_rows
+        self.chunk_rows = decoder.shape[0]
+        self.sharded = sharded
+        self.decoder = decoder
+        self.fill_value = fill_value
+        self.chunks_per_shard = shard_rows // self.chunk_rows
+        self._shards: dict[int, _Shard] = {}
+        self._local = threading.local()
+
+    @classmethod
+    def of(cls, folder: Folder, name: str, metadata: Mapping[str, Any]) -> RowReader | None:
+        """Return a reader for an array with this ``zarr.json``, or None if it needs zarr-python.
+
+        Raises
+        ------
+        StoreError
+            If the metadata are not those of an array.
+        """
+        try:
+            return cls._of(folder, name, metadata)
+        except (KeyError, TypeError, ValueError, AttributeError, IndexError) as error:
+            raise StoreError(f"{name}: its metadata make no sense ({error!r})") from None
+
+    @classmethod
+    def _of(cls, folder: Folder, name: str, metadata: Mapping[str, Any]) -> RowReader | None:
+        if metadata["data_type"] not in _DTYPES:
+            return None
+        dtype = np.dtype(metadata["data_type"]).newbyteorder("<")
+        shape = tuple(map(int, metadata["shape"]))
+        outer = tuple(map(int, metadata["chunk_grid"]["configuration"]["chunk_shape"]))
+        codecs, inner = metadata["codecs"], outer
+        sharded = codecs[0]["name"] == "sharding_indexed"
+        if sharded:
+            sharding = codecs[0]["configuration"]
+            inner, codecs = tuple(map(int, sharding["chunk_shape"])), sharding["codecs"]
+            index_codecs = [codec["name"] for codec in sharding["index_codecs"]]
+            at_end = sharding.get("index_location", "end") == "end"
+            if index_codecs != _INDEX_CODECS or not at_end or len(metadata["codecs"]) > 1:
+                return None
+        plain_keys = metadata["chunk_key_encoding"] in _KEYS
+        if not plain_keys or outer[1:] != shape[1:] or inner[1:] != shape[1:] or inner[0] < 1:
+            return None
+        decoder = ChunkDecoder.of(dtype, inner, codecs)
+        if decoder is None or outer[0] % inner[0]:
+            return None
+        fill_value = np.array(metadata["fill_value"]).astype(dtype)
+        return cls(folder, name, shape, outer[0], sharded, decoder, fill_value)
+
+    def key(self, shard: int) -> str:
+        """Return the name of a shard's file below the store."""
+        return f"{self.name}/c/{shard}" + "/0" * (len(self.shape) - 1)
+
+    def read(self, start: int, stop: int) -> NDArray[Any]:
+        """Read rows.
+
+        Parameters
+        ----------
+        start, stop : int
+            First row, and the one after the last; ``0 <= start <= stop <= len``.
+
+        Returns
+        -------
+        ndarray, shape (stop - start, ...)
+            Fresh memory in native byte order.
+
+        Raises
+        ------
+        StoreError
+            If a file is missing, cut short or damaged; the message names it.
+        """
+        if not 0 <= start <= stop <= self.shape[0]:
+            raise StoreError(f"{self.name} has {self.shape[0]} rows, not {start} to {stop}")
+        out = np.empty((stop - start, *self.shape[1:]), self.dtype)
+        rows, per_shard = self.chunk_rows, self.chunks_per_shard
+        for chunk in range(start // rows, -(-stop // rows)):
+            base = chunk * rows
+            first, last = max(start, base), min(stop, base + rows)
+            target = out[first - start : last - start]
+            if last - first == rows:
+                self._chunk(*divmod(chunk, per_shard), target)
+            else:
+                whole = self._scratch()
+                self._chunk(*divmod(chunk, per_shard), whole)
+                target[...] = whole[first - base : last - base]
+        return out
+
+    def _chunk(self, number: int, place: int, out: NDArray[Any]) -> None:
+        shard = self._shards.get(number) or self._open(number)
+        offset, length = shard.index[place].tolist()
+        if offset == length == MISSING:
+            out[...] = self.fill_value
+            return
+        data = os.pread(shard.file.fileno(), length, offset)
+        try:
+            if len(data) != length:
+                raise StoreError("the file ends before it does")
+            self.decoder.decode(data, out)
+        except StoreError as error:
+            where = f"{self.folder.path}/{self.key(number)}"
+            raise StoreError(
+                f"{where}: chunk {place} is damaged: {error}; copy the store again, or build it"
+            ) from None
+
+    def _scratch(self) -> NDArray[Any]:
+        """Return memory for a chunk of which only some rows are wanted, one for each thread."""
+        scratch: NDArray[Any] | None = getattr(self._local, "scratch", None)
+        if scratch is None:
+            scratch = self._local.scratch = np.empty(self.decoder.shape, self.dtype)
+        return scratch
+
+    def index(self, shard: int) -> NDArray[np.uint64]:
+        """Read a shard's index: offset and length of each chunk, uint64 (chunks, 2).
+
+        Raises
+        ------
+        StoreError
+            If the file is missing or its index is damaged or points out of the file.
+        """
+        return (self._shards.get(shard) or self._open(shard)).index
+
+    def _open(self, number: int) -> _Shard:
+        where = f"{self.folder.path}/{self.key(number)}"
+        try:
+            file = self.folder.open(self.key(number))
+            size = os.fstat(file.fileno()).st_size
+        except FileNotFoundError:
+            raise StoreError(
+                f"{where}: is missing; was the store replaced? Open it again, or run "
+                "`slatprep verify`"
+            ) from None
+        except OSError as error:
+            raise StoreError(f"{where}: cannot be read ({error.strerror})") from None
+        shard = _Shard(file, self._index(file, size, where))
+        # Two threads may both have opened it; whichever is kept is as good.
+        self._shards[number] = shard
+        for oldest in list(self._shards)[:-OPEN_SHARDS]:
+            self._shards.pop(oldest, None)
+        return shard
+
+    def _index(self, file: FileIO, size: int, where: str) -> NDArray[np.uint64]:
+        limit = 2 * self.decoder.nbytes + 65_536  # what no packed chunk exceeds
+        if not self.sharded:
+            index = np.array([[0, size]], np.uint64)
+        else:
+            length = 16 * self.chunks_per_shard + 4
+            data = os.pread(file.fileno(), length, size - length) if size >= length else b""
+            if not crc32c_holds(data):
+                raise StoreError(f"{where}: has no sound index; the file is damaged or cut short")
+            index = np.frombuffer(data, "<u8", 2 * self.chunks_per_shard).reshape(-1, 2)
+            size -= length
+        there = index[~(index == MISSING).all(axis=1)]
+        offset, length_of = there.T
+        if (offset > size).any() or (length_of > np.minimum(size, limit)).any():
+            raise StoreError(f"{where}: its index leads out of the file")
+        return index
+
+
+_DTYPES = ("bool", "uint8", "int64", "float32", "float64")
+_KEYS = (
+    {"name": "default"},
+    {"name": "default", "configuration": {"separator": "/"}},
+)
