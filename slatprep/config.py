@@ -72,7 +72,7 @@ def load_parameters(
     if preset is not None:
         if preset not in PRESETS:
             raise ConfigError(f"preset: there is no {preset!r}; allowed: {', '.join(PRESETS)}")
-        data["align"] = asdict(PRESETS[preset])
+        data |= asdict(PRESETS[preset])
     for group, values in overrides.items():
         if isinstance(values, Mapping):
             table = data.setdefault(group, {})

@@ -7,6 +7,7 @@ voxel after a few look-ups.
 
 from __future__ import annotations
 
+import math
 from functools import lru_cache
 
 import numpy as np
@@ -47,9 +48,7 @@ def nearest_voxel(
     """
     if len(voxels) == 0:
         raise ValueError("the nearest voxel of an empty set does not exist")
-    row = np.full((RESOLUTION,) * 3, -1, dtype=np.int32)
-    index = voxels.astype(np.intp)
-    row[index[:, 0], index[:, 1], index[:, 2]] = np.arange(len(voxels), dtype=np.int32)
+    row, index = _rows(voxels), voxels.astype(np.intp)
     # Positions in index units, where voxel i is centred at i.
     position = (np.asarray(points, dtype=np.float64) + 0.5) * RESOLUTION - 0.5
     offsets, floors = _cells()
@@ -57,6 +56,46 @@ def nearest_voxel(
         np.ascontiguousarray(position), row, index, offsets, floors, float(limit) ** 2
     )
     return distance, nearest
+
+
+def vote(
+    points: NDArray[np.float64],
+    voxels: NDArray[np.uint8],
+    labels: NDArray[np.uint8],
+    width: float,
+) -> NDArray[np.intp]:
+    """Find the voxel that speaks for each point after a vote of those around it.
+
+    The voxels in the 27 cells around the point vote for their label with the
+    weight exp(-d^2 / 2 width^2), d their distance from the point.
+
+    Parameters
+    ----------
+    points : ndarray of float64, shape (N, 3)
+        Points of the unit cube's frame.
+    voxels : ndarray of uint8, shape (K, 3)
+        The set; no voxel occurs twice.
+    labels : ndarray of uint8, shape (K,)
+        Label of each voxel.
+    width : float
+        Voxels.
+
+    Returns
+    -------
+    ndarray of intp, shape (N,)
+        Row in `voxels` of the nearest voxel that has the winning label (the
+        lower label wins a draw), or -1 where none of the 27 cells is in the set.
+    """
+    row = _rows(voxels)
+    position = (np.asarray(points, dtype=np.float64) + 0.5) * RESOLUTION - 0.5
+    return _vote(np.ascontiguousarray(position), row, labels, int(labels.max()) + 1, 0.5 / width**2)
+
+
+def _rows(voxels: NDArray[np.uint8]) -> NDArray[np.int32]:
+    row = np.full((RESOLUTION,) * 3, -1, dtype=np.int32)
+    index = voxels.astype(np.intp)
+    row[index[:, 0], index[:, 1], index[:, 2]] = np.arange(len(voxels), dtype=np.int32)
+    return row
 
 
 @lru_cache(maxsize=1)
@@ -107,3 +146,33 @@ def _search(position, row, voxels, offsets, floors, limit):  # type: ignore[no-u
         if best <= limit:
             distance[m], nearest[m] = np.sqrt(best), found
     return distance, nearest
+
+
+@njit(cache=True)
+def _vote(position, row, labels, n_labels, steepness):  # type: ignore[no-untyped-def]
+    count, size = position.shape[0], row.shape[0]
+    spokesman = np.full(count, -1, dtype=np.intp)
+    votes = np.zeros(n_labels)
+    nearest, nearest_square = np.zeros(n_labels, dtype=np.intp), np.zeros(n_labels)
+    for m in range(count):
+        votes[:] = 0.0
+        nearest_square[:] = np.inf
+        x, y, z = position[m, 0], position[m, 1], position[m, 2]
+        a, b, c = int(np.rint(x)), int(np.rint(y)), int(np.rint(z))
+        for i in range(max(a - 1, 0), min(a + 2, size)):
+            for j in range(max(b - 1, 0), min(b + 2, size)):
+                for k in range(max(c - 1, 0), min(c + 2, size)):
+                    voxel = row[i, j, k]
+                    if voxel < 0:
+                        continue
+                    square = (x - i) ** 2 + (y - j) ** 2 + (z - k) ** 2
+                    label = labels[voxel]
+                    votes[label] += math.exp(-square * steepness)
+                    if square < nearest_square[label] or (
+                        square == nearest_square[label] and voxel < nearest[label]
+                    ):
+                        nearest_square[label], nearest[label] = square, voxel
+        winner = np.argmax(votes)
+        if nearest_square[winner] < np.inf:
+            spokesman[m] = nearest[winner]
+    return spokesman

@@ -99,13 +99,18 @@ class AlignParameters:
 class SampleParameters:
     """How annotations are looked up at SLAT voxels.
 
-    Beyond `max_distance` (voxels of the PixieVerse frame) from the nearest
-    annotated voxel a SLAT voxel is not valid.
+    `method` is ``nearest`` (the paper's: the nearest annotated voxel) or
+    ``vote``: the annotated voxels around a point vote for its class, weighted
+    by a Gaussian of `vote_width` voxels, and the nearest one of that class
+    gives the properties. Beyond `max_distance` (voxels of the PixieVerse
+    frame) from the nearest annotated voxel a SLAT voxel is not valid.
     """
 
     __pydantic_config__: ClassVar[dict[str, str]] = _FORBID_UNKNOWN
 
+    method: Literal["vote", "nearest"] = "vote"
     max_distance: float = 3.0
+    vote_width: float = 0.5
 
 
 @dataclass(frozen=True)
@@ -145,8 +150,19 @@ class BuildParameters:
     store: StoreParameters = field(default_factory=StoreParameters)
 
 
-PRESETS: dict[str, AlignParameters] = {
-    "default": AlignParameters(),
-    "paper": AlignParameters(engine="open3d", model="rigid"),
+@dataclass(frozen=True)
+class Preset:
+    """Named parameters of the stages that decide what a SLAT voxel is told."""
+
+    align: AlignParameters = AlignParameters()
+    sample: SampleParameters = SampleParameters()
+
+
+PRESETS: dict[str, Preset] = {
+    "default": Preset(),
+    "paper": Preset(
+        align=AlignParameters(engine="open3d", model="rigid"),
+        sample=SampleParameters(method="nearest"),
+    ),
 }
-"""Named alignment parameters; ``paper`` is the protocol of SLAT-Phys."""
+"""``paper`` is the protocol of SLAT-Phys, the reference that all else is held against."""

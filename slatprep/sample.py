@@ -1,4 +1,4 @@
-"""Material and properties at SLAT voxels, from the nearest annotated PixieVerse voxel."""
+"""Material and properties at SLAT voxels, from the annotated PixieVerse voxels near them."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from slatprep.geometry import apply_transform, invert_transform, voxel_centres
 from slatprep.parameters import SampleParameters
-from slatprep.records import UNANNOTATED, Annotation, MaterialField
+from slatprep.records import RESOLUTION, UNANNOTATED, Annotation, MaterialField
 
 
 def sample(
@@ -19,8 +19,10 @@ def sample(
     """Look material and properties up at SLAT voxels.
 
     Each SLAT voxel is carried into the PixieVerse frame and takes the values of
-    the nearest annotated voxel there; background and unannotated voxels are
-    never anyone's label (SLAT-Phys, "Physics-to-SLAT Annotation Alignment").
+    an annotated voxel there: the nearest one (SLAT-Phys, "Physics-to-SLAT
+    Annotation Alignment"), or the nearest one of the class that the annotated
+    voxels around it vote for. Background and unannotated voxels are never
+    anyone's label.
 
     Parameters
     ----------
@@ -31,20 +33,27 @@ def sample(
     transform : array_like, shape (4, 4)
         PixieVerse frame to SLAT frame.
     parameters : SampleParameters
-        ``max_distance``: beyond this many voxels a SLAT voxel is not valid.
+        The method, and from which distance on a SLAT voxel is not valid.
 
     Returns
     -------
     Annotation
-        In SI units; NaN and 255 where not valid.
+        In SI units; NaN and 255 where not valid. ``distance`` is to the voxel
+        whose values were taken, or to the nearest where not valid.
     """
-    from slatprep.lattice import nearest_voxel
+    from slatprep.lattice import nearest_voxel, vote
 
     points = apply_transform(invert_transform(transform), voxel_centres(coords))
-    distance, nearest = nearest_voxel(points, field.voxels)
+    distance, used = nearest_voxel(points, field.voxels)
     valid = distance <= parameters.max_distance
-    properties = np.where(valid[:, None], field.properties[nearest], np.float32(np.nan))
-    material = np.where(valid, field.material[nearest], np.uint8(UNANNOTATED))
+    if parameters.method == "vote":
+        voted = vote(points, field.voxels, field.material, parameters.vote_width)
+        changed = valid & (voted >= 0) & (voted != used)
+        used = np.where(changed, voted, used)
+        apart = points[changed] - voxel_centres(field.voxels[used[changed]])
+        distance[changed] = np.linalg.norm(apart, axis=1) * RESOLUTION
+    properties = np.where(valid[:, None], field.properties[used], np.float32(np.nan))
+    material = np.where(valid, field.material[used], np.uint8(UNANNOTATED))
     return Annotation(
         properties=properties.astype(np.float32),
         material=material.astype(np.uint8),

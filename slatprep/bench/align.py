@@ -28,7 +28,6 @@ from slatprep.parameters import (
     AlignParameters,
     BuildParameters,
     PixieverseSource,
-    SampleParameters,
     SlatSource,
 )
 from slatprep.readers import discover, read_field, read_latents
@@ -156,8 +155,9 @@ def bench_align(
                     alignment = _align(engine, field, latents)
                     seconds[engine].append(time.process_time() - begin)
                     if repeat == 0:
+                        preset = PRESETS["default" if engine == REFERENCE else "paper"]
                         annotation = sample(
-                            field, latents.coords, alignment.transform, SampleParameters()
+                            field, latents.coords, alignment.transform, preset.sample
                         )
                         scores[engine].append(
                             compare_with_truth(
@@ -206,12 +206,12 @@ def _align(engine: str, field: MaterialField, latents: StructuredLatents) -> Ali
     if engine == "open3d-64":
         from slatprep.align import open3d_icp
 
-        return open3d_icp.align(field, latents, PRESETS["paper"], starts=euler_starts())
+        return open3d_icp.align(field, latents, PRESETS["paper"].align, starts=euler_starts())
     if engine == "open3d":
-        return align(field, latents, PRESETS["paper"])
+        return align(field, latents, PRESETS["paper"].align)
     if engine == "small_gicp":
         return align(field, latents, AlignParameters(engine="small_gicp", model="rigid"))
-    return align(field, latents, PRESETS["default"])
+    return align(field, latents, PRESETS["default"].align)
 
 
 def _small_asset() -> tuple[MaterialField, StructuredLatents]:

@@ -89,7 +89,9 @@ def test_options_alone_are_enough(folder: Path) -> None:
 def test_preset_replaces_the_align_table(folder: Path) -> None:
     path = write(folder, MINIMAL + '[align]\nengine = "small_gicp"\nradius = 2.5\n')
     assert load_parameters(path).align.radius == 2.5
-    assert load_parameters(path, preset="paper").align == PRESETS["paper"]
+    parameters = load_parameters(path, preset="paper")
+    assert parameters.align == PRESETS["paper"].align
+    assert parameters.sample == PRESETS["paper"].sample
 
 
 def test_patterns_are_lists(folder: Path) -> None:

@@ -1,0 +1,121 @@
+"""Settle ambiguous assets by the orientation that the rest of the dataset shares.
+
+Both pipelines have a habitual frame, so most assets of a dataset are turned the
+same way. Where an asset's geometry cannot tell placements apart, the clear
+winners of its dataset can: among its tied placements the one nearest to their
+common rotation is taken. An asset without a tie is never touched, and the
+placement that was left is kept among the placements, so that the choice can be
+undone.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from slatprep.align.starts import distinct_starts
+from slatprep.geometry import displacement, split_transform
+from slatprep.records import Alignment, Consensus, Placement, StructuredLatents
+
+LEAST_WINNERS = 5
+LEAST_SHARE = 0.5
+"""A rotation is common if so many clear winners, and this share of them, have it."""
+
+NEAR_DEGREES = 30.0
+"""Rotations this near to a quarter turn count as that quarter turn."""
+
+
+def find_consensus(transforms: Iterable[ArrayLike]) -> Consensus | None:
+    """Find the rotation that a dataset's clear winners have in common.
+
+    Parameters
+    ----------
+    transforms : iterable of array_like, shape (4, 4)
+        PixieVerse frame to SLAT frame, of the assets without a tie.
+
+    Returns
+    -------
+    Consensus or None
+        The mean of the rotations near the most frequent quarter turn; None
+        where fewer than `LEAST_WINNERS` assets or less than `LEAST_SHARE` of
+        them agree.
+    """
+    rotations = [split_transform(transform)[0] for transform in transforms]
+    near: dict[int, list[NDArray[np.float64]]] = {}
+    for rotation in rotations:
+        angles = [degrees_between(rotation, start.rotation) for start in distinct_starts()]
+        nearest = int(np.argmin(angles))
+        if angles[nearest] <= NEAR_DEGREES:
+            near.setdefault(nearest, []).append(rotation)
+    if not near:
+        return None
+    # The lowest index wins a draw, so that the order of assets does not matter.
+    _, members = max(near.items(), key=lambda item: (len(item[1]), -item[0]))
+    if len(members) < LEAST_WINNERS or len(members) < LEAST_SHARE * len(rotations):
+        return None
+    return Consensus(
+        rotation=_mean_rotation(members), winners=len(rotations), agreeing=len(members)
+    )
+
+
+def settle(alignment: Alignment, latents: StructuredLatents, consensus: Consensus) -> Alignment:
+    """Choose, among tied placements, the one nearest to the common rotation.
+
+    Parameters
+    ----------
+    alignment : Alignment
+        As an engine found it.
+    latents : StructuredLatents
+        The SLAT, over whose voxels displacements are measured.
+    consensus : Consensus
+        What `find_consensus` found.
+
+    Returns
+    -------
+    Alignment
+        The same object where nothing is tied or the choice stands. Otherwise
+        with the transform of the chosen placement, `settled_by` set, and the
+        placement that was left first among the placements; its quality is the
+        old one's and has to be measured again.
+    """
+    if not alignment.placements:
+        return alignment
+    choices = [alignment.transform, *(placement.transform for placement in alignment.placements)]
+    angles = [degrees_between(split_transform(c)[0], consensus.rotation) for c in choices]
+    chosen = int(np.argmin(angles))
+    if chosen == 0:
+        return alignment
+    transform = choices[chosen]
+    # Scores are relative to the best fit; the one that was left had it.
+    left = Placement(alignment.transform, alignment.score, 0.0)
+    others = [p for k, p in enumerate(alignment.placements, 1) if k != chosen]
+    placements = tuple(
+        replace(p, displacement=displacement(p.transform, transform, latents.coords))
+        for p in (left, *others)
+    )
+    return replace(
+        alignment,
+        transform=transform,
+        score=alignment.placements[chosen - 1].score,
+        placements=placements,
+        settled_by=consensus,
+    )
+
+
+def degrees_between(rotation: ArrayLike, other: ArrayLike) -> float:
+    """Return the angle, in degrees, of the rotation that leads from one to the other."""
+    trace = float(np.sum(np.asarray(rotation) * np.asarray(other)))
+    return float(np.degrees(np.arccos(np.clip((trace - 1.0) / 2.0, -1.0, 1.0))))
+
+
+def _mean_rotation(rotations: list[NDArray[np.float64]]) -> NDArray[np.float64]:
+    """Chordal mean: the rotation nearest to the mean matrix."""
+    # Summed in sorted order: the mean must not depend on the order of assets.
+    ordered = sorted(rotations, key=lambda rotation: rotation.tobytes())
+    u, _, v = np.linalg.svd(np.mean(ordered, axis=0))
+    sign = np.diag([1.0, 1.0, float(np.sign(np.linalg.det(u @ v)))])
+    rotation: NDArray[np.float64] = u @ sign @ v
+    return rotation
