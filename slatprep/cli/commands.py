@@ -17,8 +17,10 @@ COMMANDS = {
     "align": "slatprep.cli.build:align",
     "check-alignment": "slatprep.cli.check:check_alignment",
     "info": "slatprep.cli.info:info",
+    "report": "slatprep.cli.report:report",
     "score": "slatprep.cli.score:score",
     "export": "slatprep.cli.export:export",
+    "describe": "slatprep.cli.describe:describe",
     "bench": "slatprep.cli.bench:bench",
 }
 """Name of each command and where it lives; to add one, add its line here.
