@@ -1,18 +1,13 @@
-"""Build a store: the way from source files to rows, for one asset and for all.
+"""Build a store: every asset of a dataset, brought to one scale and packed.
 
-`process_asset` is the method for one asset, stage by stage; `build_store` runs
-it over a dataset, brings all to one scale and packs the result.
+`slatprep.process` tells the way of one asset; `build_store` runs it over a
+dataset, for what is new or changed, and replaces the store in one step.
 """
 
 from __future__ import annotations
 
-import shutil
-import tempfile
 import time
-import traceback
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
-from dataclasses import replace
 from itertools import accumulate
 from pathlib import Path
 from typing import Any
@@ -21,72 +16,44 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slatprep import provenance
-from slatprep.align import align
-from slatprep.align.ambiguity import measure_ambiguity
-from slatprep.align.quality import judge
-from slatprep.errors import MissingPartnerError, SlatprepError, StoreError
+from slatprep.errors import StoreError
 from slatprep.normalize import PIXIE_RANGES, ranges_from_extents, read_ranges
 from slatprep.parallel import run_unordered
 from slatprep.parameters import BuildParameters, NormalizeParameters, StoreParameters
-from slatprep.readers import discover, read_field, read_latents
-from slatprep.records import PROPERTY_COLUMNS, AssetPair, AssetResult, Normalization, Status
-from slatprep.sample import sample
+from slatprep.plan import Action, BuildPlan, PlannedAsset, plan_assets
+from slatprep.process import Bench, finish_asset, process_asset, worker_died
+from slatprep.publish import (
+    is_current,
+    previous_build,
+    publish_manifests,
+    repeat_summary,
+    write_all_records,
+)
+from slatprep.readers import discover
+from slatprep.records import PROPERTY_COLUMNS, AssetPair, Normalization, Status
+from slatprep.reuse import recipe_of
 from slatprep.store.reader import is_store
 from slatprep.store.replace import replace_directory
-from slatprep.store.spool import Spool, SpooledAsset
+from slatprep.store.spool import Spool, SpooledAsset, writing
+from slatprep.store.work import work_beside, work_directory
 from slatprep.store.writer import create_store, finish_store, shards, write_assets, write_shard
 from slatprep.summary import BuildSummary, problems_of, summarise
 
 __all__ = [
+    "BuildPlan",
     "BuildSummary",
     "Progress",
     "align_pairs",
     "build_store",
     "default_manifests",
+    "plan_build",
     "process_asset",
 ]
 
 Progress = Callable[[int, int], None]
 """Called with the assets done and the assets in all."""
 
-
-def process_asset(pair: AssetPair, parameters: BuildParameters) -> AssetResult:
-    """Take one asset from its two source files to annotated SLAT voxels.
-
-    Parameters
-    ----------
-    pair : AssetPair
-        Where its files lie.
-    parameters : BuildParameters
-        How to align and to look up.
-
-    Returns
-    -------
-    AssetResult
-        With properties in SI units: ranges come from the whole dataset.
-
-    Raises
-    ------
-    InputError
-        If a source cannot be used or a partner is missing.
-    """
-    field = read_field(pair)
-    latents = read_latents(pair)
-    alignment = align(field, latents, parameters.align)
-    annotation = sample(field, latents.coords, alignment.transform, parameters.sample)
-    ambiguity = measure_ambiguity(field, latents, alignment, parameters.sample)
-    verdict, reasons = judge(alignment.quality, float(annotation.valid.mean()), ambiguity)
-    return AssetResult(
-        pair=pair,
-        status=Status.OK,
-        field=field,
-        latents=latents,
-        alignment=alignment,
-        annotation=annotation,
-        ambiguity=ambiguity,
-        verdict=verdict,
-        verdict_reasons=reasons,
-    )
+_OTHERS = tuple(action for action in Action if action is not Action.REUSE)
 
 
 def build_store(
@@ -96,17 +63,19 @@ def build_store(
     manifests: Path | None = None,
     jobs: int = 1,
     strict: bool = False,
+    fresh: bool = False,
+    keep_work: bool = False,
     progress: Progress | None = None,
 ) -> BuildSummary:
-    """Build a store of all assets of a dataset, and the records of how.
+    """Build a store of all assets of a dataset, or bring it up to date, with the records of how.
 
     Parameters
     ----------
     parameters : BuildParameters
         Sources and methods.
     out : Path
-        The store; an older one is replaced, in one step, when the new one is
-        finished.
+        The store. One that is there is replaced, in one step, when the new
+        one is finished; assets that did not change are not aligned again.
     manifests : Path, optional
         Directory of ``assets.jsonl`` and ``build.json``; by default beside the
         store, see `default_manifests`.
@@ -114,6 +83,11 @@ def build_store(
         Worker processes. The store's bytes do not depend on it.
     strict : bool
         Raise at the first asset that cannot be used instead of going on.
+    fresh : bool
+        Do everything, whatever was done before.
+    keep_work : bool
+        Keep each asset's arrays beside the store, about a megabyte an asset,
+        so that the next build does not even read unchanged assets twice.
     progress : callable, optional
         See `Progress`.
 
@@ -125,46 +99,81 @@ def build_store(
     Raises
     ------
     StoreError
-        If `out` is something other than a store, or no asset can be used.
+        If `out` is something other than a store, another build is writing it,
+        no asset can be used, or the disk does not take what is written.
     InputError
         With `strict`, for the first asset that cannot be used.
     """
     begin = time.perf_counter()
     out = Path(out)
-    _refuse_other_targets(out)
-    target = out.resolve()  # What a link points to is replaced, not the link.
-    manifests = default_manifests(out) if manifests is None else Path(manifests)
+    target, manifests = _places(out, manifests)
     given = _given_ranges(parameters.normalize)
-    with _work_directory(target) as work:
-        spool = Spool(work / "spool")
-        assets = _process_all(parameters, spool, jobs, strict, progress)
-        usable = [asset for asset in assets if asset.status is Status.OK]
-        if not usable:
-            raise StoreError(_nothing_usable(assets, parameters))
-        normalization = given or _dataset_ranges(usable)
-        new = work / "store.zarr"
-        clipped = _pack(new, spool, usable, normalization, parameters.store, jobs)
-        with (
-            provenance.staged(manifests / "assets.jsonl") as records_file,
-            provenance.staged(manifests / "build.json") as build_file,
-        ):
-            records = _completed_records(spool, assets, normalization, clipped)
-            manifest = provenance.write_records(records_file, records)
-            finish_store(new, normalization, manifest, provenance.origin(parameters))
-            summary = summarise(
-                assets,
-                store=out,
-                records=manifests / "assets.jsonl",
-                manifest=manifest,
-                normalization=normalization,
-                clipped=dict(
-                    zip(PROPERTY_COLUMNS, clipped["voxel"].sum(axis=0).tolist(), strict=True)
-                ),
-                seconds=time.perf_counter() - begin,
+    with work_beside(target, keep=keep_work) as work:
+        if fresh:
+            work.spool.keep_only(set())
+        previous = None if fresh else previous_build(target)
+        bench = Bench(parameters, recipe_of(parameters), work.spool, previous, strict)
+        plan = _plan_if_any(bench, jobs, progress)
+        assets = _finish_all(bench, plan, _OTHERS, jobs, progress)
+        usable = any(asset.status is Status.OK for asset in assets)
+        if not usable and previous and is_current(plan, assets, bench, given):
+            return repeat_summary(
+                assets, bench, store=out, manifests=manifests, seconds=time.perf_counter() - begin
             )
-            provenance.write_build_record(build_file, summary, parameters)
+        assets += _finish_all(bench, plan, (Action.REUSE,), jobs, progress)
+        assets.sort(key=lambda asset: asset.asset_id)
+        usable_assets = [asset for asset in assets if asset.status is Status.OK]
+        if not usable_assets:
+            raise StoreError(_nothing_usable(assets, parameters))
+        normalization = given or _dataset_ranges(usable_assets)
+        new, records_file = work.scratch / "store.zarr", work.scratch / "assets.jsonl"
+        with writing(str(out), target.parent):
+            clipped = _pack(new, work.spool, usable_assets, normalization, parameters.store, jobs)
+            records = _completed_records(work.spool, assets, normalization, clipped)
+            manifest = write_all_records(new, records_file, records)
+            finish_store(new, normalization, manifest, provenance.origin(parameters))
             replace_directory(new, target)
+        summary = summarise(
+            assets,
+            store=out,
+            records=manifests / "assets.jsonl",
+            manifest=manifest,
+            normalization=normalization,
+            clipped=_by_property(clipped["voxel"]),
+            seconds=time.perf_counter() - begin,
+        )
+        publish_manifests(records_file, summary, parameters)
+        if keep_work:
+            work.spool.keep_only({asset.key for asset in usable_assets})
     return summary
+
+
+def plan_build(
+    parameters: BuildParameters,
+    out: Path,
+    *,
+    jobs: int = 1,
+    fresh: bool = False,
+    progress: Progress | None = None,
+) -> BuildPlan:
+    """Say what `build_store` would do with each asset, and why; nothing is written.
+
+    Parameters
+    ----------
+    parameters, out, jobs, fresh, progress
+        As for `build_store`.
+
+    Returns
+    -------
+    BuildPlan
+        An entry an asset.
+    """
+    target, _ = _places(Path(out), None)
+    directory = work_directory(target) / "spool"
+    spool = Spool(directory) if directory.is_dir() and not fresh else None
+    previous = None if fresh else previous_build(target)
+    assets = plan_assets(parameters, recipe_of(parameters), spool, previous, jobs, progress)
+    return BuildPlan(Path(out), tuple(sorted(assets, key=lambda asset: asset.asset_id)))
 
 
 def align_pairs(
@@ -199,11 +208,13 @@ def align_pairs(
     """
     begin = time.perf_counter()
     out = Path(out)
-    with _work_directory(out) as work:
-        spool = Spool(work, arrays=False)
-        assets = _process_all(parameters, spool, jobs, strict, progress)
-        with provenance.staged(out) as file:
-            records = (spool.record(asset.asset_id) for asset in assets)
+    with work_beside(out, arrays=False) as work:
+        bench = Bench(parameters, recipe_of(parameters), work.spool, None, strict)
+        plan = _plan_if_any(bench, jobs, progress)
+        assets = _finish_all(bench, plan, tuple(Action), jobs, progress)
+        assets.sort(key=lambda asset: asset.asset_id)
+        with writing(str(out), out.parent), provenance.staged(out) as file:
+            records = (work.spool.record(asset.key) for asset in assets)
             manifest = provenance.write_records(file, records)
     seconds = time.perf_counter() - begin
     return summarise(assets, records=out, manifest=manifest, seconds=seconds)
@@ -214,47 +225,43 @@ def default_manifests(store: Path) -> Path:
     return store.with_name(f"{store.name.removesuffix('.zarr')}.manifests")
 
 
-def _process_all(
-    parameters: BuildParameters,
-    spool: Spool,
+def _plan_if_any(
+    bench: Bench, jobs: int, progress: Progress | None
+) -> dict[str, PlannedAsset] | None:
+    """Return what is to be done by asset id, or None where nothing was done before."""
+    if bench.previous is None and not bench.spool.holds_any():
+        return None
+    spool = bench.spool if bench.spool.holds_any() else None
+    assets = plan_assets(bench.parameters, bench.recipe, spool, bench.previous, jobs, progress)
+    return {asset.asset_id: asset for asset in assets}
+
+
+def _finish_all(
+    bench: Bench,
+    plan: dict[str, PlannedAsset] | None,
+    actions: tuple[Action, ...],
     jobs: int,
-    strict: bool,
     progress: Progress | None,
 ) -> list[SpooledAsset]:
-    """Process every asset of the dataset into the spool; return what is kept, sorted by id."""
+    """Bring every asset with one of these actions into the spool; return what is kept of each."""
+
+    def chosen() -> Iterator[tuple[AssetPair, PlannedAsset | None]]:
+        for pair in discover(bench.parameters):
+            planned = plan.get(pair.asset_id) if plan else None
+            if planned is None or planned.action in actions:
+                yield pair, planned
+
+    if plan is None and Action.ALIGN not in actions:
+        return []
     # Listing names twice is cheap; holding a list of all pairs is not.
-    total = sum(1 for _ in discover(parameters)) if progress else 0
-    tasks = ((pair, parameters, spool, strict) for pair in discover(parameters))
+    total = sum(1 for _ in chosen()) if progress else 0
+    tasks = ((pair, planned, bench) for pair, planned in chosen())
     assets = []
-    for asset in run_unordered(_spool_asset, tasks, jobs):
+    for asset in run_unordered(finish_asset, tasks, jobs, worker_died):
         assets.append(asset)
         if progress:
             progress(len(assets), max(total, len(assets)))
-    return sorted(assets, key=lambda asset: asset.asset_id)
-
-
-def _spool_asset(
-    pair: AssetPair, parameters: BuildParameters, spool: Spool, strict: bool
-) -> SpooledAsset:
-    """Process one asset in a worker; its faults become a status unless `strict`."""
-    begin = time.perf_counter()
-    trace = ""
-    try:
-        result = process_asset(pair, parameters)
-    except SlatprepError as error:
-        if strict:
-            raise
-        missing = isinstance(error, MissingPartnerError)
-        result = AssetResult(pair, Status.SKIPPED if missing else Status.FAILED, _line(error))
-    except Exception as error:
-        # A fault of slatprep's own in one asset must not cost the others.
-        if strict:
-            raise
-        trace = traceback.format_exc()
-        reason = f"internal error, please report: {type(error).__name__}: {_line(error)}"
-        result = AssetResult(pair, Status.FAILED, reason)
-    record = provenance.asset_record(result, parameters, time.perf_counter() - begin, trace)
-    return spool.put(replace(result, record=record))
+    return assets
 
 
 def _given_ranges(parameters: NormalizeParameters) -> Normalization | None:
@@ -277,14 +284,14 @@ def _pack(
     jobs: int,
 ) -> dict[str, NDArray[np.int64]]:
     """Write the store's arrays, a task a shard; return the values clipped, by group and asset."""
-    ids = [asset.asset_id for asset in assets]
+    keys = [asset.key for asset in assets]
     offsets = [0, *accumulate(asset.n_voxels for asset in assets)]
-    create_store(path, len(ids), offsets[-1], parameters)
+    create_store(path, len(keys), offsets[-1], parameters)
     write_assets(path, assets, offsets, normalization)
-    clipped = {group: np.zeros((len(ids), 3), dtype=np.int64) for group in ("voxel", "grid")}
-    tasks = ((path, spool, shard, normalization) for shard in shards(ids, offsets, parameters))
+    clipped = {group: np.zeros((len(keys), 3), dtype=np.int64) for group in ("voxel", "grid")}
+    tasks = ((path, spool, shard, normalization) for shard in shards(keys, offsets, parameters))
     for shard, counts in run_unordered(write_shard, tasks, jobs):
-        clipped[shard.group][shard.first : shard.first + len(shard.ids)] += counts
+        clipped[shard.group][shard.first : shard.first + len(shard.keys)] += counts
     return clipped
 
 
@@ -300,14 +307,10 @@ def _completed_records(
 ) -> Iterator[dict[str, Any]]:
     counts = zip(clipped["voxel"], clipped["grid"], strict=True)
     for asset in assets:
-        record = spool.record(asset.asset_id)
+        record = spool.record(asset.key)
         if asset.status is Status.OK:
             record = provenance.complete_record(record, normalization, *next(counts))
         yield record
-
-
-def _line(error: Exception) -> str:
-    return " ".join(str(error).split())
 
 
 def _nothing_usable(assets: Sequence[SpooledAsset], parameters: BuildParameters) -> str:
@@ -322,26 +325,11 @@ def _nothing_usable(assets: Sequence[SpooledAsset], parameters: BuildParameters)
     return f"none of {len(problems)} assets can be used, so there is no store:{listed}{more}"
 
 
-def _refuse_other_targets(out: Path) -> None:
+def _places(out: Path, manifests: Path | None) -> tuple[Path, Path]:
+    """Return where the store really lies, and the directory of its records."""
     if out.exists() and not is_store(out) and not (out.is_dir() and not any(out.iterdir())):
         raise StoreError(
             f"{out} exists and is not a slatprep store; expected a store to replace, or a new path"
         )
-
-
-@contextmanager
-def _work_directory(out: Path) -> Iterator[Path]:
-    """Make a directory beside `out`, on its file system, and remove it afterwards."""
-    try:
-        out.parent.mkdir(parents=True, exist_ok=True)
-        # A name of its own for each build: what a killed one left is never taken for this one's.
-        work = Path(tempfile.mkdtemp(prefix=f".{out.name}.work-", dir=out.parent))
-    except OSError as error:
-        raise StoreError(
-            f"{out.parent}: cannot write there ({error.strerror}); "
-            "expected a folder for the result and for temporary files"
-        ) from error
-    try:
-        yield work
-    finally:
-        shutil.rmtree(work, ignore_errors=True)
+    # What a link points to is replaced, not the link.
+    return out.resolve(), default_manifests(out) if manifests is None else Path(manifests)

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import os
+import threading
+import time
 import warnings
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
@@ -24,12 +26,16 @@ _THREAD_VARIABLES = (
 
 
 def run_unordered(
-    function: Callable[..., Result], tasks: Iterable[tuple[Any, ...]], jobs: int = 1
+    function: Callable[..., Result],
+    tasks: Iterable[tuple[Any, ...]],
+    jobs: int = 1,
+    died: Callable[..., Result] | None = None,
 ) -> Iterator[Result]:
     """Yield ``function(*task)`` for each task, in the order in which they finish.
 
     Tasks are taken from the iterable only as workers come free, and each
-    worker computes on one thread.
+    worker computes on one thread. When a worker is killed, whatever was under
+    way is done again, a task at a time, in a process of its own.
 
     Parameters
     ----------
@@ -39,37 +45,127 @@ def run_unordered(
         Positional arguments of each call.
     jobs : int
         Worker processes; 1 computes in this process.
+    died : callable, optional
+        ``died(*task)`` stands in for the result of a task that was alone when
+        its worker was killed again. Without it that is an error.
 
     Raises
     ------
     SlatprepError
-        If a worker was killed from outside.
+        If a task kills its worker even alone, and `died` is not given.
     """
-    from joblib import Parallel, delayed, parallel_config
-    from joblib.externals.loky.process_executor import BrokenProcessPool
-
-    calls = (delayed(function)(*task) for task in tasks)
     if jobs == 1:
         with single_threaded():
-            yield from Parallel(n_jobs=1, return_as="generator")(calls)
+            for task in tasks:
+                yield function(*task)
         return
-    with parallel_config("loky", n_jobs=jobs, inner_max_num_threads=1):
+    from joblib.externals.loky.process_executor import BrokenProcessPool
+
+    source = _Handout(tasks)
+    while not source.exhausted:
+        try:
+            yield from _run_in_pool(function, source, jobs)
+        except BrokenProcessPool:
+            for task in source.unfinished():
+                yield _run_alone(function, task, died)
+
+
+class _Handout:
+    """Hands tasks out and remembers which have not come back."""
+
+    def __init__(self, tasks: Iterable[tuple[Any, ...]]) -> None:
+        self._tasks = enumerate(tasks)
+        self._out: dict[int, tuple[Any, ...]] = {}
+        self._lock = threading.Lock()
+        self._turn = 0
+        self.exhausted = False
+
+    def __iter__(self) -> Iterator[tuple[int, tuple[Any, ...]]]:
+        turn = self._turn
+        while True:
+            with self._lock:  # joblib asks from threads of its own, one of them perhaps too late
+                if turn != self._turn:
+                    return
+                number, task = next(self._tasks, (-1, ()))
+                if number < 0:
+                    self.exhausted = True
+                    return
+                self._out[number] = task
+            yield number, task
+
+    def back(self, number: int) -> None:
+        """Forget a task whose result has come."""
+        with self._lock:
+            del self._out[number]
+
+    def unfinished(self) -> list[tuple[Any, ...]]:
+        """Take the tasks that were under way, in order; who iterates now gets no more."""
+        with self._lock:
+            self._turn += 1
+            tasks = [self._out[number] for number in sorted(self._out)]
+            self._out.clear()
+        return tasks
+
+
+def _run_in_pool(function: Callable[..., Result], source: _Handout, jobs: int) -> Iterator[Result]:
+    from joblib import Parallel, delayed, parallel_config
+
+    calls = (delayed(_numbered)(function, number, task) for number, task in source)
+    watch = {"initializer": _end_with, "initargs": (os.getpid(),)}
+    with parallel_config("loky", n_jobs=jobs, inner_max_num_threads=1, **watch):
         # Our tasks take long enough to travel alone; in batches progress would jump.
         parallel = Parallel(return_as="generator_unordered", batch_size=1)
     results = parallel(calls)
     try:
-        for result in results:  # noqa: UP028 - "yield from" would close it before `finally` does
+        for number, result in results:
+            source.back(number)
             yield result
-    except BrokenProcessPool as error:
-        raise SlatprepError(
-            "a worker process was killed, probably because memory ran out; nothing was replaced. "
-            "Run again with fewer jobs"
-        ) from error
     finally:
         with warnings.catch_warnings():
             # Whoever stops early, as a strict build does, means to waste the rest.
             warnings.filterwarnings("ignore", message=".*but not used", category=UserWarning)
             results.close()
+
+
+def _run_alone(
+    function: Callable[..., Result],
+    task: tuple[Any, ...],
+    died: Callable[..., Result] | None,
+) -> Result:
+    from joblib.externals.loky import ProcessPoolExecutor
+    from joblib.externals.loky.process_executor import BrokenProcessPool
+
+    environment = dict.fromkeys(_THREAD_VARIABLES, "1")
+    alone = ProcessPoolExecutor(1, env=environment, initializer=_end_with, initargs=(os.getpid(),))
+    try:
+        result: Result = alone.submit(function, *task).result()
+        return result
+    except BrokenProcessPool:
+        if died is not None:
+            return died(*task)
+        raise SlatprepError(
+            "a worker process was killed twice at the same task, probably because memory ran "
+            "out; nothing was replaced. Run again with fewer jobs, or with more memory"
+        ) from None
+    finally:
+        alone.shutdown()
+
+
+def _numbered(
+    function: Callable[..., Result], number: int, task: tuple[Any, ...]
+) -> tuple[int, Result]:
+    return number, function(*task)
+
+
+def _end_with(parent: int) -> None:
+    """End this worker soon after its parent, however that ends."""
+
+    def watch() -> None:
+        while os.getppid() == parent:
+            time.sleep(1.0)
+        os._exit(1)
+
+    threading.Thread(target=watch, daemon=True).start()
 
 
 @contextmanager

@@ -206,12 +206,22 @@ def write_records(path: Path, records: Iterable[Mapping[str, Any]]) -> str:
         SHA-256, in hex, of all that the records say except how long things
         took and in what words they failed.
     """
-    digest = hashlib.sha256()
-    with path.open("w", encoding="utf-8") as file:
+
+    def writing() -> Iterator[Mapping[str, Any]]:
         for record in records:
             file.write(json.dumps(record, allow_nan=False, ensure_ascii=False) + "\n")
-            content = {k: v for k, v in record.items() if k not in _NOT_CONTENT}
-            digest.update(json.dumps(content, sort_keys=True, allow_nan=False).encode() + b"\n")
+            yield record
+
+    with path.open("w", encoding="utf-8") as file:
+        return records_id(writing())
+
+
+def records_id(records: Iterable[Mapping[str, Any]]) -> str:
+    """Return the id of a build whose records these are, in the order of their asset ids."""
+    digest = hashlib.sha256()
+    for record in records:
+        content = {k: v for k, v in record.items() if k not in _NOT_CONTENT}
+        digest.update(json.dumps(content, sort_keys=True, allow_nan=False).encode() + b"\n")
     return digest.hexdigest()
 
 

@@ -1,4 +1,8 @@
-"""Put a finished directory in the place of an old one, in one step where the system can."""
+"""Put a new directory in the place of an old one, in one step where the system can.
+
+Nothing is exchanged before all of the new one is on the disk itself, so that
+a power failure finds the old one whole or the new one whole.
+"""
 
 from __future__ import annotations
 
@@ -18,26 +22,59 @@ def replace_directory(new: Path, target: Path) -> None:
     On Linux the two directories are exchanged in one system call, so a reader
     finds the old or the new one whole at every moment. Elsewhere, and on file
     systems that cannot exchange, two renames leave a short moment without
-    either. Both must lie on one file system.
+    either; `restore_directory` mends what a kill in it leaves. Both must lie
+    on one file system.
 
     Raises
     ------
     OSError
         If the directory cannot be moved; `target` is as it was.
     """
+    flush_tree(new)
+    old = _aside(new.parent)
     if not target.exists():
         new.rename(target)
     elif _exchange(new, target):
-        shutil.rmtree(new)
+        old = new
     else:
-        old = new.with_name(f"{new.name}.old")
         target.rename(old)
         try:
             new.rename(target)
         except OSError:
             old.rename(target)
             raise
-        shutil.rmtree(old)
+    flush(target.parent)
+    if old.exists():
+        shutil.rmtree(old, ignore_errors=True)  # The work folder goes next, with what is left.
+
+
+def restore_directory(work: Path, target: Path) -> None:
+    """Put back what a kill between the two renames of `replace_directory` left in `work`."""
+    if _aside(work).exists() and not target.exists():
+        _aside(work).rename(target)
+
+
+def flush_tree(directory: Path) -> None:
+    """Bring every file below a directory, and the names of all, onto the disk itself."""
+    for parent, _, files in os.walk(directory, topdown=False):
+        for name in files:
+            flush(Path(parent, name))
+        flush(Path(parent))
+
+
+def flush(path: Path) -> None:
+    """Bring a file's content, or a directory's names, onto the disk itself."""
+    if path.is_dir() and sys.platform == "win32":
+        return  # There a directory cannot be opened.
+    descriptor = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+def _aside(work: Path) -> Path:
+    return work / "previous"
 
 
 def _exchange(new: Path, target: Path) -> bool:

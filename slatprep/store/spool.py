@@ -1,14 +1,21 @@
 """Finished assets on disk, between the pass that aligns and the pass that packs.
 
 A worker leaves an asset's arrays here, in SI units, and hands the parent only
-a `SpooledAsset`, so the parent's memory does not grow with voxels. Files are
-named by a hash: an asset id need not be a file name.
+a `SpooledAsset`, so the parent's memory does not grow with voxels. A file is
+named by its asset's key (see `slatprep.reuse`), so what an interrupted build
+finished is found again by the next one, and only by one that would write the
+same. It appears under its name when it is whole; npz holds a checksum of
+every array, so one that a power failure tore is known and done again.
 """
 
 from __future__ import annotations
 
 import hashlib
 import json
+import uuid
+import zipfile
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, cast
@@ -16,6 +23,7 @@ from typing import Any, cast
 import numpy as np
 from numpy.typing import NDArray
 
+from slatprep.errors import StoreError
 from slatprep.normalize import property_extent
 from slatprep.records import (
     BACKGROUND,
@@ -28,6 +36,11 @@ from slatprep.records import (
     StructuredLatents,
 )
 
+Arrays = dict[str, NDArray[Any]]
+
+_VOXEL_ARRAYS = ("coords", "feats", "properties", "material", "valid", "distance")
+_TORN = (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile)
+
 
 @dataclass(frozen=True, slots=True)
 class SpooledAsset:
@@ -37,6 +50,8 @@ class SpooledAsset:
     ----------
     asset_id : str
         Id of the row.
+    key : str
+        Names its file in the spool.
     status : Status
         Only ``ok`` has arrays in the spool.
     reason : str
@@ -51,6 +66,7 @@ class SpooledAsset:
     """
 
     asset_id: str
+    key: str
     status: Status
     reason: str = ""
     n_voxels: int = 0
@@ -65,7 +81,7 @@ class Spool:
     Parameters
     ----------
     directory : Path
-        Where; made with the first asset.
+        Where; it must exist.
     arrays : bool
         Whether arrays are kept, or records alone.
     """
@@ -74,52 +90,63 @@ class Spool:
         self.directory = directory
         self.arrays = arrays
 
-    def put(self, result: AssetResult) -> SpooledAsset:
-        """Write an asset's record, and its arrays if it has any; return what the parent keeps."""
-        asset_id = result.pair.asset_id
-        path = self._path(asset_id, ".json")
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(json.dumps(result.record, allow_nan=False), encoding="utf-8")
-        if result.status is not Status.OK:
-            return SpooledAsset(asset_id, result.status, result.reason)
-        field, latents, annotation = _arrays_of(result)
-        if self.arrays:
-            np.savez(
-                self._path(asset_id, ".npz"),
-                coords=latents.coords,
-                feats=latents.feats,
-                properties=annotation.properties,
-                material=annotation.material,
-                valid=annotation.valid,
-                distance=annotation.distance,
-                grid_occupancy=np.packbits(field.occupancy),
-                grid_voxels=field.voxels,
-                grid_material=field.material,
-                grid_properties=field.properties,
-            )
-        return SpooledAsset(
-            asset_id,
-            result.status,
-            n_voxels=len(latents.coords),
-            n_valid=int(annotation.valid.sum()),
-            extent=property_extent(field),
-            columns=_columns(result),
-        )
+    def put(self, result: AssetResult, key: str) -> SpooledAsset:
+        """Write an asset's record, and its arrays if it has any; return what the parent keeps.
 
-    def record(self, asset_id: str) -> dict[str, Any]:
+        Raises
+        ------
+        StoreError
+            If the disk does not take it; names the asset.
+        """
+        arrays: Arrays = {"extent": np.empty(0)}
+        if result.status is Status.OK:
+            arrays = _arrays_of(result) if self.arrays else {}
+            arrays["extent"] = property_extent(_of(result.field, result))
+        with writing(result.pair.asset_id, self.directory):
+            self._write(key, result.record, arrays)
+        return spooled(key, result.record, arrays["extent"])
+
+    def find(self, key: str) -> SpooledAsset | None:
+        """Return a finished asset, or None if there is none under this key that is whole."""
+        try:
+            with np.load(self._path(key), allow_pickle=False) as file:
+                arrays = {name: file[name] for name in file.files}  # Reads, so checks, them all.
+            record = json.loads(arrays["record"].tobytes())
+        except _TORN:
+            return None
+        if self.arrays and "coords" not in arrays:
+            return None  # Finished by an alignment without a store.
+        return spooled(key, record, arrays["extent"])
+
+    def holds_any(self) -> bool:
+        """Whether anything at all is finished."""
+        return any(self.directory.glob("[0-9a-f][0-9a-f]/*.npz"))
+
+    def amend(self, key: str, changes: dict[str, Any]) -> None:
+        """Replace entries of a finished asset's record."""
+        with np.load(self._path(key), allow_pickle=False) as file:
+            arrays = {name: file[name] for name in file.files if name != "record"}
+        record = self.record(key)
+        with writing(record["asset_id"], self.directory):
+            self._write(key, record | changes, arrays)
+
+    def keep_only(self, keys: set[str]) -> None:
+        """Remove everything but these assets' files."""
+        for path in self.directory.rglob("*"):
+            if path.is_file() and (path.stem not in keys or path.suffix != ".npz"):
+                path.unlink()
+
+    def record(self, key: str) -> dict[str, Any]:
         """Read an asset's record back."""
-        text = self._path(asset_id, ".json").read_text(encoding="utf-8")
-        return cast(dict[str, Any], json.loads(text))
+        with np.load(self._path(key), allow_pickle=False) as arrays:
+            return cast(dict[str, Any], json.loads(arrays["record"].tobytes()))
 
-    def voxels(self, asset_id: str) -> dict[str, NDArray[Any]]:
+    def voxels(self, key: str) -> Arrays:
         """Read an asset's rows of the ``voxel/*`` arrays, properties in SI units."""
-        names = ("coords", "feats", "properties", "material", "valid", "distance")
-        with np.load(self._path(asset_id, ".npz"), allow_pickle=False) as arrays:
-            return {name: arrays[name] for name in names}
+        with np.load(self._path(key), allow_pickle=False) as arrays:
+            return {name: arrays[name] for name in _VOXEL_ARRAYS}
 
-    def grid(
-        self, asset_id: str
-    ) -> tuple[NDArray[np.uint8], NDArray[np.uint8], NDArray[np.float32]]:
+    def grid(self, key: str) -> tuple[NDArray[np.uint8], NDArray[np.uint8], NDArray[np.float32]]:
         """Read an asset's PixieVerse field.
 
         Returns
@@ -131,7 +158,7 @@ class Spool:
         properties : ndarray of float32, shape (K, 3)
             Their properties in SI units.
         """
-        with np.load(self._path(asset_id, ".npz"), allow_pickle=False) as arrays:
+        with np.load(self._path(key), allow_pickle=False) as arrays:
             occupancy = np.unpackbits(arrays["grid_occupancy"]).astype(bool)
             voxels, properties = arrays["grid_voxels"], arrays["grid_properties"]
             material_of_voxels = arrays["grid_material"]
@@ -140,40 +167,106 @@ class Spool:
         material[tuple(voxels.T)] = material_of_voxels
         return material, voxels, properties
 
-    def _path(self, asset_id: str, suffix: str) -> Path:
-        key = hashlib.sha256(asset_id.encode()).hexdigest()[:32]
-        return self.directory / key[:2] / f"{key}{suffix}"
+    def _path(self, key: str) -> Path:
+        return self.directory / key[:2] / f"{key}.npz"
+
+    def _write(self, key: str, record: dict[str, Any], arrays: Arrays) -> None:
+        path = self._path(key)
+        path.parent.mkdir(exist_ok=True)
+        # A name of its own: a worker that outlives a killed build may write the same asset.
+        partial = path.with_suffix(f".{uuid.uuid4().hex}.partial")
+        text = json.dumps(record, allow_nan=False).encode()
+        try:
+            with partial.open("wb") as file:
+                np.savez(file, **{**arrays, "record": np.frombuffer(text, np.uint8)})
+            partial.replace(path)
+        finally:
+            partial.unlink(missing_ok=True)
 
 
-def _arrays_of(result: AssetResult) -> tuple[MaterialField, StructuredLatents, Annotation]:
-    field, latents, annotation = result.field, result.latents, result.annotation
-    if field is None or latents is None or annotation is None:
-        raise ValueError(f"{result.pair.asset_id}: status is ok, but arrays are missing")
-    return field, latents, annotation
+def key_of_failed(asset_id: str) -> str:
+    """Return the key of an asset without a result: it is tried again in every build."""
+    return f"none-{hashlib.sha256(asset_id.encode()).hexdigest()[:32]}"
 
 
-def _columns(result: AssetResult) -> dict[str, Any]:
-    pair, alignment, annotation = result.pair, result.alignment, result.annotation
-    ambiguity, verdict = result.ambiguity, result.verdict
-    if alignment is None or annotation is None or ambiguity is None or verdict is None:
-        raise ValueError(f"{pair.asset_id}: status is ok, but the alignment is missing")
-    quality = alignment.quality
+@contextmanager
+def writing(what: str, where: Path) -> Iterator[None]:
+    """Turn a disk's refusal into an error that names what was to be written.
+
+    Raises
+    ------
+    StoreError
+        In place of an `OSError`.
+    """
+    try:
+        yield
+    except OSError as error:
+        raise StoreError(
+            f"{what}: cannot be written to {where} ({error.strerror or error}); nothing was "
+            "replaced. Make room there and run again: what is finished is kept"
+        ) from error
+
+
+def spooled(key: str, record: dict[str, Any], extent: NDArray[np.float64] | None) -> SpooledAsset:
+    """Return what the parent keeps of an asset with this record."""
+    status = Status(record["status"])
+    if status is not Status.OK:
+        return SpooledAsset(record["asset_id"], key, status, record["reason"])
+    counts = record["counts"]
+    return SpooledAsset(
+        record["asset_id"],
+        key,
+        status,
+        n_voxels=counts["slat_voxels"],
+        n_valid=counts["valid"],
+        extent=extent,
+        columns=_columns(record),
+    )
+
+
+def _arrays_of(result: AssetResult) -> Arrays:
+    field: MaterialField = _of(result.field, result)
+    latents: StructuredLatents = _of(result.latents, result)
+    annotation: Annotation = _of(result.annotation, result)
     return {
-        "object_id": pair.object_id,
-        "view": pair.view,
-        "category": pair.category,
-        "transform": alignment.transform,
-        "engine": alignment.engine,
-        "model": alignment.model,
-        "search": alignment.search,
-        "fitness": quality.fitness,
-        "inlier_rmse": quality.inlier_rmse,
-        "fitness_backward": quality.fitness_backward,
-        "inlier_rmse_backward": quality.inlier_rmse_backward,
-        "overlap": quality.overlap,
-        "margin": ambiguity.margin,
-        "ambiguity": ambiguity.material_share,
-        "property_ambiguity": ambiguity.property_change,
-        "valid_share": float(annotation.valid.mean()),
-        "verdict": str(verdict),
+        "coords": latents.coords,
+        "feats": latents.feats,
+        "properties": annotation.properties,
+        "material": annotation.material,
+        "valid": annotation.valid,
+        "distance": annotation.distance,
+        "grid_occupancy": np.packbits(field.occupancy),
+        "grid_voxels": field.voxels,
+        "grid_material": field.material,
+        "grid_properties": field.properties,
+    }
+
+
+def _of(part: Any, result: AssetResult) -> Any:
+    if part is None:
+        raise ValueError(f"{result.pair.asset_id}: status is ok, but arrays are missing")
+    return part
+
+
+def _columns(record: dict[str, Any]) -> dict[str, Any]:
+    alignment, counts = record["alignment"], record["counts"]
+    quality, ambiguity = alignment["quality"], alignment["ambiguity"]
+    return {
+        "object_id": record["object_id"],
+        "view": record["view"],
+        "category": record["category"],
+        "transform": np.array(alignment["transform"], dtype=np.float64),
+        "engine": alignment["engine"],
+        "model": alignment["model"],
+        "search": alignment["search"],
+        "fitness": quality["fitness"],
+        "inlier_rmse": quality["inlier_rmse"],
+        "fitness_backward": quality["fitness_backward"],
+        "inlier_rmse_backward": quality["inlier_rmse_backward"],
+        "overlap": quality["overlap"],
+        "margin": ambiguity["margin"],
+        "ambiguity": ambiguity["material_share"],
+        "property_ambiguity": ambiguity["property_change"],
+        "valid_share": counts["valid"] / counts["slat_voxels"],
+        "verdict": alignment["verdict"],
     }

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from slatprep.normalize import normalize, normalize_change
 from slatprep.parameters import StoreParameters
 from slatprep.records import RESOLUTION, Normalization
+from slatprep.store.asset_records import create_record_array
 from slatprep.store.layout import (
     ARRAYS,
     create_arrays,
@@ -45,8 +46,8 @@ class Shard:
         First row and end in the store.
     first : int
         Index of the first asset that has rows in it.
-    ids : sequence of str
-        The assets that have rows in it.
+    keys : sequence of str
+        Keys, in the spool, of the assets that have rows in it.
     offsets : sequence of int
         ``voxel`` alone: first row of each of them in the store, and the last
         one's end.
@@ -55,7 +56,7 @@ class Shard:
     group: str
     rows: tuple[int, int]
     first: int
-    ids: Sequence[str]
+    keys: Sequence[str]
     offsets: Sequence[int] = ()
 
 
@@ -65,18 +66,19 @@ def create_store(path: Path, n_assets: int, n_voxels: int, parameters: StorePara
 
     root = zarr.create_group(path, zarr_format=3)
     create_arrays(root, n_assets, n_voxels, parameters)
+    create_record_array(root, n_assets, parameters.compression_level)
 
 
 def shards(
-    ids: Sequence[str], offsets: Sequence[int], parameters: StoreParameters
+    keys: Sequence[str], offsets: Sequence[int], parameters: StoreParameters
 ) -> Iterator[Shard]:
-    """Yield every shard of a store whose assets `ids` begin at rows `offsets`."""
-    for start, stop in row_ranges(len(ids), parameters.grid_assets_per_shard):
-        yield Shard("grid", (start, stop), start, ids[start:stop])
+    """Yield every shard of a store whose assets, by key, begin at rows `offsets`."""
+    for start, stop in row_ranges(len(keys), parameters.grid_assets_per_shard):
+        yield Shard("grid", (start, stop), start, keys[start:stop])
     for start, stop in row_ranges(offsets[-1], rows_per_shard(parameters)):
         owners = [asset for asset, _ in overlaps(offsets, start, stop)]
         first, last = owners[0], owners[-1] + 1
-        yield Shard("voxel", (start, stop), first, ids[first:last], offsets[first : last + 1])
+        yield Shard("voxel", (start, stop), first, keys[first:last], offsets[first : last + 1])
 
 
 def write_shard(
@@ -99,7 +101,7 @@ def write_shard(
     -------
     shard : Shard
         The same.
-    clipped : ndarray of int64, shape (len(shard.ids), 3)
+    clipped : ndarray of int64, shape (len(shard.keys), 3)
         How many of the values written lay outside the range, by property.
     """
     import zarr
@@ -117,9 +119,9 @@ def write_shard(
 
 def _voxel_rows(spool: Spool, shard: Shard, normalization: Normalization) -> Rows:
     parts: dict[str, list[NDArray[Any]]] = {}
-    clipped = np.zeros((len(shard.ids), 3), dtype=np.int64)
+    clipped = np.zeros((len(shard.keys), 3), dtype=np.int64)
     for asset, own in overlaps(shard.offsets, *shard.rows):
-        arrays = {name: array[own] for name, array in spool.voxels(shard.ids[asset]).items()}
+        arrays = {name: array[own] for name, array in spool.voxels(shard.keys[asset]).items()}
         arrays["properties"], clipped[asset] = normalize(arrays["properties"], normalization)
         for name, array in arrays.items():
             parts.setdefault(name, []).append(array)
@@ -128,11 +130,11 @@ def _voxel_rows(spool: Spool, shard: Shard, normalization: Normalization) -> Row
 
 def _grid_rows(spool: Spool, shard: Shard, normalization: Normalization) -> Rows:
     shape = (RESOLUTION,) * 3
-    material = np.empty((len(shard.ids), *shape), dtype=np.uint8)
-    properties = np.full((len(shard.ids), 3, *shape), np.nan, dtype=np.float32)
-    clipped = np.zeros((len(shard.ids), 3), dtype=np.int64)
-    for asset, asset_id in enumerate(shard.ids):
-        material[asset], voxels, values = spool.grid(asset_id)
+    material = np.empty((len(shard.keys), *shape), dtype=np.uint8)
+    properties = np.full((len(shard.keys), 3, *shape), np.nan, dtype=np.float32)
+    clipped = np.zeros((len(shard.keys), 3), dtype=np.int64)
+    for asset, key in enumerate(shard.keys):
+        material[asset], voxels, values = spool.grid(key)
         normalized, clipped[asset] = normalize(values, normalization)
         properties[(asset, slice(None), *voxels.T)] = normalized
     return {"material": material, "properties": properties}, clipped

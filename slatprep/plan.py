@@ -1,0 +1,157 @@
+"""What a build will do with each asset, and why, before it does it.
+
+Sources are compared by content. Their sizes and times are not trusted: a
+copied or restored file keeps them, and hashing takes a small part of what
+aligning takes.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from enum import StrEnum
+from pathlib import Path
+from typing import Any
+
+from slatprep.errors import SlatprepError
+from slatprep.parallel import run_unordered
+from slatprep.parameters import BuildParameters
+from slatprep.provenance import jsonable
+from slatprep.readers import discover
+from slatprep.readers.identity import hash_sources
+from slatprep.records import AssetPair, SourceFile
+from slatprep.reuse import Recipe
+from slatprep.store.asset_records import StoredRecords, stored_records
+from slatprep.store.spool import Spool
+
+
+class Action(StrEnum):
+    """What a build does with an asset."""
+
+    ALIGN = "align"
+    REUSE = "reuse"
+    RESUME = "resume"
+    REFUSE = "refuse"
+    REMOVE = "remove"
+
+
+@dataclass(frozen=True, slots=True)
+class PlannedAsset:
+    """What will be done with one asset.
+
+    Attributes
+    ----------
+    asset_id : str
+        Id of the row.
+    action : Action
+        ``align``: from its sources to the spool. ``reuse``: its alignment is
+        in the store that is there. ``resume``: an interrupted build finished
+        it. ``refuse``: it cannot go in. ``remove``: it is in the store but no
+        longer in the dataset.
+    reason : str
+        Why, in one line.
+    key : str
+        See `slatprep.reuse`; empty where the sources cannot be read.
+    sources : tuple of SourceFile
+        Files as they are now, where ``resume`` finds a record that names others.
+    """
+
+    asset_id: str
+    action: Action
+    reason: str
+    key: str = ""
+    sources: tuple[SourceFile, ...] = ()
+
+
+@dataclass(frozen=True)
+class BuildPlan:
+    """What a build will do.
+
+    Attributes
+    ----------
+    store : Path
+        The store to make or replace.
+    assets : tuple of PlannedAsset
+        Sorted by id.
+    """
+
+    store: Path
+    assets: tuple[PlannedAsset, ...]
+
+    @property
+    def actions(self) -> dict[str, int]:
+        """Assets by action."""
+        counts = Counter(asset.action for asset in self.assets)
+        return {str(action): counts[action] for action in Action}
+
+
+def plan_assets(
+    parameters: BuildParameters,
+    recipe: Recipe,
+    spool: Spool | None,
+    previous: tuple[Path, str] | None,
+    jobs: int,
+    progress: Callable[[int, int], None] | None = None,
+) -> Iterator[PlannedAsset]:
+    """Yield what will be done with each asset, in no order, those to be removed last.
+
+    Parameters
+    ----------
+    parameters : BuildParameters
+        Where the sources lie.
+    recipe : Recipe
+        What the build's parameters and code come to.
+    spool : Spool or None
+        What an interrupted build left.
+    previous : (Path, str) or None
+        The store that is there, and its build's id.
+    jobs : int
+        Worker processes.
+    progress : callable, optional
+        Called with the assets done and the assets in all.
+    """
+    # Listing names twice is cheap; holding a list of all pairs is not.
+    total = sum(1 for _ in discover(parameters)) if progress else 0
+    tasks = ((pair, recipe, spool, previous) for pair in discover(parameters))
+    seen = set()
+    for planned in run_unordered(plan_asset, tasks, jobs):
+        seen.add(planned.asset_id)
+        if progress:
+            progress(len(seen), total)
+        yield planned
+    records = _records(previous)
+    for asset_id in records.ids if records else ():
+        if asset_id not in seen:
+            yield PlannedAsset(asset_id, Action.REMOVE, "no longer among the sources")
+
+
+def plan_asset(
+    pair: AssetPair, recipe: Recipe, spool: Spool | None, previous: tuple[Path, str] | None
+) -> PlannedAsset:
+    """Say what will be done with one asset, and why."""
+    try:
+        sources, digests = hash_sources(pair)
+    except SlatprepError as error:
+        return PlannedAsset(pair.asset_id, Action.REFUSE, " ".join(str(error).split()))
+    key = recipe.key(pair.asset_id, digests)
+    if spool is not None and spool.find(key) is not None:
+        reason = "finished by an interrupted build"
+        same = spool.record(key)["sources"] == jsonable(sources)
+        return PlannedAsset(pair.asset_id, Action.RESUME, reason, key, () if same else sources)
+    record = previous_record(previous, pair.asset_id)
+    if record is None:
+        return PlannedAsset(pair.asset_id, Action.ALIGN, "not in the store", key)
+    if record["key"] == key:
+        return PlannedAsset(pair.asset_id, Action.REUSE, "unchanged", key)
+    return PlannedAsset(pair.asset_id, Action.ALIGN, recipe.difference(record, sources), key)
+
+
+def previous_record(previous: tuple[Path, str] | None, asset_id: str) -> dict[str, Any] | None:
+    """Return what the store that is there records of an asset, if anything."""
+    records = _records(previous)
+    return records.find(asset_id) if records else None
+
+
+def _records(previous: tuple[Path, str] | None) -> StoredRecords | None:
+    return stored_records(*previous) if previous else None
