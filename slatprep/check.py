@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from slatprep.align.quality import judge, measure_quality
+from slatprep.align.quality import THRESHOLDS, judge, measure_quality
 from slatprep.errors import StoreError
 from slatprep.normalize import denormalize, normalize
 from slatprep.parameters import SampleParameters
@@ -32,6 +34,17 @@ DISTANCE_TOLERANCE = 1e-3
 """Distances [voxel] computed anew differ less than this."""
 
 
+AT_LEAST = {
+    "fitness": THRESHOLDS.good_fitness,
+    "fitness_backward": THRESHOLDS.good_fitness,
+    "valid_share": THRESHOLDS.good_valid_share,
+}
+"""Figures that a good alignment reaches, by name."""
+
+AT_MOST = {"ambiguity": THRESHOLDS.good_ambiguity}
+"""Figures that a good alignment does not exceed, by name."""
+
+
 @dataclass(frozen=True)
 class Figure:
     """One number of a check.
@@ -44,6 +57,20 @@ class Figure:
     value: float
     stored: float
     limit: float
+
+    @property
+    def passes(self) -> bool | None:
+        """Whether the value is a good alignment's; None where the verdict does not ask."""
+        if self.name in AT_LEAST:
+            return self.value >= AT_LEAST[self.name]
+        return self.value <= AT_MOST[self.name] if self.name in AT_MOST else None
+
+    @property
+    def threshold_text(self) -> str:
+        """What is good, like ``>= 0.8``; empty where the verdict does not ask."""
+        if self.name in AT_LEAST:
+            return f">= {AT_LEAST[self.name]:g}"
+        return f"<= {AT_MOST[self.name]:g}" if self.name in AT_MOST else ""
 
     @property
     def ok(self) -> bool:
@@ -66,7 +93,10 @@ class AlignmentCheck:
     stored_verdict : str
         The verdict that the store holds.
     figures : tuple of Figure
-        Every number, computed now and as stored.
+        Every number, computed now and as stored. Ambiguity and margin are
+        taken from the store: the placements they come from are not there.
+    transform : ndarray of float64, shape (4, 4)
+        PixieVerse frame to SLAT frame.
     """
 
     asset_id: str
@@ -74,6 +104,11 @@ class AlignmentCheck:
     reasons: tuple[str, ...]
     stored_verdict: str
     figures: tuple[Figure, ...]
+    transform: NDArray[np.float64]
+
+    def figure(self, name: str) -> Figure:
+        """Return the figure of that name."""
+        return next(figure for figure in self.figures if figure.name == name)
 
     @property
     def consistent(self) -> bool:
@@ -99,8 +134,7 @@ def check_alignment(store: Store, asset_id: str) -> AlignmentCheck:
     Returns
     -------
     AlignmentCheck
-        Quality and annotation as computed now beside those stored. The
-        ambiguity is taken from the store: its placements are not there.
+        Quality and annotation as computed now beside those stored.
 
     Raises
     ------
@@ -138,6 +172,8 @@ def check_alignment(store: Store, asset_id: str) -> AlignmentCheck:
     ]
     figures += [
         Figure("valid_share", valid_share, float(columns["valid_share"]), QUALITY_TOLERANCE),
+        Figure("ambiguity", ambiguity.material_share, ambiguity.material_share, 0),
+        Figure("margin", ambiguity.margin, ambiguity.margin, 0),
         Figure("voxels with another valid", _count(annotation.valid != asset.valid), 0, 0),
         Figure("voxels with another material", _count(annotation.material != asset.material), 0, 0),
         Figure(
@@ -153,7 +189,46 @@ def check_alignment(store: Store, asset_id: str) -> AlignmentCheck:
             DISTANCE_TOLERANCE,
         ),
     ]
-    return AlignmentCheck(asset_id, verdict, reasons, str(columns["verdict"]), tuple(figures))
+    return AlignmentCheck(
+        asset_id, verdict, reasons, str(columns["verdict"]), tuple(figures), asset.transform
+    )
+
+
+def choose_assets(
+    store: Store, asset_ids: Iterable[str] = (), worst: int = 0, ambiguous: bool = False
+) -> list[str]:
+    """Choose assets to look at, each once: those named, then the worst, then the ambiguous.
+
+    Parameters
+    ----------
+    store : Store
+        The store; only its ``asset/*`` arrays are read.
+    asset_ids : iterable of str
+        Assets by name, in this order.
+    worst : int
+        How many of the lowest fitness, of both directions the lower.
+    ambiguous : bool
+        Whether to take all above the threshold of ambiguity, most of all first.
+
+    Returns
+    -------
+    list of str
+
+    Raises
+    ------
+    StoreError
+        If the store has no asset of a name.
+    """
+    rows = [store.find(asset_id) for asset_id in asset_ids]
+    if worst:
+        fitness = np.minimum(store.column("fitness"), store.column("fitness_backward"))
+        # An asset without a number is the worst of all.
+        rows += np.argsort(np.nan_to_num(fitness, nan=-1.0), kind="stable")[:worst].tolist()
+    if ambiguous:
+        share = store.column("ambiguity")
+        order = np.argsort(-share, kind="stable")
+        rows += order[share[order] > THRESHOLDS.good_ambiguity].tolist()
+    return [store.ids[row] for row in dict.fromkeys(rows)]
 
 
 def stored_field(asset: StoredAsset, normalization: Normalization) -> MaterialField:

@@ -1,10 +1,10 @@
-"""`slatprep check-alignment`: whether the alignment of an asset is good."""
+"""`slatprep check-alignment`: whether an alignment is good, in figures and pictures."""
 
 from __future__ import annotations
 
 import dataclasses
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -14,97 +14,196 @@ from slatprep.errors import ConfigError, StoreError
 
 if TYPE_CHECKING:
     from slatprep.check import AlignmentCheck
+    from slatprep.store import Store
+
+_COLUMNS = ("fitness", "fitness_backward", "inlier_rmse", "valid_share", "ambiguity")
 
 
 @click.command(
     name="check-alignment",
     epilog="""\b
+Exit codes:
+  0  all assets are good and the store is consistent
+  1  one is not, or a picture cannot be written
+  2  wrong use: an option, or an asset that is not there
+
+\b
 Example:
   slatprep check-alignment --asset 0a1b2c --store data/demo.zarr
-  slatprep check-alignment --asset 0a1b2c --asset 3d4e5f --json
+  slatprep check-alignment --worst 12 --ambiguous --picture pictures
+  slatprep check-alignment --asset 0a1b2c --asset 3d4e5f --json --picture none
 """,
 )
 @click.option(
-    "--asset",
-    "asset_ids",
-    multiple=True,
-    required=True,
-    metavar="ID",
-    help="The asset; may be repeated.",
+    "--asset", "asset_ids", multiple=True, metavar="ID", help="An asset; may be repeated."
+)
+@click.option(
+    "--worst",
+    type=click.IntRange(min=1),
+    metavar="N",
+    help="The N assets of the lowest fitness, of both ways the lower.",
+)
+@click.option(
+    "--ambiguous",
+    is_flag=True,
+    help="Every asset whose classes depend on a choice among ties, most of all first.",
 )
 @store_option
+@click.option(
+    "--picture",
+    metavar="PATH|none",
+    help="A .png for one asset, else a folder.  [default: NAME.pictures beside the store]",
+)
+@click.option("--show", is_flag=True, help="Open it in Open3D's viewer, where there is a screen.")
+@click.option(
+    "--manifests",
+    type=click.Path(path_type=Path, exists=True, file_okay=False),
+    metavar="DIR",
+    help="Folder of the build's records, if neither in nor beside the store.",
+)
 @output_options
-def check_alignment(output: Output, asset_ids: tuple[str, ...], store: Path | None) -> None:
-    """Say whether the alignment of an asset is good.
+def check_alignment(
+    output: Output,
+    asset_ids: tuple[str, ...],
+    worst: int | None,
+    ambiguous: bool,
+    store: Path | None,
+    picture: str | None,
+    show: bool,
+    manifests: Path | None,
+) -> None:
+    """Say and show whether the alignment of an asset is good.
 
     Its quality is computed anew from what the store holds, and compared with
-    what the store says. Exit code 0: all assets are good and the store is
-    consistent; 1: one is not.
+    what the store says. A picture shows both sides before and after from three
+    directions, the error of every voxel, the scores of the candidates and the
+    verdict. --asset, --worst and --ambiguous may be combined.
     """
+    if not (asset_ids or worst or ambiguous):
+        raise click.UsageError("say which assets: --asset ID, --worst N or --ambiguous")
     path = chosen_store(store)
     from slatprep import check
     from slatprep.store import open_store
 
     opened = open_store(path)
     try:
-        for asset_id in asset_ids:
-            opened.find(asset_id)
+        chosen = check.choose_assets(opened, asset_ids, worst or 0, ambiguous)
     except StoreError as error:
         # A name that is not there is a wrong call, not a failed check.
         raise ConfigError(str(error)) from None
-    checks = [check.check_alignment(opened, asset_id) for asset_id in asset_ids]
-    ambiguity = opened.column("ambiguity")
-    ambiguities = [float(ambiguity[opened.find(asset_id)]) for asset_id in asset_ids]
+    target = _target(path, picture, len(chosen))
+    checks = [check.check_alignment(opened, asset_id) for asset_id in chosen]
+    pictures: list[Path] = []
+    sheet = None
+    if target is not None and checks:
+        from slatprep.pictures.write import write_pictures
 
-    def show() -> None:
-        for one, ambiguous in zip(checks, ambiguities, strict=True):
-            _show(output, one, ambiguous)
+        with output.progress("pictures") as progress:
+            pictures, sheet = write_pictures(
+                opened, checks, target, manifests=manifests, progress=progress
+            )
+
+    def print_all() -> None:
+        _print(output, checks)
+        if sheet is not None:
+            click.echo(f"pictures: {target} ({len(pictures)}), all in one: {sheet}")
+        for file in pictures if sheet is None else ():
+            click.echo(f"picture: {file}")
         output.note(f"store: {path}")
 
-    documents = [
-        {**_document(one), "ambiguity": ambiguous}
-        for one, ambiguous in zip(checks, ambiguities, strict=True)
-    ]
-    output.result(documents, show)
+    output.result(_documents(checks, pictures), print_all)
+    if show:
+        _show(output, opened, chosen, sheet or (pictures[0] if pictures else None))
     if not all(one.ok for one in checks):
         click.get_current_context().exit(EXIT_INCOMPLETE)
 
 
-def _show(output: Output, check: AlignmentCheck, ambiguity: float) -> None:
-    from slatprep.align.quality import THRESHOLDS
+def _target(store: Path, picture: str | None, assets: int) -> Path | None:
+    if picture == "none":
+        return None
+    if picture is None:
+        from slatprep.pictures.write import default_pictures
 
-    good = {
-        "fitness": f">= {THRESHOLDS.good_fitness:g}",
-        "fitness_backward": f">= {THRESHOLDS.good_fitness:g}",
-        "valid_share": f">= {THRESHOLDS.good_valid_share:g}",
-    }
+        return default_pictures(store)
+    target = Path(picture)
+    if assets > 1 and target.suffix.lower() == ".png":
+        raise click.UsageError(f"--picture {target} is one file; {assets} assets need a folder")
+    return target
+
+
+def _print(output: Output, checks: list[AlignmentCheck]) -> None:
+    if not checks:
+        click.echo("no asset is ambiguous")
+    if len(checks) > 1:
+        output.table(
+            "Alignments (rmse in voxels)",
+            ("asset", "verdict", *_COLUMNS, "consistent"),
+            [
+                (one.asset_id, str(one.verdict), *(one.figure(n).value for n in _COLUMNS),
+                 one.consistent)
+                for one in checks
+            ],
+        )  # fmt: skip
+    for one in checks:
+        if len(checks) == 1 or output.verbosity > 0:
+            _print_figures(output, one)
+        for reason in one.reasons:
+            click.echo(f"{one.asset_id}: {reason}")
+        if not one.consistent:
+            click.echo(
+                f"{one.asset_id}: the store says {one.stored_verdict}, "
+                "and its figures do not all agree"
+            )
+
+
+def _print_figures(output: Output, check: AlignmentCheck) -> None:
     rows: list[tuple[Cell, ...]] = [
         (
             figure.name,
             float(figure.value),
-            good.get(figure.name, ""),
+            figure.threshold_text,
+            figure.passes if figure.passes is not None else "",
             float(figure.stored),
             f"{figure.limit:g}",
             figure.ok,
         )
         for figure in check.figures
     ]
-    rows.append(("ambiguity", None, f"<= {THRESHOLDS.good_ambiguity:g}", ambiguity, "", None))
     output.table(
         f"{check.asset_id}: alignment {check.verdict}",
-        ("figure", "computed", "good", "stored", "may differ by", "agrees"),
+        ("figure", "computed", "good", "is good", "stored", "may differ by", "agrees"),
         rows,
     )
-    for reason in check.reasons:
-        click.echo(f"  {reason}")
-    if not check.consistent:
-        click.echo(f"  the store says {check.stored_verdict}, and its figures do not all agree")
 
 
-def _document(check: AlignmentCheck) -> dict[str, object]:
-    return {
-        **dataclasses.asdict(check),
-        "figures": [{**dataclasses.asdict(figure), "ok": figure.ok} for figure in check.figures],
-        "consistent": check.consistent,
-        "ok": check.ok,
-    }
+def _documents(checks: list[AlignmentCheck], pictures: list[Path]) -> list[dict[str, Any]]:
+    files: list[Path | None] = [*pictures] or [None] * len(checks)
+    return [
+        {
+            **dataclasses.asdict(one),
+            "figures": [
+                {**dataclasses.asdict(figure), "ok": figure.ok, "good": figure.threshold_text,
+                 "passes": figure.passes}
+                for figure in one.figures
+            ],
+            "consistent": one.consistent,
+            "ok": one.ok,
+            "picture": file,
+        }
+        for one, file in zip(checks, files, strict=True)
+    ]  # fmt: skip
+
+
+def _show(output: Output, store: Store, asset_ids: list[str], file: Path | None) -> None:
+    """Open the viewer, or say why not and where to look instead."""
+    from slatprep.pictures.scene import scene_of
+    from slatprep.pictures.viewer import has_screen, show_alignment
+
+    instead = f"look at {file}" if file else "draw a picture: leave out --picture none"
+    if not has_screen():
+        output.problem(f"there is no screen to show it on; {instead}")
+        return
+    for asset_id in asset_ids:
+        if not show_alignment(scene_of(store.asset(asset_id)), asset_id):
+            output.problem(f"Open3D could not open a window; {instead}")
+            return

@@ -41,5 +41,5 @@ RULE = "#D5D9DE"
 PAPER = "#FFFFFF"
 """Highlight, text, secondary text, lines and ground."""
 
-DISTANCE_COLOURS = ("#F3E9C6", "#F5B955", "#D9662B", "#8F1D3F", "#2B0A3D")
-"""Distances from none to the end of the scale: even steps from light to dark."""
+DISTANCE_COLOURS = ("#EEF1F4", "#F3BDB6", "#DD6472", "#931D52", "#2B0A3D")
+"""Distances from none to the end of the scale: even steps, each darker than the last."""
