@@ -23,6 +23,9 @@ _CRC32C_RESIDUE = 0x48674BC7
 _ZSTD_MAGIC = 0xFD2FB528
 _BLOSC_HEADER = 16
 
+MAX_TEXT_BYTES = 64 * 2**20
+"""What one chunk of strings may unpack to; 65,536 ids take 3 MiB."""
+
 
 @dataclass(frozen=True)
 class ChunkDecoder:
@@ -34,42 +37,40 @@ class ChunkDecoder:
         Little-endian, as stored.
     shape : tuple of int
         Shape of a chunk.
-    order : tuple of int or None
-        Order in which a ``transpose`` codec stored the dimensions.
     compressor : str
         ``blosc``, ``zstd`` or empty.
     crc32c : bool
         Whether a checksum ends each chunk.
+    text : bool
+        Whether the chunks hold strings (``vlen-utf8``); `dtype` is object then.
     """
 
     dtype: np.dtype[Any]
     shape: tuple[int, ...]
-    order: tuple[int, ...] | None
     compressor: str
     crc32c: bool
+    text: bool = False
 
     @classmethod
     def of(
         cls, dtype: np.dtype[Any], shape: tuple[int, ...], codecs: Sequence[Mapping[str, Any]]
-    ) -> ChunkDecoder | None:
-        """Return the decoder for a list of codecs as ``zarr.json`` has it, or None."""
-        rest = list(codecs)
-        order = None
-        if rest and rest[0].get("name") == "transpose":
-            order = tuple(rest.pop(0).get("configuration", {}).get("order", ()))
-            if sorted(order) != list(range(len(shape))):
-                return None
-        if not rest or rest[0].get("name") != "bytes":
-            return None
-        if rest.pop(0).get("configuration", {}).get("endian", "little") != "little":
-            return None
-        names = [codec.get("name") for codec in rest]
-        crc32c = bool(names) and names[-1] == "crc32c"
-        compressors = names[:-1] if crc32c else names
-        if compressors not in ([], ["blosc"], ["zstd"]):
-            return None
-        compressor = compressors[0] if compressors else ""
-        return cls(dtype, shape, order, compressor, crc32c)
+    ) -> ChunkDecoder:
+        """Return the decoder for a list of codecs as ``zarr.json`` has it.
+
+        Raises
+        ------
+        StoreError
+            If they are none that slatprep writes.
+        """
+        text = dtype.hasobject
+        first, rest = codecs[0], [codec["name"] for codec in codecs[1:]]
+        little = first.get("configuration", {}).get("endian", "little") == "little"
+        if first["name"] == ("vlen-utf8" if text else "bytes") and little:
+            crc32c = rest[-1:] == ["crc32c"]
+            compressors = rest[:-1] if crc32c else rest
+            if compressors in ([], ["blosc"], ["zstd"]):
+                return cls(dtype, shape, "".join(compressors), crc32c, text)
+        raise StoreError(f"it is packed with {', '.join([first['name'], *rest])}")
 
     @cached_property
     def nbytes(self) -> int:
@@ -91,33 +92,34 @@ class ChunkDecoder:
         StoreError
             If the checksum is wrong or the chunk does not hold what the metadata say.
         """
-        if self.order is None:
-            self._undo(data, out)
-            return
-        stored = np.empty(tuple(self.shape[k] for k in self.order), self.dtype)
-        self._undo(data, stored)
-        out[...] = stored.transpose(np.argsort(self.order))
-
-    def _undo(self, data: bytes, out: NDArray[Any]) -> None:
         payload = memoryview(data)
         if self.crc32c:
             if not crc32c_holds(data):
                 raise StoreError("its checksum (CRC32C) is wrong")
             payload = payload[:-4]
         held = content_size(payload, self.compressor)
-        if held != out.nbytes:
-            raise StoreError(f"it holds {held} bytes; expected {out.nbytes}")
         try:
-            if self.compressor == "blosc":
-                _blosc().decompress(payload, out)
-            elif self.compressor == "zstd":
-                from numcodecs import zstd
-
-                zstd.decompress(payload, out)
+            if self.text:
+                out[...] = self._strings(payload, held)
+            elif held != out.nbytes:
+                raise StoreError(f"it holds {held} bytes; expected {out.nbytes}")
             else:
-                out.reshape(-1).view(np.uint8)[:] = np.frombuffer(payload, np.uint8)
-        except (RuntimeError, ValueError) as error:
-            raise StoreError(f"it cannot be decompressed ({error})") from None
+                _unpack(payload, self.compressor, out)
+        except (RuntimeError, ValueError, TypeError) as error:
+            raise StoreError(f"it cannot be unpacked ({error})") from None
+
+    def _strings(self, payload: memoryview, held: int) -> NDArray[Any]:
+        from numcodecs import VLenUTF8
+
+        if not 4 <= held <= MAX_TEXT_BYTES:
+            raise StoreError(f"it holds {held} bytes; expected at most {MAX_TEXT_BYTES}")
+        text = np.empty(held, np.uint8)
+        _unpack(payload, self.compressor, text)
+        count = int(text[:4].view("<u4")[0])
+        if count != self.shape[0]:
+            raise StoreError(f"it holds {count} strings; expected {self.shape[0]}")
+        strings: NDArray[Any] = VLenUTF8().decode(text)
+        return strings
 
 
 def crc32c_holds(data: bytes) -> bool:
@@ -149,6 +151,18 @@ def content_size(data: memoryview | bytes, compressor: str) -> int:
     except struct.error:
         return -1
     return len(data)
+
+
+def _unpack(payload: memoryview, compressor: str, out: NDArray[Any]) -> None:
+    """Unpack into memory of the size that `content_size` gave."""
+    if compressor == "blosc":
+        _blosc().decompress(payload, out)
+    elif compressor == "zstd":
+        from numcodecs import zstd
+
+        zstd.decompress(payload, out)
+    else:
+        out.reshape(-1).view(np.uint8)[:] = np.frombuffer(payload, np.uint8)
 
 
 @cache

@@ -180,7 +180,7 @@ ARRAYS = (
 )
 """Every array of the store."""
 
-_FIXED_SIZES = {
+FIXED_SIZES = {
     "row": 4,
     "column": 4,
     "axis": 3,
@@ -188,6 +188,7 @@ _FIXED_SIZES = {
     "latent": 8,
     **dict.fromkeys(_XYZ, RESOLUTION),
 }
+"""Dimensions that are the same in every store."""
 
 
 def rows_per_shard(parameters: StoreParameters) -> int:
@@ -251,7 +252,7 @@ def create_arrays(
     parameters : StoreParameters
         Sizes of chunks and shards, and the compression level.
     """
-    sizes = {"asset": n_assets, "asset_edge": n_assets + 1, "voxel": n_voxels, **_FIXED_SIZES}
+    sizes = {"asset": n_assets, "asset_edge": n_assets + 1, "voxel": n_voxels, **FIXED_SIZES}
     chunk_and_shard = {
         "asset": (ASSET_CHUNK, None),
         "voxel": (parameters.voxel_chunk, rows_per_shard(parameters)),

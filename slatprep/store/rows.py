@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slatprep.errors import StoreError
-from slatprep.store.chunks import ChunkDecoder, crc32c_holds
+from slatprep.store.chunks import MAX_TEXT_BYTES, ChunkDecoder, crc32c_holds
 
 MISSING = 2**64 - 1
 """Offset and length of a chunk that was never written: it holds the fill value."""
@@ -59,7 +59,7 @@ _AT = os.open in os.supports_dir_fd
 class _Shard:
     """An open shard and its index: offset and length of each chunk."""
 
-    file: FileIO
+    file: FileIO | None
     index: NDArray[np.uint64]
 
 
@@ -104,28 +104,35 @@ class RowReader:
         self.decoder = decoder
         self.fill_value = fill_value
         self.chunks_per_shard = shard_rows // self.chunk_rows
+        # Zarr leaves out files of fill values alone, as a column of empty strings is.
+        self.optional = not sharded and name != "asset/offset"
         self._shards: dict[int, _Shard] = {}
         self._local = threading.local()
 
     @classmethod
-    def of(cls, folder: Folder, name: str, metadata: Mapping[str, Any]) -> RowReader | None:
-        """Return a reader for an array with this ``zarr.json``, or None if it needs zarr-python.
+    def of(cls, folder: Folder, name: str, metadata: Mapping[str, Any]) -> RowReader:
+        """Return a reader for an array with this ``zarr.json``.
 
         Raises
         ------
         StoreError
-            If the metadata are not those of an array.
+            If the metadata make no sense, or are of a kind that slatprep does not write.
         """
         try:
             return cls._of(folder, name, metadata)
         except (KeyError, TypeError, ValueError, AttributeError, IndexError) as error:
-            raise StoreError(f"{name}: its metadata make no sense ({error!r})") from None
+            raise StoreError(f"{folder.path}/{name}: bad metadata ({error!r})") from None
+        except StoreError as error:
+            raise StoreError(
+                f"{folder.path}/{name}: {error}, which slatprep does not read; zarr-python may"
+            ) from None
 
     @classmethod
-    def _of(cls, folder: Folder, name: str, metadata: Mapping[str, Any]) -> RowReader | None:
-        if metadata["data_type"] not in _DTYPES:
-            return None
-        dtype = np.dtype(metadata["data_type"]).newbyteorder("<")
+    def _of(cls, folder: Folder, name: str, metadata: Mapping[str, Any]) -> RowReader:
+        text = metadata["data_type"] == "string"
+        if not text and metadata["data_type"] not in _DTYPES:
+            raise StoreError(f"its data type is {metadata['data_type']!r}")
+        dtype = np.dtype(object) if text else np.dtype(metadata["data_type"]).newbyteorder("<")
         shape = tuple(map(int, metadata["shape"]))
         outer = tuple(map(int, metadata["chunk_grid"]["configuration"]["chunk_shape"]))
         codecs, inner = metadata["codecs"], outer
@@ -136,14 +143,13 @@ class RowReader:
             index_codecs = [codec["name"] for codec in sharding["index_codecs"]]
             at_end = sharding.get("index_location", "end") == "end"
             if index_codecs != _INDEX_CODECS or not at_end or len(metadata["codecs"]) > 1:
-                return None
-        plain_keys = metadata["chunk_key_encoding"] in _KEYS
-        if not plain_keys or outer[1:] != shape[1:] or inner[1:] != shape[1:] or inner[0] < 1:
-            return None
+                raise StoreError("its shards have an index of another form")
+        if metadata["chunk_key_encoding"] not in _KEYS:
+            raise StoreError("its files have other names")
+        if not outer[1:] == inner[1:] == shape[1:] or inner[0] < 1 or outer[0] % inner[0]:
+            raise StoreError(f"its chunks of {inner} and shards of {outer} do not hold whole rows")
+        fill_value = np.array(metadata["fill_value"], object).astype(dtype)
         decoder = ChunkDecoder.of(dtype, inner, codecs)
-        if decoder is None or outer[0] % inner[0]:
-            return None
-        fill_value = np.array(metadata["fill_value"]).astype(dtype)
         return cls(folder, name, shape, outer[0], sharded, decoder, fill_value)
 
     def key(self, shard: int) -> str:
@@ -187,7 +193,7 @@ class RowReader:
     def _chunk(self, number: int, place: int, out: NDArray[Any]) -> None:
         shard = self._shards.get(number) or self._open(number)
         offset, length = shard.index[place].tolist()
-        if offset == length == MISSING:
+        if shard.file is None or offset == length == MISSING:
             out[...] = self.fill_value
             return
         data = os.pread(shard.file.fileno(), length, offset)
@@ -224,6 +230,8 @@ class RowReader:
             file = self.folder.open(self.key(number))
             size = os.fstat(file.fileno()).st_size
         except FileNotFoundError:
+            if self.optional:
+                return _Shard(None, np.array([[MISSING, MISSING]], np.uint64))
             raise StoreError(
                 f"{where}: is missing; was the store replaced? Open it again, or run "
                 "`slatprep verify`"
@@ -238,7 +246,8 @@ class RowReader:
         return shard
 
     def _index(self, file: FileIO, size: int, where: str) -> NDArray[np.uint64]:
-        limit = 2 * self.decoder.nbytes + 65_536  # what no packed chunk exceeds
+        # No packed chunk is much larger than its values; strings have their own bound.
+        limit = MAX_TEXT_BYTES if self.decoder.text else 2 * self.decoder.nbytes + 65_536
         if not self.sharded:
             index = np.array([[0, size]], np.uint64)
         else:

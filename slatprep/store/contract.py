@@ -1,0 +1,213 @@
+"""What a store's metadata must say, so that whoever reads it can rely on it.
+
+A store may come from a stranger. These checks cost no read beyond the root's
+``zarr.json`` and bound what any later read can claim.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from slatprep.errors import StoreError
+from slatprep.records import MATERIAL_CLASSES, PROPERTY_COLUMNS, RESOLUTION
+from slatprep.store.layout import (
+    ARRAYS,
+    ASSET_CHUNK,
+    FIXED_SIZES,
+    FORMAT,
+    FORMAT_VERSION,
+    ArrayLayout,
+)
+
+MAX_METADATA_BYTES = 16 * 2**20
+"""No zarr.json is larger: all metadata of a store take about 50 kB."""
+
+MAX_VOXELS = RESOLUTION**3
+"""Rows of one asset: each coordinate occurs once."""
+
+_MAX_CHUNK_ROWS = {"asset": ASSET_CHUNK, "voxel": 2**20, "grid": 16}
+_MAX_SHARD_ROWS = {"asset": ASSET_CHUNK, "voxel": 2**28, "grid": 2**16}
+_ZARR_NAMES = {"str": "string"}
+
+
+@dataclass(frozen=True, order=True)
+class Finding:
+    """One thing that is wrong.
+
+    Attributes
+    ----------
+    file : str
+        File below the store, or a file of the records or sources.
+    asset : str
+        Asset concerned; empty where it is the store as a whole.
+    what : str
+        What is wrong, with the value at fault.
+    expected : str
+        What should be there.
+    """
+
+    file: str
+    asset: str
+    what: str
+    expected: str
+
+    def __str__(self) -> str:
+        of = f" (asset {self.asset})" if self.asset else ""
+        return f"{self.file}{of}: {self.what}; expected {self.expected}"
+
+
+def read_metadata(path: Path) -> dict[str, Any]:
+    """Read a ``zarr.json``.
+
+    Raises
+    ------
+    StoreError
+        If it is missing, too large, or no JSON object.
+    """
+    try:
+        with path.open("rb") as file:
+            data = file.read(MAX_METADATA_BYTES + 1)
+        if len(data) > MAX_METADATA_BYTES:
+            raise ValueError(f"larger than {MAX_METADATA_BYTES >> 20} MiB")
+        document = json.loads(data.decode("utf-8"))
+        if not isinstance(document, dict):
+            raise ValueError("no JSON object")
+    except (OSError, ValueError, RecursionError) as error:
+        raise StoreError(f"{path}: cannot be read as metadata ({error})") from None
+    return document
+
+
+def attribute_findings(attributes: Mapping[str, Any]) -> Iterator[Finding]:
+    """Yield what is wrong with the root's attributes."""
+    for name, expected in (
+        ("format", FORMAT),
+        ("format_version", FORMAT_VERSION),
+        ("resolution", RESOLUTION),
+        ("material_classes", list(MATERIAL_CLASSES)),
+        ("property_columns", list(PROPERTY_COLUMNS)),
+    ):
+        value = attributes.get(name)
+        if value != expected or type(value) is not type(expected):
+            yield _root(f"attribute {name} is {value!r}", repr(expected))
+    manifest = attributes.get("manifest")
+    if not (isinstance(manifest, str) and len(manifest) == 64 and _is_hex(manifest)):
+        yield _root(f"attribute manifest is {manifest!r}", "a SHA-256 in hex")
+    build = attributes.get("build")
+    if not (isinstance(build, dict) and isinstance(build.get("parameters"), dict)):
+        yield _root("attribute build names no parameters", "the parameters of the build")
+    ranges = attributes.get("normalization")
+    for name in PROPERTY_COLUMNS:
+        entry = ranges.get(name) if isinstance(ranges, dict) else None
+        if not _is_range(entry):
+            yield _root(
+                f"attribute normalization has {entry!r} for {name}",
+                "log10 (true or false), finite lo < hi, and source",
+            )
+
+
+def array_findings(name: str, metadata: object, sizes: Mapping[str, int]) -> Iterator[Finding]:
+    """Yield what is wrong with the metadata of one array.
+
+    Parameters
+    ----------
+    name : str
+        One of the contract's arrays; of others nothing is asked.
+    metadata : object
+        Its ``zarr.json``.
+    sizes : mapping of str to int
+        What `dimension_sizes` gave.
+    """
+    layout = _LAYOUTS.get(name)
+    if layout is None:
+        return
+    where = f"{name}/zarr.json"
+    if not isinstance(metadata, dict) or metadata.get("node_type") != "array":
+        yield Finding(where, "", "describes no array", "the metadata of an array")
+        return
+    shape = tuple(sizes[dimension] for dimension in layout.dimensions)
+    for key, value, expected in (
+        ("shape", metadata.get("shape"), list(shape)),
+        ("data_type", metadata.get("data_type"), _ZARR_NAMES.get(layout.dtype, layout.dtype)),
+        ("dimension_names", metadata.get("dimension_names"), list(layout.dimensions)),
+        ("zarr_format", metadata.get("zarr_format"), 3),
+    ):
+        if value != expected:
+            yield Finding(where, "", f"{key} is {value!r}", repr(expected))
+    yield from _chunk_findings(where, layout, metadata, shape)
+
+
+def dimension_sizes(metadata: Mapping[str, Any]) -> dict[str, int]:
+    """Return the size of every dimension, from the arrays that define it.
+
+    Raises
+    ------
+    StoreError
+        If ``asset/id`` or ``voxel/coords`` say no number of rows.
+    """
+    sizes = dict(FIXED_SIZES)
+    for name, dimension, limit in (
+        ("asset/id", "asset", 2**24),
+        ("voxel/coords", "voxel", 2**40),
+    ):
+        try:
+            rows = metadata[name]["shape"][0]
+        except (KeyError, TypeError, IndexError):
+            raise StoreError(f"{name}/zarr.json: is missing or has no shape") from None
+        if type(rows) is not int or not 0 <= rows <= limit:
+            raise StoreError(f"{name}/zarr.json: {rows!r} rows; expected 0 to {limit}")
+        sizes[dimension] = rows
+    sizes["asset_edge"] = sizes["asset"] + 1
+    return sizes
+
+
+def _chunk_findings(
+    where: str, layout: ArrayLayout, metadata: Mapping[str, Any], shape: tuple[int, ...]
+) -> Iterator[Finding]:
+    group = layout.name.partition("/")[0]
+    try:
+        outer = metadata["chunk_grid"]["configuration"]["chunk_shape"]
+        codec = metadata["codecs"][0]
+        sharded = codec["name"] == "sharding_indexed"
+        inner = codec["configuration"]["chunk_shape"] if sharded else outer
+    except (KeyError, TypeError, IndexError):
+        yield Finding(where, "", "has no chunk sizes", "a regular chunk grid and codecs")
+        return
+    for kind, sizes, limit in (
+        ("chunk", inner, _MAX_CHUNK_ROWS[group]),
+        ("shard", outer, _MAX_SHARD_ROWS[group] if sharded else _MAX_CHUNK_ROWS[group]),
+    ):
+        whole = isinstance(sizes, list) and all(type(n) is int for n in sizes)
+        if not whole or sizes[1:] != list(shape[1:]) or not 1 <= sizes[0] <= limit:
+            yield Finding(
+                where,
+                "",
+                f"{kind} shape is {sizes!r}",
+                f"1 to {limit} rows of {list(shape[1:])}",
+            )
+
+
+def _root(what: str, expected: str) -> Finding:
+    return Finding("zarr.json", "", what, expected)
+
+
+def _is_hex(text: str) -> bool:
+    return all(letter in "0123456789abcdef" for letter in text)
+
+
+def _is_range(entry: object) -> bool:
+    if not isinstance(entry, dict) or not isinstance(entry.get("log10"), bool):
+        return False
+    lo, hi = entry.get("lo"), entry.get("hi")
+    if not (isinstance(lo, int | float) and isinstance(hi, int | float)):
+        return False
+    return (
+        math.isfinite(lo) and math.isfinite(hi) and lo < hi and isinstance(entry.get("source"), str)
+    )
+
+
+_LAYOUTS = {layout.name: layout for layout in ARRAYS}
