@@ -95,7 +95,9 @@ def test_describe_writes_where_the_files_are_found(store: Path, tmp_path: Path) 
         else:  # pathlib's own ** finds folders alone
             found = glob.glob(str(out.parent / entry["includes"]), recursive=True)  # noqa: PTH207
             files = [Path(path) for path in found if Path(path).is_file()]
-            assert any(path.name == "zarr.json" for path in files) and len(files) >= 2
+            assert any(path.name == "zarr.json" for path in files)
+            # Of an array of one value alone, its fill value, Zarr writes no chunk.
+            assert len(files) >= (2 if entry["@id"].startswith("voxel/") else 1)
     printed = CliRunner().invoke(
         slatprep, ["describe", str(store), "--location", "https://example.org/s.zarr/"]
     )
