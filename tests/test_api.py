@@ -1,0 +1,172 @@
+"""What `import slatprep` gives."""
+
+from __future__ import annotations
+
+import ast
+import doctest
+import importlib
+import inspect
+import pkgutil
+import subprocess
+import sys
+from pathlib import Path
+from types import ModuleType
+
+import numpy as np
+import pytest
+from synthetic import JELLY, METAL, QUARTER_TURN, make_asset
+
+import slatprep
+
+NAMES = sorted(set(slatprep.__all__) - {"__version__"})
+MODULES = sorted(
+    module.name
+    for module in pkgutil.walk_packages(slatprep.__path__, "slatprep.")
+    if not module.name.endswith("__main__")
+)
+
+
+def run(script: str) -> str:
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+def test_import_is_light() -> None:
+    loaded = run(
+        "import sys; before = set(sys.modules); import slatprep; dir(slatprep)\n"
+        "print(*{name.partition('.')[0] for name in set(sys.modules) - before})"
+    ).split()
+    assert "slatprep" in loaded
+    assert set(loaded) <= set(sys.stdlib_module_names) | {"slatprep"}
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_every_name_is_there_and_documented(name: str) -> None:
+    value = getattr(slatprep, name)
+    assert name in dir(slatprep)
+    if callable(value):
+        assert inspect.getdoc(value), name
+    if inspect.isfunction(value):
+        documented = inspect.getdoc(value) or ""
+        assert "Parameters\n---" in documented and "Returns\n---" in documented, name
+
+
+def test_what_a_type_checker_sees_is_what_there_is() -> None:
+    tree = ast.parse(Path(slatprep.__file__).read_text("utf-8"))
+    (block,) = [node for node in tree.body if isinstance(node, ast.If)]
+    seen = {
+        alias.name: node.module
+        for node in block.body
+        if isinstance(node, ast.ImportFrom)
+        for alias in node.names
+    }
+    assert seen == slatprep._HOME_OF
+    assert set(seen) | {"__version__"} == set(slatprep.__all__)
+
+
+def test_an_unknown_name_is_an_attribute_error() -> None:
+    with pytest.raises(AttributeError, match="no attribute 'open_stoer'"):
+        slatprep.open_stoer  # noqa: B018
+
+
+def test_names_stay_what_they_are_whatever_is_imported_first() -> None:
+    # A submodule of the same name would take a function's place.
+    for name in NAMES:
+        assert not isinstance(getattr(slatprep, name), ModuleType)
+        assert f"slatprep.{name}" not in MODULES
+
+
+@pytest.mark.parametrize("name", MODULES)
+def test_doctests_run(name: str) -> None:
+    failed, _ = doctest.testmod(importlib.import_module(name))
+    assert failed == 0
+
+
+def test_there_are_doctests() -> None:
+    finder = doctest.DocTestFinder()
+    examples = [
+        test
+        for name in ("slatprep.voxels", "slatprep.geometry", "slatprep.normalize")
+        for test in finder.find(importlib.import_module(name))
+        if test.examples
+    ]
+    assert len(examples) >= 4
+
+
+# -- two voxel sets ---------------------------------------------------------
+
+
+def test_two_voxel_sets_in_any_form_give_the_same_transform() -> None:
+    asset = make_asset(1)
+    occupancy = asset.grid[..., 3] != 7
+    batch = np.column_stack([np.zeros(len(asset.coords), int), asset.coords])
+    target = np.zeros((64, 64, 64), dtype=bool)
+    target[tuple(asset.coords.T)] = True
+    first = slatprep.align_voxels(occupancy, asset.coords).transform
+    np.testing.assert_allclose(first, QUARTER_TURN, atol=2e-3)
+    for source in (occupancy, np.argwhere(occupancy)):
+        for slat in (batch, target):
+            # The order of the voxels differs, the voxels do not.
+            again = slatprep.align_voxels(source, slat).transform
+            np.testing.assert_allclose(again, first, atol=2e-3)
+
+
+def test_a_field_is_looked_up_at_slat_voxels() -> None:
+    asset = make_asset(2)
+    material = asset.grid[..., 3]
+    voxels = np.argwhere(material != 7).astype(np.uint8)
+    row = tuple(voxels.T)
+    field = slatprep.MaterialField(
+        occupancy=material != 7,
+        voxels=voxels,
+        material=material[row].astype(np.uint8),
+        properties=asset.grid[row][:, [1, 0, 2]],
+    )
+    found = slatprep.annotate_voxels(field, asset.coords, QUARTER_TURN)
+    assert found.valid.all() and found.distance.max() < 1e-6
+    for stuff in (JELLY, METAL):
+        here = found.material == stuff[0]
+        assert here.any()
+        np.testing.assert_allclose(found.properties[here], [stuff[1:]] * here.sum(), rtol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("voxels", "said"),
+    [
+        (np.zeros((64, 64, 64), bool), "with a voxel in it"),
+        (np.empty((0, 3)), "with a voxel in it"),
+        (np.ones((5, 4)), r"shape \(5, 4\)"),
+        ([[0, 0, 64]], "from 0 to 64; expected whole numbers in 0..63"),
+        ([[0, 0, -1]], "from -1 to 0"),
+        ([[0.5, 0, 0]], "whole numbers"),
+        ([[np.nan, 0, 0]], "whole numbers"),
+    ],
+)
+def test_what_is_no_voxel_set_is_refused_in_words(voxels: np.ndarray, said: str) -> None:
+    with pytest.raises(ValueError, match=said):
+        slatprep.align_voxels(voxels, [[1, 2, 3]])
+    with pytest.raises(ValueError, match=said):
+        slatprep.align_voxels([[1, 2, 3]], voxels)
+
+
+def test_normalised_and_back() -> None:
+    rng = np.random.default_rng(0)
+    properties = np.column_stack(
+        [10 ** rng.uniform(4, 10, 50), 10 ** rng.uniform(2, 3.8, 50), rng.uniform(0.22, 0.44, 50)]
+    )
+    for ranges in (
+        slatprep.PIXIE_RANGES,
+        slatprep.Normalization(
+            (
+                slatprep.PropertyRange("youngs_modulus", True, 3.0, 11.0),
+                slatprep.PropertyRange("density", True, 1.0, 4.0),
+                slatprep.PropertyRange("poissons_ratio", False, 0.2, 0.45),
+            ),
+            "mine",
+        ),
+    ):
+        values = slatprep.normalize_properties(properties, ranges)
+        assert values.dtype == np.float32 and (np.abs(values) <= 1).all()
+        back = slatprep.denormalize_properties(values, ranges)
+        np.testing.assert_allclose(back, properties, rtol=1e-4)
