@@ -17,6 +17,7 @@ COMMANDS = {
     "align": "slatprep.cli.build:align",
     "check-alignment": "slatprep.cli.check:check_alignment",
     "info": "slatprep.cli.info:info",
+    "report": "slatprep.cli.report:report",
     "score": "slatprep.cli.score:score",
     "export": "slatprep.cli.export:export",
     "describe": "slatprep.cli.describe:describe",

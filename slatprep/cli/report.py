@@ -1,0 +1,73 @@
+"""`slatprep report`: one page for the dataset."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+import click
+
+from slatprep.cli.options import chosen_store, jobs_option, store_argument
+from slatprep.cli.output import Output, output_options
+
+
+@click.command(
+    epilog="""\b
+Example:
+  slatprep report data/demo.zarr
+  slatprep report data/demo.zarr --out demo.html --manifests manifests/build/demo
+"""
+)
+@store_argument
+@click.option(
+    "--out",
+    type=click.Path(path_type=Path, dir_okay=False),
+    metavar="FILE.html",
+    help="The page.  [default: beside the store]",
+)
+@click.option(
+    "--manifests",
+    type=click.Path(path_type=Path, exists=True, file_okay=False),
+    metavar="DIR",
+    help="Folder of the build's records.  [default: beside the store, or manifests/build/NAME]",
+)
+@jobs_option
+@output_options
+def report(
+    output: Output, store: Path | None, out: Path | None, manifests: Path | None, jobs: int
+) -> None:
+    """Write one page about STORE that opens in a browser.
+
+    A single HTML file, which needs no network: how many assets are in which
+    state and why, the spread of quality, orientations, classes and properties,
+    and a table of all assets that opens each in 3D. Without STORE, the one
+    that `make align` built last under data/ is taken.
+    """
+    path = chosen_store(store)
+    from slatprep.build import default_manifests
+    from slatprep.report import write_report
+    from slatprep.store import open_store
+
+    name = path.name.removesuffix(".zarr")
+    if manifests is None:
+        usual = (default_manifests(path), Path("manifests/build") / name)
+        manifests = next((folder for folder in usual if folder.is_dir()), None)
+    if manifests is None:
+        output.problem(
+            f"no records of {path} found; the page cannot say what did not go in, and why. "
+            "Name their folder with --manifests"
+        )
+    with output.progress("report") as progress:
+        summary = write_report(
+            open_store(path),
+            out or path.with_name(f"{name}.html"),
+            manifests=manifests,
+            jobs=jobs,
+            progress=progress,
+        )
+
+    def show() -> None:
+        click.echo(f"page:   {summary.path} ({summary.size / 1e6:,.1f} MB)")
+        click.echo(f"assets: {summary.assets:,}, {summary.in_detail:,} of them with a 3D view")
+
+    output.result(dataclasses.asdict(summary), show)

@@ -1,0 +1,195 @@
+/* Filters, theme, and one asset: what ties the parts together. */
+
+const Filter = (() => {
+  const initial = () => ({ text: "", category: null, states: null, kind: null, turn: null, bin: null });
+  let chosen = initial();
+  let listeners = [];
+  const haystack = ASSETS.id.map((id, k) => `${id}\n${ASSETS.category[k]}\n${ASSETS.reasons[k].join("\n")}`.toLowerCase());
+
+  function matches(index) {
+    const { text, category, states, kind, turn, bin } = chosen;
+    return (
+      (!text || haystack[index].includes(text)) &&
+      (category === null || ASSETS.category[index] === category) &&
+      (states === null || states.includes(ASSETS.state[index])) &&
+      (kind === null || ASSETS.kinds[index].includes(kind)) &&
+      (turn === null || ASSETS.turn[index] === turn) &&
+      (bin === null || (ASSETS[bin.key][index] !== null && Charts.binOf(ASSETS[bin.key][index], bin.domain, bin.bins) === bin.bin))
+    );
+  }
+
+  function apply() {
+    const found = [];
+    for (let index = 0; index < TOTAL; index++) if (matches(index)) found.push(index);
+    Table.show(found);
+    byId("count").textContent = found.length === TOTAL ? `${Format.plural(TOTAL, "asset")}` : `${Format.count(found.length)} of ${Format.plural(TOTAL, "asset")}`;
+    for (const chip of document.querySelectorAll("#state-chips .chip")) {
+      chip.setAttribute("aria-pressed", String(chosen.states?.includes(chip.dataset.state) ?? false));
+    }
+    byId("category").value = chosen.category === null ? "*" : `=${chosen.category}`;
+    if (byId("search").value.toLowerCase().trim() !== chosen.text) byId("search").value = chosen.text;
+    const applied = [];
+    if (chosen.kind !== null) applied.push(["kind", `reason: ${chosen.kind.replace(/\bN\b/g, "…")}`]);
+    if (chosen.turn !== null) applied.push(["turn", `rotation: ${CONTENT.turns[chosen.turn]}`]);
+    if (chosen.bin !== null) applied.push(["bin", `${chosen.bin.title}: ${chosen.bin.text}`]);
+    byId("applied").replaceChildren(
+      ...applied.map(([key, text]) => el("button", { type: "button", class: "chip", "aria-pressed": "true", "aria-label": `Remove the filter ${text}`, onclick: () => set({ [key]: null }) }, `${text} ✕`)),
+    );
+    listeners.forEach((listener) => listener(chosen.bin));
+  }
+
+  function set(change) {
+    chosen = { ...chosen, ...change };
+    apply();
+  }
+
+  /** Show only what has this, and bring the table into view. */
+  function only(key, value) {
+    chosen = { ...initial(), [key]: value };
+    apply();
+    byId("assets").scrollIntoView();
+  }
+
+  const same = (a, b) => a && b && a.key === b.key && a.bin === b.bin;
+  const toggleBin = (bin) => set({ bin: same(chosen.bin, bin) ? null : bin });
+
+  function toggleState(name) {
+    const states = new Set(chosen.states ?? []);
+    if (!states.delete(name)) states.add(name);
+    set({ states: states.size ? [...states] : null });
+  }
+
+  function create() {
+    byId("search").addEventListener("input", (event) => set({ text: event.target.value.toLowerCase().trim() }));
+    byId("filters").addEventListener("submit", (event) => event.preventDefault());
+    const categories = [...new Set(ASSETS.category)].sort();
+    byId("category").append(el("option", { value: "*" }, "all"), ...categories.map((name) => el("option", { value: `=${name}` }, name || "(unknown)")));
+    byId("category").addEventListener("change", (event) => set({ category: event.target.value === "*" ? null : event.target.value.slice(1) }));
+    byId("state-chips").append(
+      ...STATES.filter((state) => ASSETS.state.includes(state.name)).map((state) =>
+        el("button", { type: "button", class: "chip", "data-state": state.name, "aria-pressed": "false", title: state.means, onclick: () => toggleState(state.name) }, stateTag(state.name)),
+      ),
+    );
+  }
+
+  return { create, apply, only, toggleBin, onBin: (listener) => listeners.push(listener) };
+})();
+
+const Theme = (() => {
+  const system = matchMedia("(prefers-color-scheme: dark)");
+  let choice = null;
+  function apply() {
+    const dark = choice ? choice === "dark" : system.matches;
+    const root = document.documentElement;
+    if (choice) root.dataset.theme = choice;
+    root.toggleAttribute("data-dark", dark);
+    byId("theme").textContent = dark ? "☀ Light" : "☾ Dark";
+    byId("theme").setAttribute("aria-label", dark ? "Use light colours" : "Use dark colours");
+    Viewer.update();
+  }
+  function create() {
+    system.addEventListener("change", apply);
+    byId("theme").addEventListener("click", () => {
+      choice = document.documentElement.hasAttribute("data-dark") ? "light" : "dark";
+      apply();
+    });
+    apply();
+  }
+  return { create };
+})();
+
+const Detail = (() => {
+  const dialog = byId("asset");
+  let index = null;
+
+  function open(asked) {
+    index = asked;
+    const value = (name) => ASSETS[name][index];
+    byId("asset-title").replaceChildren(value("id"), el("small", {}, value("category") || "category unknown"));
+    const { means } = STATES.find((state) => state.name === value("state"));
+    byId("asset-state").replaceChildren(stateTag(value("state")), `: ${means}`);
+    byId("asset-reasons").replaceChildren(...value("reasons").map((reason) => el("li", {}, reason)));
+    byId("asset-figures").replaceChildren(...figures(value));
+    byId("previous").disabled = Table.neighbour(index, -1) === null;
+    byId("next").disabled = Table.neighbour(index, 1) === null;
+    byId("readout").replaceChildren();
+    if (!dialog.open) dialog.showModal();
+    history.replaceState(null, "", `#asset=${encodeURIComponent(value("id"))}`);
+    Viewer.show(index);
+  }
+
+  function figures(value) {
+    if (value("fitness") === null) return [];
+    const fixed = Format.fixed(3);
+    const matrix = value("transform");
+    const rows = [0, 4, 8].map((k) => matrix.slice(k, k + 4).map((x) => x.toFixed(4).replace("-", "−").padStart(8)).join(" "));
+    const list = [
+      ["Fitness", fixed(value("fitness"))],
+      ["Fitness, SLAT to PixieVerse", fixed(value("fitness_backward"))],
+      ["Inlier rmse", `${fixed(value("inlier_rmse"))} voxel`],
+      ["Overlap", fixed(value("overlap"))],
+      ["Valid share", Format.share(value("valid_share"), 2)],
+      ["Class ambiguous", Format.share(value("ambiguity"))],
+      ["Tied placements", value("tied") === null ? Format.NONE : Format.count(value("tied"))],
+      ["Displacement between them", value("displacement") === null ? Format.NONE : `${value("displacement").toFixed(1)} voxel`],
+      ["Margin", fixed(value("margin"))],
+      ["SLAT voxels", Format.count(value("voxels"))],
+      ["Nearest quarter turn", CONTENT.turns[value("turn")]],
+      ["Angle to it", `${value("tilt").toFixed(1)}°`],
+      [`Transform (${value("model")})`, ""],
+    ];
+    return [...list.flatMap(([name, text]) => [el("dt", {}, name), el("dd", {}, text)]), el("dd", { class: "matrix" }, rows.join("\n"))];
+  }
+
+  function step(by) {
+    const next = Table.neighbour(index, by);
+    if (next !== null) open(next);
+  }
+
+  /** Open the asset that the address names. */
+  function fromAddress() {
+    const [, id] = location.hash.match(/^#asset=(.*)$/) ?? [];
+    if (id === undefined) return;
+    let name = id;
+    try { name = decodeURIComponent(id); } catch { /* taken as it stands */ }
+    const found = ASSETS.id.indexOf(name);
+    if (found >= 0 && found !== index) open(found);
+  }
+
+  function create() {
+    byId("close").addEventListener("click", () => dialog.close());
+    byId("previous").addEventListener("click", () => step(-1));
+    byId("next").addEventListener("click", () => step(1));
+    dialog.addEventListener("keydown", (event) => {
+      const by = { PageUp: -1, PageDown: 1 }[event.key];
+      if (!by) return;
+      event.preventDefault();
+      step(by);
+    });
+    dialog.addEventListener("click", (event) => { if (event.target === dialog) dialog.close(); });
+    dialog.addEventListener("close", () => {
+      Viewer.stop();
+      history.replaceState(null, "", location.pathname + location.search);
+      Table.focus(index);
+      index = null;
+    });
+    addEventListener("hashchange", fromAddress);
+    fromAddress();
+  }
+
+  return { create, open };
+})();
+
+Viewer.create();
+Theme.create();
+Sections.states(Filter);
+Sections.quality(Filter);
+Sections.rotations(Filter);
+Sections.properties();
+Sections.balance(Filter);
+Sections.colophon();
+Filter.create();
+Table.create(Detail.open);
+Filter.apply();
+Detail.create();
+requestAnimationFrame(() => performance.mark("slatprep-ready"));

@@ -1,0 +1,99 @@
+/* The page's data: the table at once, pictures and voxels when they are wanted. */
+
+const CONTENT = JSON.parse(byId("content").textContent);
+const ASSETS = CONTENT.assets;
+const TOTAL = ASSETS.id.length;
+
+const STATES = [
+  { name: "good", sign: "✓", means: "the surfaces lie on each other" },
+  { name: "doubtful", sign: "?", means: "wants looking at" },
+  { name: "failed", sign: "!", means: "the surfaces do not lie on each other" },
+  { name: "not built", sign: "✕", means: "could not be used, not in the store" },
+  { name: "skipped", sign: "–", means: "a partner is missing, not in the store" },
+];
+
+const PROPERTY_NAMES = {
+  youngs_modulus: { name: "Young's modulus", symbol: "E", unit: "Pa" },
+  density: { name: "Density", symbol: "ρ", unit: "kg/m³" },
+  poissons_ratio: { name: "Poisson's ratio", symbol: "ν", unit: "" },
+};
+
+const Data = (() => {
+  const { per_sheet: perSheet, columns, views, side, levels } = CONTENT.detail;
+  const THUMB = 58;
+  const sheets = new Map();
+  const arrived = new Promise((resolve) => {
+    if (document.readyState !== "loading") resolve();
+    else document.addEventListener("DOMContentLoaded", () => resolve(), { once: true });
+  });
+
+  const bytesOf = (base64) =>
+    Uint8Array.fromBase64
+      ? Uint8Array.fromBase64(base64)
+      : Uint8Array.from(atob(base64), (character) => character.charCodeAt(0));
+
+  function sheetUrl(number) {
+    if (!sheets.has(number)) {
+      const block = byId(`sheet-${number}`);
+      if (!block) return null; // Still being read; asked again when it has arrived.
+      const image = new Blob([bytesOf(block.textContent)], { type: "image/png" });
+      sheets.set(number, URL.createObjectURL(image));
+    }
+    return sheets.get(number);
+  }
+
+  /** Show asset `index` as the background of an element of 3 x 1 tiles. */
+  function showThumbnail(element, index) {
+    const picture = ASSETS.picture[index];
+    const url = picture === null ? null : sheetUrl(Math.floor(picture / perSheet));
+    element.hidden = picture === null;
+    if (!url) {
+      element.style.backgroundImage = "none";
+      return;
+    }
+    const place = picture % perSheet;
+    element.style.backgroundImage = `url(${url})`;
+    element.style.backgroundSize = `${columns * views * THUMB}px auto`;
+    element.style.backgroundPosition =
+      `${-(place % columns) * views * THUMB}px ${-Math.floor(place / columns) * THUMB}px`;
+  }
+
+  /** Return the voxels of an asset; null where the page holds none. */
+  async function voxels(index) {
+    const picture = ASSETS.picture[index];
+    if (picture === null) return null;
+    await arrived;
+    const pack = byId(`pack-${Math.floor(picture / perSheet)}`).textContent.split("\n");
+    const stream = new Blob([bytesOf(pack[picture % perSheet])]).stream();
+    const plain = stream.pipeThrough(new DecompressionStream("deflate-raw"));
+    return decode(new Uint8Array(await new Response(plain).arrayBuffer()));
+  }
+
+  function decode(bytes) {
+    let at = 0;
+    const take = (length) => bytes.subarray(at, (at += length));
+    const slat = coordinates(take(side ** 3 / 8));
+    const field = coordinates(take(side ** 3 / 8));
+    const n = slat.length / 3;
+    const [material, youngs_modulus, density, poissons_ratio, distance] = Array.from({ length: 5 }, () => take(n));
+    return { slat, field, material, youngs_modulus, density, poissons_ratio, distance, fieldMaterial: take(field.length / 3) };
+  }
+
+  /** Unpack an occupancy into voxels x, y, z, in C order. */
+  function coordinates(bits) {
+    const found = [];
+    for (let byte = 0; byte < bits.length; byte++) {
+      for (let bit = 0, value = bits[byte]; value; bit++, value = (value << 1) & 255) {
+        if (!(value & 128)) continue;
+        const cell = byte * 8 + bit;
+        found.push(Math.floor(cell / (side * side)), Math.floor(cell / side) % side, cell % side);
+      }
+    }
+    return Uint8Array.from(found);
+  }
+
+  /** Return the mapped value (log10 or plain) of a property's step. */
+  const mapped = (property, step) => property.lo + (step / (levels - 1)) * (property.hi - property.lo);
+
+  return { arrived, showThumbnail, voxels, mapped, side, levels, NOT_VALID: 255 };
+})();
