@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from enum import StrEnum
 from pathlib import Path
 from typing import Any
@@ -53,15 +53,16 @@ class PlannedAsset:
         Why, in one line.
     key : str
         See `slatprep.reuse`; empty where the sources cannot be read.
-    sources : tuple of SourceFile
-        Files as they are now, where ``resume`` finds a record that names others.
+    names : dict
+        Entries of the record that differ from what is known of the asset,
+        though its content does not: its category, paths of its files.
     """
 
     asset_id: str
     action: Action
     reason: str
     key: str = ""
-    sources: tuple[SourceFile, ...] = ()
+    names: dict[str, Any] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -136,15 +137,29 @@ def plan_asset(
         return PlannedAsset(pair.asset_id, Action.REFUSE, " ".join(str(error).split()))
     key = recipe.key(pair.asset_id, digests)
     if spool is not None and spool.find(key) is not None:
-        reason = "finished by an interrupted build"
-        same = spool.record(key)["sources"] == jsonable(sources)
-        return PlannedAsset(pair.asset_id, Action.RESUME, reason, key, () if same else sources)
+        reason = "finished by an earlier build"
+        names = _new_names(spool.record(key), pair, sources)
+        return PlannedAsset(pair.asset_id, Action.RESUME, reason, key, names)
     record = previous_record(previous, pair.asset_id)
     if record is None:
         return PlannedAsset(pair.asset_id, Action.ALIGN, "not in the store", key)
     if record["key"] == key:
-        return PlannedAsset(pair.asset_id, Action.REUSE, "unchanged", key)
+        names = _new_names(record, pair, sources)
+        reason = f"unchanged, but for {', '.join(names)}" if names else "unchanged"
+        return PlannedAsset(pair.asset_id, Action.REUSE, reason, key, names)
     return PlannedAsset(pair.asset_id, Action.ALIGN, recipe.difference(record, sources), key)
+
+
+def _new_names(
+    record: dict[str, Any], pair: AssetPair, sources: tuple[SourceFile, ...]
+) -> dict[str, Any]:
+    names = {
+        "object_id": pair.object_id,
+        "view": pair.view,
+        "category": pair.category,
+        "sources": jsonable(sources),
+    }
+    return {name: value for name, value in names.items() if record[name] != value}
 
 
 def previous_record(previous: tuple[Path, str] | None, asset_id: str) -> dict[str, Any] | None:

@@ -123,7 +123,7 @@ def finish_asset(pair: AssetPair, planned: PlannedAsset | None, bench: Bench) ->
     """
     begin = time.perf_counter()
     if planned is not None and planned.action is Action.RESUME:
-        finished = _resumed(pair, planned, bench)
+        finished = _resumed(planned, bench)
         if finished is not None:
             return finished
     try:
@@ -187,23 +187,13 @@ def _result_of(
     return result, key, record["alignment"]
 
 
-def _resumed(pair: AssetPair, planned: PlannedAsset, bench: Bench) -> SpooledAsset | None:
+def _resumed(planned: PlannedAsset, bench: Bench) -> SpooledAsset | None:
     """Return what an interrupted build finished, under the names things have now."""
     finished = bench.spool.find(planned.key)
-    if finished is None:
-        return None
-    now: dict[str, Any] = {
-        "object_id": pair.object_id,
-        "view": pair.view,
-        "category": pair.category,
-    }
-    if planned.sources:
-        now["sources"] = provenance.jsonable(planned.sources)
-    record = bench.spool.record(planned.key)
-    if any(record[name] != value for name, value in now.items()):
-        bench.spool.amend(planned.key, now)
-        finished = bench.spool.find(planned.key)
-    return finished
+    if finished is None or not planned.names:
+        return finished
+    bench.spool.amend(planned.key, planned.names)
+    return bench.spool.find(planned.key)
 
 
 def _reason(error: Exception) -> tuple[str, str]:

@@ -95,9 +95,11 @@ def is_current(
         Ranges that do not depend on the dataset.
     """
     store = _previous(bench)
-    actions = [asset.action for asset in (plan or {}).values()]
+    plan = plan or {}
+    actions = [asset.action for asset in plan.values()]
     return (
         Action.REMOVE not in actions
+        and not any(asset.names for asset in plan.values())
         and actions.count(Action.REUSE) == len(store)
         and store.attributes.get("build") == provenance.origin(bench.parameters)
         and (given is None or store.normalization == given)

@@ -13,7 +13,7 @@ from slatprep.cli.output import EXIT_INCOMPLETE, Output, output_options
 from slatprep.cli.overview import show_quality
 
 if TYPE_CHECKING:
-    from slatprep.build import BuildSummary
+    from slatprep.build import BuildPlan, BuildSummary
 
 _MANIFESTS = click.option(
     "--manifests",
@@ -30,6 +30,7 @@ _STRICT = click.option("--strict", is_flag=True, help="Stop at the first asset t
 Example:
   slatprep build-store --pixieverse demo/pixieverse --slat demo/slat --out demo.zarr --jobs 2
   slatprep build-store --config manifests/demo.toml --preset paper --out data/demo.zarr
+  slatprep build-store --config manifests/demo.toml --out data/demo.zarr --dry-run
 """,
 )
 @source_options
@@ -38,28 +39,58 @@ Example:
     required=True,
     type=click.Path(path_type=Path),
     metavar="STORE.zarr",
-    help="The store; one that is there is replaced when the new one is complete.",
+    help="The store; one that is there is brought up to date and replaced in one step.",
 )
 @jobs_option
 @_MANIFESTS
 @_STRICT
+@click.option("--fresh", is_flag=True, help="Do everything, whatever was done before.")
+@click.option(
+    "--keep-work",
+    is_flag=True,
+    help="Keep all assets' arrays beside the store, about 1 MB each; the next build is faster.",
+)
+@click.option("--dry-run", is_flag=True, help="Say what would be done, and why; write nothing.")
 @output_options
 def build_store(
-    output: Output, out: Path, jobs: int, manifests: Path | None, strict: bool, **sources: Any
+    output: Output,
+    out: Path,
+    jobs: int,
+    manifests: Path | None,
+    strict: bool,
+    fresh: bool,
+    keep_work: bool,
+    dry_run: bool,
+    **sources: Any,
 ) -> None:
-    """Build one store of aligned, normalised supervision.
+    """Build one store of aligned, normalised supervision, or bring it up to date.
 
     Pairs the assets of both sides by id, aligns them, looks the material and
     its properties up at every SLAT voxel, normalises and writes. An asset that
     cannot go in never stops the others: it is named on standard error and in
     the records, and the exit code is 1.
+
+    Assets whose sources, parameters and code did not change are not aligned
+    again, and a build that was interrupted goes on where it stopped.
     """
     parameters = parameters_of(**sources)
     from slatprep import build
 
+    if dry_run:
+        with output.progress("compare") as progress:
+            plan = build.plan_build(parameters, out, jobs=jobs, fresh=fresh, progress=progress)
+        _show_plan(output, plan)
+        return
     with output.progress("build") as progress:
         summary = build.build_store(
-            parameters, out, manifests=manifests, jobs=jobs, strict=strict, progress=progress
+            parameters,
+            out,
+            manifests=manifests,
+            jobs=jobs,
+            strict=strict,
+            fresh=fresh,
+            keep_work=keep_work,
+            progress=progress,
         )
     _report(output, summary)
 
@@ -93,6 +124,29 @@ def align(output: Output, out: Path, jobs: int, strict: bool, **sources: Any) ->
     with output.progress("align") as progress:
         summary = build.align_pairs(parameters, out, jobs=jobs, strict=strict, progress=progress)
     _report(output, summary)
+
+
+def _show_plan(output: Output, plan: BuildPlan) -> None:
+    """Print what would be done with each asset, and why; unchanged ones are counted alone."""
+
+    def show() -> None:
+        rows = [
+            (asset.asset_id, str(asset.action), asset.reason)
+            for asset in plan.assets
+            if asset.action != "reuse" or output.verbosity > 0
+        ]
+        if rows:
+            output.table("What would be done", ("asset", "action", "why"), rows)
+        counts = ", ".join(f"{count:,} to {action}" for action, count in plan.actions.items())
+        click.echo(f"assets:  {len(plan.assets):,} ({counts})")
+        click.echo(f"store:   {plan.store} (a dry run: nothing is written)")
+
+    assets = [
+        {"asset_id": asset.asset_id, "action": str(asset.action), "reason": asset.reason}
+        for asset in plan.assets
+    ]
+    document = {"store": plan.store, "actions": plan.actions, "assets": assets}
+    output.result(document, show)
 
 
 def _report(output: Output, summary: BuildSummary) -> None:

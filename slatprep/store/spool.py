@@ -176,9 +176,10 @@ class Spool:
         # A name of its own: a worker that outlives a killed build may write the same asset.
         partial = path.with_suffix(f".{uuid.uuid4().hex}.partial")
         text = json.dumps(record, allow_nan=False).encode()
+        everything: dict[str, Any] = {**arrays, "record": np.frombuffer(text, np.uint8)}
         try:
             with partial.open("wb") as file:
-                np.savez(file, **{**arrays, "record": np.frombuffer(text, np.uint8)})
+                np.savez(file, **everything)
             partial.replace(path)
         finally:
             partial.unlink(missing_ok=True)
