@@ -54,14 +54,8 @@ class ChunkDecoder:
     @classmethod
     def of(
         cls, dtype: np.dtype[Any], shape: tuple[int, ...], codecs: Sequence[Mapping[str, Any]]
-    ) -> ChunkDecoder:
-        """Return the decoder for a list of codecs as ``zarr.json`` has it.
-
-        Raises
-        ------
-        StoreError
-            If they are none that slatprep writes.
-        """
+    ) -> ChunkDecoder | None:
+        """Return the decoder for a list of codecs as ``zarr.json`` has it, or None."""
         text = dtype.hasobject
         first, rest = codecs[0], [codec["name"] for codec in codecs[1:]]
         little = first.get("configuration", {}).get("endian", "little") == "little"
@@ -70,7 +64,7 @@ class ChunkDecoder:
             compressors = rest[:-1] if crc32c else rest
             if compressors in ([], ["blosc"], ["zstd"]):
                 return cls(dtype, shape, "".join(compressors), crc32c, text)
-        raise StoreError(f"it is packed with {', '.join([first['name'], *rest])}")
+        return None
 
     @cached_property
     def nbytes(self) -> int:

@@ -125,19 +125,31 @@ def array_findings(name: str, metadata: object, sizes: Mapping[str, int]) -> Ite
     layout = _LAYOUTS.get(name)
     if layout is None:
         return
+    yield from size_findings(name, metadata, sizes)
+    if isinstance(metadata, dict):
+        dtype = _ZARR_NAMES.get(layout.dtype, layout.dtype)
+        yield from _differences(
+            f"{name}/zarr.json",
+            metadata,
+            {"data_type": dtype, "dimension_names": list(layout.dimensions), "zarr_format": 3},
+        )
+
+
+def size_findings(name: str, metadata: object, sizes: Mapping[str, int]) -> Iterator[Finding]:
+    """Yield what is wrong with the sizes that the metadata of one array claim.
+
+    Parameters are those of `array_findings`. An array without findings may be
+    read: no more memory is set aside than its files account for.
+    """
+    layout = _LAYOUTS.get(name)
+    if layout is None:
+        return
     where = f"{name}/zarr.json"
     if not isinstance(metadata, dict) or metadata.get("node_type") != "array":
         yield Finding(where, "", "describes no array", "the metadata of an array")
         return
     shape = tuple(sizes[dimension] for dimension in layout.dimensions)
-    for key, value, expected in (
-        ("shape", metadata.get("shape"), list(shape)),
-        ("data_type", metadata.get("data_type"), _ZARR_NAMES.get(layout.dtype, layout.dtype)),
-        ("dimension_names", metadata.get("dimension_names"), list(layout.dimensions)),
-        ("zarr_format", metadata.get("zarr_format"), 3),
-    ):
-        if value != expected:
-            yield Finding(where, "", f"{key} is {value!r}", repr(expected))
+    yield from _differences(where, metadata, {"shape": list(shape)})
     yield from _chunk_findings(where, layout, metadata, shape)
 
 
@@ -165,6 +177,14 @@ def dimension_sizes(metadata: Mapping[str, Any]) -> dict[str, int]:
     return sizes
 
 
+def _differences(
+    where: str, metadata: Mapping[str, Any], wanted: Mapping[str, object]
+) -> Iterator[Finding]:
+    for key, expected in wanted.items():
+        if metadata.get(key) != expected:
+            yield Finding(where, "", f"{key} is {metadata.get(key)!r}", repr(expected))
+
+
 def _chunk_findings(
     where: str, layout: ArrayLayout, metadata: Mapping[str, Any], shape: tuple[int, ...]
 ) -> Iterator[Finding]:
@@ -182,13 +202,15 @@ def _chunk_findings(
         ("shard", outer, _MAX_SHARD_ROWS[group] if sharded else _MAX_CHUNK_ROWS[group]),
     ):
         whole = isinstance(sizes, list) and all(type(n) is int for n in sizes)
-        if not whole or sizes[1:] != list(shape[1:]) or not 1 <= sizes[0] <= limit:
-            yield Finding(
-                where,
-                "",
-                f"{kind} shape is {sizes!r}",
-                f"1 to {limit} rows of {list(shape[1:])}",
-            )
+        rows = list(shape[1:])
+        fits = (
+            whole
+            and len(sizes) == len(shape)
+            and all(n <= m for n, m in zip(sizes[1:], rows, strict=True))
+        )
+        if not fits or min(sizes) < 1 or sizes[0] > limit:
+            expected = f"1 to {limit} rows of at most {rows}"
+            yield Finding(where, "", f"{kind} shape is {sizes!r}", expected)
 
 
 def _root(what: str, expected: str) -> Finding:

@@ -16,9 +16,9 @@ from slatprep.errors import StoreError
 from slatprep.records import Normalization, PropertyRange
 from slatprep.store.contract import (
     MAX_VOXELS,
-    array_findings,
     dimension_sizes,
     read_metadata,
+    size_findings,
 )
 from slatprep.store.layout import ARRAYS, FORMAT, FORMAT_VERSION
 from slatprep.store.rows import Folder, RowReader
@@ -94,7 +94,7 @@ class Store:
         self._folder = Folder(path)
         self._metadata = _consolidated(document)
         self._columns: dict[str, NDArray[Any]] = {}
-        self._readers: dict[str, RowReader] = {}
+        self._readers: dict[str, RowReader | None] = {}
 
     def __reduce__(self) -> tuple[Any, ...]:
         return (open_store, (self.path,))
@@ -142,10 +142,9 @@ class Store:
         StoreError
             If there is no such array, or it cannot be read.
         """
-        reader = self.reader(f"asset/{name}")
         # Offsets are always written: that they are there bounds what the others may claim.
-        rows = reader.shape[0] if name == "offset" else len(self)
-        return reader.read(0, rows)
+        rows = self._asset_rows + 1 if name == "offset" else len(self)
+        return self._read(f"asset/{name}", 0, rows)
 
     def find(self, asset_id: str) -> int:
         """Return the index of an asset.
@@ -242,29 +241,40 @@ class Store:
         return self._columns[name]
 
     def _read(self, name: str, start: int, stop: int) -> NDArray[Any]:
-        return self.reader(name).read(start, stop)
+        if name not in self._readers:
+            self._readers[name] = self.reader(name)
+        reader = self._readers[name]
+        if reader is None:
+            array: Any = self.group[name]
+            return np.asarray(array[start:stop])
+        return reader.read(start, stop)
 
-    def reader(self, name: str) -> RowReader:
-        """Return the reader of an array of the contract, by its full name.
+    def reader(self, name: str) -> RowReader | None:
+        """Return a direct reader of an array, by its full name.
+
+        Returns
+        -------
+        RowReader or None
+            None where the array is not cut and packed as slatprep does it; then
+            zarr-python reads it.
 
         Raises
         ------
         StoreError
-            If there is no such array, or its metadata are not the contract's.
+            If there is no such array, or its metadata claim another size than
+            the contract has, or unreasonably large chunks.
         """
-        reader = self._readers.get(name)
-        if reader is None:
-            for needed in ("asset/id", "voxel/coords", name):
-                self._metadata.setdefault(needed, self._array_metadata(needed))
-            for finding in array_findings(name, self._metadata[name], self._sizes):
-                raise StoreError(f"{self.path}/{finding}; run `slatprep verify`")
-            reader = RowReader.of(self._folder, name, self._metadata[name])
-            self._readers[name] = reader
-        return reader
+        for needed in ("asset/id", "voxel/coords", name):
+            self._metadata.setdefault(needed, self._array_metadata(needed))
+        sizes = dimension_sizes(self._metadata)
+        for finding in size_findings(name, self._metadata[name], sizes):
+            raise StoreError(f"{self.path}/{finding}; run `slatprep verify`")
+        return RowReader.of(self._folder, name, self._metadata[name])
 
     @property
-    def _sizes(self) -> dict[str, int]:
-        return dimension_sizes(self._metadata)
+    def _asset_rows(self) -> int:
+        self.reader("asset/id")
+        return int(self._metadata["asset/id"]["shape"][0])
 
     def _array_metadata(self, name: str) -> Mapping[str, Any]:
         if name in self._metadata:

@@ -110,28 +110,24 @@ class RowReader:
         self._local = threading.local()
 
     @classmethod
-    def of(cls, folder: Folder, name: str, metadata: Mapping[str, Any]) -> RowReader:
-        """Return a reader for an array with this ``zarr.json``.
+    def of(cls, folder: Folder, name: str, metadata: Mapping[str, Any]) -> RowReader | None:
+        """Return a reader for an array with this ``zarr.json``, or None if it is of another kind.
 
         Raises
         ------
         StoreError
-            If the metadata make no sense, or are of a kind that slatprep does not write.
+            If the metadata make no sense.
         """
         try:
             return cls._of(folder, name, metadata)
         except (KeyError, TypeError, ValueError, AttributeError, IndexError) as error:
             raise StoreError(f"{folder.path}/{name}: bad metadata ({error!r})") from None
-        except StoreError as error:
-            raise StoreError(
-                f"{folder.path}/{name}: {error}, which slatprep does not read; zarr-python may"
-            ) from None
 
     @classmethod
-    def _of(cls, folder: Folder, name: str, metadata: Mapping[str, Any]) -> RowReader:
+    def _of(cls, folder: Folder, name: str, metadata: Mapping[str, Any]) -> RowReader | None:
         text = metadata["data_type"] == "string"
         if not text and metadata["data_type"] not in _DTYPES:
-            raise StoreError(f"its data type is {metadata['data_type']!r}")
+            return None
         dtype = np.dtype(object) if text else np.dtype(metadata["data_type"]).newbyteorder("<")
         shape = tuple(map(int, metadata["shape"]))
         outer = tuple(map(int, metadata["chunk_grid"]["configuration"]["chunk_shape"]))
@@ -143,13 +139,14 @@ class RowReader:
             index_codecs = [codec["name"] for codec in sharding["index_codecs"]]
             at_end = sharding.get("index_location", "end") == "end"
             if index_codecs != _INDEX_CODECS or not at_end or len(metadata["codecs"]) > 1:
-                raise StoreError("its shards have an index of another form")
-        if metadata["chunk_key_encoding"] not in _KEYS:
-            raise StoreError("its files have other names")
-        if not outer[1:] == inner[1:] == shape[1:] or inner[0] < 1 or outer[0] % inner[0]:
-            raise StoreError(f"its chunks of {inner} and shards of {outer} do not hold whole rows")
+                return None
+        whole_rows = outer[1:] == inner[1:] == shape[1:] and inner[0] > 0 == outer[0] % inner[0]
+        if not whole_rows or metadata["chunk_key_encoding"] not in _KEYS:
+            return None
         fill_value = np.array(metadata["fill_value"], object).astype(dtype)
         decoder = ChunkDecoder.of(dtype, inner, codecs)
+        if decoder is None:
+            return None
         return cls(folder, name, shape, outer[0], sharded, decoder, fill_value)
 
     def key(self, shard: int) -> str:
