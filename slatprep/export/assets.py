@@ -13,8 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slatprep.errors import ConfigError, StoreError
+from slatprep.geometry import voxels_of
 from slatprep.normalize import denormalize
-from slatprep.records import Verdict
+from slatprep.records import BACKGROUND, Verdict
 from slatprep.store import Store
 
 COLUMNS = (
@@ -30,6 +31,7 @@ COLUMNS = (
 )
 """The columns of ``asset/*`` that travel with an exported asset."""
 
+_ARRAYS = ("coords", "feats", "properties", "material", "valid", "distance")
 _LONGEST_NAME = 180
 
 
@@ -112,36 +114,29 @@ def select_assets(store: Store, assets: Sequence[str], verdicts: Sequence[str]) 
 def read_assets(store: Store, ids: Sequence[str], *, grid: bool = False) -> Iterator[ExportedAsset]:
     """Read assets one after the other, their PixieVerse fields only if `grid`."""
     transforms = store.column("transform")
-    table = {name: store.column(name) for name in COLUMNS}
+    table = {name: store.column(name).tolist() for name in COLUMNS}
     normalization = store.normalization
-    voxel: Any = store.group["voxel"]
     for asset_id in ids:
         row = store.find(asset_id)
-        rows = slice(int(store.offsets[row]), int(store.offsets[row + 1]))
-        arrays = {
-            name: np.asarray(voxel[name][rows])
-            for name in ("coords", "feats", "properties", "material", "valid", "distance")
-        }
+        arrays = store.read(row, _ARRAYS)
         yield ExportedAsset(
             asset_id=asset_id,
             properties_si=denormalize(arrays["properties"], normalization),
-            transform=np.asarray(transforms[row]),
-            columns={name: table[name][row].item() if hasattr(table[name][row], "item")
-                     else str(table[name][row]) for name in COLUMNS},
+            transform=transforms[row],
+            columns={name: values[row] for name, values in table.items()},
             **arrays,
-            **(_read_grid(store, row) if grid else {}),
-        )  # fmt: skip
+            **(_read_grid(store, asset_id) if grid else {}),
+        )
 
 
-def _read_grid(store: Store, row: int) -> dict[str, NDArray[Any]]:
-    group: Any = store.group["grid"]
-    material = np.asarray(group["material"][row])
-    annotated = material < 7
-    properties = np.asarray(group["properties"][row])[:, annotated].T
+def _read_grid(store: Store, asset_id: str) -> dict[str, NDArray[Any]]:
+    asset = store.asset(asset_id)
+    material, properties = asset.grid_material, asset.grid_properties
+    annotated = material < BACKGROUND
     return {
-        "grid_voxels": np.argwhere(annotated).astype(np.uint8),
+        "grid_voxels": voxels_of(annotated),
         "grid_material": material[annotated],
-        "grid_properties_si": denormalize(properties, store.normalization),
+        "grid_properties_si": denormalize(properties[:, annotated].T, store.normalization),
     }
 
 
@@ -174,8 +169,8 @@ def file_name(asset_id: str, *, dots: bool = True) -> str:
     name = quote(asset_id, safe="")
     if not dots:
         name = name.replace(".", "%2E")
-    if name[:1] in "._-~":
-        name = f"%{ord(name[0]):02X}{name[1:]}" if name else "%"
+    if name.startswith((".", "_", "-", "~")):
+        name = f"%{ord(name[0]):02X}{name[1:]}"
     if len(name) > _LONGEST_NAME:
         digest = hashlib.sha256(asset_id.encode()).hexdigest()[:32]
         name = f"{name[:_LONGEST_NAME]}~{digest}"
