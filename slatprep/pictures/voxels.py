@@ -83,8 +83,8 @@ def view_rotation(azimuth: float, elevation: float) -> NDArray[np.float64]:
 
     Examples
     --------
-    >>> view_rotation(270, 0).round().tolist()  # from in front: x right, z up
-    [[1.0, -0.0, 0.0], [-0.0, -0.0, 1.0], [-0.0, -1.0, 0.0]]
+    >>> (view_rotation(270, 0).round() + 0.0).tolist()  # from in front: x right, z up
+    [[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]]
     """
     a, e = np.radians([azimuth, elevation])
     towards = np.array([np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e)])
@@ -196,8 +196,9 @@ def _resolve(buffer: NDArray[np.int64], lit: NDArray[np.float64], view: View) ->
     tone = np.where(buffer & 1, 1.0, _SEAM)
     depth = np.where(covered, (buffer >> _FACE_BITS) / _DEPTH_STEPS * 8 * view.half_width, -np.inf)
     tone = np.where(covered & _steps_down(depth), _OUTLINE, tone)
-    rgb = np.ones((*buffer.shape, 3))
-    rgb[covered] = np.clip(lit[face[covered]] * tone[covered][:, None], 0, 1)
+    white = np.array([[1.0, 1.0, 1.0]])
+    table = np.concatenate([np.clip(lit, 0, 1), white])
+    rgb = table[np.where(covered, face, len(lit))] * np.where(covered, tone, 1.0)[..., None]
     return Drawing(_averaged(rgb), _averaged(covered.astype(np.float64)))
 
 
