@@ -8,7 +8,7 @@ from io import BytesIO
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from slatprep.check import AlignmentCheck
 from slatprep.geometry import split_transform
@@ -34,7 +34,7 @@ COLUMNS = (
     ("before", "PixieVerse classes, SLAT outlined"),
     ("after", "PixieVerse moved, SLAT outlined"),
     ("result", "SLAT voxels by class received"),
-    ("error", "distance to the PixieVerse surface"),
+    ("error", "distance to PixieVerse, scale at right"),
 )
 """Heading of each column of a picture, and what it shows."""
 
@@ -108,29 +108,41 @@ def png_of(figure: Figure) -> bytes:
     return buffer.getvalue()
 
 
-def overlay(scene: Scene, transform: NDArray[np.float64], view: View) -> NDArray[np.float64]:
-    """Draw the PixieVerse set by class, and the SLAT as a pale shape with an outline."""
-    field = draw_voxels(scene.pixieverse, class_colours(scene.pixieverse_material), transform, view)
+def outlined(scene: Scene, view: View, *transforms: ArrayLike) -> list[NDArray[np.float64]]:
+    """Draw the PixieVerse set by class where each transform puts it, over the outlined SLAT.
+
+    Returns
+    -------
+    list of ndarray of float64, shape (n, n, 3)
+        A picture in 0..1 a transform; the SLAT is pale where nothing covers it.
+    """
     grey = np.broadcast_to(rgb(palette.RULE), (len(scene.slat), 3))
-    ghost = draw_voxels(scene.slat, grey, np.eye(4), view, contrast=0.5)
-    pale = 0.45 + 0.55 * ghost.rgb
-    cover = field.cover[..., None]
-    image = field.rgb * cover + pale * (1 - cover)
-    line = _outline(ghost)[..., None]
-    outlined: NDArray[np.float64] = image * (1 - line) + rgb(palette.INK) * line
-    return outlined
+    slat = draw_voxels(scene.slat, grey, np.eye(4), view, contrast=0.5)
+    pale = 0.45 + 0.55 * slat.rgb
+    line = _outline(slat)[..., None]
+    colours = class_colours(scene.pixieverse_material)
+    pictures = []
+    for transform in transforms:
+        field = draw_voxels(scene.pixieverse, colours, transform, view)
+        cover = field.cover[..., None]
+        image = field.rgb * cover + pale * (1 - cover)
+        pictures.append(image * (1 - line) + rgb(palette.INK) * line)
+    return pictures
+
+
+def error_picture(scene: Scene, view: View) -> NDArray[np.float64]:
+    """Draw the SLAT's surface by the error of each voxel, nearly unshaded, (n, n, 3) in 0..1."""
+    colours = distance_colours(scene.error)
+    return draw_voxels(scene.surface, colours, np.eye(4), view, contrast=0.35).rgb
 
 
 def panels(scene: Scene, view: View) -> tuple[NDArray[np.float64], ...]:
     """Draw one direction: before, after, result and error, each (n, n, 3) in 0..1."""
-    identity = np.eye(4)
+    result = draw_voxels(scene.slat, class_colours(scene.slat_material), np.eye(4), view)
     return (
-        overlay(scene, identity, view),
-        overlay(scene, scene.transform, view),
-        draw_voxels(scene.slat, class_colours(scene.slat_material), identity, view).rgb,
-        draw_voxels(
-            scene.surface, distance_colours(scene.error), identity, view, contrast=0.35
-        ).rgb,
+        *outlined(scene, view, np.eye(4), scene.transform),
+        result.rgb,
+        error_picture(scene, view),
     )
 
 
@@ -286,7 +298,7 @@ def _candidates(figure: Figure, candidates: Sequence[Candidate] | str, y: float)
             _text(figure, _SIDE, y + 20 + 17 * number, line, size=7, color=palette.MUTED)
         return
     own = sorted((c for c in candidates if c.same_as is None), key=lambda c: (-c.fitness, c.index))
-    words = f"{len(own)} different starts of {len(candidates)}; coarse fitness, best first"
+    words = f"{len(own)} different of {len(candidates)}, by coarse fitness; some end alike"
     _text(figure, _SIDE, y + 20, words, size=7, color=palette.MUTED)
     axes = _axes(figure, y + 36, 190)
     colours = [palette.ACCENT] + [palette.RULE] * (len(own) - 1)

@@ -9,9 +9,8 @@ import numpy as np
 
 from slatprep.check import AlignmentCheck
 from slatprep.pictures import palette
-from slatprep.pictures.alignment import DPI, STYLE, overlay, png_of
-from slatprep.pictures.scene import FARTHEST, Scene, distance_colours, views
-from slatprep.pictures.voxels import draw_voxels
+from slatprep.pictures.alignment import DPI, STYLE, error_picture, outlined, png_of
+from slatprep.pictures.scene import FARTHEST, Scene, views
 
 MOST = 60
 """Assets on one sheet."""
@@ -61,9 +60,8 @@ def draw_sheet(
             row, column = divmod(number, columns)
             x, y = _MARGIN + column * (_CELL_WIDTH + _GAP), _HEAD + row * _CELL_HEIGHT
             view = views(scene, _THUMBNAIL)[0]
-            colours = distance_colours(scene.error)
-            error = draw_voxels(scene.surface, colours, np.eye(4), view, contrast=0.35).rgb
-            for k, image in enumerate((overlay(scene, scene.transform, view), error)):
+            images = *outlined(scene, view, scene.transform), error_picture(scene, view)
+            for k, image in enumerate(images):
                 pixels = np.rint(np.clip(image, 0, 1) * 255).astype(np.uint8)
                 left, bottom = x + k * _THUMBNAIL, height - y - _THUMBNAIL
                 figure.figimage(pixels, xo=left, yo=bottom, origin="upper")
