@@ -1,0 +1,135 @@
+"""The rotation that a dataset shares settles ties, and nothing else."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from slatprep.align import align
+from slatprep.align.consensus import degrees_between, find_consensus, settle
+from slatprep.align.starts import distinct_starts
+from slatprep.geometry import displacement, make_transform, split_transform
+from slatprep.parameters import AlignParameters
+from tests.align.conftest import GRID, chair, field_of, surface_latents, turned
+
+COMMON = distinct_starts()[14].rotation
+
+
+def _tilted(rotation: np.ndarray, seed: int) -> np.ndarray:
+    tilt = Rotation.from_rotvec(np.random.default_rng(seed).normal(scale=0.05, size=3))
+    return make_transform(tilt.as_matrix() @ rotation, [0.01, 0.0, 0.02])
+
+
+def test_the_common_rotation_is_found_among_others() -> None:
+    transforms = [_tilted(COMMON, seed) for seed in range(12)]
+    transforms += [_tilted(start.rotation, 50) for start in distinct_starts()[:8]]
+    consensus = find_consensus(transforms)
+    assert consensus is not None
+    assert (consensus.winners, consensus.agreeing) == (20, 12)
+    assert degrees_between(consensus.rotation, COMMON) < 3.0
+    assert np.linalg.det(consensus.rotation) == pytest.approx(1.0)
+    shuffled = [transforms[i] for i in np.random.default_rng(0).permutation(20)]
+    again = find_consensus(shuffled)
+    assert again is not None
+    assert again.rotation.tobytes() == consensus.rotation.tobytes()
+
+
+@pytest.mark.parametrize(
+    "transforms",
+    [
+        [],
+        [_tilted(COMMON, seed) for seed in range(4)],  # too few
+        [_tilted(start.rotation, 1) for start in distinct_starts()],  # all different
+    ],
+)
+def test_no_rotation_is_common_where_few_agree(transforms: list[np.ndarray]) -> None:
+    assert find_consensus(transforms) is None
+
+
+def _box() -> np.ndarray:
+    box = np.zeros((64, 64, 64), dtype=bool)
+    box[12:52, 22:42, 27:37] = True
+    return box
+
+
+def test_a_tie_goes_to_the_common_rotation_and_can_be_undone() -> None:
+    consensus = find_consensus([make_transform(COMMON)] * 6)
+    assert consensus is not None
+    latents = surface_latents(turned(_box(), COMMON))
+    before = align(field_of(_box()), latents, AlignParameters())
+    after = settle(before, latents, consensus)
+    assert displacement(after.transform, make_transform(COMMON), latents.coords) < 0.05
+    choices = [before.transform, *(p.transform for p in before.placements)]
+    others = [after.transform, *(p.transform for p in after.placements)]
+    assert {c.tobytes() for c in choices} == {c.tobytes() for c in others}
+    if after is not before:
+        assert after.settled_by is consensus
+        np.testing.assert_array_equal(after.placements[0].transform, before.transform)
+
+
+def test_whichever_placement_came_first_the_same_one_is_chosen() -> None:
+    consensus = find_consensus([make_transform(COMMON)] * 6)
+    assert consensus is not None
+    latents = surface_latents(turned(_box(), COMMON))
+    found = align(field_of(_box()), latents, AlignParameters())
+    assert len(found.placements) == 3
+    chosen = set()
+    transforms = [found.transform, *(p.transform for p in found.placements)]
+    for first in range(4):
+        order = [transforms[first], *transforms[:first], *transforms[first + 1 :]]
+        other = replace(
+            found,
+            transform=order[0],
+            placements=tuple(
+                replace(p, transform=t) for p, t in zip(found.placements, order[1:], strict=True)
+            ),
+        )
+        chosen.add(settle(other, latents, consensus).transform.tobytes())
+    assert len(chosen) == 1
+
+
+def test_a_clear_winner_is_left_alone() -> None:
+    consensus = find_consensus([make_transform(COMMON)] * 6)
+    assert consensus is not None
+    latents = surface_latents(chair())
+    alignment = align(field_of(chair()), latents, AlignParameters())
+    assert degrees_between(split_transform(alignment.transform)[0], COMMON) > 80
+    assert settle(alignment, latents, consensus) is alignment
+
+
+def test_a_planted_rotation_raises_the_share_of_symmetric_assets_placed_right() -> None:
+    rng = np.random.default_rng(3)
+    right = {"before": 0, "after": 0}
+    winners, ambiguous = [], []
+    for number in range(16):
+        if number % 2:
+            solid = np.zeros((64, 64, 64), dtype=bool)
+            a, b, c = rng.integers(8, 24, 3)
+            solid[32 - a : 32 + a, 32 - b : 32 + b, 32 - c : 32 + c] = True
+        else:
+            solid = np.roll(chair(), rng.integers(-3, 4, 3), axis=(0, 1, 2))
+        latents = surface_latents(turned(solid, COMMON))
+        alignment = align(field_of(solid), latents, AlignParameters())
+        (ambiguous if alignment.placements else winners).append((alignment, latents))
+    consensus = find_consensus([alignment.transform for alignment, _ in winners])
+    assert consensus is not None
+    for alignment, latents in ambiguous:
+        for when, settled in (
+            ("before", alignment),
+            ("after", settle(alignment, latents, consensus)),
+        ):
+            apart = displacement(settled.transform, make_transform(COMMON), latents.coords)
+            right[when] += apart < 1.5
+    assert len(ambiguous) == 8
+    assert right["after"] == 8
+    assert right["before"] < 8
+    assert all(settle(a, latents, consensus) is a for a, latents in winners)
+
+
+def test_degrees_between_is_the_angle_of_the_turn() -> None:
+    turn = Rotation.from_rotvec([0, np.radians(33), 0]).as_matrix()
+    assert degrees_between(COMMON, turn @ COMMON) == pytest.approx(33)
+    assert GRID.shape == (64, 64, 64, 3)

@@ -1,0 +1,235 @@
+"""The default engine against transforms known by construction."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from slatprep.align import align, engine_versions
+from slatprep.align.ambiguity import measure_ambiguity
+from slatprep.align.quality import judge
+from slatprep.align.starts import distinct_starts
+from slatprep.geometry import displacement, make_transform, split_transform
+from slatprep.parameters import AlignParameters, SampleParameters
+from slatprep.records import Verdict
+from slatprep.sample import sample
+from tests.align.conftest import GRID, Case, chair, field_of, latents_of, surface_latents, turned
+
+DEFAULT = AlignParameters()
+
+
+@pytest.mark.parametrize("index", range(0, 24, 5))
+def test_a_quarter_turn_is_found_exactly(index: int) -> None:
+    rotation = distinct_starts()[index].rotation
+    solid = chair()
+    latents = surface_latents(turned(solid, rotation))
+    alignment = align(field_of(solid), latents, DEFAULT)
+    assert displacement(alignment.transform, make_transform(rotation), latents.coords) < 0.01
+    assert alignment.model == "rigid"
+    assert alignment.search == "euler64"
+    assert alignment.quality.fitness == alignment.quality.fitness_backward == 1.0
+
+
+# The median and worst displacement [voxel] over the level's assets without
+# symmetry, and by how much label accuracy may fall below the truth's own.
+# Warped rotationally symmetric shapes may turn with the warp: the worst is free.
+ACCURACY = {
+    0: (0.01, 0.02, 0.001),
+    1: (0.15, 0.5, 0.002),
+    2: (0.25, 0.6, 0.003),
+    3: (0.3, 0.6, 0.005),
+    4: (1.0, None, 0.005),
+}
+
+
+@pytest.mark.parametrize("level", ACCURACY)
+def test_accuracy_on_demo_data(level: int, demo_cases: Callable[[int], list[Case]]) -> None:
+    from slatprep.truth import compare_with_truth
+
+    scores = []
+    for field, latents, truth in demo_cases(level):
+        alignment = align(field, latents, DEFAULT)
+        annotation = sample(field, latents.coords, alignment.transform, SampleParameters())
+        scores.append(
+            compare_with_truth(
+                truth.name,
+                truth,
+                coords=latents.coords,
+                transform=alignment.transform,
+                material=annotation.material,
+                valid=annotation.valid,
+                annotated=field.voxels,
+                annotated_material=field.material,
+            )
+        )
+    scores = [score for score in scores if not score.symmetric]
+    assert len(scores) >= 4
+    apart = [score.displacement for score in scores]
+    median, worst, loss = ACCURACY[level]
+    assert np.median(apart) < median, dict(zip([s.name for s in scores], apart, strict=True))
+    assert worst is None or max(apart) < worst
+    accuracy = np.mean([score.label_accuracy for score in scores])
+    assert accuracy > np.mean([score.truth_own for score in scores]) - loss
+
+
+def test_rigid_and_similarity_are_told_apart(demo_cases: Callable[[int], list[Case]]) -> None:
+    for field, latents, _ in demo_cases(1)[:4]:
+        assert align(field, latents, DEFAULT).model == "rigid"
+    for field, latents, truth in demo_cases(2):
+        scale = split_transform(truth.transform)[2]
+        if abs(scale - 1) > 0.04 and not truth.symmetric:
+            alignment = align(field, latents, DEFAULT)
+            assert alignment.model == "similarity"
+            assert abs(split_transform(alignment.transform)[2] / scale - 1) < 0.02
+
+
+def test_a_rigid_alignment_has_no_scale_and_bounds_hold(
+    demo_cases: Callable[[int], list[Case]],
+) -> None:
+    field, latents, _ = demo_cases(3)[0]
+    rigid = align(field, latents, AlignParameters(model="rigid"))
+    assert split_transform(rigid.transform)[2] == pytest.approx(1.0, abs=1e-12)
+    bounded = align(field, latents, AlignParameters(model="similarity", scale_bounds=(0.98, 1.02)))
+    assert 0.98 - 1e-9 <= split_transform(bounded.transform)[2] <= 1.02 + 1e-9
+
+
+def test_a_poor_fit_widens_the_search_and_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
+    # All starts point the same wrong way, so only the wider search can help.
+    rotation = distinct_starts()[13].rotation
+    latents = surface_latents(turned(chair(), rotation))
+    same = tuple(replace(start, rotation=np.eye(3)) for start in distinct_starts())
+    monkeypatch.setattr("slatprep.align.field.distinct_starts", lambda: same)
+    alignment = align(field_of(chair()), latents, DEFAULT)
+    assert alignment.search == "so3"
+    assert displacement(alignment.transform, make_transform(rotation), latents.coords) < 0.01
+
+
+def test_two_different_objects_fail_after_a_search_of_all_orientations() -> None:
+    alignment = align(field_of(chair()), surface_latents(BALL), DEFAULT)
+    assert alignment.search == "so3"
+    assert judge(alignment.quality, 1.0, None)[0] is Verdict.FAILED
+
+
+def test_a_missing_part_and_a_stray_part_do_not_pull() -> None:
+    solid = chair()
+    latents = surface_latents(solid)
+    damaged = solid & (((GRID - np.array([42, 30, 24])) ** 2).sum(axis=-1) > 64)
+    damaged |= ((GRID - np.array([56, 8, 8])) ** 2).sum(axis=-1) < 16
+    alignment = align(field_of(damaged), latents, DEFAULT)
+    assert displacement(alignment.transform, np.eye(4), latents.coords) < 0.05
+
+
+BALL = ((GRID - 31.5) ** 2).sum(axis=-1) < 22**2
+DEGENERATE = {
+    "one voxel": np.array([[5, 5, 5]]),
+    "a corner": np.array([[0, 0, 63]]),
+    "a dozen": np.array([[i, i * i % 7, i % 3] for i in range(12)]) + 20,
+    "a line": np.array([[i, 7, 9] for i in range(64)]),
+    "a plane": np.argwhere(GRID[..., 2] == 30),
+    "two far blobs": np.argwhere(
+        (((GRID - 6) ** 2).sum(axis=-1) < 9) | (((GRID - 57) ** 2).sum(axis=-1) < 9)
+    ),
+    "a full cube": np.argwhere(np.ones((64, 64, 64), dtype=bool)),
+    "a ball": np.argwhere(BALL),
+    "32,768 voxels": np.random.default_rng(0).permutation(np.argwhere(GRID[..., 0] >= 0))[:32768],
+}
+
+
+@pytest.mark.parametrize("name", DEGENERATE)
+def test_odd_shapes_get_a_finite_answer_and_a_verdict(name: str) -> None:
+    occupancy = np.zeros((64, 64, 64), dtype=bool)
+    occupancy[tuple(DEGENERATE[name].T)] = True
+    field = field_of(occupancy)
+    own = latents_of(DEGENERATE[name][:32768])
+    for latents in (own, latents_of(DEGENERATE["a dozen"]), surface_latents(BALL)):
+        alignment = align(field, latents, DEFAULT)
+        annotation = sample(field, latents.coords, alignment.transform, SampleParameters())
+        ambiguity = measure_ambiguity(field, latents, alignment, SampleParameters())
+        verdict, reasons = judge(alignment.quality, float(annotation.valid.mean()), ambiguity)
+        numbers = [
+            *alignment.transform.ravel(),
+            alignment.score,
+            alignment.margin,
+            alignment.quality.fitness,
+            alignment.quality.inlier_rmse,
+            alignment.quality.fitness_backward,
+            alignment.quality.inlier_rmse_backward,
+            alignment.quality.overlap,
+            ambiguity.material_share,
+            *ambiguity.property_change,
+        ]
+        assert np.isfinite(numbers).all()
+        assert isinstance(verdict, Verdict)
+        assert (verdict is Verdict.GOOD) == (not reasons)
+    if name in ("a dozen", "two far blobs"):
+        same = align(field, own, DEFAULT)
+        assert displacement(same.transform, np.eye(4), own.coords) < 0.01
+
+
+@settings(max_examples=15, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+@given(
+    voxels=st.sets(st.tuples(*[st.integers(0, 63)] * 3), min_size=1, max_size=40),
+    other=st.sets(st.tuples(*[st.integers(0, 63)] * 3), min_size=1, max_size=40),
+)
+def test_any_two_small_sets_get_a_similarity(
+    voxels: set[tuple[int, int, int]], other: set[tuple[int, int, int]]
+) -> None:
+    occupancy = np.zeros((64, 64, 64), dtype=bool)
+    occupancy[tuple(np.array(sorted(voxels)).T)] = True
+    alignment = align(field_of(occupancy), latents_of(np.array(sorted(other))), DEFAULT)
+    _, _, scale = split_transform(alignment.transform)  # raises where it is none
+    assert 0.6 - 1e-9 <= scale <= 1.6 + 1e-9
+    assert 0.0 <= alignment.quality.overlap <= 1.0
+
+
+def test_the_order_of_voxels_does_not_matter_and_repetition_gives_the_same_bits() -> None:
+    solid = chair()
+    latents = surface_latents(turned(solid, distinct_starts()[7].rotation))
+    shuffled = np.random.default_rng(1).permutation(latents.coords)
+    once = align(field_of(solid), latents, DEFAULT)
+    again = align(field_of(solid), latents, DEFAULT)
+    other = align(field_of(solid), replace(latents, coords=shuffled), DEFAULT)
+    assert once.transform.tobytes() == again.transform.tobytes() == other.transform.tobytes()
+    assert once.candidates == again.candidates
+
+
+def test_threads_do_not_change_a_bit() -> None:
+    code = (
+        "import sys; sys.path.insert(0, '.')\n"
+        "from tests.align.conftest import *\n"
+        "from slatprep.align import align\n"
+        "from slatprep.parameters import AlignParameters\n"
+        "solid = chair(); tilted = np.roll(solid, 2, axis=1)\n"
+        "a = align(field_of(solid), surface_latents(tilted), AlignParameters())\n"
+        "print(a.transform.tobytes().hex())"
+    )
+    outputs = {
+        subprocess.run(
+            [sys.executable, "-c", code],
+            env={
+                **os.environ,
+                **dict.fromkeys(
+                    ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS"), threads
+                ),
+            },
+            check=True,
+            capture_output=True,
+            text=True,
+        ).stdout
+        for threads in ("1", "2")
+    }
+    assert len(outputs) == 1
+
+
+def test_the_libraries_that_make_the_numbers_are_named() -> None:
+    assert {"numpy", "scipy", "numba", "edt"} <= set(engine_versions(DEFAULT))
+    assert "small_gicp" in engine_versions(AlignParameters(engine="small_gicp"))
+    assert any("open3d" in name for name in engine_versions(AlignParameters(engine="open3d")))

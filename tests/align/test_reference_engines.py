@@ -1,0 +1,43 @@
+"""The paper's protocol on Open3D, and GICP."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from slatprep.align import align
+from slatprep.align.starts import distinct_starts
+from slatprep.geometry import displacement, make_transform, split_transform
+from slatprep.parameters import PRESETS, AlignParameters
+from tests.align.conftest import chair, field_of, surface_latents, turned
+
+ENGINES = {"open3d": PRESETS["paper"].align, "small_gicp": AlignParameters(engine="small_gicp")}
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+@pytest.mark.parametrize("index", [0, 9, 17])
+def test_a_quarter_turn_is_found(engine: str, index: int) -> None:
+    rotation = distinct_starts()[index].rotation
+    solid = chair()[::1]
+    latents = surface_latents(turned(solid, rotation))
+    alignment = align(field_of(solid), latents, ENGINES[engine])
+    assert displacement(alignment.transform, make_transform(rotation), latents.coords) < 0.05
+    assert alignment.engine == engine
+    assert alignment.model == "rigid"
+    assert split_transform(alignment.transform)[2] == pytest.approx(1.0, abs=1e-6)
+    assert len(alignment.candidates) == 64
+    by_fitness = max(alignment.candidates, key=lambda c: (c.fitness, -c.inlier_rmse))
+    turn = by_fitness.index if by_fitness.same_as is None else by_fitness.same_as
+    assert turn == distinct_starts()[index].index
+    for candidate in alignment.candidates:
+        if candidate.same_as is not None:
+            twin = alignment.candidates[candidate.same_as]
+            assert (candidate.fitness, candidate.inlier_rmse) == (twin.fitness, twin.inlier_rmse)
+
+
+def test_the_paper_s_protocol_gives_the_same_bits_again() -> None:
+    solid = chair()
+    latents = surface_latents(np.roll(solid, 1, axis=0))
+    once, again = (align(field_of(solid), latents, PRESETS["paper"].align) for _ in range(2))
+    assert once.transform.tobytes() == again.transform.tobytes()
+    assert once.candidates == again.candidates

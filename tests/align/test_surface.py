@@ -1,0 +1,71 @@
+"""Filled sets, their distance fields and samples."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.ndimage import binary_fill_holes
+
+from slatprep.align.surface import CENTRE, DILATION, surface_of
+from slatprep.geometry import boundary, filled
+from tests.align.conftest import GRID, chair
+
+
+def test_a_shell_and_its_solid_have_the_same_surface() -> None:
+    solid = chair()
+    shell = boundary(solid)
+    here, there = surface_of(shell), surface_of(solid)
+    np.testing.assert_array_equal(here.distance, there.distance)
+    np.testing.assert_array_equal(here.points, there.points)
+    np.testing.assert_array_equal(here.boundary, there.boundary)
+
+
+def test_filling_agrees_with_scipy_and_leaves_open_vessels_open() -> None:
+    rng = np.random.default_rng(0)
+    for _ in range(5):
+        noise = rng.random((64, 64, 64)) < 0.6
+        np.testing.assert_array_equal(filled(noise), binary_fill_holes(noise))
+    box = np.zeros((64, 64, 64), dtype=bool)
+    box[10:30, 10:30, 10:30] = True
+    box[12:28, 12:28, 12:28] = False
+    assert filled(box).sum() == 20**3
+    box[20, 20, 28:30] = False  # a hole through the lid
+    np.testing.assert_array_equal(filled(box), box)
+
+
+def test_the_distance_is_that_to_the_faces_less_the_dilation() -> None:
+    slab = np.zeros((64, 64, 64), dtype=bool)
+    slab[:, :, 20:40] = True  # faces at 19.5 and 39.5 in index units
+    surface = surface_of(slab)
+    z = np.arange(surface.distance.shape[2]) + surface.origin[2] + CENTRE
+    middle = tuple(n // 2 for n in surface.distance.shape[:2])
+    expected = np.maximum(19.5 - z, z - 39.5) + DILATION
+    np.testing.assert_allclose(surface.distance[middle], expected, atol=1e-6)
+
+
+def test_the_distance_is_euclidean() -> None:
+    dot = np.zeros((64, 64, 64), dtype=bool)
+    dot[30, 30, 30] = True
+    surface = surface_of(dot)
+    lattice = np.argwhere(np.ones(surface.distance.shape)) + surface.origin + CENTRE
+    expected = np.linalg.norm(lattice - 30, axis=1) - 0.5 + DILATION
+    expected[np.all(lattice == 30, axis=1)] = -0.5 + DILATION
+    np.testing.assert_allclose(surface.distance.ravel(), expected, atol=1e-5)
+
+
+def test_samples_lie_near_the_faces_on_both_sides() -> None:
+    ball = ((GRID - 31.5) ** 2).sum(axis=-1) < 20**2
+    surface = surface_of(ball)
+    radius = np.linalg.norm(surface.points, axis=1)
+    assert abs(radius.mean() - 20) < 0.1
+    assert (radius < 20).any() and (radius > 20).any()
+    assert np.abs(radius - 20).max() < 2.5
+    assert abs(surface.size - 20) < 0.2
+
+
+def test_a_subset_is_even_and_repeatable() -> None:
+    surface = surface_of(chair())
+    some = surface.subset(300)
+    assert 250 <= len(some.points) <= 300
+    np.testing.assert_array_equal(some.points, surface.subset(300).points)
+    assert np.abs(some.centroid - surface.centroid).max() < 1.0
+    assert len(surface.subset(10**9).points) == len(surface.points)

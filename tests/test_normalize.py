@@ -1,0 +1,153 @@
+"""Normalisation against arithmetic by hand, and its inverse."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from slatprep.errors import ConfigError
+from slatprep.normalize import (
+    PIXIE_RANGES,
+    denormalize,
+    normalize,
+    normalize_change,
+    property_extent,
+    ranges_from_extents,
+    read_ranges,
+)
+from slatprep.records import MaterialField, Normalization, PropertyRange
+
+DECADES = Normalization(
+    (
+        PropertyRange("youngs_modulus", True, 4.0, 12.0),
+        PropertyRange("density", True, 2.0, 4.0),
+        PropertyRange("poissons_ratio", False, 0.2, 0.4),
+    ),
+    source="by hand",
+)
+
+
+def test_by_hand() -> None:
+    # 10^4..10^12: 10^6 lies a quarter of the way, 2 * 0.25 - 1 = -0.5.
+    values, clipped = normalize([[1e6, 1e3, 0.35]], DECADES)
+    np.testing.assert_allclose(values, [[-0.5, 0.0, 0.5]], atol=1e-6)
+    assert clipped.tolist() == [0, 0, 0]
+    assert values.dtype == np.float32
+
+
+def test_the_ends_are_not_clipped_and_what_lies_beyond_is_counted() -> None:
+    values, clipped = normalize(
+        [[1e4, 1e2, 0.2], [1e12, 1e4, 0.4], [1e3, 1e5, 0.3], [1e13, 1e3, 0.5]], DECADES
+    )
+    np.testing.assert_array_equal(values[:2], [[-1, -1, -1], [1, 1, 1]])
+    np.testing.assert_allclose(values[2:], [[-1, 1, 0], [1, 0, 1]], atol=1e-6)
+    assert clipped.tolist() == [2, 1, 1]
+
+
+def test_nan_passes_through_uncounted() -> None:
+    values, clipped = normalize([[np.nan, np.nan, np.nan]], DECADES)
+    assert np.isnan(values).all()
+    assert clipped.tolist() == [0, 0, 0]
+
+
+@given(
+    st.lists(
+        st.tuples(st.floats(1.1e3, 7e10), st.floats(51, 7400), st.floats(0.211, 0.449)),
+        min_size=1,
+        max_size=20,
+    )
+)
+def test_the_inverse_is_exact_to_float32(rows: list[tuple[float, float, float]]) -> None:
+    properties = np.array(rows, dtype=np.float32)
+    values, clipped = normalize(properties, PIXIE_RANGES)
+    assert clipped.sum() == 0
+    # Half a step of float32 near 1 is 3e-8; eight decades of E stretch it to
+    # 3e-8 * 4 ln 10 of the value.
+    np.testing.assert_allclose(denormalize(values, PIXIE_RANGES), properties, rtol=1e-6)
+
+
+@given(st.lists(st.tuples(*[st.floats(-1, 1, width=32)] * 3), min_size=1, max_size=20))
+def test_the_other_way_round_too(rows: list[tuple[float, float, float]]) -> None:
+    values = np.array(rows, dtype=np.float32)
+    again, _ = normalize(denormalize(values, DECADES), DECADES)
+    np.testing.assert_allclose(again, values, atol=5e-7)
+
+
+def test_pixie_s_ranges_are_the_published_ones() -> None:
+    assert [(r.lo, r.hi, r.log10) for r in PIXIE_RANGES.ranges] == [
+        (3.0183002948760986, 10.881680488586426, True),
+        (1.7031893730163574, 3.871432304382324, True),
+        (0.21027633547782898, 0.4492689371109009, False),
+    ]
+
+
+def _field(properties: list[list[float]]) -> MaterialField:
+    count = len(properties)
+    voxels = np.stack([np.arange(count)] * 3, axis=1).astype(np.uint8)
+    return MaterialField(
+        np.zeros((64, 64, 64), dtype=bool),
+        voxels,
+        np.zeros(count, np.uint8),
+        np.array(properties, np.float32),
+    )
+
+
+def test_dataset_ranges_span_all_assets() -> None:
+    here = property_extent(_field([[1e5, 100, 0.2], [1e7, 1000, 0.3]]))
+    there = property_extent(_field([[1e9, 10, 0.25]]))
+    np.testing.assert_allclose(here, [[5, 7], [2, 3], [0.2, 0.3]], atol=1e-7)
+    found = ranges_from_extents([here, there])
+    assert found.source == "dataset"
+    np.testing.assert_allclose([(r.lo, r.hi) for r in found.ranges],
+                               [(5, 9), (1, 3), (0.2, 0.3)], atol=1e-7)  # fmt: skip
+
+
+def test_one_value_in_all_the_dataset_becomes_zero() -> None:
+    field = _field([[1e5, 100, 0.3]])
+    values, clipped = normalize(field.properties, ranges_from_extents([property_extent(field)]))
+    np.testing.assert_allclose(values, [[0, 0, 0]], atol=1e-6)
+    assert clipped.sum() == 0
+
+
+@pytest.mark.parametrize("extents", [np.zeros((0, 3, 2)), np.full((1, 3, 2), np.nan)])
+def test_ranges_of_nothing_are_refused(extents: np.ndarray) -> None:
+    with pytest.raises(ValueError, match="at least one asset"):
+        ranges_from_extents(extents)
+
+
+def test_a_change_is_scaled_as_the_values_are() -> None:
+    np.testing.assert_allclose(normalize_change([2.0, 1.0, 0.1], DECADES), [0.5, 1.0, 1.0])
+
+
+def test_ranges_are_read_from_toml_and_json(tmp_path: Path) -> None:
+    table = {r.name: {"lo": r.lo, "hi": r.hi} for r in DECADES.ranges}
+    (tmp_path / "ranges.json").write_text(json.dumps(table))
+    (tmp_path / "ranges.toml").write_text(
+        "".join(f"[{r.name}]\nlo = {r.lo}\nhi = {r.hi}\n" for r in DECADES.ranges)
+    )
+    for name in ("ranges.json", "ranges.toml"):
+        found = read_ranges(tmp_path / name)
+        assert found.ranges == DECADES.ranges
+        assert found.source == name
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "",
+        "not toml at all",
+        "[youngs_modulus]\nlo = 3\nhi = 3\n",
+        "[youngs_modulus]\nlo = 3\nhi = inf\n",
+        "[youngs_modulus]\nlo = '3'\nhi = 4\n",
+        "youngs_modulus = 3\n",
+    ],
+)
+def test_bad_ranges_name_the_file_and_what_is_expected(tmp_path: Path, text: str) -> None:
+    (tmp_path / "ranges.toml").write_text(text)
+    with pytest.raises(ConfigError, match=r"ranges\.toml"):
+        read_ranges(tmp_path / "ranges.toml")

@@ -1,0 +1,75 @@
+"""Look-ups at SLAT voxels whose answer is known by construction."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from slatprep.geometry import make_transform
+from slatprep.parameters import SampleParameters
+from slatprep.records import MaterialField
+from slatprep.sample import sample
+
+NEAREST = SampleParameters(method="nearest")
+
+
+def _field() -> MaterialField:
+    """Two voxels with values of their own."""
+    voxels = np.array([[10, 10, 10], [20, 10, 10]], dtype=np.uint8)
+    occupancy = np.zeros((64, 64, 64), dtype=bool)
+    occupancy[tuple(voxels.T)] = True
+    return MaterialField(
+        occupancy,
+        voxels,
+        np.array([1, 4], dtype=np.uint8),
+        np.array([[2e11, 7800, 0.3], [1e5, 1000, 0.45]], dtype=np.float32),
+    )
+
+
+def test_values_come_from_the_nearest_voxel_and_end_at_the_limit() -> None:
+    coords = np.array([[10, 10, 10], [13, 10, 10], [14, 10, 10], [18, 11, 10]], dtype=np.uint8)
+    for parameters in (NEAREST, SampleParameters()):
+        found = sample(_field(), coords, np.eye(4), parameters)
+        assert found.valid.tolist() == [True, True, False, True]
+        assert found.material.tolist() == [1, 1, 255, 4]
+        np.testing.assert_allclose(found.distance, [0, 3, 4, np.sqrt(5)], rtol=1e-6)
+        np.testing.assert_array_equal(found.properties[0], np.float32([2e11, 7800, 0.3]))
+        np.testing.assert_array_equal(found.properties[3], np.float32([1e5, 1000, 0.45]))
+        assert np.isnan(found.properties[2]).all()
+        assert found.properties.dtype == found.distance.dtype == np.float32
+
+
+def test_voxels_are_carried_by_the_inverse_transform() -> None:
+    # (x, y, z) -> (-y, x, z): field voxel (20, 10, 10) lies at SLAT (53, 20, 10).
+    turn = make_transform([[0, -1, 0], [1, 0, 0], [0, 0, 1]])
+    found = sample(_field(), np.array([[53, 20, 10]], dtype=np.uint8), turn, NEAREST)
+    assert found.material.tolist() == [4]
+    assert found.distance.tolist() == [0.0]
+
+
+def test_distances_are_in_voxels_of_the_pixieverse_frame() -> None:
+    # Magnified twice about the cube's centre, SLAT voxel 31 looks at 31.25.
+    voxels = np.array([[31, 31, 31]], dtype=np.uint8)
+    occupancy = np.zeros((64, 64, 64), dtype=bool)
+    occupancy[31, 31, 31] = True
+    field = MaterialField(occupancy, voxels, np.ones(1, np.uint8), np.ones((1, 3), np.float32))
+    found = sample(field, voxels, make_transform(np.eye(3), scale=2.0), NEAREST)
+    np.testing.assert_allclose(found.distance, [np.sqrt(3) / 4], rtol=1e-6)
+
+
+def test_a_vote_changes_the_class_and_takes_that_class_s_nearest_values() -> None:
+    # One voxel of class 0 in a block of class 3: looked at slightly off its
+    # centre, its neighbours outvote it.
+    block = np.argwhere(np.ones((5, 5, 5), dtype=bool)) + 30
+    classes = np.where((block == 32).all(axis=1), 0, 3).astype(np.uint8)
+    properties = np.stack([np.arange(125) + 1.0] * 3, axis=1).astype(np.float32)
+    occupancy = np.zeros((64, 64, 64), dtype=bool)
+    occupancy[tuple(block.T)] = True
+    field = MaterialField(occupancy, block.astype(np.uint8), classes, properties)
+    shift = make_transform(np.eye(3), np.array([0.3, 0, 0]) / 64)
+    coords = np.array([[32, 32, 32]], dtype=np.uint8)  # looks at (31.7, 32, 32)
+    assert sample(field, coords, shift, NEAREST).material.tolist() == [0]
+    voted = sample(field, coords, shift, SampleParameters())
+    assert voted.material.tolist() == [3]
+    neighbour = int(np.flatnonzero((block == [31, 32, 32]).all(axis=1))[0])
+    np.testing.assert_array_equal(voted.properties[0], properties[neighbour])
+    np.testing.assert_allclose(voted.distance, [0.7], rtol=1e-5)
