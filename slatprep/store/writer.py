@@ -20,6 +20,7 @@ from slatprep.normalize import normalize, normalize_change
 from slatprep.parameters import StoreParameters
 from slatprep.records import RESOLUTION, Normalization
 from slatprep.store.asset_records import create_record_array
+from slatprep.store.digests import write_digests
 from slatprep.store.layout import (
     ARRAYS,
     create_arrays,
@@ -110,7 +111,13 @@ def write_shard(
     arrays, clipped = read(spool, shard, normalization)
     start, stop = shard.rows
     # Workers are the parallelism; zarr's own thread pool would oversubscribe.
-    with zarr.config.set({"async.concurrency": 1, "threading.max_workers": 1}):
+    settings = {
+        "async.concurrency": 1,
+        "threading.max_workers": 1,
+        # A chunk of fill values alone is written too, so that a missing one is always a fault.
+        "array.write_empty_chunks": True,
+    }
+    with zarr.config.set(settings):
         group = _open(path)[shard.group]
         for name, rows in arrays.items():
             group[name][start:stop] = rows
@@ -160,7 +167,7 @@ def write_assets(
 def finish_store(
     path: Path, normalization: Normalization, manifest: str, build: Mapping[str, object]
 ) -> None:
-    """Write the root's attributes and gather all metadata in one file.
+    """Write the root's attributes and all files' digests; gather all metadata in one file.
 
     Parameters
     ----------
@@ -176,6 +183,7 @@ def finish_store(
     import zarr
 
     _open(path).attrs.update(root_attributes(normalization, manifest, build))
+    write_digests(path)
     with warnings.catch_warnings():
         # Zarr says that consolidated metadata are not in format 3's text yet.
         # They only save reads: a reader that ignores them finds every array.

@@ -1,0 +1,103 @@
+"""Digests of a store's files, kept in the store.
+
+``file/name``, ``file/size`` and ``file/sha256`` say what every file held when
+the store was finished: all but the root's ``zarr.json`` and the three arrays
+themselves, which carry checksums of their own. Of the root's ``zarr.json``
+they hold the attributes' digest, under `ATTRIBUTES`; the rest of it repeats
+the ``zarr.json`` of the arrays.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+GROUP = "file"
+
+ATTRIBUTES = "zarr.json#attributes"
+"""Name under which the digest of the root's attributes is kept."""
+
+
+def write_digests(path: Path) -> None:
+    """Add the digests of all files to a store that is otherwise complete.
+
+    Parameters
+    ----------
+    path : Path
+        The store; its root attributes are written, metadata not yet consolidated.
+    """
+    import zarr
+
+    root = zarr.open_group(path, mode="r+", zarr_format=3, use_consolidated=False)
+    names = [name for name in list_files(path) if _is_covered(name)]
+    sizes = [(path / name).stat().st_size for name in names]
+    digests = [file_digest(path / name) for name in names]
+    attributes = dict(root.attrs)
+    names.append(ATTRIBUTES)
+    sizes.append(len(_canonical(attributes)))
+    digests.append(attributes_digest(attributes))
+    # Row by row these are small; one chunk holds all of a large store's.
+    for name, values, dtype, description in (
+        ("name", np.array(names, dtype=object), str, "file below the store, with forward slashes"),
+        ("size", np.array(sizes, dtype=np.int64), "int64", "bytes"),
+        ("sha256", np.array(digests, dtype=object), str, "SHA-256 in hex"),
+    ):
+        array = root.create_array(
+            f"{GROUP}/{name}",
+            shape=values.shape,
+            dtype=dtype,
+            compressors=_compressors(),
+            chunks=values.shape,
+            dimension_names=("file",),
+            attributes={"description": description},
+        )
+        array[:] = values
+
+
+def list_files(path: Path) -> Iterator[str]:
+    """Yield the name of every file below a folder, with forward slashes, sorted by folder.
+
+    Links are listed, and not followed.
+    """
+    for folder, folders, files in os.walk(path):
+        folders.sort()
+        relative = Path(folder).relative_to(path)
+        links = [name for name in folders if (Path(folder) / name).is_symlink()]
+        for name in sorted([*files, *links]):
+            yield (relative / name).as_posix()
+
+
+def file_digest(path: Path) -> str:
+    """Return the SHA-256 of a file, in hex."""
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def attributes_digest(attributes: Mapping[str, Any]) -> str:
+    """Return the SHA-256 of attributes, in hex, however their JSON is laid out."""
+    return hashlib.sha256(_canonical(attributes)).hexdigest()
+
+
+def is_own(name: str) -> bool:
+    """Whether a file belongs to the arrays of digests."""
+    return name.startswith(f"{GROUP}/")
+
+
+def _is_covered(name: str) -> bool:
+    return name != "zarr.json" and not is_own(name)
+
+
+def _canonical(attributes: Mapping[str, Any]) -> bytes:
+    return json.dumps(attributes, sort_keys=True, ensure_ascii=False).encode()
+
+
+def _compressors() -> tuple[Any, ...]:
+    from zarr.codecs import Crc32cCodec, ZstdCodec
+
+    return (ZstdCodec(level=1), Crc32cCodec())
