@@ -20,14 +20,14 @@ def _complete_asset(
     context: click.Context, parameter: click.Parameter, incomplete: str
 ) -> list[str]:
     """Offer the store's asset ids to the shell."""
-    from slatprep.errors import StoreError
     from slatprep.store import open_store
+    from slatprep.store.reader import is_store
 
-    try:
-        ids = open_store(context.params["store"]).ids
-    except (StoreError, KeyError, TypeError):
-        return []  # No store was named yet: there is nothing to offer.
-    return [asset_id for asset_id in ids if asset_id.startswith(incomplete)]
+    # An option that still lacks its value leaves the arguments unparsed.
+    for word in (context.params.get("store"), *context.args):
+        if word is not None and is_store(Path(word)):
+            return [known for known in open_store(word).ids if known.startswith(incomplete)]
+    return []
 
 
 @click.command(

@@ -1,0 +1,189 @@
+"""The pages of docs/ that show code, messages and habits of the shell."""
+
+from __future__ import annotations
+
+import ast
+import contextlib
+import io
+import os
+import re
+import shlex
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from click.testing import CliRunner
+
+from slatprep.build import BuildSummary
+from slatprep.cli.commands import slatprep
+
+ROOT = Path(__file__).parents[2]
+DOCS = ROOT / "docs"
+
+
+def blocks(page: str) -> list[tuple[str, str]]:
+    """Return the language and text of every code block of a page, in order."""
+    return re.findall(r"^```(\w+)\n(.*?)^```$", (DOCS / page).read_text("utf-8"), re.S | re.M)
+
+
+def test_tutorial_runs_and_prints_what_it_shows(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    namespace: dict[str, object] = {}
+    printed, compared = "", 0
+    for language, text in blocks("tutorial.md"):
+        if language == "python":
+            with contextlib.redirect_stdout(io.StringIO()) as stream:
+                exec(compile(text, "tutorial.md", "exec"), namespace)
+            printed = stream.getvalue()
+        elif language == "text":
+            assert printed == text
+            compared += 1
+        else:
+            for line in text.splitlines():
+                program, *arguments = shlex.split(line)
+                assert program == "slatprep"
+                result = CliRunner().invoke(slatprep, arguments)
+                assert result.exit_code == 0, f"{line}: {result.output}"
+    assert compared >= 10
+    assert (tmp_path / "shards" / "shard-000001.tar").exists()
+
+
+# -- messages ---------------------------------------------------------------
+
+
+def templates() -> list[str]:
+    """Return every text of the source, with … for what is filled in."""
+    found = []
+    for path in (ROOT / "slatprep").rglob("*.py"):
+        for node in ast.walk(ast.parse(path.read_text("utf-8"))):
+            if isinstance(node, ast.JoinedStr):
+                parts = (
+                    part.value if isinstance(part, ast.Constant) else "…" for part in node.values
+                )
+                found.append("".join(map(str, parts)))
+            elif isinstance(node, ast.Constant) and isinstance(node.value, str):
+                found.append(node.value)
+    return found
+
+
+TEMPLATES = templates()
+MESSAGES = [
+    message
+    for section in (DOCS / "troubleshooting.md").read_text("utf-8").split("\n## ")
+    if not section.startswith("Results")
+    for message in re.findall(r"^\| `([^`]+)` \|", section, re.M)
+]
+
+
+def test_troubleshooting_lists_messages() -> None:
+    assert len(MESSAGES) >= 30
+    assert len(set(MESSAGES)) == len(MESSAGES)
+
+
+@pytest.mark.parametrize("message", MESSAGES)
+def test_message_is_one_of_the_source(message: str) -> None:
+    pattern = re.compile(".*".join(map(re.escape, message.split("…"))), re.S)
+    assert any(pattern.search(template) for template in TEMPLATES), message
+
+
+# -- the shell --------------------------------------------------------------
+
+
+def complete(words: str, shell: str = "bash_complete", cwd: Path | None = None) -> str:
+    environment = {
+        **os.environ,
+        "_SLATPREP_COMPLETE": shell,
+        "COMP_WORDS": words,
+        "COMP_CWORD": str(len(words.split()) - 1),
+    }
+    done = subprocess.run(
+        [sys.executable, "-m", "slatprep.cli"],
+        capture_output=True,
+        text=True,
+        env=environment,
+        cwd=cwd,
+    )
+    assert "Traceback" not in done.stderr, done.stderr
+    return done.stdout
+
+
+def test_completion_is_documented_for_every_shell_click_knows() -> None:
+    text = (DOCS / "shell.md").read_text("utf-8")
+    for shell in ("bash", "zsh", "fish"):
+        assert f"_SLATPREP_COMPLETE={shell}_source slatprep" in text
+
+
+@pytest.mark.parametrize("shell", ["zsh", "fish", "bash"])
+def test_completion_script_is_made(shell: str) -> None:
+    if shell == "bash" and shutil.which("bash") is None:
+        pytest.skip("click asks bash for its version")
+    script = complete("slatprep", f"{shell}_source")
+    assert "_SLATPREP_COMPLETE" in script and "slatprep" in script
+
+
+def test_commands_options_and_values_complete() -> None:
+    assert complete("slatprep exp").splitlines() == ["plain,export"]
+    offered = complete("slatprep export x --format w").splitlines()
+    assert offered == ["plain,webdataset"]
+    assert "plain,--verdict" in complete("slatprep export x --verd").splitlines()
+
+
+def test_asset_ids_complete_from_the_store(mixed_build: BuildSummary) -> None:
+    store = mixed_build.store
+    assert store is not None
+    offered = complete(f"slatprep export {store.name} --asset bear", cwd=store.parent)
+    assert offered.splitlines() == ["plain,bear.front", "plain,bear.side"]
+    later = f"slatprep export {store.name} --format npz --asset cup --asset d"
+    assert complete(later, cwd=store.parent).splitlines() == ["plain,dog"]
+    assert complete("slatprep export no.zarr --asset b", cwd=store.parent).strip() == ""
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ("export", "STORE", "--format", "npz", "--out", "x", "--asset", "cuo"),
+        ("check-alignment", "--store", "STORE", "--asset", "cuo"),
+    ],
+    ids=lambda arguments: arguments[0],
+)
+def test_wrong_asset_is_answered_with_the_one_it_might_be(
+    arguments: tuple[str, ...],
+    mixed_build: BuildSummary,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    words = [str(mixed_build.store) if word == "STORE" else word for word in arguments]
+    result = CliRunner().invoke(slatprep, words)
+    assert result.exit_code == 2
+    assert "has no asset 'cuo'; did you mean cup?" in result.stderr
+    assert len(result.stderr.splitlines()) == 1
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        (("--format", "npz", "--points", "grid"), "--points is for --format ply, not npz"),
+        (("--format", "ply", "--shard-size", "3"), "--shard-size is for --format webdataset"),
+        (("--format", "ply", "--records", "."), "--records is for --frame pixieverse"),
+    ],
+)
+def test_option_without_effect_is_refused(
+    options: tuple[str, ...], said: str, mixed_build: BuildSummary, tmp_path: Path
+) -> None:
+    words = ["export", str(mixed_build.store), "--out", str(tmp_path / "x"), *options]
+    result = CliRunner().invoke(slatprep, words)
+    assert result.exit_code == 2 and said in result.stderr
+
+
+def test_quiet_export_prints_its_result_alone(mixed_build: BuildSummary, tmp_path: Path) -> None:
+    words = ["export", str(mixed_build.store), "--format", "ply", "--frame", "pixieverse"]
+    loud = CliRunner().invoke(slatprep, [*words, "--out", str(tmp_path / "a")])
+    assert "have no world bounds" in loud.stderr and "Exported to" in loud.stdout
+    quiet = CliRunner().invoke(slatprep, [*words, "--out", str(tmp_path / "b"), "-q"])
+    assert quiet.stderr == "" and "Exported to" in quiet.stdout
