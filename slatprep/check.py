@@ -97,6 +97,8 @@ class AlignmentCheck:
         taken from the store: the placements they come from are not there.
     transform : ndarray of float64, shape (4, 4)
         PixieVerse frame to SLAT frame.
+    radius : float
+        Voxels within which fitness counts a voxel as near the other side.
     """
 
     asset_id: str
@@ -105,10 +107,25 @@ class AlignmentCheck:
     stored_verdict: str
     figures: tuple[Figure, ...]
     transform: NDArray[np.float64]
+    radius: float
 
     def figure(self, name: str) -> Figure:
         """Return the figure of that name."""
         return next(figure for figure in self.figures if figure.name == name)
+
+    @property
+    def words(self) -> tuple[str, ...]:
+        """The verdict in words: why it is not better, or what makes it good."""
+        if self.reasons:
+            return self.reasons
+        forward, backward = self.figure("fitness").value, self.figure("fitness_backward").value
+        open_share = self.figure("ambiguity").value
+        ties = f"the class of {open_share:.1%} of the voxels" if open_share else "no class"
+        return (
+            f"{forward:.1%} of the PixieVerse boundary and {backward:.1%} of the SLAT boundary lie "
+            f"within {self.radius:g} voxel of the other side; placements that fit as well change "
+            f"{ties}",
+        )
 
     @property
     def consistent(self) -> bool:
@@ -145,7 +162,8 @@ def check_alignment(store: Store, asset_id: str) -> AlignmentCheck:
     parameters = _parameters(store)
     field = stored_field(asset, store.normalization)
     latents = StructuredLatents(asset.coords, asset.feats)
-    quality = measure_quality(field, latents, asset.transform, float(parameters["align"]["radius"]))
+    radius = float(parameters["align"]["radius"])
+    quality = measure_quality(field, latents, asset.transform, radius)
     annotation = sample(
         field, asset.coords, asset.transform, SampleParameters(**parameters["sample"])
     )
@@ -190,7 +208,7 @@ def check_alignment(store: Store, asset_id: str) -> AlignmentCheck:
         ),
     ]
     return AlignmentCheck(
-        asset_id, verdict, reasons, str(columns["verdict"]), tuple(figures), asset.transform
+        asset_id, verdict, reasons, str(columns["verdict"]), tuple(figures), asset.transform, radius
     )
 
 

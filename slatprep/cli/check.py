@@ -147,12 +147,12 @@ def _print(output: Output, checks: list[AlignmentCheck]) -> None:
     for one in checks:
         if len(checks) == 1 or output.verbosity > 0:
             _print_figures(output, one)
-        for reason in one.reasons:
-            click.echo(f"{one.asset_id}: {reason}")
+        for words in one.reasons if len(checks) > 1 else one.words:
+            click.echo(f"{one.asset_id}: {words}")
         if not one.consistent:
             click.echo(
-                f"{one.asset_id}: the store says {one.stored_verdict}, "
-                "and its figures do not all agree"
+                f"{one.asset_id}: the store says {one.stored_verdict}, and its figures do not all "
+                "agree: it was changed, or another version of slatprep built it"
             )
 
 

@@ -77,7 +77,7 @@ def draw_alignment(
         _legend(figure, scene)
         tops = [_TOP + row * (PANEL + _GAP) for row in range(3)]
         _figures(figure, check, tops[0])
-        _histogram(figure, scene, tops[1] + 12)
+        _histogram(figure, scene, check.radius, tops[1] + 12)
         _candidates(figure, candidates, tops[2] + 12)
         return png_of(figure)
 
@@ -188,9 +188,7 @@ def _head(figure: Figure, check: AlignmentCheck, title: str, subtitle: str) -> N
     _text(figure, _LEFT, 76, subtitle, size=7.5, color=palette.MUTED)
     colour = palette.VERDICT_COLOURS[check.verdict]
     _text(figure, _SIDE, 50, f"alignment {check.verdict}", weight="bold", size=13, color=colour)
-    reasons = list(check.reasons) or [
-        "the two surfaces lie on each other, and no placement that fits as well changes the classes"
-    ]
+    reasons = list(check.words)
     if not check.consistent:
         reasons.append("the store's figures do not all agree with its voxels")
     lines = [line for reason in reasons for line in textwrap.wrap(reason, 52)]
@@ -264,10 +262,10 @@ SHOWN = (
 """The figures of a check that a picture shows, named as the store names them."""
 
 
-def _histogram(figure: Figure, scene: Scene, y: float) -> None:
+def _histogram(figure: Figure, scene: Scene, radius: float, y: float) -> None:
     _text(figure, _SIDE, y, "error per SLAT surface voxel", weight="bold", size=8.5)
-    share = float((scene.error <= 1).mean())
-    words = f"median {np.median(scene.error):.2f} voxel; {share:.1%} within 1"
+    share = float((scene.error <= radius).mean())
+    words = f"median {np.median(scene.error):.2f} voxel; {share:.1%} within {radius:g}"
     _text(figure, _SIDE, y + 20, words, size=7, color=palette.MUTED)
     axes = _axes(figure, y + 36, 190)
     edges = np.linspace(0, FARTHEST, 31)
@@ -282,7 +280,7 @@ def _histogram(figure: Figure, scene: Scene, y: float) -> None:
     top = max(shares[0].max(), 0.02)
     if shares[1].max() > 1.15 * top:
         axes.set_ylim(0, 1.15 * top)
-    axes.axvline(1.0, color=palette.INK, linewidth=0.8, linestyle=(0, (4, 3)))
+    axes.axvline(radius, color=palette.INK, linewidth=0.8, linestyle=(0, (4, 3)))
     axes.set_xlim(0, FARTHEST)
     axes.set_xticks(range(int(FARTHEST) + 1), ["0", "1 voxel", "2", f"\u2265 {FARTHEST:g}"])
     axes.text(0.95, 0.93, "line: before alignment", transform=axes.transAxes, ha="right",

@@ -193,6 +193,7 @@ def test_numbers_stand_beside_their_thresholds(copy: Path) -> None:
     rows = {line.split()[0]: line.split()[1:] for line in told.splitlines() if "  " in line}
     assert rows["fitness"][1:4] == [">=", "0.8", "yes"]
     assert rows["ambiguity"][1:4] == ["<=", "0.05", "yes"]
+    assert "100.0% of the SLAT boundary lie within 1 voxel" in told
     assert "\x1b" not in told
 
 
