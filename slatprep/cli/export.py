@@ -13,7 +13,7 @@ from slatprep.cli.output import Output, output_options
 from slatprep.errors import ConfigError
 
 # Which options belong to which format; an option without effect is a mistake.
-_ONLY_FOR = {"points": "ply", "frame": "ply", "records": "ply", "shard_size": "webdataset"}
+_ONLY_FOR = {"points": "ply", "frame": "ply", "shard_size": "webdataset"}
 
 
 def _complete_asset(
@@ -59,9 +59,6 @@ Example:
 @click.option("--frame", type=click.Choice(["slat", "pixieverse"]),
               help="ply: the SLAT's unit cube, or PixieVerse's world."
               "  [default: slat]")  # fmt: skip
-@click.option("--records", type=click.Path(path_type=Path, exists=True, file_okay=False),
-              metavar="DIR", help="ply --frame pixieverse: folder of the build's records."
-              "  [default: the one beside the store]")  # fmt: skip
 @click.option("--shard-size", type=click.IntRange(min=1), metavar="N",
               help="webdataset: assets in one shard.  [default: 256]")  # fmt: skip
 @jobs_option
@@ -86,8 +83,6 @@ def export(
         if _ONLY_FOR[name] != kind:
             option = f"--{name.replace('_', '-')}"
             raise ConfigError(f"{option} is for --format {_ONLY_FOR[name]}, not {kind}")
-    if "records" in options and options.get("frame") != "pixieverse":
-        raise ConfigError("--records is for --frame pixieverse, whose bounds it holds")
     from slatprep.export import ExportOptions, export_store
 
     with output.progress("export") as progress:

@@ -56,16 +56,12 @@ class ExportOptions:
         annotated voxels of the PixieVerse field.
     frame : {"slat", "pixieverse"}
         PLY: the unit cube of the SLAT, or the world of PixieVerse's bounds.
-    records : Path or None
-        PLY in the PixieVerse frame: the build's folder of records, which holds
-        the bounds; None takes the one beside the store.
     shard_size : int
         WebDataset: assets in one shard.
     """
 
     points: Points = "slat"
     frame: Frame = "slat"
-    records: Path | None = None
     shard_size: int = 256
 
 
@@ -230,7 +226,7 @@ def _export_ply(job: _Job, directory: Path) -> tuple[list[_Entry], tuple[str, ..
     bounds: dict[str, Bounds] = {}
     notes: tuple[str, ...] = ()
     if options.frame == "pixieverse":
-        bounds, notes = read_bounds(job.store, job.ids, options.records)
+        bounds, notes = read_bounds(job.store, job.ids)
     write = functools.partial(
         ply.write_asset,
         points=options.points,

@@ -170,7 +170,6 @@ def test_wrong_asset_is_answered_with_the_one_it_might_be(
     [
         (("--format", "npz", "--points", "grid"), "--points is for --format ply, not npz"),
         (("--format", "ply", "--shard-size", "3"), "--shard-size is for --format webdataset"),
-        (("--format", "ply", "--records", "."), "--records is for --frame pixieverse"),
     ],
 )
 def test_option_without_effect_is_refused(

@@ -13,7 +13,7 @@ import pytest
 from synthetic import JELLY, METAL, QUARTER_TURN, Dataset
 
 from slatprep.build import BuildSummary, build_store
-from slatprep.errors import ConfigError, SlatprepError
+from slatprep.errors import ConfigError, SlatprepError, StoreError
 from slatprep.export import FORMATS, ExportOptions, export_store
 from slatprep.export.assets import file_name
 from slatprep.export.ply import VERTEX
@@ -142,9 +142,9 @@ def test_world_bounds_of_the_records_are_used(tmp_path: Path) -> None:
         tmp_path / "sources" / "pixieverse" / "cup" / "clip_features.npz",
         min_bounds=lo, max_bounds=hi, grid_shape=(64, 64, 64),
     )  # fmt: skip
-    summary = build_store(dataset.parameters(), tmp_path / "s.zarr", manifests=tmp_path / "m")
+    summary = build_store(dataset.parameters(), tmp_path / "s.zarr")
     assert summary.store is not None
-    options = ExportOptions(points="grid", frame="pixieverse", records=tmp_path / "m")
+    options = ExportOptions(points="grid", frame="pixieverse")
     done = export_store(summary.store, tmp_path / "ply", "ply", options=options)
     assert done.notes == ()
     vertex = plyfile.PlyData.read(tmp_path / "ply" / "cup.ply")["vertex"]
@@ -154,21 +154,35 @@ def test_world_bounds_of_the_records_are_used(tmp_path: Path) -> None:
         np.testing.assert_allclose(vertex[name], expected, atol=1e-5)
 
 
-def test_records_that_are_missing_or_of_another_build_are_refused(
-    store: Path, mixed_build: BuildSummary, tmp_path: Path
-) -> None:
-    (tmp_path / "none").mkdir()
-    other = tmp_path / "other"
-    shutil.copytree(mixed_build.records.parent, other)
-    build = json.loads((other / "build.json").read_text())
-    (other / "build.json").write_text(json.dumps({**build, "id": "0" * 64}))
-    for folder, said in ((tmp_path / "none", "no records"), (other, "of another build")):
-        options = ExportOptions(frame="pixieverse", records=folder)
-        with pytest.raises(ConfigError, match=said):
-            export_store(store, tmp_path / "ply", "ply", options=options)
-    assert not (tmp_path / "ply").exists()
+def test_a_field_without_bounds_is_told(store: Path, tmp_path: Path) -> None:
     done = export_store(store, tmp_path / "ply", "ply", options=ExportOptions(frame="pixieverse"))
     assert "5 assets have no world bounds" in done.notes[0]
+    assert json.loads((tmp_path / "ply" / "index.json").read_text())["notes"] == list(done.notes)
+
+
+@pytest.mark.parametrize(
+    "bounds",
+    [
+        {"min_bounds": [0, 0, 0]},
+        {"min_bounds": [0, 0, 0], "max_bounds": [1, 1, 0]},
+        {"min_bounds": [0, 0], "max_bounds": [1, 1]},
+        {"min_bounds": "low", "max_bounds": "high"},
+        [1, 2],
+    ],
+)
+def test_bounds_that_make_no_sense_are_refused(bounds: object, store: Path, tmp_path: Path) -> None:
+    import zarr
+
+    shutil.copytree(store, tmp_path / "s.zarr")
+    records = zarr.open_group(tmp_path / "s.zarr", mode="r+", use_consolidated=False)[
+        "asset/record"
+    ]
+    texts = [json.dumps({**json.loads(text), "bounds": bounds}) for text in records[:]]
+    records[:] = np.array(texts, dtype=object)
+    options = ExportOptions(frame="pixieverse")
+    with pytest.raises(StoreError, match="expected min_bounds and max_bounds of three numbers"):
+        export_store(tmp_path / "s.zarr", tmp_path / "ply", "ply", options=options)
+    assert not (tmp_path / "ply").exists()
 
 
 # -- HDF5, WebDataset, npz --------------------------------------------------

@@ -1,0 +1,56 @@
+"""Coordinates of a store's dimensions, so that xarray can name rows, columns and places.
+
+An array that is named as its dimension becomes an index in xarray: after
+``xarray.open_zarr(store, group="voxel")`` one may write
+``.sel(property="density")``. Zarr itself gives such an array no meaning.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from slatprep.geometry import voxel_centres
+from slatprep.records import PROPERTY_COLUMNS, RESOLUTION
+
+_AXES = ("x", "y", "z")
+
+ASSET_COORDINATES = "id object_id view category"
+"""Arrays of ``asset`` that name its rows; the attribute is CF's."""
+
+
+def write_coordinates(path: Path) -> None:
+    """Write the coordinates of every group into a store that is being made.
+
+    Parameters
+    ----------
+    path : Path
+        The store, with its groups in place; to be called before its metadata
+        are consolidated.
+    """
+    import zarr
+
+    root: Any = zarr.open_group(path, mode="r+", zarr_format=3, use_consolidated=False)
+    centres = voxel_centres(np.repeat(np.arange(RESOLUTION)[:, None], 3, axis=1))[:, 0]
+    texts = {"property": PROPERTY_COLUMNS, "axis": _AXES}
+    for group, dimensions in (
+        ("asset", ("property",)),
+        ("voxel", ("axis", "property")),
+        ("grid", ("property", *_AXES)),
+    ):
+        for dimension in dimensions:
+            values: Any = centres
+            if dimension in texts:
+                values = np.array(texts[dimension], dtype=object)
+            array = root[group].create_array(
+                dimension,
+                shape=values.shape,
+                dtype=str if dimension in texts else "float64",
+                chunks=values.shape,
+                dimension_names=(dimension,),
+                attributes={"description": f"coordinate of the dimension {dimension}"},
+            )
+            array[:] = values
+    root["asset"].attrs["coordinates"] = ASSET_COORDINATES
