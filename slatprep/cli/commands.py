@@ -16,6 +16,7 @@ COMMANDS = {
     "build-store": "slatprep.cli.build:build_store",
     "align": "slatprep.cli.build:align",
     "check-alignment": "slatprep.cli.check:check_alignment",
+    "verify": "slatprep.cli.verify:verify",
     "info": "slatprep.cli.info:info",
     "report": "slatprep.cli.report:report",
     "score": "slatprep.cli.score:score",

@@ -143,8 +143,8 @@ class Store:
             If there is no such array, or it cannot be read.
         """
         # Offsets are always written: that they are there bounds what the others may claim.
-        rows = self._asset_rows + 1 if name == "offset" else len(self)
-        return self._read(f"asset/{name}", 0, rows)
+        rows = self.shape("asset/offset")[0] if name == "offset" else len(self)
+        return self.read_rows(f"asset/{name}", 0, rows)
 
     def find(self, asset_id: str) -> int:
         """Return the index of an asset.
@@ -188,7 +188,7 @@ class Store:
             If there is no such asset or array, or a file is missing or damaged.
         """
         start, stop = self.rows(index)
-        return {name: self._read(f"voxel/{name}", start, stop) for name in columns}
+        return {name: self.read_rows(f"voxel/{name}", start, stop) for name in columns}
 
     def rows(self, index: int) -> tuple[int, int]:
         """Return the first row of an asset in ``voxel/*``, and the one after its last.
@@ -225,8 +225,8 @@ class Store:
         return StoredAsset(
             asset_id=asset_id,
             transform=np.asarray(self._column("transform")[index]),
-            grid_properties=self._read("grid/properties", index, index + 1)[0],
-            grid_material=self._read("grid/material", index, index + 1)[0],
+            grid_properties=self.read_rows("grid/properties", index, index + 1)[0],
+            grid_material=self.read_rows("grid/material", index, index + 1)[0],
             columns=columns,
             **self.read(index, names["voxel"]),
         )
@@ -240,7 +240,14 @@ class Store:
             self._columns[name] = self.column(name)
         return self._columns[name]
 
-    def _read(self, name: str, start: int, stop: int) -> NDArray[Any]:
+    def read_rows(self, name: str, start: int, stop: int) -> NDArray[Any]:
+        """Read rows of any array by its full name, such as ``voxel/coords``.
+
+        Raises
+        ------
+        StoreError
+            If there is no such array or row, or a file is missing or damaged.
+        """
         if name not in self._readers:
             self._readers[name] = self.reader(name)
         reader = self._readers[name]
@@ -248,6 +255,11 @@ class Store:
             array: Any = self.group[name]
             return np.asarray(array[start:stop])
         return reader.read(start, stop)
+
+    def shape(self, name: str) -> tuple[int, ...]:
+        """Return the shape of an array, from its metadata alone."""
+        self.reader(name)
+        return tuple(self._metadata[name]["shape"])
 
     def reader(self, name: str) -> RowReader | None:
         """Return a direct reader of an array, by its full name.
@@ -270,11 +282,6 @@ class Store:
         for finding in size_findings(name, self._metadata[name], sizes):
             raise StoreError(f"{self.path}/{finding}; run `slatprep verify`")
         return RowReader.of(self._folder, name, self._metadata[name])
-
-    @property
-    def _asset_rows(self) -> int:
-        self.reader("asset/id")
-        return int(self._metadata["asset/id"]["shape"][0])
 
     def _array_metadata(self, name: str) -> Mapping[str, Any]:
         if name in self._metadata:

@@ -31,6 +31,39 @@ OPEN_SHARDS = 32
 _INDEX_CODECS = ["bytes", "crc32c"]
 
 
+MAX_CHUNK_BYTES = 256 * 2**20
+"""What one chunk may unpack to; a grid's takes 3 MiB."""
+
+
+MAX_CHUNKS = 2**20
+"""Chunks of one shard, whose index is held in memory."""
+
+
+class DamagedFileError(StoreError):
+    """A file of a store that is missing, cut short or damaged.
+
+    Parameters
+    ----------
+    folder : str
+        The store.
+    file : str
+        The file, below the store.
+    fault : str
+        What is wrong with it.
+    expected : str
+        What should be there.
+    """
+
+    def __init__(self, folder: str, file: str, fault: str, expected: str) -> None:
+        super().__init__(
+            f"{folder}/{file}: {fault}; expected {expected}. Copy the store again, or build it"
+        )
+        self.folder, self.file, self.fault, self.expected = folder, file, fault, expected
+
+    def __reduce__(self) -> tuple[type, tuple[str, str, str, str]]:
+        return (type(self), (self.folder, self.file, self.fault, self.expected))
+
+
 class Folder:
     """An open directory: what is read below it stays of one store, even if that is replaced."""
 
@@ -105,7 +138,7 @@ class RowReader:
         self.fill_value = fill_value
         self.chunks_per_shard = shard_rows // self.chunk_rows
         # Zarr leaves out files of fill values alone, as a column of empty strings is.
-        self.optional = not sharded and name != "asset/offset"
+        self.optional = name.startswith("asset/") and name != "asset/offset"
         self._shards: dict[int, _Shard] = {}
         self._local = threading.local()
 
@@ -147,6 +180,8 @@ class RowReader:
         decoder = ChunkDecoder.of(dtype, inner, codecs)
         if decoder is None:
             return None
+        if decoder.nbytes > MAX_CHUNK_BYTES or outer[0] // inner[0] > MAX_CHUNKS:
+            raise ValueError(f"chunks of {inner} in shards of {outer}")
         return cls(folder, name, shape, outer[0], sharded, decoder, fill_value)
 
     def key(self, shard: int) -> str:
@@ -199,10 +234,7 @@ class RowReader:
                 raise StoreError("the file ends before it does")
             self.decoder.decode(data, out)
         except StoreError as error:
-            where = f"{self.folder.path}/{self.key(number)}"
-            raise StoreError(
-                f"{where}: chunk {place} is damaged: {error}; copy the store again, or build it"
-            ) from None
+            raise self._damaged(number, f"chunk {place} is damaged: {error}") from None
 
     def _scratch(self) -> NDArray[Any]:
         """Return memory for a chunk of which only some rows are wanted, one for each thread."""
@@ -211,38 +243,24 @@ class RowReader:
             scratch = self._local.scratch = np.empty(self.decoder.shape, self.dtype)
         return scratch
 
-    def index(self, shard: int) -> NDArray[np.uint64]:
-        """Read a shard's index: offset and length of each chunk, uint64 (chunks, 2).
-
-        Raises
-        ------
-        StoreError
-            If the file is missing or its index is damaged or points out of the file.
-        """
-        return (self._shards.get(shard) or self._open(shard)).index
-
     def _open(self, number: int) -> _Shard:
-        where = f"{self.folder.path}/{self.key(number)}"
         try:
             file = self.folder.open(self.key(number))
             size = os.fstat(file.fileno()).st_size
         except FileNotFoundError:
             if self.optional:
                 return _Shard(None, np.array([[MISSING, MISSING]], np.uint64))
-            raise StoreError(
-                f"{where}: is missing; was the store replaced? Open it again, or run "
-                "`slatprep verify`"
-            ) from None
+            raise self._damaged(number, "is missing (was the store replaced?)") from None
         except OSError as error:
-            raise StoreError(f"{where}: cannot be read ({error.strerror})") from None
-        shard = _Shard(file, self._index(file, size, where))
+            raise self._damaged(number, f"cannot be read ({error.strerror})") from None
+        shard = _Shard(file, self._index(number, file, size))
         # Two threads may both have opened it; whichever is kept is as good.
         self._shards[number] = shard
         for oldest in list(self._shards)[:-OPEN_SHARDS]:
             self._shards.pop(oldest, None)
         return shard
 
-    def _index(self, file: FileIO, size: int, where: str) -> NDArray[np.uint64]:
+    def _index(self, number: int, file: FileIO, size: int) -> NDArray[np.uint64]:
         # No packed chunk is much larger than its values; strings have their own bound.
         limit = MAX_TEXT_BYTES if self.decoder.text else 2 * self.decoder.nbytes + 65_536
         if not self.sharded:
@@ -251,14 +269,17 @@ class RowReader:
             length = 16 * self.chunks_per_shard + 4
             data = os.pread(file.fileno(), length, size - length) if size >= length else b""
             if not crc32c_holds(data):
-                raise StoreError(f"{where}: has no sound index; the file is damaged or cut short")
+                raise self._damaged(number, "has no sound index; it is damaged or cut short")
             index = np.frombuffer(data, "<u8", 2 * self.chunks_per_shard).reshape(-1, 2)
             size -= length
         there = index[~(index == MISSING).all(axis=1)]
         offset, length_of = there.T
         if (offset > size).any() or (length_of > np.minimum(size, limit)).any():
-            raise StoreError(f"{where}: its index leads out of the file")
+            raise self._damaged(number, "its index leads out of it")
         return index
+
+    def _damaged(self, number: int, fault: str) -> DamagedFileError:
+        return DamagedFileError(self.folder.path, self.key(number), fault, "the file as written")
 
 
 _DTYPES = ("bool", "uint8", "int64", "float32", "float64")

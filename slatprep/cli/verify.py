@@ -1,0 +1,84 @@
+"""`slatprep verify`: whether a store is what it says it is."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+import click
+
+from slatprep.cli.options import chosen_store, jobs_option, store_argument
+from slatprep.cli.output import EXIT_INCOMPLETE, Output, output_options
+
+_DIRECTORY = click.Path(path_type=Path, exists=True, file_okay=False)
+
+
+@click.command(
+    epilog="""\b
+Example:
+  slatprep verify data/demo.zarr --jobs 2
+  slatprep verify data/demo.zarr --sources --json
+"""
+)
+@store_argument
+@click.option(
+    "--manifests", type=_DIRECTORY, metavar="DIR",
+    help="Folder of the records.  [default: beside the store]",
+)  # fmt: skip
+@click.option("--sources", is_flag=True, help="Compare the source files with the records, too.")
+@click.option(
+    "--pixieverse", type=_DIRECTORY, metavar="DIR",
+    help="Where the PixieVerse files lie now.  [default: where they lay]",
+)  # fmt: skip
+@click.option(
+    "--slat", type=_DIRECTORY, metavar="DIR",
+    help="Where the latents lie now, or their one HDF5 file does.  [default: where they lay]",
+)  # fmt: skip
+@jobs_option
+@output_options
+def verify(
+    output: Output,
+    store: Path | None,
+    manifests: Path | None,
+    sources: bool,
+    pixieverse: Path | None,
+    slat: Path | None,
+    jobs: int,
+) -> None:
+    """Check that STORE is whole, unchanged and consistent.
+
+    Metadata against the contract, every file against its digest, every chunk
+    against its checksum, values against their ranges, annotations against what
+    the stored grid and transform give, records against their schema and the
+    rows. Every fault is named. Exit code 0: nothing is wrong; 1: something is.
+    """
+    if (pixieverse is None) != (slat is None):
+        raise click.UsageError("--pixieverse and --slat go together: name both, or neither")
+    path = chosen_store(store)
+    from slatprep.verify import SourceRoots, verify_store
+
+    roots = SourceRoots(pixieverse, slat) if pixieverse and slat else None
+    with output.progress("verify") as progress:
+        result = verify_store(
+            path,
+            manifests=manifests,
+            sources=sources or roots is not None,
+            roots=roots,
+            jobs=jobs,
+            progress=progress,
+        )
+
+    def show() -> None:
+        for finding in result.findings:
+            click.echo(finding)
+        records = result.manifests or "none beside the store"
+        output.note(
+            f"{result.assets:,} assets, {result.files:,} files, {result.sources:,} sources; "
+            f"records: {records}"
+        )
+        click.echo(f"{path}: {len(result.findings):,} findings" if result.findings else
+                   f"{path}: nothing is wrong")  # fmt: skip
+
+    output.result({**dataclasses.asdict(result), "ok": result.ok}, show)
+    if not result.ok:
+        click.get_current_context().exit(EXIT_INCOMPLETE)

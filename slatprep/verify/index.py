@@ -1,0 +1,85 @@
+"""Ids, offsets and the columns of numbers: what is small and spans all assets."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from itertools import pairwise
+
+import numpy as np
+
+from slatprep.records import Verdict
+from slatprep.store.contract import MAX_VOXELS, Finding
+from slatprep.store.reader import Store
+
+SHARES = ("fitness", "fitness_backward", "overlap", "ambiguity", "valid_share")
+"""Columns of shares, 0 to 1."""
+
+DISTANCES = ("inlier_rmse", "inlier_rmse_backward", "margin")
+"""Columns of numbers that are not negative, or NaN where there is nothing to tell."""
+
+WORDS = {"model": ("rigid", "similarity"), "verdict": tuple(str(v) for v in Verdict)}
+"""Columns of words, and those allowed."""
+
+# R of a similarity satisfies R^T R = s^2 I; rounding leaves this much.
+_TOLERANCE = 1e-6
+
+
+def index_findings(store: Store) -> Iterator[Finding]:
+    """Yield what is wrong with the ``asset/*`` arrays."""
+    ids = store.ids
+    for before, after in pairwise(ids):
+        if before >= after:
+            what = "occurs twice" if before == after else f"comes after {before!r}"
+            yield Finding("asset/id", after, what, "ids sorted ascending, each once")
+    yield from _offset_findings(store)
+    for name in SHARES:
+        yield from _outside(store, name, 0.0, 1.0)
+    for name in DISTANCES:
+        yield from _outside(store, name, 0.0, np.inf, nan=True)
+    for name, allowed in WORDS.items():
+        for asset_id, word in zip(ids, store.column(name), strict=True):
+            if str(word) not in allowed:
+                yield Finding(f"asset/{name}", asset_id, repr(word), f"one of {allowed}")
+    yield from _transform_findings(store)
+
+
+def _offset_findings(store: Store) -> Iterator[Finding]:
+    where, offsets = "asset/offset", store.offsets
+    voxels = store.shape("voxel/coords")[0]
+    if offsets[0] != 0 or offsets[-1] != voxels:
+        ends = f"runs from {offsets[0]} to {offsets[-1]}"
+        yield Finding(where, "", ends, f"0 to {voxels}, the rows of voxel/*")
+    sizes = np.diff(offsets)
+    for row in np.flatnonzero((sizes < 1) | (sizes > MAX_VOXELS)):
+        yield Finding(where, store.ids[row], f"{sizes[row]} rows", f"1 to {MAX_VOXELS} rows")
+
+
+def _outside(store: Store, name: str, lo: float, hi: float, nan: bool = False) -> Iterator[Finding]:
+    values = store.column(name)
+    fine = (values >= lo) & (values <= hi)
+    if nan:
+        fine |= np.isnan(values)
+    for row in np.flatnonzero(~fine):
+        yield Finding(f"asset/{name}", store.ids[row], f"is {values[row]}", f"{lo:g} to {hi:g}")
+
+
+def _transform_findings(store: Store) -> Iterator[Finding]:
+    for asset_id, model, transform in zip(
+        store.ids, store.column("model"), store.column("transform"), strict=True
+    ):
+        linear = transform[:3, :3]
+        similar = np.isfinite(transform).all() and (transform[3] == (0, 0, 0, 1)).all()
+        determinant = float(np.linalg.det(linear)) if similar else 0.0
+        square = abs(determinant) ** (2 / 3)
+        unit = abs(determinant - 1) <= _TOLERANCE if model == "rigid" else True
+        if determinant <= 0 or not unit or not _is_multiple_of_unit(linear.T @ linear, square):
+            yield Finding(
+                "asset/transform",
+                asset_id,
+                f"{transform.tolist()} is no {model} transform",
+                "a rotation (scaled by one factor where similarity) and a shift, finite",
+            )
+
+
+def _is_multiple_of_unit(matrix: np.ndarray, factor: float) -> bool:
+    return bool(np.abs(matrix - factor * np.eye(3)).max() <= _TOLERANCE * max(factor, 1.0))
