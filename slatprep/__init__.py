@@ -122,13 +122,15 @@ __all__ = [
 ]
 
 
-def __getattr__(name: str) -> object:
-    # PEP 562: importing everything takes a second, importing the package must not.
-    if name not in _HOME_OF:
-        raise AttributeError(f"module 'slatprep' has no attribute {name!r}")
-    value = getattr(importlib.import_module(_HOME_OF[name]), name)
-    globals()[name] = value
-    return value
+if not TYPE_CHECKING:  # to a type checker, this would make every misspelt name one that exists
+
+    def __getattr__(name: str) -> object:
+        # PEP 562: importing everything takes a second, importing the package must not.
+        if name not in _HOME_OF:
+            raise AttributeError(f"module 'slatprep' has no attribute {name!r}")
+        value = getattr(importlib.import_module(_HOME_OF[name]), name)
+        globals()[name] = value
+        return value
 
 
 def __dir__() -> list[str]:

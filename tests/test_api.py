@@ -54,7 +54,8 @@ def test_every_name_is_there_and_documented(name: str) -> None:
 
 def test_what_a_type_checker_sees_is_what_there_is() -> None:
     tree = ast.parse(Path(slatprep.__file__).read_text("utf-8"))
-    (block,) = [node for node in tree.body if isinstance(node, ast.If)]
+    block = next(node for node in tree.body if isinstance(node, ast.If))
+    assert ast.unparse(block.test) == "TYPE_CHECKING"
     seen = {
         alias.name: node.module
         for node in block.body

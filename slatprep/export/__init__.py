@@ -122,7 +122,8 @@ def export_store(
     Raises
     ------
     ConfigError
-        If no asset is left, an id is unknown or `out` is something else.
+        If no asset is left, an id is unknown, or `out` is something else or
+        lies in the store.
     StoreError
         If the store cannot be read.
     """
@@ -131,6 +132,8 @@ def export_store(
         raise ConfigError(f"format is {format!r}; expected one of {', '.join(FORMATS)}")
     options, store, out = options or ExportOptions(), Path(store), Path(out)
     opened = open_store(store)
+    if store.resolve() in out.resolve().parents:
+        raise ConfigError(f"{out} lies inside the store; expected a path outside {store}")
     ids = select_assets(opened, assets, verdicts)
     job = _Job(opened, ids, options, jobs, progress)
     notes: tuple[str, ...] = ()

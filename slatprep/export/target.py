@@ -31,6 +31,8 @@ def directory(out: Path) -> Iterator[Path]:
     SlatprepError
         If nothing can be written there.
     """
+    # What a link points at is replaced, not the link.
+    out = out.resolve()
     if out.exists() and not _may_be_replaced(out):
         raise ConfigError(
             f"{out} exists and is not an export of slatprep; expected an export to replace, "
@@ -60,6 +62,7 @@ def file(out: Path, is_export: Callable[[Path], bool]) -> Iterator[Path]:
     SlatprepError
         If nothing can be written there.
     """
+    out = out.resolve()
     if out.exists() and not (out.is_file() and is_export(out)):
         raise ConfigError(
             f"{out} exists and is not an export of slatprep; expected an export to replace, "

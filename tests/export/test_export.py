@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import shutil
 import tarfile
 from pathlib import Path
@@ -10,6 +11,8 @@ from typing import Any
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 from synthetic import JELLY, METAL, QUARTER_TURN, Dataset
 
 from slatprep.build import BuildSummary, build_store
@@ -291,6 +294,21 @@ def test_what_is_no_export_is_never_replaced(format: Any, store: Path, tmp_path:
 
 
 @pytest.mark.parametrize("format", FORMATS)
+def test_a_link_stays_and_the_store_is_left_alone(format: Any, store: Path, tmp_path: Path) -> None:
+    there, link = tmp_path / "disk" / "export", tmp_path / "link"
+    export_store(store, there, format, assets=["cup"])
+    link.symlink_to(there)
+    export_store(store, link, format, assets=["dog"])
+    assert link.is_symlink() and not there.is_symlink()
+    fresh = tmp_path / "fresh"
+    export_store(store, fresh / "export", format, assets=["dog"])
+    assert bytes_of(there) == bytes_of(fresh / "export")
+    with pytest.raises(ConfigError, match="lies inside the store"):
+        export_store(store, store / "voxel" / "export", format)
+    assert not (store / "voxel" / "export").exists()
+
+
+@pytest.mark.parametrize("format", FORMATS)
 def test_a_failed_export_leaves_the_old_one(
     format: Any, store: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -333,6 +351,17 @@ def test_hostile_ids_become_file_names(tmp_path: Path) -> None:
             (tmp_path / name).write_text("x")
             assert (tmp_path / name).resolve().parent == tmp_path.resolve()
             assert name.isascii() and name[0] not in ".-_~" and (dots or "." not in name)
+
+
+@given(
+    ids=st.sets(st.text(st.characters(codec="utf-8"), min_size=1, max_size=300), max_size=8),
+    dots=st.booleans(),
+)
+def test_any_ids_become_distinct_plain_names(ids: set[str], dots: bool) -> None:
+    names = {file_name(asset_id, dots=dots) for asset_id in ids}
+    assert len(names) == len(ids)
+    for name in names:
+        assert re.fullmatch(r"[A-Za-z0-9%][A-Za-z0-9%._~-]*", name) and len(name) < 250
 
 
 @pytest.mark.parametrize("format", FORMATS)
