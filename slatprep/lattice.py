@@ -88,7 +88,10 @@ def vote(
     """
     row = _rows(voxels)
     position = (np.asarray(points, dtype=np.float64) + 0.5) * RESOLUTION - 0.5
-    return _vote(np.ascontiguousarray(position), row, labels, int(labels.max()) + 1, 0.5 / width**2)
+    spokesman: NDArray[np.intp] = _vote(
+        np.ascontiguousarray(position), row, labels, int(labels.max()) + 1, 0.5 / width**2
+    )
+    return spokesman
 
 
 def _rows(voxels: NDArray[np.uint8]) -> NDArray[np.int32]:
