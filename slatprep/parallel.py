@@ -66,8 +66,7 @@ def run_unordered(
         try:
             yield from _run_in_pool(function, source, jobs)
         except BrokenProcessPool:
-            for task in source.unfinished():
-                yield _run_alone(function, task, died)
+            yield from _run_alone(function, source.unfinished(), died)
 
 
 class _Handout:
@@ -129,25 +128,31 @@ def _run_in_pool(function: Callable[..., Result], source: _Handout, jobs: int) -
 
 def _run_alone(
     function: Callable[..., Result],
-    task: tuple[Any, ...],
+    tasks: Iterable[tuple[Any, ...]],
     died: Callable[..., Result] | None,
-) -> Result:
+) -> Iterator[Result]:
+    """Yield the result of each task, one at a time in a process that does nothing else."""
     from joblib.externals.loky import ProcessPoolExecutor
     from joblib.externals.loky.process_executor import BrokenProcessPool
 
     environment = dict.fromkeys(_THREAD_VARIABLES, "1")
-    alone = ProcessPoolExecutor(1, env=environment, initializer=_end_with, initargs=(os.getpid(),))
-    try:
-        result: Result = alone.submit(function, *task).result()
-        return result
-    except BrokenProcessPool:
-        if died is not None:
-            return died(*task)
-        raise SlatprepError(
-            "a worker process was killed twice at the same task, probably because memory ran "
-            "out; nothing was replaced. Run again with fewer jobs, or with more memory"
-        ) from None
-    finally:
+    alone = None
+    for task in tasks:
+        if alone is None:
+            alone = ProcessPoolExecutor(
+                1, env=environment, initializer=_end_with, initargs=(os.getpid(),)
+            )
+        try:
+            yield alone.submit(function, *task).result()
+        except BrokenProcessPool:
+            alone = None
+            if died is None:
+                raise SlatprepError(
+                    "a worker process was killed twice at the same task, probably because memory "
+                    "ran out; nothing was replaced. Run again with fewer jobs or more memory"
+                ) from None
+            yield died(*task)
+    if alone is not None:
         alone.shutdown()
 
 

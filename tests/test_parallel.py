@@ -57,3 +57,15 @@ def test_single_threaded_holds_and_gives_back(monkeypatch: pytest.MonkeyPatch) -
         assert os.environ["MKL_NUM_THREADS"] == "1"
     assert os.environ["OMP_NUM_THREADS"] == "2"
     assert "MKL_NUM_THREADS" not in os.environ
+
+
+def die_at(number: int, deadly: int) -> int:
+    if number == deadly:
+        os._exit(9)
+    return number
+
+
+def test_a_task_that_kills_its_worker_even_alone_is_answered_for() -> None:
+    tasks = [(number, 5) for number in range(20)]
+    results = run_unordered(die_at, tasks, 2, died=lambda number, deadly: -number)
+    assert sorted(results) == sorted(-n if n == 5 else n for n in range(20))

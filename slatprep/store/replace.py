@@ -49,9 +49,10 @@ def replace_directory(new: Path, target: Path) -> None:
 
 
 def restore_directory(work: Path, target: Path) -> None:
-    """Put back what a kill between the two renames of `replace_directory` left in `work`."""
-    if _aside(work).exists() and not target.exists():
-        _aside(work).rename(target)
+    """Put back what a kill between the two renames of `replace_directory` left below `work`."""
+    for scratch in sorted(work.glob("*")):
+        if _aside(scratch).exists() and not target.exists():
+            _aside(scratch).rename(target)
 
 
 def flush_tree(directory: Path) -> None:
@@ -73,8 +74,8 @@ def flush(path: Path) -> None:
         os.close(descriptor)
 
 
-def _aside(work: Path) -> Path:
-    return work / "previous"
+def _aside(scratch: Path) -> Path:
+    return scratch / "previous"
 
 
 def _exchange(new: Path, target: Path) -> bool:
