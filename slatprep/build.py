@@ -32,6 +32,7 @@ from slatprep.publish import (
 from slatprep.readers import discover
 from slatprep.records import PROPERTY_COLUMNS, AssetPair, Normalization, Status
 from slatprep.reuse import recipe_of
+from slatprep.settle import settle_ties
 from slatprep.store.reader import is_store
 from slatprep.store.replace import replace_directory
 from slatprep.store.spool import Spool, SpooledAsset, writing
@@ -122,6 +123,8 @@ def build_store(
             )
         assets += _finish_all(bench, plan, (Action.REUSE,), jobs, progress)
         assets.sort(key=lambda asset: asset.asset_id)
+        if parameters.consensus.settle:
+            assets = settle_ties(assets, work.spool, parameters, jobs)
         usable_assets = [asset for asset in assets if asset.status is Status.OK]
         if not usable_assets:
             raise StoreError(_nothing_usable(assets, parameters))

@@ -2,7 +2,7 @@
 
 The file has one table for each group of `slatprep.parameters`. Relative paths
 in it are resolved against its own folder. Options win over the file, and a
-preset replaces the whole ``align`` group of the file.
+preset replaces the whole ``align`` and ``sample`` groups of the file.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ def load_parameters(
         relative to the working directory.
     preset : str, optional
         Name of one of `slatprep.parameters.PRESETS`; it replaces the align
-        group of the file, and `overrides` win over it.
+        and sample groups of the file, and `overrides` win over it.
 
     Returns
     -------
@@ -224,8 +224,8 @@ _LIMITS: Mapping[str, tuple[Callable[[Any], bool], str]] = types.MappingProxyTyp
         "align.radius": (_above(0), "a number of voxels above 0"),
         "align.icp_radius": (_above(0), "a number of voxels above 0"),
         "align.icp_iterations": (_above(0), "a whole number above 0"),
-        "align.seed": (_above(-1), "a whole number, 0 or more"),
         "sample.max_distance": (_above(0), "a number of voxels above 0"),
+        "sample.vote_width": (_above(0), "a number of voxels above 0"),
         "store.voxel_chunk": (_above(0), "a whole number of rows above 0"),
         "store.voxel_chunks_per_shard": (_above(0), "a whole number above 0"),
         "store.grid_assets_per_shard": (_above(0), "a whole number above 0"),

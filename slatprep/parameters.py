@@ -81,7 +81,7 @@ class AlignParameters:
     `model` is ``rigid`` (the paper's SE(3)), ``similarity`` (one scale more)
     or ``auto`` (the simplest that the data support). Scale stays within
     `scale_bounds`; `radius` is the correspondence radius of quality figures,
-    in voxels. `seed` feeds whatever an engine draws at random.
+    in voxels. No engine draws anything at random.
     """
 
     __pydantic_config__: ClassVar[dict[str, str]] = _FORBID_UNKNOWN
@@ -92,7 +92,20 @@ class AlignParameters:
     radius: float = 1.0
     icp_radius: float = 3.2
     icp_iterations: int = 60
-    seed: int = 0
+
+
+@dataclass(frozen=True)
+class ConsensusParameters:
+    """Whether ties are settled by the rotation that the dataset has in common.
+
+    With `settle`, a second pass gives each asset whose geometry cannot tell
+    placements apart the one nearest to the rotation that most assets without
+    a tie share.
+    """
+
+    __pydantic_config__: ClassVar[dict[str, str]] = _FORBID_UNKNOWN
+
+    settle: bool = False
 
 
 @dataclass(frozen=True)
@@ -145,6 +158,7 @@ class BuildParameters:
     name: str = ""
     pairing: PairingParameters = field(default_factory=PairingParameters)
     align: AlignParameters = field(default_factory=AlignParameters)
+    consensus: ConsensusParameters = field(default_factory=ConsensusParameters)
     sample: SampleParameters = field(default_factory=SampleParameters)
     normalize: NormalizeParameters = field(default_factory=NormalizeParameters)
     store: StoreParameters = field(default_factory=StoreParameters)

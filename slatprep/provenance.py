@@ -119,9 +119,9 @@ def asset_record(
         "versions": library_versions(parameters.align),
         "code": code,
         "key": key,
-        "alignment": _alignment(result) if alignment is None else dict(alignment),
+        "alignment": alignment_entry(result) if alignment is None else dict(alignment),
         "normalization": None,
-        "counts": _counts(result),
+        "counts": counts_entry(result),
         "warnings": list(warnings),
         "duration_s": round(duration, 4),
     }
@@ -179,6 +179,7 @@ def origin(parameters: BuildParameters) -> dict[str, Any]:
         "name": parameters.name,
         "parameters": {
             **content_parameters(parameters),
+            "consensus": jsonable(parameters.consensus),
             "normalize": jsonable(parameters.normalize),
             "store": jsonable(parameters.store),
         },
@@ -270,7 +271,8 @@ def jsonable(value: object) -> Any:
     raise TypeError(f"a record cannot hold {type(value).__name__} {value!r}")
 
 
-def _alignment(result: AssetResult) -> dict[str, Any] | None:
+def alignment_entry(result: AssetResult) -> dict[str, Any] | None:
+    """Return what a record says of an alignment; None where there is none."""
     alignment, ambiguity = result.alignment, result.ambiguity
     if alignment is None or ambiguity is None:
         return None
@@ -294,7 +296,8 @@ def _alignment(result: AssetResult) -> dict[str, Any] | None:
     }
 
 
-def _counts(result: AssetResult) -> dict[str, Any] | None:
+def counts_entry(result: AssetResult) -> dict[str, Any] | None:
+    """Return what a record counts, clipped values left out; None where there is no result."""
     field, latents, annotation = result.field, result.latents, result.annotation
     if field is None or latents is None or annotation is None:
         return None

@@ -44,6 +44,11 @@ Example:
 @jobs_option
 @_MANIFESTS
 @_STRICT
+@click.option(
+    "--consensus",
+    is_flag=True,
+    help="Settle ties by the rotation that most assets have in common, in a second pass.",
+)
 @click.option("--fresh", is_flag=True, help="Do everything, whatever was done before.")
 @click.option(
     "--keep-work",

@@ -98,6 +98,7 @@ def parameters_of(
     pairing_map: Path | None,
     ranges: str | None,
     preset: str | None,
+    consensus: bool = False,
     **_other: Any,
 ) -> BuildParameters:
     """Return the parameters that the options of `source_options` ask for."""
@@ -112,4 +113,6 @@ def parameters_of(
     ):
         if value is not None:
             given[group] = {key: str(value)}
+    if consensus:
+        given["consensus"] = {"settle": True}
     return load_parameters(config, given, preset)

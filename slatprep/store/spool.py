@@ -58,6 +58,8 @@ class SpooledAsset:
         Why not, in one line; empty where all is well.
     n_voxels, n_valid : int
         SLAT voxels, and those that found an annotation.
+    n_placements : int
+        Distinct placements that fit about as well as the one chosen.
     extent : ndarray of float64, shape (3, 2), or None
         What `slatprep.normalize.property_extent` gives.
     columns : dict
@@ -71,6 +73,7 @@ class SpooledAsset:
     reason: str = ""
     n_voxels: int = 0
     n_valid: int = 0
+    n_placements: int = 0
     extent: NDArray[np.float64] | None = None
     columns: dict[str, Any] | None = None
 
@@ -220,6 +223,7 @@ def spooled(key: str, record: dict[str, Any], extent: NDArray[np.float64] | None
         status,
         n_voxels=counts["slat_voxels"],
         n_valid=counts["valid"],
+        n_placements=len(record["alignment"]["placements"]),
         extent=extent,
         columns=_columns(record),
     )

@@ -102,14 +102,14 @@ def test_patterns_are_lists(folder: Path) -> None:
 @pytest.mark.parametrize(
     ("addition", "line", "words"),
     [
-        ('[align]\nengin = "field"\n', 9, ("align.engin", "did you mean 'engine'", "seed")),
+        ('[align]\nengin = "field"\n', 9, ("align.engin", "did you mean 'engine'", "radius")),
         ('[align]\nengine = "magic"\n', 9, ("align.engine", "'magic'", "'open3d'")),
         ("[align]\nradius = true\n", 9, ("align.radius", "True", "number")),
         ('[align]\nradius = "3"\n', 9, ("align.radius", "'3'", "number")),
         ("[align]\nradius = -1.0\n", 9, ("align.radius", "-1.0", "above 0")),
         ("[align]\nradius = nan\n", 9, ("align.radius", "nan", "above 0")),
         ("[align]\n\nscale_bounds = [1.2, 1.6]\n", 10, ("align.scale_bounds", "low <= 1")),
-        ("align.seed = 1.5\n", 8, ("slat.align", "unknown key")),
+        ("align.radius = 1.5\n", 8, ("slat.align", "unknown key")),
         ("[alingment]\n", 8, ("alingment", "unknown key", "did you mean 'align'")),
         ("[store]\ncompression_level = 23\n", 9, ("store.compression_level", "0 to 22")),
         ('[pairing]\nmap = "absent.csv"\n', 9, ("pairing.map", "absent.csv", "does not exist")),

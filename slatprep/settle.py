@@ -1,0 +1,164 @@
+"""The second pass: ties settled by the rotation that the dataset has in common.
+
+It works on what the first pass left in the spool and changes nothing there: an
+asset whose placement changes is written again under a key of its own, so the
+choice is undone by building without it.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from slatprep import provenance
+from slatprep.align.ambiguity import measure_ambiguity
+from slatprep.align.consensus import find_consensus, settle
+from slatprep.align.quality import judge, measure_quality
+from slatprep.parallel import run_unordered
+from slatprep.parameters import BuildParameters
+from slatprep.records import (
+    BACKGROUND,
+    Alignment,
+    AssetPair,
+    AssetResult,
+    Candidate,
+    Consensus,
+    MaterialField,
+    Placement,
+    Quality,
+    Status,
+    StructuredLatents,
+    Verdict,
+)
+from slatprep.sample import sample
+from slatprep.store.spool import Spool, SpooledAsset
+
+
+def settle_ties(
+    assets: Sequence[SpooledAsset], spool: Spool, parameters: BuildParameters, jobs: int
+) -> list[SpooledAsset]:
+    """Give ambiguous assets the placement nearest to the dataset's common rotation.
+
+    Parameters
+    ----------
+    assets : sequence of SpooledAsset
+        All assets of the build.
+    spool : Spool
+        Where they lie.
+    parameters : BuildParameters
+        How annotations are looked up, and the radius of the quality figures.
+    jobs : int
+        Worker processes.
+
+    Returns
+    -------
+    list of SpooledAsset
+        In the same order; those without a tie are the same objects.
+    """
+    consensus = find_consensus(
+        _row(asset)["transform"]
+        for asset in assets
+        if asset.status is Status.OK
+        and not asset.n_placements
+        and _row(asset)["verdict"] != Verdict.FAILED
+    )
+    if consensus is None:
+        return list(assets)
+    tied = ((asset, spool, consensus, parameters) for asset in assets if asset.n_placements)
+    settled = {asset.asset_id: asset for asset in run_unordered(settle_asset, tied, jobs)}
+    return [settled.get(asset.asset_id, asset) for asset in assets]
+
+
+def settle_asset(
+    asset: SpooledAsset, spool: Spool, consensus: Consensus, parameters: BuildParameters
+) -> SpooledAsset:
+    """Settle one asset's tie; return it as it was where the choice stands."""
+    record = spool.record(asset.key)
+    arrays = spool.voxels(asset.key)
+    latents = StructuredLatents(arrays["coords"], arrays["feats"])
+    before = alignment_of(record["alignment"])
+    after = settle(before, latents, consensus)
+    if after is before:
+        return asset
+    grid, voxels, properties = spool.grid(asset.key)
+    field = MaterialField(grid != BACKGROUND, voxels, grid[tuple(voxels.T)], properties)
+    quality = measure_quality(field, latents, after.transform, parameters.align.radius)
+    annotation = sample(field, latents.coords, after.transform, parameters.sample)
+    ambiguity = measure_ambiguity(field, latents, after, parameters.sample)
+    verdict, reasons = judge(quality, float(annotation.valid.mean()), ambiguity)
+    result = AssetResult(
+        pair=_pair_of(record),
+        status=Status.OK,
+        field=field,
+        latents=latents,
+        alignment=replace(after, quality=quality),
+        annotation=annotation,
+        ambiguity=ambiguity,
+        verdict=verdict,
+        verdict_reasons=reasons,
+    )
+    key = hashlib.sha256(f"{asset.key} {consensus.rotation.tobytes().hex()}".encode()).hexdigest()
+    entries = {
+        "key": key,
+        "alignment": provenance.alignment_entry(result),
+        "counts": provenance.counts_entry(result),
+    }
+    return spool.put(replace(result, record=record | entries), key)
+
+
+def alignment_of(entry: Mapping[str, Any]) -> Alignment:
+    """Return the alignment that a record describes."""
+    settled_by = entry["settled_by"]
+    return Alignment(
+        transform=np.array(entry["transform"]),
+        engine=entry["engine"],
+        model=entry["model"],
+        search=entry["search"],
+        quality=Quality(**entry["quality"]),
+        candidates=tuple(
+            Candidate(**{**c, "euler_degrees": c["euler_degrees"] and tuple(c["euler_degrees"])})
+            for c in entry["candidates"]
+        ),
+        margin=_number(entry["ambiguity"]["margin"]),
+        placements=tuple(
+            Placement(np.array(p["transform"]), p["score"], p["displacement"])
+            for p in entry["placements"]
+        ),
+        score=_number(entry["score"]),
+        settled_by=settled_by
+        and Consensus(
+            np.array(settled_by["rotation"]), settled_by["winners"], settled_by["agreeing"]
+        ),
+    )
+
+
+def _number(value: float | None) -> float:
+    return float("nan") if value is None else value
+
+
+def _row(asset: SpooledAsset) -> dict[str, Any]:
+    if asset.columns is None:
+        raise ValueError(f"{asset.asset_id}: status is ok, but its row is missing")
+    return asset.columns
+
+
+def _pair_of(record: Mapping[str, Any]) -> AssetPair:
+    """Return the pair that a record is of, as far as names go."""
+    nowhere = Path()
+    return AssetPair(
+        asset_id=record["asset_id"],
+        object_id=record["object_id"],
+        view=record["view"],
+        category=record["category"],
+        pixieverse_root=nowhere,
+        slat_root=nowhere,
+        grid=None,
+        mask=None,
+        bounds=None,
+        slat=None,
+    )
