@@ -49,7 +49,7 @@ def write_page(
         f"style-src {_hash(style)}; script-src {_hash(script)} {_hash(library)}"
     )
     head, body = _asset("page.html").split("{{content}}")
-    for name, text in (("title", html.escape(title)), ("policy", policy), ("style", style)):
+    for name, text in (("style", style), ("policy", policy), ("title", html.escape(title))):
         head = head.replace(f"{{{{{name}}}}}", text)
     file.write(head)
     # The table can be used while the pictures below it are still being read.

@@ -15,7 +15,7 @@ from slatprep.store import StoredAsset
 VIEWS = 3
 """From the front (along +y), from the right (along -x) and from above (along -z)."""
 
-PER_SHEET = 256
+PER_SHEET = 64
 """Pictures in one image file."""
 
 COLUMNS = 8

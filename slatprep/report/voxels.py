@@ -67,7 +67,7 @@ def encode_asset(asset: StoredAsset, max_distance: float, side: int) -> bytes:
         *(_quantised(column).tobytes() for column in scalars.T),
         material[chosen].tobytes(),
     ]
-    deflate = zlib.compressobj(9, zlib.DEFLATED, -zlib.MAX_WBITS)
+    deflate = zlib.compressobj(6, zlib.DEFLATED, -zlib.MAX_WBITS)
     return deflate.compress(b"".join(parts)) + deflate.flush()
 
 

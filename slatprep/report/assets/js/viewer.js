@@ -252,11 +252,10 @@ const Viewer = (() => {
 
   /** Make the switches beside the stage. */
   function create() {
-    const radios = MODES.map((mode) =>
-      el("button", { type: "button", class: "chip", role: "radio", "data-mode": mode.key, title: mode.property && PROPERTY_NAMES[mode.key].name, "aria-checked": String(mode.key === state.mode), onclick: () => setMode(mode.key) }, mode.title),
+    const modes = MODES.map((mode) =>
+      el("button", { type: "button", class: "chip", "data-mode": mode.key, title: mode.property && PROPERTY_NAMES[mode.key].name, "aria-pressed": String(mode.key === state.mode), onclick: () => setMode(mode.key) }, mode.title),
     );
-    byId("colour-by").setAttribute("role", "radiogroup");
-    byId("colour-by").append(...radios);
+    byId("colour-by").append(...modes);
     const switches = { slat: "SLAT", field: "PixieVerse boundary", before: "before alignment", turning: "turn" };
     byId("show").append(
       ...Object.entries(switches).map(([key, title]) =>
@@ -267,7 +266,7 @@ const Viewer = (() => {
 
   function setMode(mode) {
     state.mode = mode;
-    document.querySelectorAll("[data-mode]").forEach((button) => button.setAttribute("aria-checked", String(button.dataset.mode === mode)));
+    document.querySelectorAll("[data-mode]").forEach((button) => button.setAttribute("aria-pressed", String(button.dataset.mode === mode)));
     update();
   }
 
