@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 import click
 
+from slatprep.cli.bench_read import read
 from slatprep.cli.output import Output, output_options
 
 if TYPE_CHECKING:
@@ -25,6 +26,9 @@ Example:
 )
 def bench() -> None:
     """Measure slatprep on this machine, side by side with what else there is."""
+
+
+bench.add_command(read)
 
 
 @bench.command(

@@ -278,7 +278,10 @@ class Store:
         """
         for needed in ("asset/id", "voxel/coords", name):
             self._metadata.setdefault(needed, self._array_metadata(needed))
-        sizes = dimension_sizes(self._metadata)
+        try:
+            sizes = dimension_sizes(self._metadata)
+        except StoreError as error:
+            raise StoreError(f"{self.path}/{error}") from None
         for finding in size_findings(name, self._metadata[name], sizes):
             raise StoreError(f"{self.path}/{finding}; run `slatprep verify`")
         return RowReader.of(self._folder, name, self._metadata[name])

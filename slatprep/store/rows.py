@@ -10,6 +10,7 @@ zarr-python reads the same bytes with far more work around them.
 from __future__ import annotations
 
 import os
+import stat
 import threading
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -78,7 +79,8 @@ class Folder:
         return FileIO(name, opener=self._open_at)
 
     def _open_at(self, name: str, flags: int) -> int:
-        return os.open(name, flags, dir_fd=self._descriptor)
+        # A pipe in a shard's place must not make the reader wait for a writer.
+        return os.open(name, flags | os.O_NONBLOCK, dir_fd=self._descriptor)
 
     def __del__(self) -> None:
         if getattr(self, "_descriptor", None) is not None:
@@ -246,14 +248,16 @@ class RowReader:
     def _open(self, number: int) -> _Shard:
         try:
             file = self.folder.open(self.key(number))
-            size = os.fstat(file.fileno()).st_size
+            state = os.fstat(file.fileno())
         except FileNotFoundError:
             if self.optional:
                 return _Shard(None, np.array([[MISSING, MISSING]], np.uint64))
             raise self._damaged(number, "is missing (was the store replaced?)") from None
         except OSError as error:
             raise self._damaged(number, f"cannot be read ({error.strerror})") from None
-        shard = _Shard(file, self._index(number, file, size))
+        if not stat.S_ISREG(state.st_mode):
+            raise self._damaged(number, "is no regular file")
+        shard = _Shard(file, self._index(number, file, state.st_size))
         # Two threads may both have opened it; whichever is kept is as good.
         self._shards[number] = shard
         for oldest in list(self._shards)[:-OPEN_SHARDS]:

@@ -1,0 +1,45 @@
+"""The benchmark of reading reads the same by every way."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+from slatprep.bench import read
+from slatprep.build import BuildSummary
+from slatprep.cli.commands import slatprep
+from slatprep.errors import StoreError
+from slatprep.store import open_store
+
+
+def test_every_way_reads_every_asset_alike(mixed_build: BuildSummary, tmp_path: Path) -> None:
+    store = open_store(mixed_build.store)
+    read.write_forms(store.path, tmp_path, len(store))
+    (tmp_path / "store").symlink_to(store.path)
+    for way in read.WAYS[:5]:
+        reader = way.open(tmp_path)
+        for row, asset in enumerate(store):
+            arrays = reader(row)
+            assert np.array_equal(arrays["coords"], asset.coords)
+            assert np.array_equal(arrays["feats"], asset.feats)
+            assert np.array_equal(arrays["properties"], asset.properties, equal_nan=True)
+
+
+def test_a_way_that_reads_something_else_is_not_measured(
+    mixed_build: BuildSummary, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    wrong = read.Way("npz", lambda _: lambda row: {"coords": np.zeros((3, 3))}, "npz")
+    monkeypatch.setattr(read, "WAYS", (wrong,))
+    with pytest.raises((StoreError, KeyError)):
+        read.bench_read(mixed_build.store, tmp_path, repeats=1)
+
+
+def test_the_command_gives_a_figure_for_every_way(mixed_build: BuildSummary) -> None:
+    call = ["bench", "read", str(mixed_build.store), "--assets", "2", "--repeats", "1", "--json"]
+    result = CliRunner().invoke(slatprep, [*call, "-q"], catch_exceptions=False)
+    ways = {way["name"]: way for way in json.loads(result.stdout)["ways"]}
+    assert set(ways) >= {"slatprep", "npz", "npz compressed", "one HDF5 file", "zarr-python"}
+    assert all(way["warm"] > 0 and way["warm_two"] > 0 for way in ways.values())
+    assert ways["npz"]["files"] == 2
