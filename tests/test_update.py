@@ -266,3 +266,20 @@ def test_a_dry_run_writes_nothing(built: tuple[Dataset, Path]) -> None:
     assert tree(out.parent) == added
     assert before.items() <= added.items()
     assert np.all([not path.name.startswith(".") for path in out.parent.iterdir()])
+
+
+def test_a_dry_run_at_the_shell(built: tuple[Dataset, Path]) -> None:
+    from click.testing import CliRunner
+
+    from slatprep.cli.commands import slatprep
+
+    dataset, out = built
+    sources = ["--pixieverse", dataset.root / "pixieverse", "--slat", dataset.root / "slat"]
+    command = [str(part) for part in ("build-store", *sources, "--out", out, "--dry-run")]
+    told = CliRunner().invoke(slatprep, [*command, "--json"])
+    assert told.exit_code == 0, told.output
+    document = json.loads(told.stdout)
+    assert document["actions"] == {"align": 0, "reuse": 3, "resume": 0, "refuse": 0, "remove": 0}
+    assert all(asset["reason"] == "unchanged" for asset in document["assets"])
+    shown = CliRunner().invoke(slatprep, command)
+    assert "nothing is written" in shown.stdout

@@ -22,8 +22,8 @@ from slatprep.store.reader import Store, open_store
 RECORD_ARRAY = "asset/record"
 
 RECORDS_IN_CHUNK = 64
-RECORDS_IN_SHARD = 4096
-"""About 40 MB of text: what the parent holds at a time."""
+RECORDS_IN_SHARD = 1024
+"""About 10 MB of text: what the parent holds at a time."""
 
 
 def create_record_array(root: Any, n_assets: int, level: int) -> None:

@@ -1,0 +1,142 @@
+"""What a build costs beside reading its inputs and writing the same arrays, and on what.
+
+    slatprep make-demo demo --assets 200
+    python benchmarks/build_cost.py demo/dataset.toml
+
+Times are CPU seconds of the process and its children, so that other work on
+the machine hardly matters; two jobs against one is wall clock and needs two
+free cores. Every step is run once before it is timed, so nothing is compiled.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import resource
+import shutil
+import tempfile
+import time
+from collections import defaultdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import zarr
+
+from slatprep import build, process
+from slatprep.config import load_parameters
+from slatprep.parameters import BuildParameters
+from slatprep.readers import discover
+from slatprep.store.layout import create_arrays
+
+STEPS = ("read_field", "read_latents", "align", "sample", "measure_ambiguity", "judge")
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("dataset", type=Path)
+    parser.add_argument("--no-jobs", action="store_true", help="leave out two jobs against one")
+    arguments = parser.parse_args()
+    parameters = load_parameters(arguments.dataset)
+    folder = Path(tempfile.mkdtemp(prefix="build-cost-"))
+    try:
+        report = measure(parameters, folder, jobs=not arguments.no_jobs)
+    finally:
+        shutil.rmtree(folder)
+    print(json.dumps(report, indent=2))
+
+
+def measure(parameters: BuildParameters, folder: Path, jobs: bool) -> dict[str, Any]:
+    pairs = list(discover(parameters))
+    for pair in pairs[:3]:
+        process.process_asset(pair, parameters)
+    steps: dict[str, float] = defaultdict(float)
+    for name in STEPS:
+        setattr(process, name, timed(getattr(process, name), steps, name))
+    for name in ("finish_asset", "_pack", "replace_directory"):
+        setattr(build, name, timed(getattr(build, name), steps, name))
+    begin = cpu()
+    summary = build.build_store(parameters, folder / "s.zarr")
+    whole = cpu() - begin
+    least = reading_alone(pairs) + writing_alone(folder / "s.zarr", folder / "w.zarr", parameters)
+    inside = sum(steps[name] for name in STEPS)
+    count = len(pairs)
+
+    def per_asset(seconds: float) -> float:
+        return round(1e3 * seconds / count, 1)
+
+    report = {
+        "assets": count,
+        "voxels": summary.n_voxels,
+        "build [CPU ms/asset]": per_asset(whole),
+        "read and write alone [CPU ms/asset]": per_asset(least),
+        "ratio": round(whole / least, 2),
+        **{f"{name} [CPU ms/asset]": per_asset(steps[name]) for name in STEPS},
+        "spool and records [CPU ms/asset]": per_asset(steps["finish_asset"] - inside),
+        "pack [CPU ms/asset]": per_asset(steps["_pack"]),
+        "flush and replace [CPU ms/asset]": per_asset(steps["replace_directory"]),
+        "peak memory of this process [MB]": round(
+            resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+        ),
+    }
+    if jobs:
+        walls = {}
+        for number in (1, 2):
+            begin = time.perf_counter()
+            build.build_store(parameters, folder / f"{number}.zarr", jobs=number)
+            walls[number] = time.perf_counter() - begin
+        report["wall, one job [s]"] = round(walls[1], 1)
+        report["wall, two jobs [s]"] = round(walls[2], 1)
+        report["two jobs over one"] = round(walls[1] / walls[2], 2)
+        children = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss
+        report["peak memory of a worker [MB]"] = round(children / 1024)
+    return report
+
+
+def reading_alone(pairs: list[Any]) -> float:
+    begin = cpu()
+    for pair in pairs:
+        np.load(pair.grid)
+        if pair.mask:
+            np.load(pair.mask)
+        with np.load(pair.slat) as arrays:
+            _ = [arrays[name] for name in arrays.files]
+    return cpu() - begin
+
+
+def writing_alone(built: Path, new: Path, parameters: BuildParameters) -> float:
+    """Write the arrays of a store again, a shard at a time, their values in memory."""
+    source = zarr.open_group(built, mode="r")
+    rows = source["voxel/coords"].shape[0]
+    begin = cpu()
+    root = zarr.create_group(new, zarr_format=3)
+    create_arrays(root, source["asset/id"].shape[0], rows, parameters.store)
+    spent = cpu() - begin
+    for group in ("asset", "voxel", "grid"):
+        for name, array in root[group].arrays():
+            step = (array.shards or array.chunks)[0]
+            for start in range(0, array.shape[0], step):
+                values = source[f"{group}/{name}"][start : start + step]
+                begin = cpu()
+                array[start : start + step] = values
+                spent += cpu() - begin
+    return spent
+
+
+def timed(function: Any, steps: dict[str, float], name: str) -> Any:
+    def wrapped(*args: Any, **kwargs: Any) -> Any:
+        begin = cpu()
+        try:
+            return function(*args, **kwargs)
+        finally:
+            steps[name] += cpu() - begin
+
+    return wrapped
+
+
+def cpu() -> float:
+    return time.process_time()
+
+
+if __name__ == "__main__":
+    main()
