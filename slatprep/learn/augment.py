@@ -1,0 +1,71 @@
+"""Augmentation that stays true: the symmetries of the voxel lattice.
+
+A quarter turn or a flip sends voxels to voxels, so it needs no interpolation,
+and each voxel keeps its own latents and targets. Young's modulus, density,
+Poisson's ratio and the class are scalars of an isotropic material: no turn and
+no mirror changes them. Nothing else is done here, because a scaled, sheared or
+jittered object would no longer have the voxels that its latents were made for.
+
+The latents themselves are carried along unchanged. Whether TRELLIS would have
+given the turned object the same ones is a property of TRELLIS and not known
+here, which is why augmentation is off unless asked for.
+"""
+
+from __future__ import annotations
+
+import itertools
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from slatprep.records import RESOLUTION
+
+Augmentation = Literal["none", "upright", "all"]
+
+
+def lattice_symmetries(kind: Augmentation) -> NDArray[np.int64]:
+    """Return the symmetries as signed permutation matrices.
+
+    Parameters
+    ----------
+    kind : {"none", "upright", "all"}
+        ``none`` is the identity; ``upright`` the 8 quarter turns about z and
+        flips that keep TRELLIS's z axis pointing up; ``all`` the 48 of the cube.
+
+    Returns
+    -------
+    ndarray of int64, shape (S, 3, 3)
+        The identity is the first.
+    """
+    matrices = []
+    for order in itertools.permutations(range(3)):
+        for signs in itertools.product((1, -1), repeat=3):
+            matrix = np.zeros((3, 3), np.int64)
+            matrix[range(3), order] = signs
+            matrices.append(matrix)
+    symmetries = np.stack(matrices)
+    if kind == "none":
+        return symmetries[:1]
+    return symmetries[symmetries[:, 2, 2] == 1] if kind == "upright" else symmetries
+
+
+def move(coords: NDArray[np.int32], symmetry: NDArray[np.int64]) -> NDArray[np.int32]:
+    """Move voxels by a symmetry about the centre of the grid.
+
+    Parameters
+    ----------
+    coords : ndarray of int32, shape (N, 3)
+        Voxels, 0 to 63.
+    symmetry : ndarray of int64, shape (3, 3)
+        Signed permutation matrix.
+
+    Returns
+    -------
+    ndarray of int32, shape (N, 3)
+        Voxel centres ``(i + 0.5) / 64 - 0.5`` times the matrix, as indices again.
+    """
+    # Twice the distance from the centre is an odd integer, so all is exact.
+    doubled = 2 * coords.astype(np.int64) - (RESOLUTION - 1)
+    moved = doubled @ symmetry.T
+    return ((moved + (RESOLUTION - 1)) // 2).astype(np.int32)

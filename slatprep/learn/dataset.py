@@ -1,0 +1,291 @@
+"""A store as a PyTorch dataset, and batches in the form of TRELLIS's sparse tensors."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterator, Sequence
+from dataclasses import dataclass, fields, replace
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.utils.data import DataLoader, Dataset, Sampler
+
+from slatprep.errors import ConfigError
+from slatprep.learn.augment import Augmentation, lattice_symmetries, move
+from slatprep.learn.splits import Shares, Split, select_assets
+from slatprep.records import UNANNOTATED
+from slatprep.store import Store, open_store
+
+FEATS_MEAN = (-2.1688, -0.0043, -0.1335, -0.0842, -0.5271, 0.7239, -1.1414, 1.2039)
+FEATS_STD = (2.3777, 2.3864, 2.1244, 2.1749, 2.6639, 2.3712, 2.6217, 2.6845)
+"""What TRELLIS publishes for ``slat_flow_img_dit_L_64l8p2_fp16``."""
+
+IGNORED = -100
+"""Class of a voxel without annotation: what `torch.nn.functional.cross_entropy` passes over."""
+
+_COLUMNS = ("coords", "feats", "properties", "material", "valid")
+
+
+class Draw(NamedTuple):
+    """One asset of one epoch; the epoch decides its augmentation."""
+
+    index: int
+    epoch: int
+
+
+@dataclass
+class Item:
+    """One asset as tensors.
+
+    Attributes
+    ----------
+    asset_id : str
+        Id of the row.
+    coords : Tensor of int32, shape (N, 3)
+        SLAT voxels.
+    feats : Tensor of float32, shape (N, 8)
+        Latents, standardised with TRELLIS's mean and standard deviation.
+    properties : Tensor of float32, shape (N, 3)
+        Young's modulus, density, Poisson's ratio in [-1, 1]; 0 where not valid.
+    material : Tensor of int64, shape (N,)
+        Class 0..6; -100 where not valid.
+    valid : Tensor of bool, shape (N,)
+        Where the targets mean something.
+    """
+
+    asset_id: str
+    coords: Tensor
+    feats: Tensor
+    properties: Tensor
+    material: Tensor
+    valid: Tensor
+
+
+@dataclass
+class SparseBatch:
+    """Assets one after the other, as TRELLIS's ``SparseTensor`` has them.
+
+    ``SparseTensor(feats=batch.feats, coords=batch.coords)`` is one.
+
+    Attributes
+    ----------
+    asset_ids : list of str
+        One for each value of the batch column.
+    coords : Tensor of int32, shape (N, 4)
+        Batch column, then the voxel.
+    feats, properties, material, valid : Tensor
+        As in `Item`, of N rows.
+    """
+
+    asset_ids: list[str]
+    coords: Tensor
+    feats: Tensor
+    properties: Tensor
+    material: Tensor
+    valid: Tensor
+
+    @property
+    def layout(self) -> list[slice]:
+        """Rows of each asset, as ``SparseTensor.layout``."""
+        counts = torch.bincount(self.coords[:, 0].long(), minlength=len(self.asset_ids))
+        stops = np.cumsum(counts.tolist()).tolist()
+        return [slice(a, b) for a, b in zip([0, *stops[:-1]], stops, strict=True)]
+
+    def to(self, device: torch.device | str) -> SparseBatch:
+        """Return the batch on a device."""
+        tensors = {f.name: getattr(self, f.name) for f in fields(self) if f.name != "asset_ids"}
+        moved = {name: tensor.to(device, non_blocking=True) for name, tensor in tensors.items()}
+        return replace(self, **moved)
+
+    def pin_memory(self) -> SparseBatch:
+        """Return the batch in pinned memory; `DataLoader` calls this."""
+        tensors = {f.name: getattr(self, f.name) for f in fields(self) if f.name != "asset_ids"}
+        return replace(self, **{name: tensor.pin_memory() for name, tensor in tensors.items()})
+
+
+class SlatDataset(Dataset[Item]):
+    """The assets of one split of a store.
+
+    Parameters
+    ----------
+    store : Store or path
+        An open store, or where one lies. Worker processes, forked or spawned,
+        each read it for themselves.
+    split : {"train", "val", "test"}, optional
+        Which objects, as `slatprep.learn.splits.split_of` decides; all if not given.
+    shares : Shares
+        Shares of the splits.
+    verdicts : collection of str, optional
+        Verdicts that are good enough; all if not given.
+    max_ambiguity : float, optional
+        Largest ambiguity that is good enough.
+    augmentation : {"none", "upright", "all"}
+        Symmetries of the lattice to draw from, see `slatprep.learn.augment`.
+    seed : int
+        Decides, with the epoch and the asset's id, which symmetry is drawn.
+
+    Raises
+    ------
+    ConfigError
+        If no asset is left.
+    StoreError
+        If the store cannot be read.
+    """
+
+    def __init__(
+        self,
+        store: Store | str | Path,
+        split: Split | None = None,
+        *,
+        shares: Shares = Shares(),  # noqa: B008 (immutable)
+        verdicts: Collection[str] | None = None,
+        max_ambiguity: float | None = None,
+        augmentation: Augmentation = "none",
+        seed: int = 0,
+    ) -> None:
+        self.store = store if isinstance(store, Store) else open_store(store)
+        self.indices = select_assets(
+            self.store, split, shares=shares, verdicts=verdicts, max_ambiguity=max_ambiguity
+        )
+        if len(self.indices) == 0:
+            raise ConfigError(
+                f"{self.store.path} has no asset of split {split or 'all'} that passes the "
+                f"filter, of {len(self.store)} in all; expected one at least: "
+                "loosen the filter or change the shares"
+            )
+        self.asset_ids = [self.store.ids[index] for index in self.indices]
+        self.seed = seed
+        self._symmetries = lattice_symmetries(augmentation)
+        self._mean = np.array(FEATS_MEAN, np.float32)
+        self._std = np.array(FEATS_STD, np.float32)
+
+    def __len__(self) -> int:
+        return len(self.indices)
+
+    def __getitem__(self, key: int | Draw) -> Item:
+        draw = key if isinstance(key, Draw) else Draw(key, 0)
+        if not 0 <= draw.index < len(self):
+            raise IndexError(f"asset {draw.index} of {len(self)}")
+        rows = self.store.read(int(self.indices[draw.index]), _COLUMNS)
+        asset_id = self.asset_ids[draw.index]
+        valid = rows["valid"]
+        material = rows["material"].astype(np.int64)
+        material[~valid | (rows["material"] == UNANNOTATED)] = IGNORED
+        return Item(
+            asset_id,
+            torch.from_numpy(move(rows["coords"].astype(np.int32), self._symmetry(asset_id, draw))),
+            torch.from_numpy((rows["feats"] - self._mean) / self._std),
+            torch.from_numpy(np.where(valid[:, None], rows["properties"], np.float32(0))),
+            torch.from_numpy(material),
+            torch.from_numpy(valid),
+        )
+
+    def _symmetry(self, asset_id: str, draw: Draw) -> np.ndarray:
+        # Not from a worker's own generator: the draw must not depend on how many there are.
+        words = np.frombuffer(asset_id.encode("utf-8").ljust(4, b"\0"), np.uint8)
+        rng = np.random.default_rng([self.seed, draw.epoch, *words.tolist()])
+        return np.asarray(self._symmetries[rng.integers(len(self._symmetries))])
+
+
+def collate(items: Sequence[Item]) -> SparseBatch:
+    """Make one sparse batch of several assets.
+
+    Parameters
+    ----------
+    items : sequence of Item
+        One at least.
+    """
+    coords = [
+        torch.nn.functional.pad(item.coords, (1, 0), value=number)
+        for number, item in enumerate(items)
+    ]
+    return SparseBatch(
+        [item.asset_id for item in items],
+        torch.cat(coords),
+        *(
+            torch.cat([getattr(item, name) for item in items])
+            for name in ("feats", "properties", "material", "valid")
+        ),
+    )
+
+
+class EpochSampler(Sampler[Draw]):
+    """Every asset once, in an order that seed and epoch decide.
+
+    Parameters
+    ----------
+    length : int
+        Number of assets.
+    shuffle : bool
+        In the order of the store if False.
+    seed : int
+        With the epoch, decides the order.
+    """
+
+    def __init__(self, length: int, *, shuffle: bool, seed: int) -> None:
+        self.length, self.shuffle, self.seed = length, shuffle, seed
+        self.epoch = 0
+
+    def __len__(self) -> int:
+        return self.length
+
+    def __iter__(self) -> Iterator[Draw]:
+        order = np.arange(self.length)
+        if self.shuffle:
+            order = np.random.default_rng([self.seed, self.epoch]).permutation(self.length)
+        return (Draw(int(index), self.epoch) for index in order)
+
+
+class SlatLoader(DataLoader[Item]):
+    """Batches of a `SlatDataset`, the same ones whatever the number of workers.
+
+    Parameters
+    ----------
+    dataset : SlatDataset
+        What to load.
+    batch_size : int
+        Assets in a batch; the last may have fewer.
+    shuffle : bool
+        A new order each epoch, which the dataset's seed decides.
+    workers : int
+        Processes that read ahead; 0 reads in this one.
+    start_method : {"fork", "spawn", "forkserver"}, optional
+        How they start; the platform's way if not given.
+    pin_memory : bool
+        For a GPU.
+
+    Examples
+    --------
+    >>> loader = SlatLoader(SlatDataset("demo.zarr", "train"), 4)  # doctest: +SKIP
+    >>> for epoch in range(10):  # doctest: +SKIP
+    ...     loader.set_epoch(epoch)
+    ...     for batch in loader:
+    ...         print(batch.coords.shape, batch.feats.shape)
+    """
+
+    def __init__(
+        self,
+        dataset: SlatDataset,
+        batch_size: int = 1,
+        *,
+        shuffle: bool = False,
+        workers: int = 0,
+        start_method: str | None = None,
+        pin_memory: bool = False,
+    ) -> None:
+        self.order = EpochSampler(len(dataset), shuffle=shuffle, seed=dataset.seed)
+        super().__init__(
+            dataset,
+            batch_size,
+            sampler=self.order,
+            num_workers=workers,
+            collate_fn=collate,
+            multiprocessing_context=start_method if workers else None,
+            pin_memory=pin_memory,
+        )
+
+    def set_epoch(self, epoch: int) -> None:
+        """Choose the epoch, which decides order and augmentation."""
+        self.order.epoch = epoch

@@ -1,0 +1,152 @@
+"""The loader: splits, batches, workers, symmetries."""
+
+from __future__ import annotations
+
+import hashlib
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+import zarr
+from hypothesis import given
+from hypothesis import strategies as st
+
+from slatprep import ConfigError, open_store
+from slatprep.geometry import voxel_centres
+from slatprep.learn.augment import lattice_symmetries, move
+from slatprep.learn.splits import select_assets
+from slatprep.torch import (
+    FEATS_MEAN,
+    FEATS_STD,
+    IGNORED,
+    Shares,
+    SlatDataset,
+    SlatLoader,
+    SparseBatch,
+    collate,
+    split_of,
+)
+
+THIRDS = Shares(0.4, 0.3, 0.3)
+
+
+@given(st.text(), st.tuples(st.integers(0, 100), st.integers(1, 100), st.integers(1, 100)))
+def test_split_is_where_the_hash_falls(object_id: str, parts: tuple[int, int, int]) -> None:
+    total = sum(parts)
+    shares = Shares(parts[0] / total, parts[1] / total, 1 - (parts[0] + parts[1]) / total)
+    position = int(hashlib.sha256(object_id.encode()).hexdigest()[:16], 16) / 2**64
+    edges = np.array([shares.train, shares.train + shares.val])
+    expected = ("train", "val", "test")[int(np.searchsorted(edges, position, side="right"))]
+    if np.abs(edges - position).min() > 1e-9:
+        assert split_of(object_id, shares) == expected
+
+
+def test_shares_are_kept_on_many_objects() -> None:
+    found = [split_of(f"{k:032x}") for k in range(20_000)]
+    assert [found.count(s) / 20_000 for s in ("train", "val", "test")] == pytest.approx(
+        [0.8, 0.1, 0.1], abs=0.01
+    )
+
+
+def test_splits_part_the_store_and_keep_views_together(learn_store: Path) -> None:
+    store = open_store(learn_store)
+    parts = [select_assets(store, split, shares=THIRDS) for split in ("train", "val", "test")]
+    assert sorted(np.concatenate(parts).tolist()) == list(range(len(store)))
+    views = {store.find("h.front"), store.find("h.side")}
+    assert [len(views & set(part.tolist())) for part in parts].count(2) == 1
+
+
+def test_filters(learn_store: Path) -> None:
+    store = open_store(learn_store)
+    good = select_assets(store, verdicts=("good",))
+    assert good.tolist() == np.flatnonzero(store.column("verdict").astype(str) == "good").tolist()
+    limit = float(np.median(store.column("ambiguity")))
+    kept = select_assets(store, max_ambiguity=limit)
+    assert kept.tolist() == np.flatnonzero(store.column("ambiguity") <= limit).tolist()
+    with pytest.raises(ConfigError, match="expected good, doubtful or failed"):
+        select_assets(store, verdicts=("fine",))
+    with pytest.raises(ConfigError, match="add up to 1"):
+        Shares(0.5, 0.1, 0.1)
+    with pytest.raises(ConfigError, match="no asset"):
+        SlatDataset(store, "train", shares=Shares(0.0, 0.0, 1.0))
+
+
+def test_batch_is_what_zarr_reads(learn_store: Path) -> None:
+    dataset = SlatDataset(learn_store)
+    batch = collate([dataset[k] for k in range(3)])
+    root = zarr.open_group(learn_store, mode="r")
+    offset = np.asarray(root["asset/offset"])
+    rows = np.s_[: offset[3]]
+    assert batch.asset_ids == np.asarray(root["asset/id"])[:3].tolist()
+    assert batch.coords.dtype == torch.int32
+    assert batch.coords[:, 0].tolist() == np.repeat(range(3), np.diff(offset[:4])).tolist()
+    np.testing.assert_array_equal(batch.coords[:, 1:], root["voxel/coords"][rows])
+    feats = (root["voxel/feats"][rows] - np.array(FEATS_MEAN)) / np.array(FEATS_STD)
+    np.testing.assert_allclose(batch.feats, feats, rtol=1e-5, atol=1e-6)
+    valid = root["voxel/valid"][rows]
+    np.testing.assert_array_equal(batch.valid, valid)
+    np.testing.assert_array_equal(
+        batch.properties, np.nan_to_num(root["voxel/properties"][rows], nan=0.0)
+    )
+    material = np.where(valid, root["voxel/material"][rows].astype(int), IGNORED)
+    np.testing.assert_array_equal(batch.material, material)
+    assert [(s.start, s.stop) for s in batch.layout] == list(
+        zip(offset[:3].tolist(), offset[1:4].tolist(), strict=True)
+    )
+
+
+def epochs(loader: SlatLoader) -> list[SparseBatch]:
+    batches = []
+    for epoch in (0, 1):
+        loader.set_epoch(epoch)
+        batches += list(loader)
+    return batches
+
+
+@pytest.mark.parametrize(("workers", "method"), [(2, "fork"), (1, "spawn")])
+def test_workers_change_nothing(learn_store: Path, workers: int, method: str) -> None:
+    dataset = SlatDataset(learn_store, augmentation="all", seed=3)
+    alone = epochs(SlatLoader(dataset, 2, shuffle=True))
+    shared = epochs(SlatLoader(dataset, 2, shuffle=True, workers=workers, start_method=method))
+    assert [b.asset_ids for b in alone] == [b.asset_ids for b in shared]
+    for ours, theirs in zip(alone, shared, strict=True):
+        for name in ("coords", "feats", "properties", "material", "valid"):
+            assert torch.equal(getattr(ours, name), getattr(theirs, name)), name
+    first, second = ([i for b in half for i in b.asset_ids] for half in (alone[:5], alone[5:]))
+    assert sorted(first) == sorted(second) == dataset.asset_ids
+    assert first != second
+
+
+def test_symmetries_are_the_groups_they_should_be() -> None:
+    for kind, size in (("none", 1), ("upright", 8), ("all", 48)):
+        matrices = lattice_symmetries(kind)
+        known = {m.tobytes() for m in matrices}
+        assert len(known) == len(matrices) == size
+        assert np.array_equal(matrices[0], np.eye(3))
+        assert all((a @ b).tobytes() in known for a in matrices for b in matrices)
+        assert all(np.array_equal(m @ m.T, np.eye(3)) for m in matrices)
+
+
+def test_moving_turns_the_centres() -> None:
+    coords = np.random.default_rng(0).integers(0, 64, (50, 3)).astype(np.int32)
+    for matrix in lattice_symmetries("all"):
+        moved = move(coords, matrix)
+        np.testing.assert_allclose(
+            voxel_centres(moved.astype(np.uint8)),
+            voxel_centres(coords.astype(np.uint8)) @ matrix.T,
+            atol=1e-12,
+        )
+
+
+def test_augmentation_moves_coordinates_and_nothing_else(learn_store: Path) -> None:
+    plain, turned = SlatDataset(learn_store), SlatDataset(learn_store, augmentation="all", seed=1)
+    moved = 0
+    for k in range(len(plain)):
+        for name in ("feats", "properties", "material", "valid"):
+            assert torch.equal(getattr(plain[k], name), getattr(turned[k], name))
+        moved += not torch.equal(plain[k].coords, turned[k].coords)
+        # Voxels stay as far from one another as they were, all of them.
+        a, b = (item.coords[::7].double() for item in (plain[k], turned[k]))
+        assert torch.equal(torch.cdist(a, a).round(decimals=6), torch.cdist(b, b).round(decimals=6))
+    assert moved > len(plain) // 2
