@@ -21,6 +21,7 @@ COMMANDS = {
     "report": "slatprep.cli.report:report",
     "score": "slatprep.cli.score:score",
     "export": "slatprep.cli.export:export",
+    "transfer": "slatprep.cli.transfer:transfer",
     "describe": "slatprep.cli.describe:describe",
     "bench": "slatprep.cli.bench:bench",
 }

@@ -34,6 +34,9 @@ VERTEX = np.dtype(
 
 _TYPE_NAMES = {"<f4": "float", "<i4": "int", "|u1": "uchar"}
 
+UNITS = "density kg/m^3, E Pa, nu 1"
+"""The comment by which every PLY written here states its units."""
+
 _COMMENTS = {
     "slat": "frame SLAT, unit cube -0.5..0.5, z up",
     "pixieverse": "frame PixieVerse, world coordinates of its bounds",
@@ -89,6 +92,35 @@ def write_asset(
         positions = to_world(in_pixieverse, bounds.get(asset.asset_id, UNIT_CUBE))
     else:
         positions = in_slat
+    write_points(path, positions, material, values, conf, _COMMENTS[frame])
+    return len(material)
+
+
+def write_points(
+    path: Path,
+    positions: NDArray[np.floating],
+    material: NDArray[np.uint8],
+    properties: NDArray[np.float32],
+    conf: NDArray[np.floating],
+    frame: str,
+) -> None:
+    """Write annotated points as Pixie does.
+
+    Parameters
+    ----------
+    path : Path
+        The file.
+    positions : ndarray of float, shape (N, 3)
+        Where they lie.
+    material : ndarray of uint8, shape (N,)
+        Class of each, 0..7.
+    properties : ndarray of float32, shape (N, 3)
+        Young's modulus [Pa], density [kg/m^3], Poisson's ratio.
+    conf : ndarray of float, shape (N,)
+        Confidence in 0..1.
+    frame : str
+        What the file says of the frame, in one line.
+    """
     vertices = np.zeros(len(material), dtype=VERTEX)
     for axis, name in enumerate("xyz"):
         vertices[name] = positions[:, axis]
@@ -96,11 +128,10 @@ def write_asset(
     for channel, name in enumerate(("red", "green", "blue")):
         vertices[name] = colours[material, channel]
     vertices["alpha"] = 255
-    vertices["E"], vertices["density"], vertices["nu"] = values.T
+    vertices["E"], vertices["density"], vertices["nu"] = properties.T
     vertices["material_id"] = vertices["part_label"] = material
     vertices["conf"] = conf
-    _write(path, vertices, (_COMMENTS[frame], "density kg/m^3, E Pa, nu 1"))
-    return len(vertices)
+    _write(path, vertices, (frame, UNITS))
 
 
 def to_world(points: ArrayLike, bounds: Bounds) -> NDArray[np.float64]:

@@ -57,14 +57,21 @@ def read_latents(pair: AssetPair) -> StructuredLatents:
         raise InputError(where, "the SLAT is empty", "at least one voxel")
     warnings: list[str] = []
     return StructuredLatents(
-        coords=_check_coords(coords, where),
+        coords=check_coords(coords, where),
         feats=_check_feats(feats, where, warnings),
         sources=(source,),
         warnings=tuple(warnings),
     )
 
 
-def _check_coords(coords: NDArray[Any], where: str | Path) -> NDArray[np.uint8]:
+def check_coords(coords: NDArray[Any], where: str | Path) -> NDArray[np.uint8]:
+    """Return SLAT coordinates as (N, 3) uint8, without the batch column where there is one.
+
+    Raises
+    ------
+    InputError
+        If one is out of range or occurs twice, or there is more than one asset.
+    """
     if coords.shape[1] == 4:
         batch = coords[:, 0]
         if batch.any():

@@ -1,0 +1,118 @@
+"""`slatprep transfer`: materials at the particles that a simulation moves."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from slatprep.cli.options import store_option
+from slatprep.cli.output import Output, output_options
+from slatprep.errors import ConfigError
+
+if TYPE_CHECKING:
+    from slatprep.transfer import VoxelField
+
+_FILE = click.Path(path_type=Path, exists=True, dir_okay=False)
+
+
+@click.command(
+    epilog="""\b
+Example:
+  slatprep transfer gaussians.ply --store demo.zarr --asset 0a1b2c --out materials.ply
+  slatprep transfer solid.npy --store demo.zarr --asset 0a1b2c --points grid --out solid.ply
+  slatprep transfer gaussians.ply --prediction 0a1b2c.npz --store demo.zarr --out predicted.ply
+"""
+)
+@click.argument("particles", type=_FILE)
+@store_option
+@click.option("--asset", metavar="ID", help="The asset of the store.")
+@click.option("--prediction", type=_FILE, metavar="FILE.npz",
+              help="Predicted materials instead of an asset: coords, material, and properties "
+              "(normalised as --store or --ranges says) or properties_si.")  # fmt: skip
+@click.option("--ranges", metavar="pixie|FILE", help="Ranges of a prediction's properties.")
+@click.option("--out", required=True, type=click.Path(path_type=Path, dir_okay=False),
+              metavar="FILE.ply",
+              help="Where to write the particles with their materials.")  # fmt: skip
+@click.option("--points", type=click.Choice(["slat", "grid"]), default="slat", show_default=True,
+              help="Take an asset's materials from its SLAT voxels, a surface, or from its "
+              "PixieVerse field, a solid.")  # fmt: skip
+@click.option("--axes", type=click.Choice(["trellis", "slat"]),
+              help="Frame of the particles: turned as TRELLIS saves Gaussians, or the SLAT's."
+              "  [default: trellis for a PLY of Gaussians, else slat]")  # fmt: skip
+@click.option("--frame", type=click.Choice(["file", "slat"]), default="file", show_default=True,
+              help="Write positions as the particles' file has them, or in the SLAT "
+              "frame.")  # fmt: skip
+@click.option("--max-distance", type=click.FloatRange(min=0, min_open=True), default=2.0,
+              show_default=True, metavar="VOXELS",
+              help="A particle without a voxel this near is far.")  # fmt: skip
+@click.option("--far", type=click.Choice(["background", "drop", "nearest"]), default="background",
+              show_default=True, help="Give far particles class 7 and properties 0, leave them "
+              "out, or give them the nearest material.")  # fmt: skip
+@output_options
+def transfer(
+    output: Output,
+    particles: Path,
+    store: Path | None,
+    asset: str | None,
+    prediction: Path | None,
+    ranges: str | None,
+    out: Path,
+    points: Any,
+    axes: Any,
+    frame: str,
+    max_distance: float,
+    far: Any,
+) -> None:
+    """Give each particle of PARTICLES the material of the nearest voxel.
+
+    PARTICLES is a PLY of Gaussians as TRELLIS saves it, any other PLY with
+    x, y and z, or an npy or npz of positions. What is written is a PLY with
+    the fields of Pixie's material fields, in SI units, for PhysGaussian.
+    """
+    from slatprep import transfer as work
+
+    field = _field(store, asset, prediction, ranges, points)
+    read = work.read_particles(particles, axes)
+    result = work.transfer(read.in_slat(), field, max_distance=max_distance, far=far)
+    work.write_transferred(out, read, result, max_distance=max_distance, in_slat=frame == "slat")
+    if result.far:
+        output.note(
+            f"{result.far:,} of {len(read.positions):,} particles have no voxel within "
+            f"{max_distance:g} voxels: {far}"
+        )
+    counts = {
+        "particles": len(read.positions),
+        "axes": read.axes,
+        "written": len(result.rows),
+        "far": result.far,
+    }
+
+    def show() -> None:
+        output.table(f"Transferred to {out}", tuple(counts), [tuple(counts.values())])
+
+    output.result({"path": out, **counts}, show)
+
+
+def _field(
+    store: Path | None, asset: str | None, prediction: Path | None, ranges: str | None, points: Any
+) -> VoxelField:
+    from slatprep.normalize import PIXIE_RANGES, read_ranges
+    from slatprep.store import open_store
+    from slatprep.transfer import predicted_field, stored_field
+
+    if (asset is None) == (prediction is None):
+        raise ConfigError("expected either --asset, with --store, or --prediction")
+    if asset is not None:
+        if store is None or ranges is not None:
+            raise ConfigError("--asset needs --store, which knows the ranges; --ranges does not go")
+        return stored_field(open_store(store), asset, points)
+    if points != "slat" or (store is not None and ranges is not None):
+        raise ConfigError("--prediction goes with --store or --ranges, and without --points grid")
+    normalization = None
+    if ranges is not None:
+        normalization = PIXIE_RANGES if ranges == "pixie" else read_ranges(Path(ranges))
+    elif store is not None:
+        normalization = open_store(store).normalization
+    return predicted_field(prediction, normalization)  # type: ignore[arg-type]

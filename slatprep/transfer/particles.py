@@ -1,0 +1,126 @@
+"""Read particles: Gaussians as TRELLIS saves them, or plain points."""
+
+from __future__ import annotations
+
+import zipfile
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from slatprep.errors import InputError, SlatprepError
+
+Axes = Literal["trellis", "slat"]
+
+SAVED_AXES = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
+"""What TRELLIS multiplies positions with as it saves them (``Gaussian.save_ply``)."""
+
+_GAUSSIAN = ("f_dc_0", "opacity", "scale_0", "rot_0")
+_KEYS = ("positions", "points", "xyz")
+
+
+@dataclass(frozen=True)
+class Particles:
+    """Particles as their file has them.
+
+    Attributes
+    ----------
+    positions : ndarray of float64, shape (N, 3)
+        As in the file.
+    axes : {"trellis", "slat"}
+        The frame of the file: turned as TRELLIS saves Gaussians, or the SLAT's.
+    """
+
+    positions: NDArray[np.float64]
+    axes: Axes
+
+    def in_slat(self) -> NDArray[np.float64]:
+        """Return the positions (N, 3) in the SLAT frame."""
+        # The transpose is the inverse; a row vector is multiplied from the right.
+        return self.positions @ SAVED_AXES if self.axes == "trellis" else self.positions
+
+
+def read_particles(path: Path, axes: Axes | None = None) -> Particles:
+    """Read particles from a file.
+
+    Parameters
+    ----------
+    path : Path
+        A PLY with ``x y z``; an npy of shape (N, 3); or an npz that holds such
+        an array as ``positions``, ``points`` or ``xyz``.
+    axes : {"trellis", "slat"}, optional
+        The frame of the file. By default a PLY with the fields of Gaussians
+        (``f_dc_0``, ``opacity``, ``scale_0``, ``rot_0``) is as TRELLIS saves
+        it, and everything else in the SLAT frame.
+
+    Returns
+    -------
+    Particles
+        At least one, all finite.
+
+    Raises
+    ------
+    InputError
+        If the file cannot be used.
+    SlatprepError
+        If a PLY is to be read and plyfile is not installed.
+    """
+    path = Path(path)
+    if path.suffix.lower() == ".ply":
+        positions, gaussian = _read_ply(path)
+    else:
+        positions, gaussian = _read_numpy(path), False
+    if len(positions) == 0:
+        raise InputError(path, "holds no particles", "at least one")
+    finite = np.isfinite(positions).all(axis=1)
+    if not finite.all():
+        row = int(np.argmin(finite))
+        raise InputError(
+            path, f"particle {row} lies at {positions[row].tolist()}", "finite x, y, z"
+        )
+    return Particles(positions, axes or ("trellis" if gaussian else "slat"))
+
+
+def _read_ply(path: Path) -> tuple[NDArray[np.float64], bool]:
+    try:
+        import plyfile
+    except ImportError as error:
+        raise SlatprepError(
+            "reading a PLY needs the package plyfile; install it with "
+            "`pip install 'slatprep[simulate]'`"
+        ) from error
+    try:
+        vertex = plyfile.PlyData.read(path)["vertex"].data
+    except (OSError, KeyError, ValueError, UnicodeDecodeError, plyfile.PlyParseError) as error:
+        raise InputError(
+            path, f"is no readable PLY with vertices ({error})", "a PLY of Gaussians or points"
+        ) from None
+    names = vertex.dtype.names or ()
+    if not {"x", "y", "z"} <= set(names):
+        raise InputError(path, f"has vertices of {', '.join(names)}", "fields x, y and z")
+    positions = np.column_stack([np.asarray(vertex[axis], dtype=np.float64) for axis in "xyz"])
+    return positions, set(_GAUSSIAN) <= set(names)
+
+
+def _read_numpy(path: Path) -> NDArray[np.float64]:
+    try:
+        loaded: Any = np.load(path, allow_pickle=False)
+        if not isinstance(loaded, np.ndarray):
+            with loaded:
+                held = [key for key in _KEYS if key in loaded.files]
+                if len(held) != 1:
+                    raise InputError(
+                        path,
+                        f"holds {', '.join(loaded.files) or 'nothing'}",
+                        f"one array named {' or '.join(_KEYS)}",
+                    )
+                loaded = loaded[held[0]]
+    except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
+        raise InputError(
+            path, f"cannot be read ({error})", "particles as PLY, npy or npz"
+        ) from None
+    if loaded.ndim != 2 or loaded.shape[1] != 3 or loaded.dtype.kind not in "fiu":
+        raise InputError(path, f"has shape {loaded.shape}, dtype {loaded.dtype}", "numbers (N, 3)")
+    return np.asarray(loaded, dtype=np.float64)
