@@ -142,8 +142,8 @@ class StoreParameters:
     __pydantic_config__: ClassVar[dict[str, str]] = _FORBID_UNKNOWN
 
     voxel_chunk: int = 4_096
-    voxel_chunks_per_shard: int = 256
-    grid_assets_per_shard: int = 32
+    voxel_chunks_per_shard: int = 4_096
+    grid_assets_per_shard: int = 512
     compression_level: int = 1
 
 

@@ -150,7 +150,7 @@ def content_size(data: memoryview | bytes, compressor: str) -> int:
 def _unpack(payload: memoryview, compressor: str, out: NDArray[Any]) -> None:
     """Unpack into memory of the size that `content_size` gave."""
     if compressor == "blosc":
-        _blosc().decompress(payload, out)
+        single_threaded_blosc().decompress(payload, out)
     elif compressor == "zstd":
         from numcodecs import zstd
 
@@ -160,10 +160,11 @@ def _unpack(payload: memoryview, compressor: str, out: NDArray[Any]) -> None:
 
 
 @cache
-def _blosc() -> Any:
+def single_threaded_blosc() -> Any:
+    """Return numcodecs' blosc, with its own threads turned off."""
     from numcodecs import blosc
 
-    # Training loaders read in many processes and threads; a pool of threads
-    # in each would only get in their way, and does not survive a fork.
+    # Workers and training loaders are processes enough; a pool of threads in
+    # each would only get in their way, and does not survive a fork.
     blosc.use_threads = False
     return blosc

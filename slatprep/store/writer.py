@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -18,7 +19,7 @@ from numpy.typing import NDArray
 
 from slatprep.normalize import normalize, normalize_change
 from slatprep.parameters import StoreParameters
-from slatprep.records import RESOLUTION, Normalization
+from slatprep.records import Normalization
 from slatprep.store.asset_records import create_record_array
 from slatprep.store.digests import write_digests
 from slatprep.store.layout import (
@@ -29,10 +30,11 @@ from slatprep.store.layout import (
     row_ranges,
     rows_per_shard,
 )
+from slatprep.store.shard_writer import ShardWriter
 from slatprep.store.spool import Spool, SpooledAsset
 
-Rows = tuple[dict[str, NDArray[Any]], NDArray[np.int64]]
-"""Rows of the arrays of a group, and the values clipped of each asset and property."""
+Rows = tuple[int, dict[str, NDArray[Any]], NDArray[np.int64]]
+"""An asset by its place in the shard, its rows of the group's arrays, and the values clipped."""
 
 
 @dataclass(frozen=True)
@@ -74,12 +76,12 @@ def shards(
     keys: Sequence[str], offsets: Sequence[int], parameters: StoreParameters
 ) -> Iterator[Shard]:
     """Yield every shard of a store whose assets, by key, begin at rows `offsets`."""
-    for start, stop in row_ranges(len(keys), parameters.grid_assets_per_shard):
-        yield Shard("grid", (start, stop), start, keys[start:stop])
     for start, stop in row_ranges(offsets[-1], rows_per_shard(parameters)):
         owners = [asset for asset, _ in overlaps(offsets, start, stop)]
         first, last = owners[0], owners[-1] + 1
         yield Shard("voxel", (start, stop), first, keys[first:last], offsets[first : last + 1])
+    for start, stop in row_ranges(len(keys), parameters.grid_assets_per_shard):
+        yield Shard("grid", (start, stop), start, keys[start:stop])
 
 
 def write_shard(
@@ -105,46 +107,37 @@ def write_shard(
     clipped : ndarray of int64, shape (len(shard.keys), 3)
         How many of the values written lay outside the range, by property.
     """
-    import zarr
-
-    read = _grid_rows if shard.group == "grid" else _voxel_rows
-    arrays, clipped = read(spool, shard, normalization)
-    start, stop = shard.rows
-    # Workers are the parallelism; zarr's own thread pool would oversubscribe.
-    settings = {
-        "async.concurrency": 1,
-        "threading.max_workers": 1,
-        # A chunk of fill values alone is written too, so that a missing one is always a fault.
-        "array.write_empty_chunks": True,
-    }
-    with zarr.config.set(settings):
-        group = _open(path)[shard.group]
-        for name, rows in arrays.items():
-            group[name][start:stop] = rows
+    clipped = np.zeros((len(shard.keys), 3), dtype=np.int64)
+    with ExitStack() as stack:
+        writers = {
+            layout.name.partition("/")[2]: stack.enter_context(
+                ShardWriter(path, layout.name, shard.rows[0])
+            )
+            for layout in ARRAYS
+            if layout.name.startswith(f"{shard.group}/")
+        }
+        read = _grid_rows if shard.group == "grid" else _voxel_rows
+        for asset, arrays, counts in read(spool, shard, normalization):
+            clipped[asset] = counts
+            for name, rows in arrays.items():
+                writers[name].append(rows)
     return shard, clipped
 
 
-def _voxel_rows(spool: Spool, shard: Shard, normalization: Normalization) -> Rows:
-    parts: dict[str, list[NDArray[Any]]] = {}
-    clipped = np.zeros((len(shard.keys), 3), dtype=np.int64)
+def _voxel_rows(spool: Spool, shard: Shard, normalization: Normalization) -> Iterator[Rows]:
     for asset, own in overlaps(shard.offsets, *shard.rows):
         arrays = {name: array[own] for name, array in spool.voxels(shard.keys[asset]).items()}
-        arrays["properties"], clipped[asset] = normalize(arrays["properties"], normalization)
-        for name, array in arrays.items():
-            parts.setdefault(name, []).append(array)
-    return {name: np.concatenate(arrays) for name, arrays in parts.items()}, clipped
+        arrays["properties"], clipped = normalize(arrays["properties"], normalization)
+        yield asset, arrays, clipped
 
 
-def _grid_rows(spool: Spool, shard: Shard, normalization: Normalization) -> Rows:
-    shape = (RESOLUTION,) * 3
-    material = np.empty((len(shard.keys), *shape), dtype=np.uint8)
-    properties = np.full((len(shard.keys), 3, *shape), np.nan, dtype=np.float32)
-    clipped = np.zeros((len(shard.keys), 3), dtype=np.int64)
+def _grid_rows(spool: Spool, shard: Shard, normalization: Normalization) -> Iterator[Rows]:
     for asset, key in enumerate(shard.keys):
-        material[asset], voxels, values = spool.grid(key)
-        normalized, clipped[asset] = normalize(values, normalization)
-        properties[(asset, slice(None), *voxels.T)] = normalized
-    return {"material": material, "properties": properties}, clipped
+        material, voxels, values = spool.grid(key)
+        properties = np.full((3, *material.shape), np.nan, dtype=np.float32)
+        normalized, clipped = normalize(values, normalization)
+        properties[(slice(None), *voxels.T)] = normalized.T
+        yield asset, {"material": material[None], "properties": properties[None]}, clipped
 
 
 def write_assets(
