@@ -45,7 +45,9 @@ endif
 ifeq ($(DATA),manifests/demo.toml)
 	@$(BIN)/slatprep score $(STORE) $(DEMO)/truth
 endif
+	@$(BIN)/slatprep report $(STORE) --manifests $(MANIFESTS) --out data/$(NAME).html --quiet
 	@echo "results: $(STORE) (the store), $(MANIFESTS) (a record of every asset)"
+	@echo "look:    open data/$(NAME).html in a browser"
 	@echo "next:    $(BIN)/slatprep info $(STORE)"
 
 $(DEMO)/.assets-$(ASSETS)-seed-$(SEED): | $(VENV)/.installed
