@@ -21,8 +21,11 @@ COMMANDS = {
     "report": "slatprep.cli.report:report",
     "score": "slatprep.cli.score:score",
     "export": "slatprep.cli.export:export",
+    "extract-slat": "slatprep.cli.extract:extract_slat",
     "transfer": "slatprep.cli.transfer:transfer",
     "describe": "slatprep.cli.describe:describe",
+    "train": "slatprep.cli.train:train",
+    "evaluate": "slatprep.cli.evaluate:evaluate",
     "bench": "slatprep.cli.bench:bench",
 }
 """Name of each command and where it lives; to add one, add its line here.

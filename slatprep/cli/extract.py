@@ -1,0 +1,79 @@
+"""`slatprep extract-slat`: structured latents of images, by TRELLIS."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+from slatprep.cli.output import EXIT_INCOMPLETE, Output, output_options
+from slatprep.errors import InputError
+
+
+@click.command(
+    name="extract-slat",
+    epilog="""\b
+Example:
+  slatprep extract-slat renders/*.png --out slat
+  slatprep extract-slat renders/*/*.png --by-folder --out slat --seed 0 --seed 1
+  slatprep build-store --pixieverse pixieverse --slat slat --out store.zarr
+""",
+)
+@click.argument("images", nargs=-1, required=True,
+                type=click.Path(path_type=Path, exists=True, dir_okay=False))  # fmt: skip
+@click.option("--out", required=True, type=click.Path(path_type=Path, file_okay=False),
+              metavar="DIR", help="Folder of the latents, the --slat of build-store.")  # fmt: skip
+@click.option("--seed", "seeds", type=click.IntRange(min=0), multiple=True, default=(42,),
+              help="Seed of what is drawn; may be repeated, each seed is a view."
+              "  [default: 42]")  # fmt: skip
+@click.option("--by-folder", is_flag=True, help="Images are named <id>/<view>, not <id>.")
+@click.option("--model", default="microsoft/TRELLIS-image-large", show_default=True,
+              help="Name of the model's repository, or a folder that holds it.")  # fmt: skip
+@click.option("--revision", metavar="COMMIT", help="Revision of the model.  [default: newest]")
+@click.option("--device", default="cuda", show_default=True, help="Where to run it.")
+@click.option("--no-preprocess", is_flag=True, help="Images are cut out and cropped already.")
+@output_options
+def extract_slat(
+    output: Output,
+    images: tuple[Path, ...],
+    out: Path,
+    seeds: tuple[int, ...],
+    by_folder: bool,
+    model: str,
+    revision: str | None,
+    device: str,
+    no_preprocess: bool,
+) -> None:
+    """Turn IMAGES into structured latents with TRELLIS's image pipeline.
+
+    Every image and seed gives <id>.npz, or <id>/<view>.npz where there are
+    views, in the form that build-store reads, and a JSON beside it that says
+    image, seed, model and revision. What is there already is kept, so that a
+    stopped run goes on. TRELLIS itself must be installed.
+    """
+    from slatprep import extract as work
+
+    jobs = work.plan(images, out, seeds, by_folder)
+    session = work.load_session(model, revision, device)
+    done, problems = [], []
+    with output.progress("extract-slat") as progress:
+        for number, result in enumerate(work.extract(session, jobs, preprocess=not no_preprocess)):
+            if isinstance(result, InputError):
+                problems.append(str(result))
+                output.problem(f"slatprep: {result}")
+            else:
+                done.append(result)
+            progress(number + 1, len(jobs))
+    counts = {
+        "extracted": sum(not result.kept for result in done),
+        "kept": sum(result.kept for result in done),
+        "failed": len(problems),
+        "voxels": sum(result.voxels for result in done),
+    }
+
+    def show() -> None:
+        output.table(f"Latents in {out}", tuple(counts), [tuple(counts.values())])
+
+    output.result({"path": out, "model": session.model, **counts, "problems": problems}, show)
+    if problems:
+        click.get_current_context().exit(EXIT_INCOMPLETE)
