@@ -26,6 +26,7 @@ COMMANDS = {
     "describe": "slatprep.cli.describe:describe",
     "train": "slatprep.cli.train:train",
     "evaluate": "slatprep.cli.evaluate:evaluate",
+    "evaluate": "slatprep.cli.evaluate:evaluate",
     "bench": "slatprep.cli.bench:bench",
 }
 """Name of each command and where it lives; to add one, add its line here.

@@ -31,7 +31,7 @@ _COLUMNS = ("coords", "feats", "properties", "material", "valid")
 class Draw(NamedTuple):
     """One asset of one epoch; the epoch decides its augmentation."""
 
-    index: int
+    number: int
     epoch: int
 
 
@@ -166,10 +166,10 @@ class SlatDataset(Dataset[Item]):
 
     def __getitem__(self, key: int | Draw) -> Item:
         draw = key if isinstance(key, Draw) else Draw(key, 0)
-        if not 0 <= draw.index < len(self):
-            raise IndexError(f"asset {draw.index} of {len(self)}")
-        rows = self.store.read(int(self.indices[draw.index]), _COLUMNS)
-        asset_id = self.asset_ids[draw.index]
+        if not 0 <= draw.number < len(self):
+            raise IndexError(f"asset {draw.number} of {len(self)}")
+        rows = self.store.read(int(self.indices[draw.number]), _COLUMNS)
+        asset_id = self.asset_ids[draw.number]
         valid = rows["valid"]
         material = rows["material"].astype(np.int64)
         material[~valid | (rows["material"] == UNANNOTATED)] = IGNORED

@@ -1,0 +1,79 @@
+"""`slatprep evaluate`: predictions by Pixie's protocol."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from slatprep.cli.learn import STORE, shares_of, shares_option
+from slatprep.cli.output import EXIT_INCOMPLETE, Output, output_options
+
+if TYPE_CHECKING:
+    from slatprep.learn.metrics import Evaluation, Measure
+
+
+@click.command(
+    epilog="""\b
+Example:
+  slatprep evaluate runs/small/predictions --store demo.zarr
+  slatprep evaluate predictions.h5 --store demo.zarr --split all --spread sd --csv scores.csv
+"""
+)
+@click.argument("predictions", type=click.Path(path_type=Path, exists=True))
+@click.option("--store", type=STORE, required=True, metavar="STORE.zarr",
+              help="The store that has the truth.")  # fmt: skip
+@click.option("--split", type=click.Choice(["train", "val", "test", "all"]), default="test",
+              show_default=True, help="Objects to measure on.")  # fmt: skip
+@shares_option
+@click.option("--spread", type=click.Choice(["se", "sd"]), default="se", show_default=True,
+              help="Standard error or standard deviation over objects.")  # fmt: skip
+@click.option("--csv", "csv_file", type=click.Path(path_type=Path, dir_okay=False),
+              help="Also write the table there.")  # fmt: skip
+@output_options
+def evaluate(
+    output: Output, predictions: Path, store: Path, split: Any, shares: str, spread: Any,
+    csv_file: Path | None,
+) -> None:  # fmt: skip
+    """Measure PREDICTIONS by Pixie's protocol.
+
+    PREDICTIONS is a directory of npz files, one an asset, or a Zarr or HDF5
+    store with one group an asset; each has properties (N,3) in normalised
+    space, and may have material (N,) or logits (N,8), and coords (N,3). Errors are means over
+    valid voxels, then over objects. Exit code 1 says that an asset of the
+    split has no prediction.
+    """
+    from slatprep.learn.metrics import evaluate_store
+
+    result = evaluate_store(
+        predictions, store, None if split == "all" else split, shares_of(shares), spread
+    )
+    rows = _rows(result)
+    header = ("category", "objects", *(f"{name}{end}" for name in result.overall.means
+                                       for end in ("", f" {spread}")))  # fmt: skip
+    if csv_file is not None:
+        import csv
+
+        with csv_file.open("w", encoding="utf-8", newline="") as file:
+            csv.writer(file).writerows([header, *rows])
+    output.result(
+        dataclasses.asdict(result),
+        lambda: output.table(
+            "Mean squared error in normalised space; accuracy of the class", header, rows
+        ),
+    )
+    for asset_id in result.missing:
+        output.problem(f"{predictions}: no prediction of {asset_id}")
+    if result.missing:
+        click.get_current_context().exit(EXIT_INCOMPLETE)
+
+
+def _rows(result: Evaluation) -> list[tuple[str | int | float, ...]]:
+    measures: dict[str, Measure] = {**result.categories, "all": result.overall}
+    return [
+        (name or "(none)", m.objects,
+         *(value for key in m.means for value in (m.means[key], m.spreads[key])))
+        for name, m in measures.items()
+    ]  # fmt: skip

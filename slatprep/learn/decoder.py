@@ -1,0 +1,237 @@
+"""SLAT-Phys's decoder: a sparse Swin transformer over occupied voxels, in plain PyTorch.
+
+The form is that of TRELLIS's sparse Swin decoders, written anew: pre-norm
+blocks of multi-head attention within windows of 8^3 voxels, moved by half a
+window in every other block (Liu et al., "Swin Transformer", ICCV 2021), an
+MLP of four times the width, layer norms without parameters, and a sinusoidal
+embedding of the absolute position. With the widths, depths and heads that
+SLAT-Phys states, this has the numbers of parameters that it states.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+from slatprep.records import RESOLUTION
+
+LATENTS = 8
+PROPERTIES = 3
+CLASSES = 8
+WINDOW = 8
+
+_BUCKETS = (8, 16, 32, 48, 64, 96, 128, 192, 256, 384, 512)
+"""Window populations that share one padded attention call; 8^3 is the most there can be."""
+
+
+@dataclass(frozen=True)
+class DecoderSize:
+    """Width, number of blocks and of attention heads."""
+
+    channels: int
+    blocks: int
+    heads: int
+
+
+SIZES = {
+    "small": DecoderSize(64, 4, 4),
+    "medium": DecoderSize(128, 6, 8),
+    "large": DecoderSize(256, 8, 16),
+}
+"""The three of SLAT-Phys: 0.20, 1.19 and 6.32 million parameters."""
+
+
+class Prediction(NamedTuple):
+    """What the decoder says of N voxels.
+
+    Attributes
+    ----------
+    properties : Tensor of float32, shape (N, 3)
+        Young's modulus, density, Poisson's ratio in [-1, 1].
+    logits : Tensor of float32, shape (N, 8)
+        Scores of the classes.
+    """
+
+    properties: Tensor
+    logits: Tensor
+
+
+class Windows(NamedTuple):
+    """Voxels grouped by window, windows of like population padded to one length.
+
+    Attributes
+    ----------
+    rows : Tensor of int64, shape (P,)
+        Rows of the voxels, window by window, padding included.
+    masks : list of Tensor of bool, shape (W, L)
+        For each group of W windows of length L, which of its entries are real.
+    back : Tensor of int64, shape (N,)
+        Where each voxel is in `rows`.
+    """
+
+    rows: Tensor
+    masks: list[Tensor]
+    back: Tensor
+
+
+def partition(coords: Tensor, window: int, shift: int) -> Windows:
+    """Group voxels by window.
+
+    Parameters
+    ----------
+    coords : Tensor of int, shape (N, 4)
+        Batch column and voxel, in any order.
+    window : int
+        Edge of a window, voxels.
+    shift : int
+        By how much the windows are moved, voxels.
+    """
+    cell = torch.div(coords[:, 1:].long() + shift, window, rounding_mode="floor")
+    across = (RESOLUTION + window) // window + 1
+    key = ((coords[:, 0].long() * across + cell[:, 0]) * across + cell[:, 1]) * across + cell[:, 2]
+    order = torch.argsort(key, stable=True)
+    counts = torch.unique_consecutive(key[order], return_counts=True)[1]
+    starts = torch.cumsum(counts, 0) - counts
+    rows, masks, smallest = [], [], 0
+    for limit in [*(size for size in _BUCKETS if size < window**3), window**3]:
+        chosen = (counts > smallest) & (counts <= limit)
+        smallest = limit
+        if bool(chosen.any()):
+            place = torch.arange(int(counts[chosen].max()), device=coords.device)
+            real = place < counts[chosen, None]
+            # Padding repeats a window's first voxel; the mask keeps it from being seen.
+            rows.append(order[starts[chosen, None] + place * real].flatten())
+            masks.append(real)
+    every = torch.cat(rows)
+    back = torch.empty_like(order)
+    places = torch.cat([mask.flatten() for mask in masks]).nonzero()[:, 0]
+    back[every[places]] = places
+    return Windows(every, masks, back)
+
+
+def embed_position(coords: Tensor, channels: int) -> Tensor:
+    """Return sines and cosines of the voxel's indices, float32 (N, channels).
+
+    The frequencies are 10000^(-k / K), k = 0..K-1, for each axis (Vaswani et
+    al., 2017); channels that do not divide by six are filled with 0.
+
+    Parameters
+    ----------
+    coords : Tensor of int, shape (N, 3)
+        Voxels.
+    channels : int
+        Width.
+    """
+    count = channels // 6
+    steps = torch.arange(count, dtype=torch.float32, device=coords.device) / count
+    angles = coords.float()[..., None] * 10000.0**-steps
+    waves = torch.cat([angles.sin(), angles.cos()], dim=-1).flatten(1)
+    return functional.pad(waves, (0, channels - waves.shape[1]))
+
+
+class WindowAttention(nn.Module):
+    """Multi-head self-attention among the voxels of one window."""
+
+    def __init__(self, channels: int, heads: int) -> None:
+        super().__init__()
+        self.heads = heads
+        self.qkv = nn.Linear(channels, 3 * channels)
+        self.out = nn.Linear(channels, channels)
+
+    def forward(self, hidden: Tensor, windows: Windows) -> Tensor:
+        """Return the attended features, (N, channels)."""
+        padded = self.qkv(hidden).index_select(0, windows.rows)
+        parts = []
+        groups = padded.split([mask.numel() for mask in windows.masks])
+        for group, real in zip(groups, windows.masks, strict=True):
+            split = group.unflatten(1, (3, self.heads, -1)).unflatten(0, tuple(real.shape))
+            q, k, v = split.permute(2, 0, 3, 1, 4)  # each (windows, heads, voxels, width)
+            attended = functional.scaled_dot_product_attention(
+                q, k, v, attn_mask=real[:, None, None, :]
+            )
+            parts.append(attended.transpose(1, 2).flatten(2).flatten(0, 1))
+        result: Tensor = self.out(torch.cat(parts).index_select(0, windows.back))
+        return result
+
+
+class SwinBlock(nn.Module):
+    """Attention and MLP, each after a layer norm and added to what came in."""
+
+    def __init__(self, channels: int, heads: int) -> None:
+        super().__init__()
+        self.norm_attention = nn.LayerNorm(channels, eps=1e-6, elementwise_affine=False)
+        self.attention = WindowAttention(channels, heads)
+        self.norm_mlp = nn.LayerNorm(channels, eps=1e-6, elementwise_affine=False)
+        self.mlp = nn.Sequential(
+            nn.Linear(channels, 4 * channels),
+            nn.GELU(approximate="tanh"),
+            nn.Linear(4 * channels, channels),
+        )
+
+    def forward(self, hidden: Tensor, windows: Windows) -> Tensor:
+        """Return the features after the block, (N, channels)."""
+        hidden = hidden + self.attention(self.norm_attention(hidden), windows)
+        updated: Tensor = hidden + self.mlp(self.norm_mlp(hidden))
+        return updated
+
+
+class PhysicsDecoder(nn.Module):
+    """Physical properties and class of every voxel, from its SLAT.
+
+    Parameters
+    ----------
+    size : DecoderSize
+        One of `SIZES`, or another.
+    window : int
+        Edge of an attention window, voxels.
+    """
+
+    def __init__(self, size: DecoderSize, window: int = WINDOW) -> None:
+        super().__init__()
+        self.size, self.window = size, window
+        self.embed = nn.Linear(LATENTS, size.channels)
+        self.blocks = nn.ModuleList(
+            SwinBlock(size.channels, size.heads) for _ in range(size.blocks)
+        )
+        self.norm = nn.LayerNorm(size.channels, eps=1e-6, elementwise_affine=False)
+        self.regression = nn.Linear(size.channels, PROPERTIES)
+        self.classification = nn.Linear(size.channels, CLASSES)
+        for module in self.modules():
+            if isinstance(module, nn.Linear):
+                nn.init.xavier_uniform_(module.weight)
+                nn.init.zeros_(module.bias)
+
+    def forward(self, coords: Tensor, feats: Tensor) -> Prediction:
+        """Predict.
+
+        Parameters
+        ----------
+        coords : Tensor of int, shape (N, 4)
+            Batch column and voxel; rows in any order.
+        feats : Tensor of float32, shape (N, 8)
+            Standardised latents.
+        """
+        shifts = (0, self.window // 2)
+        windows = [partition(coords, self.window, shift) for shift in shifts]
+        hidden = self.embed(feats) + embed_position(coords[:, 1:], self.size.channels)
+        for number, block in enumerate(self.blocks):
+            hidden = block(hidden, windows[number % 2])
+        hidden = self.norm(hidden)
+        # The heads give float32: bf16 has three digits, too few for a loss to fall.
+        with torch.autocast(hidden.device.type, enabled=False):
+            hidden = hidden.float()
+            return Prediction(torch.tanh(self.regression(hidden)), self.classification(hidden))
+
+
+def make_decoder(size: str) -> PhysicsDecoder:
+    """Return a decoder by the name of its size: small, medium or large."""
+    return PhysicsDecoder(SIZES[size])
+
+
+def count_parameters(model: nn.Module) -> int:
+    """Return the number of trainable parameters."""
+    return sum(p.numel() for p in model.parameters() if p.requires_grad)

@@ -1,0 +1,208 @@
+"""Pixie's protocol as SLAT-Phys states it: per voxel, then per object, then over objects."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from slatprep.errors import InputError
+from slatprep.learn.predictions import VoxelPrediction, check_prediction, open_predictions
+from slatprep.learn.splits import Shares, Split, select_assets
+from slatprep.store import open_store
+
+METRICS = ("log10 E", "log10 density", "nu", "mean", "accuracy")
+"""Mean squared errors in normalised space, the mean of the three, and class accuracy."""
+
+Spread = Literal["se", "sd"]
+
+
+@dataclass(frozen=True)
+class Measure:
+    """Scores over objects.
+
+    Attributes
+    ----------
+    objects : int
+        How many.
+    means, spreads : dict of str to float
+        For each of `METRICS` the mean over objects, and its standard error or
+        the standard deviation (of a sample); NaN where there is none.
+    """
+
+    objects: int
+    means: dict[str, float]
+    spreads: dict[str, float]
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """Scores of predictions.
+
+    Attributes
+    ----------
+    spread : {"se", "sd"}
+        What `Measure.spreads` are.
+    overall : Measure
+        Over all objects.
+    categories : dict of str to Measure
+        Over those of each category.
+    missing : list of str
+        Assets of the split without a prediction; they are not in the scores.
+    """
+
+    spread: Spread
+    overall: Measure
+    categories: dict[str, Measure]
+    missing: list[str]
+
+
+def score_asset(
+    prediction: VoxelPrediction,
+    properties: NDArray[np.float32],
+    material: NDArray[np.uint8],
+    valid: NDArray[np.bool_],
+) -> NDArray[np.float64]:
+    """Return the five `METRICS` of one asset, means over its valid voxels.
+
+    Parameters
+    ----------
+    prediction : VoxelPrediction
+        N voxels.
+    properties : ndarray of float32, shape (N, 3)
+        The truth in [-1, 1].
+    material : ndarray of uint8, shape (N,)
+        The true class.
+    valid : ndarray of bool, shape (N,)
+        Where there is a truth; one voxel at least.
+
+    Returns
+    -------
+    ndarray of float64, shape (5,)
+        Accuracy is NaN where no class was predicted.
+    """
+    errors = np.square(prediction.properties - properties)[valid].mean(axis=0)
+    accuracy = np.nan
+    if prediction.material is not None:
+        accuracy = float((prediction.material == material)[valid].mean())
+    return np.array([*errors, errors.mean(), accuracy])
+
+
+def measure(scores: NDArray[np.float64], spread: Spread) -> Measure:
+    """Summarise objects.
+
+    Parameters
+    ----------
+    scores : ndarray of float64, shape (objects, 5)
+        `METRICS` of each.
+    spread : {"se", "sd"}
+        Standard error of the mean, or standard deviation.
+    """
+    count = len(scores)
+    deviation = np.full(len(METRICS), np.nan)
+    if count > 1:
+        deviation = scores.std(axis=0, ddof=1) / (np.sqrt(count) if spread == "se" else 1.0)
+    mean = scores.mean(axis=0) if count else deviation
+    return Measure(
+        count,
+        dict(zip(METRICS, mean.tolist(), strict=True)),
+        dict(zip(METRICS, deviation.tolist(), strict=True)),
+    )
+
+
+def summarise(
+    scores: Sequence[NDArray[np.float64]],
+    objects: Sequence[str],
+    categories: Sequence[str],
+    spread: Spread,
+) -> tuple[Measure, dict[str, Measure]]:
+    """Average assets per object, then objects, over all and per category.
+
+    Parameters
+    ----------
+    scores : sequence of ndarray of float64, shape (5,)
+        `METRICS` of each asset.
+    objects, categories : sequence of str
+        Object and category of each. Several views of an object count as one.
+    spread : {"se", "sd"}
+        As in `measure`.
+    """
+    views: dict[str, list[NDArray[np.float64]]] = {}
+    for score, object_id in zip(scores, objects, strict=True):
+        views.setdefault(object_id, []).append(score)
+    per_object = {object_id: np.mean(rows, axis=0) for object_id, rows in views.items()}
+    category_of = dict(zip(objects, categories, strict=True))
+
+    def over(chosen: list[str]) -> Measure:
+        rows = np.array([per_object[object_id] for object_id in chosen])
+        return measure(rows.reshape(-1, len(METRICS)), spread)
+
+    groups = {
+        category: over([o for o in per_object if category_of[o] == category])
+        for category in sorted(set(categories))
+    }
+    return over(list(per_object)), groups
+
+
+def evaluate_store(
+    predictions: Path,
+    store_path: Path,
+    split: Split | None = "test",
+    shares: Shares = Shares(),  # noqa: B008 (immutable)
+    spread: Spread = "se",
+) -> Evaluation:
+    """Measure predictions against a store.
+
+    Parameters
+    ----------
+    predictions : Path
+        As `open_predictions` reads it.
+    store_path : Path
+        The store.
+    split : {"train", "val", "test"}, optional
+        Objects to measure on; all if None.
+    shares : Shares
+        Shares of the splits, as in training.
+    spread : {"se", "sd"}
+        Standard error or standard deviation over objects.
+
+    Raises
+    ------
+    InputError
+        If nothing was predicted of the split, or a prediction cannot be used.
+    StoreError
+        If the store cannot be read.
+    """
+    store = open_store(store_path)
+    object_ids, categories = store.column("object_id"), store.column("category")
+    scored: list[int] = []
+    scores: list[NDArray[np.float64]] = []
+    missing: list[str] = []
+    with open_predictions(predictions) as read:
+        for index in select_assets(store, split, shares=shares).tolist():
+            asset_id = store.ids[index]
+            arrays = read(asset_id)
+            if arrays is None:
+                missing.append(asset_id)
+                continue
+            rows = store.read(index, ("coords", "properties", "material", "valid"))
+            prediction = check_prediction(f"{predictions}/{asset_id}", arrays, rows.pop("coords"))
+            scored.append(index)
+            scores.append(score_asset(prediction, **rows))
+    if not scored:
+        raise InputError(
+            predictions,
+            f"has no prediction of an asset of split {split or 'all'}",
+            f"asset ids as names, such as {', '.join(missing[:3]) or 'none: the split is empty'}",
+        )
+    overall, groups = summarise(
+        scores,
+        [str(object_ids[k]) for k in scored],
+        [str(categories[k]) for k in scored],
+        spread,
+    )
+    return Evaluation(spread, overall, groups, missing)

@@ -1,0 +1,149 @@
+"""Read predictions: npz files, Zarr or HDF5, by asset."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from slatprep.errors import InputError
+
+CLASSES = 8
+
+_FORMS = "a directory of <asset id>.npz, a Zarr group or an HDF5 file with a group an asset"
+
+
+@dataclass(frozen=True)
+class VoxelPrediction:
+    """What was predicted of one asset, voxels in the order of the store.
+
+    Attributes
+    ----------
+    properties : ndarray of float64, shape (N, 3)
+        Young's modulus, density, Poisson's ratio in normalised space.
+    material : ndarray of int64, shape (N,), optional
+        Class 0..7.
+    """
+
+    properties: NDArray[np.float64]
+    material: NDArray[np.int64] | None
+
+
+ReadAsset = Callable[[str], Mapping[str, NDArray[Any]] | None]
+"""Arrays of an asset by name; None where there is no such asset."""
+
+
+@contextmanager
+def open_predictions(path: Path) -> Iterator[ReadAsset]:
+    """Open predictions of any form.
+
+    Parameters
+    ----------
+    path : Path
+        A directory of ``<asset_id>.npz``, a Zarr group, or an HDF5 file.
+
+    Raises
+    ------
+    InputError
+        If it is none of these.
+    """
+    with ExitStack() as stack:
+        if path.is_dir() and any((path / name).exists() for name in ("zarr.json", ".zgroup")):
+            import zarr
+
+            yield _grouped(zarr.open_group(path, mode="r"))
+        elif path.is_dir():
+            yield lambda asset_id: _npz(path / f"{asset_id}.npz")
+        else:
+            import h5py
+
+            if not h5py.is_hdf5(path):
+                raise InputError(path, "is not in a form that is known", _FORMS)
+            yield _grouped(stack.enter_context(h5py.File(path, "r")))
+
+
+def check_prediction(
+    source: str, arrays: Mapping[str, NDArray[Any]], coords: NDArray[np.uint8]
+) -> VoxelPrediction:
+    """Check a prediction and put its voxels in the order of the store.
+
+    Parameters
+    ----------
+    source : str
+        Where it comes from, for messages.
+    arrays : mapping of str to ndarray
+        ``properties`` (N, 3); optionally ``material`` (N,) or ``logits``
+        (N, 8), and ``coords`` (N, 3), without which the order is taken to be
+        the store's.
+    coords : ndarray of uint8, shape (N, 3)
+        Voxels of the store.
+
+    Raises
+    ------
+    InputError
+        If an array is missing, has another shape, is not finite, or the voxels are others.
+    """
+    count = len(coords)
+    if "properties" not in arrays:
+        raise InputError(source, f"has {', '.join(sorted(arrays)) or 'nothing'}", "properties")
+    properties = _shaped(source, "properties", arrays, (count, 3)).astype(np.float64)
+    if not np.isfinite(properties).all():
+        raise InputError(source, "properties are not all finite", "numbers in normalised space")
+    material = None
+    if "material" in arrays:
+        material = _shaped(source, "material", arrays, (count,)).astype(np.int64)
+        if material.size and not 0 <= material.min() <= material.max() < CLASSES:
+            raise InputError(source, f"has class {material.max()}", f"0 to {CLASSES - 1}")
+    elif "logits" in arrays:
+        material = _shaped(source, "logits", arrays, (count, CLASSES)).argmax(axis=1)
+    if "coords" in arrays:
+        order = _order(source, _shaped(source, "coords", arrays, (count, 3)), coords)
+        properties = properties[order]
+        material = None if material is None else material[order]
+    return VoxelPrediction(properties, material)
+
+
+def _order(source: str, ours: NDArray[Any], theirs: NDArray[np.uint8]) -> NDArray[np.int64]:
+    keys = [voxels.astype(np.int64) @ (4096, 64, 1) for voxels in (ours, theirs)]
+    if ours.size and not 0 <= ours.min() <= ours.max() < 64:
+        raise InputError(source, f"has a coordinate {ours.max()}", "0 to 63")
+    mine, stored = (np.argsort(key, kind="stable") for key in keys)
+    if not np.array_equal(keys[0][mine], keys[1][stored]):
+        raise InputError(source, "has other voxels than the store", "the store's voxel/coords")
+    order = np.empty_like(mine)
+    order[stored] = mine
+    return order
+
+
+def _shaped(
+    source: str, name: str, arrays: Mapping[str, NDArray[Any]], shape: tuple[int, ...]
+) -> NDArray[Any]:
+    array = np.asarray(arrays[name])
+    if array.shape != shape:
+        raise InputError(source, f"{name} has shape {array.shape}", f"{shape}")
+    return array
+
+
+def _npz(path: Path) -> Mapping[str, NDArray[Any]] | None:
+    if not path.exists():
+        return None
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            return {name: file[name] for name in file.files}
+    except (OSError, ValueError, EOFError, KeyError) as error:
+        raise InputError(path, f"cannot be read ({error})", "a file of numpy.savez") from error
+
+
+def _grouped(root: Any) -> ReadAsset:
+    def read(asset_id: str) -> Mapping[str, NDArray[Any]] | None:
+        if asset_id not in root:
+            return None
+        group = root[asset_id]
+        return {name: np.asarray(group[name][...]) for name in group}
+
+    return read

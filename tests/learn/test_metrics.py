@@ -1,0 +1,165 @@
+"""Scores against cases done by hand and a second computation."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+import zarr
+from click.testing import CliRunner
+
+from slatprep import InputError, open_store
+from slatprep.cli.commands import slatprep
+from slatprep.learn.metrics import METRICS, evaluate_store, measure, score_asset, summarise
+from slatprep.learn.predictions import VoxelPrediction
+
+
+def test_one_asset_by_hand() -> None:
+    truth = np.array([[0, 0, 0], [1, 1, 1], [np.nan] * 3], np.float32)
+    predicted = VoxelPrediction(
+        np.array([[0.5, 0, 1], [0.5, 1, 0], [9, 9, 9]]), np.array([2, 3, 4])
+    )
+    score = score_asset(
+        predicted, truth, np.array([2, 2, 255], np.uint8), np.array([True, True, False])
+    )
+    # E: (0.25 + 0.25) / 2; density: 0; nu: (1 + 1) / 2; their mean; one class of two right.
+    assert score.tolist() == [0.25, 0.0, 1.0, pytest.approx(1.25 / 3), 0.5]
+
+
+def test_objects_count_alike_whatever_their_views() -> None:
+    scores = [np.full(5, value) for value in (0.0, 2.0, 4.0)]
+    overall, groups = summarise(scores, ["a", "a", "b"], ["x", "x", "y"], "sd")
+    # a is (0 + 2) / 2 = 1, b is 4: mean 2.5, sample deviation 3 / sqrt(2).
+    assert overall.objects == 2
+    assert overall.means["nu"] == 2.5
+    assert overall.spreads["nu"] == pytest.approx(3 / np.sqrt(2))
+    assert (groups["x"].means["nu"], groups["y"].means["nu"]) == (1.0, 4.0)
+    assert np.isnan(groups["x"].spreads["nu"])
+
+
+def test_standard_error_is_the_deviation_over_root_n() -> None:
+    rows = np.random.default_rng(0).random((9, 5))
+    sd, se = measure(rows, "sd").spreads, measure(rows, "se").spreads
+    assert {k: v / 3 for k, v in sd.items()} == pytest.approx(se)
+
+
+@pytest.fixture(scope="module")
+def predicted(learn_store: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    """Write one set of noisy predictions in each form, two with their voxels shuffled."""
+    folder = tmp_path_factory.mktemp("predictions")
+    paths = {"npz": folder / "npz", "zarr": folder / "p.zarr", "hdf5": folder / "p.h5"}
+    paths["npz"].mkdir()
+    store, rng = open_store(learn_store), np.random.default_rng(0)
+    with h5py.File(paths["hdf5"], "w") as file:
+        root = zarr.open_group(paths["zarr"], mode="w")
+        for index, asset_id in enumerate(store.ids):
+            rows = store.read(index, ("coords", "properties"))
+            count = len(rows["coords"])
+            properties = np.nan_to_num(rows["properties"]) + rng.normal(0, 0.3, (count, 3))
+            logits = rng.normal(size=(count, 8))
+            order = rng.permutation(count)
+            np.savez(
+                paths["npz"] / f"{asset_id}.npz",
+                properties=properties[order],
+                material=logits.argmax(1)[order],
+                coords=rows["coords"][order],
+            )
+            root.create_group(asset_id)
+            root[asset_id].create_array("properties", data=properties)
+            root[asset_id].create_array("logits", data=logits)
+            file[f"{asset_id}/properties"] = properties
+            file[f"{asset_id}/logits"] = logits
+    return paths
+
+
+@pytest.mark.parametrize("form", ["npz", "zarr", "hdf5"])
+def test_against_a_plain_computation(
+    learn_store: Path, predicted: dict[str, Path], form: str
+) -> None:
+    root = zarr.open_group(learn_store, mode="r")
+    offset, objects = np.asarray(root["asset/offset"]), np.asarray(root["asset/object_id"])
+    truth, material = np.asarray(root["voxel/properties"]), np.asarray(root["voxel/material"])
+    valid = np.asarray(root["voxel/valid"])
+    by_object: dict[str, list[list[float]]] = {}
+    with h5py.File(predicted["hdf5"]) as file:
+        for k, asset_id in enumerate(np.asarray(root["asset/id"])):
+            properties = file[f"{asset_id}/properties"][:].tolist()
+            logits = file[f"{asset_id}/logits"][:].tolist()
+            sums, right, count = [0.0, 0.0, 0.0], 0, 0
+            for local, row in enumerate(range(offset[k], offset[k + 1])):
+                if valid[row]:
+                    for axis in range(3):
+                        sums[axis] += (properties[local][axis] - float(truth[row, axis])) ** 2
+                    right += logits[local].index(max(logits[local])) == material[row]
+                    count += 1
+            means = [total / count for total in sums]
+            views = by_object.setdefault(str(objects[k]), [])
+            views.append([*means, sum(means) / 3, right / count])
+    rows = [np.mean(views, axis=0) for views in by_object.values()]
+    result = evaluate_store(predicted[form], learn_store, None, spread="se")
+    assert result.overall.objects == 8
+    assert list(result.overall.means.values()) == pytest.approx(np.mean(rows, axis=0).tolist())
+    error = np.std(rows, axis=0, ddof=1) / np.sqrt(8)
+    assert list(result.overall.spreads.values()) == pytest.approx(error.tolist())
+
+
+def test_perfect_predictions_score_perfectly(learn_store: Path, tmp_path: Path) -> None:
+    store = open_store(learn_store)
+    for index, asset_id in enumerate(store.ids):
+        rows = store.read(index, ("properties", "material"))
+        np.savez(
+            tmp_path / f"{asset_id}.npz",
+            properties=np.nan_to_num(rows["properties"]),
+            material=np.where(rows["material"] == 255, 0, rows["material"]),
+        )
+    means = evaluate_store(tmp_path, learn_store, None).overall.means
+    assert list(means.values()) == [0.0, 0.0, 0.0, 0.0, 1.0]
+
+
+@pytest.mark.parametrize(
+    ("arrays", "message"),
+    [
+        ({"E": np.zeros(3)}, "expected properties"),
+        ({"properties": np.zeros((5, 3))}, "properties has shape"),
+        ({"properties": None, "material": 9}, "class 9"),
+        ({"properties": np.nan}, "not all finite"),
+        ({"properties": None, "coords": 1}, "other voxels"),
+    ],
+)
+def test_bad_predictions_are_named(
+    learn_store: Path, tmp_path: Path, arrays: dict[str, object], message: str
+) -> None:
+    store = open_store(learn_store)
+    count = store.rows(0)[1]
+    shapes = {"properties": (count, 3), "material": (count,), "coords": (count, 3)}
+    whole = {
+        name: value if isinstance(value, np.ndarray) else np.full(shapes[name], value or 0.0)
+        for name, value in arrays.items()
+    }
+    np.savez(tmp_path / f"{store.ids[0]}.npz", **whole)
+    with pytest.raises(InputError, match=message) as caught:
+        evaluate_store(tmp_path, learn_store, None)
+    assert store.ids[0] in str(caught.value)
+
+
+def test_command(learn_store: Path, predicted: dict[str, Path], tmp_path: Path) -> None:
+    some = tmp_path / "some"
+    shutil.copytree(predicted["npz"], some)
+    (some / "a.npz").unlink()
+    arguments = ["evaluate", str(some), "--store", str(learn_store), "--split", "all"]
+    done = CliRunner().invoke(slatprep, [*arguments, "--json", "--csv", str(tmp_path / "s.csv")])
+    assert done.exit_code == 1
+    assert "no prediction of a" in done.stderr
+    document = json.loads(done.stdout)
+    assert document["missing"] == ["a"]
+    assert document["overall"]["objects"] == 7
+    assert list(document["overall"]["means"]) == list(METRICS)
+    last = (tmp_path / "s.csv").read_text().splitlines()[-1].split(",")
+    assert last[:2] == ["all", "7"]
+    assert float(last[2]) == pytest.approx(document["overall"]["means"]["log10 E"])
+    table = CliRunner().invoke(slatprep, arguments).stdout
+    assert "log10 density" in table
