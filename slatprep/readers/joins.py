@@ -10,6 +10,9 @@ from pathlib import Path
 
 from slatprep.errors import ConfigError
 
+MAX_JSON_BYTES = 256 * 2**20
+"""No list of categories is larger; one of 500,000 objects takes 50 MB."""
+
 _UID = re.compile(r"([0-9a-f]{32})/?$")
 
 
@@ -76,6 +79,8 @@ def read_categories(path: Path) -> dict[str, str]:
         If the file cannot be read or an entry has no ``obj_class``.
     """
     try:
+        if path.stat().st_size > MAX_JSON_BYTES:
+            raise ConfigError(f"{path}: is larger than {MAX_JSON_BYTES >> 20} MiB")
         entries = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError, RecursionError) as error:
         raise ConfigError(f"{path}: cannot be read as JSON ({error})") from None

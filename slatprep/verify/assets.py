@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from slatprep.check import DISTANCE_TOLERANCE, PROPERTY_TOLERANCE, stored_field
 from slatprep.errors import InputError, StoreError
@@ -97,7 +98,7 @@ def value_findings(asset: StoredAsset) -> Iterator[Finding]:
             "0 to 6 where valid, 255 elsewhere",
         ),
         "voxel/properties": (
-            _normalised(asset.properties, valid),
+            _normalised(asset.properties.T, valid),
             "a property that does not go with valid",
             "-1 to 1 where valid, NaN elsewhere",
         ),
@@ -112,7 +113,7 @@ def value_findings(asset: StoredAsset) -> Iterator[Finding]:
             "0 to 7, or 255",
         ),
         "grid/properties": (
-            _normalised(np.moveaxis(asset.grid_properties, 0, -1), asset.grid_material < 7),
+            _normalised(asset.grid_properties, asset.grid_material < BACKGROUND),
             "a property that does not go with grid/material",
             "-1 to 1 where annotated, NaN elsewhere",
         ),
@@ -194,9 +195,10 @@ def source_findings(record: Mapping[str, Any], roots: SourceRoots) -> Iterator[F
 _GRID_CLASSES = (*range(BACKGROUND + 1), UNANNOTATED)
 
 
-def _normalised(values: np.ndarray, where: np.ndarray) -> bool:
-    """Whether values are in [-1, 1] at the rows of a mask and NaN at all others."""
-    return bool((np.abs(values[where]) <= 1).all() and np.isnan(values[~where]).all())
+def _normalised(values: NDArray[np.float32], where: NDArray[np.bool_]) -> bool:
+    """Whether values (..., rows) are in [-1, 1] at the rows of a mask and NaN at all others."""
+    missing = np.isnan(values)
+    return bool((missing == ~where).all() and (missing | (np.abs(values) <= 1)).all())
 
 
 def _claims(

@@ -253,6 +253,14 @@ def test_bad_maps(find, tmp_path, text, message):
         find(map=tmp_path / "none.csv")
 
 
+def test_a_list_of_categories_beyond_reason_is_not_read(find, tmp_path):
+    table = tmp_path / "huge.json"
+    with table.open("wb") as file:
+        file.truncate(2**40)  # a hole: it takes no space on disk
+    with pytest.raises(ConfigError, match="is larger than 256 MiB"):
+        find([grid("a")], ["a.npz"], categories=table)
+
+
 def test_categories(find, tmp_path):
     table = tmp_path / "obj_ids_metadata.json"
     entry = {"obj_class": "soda_cans", "vlm_filtering": {"is_appropriate": True}}
