@@ -1,0 +1,167 @@
+"""Draw a simulated object: its surface moves with the particles, rays find light and shadow."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import open3d as o3d
+from matplotlib.colors import LinearSegmentedColormap
+from matplotlib.figure import Figure
+from scipy.spatial import cKDTree
+
+from slatprep.geometry import VOXEL_SIZE, apply_transform, occupancy_of
+from slatprep.pictures.palette import DISTANCE_COLOURS, INK, MUTED
+from slatprep.store.reader import StoredAsset
+
+MOST = 0.5
+"""Strain at the end of the scale."""
+
+SIZE = (800, 800)
+"""Height and width of a panel before it is halved against jagged edges."""
+
+SCALE = LinearSegmentedColormap.from_list("strain", DISTANCE_COLOURS)
+_CORNERS = np.array([[0, 0], [1, 0], [1, 1], [0, 0], [1, 1], [0, 1]])
+
+
+def draw(
+    path: Path,
+    frames: np.ndarray,
+    strains: np.ndarray,
+    material: np.ndarray,
+    asset: StoredAsset,
+    chosen: tuple[int, ...],
+    rate: int = 60,
+) -> None:
+    """Draw chosen frames and the course of the strain, and write them as a PNG."""
+    figure = Figure(figsize=(12, 5.4), dpi=130)
+    grid = figure.add_gridspec(2, len(chosen), height_ratios=(2.0, 1.0), hspace=0.12, wspace=0.04,
+                               left=0.055, right=0.885, top=0.94, bottom=0.11)  # fmt: skip
+    meshes = [surface(asset, number) for number in (0, 1)]
+    lift = frames[0].mean(axis=0) - _rest_centre(frames[0], asset)
+    for column, frame in enumerate(chosen):
+        axis = figure.add_subplot(grid[0, column])
+        axis.imshow(_render(meshes, lift, frames, strains, material, frame))
+        axis.set_title(f"{frame / rate:.2f} s", fontsize=11, color=INK)
+        axis.set_axis_off()
+    axis = figure.add_subplot(grid[1, :])
+    seconds = np.arange(len(frames)) / rate
+    for number, name, style in ((0, "jelly, E = 30 kPa", "-"), (1, "steel, E = 50 GPa", "--")):
+        mean = np.nanmean(strains[:, material == number], axis=1)
+        axis.plot(seconds, 100 * mean, style, color=INK, lw=1.8)
+        axis.annotate(name, (seconds[-1], 100 * mean[-1]), (6, 0), textcoords="offset points",
+                      va="center", fontsize=9, color=INK, annotation_clip=False)  # fmt: skip
+    for frame in chosen:
+        axis.axvline(frame / rate, color=MUTED, lw=0.6, zorder=0)
+    axis.set(xlim=(0, seconds[-1]), ylim=(0, None), xlabel="time [s]", ylabel="mean strain [%]")
+    axis.spines[["top", "right"]].set_visible(False)
+    bar = figure.add_axes((0.91, 0.46, 0.011, 0.4))
+    bar.imshow(np.linspace(1, 0, 256)[:, None], aspect="auto", cmap=SCALE, extent=(0, 1, 0, 50))
+    bar.set(xticks=[], yticks=[0, 25, 50])
+    bar.yaxis.tick_right()
+    bar.set_title("strain [%]", fontsize=9, loc="left", pad=8)
+    figure.savefig(path)
+
+
+def surface(asset: StoredAsset, number: int) -> o3d.geometry.TriangleMesh:
+    """Return the smoothed surface of a part, in the SLAT frame."""
+    solid = np.pad(asset.grid_material == number, 1)
+    corners = []
+    for axis in range(3):
+        others = [a for a in range(3) if a != axis]
+        for side in (-1, 1):
+            faces = np.argwhere(solid & ~np.roll(solid, -side, axis))
+            quad = np.zeros((len(faces), 6, 3))
+            quad[..., axis] = faces[:, None, axis] + (side + 1) / 2
+            for k, other in enumerate(others):
+                quad[..., other] = faces[:, None, other] + _CORNERS[None, :, k]
+            corners.append(quad if (side > 0) != (axis == 1) else quad[:, ::-1])
+    points = (np.concatenate(corners).reshape(-1, 3) - 1) * VOXEL_SIZE - 0.5
+    vertices, triangles = np.unique(points, axis=0, return_inverse=True)
+    mesh = o3d.geometry.TriangleMesh(
+        o3d.utility.Vector3dVector(apply_transform(asset.transform, vertices)),
+        o3d.utility.Vector3iVector(triangles.reshape(-1, 3)),
+    )
+    return mesh.filter_smooth_taubin(60)
+
+
+def _rest_centre(rest: np.ndarray, asset: StoredAsset) -> np.ndarray:
+    """Return where the particles' centre would be, had `drop` not lifted them."""
+    low = (np.argwhere(occupancy_of(asset.coords))[:, 2].min()) * VOXEL_SIZE - 0.5
+    spacing = np.diff(np.unique(rest[:, 2].round(6))).min()
+    bottom = np.ceil((low + 0.5) / spacing - 0.5) * spacing - 0.5 + spacing / 2
+    centre: np.ndarray = rest.mean(axis=0) - [0.0, 0.0, rest[:, 2].min() - bottom]
+    return centre
+
+
+def _camera() -> np.ndarray:
+    """Return the rays (height, width, 6) of a camera that looks down on the ground."""
+    eye, target = np.array([1.5, -2.1, 1.0]), np.array([0.0, 0.0, 0.37])
+    ahead = (target - eye) / np.linalg.norm(target - eye)
+    right = np.cross(ahead, [0.0, 0.0, 1.0])
+    right /= np.linalg.norm(right)
+    up = np.cross(right, ahead)
+    step = 2 * np.tan(np.radians(23.0) / 2) / SIZE[0]
+    rows = (SIZE[0] / 2 - 0.5 - np.arange(SIZE[0])) * step
+    columns = (np.arange(SIZE[1]) + 0.5 - SIZE[1] / 2) * step
+    ways = ahead + rows[:, None, None] * up + columns[None, :, None] * right
+    return np.concatenate([np.broadcast_to(eye, ways.shape), ways], axis=-1)
+
+
+def _render(meshes, lift, frames, strains, material, frame):
+    scene = o3d.t.geometry.RaycastingScene()
+    normals, values, first = [], [], [0]
+    for number, mesh in enumerate(meshes):
+        here = material == number
+        known = np.flatnonzero(here)[np.isfinite(strains[frame, here])]
+        rest = np.asarray(mesh.vertices) + lift
+        distance, near = cKDTree(frames[0, known]).query(rest, k=8)
+        weight = 1.0 / (distance**2 + 1e-4)
+        weight /= weight.sum(axis=1, keepdims=True)
+        shift = (frames[frame] - frames[0])[known][near]
+        moved = o3d.geometry.TriangleMesh(mesh)
+        moved.vertices = o3d.utility.Vector3dVector(rest + (weight[..., None] * shift).sum(axis=1))
+        moved.compute_vertex_normals()
+        triangles = np.asarray(moved.triangles)
+        normals.append(np.asarray(moved.vertex_normals)[triangles])
+        values.append((weight * strains[frame, known][near]).sum(axis=1)[triangles])
+        first.append(first[-1] + len(triangles))
+        scene.add_triangles(o3d.t.geometry.TriangleMesh.from_legacy(moved))
+    ground = o3d.geometry.TriangleMesh.create_box(8.0, 8.0, 0.01).translate((-4, -4, -0.01))
+    scene.add_triangles(o3d.t.geometry.TriangleMesh.from_legacy(ground))
+
+    rays = o3d.core.Tensor(_camera(), dtype=o3d.core.Dtype.Float32)
+    hit = scene.cast_rays(rays)
+    geometry, triangle = hit["geometry_ids"].numpy(), hit["primitive_ids"].numpy()
+    uv, far = hit["primitive_uvs"].numpy(), hit["t_hit"].numpy()
+    ray = rays.numpy()
+    seen = np.isfinite(far)
+    place = ray[..., :3] + np.where(seen, far, 0)[..., None] * ray[..., 3:]
+    normal = hit["primitive_normals"].numpy().copy()
+    colour = np.ones((*far.shape, 3))
+    share = np.stack([1 - uv.sum(axis=-1), uv[..., 0], uv[..., 1]], axis=-1)
+    for number in (0, 1):
+        on = geometry == number
+        normal[on] = np.einsum("nk,nkc->nc", share[on], normals[number][triangle[on]])
+        value = (share[on] * values[number][triangle[on]]).sum(axis=-1)
+        colour[on] = SCALE(value / MOST)[:, :3]
+    normal /= np.linalg.norm(normal, axis=-1, keepdims=True) + 1e-12
+
+    sun = np.array([0.35, -0.5, 0.8]) / np.linalg.norm([0.35, -0.5, 0.8])
+    facing = np.clip(normal @ sun, 0, 1)
+    start = place + 4e-3 * normal
+    shadow = scene.test_occlusions(
+        o3d.core.Tensor(np.concatenate([start, np.broadcast_to(sun, start.shape)], axis=-1),
+                        dtype=o3d.core.Dtype.Float32)
+    ).numpy()  # fmt: skip
+    light = 0.5 + 0.12 * normal[..., 2] + 0.45 * facing * ~shadow
+    half = sun - ray[..., 3:] / np.linalg.norm(ray[..., 3:], axis=-1, keepdims=True)
+    half /= np.linalg.norm(half, axis=-1, keepdims=True)
+    shine = np.clip((normal * half).sum(axis=-1), 0, 1) ** 60 * ~shadow
+    shine *= np.where(geometry == 1, 0.5, np.where(geometry == 0, 0.18, 0.0))
+    image = np.clip(colour * light[..., None] + shine[..., None], 0, 1)
+    # The ground is white but for the shadow on it.
+    on_ground = geometry == 2
+    image[on_ground] = np.where(shadow[on_ground], 0.83, 1.0)[:, None]
+    image[~seen] = 1.0
+    return image.reshape(SIZE[0] // 2, 2, SIZE[1] // 2, 2, 3).mean(axis=(1, 3))
