@@ -24,6 +24,7 @@ COMMANDS = {
     "extract-slat": "slatprep.cli.extract:extract_slat",
     "transfer": "slatprep.cli.transfer:transfer",
     "describe": "slatprep.cli.describe:describe",
+    "train": "slatprep.cli.train:train",
     "evaluate": "slatprep.cli.evaluate:evaluate",
     "bench": "slatprep.cli.bench:bench",
 }

@@ -204,6 +204,9 @@ class PhysicsDecoder(nn.Module):
             if isinstance(module, nn.Linear):
                 nn.init.xavier_uniform_(module.weight)
                 nn.init.zeros_(module.bias)
+        # From 0 the regression starts in the middle of tanh, not where it is flat.
+        for head in (self.regression, self.classification):
+            nn.init.zeros_(head.weight)
 
     def forward(self, coords: Tensor, feats: Tensor) -> Prediction:
         """Predict.

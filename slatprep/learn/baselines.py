@@ -1,0 +1,66 @@
+"""What any decoder must beat: the training mean, and a linear model of each voxel alone."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from slatprep.learn.dataset import Item, SlatDataset
+from slatprep.records import RESOLUTION
+
+_CLASSES = 8
+
+
+@dataclass(frozen=True)
+class VoxelBaseline:
+    """Targets as a linear function of a voxel's inputs.
+
+    Attributes
+    ----------
+    weights : ndarray of float64, shape (12, 11)
+        From the 8 latents, the position and 1 to the three properties and the
+        class indicators.
+    """
+
+    weights: NDArray[np.float64]
+
+    def predict(self, item: Item) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+        """Return properties (N, 3), within [-1, 1], and classes (N,)."""
+        outputs = _inputs(item) @ self.weights
+        return np.clip(outputs[:, :3], -1, 1), outputs[:, 3:].argmax(axis=1)
+
+
+def fit_linear(dataset: SlatDataset) -> VoxelBaseline:
+    """Fit by least squares over all valid voxels, each weighted alike."""
+    products = np.zeros((12, 12)), np.zeros((12, 3 + _CLASSES))
+    for item in (dataset[k] for k in range(len(dataset))):
+        valid = item.valid.numpy()
+        inputs, targets = _inputs(item)[valid], _targets(item)[valid]
+        products[0][...] += inputs.T @ inputs
+        products[1][...] += inputs.T @ targets
+    solution = np.linalg.lstsq(*products, rcond=None)[0]
+    return VoxelBaseline(np.asarray(solution, np.float64))
+
+
+def fit_mean(dataset: SlatDataset) -> VoxelBaseline:
+    """Return the model that predicts the mean, and the most frequent class, everywhere."""
+    total, count = np.zeros(3 + _CLASSES), 0
+    for item in (dataset[k] for k in range(len(dataset))):
+        valid = item.valid.numpy()
+        total += _targets(item)[valid].sum(axis=0)
+        count += int(valid.sum())
+    weights = np.zeros((12, 3 + _CLASSES))
+    weights[-1] = total / count
+    return VoxelBaseline(weights)
+
+
+def _inputs(item: Item) -> NDArray[np.float64]:
+    position = (item.coords.numpy() + 0.5) / RESOLUTION - 0.5
+    return np.hstack([item.feats.numpy(), position, np.ones((len(position), 1))])
+
+
+def _targets(item: Item) -> NDArray[np.float64]:
+    indicators = item.material.numpy()[:, None] == np.arange(_CLASSES)
+    return np.hstack([item.properties.numpy(), indicators])

@@ -1,0 +1,142 @@
+"""What a training run leaves behind: parameters, log, checkpoints, curve, predictions."""
+
+from __future__ import annotations
+
+import csv
+import dataclasses
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from pickle import UnpicklingError
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from slatprep.errors import ConfigError, InputError
+
+LAST, BEST = "last.pt", "best.pt"
+
+
+@dataclasses.dataclass(frozen=True)
+class EpochRecord:
+    """One line of ``log.csv``: means over the epoch, in the loss's own units."""
+
+    epoch: int
+    learning_rate: float
+    train_loss: float
+    val_loss: float
+    val_mse: float
+    val_accuracy: float
+
+
+class Run:
+    """The directory of one training run.
+
+    Parameters
+    ----------
+    path : Path
+        New, empty, or that of a run with the same parameters, which goes on.
+    parameters : dict
+        Everything that decides the result.
+
+    Raises
+    ------
+    ConfigError
+        If the directory holds something else.
+    """
+
+    def __init__(self, path: Path, parameters: dict[str, Any]) -> None:
+        self.path = path
+        file = path / "run.json"
+        text = json.dumps(parameters, indent=1, sort_keys=True) + "\n"
+        if file.exists():
+            if file.read_text(encoding="utf-8") != text:
+                raise ConfigError(
+                    f"{file}: the run there has other parameters; "
+                    "repeat them to go on with it, or choose another --out"
+                )
+        elif path.exists() and any(path.iterdir()):
+            raise ConfigError(f"{path} is not empty and holds no run; choose another --out")
+        else:
+            path.mkdir(parents=True, exist_ok=True)
+            file.write_text(text, encoding="utf-8")
+
+    def save(self, name: str, state: dict[str, Any]) -> None:
+        """Write a checkpoint; the old one stays until the new one is whole."""
+        partial = self.path / f"{name}.partial"
+        torch.save(state, partial)
+        partial.replace(self.path / name)
+
+    def load(self, name: str) -> dict[str, Any] | None:
+        """Read a checkpoint, None if there is none.
+
+        Raises
+        ------
+        InputError
+            If the file is damaged.
+        """
+        path = self.path / name
+        if not path.exists():
+            return None
+        try:
+            state: dict[str, Any] = torch.load(path, map_location="cpu", weights_only=True)
+        except (RuntimeError, OSError, EOFError, ValueError, UnpicklingError) as error:
+            raise InputError(
+                path, f"cannot be read ({error})", "a checkpoint of `slatprep train`"
+            ) from error
+        return state
+
+    def log(self, history: Sequence[EpochRecord]) -> None:
+        """Write ``log.csv``, and TensorBoard's events where it is installed."""
+        names = [field.name for field in dataclasses.fields(EpochRecord)]
+        with (self.path / "log.csv").open("w", encoding="utf-8", newline="") as file:
+            writer = csv.writer(file)
+            writer.writerow(names)
+            writer.writerows(dataclasses.astuple(record) for record in history)
+        try:
+            from torch.utils.tensorboard import SummaryWriter
+        except ImportError:
+            return
+        with SummaryWriter(str(self.path / "tensorboard")) as board:
+            for name in names[1:]:
+                board.add_scalar(name, getattr(history[-1], name), history[-1].epoch)
+
+    def draw(self, history: Sequence[EpochRecord], references: dict[str, float]) -> None:
+        """Draw ``curve.png``: validation error by epoch, beside what needs no network.
+
+        Parameters
+        ----------
+        history : sequence of EpochRecord
+            One epoch at least.
+        references : dict of str to float
+            Name and mean squared error of each reference.
+        """
+        from matplotlib.backends.backend_agg import FigureCanvasAgg
+        from matplotlib.figure import Figure
+
+        figure = Figure(figsize=(6, 3.6), layout="constrained")
+        FigureCanvasAgg(figure)
+        axes = figure.add_subplot()
+        axes.plot([r.epoch for r in history], [r.val_mse for r in history], "o-", label="decoder")
+        for style, (name, error) in zip(("--", ":", "-."), references.items(), strict=False):
+            axes.axhline(error, color="0.4", linestyle=style, label=name)
+        axes.set(xlabel="epoch", ylabel="validation MSE (normalised)", yscale="log")
+        axes.grid(alpha=0.3)
+        axes.legend()
+        figure.savefig(self.path / "curve.png", dpi=110)
+
+    def write_prediction(
+        self,
+        asset_id: str,
+        coords: NDArray[np.uint8],
+        properties: NDArray[np.float32],
+        material: NDArray[np.uint8],
+    ) -> None:
+        """Write what `slatprep evaluate` reads: ``predictions/<asset_id>.npz``."""
+        folder = self.path / "predictions"
+        folder.mkdir(exist_ok=True)
+        np.savez_compressed(
+            folder / f"{asset_id}.npz", coords=coords, properties=properties, material=material
+        )

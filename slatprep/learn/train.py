@@ -1,0 +1,316 @@
+"""SLAT-Phys's training recipe: read, predict, weigh the losses, step, validate."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.nn import functional
+
+from slatprep.errors import ConfigError
+from slatprep.learn.augment import Augmentation
+from slatprep.learn.baselines import VoxelBaseline, fit_linear, fit_mean
+from slatprep.learn.dataset import IGNORED, SlatDataset, SlatLoader, SparseBatch
+from slatprep.learn.decoder import SIZES, PhysicsDecoder, Prediction, make_decoder
+from slatprep.learn.runs import BEST, LAST, EpochRecord, Run
+from slatprep.learn.splits import Shares, Split
+
+PROPERTY_WEIGHT = 1.0
+CLASS_WEIGHT = 0.5
+"""SLAT-Phys: 1 for the MSE of each property, 0.5 for the cross-entropy of the classes."""
+
+
+@dataclass(frozen=True)
+class TrainParameters:
+    """Everything that decides a training run.
+
+    Attributes
+    ----------
+    size : str
+        Size of the decoder: small, medium or large.
+    epochs : int
+        Passes over the training objects; the cosine ends with the last.
+    batch_size, accumulate : int
+        Assets in a batch, and batches in a step of the optimiser.
+    learning_rate : float
+        Of AdamW, before the cosine lowers it to 0.
+    precision : str
+        ``fp32``, or ``bf16`` for mixed precision.
+    patience : int
+        Epochs without a better validation loss after which training stops.
+    augmentation : str
+        none, upright or all, see `slatprep.learn.augment`.
+    verdicts : tuple of str
+        Verdicts of alignments that are good enough.
+    max_ambiguity : float, optional
+        Largest ambiguity that is good enough.
+    shares : Shares
+        Shares of train, val and test.
+    seed : int
+        Of weights, order and augmentation.
+    """
+
+    size: str = "large"
+    epochs: int = 100
+    batch_size: int = 1
+    accumulate: int = 1
+    learning_rate: float = 1e-4
+    precision: str = "bf16"
+    patience: int = 10
+    augmentation: Augmentation = "none"
+    verdicts: tuple[str, ...] = ("good", "doubtful", "failed")
+    max_ambiguity: float | None = None
+    shares: Shares = field(default_factory=Shares)
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        for name, allowed in (("size", tuple(SIZES)), ("precision", ("fp32", "bf16"))):
+            if getattr(self, name) not in allowed:
+                raise ConfigError(
+                    f"{name} is {getattr(self, name)!r}; expected one of {', '.join(allowed)}"
+                )
+
+
+@dataclass(frozen=True)
+class TrainSummary:
+    """What came of a run.
+
+    Attributes
+    ----------
+    history : list of EpochRecord
+        All epochs.
+    best_epoch : int
+        The one whose weights are kept.
+    references : dict of str to float
+        Validation MSE of the training mean and of a per-voxel linear model.
+    predictions : Path
+        Predictions of the test objects, for `slatprep evaluate`.
+    """
+
+    history: list[EpochRecord]
+    best_epoch: int
+    references: dict[str, float]
+    predictions: Path
+
+
+def loss_of(prediction: Prediction, batch: SparseBatch) -> Tensor:
+    """Return SLAT-Phys's loss over the valid voxels of a batch.
+
+    The sum of the three mean squared errors, and half the cross-entropy.
+    """
+    if not bool(batch.valid.any()):
+        return prediction.properties.sum() * 0.0 + prediction.logits.sum() * 0.0
+    squared = (prediction.properties - batch.properties)[batch.valid].square()
+    entropy = functional.cross_entropy(prediction.logits, batch.material, ignore_index=IGNORED)
+    return PROPERTY_WEIGHT * squared.mean(dim=0).sum() + CLASS_WEIGHT * entropy
+
+
+def train(
+    store: Path,
+    out: Path,
+    parameters: TrainParameters,
+    *,
+    device: str = "cpu",
+    workers: int = 0,
+    progress: Callable[[EpochRecord], None] | None = None,
+    stop_after: int | None = None,
+) -> TrainSummary:
+    """Train a decoder, or go on with a run that was stopped.
+
+    On one machine's CPU a run that was stopped and resumed has the very
+    weights of one that was not; a GPU's sums may differ in the last bits.
+
+    Parameters
+    ----------
+    store : Path
+        The store.
+    out : Path
+        Directory of the run, see `slatprep.learn.runs.Run`.
+    parameters : TrainParameters
+        What to do.
+    device : str
+        ``cpu`` or ``cuda``.
+    workers : int
+        Processes that read ahead.
+    progress : callable, optional
+        Called after each epoch.
+    stop_after : int, optional
+        Stop when so many epochs are done, as if interrupted.
+
+    Raises
+    ------
+    ConfigError
+        If `out` holds another run, or a split has no asset.
+    InputError
+        If a checkpoint is damaged.
+    StoreError
+        If the store cannot be read.
+    """
+    train_set = _dataset(store, "train", parameters)
+    val_set, test_set = _dataset(store, "val", parameters), _dataset(store, "test", parameters)
+    run = Run(out, asdict(parameters) | {"store": str(train_set.store.attributes["manifest"])})
+    session = _Session(parameters, train_set, device, workers)
+    session.restore(run.load(LAST))
+    while not session.finished and session.epoch != stop_after:
+        train_loss, rate = session.run_epoch()
+        record = EpochRecord(session.epoch, rate, train_loss, *session.validate(val_set))
+        better = session.note(record)
+        run.save(LAST, session.state())
+        if better:
+            run.save(BEST, {"size": parameters.size, "model": session.model.state_dict()})
+        run.log(session.history)
+        if progress is not None:
+            progress(record)
+    references = {
+        "mean of the training voxels": _reference(fit_mean(train_set), val_set),
+        "linear in each voxel": _reference(fit_linear(train_set), val_set),
+    }
+    run.draw(session.history, references)
+    best = run.load(BEST)
+    assert best is not None
+    session.model.load_state_dict(best["model"])
+    _predict(session.model, test_set, run, device)
+    return TrainSummary(session.history, session.best_epoch, references, out / "predictions")
+
+
+class _Session:
+    """Everything that changes while a model is trained."""
+
+    def __init__(
+        self, parameters: TrainParameters, dataset: SlatDataset, device: str, workers: int
+    ) -> None:
+        torch.manual_seed(parameters.seed)
+        torch.use_deterministic_algorithms(device == "cpu")
+        self.parameters, self.device = parameters, device
+        self.model = make_decoder(parameters.size).to(device)
+        self.optimizer = torch.optim.AdamW(self.model.parameters(), lr=parameters.learning_rate)
+        self.loader = SlatLoader(
+            dataset,
+            parameters.batch_size,
+            shuffle=True,
+            workers=workers,
+            pin_memory=device != "cpu",
+        )
+        self.steps = math.ceil(len(self.loader) / parameters.accumulate)
+        self.history: list[EpochRecord] = []
+
+    @property
+    def epoch(self) -> int:
+        return len(self.history)
+
+    @property
+    def best_epoch(self) -> int:
+        return int(np.argmin([record.val_loss for record in self.history]))
+
+    @property
+    def finished(self) -> bool:
+        if self.epoch >= self.parameters.epochs:
+            return True
+        return bool(self.history) and self.epoch - 1 - self.best_epoch >= self.parameters.patience
+
+    def run_epoch(self) -> tuple[float, float]:
+        """Train for one epoch; return the mean loss and the last learning rate."""
+        self.model.train()
+        self.loader.set_epoch(self.epoch)
+        accumulate, losses, rate = self.parameters.accumulate, [], 0.0
+        for number, batch in enumerate(self.loader):
+            loss = self._loss(batch.to(self.device))
+            # The last step of an epoch may have fewer batches.
+            first = number - number % accumulate
+            (loss / min(accumulate, len(self.loader) - first)).backward()  # type: ignore[no-untyped-call]
+            losses.append(float(loss.detach()))
+            if (number + 1) % accumulate == 0 or number + 1 == len(self.loader):
+                rate = self._rate(self.epoch * self.steps + number // accumulate)
+                for group in self.optimizer.param_groups:
+                    group["lr"] = rate
+                self.optimizer.step()
+                self.optimizer.zero_grad(set_to_none=True)
+        return float(np.mean(losses)), rate
+
+    @torch.no_grad()
+    def validate(self, dataset: SlatDataset) -> tuple[float, float, float]:
+        """Return loss, MSE and class accuracy, each a mean over assets."""
+        self.model.eval()
+        scores = []
+        for batch in SlatLoader(dataset):
+            moved = batch.to(self.device)
+            prediction = self._predict(moved)
+            valid = moved.valid
+            error = (prediction.properties - moved.properties)[valid].square().mean()
+            right = (prediction.logits.argmax(1) == moved.material)[valid].float().mean()
+            scores.append([float(loss_of(prediction, moved)), float(error), float(right)])
+        loss, error, accuracy = np.mean(scores, axis=0).tolist()
+        return loss, error, accuracy
+
+    def note(self, record: EpochRecord) -> bool:
+        """Remember an epoch; return whether it is the best so far."""
+        self.history.append(record)
+        return self.best_epoch == record.epoch
+
+    def state(self) -> dict[str, Any]:
+        return {
+            "model": self.model.state_dict(),
+            "optimizer": self.optimizer.state_dict(),
+            "history": [asdict(record) for record in self.history],
+        }
+
+    def restore(self, state: dict[str, Any] | None) -> None:
+        # Order, augmentation and learning rate follow from seed and epoch: no more is needed.
+        if state is not None:
+            self.model.load_state_dict(state["model"])
+            self.optimizer.load_state_dict(state["optimizer"])
+            self.history = [EpochRecord(**record) for record in state["history"]]
+
+    def _rate(self, step: int) -> float:
+        total = self.parameters.epochs * self.steps
+        return self.parameters.learning_rate * 0.5 * (1 + math.cos(math.pi * step / total))
+
+    def _predict(self, batch: SparseBatch) -> Prediction:
+        mixed = self.parameters.precision == "bf16"
+        with torch.autocast(self.device, torch.bfloat16, enabled=mixed):
+            prediction: Prediction = self.model(batch.coords, batch.feats)
+        return prediction
+
+    def _loss(self, batch: SparseBatch) -> Tensor:
+        return loss_of(self._predict(batch), batch)
+
+
+def _dataset(store: Path, split: Split, parameters: TrainParameters) -> SlatDataset:
+    return SlatDataset(
+        store,
+        split,
+        shares=parameters.shares,
+        verdicts=parameters.verdicts,
+        max_ambiguity=parameters.max_ambiguity,
+        augmentation=parameters.augmentation if split == "train" else "none",
+        seed=parameters.seed,
+    )
+
+
+def _reference(baseline: VoxelBaseline, dataset: SlatDataset) -> float:
+    errors = []
+    for item in (dataset[k] for k in range(len(dataset))):
+        predicted, _ = baseline.predict(item)
+        valid = item.valid.numpy()
+        errors.append(np.square(predicted - item.properties.numpy())[valid].mean())
+    return float(np.mean(errors))
+
+
+@torch.no_grad()
+def _predict(model: PhysicsDecoder, dataset: SlatDataset, run: Run, device: str) -> None:
+    model.eval()
+    for batch in SlatLoader(dataset):
+        moved = batch.to(device)
+        prediction: Prediction = model(moved.coords, moved.feats)
+        run.write_prediction(
+            batch.asset_ids[0],
+            batch.coords[:, 1:].numpy().astype(np.uint8),
+            prediction.properties.cpu().numpy(),
+            prediction.logits.argmax(1).cpu().numpy().astype(np.uint8),
+        )

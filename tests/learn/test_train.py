@@ -1,0 +1,156 @@
+"""Training: the loss by hand, resuming to the bit, stopping, and learning at all."""
+
+from __future__ import annotations
+
+import csv
+import dataclasses
+import json
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from click.testing import CliRunner
+
+from slatprep import ConfigError, InputError
+from slatprep.cli.commands import slatprep
+from slatprep.learn.baselines import fit_linear, fit_mean
+from slatprep.learn.dataset import IGNORED, SlatDataset, SparseBatch, collate
+from slatprep.learn.decoder import Prediction, make_decoder
+from slatprep.learn.runs import BEST, LAST
+from slatprep.learn.splits import Shares, split_of
+from slatprep.learn.train import TrainParameters, loss_of, train
+
+SHARES = Shares(0.4, 0.3, 0.3)
+SHORT = TrainParameters(
+    size="small", epochs=3, batch_size=2, accumulate=2, learning_rate=2e-3, shares=SHARES,
+    augmentation="upright", seed=1,
+)  # fmt: skip
+
+
+@pytest.fixture(autouse=True)
+def _default_torch() -> None:
+    torch.use_deterministic_algorithms(False)
+
+
+def test_loss_by_hand() -> None:
+    batch = SparseBatch(
+        ["a"],
+        torch.zeros(3, 4, dtype=torch.int32),
+        torch.zeros(3, 8),
+        torch.tensor([[0.0, 0.0, 0.0], [1.0, 0.0, -1.0], [0.0, 0.0, 0.0]]),
+        torch.tensor([0, 1, IGNORED]),
+        torch.tensor([True, True, False]),
+    )
+    prediction = Prediction(
+        torch.tensor([[0.5, 0.0, 0.0], [0.5, 1.0, -1.0], [1.0, 1.0, 1.0]]), torch.zeros(3, 8)
+    )
+    # (0.25 + 0.25) / 2 + (0 + 1) / 2 + 0, and half of ln 8 for eight equal scores.
+    assert float(loss_of(prediction, batch)) == pytest.approx(0.25 + 0.5 + 0.5 * math.log(8))
+    batch.valid[:] = False
+    assert float(loss_of(prediction, batch)) == 0.0
+
+
+def weights_of(path: Path) -> dict[str, torch.Tensor]:
+    state = torch.load(path, weights_only=True)
+    model: dict[str, torch.Tensor] = state["model"]
+    return model
+
+
+def test_resumed_run_has_the_same_bits(learn_store: Path, tmp_path: Path) -> None:
+    whole = train(learn_store, tmp_path / "whole", SHORT)
+    train(learn_store, tmp_path / "parts", SHORT, stop_after=1)
+    resumed = train(learn_store, tmp_path / "parts", SHORT)
+    assert resumed.history == whole.history
+    for name in (LAST, BEST):
+        ours, theirs = (weights_of(tmp_path / run / name) for run in ("whole", "parts"))
+        assert all(torch.equal(ours[key], theirs[key]) for key in ours), name
+    logs = [(tmp_path / run / "log.csv").read_bytes() for run in ("whole", "parts")]
+    assert logs[0] == logs[1]
+    rates = [float(row["learning_rate"]) for row in csv.DictReader(logs[0].decode().splitlines())]
+    # Two steps an epoch, so a cosine over six; the log has the last of each.
+    cosine = [2e-3 * (1 + math.cos(math.pi * step / 6)) / 2 for step in (1, 3, 5)]
+    assert rates == pytest.approx(cosine)
+    assert (tmp_path / "whole" / "curve.png").read_bytes().startswith(b"\x89PNG")
+    predicted = {path.stem for path in whole.predictions.iterdir()}
+    assert predicted == {
+        asset_id for asset_id in ["a", "b", "c", "d", "e", "f", "g", "h.front", "h.side"]
+        if split_of(asset_id[0], SHARES) == "test"
+    }  # fmt: skip
+
+
+def test_wrong_runs_are_named(learn_store: Path, tmp_path: Path) -> None:
+    out = tmp_path / "run"
+    one = dataclasses.replace(SHORT, epochs=1)
+    train(learn_store, out, one)
+    with pytest.raises(ConfigError, match="other parameters"):
+        train(learn_store, out, dataclasses.replace(one, seed=2))
+    (out / LAST).write_bytes(b"not a checkpoint")
+    with pytest.raises(InputError, match=r"last\.pt"):
+        train(learn_store, out, one)
+    with pytest.raises(ConfigError, match="holds no run"):
+        train(learn_store, tmp_path, one)
+
+
+def test_accumulation_is_the_gradient_of_the_mean(learn_store: Path, tmp_path: Path) -> None:
+    # Equal batches by equal weights: all objects in one step, one at a time, in any order.
+    base = dataclasses.replace(SHORT, epochs=1, batch_size=1, accumulate=100, precision="fp32")
+    train(learn_store, tmp_path / "run", dataclasses.replace(base, augmentation="none"))
+    moved = weights_of(tmp_path / "run" / LAST)
+    torch.manual_seed(base.seed)
+    model = make_decoder("small")
+    optimizer = torch.optim.AdamW(model.parameters(), lr=base.learning_rate)
+    dataset = SlatDataset(learn_store, "train", shares=SHARES)
+    batches = [collate([dataset[k]]) for k in range(len(dataset))]
+    losses = [loss_of(model(batch.coords, batch.feats), batch) for batch in batches]
+    torch.stack(losses).mean().backward()
+    optimizer.step()
+    for name, parameter in model.named_parameters():
+        torch.testing.assert_close(moved[name], parameter.detach(), rtol=0, atol=2e-4)
+
+
+def test_stops_when_validation_gets_no_better(learn_store: Path, tmp_path: Path) -> None:
+    # At a rate this small nothing moves, so the first epoch stays the best.
+    still = dataclasses.replace(SHORT, epochs=50, learning_rate=1e-30, patience=2)
+    summary = train(learn_store, tmp_path / "still", still)
+    assert summary.best_epoch == 0
+    assert len(summary.history) == 3
+
+
+def test_baselines_are_what_numpy_finds(learn_store: Path) -> None:
+    dataset = SlatDataset(learn_store)
+    items = [dataset[k] for k in range(len(dataset))]
+    valid = np.concatenate([item.valid.numpy() for item in items])
+    targets = np.concatenate([item.properties.numpy() for item in items])[valid]
+    feats = np.concatenate([item.feats.numpy() for item in items])
+    places = np.concatenate([(item.coords.numpy() + 0.5) / 64 - 0.5 for item in items])
+    inputs = np.hstack([feats, places, np.ones((len(feats), 1))])[valid]
+    solution = np.linalg.lstsq(inputs, targets, rcond=None)[0]
+    np.testing.assert_allclose(fit_linear(dataset).weights[:, :3], solution, atol=1e-6)
+    mean, classes = fit_mean(dataset).predict(items[0])
+    np.testing.assert_allclose(mean[0], targets.mean(axis=0), atol=1e-9)
+    material = np.concatenate([item.material.numpy() for item in items])[valid]
+    assert (classes == np.bincount(material).argmax()).all()
+
+
+def test_commands_train_and_evaluate(learn_store: Path, tmp_path: Path) -> None:
+    shares = ("--shares", "0.4,0.3,0.3")
+    trained = CliRunner().invoke(
+        slatprep,
+        ["train", str(learn_store), "--out", str(tmp_path / "run"), "--size", "small", "--epochs",
+         "2", "--learning-rate", "0.002", "--threads", "1", *shares, "--json"],
+    )  # fmt: skip
+    assert trained.exit_code == 0, trained.output
+    history = json.loads(trained.stdout)["small"]["history"]
+    assert history[1]["train_loss"] < history[0]["train_loss"]
+    predictions = tmp_path / "run" / "predictions"
+    measured = CliRunner().invoke(
+        slatprep, ["evaluate", str(predictions), "--store", str(learn_store), *shares, "--json"]
+    )
+    assert measured.exit_code == 0, measured.output
+    assert json.loads(measured.stdout)["missing"] == []
+    wrong = CliRunner().invoke(
+        slatprep, ["train", str(learn_store), "--out", str(tmp_path), "--shares", "1,2"]
+    )
+    assert wrong.exit_code == 2
