@@ -56,7 +56,8 @@ def main() -> None:
         print(f"steel: mean strain up to {mean[1].max():.4f}, {mean[1][worst]:.4f} at that time")
         print(f"steel: at most {1000 * apart:.2f} mm (rms) from a rigid motion")
         asset = open_store(Path(folder) / "drop.zarr").asset("drop")
-        draw(options.out, frames, strains, material, asset, (0, 13, worst, len(frames) - 1))
+        chosen = (0, 13, worst, len(frames) - 1)
+        draw(options.out, positions, frames, strains, material, asset, chosen)
 
 
 def write_sources(folder: Path) -> None:

@@ -10,7 +10,7 @@ from matplotlib.colors import LinearSegmentedColormap
 from matplotlib.figure import Figure
 from scipy.spatial import cKDTree
 
-from slatprep.geometry import VOXEL_SIZE, apply_transform, occupancy_of
+from slatprep.geometry import VOXEL_SIZE, apply_transform
 from slatprep.pictures.palette import DISTANCE_COLOURS, INK, MUTED
 from slatprep.store.reader import StoredAsset
 
@@ -26,6 +26,7 @@ _CORNERS = np.array([[0, 0], [1, 0], [1, 1], [0, 0], [1, 1], [0, 1]])
 
 def draw(
     path: Path,
+    positions: np.ndarray,
     frames: np.ndarray,
     strains: np.ndarray,
     material: np.ndarray,
@@ -33,12 +34,32 @@ def draw(
     chosen: tuple[int, ...],
     rate: int = 60,
 ) -> None:
-    """Draw chosen frames and the course of the strain, and write them as a PNG."""
+    """Draw chosen frames and the course of the strain, and write them as a PNG.
+
+    Parameters
+    ----------
+    path : Path
+        The PNG.
+    positions : ndarray, shape (N, 3)
+        The particles where the store has them, SLAT frame.
+    frames : ndarray, shape (F, N, 3)
+        Their motion; the first frame is at rest.
+    strains : ndarray, shape (F, N)
+        Their strains.
+    material : ndarray, shape (N,)
+        0 for jelly, 1 for steel.
+    asset : StoredAsset
+        The object, whose field gives the surfaces.
+    chosen : tuple of int
+        The frames to draw.
+    rate : int
+        Frames a second.
+    """
     figure = Figure(figsize=(12, 5.4), dpi=130)
     grid = figure.add_gridspec(2, len(chosen), height_ratios=(2.0, 1.0), hspace=0.12, wspace=0.04,
                                left=0.055, right=0.885, top=0.94, bottom=0.11)  # fmt: skip
     meshes = [surface(asset, number) for number in (0, 1)]
-    lift = frames[0].mean(axis=0) - _rest_centre(frames[0], asset)
+    lift = frames[0].mean(axis=0) - positions.mean(axis=0)
     for column, frame in enumerate(chosen):
         axis = figure.add_subplot(grid[0, column])
         axis.imshow(_render(meshes, lift, frames, strains, material, frame))
@@ -83,15 +104,6 @@ def surface(asset: StoredAsset, number: int) -> o3d.geometry.TriangleMesh:
         o3d.utility.Vector3iVector(triangles.reshape(-1, 3)),
     )
     return mesh.filter_smooth_taubin(60)
-
-
-def _rest_centre(rest: np.ndarray, asset: StoredAsset) -> np.ndarray:
-    """Return where the particles' centre would be, had `drop` not lifted them."""
-    low = (np.argwhere(occupancy_of(asset.coords))[:, 2].min()) * VOXEL_SIZE - 0.5
-    spacing = np.diff(np.unique(rest[:, 2].round(6))).min()
-    bottom = np.ceil((low + 0.5) / spacing - 0.5) * spacing - 0.5 + spacing / 2
-    centre: np.ndarray = rest.mean(axis=0) - [0.0, 0.0, rest[:, 2].min() - bottom]
-    return centre
 
 
 def _camera() -> np.ndarray:

@@ -45,13 +45,13 @@ def test_picture_shows_the_jelly_strained_and_the_steel_not(
     from PIL import Image
 
     monkeypatch.setattr(drop_picture, "SIZE", (200, 200))
-    rest, material, _ = made[1]
-    rest = rest + np.array([0.0, 0.0, 0.5])
+    positions, material, _ = made[1]
+    rest = positions + np.array([0.0, 0.0, 0.5])
     squeezed = rest * np.where(material[:, None] == 0, [1.2, 1.2, 1.0], 1.0)
     frames = np.stack([rest, squeezed])
     strains = np.stack([strain(rest, frame, material, 1 / 32) for frame in frames])
     asset = open_store(made[0] / "drop.zarr").asset("drop")
-    drop_picture.draw(tmp_path / "drop.png", frames, strains, material, asset, (0, 1))
+    drop_picture.draw(tmp_path / "drop.png", positions, frames, strains, material, asset, (0, 1))
     with Image.open(tmp_path / "drop.png") as image:
         pixels = np.asarray(image.convert("RGB"), dtype=int)
     left, right = (
