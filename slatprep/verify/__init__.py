@@ -7,6 +7,7 @@ the sources that the records name.
 
 from __future__ import annotations
 
+import uuid
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -133,8 +134,9 @@ def verify_store(
 def _assets(
     store: Store, roots: SourceRoots | None, total: int, jobs: int
 ) -> Iterator[tuple[list[Finding], int]]:
+    run = uuid.uuid4().hex
     tasks = (
-        (store.path, range(first, min(first + ASSETS_IN_TASK, total)), roots)
+        (store.path, range(first, min(first + ASSETS_IN_TASK, total)), roots, run)
         for first in range(0, total, ASSETS_IN_TASK)
     )
     return run_unordered(asset_findings, tasks, jobs)

@@ -47,6 +47,9 @@ def asset_findings(path: Path, rows: range, roots: SourceRoots | None) -> tuple[
         Which assets, by index.
     roots : SourceRoots or None
         Where the sources lie, if they are to be compared.
+    run : str
+        Something unique to this verification: whatever a process remembers of
+        an earlier one, of files that may have changed since, is not used.
 
     Returns
     -------
@@ -55,7 +58,7 @@ def asset_findings(path: Path, rows: range, roots: SourceRoots | None) -> tuple[
     sources : int
         How many source files were compared.
     """
-    store = _opened(path)
+    store = _opened(path, run)
     findings: list[Finding] = []
     sources = 0
     for row in rows:
@@ -77,7 +80,7 @@ def asset_findings(path: Path, rows: range, roots: SourceRoots | None) -> tuple[
             continue
         findings += record_findings(asset, record, store)
         if roots is not None:
-            findings += source_findings(record, roots)
+            findings += source_findings(record, roots, run)
             sources += len(record.get("sources", ()))
     return findings, sources
 
@@ -170,7 +173,7 @@ def record_findings(
             )
 
 
-def source_findings(record: Mapping[str, Any], roots: SourceRoots) -> Iterator[Finding]:
+def source_findings(record: Mapping[str, Any], roots: SourceRoots, run: str) -> Iterator[Finding]:
     """Yield sources of an asset that are gone or are not what its record says."""
     for source in record.get("sources", ()):
         root = roots.slat if source["role"] == "slat" else roots.pixieverse
@@ -181,7 +184,7 @@ def source_findings(record: Mapping[str, Any], roots: SourceRoots) -> Iterator[F
             state = resolved.stat()
             if state.st_size != source["size"]:
                 what = f"has {state.st_size} of {source['size']} bytes"
-            elif _digest(resolved, state.st_mtime_ns) != source["sha256"]:
+            elif _digest(resolved, run) != source["sha256"]:
                 what = "its bytes changed"
             else:
                 continue
@@ -275,7 +278,7 @@ def schema_findings(
 
 
 @lru_cache(maxsize=1)
-def _opened(path: Path) -> Store:
+def _opened(path: Path, run: str) -> Store:
     return open_store(path)
 
 
@@ -287,6 +290,6 @@ def _validator(schema: str) -> Any:
 
 
 @lru_cache(maxsize=64)
-def _digest(path: Path, mtime_ns: int) -> str:
+def _digest(path: Path, run: str) -> str:
     # One file may hold the SLATs of many assets.
     return file_digest(path)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -264,6 +265,25 @@ def test_changed_and_missing_sources_are_found(store: Path, mixed: Dataset, tmp_
         (str(grid), "ant", "its bytes changed"),
         (str(slat), "cup", "does not exist"),
     ]
+
+
+def test_a_second_look_remembers_nothing_of_the_first(
+    store: Path, mixed: Dataset, tmp_path: Path
+) -> None:
+    parameters = mixed.parameters()
+    roots = SourceRoots(parameters.pixieverse.root, tmp_path / "slat")
+    shutil.copytree(parameters.slat.root, roots.slat)
+    assert verify_store(store, roots=roots, sources=True).ok
+    slat = roots.slat / "ant.npz"
+    times = slat.stat().st_atime_ns, slat.stat().st_mtime_ns
+    data = bytearray(slat.read_bytes())
+    data[300] ^= 1
+    slat.write_bytes(data)
+    os.utime(slat, ns=times)
+    rewrite(store, "asset/id", 4, "zebra")
+    findings = found(store, roots=roots, sources=True)
+    assert {"its bytes changed"} <= {f.what for f in of_file(findings, str(slat))}
+    assert any(finding.asset == "zebra" for finding in findings)
 
 
 def test_sources_that_nobody_knows_of_are_asked_for(store: Path) -> None:
