@@ -36,7 +36,9 @@ class SourceRoots:
     slat: Path
 
 
-def asset_findings(path: Path, rows: range, roots: SourceRoots | None) -> tuple[list[Finding], int]:
+def asset_findings(
+    path: Path, rows: range, roots: SourceRoots | None, run: str
+) -> tuple[list[Finding], int]:
     """Check some assets of a store.
 
     Parameters
