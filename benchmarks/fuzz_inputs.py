@@ -11,8 +11,8 @@ the same values. A process that crashes, hangs (20 s a file) or takes more
 than 600 MB counts as a fault, as does any other exception. Files are read in
 processes of their own, so a crash is one fault and not the end.
 
-Whole builds take datasets of which every asset has one damaged file; each must
-finish, and the store must pass `slatprep verify`.
+Whole builds take datasets of which three assets in four have one damaged file;
+each must finish with the sound ones, and the store must pass `slatprep verify`.
 """
 
 from __future__ import annotations
@@ -346,7 +346,7 @@ def fuzz_form(form: str, files: int, seed: int, folder: Path) -> dict[str, objec
 
 
 def fuzz_builds(assets: int, seed: int, folder: Path) -> dict[str, object]:
-    """Build datasets in which every asset has a damaged file, and verify what comes out."""
+    """Build datasets in which most assets have a damaged file, and verify what comes out."""
     demo = folder / "whole"
     make_demo(demo, ASSETS_IN_BUILD, seed=1)
     parameters = BuildParameters(PixieverseSource(demo / "pixieverse"), SlatSource(demo / "slat"))
@@ -357,6 +357,8 @@ def fuzz_builds(assets: int, seed: int, folder: Path) -> dict[str, object]:
         target = folder / "damaged"
         shutil.copytree(demo, target)
         for number, pair in enumerate(pairs):
+            if number % 4 == 0:
+                continue
             rng = np.random.default_rng((seed, 1, first + number))
             kinds = [path for path in (pair.grid, pair.mask, pair.slat) if path]
             file = target / kinds[rng.integers(len(kinds))].relative_to(demo)
@@ -369,6 +371,9 @@ def fuzz_builds(assets: int, seed: int, folder: Path) -> dict[str, object]:
         try:
             summary = build_store(damaged, folder / "damaged.zarr")
             total.update(summary.statuses)
+            sound = -(-len(pairs) // 4)
+            if summary.statuses["ok"] < sound:
+                faults.append(f"build {first}: {summary.statuses}, {sound} of them sound")
             internal = [why for _, why in summary.problems if "internal error" in why]
             checked = verify_store(folder / "damaged.zarr", sources=True)
             faults += internal + [str(finding) for finding in checked.findings]
