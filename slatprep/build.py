@@ -330,9 +330,16 @@ def _nothing_usable(assets: Sequence[SpooledAsset], parameters: BuildParameters)
 
 def _places(out: Path, manifests: Path | None) -> tuple[Path, Path]:
     """Return where the store really lies, and the directory of its records."""
-    if out.exists() and not is_store(out) and not (out.is_dir() and not any(out.iterdir())):
+    try:
+        taken = out.exists() and not is_store(out) and not (out.is_dir() and not any(out.iterdir()))
+        target = out.resolve()  # What a link points to is replaced, not the link.
+    except OSError as error:
+        raise StoreError(
+            f"{out}: cannot be looked at ({error.strerror}); expected a path that may be read and "
+            "written"
+        ) from error
+    if taken:
         raise StoreError(
             f"{out} exists and is not a slatprep store; expected a store to replace, or a new path"
         )
-    # What a link points to is replaced, not the link.
-    return out.resolve(), default_manifests(out) if manifests is None else Path(manifests)
+    return target, default_manifests(out) if manifests is None else Path(manifests)

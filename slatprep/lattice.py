@@ -16,7 +16,8 @@ from numpy.typing import NDArray
 
 from slatprep.records import RESOLUTION
 
-_REACH = 6  # voxels searched by cells before all voxels are tried one by one
+_REACH = 6  # voxels searched by cells before a tree is built after all
+_SURE = _REACH + 0.5  # no voxel beyond the cells can be nearer than this
 
 
 def nearest_voxel(
@@ -53,8 +54,29 @@ def nearest_voxel(
     position = (np.asarray(points, dtype=np.float64) + 0.5) * RESOLUTION - 0.5
     offsets, floors = _cells()
     distance, nearest = _search(
-        np.ascontiguousarray(position), row, index, offsets, floors, float(limit) ** 2
+        np.ascontiguousarray(position), row, offsets, floors, float(limit) ** 2
     )
+    if limit > _SURE:
+        # Few points lie so far off that their cells cannot tell; a tree knows of those.
+        far = np.flatnonzero(~(distance <= _SURE))
+        if len(far):
+            distance[far], nearest[far] = _search_far(position[far], index, limit)
+    return distance, nearest
+
+
+def _search_far(
+    position: NDArray[np.float64], voxels: NDArray[np.intp], limit: float
+) -> tuple[NDArray[np.float64], NDArray[np.intp]]:
+    from scipy.spatial import cKDTree
+
+    # Of equally near voxels the lower row wins, here as above.
+    tree = cKDTree(voxels)
+    distance, nearest = tree.query(position, k=1)
+    for point, apart in enumerate(distance):
+        rivals = tree.query_ball_point(position[point], apart * (1.0 + 1e-12))
+        nearest[point] = min([*rivals, nearest[point]])
+    beyond = distance > limit
+    distance[beyond], nearest[beyond] = np.inf, -1
     return distance, nearest
 
 
@@ -109,17 +131,16 @@ def _cells() -> tuple[NDArray[np.int64], NDArray[np.float64]]:
     floors = (np.maximum(np.abs(offsets) - 0.5, 0.0) ** 2).sum(axis=1)
     order = np.argsort(floors, kind="stable")
     # Cells beyond the reach may be as near as this; nothing farther is sure.
-    sure = floors[order] <= (_REACH + 0.5) ** 2
+    sure = floors[order] <= _SURE**2
     return offsets[order][sure].astype(np.int64), floors[order][sure]
 
 
 @njit(cache=True)
-def _search(position, row, voxels, offsets, floors, limit):  # type: ignore[no-untyped-def]
+def _search(position, row, offsets, floors, limit):  # type: ignore[no-untyped-def]
     count = position.shape[0]
     size = row.shape[0]
     distance = np.full(count, np.inf)
     nearest = np.full(count, -1, dtype=np.intp)
-    sure = (_REACH + 0.5) ** 2
     for m in range(count):
         x, y, z = position[m, 0], position[m, 1], position[m, 2]
         a, b, c = int(np.rint(x)), int(np.rint(y)), int(np.rint(z))
@@ -137,15 +158,6 @@ def _search(position, row, voxels, offsets, floors, limit):  # type: ignore[no-u
             square = (x - i) ** 2 + (y - j) ** 2 + (z - k) ** 2
             if square < best or (square == best and candidate < found):
                 best, found = square, candidate
-        if best > sure and limit > sure:
-            for candidate in range(voxels.shape[0]):
-                square = (
-                    (x - voxels[candidate, 0]) ** 2
-                    + (y - voxels[candidate, 1]) ** 2
-                    + (z - voxels[candidate, 2]) ** 2
-                )
-                if square < best:
-                    best, found = square, candidate
         if best <= limit:
             distance[m], nearest[m] = np.sqrt(best), found
     return distance, nearest

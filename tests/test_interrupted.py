@@ -326,13 +326,30 @@ def test_a_target_that_is_read_only(
     folder.chmod(0o555)
     # Root may write anywhere, so it becomes nobody first.
     fault = "import fcntl; os.geteuid() or os.seteuid(65534)"
-    for path in (tmp_path, *tmp_path.parents[:2]):
-        path.chmod(0o755)
+    for path in (tmp_path, *tmp_path.parents[:3]):  # one more under pytest-xdist
+        path.chmod(path.stat().st_mode | 0o755)
     done = run(script, dataset, folder / "s.zarr", fault)
     assert done.returncode == 1
     assert "locked: cannot write there (Permission denied)" in done.stderr
     folder.chmod(0o755)
     ends_well(dataset, folder / "s.zarr", expected)
+
+
+def test_a_target_that_may_not_even_be_looked_at(
+    reference: tuple[Dataset, dict[str, str]], script: Path, tmp_path: Path
+) -> None:
+    dataset, _ = reference
+    folder = tmp_path / "hidden"
+    folder.mkdir()
+    folder.chmod(0o000)
+    fault = "import fcntl; os.geteuid() or os.seteuid(65534)"
+    for path in (tmp_path, *tmp_path.parents[:3]):
+        path.chmod(path.stat().st_mode | 0o755)
+    done = run(script, dataset, folder / "s.zarr", fault)
+    folder.chmod(0o755)
+    assert done.returncode == 1
+    assert "s.zarr: cannot be looked at (Permission denied)" in done.stderr
+    assert "Traceback" not in done.stderr
 
 
 def test_the_second_of_two_builds_is_refused_and_told_of_the_first(

@@ -16,7 +16,6 @@ from slatprep.errors import InputError
 Example:
   slatprep extract-slat renders/*.png --out slat
   slatprep extract-slat renders/*/*.png --by-folder --out slat --seed 0 --seed 1
-  slatprep build-store --pixieverse pixieverse --slat slat --out store.zarr
 """,
 )
 @click.argument("images", nargs=-1, required=True,

@@ -41,7 +41,7 @@ def write_store(path: Path, assets: dict[str, dict[str, np.ndarray]]) -> None:
         arrays[f"asset/{name}"] = np.zeros(len(ids))
     arrays["asset/property_ambiguity"] = np.zeros((len(ids), 3))
     for name, array in arrays.items():
-        root.create_array(name, data=array)
+        root.create_array(name, data=array, config={"write_empty_chunks": True})
     for name in ("id", "object_id", "view", "category", "engine", "model", "search", "verdict"):
         strings = root.create_array(f"asset/{name}", shape=(len(ids),), dtype=str)
         strings[:] = np.array(ids if name == "id" else [""] * len(ids), dtype=object)
