@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import glob
 import json
-import shutil
 from pathlib import Path
 
 import mlcroissant
@@ -137,23 +136,17 @@ def test_tensorstore_reads_the_same_numbers(store: Path, layout: object) -> None
     np.testing.assert_array_equal(read, ours[...])
 
 
-def test_coordinates_name_rows_columns_and_places(store: Path, tmp_path: Path) -> None:
-    from slatprep.store.coordinates import write_coordinates
-
-    named = tmp_path / "named.zarr"
-    shutil.copytree(store, named)
-    write_coordinates(named)
-    zarr.consolidate_metadata(str(named), zarr_format=3)
+def test_coordinates_name_rows_columns_and_places(store: Path) -> None:
     group = zarr.open_group(store, mode="r")
-    with xarray.open_zarr(named, group="asset") as assets:
+    with xarray.open_zarr(store, group="asset") as assets:
         assert set(assets.coords) == {"id", "object_id", "view", "category", "property"}
         row = int(np.flatnonzero(assets["id"].values == "dog")[0])
         assert assets["fitness"][row] == group["asset/fitness"][row]
-    with xarray.open_zarr(named, group="voxel") as voxels:
+    with xarray.open_zarr(store, group="voxel") as voxels:
         density = voxels["properties"].sel(property="density")
         np.testing.assert_array_equal(density.values, group["voxel/properties"][:, 1])
         assert list(voxels["axis"].values) == ["x", "y", "z"]
-    with xarray.open_zarr(named, group="grid") as grids:
+    with xarray.open_zarr(store, group="grid") as grids:
         assert set(grids.coords) == {"property", "x", "y", "z"}
         assert grids["x"].values[0] == -0.5 + 0.5 / 64
         there = grids["material"].sel(x=0.1, y=-0.1, z=0.02, method="nearest")

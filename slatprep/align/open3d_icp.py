@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from slatprep.align.quality import measure_quality
 from slatprep.align.starts import Start, candidates_of, distinct_starts
 from slatprep.geometry import VOXEL_SIZE, boundary, make_transform, voxel_centres, voxels_of
+from slatprep.parallel import single_threaded
 from slatprep.parameters import AlignParameters
 from slatprep.records import Alignment, MaterialField, StructuredLatents
 
@@ -34,7 +35,19 @@ def align(
     `starts` is for the benchmark, which times all 64 as published; left out,
     the 40 that repeat another rotation are not computed twice.
     """
-    o3d = load_open3d()
+    # Open3D sums over threads in the order in which they finish: with one, the
+    # same input gives the same bits.
+    with single_threaded():
+        return _align(load_open3d(), field, latents, parameters, starts)
+
+
+def _align(
+    o3d: Any,
+    field: MaterialField,
+    latents: StructuredLatents,
+    parameters: AlignParameters,
+    starts: Sequence[Start] | None,
+) -> Alignment:
     registration = o3d.pipelines.registration
     method = registration.TransformationEstimationPointToPoint()
     criteria = registration.ICPConvergenceCriteria(max_iteration=parameters.icp_iterations)

@@ -21,6 +21,7 @@ from slatprep.normalize import normalize, normalize_change
 from slatprep.parameters import StoreParameters
 from slatprep.records import Normalization
 from slatprep.store.asset_records import create_record_array
+from slatprep.store.coordinates import write_coordinates
 from slatprep.store.digests import write_digests
 from slatprep.store.layout import (
     ARRAYS,
@@ -176,6 +177,7 @@ def finish_store(
     import zarr
 
     _open(path).attrs.update(root_attributes(normalization, manifest, build))
+    write_coordinates(path)
     write_digests(path)
     with warnings.catch_warnings():
         # Zarr says that consolidated metadata are not in format 3's text yet.

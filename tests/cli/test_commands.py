@@ -272,7 +272,7 @@ def test_stopped_build_leaves_the_older_store_and_nothing_else(
     before = {path: path.read_bytes() for path in store.rglob("*") if path.is_file()}
     build = subprocess.Popen(
         [sys.executable, "-m", "slatprep.cli", "build-store", "--config",
-         demo / "demo" / "dataset.toml", "--out", store, "--jobs", "2"],
+         demo / "demo" / "dataset.toml", "--out", store, "--jobs", "2", "--fresh"],
         stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True,
     )  # fmt: skip
     while len(list(tmp_path.iterdir())) == 1 and build.poll() is None:
