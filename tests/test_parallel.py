@@ -1,4 +1,5 @@
 import os
+import time
 import warnings
 from collections.abc import Iterator
 
@@ -18,12 +19,12 @@ def test_every_task_is_done_once(jobs: int) -> None:
 def test_tasks_are_taken_as_workers_come_free(jobs: int) -> None:
     taken = 0
 
-    def tasks() -> Iterator[tuple[int]]:
+    def tasks() -> Iterator[tuple[float]]:
         nonlocal taken
         for taken in range(1, 100_001):
-            yield (taken,)
+            yield (0.05,)  # long enough that a hundred cannot be done before the first is seen
 
-    results = run_unordered(abs, tasks(), jobs)
+    results = run_unordered(time.sleep, tasks(), jobs)
     next(results)
     assert taken < 100
     with warnings.catch_warnings():
