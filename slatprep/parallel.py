@@ -14,7 +14,7 @@ from slatprep.errors import SlatprepError
 
 Result = TypeVar("Result")
 
-_THREAD_VARIABLES = (
+THREAD_VARIABLES = (
     "OMP_NUM_THREADS",
     "OPENBLAS_NUM_THREADS",
     "MKL_NUM_THREADS",
@@ -23,6 +23,7 @@ _THREAD_VARIABLES = (
     "NUMEXPR_NUM_THREADS",
     "NUMBA_NUM_THREADS",
 )
+"""What the numeric libraries read, once, when they are loaded."""
 
 
 def run_unordered(
@@ -135,7 +136,7 @@ def _run_alone(
     from joblib.externals.loky import ProcessPoolExecutor
     from joblib.externals.loky.process_executor import BrokenProcessPool
 
-    environment = dict.fromkeys(_THREAD_VARIABLES, "1")
+    environment = dict.fromkeys(THREAD_VARIABLES, "1")
     alone = None
     for task in tasks:
         if alone is None:
@@ -178,8 +179,8 @@ def single_threaded() -> Iterator[None]:
     """Hold the numeric libraries to one thread each, loaded already or loaded within."""
     from threadpoolctl import threadpool_limits
 
-    before = {name: os.environ.get(name) for name in _THREAD_VARIABLES}
-    os.environ.update(dict.fromkeys(_THREAD_VARIABLES, "1"))
+    before = {name: os.environ.get(name) for name in THREAD_VARIABLES}
+    os.environ.update(dict.fromkeys(THREAD_VARIABLES, "1"))
     try:
         with threadpool_limits(limits=1):
             yield

@@ -23,7 +23,14 @@ from slatprep.parameters import BuildParameters
 from slatprep.plan import Action, PlannedAsset, previous_record
 from slatprep.readers import read_field, read_latents
 from slatprep.readers.identity import source_digests
-from slatprep.records import AssetPair, AssetResult, MaterialField, Status, StructuredLatents
+from slatprep.records import (
+    Alignment,
+    AssetPair,
+    AssetResult,
+    MaterialField,
+    Status,
+    StructuredLatents,
+)
 from slatprep.reuse import Recipe
 from slatprep.sample import sample
 from slatprep.store.spool import Spool, SpooledAsset, key_of_failed
@@ -49,13 +56,19 @@ def process_asset(pair: AssetPair, parameters: BuildParameters) -> AssetResult:
     InputError
         If a source cannot be used or a partner is missing.
     """
-    return _annotate(pair, read_field(pair), read_latents(pair), parameters)
-
-
-def _annotate(
-    pair: AssetPair, field: MaterialField, latents: StructuredLatents, parameters: BuildParameters
-) -> AssetResult:
+    field, latents = read_field(pair), read_latents(pair)
     alignment = align(field, latents, parameters.align)
+    return annotate_asset(pair, field, latents, alignment, parameters)
+
+
+def annotate_asset(
+    pair: AssetPair,
+    field: MaterialField,
+    latents: StructuredLatents,
+    alignment: Alignment,
+    parameters: BuildParameters,
+) -> AssetResult:
+    """Look an aligned asset up, and say what its alignment is worth."""
     annotation = sample(field, latents.coords, alignment.transform, parameters.sample)
     ambiguity = measure_ambiguity(field, latents, alignment, parameters.sample)
     verdict, reasons = judge(alignment.quality, float(annotation.valid.mean()), ambiguity)
@@ -180,7 +193,8 @@ def _result_of(
     if planned is not None and planned.action is Action.REUSE:
         record = previous_record(bench.previous, pair.asset_id)
     if record is None or record["key"] != key:  # The files may have changed since the plan.
-        return _annotate(pair, field, latents, bench.parameters), key, None
+        alignment = align(field, latents, bench.parameters.align)
+        return annotate_asset(pair, field, latents, alignment, bench.parameters), key, None
     transform = record["alignment"]["transform"]
     annotation = sample(field, latents.coords, transform, bench.parameters.sample)
     result = AssetResult(pair, Status.OK, field=field, latents=latents, annotation=annotation)

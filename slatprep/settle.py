@@ -16,16 +16,15 @@ from typing import Any
 import numpy as np
 
 from slatprep import provenance
-from slatprep.align.ambiguity import measure_ambiguity
 from slatprep.align.consensus import find_consensus, settle
-from slatprep.align.quality import judge, measure_quality
+from slatprep.align.quality import measure_quality
 from slatprep.parallel import run_unordered
 from slatprep.parameters import BuildParameters
+from slatprep.process import annotate_asset
 from slatprep.records import (
     BACKGROUND,
     Alignment,
     AssetPair,
-    AssetResult,
     Candidate,
     Consensus,
     MaterialField,
@@ -35,7 +34,6 @@ from slatprep.records import (
     StructuredLatents,
     Verdict,
 )
-from slatprep.sample import sample
 from slatprep.store.spool import Spool, SpooledAsset
 
 
@@ -88,20 +86,8 @@ def settle_asset(
     grid, voxels, properties = spool.grid(asset.key)
     field = MaterialField(grid != BACKGROUND, voxels, grid[tuple(voxels.T)], properties)
     quality = measure_quality(field, latents, after.transform, parameters.align.radius)
-    annotation = sample(field, latents.coords, after.transform, parameters.sample)
-    ambiguity = measure_ambiguity(field, latents, after, parameters.sample)
-    verdict, reasons = judge(quality, float(annotation.valid.mean()), ambiguity)
-    result = AssetResult(
-        pair=_pair_of(record),
-        status=Status.OK,
-        field=field,
-        latents=latents,
-        alignment=replace(after, quality=quality),
-        annotation=annotation,
-        ambiguity=ambiguity,
-        verdict=verdict,
-        verdict_reasons=reasons,
-    )
+    after = replace(after, quality=quality)
+    result = annotate_asset(_pair_of(record), field, latents, after, parameters)
     key = hashlib.sha256(f"{asset.key} {consensus.rotation.tobytes().hex()}".encode()).hexdigest()
     entries = {
         "key": key,

@@ -127,7 +127,7 @@ def bench_align(
     if unknown:
         raise ConfigError(f"no engine {sorted(unknown)}; expected some of {', '.join(ENGINES)}")
     chosen = [REFERENCE, *(e for e in ENGINES if e in engines and e != REFERENCE)]
-    pairs = [(pair, truth) for pair, truth in _pairs(folder, limit)]
+    pairs = list(_pairs(folder, limit))
     if not pairs:
         raise ConfigError(
             f"{folder}: no asset with truth; expected pixieverse/, slat/ and truth/ in it, "

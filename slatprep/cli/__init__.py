@@ -5,23 +5,15 @@ from __future__ import annotations
 import os
 import signal
 
-# One process is one job and computes on one thread: `--jobs` alone decides how
-# many cores are busy, and the numbers do not depend on a thread count. The
-# libraries read these once, when they are loaded; workers inherit them.
-_THREAD_VARIABLES = (
-    "OMP_NUM_THREADS",
-    "OPENBLAS_NUM_THREADS",
-    "MKL_NUM_THREADS",
-    "BLIS_NUM_THREADS",
-    "VECLIB_MAXIMUM_THREADS",
-    "NUMEXPR_NUM_THREADS",
-    "NUMBA_NUM_THREADS",
-)
+from slatprep.parallel import THREAD_VARIABLES
 
 
 def main() -> None:
     """Run `slatprep`; the entry point of the console script."""
-    for variable in _THREAD_VARIABLES:
+    # One process is one job and computes on one thread: `--jobs` alone decides how
+    # many cores are busy, and the numbers do not depend on a thread count. The
+    # libraries read these once, when they are loaded; workers inherit them.
+    for variable in THREAD_VARIABLES:
         os.environ[variable] = "1"
     # A batch system's request to stop is as good as Ctrl-C: clean up, then go.
     signal.signal(signal.SIGTERM, signal.default_int_handler)
