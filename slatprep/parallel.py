@@ -123,7 +123,8 @@ def _run_in_pool(function: Callable[..., Result], source: _Handout, jobs: int) -
     finally:
         with warnings.catch_warnings():
             # Whoever stops early, as a strict build does, means to waste the rest.
-            warnings.filterwarnings("ignore", message=".*but not used", category=UserWarning)
+            for wasted in (".*but not used", ".*have been cancelled"):
+                warnings.filterwarnings("ignore", message=wasted, category=UserWarning)
             results.close()
 
 

@@ -21,7 +21,8 @@ def test_tasks_are_taken_as_workers_come_free(jobs: int) -> None:
 
     def tasks() -> Iterator[tuple[float]]:
         nonlocal taken
-        for taken in range(1, 100_001):
+        while taken < 100_000:
+            taken += 1
             yield (0.05,)  # long enough that a hundred cannot be done before the first is seen
 
     results = run_unordered(time.sleep, tasks(), jobs)
