@@ -20,48 +20,96 @@ _REACH = 6  # voxels searched by cells before a tree is built after all
 _SURE = _REACH + 0.5  # no voxel beyond the cells can be nearer than this
 
 
-def nearest_voxel(
-    points: NDArray[np.float64], voxels: NDArray[np.uint8], limit: float = np.inf
-) -> tuple[NDArray[np.float64], NDArray[np.intp]]:
-    """Find the nearest voxel of a set for each point.
+class Lattice:
+    """A set of voxels that knows which row each cell of the grid belongs to.
 
     Parameters
     ----------
-    points : ndarray of float64, shape (N, 3)
-        Points of the unit cube's frame; they may lie outside the cube.
     voxels : ndarray of uint8, shape (K, 3)
         The set, K >= 1; no voxel occurs twice.
-    limit : float
-        Voxels; a point without a voxel this near needs no exact answer.
-
-    Returns
-    -------
-    distance : ndarray of float64, shape (N,)
-        Euclidean distance in voxels; infinite where it exceeds `limit`.
-    index : ndarray of intp, shape (N,)
-        Row of the nearest voxel in `voxels`, the first of several equally near
-        ones; -1 where the distance exceeds `limit`.
 
     Raises
     ------
     ValueError
         If the set is empty.
     """
-    if len(voxels) == 0:
-        raise ValueError("the nearest voxel of an empty set does not exist")
-    row, index = _rows(voxels), voxels.astype(np.intp)
-    # Positions in index units, where voxel i is centred at i.
-    position = (np.asarray(points, dtype=np.float64) + 0.5) * RESOLUTION - 0.5
-    offsets, floors = _cells()
-    distance, nearest = _search(
-        np.ascontiguousarray(position), row, offsets, floors, float(limit) ** 2
-    )
-    if limit > _SURE:
-        # Few points lie so far off that their cells cannot tell; a tree knows of those.
-        far = np.flatnonzero(~(distance <= _SURE))
-        if len(far):
-            distance[far], nearest[far] = _search_far(position[far], index, limit)
-    return distance, nearest
+
+    def __init__(self, voxels: NDArray[np.uint8]) -> None:
+        if len(voxels) == 0:
+            raise ValueError("the nearest voxel of an empty set does not exist")
+        self._voxels = voxels
+        self._row = np.full((RESOLUTION,) * 3, -1, dtype=np.int32)
+        self._row[tuple(voxels.T)] = np.arange(len(voxels), dtype=np.int32)
+
+    def nearest(
+        self, points: NDArray[np.float64], limit: float = np.inf
+    ) -> tuple[NDArray[np.float64], NDArray[np.intp]]:
+        """Find the nearest voxel for each point.
+
+        Parameters
+        ----------
+        points : ndarray of float64, shape (N, 3)
+            Points of the unit cube's frame; they may lie outside the cube.
+        limit : float
+            Voxels; a point without a voxel this near needs no exact answer.
+
+        Returns
+        -------
+        distance : ndarray of float64, shape (N,)
+            Euclidean distance in voxels; infinite where it exceeds `limit`.
+        index : ndarray of intp, shape (N,)
+            Row of the nearest voxel in the set, the first of several equally
+            near ones; -1 where the distance exceeds `limit`.
+        """
+        position = _in_voxels(points)
+        distance, nearest = _search(position, self._row, *_cells(), float(limit) ** 2)
+        if limit > _SURE:
+            # Few points lie so far off that their cells cannot tell; a tree knows of those.
+            far = np.flatnonzero(~(distance <= _SURE))
+            if len(far):
+                voxels = self._voxels.astype(np.intp)
+                distance[far], nearest[far] = _search_far(position[far], voxels, limit)
+        return distance, nearest
+
+    def vote(
+        self, points: NDArray[np.float64], labels: NDArray[np.uint8], width: float
+    ) -> NDArray[np.intp]:
+        """Find the voxel that speaks for each point after a vote of those around it.
+
+        The voxels in the 27 cells around the point vote for their label with the
+        weight exp(-d^2 / 2 width^2), d their distance from the point.
+
+        Parameters
+        ----------
+        points : ndarray of float64, shape (N, 3)
+            Points of the unit cube's frame.
+        labels : ndarray of uint8, shape (K,)
+            Label of each voxel.
+        width : float
+            Voxels.
+
+        Returns
+        -------
+        ndarray of intp, shape (N,)
+            Row of the nearest voxel that has the winning label (the lower label
+            wins a draw), or -1 where none of the 27 cells is in the set.
+        """
+        spokesman: NDArray[np.intp] = _vote(
+            _in_voxels(points), self._row, labels, int(labels.max()) + 1, 0.5 / width**2
+        )
+        return spokesman
+
+
+def nearest_voxel(
+    points: NDArray[np.float64], voxels: NDArray[np.uint8], limit: float = np.inf
+) -> tuple[NDArray[np.float64], NDArray[np.intp]]:
+    """Find the nearest voxel of a set for each point; see `Lattice` and `Lattice.nearest`."""
+    return Lattice(voxels).nearest(points, limit)
+
+
+def _in_voxels(points: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return positions in index units, where voxel i is centred at i."""
+    return np.ascontiguousarray((np.asarray(points, dtype=np.float64) + 0.5) * RESOLUTION - 0.5)
 
 
 def _search_far(
@@ -78,49 +126,6 @@ def _search_far(
     beyond = distance > limit
     distance[beyond], nearest[beyond] = np.inf, -1
     return distance, nearest
-
-
-def vote(
-    points: NDArray[np.float64],
-    voxels: NDArray[np.uint8],
-    labels: NDArray[np.uint8],
-    width: float,
-) -> NDArray[np.intp]:
-    """Find the voxel that speaks for each point after a vote of those around it.
-
-    The voxels in the 27 cells around the point vote for their label with the
-    weight exp(-d^2 / 2 width^2), d their distance from the point.
-
-    Parameters
-    ----------
-    points : ndarray of float64, shape (N, 3)
-        Points of the unit cube's frame.
-    voxels : ndarray of uint8, shape (K, 3)
-        The set; no voxel occurs twice.
-    labels : ndarray of uint8, shape (K,)
-        Label of each voxel.
-    width : float
-        Voxels.
-
-    Returns
-    -------
-    ndarray of intp, shape (N,)
-        Row in `voxels` of the nearest voxel that has the winning label (the
-        lower label wins a draw), or -1 where none of the 27 cells is in the set.
-    """
-    row = _rows(voxels)
-    position = (np.asarray(points, dtype=np.float64) + 0.5) * RESOLUTION - 0.5
-    spokesman: NDArray[np.intp] = _vote(
-        np.ascontiguousarray(position), row, labels, int(labels.max()) + 1, 0.5 / width**2
-    )
-    return spokesman
-
-
-def _rows(voxels: NDArray[np.uint8]) -> NDArray[np.int32]:
-    row = np.full((RESOLUTION,) * 3, -1, dtype=np.int32)
-    index = voxels.astype(np.intp)
-    row[index[:, 0], index[:, 1], index[:, 2]] = np.arange(len(voxels), dtype=np.int32)
-    return row
 
 
 @lru_cache(maxsize=1)
@@ -170,13 +175,31 @@ def _vote(position, row, labels, n_labels, steepness):  # type: ignore[no-untype
     votes = np.zeros(n_labels)
     nearest, nearest_square = np.zeros(n_labels, dtype=np.intp), np.zeros(n_labels)
     for m in range(count):
-        votes[:] = 0.0
-        nearest_square[:] = np.inf
         x, y, z = position[m, 0], position[m, 1], position[m, 2]
         a, b, c = int(np.rint(x)), int(np.rint(y)), int(np.rint(z))
-        for i in range(max(a - 1, 0), min(a + 2, size)):
-            for j in range(max(b - 1, 0), min(b + 2, size)):
-                for k in range(max(c - 1, 0), min(c + 2, size)):
+        low = (max(a - 1, 0), max(b - 1, 0), max(c - 1, 0))
+        high = (min(a + 2, size), min(b + 2, size), min(c + 2, size))
+        # Away from borders all voters agree, and only the nearest is looked for.
+        winner, unanimous, best = -1, True, np.inf
+        for i in range(low[0], high[0]):
+            for j in range(low[1], high[1]):
+                for k in range(low[2], high[2]):
+                    voxel = row[i, j, k]
+                    if voxel < 0:
+                        continue
+                    if winner < 0:
+                        winner = labels[voxel]
+                    unanimous = unanimous and labels[voxel] == winner
+                    square = (x - i) ** 2 + (y - j) ** 2 + (z - k) ** 2
+                    if square < best or (square == best and voxel < spokesman[m]):
+                        best, spokesman[m] = square, voxel
+        if unanimous:
+            continue
+        votes[:] = 0.0
+        nearest_square[:] = np.inf
+        for i in range(low[0], high[0]):
+            for j in range(low[1], high[1]):
+                for k in range(low[2], high[2]):
                     voxel = row[i, j, k]
                     if voxel < 0:
                         continue
@@ -187,7 +210,5 @@ def _vote(position, row, labels, n_labels, steepness):  # type: ignore[no-untype
                         square == nearest_square[label] and voxel < nearest[label]
                     ):
                         nearest_square[label], nearest[label] = square, voxel
-        winner = np.argmax(votes)
-        if nearest_square[winner] < np.inf:
-            spokesman[m] = nearest[winner]
+        spokesman[m] = nearest[np.argmax(votes)]
     return spokesman

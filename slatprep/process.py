@@ -70,7 +70,7 @@ def annotate_asset(
 ) -> AssetResult:
     """Look an aligned asset up, and say what its alignment is worth."""
     annotation = sample(field, latents.coords, alignment.transform, parameters.sample)
-    ambiguity = measure_ambiguity(field, latents, alignment, parameters.sample)
+    ambiguity = measure_ambiguity(field, latents, alignment, annotation, parameters.sample)
     verdict, reasons = judge(alignment.quality, float(annotation.valid.mean()), ambiguity)
     return AssetResult(
         pair=pair,

@@ -41,22 +41,31 @@ def sample(
         In SI units; NaN and 255 where not valid. ``distance`` is to the voxel
         whose values were taken, or to the nearest where not valid.
     """
-    from slatprep.lattice import nearest_voxel, vote
+    return Lookup(field, parameters).at(coords, transform)
 
-    points = apply_transform(invert_transform(transform), voxel_centres(coords))
-    distance, used = nearest_voxel(points, field.voxels)
-    valid = distance <= parameters.max_distance
-    if parameters.method == "vote":
-        voted = vote(points, field.voxels, field.material, parameters.vote_width)
-        changed = valid & (voted >= 0) & (voted != used)
-        used = np.where(changed, voted, used)
-        apart = points[changed] - voxel_centres(field.voxels[used[changed]])
-        distance[changed] = np.linalg.norm(apart, axis=1) * RESOLUTION
-    properties = np.where(valid[:, None], field.properties[used], np.float32(np.nan))
-    material = np.where(valid, field.material[used], np.uint8(UNANNOTATED))
-    return Annotation(
-        properties=properties.astype(np.float32),
-        material=material.astype(np.uint8),
-        valid=valid,
-        distance=distance.astype(np.float32),
-    )
+
+class Lookup:
+    """A field that is looked up more than once; see `sample`."""
+
+    def __init__(self, field: MaterialField, parameters: SampleParameters) -> None:
+        from slatprep.lattice import Lattice
+
+        self._field, self._parameters = field, parameters
+        self._lattice = Lattice(field.voxels)
+
+    def at(self, coords: NDArray[np.uint8], transform: ArrayLike) -> Annotation:
+        """Look material and properties up at SLAT voxels under a transform."""
+        field, parameters = self._field, self._parameters
+        points = apply_transform(invert_transform(transform), voxel_centres(coords))
+        distance, used = self._lattice.nearest(points)
+        valid = distance <= parameters.max_distance
+        if parameters.method == "vote":
+            voted = self._lattice.vote(points, field.material, parameters.vote_width)
+            changed = valid & (voted >= 0) & (voted != used)
+            used = np.where(changed, voted, used)
+            apart = points[changed] - voxel_centres(field.voxels[used[changed]])
+            distance[changed] = np.linalg.norm(apart, axis=1) * RESOLUTION
+        properties, material = field.properties[used], field.material[used]
+        properties[~valid] = np.nan
+        material[~valid] = UNANNOTATED
+        return Annotation(properties, material, valid, distance.astype(np.float32))

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from scipy.spatial import cKDTree
 
 from slatprep.geometry import voxel_centres
-from slatprep.lattice import nearest_voxel, vote
+from slatprep.lattice import Lattice, nearest_voxel
 
 
 @settings(deadline=None, max_examples=40)
@@ -54,13 +54,15 @@ def test_two_voters_outvote_a_nearer_one() -> None:
     point = voxel_centres([[30, 20, 20]]) + np.array([[0.4, 0, 0]]) / 64
     weight = {2: np.exp(-2 * 0.4**2), 5: np.exp(-2 * 0.6**2) + 2 * np.exp(-2 * (0.6**2 + 1))}
     assert weight[5] < weight[2]  # with a width of 0.5 the nearest one still holds
-    assert vote(point, voxels, labels, 0.5).tolist() == [0]
-    assert vote(point, voxels, labels, 1.0).tolist() == [1]  # with 1.0 it does not
+    assert Lattice(voxels).vote(point, labels, 0.5).tolist() == [0]
+    assert Lattice(voxels).vote(point, labels, 1.0).tolist() == [1]  # with 1.0 it does not
 
 
 def test_a_vote_without_voters_is_empty() -> None:
     voxels = np.array([[0, 0, 0]], dtype=np.uint8)
-    assert vote(voxel_centres([[5, 5, 5]]), voxels, np.zeros(1, np.uint8), 0.5).tolist() == [-1]
+    assert Lattice(voxels).vote(
+        voxel_centres([[5, 5, 5]]), np.zeros(1, np.uint8), 0.5
+    ).tolist() == [-1]
 
 
 @settings(deadline=None, max_examples=25)
@@ -70,7 +72,7 @@ def test_votes_are_those_of_a_plain_count(seed: int, width: float) -> None:
     voxels = np.unique(rng.integers(20, 26, (80, 3)), axis=0).astype(np.uint8)
     labels = rng.integers(0, 7, len(voxels)).astype(np.uint8)
     points = voxel_centres(rng.integers(19, 27, (20, 3))) + rng.uniform(-0.5, 0.5, (20, 3)) / 64
-    spokesmen = vote(points, voxels, labels, width)
+    spokesmen = Lattice(voxels).vote(points, labels, width)
     for point, spokesman in zip(points, spokesmen, strict=True):
         index = (point + 0.5) * 64 - 0.5
         around = np.abs(voxels - np.rint(index)).max(axis=1) <= 1

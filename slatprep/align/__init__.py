@@ -10,7 +10,7 @@ from slatprep.records import Alignment, MaterialField, StructuredLatents
 
 # Engines are imported when first used: Open3D alone takes seconds.
 _ENGINES = {
-    "field": ("slatprep.align.field", ("numpy", "scipy", "numba", "edt")),
+    "field": ("slatprep.align.field", ("numpy", "scipy", "numba")),
     "open3d": ("slatprep.align.open3d_icp", ("numpy", "open3d-cpu", "open3d")),
     "small_gicp": ("slatprep.align.gicp", ("numpy", "small_gicp")),
 }

@@ -6,14 +6,15 @@ import numpy as np
 
 from slatprep.normalize import to_mapped
 from slatprep.parameters import SampleParameters
-from slatprep.records import Alignment, Ambiguity, MaterialField, StructuredLatents
-from slatprep.sample import sample
+from slatprep.records import Alignment, Ambiguity, Annotation, MaterialField, StructuredLatents
+from slatprep.sample import Lookup
 
 
 def measure_ambiguity(
     field: MaterialField,
     latents: StructuredLatents,
     alignment: Alignment,
+    annotation: Annotation,
     parameters: SampleParameters,
 ) -> Ambiguity:
     """Measure how the labels change between placements that fit about equally well.
@@ -24,6 +25,8 @@ def measure_ambiguity(
         The two sides of the asset.
     alignment : Alignment
         Its alignment; ``placements`` are the ones that tie with the best.
+    annotation : Annotation
+        What was looked up under its transform.
     parameters : SampleParameters
         How annotations are looked up.
 
@@ -34,16 +37,18 @@ def measure_ambiguity(
         and the largest mean absolute change of log10 Young's modulus, log10
         density and Poisson's ratio over the voxels valid in both.
     """
-    best = sample(field, latents.coords, alignment.transform, parameters)
     differs = np.zeros(len(latents.coords), dtype=bool)
     change = np.zeros(3)
-    for placement in alignment.placements:
-        other = sample(field, latents.coords, placement.transform, parameters)
-        differs |= other.material != best.material
-        both = best.valid & other.valid
-        if both.any():
-            delta = to_mapped(best.properties[both]) - to_mapped(other.properties[both])
-            change = np.maximum(change, np.abs(delta).mean(axis=0))
+    if alignment.placements:
+        lookup = Lookup(field, parameters)
+        mapped = to_mapped(annotation.properties)
+        for placement in alignment.placements:
+            other = lookup.at(latents.coords, placement.transform)
+            differs |= other.material != annotation.material
+            both = annotation.valid & other.valid
+            if both.any():
+                delta = np.abs(mapped - to_mapped(other.properties))[both]
+                change = np.maximum(change, delta.mean(axis=0))
     return Ambiguity(
         material_share=float(differs.mean()),
         property_change=(float(change[0]), float(change[1]), float(change[2])),

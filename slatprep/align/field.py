@@ -31,7 +31,7 @@ from slatprep.records import (
     StructuredLatents,
 )
 
-COARSE_SAMPLES, POLISH_SAMPLES, FINE_SAMPLES = 100, 400, 4_000
+COARSE_SAMPLES, POLISH_SAMPLES, FINE_SAMPLES = 100, 400, 2_000
 """Samples a side used from the starts, on the survivors, and at the end."""
 
 COARSE_TAUS = (8.0, 8.0, 6.0, 6.0, 4.0, 4.0, 3.0, 3.0, 2.0, 2.0)
@@ -145,7 +145,9 @@ class _Pair:
         self.free_scale = parameters.model != "rigid"
         points = slat.points
         self._mean: NDArray[np.float64] = points.mean(axis=0)
-        self._covariance = np.cov(points.T, bias=True) if len(points) > 1 else np.zeros((3, 3))
+        covariance = np.cov(points.T, bias=True) if len(points) > 1 else np.zeros((3, 3))
+        variances, axes = np.linalg.eigh(covariance)
+        self._spread: NDArray[np.float64] = axes * np.sqrt(np.maximum(variances, 0.0))
 
     def poses(self, rotations: Iterable[NDArray[np.float64]]) -> list[Pose]:
         """Start poses that lay centroid on centroid and, where scale is free, size on size."""
@@ -169,18 +171,23 @@ class _Pair:
 
         slat, pixie = self._subsets(samples)
         low, high = self.parameters.scale_bounds
-        refined = []
-        for pose in poses:
-            rotation, shift, scale, offset, here, back, fitness, rmse = solve(
-                slat.points, slat.values, slat.distance, slat.origin,
-                pixie.points, pixie.values, pixie.distance, pixie.origin,
-                np.ascontiguousarray(pose.rotation), pose.shift, pose.scale, pose.offset,
-                np.array(taus), self.free_scale if free_scale is None else free_scale,
-                low, high, tolerance,
-            )  # fmt: skip
-            score = 0.5 * (here + back)
-            refined.append(Pose(rotation, shift, scale, offset, score, fitness, rmse))
-        return refined
+        rotations = np.array([pose.rotation for pose in poses])
+        shifts = np.array([pose.shift for pose in poses])
+        scales = np.array([pose.scale for pose in poses])
+        offsets = np.array([pose.offset for pose in poses])
+        fits = solve(
+            slat.points, slat.values, slat.distance, slat.origin,
+            pixie.points, pixie.values, pixie.distance, pixie.origin,
+            rotations, shifts, scales, offsets,
+            np.array(taus), self.free_scale if free_scale is None else free_scale,
+            low, high, tolerance,
+        )  # fmt: skip
+        return [
+            Pose(rotation, shift, float(scale), float(offset), float(0.5 * (here + back)), *fit)
+            for rotation, shift, scale, offset, (here, back, *fit) in zip(
+                rotations, shifts, scales, offsets, fits.tolist(), strict=True
+            )
+        ]
 
     def _subsets(self, samples: int) -> tuple[Surface, Surface]:
         if samples not in self._cache:
@@ -211,27 +218,32 @@ class _Pair:
         return centre + (pose.shift - centre) / pose.scale
 
     def apart(self, poses: Sequence[Pose], other: Pose) -> NDArray[np.float64]:
-        """Rms distance, in voxels, between where poses and another look the SLAT's surface up.
-
-        Over samples of mean m and covariance C, the mean square of A x + b is
-        trace(A C A^T) + |A m + b|^2.
-        """
-        inverse = np.stack([pose.rotation.T / pose.scale for pose in (*poses, other)])
-        shift = -np.stack(
-            [m @ pose.shift for m, pose in zip(inverse, (*poses, other), strict=True)]
-        )
-        linear, shift = inverse[:-1] - inverse[-1], shift[:-1] - shift[-1]
-        spread = np.einsum("nij,jk,nik->n", linear, self._covariance, linear)
-        square = spread + ((linear @ self._mean + shift) ** 2).sum(axis=1)
-        distance: NDArray[np.float64] = np.sqrt(np.maximum(square, 0.0))
+        """Rms distance, in voxels, between where poses and another look the SLAT's surface up."""
+        places = self._places([*poses, other])
+        distance: NDArray[np.float64] = np.linalg.norm(places[:-1] - places[-1], axis=1)
         return distance
+
+    def _places(self, poses: Sequence[Pose]) -> NDArray[np.float64]:
+        """Return poses as points in 12 dimensions whose distances are those of `apart`.
+
+        Over samples of mean m and covariance L L^T, the mean square of A x + b is
+        the sum of squares of A L and of A m + b.
+        """
+        inverse = np.array([pose.rotation for pose in poses]).transpose(0, 2, 1)
+        inverse = inverse / np.array([pose.scale for pose in poses])[:, None, None]
+        shift = np.array([pose.shift for pose in poses])
+        centre = np.einsum("nij,nj->ni", inverse, self._mean - shift)
+        return np.concatenate([(inverse @ self._spread).reshape(-1, 9), centre], axis=1)
 
     def distinct(self, poses: Sequence[Pose]) -> list[Pose]:
         """Return the poses best first, without those that repeat a better one."""
-        kept: list[Pose] = []
         rest = sorted(poses, key=lambda pose: -pose.score)
-        while rest:
-            kept.append(rest[0])
-            apart = self.apart(rest, rest[0])
-            rest = [pose for pose, a in zip(rest[1:], apart[1:], strict=True) if a >= DISTINCT]
+        places = self._places(rest)
+        left = np.arange(len(rest))
+        kept: list[Pose] = []
+        while len(left):
+            best, left = left[0], left[1:]
+            kept.append(rest[best])
+            square = ((places[left] - places[best]) ** 2).sum(axis=1)
+            left = left[square >= DISTINCT**2]
         return kept

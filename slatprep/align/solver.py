@@ -137,95 +137,113 @@ def _rotation_of(turn):  # type: ignore[no-untyped-def]
 
 @njit(cache=True)
 def solve(  # type: ignore[no-untyped-def]
-    slat_points,
-    slat_values,
-    slat_field,
-    slat_origin,
-    pixie_points,
-    pixie_values,
-    pixie_field,
-    pixie_origin,
-    rotation,
-    shift,
-    scale,
-    offset,
-    taus,
-    free_scale,
-    scale_low,
-    scale_high,
-    tolerance,
-):
-    """Refine a pose of the PixieVerse surface on the SLAT surface.
+    slat_points, slat_values, slat_field, slat_origin,
+    pixie_points, pixie_values, pixie_field, pixie_origin,
+    rotations, shifts, scales, offsets,
+    taus, free_scale, scale_low, scale_high, tolerance,
+):  # fmt: skip
+    """Refine poses of the PixieVerse surface on the SLAT surface, in place.
 
     One Gauss-Newton step for each of `taus` (voxels), ended early once a step
-    moves the object's rim by less than `tolerance` voxels. Returns rotation,
-    shift, scale, offset, the mean kernel at tau = 1 voxel at the SLAT's and at
-    the PixieVerse samples, the share of all samples within one voxel, and the
-    rms residual of those.
+    moves the object's rim by less than `tolerance` voxels. Returns, a row a
+    pose, the mean kernel at tau = 1 voxel over the SLAT's and over the
+    PixieVerse samples, the share of all samples within one voxel, and the rms
+    residual of those.
     """
     centre = np.zeros(3)
     for m in range(slat_points.shape[0]):
         centre += slat_points[m]
     centre /= slat_points.shape[0]
     samples = slat_points.shape[0] + pixie_points.shape[0]
-    unknowns = np.array([0, 1, 2, 3, 4, 5, 6, 7]) if free_scale else np.array([0, 1, 2, 3, 4, 5, 7])
-    count = len(unknowns)
     normal, rhs = np.zeros((UNKNOWNS, UNKNOWNS)), np.zeros(UNKNOWNS)
-    matrix, vector = np.zeros((count, count)), np.zeros(count)
     step = np.zeros(UNKNOWNS)
-    for tau in taus:
-        normal[:] = 0.0
-        rhs[:] = 0.0
-        _accumulate(
+    fits = np.zeros((len(scales), 4))
+    for pose in range(len(scales)):
+        rotation, shift = rotations[pose], shifts[pose]
+        scale, offset = scales[pose], offsets[pose]
+        for tau in taus:
+            normal[:] = 0.0
+            rhs[:] = 0.0
+            _accumulate(
+                slat_points, slat_values, pixie_field, pixie_origin,
+                rotation, shift, scale, offset, centre, tau, True, normal, rhs,
+            )  # fmt: skip
+            _accumulate(
+                pixie_points, pixie_values, slat_field, slat_origin,
+                rotation, shift, scale, offset, centre, tau, False, normal, rhs,
+            )  # fmt: skip
+            # On a ball, offset and scale cannot be told apart: a weak prior keeps
+            # the offset near 0. A little damping keeps a plane's slide at rest.
+            normal[7, 7] += _OFFSET_PRIOR * samples
+            rhs[7] += _OFFSET_PRIOR * samples * offset
+            if not free_scale:
+                normal[:7, 6] = 0.0
+                normal[6, 6:] = 0.0
+                rhs[6] = 0.0
+            for i in range(UNKNOWNS):
+                normal[i, i] += 1e-4 * normal[i, i] + 1e-6 * samples
+            _solve_symmetric(normal, rhs, step)
+            angle = math.sqrt(step[0] ** 2 + step[1] ** 2 + step[2] ** 2)
+            if angle > _LONGEST_TURN:
+                step[:3] *= _LONGEST_TURN / angle
+                angle = _LONGEST_TURN
+            growth = math.exp(min(max(step[6], -_LARGEST_GROWTH), _LARGEST_GROWTH))
+            growth = min(max(growth, scale_low / scale), scale_high / scale)
+            turn = _rotation_of(step)
+            shift[:] = centre + growth * _product(turn, shift - centre) + step[3:6]
+            for column in range(3):
+                rotation[:, column] = _product(turn, rotation[:, column])
+            scale *= growth
+            offset += step[7]
+            moved = math.sqrt(step[3] ** 2 + step[4] ** 2 + step[5] ** 2)
+            if moved + _LEVER * (angle + abs(growth - 1.0)) < tolerance:
+                break
+        here, near, squares = _accumulate(
             slat_points, slat_values, pixie_field, pixie_origin,
-            rotation, shift, scale, offset, centre, tau, True, normal, rhs,
+            rotation, shift, scale, offset, centre, 1.0, True, normal, rhs,
         )  # fmt: skip
-        _accumulate(
+        back, near_back, squares_back = _accumulate(
             pixie_points, pixie_values, slat_field, slat_origin,
-            rotation, shift, scale, offset, centre, tau, False, normal, rhs,
+            rotation, shift, scale, offset, centre, 1.0, False, normal, rhs,
         )  # fmt: skip
-        # On a ball, offset and scale cannot be told apart: a weak prior keeps
-        # the offset near 0. A little damping keeps a plane's slide at rest.
-        normal[7, 7] += _OFFSET_PRIOR * samples
-        rhs[7] += _OFFSET_PRIOR * samples * offset
-        for i in range(count):
-            vector[i] = -rhs[unknowns[i]]
-            for j in range(i, count):
-                matrix[i, j] = matrix[j, i] = normal[unknowns[i], unknowns[j]]
-            matrix[i, i] += 1e-4 * matrix[i, i] + 1e-6 * samples
-        solution = np.linalg.solve(matrix, vector)
-        for i in range(count):
-            step[unknowns[i]] = solution[i]
-        angle = math.sqrt(step[0] ** 2 + step[1] ** 2 + step[2] ** 2)
-        if angle > _LONGEST_TURN:
-            step[:3] *= _LONGEST_TURN / angle
-            angle = _LONGEST_TURN
-        growth = math.exp(min(max(step[6], -_LARGEST_GROWTH), _LARGEST_GROWTH))
-        growth = min(max(growth, scale_low / scale), scale_high / scale)
-        turn = _rotation_of(step)
-        shift = centre + growth * (turn @ (shift - centre)) + step[3:6]
-        rotation = turn @ rotation
-        scale *= growth
-        offset += step[7]
-        moved = math.sqrt(step[3] ** 2 + step[4] ** 2 + step[5] ** 2)
-        if moved + _LEVER * (angle + abs(growth - 1.0)) < tolerance:
-            break
-    here, near, squares = _accumulate(
-        slat_points, slat_values, pixie_field, pixie_origin,
-        rotation, shift, scale, offset, centre, 1.0, True, normal, rhs,
-    )  # fmt: skip
-    back, near_back, squares_back = _accumulate(
-        pixie_points, pixie_values, slat_field, slat_origin,
-        rotation, shift, scale, offset, centre, 1.0, False, normal, rhs,
-    )  # fmt: skip
-    inliers = near + near_back
-    return (
-        rotation,
-        shift,
-        scale,
-        offset,
-        here / slat_points.shape[0],
-        back / pixie_points.shape[0],
-        inliers / samples,
-        math.sqrt((squares + squares_back) / max(inliers, 1)),
-    )
+        inliers = near + near_back
+        scales[pose], offsets[pose] = scale, offset
+        fits[pose, 0] = here / slat_points.shape[0]
+        fits[pose, 1] = back / pixie_points.shape[0]
+        fits[pose, 2] = inliers / samples
+        fits[pose, 3] = math.sqrt((squares + squares_back) / max(inliers, 1))
+    return fits
+
+
+@njit(cache=True)
+def _product(matrix, vector):  # type: ignore[no-untyped-def]
+    product = np.zeros(3)
+    for i in range(3):
+        for j in range(3):
+            product[i] += matrix[i, j] * vector[j]
+    return product
+
+
+@njit(cache=True)
+def _solve_symmetric(matrix, rhs, step):  # type: ignore[no-untyped-def]
+    """Solve ``matrix @ step = -rhs`` by Cholesky's method, from and in the upper half.
+
+    Eight unknowns take less time here than calling LAPACK does, and the bits
+    do not depend on which kernels a BLAS picks for the processor.
+    """
+    for i in range(UNKNOWNS):
+        for j in range(i, UNKNOWNS):
+            total = matrix[i, j]
+            for k in range(i):
+                total -= matrix[k, i] * matrix[k, j]
+            matrix[i, j] = math.sqrt(total) if i == j else total / matrix[i, i]
+    for i in range(UNKNOWNS):
+        total = -rhs[i]
+        for k in range(i):
+            total -= matrix[k, i] * step[k]
+        step[i] = total / matrix[i, i]
+    for i in range(UNKNOWNS - 1, -1, -1):
+        total = step[i]
+        for k in range(i + 1, UNKNOWNS):
+            total -= matrix[i, k] * step[k]
+        step[i] = total / matrix[i, i]

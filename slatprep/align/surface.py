@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from slatprep.geometry import boundary, bounding_box, filled, voxels_of
+from slatprep.geometry import bounding_box, filled
 from slatprep.records import RESOLUTION
 
 CENTRE = (RESOLUTION - 1) / 2
@@ -96,26 +96,25 @@ def surface_of(occupancy: NDArray[np.bool_]) -> Surface:
 
     Notes
     -----
-    The distance transform is exact and Euclidean (Felzenszwalb and Huttenlocher,
-    2012, as the package edt computes it), taken to the nearest voxel centre of
-    the other kind, less half a voxel to the face between the two.
+    The distance transform is exact and Euclidean, taken to the nearest voxel
+    centre of the other kind, less half a voxel to the face between the two.
     """
-    import edt
+    from slatprep.align.distance import signed_distance
 
     full = filled(occupancy)
     box = bounding_box(full)
     solid = np.pad(full[box], _MARGIN)
-    # With two labels one transform measures the inside and the outside at once.
-    distance: NDArray[np.float32] = edt.edt(solid + np.uint8(1), parallel=1)
-    distance -= np.float32(0.5)
-    near = np.argwhere(distance <= BAND)
-    np.negative(distance, out=distance, where=solid)
+    distance = signed_distance(solid)
+    near = np.argwhere(np.abs(distance) <= BAND)
+    values = distance[tuple(near.T)]
+    # Half a voxel deep are just those that touch an empty voxel by a face.
+    boundary = near[values == -0.5] + [side.start - _MARGIN for side in box]
     distance += np.float32(DILATION)
     origin = np.array([side.start for side in box], dtype=np.float64) - _MARGIN - CENTRE
     return Surface(
         distance=distance,
         origin=origin,
         points=near + origin,
-        values=distance[tuple(near.T)].astype(np.float64),
-        boundary=voxels_of(boundary(full)),
+        values=values.astype(np.float64) + DILATION,
+        boundary=boundary.astype(np.uint8),
     )

@@ -8,6 +8,7 @@ from slatprep.align import align
 from slatprep.align.ambiguity import measure_ambiguity
 from slatprep.parameters import AlignParameters, SampleParameters
 from slatprep.records import Ambiguity
+from slatprep.sample import sample
 from tests.align.conftest import GRID, chair, field_of, surface_latents
 
 BALL = ((GRID - 31.5) ** 2).sum(axis=-1) < 20**2
@@ -16,7 +17,8 @@ BALL = ((GRID - 31.5) ** 2).sum(axis=-1) < 20**2
 def _ambiguity(occupancy: np.ndarray, material: np.ndarray | None = None) -> Ambiguity:
     field, latents = field_of(occupancy, material), surface_latents(occupancy)
     alignment = align(field, latents, AlignParameters())
-    return measure_ambiguity(field, latents, alignment, SampleParameters())
+    annotation = sample(field, latents.coords, alignment.transform, SampleParameters())
+    return measure_ambiguity(field, latents, alignment, annotation, SampleParameters())
 
 
 def test_a_ball_of_one_material_is_ambiguous_and_harmless() -> None:
