@@ -165,7 +165,7 @@ def filled(occupancy: NDArray[np.bool_]) -> NDArray[np.bool_]:
     Parameters
     ----------
     occupancy : ndarray of bool, shape (n, n, n)
-        A shell or a solid; at least one voxel.
+        A shell or a solid; n <= 64.
 
     Returns
     -------
@@ -173,18 +173,23 @@ def filled(occupancy: NDArray[np.bool_]) -> NDArray[np.bool_]:
         The set and every empty voxel that no path over faces joins with the
         outside of the grid.
     """
-    from scipy import ndimage
+    from slatprep.flood import outside_of
 
-    box = bounding_box(occupancy)
-    regions, _ = ndimage.label(~np.pad(occupancy[box], 1))
-    solid = np.zeros_like(occupancy)
-    solid[box] = (regions != regions[0, 0, 0])[1:-1, 1:-1, 1:-1]
-    return solid
+    return ~outside_of(occupancy)
 
 
 def voxels_of(occupancy: NDArray[np.bool_]) -> NDArray[np.uint8]:
     """Return the indices (N, 3) uint8 of the occupied voxels, in C order."""
     return np.argwhere(occupancy).astype(np.uint8)
+
+
+def outer_boundary(occupancy: NDArray[np.bool_]) -> NDArray[np.uint8]:
+    """Return the boundary voxels (B, 3) uint8 of a set with its inside filled, in C order.
+
+    A SLAT has voxels inside the object wherever its parts meet, which the
+    boundary of a solid cannot have; both sides are compared by this one.
+    """
+    return voxels_of(boundary(filled(occupancy)))
 
 
 def occupancy_of(voxels: ArrayLike) -> NDArray[np.bool_]:

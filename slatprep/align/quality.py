@@ -9,13 +9,11 @@ from numpy.typing import ArrayLike, NDArray
 
 from slatprep.geometry import (
     apply_transform,
-    boundary,
-    filled,
     invert_transform,
     occupancy_of,
+    outer_boundary,
     split_transform,
     voxel_centres,
-    voxels_of,
 )
 from slatprep.records import Ambiguity, MaterialField, Quality, StructuredLatents, Verdict
 
@@ -66,8 +64,8 @@ def measure_quality(
         See `compare`.
     """
     return compare(
-        voxels_of(boundary(filled(field.occupancy))),
-        voxels_of(boundary(filled(occupancy_of(latents.coords)))),
+        outer_boundary(field.occupancy),
+        outer_boundary(occupancy_of(latents.coords)),
         transform,
         radius,
     )

@@ -11,9 +11,9 @@ from slatprep.geometry import (
     VOXEL_SIZE,
     apply_transform,
     boundary,
-    filled,
     invert_transform,
     occupancy_of,
+    outer_boundary,
     split_transform,
     voxel_centres,
     voxels_of,
@@ -68,8 +68,8 @@ def scene_of(asset: StoredAsset) -> Scene:
     """Return the scene of an asset as the store holds it."""
     occupancy = asset.grid_material != BACKGROUND
     shell = voxels_of(boundary(occupancy))
-    outer = voxels_of(boundary(filled(occupancy)))
-    surface = voxels_of(boundary(filled(occupancy_of(asset.coords))))
+    outer = outer_boundary(occupancy)
+    surface = outer_boundary(occupancy_of(asset.coords))
     return Scene(
         pixieverse=shell,
         pixieverse_material=asset.grid_material[tuple(shell.T)],

@@ -1,0 +1,87 @@
+"""Find what lies outside a voxel set, 64 voxels at a time.
+
+A line of the grid along its last axis is one 64-bit word, so that a flood runs
+along a line in six steps and from line to line in one.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+WORD = 64
+"""Longest line that fits a word."""
+
+
+def outside_of(occupancy: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Return the empty voxels that a path over faces joins with the outside of the grid.
+
+    Parameters
+    ----------
+    occupancy : ndarray of bool, shape (a, b, c), c <= 64
+        Occupied voxels.
+
+    Returns
+    -------
+    ndarray of bool, shape (a, b, c)
+        The outside.
+
+    Raises
+    ------
+    ValueError
+        If a line is too long for a word.
+    """
+    a, b, c = occupancy.shape
+    if c > WORD:
+        raise ValueError(f"the last axis is at most {WORD} long, got shape {occupancy.shape}")
+    # What a line lacks to a word is occupied: no flood enters it.
+    empty = np.zeros((a, b, WORD), dtype=bool)
+    np.logical_not(occupancy, out=empty[:, :, :c])
+    free = np.packbits(empty, axis=-1, bitorder="little").view("<u8")[..., 0].astype(np.uint64)
+    ends = np.uint64(1 | 1 << (c - 1))
+    flooded = _flood(free, ends).astype("<u8").reshape(a, b, 1).view(np.uint8)
+    bits = np.unpackbits(flooded, axis=-1, bitorder="little", count=c)
+    outside: NDArray[np.bool_] = bits.view(np.bool_)
+    return outside
+
+
+@njit(cache=True)
+def _flood(free, ends):  # type: ignore[no-untyped-def]
+    """Flood `free` from the grid's faces; sweeps go to and fro until nothing changes."""
+    rows, columns = free.shape
+    flooded = np.zeros_like(free)
+    changed, forward = True, True
+    while changed:
+        changed = False
+        for step in range(rows * columns):
+            line = step if forward else rows * columns - 1 - step
+            i, j = line // columns, line % columns
+            if flooded[i, j] == free[i, j]:
+                continue
+            seeds = flooded[i, j]
+            if i == 0 or j == 0 or i == rows - 1 or j == columns - 1:
+                seeds = free[i, j]
+            else:
+                seeds |= flooded[i - 1, j] | flooded[i + 1, j]
+                seeds |= flooded[i, j - 1] | flooded[i, j + 1] | ends
+            reached = _along_line(seeds & free[i, j], free[i, j])
+            if reached != flooded[i, j]:
+                flooded[i, j] = reached
+                changed = True
+        forward = not forward
+    return flooded
+
+
+@njit(cache=True, inline="always")
+def _along_line(seeds, free):  # type: ignore[no-untyped-def]
+    """Spread set bits over adjacent free ones both ways, the step doubling (Kogge and Stone)."""
+    up, down = seeds, seeds
+    way_up, way_down = free, free
+    for exponent in range(6):
+        step = np.uint64(1 << exponent)
+        up |= way_up & (up << step)
+        way_up &= way_up << step
+        down |= way_down & (down >> step)
+        way_down &= way_down >> step
+    return up | down
