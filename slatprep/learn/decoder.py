@@ -150,12 +150,20 @@ class WindowAttention(nn.Module):
         for group, real in zip(groups, windows.masks, strict=True):
             split = group.unflatten(1, (3, self.heads, -1)).unflatten(0, tuple(real.shape))
             q, k, v = split.permute(2, 0, 3, 1, 4)  # each (windows, heads, voxels, width)
-            attended = functional.scaled_dot_product_attention(
-                q, k, v, attn_mask=real[:, None, None, :]
-            )
+            attended = _attend(q, k, v, real[:, None, None, :])
             parts.append(attended.transpose(1, 2).flatten(2).flatten(0, 1))
         result: Tensor = self.out(torch.cat(parts).index_select(0, windows.back))
         return result
+
+
+def _attend(q: Tensor, k: Tensor, v: Tensor, mask: Tensor) -> Tensor:
+    if q.device.type != "cpu":
+        return functional.scaled_dot_product_attention(q, k, v, attn_mask=mask)
+    # On a CPU the backward pass of PyTorch's bf16 attention takes as long as all
+    # the rest of a step twice over; in fp32 it is a small part.
+    with torch.autocast("cpu", enabled=False):
+        q, k, v = q.float(), k.float(), v.float()
+        return functional.scaled_dot_product_attention(q, k, v, attn_mask=mask)
 
 
 class SwinBlock(nn.Module):
