@@ -13,6 +13,7 @@ from slatprep.cli.output import EXIT_INCOMPLETE, Output, output_options
 
 if TYPE_CHECKING:
     from slatprep.learn.metrics import Evaluation, Measure
+    from slatprep.learn.published import PublishedScore
 
 
 @click.command(
@@ -20,6 +21,7 @@ if TYPE_CHECKING:
 Example:
   slatprep evaluate runs/small/predictions --store demo.zarr
   slatprep evaluate predictions.h5 --store demo.zarr --split all --spread sd --csv scores.csv
+  slatprep evaluate runs/large/predictions --store pixieverse.zarr --beside pixie
 """
 )
 @click.argument("predictions", type=click.Path(path_type=Path, exists=True))
@@ -32,10 +34,13 @@ Example:
               help="Standard error or standard deviation over objects.")  # fmt: skip
 @click.option("--csv", "csv_file", type=click.Path(path_type=Path, dir_okay=False),
               help="Also write the table there.")  # fmt: skip
+@click.option("--beside", metavar="pixie|FILE.csv",
+              help="Also print Pixie's published table, which has NeRF2Physics too, or one of your "
+              "own: a name, then columns named as here.")  # fmt: skip
 @output_options
 def evaluate(
     output: Output, predictions: Path, store: Path, split: Any, shares: str, spread: Any,
-    csv_file: Path | None,
+    csv_file: Path | None, beside: str | None,
 ) -> None:  # fmt: skip
     """Measure PREDICTIONS by Pixie's protocol.
 
@@ -46,7 +51,11 @@ def evaluate(
     split has no prediction.
     """
     from slatprep.learn.metrics import evaluate_store
+    from slatprep.learn.published import PIXIE_TABLE, read_scores
 
+    others: tuple[PublishedScore, ...] = ()
+    if beside is not None:
+        others = PIXIE_TABLE if beside == "pixie" else read_scores(Path(beside))
     result = evaluate_store(
         predictions, store, None if split == "all" else split, shares_of(shares), spread
     )
@@ -58,16 +67,39 @@ def evaluate(
 
         with csv_file.open("w", encoding="utf-8", newline="") as file:
             csv.writer(file).writerows([header, *rows])
-    output.result(
-        dataclasses.asdict(result),
-        lambda: output.table(
-            "Mean squared error in normalised space; accuracy of the class", header, rows
-        ),
-    )
+
+    def show() -> None:
+        output.table("Mean squared error in normalised space; accuracy of the class", header, rows)
+        if beside is not None:
+            _show_beside(output, result, others, beside)
+
+    document = dataclasses.asdict(result)
+    if beside is not None:
+        document["beside"] = [dataclasses.asdict(score) for score in others]
+    output.result(document, show)
     for asset_id in result.missing:
         output.problem(f"{predictions}: no prediction of {asset_id}")
     if result.missing:
         click.get_current_context().exit(EXIT_INCOMPLETE)
+
+
+def _show_beside(
+    output: Output, result: Evaluation, others: tuple[PublishedScore, ...], beside: str
+) -> None:
+    names = tuple(result.overall.means)
+    rows: list[tuple[str | float | None, ...]] = [
+        ("these predictions", *result.overall.means.values())
+    ]
+    rows += [(score.method, *(score.means.get(name) for name in names)) for score in others]
+    if beside == "pixie":
+        title = "Beside Pixie's Table 1 (arXiv 2508.17437)"
+        output.note(
+            "note: those were measured on PixieVerse's test objects; they compare only with "
+            "predictions of the same objects, normalised by Pixie's ranges (--ranges pixie)"
+        )
+    else:
+        title = f"Beside {beside}"
+    output.table(title, ("method", *names), rows)
 
 
 def _rows(result: Evaluation) -> list[tuple[str | int | float, ...]]:
