@@ -1,0 +1,76 @@
+"""Published scores, and tables of one's own, to print beside an evaluation."""
+
+from __future__ import annotations
+
+import csv
+from dataclasses import dataclass
+from pathlib import Path
+
+from slatprep.errors import InputError
+from slatprep.learn.metrics import METRICS
+
+
+@dataclass(frozen=True)
+class PublishedScore:
+    """One row of a table.
+
+    Attributes
+    ----------
+    method : str
+        Who was measured.
+    means : dict of str to float
+        Some of `slatprep.learn.metrics.METRICS`.
+    """
+
+    method: str
+    means: dict[str, float]
+
+
+def _pixie(method: str, *values: float) -> PublishedScore:
+    return PublishedScore(method, dict(zip(METRICS, values, strict=True)))
+
+
+PIXIE_TABLE = (
+    _pixie("NeRF2Physics", 1.115, 0.997, 0.462, 0.858, 0.274),
+    _pixie("Pixie, occupancy", 0.149, 0.105, 0.124, 0.126, 0.643),
+    _pixie("Pixie, RGB", 0.196, 0.045, 0.079, 0.106, 0.722),
+    _pixie("Pixie", 0.022, 0.112, 0.034, 0.056, 0.985),
+)
+"""Le et al., "Pixie: Fast and Generalizable Supervised Learning of 3D Physics from
+Pixels", arXiv 2508.17437, Table 1: NeRF2Physics as Pixie's authors measured it, and
+Pixie with three kinds of features. On PixieVerse's test objects, over the voxels of
+Pixie's grids, normalised by Pixie's ranges."""
+
+
+def read_scores(path: Path) -> tuple[PublishedScore, ...]:
+    """Read a table of scores.
+
+    Parameters
+    ----------
+    path : Path
+        A CSV whose first column names the methods and that has some of the
+        columns "log10 E", "log10 density", "nu", "mean" and "accuracy". What
+        ``slatprep evaluate --csv`` writes is one.
+
+    Raises
+    ------
+    InputError
+        If the file cannot be read, has none of these columns, or something in
+        one of them is no number.
+    """
+    expected = f"a CSV with a name in the first column and some of {', '.join(METRICS)}"
+    try:
+        with path.open(encoding="utf-8", newline="") as file:
+            header, *rows = [row for row in csv.reader(file) if row]
+    except (OSError, UnicodeDecodeError, csv.Error, ValueError) as error:
+        raise InputError(path, f"cannot be read ({error})", expected) from error
+    places = {name: header.index(name) for name in METRICS if name in header[1:]}
+    if not places:
+        raise InputError(path, f"has the columns {', '.join(header)}", expected)
+    try:
+        return tuple(
+            PublishedScore(row[0], {n: float(row[k]) for n, k in places.items() if row[k].strip()})
+            for row in rows
+        )
+    except (ValueError, IndexError) as error:
+        raise InputError(path, f"has a row that is not numbers ({error})", expected) from error
