@@ -129,14 +129,11 @@ def boundary(occupancy: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """
     padded = np.pad(np.asarray(occupancy, dtype=bool), 1)
     inner = padded[1:-1, 1:-1, 1:-1]
-    buried = (
-        padded[:-2, 1:-1, 1:-1]
-        & padded[2:, 1:-1, 1:-1]
-        & padded[1:-1, :-2, 1:-1]
-        & padded[1:-1, 2:, 1:-1]
-        & padded[1:-1, 1:-1, :-2]
-        & padded[1:-1, 1:-1, 2:]
-    )
+    buried = padded[:-2, 1:-1, 1:-1] & padded[2:, 1:-1, 1:-1]
+    buried &= padded[1:-1, :-2, 1:-1]
+    buried &= padded[1:-1, 2:, 1:-1]
+    buried &= padded[1:-1, 1:-1, :-2]
+    buried &= padded[1:-1, 1:-1, 2:]
     surface: NDArray[np.bool_] = inner & ~buried
     return surface
 
@@ -192,12 +189,18 @@ def outer_boundary(occupancy: NDArray[np.bool_]) -> NDArray[np.uint8]:
     return voxels_of(boundary(filled(occupancy)))
 
 
+def flat_index(voxels: ArrayLike) -> NDArray[np.intp]:
+    """Return the place (N,) of each voxel (N, 3) in the flattened grid, in C order."""
+    index = np.asarray(voxels).astype(np.intp)
+    flat: NDArray[np.intp] = (index[:, 0] * RESOLUTION + index[:, 1]) * RESOLUTION + index[:, 2]
+    return flat
+
+
 def occupancy_of(voxels: ArrayLike) -> NDArray[np.bool_]:
     """Return the (64, 64, 64) occupancy of a list of voxels (N, 3)."""
-    index = np.asarray(voxels, dtype=np.intp).reshape(-1, 3)
-    occupancy = np.zeros((RESOLUTION,) * 3, dtype=bool)
-    occupancy[index[:, 0], index[:, 1], index[:, 2]] = True
-    return occupancy
+    occupancy = np.zeros(RESOLUTION**3, dtype=bool)
+    occupancy[flat_index(voxels)] = True
+    return occupancy.reshape((RESOLUTION,) * 3)
 
 
 def displacement(transform: ArrayLike, reference: ArrayLike, slat_voxels: ArrayLike) -> float:

@@ -58,8 +58,9 @@ def property_extent(field: MaterialField) -> NDArray[np.float64]:
         Young's modulus and density.
     """
     # log10 is monotonic, so it is taken of six numbers and not of the whole field.
-    extent = np.stack([field.properties.min(axis=0), field.properties.max(axis=0)])
-    return to_mapped(extent).T
+    # By column: numpy takes ten times as long along the first axis of a narrow array.
+    columns = [field.properties[:, k] for k in range(len(PROPERTY_COLUMNS))]
+    return to_mapped([[c.min() for c in columns], [c.max() for c in columns]]).T
 
 
 def ranges_from_extents(extents: ArrayLike) -> Normalization:
@@ -151,11 +152,18 @@ def normalize(
     >>> [round(float(v), 4) for v in values[0]], clipped.tolist()
     ([0.0127, 0.1962, -0.2492], [0, 0, 0])
     """
-    lo, hi = _limits(normalization)
-    values = (2.0 * (to_mapped(properties) - lo) / (hi - lo) - 1.0).astype(np.float32)
-    # Counted after rounding: a range's own end point must not count as clipped.
-    clipped = (np.abs(values) > 1.0).sum(axis=0)
-    return np.clip(values, -1.0, 1.0), clipped.astype(np.int64)
+    given = np.asarray(properties)
+    values = np.empty(given.shape, dtype=np.float32)
+    clipped = np.zeros(len(PROPERTY_COLUMNS), dtype=np.int64)
+    for column, span in enumerate(normalization.ranges):
+        mapped = given[..., column].astype(np.float64)
+        if span.log10:
+            np.log10(mapped, out=mapped)
+        # Counted after rounding: a range's own end point must not count as clipped.
+        value = (2.0 * (mapped - span.lo) / (span.hi - span.lo) - 1.0).astype(np.float32)
+        clipped[column] = np.count_nonzero(np.abs(value) > 1.0)
+        values[..., column] = np.clip(value, -1.0, 1.0)
+    return values, clipped
 
 
 def denormalize(values: ArrayLike, normalization: Normalization) -> NDArray[np.float32]:

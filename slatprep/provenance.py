@@ -252,6 +252,11 @@ def load_schema(name: str) -> dict[str, Any]:
 
 def jsonable(value: object) -> Any:
     """Return a value as JSON can hold it: NaN and infinity become None."""
+    # Most of a record are plain numbers and words: these first.
+    if value is None or type(value) in (bool, int, str):
+        return value
+    if isinstance(value, float):
+        return float(value) if math.isfinite(value) else None
     if is_dataclass(value) and not isinstance(value, type):
         return {f.name: jsonable(getattr(value, f.name)) for f in fields(value)}
     if isinstance(value, np.ndarray | np.generic):
@@ -264,9 +269,7 @@ def jsonable(value: object) -> Any:
         return value.value
     if isinstance(value, Path):
         return value.as_posix()
-    if isinstance(value, float) and not math.isfinite(value):
-        return None
-    if value is None or isinstance(value, bool | int | float | str):
+    if isinstance(value, bool | int | str):
         return value
     raise TypeError(f"a record cannot hold {type(value).__name__} {value!r}")
 
@@ -301,13 +304,13 @@ def counts_entry(result: AssetResult) -> dict[str, Any] | None:
     field, latents, annotation = result.field, result.latents, result.annotation
     if field is None or latents is None or annotation is None:
         return None
-    occupied = int(field.occupancy.sum())
+    occupied = int(np.count_nonzero(field.occupancy))
     return {
         "occupied": occupied,
         "annotated": len(field.voxels),
         "unannotated": occupied - len(field.voxels),
-        "boundary": int(boundary(field.occupancy).sum()),
+        "boundary": int(np.count_nonzero(boundary(field.occupancy))),
         "slat_voxels": len(latents.coords),
-        "valid": int(annotation.valid.sum()),
+        "valid": int(np.count_nonzero(annotation.valid)),
         "clipped": None,
     }

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slatprep.errors import InputError
+from slatprep.geometry import flat_index
 from slatprep.readers.files import ArraySpec, load_source, npz_arrays, require_complete
 from slatprep.readers.hdf5 import SUFFIXES, load_datasets
 from slatprep.records import RESOLUTION, AssetPair, StructuredLatents
@@ -91,7 +92,7 @@ def check_coords(coords: NDArray[Any], where: str | Path) -> NDArray[np.uint8]:
             f"coordinates in 0..{RESOLUTION - 1}",
         )
     voxels = np.ascontiguousarray(coords).astype(np.uint8)
-    flat = np.ravel_multi_index(tuple(voxels.T.astype(np.intp)), (RESOLUTION,) * 3)
+    flat = flat_index(voxels)
     counts = np.bincount(flat, minlength=RESOLUTION**3)
     if counts.max() > 1:
         rows = np.flatnonzero(counts[flat] > 1)

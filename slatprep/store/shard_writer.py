@@ -53,16 +53,19 @@ class ShardWriter:
         while len(rows):
             room = len(self._chunk) - self._rows
             taken, rows = rows[:room], rows[room:]
+            if len(taken) == len(self._chunk):  # A whole chunk needs no copy.
+                self._flush(np.ascontiguousarray(taken, dtype=self._chunk.dtype))
+                continue
             self._chunk[self._rows : self._rows + len(taken)] = taken
             self._rows += len(taken)
             if self._rows == len(self._chunk):
-                self._flush()
+                self._flush(self._chunk)
 
     def finish(self) -> None:
         """Write the last chunk, filled up, and the index."""
         if self._rows:
             self._chunk[self._rows :] = self._fill_value
-            self._flush()
+            self._flush(self._chunk)
         self._file.write(_with_checksum(self._index.tobytes()))
 
     def __enter__(self) -> ShardWriter:
@@ -78,8 +81,8 @@ class ShardWriter:
             if kind is None:
                 self.finish()
 
-    def _flush(self) -> None:
-        data = self._encode(self._chunk)
+    def _flush(self, chunk: NDArray[Any]) -> None:
+        data = self._encode(chunk)
         self._file.write(data)
         self._index[self._chunks] = self._bytes, len(data)
         self._chunks, self._bytes, self._rows = self._chunks + 1, self._bytes + len(data), 0

@@ -24,6 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slatprep.errors import StoreError
+from slatprep.geometry import flat_index
 from slatprep.normalize import property_extent
 from slatprep.records import (
     BACKGROUND,
@@ -166,9 +167,8 @@ class Spool:
             voxels, properties = arrays["grid_voxels"], arrays["grid_properties"]
             material_of_voxels = arrays["grid_material"]
         material = np.where(occupancy, np.uint8(UNANNOTATED), np.uint8(BACKGROUND))
-        material = material.reshape((RESOLUTION,) * 3)
-        material[tuple(voxels.T)] = material_of_voxels
-        return material, voxels, properties
+        material[flat_index(voxels)] = material_of_voxels
+        return material.reshape((RESOLUTION,) * 3), voxels, properties
 
     def _path(self, key: str) -> Path:
         return self.directory / key[:2] / f"{key}.npz"

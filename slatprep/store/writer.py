@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from slatprep.geometry import flat_index
 from slatprep.normalize import normalize, normalize_change
 from slatprep.parameters import StoreParameters
 from slatprep.records import Normalization
@@ -135,10 +136,13 @@ def _voxel_rows(spool: Spool, shard: Shard, normalization: Normalization) -> Ite
 def _grid_rows(spool: Spool, shard: Shard, normalization: Normalization) -> Iterator[Rows]:
     for asset, key in enumerate(shard.keys):
         material, voxels, values = spool.grid(key)
-        properties = np.full((3, *material.shape), np.nan, dtype=np.float32)
+        properties = np.full((3, material.size), np.nan, dtype=np.float32)
         normalized, clipped = normalize(values, normalization)
-        properties[(slice(None), *voxels.T)] = normalized.T
-        yield asset, {"material": material[None], "properties": properties[None]}, clipped
+        cells = flat_index(voxels)
+        for plane, column in zip(properties, normalized.T, strict=True):
+            plane[cells] = column
+        properties = properties.reshape(1, 3, *material.shape)
+        yield asset, {"material": material[None], "properties": properties}, clipped
 
 
 def write_assets(
