@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from slatprep import provenance
 from slatprep.errors import StoreError
 from slatprep.normalize import PIXIE_RANGES, ranges_from_extents, read_ranges
-from slatprep.parallel import run_unordered
+from slatprep.parallel import Jobs, require_shared, run_unordered
 from slatprep.parameters import BuildParameters, NormalizeParameters, StoreParameters
 from slatprep.plan import Action, BuildPlan, PlannedAsset, plan_assets
 from slatprep.process import Bench, finish_asset, process_asset, worker_died
@@ -62,7 +62,7 @@ def build_store(
     out: Path,
     *,
     manifests: Path | None = None,
-    jobs: int = 1,
+    jobs: Jobs = 1,
     strict: bool = False,
     fresh: bool = False,
     keep_work: bool = False,
@@ -80,8 +80,9 @@ def build_store(
     manifests : Path, optional
         Directory of ``assets.jsonl`` and ``build.json``; by default beside the
         store, see `default_manifests`.
-    jobs : int
-        Worker processes. The store's bytes do not depend on it.
+    jobs : int or Workers
+        Worker processes, or a `slatprep.cluster.Cluster`. The store's bytes do
+        not depend on it.
     strict : bool
         Raise at the first asset that cannot be used instead of going on.
     fresh : bool
@@ -112,6 +113,7 @@ def build_store(
     with work_beside(target, keep=keep_work) as work:
         if fresh:
             work.spool.keep_only(set())
+        require_shared(jobs, [work.scratch, *_some_sources(parameters)])
         previous = None if fresh else previous_build(target)
         bench = Bench(parameters, recipe_of(parameters), work.spool, previous, strict)
         plan = _plan_if_any(bench, jobs, progress)
@@ -155,7 +157,7 @@ def plan_build(
     parameters: BuildParameters,
     out: Path,
     *,
-    jobs: int = 1,
+    jobs: Jobs = 1,
     fresh: bool = False,
     progress: Progress | None = None,
 ) -> BuildPlan:
@@ -174,6 +176,7 @@ def plan_build(
     target, _ = _places(Path(out), None)
     directory = work_directory(target) / "spool"
     spool = Spool(directory) if directory.is_dir() and not fresh else None
+    require_shared(jobs, _some_sources(parameters))
     previous = None if fresh else previous_build(target)
     assets = plan_assets(parameters, recipe_of(parameters), spool, previous, jobs, progress)
     return BuildPlan(Path(out), tuple(sorted(assets, key=lambda asset: asset.asset_id)))
@@ -183,7 +186,7 @@ def align_pairs(
     parameters: BuildParameters,
     out: Path,
     *,
-    jobs: int = 1,
+    jobs: Jobs = 1,
     strict: bool = False,
     progress: Progress | None = None,
 ) -> BuildSummary:
@@ -211,7 +214,8 @@ def align_pairs(
     """
     begin = time.perf_counter()
     out = Path(out)
-    with work_beside(out, arrays=False) as work:
+    with work_beside(out.absolute(), arrays=False) as work:
+        require_shared(jobs, [work.scratch, *_some_sources(parameters)])
         bench = Bench(parameters, recipe_of(parameters), work.spool, None, strict)
         plan = _plan_if_any(bench, jobs, progress)
         assets = _finish_all(bench, plan, tuple(Action), jobs, progress)
@@ -229,7 +233,7 @@ def default_manifests(store: Path) -> Path:
 
 
 def _plan_if_any(
-    bench: Bench, jobs: int, progress: Progress | None
+    bench: Bench, jobs: Jobs, progress: Progress | None
 ) -> dict[str, PlannedAsset] | None:
     """Return what is to be done by asset id, or None where nothing was done before."""
     if bench.previous is None and not bench.spool.holds_any():
@@ -239,11 +243,19 @@ def _plan_if_any(
     return {asset.asset_id: asset for asset in assets}
 
 
+def _some_sources(parameters: BuildParameters) -> Iterator[Path]:
+    """Yield the files of a pair, by which to see that a worker has the sources."""
+    for pair in discover(parameters):
+        if pair.grid and pair.slat:
+            yield from (pair.grid, pair.slat)
+            return
+
+
 def _finish_all(
     bench: Bench,
     plan: dict[str, PlannedAsset] | None,
     actions: tuple[Action, ...],
-    jobs: int,
+    jobs: Jobs,
     progress: Progress | None,
 ) -> list[SpooledAsset]:
     """Bring every asset with one of these actions into the spool; return what is kept of each."""
@@ -284,7 +296,7 @@ def _pack(
     assets: Sequence[SpooledAsset],
     normalization: Normalization,
     parameters: StoreParameters,
-    jobs: int,
+    jobs: Jobs,
 ) -> dict[str, NDArray[np.int64]]:
     """Write the store's arrays, a task a shard; return the values clipped, by group and asset."""
     keys = [asset.key for asset in assets]

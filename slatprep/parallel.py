@@ -1,4 +1,4 @@
-"""One function over many tasks, on one core or several, one thread each."""
+"""One function over many tasks, on one core or several, or on a cluster, one thread each."""
 
 from __future__ import annotations
 
@@ -6,9 +6,10 @@ import os
 import threading
 import time
 import warnings
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Generator, Iterable, Iterator
 from contextlib import contextmanager
-from typing import Any, TypeVar
+from pathlib import Path
+from typing import Any, Protocol, TypeVar
 
 from slatprep.errors import SlatprepError
 
@@ -25,11 +26,35 @@ THREAD_VARIABLES = (
 )
 """What the numeric libraries read, once, when they are loaded."""
 
+WORKER_DIED = object()
+"""Stands in a pair of a task's number and its result for one that cost its workers their lives."""
+
+
+class Workers(Protocol):
+    """Workers other than this process's own, as `slatprep.cluster.Cluster` has them."""
+
+    def run_unordered(
+        self,
+        function: Callable[..., Result],
+        tasks: Iterable[tuple[Any, ...]],
+        died: Callable[..., Result] | None = None,
+    ) -> Iterator[Result]:
+        """Do what the function `run_unordered` promises."""
+        ...
+
+    def require_shared(self, paths: Iterable[Path]) -> None:
+        """Raise `SlatprepError` unless every worker sees these files and folders as we do."""
+        ...
+
+
+Jobs = int | Workers
+"""How many processes of this machine compute, or who else does."""
+
 
 def run_unordered(
     function: Callable[..., Result],
     tasks: Iterable[tuple[Any, ...]],
-    jobs: int = 1,
+    jobs: Jobs = 1,
     died: Callable[..., Result] | None = None,
 ) -> Iterator[Result]:
     """Yield ``function(*task)`` for each task, in the order in which they finish.
@@ -44,8 +69,8 @@ def run_unordered(
         Must be importable by a worker.
     tasks : iterable of tuple
         Positional arguments of each call.
-    jobs : int
-        Worker processes; 1 computes in this process.
+    jobs : int or Workers
+        Worker processes, 1 computes in this process; or workers elsewhere.
     died : callable, optional
         ``died(*task)`` stands in for the result of a task that was alone when
         its worker was killed again. Without it that is an error.
@@ -55,6 +80,9 @@ def run_unordered(
     SlatprepError
         If a task kills its worker even alone, and `died` is not given.
     """
+    if not isinstance(jobs, int):
+        yield from jobs.run_unordered(function, tasks, died)
+        return
     if jobs == 1:
         with single_threaded():
             for task in tasks:
@@ -62,7 +90,7 @@ def run_unordered(
         return
     from joblib.externals.loky.process_executor import BrokenProcessPool
 
-    source = _Handout(tasks)
+    source = Handout(tasks)
     while not source.exhausted:
         try:
             yield from _run_in_pool(function, source, jobs)
@@ -70,7 +98,13 @@ def run_unordered(
             yield from _run_alone(function, source.unfinished(), died)
 
 
-class _Handout:
+def require_shared(jobs: Jobs, paths: Iterable[Path]) -> None:
+    """Raise `SlatprepError` unless all workers see these files; those of this machine do."""
+    if not isinstance(jobs, int):
+        jobs.require_shared(paths)
+
+
+class Handout:
     """Hands tasks out and remembers which have not come back."""
 
     def __init__(self, tasks: Iterable[tuple[Any, ...]]) -> None:
@@ -107,7 +141,24 @@ class _Handout:
         return tasks
 
 
-def _run_in_pool(function: Callable[..., Result], source: _Handout, jobs: int) -> Iterator[Result]:
+def results_of(
+    results: Generator[tuple[int, Result], None, None], source: Handout
+) -> Iterator[Result]:
+    """Yield what joblib yields of numbered tasks; those whose worker died stay unfinished."""
+    try:
+        for number, result in results:
+            if result is not WORKER_DIED:
+                source.back(number)
+                yield result
+    finally:
+        with warnings.catch_warnings():
+            # Whoever stops early, as a strict build does, means to waste the rest.
+            for wasted in (".*but not used", ".*have been cancelled"):
+                warnings.filterwarnings("ignore", message=wasted, category=UserWarning)
+            results.close()
+
+
+def _run_in_pool(function: Callable[..., Result], source: Handout, jobs: int) -> Iterator[Result]:
     from joblib import Parallel, delayed, parallel_config
 
     calls = (delayed(_numbered)(function, number, task) for number, task in source)
@@ -115,17 +166,7 @@ def _run_in_pool(function: Callable[..., Result], source: _Handout, jobs: int) -
     with parallel_config("loky", n_jobs=jobs, inner_max_num_threads=1, **watch):
         # Our tasks take long enough to travel alone; in batches progress would jump.
         parallel = Parallel(return_as="generator_unordered", batch_size=1)
-    results = parallel(calls)
-    try:
-        for number, result in results:
-            source.back(number)
-            yield result
-    finally:
-        with warnings.catch_warnings():
-            # Whoever stops early, as a strict build does, means to waste the rest.
-            for wasted in (".*but not used", ".*have been cancelled"):
-                warnings.filterwarnings("ignore", message=wasted, category=UserWarning)
-            results.close()
+    yield from results_of(parallel(calls), source)
 
 
 def _run_alone(
@@ -148,14 +189,19 @@ def _run_alone(
             yield alone.submit(function, *task).result()
         except BrokenProcessPool:
             alone = None
-            if died is None:
-                raise SlatprepError(
-                    "a worker process was killed twice at the same task, probably because memory "
-                    "ran out; nothing was replaced. Run again with fewer jobs or more memory"
-                ) from None
-            yield died(*task)
+            yield result_of_death(task, died)
     if alone is not None:
         alone.shutdown()
+
+
+def result_of_death(task: tuple[Any, ...], died: Callable[..., Result] | None) -> Result:
+    """Return what stands in for a task that kills its worker even alone."""
+    if died is None:
+        raise SlatprepError(
+            "a worker process was killed twice at the same task, probably because memory "
+            "ran out; nothing was replaced. Run again with fewer jobs or more memory"
+        )
+    return died(*task)
 
 
 def _numbered(

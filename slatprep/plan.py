@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from slatprep.errors import SlatprepError
-from slatprep.parallel import run_unordered
+from slatprep.parallel import Jobs, run_unordered
 from slatprep.parameters import BuildParameters
 from slatprep.provenance import jsonable
 from slatprep.readers import discover
@@ -92,7 +92,7 @@ def plan_assets(
     recipe: Recipe,
     spool: Spool | None,
     previous: tuple[Path, str] | None,
-    jobs: int,
+    jobs: Jobs,
     progress: Callable[[int, int], None] | None = None,
 ) -> Iterator[PlannedAsset]:
     """Yield what will be done with each asset, in no order, those to be removed last.
@@ -107,8 +107,8 @@ def plan_assets(
         What an interrupted build left.
     previous : (Path, str) or None
         The store that is there, and its build's id.
-    jobs : int
-        Worker processes.
+    jobs : int or Workers
+        Worker processes, or a cluster's.
     progress : callable, optional
         Called with the assets done and the assets in all.
     """

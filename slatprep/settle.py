@@ -18,7 +18,7 @@ import numpy as np
 from slatprep import provenance
 from slatprep.align.consensus import find_consensus, settle
 from slatprep.align.quality import measure_quality
-from slatprep.parallel import run_unordered
+from slatprep.parallel import Jobs, run_unordered
 from slatprep.parameters import BuildParameters
 from slatprep.process import annotate_asset
 from slatprep.records import (
@@ -38,7 +38,7 @@ from slatprep.store.spool import Spool, SpooledAsset
 
 
 def settle_ties(
-    assets: Sequence[SpooledAsset], spool: Spool, parameters: BuildParameters, jobs: int
+    assets: Sequence[SpooledAsset], spool: Spool, parameters: BuildParameters, jobs: Jobs
 ) -> list[SpooledAsset]:
     """Give ambiguous assets the placement nearest to the dataset's common rotation.
 
@@ -50,8 +50,8 @@ def settle_ties(
         Where they lie.
     parameters : BuildParameters
         How annotations are looked up, and the radius of the quality figures.
-    jobs : int
-        Worker processes.
+    jobs : int or Workers
+        Worker processes, or a cluster's.
 
     Returns
     -------

@@ -8,12 +8,13 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from slatprep.cli.options import jobs_option, parameters_of, source_options
+from slatprep.cli.options import parameters_of, source_options, workers_options
 from slatprep.cli.output import EXIT_INCOMPLETE, Output, output_options
 from slatprep.cli.overview import show_quality
 
 if TYPE_CHECKING:
     from slatprep.build import BuildPlan, BuildSummary
+    from slatprep.parallel import Jobs
 
 _MANIFESTS = click.option(
     "--manifests",
@@ -31,6 +32,7 @@ Example:
   slatprep build-store --pixieverse demo/pixieverse --slat demo/slat --out demo.zarr --jobs 2
   slatprep build-store --config manifests/demo.toml --preset paper --out data/demo.zarr
   slatprep build-store --config manifests/demo.toml --out data/demo.zarr --dry-run
+  slatprep build-store --config manifests/demo.toml --out data/demo.zarr --scheduler tcp://node7:8786
 """,
 )
 @source_options
@@ -41,7 +43,6 @@ Example:
     metavar="STORE.zarr",
     help="The store; one that is there is brought up to date and replaced in one step.",
 )
-@jobs_option
 @_MANIFESTS
 @_STRICT
 @click.option(
@@ -57,10 +58,11 @@ Example:
 )
 @click.option("--dry-run", is_flag=True, help="Say what would be done, and why; write nothing.")
 @output_options
+@workers_options
 def build_store(
     output: Output,
     out: Path,
-    jobs: int,
+    jobs: Jobs,
     manifests: Path | None,
     strict: bool,
     fresh: bool,
@@ -114,10 +116,10 @@ Example:
     metavar="FILE.jsonl",
     help="One JSON record an asset: transform, quality, candidates.",
 )
-@jobs_option
 @_STRICT
 @output_options
-def align(output: Output, out: Path, jobs: int, strict: bool, **sources: Any) -> None:
+@workers_options
+def align(output: Output, out: Path, jobs: Jobs, strict: bool, **sources: Any) -> None:
     """Align without building a store.
 
     Writes one JSON record an asset: the transform, its quality, and the score

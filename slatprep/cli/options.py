@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
+
+from slatprep.cli.output import Output
 
 if TYPE_CHECKING:
     from slatprep.parameters import BuildParameters
@@ -90,6 +93,36 @@ jobs_option = click.option(
 )
 
 
+def workers_options(command: _Command) -> _Command:
+    """Add ``--jobs`` and ``--scheduler``, of which the command gets what was chosen as `jobs`.
+
+    It stands below `output_options`, whose `Output` it takes and hands on.
+    """
+
+    @jobs_option
+    @click.option(
+        "--scheduler",
+        metavar="ADDRESS",
+        help="Compute on the Dask cluster of this scheduler, as tcp://host:8786, instead of here.",
+    )
+    @functools.wraps(command)
+    def with_workers(output: Output, *, jobs: int, scheduler: str | None, **options: Any) -> object:
+        if scheduler is None:
+            return command(output, jobs=jobs, **options)
+        given = click.get_current_context().get_parameter_source("jobs")
+        if given is not click.core.ParameterSource.DEFAULT:
+            raise click.UsageError(
+                "--jobs is for this machine, and --scheduler uses all workers that the cluster "
+                "has; give one of them"
+            )
+        from slatprep.cluster import Cluster
+
+        with Cluster(scheduler, output.note) as cluster:
+            return command(output, jobs=cluster, **options)
+
+    return with_workers  # type: ignore[return-value]
+
+
 def parameters_of(
     *,
     config: Path | None,
@@ -112,7 +145,7 @@ def parameters_of(
         ("normalize", "ranges", ranges),
     ):
         if value is not None:
-            given[group] = {key: str(value)}
+            given[group] = {key: str(value.absolute()) if isinstance(value, Path) else value}
     if consensus:
         given["consensus"] = {"settle": True}
     return load_parameters(config, given, preset)

@@ -4,11 +4,15 @@ from __future__ import annotations
 
 import dataclasses
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import click
 
-from slatprep.cli.options import chosen_store, jobs_option, store_argument
+from slatprep.cli.options import chosen_store, store_argument, workers_options
 from slatprep.cli.output import EXIT_INCOMPLETE, Output, output_options
+
+if TYPE_CHECKING:
+    from slatprep.parallel import Jobs
 
 _DIRECTORY = click.Path(path_type=Path, exists=True, file_okay=False)
 
@@ -34,8 +38,8 @@ Example:
     "--slat", type=_DIRECTORY, metavar="DIR",
     help="Where the latents lie now, or their one HDF5 file does.  [default: where they lay]",
 )  # fmt: skip
-@jobs_option
 @output_options
+@workers_options
 def verify(
     output: Output,
     store: Path | None,
@@ -43,7 +47,7 @@ def verify(
     sources: bool,
     pixieverse: Path | None,
     slat: Path | None,
-    jobs: int,
+    jobs: Jobs,
 ) -> None:
     """Check that STORE is whole, unchanged and consistent.
 

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from slatprep.errors import StoreError
-from slatprep.parallel import run_unordered
+from slatprep.parallel import Jobs, require_shared, run_unordered
 from slatprep.store.contract import Finding
 from slatprep.store.reader import Store, open_store
 from slatprep.verify.assets import SourceRoots, asset_findings
@@ -68,7 +68,7 @@ def verify_store(
     manifests: Path | None = None,
     sources: bool = False,
     roots: SourceRoots | None = None,
-    jobs: int = 1,
+    jobs: Jobs = 1,
     progress: Progress | None = None,
 ) -> Verification:
     """Check everything about a store that can be checked.
@@ -84,8 +84,8 @@ def verify_store(
         Whether to compare the source files with the records.
     roots : SourceRoots, optional
         Where the sources lie now; by default where ``build.json`` says they lay.
-    jobs : int
-        Worker processes.
+    jobs : int or Workers
+        Worker processes, or a `slatprep.cluster.Cluster`.
     progress : callable, optional
         See `Progress`.
 
@@ -102,7 +102,7 @@ def verify_store(
     """
     path = Path(path)
     try:
-        store = open_store(path)
+        store = open_store(path.absolute())  # workers may stand in another folder
     except StoreError as error:
         if not (path / "zarr.json").is_file():
             raise
@@ -111,6 +111,8 @@ def verify_store(
     folder = manifests or usual_manifests(path)
     if sources and roots is None:
         roots = source_roots(folder)
+    needed = [roots.pixieverse, roots.slat] if sources and roots else []
+    require_shared(jobs, [store.path / "zarr.json", *needed])
     findings = set(metadata_findings(path))
     digests, found = file_findings(store, jobs)
     findings |= found
@@ -132,7 +134,7 @@ def verify_store(
 
 
 def _assets(
-    store: Store, roots: SourceRoots | None, total: int, jobs: int
+    store: Store, roots: SourceRoots | None, total: int, jobs: Jobs
 ) -> Iterator[tuple[list[Finding], int]]:
     run = uuid.uuid4().hex
     tasks = (

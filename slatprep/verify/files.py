@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from slatprep.errors import StoreError
-from slatprep.parallel import run_unordered
+from slatprep.parallel import Jobs, run_unordered
 from slatprep.store.contract import (
     Finding,
     array_findings,
@@ -59,7 +59,7 @@ def metadata_findings(path: Path) -> Iterator[Finding]:
             yield from array_findings(layout.name, arrays[layout.name], sizes)
 
 
-def file_findings(store: Store, jobs: int) -> tuple[int, set[Finding]]:
+def file_findings(store: Store, jobs: Jobs) -> tuple[int, set[Finding]]:
     """Compare every file of a store with its digest.
 
     Returns
