@@ -80,6 +80,19 @@ def test_resumed_run_has_the_same_bits(learn_store: Path, tmp_path: Path) -> Non
     }  # fmt: skip
 
 
+def test_tensorboard_reads_what_was_logged(learn_store: Path, tmp_path: Path) -> None:
+    accumulator = pytest.importorskip("tensorboard.backend.event_processing.event_accumulator")
+    two = dataclasses.replace(SHORT, epochs=2)
+    train(learn_store, tmp_path / "run", two, stop_after=1)
+    history = train(learn_store, tmp_path / "run", two).history
+    events = accumulator.EventAccumulator(str(tmp_path / "run" / "tensorboard"))
+    events.Reload()
+    for name in ("learning_rate", "train_loss", "val_loss", "val_mse", "val_accuracy"):
+        read = [(event.step, event.value) for event in events.Scalars(name)]
+        logged = [(record.epoch, pytest.approx(getattr(record, name))) for record in history]
+        assert read == logged, name
+
+
 def test_wrong_runs_are_named(learn_store: Path, tmp_path: Path) -> None:
     out = tmp_path / "run"
     one = dataclasses.replace(SHORT, epochs=1)
