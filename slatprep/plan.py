@@ -163,9 +163,10 @@ def _new_names(
 
 
 def previous_record(previous: tuple[Path, str] | None, asset_id: str) -> dict[str, Any] | None:
-    """Return what the store that is there records of an asset, if anything."""
+    """Return what is recorded of an asset of the store that is there, as the first pass left it."""
     records = _records(previous)
-    return records.find(asset_id) if records else None
+    record = records.find(asset_id) if records else None
+    return record and {**record, **(record["before_settling"] or {})}
 
 
 def _records(previous: tuple[Path, str] | None) -> StoredRecords | None:

@@ -120,6 +120,7 @@ def asset_record(
         "code": code,
         "key": key,
         "alignment": alignment_entry(result) if alignment is None else dict(alignment),
+        "before_settling": None,
         "normalization": None,
         "counts": counts_entry(result),
         "warnings": list(warnings),

@@ -1,8 +1,9 @@
 """The second pass: ties settled by the rotation that the dataset has in common.
 
 It works on what the first pass left in the spool and changes nothing there: an
-asset whose placement changes is written again under a key of its own, so the
-choice is undone by building without it.
+asset whose placement changes is written again under a key of its own. Its
+record keeps what the first pass found, so the next build does not align it
+again, with this pass or without.
 """
 
 from __future__ import annotations
@@ -93,6 +94,7 @@ def settle_asset(
         "key": key,
         "alignment": provenance.alignment_entry(result),
         "counts": provenance.counts_entry(result),
+        "before_settling": {"key": asset.key, "alignment": record["alignment"]},
     }
     return spool.put(replace(result, record=record | entries), key)
 

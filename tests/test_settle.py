@@ -89,11 +89,20 @@ def test_building_without_it_brings_the_first_placements_back(
     build_store(with_it, store, jobs=2)
     assert _tree(store) == _tree(stores[1])  # whatever the jobs
     plan = plan_build(parameters, store)
-    settled = [k for k, r in _records(stores[1]).items() if r["alignment"]["settled_by"]]
-    again = [asset.asset_id for asset in plan.assets if asset.action == "align"]
-    assert again == settled
+    assert {asset.action for asset in plan.assets} == {"reuse"}  # no asset is aligned again
     build_store(parameters, store)
     assert _tree(store) == _tree(stores[0])
+    build_store(with_it, store)
+    assert _tree(store) == _tree(stores[1])
+
+
+def test_a_settled_store_that_is_built_again_is_found_unchanged(
+    habitual: tuple[Path, BuildParameters], stores: tuple[Path, Path]
+) -> None:
+    with_it = replace(habitual[1], consensus=ConsensusParameters(settle=True))
+    times = {path: path.stat().st_mtime_ns for path in stores[1].rglob("*")}
+    build_store(with_it, stores[1])
+    assert {path: path.stat().st_mtime_ns for path in stores[1].rglob("*")} == times
 
 
 def _tree(store: Path) -> dict[str, bytes]:
