@@ -34,8 +34,8 @@ from slatprep.records import (
 COARSE_SAMPLES, POLISH_SAMPLES, FINE_SAMPLES = 100, 400, 2_000
 """Samples a side used from the starts, on the survivors, and at the end."""
 
-COARSE_TAUS = (8.0, 8.0, 6.0, 6.0, 4.0, 4.0, 3.0, 3.0, 2.0, 2.0)
-POLISH_TAUS = (2.0,) * 5 + (1.0,) * 5
+COARSE_TAUS = (8.0, 8.0, 6.0, 5.0, 4.0, 3.0, 2.0, 2.0)
+POLISH_TAUS = (2.0,) * 4 + (1.0,) * 4
 FINE_TAUS = (1.0,) * 10
 """Width of the robust kernel at each step, in voxels."""
 
@@ -52,7 +52,7 @@ POOR, FAIR, CLEAR = 0.8, 0.9, 0.1
 """All orientations are searched if the best score from the 24 starts is poor, or if it is
 no better than fair and not clearly above that of the next distinct placement."""
 
-SO3_STARTS, SO3_HALFWAY, SO3_KEPT = 240, 5, 80
+SO3_STARTS, SO3_HALFWAY, SO3_KEPT = 240, 4, 80
 """Starts over all orientations, and how many of them are refined further after so many steps.
 
 Of 180 assets the best placement was among the first 30 then, but for three with ties in plenty.
