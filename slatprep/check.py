@@ -251,12 +251,19 @@ def choose_assets(
 
 def stored_field(asset: StoredAsset, normalization: Normalization) -> MaterialField:
     """Return the PixieVerse field that a store holds, in SI units again."""
-    annotated = asset.grid_material < BACKGROUND
+    material = asset.grid_material.reshape(-1)
+    cells = np.flatnonzero(material < BACKGROUND)
+    values = asset.grid_properties.reshape(3, -1)[:, cells]
     return MaterialField(
         occupancy=asset.grid_material != BACKGROUND,
-        voxels=np.argwhere(annotated).astype(np.uint8),
-        material=asset.grid_material[annotated],
-        properties=denormalize(asset.grid_properties[:, annotated].T, normalization),
+        voxels=np.stack(
+            np.unravel_index(cells, asset.grid_material.shape),
+            axis=1,
+            dtype=np.uint8,
+            casting="unsafe",
+        ),
+        material=material[cells],
+        properties=denormalize(values.T, normalization),
     )
 
 

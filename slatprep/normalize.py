@@ -181,10 +181,12 @@ def denormalize(values: ArrayLike, normalization: Normalization) -> NDArray[np.f
     ndarray of float32, shape (N, 3)
         Young's modulus [Pa], density [kg/m^3], Poisson's ratio.
     """
-    lo, hi = _limits(normalization)
-    mapped = (np.asarray(values, dtype=np.float64) + 1.0) * 0.5 * (hi - lo) + lo
-    mapped[..., :2] = 10.0 ** mapped[..., :2]
-    return mapped.astype(np.float32)
+    given = np.asarray(values)
+    properties = np.empty(given.shape, dtype=np.float32)
+    for column, span in enumerate(normalization.ranges):
+        mapped = (given[..., column].astype(np.float64) + 1.0) * 0.5 * (span.hi - span.lo) + span.lo
+        properties[..., column] = 10.0**mapped if span.log10 else mapped
+    return properties
 
 
 def normalize_change(change: ArrayLike, normalization: Normalization) -> NDArray[np.float64]:

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from slatprep.check import DISTANCE_TOLERANCE, PROPERTY_TOLERANCE, stored_field
 from slatprep.errors import InputError, StoreError
+from slatprep.geometry import flat_index
 from slatprep.normalize import normalize
 from slatprep.parameters import SampleParameters
 from slatprep.provenance import load_schema
@@ -113,7 +114,7 @@ def value_findings(asset: StoredAsset) -> Iterator[Finding]:
             "a distance of 0 or more",
         ),
         "grid/material": (
-            np.isin(asset.grid_material, _GRID_CLASSES).all(),
+            _IS_GRID_CLASS[asset.grid_material].all(),
             "an unknown class",
             "0 to 7, or 255",
         ),
@@ -126,8 +127,8 @@ def value_findings(asset: StoredAsset) -> Iterator[Finding]:
     for where, (fine, what, expected) in checks.items():
         if not fine:
             yield Finding(where, asset.asset_id, what, expected)
-    flat = (coords.astype(np.int32) @ (RESOLUTION**2, RESOLUTION, 1)).astype(np.int32)
-    if len(np.unique(flat)) < len(flat):
+    # Coordinates that are out of range, which was found above, may share a cell.
+    if np.bincount(flat_index(coords)).max(initial=0) > 1:
         yield Finding("voxel/coords", asset.asset_id, "a coordinate occurs twice", "each once")
 
 
@@ -197,7 +198,7 @@ def source_findings(record: Mapping[str, Any], roots: SourceRoots, run: str) -> 
         yield Finding(str(path), record["asset_id"], what, expected)
 
 
-_GRID_CLASSES = (*range(BACKGROUND + 1), UNANNOTATED)
+_IS_GRID_CLASS = np.isin(np.arange(256), (*range(BACKGROUND + 1), UNANNOTATED))
 
 
 def _normalised(values: NDArray[np.float32], where: NDArray[np.bool_]) -> bool:
@@ -272,7 +273,7 @@ def schema_findings(
         Finding(
             where,
             asset_id,
-            f"{'/'.join(map(str, fault.absolute_path)) or 'it'}: {fault.message[:120]}",
+            f"{'/'.join(map(str, fault.instance_path)) or 'it'}: {fault.message[:120]}",
             "the published schema",
         )
         for fault in faults
@@ -286,7 +287,7 @@ def _opened(path: Path, run: str) -> Store:
 
 @lru_cache(maxsize=2)
 def _validator(schema: str) -> Any:
-    from jsonschema import Draft202012Validator
+    from jsonschema_rs import Draft202012Validator
 
     return Draft202012Validator(load_schema(schema))
 

@@ -189,7 +189,7 @@ def test_a_record_that_breaks_its_schema_is_found(store: Path) -> None:
     rewrite(store, "asset/record", 1, json.dumps(record))
     findings = of_file(found(store), "asset/record")
     assert [f.asset for f in findings] == ["bear.front"]
-    assert findings[0].what.startswith("sources/0/sha256: 'beef' does not match")
+    assert findings[0].what.startswith('sources/0/sha256: "beef" does not match')
 
 
 def edit_json(path: Path, edit: Callable[[dict], object]) -> None:
