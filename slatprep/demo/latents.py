@@ -40,12 +40,9 @@ def make_latents(
     rng : numpy.random.Generator
         Source of the noise.
     kind : {"placeholder", "material"}
-        ``placeholder`` is normal noise. ``material`` depends on what is there:
-        before mean and standard deviation are applied, channel vector ``z`` of
-        a voxel is ``2 * code[material] + p @ code[:3] + sin(pi * x) @ code[3:6] / 2
-        + 0.5 * noise``, with ``code`` eight fixed orthonormal vectors, ``p`` the
-        three properties (log10 Young's modulus, log10 density, Poisson's
-        ratio) mapped to about -1..1, and ``x`` the voxel's centre.
+        ``placeholder`` is normal noise. ``material`` is `NOISE` times that, and
+        `clean_latents` of what is there; then TRELLIS's mean and standard
+        deviation are applied.
     coords : ndarray of uint8, shape (N, 3)
         SLAT voxels.
     material : ndarray of uint8, shape (N,)
@@ -53,13 +50,35 @@ def make_latents(
     properties : ndarray of float32, shape (N, 3)
         Young's modulus, density and Poisson's ratio of each, SI.
     """
-    noise = rng.normal(size=(len(coords), 8))
-    if kind == "placeholder":
-        return (MEAN + STD * noise).astype(np.float32)
+    z = rng.normal(size=(len(coords), 8))
+    if kind == "material":
+        z = clean_latents(coords, material, properties) + NOISE * z
+    feats: NDArray[np.float32] = (MEAN + STD * z).astype(np.float32)
+    return feats
+
+
+def clean_latents(
+    coords: NDArray[np.uint8], material: NDArray[np.uint8], properties: NDArray[np.float32]
+) -> NDArray[np.float64]:
+    """Return the part of ``material`` latents that is no noise, standardised (N, 8).
+
+    ``2 * code[material] + p @ code[:3] + sin(pi * x) @ code[3:6] / 2``, with
+    ``code`` eight fixed orthonormal vectors, ``p`` the three properties (log10
+    Young's modulus, log10 density, Poisson's ratio) mapped to about -1..1, and
+    ``x`` the voxel's centre. It is linear in what is to be learnt, so a linear
+    model of each voxel has the form of the truth; what it cannot do is to look
+    at the neighbours, whose noise is independent.
+
+    Parameters
+    ----------
+    coords, material, properties : ndarray
+        As in `make_latents`.
+    """
     mapped = properties.astype(np.float64)
     mapped[:, :2] = np.log10(mapped[:, :2])
     mapped = (mapped - _PROPERTY_CENTRE) / _PROPERTY_SPREAD
-    z = 2.0 * _CODES[material] + mapped @ _CODES[:3] + NOISE * noise
-    z += 0.5 * np.sin(np.pi * voxel_centres(coords)) @ _CODES[3:6]
-    feats: NDArray[np.float32] = (MEAN + STD * z).astype(np.float32)
-    return feats
+    place = np.sin(np.pi * voxel_centres(coords))
+    z: NDArray[np.float64] = (
+        2.0 * _CODES[material] + mapped @ _CODES[:3] + 0.5 * place @ _CODES[3:6]
+    )
+    return z
