@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING, Any, get_args, get_type_hints
 
 from slatprep.errors import ConfigError
 from slatprep.parameters import PRESETS, BuildParameters
+from slatprep.remote import RemotePath, as_path
 
 if TYPE_CHECKING:
     from pydantic_core import ErrorDetails
@@ -159,7 +160,9 @@ def _resolve_paths(data: dict[str, Any], folder: Path) -> dict[str, Any]:
         table = data.get(group)
         value = table.get(key) if isinstance(table, dict) else None
         if isinstance(value, str) and value and (key != "ranges" or value not in NAMED_RANGES):
-            data[group][key] = str((folder / Path(value).expanduser()).resolve())
+            path = as_path(value).expanduser()
+            path = path if isinstance(path, RemotePath) else (folder / path).resolve()
+            data[group][key] = str(path)
     return data
 
 
@@ -252,7 +255,14 @@ def _check_paths(parameters: BuildParameters, source: _Source) -> None:
         value = _value(parameters, name)
         if value is None or value in NAMED_RANGES:
             continue
-        if not Path(value).exists():
+        try:
+            there = as_path(value).exists()
+        except OSError as error:
+            place = source.where(tuple(name.split(".")))
+            raise ConfigError(
+                f"{place}: {name}: {value} cannot be looked at ({error.strerror})"
+            ) from None
+        if not there:
             where = source.where(tuple(name.split(".")))
             named = f", or one of {', '.join(NAMED_RANGES)}" if name == "normalize.ranges" else ""
             raise ConfigError(f"{where}: {name}: {value} does not exist; expected a path{named}")

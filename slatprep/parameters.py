@@ -11,6 +11,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import ClassVar, Literal
 
+from slatprep.remote import as_path
+
 _FORBID_UNKNOWN: dict[str, str] = {"extra": "forbid"}
 
 
@@ -35,6 +37,9 @@ class PixieverseSource:
     bounds: tuple[str, ...] = ("{id}/clip_features.npz",)
     sample: str = ""
 
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "root", as_path(self.root))
+
 
 @dataclass(frozen=True)
 class SlatSource:
@@ -58,6 +63,9 @@ class SlatSource:
     )
     group: str = "{id}"
 
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "root", as_path(self.root))
+
 
 @dataclass(frozen=True)
 class PairingParameters:
@@ -72,6 +80,11 @@ class PairingParameters:
 
     map: Path | None = None
     categories: Path | None = None
+
+    def __post_init__(self) -> None:
+        for name in ("map", "categories"):
+            place = getattr(self, name)
+            object.__setattr__(self, name, None if place is None else as_path(place))
 
 
 @dataclass(frozen=True)

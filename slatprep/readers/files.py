@@ -26,6 +26,7 @@ from numpy.typing import NDArray
 
 from slatprep.errors import InputError, MissingPartnerError
 from slatprep.records import RESOLUTION, AssetPair, SourceFile
+from slatprep.remote import RemoteFile, RemotePath
 
 MAX_FILE_BYTES = 128 * 2**20
 """No file of one asset is larger; the largest form, an 11-channel float64 grid, takes 22 MiB."""
@@ -162,6 +163,8 @@ def resolve_inside(path: Path, root: Path) -> tuple[Path, str]:
     """
     try:
         relative = path.relative_to(root)
+        if isinstance(path, RemotePath):  # An object store has no links that could lead out.
+            return _require_plain(path, relative)
         resolved = path.resolve(strict=True)
         inside = ".." not in relative.parts and resolved.is_relative_to(root.resolve())
         regular = stat.S_ISREG(resolved.stat().st_mode)
@@ -176,6 +179,12 @@ def resolve_inside(path: Path, root: Path) -> tuple[Path, str]:
     if not regular:
         raise InputError(path, "is not a regular file", "a readable file")
     return resolved, relative.as_posix()
+
+
+def _require_plain(path: RemotePath, relative: Path) -> tuple[Path, str]:
+    if {".", ".."} & set(relative.parts) or not relative.parts:
+        raise InputError(path, "is no plain name below its root", "a name without '..'")
+    return path, "/".join(relative.parts)
 
 
 def load_source(path: Path, root: Path, role: str) -> tuple[bytes, SourceFile]:
@@ -197,10 +206,9 @@ def load_source(path: Path, root: Path, role: str) -> tuple[bytes, SourceFile]:
     """
     resolved, name = resolve_inside(path, root)
     try:
-        with resolved.open("rb") as file:
-            size = os.fstat(file.fileno()).st_size
-            # read() would set aside all that it is allowed to return.
-            data = b"" if size > MAX_FILE_BYTES else file.read(size)
+        data, size = _read(resolved)
+    except FileNotFoundError:
+        raise InputError(path, "does not exist", "a readable file") from None
     except OSError as error:
         raise InputError(path, f"cannot be read ({error.strerror})", "a readable file") from None
     if size > MAX_FILE_BYTES:
@@ -212,6 +220,17 @@ def load_source(path: Path, root: Path, role: str) -> tuple[bytes, SourceFile]:
     if not data:
         raise InputError(path, "has zero bytes", "a complete file; copy or make it again")
     return data, SourceFile(role, name, len(data), hashlib.sha256(data).hexdigest())
+
+
+def _read(path: Path) -> tuple[bytes, int]:
+    """Return what a file holds and its size; nothing, or too much, where it is too large."""
+    if isinstance(path, RemotePath):
+        data = RemoteFile(path).pread(MAX_FILE_BYTES + 1, 0)
+        return data, len(data)
+    with path.open("rb") as file:
+        size = os.fstat(file.fileno()).st_size
+        # read() would set aside all that it is allowed to return.
+        return (b"" if size > MAX_FILE_BYTES else file.read(size)), size
 
 
 def npy_array(data: bytes, where: str | Path, spec: ArraySpec) -> NDArray[Any]:

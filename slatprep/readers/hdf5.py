@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from slatprep.cache import on_disk
 from slatprep.errors import InputError
 from slatprep.readers.files import ArraySpec, load_source, resolve_inside
 from slatprep.readers.patterns import component_regex
@@ -73,7 +74,7 @@ def load_datasets(
     try:
         if group:
             source = _hash_shared(path, root)
-            file = h5py.File(path, "r", locking=False)
+            file = h5py.File(on_disk(path), "r", locking=False)
         else:
             data, source = load_source(path, root, "slat")
             file = h5py.File(h5py.h5f.open_file_image(data))
@@ -123,7 +124,7 @@ def find_groups(
 
     resolved, _ = resolve_inside(path, root)
     try:
-        with h5py.File(resolved, "r", locking=False) as file:
+        with h5py.File(on_disk(resolved), "r", locking=False) as file:
             yield from _walk_groups(file, pattern.strip("/").split("/"), dict(known), "")
     except HDF5_ERRORS as error:
         raise InputError(
@@ -270,10 +271,9 @@ def _reason(error: BaseException) -> str:
 def _hash_shared(path: Path, root: Path) -> SourceFile:
     """Describe a file that many assets share; it is hashed once a process, not once an asset."""
     resolved, name = resolve_inside(path, root)
-    state = resolved.stat()
-    return SourceFile(
-        "slat", name, state.st_size, _sha256(resolved, state.st_size, state.st_mtime_ns)
-    )
+    copy = on_disk(resolved)
+    state = copy.stat()
+    return SourceFile("slat", name, state.st_size, _sha256(copy, state.st_size, state.st_mtime_ns))
 
 
 @lru_cache(maxsize=64)

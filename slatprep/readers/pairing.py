@@ -70,18 +70,22 @@ def discover(parameters: BuildParameters) -> Iterator[AssetPair]:
         is found on one side.
     """
     pixieverse, slat, pairing = parameters.pixieverse, parameters.slat, parameters.pairing
-    if not pixieverse.root.is_dir():
-        raise ConfigError(f"{pixieverse.root}: no such folder; expected the PixieVerse root")
-    if not slat.root.exists():
-        raise ConfigError(
-            f"{slat.root}: does not exist; expected a folder of SLATs or an HDF5 file"
-        )
+    try:
+        if not pixieverse.root.is_dir():
+            raise ConfigError(f"{pixieverse.root}: no such folder; expected the PixieVerse root")
+        if not slat.root.exists():
+            raise ConfigError(
+                f"{slat.root}: does not exist; expected a folder of SLATs or an HDF5 file"
+            )
+        one_file = slat.root.is_file()
+    except OSError as error:
+        raise ConfigError(f"{error.filename}: cannot be looked at ({error.strerror})") from None
     grids = _find_grids(pixieverse)
-    slats = _find_slats(slat)
+    slats = _find_slats(slat, one_file)
     claims = {} if pairing.map is None else read_map(pairing.map, grids, slats)
     categories = {} if pairing.categories is None else read_categories(pairing.categories)
     rows = sorted(_rows(grids, slats, claims), key=lambda row: (row.asset_id, row.object_id))
-    return _pairs(rows, grids, categories, parameters)
+    return _pairs(rows, grids, categories, parameters, one_file)
 
 
 def _find_grids(source: PixieverseSource) -> dict[str, list[_Grid]]:
@@ -100,49 +104,44 @@ def _find_grids(source: PixieverseSource) -> dict[str, list[_Grid]]:
     return grids
 
 
-def _find_slats(source: SlatSource) -> dict[str, list[_Slat]]:
+def _find_slats(source: SlatSource, one_file: bool) -> dict[str, list[_Slat]]:
     slats: dict[str, list[_Slat]] = {}
-    for slat in _each_slat(source):
+    for slat in _each_slat(source, one_file):
         slats.setdefault(slat.slat_id, []).append(slat)
     if not slats:
-        tried = f"groups {source.group}" if source.root.is_file() else _tried(source.pattern, {})
+        tried = f"groups {source.group}" if one_file else _tried(source.pattern, {})
         raise ConfigError(f"{source.root}: no SLAT found; looked for {tried}")
     problems = [slat.problem for found in slats.values() for slat in found if slat.problem]
-    if source.root.is_file() and problems:
+    if one_file and problems:
         raise ConfigError(problems[0])
     return slats
 
 
-def _each_slat(source: SlatSource) -> Iterator[_Slat]:
-    if source.root.is_file():
-        yield from _each_group(source, source.root.name)
+def _each_slat(source: SlatSource, one_file: bool) -> Iterator[_Slat]:
+    if one_file:
+        yield from _each_group(source, source.root.parent, source.root.name)
         return
     for pattern in source.pattern:
         for fields, path in find_files(source.root, pattern, {}):
             if "id" in fields:
                 yield _Slat(fields["id"], fields.get("view", ""), path)
             else:
-                yield from _each_group(source, path, fields)
+                yield from _each_group(source, source.root, path, fields)
 
 
 def _each_group(
-    source: SlatSource, path: str, known: Mapping[str, str] | None = None
+    source: SlatSource, root: Path, path: str, known: Mapping[str, str] | None = None
 ) -> Iterator[_Slat]:
     """Return the SLATs that lie as groups in one HDF5 file."""
     from slatprep.readers.hdf5 import find_groups
 
     if "{id}" not in source.group:
         raise ConfigError(f"group pattern {source.group!r} names no {{id}}")
-    root = _slat_root(source)
     try:
         for fields, group in find_groups(root / path, root, source.group, known or {}):
             yield _Slat(fields["id"], fields.get("view", ""), path, group)
     except InputError as error:
         yield _Slat(path, "", path, problem=str(error))
-
-
-def _slat_root(source: SlatSource) -> Path:
-    return source.root.parent if source.root.is_file() else source.root
 
 
 def _rows(
@@ -201,6 +200,7 @@ def _pairs(
     grids: Mapping[str, list[_Grid]],
     categories: Mapping[str, str],
     parameters: BuildParameters,
+    one_file: bool,
 ) -> Iterator[AssetPair]:
     for asset_id, group in groupby(rows, key=lambda row: row.asset_id):
         same = list(group)
@@ -212,7 +212,8 @@ def _pairs(
             )
             shared = f"asset id {asset_id!r} would stand for {names}; rename one"
         row = same[0]
-        yield _pair(row, grids.get(row.object_id, []), categories, parameters, shared)
+        found = grids.get(row.object_id, [])
+        yield _pair(row, found, categories, parameters, one_file, shared)
 
 
 def _pair(
@@ -220,6 +221,7 @@ def _pair(
     grids: list[_Grid],
     categories: Mapping[str, str],
     parameters: BuildParameters,
+    one_file: bool,
     shared: str,
 ) -> AssetPair:
     source, slat_source = parameters.pixieverse, parameters.slat
@@ -249,14 +251,14 @@ def _pair(
         )
     found = [slat for slat in row.slats if slat.path]
     if not found:
-        problems.append(_no_slat(row, slat_source))
+        problems.append(_no_slat(row, slat_source, one_file))
     elif len(found) > 1:
         files = ", ".join(slat.path + (f" [{slat.group}]" if slat.group else "") for slat in found)
         problems.append(
             f"{len(found)} SLATs for one id {row.asset_id!r} ({files}); expected one, "
             "or a pattern with {view}"
         )
-    slat_root = _slat_root(slat_source)
+    slat_root = slat_source.root.parent if one_file else slat_source.root
     return AssetPair(
         asset_id=row.asset_id,
         object_id=_safe(row.object_id),
@@ -289,9 +291,9 @@ def _several_grids(object_id: str, grids: list[_Grid]) -> str:
     return f"{len(grids)} grids for one id {object_id!r} ({files}); expected one"
 
 
-def _no_slat(row: _Row, source: SlatSource) -> str:
+def _no_slat(row: _Row, source: SlatSource, one_file: bool) -> str:
     names = {slat.slat_id for slat in row.slats} or {row.object_id}
-    if source.root.is_file():
+    if one_file:
         tried = " or ".join(f"group {fill(source.group, {'id': name})}" for name in sorted(names))
         return f"no SLAT for id {row.object_id!r}; looked for {tried} in {source.root}"
     tried = "; ".join(_tried(source.pattern, {"id": name}) for name in sorted(names))

@@ -6,13 +6,14 @@ Component by component only the folders that can match are listed.
 
 from __future__ import annotations
 
-import os
 import re
 from collections.abc import Iterator, Mapping
 from functools import lru_cache
 from pathlib import Path
 
 from slatprep.errors import ConfigError
+from slatprep.readers.names import LocalNames, RemoteNames
+from slatprep.remote import RemotePath
 
 FIELDS = ("id", "sample", "view")
 
@@ -50,7 +51,8 @@ def find_files(
         raise ConfigError(
             f"pattern {pattern!r} is not a path below its root; write it relative, without '..'"
         )
-    yield from _walk(root, "", components, dict(known))
+    names = RemoteNames.of(root) if isinstance(root, RemotePath) else LocalNames(root)
+    yield from _walk(names, "", components, dict(known))
 
 
 def fill(pattern: str, known: Mapping[str, str]) -> str:
@@ -90,28 +92,17 @@ def _compile(component: str, known: tuple[tuple[str, str], ...]) -> re.Pattern[s
 
 
 def _walk(
-    root: Path, prefix: str, components: list[str], known: dict[str, str]
+    names: LocalNames | RemoteNames, prefix: str, components: list[str], known: dict[str, str]
 ) -> Iterator[tuple[dict[str, str], str]]:
     component, rest = components[0], components[1:]
     regex = component_regex(component, known)
     literal = fill(component, known)
-    names = [literal] if "*" not in literal else _names(root / prefix)
-    for name in names:
+    for name in [literal] if "*" not in literal else names.of_folder(prefix):
         match = regex.fullmatch(name)
         if match is None:
             continue
         path = prefix + name
         if rest:
-            yield from _walk(root, path + "/", rest, known | match.groupdict())
-        elif os.path.isfile(os.path.join(root, path)):  # noqa: PTH113, PTH118 - half a million times
+            yield from _walk(names, path + "/", rest, known | match.groupdict())
+        elif names.is_file(path):
             yield known | match.groupdict(), path
-
-
-def _names(folder: Path) -> list[str]:
-    try:
-        with os.scandir(folder) as entries:
-            return [entry.name for entry in entries]
-    except (FileNotFoundError, NotADirectoryError):
-        return []
-    except OSError as error:
-        raise ConfigError(f"{folder}: cannot be listed ({error.strerror})") from None
