@@ -21,6 +21,7 @@ from pathlib import Path
 from typing import Any, cast
 
 import numpy as np
+import orjson
 
 from slatprep import __version__
 from slatprep.align import engine_versions
@@ -37,6 +38,8 @@ RECORD_VERSION = 1
 # These differ between runs, machines or folders without the content differing,
 # so a build's id leaves them out.
 _NOT_CONTENT = ("duration_s", "reason", "traceback")
+
+_SORTED_LINE = orjson.OPT_SORT_KEYS | orjson.OPT_APPEND_NEWLINE
 
 
 def library_versions(parameters: AlignParameters) -> dict[str, str]:
@@ -211,10 +214,10 @@ def write_records(path: Path, records: Iterable[Mapping[str, Any]]) -> str:
 
     def writing() -> Iterator[Mapping[str, Any]]:
         for record in records:
-            file.write(json.dumps(record, allow_nan=False, ensure_ascii=False) + "\n")
+            file.write(orjson.dumps(record, option=orjson.OPT_APPEND_NEWLINE))
             yield record
 
-    with path.open("w", encoding="utf-8") as file:
+    with path.open("wb") as file:
         return records_id(writing())
 
 
@@ -223,7 +226,7 @@ def records_id(records: Iterable[Mapping[str, Any]]) -> str:
     digest = hashlib.sha256()
     for record in records:
         content = {k: v for k, v in record.items() if k not in _NOT_CONTENT}
-        digest.update(json.dumps(content, sort_keys=True, allow_nan=False).encode() + b"\n")
+        digest.update(orjson.dumps(content, option=_SORTED_LINE))
     return digest.hexdigest()
 
 

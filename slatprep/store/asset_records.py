@@ -8,13 +8,13 @@ build compares with.
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator, Mapping
 from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import orjson
 
 from slatprep.errors import StoreError
 from slatprep.store.reader import Store, open_store
@@ -60,7 +60,7 @@ class RecordWriter:
     def add(self, record: Mapping[str, Any]) -> None:
         """Take the next row's record."""
         content = {name: value for name, value in record.items() if name != "duration_s"}
-        self._texts.append(json.dumps(content, ensure_ascii=False, allow_nan=False))
+        self._texts.append(orjson.dumps(content).decode())
         if len(self._texts) == RECORDS_IN_SHARD:
             self.flush()
 
@@ -113,7 +113,7 @@ class StoredRecords:
         # Assets are asked for nearly in order: the last chunk answers most of the time.
         if self._last[0] != number:
             rows = slice(number * RECORDS_IN_CHUNK, (number + 1) * RECORDS_IN_CHUNK)
-            self._last = (number, [json.loads(str(text)) for text in self._array[rows]])
+            self._last = (number, [orjson.loads(str(text)) for text in self._array[rows]])
         return self._last[1]
 
     _last: tuple[int, list[dict[str, Any]]] = (-1, [])

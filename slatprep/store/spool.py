@@ -11,7 +11,6 @@ every array, so one that a power failure tore is known and done again.
 from __future__ import annotations
 
 import hashlib
-import json
 import uuid
 import zipfile
 from collections.abc import Iterator
@@ -21,6 +20,7 @@ from pathlib import Path
 from typing import Any, cast
 
 import numpy as np
+import orjson
 from numpy.typing import NDArray
 
 from slatprep.errors import StoreError
@@ -115,7 +115,7 @@ class Spool:
         try:
             with np.load(self._path(key), allow_pickle=False) as file:
                 arrays = {name: file[name] for name in file.files}  # Reads, so checks, them all.
-            record = json.loads(arrays["record"].tobytes())
+            record = orjson.loads(arrays["record"].tobytes())
         except _TORN:
             return None
         if self.arrays and "coords" not in arrays:
@@ -143,7 +143,7 @@ class Spool:
     def record(self, key: str) -> dict[str, Any]:
         """Read an asset's record back."""
         with np.load(self._path(key), allow_pickle=False) as arrays:
-            return cast(dict[str, Any], json.loads(arrays["record"].tobytes()))
+            return cast(dict[str, Any], orjson.loads(arrays["record"].tobytes()))
 
     def voxels(self, key: str) -> Arrays:
         """Read an asset's rows of the ``voxel/*`` arrays, properties in SI units."""
@@ -178,7 +178,7 @@ class Spool:
         path.parent.mkdir(exist_ok=True)
         # A name of its own: a worker that outlives a killed build may write the same asset.
         partial = path.with_suffix(f".{uuid.uuid4().hex}.partial")
-        text = json.dumps(record, allow_nan=False).encode()
+        text = orjson.dumps(record)
         everything: dict[str, Any] = {**arrays, "record": np.frombuffer(text, np.uint8)}
         try:
             with partial.open("wb") as file:

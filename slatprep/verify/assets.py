@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from functools import lru_cache
@@ -10,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import orjson
 from numpy.typing import NDArray
 
 from slatprep.check import DISTANCE_TOLERANCE, PROPERTY_TOLERANCE, stored_field
@@ -258,7 +258,7 @@ def stored_record(store: Store, row: int) -> dict[str, Any]:
     StoreError, ValueError
         If it cannot be read, or is no JSON object.
     """
-    record = json.loads(str(store.read_rows(RECORD_ARRAY, row, row + 1)[0]))
+    record = orjson.loads(str(store.read_rows(RECORD_ARRAY, row, row + 1)[0]))
     if not isinstance(record, dict):
         raise ValueError("no JSON object")
     return record

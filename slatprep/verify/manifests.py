@@ -8,6 +8,8 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import orjson
+
 from slatprep.errors import StoreError
 from slatprep.provenance import records_id
 from slatprep.store.contract import MAX_METADATA_BYTES, Finding
@@ -90,7 +92,7 @@ def _checked(
     rows = {asset_id: row for row, asset_id in enumerate(store.ids)}
     with path.open("rb") as file:
         while line := file.readline(MAX_METADATA_BYTES):
-            record = json.loads(line.decode("utf-8"))
+            record = orjson.loads(line)
             if not isinstance(record, dict):
                 raise ValueError("a line that is no JSON object")
             asset_id = str(record.get("asset_id", ""))
