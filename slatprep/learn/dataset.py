@@ -153,7 +153,8 @@ class SlatDataset(Dataset[Item]):
             raise ConfigError(
                 f"{self.store.path} has no asset of split {split or 'all'} that passes the "
                 f"filter, of {len(self.store)} in all; expected one at least: "
-                "loosen the filter or change the shares"
+                "loosen the filter or change the shares (a hash of the object's id decides "
+                "where it goes, so a small dataset needs some such as 0.6,0.2,0.2)"
             )
         self.asset_ids = [self.store.ids[index] for index in self.indices]
         self.seed = seed
