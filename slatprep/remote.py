@@ -162,14 +162,18 @@ class RemoteFile(io.RawIOBase):
     def __init__(self, path: RemotePath) -> None:
         super().__init__()
         self.path = path
-        self._position = 0
+        self._position, self._ended = 0, False
+        self._held = (0, b"")
 
     def size(self) -> int:
         """Return its length in bytes."""
         return self._size
 
     def pread(self, length: int, offset: int) -> bytes:
-        """Read up to `length` bytes from a place on, with one request."""
+        """Read up to `length` bytes from a place on, with one request if they are not held."""
+        begin, held = self._held
+        if begin <= offset and offset + length <= begin + len(held):
+            return held[offset - begin : offset - begin + length]
         # Asked for anew: a connection does not survive a fork, and fsspec keeps one a process.
         system, name = reach(self.path)
         try:
@@ -182,15 +186,22 @@ class RemoteFile(io.RawIOBase):
                 raise
             return b""  # Servers refuse a range that begins behind the end.
 
+    def hold(self, length: int, offset: int) -> None:
+        """Read bytes that will be asked for piece by piece; they are held until the next."""
+        self._held = (offset, self.pread(length, offset))
+
     def readable(self) -> bool:
         """Return True."""
         return True
 
     def readinto(self, buffer: Any) -> int:
         """Read on, as `io.BufferedReader` asks it."""
+        if self._ended:
+            return 0
         data = self.pread(len(buffer), self._position)
         buffer[: len(data)] = data
         self._position += len(data)
+        self._ended = len(data) < len(buffer)
         return len(data)
 
     @cached_property

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from slatprep.errors import StoreError
 from slatprep.records import Normalization, PropertyRange
+from slatprep.remote import RemotePath, as_path
 from slatprep.store.contract import (
     MAX_VOXELS,
     dimension_sizes,
@@ -21,7 +22,8 @@ from slatprep.store.contract import (
     size_findings,
 )
 from slatprep.store.layout import ARRAYS, FORMAT, FORMAT_VERSION
-from slatprep.store.rows import Folder, RowReader
+from slatprep.store.rows import Folder, RemoteFolder, RowReader
+from slatprep.store.versions import current_version
 
 if TYPE_CHECKING:
     import zarr
@@ -91,7 +93,7 @@ class Store:
     def __init__(self, path: Path, document: dict[str, Any]) -> None:
         self.path = path
         self.attributes: dict[str, Any] = document["attributes"]
-        self._folder = Folder(path)
+        self._folder = RemoteFolder(path) if isinstance(path, RemotePath) else Folder(path)
         self._metadata = _consolidated(document)
         self._columns: dict[str, NDArray[Any]] = {}
         self._readers: dict[str, RowReader | None] = {}
@@ -110,7 +112,7 @@ class Store:
         """The root as zarr-python has it, for everything this class does not offer."""
         import zarr
 
-        return zarr.open_group(self.path, mode="r", zarr_format=3)
+        return zarr.open_group(str(self.path), mode="r", zarr_format=3)
 
     @cached_property
     def ids(self) -> list[str]:
@@ -304,7 +306,8 @@ def open_store(path: str | Path) -> Store:
     Parameters
     ----------
     path : str or Path
-        The store's directory.
+        The store's directory, or its URL on an object store. There the version
+        that is current now is opened, and stays open when it is replaced.
 
     Returns
     -------
@@ -316,10 +319,10 @@ def open_store(path: str | Path) -> Store:
     StoreError
         If there is nothing, something else, or a store of a newer format.
     """
-    path = Path(path)
-    if not path.exists():
-        raise StoreError(f"{path} does not exist; build a store with `slatprep build-store`")
+    path = current_version(as_path(path))
     document = _root_document(path)
+    if not document:
+        _require_there(path)
     attributes = document.get("attributes", {})
     if attributes.get("format") != FORMAT:
         raise StoreError(
@@ -337,7 +340,19 @@ def open_store(path: str | Path) -> Store:
 
 def is_store(path: Path) -> bool:
     """Whether a path holds a slatprep store of any version."""
-    return bool(_root_document(path).get("attributes", {}).get("format") == FORMAT)
+    document = _root_document(current_version(path))
+    return bool(document.get("attributes", {}).get("format") == FORMAT)
+
+
+def _require_there(path: Path) -> None:
+    """Raise StoreError if there is nothing at all, or nobody can tell."""
+    needed = path / "zarr.json" if isinstance(path, RemotePath) else path
+    try:
+        there = needed.exists()
+    except OSError as error:
+        raise StoreError(f"{path}: cannot be reached ({error.strerror})") from None
+    if not there:
+        raise StoreError(f"{needed} does not exist; build a store with `slatprep build-store`")
 
 
 def _root_document(path: Path) -> dict[str, Any]:

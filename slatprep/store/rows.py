@@ -9,18 +9,21 @@ zarr-python reads the same bytes with far more work around them.
 
 from __future__ import annotations
 
+import errno
 import os
 import stat
 import threading
 from collections.abc import Mapping
 from dataclasses import dataclass
 from io import FileIO
+from itertools import groupby
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from slatprep.errors import StoreError
+from slatprep.remote import RemoteFile, RemotePath
 from slatprep.store.chunks import MAX_TEXT_BYTES, ChunkDecoder, crc32c_holds
 
 MISSING = 2**64 - 1
@@ -72,11 +75,11 @@ class Folder:
         self.path = os.fspath(path)
         self._descriptor = os.open(self.path, os.O_RDONLY) if _AT else None
 
-    def open(self, name: str) -> FileIO:
+    def open(self, name: str) -> LocalFile:
         """Open a file for reading, without buffer."""
         if self._descriptor is None:
-            return FileIO(os.path.join(self.path, name))  # noqa: PTH118 - the hot path
-        return FileIO(name, opener=self._open_at)
+            return LocalFile(os.path.join(self.path, name))  # noqa: PTH118 - the hot path
+        return LocalFile(name, opener=self._open_at)
 
     def _open_at(self, name: str, flags: int) -> int:
         # A pipe in a shard's place must not make the reader wait for a writer.
@@ -90,11 +93,54 @@ class Folder:
 _AT = os.open in os.supports_dir_fd
 
 
+class RemoteFolder:
+    """A version of a store on an object store, which stays of one store because it never changes.
+
+    Parameters
+    ----------
+    path : RemotePath
+        Its URL.
+    """
+
+    def __init__(self, path: RemotePath) -> None:
+        self.path = str(path)
+        self._root = path
+
+    def open(self, name: str) -> RemoteFile:
+        """Open a file for reading; nothing is asked yet."""
+        return RemoteFile(self._root / name)
+
+
+class LocalFile(FileIO):
+    """A file of the local disk; threads may share it."""
+
+    def size(self) -> int:
+        """Return its length in bytes.
+
+        Raises
+        ------
+        OSError
+            If it is a folder, pipe or device.
+        """
+        state = os.fstat(self.fileno())
+        if not stat.S_ISREG(state.st_mode):
+            raise OSError(errno.EINVAL, "it is no regular file")
+        return state.st_size
+
+    def pread(self, length: int, offset: int) -> bytes:
+        """Read up to `length` bytes from a place on."""
+        return os.pread(self.fileno(), length, offset)
+
+
+HELD_BYTES = 64 * 2**20
+"""What is asked of an object store at once; more is asked for chunk by chunk."""
+
+
 @dataclass(frozen=True, slots=True)
 class _Shard:
     """An open shard and its index: offset and length of each chunk."""
 
-    file: FileIO | None
+    file: LocalFile | RemoteFile | None
     index: NDArray[np.uint64]
 
 
@@ -103,7 +149,7 @@ class RowReader:
 
     Parameters
     ----------
-    folder : Folder
+    folder : Folder or RemoteFolder
         The store.
     name : str
         Name of the array, such as ``voxel/feats``.
@@ -121,7 +167,7 @@ class RowReader:
 
     def __init__(
         self,
-        folder: Folder,
+        folder: Folder | RemoteFolder,
         name: str,
         shape: tuple[int, ...],
         shard_rows: int,
@@ -145,7 +191,9 @@ class RowReader:
         self._local = threading.local()
 
     @classmethod
-    def of(cls, folder: Folder, name: str, metadata: Mapping[str, Any]) -> RowReader | None:
+    def of(
+        cls, folder: Folder | RemoteFolder, name: str, metadata: Mapping[str, Any]
+    ) -> RowReader | None:
         """Return a reader for an array with this ``zarr.json``, or None if it is of another kind.
 
         Raises
@@ -159,7 +207,9 @@ class RowReader:
             raise StoreError(f"{folder.path}/{name}: bad metadata ({error!r})") from None
 
     @classmethod
-    def _of(cls, folder: Folder, name: str, metadata: Mapping[str, Any]) -> RowReader | None:
+    def _of(
+        cls, folder: Folder | RemoteFolder, name: str, metadata: Mapping[str, Any]
+    ) -> RowReader | None:
         text = metadata["data_type"] == "string"
         if not text and metadata["data_type"] not in _DTYPES:
             return None
@@ -212,6 +262,8 @@ class RowReader:
             raise StoreError(f"{self.name} has {self.shape[0]} rows, not {start} to {stop}")
         out = np.empty((stop - start, *self.shape[1:]), self.dtype)
         rows, per_shard = self.chunk_rows, self.chunks_per_shard
+        if isinstance(self.folder, RemoteFolder):
+            self._hold(range(start // rows, -(-stop // rows)))
         for chunk in range(start // rows, -(-stop // rows)):
             base = chunk * rows
             first, last = max(start, base), min(stop, base + rows)
@@ -230,13 +282,30 @@ class RowReader:
         if shard.file is None or offset == length == MISSING:
             out[...] = self.fill_value
             return
-        data = os.pread(shard.file.fileno(), length, offset)
         try:
+            data = shard.file.pread(length, offset)
             if len(data) != length:
                 raise StoreError("the file ends before it does")
             self.decoder.decode(data, out)
         except StoreError as error:
             raise self._damaged(number, f"chunk {place} is damaged: {error}") from None
+        except OSError as error:
+            raise self._damaged(number, f"cannot be read ({error.strerror})") from None
+
+    def _hold(self, chunks: range) -> None:
+        """Ask once for the chunks of each shard, which lie side by side, and not once for each."""
+        for number, own in groupby(chunks, lambda chunk: chunk // self.chunks_per_shard):
+            shard = self._shards.get(number) or self._open(number)
+            index = shard.index[[chunk % self.chunks_per_shard for chunk in own]]
+            offset, length = index[index[:, 0] != MISSING].astype(np.int64).T
+            if len(offset) > 1 and isinstance(shard.file, RemoteFile):
+                begin, end = int(offset.min()), int((offset + length).max())
+                if end - begin <= HELD_BYTES:
+                    try:
+                        shard.file.hold(end - begin, begin)
+                    except OSError as error:
+                        fault = f"cannot be read ({error.strerror})"
+                        raise self._damaged(number, fault) from None
 
     def _scratch(self) -> NDArray[Any]:
         """Return memory for a chunk of which only some rows are wanted, one for each thread."""
@@ -248,30 +317,28 @@ class RowReader:
     def _open(self, number: int) -> _Shard:
         try:
             file = self.folder.open(self.key(number))
-            state = os.fstat(file.fileno())
+            size = file.size()
         except FileNotFoundError:
             if self.optional:
                 return _Shard(None, np.array([[MISSING, MISSING]], np.uint64))
             raise self._damaged(number, "is missing (was the store replaced?)") from None
         except OSError as error:
             raise self._damaged(number, f"cannot be read ({error.strerror})") from None
-        if not stat.S_ISREG(state.st_mode):
-            raise self._damaged(number, "is no regular file")
-        shard = _Shard(file, self._index(number, file, state.st_size))
+        shard = _Shard(file, self._index(number, file, size))
         # Two threads may both have opened it; whichever is kept is as good.
         self._shards[number] = shard
         for oldest in list(self._shards)[:-OPEN_SHARDS]:
             self._shards.pop(oldest, None)
         return shard
 
-    def _index(self, number: int, file: FileIO, size: int) -> NDArray[np.uint64]:
+    def _index(self, number: int, file: LocalFile | RemoteFile, size: int) -> NDArray[np.uint64]:
         # No packed chunk is much larger than its values; strings have their own bound.
         limit = MAX_TEXT_BYTES if self.decoder.text else 2 * self.decoder.nbytes + 65_536
         if not self.sharded:
             index = np.array([[0, size]], np.uint64)
         else:
             length = 16 * self.chunks_per_shard + 4
-            data = os.pread(file.fileno(), length, size - length) if size >= length else b""
+            data = file.pread(length, size - length) if size >= length else b""
             if not crc32c_holds(data):
                 raise self._damaged(number, "has no sound index; it is damaged or cut short")
             index = np.frombuffer(data, "<u8", 2 * self.chunks_per_shard).reshape(-1, 2)

@@ -203,5 +203,5 @@ def test_a_shard_that_is_a_pipe_or_a_folder_does_not_hang(copy: Path) -> None:
         open_store(copy).read(0)
     shard.rmdir()
     os.mkfifo(shard)
-    with pytest.raises(StoreError, match="is no regular file"):
+    with pytest.raises(StoreError, match="no regular file"):
         open_store(copy).read(0)
