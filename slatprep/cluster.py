@@ -8,13 +8,14 @@ and computes on one thread. Only then are the bytes the same as on one machine.
 
 from __future__ import annotations
 
+import asyncio
 import hashlib
 import logging
 import os
 import platform
 import stat
 from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import Future
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import lru_cache
@@ -30,6 +31,7 @@ try:
     import distributed
     from distributed.scheduler import KilledWorker
     from joblib._dask import DaskDistributedBackend
+    from tornado.ioloop import PeriodicCallback
 except ImportError as error:
     raise ConfigError(
         f"Dask cannot be imported ({error}); install it with `pip install 'slatprep[cluster]'`"
@@ -37,8 +39,8 @@ except ImportError as error:
 
 Result = TypeVar("Result")
 
-CONNECT_SECONDS = 10.0
-"""How long a scheduler may take to answer."""
+ANSWER_SECONDS = 15.0
+"""How long a scheduler may take to answer, and three times as long as to be found at all."""
 
 IN_FLIGHT = 1000
 """Tasks the cluster has at a time: enough for workers that join midway, and few to remember."""
@@ -77,11 +79,14 @@ class Cluster:
         self._common = _Common(_software())
 
     def __enter__(self) -> Cluster:
-        # What Dask logs of lost workers and connections is either mended or raised by us.
-        logging.getLogger("distributed.client").setLevel(logging.CRITICAL)
+        # What is logged of lost workers and connections is either mended or raised by us.
+        for name in ("distributed.client", "tornado.application"):
+            logging.getLogger(name).setLevel(logging.CRITICAL)
         try:
+            with ThreadPoolExecutor(1) as thread:  # in a notebook, this one has a loop already
+                thread.submit(asyncio.run, _reach(self.scheduler)).result()
             self._client = distributed.Client(
-                self.scheduler, timeout=CONNECT_SECONDS, set_as_default=False
+                self.scheduler, timeout=ANSWER_SECONDS, set_as_default=False
             )
         except (OSError, ValueError) as error:
             raise SlatprepError(
@@ -89,10 +94,11 @@ class Cluster:
                 "address such as tcp://host:8786, as `dask scheduler` prints it when it starts"
             ) from error
         try:
-            self._check_workers()
+            workers = self._check_workers()
         except BaseException:
             self._client.close()
             raise
+        self._note(f"{self.scheduler}: {workers} worker{'s'[: workers != 1]}")
         return self
 
     def __exit__(
@@ -126,9 +132,10 @@ class Cluster:
     def require_shared(self, paths: Iterable[Path]) -> None:
         """Raise `SlatprepError` unless every worker sees these files and folders as we do.
 
-        Workers that join later are asked before their first task.
+        Workers that join later are asked before their first task, until other
+        files are asked for.
         """
-        files = dict(self._common.files)
+        files = {}
         for path in paths:
             if not path.is_absolute():
                 raise SlatprepError(
@@ -154,8 +161,8 @@ class Cluster:
         )
         yield from results_of(parallel(calls), source)
 
-    def _check_workers(self) -> None:
-        """Wait for a first worker, without limit, and raise unless all there are fit."""
+    def _check_workers(self) -> int:
+        """Wait for a first worker, without limit; raise unless all are fit, or say how many."""
         found: dict[str, Exception | None] = {}
         while not found:
             if not self._client.ncores():
@@ -173,6 +180,7 @@ class Cluster:
                     f"{worker}: cannot run slatprep ({type(fault).__name__}: {fault}); "
                     "expected the same environment on all workers"
                 )
+        return len(found)
 
     @contextmanager
     def _connected(self) -> Iterator[None]:
@@ -180,8 +188,8 @@ class Cluster:
         try:
             yield
         except (OSError, distributed.CancelledError) as error:
-            if self._client.status == "running":
-                raise
+            if isinstance(error, OSError) and self._client.status == "running":
+                raise  # it is a task's own
             raise SlatprepError(
                 f"{self.scheduler}: the connection to the scheduler was lost; what was finished "
                 "is kept, so run the same again when it is back"
@@ -204,8 +212,37 @@ class _Common:
     files: tuple[tuple[str, str], ...] = ()
 
 
+async def _reach(scheduler: str) -> None:
+    """Connect once and leave; a Dask client waits for ever where something else answers.
+
+    Raises
+    ------
+    OSError, ValueError
+        If nothing answers in time, or the address is none.
+    """
+    arguments = distributed.Security().get_connection_args("client")
+    try:
+        async with asyncio.timeout(ANSWER_SECONDS):
+            comm = await distributed.comm.connect(scheduler, ANSWER_SECONDS / 3, **arguments)
+    except TimeoutError as error:
+        raise OSError(f"what is there did not speak within {ANSWER_SECONDS:.0f} s") from error
+    comm.abort()
+
+
 class _Backend(DaskDistributedBackend):  # type: ignore[misc]
-    """Joblib's backend, mended in two places where it would compute here, or wait for ever."""
+    """Joblib's backend, mended where it would compute in this process, or wait for ever."""
+
+    def start_call(self) -> None:
+        """Begin a run, and watch the scheduler in it."""
+        self._waiting: set[Future[Any]] = set()
+        self._watch = PeriodicCallback(self._give_up_if_lost, 1000)
+        self.client.loop.add_callback(self._watch.start)
+        super().start_call()
+
+    def stop_call(self) -> None:
+        """End a run."""
+        self.client.loop.add_callback(self._watch.stop)
+        super().stop_call()
 
     def effective_n_jobs(self, n_jobs: int) -> int:
         """Return the number of workers, two at least.
@@ -216,13 +253,10 @@ class _Backend(DaskDistributedBackend):  # type: ignore[misc]
         return max(2, workers)
 
     def submit(self, func: Any, callback: Callable[[Any], None]) -> Future[Any]:
-        """Submit a batch; tell joblib as well of one that Dask itself gave up.
-
-        Joblib's own backend never calls back then, and would be waited for
-        without end.
-        """
+        """Submit a batch; call back as well where Dask itself gave up, as joblib's own does not."""
 
         def done(future: Future[Any]) -> None:
+            self._waiting.discard(future)
             error = future.exception()
             if isinstance(error, KilledWorker):
                 callback([(number, WORKER_DIED) for _, (_, number, *_), _ in func.items])
@@ -230,8 +264,15 @@ class _Backend(DaskDistributedBackend):  # type: ignore[misc]
                 callback(error)
 
         future: Future[Any] = super().submit(func, callback)
+        self._waiting.add(future)
         future.add_done_callback(done)
         return future
+
+    def _give_up_if_lost(self) -> None:
+        """End the wait for results that were on their way when the connection broke."""
+        if self.client.status != "running":
+            for future in list(self._waiting):
+                future.set_exception(ConnectionError("the connection to the scheduler was lost"))
 
 
 def _do(
