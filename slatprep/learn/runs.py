@@ -115,17 +115,28 @@ class Run:
         """
         from matplotlib.backends.backend_agg import FigureCanvasAgg
         from matplotlib.figure import Figure
+        from matplotlib.ticker import MaxNLocator
 
-        figure = Figure(figsize=(6, 3.6), layout="constrained")
+        from slatprep.pictures.palette import INK, MUTED
+
+        figure = Figure(figsize=(6.6, 3.6), layout="constrained")
         FigureCanvasAgg(figure)
         axes = figure.add_subplot()
-        axes.plot([r.epoch for r in history], [r.val_mse for r in history], "o-", label="decoder")
-        for style, (name, error) in zip(("--", ":", "-."), references.items(), strict=False):
-            axes.axhline(error, color="0.4", linestyle=style, label=name)
-        axes.set(xlabel="epoch", ylabel="validation MSE (normalised)", yscale="log")
-        axes.grid(alpha=0.3)
-        axes.legend()
-        figure.savefig(self.path / "curve.png", dpi=110)
+        errors = [record.val_mse for record in history]
+        axes.plot([record.epoch + 1 for record in history], errors, "o-", color=INK, ms=4)
+        lines = {"decoder": errors[-1]} | references
+        for style, error in zip(
+            ("--", ":", "-.") * len(references), references.values(), strict=False
+        ):
+            axes.axhline(error, color=MUTED, linestyle=style)
+        for name, error in lines.items():
+            axes.annotate(name, (1.0, error), (6, 0), va="center", textcoords="offset points",
+                          xycoords=("axes fraction", "data"), fontsize=9, color=INK)  # fmt: skip
+        axes.set(xlabel="passes over the training objects", ylabel="validation MSE (normalised)")
+        axes.set_ylim(0, 1.08 * max(*errors, *references.values()))
+        axes.xaxis.set_major_locator(MaxNLocator(integer=True))
+        axes.spines[["top", "right"]].set_visible(False)
+        figure.savefig(self.path / "curve.png", dpi=120)
 
     def write_prediction(
         self,
