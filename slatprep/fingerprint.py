@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import ast
 import hashlib
-import importlib.util
 from collections.abc import Iterator
 from functools import lru_cache
 from pathlib import Path
@@ -57,11 +56,10 @@ def numeric_modules() -> dict[str, Path]:
 
 
 def _source(name: str) -> Path | None:
-    try:
-        spec = importlib.util.find_spec(name)
-    except ModuleNotFoundError:  # its parent is no package
-        return None
-    return Path(spec.origin) if spec and spec.origin else None
+    # Not by importlib, which would import, and compile, what a name is looked for in.
+    place = Path(__file__).parent.joinpath(*name.split(".")[1:])
+    files = (place.with_name(f"{place.name}.py"), place / "__init__.py")
+    return next((file for file in files if file.is_file()), None)
 
 
 def _imports(path: Path) -> Iterator[str]:
