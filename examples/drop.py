@@ -1,11 +1,13 @@
-"""Drop a steel ball that lies in a block of jelly: from a store, by way of transfer, to a picture.
+"""Drop an object of a store: by way of transfer, to a picture.
 
     pip install 'slatprep[simulate]'
     python examples/drop.py --out docs/images/drop.png
+    python examples/drop.py --store demo.zarr --asset ID --size 0.2 --out drop.png
 
-An object of two materials is made in both layouts, built into a store, filled
-with particles, and given its materials by `slatprep.transfer`; the PLY that
-comes out is all the simulation reads. The unit cube is one metre.
+Without a store, a steel ball that lies in a block of jelly is made in both
+layouts and built into one. The SLAT is filled with particles, which get their
+materials by `slatprep.transfer`; the PLY that comes out is all the simulation
+reads.
 """
 
 from __future__ import annotations
@@ -17,15 +19,15 @@ from pathlib import Path
 
 import numpy as np
 import plyfile
-from drop_picture import draw
+from drop_picture import Part, draw
 
 from slatprep import transfer
 from slatprep.build import build_store
 from slatprep.geometry import boundary, filled, occupancy_of, voxel_centres
 from slatprep.parameters import BuildParameters, PixieverseSource, SlatSource
-from slatprep.records import BACKGROUND, RESOLUTION
+from slatprep.records import BACKGROUND, MATERIAL_CLASSES, RESOLUTION
 from slatprep.simulate import drop, rigid_deviation, strain
-from slatprep.store import open_store
+from slatprep.store import Store, open_store
 
 # Class, then density [kg/m^3], Young's modulus [Pa] and Poisson's ratio, as PixieVerse orders them.
 JELLY = (0, 1050.0, 3.0e4, 0.42)
@@ -34,30 +36,66 @@ STEEL = (1, 7200.0, 5.0e10, 0.29)
 
 def main() -> None:
     """Make, transfer, drop, measure and draw."""
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--out", type=Path, default=Path("drop.png"))
+    parser.add_argument("--store", type=Path, help="else a steel ball in jelly is made")
+    parser.add_argument("--asset", help="of the store")
+    parser.add_argument("--size", type=float, default=1.0, help="edge of the unit cube [m]")
     parser.add_argument("--particles", type=int, default=32, help="along each axis of the cube")
     parser.add_argument("--seconds", type=float, default=0.5)
+    parser.add_argument("--substeps", type=int, default=2, help="time steps a 60th of a second")
     options = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
-        write_sources(Path(folder))
-        positions, material, properties = particles(Path(folder), options.particles)
-        spacing = 1.0 / options.particles
-        print(f"{len(positions)} particles, {np.count_nonzero(material == 1)} of steel")
-        begin = time.perf_counter()
-        frames = drop(positions, material, properties, spacing, seconds=options.seconds)
-        print(f"simulated {options.seconds} s in {time.perf_counter() - begin:.0f} s")
-        strains = np.stack([strain(frames[0], frame, material, spacing) for frame in frames])
-        steel = material == 1
-        mean = [np.nanmean(strains[:, here], axis=1) for here in (~steel, steel)]
-        worst = int(np.argmax(mean[0]))
-        apart = max(rigid_deviation(frames[0][steel], frame[steel]) for frame in frames)
-        print(f"jelly: mean strain up to {mean[0].max():.3f}, at {worst / 60:.2f} s")
-        print(f"steel: mean strain up to {mean[1].max():.4f}, {mean[1][worst]:.4f} at that time")
-        print(f"steel: at most {1000 * apart:.2f} mm (rms) from a rigid motion")
-        asset = open_store(Path(folder) / "drop.zarr").asset("drop")
-        chosen = (0, 13, worst, len(frames) - 1)
-        draw(options.out, positions, frames, strains, material, asset, chosen)
+        path, name = options.store, options.asset
+        if path is None:
+            path, name = make_store(Path(folder)), "drop"
+        store = open_store(path)
+        positions, material, properties = particles(store, name, options.particles, Path(folder))
+        asset = store.asset(name)
+    spacing = options.size / options.particles
+    begin = time.perf_counter()
+    frames = drop(
+        options.size * positions, material, properties, spacing, height=0.25 * options.size,
+        seconds=options.seconds, substeps=options.substeps,
+    )  # fmt: skip
+    print(
+        f"{len(positions)} particles, simulated {options.seconds} s in "
+        f"{time.perf_counter() - begin:.0f} s"
+    )
+    strains = np.stack([strain(frames[0], frame, material, spacing) for frame in frames])
+    present = sorted(set(material.tolist()))
+    worst = int(np.argmax(np.nanmean(strains[:, material == present[0]], axis=1)))
+    parts = []
+    for number in present:
+        here = material == number
+        modulus = in_pascal(float(np.median(properties[here, 0])))
+        kind = MATERIAL_CLASSES[number]
+        parts.append(Part(number, f"{kind}, E = {modulus}", shiny=number == 1))
+        mean = np.nanmean(strains[:, here], axis=1)
+        apart = max(rigid_deviation(frames[0][here], frame[here]) for frame in frames)
+        print(
+            f"{kind}: {here.sum()} particles, E = {modulus}; mean strain {mean[worst]:.4f} at "
+            f"{worst / 60:.2f} s, at most {mean.max():.4f}; at most {1000 * apart:.2f} mm (rms) "
+            "from a rigid motion"
+        )
+    fall = int(60 * np.sqrt(2 * 0.25 * options.size / 9.81))  # the last frame in the air
+    chosen = (0, fall, worst, len(frames) - 1)
+    draw(options.out, positions, frames / options.size, strains, material, asset, parts, chosen)
+
+
+def in_pascal(value: float) -> str:
+    """Write a modulus with two digits and a fitting unit."""
+    scale, unit = next(pair for pair in ((1e9, "GPa"), (1e6, "MPa"), (1e3, "kPa"), (0.0, "Pa"))
+                       if value >= pair[0])  # fmt: skip
+    return f"{value / (scale or 1.0):.2g} {unit}"
+
+
+def make_store(folder: Path) -> Path:
+    """Build the steel ball in jelly into a store."""
+    write_sources(folder)
+    sources = BuildParameters(PixieverseSource(folder / "pixieverse"), SlatSource(folder / "slat"))
+    build_store(sources, folder / "drop.zarr")
+    return folder / "drop.zarr"
 
 
 def write_sources(folder: Path) -> None:
@@ -79,19 +117,18 @@ def write_sources(folder: Path) -> None:
     np.savez(folder / "slat" / "drop.npz", coords=turned.astype(np.uint8), feats=feats)
 
 
-def particles(folder: Path, count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Fill the SLAT with a lattice of particles and give them the store's materials."""
-    sources = BuildParameters(PixieverseSource(folder / "pixieverse"), SlatSource(folder / "slat"))
-    build_store(sources, folder / "drop.zarr")
-    store = open_store(folder / "drop.zarr")
-    inside = filled(occupancy_of(store.asset("drop").coords))
+def particles(
+    store: Store, name: str, count: int, folder: Path
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Fill a SLAT with a lattice of particles and give them the store's materials."""
+    inside = filled(occupancy_of(store.asset(name).coords))
     lattice = (np.argwhere(np.ones((count,) * 3)) + 0.5) / count - 0.5
     voxels = np.floor((lattice + 0.5) * RESOLUTION).astype(int)
     np.save(folder / "solid.npy", lattice[inside[tuple(voxels.T)]])
 
-    # What `slatprep transfer solid.npy --store drop.zarr --asset drop --points grid` does.
+    # What `slatprep transfer solid.npy --store STORE --asset NAME --points grid --far drop` does.
     solid = transfer.read_particles(folder / "solid.npy")
-    field = transfer.stored_field(store, "drop", points="grid")
+    field = transfer.stored_field(store, name, points="grid")
     result = transfer.transfer(solid.in_slat(), field, far="drop")
     transfer.write_transferred(folder / "solid.ply", solid, result, max_distance=2.0, in_slat=True)
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -17,6 +19,16 @@ from slatprep.store.reader import StoredAsset
 MOST = 0.5
 """Strain at the end of the scale."""
 
+
+@dataclass(frozen=True)
+class Part:
+    """The particles of one class: its number, and what the curve is called."""
+
+    number: int
+    label: str
+    shiny: bool = False
+
+
 SIZE = (800, 800)
 """Height and width of a panel before it is halved against jagged edges."""
 
@@ -31,6 +43,7 @@ def draw(
     strains: np.ndarray,
     material: np.ndarray,
     asset: StoredAsset,
+    parts: Sequence[Part],
     chosen: tuple[int, ...],
     rate: int = 60,
 ) -> None:
@@ -43,13 +56,15 @@ def draw(
     positions : ndarray, shape (N, 3)
         The particles where the store has them, SLAT frame.
     frames : ndarray, shape (F, N, 3)
-        Their motion; the first frame is at rest.
+        Their motion, in edges of the unit cube; the first frame is at rest.
     strains : ndarray, shape (F, N)
         Their strains.
     material : ndarray, shape (N,)
-        0 for jelly, 1 for steel.
+        Class of each.
     asset : StoredAsset
         The object, whose field gives the surfaces.
+    parts : sequence of Part
+        The classes there are; dashed lines are for all but the first.
     chosen : tuple of int
         The frames to draw.
     rate : int
@@ -57,31 +72,41 @@ def draw(
     """
     figure = Figure(figsize=(12, 5.4), dpi=130)
     grid = figure.add_gridspec(2, len(chosen), height_ratios=(2.0, 1.0), hspace=0.12, wspace=0.04,
-                               left=0.055, right=0.885, top=0.94, bottom=0.11)  # fmt: skip
-    meshes = [surface(asset, number) for number in (0, 1)]
+                               left=0.055, right=0.865, top=0.94, bottom=0.11)  # fmt: skip
+    meshes = [surface(asset, part.number) for part in parts]
     lift = frames[0].mean(axis=0) - positions.mean(axis=0)
     for column, frame in enumerate(chosen):
         axis = figure.add_subplot(grid[0, column])
-        axis.imshow(_render(meshes, lift, frames, strains, material, frame))
+        axis.imshow(_render(parts, meshes, lift, frames, strains, material, frame))
         axis.set_title(f"{frame / rate:.2f} s", fontsize=11, color=INK)
         axis.set_axis_off()
     axis = figure.add_subplot(grid[1, :])
     seconds = np.arange(len(frames)) / rate
-    for number, name, style in ((0, "jelly, E = 30 kPa", "-"), (1, "steel, E = 50 GPa", "--")):
-        mean = np.nanmean(strains[:, material == number], axis=1)
-        axis.plot(seconds, 100 * mean, style, color=INK, lw=1.8)
-        axis.annotate(name, (seconds[-1], 100 * mean[-1]), (6, 0), textcoords="offset points",
+    curves = [np.nanmean(strains[:, material == part.number], axis=1) for part in parts]
+    top = 105 * max(curve.max() for curve in curves)
+    places = spread([100 * curve[-1] for curve in curves], 0.11 * top)
+    for k, (part, curve, place) in enumerate(zip(parts, curves, places, strict=True)):
+        axis.plot(seconds, 100 * curve, "--" if k else "-", color=INK, lw=1.8)
+        axis.annotate(part.label, (seconds[-1], place), (6, 0), textcoords="offset points",
                       va="center", fontsize=9, color=INK, annotation_clip=False)  # fmt: skip
     for frame in chosen:
         axis.axvline(frame / rate, color=MUTED, lw=0.6, zorder=0)
-    axis.set(xlim=(0, seconds[-1]), ylim=(0, None), xlabel="time [s]", ylabel="mean strain [%]")
+    axis.set(xlim=(0, seconds[-1]), ylim=(0, top), xlabel="time [s]", ylabel="mean strain [%]")
     axis.spines[["top", "right"]].set_visible(False)
-    bar = figure.add_axes((0.91, 0.46, 0.011, 0.4))
+    bar = figure.add_axes((0.9, 0.46, 0.011, 0.4))
     bar.imshow(np.linspace(1, 0, 256)[:, None], aspect="auto", cmap=SCALE, extent=(0, 1, 0, 50))
     bar.set(xticks=[], yticks=[0, 25, 50])
     bar.yaxis.tick_right()
     bar.set_title("strain [%]", fontsize=9, loc="left", pad=8)
     figure.savefig(path)
+
+
+def spread(heights: Sequence[float], gap: float) -> list[float]:
+    """Move labels up until none is nearer than `gap` to the one below it."""
+    moved, last = [0.0] * len(heights), -np.inf
+    for k in np.argsort(heights, kind="stable"):
+        moved[k] = last = max(heights[k], last + gap)
+    return moved
 
 
 def surface(asset: StoredAsset, number: int) -> o3d.geometry.TriangleMesh:
@@ -113,18 +138,18 @@ def _camera() -> np.ndarray:
     right = np.cross(ahead, [0.0, 0.0, 1.0])
     right /= np.linalg.norm(right)
     up = np.cross(right, ahead)
-    step = 2 * np.tan(np.radians(23.0) / 2) / SIZE[0]
+    step = 2 * np.tan(np.radians(25.0) / 2) / SIZE[0]
     rows = (SIZE[0] / 2 - 0.5 - np.arange(SIZE[0])) * step
     columns = (np.arange(SIZE[1]) + 0.5 - SIZE[1] / 2) * step
     ways = ahead + rows[:, None, None] * up + columns[None, :, None] * right
     return np.concatenate([np.broadcast_to(eye, ways.shape), ways], axis=-1)
 
 
-def _render(meshes, lift, frames, strains, material, frame):
+def _render(parts, meshes, lift, frames, strains, material, frame):
     scene = o3d.t.geometry.RaycastingScene()
     normals, values, first = [], [], [0]
-    for number, mesh in enumerate(meshes):
-        here = material == number
+    for part, mesh in zip(parts, meshes, strict=True):
+        here = material == part.number
         known = np.flatnonzero(here)[np.isfinite(strains[frame, here])]
         rest = np.asarray(mesh.vertices) + lift
         distance, near = cKDTree(frames[0, known]).query(rest, k=8)
@@ -152,10 +177,12 @@ def _render(meshes, lift, frames, strains, material, frame):
     normal = hit["primitive_normals"].numpy().copy()
     colour = np.ones((*far.shape, 3))
     share = np.stack([1 - uv.sum(axis=-1), uv[..., 0], uv[..., 1]], axis=-1)
-    for number in (0, 1):
-        on = geometry == number
-        normal[on] = np.einsum("nk,nkc->nc", share[on], normals[number][triangle[on]])
-        value = (share[on] * values[number][triangle[on]]).sum(axis=-1)
+    gloss = np.zeros(far.shape)
+    for k, part in enumerate(parts):
+        on = geometry == k
+        gloss[on] = 0.5 if part.shiny else 0.18
+        normal[on] = np.einsum("nk,nkc->nc", share[on], normals[k][triangle[on]])
+        value = (share[on] * values[k][triangle[on]]).sum(axis=-1)
         colour[on] = SCALE(value / MOST)[:, :3]
     normal /= np.linalg.norm(normal, axis=-1, keepdims=True) + 1e-12
 
@@ -170,10 +197,10 @@ def _render(meshes, lift, frames, strains, material, frame):
     half = sun - ray[..., 3:] / np.linalg.norm(ray[..., 3:], axis=-1, keepdims=True)
     half /= np.linalg.norm(half, axis=-1, keepdims=True)
     shine = np.clip((normal * half).sum(axis=-1), 0, 1) ** 60 * ~shadow
-    shine *= np.where(geometry == 1, 0.5, np.where(geometry == 0, 0.18, 0.0))
+    shine *= gloss
     image = np.clip(colour * light[..., None] + shine[..., None], 0, 1)
     # The ground is white but for the shadow on it.
-    on_ground = geometry == 2
+    on_ground = geometry == len(parts)
     image[on_ground] = np.where(shadow[on_ground], 0.83, 1.0)[:, None]
     image[~seen] = 1.0
     return image.reshape(SIZE[0] // 2, 2, SIZE[1] // 2, 2, 3).mean(axis=(1, 3))

@@ -19,8 +19,8 @@ import drop_picture
 @pytest.fixture(scope="module")
 def made(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, tuple[np.ndarray, ...]]:
     folder = tmp_path_factory.mktemp("drop")
-    drop.write_sources(folder)
-    return folder, drop.particles(folder, 32)
+    store = open_store(drop.make_store(folder))
+    return folder, drop.particles(store, "drop", 32, folder)
 
 
 def test_particles_have_the_materials_that_were_made(
@@ -51,7 +51,10 @@ def test_picture_shows_the_jelly_strained_and_the_steel_not(
     frames = np.stack([rest, squeezed])
     strains = np.stack([strain(rest, frame, material, 1 / 32) for frame in frames])
     asset = open_store(made[0] / "drop.zarr").asset("drop")
-    drop_picture.draw(tmp_path / "drop.png", positions, frames, strains, material, asset, (0, 1))
+    parts = [drop_picture.Part(number, "", shiny=number == 1) for number in (0, 1)]
+    drop_picture.draw(
+        tmp_path / "drop.png", positions, frames, strains, material, asset, parts, (0, 1)
+    )
     with Image.open(tmp_path / "drop.png") as image:
         pixels = np.asarray(image.convert("RGB"), dtype=int)
     left, right = (
