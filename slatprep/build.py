@@ -30,12 +30,16 @@ from slatprep.publish import (
     write_all_records,
 )
 from slatprep.readers import discover
+from slatprep.readers.names import listed_once
 from slatprep.records import PROPERTY_COLUMNS, AssetPair, Normalization, Status
+from slatprep.remote import RemotePath, as_path
 from slatprep.reuse import recipe_of
 from slatprep.settle import settle_ties
 from slatprep.store.reader import is_store
 from slatprep.store.replace import replace_directory
 from slatprep.store.spool import Spool, SpooledAsset, writing
+from slatprep.store.upload import look_at, upload_store
+from slatprep.store.versions import manifests_of
 from slatprep.store.work import work_beside, work_directory
 from slatprep.store.writer import create_store, finish_store, shards, write_assets, write_shard
 from slatprep.summary import BuildSummary, problems_of, summarise
@@ -57,6 +61,7 @@ Progress = Callable[[int, int], None]
 _OTHERS = tuple(action for action in Action if action is not Action.REUSE)
 
 
+@listed_once()
 def build_store(
     parameters: BuildParameters,
     out: Path,
@@ -107,21 +112,23 @@ def build_store(
         With `strict`, for the first asset that cannot be used.
     """
     begin = time.perf_counter()
-    out = Path(out)
+    out = as_path(out)
     target, manifests = _places(out, manifests)
     given = _given_ranges(parameters.normalize)
     with work_beside(target, keep=keep_work) as work:
         if fresh:
             work.spool.keep_only(set())
         require_shared(jobs, [work.scratch, *_some_sources(parameters)])
+        base = look_at(target) if isinstance(target, RemotePath) else None
         previous = None if fresh else previous_build(target)
         bench = Bench(parameters, recipe_of(parameters), work.spool, previous, strict)
         plan = _plan_if_any(bench, jobs, progress)
         assets = _finish_all(bench, plan, _OTHERS, jobs, progress)
         usable = any(asset.status is Status.OK for asset in assets)
         if not usable and previous and is_current(plan, assets, bench, given):
+            folder = manifests or default_manifests(out if base is None else previous[0])
             return repeat_summary(
-                assets, bench, store=out, manifests=manifests, seconds=time.perf_counter() - begin
+                assets, bench, store=out, manifests=folder, seconds=time.perf_counter() - begin
             )
         assets += _finish_all(bench, plan, (Action.REUSE,), jobs, progress)
         assets.sort(key=lambda asset: asset.asset_id)
@@ -132,27 +139,33 @@ def build_store(
             raise StoreError(_nothing_usable(assets, parameters))
         normalization = given or _dataset_ranges(usable_assets)
         new, records_file = work.scratch / "store.zarr", work.scratch / "assets.jsonl"
-        with writing(str(out), target.parent):
+        with writing(str(out), work_directory(target).parent):
             clipped = _pack(new, work.spool, usable_assets, normalization, parameters.store, jobs)
             records = _completed_records(work.spool, assets, normalization, clipped)
             manifest = write_all_records(new, records_file, records)
             finish_store(new, normalization, manifest, provenance.origin(parameters))
-            replace_directory(new, target)
+            if not isinstance(target, RemotePath):
+                replace_directory(new, target)
+        upload = None if base is None else upload_store(new, base)
+        folder = manifests or default_manifests(upload.version if upload else out)
         summary = summarise(
             assets,
             store=out,
-            records=manifests / "assets.jsonl",
+            records=folder / "assets.jsonl",
             manifest=manifest,
             normalization=normalization,
             clipped=_by_property(clipped["voxel"]),
             seconds=time.perf_counter() - begin,
         )
         publish_manifests(records_file, summary, parameters)
+        if upload is not None:
+            upload.show()
         if keep_work:
             work.spool.keep_only({asset.key for asset in usable_assets})
     return summary
 
 
+@listed_once()
 def plan_build(
     parameters: BuildParameters,
     out: Path,
@@ -173,15 +186,17 @@ def plan_build(
     BuildPlan
         An entry an asset.
     """
-    target, _ = _places(Path(out), None)
+    out = as_path(out)
+    target, _ = _places(out, None)
     directory = work_directory(target) / "spool"
     spool = Spool(directory) if directory.is_dir() and not fresh else None
     require_shared(jobs, _some_sources(parameters))
     previous = None if fresh else previous_build(target)
     assets = plan_assets(parameters, recipe_of(parameters), spool, previous, jobs, progress)
-    return BuildPlan(Path(out), tuple(sorted(assets, key=lambda asset: asset.asset_id)))
+    return BuildPlan(out, tuple(sorted(assets, key=lambda asset: asset.asset_id)))
 
 
+@listed_once()
 def align_pairs(
     parameters: BuildParameters,
     out: Path,
@@ -229,7 +244,7 @@ def align_pairs(
 
 def default_manifests(store: Path) -> Path:
     """Return the directory of a store's records: ``demo.manifests`` beside ``demo.zarr``."""
-    return store.with_name(f"{store.name.removesuffix('.zarr')}.manifests")
+    return manifests_of(store)
 
 
 def _plan_if_any(
@@ -283,7 +298,7 @@ def _given_ranges(parameters: NormalizeParameters) -> Normalization | None:
     """Return ranges that do not depend on the dataset, or None; read first, to fail early."""
     if parameters.ranges == "dataset":
         return None
-    return PIXIE_RANGES if parameters.ranges == "pixie" else read_ranges(Path(parameters.ranges))
+    return PIXIE_RANGES if parameters.ranges == "pixie" else read_ranges(as_path(parameters.ranges))
 
 
 def _dataset_ranges(usable: Sequence[SpooledAsset]) -> Normalization:
@@ -340,8 +355,13 @@ def _nothing_usable(assets: Sequence[SpooledAsset], parameters: BuildParameters)
     return f"none of {len(problems)} assets can be used, so there is no store:{listed}{more}"
 
 
-def _places(out: Path, manifests: Path | None) -> tuple[Path, Path]:
-    """Return where the store really lies, and the directory of its records."""
+def _places(out: Path, manifests: Path | None) -> tuple[Path, Path | None]:
+    """Return where the store really lies, and the directory of its records if one is named."""
+    manifests = None if manifests is None else as_path(manifests)
+    if isinstance(manifests, RemotePath):
+        raise StoreError(f"{manifests}: expected a local folder for the records")
+    if isinstance(out, RemotePath):
+        return out, manifests
     try:
         taken = out.exists() and not is_store(out) and not (out.is_dir() and not any(out.iterdir()))
         target = out.resolve()  # What a link points to is replaced, not the link.
@@ -354,4 +374,4 @@ def _places(out: Path, manifests: Path | None) -> tuple[Path, Path]:
         raise StoreError(
             f"{out} exists and is not a slatprep store; expected a store to replace, or a new path"
         )
-    return target, default_manifests(out) if manifests is None else Path(manifests)
+    return target, manifests

@@ -104,7 +104,7 @@ def describe(
     StoreError
         If the store's metadata cannot be read.
     """
-    location = location or store.path.name
+    location = location or store.name
     stated = {
         "description": description,
         "license": license,
@@ -117,7 +117,7 @@ def describe(
         "@context": _CONTEXT,
         "@type": "sc:Dataset",
         "conformsTo": CONFORMS_TO,
-        "name": name or store.path.name.removesuffix(".zarr"),
+        "name": name or store.name.removesuffix(".zarr"),
         **{key: value for key, value in stated.items() if value},
         "keywords": ["3D", "physics", "material properties", "structured latents", "Zarr"],
         "distribution": _distribution(store, location),

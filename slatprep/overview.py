@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slatprep.records import Normalization, Verdict
+from slatprep.remote import RemotePath, list_objects
 from slatprep.store import Store
 
 
@@ -74,13 +75,13 @@ def describe_store(store: Store) -> StoreOverview:
     columns = {name: store.column(name) for name in names}
     columns["voxels"] = np.diff(store.offsets)
     categories = np.array([str(category) for category in columns["category"]])
-    files = [path for path in store.path.rglob("*") if path.is_file()]
+    sizes = _file_sizes(store.path)
     return StoreOverview(
         path=store.path,
         format_version=int(store.attributes["format_version"]),
         manifest=str(store.attributes["manifest"]),
-        files=len(files),
-        size=sum(path.stat().st_size for path in files),
+        files=len(sizes),
+        size=sum(sizes),
         engines=_counts(columns["engine"]),
         models=_counts(columns["model"]),
         normalization=store.normalization,
@@ -90,6 +91,12 @@ def describe_store(store: Store) -> StoreOverview:
             for name in sorted(set(categories))
         ),
     )
+
+
+def _file_sizes(path: Path) -> list[int]:
+    if isinstance(path, RemotePath):
+        return [int(entry["size"]) for entry in list_objects(path).values()]
+    return [file.stat().st_size for file in path.rglob("*") if file.is_file()]
 
 
 def _describe(

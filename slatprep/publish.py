@@ -10,7 +10,9 @@ from __future__ import annotations
 import heapq
 import json
 import shutil
+import tempfile
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +22,7 @@ from slatprep.parameters import BuildParameters
 from slatprep.plan import Action, PlannedAsset
 from slatprep.process import Bench
 from slatprep.records import PROPERTY_COLUMNS, Normalization, Status
+from slatprep.remote import RemotePath
 from slatprep.store.asset_records import RecordWriter, StoredRecords
 from slatprep.store.reader import Store, is_store, open_store
 from slatprep.store.spool import SpooledAsset, spooled, writing
@@ -29,7 +32,10 @@ from slatprep.summary import BuildSummary, summarise
 def previous_build(target: Path) -> tuple[Path, str] | None:
     """Return a store that later builds can go on from, and the id of its build."""
     try:
-        return (target, open_store(target).attributes["manifest"]) if is_store(target) else None
+        if not is_store(target):
+            return None
+        store = open_store(target)
+        return store.path, store.attributes["manifest"]
     except (StoreError, KeyError):
         return None  # Of another format version, or damaged: made anew.
 
@@ -63,8 +69,8 @@ def publish_manifests(records: Path, summary: BuildSummary, parameters: BuildPar
     folder = summary.records.parent
     try:
         with (
-            provenance.staged(summary.records) as records_file,
-            provenance.staged(folder / "build.json") as build_file,
+            _staged(summary.records) as records_file,
+            _staged(folder / "build.json") as build_file,
         ):
             shutil.copyfile(records, records_file)
             provenance.write_build_record(build_file, summary, parameters)
@@ -73,6 +79,19 @@ def publish_manifests(records: Path, summary: BuildSummary, parameters: BuildPar
             f"{folder}: the records cannot be written there ({error.strerror or error}); the store "
             "is complete and holds those of its assets. Run again to write them here"
         ) from error
+
+
+@contextmanager
+def _staged(path: Path) -> Iterator[Path]:
+    """Yield a local file that takes its place at `path` when it is whole."""
+    if not isinstance(path, RemotePath):
+        with provenance.staged(path) as file:
+            yield file
+        return
+    with tempfile.TemporaryDirectory() as folder:
+        file = Path(folder, path.name)
+        yield file
+        path.upload(file)
 
 
 def is_current(

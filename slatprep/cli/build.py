@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from slatprep.cli.options import parameters_of, source_options, workers_options
+from slatprep.cli.options import PLACE, parameters_of, source_options, workers_options
 from slatprep.cli.output import EXIT_INCOMPLETE, Output, output_options
 from slatprep.cli.overview import show_quality
 
@@ -39,9 +39,9 @@ Example:
 @click.option(
     "--out",
     required=True,
-    type=click.Path(path_type=Path),
+    type=PLACE,
     metavar="STORE.zarr",
-    help="The store; one that is there is brought up to date and replaced in one step.",
+    help="The store, a path or URL; one that is there is updated, and replaced in one step.",
 )
 @_MANIFESTS
 @_STRICT

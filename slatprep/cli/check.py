@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from slatprep.cli.options import chosen_store, store_option
+from slatprep.cli.options import beside, chosen_store, store_option
 from slatprep.cli.output import EXIT_INCOMPLETE, Cell, Output, output_options
 from slatprep.errors import ConfigError, StoreError
 
@@ -122,9 +122,7 @@ def _target(store: Path, picture: str | None, assets: int) -> Path | None:
     if picture == "none":
         return None
     if picture is None:
-        from slatprep.pictures.write import default_pictures
-
-        return default_pictures(store)
+        return beside(store, ".pictures")
     target = Path(picture)
     if assets > 1 and target.suffix.lower() == ".png":
         raise click.UsageError(f"--picture {target} is one file; {assets} assets need a folder")

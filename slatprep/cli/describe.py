@@ -7,6 +7,7 @@ from pathlib import Path
 
 import click
 
+from slatprep.cli.options import STORE
 from slatprep.cli.output import Output, output_options
 
 
@@ -17,7 +18,7 @@ Example:
   slatprep describe demo.zarr --out demo.croissant.json --name demo
 """
 )
-@click.argument("store", type=click.Path(path_type=Path, exists=True, file_okay=False))
+@click.argument("store", type=STORE)
 @click.option("--out", type=click.Path(path_type=Path, dir_okay=False), metavar="FILE.json",
               help="Where to write it.  [default: standard output]")  # fmt: skip
 @click.option("--location", default="", metavar="URL", help="Where its readers will find the "

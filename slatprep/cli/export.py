@@ -8,7 +8,7 @@ from typing import Any
 
 import click
 
-from slatprep.cli.options import jobs_option
+from slatprep.cli.options import STORE, jobs_option
 from slatprep.cli.output import Output, output_options
 from slatprep.errors import ConfigError
 
@@ -40,7 +40,7 @@ Example:
   slatprep export demo.zarr --format npz --out latents
 """
 )
-@click.argument("store", type=click.Path(path_type=Path, exists=True, file_okay=False))
+@click.argument("store", type=STORE)
 @click.option("--format", "kind", required=True,
               type=click.Choice(["ply", "hdf5", "webdataset", "npz"]),
               help="Point clouds with Pixie's fields, one HDF5 file, tar shards, or TRELLIS's "

@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
 
+from slatprep.cli.options import STORE
+
 if TYPE_CHECKING:
     from slatprep.learn.splits import Shares
 
-STORE = click.Path(path_type=Path, exists=True, file_okay=False)
+__all__ = ["STORE", "shares_of", "shares_option"]
 
 shares_option = click.option(
     "--shares",

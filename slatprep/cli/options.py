@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import click
 
 from slatprep.cli.output import Output
+from slatprep.remote import RemotePath, as_path
 
 if TYPE_CHECKING:
     from slatprep.parameters import BuildParameters
@@ -17,6 +18,23 @@ if TYPE_CHECKING:
 _Command = TypeVar("_Command", bound=Callable[..., object])
 
 _FILE = click.Path(path_type=Path, exists=True, dir_okay=False)
+
+
+class PlaceType(click.Path):
+    """A path as click takes it, or the URL of an object store, of which nothing is asked here."""
+
+    def convert(
+        self, value: Any, parameter: click.Parameter | None, context: click.Context | None
+    ) -> Any:
+        """Return a `Path`."""
+        place = as_path(value)
+        if isinstance(place, RemotePath):
+            return place
+        return super().convert(str(place), parameter, context)
+
+
+PLACE = PlaceType(path_type=Path)
+STORE = PlaceType(path_type=Path, exists=True, file_okay=False)
 
 
 def source_options(command: _Command) -> _Command:
@@ -29,20 +47,20 @@ def source_options(command: _Command) -> _Command:
         ),
         click.option(
             "--pixieverse",
-            type=click.Path(path_type=Path),
+            type=PLACE,
             metavar="DIR",
-            help="Root of the PixieVerse grids or predictions.",
+            help="Root of the PixieVerse grids or predictions, a folder or a URL.",
         ),
         click.option(
             "--slat",
-            type=click.Path(path_type=Path),
+            type=PLACE,
             metavar="DIR",
-            help="Root of the TRELLIS latents, or one HDF5 file.",
+            help="Root of the TRELLIS latents, or one HDF5 file; a path or a URL.",
         ),
         click.option(
             "--map",
             "pairing_map",
-            type=click.Path(path_type=Path),
+            type=PLACE,
             metavar="CSV",
             help="CSV that joins the ids of the two sides, or TRELLIS's metadata.csv.",
         ),
@@ -62,13 +80,11 @@ def source_options(command: _Command) -> _Command:
     return command
 
 
-store_argument = click.argument(
-    "store", required=False, type=click.Path(path_type=Path, exists=True, file_okay=False)
-)
+store_argument = click.argument("store", required=False, type=STORE)
 
 store_option = click.option(
     "--store",
-    type=click.Path(path_type=Path, exists=True, file_okay=False),
+    type=STORE,
     metavar="STORE.zarr",
     help="The store.  [default: the one built last under data/]",
 )
@@ -82,6 +98,12 @@ def chosen_store(store: Path | None) -> Path:
     if not built:
         raise click.UsageError("there is no store under data/; name one, or run `make align`")
     return built[-1]
+
+
+def beside(store: Path, suffix: str) -> Path:
+    """Return NAME`suffix` beside NAME.zarr; in the working folder if that is on no local disk."""
+    name = f"{store.name.removesuffix('.zarr')}{suffix}"
+    return Path(name) if isinstance(store, RemotePath) else store.with_name(name)
 
 
 jobs_option = click.option(

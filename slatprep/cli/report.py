@@ -7,7 +7,7 @@ from pathlib import Path
 
 import click
 
-from slatprep.cli.options import chosen_store, jobs_option, store_argument
+from slatprep.cli.options import beside, chosen_store, jobs_option, store_argument
 from slatprep.cli.output import Output, output_options
 
 
@@ -48,9 +48,10 @@ def report(
     from slatprep.report import write_report
     from slatprep.store import open_store
 
+    opened = open_store(path)
     name = path.name.removesuffix(".zarr")
     if manifests is None:
-        usual = (default_manifests(path), Path("manifests/build") / name)
+        usual = (default_manifests(opened.path), Path("manifests/build") / name)
         manifests = next((folder for folder in usual if folder.is_dir()), None)
     if manifests is None:
         output.problem(
@@ -59,8 +60,8 @@ def report(
         )
     with output.progress("report") as progress:
         summary = write_report(
-            open_store(path),
-            out or path.with_name(f"{name}.html"),
+            opened,
+            out or beside(path, ".html"),
             manifests=manifests,
             jobs=jobs,
             progress=progress,

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import click
 
+from slatprep.cli.options import STORE
 from slatprep.cli.output import EXIT_INCOMPLETE, Output, output_options
 
 
@@ -16,7 +17,7 @@ Example:
   slatprep score demo.zarr demo/truth
 """
 )
-@click.argument("store", type=click.Path(path_type=Path, exists=True, file_okay=False))
+@click.argument("store", type=STORE)
 @click.argument("truth_dir", type=click.Path(path_type=Path, exists=True, file_okay=False))
 @output_options
 def score(output: Output, store: Path, truth_dir: Path) -> None:

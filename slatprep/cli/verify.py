@@ -8,13 +8,11 @@ from typing import TYPE_CHECKING
 
 import click
 
-from slatprep.cli.options import chosen_store, store_argument, workers_options
+from slatprep.cli.options import STORE, chosen_store, store_argument, workers_options
 from slatprep.cli.output import EXIT_INCOMPLETE, Output, output_options
 
 if TYPE_CHECKING:
     from slatprep.parallel import Jobs
-
-_DIRECTORY = click.Path(path_type=Path, exists=True, file_okay=False)
 
 
 @click.command(
@@ -26,16 +24,16 @@ Example:
 )
 @store_argument
 @click.option(
-    "--manifests", type=_DIRECTORY, metavar="DIR",
+    "--manifests", type=STORE, metavar="DIR",
     help="Folder of the records.  [default: beside the store]",
 )  # fmt: skip
 @click.option("--sources", is_flag=True, help="Compare the source files with the records, too.")
 @click.option(
-    "--pixieverse", type=_DIRECTORY, metavar="DIR",
+    "--pixieverse", type=STORE, metavar="DIR",
     help="Where the PixieVerse files lie now.  [default: where they lay]",
 )  # fmt: skip
 @click.option(
-    "--slat", type=_DIRECTORY, metavar="DIR",
+    "--slat", type=STORE, metavar="DIR",
     help="Where the latents lie now, or their one HDF5 file does.  [default: where they lay]",
 )  # fmt: skip
 @output_options

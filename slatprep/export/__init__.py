@@ -164,7 +164,7 @@ def describe_store(store: Store, format: str) -> dict[str, Any]:
         "format": target.FORMAT,
         "format_version": target.FORMAT_VERSION,
         "kind": format,
-        "store": store.path.name,
+        "store": store.name,
         "manifest": attributes["manifest"],
         "resolution": attributes["resolution"],
         "material_classes": attributes["material_classes"],

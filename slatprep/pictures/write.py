@@ -18,11 +18,6 @@ SHEET = "sheet.png"
 """Name of the contact sheet in a folder of pictures."""
 
 
-def default_pictures(store: Path) -> Path:
-    """Return the folder of a store's pictures: ``demo.pictures`` beside ``demo.zarr``."""
-    return store.with_name(f"{store.name.removesuffix('.zarr')}.pictures")
-
-
 def write_pictures(
     store: Store,
     checks: Sequence[AlignmentCheck],

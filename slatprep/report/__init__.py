@@ -113,8 +113,8 @@ def write_report(
     """
     outcomes: list[Outcome] | None = None
     if manifests is not None:
-        outcomes = list(read_outcomes(Path(manifests), str(store.attributes["manifest"])))
-        _refuse_other_records(store, outcomes, Path(manifests))
+        outcomes = list(read_outcomes(manifests, str(store.attributes["manifest"])))
+        _refuse_other_records(store, outcomes, manifests)
     chosen = _chosen(store)
     details = _details(store, chosen, jobs, progress)
     side = details.side()

@@ -57,7 +57,7 @@ def describe(
     """
     build = store.attributes["build"]
     return {
-        "title": store.path.resolve().name,
+        "title": store.name,
         "name": str(build.get("name", "")),
         "manifest": str(store.attributes["manifest"]),
         "records": outcomes is not None,

@@ -18,6 +18,8 @@ from typing import Any
 
 import numpy as np
 
+from slatprep.remote import RemotePath, list_objects
+
 GROUP = "file"
 
 ATTRIBUTES = "zarr.json#attributes"
@@ -65,6 +67,9 @@ def list_files(path: Path) -> Iterator[str]:
 
     Links are listed, and not followed.
     """
+    if isinstance(path, RemotePath):
+        yield from list_objects(path)
+        return
     for folder, folders, files in os.walk(path):
         folders.sort()
         relative = Path(folder).relative_to(path)

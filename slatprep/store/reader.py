@@ -23,7 +23,7 @@ from slatprep.store.contract import (
 )
 from slatprep.store.layout import ARRAYS, FORMAT, FORMAT_VERSION
 from slatprep.store.rows import Folder, RemoteFolder, RowReader
-from slatprep.store.versions import current_version
+from slatprep.store.versions import current_version, is_version
 
 if TYPE_CHECKING:
     import zarr
@@ -106,6 +106,12 @@ class Store:
 
     def __iter__(self) -> Iterator[StoredAsset]:
         return (self.asset(asset_id) for asset_id in self.ids)
+
+    @property
+    def name(self) -> str:
+        """The last part of its path, or of its URL without the version."""
+        remote = isinstance(self.path, RemotePath) and is_version(self.path)
+        return (self.path.parent.parent if remote else self.path.absolute()).name
 
     @cached_property
     def group(self) -> zarr.Group:

@@ -74,7 +74,7 @@ class Pointer:
         )
         pointer = cls(version, previous, content, published)
         for name in (pointer.version, pointer.previous or pointer.version):
-            if not _NAME.fullmatch(name):
+            if not is_version_name(name):
                 raise ValueError(f"version {name!r}, expected 16 digits 0-9, a-f")
         return pointer
 
@@ -97,8 +97,8 @@ def read_pointer(store: RemotePath) -> Pointer | None:
         return Pointer.decode(data)
     except (ValueError, RecursionError) as error:
         raise StoreError(
-            f"{store / POINTER}: names no version of a store ({error}); build the store again, or "
-            "open a version below it by its own URL"
+            f"{store / POINTER}: names no version of a store ({error}); remove it and build the "
+            "store again, or open a version below it by its own URL"
         ) from None
 
 
@@ -127,9 +127,19 @@ def current_version(store: Path) -> Path:
 
 def is_version(path: RemotePath) -> bool:
     """Whether a URL is that of a version of a store."""
-    return path.parent.name == VERSIONS and _NAME.fullmatch(path.name) is not None
+    return path.parent.name == VERSIONS and is_version_name(path.name)
 
 
-def records_of(version: RemotePath) -> RemotePath:
-    """Return the folder of the records of a version."""
-    return version.parent.parent / RECORDS / version.name
+def is_version_name(name: str) -> bool:
+    """Whether a version may be called so."""
+    return _NAME.fullmatch(name) is not None
+
+
+def manifests_of(store: Path) -> Path:
+    """Return the folder of a store's records: ``demo.manifests`` beside ``demo.zarr``.
+
+    Those of a version on an object store lie beside all versions.
+    """
+    if isinstance(store, RemotePath) and is_version(store):
+        return store.parent.parent / RECORDS / store.name
+    return store.with_name(f"{store.name.removesuffix('.zarr')}.manifests")

@@ -19,7 +19,9 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 
+from slatprep.cache import folder_for
 from slatprep.errors import StoreError
+from slatprep.remote import RemotePath
 from slatprep.store.replace import restore_directory
 from slatprep.store.spool import Spool
 
@@ -64,7 +66,7 @@ def work_beside(target: Path, *, arrays: bool = True, keep: bool = False) -> Ite
         lock = _locked(directory, target)
     except OSError as error:
         raise StoreError(
-            f"{target.parent}: cannot write there ({error.strerror}); "
+            f"{directory.parent}: cannot write there ({error.strerror}); "
             "expected a folder for the result and for temporary files"
         ) from error
     finished = False
@@ -85,7 +87,9 @@ def work_beside(target: Path, *, arrays: bool = True, keep: bool = False) -> Ite
 
 
 def work_directory(target: Path) -> Path:
-    """Return the work folder of a target."""
+    """Return the work folder of a target: beside it, or in the cache if it is on no local disk."""
+    if isinstance(target, RemotePath):
+        return folder_for(target) / "work"
     return target.with_name(f".{target.name}.work")
 
 

@@ -14,8 +14,10 @@ from pathlib import Path
 
 from slatprep.errors import StoreError
 from slatprep.parallel import Jobs, require_shared, run_unordered
+from slatprep.remote import as_path
 from slatprep.store.contract import Finding
 from slatprep.store.reader import Store, open_store
+from slatprep.store.versions import current_version
 from slatprep.verify.assets import SourceRoots, asset_findings
 from slatprep.verify.files import file_findings, metadata_findings
 from slatprep.verify.index import index_findings
@@ -76,7 +78,7 @@ def verify_store(
     Parameters
     ----------
     path : Path
-        The store.
+        The store; on an object store its current version is checked.
     manifests : Path, optional
         Folder of the build's records; by default the one beside the store, if
         there is one.
@@ -100,11 +102,11 @@ def verify_store(
         If there is no store at all, or sources are asked for and nobody says
         where they lie.
     """
-    path = Path(path)
+    path = current_version(as_path(path))
     try:
         store = open_store(path.absolute())  # workers may stand in another folder
     except StoreError as error:
-        if not (path / "zarr.json").is_file():
+        if not _is_file(path / "zarr.json"):
             raise
         finding = Finding("zarr.json", "", str(error), "the metadata of a slatprep store")
         return Verification(path, 0, 0, 0, None, (finding,))
@@ -131,6 +133,13 @@ def verify_store(
     if folder is not None:
         findings |= set(manifest_findings(store, folder))
     return Verification(path, total, digests, hashed, folder, tuple(sorted(findings)))
+
+
+def _is_file(path: Path) -> bool:
+    try:
+        return path.is_file()
+    except OSError:  # An object store that does not answer.
+        return False
 
 
 def _assets(

@@ -12,8 +12,10 @@ import orjson
 
 from slatprep.errors import StoreError
 from slatprep.provenance import records_id
+from slatprep.remote import as_path
 from slatprep.store.contract import MAX_METADATA_BYTES, Finding
 from slatprep.store.reader import Store
+from slatprep.store.versions import manifests_of
 from slatprep.verify.assets import SourceRoots, schema_findings, stored_record
 
 BUILD, ASSETS = "build.json", "assets.jsonl"
@@ -21,7 +23,7 @@ BUILD, ASSETS = "build.json", "assets.jsonl"
 
 def usual_manifests(store: Path) -> Path | None:
     """Return the folder of a store's records beside it, if there is one."""
-    folder = store.with_name(f"{store.name.removesuffix('.zarr')}.manifests")
+    folder = manifests_of(store)
     return folder if (folder / BUILD).exists() or (folder / ASSETS).exists() else None
 
 
@@ -38,11 +40,12 @@ def source_roots(manifests: Path | None) -> SourceRoots:
         raise StoreError(f"no records beside the store say where its sources lie; {advice}")
     try:
         parameters = json.loads((manifests / BUILD).read_text(encoding="utf-8"))["parameters"]
-        pixieverse = Path(parameters["pixieverse"]["root"])
-        slat = Path(parameters["slat"]["root"])
+        pixieverse = as_path(parameters["pixieverse"]["root"])
+        slat = as_path(parameters["slat"]["root"])
+        slat = slat.parent if slat.is_file() else slat
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise StoreError(f"{manifests / BUILD}: names no sources ({error}); {advice}") from None
-    return SourceRoots(pixieverse, slat.parent if slat.is_file() else slat)
+    return SourceRoots(pixieverse, slat)
 
 
 def manifest_findings(store: Store, folder: Path) -> Iterator[Finding]:
