@@ -14,9 +14,12 @@ import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from pathlib import Path
 from typing import Any, TypeVar
 
 import click
+
+from slatprep.remote import RemotePath, as_path
 
 EXIT_INCOMPLETE = 1
 EXIT_USAGE = 2
@@ -109,9 +112,20 @@ def output_options(command: _Command) -> _Command:
     @click.option("-v", "--verbose", is_flag=True, help="Print more than the usual.")
     @functools.wraps(command)
     def with_output(*, as_json: bool, quiet: bool, verbose: bool, **options: Any) -> object:
-        return command(Output(as_json, int(verbose) - int(quiet)), **options)
+        given = {name: _local(value) for name, value in options.items()}
+        return command(Output(as_json, int(verbose) - int(quiet)), **given)
 
     return with_output  # type: ignore[return-value]
+
+
+def _local(value: Any) -> Any:
+    """Return an option's value; of a URL that was taken for a path, say that it is none."""
+    if not isinstance(value, Path) or isinstance(value, RemotePath):
+        return value  # Options that may be a URL make it one themselves.
+    path = as_path(value)
+    if isinstance(path, RemotePath):
+        raise click.UsageError(f"{path}: expected a path of the local disk")
+    return path
 
 
 def plain(value: Any) -> Any:
