@@ -145,7 +145,7 @@ class SlatDataset(Dataset[Item]):
         augmentation: Augmentation = "none",
         seed: int = 0,
     ) -> None:
-        self.store = store if isinstance(store, Store) else open_store(store)
+        self.store = store if isinstance(store, Store) else open_store(store, copy=True)
         self.indices = select_assets(
             self.store, split, shares=shares, verdicts=verdicts, max_ambiguity=max_ambiguity
         )

@@ -21,6 +21,7 @@ from slatprep.store.contract import (
     read_metadata,
     size_findings,
 )
+from slatprep.store.copies import local_copy
 from slatprep.store.layout import ARRAYS, FORMAT, FORMAT_VERSION
 from slatprep.store.rows import Folder, RemoteFolder, RowReader
 from slatprep.store.versions import current_version, is_version
@@ -306,7 +307,7 @@ class Store:
 _NOT_COLUMNS = ("id", "offset", "transform")
 
 
-def open_store(path: str | Path) -> Store:
+def open_store(path: str | Path, *, copy: bool = False) -> Store:
     """Open a store for reading.
 
     Parameters
@@ -314,6 +315,9 @@ def open_store(path: str | Path) -> Store:
     path : str or Path
         The store's directory, or its URL on an object store. There the version
         that is current now is opened, and stays open when it is replaced.
+    copy : bool
+        Copy a store on an object store to the local disk first, if that has
+        not been done before: for training, which reads it many times.
 
     Returns
     -------
@@ -326,6 +330,8 @@ def open_store(path: str | Path) -> Store:
         If there is nothing, something else, or a store of a newer format.
     """
     path = current_version(as_path(path))
+    if copy:
+        path = local_copy(path)
     document = _root_document(path)
     if not document:
         _require_there(path)
