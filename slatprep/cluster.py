@@ -26,6 +26,7 @@ from typing import Any, TypeVar
 
 from slatprep.errors import ConfigError, SlatprepError
 from slatprep.parallel import WORKER_DIED, Handout, result_of_death, results_of, single_threaded
+from slatprep.remote import as_path
 
 try:
     import distributed
@@ -305,7 +306,7 @@ def _agree(common: _Common, worker: Any) -> None:
                 f"it is {version or 'absent'}; expected the same environment on all workers"
             )
     for path, look in common.files:
-        seen = _look(Path(path))
+        seen = _look(as_path(path))
         if seen != look:
             raise SlatprepError(
                 f"{name}: sees {seen} at {path}, which is {look} where the build was started; "
