@@ -100,21 +100,15 @@ class RemotePath(PosixPath):
 
     def exists(self, *, follow_symlinks: bool = True) -> bool:
         """Whether there is an object, or any below."""
-        system, name = reach(self)
-        with telling(self):
-            return bool(system.exists(name))
+        return self._kind() != ""
 
     def is_dir(self, *, follow_symlinks: bool = True) -> bool:
-        """Whether there is any object below."""
-        system, name = reach(self)
-        with telling(self):
-            return bool(system.isdir(name))
+        """Whether there is any object below, but none of this name."""
+        return self._kind() == "directory"
 
     def is_file(self, *, follow_symlinks: bool = True) -> bool:
         """Whether there is an object."""
-        system, name = reach(self)
-        with telling(self):
-            return bool(system.isfile(name))
+        return self._kind() == "file"
 
     def stat(self, *, follow_symlinks: bool = True) -> stat_result:
         """Return the size of an object; times are not told."""
@@ -147,6 +141,15 @@ class RemotePath(PosixPath):
         system, name = reach(self)
         with telling(self):
             system.put_file(str(local), name)
+
+    def _kind(self) -> str:
+        # Not by isdir, which lists all that is below.
+        system, name = reach(self)
+        try:
+            with telling(self):
+                return str(system.info(name)["type"])
+        except FileNotFoundError:
+            return ""
 
     def _refuse(self, *_: Any, **__: Any) -> NoReturn:
         raise OSError(errno.ENOTSUP, "this is possible at a local path only", str(self))
