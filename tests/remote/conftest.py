@@ -6,12 +6,13 @@ import hashlib
 import subprocess
 import sys
 import uuid
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 import fsspec
 import pytest
+from s3fs.core import S3FileSystem
 from synthetic import Dataset
 
 from slatprep.build import build_store
@@ -38,26 +39,40 @@ def server() -> Iterator[str]:
         process.kill()
 
 
-@pytest.fixture(autouse=True)
-def environment(server: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.fixture(scope="session", autouse=True)
+def environment(server: str, tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
     """Say where the server is, and let nobody's own settings in."""
-    for name, value in {
-        "AWS_ENDPOINT_URL": server,
-        "AWS_ACCESS_KEY_ID": "key",
-        "AWS_SECRET_ACCESS_KEY": "secret",
-        "AWS_DEFAULT_REGION": "us-east-1",
-        "AWS_EC2_METADATA_DISABLED": "true",
-        "AWS_CONFIG_FILE": str(tmp_path / "none"),
-        "AWS_SHARED_CREDENTIALS_FILE": str(tmp_path / "none"),
-        "SLATPREP_CACHE": str(tmp_path / "cache"),
-    }.items():
-        monkeypatch.setenv(name, value)
-    # Clients remember the credentials that they were made with.
-    fsspec.get_filesystem_class("s3").clear_instance_cache()
+    none = str(tmp_path_factory.mktemp("aws") / "none")
+    with pytest.MonkeyPatch.context() as monkeypatch:
+        for name, value in {
+            "AWS_ENDPOINT_URL": server,
+            "AWS_ACCESS_KEY_ID": "key",
+            "AWS_SECRET_ACCESS_KEY": "secret",
+            "AWS_DEFAULT_REGION": "us-east-1",
+            "AWS_EC2_METADATA_DISABLED": "true",
+            "AWS_CONFIG_FILE": none,
+            "AWS_SHARED_CREDENTIALS_FILE": none,
+        }.items():
+            monkeypatch.setenv(name, value)
+        yield
+
+
+@pytest.fixture(autouse=True)
+def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Give each test a cache of its own."""
+    monkeypatch.setenv("SLATPREP_CACHE", str(tmp_path / "cache"))
 
 
 @pytest.fixture
-def s3(environment: None) -> Any:
+def new_clients(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[], None]]:
+    """Return what makes fsspec forget its clients: they keep the credentials they began with."""
+    yield S3FileSystem.clear_instance_cache
+    monkeypatch.undo()
+    S3FileSystem.clear_instance_cache()
+
+
+@pytest.fixture
+def s3() -> Any:
     """Return a client that sees what others have just written."""
     return fsspec.filesystem("s3", use_listings_cache=False)
 
@@ -104,8 +119,7 @@ class Requests:
     """Counts what is asked of the server from this process, by operation and key."""
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        client = fsspec.get_filesystem_class("s3")
-        call = client._call_s3
+        call = S3FileSystem._call_s3
         self.made: list[tuple[str, str]] = []
 
         async def counting(filesystem: Any, method: str, *args: Any, **options: Any) -> Any:
@@ -113,7 +127,7 @@ class Requests:
             self.made.append((method, str(options.get("Key", listed))))
             return await call(filesystem, method, *args, **options)
 
-        monkeypatch.setattr(client, "_call_s3", counting)
+        monkeypatch.setattr(S3FileSystem, "_call_s3", counting)
 
     def of(self, method: str) -> list[str]:
         """Return the keys that a method was called with; of listings prefix*delimiter."""

@@ -8,7 +8,6 @@ import sys
 from pathlib import Path
 from typing import Any
 
-import fsspec
 import pytest
 
 from slatprep.errors import ConfigError
@@ -101,9 +100,11 @@ def test_what_cannot_be_read_is_named(s3: Any, bucket: str) -> None:
         as_path("s4://bucket/x").read_bytes()
 
 
-def test_missing_credentials_are_told_of_the_place(bucket: str, monkeypatch: Any) -> None:
+def test_missing_credentials_are_told_of_the_place(
+    bucket: str, monkeypatch: Any, new_clients: Any
+) -> None:
     monkeypatch.delenv("AWS_ACCESS_KEY_ID")
-    fsspec.get_filesystem_class("s3").clear_instance_cache()
+    new_clients()
     with pytest.raises(OSError, match=f"Unable to locate credentials: 's3://{bucket}/x'"):
         as_path(f"s3://{bucket}/x").read_bytes()
 

@@ -53,10 +53,15 @@ def current(s3: Any, url: str) -> dict[str, str]:
     return contents(s3, f"{url}/versions/{pointer['version']}")
 
 
-def change_client(monkeypatch: pytest.MonkeyPatch, name: str, method: Any) -> None:
-    """Have the client of this process do something else; those that are made already would not."""
-    monkeypatch.setattr(S3FileSystem, name, method)
-    S3FileSystem.clear_instance_cache()
+@pytest.fixture
+def change_client(monkeypatch: pytest.MonkeyPatch, new_clients: Any) -> Callable[[str, Any], None]:
+    """Return what has the client of this process do something else."""
+
+    def change(name: str, method: Any) -> None:
+        monkeypatch.setattr(S3FileSystem, name, method)
+        new_clients()
+
+    return change
 
 
 def versions(s3: Any, url: str) -> set[str]:
@@ -308,7 +313,7 @@ def test_the_server_itself_refuses_a_pointer_that_moved_at_the_last_moment(
     url: str,
     undisturbed: Made,
     another: Made,
-    monkeypatch: pytest.MonkeyPatch,
+    change_client: Any,
     first: bool,
     tmp_path: Path,
 ) -> None:
@@ -324,14 +329,14 @@ def test_the_server_itself_refuses_a_pointer_that_moved_at_the_last_moment(
         await pipe(filesystem, path, early.pointer.encode())
         return await pipe(filesystem, path, data, **options)
 
-    change_client(monkeypatch, "_pipe_file", overtaken)
+    change_client("_pipe_file", overtaken)
     with pytest.raises(StoreError, match="another build replaced it"):
         late.show()
     assert current(s3, url) == tree(another[1])
 
 
 def test_an_answer_that_is_lost_does_not_make_a_failure_of_a_success(
-    s3: Any, url: str, undisturbed: Made, another: Made, monkeypatch: pytest.MonkeyPatch
+    s3: Any, url: str, undisturbed: Made, another: Made, change_client: Any
 ) -> None:
     put(another[1], url)
     made = upload_store(undisturbed[1], look_at(as_path(url)))  # type: ignore[arg-type]
@@ -341,14 +346,14 @@ def test_an_answer_that_is_lost_does_not_make_a_failure_of_a_success(
         lost.append(await pipe(*args, **options))
         raise OSError("connection lost")
 
-    change_client(monkeypatch, "_pipe_file", deaf)
+    change_client("_pipe_file", deaf)
     made.show()
     assert len(lost) == 1
     assert current(s3, url) == tree(undisturbed[1])
 
 
 def test_older_versions_that_must_not_be_removed_are_told(
-    url: str, undisturbed: Made, another: Made, monkeypatch: pytest.MonkeyPatch, s3: Any
+    url: str, undisturbed: Made, another: Made, change_client: Any, s3: Any
 ) -> None:
     put(another[1], url)
     put(undisturbed[1], url)
@@ -357,7 +362,7 @@ def test_older_versions_that_must_not_be_removed_are_told(
     async def denied(*_: Any, **__: Any) -> None:
         raise PermissionError("Access Denied")
 
-    change_client(monkeypatch, "_rm", denied)
+    change_client("_rm", denied)
     with pytest.warns(UserWarning, match=r"older versions could not be removed \(Access Denied\)"):
         made.show()
     assert current(s3, url) == tree(another[1])
@@ -414,7 +419,7 @@ def test_a_pointer_that_is_none_is_refused(
 
 
 def test_places_that_cannot_be_written_are_told_before_the_work(
-    s3: Any, bucket: str, undisturbed: Made, monkeypatch: pytest.MonkeyPatch
+    s3: Any, bucket: str, undisturbed: Made, monkeypatch: pytest.MonkeyPatch, new_clients: Any
 ) -> None:
     parameters = undisturbed[0].parameters("pixie")
     monkeypatch.setattr(build, "_finish_all", None)  # Nothing is aligned.
@@ -430,7 +435,7 @@ def test_places_that_cannot_be_written_are_told_before_the_work(
         build_store(parameters, f"s3://{bucket}/a.zarr", manifests=as_path(f"s3://{bucket}/m"))
     monkeypatch.delenv("AWS_SECRET_ACCESS_KEY")
     monkeypatch.delenv("AWS_ACCESS_KEY_ID")
-    S3FileSystem.clear_instance_cache()
+    new_clients()
     for refused in (
         lambda: build_store(parameters, f"s3://{bucket}/a.zarr"),
         lambda: open_store(f"s3://{bucket}/a.zarr"),
