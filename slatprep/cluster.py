@@ -47,7 +47,7 @@ IN_FLIGHT = 1000
 """Tasks the cluster has at a time: enough for workers that join midway, and few to remember."""
 
 _LIBRARIES = (
-    "numpy", "scipy", "numba", "edt", "open3d", "open3d-cpu", "small_gicp",
+    "numpy", "scipy", "numba", "open3d", "open3d-cpu", "small_gicp",
     "h5py", "zarr", "numcodecs", "google-crc32c", "joblib",
 )  # fmt: skip
 
