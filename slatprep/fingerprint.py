@@ -23,8 +23,16 @@ STAGES = (
 """Where an asset's numbers are made; a package stands for all of its modules."""
 
 # Parameters enter an asset's key as values, so their defaults may change; the
-# words of an error are no numbers; and of slatprep itself only the version.
-_NOT_NUMBERS = ("slatprep", "slatprep.parameters", "slatprep.errors")
+# words of an error are no numbers; of slatprep itself it is only the version;
+# and whichever way bytes come from a disk or a network, their digest tells them.
+_NOT_NUMBERS = (
+    "slatprep",
+    "slatprep.cache",
+    "slatprep.errors",
+    "slatprep.parallel",
+    "slatprep.parameters",
+    "slatprep.remote",
+)
 
 
 @lru_cache(maxsize=1)
