@@ -11,7 +11,7 @@ import os
 import tempfile
 from pathlib import Path
 
-from slatprep.remote import RemotePath, reach, telling
+from slatprep.remote import RemotePath, in_parts, reach, telling
 
 VARIABLE = "SLATPREP_CACHE"
 """Environment variable that says where the folder is."""
@@ -55,7 +55,7 @@ def on_disk(path: Path) -> Path:
     with tempfile.TemporaryDirectory(dir=folder) as own:
         part = Path(own, "part")
         with telling(path):
-            system.get_file(name, str(part))
+            system.get_file(name, str(part), **in_parts(system))
         part.replace(copy)
     for older in folder.iterdir():
         if older != copy and older.is_file():

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from slatprep.cache import folder_for
 from slatprep.errors import StoreError
-from slatprep.remote import RemotePath, list_objects, reach, telling
+from slatprep.remote import RemotePath, in_parts, list_objects, reach, telling
 from slatprep.store.versions import is_version
 
 
@@ -44,7 +44,12 @@ def local_copy(path: Path) -> Path:
             part = Path(own, "part")
             system, root = reach(path)
             with telling(path):
-                system.get([f"{root}/{name}" for name in objects], [str(part / n) for n in objects])
+                options = in_parts(system) | ({"batch_size": 4} if system.async_impl else {})
+                system.get(
+                    [f"{root}/{name}" for name in objects],
+                    [str(part / name) for name in objects],
+                    **options,
+                )
             for name, entry in objects.items():
                 if (part / name).stat().st_size != entry["size"]:
                     raise StoreError(f"{path / name}: changed while it was copied; run again")

@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import Any
 
 from slatprep.errors import StoreError
-from slatprep.remote import RemotePath, list_objects, reach, telling
+from slatprep.remote import RemotePath, in_parts, list_objects, reach, telling
 from slatprep.store.digests import file_digest, list_files
 from slatprep.store.versions import (
     POINTER,
@@ -35,8 +35,8 @@ from slatprep.store.versions import (
 
 _SMALL_BYTES = 8 * 2**20
 
-_AT_ONCE = {True: 16, False: 2}
-"""Small files and large ones that are uploaded at a time, each held in memory."""
+_AT_ONCE = {True: 16, False: 1}
+"""Small files, held in memory whole, and large ones that are uploaded at a time."""
 
 
 @dataclass(frozen=True)
@@ -220,7 +220,7 @@ def _put(new: Path, version: RemotePath, names: list[str], at_once: int) -> None
     if not names:
         return
     system, root = reach(version)
-    options = {"batch_size": at_once} if system.async_impl else {}
+    options = in_parts(system) | ({"batch_size": at_once} if system.async_impl else {})
     with telling(version):
         system.put([str(new / name) for name in names], [f"{root}/{n}" for n in names], **options)
 
