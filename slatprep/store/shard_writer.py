@@ -6,6 +6,7 @@ once: chunks one after the other, then their index (see `slatprep.store.rows`).
 
 from __future__ import annotations
 
+import uuid
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from types import TracebackType
@@ -44,9 +45,11 @@ class ShardWriter:
         self._chunk = np.empty(layout.decoder.shape, layout.dtype)
         self._fill_value = layout.fill_value
         self._rows = self._chunks = self._bytes = 0
-        path = store / layout.key(start // layout.shard_rows)
-        path.parent.mkdir(parents=True, exist_ok=True)
-        self._file = path.open("wb")
+        self._path = store / layout.key(start // layout.shard_rows)
+        self._path.parent.mkdir(parents=True, exist_ok=True)
+        # A worker that a cluster has given up may still be writing the same shard.
+        self._partial = self._path.with_name(f".{self._path.name}.{uuid.uuid4().hex}.partial")
+        self._file = self._partial.open("wb")
 
     def append(self, rows: NDArray[Any]) -> None:
         """Take the next rows."""
@@ -62,7 +65,7 @@ class ShardWriter:
                 self._flush(self._chunk)
 
     def finish(self) -> None:
-        """Write the last chunk, filled up, and the index."""
+        """Write the last chunk, filled up, and the index; on exit the shard gets its name."""
         if self._rows:
             self._chunk[self._rows :] = self._fill_value
             self._flush(self._chunk)
@@ -77,9 +80,14 @@ class ShardWriter:
         error: BaseException | None,
         trace: TracebackType | None,
     ) -> None:
-        with self._file:
+        try:
+            with self._file:
+                if kind is None:
+                    self.finish()
             if kind is None:
-                self.finish()
+                self._partial.replace(self._path)
+        finally:
+            self._partial.unlink(missing_ok=True)
 
     def _flush(self, chunk: NDArray[Any]) -> None:
         data = self._encode(chunk)

@@ -64,10 +64,23 @@ def files(folder: Path) -> dict[str, bytes]:
     }
 
 
-def test_a_shard_that_failed_has_no_index(tmp_path: Path) -> None:
+def test_a_shard_is_there_whole_or_not_at_all(tmp_path: Path) -> None:
     create_store(tmp_path / "s", 1, 40, PARAMETERS)
+    place = tmp_path / "s" / "voxel" / "valid" / "c"
     with pytest.raises(RuntimeError), ShardWriter(tmp_path / "s", "voxel/valid", 0) as writer:
         writer.append(np.ones(40, bool))
         raise RuntimeError("disk full")
-    with pytest.raises((ValueError, RuntimeError)):
-        zarr.open_group(tmp_path / "s")["voxel/valid"][:]
+    assert list(place.iterdir()) == []
+
+
+def test_a_writer_that_was_given_up_leaves_a_finished_shard_alone(tmp_path: Path) -> None:
+    create_store(tmp_path / "s", 1, 40, PARAMETERS)
+    place = tmp_path / "s" / "voxel" / "valid" / "c"
+    with ShardWriter(tmp_path / "s", "voxel/valid", 0) as writer:
+        writer.append(np.ones(40, bool))
+    (shard,) = place.iterdir()
+    finished = shard.read_bytes()
+    with ShardWriter(tmp_path / "s", "voxel/valid", 0) as late:
+        late.append(np.ones(40, bool))
+        assert shard.read_bytes() == finished
+    assert [path.read_bytes() for path in place.iterdir()] == [finished]
