@@ -227,7 +227,11 @@ def list_objects(path: RemotePath) -> dict[str, dict[str, Any]]:
     with telling(path):
         found = system.find(name, detail=True)
     base = name.rstrip("/") + "/"
-    below = {key[len(base) :]: entry for key, entry in found.items() if key.startswith(base)}
+    below = {
+        key[len(base) :]: entry
+        for key, entry in found.items()
+        if key.startswith(base) and entry["type"] == "file"
+    }
     return {key: entry for key, entry in sorted(below.items()) if _is_plain(key)}
 
 

@@ -110,7 +110,7 @@ def contents(s3: Any, place: str) -> dict[str, str]:
     """Return the hash of every object below a place, by its name relative to that."""
     base = place.removeprefix("s3://").rstrip("/") + "/"
     return {
-        name.removeprefix(base): hashlib.sha256(s3.cat_file(name, max_concurrency=1)).hexdigest()
+        name.removeprefix(base): hashlib.sha256(s3.cat_file(name)).hexdigest()
         for name in s3.find(base)
     }
 
