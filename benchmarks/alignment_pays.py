@@ -23,7 +23,6 @@ import numpy as np
 import torch
 import zarr
 
-from slatprep.build import build_store
 from slatprep.config import load_parameters
 from slatprep.demo import make_demo
 from slatprep.learn.dataset import SlatDataset, SlatLoader
@@ -33,6 +32,7 @@ from slatprep.learn.predictions import VoxelPrediction
 from slatprep.learn.splits import Shares
 from slatprep.learn.train import TrainParameters, train
 from slatprep.normalize import normalize
+from slatprep.pipeline.dataset import build_store
 from slatprep.store import open_store
 
 PRESETS = {"paper": "paper", "slatprep": "default"}

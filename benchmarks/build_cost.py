@@ -23,9 +23,10 @@ from typing import Any
 import numpy as np
 import zarr
 
-from slatprep import build, process
 from slatprep.config import load_parameters
 from slatprep.parameters import BuildParameters
+from slatprep.pipeline import asset as process
+from slatprep.pipeline import dataset as build
 from slatprep.readers import discover
 from slatprep.store.layout import create_arrays
 

@@ -26,11 +26,11 @@ from pathlib import Path
 
 import psutil
 
-from slatprep.build import build_store
-from slatprep.cluster import Cluster
 from slatprep.config import load_parameters
-from slatprep.parallel import Jobs
 from slatprep.parameters import BuildParameters
+from slatprep.pipeline.dataset import build_store
+from slatprep.workers.dask import Cluster
+from slatprep.workers.local import Jobs
 
 ADVISED = {
     "MALLOC_TRIM_THRESHOLD_": "67108864",

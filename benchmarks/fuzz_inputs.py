@@ -36,9 +36,9 @@ from pathlib import Path
 
 import numpy as np
 
-from slatprep.build import build_store
 from slatprep.demo import make_demo
 from slatprep.errors import ConfigError, InputError, StoreError
+from slatprep.inspect.verify import verify_store
 from slatprep.normalize import PIXIE_RANGES, denormalize
 from slatprep.parameters import (
     BuildParameters,
@@ -46,9 +46,9 @@ from slatprep.parameters import (
     PixieverseSource,
     SlatSource,
 )
+from slatprep.pipeline.dataset import build_store
 from slatprep.readers import discover, read_field, read_latents
 from slatprep.records import AssetPair, MaterialField, StructuredLatents
-from slatprep.verify import verify_store
 
 SECONDS_A_FILE = 20
 MEGABYTES = 600

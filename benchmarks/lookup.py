@@ -22,7 +22,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from slatprep.align import align
-from slatprep.geometry import RESOLUTION, apply_transform, invert_transform, voxel_centres
+from slatprep.geometry.frames import RESOLUTION, apply_transform, invert_transform, voxel_centres
 from slatprep.normalize import to_mapped
 from slatprep.parameters import AlignParameters, BuildParameters, PixieverseSource, SlatSource
 from slatprep.readers import discover, read_field, read_latents

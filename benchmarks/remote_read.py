@@ -26,9 +26,9 @@ import fsspec
 import numpy as np
 from s3fs.core import S3FileSystem
 
-from slatprep.remote import as_path
+from slatprep.storage.remote import as_path
+from slatprep.storage.upload import look_at, upload_store
 from slatprep.store import Store, open_store
-from slatprep.store.upload import look_at, upload_store
 
 SERVER = """
 import sys

@@ -25,9 +25,9 @@ from pathlib import Path
 import numpy as np
 import zarr
 
-from slatprep.build import default_manifests
+from slatprep.inspect.report import write_report
 from slatprep.parameters import StoreParameters
-from slatprep.report import write_report
+from slatprep.pipeline.dataset import default_manifests
 from slatprep.store import open_store
 from slatprep.store.layout import ARRAYS, create_arrays
 

@@ -24,15 +24,15 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 
-from synthetic import Dataset, make_asset
+from support.synthetic import Dataset, make_asset
 
 VARIANTS = 8
 BUILD = """
 import json, resource, sys
 from pathlib import Path
 from dataclasses import replace
-from synthetic import Dataset
-from slatprep.build import build_store
+from support.synthetic import Dataset
+from slatprep.pipeline import build_store
 from slatprep.parameters import StoreParameters
 parameters = replace(Dataset(Path(sys.argv[1])).parameters(), store=StoreParameters())
 build_store(parameters, Path(sys.argv[2]), jobs=2)

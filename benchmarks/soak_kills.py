@@ -30,16 +30,16 @@ import zarr
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 
-from synthetic import Dataset
-from trees import tree
+from support.synthetic import Dataset
+from support.trees import tree
 
 STATES = 4
 ENDED = "ended before its kill, so not counted"
 BUILD = """
 import sys
 from pathlib import Path
-from synthetic import Dataset
-from slatprep.build import build_store
+from support.synthetic import Dataset
+from slatprep.pipeline import build_store
 build_store(Dataset(Path(sys.argv[1])).parameters(), Path(sys.argv[2]), jobs=2)
 """
 

@@ -28,8 +28,10 @@ from pathlib import Path
 import numpy as np
 
 from slatprep.align import align, field
-from slatprep.align.quality import judge, measure_quality
-from slatprep.geometry import displacement
+from slatprep.align.quality import measure_quality
+from slatprep.bench.truth import read_truth
+from slatprep.geometry.frames import displacement
+from slatprep.judge import judge
 from slatprep.parameters import (
     AlignParameters,
     BuildParameters,
@@ -39,7 +41,6 @@ from slatprep.parameters import (
 )
 from slatprep.readers import discover, read_field, read_latents
 from slatprep.sample import sample
-from slatprep.truth import read_truth
 
 OTHERS = 4
 """With so many other objects each asset is paired."""

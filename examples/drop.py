@@ -6,7 +6,7 @@
 
 Without a store, a steel ball that lies in a block of jelly is made in both
 layouts and built into one. The SLAT is filled with particles, which get their
-materials by `slatprep.transfer`; the PLY that comes out is all the simulation
+materials by `slatprep.particles.transfer`; the PLY that comes out is all the simulation
 reads.
 """
 
@@ -21,12 +21,13 @@ import numpy as np
 import plyfile
 from drop_picture import Part, draw
 
-from slatprep import transfer
-from slatprep.build import build_store
-from slatprep.geometry import boundary, filled, occupancy_of, voxel_centres
+from slatprep.geometry.frames import voxel_centres
+from slatprep.geometry.voxels import boundary, filled, occupancy_of
 from slatprep.parameters import BuildParameters, PixieverseSource, SlatSource
+from slatprep.particles import transfer
+from slatprep.particles.simulate import drop, rigid_deviation, strain
+from slatprep.pipeline.dataset import build_store
 from slatprep.records import BACKGROUND, MATERIAL_CLASSES, RESOLUTION
-from slatprep.simulate import drop, rigid_deviation, strain
 from slatprep.store import Store, open_store
 
 # Class, then density [kg/m^3], Young's modulus [Pa] and Poisson's ratio, as PixieVerse orders them.

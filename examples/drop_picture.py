@@ -12,8 +12,8 @@ from matplotlib.colors import LinearSegmentedColormap
 from matplotlib.figure import Figure
 from scipy.spatial import cKDTree
 
-from slatprep.geometry import VOXEL_SIZE, apply_transform
-from slatprep.pictures.palette import DISTANCE_COLOURS, INK, MUTED
+from slatprep.geometry.frames import VOXEL_SIZE, apply_transform
+from slatprep.inspect.pictures.palette import DISTANCE_COLOURS, INK, MUTED
 from slatprep.store.reader import StoredAsset
 
 MOST = 0.5

@@ -19,14 +19,20 @@ import importlib
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from slatprep.build import build_store
+    from slatprep.api import (
+        align_voxels,
+        annotate_voxels,
+        denormalize_properties,
+        normalize_properties,
+    )
     from slatprep.config import load_parameters
     from slatprep.demo import make_demo
     from slatprep.errors import ConfigError, InputError, SlatprepError, StoreError
     from slatprep.export import export_store
-    from slatprep.geometry import apply_transform, voxel_centres
+    from slatprep.geometry.frames import apply_transform, voxel_centres
     from slatprep.normalize import PIXIE_RANGES
     from slatprep.parameters import BuildParameters
+    from slatprep.pipeline.dataset import build_store
     from slatprep.readers import discover, read_field, read_latents
     from slatprep.records import (
         MATERIAL_CLASSES,
@@ -42,22 +48,16 @@ if TYPE_CHECKING:
         Verdict,
     )
     from slatprep.store import Store, StoredAsset, open_store
-    from slatprep.voxels import (
-        align_voxels,
-        annotate_voxels,
-        denormalize_properties,
-        normalize_properties,
-    )
 
 __version__ = "0.1.0"
 
 _HOMES = {
-    "slatprep.build": ("build_store",),
+    "slatprep.pipeline.dataset": ("build_store",),
     "slatprep.config": ("load_parameters",),
     "slatprep.demo": ("make_demo",),
     "slatprep.errors": ("ConfigError", "InputError", "SlatprepError", "StoreError"),
     "slatprep.export": ("export_store",),
-    "slatprep.geometry": ("apply_transform", "voxel_centres"),
+    "slatprep.geometry.frames": ("apply_transform", "voxel_centres"),
     "slatprep.normalize": ("PIXIE_RANGES",),
     "slatprep.parameters": ("BuildParameters",),
     "slatprep.readers": ("discover", "read_field", "read_latents"),
@@ -75,7 +75,7 @@ _HOMES = {
         "Verdict",
     ),
     "slatprep.store": ("Store", "StoredAsset", "open_store"),
-    "slatprep.voxels": (
+    "slatprep.api": (
         "align_voxels",
         "annotate_voxels",
         "denormalize_properties",

@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any, get_args, get_type_hints
 
 from slatprep.errors import ConfigError
 from slatprep.parameters import PRESETS, BuildParameters
-from slatprep.remote import RemotePath, as_path
+from slatprep.storage.remote import RemotePath, as_path
 
 if TYPE_CHECKING:
     from pydantic_core import ErrorDetails

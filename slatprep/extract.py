@@ -11,17 +11,18 @@ import io
 import json
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from importlib import metadata
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from slatprep import __version__
 from slatprep.errors import ConfigError, InputError, SlatprepError
-from slatprep.provenance import jsonable, staged
+from slatprep.provenance.jsonable import jsonable
 from slatprep.readers.patterns import NAME
 from slatprep.readers.slat import LATENT_CHANNELS, check_coords
+from slatprep.storage.atomic import staged
 
 if TYPE_CHECKING:
     from PIL.Image import Image
@@ -221,7 +222,7 @@ def _extract(session: Session, job: Job, preprocess: bool) -> Extracted:
         {
             "format": FORMAT,
             "format_version": 1,
-            "slatprep": __version__,
+            "slatprep": metadata.version("slatprep"),
             "image": {"name": job.image.name, "sha256": hashlib.sha256(data).hexdigest()},
             "seed": job.seed,
             "preprocessed": preprocess,

@@ -7,15 +7,9 @@ ratio is taken as it is; the mapped value v of a range lo..hi becomes
 
 from __future__ import annotations
 
-import json
-import tomllib
-from pathlib import Path
-from typing import TypeGuard
-
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from slatprep.errors import ConfigError
 from slatprep.records import PROPERTY_COLUMNS, MaterialField, Normalization, PropertyRange
 
 LOG10 = (True, True, False)
@@ -94,39 +88,6 @@ def ranges_from_extents(extents: ArrayLike) -> Normalization:
     return Normalization((first, second, third), source="dataset")
 
 
-def read_ranges(path: Path) -> Normalization:
-    """Read ranges from a TOML or JSON file.
-
-    The file has one table a property with ``lo`` and ``hi`` in mapped units
-    (log10 of Pa and of kg/m^3, plain Poisson's ratio)::
-
-        [youngs_modulus]
-        lo = 3.0
-        hi = 11.0
-
-    Raises
-    ------
-    ConfigError
-        If the file cannot be read, lacks a property or has an empty range.
-    """
-    try:
-        text = Path(path).read_text(encoding="utf-8")
-        table = json.loads(text) if Path(path).suffix == ".json" else tomllib.loads(text)
-    except (OSError, UnicodeDecodeError, ValueError) as error:
-        raise ConfigError(f"{path}: cannot read ranges ({error})") from error
-    ranges = []
-    for name, log10 in zip(PROPERTY_COLUMNS, LOG10, strict=True):
-        entry = table.get(name) if isinstance(table, dict) else None
-        lo, hi = (entry.get(k) if isinstance(entry, dict) else None for k in ("lo", "hi"))
-        if not _is_number(lo) or not _is_number(hi) or lo >= hi:
-            raise ConfigError(
-                f"{path}: {name} has lo = {lo!r} and hi = {hi!r}; expected a table [{name}] with "
-                f"finite lo < hi{' in log10 of the SI value' if log10 else ''}"
-            )
-        ranges.append(PropertyRange(name, log10, float(lo), float(hi)))
-    return Normalization((ranges[0], ranges[1], ranges[2]), source=Path(path).name)
-
-
 def normalize(
     properties: ArrayLike, normalization: Normalization
 ) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
@@ -193,10 +154,6 @@ def normalize_change(change: ArrayLike, normalization: Normalization) -> NDArray
     """Scale differences of mapped properties to differences of normalised ones."""
     lo, hi = _limits(normalization)
     return np.asarray(change, dtype=np.float64) * 2.0 / (hi - lo)
-
-
-def _is_number(value: object) -> TypeGuard[float]:
-    return isinstance(value, int | float) and bool(np.isfinite(value))
 
 
 def _limits(normalization: Normalization) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

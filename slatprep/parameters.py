@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import ClassVar, Literal
 
-from slatprep.remote import as_path
+from slatprep.storage.remote import as_path
 
 _FORBID_UNKNOWN: dict[str, str] = {"extra": "forbid"}
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from slatprep.geometry import apply_transform, invert_transform, voxel_centres
+from slatprep.geometry.frames import apply_transform, invert_transform, voxel_centres
 from slatprep.parameters import SampleParameters
 from slatprep.records import RESOLUTION, UNANNOTATED, Annotation, MaterialField
 
@@ -48,7 +48,7 @@ class Lookup:
     """A field that is looked up more than once; see `sample`."""
 
     def __init__(self, field: MaterialField, parameters: SampleParameters) -> None:
-        from slatprep.lattice import Lattice
+        from slatprep.geometry.nearest import Lattice
 
         self._field, self._parameters = field, parameters
         self._lattice = Lattice(field.voxels)

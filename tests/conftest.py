@@ -7,9 +7,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from synthetic import Dataset, make_asset
+from support.synthetic import Dataset, make_asset
 
-from slatprep.build import BuildSummary, build_store
+from slatprep.pipeline.dataset import BuildSummary, build_store
 
 
 @pytest.fixture

@@ -14,7 +14,7 @@ from types import ModuleType
 
 import numpy as np
 import pytest
-from synthetic import JELLY, METAL, QUARTER_TURN, make_asset
+from support.synthetic import JELLY, METAL, QUARTER_TURN, make_asset
 
 import slatprep
 
@@ -88,7 +88,7 @@ def test_there_are_doctests() -> None:
     finder = doctest.DocTestFinder()
     examples = [
         test
-        for name in ("slatprep.voxels", "slatprep.geometry", "slatprep.normalize")
+        for name in ("slatprep.api", "slatprep.geometry.frames", "slatprep.normalize")
         for test in finder.find(importlib.import_module(name))
         if test.examples
     ]

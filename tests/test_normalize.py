@@ -18,8 +18,8 @@ from slatprep.normalize import (
     normalize_change,
     property_extent,
     ranges_from_extents,
-    read_ranges,
 )
+from slatprep.readers.ranges import read_ranges
 from slatprep.records import MaterialField, Normalization, PropertyRange
 
 DECADES = Normalization(

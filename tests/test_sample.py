@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from slatprep.geometry import make_transform
+from slatprep.geometry.frames import make_transform
 from slatprep.parameters import SampleParameters
 from slatprep.records import MaterialField
 from slatprep.sample import sample

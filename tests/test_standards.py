@@ -14,9 +14,9 @@ import xarray
 import zarr
 from click.testing import CliRunner
 
-from slatprep.build import BuildSummary
 from slatprep.cli.commands import slatprep
-from slatprep.croissant import describe, to_json
+from slatprep.export.croissant import describe, to_json
+from slatprep.pipeline.dataset import BuildSummary
 from slatprep.store import open_store
 from slatprep.store.layout import ARRAYS
 

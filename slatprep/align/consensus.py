@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from slatprep.align.starts import distinct_starts
-from slatprep.geometry import displacement, split_transform
+from slatprep.geometry.frames import displacement, split_transform
 from slatprep.records import Alignment, Consensus, Placement, StructuredLatents
 
 LEAST_WINNERS = 5

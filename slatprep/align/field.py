@@ -22,7 +22,8 @@ from numpy.typing import NDArray
 from slatprep.align.quality import compare
 from slatprep.align.starts import candidates_of, distinct_starts, so3_starts
 from slatprep.align.surface import Surface, surface_of
-from slatprep.geometry import VOXEL_SIZE, make_transform, occupancy_of
+from slatprep.geometry.frames import VOXEL_SIZE, make_transform
+from slatprep.geometry.voxels import occupancy_of
 from slatprep.parameters import AlignParameters
 from slatprep.records import (
     Alignment,

@@ -17,7 +17,8 @@ from numpy.typing import NDArray
 from slatprep.align.quality import compare, measure_quality
 from slatprep.align.starts import candidates_of, distinct_starts
 from slatprep.errors import SlatprepError
-from slatprep.geometry import VOXEL_SIZE, boundary, make_transform, voxel_centres, voxels_of
+from slatprep.geometry.frames import VOXEL_SIZE, make_transform, voxel_centres
+from slatprep.geometry.voxels import boundary, voxels_of
 from slatprep.parameters import AlignParameters
 from slatprep.records import RESOLUTION, Alignment, MaterialField, StructuredLatents
 

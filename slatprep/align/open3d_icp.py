@@ -18,10 +18,11 @@ from numpy.typing import NDArray
 
 from slatprep.align.quality import measure_quality
 from slatprep.align.starts import Start, candidates_of, distinct_starts
-from slatprep.geometry import VOXEL_SIZE, boundary, make_transform, voxel_centres, voxels_of
-from slatprep.parallel import single_threaded
+from slatprep.geometry.frames import VOXEL_SIZE, make_transform, voxel_centres
+from slatprep.geometry.voxels import boundary, voxels_of
 from slatprep.parameters import AlignParameters
 from slatprep.records import Alignment, MaterialField, StructuredLatents
+from slatprep.workers.local import single_threaded
 
 
 def align(

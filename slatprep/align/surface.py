@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from slatprep.geometry import bounding_box, filled
+from slatprep.geometry.voxels import bounding_box, filled
 from slatprep.records import RESOLUTION
 
 CENTRE = (RESOLUTION - 1) / 2
@@ -99,7 +99,7 @@ def surface_of(occupancy: NDArray[np.bool_]) -> Surface:
     The distance transform is exact and Euclidean, taken to the nearest voxel
     centre of the other kind, less half a voxel to the face between the two.
     """
-    from slatprep.align.distance import signed_distance
+    from slatprep.geometry.distance import signed_distance
 
     full = filled(occupancy)
     box = bounding_box(full)

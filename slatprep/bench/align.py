@@ -20,9 +20,9 @@ import numpy as np
 from slatprep.align import align
 from slatprep.align.starts import euler_starts
 from slatprep.align.surface import surface_of
+from slatprep.bench.truth import LevelScore, TruthScore, compare_with_truth, read_truth, summarise
 from slatprep.errors import ConfigError
-from slatprep.geometry import occupancy_of
-from slatprep.parallel import single_threaded
+from slatprep.geometry.voxels import occupancy_of
 from slatprep.parameters import (
     PRESETS,
     AlignParameters,
@@ -33,7 +33,7 @@ from slatprep.parameters import (
 from slatprep.readers import discover, read_field, read_latents
 from slatprep.records import Alignment, AssetPair, MaterialField, StructuredLatents
 from slatprep.sample import sample
-from slatprep.truth import LevelScore, TruthScore, compare_with_truth, read_truth, summarise
+from slatprep.workers.local import single_threaded
 
 ENGINES = ("field", "small_gicp", "open3d", "open3d-64")
 """The default engine, GICP from the same 24 rotations, the paper's protocol

@@ -21,9 +21,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slatprep.errors import StoreError
-from slatprep.parallel import single_threaded
 from slatprep.store import open_store
 from slatprep.store.reader import TRAINING_COLUMNS
+from slatprep.workers.local import single_threaded
 
 STORED_COLUMNS = ("coords", "feats", "properties", "material", "valid", "distance")
 """What every way holds of an asset; `TRAINING_COLUMNS` of it are read."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import signal
 
-from slatprep.parallel import THREAD_VARIABLES
+from slatprep.workers.local import THREAD_VARIABLES
 
 
 def main() -> None:

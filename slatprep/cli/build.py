@@ -13,8 +13,8 @@ from slatprep.cli.output import EXIT_INCOMPLETE, Output, output_options
 from slatprep.cli.overview import show_quality
 
 if TYPE_CHECKING:
-    from slatprep.build import BuildPlan, BuildSummary
-    from slatprep.parallel import Jobs
+    from slatprep.pipeline.dataset import BuildPlan, BuildSummary
+    from slatprep.workers.local import Jobs
 
 _MANIFESTS = click.option(
     "--manifests",
@@ -81,7 +81,7 @@ def build_store(
     again, and a build that was interrupted goes on where it stopped.
     """
     parameters = parameters_of(**sources)
-    from slatprep import build
+    from slatprep.pipeline import dataset as build
 
     if dry_run:
         with output.progress("compare") as progress:
@@ -126,7 +126,7 @@ def align(output: Output, out: Path, jobs: Jobs, strict: bool, **sources: Any) -
     of every candidate.
     """
     parameters = parameters_of(**sources)
-    from slatprep import build
+    from slatprep.pipeline import dataset as build
 
     with output.progress("align") as progress:
         summary = build.align_pairs(parameters, out, jobs=jobs, strict=strict, progress=progress)
@@ -167,7 +167,7 @@ def _report(output: Output, summary: BuildSummary) -> None:
 
     def show() -> None:
         if summary.store is not None:
-            from slatprep.overview import describe_store
+            from slatprep.inspect.overview import describe_store
             from slatprep.store import open_store
 
             show_quality(output, describe_store(open_store(summary.store)))

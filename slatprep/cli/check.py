@@ -13,7 +13,7 @@ from slatprep.cli.output import EXIT_INCOMPLETE, Cell, Output, output_options
 from slatprep.errors import ConfigError, StoreError
 
 if TYPE_CHECKING:
-    from slatprep.check import AlignmentCheck
+    from slatprep.inspect.check import AlignmentCheck
     from slatprep.store import Store
 
 _COLUMNS = ("fitness", "fitness_backward", "inlier_rmse", "valid_share", "ambiguity")
@@ -82,7 +82,7 @@ def check_alignment(
     if not (asset_ids or worst or ambiguous):
         raise click.UsageError("say which assets: --asset ID, --worst N or --ambiguous")
     path = chosen_store(store)
-    from slatprep import check
+    from slatprep.inspect import check
     from slatprep.store import open_store
 
     opened = open_store(path)
@@ -96,7 +96,7 @@ def check_alignment(
     pictures: list[Path] = []
     sheet = None
     if target is not None and checks:
-        from slatprep.pictures.write import write_pictures
+        from slatprep.inspect.pictures.write import write_pictures
 
         with output.progress("pictures") as progress:
             pictures, sheet = write_pictures(
@@ -194,8 +194,8 @@ def _documents(checks: list[AlignmentCheck], pictures: list[Path]) -> list[dict[
 
 def _show(output: Output, store: Store, asset_ids: list[str], file: Path | None) -> None:
     """Open the viewer, or say why not and where to look instead."""
-    from slatprep.pictures.scene import scene_of
-    from slatprep.pictures.viewer import has_screen, show_alignment
+    from slatprep.inspect.pictures.scene import scene_of
+    from slatprep.inspect.pictures.viewer import has_screen, show_alignment
 
     instead = f"look at {file}" if file else "draw a picture: leave out --picture none"
     if not has_screen():

@@ -7,7 +7,6 @@ from typing import Any
 
 import click
 
-from slatprep import __version__
 from slatprep.cli.output import EXIT_INCOMPLETE, EXIT_INTERRUPTED, EXIT_USAGE
 from slatprep.errors import ConfigError, SlatprepError
 
@@ -80,6 +79,6 @@ Example:
   slatprep build-store --pixieverse demo/pixieverse --slat demo/slat --out demo.zarr
 """,
 )
-@click.version_option(__version__, prog_name="slatprep")
+@click.version_option(package_name="slatprep", prog_name="slatprep")
 def slatprep() -> None:
     """Turn PixieVerse grids and TRELLIS latents into one store of aligned supervision."""

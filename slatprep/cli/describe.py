@@ -46,8 +46,8 @@ def describe(
     meaning, the classes, the ranges of the properties, and the table of
     assets. Catalogues of datasets and the mlcroissant package read it.
     """
-    from slatprep import croissant
-    from slatprep.provenance import staged
+    from slatprep.export import croissant
+    from slatprep.storage.atomic import staged
     from slatprep.store import open_store
 
     if not location:

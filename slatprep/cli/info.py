@@ -26,7 +26,7 @@ def info(output: Output, store: Path | None) -> None:
     Without STORE, the one that `make align` built last under data/ is taken.
     """
     path = chosen_store(store)
-    from slatprep.overview import describe_store
+    from slatprep.inspect.overview import describe_store
     from slatprep.store import open_store
 
     overview = describe_store(open_store(path))

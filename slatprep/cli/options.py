@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import click
 
 from slatprep.cli.output import Output
-from slatprep.remote import RemotePath, as_path
+from slatprep.storage.remote import RemotePath, as_path
 
 if TYPE_CHECKING:
     from slatprep.parameters import BuildParameters
@@ -137,7 +137,7 @@ def workers_options(command: _Command) -> _Command:
                 "--jobs is for this machine, and --scheduler uses all workers that the cluster "
                 "has; give one of them"
             )
-        from slatprep.cluster import Cluster
+        from slatprep.workers.dask import Cluster
 
         with Cluster(scheduler, output.note) as cluster:
             return command(output, jobs=cluster, **options)

@@ -19,7 +19,7 @@ from typing import Any, TypeVar
 
 import click
 
-from slatprep.remote import RemotePath, as_path
+from slatprep.storage.remote import RemotePath, as_path
 
 EXIT_INCOMPLETE = 1
 EXIT_USAGE = 2

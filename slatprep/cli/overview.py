@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 from slatprep.cli.output import Cell, Output
 
 if TYPE_CHECKING:
-    from slatprep.overview import GroupOverview, StoreOverview
+    from slatprep.inspect.overview import GroupOverview, StoreOverview
 
 
 def show_quality(output: Output, overview: StoreOverview) -> None:

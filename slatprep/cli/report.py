@@ -44,8 +44,8 @@ def report(
     that `make align` built last under data/ is taken.
     """
     path = chosen_store(store)
-    from slatprep.build import default_manifests
-    from slatprep.report import write_report
+    from slatprep.inspect.report import write_report
+    from slatprep.pipeline.dataset import default_manifests
     from slatprep.store import open_store
 
     opened = open_store(path)

@@ -30,7 +30,7 @@ def score(output: Output, store: Path, truth_dir: Path) -> None:
     truth's own transform would give. Exit code 1 says that an asset with a
     truth is not in the store.
     """
-    from slatprep.truth import score_against_truth
+    from slatprep.bench.truth import score_against_truth
 
     report = score_against_truth(store, truth_dir)
 

@@ -12,7 +12,7 @@ from slatprep.cli.output import Output, output_options
 from slatprep.errors import ConfigError
 
 if TYPE_CHECKING:
-    from slatprep.transfer import VoxelField
+    from slatprep.particles.transfer import VoxelField
 
 _FILE = click.Path(path_type=Path, exists=True, dir_okay=False)
 
@@ -71,7 +71,7 @@ def transfer(
     x, y and z, or an npy or npz of positions. What is written is a PLY with
     the fields of Pixie's material fields, in SI units, for PhysGaussian.
     """
-    from slatprep import transfer as work
+    from slatprep.particles import transfer as work
 
     field = _field(store, asset, prediction, ranges, points)
     read = work.read_particles(particles, axes)
@@ -98,9 +98,10 @@ def transfer(
 def _field(
     store: Path | None, asset: str | None, prediction: Path | None, ranges: str | None, points: Any
 ) -> VoxelField:
-    from slatprep.normalize import PIXIE_RANGES, read_ranges
+    from slatprep.normalize import PIXIE_RANGES
+    from slatprep.particles.transfer import predicted_field, stored_field
+    from slatprep.readers.ranges import read_ranges
     from slatprep.store import open_store
-    from slatprep.transfer import predicted_field, stored_field
 
     if (asset is None) == (prediction is None):
         raise ConfigError("expected either --asset, with --store, or --prediction")

@@ -12,7 +12,7 @@ from slatprep.cli.options import STORE, chosen_store, store_argument, workers_op
 from slatprep.cli.output import EXIT_INCOMPLETE, Output, output_options
 
 if TYPE_CHECKING:
-    from slatprep.parallel import Jobs
+    from slatprep.workers.local import Jobs
 
 
 @click.command(
@@ -57,7 +57,7 @@ def verify(
     if (pixieverse is None) != (slat is None):
         raise click.UsageError("--pixieverse and --slat go together: name both, or neither")
     path = chosen_store(store)
-    from slatprep.verify import SourceRoots, verify_store
+    from slatprep.inspect.verify import SourceRoots, verify_store
 
     roots = SourceRoots(pixieverse, slat) if pixieverse and slat else None
     with output.progress("verify") as progress:

@@ -20,7 +20,7 @@ from slatprep.demo.difficulty import (
 from slatprep.demo.latents import LatentKind, make_latents
 from slatprep.demo.shapes import Solid
 from slatprep.demo.voxelise import voxelise
-from slatprep.geometry import voxel_centres
+from slatprep.geometry.frames import voxel_centres
 from slatprep.records import BACKGROUND, RESOLUTION
 
 # Each random choice has a stream of its own, so that one option of the demo

@@ -21,7 +21,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slatprep.demo.shapes import Solid, bounding_box
-from slatprep.geometry import VOXEL_SIZE, boundary, make_transform, voxel_centres
+from slatprep.geometry.frames import VOXEL_SIZE, make_transform, voxel_centres
+from slatprep.geometry.voxels import boundary
 from slatprep.records import RESOLUTION
 
 Rng = np.random.Generator

@@ -11,7 +11,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from slatprep.geometry import voxel_centres
+from slatprep.geometry.frames import voxel_centres
 
 LatentKind = Literal["placeholder", "material"]
 

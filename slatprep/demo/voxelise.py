@@ -13,7 +13,7 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from slatprep.geometry import VOXEL_SIZE, voxel_centres
+from slatprep.geometry.frames import VOXEL_SIZE, voxel_centres
 from slatprep.records import RESOLUTION
 
 Distance = Callable[[NDArray[np.float64]], NDArray[np.float64]]

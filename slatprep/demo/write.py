@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slatprep.demo.asset import DemoAsset, DemoView
-from slatprep.geometry import VOXEL_SIZE
+from slatprep.geometry.frames import VOXEL_SIZE
 from slatprep.records import BACKGROUND, RESOLUTION
 
 GridForm = Literal["raw", "prediction", "prediction-ids"]

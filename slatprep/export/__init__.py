@@ -26,8 +26,8 @@ from slatprep.export.assets import (
 )
 from slatprep.export.bounds import Bounds, read_bounds
 from slatprep.export.ply import Frame, Points
-from slatprep.parallel import run_unordered
 from slatprep.store import Store, open_store
+from slatprep.workers.local import run_unordered
 
 __all__ = ["FORMATS", "ExportOptions", "ExportSummary", "export_store"]
 

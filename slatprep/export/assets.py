@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slatprep.errors import ConfigError, StoreError
-from slatprep.geometry import voxels_of
+from slatprep.geometry.voxels import voxels_of
 from slatprep.normalize import denormalize
 from slatprep.records import BACKGROUND, Verdict
 from slatprep.store import Store

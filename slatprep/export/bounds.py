@@ -40,7 +40,7 @@ def read_bounds(store: Store, ids: Sequence[str]) -> tuple[dict[str, Bounds], tu
     StoreError
         If a record's bounds make no sense.
     """
-    from slatprep.store.asset_records import StoredRecords
+    from slatprep.store.records import StoredRecords
 
     records = StoredRecords(store)
     bounds, missing = {}, 0

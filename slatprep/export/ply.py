@@ -15,8 +15,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from slatprep.export.assets import ExportedAsset
 from slatprep.export.bounds import LAST, UNIT_CUBE, Bounds
-from slatprep.geometry import apply_transform, invert_transform, voxel_centres
-from slatprep.pictures.palette import MATERIAL_COLOURS
+from slatprep.geometry.frames import apply_transform, invert_transform, voxel_centres
+from slatprep.inspect.pictures.palette import MATERIAL_COLOURS
 from slatprep.records import RESOLUTION
 
 Points = Literal["slat", "grid"]

@@ -10,9 +10,9 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from slatprep import provenance
 from slatprep.errors import ConfigError, SlatprepError
-from slatprep.store.replace import replace_directory
+from slatprep.provenance.jsonable import jsonable
+from slatprep.storage.atomic import replace_directory, staged
 
 FORMAT = "slatprep-export"
 FORMAT_VERSION = 1
@@ -68,16 +68,15 @@ def file(out: Path, is_export: Callable[[Path], bool]) -> Iterator[Path]:
             f"{out} exists and is not an export of slatprep; expected an export to replace, "
             "or a new path"
         )
-    with _writable(out), provenance.staged(out) as path:
+    with _writable(out), staged(out) as path:
         yield path
 
 
 def write_index(path: Path, about: dict[str, Any], entries: Sequence[dict[str, Any]]) -> None:
     """Write what an exported directory holds, one asset a line."""
-    head = json.dumps(provenance.jsonable(about), indent=1, ensure_ascii=False)
+    head = json.dumps(jsonable(about), indent=1, ensure_ascii=False)
     rows = ",\n  ".join(
-        json.dumps(provenance.jsonable(entry), allow_nan=False, ensure_ascii=False)
-        for entry in entries
+        json.dumps(jsonable(entry), allow_nan=False, ensure_ascii=False) for entry in entries
     )
     text = f'{head[:-2]},\n "assets": [\n  {rows}\n ]\n}}\n'
     (path / INDEX).write_text(text, encoding="utf-8")

@@ -12,7 +12,7 @@ from typing import Self
 import numpy as np
 
 from slatprep.export.assets import ExportedAsset, describe_columns, file_name
-from slatprep.provenance import jsonable
+from slatprep.provenance.jsonable import jsonable
 
 
 class ShardWriter:

@@ -117,7 +117,7 @@ class Run:
         from matplotlib.figure import Figure
         from matplotlib.ticker import MaxNLocator
 
-        from slatprep.pictures.palette import INK, MUTED
+        from slatprep.inspect.pictures.palette import INK, MUTED
 
         figure = Figure(figsize=(6.6, 3.6), layout="constrained")
         FigureCanvasAgg(figure)

@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 
 from slatprep.errors import InputError, MissingPartnerError
 from slatprep.records import RESOLUTION, AssetPair, SourceFile
-from slatprep.remote import RemoteFile, RemotePath
+from slatprep.storage.remote import RemoteFile, RemotePath
 
 MAX_FILE_BYTES = 128 * 2**20
 """No file of one asset is larger; the largest form, an 11-channel float64 grid, takes 22 MiB."""

@@ -19,11 +19,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from slatprep.cache import on_disk
 from slatprep.errors import InputError
 from slatprep.readers.files import ArraySpec, load_source, resolve_inside
 from slatprep.readers.patterns import component_regex
 from slatprep.records import SourceFile
+from slatprep.storage.cache import on_disk
 
 if TYPE_CHECKING:
     import h5py

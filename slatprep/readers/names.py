@@ -12,7 +12,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from slatprep.errors import ConfigError
-from slatprep.remote import RemotePath, list_objects
+from slatprep.storage.remote import RemotePath, list_objects
 
 
 class LocalNames:

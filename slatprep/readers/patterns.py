@@ -13,7 +13,7 @@ from pathlib import Path
 
 from slatprep.errors import ConfigError
 from slatprep.readers.names import LocalNames, RemoteNames
-from slatprep.remote import RemotePath
+from slatprep.storage.remote import RemotePath
 
 FIELDS = ("id", "sample", "view")
 

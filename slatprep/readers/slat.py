@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slatprep.errors import InputError
-from slatprep.geometry import flat_index
+from slatprep.geometry.voxels import flat_index
 from slatprep.readers.files import ArraySpec, load_source, npz_arrays, require_complete
 from slatprep.readers.hdf5 import SUFFIXES, load_datasets
 from slatprep.records import RESOLUTION, AssetPair, StructuredLatents

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from slatprep.geometry import voxel_centres
+from slatprep.geometry.frames import voxel_centres
 from slatprep.records import PROPERTY_COLUMNS, RESOLUTION
 
 _AXES = ("x", "y", "z")

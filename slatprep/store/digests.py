@@ -11,14 +11,13 @@ from __future__ import annotations
 
 import hashlib
 import json
-import os
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from slatprep.remote import RemotePath, list_objects
+from slatprep.storage.files import file_digest, list_files
 
 GROUP = "file"
 
@@ -60,28 +59,6 @@ def write_digests(path: Path) -> None:
             attributes={"description": description},
         )
         array[:] = values
-
-
-def list_files(path: Path) -> Iterator[str]:
-    """Yield the name of every file below a folder, with forward slashes, sorted by folder.
-
-    Links are listed, and not followed.
-    """
-    if isinstance(path, RemotePath):
-        yield from list_objects(path)
-        return
-    for folder, folders, files in os.walk(path):
-        folders.sort()
-        relative = Path(folder).relative_to(path)
-        links = [name for name in folders if (Path(folder) / name).is_symlink()]
-        for name in sorted([*files, *links]):
-            yield (relative / name).as_posix()
-
-
-def file_digest(path: Path) -> str:
-    """Return the SHA-256 of a file, in hex."""
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def attributes_digest(attributes: Mapping[str, Any]) -> str:

@@ -14,17 +14,17 @@ from numpy.typing import NDArray
 
 from slatprep.errors import StoreError
 from slatprep.records import Normalization, PropertyRange
-from slatprep.remote import RemotePath, as_path
+from slatprep.storage.copies import local_copy
+from slatprep.storage.remote import RemotePath, as_path
+from slatprep.storage.versions import current_version, is_version
 from slatprep.store.contract import (
     MAX_VOXELS,
     dimension_sizes,
     read_metadata,
     size_findings,
 )
-from slatprep.store.copies import local_copy
 from slatprep.store.layout import ARRAYS, FORMAT, FORMAT_VERSION
-from slatprep.store.rows import Folder, RemoteFolder, RowReader
-from slatprep.store.versions import current_version, is_version
+from slatprep.store.shard_reader import Folder, RemoteFolder, RowReader
 
 if TYPE_CHECKING:
     import zarr

@@ -1,7 +1,7 @@
 """Write a shard chunk by chunk, so that a shard may be far larger than memory.
 
 The file is the one that zarr-python writes, byte for byte, given all rows at
-once: chunks one after the other, then their index (see `slatprep.store.rows`).
+once: chunks one after the other, then their index (see `slatprep.store.shard_reader`).
 """
 
 from __future__ import annotations
@@ -15,9 +15,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from slatprep.store.chunks import single_threaded_blosc
+from slatprep.store.codecs import single_threaded_blosc
 from slatprep.store.contract import read_metadata
-from slatprep.store.rows import MISSING, Folder, RowReader
+from slatprep.store.shard_reader import MISSING, Folder, RowReader
 
 _SHUFFLES = {"noshuffle": 0, "shuffle": 1, "bitshuffle": 2}
 

@@ -9,34 +9,22 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
-from slatprep.geometry import flat_index
-from slatprep.normalize import normalize, normalize_change
 from slatprep.parameters import StoreParameters
 from slatprep.records import Normalization
-from slatprep.store.asset_records import create_record_array
 from slatprep.store.coordinates import write_coordinates
 from slatprep.store.digests import write_digests
 from slatprep.store.layout import (
-    ARRAYS,
     create_arrays,
     overlaps,
     root_attributes,
     row_ranges,
     rows_per_shard,
 )
-from slatprep.store.shard_writer import ShardWriter
-from slatprep.store.spool import Spool, SpooledAsset
-
-Rows = tuple[int, dict[str, NDArray[Any]], NDArray[np.int64]]
-"""An asset by its place in the shard, its rows of the group's arrays, and the values clipped."""
+from slatprep.store.records import create_record_array
 
 
 @dataclass(frozen=True)
@@ -84,82 +72,6 @@ def shards(
         yield Shard("voxel", (start, stop), first, keys[first:last], offsets[first : last + 1])
     for start, stop in row_ranges(len(keys), parameters.grid_assets_per_shard):
         yield Shard("grid", (start, stop), start, keys[start:stop])
-
-
-def write_shard(
-    path: Path, spool: Spool, shard: Shard, normalization: Normalization
-) -> tuple[Shard, NDArray[np.int64]]:
-    """Normalise and write one shard of every array of its group.
-
-    Parameters
-    ----------
-    path : Path
-        The store, made by `create_store`.
-    spool : Spool
-        Where the assets lie.
-    shard : Shard
-        What to write; no other task may have it.
-    normalization : Normalization
-        Ranges of the properties.
-
-    Returns
-    -------
-    shard : Shard
-        The same.
-    clipped : ndarray of int64, shape (len(shard.keys), 3)
-        How many of the values written lay outside the range, by property.
-    """
-    clipped = np.zeros((len(shard.keys), 3), dtype=np.int64)
-    with ExitStack() as stack:
-        writers = {
-            layout.name.partition("/")[2]: stack.enter_context(
-                ShardWriter(path, layout.name, shard.rows[0])
-            )
-            for layout in ARRAYS
-            if layout.name.startswith(f"{shard.group}/")
-        }
-        read = _grid_rows if shard.group == "grid" else _voxel_rows
-        for asset, arrays, counts in read(spool, shard, normalization):
-            clipped[asset] = counts
-            for name, rows in arrays.items():
-                writers[name].append(rows)
-    return shard, clipped
-
-
-def _voxel_rows(spool: Spool, shard: Shard, normalization: Normalization) -> Iterator[Rows]:
-    for asset, own in overlaps(shard.offsets, *shard.rows):
-        arrays = {name: array[own] for name, array in spool.voxels(shard.keys[asset]).items()}
-        arrays["properties"], clipped = normalize(arrays["properties"], normalization)
-        yield asset, arrays, clipped
-
-
-def _grid_rows(spool: Spool, shard: Shard, normalization: Normalization) -> Iterator[Rows]:
-    for asset, key in enumerate(shard.keys):
-        material, voxels, values = spool.grid(key)
-        properties = np.full((3, material.size), np.nan, dtype=np.float32)
-        normalized, clipped = normalize(values, normalization)
-        cells = flat_index(voxels)
-        for plane, column in zip(properties, normalized.T, strict=True):
-            plane[cells] = column
-        properties = properties.reshape(1, 3, *material.shape)
-        yield asset, {"material": material[None], "properties": properties}, clipped
-
-
-def write_assets(
-    path: Path, assets: Sequence[SpooledAsset], offsets: Sequence[int], normalization: Normalization
-) -> None:
-    """Write every ``asset/*`` array."""
-    rows = [asset.columns or {} for asset in assets]
-    columns: dict[str, Any] = {name: [row[name] for row in rows] for name in rows[0]}
-    columns["id"] = [asset.asset_id for asset in assets]
-    columns["offset"] = offsets
-    columns["property_ambiguity"] = normalize_change(columns["property_ambiguity"], normalization)
-    group = _open(path)["asset"]
-    for layout in ARRAYS:
-        where, _, name = layout.name.partition("/")
-        if where == "asset":
-            dtype = object if layout.dtype == "str" else layout.dtype
-            group[name][:] = np.array(columns[name], dtype=dtype)
 
 
 def finish_store(

@@ -7,13 +7,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from support.shapes import GRID, chair, field_of, surface_latents, turned
 
 from slatprep.align import align
 from slatprep.align.consensus import degrees_between, find_consensus, settle
 from slatprep.align.starts import distinct_starts
-from slatprep.geometry import displacement, make_transform, split_transform
+from slatprep.geometry.frames import displacement, make_transform, split_transform
 from slatprep.parameters import AlignParameters
-from tests.align.conftest import GRID, chair, field_of, surface_latents, turned
 
 COMMON = distinct_starts()[14].rotation
 

@@ -12,16 +12,15 @@ import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from support.shapes import GRID, Case, chair, field_of, latents_of, surface_latents, turned
 
 from slatprep.align import align, engine_versions
-from slatprep.align.ambiguity import measure_ambiguity
-from slatprep.align.quality import judge
 from slatprep.align.starts import distinct_starts
-from slatprep.geometry import displacement, make_transform, split_transform
+from slatprep.geometry.frames import displacement, make_transform, split_transform
+from slatprep.judge import judge, measure_ambiguity
 from slatprep.parameters import AlignParameters, SampleParameters
 from slatprep.records import Verdict
 from slatprep.sample import sample
-from tests.align.conftest import GRID, Case, chair, field_of, latents_of, surface_latents, turned
 
 DEFAULT = AlignParameters()
 
@@ -52,7 +51,7 @@ ACCURACY = {
 
 @pytest.mark.parametrize("level", ACCURACY)
 def test_accuracy_on_demo_data(level: int, demo_cases: Callable[[int], list[Case]]) -> None:
-    from slatprep.truth import compare_with_truth
+    from slatprep.bench.truth import compare_with_truth
 
     scores = []
     for field, latents, truth in demo_cases(level):
@@ -203,8 +202,7 @@ def test_the_order_of_voxels_does_not_matter_and_repetition_gives_the_same_bits(
 
 def test_threads_do_not_change_a_bit() -> None:
     code = (
-        "import sys; sys.path.insert(0, '.')\n"
-        "from tests.align.conftest import *\n"
+        "from support.shapes import *\n"
         "from slatprep.align import align\n"
         "from slatprep.parameters import AlignParameters\n"
         "solid = chair(); tilted = np.roll(solid, 2, axis=1)\n"
@@ -216,6 +214,7 @@ def test_threads_do_not_change_a_bit() -> None:
             [sys.executable, "-c", code],
             env={
                 **os.environ,
+                "PYTHONPATH": os.pathsep.join(sys.path),
                 **dict.fromkeys(
                     ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS"), threads
                 ),

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from support.shapes import chair, field_of, surface_latents
 
-from slatprep.align.quality import THRESHOLDS, compare, judge, measure_quality
-from slatprep.geometry import make_transform
+from slatprep.align.quality import compare, measure_quality
+from slatprep.geometry.frames import make_transform
+from slatprep.judge import THRESHOLDS, judge
 from slatprep.records import Ambiguity, Placement, Quality, Verdict
-from tests.align.conftest import chair, field_of, surface_latents
 
 LINE = np.array([[i, 30, 30] for i in range(10)], dtype=np.uint8)
 

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from support.shapes import chair, field_of, surface_latents, turned
 
 from slatprep.align import align
 from slatprep.align.starts import distinct_starts
-from slatprep.geometry import displacement, make_transform, split_transform
+from slatprep.geometry.frames import displacement, make_transform, split_transform
 from slatprep.parameters import PRESETS, AlignParameters
-from tests.align.conftest import chair, field_of, surface_latents, turned
 
 ENGINES = {"open3d": PRESETS["paper"].align, "small_gicp": AlignParameters(engine="small_gicp")}
 

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 from scipy.ndimage import binary_fill_holes
+from support.shapes import GRID, chair
 
 from slatprep.align.surface import CENTRE, DILATION, surface_of
-from slatprep.geometry import boundary, filled
-from tests.align.conftest import GRID, chair
+from slatprep.geometry.voxels import boundary, filled
 
 
 def test_a_shell_and_its_solid_have_the_same_surface() -> None:

@@ -8,9 +8,9 @@ import pytest
 from click.testing import CliRunner
 
 from slatprep.bench import read
-from slatprep.build import BuildSummary
 from slatprep.cli.commands import slatprep
 from slatprep.errors import StoreError
+from slatprep.pipeline.dataset import BuildSummary
 from slatprep.store import open_store
 
 

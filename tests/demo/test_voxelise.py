@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from slatprep.demo.voxelise import voxelise
-from slatprep.geometry import voxel_centres
+from slatprep.geometry.frames import voxel_centres
 
 ALL = np.argwhere(np.ones((64, 64, 64), dtype=bool))
 CENTRES = voxel_centres(ALL)

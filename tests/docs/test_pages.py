@@ -16,8 +16,8 @@ from pathlib import Path
 import pytest
 from click.testing import CliRunner
 
-from slatprep.build import BuildSummary
 from slatprep.cli.commands import slatprep
+from slatprep.pipeline.dataset import BuildSummary
 
 ROOT = Path(__file__).parents[2]
 DOCS = ROOT / "docs"

@@ -13,14 +13,14 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from synthetic import JELLY, METAL, QUARTER_TURN, Dataset
+from support.synthetic import JELLY, METAL, QUARTER_TURN, Dataset
 
-from slatprep.build import BuildSummary, build_store
 from slatprep.errors import ConfigError, SlatprepError, StoreError
 from slatprep.export import FORMATS, ExportOptions, export_store
 from slatprep.export.assets import file_name
 from slatprep.export.ply import VERTEX
 from slatprep.parameters import PixieverseSource, SlatSource
+from slatprep.pipeline.dataset import BuildSummary, build_store
 from slatprep.readers import discover, read_latents
 
 # What an asset's points may be: material id to E, density, nu.

@@ -5,9 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-from synthetic import Dataset
+from support.synthetic import Dataset
 
-from slatprep.build import build_store
+from slatprep.pipeline.dataset import build_store
 
 
 @pytest.fixture(scope="session")

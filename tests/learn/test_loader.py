@@ -13,7 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from slatprep import ConfigError, open_store
-from slatprep.geometry import voxel_centres
+from slatprep.geometry.frames import voxel_centres
 from slatprep.learn.augment import lattice_symmetries, move
 from slatprep.learn.splits import select_assets
 from slatprep.torch import (

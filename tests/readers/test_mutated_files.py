@@ -12,12 +12,11 @@ import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from support.raw_sources import COORDS, FEATS, raw_grid
 
 from slatprep.errors import InputError
 from slatprep.readers import read_field, read_latents
 from slatprep.records import AssetPair
-
-from .conftest import COORDS, FEATS, raw_grid
 
 SETTINGS = settings(
     max_examples=150,

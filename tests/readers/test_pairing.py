@@ -8,6 +8,7 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
+from support.raw_sources import COORDS, FEATS, raw_grid
 
 from slatprep.errors import ConfigError, InputError, MissingPartnerError
 from slatprep.parameters import (
@@ -17,8 +18,6 @@ from slatprep.parameters import (
     SlatSource,
 )
 from slatprep.readers import discover, read_field, read_latents
-
-from .conftest import COORDS, FEATS, raw_grid
 
 UID = "0123456789abcdef0123456789abcdef"
 SHA = "ab" * 32

@@ -7,11 +7,10 @@ import json
 
 import numpy as np
 import pytest
+from support.raw_sources import raw_grid
 
 from slatprep.errors import InputError
 from slatprep.readers import read_field
-
-from .conftest import raw_grid
 
 VOXELS = [[1, 2, 3], [1, 2, 4], [60, 0, 63]]
 MATERIAL = [0, 1, 6]

@@ -8,11 +8,10 @@ from dataclasses import replace
 import h5py
 import numpy as np
 import pytest
+from support.raw_sources import COORDS, FEATS
 
 from slatprep.errors import InputError
 from slatprep.readers import read_latents
-
-from .conftest import COORDS, FEATS
 
 BATCHED = np.concatenate([np.zeros((3, 1), np.int32), COORDS.astype(np.int32)], axis=1)
 

@@ -13,12 +13,11 @@ from dataclasses import replace
 import h5py
 import numpy as np
 import pytest
+from support.raw_sources import COORDS, FEATS, raw_grid
 
 from slatprep.errors import InputError
 from slatprep.readers import read_field, read_latents
 from slatprep.readers.files import ArraySpec, load_source, npy_array, npz_arrays, resolve_inside
-
-from .conftest import COORDS, FEATS, raw_grid
 
 ROWS = {"feats": ArraySpec(shapes=((None, 8),), kinds="f")}
 

@@ -9,9 +9,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 import zarr
-from synthetic import JELLY, METAL, QUARTER_TURN, SMALL_SHARDS, Dataset
+from support.synthetic import JELLY, METAL, QUARTER_TURN, SMALL_SHARDS, Dataset
 
-from slatprep.build import BuildSummary
+from slatprep.pipeline.dataset import BuildSummary
 
 IDS = ["ant", "bear.front", "bear.side", "cup", "dog"]
 

@@ -3,10 +3,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from synthetic import Dataset
+from support.synthetic import Dataset
 
-from slatprep.build import BuildSummary
 from slatprep.errors import StoreError
+from slatprep.pipeline.dataset import BuildSummary
 from slatprep.store import open_store
 
 

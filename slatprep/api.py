@@ -1,0 +1,183 @@
+"""The stages on plain arrays, with defaults: what a notebook calls."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from slatprep.align import align
+from slatprep.geometry.voxels import occupancy_of, voxels_of
+from slatprep.normalize import PIXIE_RANGES, denormalize, normalize
+from slatprep.parameters import AlignParameters, SampleParameters
+from slatprep.records import (
+    RESOLUTION,
+    Alignment,
+    Annotation,
+    MaterialField,
+    Normalization,
+    StructuredLatents,
+)
+from slatprep.sample import sample
+
+
+def align_voxels(
+    pixieverse: ArrayLike, slat: ArrayLike, parameters: AlignParameters | None = None
+) -> Alignment:
+    """Find the transform that lays one voxel set on another.
+
+    Parameters
+    ----------
+    pixieverse : array_like
+        The PixieVerse side: an occupancy, (64, 64, 64) bool with axes x, y, z,
+        or the occupied voxels, (K, 3) in 0..63. Solid or shell.
+    slat : array_like
+        The SLAT side, in either form; a leading batch column of zeros, (N, 4),
+        is dropped.
+    parameters : AlignParameters, optional
+        Engine, model and scale bounds; the defaults of a build otherwise.
+
+    Returns
+    -------
+    Alignment
+        ``transform`` (4, 4) takes points of the PixieVerse frame to points of
+        the SLAT frame, both the unit cube [-0.5, 0.5]^3; with ``quality``
+        and the score of every candidate.
+
+    Raises
+    ------
+    ValueError
+        If a voxel set is empty, has another shape, or leaves the grid.
+
+    Notes
+    -----
+    The problem is the one of SLAT-Phys, "Physics-to-SLAT Annotation
+    Alignment"; the default engine is described in docs/method.md.
+
+    Examples
+    --------
+    An L, and the same L after a quarter turn about z:
+
+    >>> import numpy as np
+    >>> shape = np.zeros((64, 64, 64), dtype=bool)
+    >>> shape[20:44, 22:36, 26:34] = shape[20:26, 22:36, 34:50] = True
+    >>> turned = np.rot90(shape, axes=(0, 1))
+    >>> alignment = align_voxels(shape, turned)
+    >>> (alignment.transform[:3, :3].round(2) + 0.0).tolist()
+    [[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]
+    >>> round(alignment.quality.fitness, 2)
+    1.0
+    """
+    source, target = _voxels(pixieverse, "pixieverse"), _voxels(slat, "slat")
+    field = MaterialField(
+        occupancy=occupancy_of(source),
+        voxels=source,
+        material=np.zeros(len(source), dtype=np.uint8),
+        properties=np.ones((len(source), 3), dtype=np.float32),
+    )
+    latents = StructuredLatents(target, np.zeros((len(target), 8), dtype=np.float32))
+    return align(field, latents, parameters or AlignParameters())
+
+
+def annotate_voxels(
+    field: MaterialField,
+    coords: ArrayLike,
+    transform: ArrayLike,
+    parameters: SampleParameters | None = None,
+) -> Annotation:
+    """Look the material and its properties up at SLAT voxels.
+
+    Parameters
+    ----------
+    field : MaterialField
+        The PixieVerse field, as `read_field` gives it.
+    coords : array_like, shape (N, 3)
+        SLAT voxels in 0..63.
+    transform : array_like, shape (4, 4)
+        PixieVerse frame to SLAT frame.
+    parameters : SampleParameters, optional
+        How far an annotation may be; the defaults of a build otherwise.
+
+    Returns
+    -------
+    Annotation
+        Properties in SI units (N, 3), material (N,), valid (N,) and distance
+        (N,) in voxels.
+
+    Raises
+    ------
+    ValueError
+        If `coords` are no voxels, or `transform` no similarity.
+    """
+    return sample(field, _voxels(coords, "coords"), transform, parameters or SampleParameters())
+
+
+def normalize_properties(
+    properties: ArrayLike, normalization: Normalization = PIXIE_RANGES
+) -> NDArray[np.float32]:
+    """Bring Young's modulus, density and Poisson's ratio to [-1, 1].
+
+    Parameters
+    ----------
+    properties : array_like, shape (N, 3)
+        Young's modulus [Pa], density [kg/m^3], Poisson's ratio; NaN passes.
+    normalization : Normalization
+        The ranges; Pixie's published ones by default, a store's own are
+        ``store.normalization``.
+
+    Returns
+    -------
+    ndarray of float32, shape (N, 3)
+        Clipped to [-1, 1].
+
+    Examples
+    --------
+    >>> values = normalize_properties([[1e7, 1000.0, 0.3]])
+    >>> values.round(3).tolist() == np.float32([[0.013, 0.196, -0.249]]).tolist()
+    True
+    >>> denormalize_properties(values).round(3).tolist()
+    [[10000000.0, 1000.0, 0.30000001192092896]]
+    """
+    return normalize(properties, normalization)[0]
+
+
+def denormalize_properties(
+    values: ArrayLike, normalization: Normalization = PIXIE_RANGES
+) -> NDArray[np.float32]:
+    """Bring normalised properties back to SI units, the inverse of `normalize_properties`.
+
+    Parameters
+    ----------
+    values : array_like, shape (N, 3)
+        Normalised Young's modulus, density and Poisson's ratio.
+    normalization : Normalization
+        The ranges they were normalised with.
+
+    Returns
+    -------
+    ndarray of float32, shape (N, 3)
+        Young's modulus [Pa], density [kg/m^3], Poisson's ratio. What had been
+        clipped comes back as the end of its range.
+    """
+    return denormalize(values, normalization)
+
+
+def _voxels(voxels: ArrayLike, name: str) -> NDArray[np.uint8]:
+    """Return voxels (N, 3) uint8 of an occupancy or of a list of voxels."""
+    array: NDArray[Any] = np.asarray(voxels)
+    if array.shape == (RESOLUTION,) * 3:
+        array = voxels_of(array.astype(bool))
+    if array.ndim == 2 and array.shape[1] == 4 and not array[:, 0].any():
+        array = array[:, 1:]
+    if array.ndim != 2 or array.shape[1] != 3 or len(array) == 0:
+        raise ValueError(
+            f"{name} has shape {array.shape}; expected an occupancy of (64, 64, 64) with a voxel "
+            "in it, or voxels (N, 3)"
+        )
+    if not ((array >= 0) & (array < RESOLUTION) & (array == np.floor(array))).all():
+        raise ValueError(
+            f"{name} has values from {array.min()} to {array.max()}; "
+            "expected whole numbers in 0..63"
+        )
+    return array.astype(np.uint8)

@@ -1,0 +1,278 @@
+"""Describe a store in Croissant, MLCommons' vocabulary for datasets.
+
+The description is JSON-LD after the Croissant 1.0 specification
+(http://mlcommons.org/croissant/1.0). Croissant has no extraction from Zarr
+yet, so the arrays are described (files, shapes, types, meaning) and the table
+of assets and the classes are in the description itself, as records.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Mapping
+from typing import Any
+
+from slatprep.errors import StoreError
+from slatprep.provenance.jsonable import jsonable
+from slatprep.store import Store
+
+CONFORMS_TO = "http://mlcommons.org/croissant/1.0"
+
+# The context that the specification prescribes, word for word.
+_CONTEXT: dict[str, Any] = {
+    "@language": "en",
+    "@vocab": "https://schema.org/",
+    "citeAs": "cr:citeAs",
+    "column": "cr:column",
+    "conformsTo": "dct:conformsTo",
+    "cr": "http://mlcommons.org/croissant/",
+    "rai": "http://mlcommons.org/croissant/RAI/",
+    "data": {"@id": "cr:data", "@type": "@json"},
+    "dataType": {"@id": "cr:dataType", "@type": "@vocab"},
+    "dct": "http://purl.org/dc/terms/",
+    "equivalentProperty": "cr:equivalentProperty",
+    "examples": {"@id": "cr:examples", "@type": "@json"},
+    "extract": "cr:extract",
+    "field": "cr:field",
+    "fileProperty": "cr:fileProperty",
+    "fileObject": "cr:fileObject",
+    "fileSet": "cr:fileSet",
+    "format": "cr:format",
+    "includes": "cr:includes",
+    "isLiveDataset": "cr:isLiveDataset",
+    "jsonPath": "cr:jsonPath",
+    "key": "cr:key",
+    "md5": "cr:md5",
+    "parentField": "cr:parentField",
+    "path": "cr:path",
+    "recordSet": "cr:recordSet",
+    "references": "cr:references",
+    "regex": "cr:regex",
+    "repeated": "cr:repeated",
+    "replace": "cr:replace",
+    "samplingRate": "cr:samplingRate",
+    "sc": "https://schema.org/",
+    "separator": "cr:separator",
+    "source": "cr:source",
+    "subField": "cr:subField",
+    "transform": "cr:transform",
+}
+
+ZARR = "https://zarr-specs.readthedocs.io/en/latest/v3/core/index.html"
+"""What Zarr's files are; no media type is registered for them."""
+
+DESCRIPTION = (
+    "PixieVerse material fields aligned with TRELLIS structured latents: for every latent voxel "
+    "its Young's modulus, density, Poisson's ratio and material class, normalised, with the "
+    "transform between the two frames and how far it can be trusted."
+)
+
+
+def describe(
+    store: Store,
+    *,
+    location: str = "",
+    name: str = "",
+    description: str = DESCRIPTION,
+    license: str = "",
+    url: str = "",
+    cite_as: str = "",
+    version: str = "1.0.0",
+    date_published: str = "",
+) -> dict[str, Any]:
+    """Describe a store as a Croissant dataset.
+
+    Parameters
+    ----------
+    store : Store
+        The store.
+    location : str
+        Path or URL of the store as the description's readers see it, the
+        store's own name by default.
+    name, description, license, url, cite_as, version, date_published : str
+        What the store cannot know about itself. What is empty is left out,
+        and Croissant's validator says that it is recommended.
+
+    Returns
+    -------
+    dict
+        JSON-LD, JSON-ready. The same store gives the same description.
+
+    Raises
+    ------
+    StoreError
+        If the store's metadata cannot be read.
+    """
+    location = location or store.name
+    stated = {
+        "description": description,
+        "license": license,
+        "url": url,
+        "citeAs": cite_as,
+        "version": version,
+        "datePublished": date_published,
+    }
+    return {
+        "@context": _CONTEXT,
+        "@type": "sc:Dataset",
+        "conformsTo": CONFORMS_TO,
+        "name": name or store.name.removesuffix(".zarr"),
+        **{key: value for key, value in stated.items() if value},
+        "keywords": ["3D", "physics", "material properties", "structured latents", "Zarr"],
+        "distribution": _distribution(store, location),
+        "recordSet": [_classes(store), _properties(store), _assets(store)],
+    }
+
+
+def _distribution(store: Store, location: str) -> list[dict[str, Any]]:
+    """Describe the root's metadata as a file, and each array as a set of files."""
+    path = store.path / "zarr.json"
+    try:
+        content = path.read_bytes()
+    except OSError as error:
+        raise StoreError(f"{path}: cannot be read ({error.strerror})") from error
+    root = {
+        "@type": "cr:FileObject",
+        "@id": "store",
+        "name": "store",
+        "description": f"Root of the Zarr store, format {store.attributes['format']} "
+        f"{store.attributes['format_version']}: attributes and the metadata of all arrays.",
+        "contentUrl": f"{location}/zarr.json",
+        "contentSize": f"{len(content)} B",
+        "encodingFormat": "application/json",
+        "sha256": hashlib.sha256(content).hexdigest(),
+    }
+    return [root, *(_file_set(name, array, location) for name, array in _arrays(store))]
+
+
+def _arrays(store: Store) -> list[tuple[str, Any]]:
+    import zarr
+
+    members = store.group.members(max_depth=None)
+    return sorted((name, node) for name, node in members if isinstance(node, zarr.Array))
+
+
+def _file_set(name: str, array: Any, location: str) -> dict[str, Any]:
+    attributes: Mapping[str, Any] = array.attrs
+    dimensions = ", ".join(
+        f"{dimension} {size}"
+        for dimension, size in zip(array.metadata.dimension_names, array.shape, strict=True)
+    )
+    units = f" [{attributes['units']}]" if "units" in attributes else ""
+    return {
+        "@type": "cr:FileSet",
+        "@id": name,
+        "name": name,
+        "description": f"{attributes.get('description', '')}{units}. "
+        f"Zarr array of {_type_name(array)}: {dimensions}.",
+        "encodingFormat": ZARR,
+        "includes": f"{location}/{name}/**",
+    }
+
+
+def _type_name(array: Any) -> str:
+    return "str" if array.dtype.kind in "OTU" else str(array.dtype)
+
+
+def _field(record_set: str, name: str, kind: str, description: str) -> dict[str, Any]:
+    return {
+        "@type": "cr:Field",
+        "@id": f"{record_set}/{name}",
+        "name": name,
+        "description": description,
+        "dataType": kind,
+    }
+
+
+def _record_set(
+    name: str, description: str, fields: list[dict[str, Any]], rows: list[dict[str, Any]],
+    key: str, **more: Any,
+) -> dict[str, Any]:  # fmt: skip
+    return {
+        "@type": "cr:RecordSet",
+        "@id": name,
+        "name": name,
+        "description": description,
+        **more,
+        "key": {"@id": f"{name}/{key}"},
+        "field": fields,
+        "data": [{f"{name}/{field}": value for field, value in row.items()} for row in rows],
+    }
+
+
+def _classes(store: Store) -> dict[str, Any]:
+    return _record_set(
+        "materials",
+        "PhysGaussian's material classes, the values of voxel/material and grid/material.",
+        [
+            _field("materials", "id", "sc:Integer", "value in the arrays"),
+            _field("materials", "name", "sc:Text", "name of the class"),
+        ],
+        [{"id": index, "name": name}
+         for index, name in enumerate(store.attributes["material_classes"])],
+        "id",
+        dataType="sc:Enumeration",
+    )  # fmt: skip
+
+
+def _properties(store: Store) -> dict[str, Any]:
+    return _record_set(
+        "properties",
+        "The columns of voxel/properties and the channels of grid/properties: a normalised value "
+        "v is m = lo + (v + 1) / 2 * (hi - lo), and 10**m where log10 is true, in SI units.",
+        [
+            _field("properties", "name", "sc:Text", "name of the property"),
+            _field("properties", "unit", "sc:Text", "SI unit"),
+            _field("properties", "log10", "sc:Boolean", "whether lo and hi are log10 of it"),
+            _field("properties", "lo", "sc:Float", "value that becomes -1"),
+            _field("properties", "hi", "sc:Float", "value that becomes 1"),
+        ],
+        [
+            {"name": one.name, "unit": unit, "log10": one.log10, "lo": one.lo, "hi": one.hi}
+            for one, unit in zip(store.normalization.ranges, ("Pa", "kg/m^3", "1"), strict=True)
+        ],
+        "name",
+    )
+
+
+_ASSET_FIELDS = {
+    "id": "sc:Text",
+    "object_id": "sc:Text",
+    "view": "sc:Text",
+    "category": "sc:Text",
+    "verdict": "sc:Text",
+    "fitness": "sc:Float",
+    "fitness_backward": "sc:Float",
+    "inlier_rmse": "sc:Float",
+    "ambiguity": "sc:Float",
+    "valid_share": "sc:Float",
+}
+
+
+def _assets(store: Store) -> dict[str, Any]:
+    columns = {name: jsonable(store.column(name)) for name in _ASSET_FIELDS}
+    group: Any = store.group["asset"]
+    fields = [
+        _field("assets", name, kind, group[name].attrs["description"])
+        for name, kind in _ASSET_FIELDS.items()
+    ]
+    fields += [
+        _field("assets", "first_row", "sc:Integer", "its first row of voxel/*"),
+        _field("assets", "end_row", "sc:Integer", "the row after its last"),
+    ]
+    offsets = store.offsets.tolist()
+    rows = [
+        {**dict(zip(columns, values, strict=True)), "first_row": first, "end_row": end}
+        for *values, first, end in zip(
+            *columns.values(), offsets[:-1], offsets[1:], strict=True
+        )
+    ]  # fmt: skip
+    return _record_set(
+        "assets", "One row an asset: what it is, and how good its alignment is.", fields, rows, "id"
+    )
+
+
+def to_json(description: Mapping[str, Any]) -> str:
+    """Return a description as the text of a file."""
+    return json.dumps(description, indent=2, ensure_ascii=False, allow_nan=False) + "\n"

@@ -1,0 +1,1 @@
+"""Frames and voxel sets, and the compiled kernels on 64^3 voxels."""

@@ -1,0 +1,118 @@
+"""Frames, voxels, boundaries and transforms.
+
+Both frames are the unit cube [-0.5, 0.5]^3 with voxel ``i`` centred at
+``(i + 0.5) / 64 - 0.5`` on each axis. Transforms are 4x4 homogeneous matrices
+that map points of the PixieVerse frame to points of the SLAT frame.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from slatprep.records import RESOLUTION
+
+VOXEL_SIZE = 1.0 / RESOLUTION
+"""Edge of a voxel in the unit cube."""
+
+
+def voxel_centres(voxels: ArrayLike) -> NDArray[np.float64]:
+    """Return the centres of voxels in the unit cube.
+
+    Parameters
+    ----------
+    voxels : array_like of int, shape (N, 3)
+        Voxel indices in 0..63.
+
+    Returns
+    -------
+    ndarray of float64, shape (N, 3)
+        Points in [-0.5, 0.5]^3 of the same frame.
+
+    Examples
+    --------
+    >>> voxel_centres([[0, 32, 63]]).tolist()
+    [[-0.4921875, 0.0078125, 0.4921875]]
+    """
+    return (np.asarray(voxels, dtype=np.float64) + 0.5) * VOXEL_SIZE - 0.5
+
+
+def apply_transform(transform: ArrayLike, points: ArrayLike) -> NDArray[np.float64]:
+    """Map points by a homogeneous transform.
+
+    Parameters
+    ----------
+    transform : array_like, shape (4, 4)
+        Homogeneous transform; the last row is taken to be 0, 0, 0, 1.
+    points : array_like, shape (N, 3)
+        Points of the transform's source frame.
+
+    Returns
+    -------
+    ndarray of float64, shape (N, 3)
+        Points of its target frame.
+
+    Examples
+    --------
+    >>> quarter_turn = [[0, -1, 0, 1], [1, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
+    >>> apply_transform(quarter_turn, [[2, 3, 4]]).tolist()
+    [[-2.0, 2.0, 4.0]]
+    """
+    matrix = np.asarray(transform, dtype=np.float64)
+    return np.asarray(points, dtype=np.float64) @ matrix[:3, :3].T + matrix[:3, 3]
+
+
+def make_transform(
+    rotation: ArrayLike, translation: ArrayLike = (0.0, 0.0, 0.0), scale: float = 1.0
+) -> NDArray[np.float64]:
+    """Assemble ``x -> scale * rotation @ x + translation`` as a 4x4 matrix."""
+    transform = np.eye(4)
+    transform[:3, :3] = scale * np.asarray(rotation, dtype=np.float64)
+    transform[:3, 3] = translation
+    return transform
+
+
+def split_transform(
+    transform: ArrayLike,
+) -> tuple[NDArray[np.float64], NDArray[np.float64], float]:
+    """Split a similarity transform into rotation (3, 3), translation (3,) and scale.
+
+    Raises
+    ------
+    ValueError
+        If the matrix is not 4x4, not finite, mirrors, or is no similarity.
+    """
+    matrix = np.asarray(transform, dtype=np.float64)
+    if matrix.shape != (4, 4) or not np.isfinite(matrix).all():
+        raise ValueError(f"a transform is a finite 4x4 matrix, got shape {matrix.shape}")
+    determinant = float(np.linalg.det(matrix[:3, :3]))
+    if determinant <= 0:
+        raise ValueError(f"a transform must not mirror or flatten, got determinant {determinant:g}")
+    scale = determinant ** (1.0 / 3.0)
+    rotation = matrix[:3, :3] / scale
+    if np.abs(rotation @ rotation.T - np.eye(3)).max() > 1e-6:
+        raise ValueError(
+            "a transform must be a rotation, a uniform scale and a shift, without shear"
+        )
+    return rotation, matrix[:3, 3].copy(), scale
+
+
+def invert_transform(transform: ArrayLike) -> NDArray[np.float64]:
+    """Return the inverse of a similarity transform (SLAT frame to PixieVerse frame)."""
+    rotation, translation, scale = split_transform(transform)
+    inverse = np.eye(4)
+    inverse[:3, :3] = rotation.T / scale
+    inverse[:3, 3] = -inverse[:3, :3] @ translation
+    return inverse
+
+
+def displacement(transform: ArrayLike, reference: ArrayLike, slat_voxels: ArrayLike) -> float:
+    """Mean distance, in voxels, between where two transforms look a SLAT voxel up.
+
+    Both transforms are inverted and applied to the voxel centres, so the
+    distance is measured in the PixieVerse frame, where the annotation lies.
+    """
+    points = voxel_centres(slat_voxels)
+    here = apply_transform(invert_transform(transform), points)
+    there = apply_transform(invert_transform(reference), points)
+    return float(np.linalg.norm(here - there, axis=1).mean() * RESOLUTION)

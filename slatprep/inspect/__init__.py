@@ -1,0 +1,1 @@
+"""What people look at: checks, overviews, pictures, the report, verification."""

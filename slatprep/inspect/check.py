@@ -1,0 +1,286 @@
+"""Is an asset's alignment good? The answer from what the store holds, computed anew."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from slatprep.align.quality import measure_quality
+from slatprep.errors import StoreError
+from slatprep.judge import THRESHOLDS, judge
+from slatprep.normalize import denormalize, normalize
+from slatprep.parameters import SampleParameters
+from slatprep.records import (
+    BACKGROUND,
+    Ambiguity,
+    MaterialField,
+    Normalization,
+    StructuredLatents,
+    Verdict,
+)
+from slatprep.sample import sample
+from slatprep.store.reader import Store, StoredAsset
+
+QUALITY_TOLERANCE = 1e-3
+"""Quality computed anew differs less than this; one voxel at the radius may round either way."""
+
+PROPERTY_TOLERANCE = 1e-5
+"""Normalised properties computed anew differ less than this: float32 through SI and back."""
+
+DISTANCE_TOLERANCE = 1e-3
+"""Distances [voxel] computed anew differ less than this."""
+
+
+AT_LEAST = {
+    "fitness": THRESHOLDS.good_fitness,
+    "fitness_backward": THRESHOLDS.good_fitness,
+    "valid_share": THRESHOLDS.good_valid_share,
+}
+"""Figures that a good alignment reaches, by name."""
+
+AT_MOST = {"ambiguity": THRESHOLDS.good_ambiguity}
+"""Figures that a good alignment does not exceed, by name."""
+
+
+@dataclass(frozen=True)
+class Figure:
+    """One number of a check.
+
+    ``value`` was computed now, ``stored`` is what the store says; ``limit`` is
+    the largest allowed difference of the two.
+    """
+
+    name: str
+    value: float
+    stored: float
+    limit: float
+
+    @property
+    def passes(self) -> bool | None:
+        """Whether the value is a good alignment's; None where the verdict does not ask."""
+        if self.name in AT_LEAST:
+            return self.value >= AT_LEAST[self.name]
+        return self.value <= AT_MOST[self.name] if self.name in AT_MOST else None
+
+    @property
+    def threshold_text(self) -> str:
+        """What is good, like ``>= 0.8``; empty where the verdict does not ask."""
+        if self.name in AT_LEAST:
+            return f">= {AT_LEAST[self.name]:g}"
+        return f"<= {AT_MOST[self.name]:g}" if self.name in AT_MOST else ""
+
+    @property
+    def ok(self) -> bool:
+        """Whether the two agree."""
+        return bool(abs(self.value - self.stored) <= self.limit)
+
+
+@dataclass(frozen=True)
+class AlignmentCheck:
+    """What a check found.
+
+    Attributes
+    ----------
+    asset_id : str
+        The asset.
+    verdict : Verdict
+        The verdict on the quality computed now.
+    reasons : tuple of str
+        Why the verdict is not better.
+    stored_verdict : str
+        The verdict that the store holds.
+    figures : tuple of Figure
+        Every number, computed now and as stored. Ambiguity and margin are
+        taken from the store: the placements they come from are not there.
+    transform : ndarray of float64, shape (4, 4)
+        PixieVerse frame to SLAT frame.
+    radius : float
+        Voxels within which fitness counts a voxel as near the other side.
+    """
+
+    asset_id: str
+    verdict: Verdict
+    reasons: tuple[str, ...]
+    stored_verdict: str
+    figures: tuple[Figure, ...]
+    transform: NDArray[np.float64]
+    radius: float
+
+    def figure(self, name: str) -> Figure:
+        """Return the figure of that name."""
+        return next(figure for figure in self.figures if figure.name == name)
+
+    @property
+    def words(self) -> tuple[str, ...]:
+        """The verdict in words: why it is not better, or what makes it good."""
+        if self.reasons:
+            return self.reasons
+        forward, backward = self.figure("fitness").value, self.figure("fitness_backward").value
+        open_share = self.figure("ambiguity").value
+        ties = f"the class of {open_share:.1%} of the voxels" if open_share else "no class"
+        return (
+            f"{forward:.1%} of the PixieVerse boundary and {backward:.1%} of the SLAT boundary lie "
+            f"within {self.radius:g} voxel of the other side; placements that fit as well change "
+            f"{ties}",
+        )
+
+    @property
+    def consistent(self) -> bool:
+        """Whether the store holds what its own grid, voxels and transform give."""
+        return self.verdict == self.stored_verdict and all(figure.ok for figure in self.figures)
+
+    @property
+    def ok(self) -> bool:
+        """Whether the alignment is good and the store consistent."""
+        return self.verdict is Verdict.GOOD and self.consistent
+
+
+def check_alignment(store: Store, asset_id: str) -> AlignmentCheck:
+    """Recompute an alignment's quality, and the annotation it gives, from the store alone.
+
+    Parameters
+    ----------
+    store : Store
+        From `slatprep.store.open_store`.
+    asset_id : str
+        Which asset.
+
+    Returns
+    -------
+    AlignmentCheck
+        Quality and annotation as computed now beside those stored.
+
+    Raises
+    ------
+    StoreError
+        If the store has no such asset, or does not say how it was made.
+    """
+    asset = store.asset(asset_id)
+    parameters = _parameters(store)
+    field = stored_field(asset, store.normalization)
+    latents = StructuredLatents(asset.coords, asset.feats)
+    radius = float(parameters["align"]["radius"])
+    quality = measure_quality(field, latents, asset.transform, radius)
+    annotation = sample(
+        field, asset.coords, asset.transform, SampleParameters(**parameters["sample"])
+    )
+    properties, _ = normalize(annotation.properties, store.normalization)
+    columns = asset.columns
+    change = columns["property_ambiguity"]
+    ambiguity = Ambiguity(
+        material_share=float(columns["ambiguity"]),
+        property_change=(float(change[0]), float(change[1]), float(change[2])),
+        margin=float(columns["margin"]),
+    )
+    valid_share = float(annotation.valid.mean())
+    verdict, reasons = judge(quality, valid_share, ambiguity)
+    both = annotation.valid & asset.valid
+    figures = [
+        Figure(name, getattr(quality, name), float(columns[name]), QUALITY_TOLERANCE)
+        for name in (
+            "fitness",
+            "inlier_rmse",
+            "fitness_backward",
+            "inlier_rmse_backward",
+            "overlap",
+        )
+    ]
+    figures += [
+        Figure("valid_share", valid_share, float(columns["valid_share"]), QUALITY_TOLERANCE),
+        Figure("ambiguity", ambiguity.material_share, ambiguity.material_share, 0),
+        Figure("margin", ambiguity.margin, ambiguity.margin, 0),
+        Figure("voxels with another valid", _count(annotation.valid != asset.valid), 0, 0),
+        Figure("voxels with another material", _count(annotation.material != asset.material), 0, 0),
+        Figure(
+            "largest difference of a property",
+            _largest(properties[both] - asset.properties[both]),
+            0,
+            PROPERTY_TOLERANCE,
+        ),
+        Figure(
+            "largest difference of a distance",
+            _largest(annotation.distance - asset.distance),
+            0,
+            DISTANCE_TOLERANCE,
+        ),
+    ]
+    return AlignmentCheck(
+        asset_id, verdict, reasons, str(columns["verdict"]), tuple(figures), asset.transform, radius
+    )
+
+
+def choose_assets(
+    store: Store, asset_ids: Iterable[str] = (), worst: int = 0, ambiguous: bool = False
+) -> list[str]:
+    """Choose assets to look at, each once: those named, then the worst, then the ambiguous.
+
+    Parameters
+    ----------
+    store : Store
+        The store; only its ``asset/*`` arrays are read.
+    asset_ids : iterable of str
+        Assets by name, in this order.
+    worst : int
+        How many of the lowest fitness, of both directions the lower.
+    ambiguous : bool
+        Whether to take all above the threshold of ambiguity, most of all first.
+
+    Returns
+    -------
+    list of str
+
+    Raises
+    ------
+    StoreError
+        If the store has no asset of a name.
+    """
+    rows = [store.find(asset_id) for asset_id in asset_ids]
+    if worst:
+        fitness = np.minimum(store.column("fitness"), store.column("fitness_backward"))
+        # An asset without a number is the worst of all.
+        rows += np.argsort(np.nan_to_num(fitness, nan=-1.0), kind="stable")[:worst].tolist()
+    if ambiguous:
+        share = store.column("ambiguity")
+        order = np.argsort(-share, kind="stable")
+        rows += order[share[order] > THRESHOLDS.good_ambiguity].tolist()
+    return [store.ids[row] for row in dict.fromkeys(rows)]
+
+
+def stored_field(asset: StoredAsset, normalization: Normalization) -> MaterialField:
+    """Return the PixieVerse field that a store holds, in SI units again."""
+    material = asset.grid_material.reshape(-1)
+    cells = np.flatnonzero(material < BACKGROUND)
+    values = asset.grid_properties.reshape(3, -1)[:, cells]
+    return MaterialField(
+        occupancy=asset.grid_material != BACKGROUND,
+        voxels=np.stack(
+            np.unravel_index(cells, asset.grid_material.shape),
+            axis=1,
+            dtype=np.uint8,
+            casting="unsafe",
+        ),
+        material=material[cells],
+        properties=denormalize(values.T, normalization),
+    )
+
+
+def _parameters(store: Store) -> dict[str, Any]:
+    try:
+        parameters: dict[str, Any] = store.attributes["build"]["parameters"]
+    except (KeyError, TypeError):
+        raise StoreError(
+            f"{store.path} does not say with what parameters it was built; build it again"
+        ) from None
+    return parameters
+
+
+def _count(differs: np.ndarray) -> float:
+    return float(differs.sum())
+
+
+def _largest(difference: np.ndarray) -> float:
+    return float(np.abs(difference).max(initial=0.0))

@@ -1,0 +1,123 @@
+"""What a store holds and how good it is, small enough for one screen."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from slatprep.records import Normalization, Verdict
+from slatprep.storage.remote import RemotePath, list_objects
+from slatprep.store import Store
+
+
+@dataclass(frozen=True)
+class GroupOverview:
+    """Some assets of a store in one line.
+
+    ``verdicts`` counts the assets by verdict. Fitness, rmse [voxel] and
+    overlap are medians over the assets; ``valid_share`` is over all their
+    voxels; ``ambiguous`` counts assets with tied placements that differ in
+    class at some voxel.
+    """
+
+    name: str
+    assets: int
+    voxels: int
+    verdicts: dict[str, int]
+    fitness: float
+    inlier_rmse: float
+    fitness_backward: float
+    overlap: float
+    valid_share: float
+    ambiguous: int
+
+
+@dataclass(frozen=True)
+class StoreOverview:
+    """What a store holds.
+
+    ``total`` is over all assets, ``categories`` has an entry for each category
+    in alphabetical order; ``files`` and ``size`` [byte] are what it takes on disk.
+    """
+
+    path: Path
+    format_version: int
+    manifest: str
+    files: int
+    size: int
+    engines: dict[str, int]
+    models: dict[str, int]
+    normalization: Normalization
+    total: GroupOverview
+    categories: tuple[GroupOverview, ...]
+
+
+def describe_store(store: Store) -> StoreOverview:
+    """Sum a store up; only its ``asset/*`` arrays are read.
+
+    Parameters
+    ----------
+    store : Store
+        From `slatprep.store.open_store`.
+
+    Returns
+    -------
+    StoreOverview
+    """
+    names = ("category", "verdict", "fitness", "inlier_rmse", "fitness_backward", "overlap",
+             "valid_share", "ambiguity", "engine", "model")  # fmt: skip
+    columns = {name: store.column(name) for name in names}
+    columns["voxels"] = np.diff(store.offsets)
+    categories = np.array([str(category) for category in columns["category"]])
+    sizes = _file_sizes(store.path)
+    return StoreOverview(
+        path=store.path,
+        format_version=int(store.attributes["format_version"]),
+        manifest=str(store.attributes["manifest"]),
+        files=len(sizes),
+        size=sum(sizes),
+        engines=_counts(columns["engine"]),
+        models=_counts(columns["model"]),
+        normalization=store.normalization,
+        total=_describe("all", columns, np.ones(len(categories), dtype=bool)),
+        categories=tuple(
+            _describe(name or "(unknown)", columns, categories == name)
+            for name in sorted(set(categories))
+        ),
+    )
+
+
+def _file_sizes(path: Path) -> list[int]:
+    if isinstance(path, RemotePath):
+        return [int(entry["size"]) for entry in list_objects(path).values()]
+    return [file.stat().st_size for file in path.rglob("*") if file.is_file()]
+
+
+def _describe(
+    name: str, columns: dict[str, NDArray[Any]], chosen: NDArray[np.bool_]
+) -> GroupOverview:
+    own = {column: values[chosen] for column, values in columns.items()}
+    voxels = int(own["voxels"].sum())
+    verdicts = _counts(own["verdict"])
+    return GroupOverview(
+        name=name,
+        assets=int(chosen.sum()),
+        voxels=voxels,
+        verdicts={str(verdict): verdicts.get(str(verdict), 0) for verdict in Verdict},
+        fitness=float(np.median(own["fitness"])),
+        inlier_rmse=float(np.median(own["inlier_rmse"])),
+        fitness_backward=float(np.median(own["fitness_backward"])),
+        overlap=float(np.median(own["overlap"])),
+        valid_share=float(own["valid_share"] @ own["voxels"] / voxels),
+        ambiguous=int((own["ambiguity"] > 0).sum()),
+    )
+
+
+def _counts(values: Sequence[Any] | NDArray[Any]) -> dict[str, int]:
+    return dict(sorted(Counter(map(str, values)).items()))

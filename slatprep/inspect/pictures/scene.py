@@ -1,0 +1,141 @@
+"""What a picture of an alignment shows: two voxel sets, their classes, and the error per voxel."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from slatprep.geometry.frames import (
+    VOXEL_SIZE,
+    apply_transform,
+    invert_transform,
+    split_transform,
+    voxel_centres,
+)
+from slatprep.geometry.voxels import boundary, occupancy_of, outer_boundary, voxels_of
+from slatprep.inspect.pictures.palette import DISTANCE_COLOURS, MATERIAL_COLOURS
+from slatprep.inspect.pictures.voxels import View, view_rotation
+from slatprep.records import BACKGROUND
+from slatprep.store.reader import StoredAsset
+
+FARTHEST = 3.0
+"""End of the scale of distances [voxel]; all beyond it looks the same."""
+
+VIEWPOINTS = ((300.0, 22.0), (60.0, 22.0), (205.0, 50.0))
+"""Azimuth and elevation [degree] of the three directions a picture looks from."""
+
+
+@dataclass(frozen=True)
+class Scene:
+    """An asset, ready to be drawn.
+
+    Attributes
+    ----------
+    pixieverse : ndarray of uint8, shape (K, 3)
+        Boundary voxels of the PixieVerse field, PixieVerse frame.
+    pixieverse_material : ndarray of uint8, shape (K,)
+        Their classes; 255 where not annotated.
+    slat : ndarray of uint8, shape (N, 3)
+        SLAT voxels.
+    slat_material : ndarray of uint8, shape (N,)
+        The classes they were given; 255 where none.
+    transform : ndarray of float64, shape (4, 4)
+        PixieVerse frame to SLAT frame.
+    surface : ndarray of uint8, shape (M, 3)
+        The SLAT's outer voxels, on which errors are measured.
+    error, error_before : ndarray of float64, shape (M,)
+        Distance [voxel] of each to the nearest outer voxel of the PixieVerse
+        field, under the transform, and with the frames laid on each other as
+        they are.
+    """
+
+    pixieverse: NDArray[np.uint8]
+    pixieverse_material: NDArray[np.uint8]
+    slat: NDArray[np.uint8]
+    slat_material: NDArray[np.uint8]
+    transform: NDArray[np.float64]
+    surface: NDArray[np.uint8]
+    error: NDArray[np.float64]
+    error_before: NDArray[np.float64]
+
+
+def scene_of(asset: StoredAsset) -> Scene:
+    """Return the scene of an asset as the store holds it."""
+    occupancy = asset.grid_material != BACKGROUND
+    shell = voxels_of(boundary(occupancy))
+    outer = outer_boundary(occupancy)
+    surface = outer_boundary(occupancy_of(asset.coords))
+    return Scene(
+        pixieverse=shell,
+        pixieverse_material=asset.grid_material[tuple(shell.T)],
+        slat=asset.coords,
+        slat_material=asset.material,
+        transform=asset.transform,
+        surface=surface,
+        error=surface_distance(surface, outer, asset.transform),
+        error_before=surface_distance(surface, outer, np.eye(4)),
+    )
+
+
+def surface_distance(
+    slat: NDArray[np.uint8], pixieverse: NDArray[np.uint8], transform: ArrayLike
+) -> NDArray[np.float64]:
+    """Return how far each SLAT voxel is from the nearest PixieVerse voxel.
+
+    Parameters
+    ----------
+    slat, pixieverse : ndarray of uint8, shapes (M, 3) and (K, 3)
+        Surface voxels, each in its own frame.
+    transform : array_like, shape (4, 4)
+        PixieVerse frame to SLAT frame.
+
+    Returns
+    -------
+    ndarray of float64, shape (M,)
+        Voxels of the SLAT frame.
+    """
+    from slatprep.geometry.nearest import nearest_voxel
+
+    _, _, scale = split_transform(transform)
+    points = apply_transform(invert_transform(transform), voxel_centres(slat))
+    distance, _ = nearest_voxel(points, pixieverse)
+    scaled: NDArray[np.float64] = distance * scale
+    return scaled
+
+
+def views(scene: Scene, size: int) -> tuple[View, ...]:
+    """Return the three views, at one scale that holds the sets before and after."""
+    here = voxel_centres(scene.pixieverse)
+    after = apply_transform(scene.transform, here)
+    points = np.concatenate([here, after, voxel_centres(scene.slat)])
+    placed = []
+    for azimuth, elevation in VIEWPOINTS:
+        rotation = view_rotation(azimuth, elevation)
+        seen = points @ rotation.T
+        low, high = seen.min(axis=0), seen.max(axis=0)
+        placed.append((rotation, rotation.T @ ((low + high) / 2), (high - low)[:2].max() / 2))
+    # Room for the voxels at the edge, as wide as their diagonal, and the outline.
+    half_width = max(reach for _, _, reach in placed) + 2 * VOXEL_SIZE
+    return tuple(View(rotation, centre, float(half_width), size) for rotation, centre, _ in placed)
+
+
+def class_colours(material: NDArray[np.uint8]) -> NDArray[np.float64]:
+    """Return the colour (N, 3) in 0..1 of each material id (N,)."""
+    table = np.zeros((256, 3))
+    for index, colour in MATERIAL_COLOURS.items():
+        table[index] = rgb(colour)
+    return table[material]
+
+
+def distance_colours(distance: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the colour (N, 3) in 0..1 of each distance (N,) in voxels, up to `FARTHEST`."""
+    stops = np.array([rgb(colour) for colour in DISTANCE_COLOURS])
+    along = np.linspace(0, FARTHEST, len(stops))
+    return np.stack([np.interp(distance, along, stops[:, c]) for c in range(3)], axis=-1)
+
+
+def rgb(colour: str) -> NDArray[np.float64]:
+    """Return a colour like ``#FF8000`` as three numbers in 0..1."""
+    return np.frombuffer(bytes.fromhex(colour[1:]), dtype=np.uint8) / 255.0

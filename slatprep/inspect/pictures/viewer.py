@@ -1,0 +1,125 @@
+"""An alignment in Open3D's viewer, to be turned by hand."""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from slatprep.geometry.frames import apply_transform
+from slatprep.geometry.voxels import occupancy_of
+from slatprep.inspect.pictures.scene import Scene, class_colours, distance_colours
+from slatprep.records import RESOLUTION
+
+APART = 1.25
+"""Distance between the parts shown, in edges of the unit cube."""
+
+
+def has_screen(environment: Mapping[str, str] = os.environ, platform: str = sys.platform) -> bool:
+    """Whether a window can be opened, as far as the environment tells."""
+    if platform in ("darwin", "win32"):
+        return True
+    return bool(environment.get("DISPLAY") or environment.get("WAYLAND_DISPLAY"))
+
+
+def show_alignment(scene: Scene, title: str) -> bool:
+    """Open a window with four parts: before, after, result and error; wait until it is closed.
+
+    Parameters
+    ----------
+    scene : Scene
+        From `slatprep.inspect.pictures.scene.scene_of`.
+    title : str
+        Of the window.
+
+    Returns
+    -------
+    bool
+        False if no window could be opened.
+    """
+    import open3d
+
+    window = open3d.visualization.Visualizer()
+    if not window.create_window(window_name=title, width=1600, height=700):
+        return False
+    for mesh in meshes(scene):
+        window.add_geometry(_open3d_mesh(open3d, *mesh))
+    window.run()
+    window.destroy_window()
+    return True
+
+
+Mesh = tuple[NDArray[np.float64], NDArray[np.int32], NDArray[np.float64]]
+"""Vertices (V, 3), triangles (T, 3) and a colour (V, 3) of each vertex."""
+
+
+def meshes(scene: Scene) -> tuple[Mesh, ...]:
+    """Return the four parts side by side along x, in the SLAT frame."""
+    identity = np.eye(4)
+    classes = class_colours(scene.pixieverse_material)
+    parts = (
+        (scene.pixieverse, classes, identity),
+        (scene.pixieverse, classes, scene.transform),
+        (scene.slat, class_colours(scene.slat_material), identity),
+        (scene.surface, distance_colours(scene.error), identity),
+    )
+    placed = []
+    for number, (voxels, colours, transform) in enumerate(parts):
+        vertices, triangles, painted = cube_mesh(voxels, colours, transform)
+        placed.append((vertices + APART * number * np.eye(3)[0], triangles, painted))
+    return tuple(placed)
+
+
+def cube_mesh(
+    voxels: NDArray[np.uint8], colours: NDArray[np.float64], transform: ArrayLike
+) -> Mesh:
+    """Return the outside of voxels as triangles, with four vertices a side.
+
+    Parameters
+    ----------
+    voxels : ndarray of uint8, shape (N, 3)
+        Voxels of one frame.
+    colours : ndarray of float64, shape (N, 3)
+        Their colours in 0..1.
+    transform : array_like, shape (4, 4)
+        To the frame that is shown.
+
+    Returns
+    -------
+    Mesh
+        Triangles turn counterclockwise seen from outside.
+    """
+    empty = ~np.pad(occupancy_of(voxels), 1)
+    corners, painted = [], []
+    unit = np.eye(3, dtype=np.intp)
+    for axis in range(3):
+        for sign in (1, -1):
+            beside = voxels + 1 + sign * unit[axis]
+            exposed = empty[tuple(beside.T)]
+            u, v = (unit[(axis + 1) % 3], unit[(axis + 2) % 3])[::sign]
+            origin = voxels[exposed] + (unit[axis] if sign > 0 else 0)
+            corners.append(origin[:, None] + np.stack([0 * u, u, u + v, v]))
+            painted.append(np.repeat(colours[exposed], 4, axis=0))
+    points = np.concatenate(corners).reshape(-1, 3) / RESOLUTION - 0.5
+    first = 4 * np.arange(len(points) // 4, dtype=np.int32)[:, None]
+    halves = np.array([[0, 1, 2], [0, 2, 3]], dtype=np.int32)
+    triangles = np.concatenate([first + half for half in halves])
+    return apply_transform(transform, points), triangles, np.concatenate(painted)
+
+
+def _open3d_mesh(
+    open3d: Any,
+    vertices: NDArray[np.float64],
+    triangles: NDArray[np.int32],
+    colours: NDArray[np.float64],
+) -> Any:
+    mesh = open3d.geometry.TriangleMesh(
+        open3d.utility.Vector3dVector(vertices), open3d.utility.Vector3iVector(triangles)
+    )
+    mesh.vertex_colors = open3d.utility.Vector3dVector(colours)
+    mesh.compute_triangle_normals()
+    return mesh

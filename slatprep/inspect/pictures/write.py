@@ -1,0 +1,105 @@
+"""Write the pictures of checked alignments."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from urllib.parse import quote
+
+from slatprep.errors import StoreError
+from slatprep.inspect.check import AlignmentCheck
+from slatprep.inspect.pictures.alignment import draw_alignment
+from slatprep.inspect.pictures.scene import Scene, scene_of
+from slatprep.inspect.pictures.sheet import MOST, draw_sheet
+from slatprep.provenance.candidates import candidates_of
+from slatprep.store.reader import Store, StoredAsset
+
+SHEET = "sheet.png"
+"""Name of the contact sheet in a folder of pictures."""
+
+
+def write_pictures(
+    store: Store,
+    checks: Sequence[AlignmentCheck],
+    target: Path,
+    *,
+    manifests: Path | None = None,
+    progress: Callable[[int, int], None] | None = None,
+) -> tuple[list[Path], Path | None]:
+    """Draw alignments and write them as PNG files.
+
+    Parameters
+    ----------
+    store : Store
+        The store.
+    checks : sequence of AlignmentCheck
+        The assets to draw, in the order of the contact sheet.
+    target : Path
+        A file that ends in ``.png`` for one asset, a folder otherwise: it gets
+        a file an asset, named by its id, and a contact sheet of several.
+    manifests : Path, optional
+        Folder of the build's records, which hold the candidates.
+    progress : callable, optional
+        Called with the assets done and the assets in all.
+
+    Returns
+    -------
+    pictures : list of Path
+        The file of each asset.
+    sheet : Path or None
+        The contact sheet of the first `MOST` assets; None for one asset.
+
+    Raises
+    ------
+    StoreError
+        If a file cannot be written, or the records are of another build.
+    """
+    alone = len(checks) == 1 and target.suffix.lower() == ".png"
+    candidates = candidates_of(store, [check.asset_id for check in checks], manifests)
+    pictures: list[Path] = []
+    scenes: list[Scene] = []
+    titles: list[str] = []
+    for number, check in enumerate(checks):
+        asset = store.asset(check.asset_id)
+        scene, title = scene_of(asset), title_of(asset)
+        drawn = draw_alignment(scene, check, title, subtitle_of(asset), candidates[check.asset_id])
+        # An id may hold characters that a file name must not.
+        pictures.append(target if alone else target / f"{quote(check.asset_id, safe=' ')}.png")
+        _write(pictures[-1], drawn)
+        if len(checks) > 1 and number < MOST:
+            scenes.append(scene)
+            titles.append(title)
+        if progress is not None:
+            progress(number + 1, len(checks))
+    if not scenes:
+        return pictures, None
+    _write(target / SHEET, draw_sheet(scenes, checks[: len(scenes)], titles))
+    return pictures, target / SHEET
+
+
+def title_of(asset: StoredAsset) -> str:
+    """Return what a picture calls an asset: its category, else its id."""
+    return str(asset.columns["category"]).replace("_", " ") or asset.asset_id
+
+
+def subtitle_of(asset: StoredAsset) -> str:
+    """Return an asset's id, its size and how it was aligned, in one line."""
+    columns = asset.columns
+    return "   ".join(
+        (
+            asset.asset_id,
+            f"{len(asset.coords):,} SLAT voxels",
+            f"engine {columns['engine']}, {columns['model']}, starts {columns['search']}",
+        )
+    )
+
+
+def _write(path: Path, content: bytes) -> None:
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_bytes(content)
+    except OSError as error:
+        raise StoreError(
+            f"{path}: the picture cannot be written ({error.strerror}); name another place with "
+            "--picture, or --picture none"
+        ) from error

@@ -1,0 +1,200 @@
+"""One page for a dataset: a single HTML file that needs nothing but a browser."""
+
+from __future__ import annotations
+
+import base64
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from slatprep.errors import StoreError
+from slatprep.inspect.report.content import describe
+from slatprep.inspect.report.outcomes import Outcome, read_outcomes
+from slatprep.inspect.report.page import write_page
+from slatprep.inspect.report.statistics import Tally, no_tally, tally
+from slatprep.inspect.report.thumbnails import PER_SHEET, sheet, thumbnail
+from slatprep.inspect.report.voxels import COARSE, FULL, encode_asset
+from slatprep.records import Verdict
+from slatprep.storage.atomic import staged
+from slatprep.store import open_store
+from slatprep.store.reader import Store
+from slatprep.workers.local import run_unordered
+
+__all__ = ["ReportSummary", "write_report"]
+
+ASSETS_IN_DETAIL = 5_000
+"""Assets with thumbnail and 3D view at most; a store with more shows some of them."""
+
+VOXEL_BYTES = 36_000_000
+"""Bytes of voxels at most, before base64 makes them a third larger."""
+
+TASK_ASSETS = 16
+"""Assets that a worker draws at a time."""
+
+Progress = Callable[[int, int], None]
+"""Called with the assets done and the assets in all."""
+
+
+@dataclass(frozen=True)
+class ReportSummary:
+    """What a page holds.
+
+    Attributes
+    ----------
+    path : Path
+        The HTML file.
+    size : int
+        Its bytes.
+    assets : int
+        Rows of its table: assets of the store and those that did not go in.
+    in_detail : int
+        Assets with a thumbnail and a 3D view.
+    side : int
+        Voxels a side of the 3D views: 64, or 32 where 64 took too much.
+    """
+
+    path: Path
+    size: int
+    assets: int
+    in_detail: int
+    side: int
+
+
+@dataclass
+class Details:
+    """What is drawn of the assets: thumbnails and voxels by index, and counts over all."""
+
+    thumbnails: dict[int, NDArray[np.uint8]] = field(default_factory=dict)
+    voxels: dict[int, dict[int, bytes]] = field(default_factory=dict)
+    tallies: dict[str, Tally] = field(default_factory=dict)
+
+    def side(self) -> int:
+        """Return the finest level of detail that the page can hold."""
+        size = sum(len(levels[FULL]) for levels in self.voxels.values())
+        return FULL if size <= VOXEL_BYTES else COARSE
+
+
+def write_report(
+    store: Store,
+    out: Path,
+    *,
+    manifests: Path | None = None,
+    jobs: int = 1,
+    progress: Progress | None = None,
+) -> ReportSummary:
+    """Write the page of a store.
+
+    Parameters
+    ----------
+    store : Store
+        From `slatprep.store.open_store`.
+    out : Path
+        The HTML file; an older one is replaced when the new one is complete.
+    manifests : Path, optional
+        Directory of the build's records. Without them the page cannot say
+        what did not go in, and why.
+    jobs : int
+        Worker processes. The page's bytes do not depend on it.
+    progress : callable, optional
+        See `Progress`.
+
+    Returns
+    -------
+    ReportSummary
+        What went into it.
+
+    Raises
+    ------
+    StoreError
+        If the store or its records cannot be read, or belong to different builds.
+    """
+    outcomes: list[Outcome] | None = None
+    if manifests is not None:
+        outcomes = list(read_outcomes(manifests, str(store.attributes["manifest"])))
+        _refuse_other_records(store, outcomes, manifests)
+    chosen = _chosen(store)
+    details = _details(store, chosen, jobs, progress)
+    side = details.side()
+    content = describe(store, outcomes, details.tallies, chosen, side)
+    with staged(Path(out)) as temporary:
+        with temporary.open("w", encoding="utf-8", newline="\n") as file:
+            write_page(
+                file,
+                str(content["title"]),
+                content,
+                sheets=_sheets(details, chosen),
+                packs=_packs(details, chosen, side),
+            )
+        size = temporary.stat().st_size
+    return ReportSummary(Path(out), size, len(content["assets"]["id"]), len(chosen), side)
+
+
+def _refuse_other_records(store: Store, outcomes: Sequence[Outcome], manifests: Path) -> None:
+    missing = set(store.ids) - {outcome.asset_id for outcome in outcomes}
+    if missing:
+        raise StoreError(
+            f"{manifests} has no record of {len(missing)} assets of {store.path}, such as "
+            f"{min(missing)!r}; name the folder of its own records with --manifests"
+        )
+
+
+def _chosen(store: Store) -> list[int]:
+    """Return the indices of the assets that are shown in detail, all where there are few."""
+    total = len(store)
+    if total <= ASSETS_IN_DETAIL:
+        return list(range(total))
+    # Those that want looking at come first, the rest is spread over the store.
+    doubtful = np.flatnonzero(store.column("verdict") != str(Verdict.GOOD))
+    doubtful = doubtful[: ASSETS_IN_DETAIL // 2]
+    spread = np.linspace(0, total - 1, ASSETS_IN_DETAIL - len(doubtful)).round().astype(int)
+    return [int(index) for index in np.union1d(doubtful, spread)]
+
+
+def _details(store: Store, chosen: Sequence[int], jobs: int, progress: Progress | None) -> Details:
+    """Draw and count the chosen assets."""
+    details = Details()
+    tasks = (
+        (store.path, chosen[start : start + TASK_ASSETS])
+        for start in range(0, len(chosen), TASK_ASSETS)
+    )
+    for part in run_unordered(_draw, tasks, jobs):
+        details.thumbnails |= part.thumbnails
+        details.voxels |= part.voxels
+        for category, counts in part.tallies.items():
+            details.tallies[category] = details.tallies.get(category, no_tally()) + counts
+        if progress:
+            progress(len(details.voxels), len(chosen))
+    return details
+
+
+def _draw(path: Path, indices: Sequence[int]) -> Details:
+    """Draw and count some assets of a store, in a worker."""
+    store = open_store(path)
+    max_distance = float(store.attributes["build"]["parameters"]["sample"]["max_distance"])
+    details = Details()
+    for index in indices:
+        asset = store.asset(store.ids[index])
+        details.thumbnails[index] = thumbnail(asset)
+        details.voxels[index] = {
+            side: encode_asset(asset, max_distance, side) for side in (FULL, COARSE)
+        }
+        category = str(asset.columns["category"])
+        details.tallies[category] = details.tallies.get(category, no_tally()) + tally(asset)
+    return details
+
+
+def _sheets(details: Details, chosen: Sequence[int]) -> Iterator[bytes]:
+    for start in range(0, len(chosen), PER_SHEET):
+        yield sheet([details.thumbnails[index] for index in chosen[start : start + PER_SHEET]])
+
+
+def _packs(details: Details, chosen: Sequence[int], side: int) -> Iterator[list[str]]:
+    """Yield the voxels of the assets of each sheet, in base64."""
+    for start in range(0, len(chosen), PER_SHEET):
+        yield [
+            base64.b64encode(details.voxels[index][side]).decode("ascii")
+            for index in chosen[start : start + PER_SHEET]
+        ]

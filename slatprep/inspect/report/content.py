@@ -1,0 +1,188 @@
+"""What the page says, as one JSON document; how it looks is the page's own affair."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from slatprep.inspect.pictures.palette import CLASS_COLOURS, DISTANCE_COLOURS, UNANNOTATED_COLOUR
+from slatprep.inspect.report.outcomes import Outcome, kind_of
+from slatprep.inspect.report.statistics import Tally, nearest_quarter_turn, no_tally, quarter_turns
+from slatprep.inspect.report.thumbnails import COLUMNS, PER_SHEET, VIEWS
+from slatprep.inspect.report.voxels import LEVELS
+from slatprep.judge import THRESHOLDS
+from slatprep.normalize import PIXIE_RANGES
+from slatprep.records import BACKGROUND, MATERIAL_CLASSES, Normalization, Status
+from slatprep.store.reader import Store
+
+# Matplotlib's viridis (CC0) at even steps: light and dark tell the values apart
+# whatever colours a person sees.
+_PROPERTY_COLOURS = ("#440154", "#472D7B", "#3B528B", "#2C728E", "#21918C", "#28AE80",
+                     "#5EC962", "#ADDC30", "#FDE725")  # fmt: skip
+
+_FIGURES = ("fitness", "fitness_backward", "inlier_rmse", "overlap", "valid_share", "ambiguity",
+            "margin")  # fmt: skip
+_DIGITS = 5
+
+
+def describe(
+    store: Store,
+    outcomes: Sequence[Outcome] | None,
+    tallies: Mapping[str, Tally],
+    chosen: Sequence[int],
+    side: int,
+) -> dict[str, Any]:
+    """Return the content of a page.
+
+    Parameters
+    ----------
+    store : Store
+        The store.
+    outcomes : sequence of Outcome or None
+        From its records, where there are any.
+    tallies : mapping of str to Tally
+        Counts over the voxels of each category.
+    chosen : sequence of int
+        Assets with a thumbnail and a 3D view, ascending.
+    side : int
+        Voxels a side of the 3D views.
+
+    Returns
+    -------
+    dict
+        JSON-ready. Table columns are lists of one entry an asset, those of
+        the store first; not-a-number and what is unknown are None.
+    """
+    build = store.attributes["build"]
+    return {
+        "title": store.name,
+        "name": str(build.get("name", "")),
+        "manifest": str(store.attributes["manifest"]),
+        "records": outcomes is not None,
+        "versions": build["versions"],
+        "voxels": int(store.offsets[-1]),
+        "engine": sorted(set(map(str, store.column("engine")))),
+        "thresholds": {
+            "fitness": THRESHOLDS.good_fitness,
+            "fitness_backward": THRESHOLDS.good_fitness,
+            "valid_share": THRESHOLDS.good_valid_share,
+            "ambiguity": THRESHOLDS.good_ambiguity,
+        },
+        "classes": [
+            {"name": name, "colour": CLASS_COLOURS[name]} for name in MATERIAL_CLASSES[:BACKGROUND]
+        ],
+        "scales": {
+            "none": UNANNOTATED_COLOUR,
+            "property": _PROPERTY_COLOURS,
+            "distance": DISTANCE_COLOURS,
+            "max_distance": build["parameters"]["sample"]["max_distance"],
+            "radius": build["parameters"]["align"]["radius"],
+        },
+        "detail": {
+            "side": side,
+            "assets": len(chosen),
+            "levels": LEVELS,
+            "per_sheet": PER_SHEET,
+            "columns": COLUMNS,
+            "views": VIEWS,
+        },
+        "turns": quarter_turns(),
+        "properties": _properties(store.normalization, outcomes, tallies),
+        "balance": _balance(store, tallies),
+        "assets": _table(store, outcomes, chosen),
+    }
+
+
+def _properties(
+    normalization: Normalization,
+    outcomes: Sequence[Outcome] | None,
+    tallies: Mapping[str, Tally],
+) -> list[dict[str, Any]]:
+    """Return the spread of each property, by class, and the ranges it is held against."""
+    total = sum(tallies.values(), start=no_tally())
+    clipped = np.zeros(len(normalization.ranges), dtype=np.int64)
+    for outcome in outcomes or ():
+        if outcome.clipped:
+            clipped += outcome.clipped
+    return [
+        {
+            "name": span.name,
+            "log10": span.log10,
+            "lo": span.lo,
+            "hi": span.hi,
+            "source": normalization.source,
+            "pixie": [published.lo, published.hi],
+            "field": field.tolist(),
+            "slat": slat.tolist(),
+            "clipped": int(count) if outcomes is not None else None,
+        }
+        for span, published, field, slat, count in zip(
+            normalization.ranges, PIXIE_RANGES.ranges, total.field, total.slat, clipped, strict=True
+        )
+    ]
+
+
+def _balance(store: Store, tallies: Mapping[str, Tally]) -> list[dict[str, Any]]:
+    """Return the SLAT voxels of each class by category; the last count is of those not valid."""
+    categories = [str(category) for category in store.column("category")]
+    return [
+        {
+            "category": category,
+            "assets": categories.count(category),
+            "classes": tallies[category].classes.tolist(),
+        }
+        for category in sorted(tallies)
+    ]
+
+
+def _table(
+    store: Store, outcomes: Sequence[Outcome] | None, chosen: Sequence[int]
+) -> dict[str, list[Any]]:
+    """Return the columns of the table of assets."""
+    known = {outcome.asset_id: outcome for outcome in outcomes or ()}
+    stored = [known.get(asset_id) for asset_id in store.ids]
+    absent = [outcome for outcome in known.values() if outcome.status is not Status.OK]
+    transforms = store.column("transform")
+    nearest = [nearest_quarter_turn(transform) for transform in transforms]
+    blank: list[Any] = [None] * len(absent)
+    pictures = {index: number for number, index in enumerate(chosen)}
+    columns: dict[str, list[Any]] = {
+        "id": [*store.ids, *(outcome.asset_id for outcome in absent)],
+        "category": [
+            *map(str, store.column("category")),
+            *(outcome.category for outcome in absent),
+        ],
+        "state": [
+            *map(str, store.column("verdict")),
+            *(_ABSENT[outcome.status] for outcome in absent),
+        ],
+        "voxels": [*np.diff(store.offsets).tolist(), *blank],
+        "model": [*map(str, store.column("model")), *blank],
+        "turn": [*(index for index, _ in nearest), *blank],
+        "tilt": [*(round(angle, 2) for _, angle in nearest), *blank],
+        "transform": [
+            *([round(float(value), 6) for value in matrix[:3].ravel()] for matrix in transforms),
+            *blank,
+        ],
+        "tied": [*(outcome.tied if outcome else None for outcome in stored), *blank],
+        "displacement": [
+            *(_number(outcome.displacement) if outcome else None for outcome in stored),
+            *blank,
+        ],
+        "reasons": [list(outcome.reasons) if outcome else [] for outcome in (*stored, *absent)],
+        "picture": [*(pictures.get(index) for index in range(len(store))), *blank],
+    }
+    for name in _FIGURES:
+        columns[name] = [*map(_number, store.column(name).tolist()), *blank]
+    columns["kinds"] = [[kind_of(reason) for reason in own] for own in columns["reasons"]]
+    return columns
+
+
+# "failed" is the verdict on an alignment; these could not be aligned at all.
+_ABSENT = {Status.FAILED: "not built", Status.SKIPPED: "skipped"}
+
+
+def _number(value: float | None) -> float | None:
+    return None if value is None or not np.isfinite(value) else round(value, _DIGITS)

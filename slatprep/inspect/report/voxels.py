@@ -1,0 +1,94 @@
+"""An asset's voxels in the few kilobytes that the 3D view is drawn from.
+
+One asset is one stream of raw deflate (RFC 1951), which a browser undoes by
+itself. It holds, for n voxels a side and voxels in C order of the grid::
+
+    n^3 / 8 bytes   occupancy of the SLAT, most significant bit first
+    n^3 / 8 bytes   occupancy of the PixieVerse boundary, in its own frame
+    N bytes each    class, E, density, Poisson's ratio, distance of the SLAT voxels
+    K bytes         class of the boundary voxels
+
+Properties are quantised to `LEVELS` over [-1, 1] and distances over 0 to the
+largest distance allowed; 255 means not valid, for a class as well.
+"""
+
+from __future__ import annotations
+
+import zlib
+
+import numpy as np
+from numpy.typing import NDArray
+
+from slatprep.geometry.voxels import boundary, filled, occupancy_of
+from slatprep.records import BACKGROUND, RESOLUTION, UNANNOTATED
+from slatprep.store import StoredAsset
+
+LEVELS = 64
+"""Steps of a quantised property or distance: finer than a colour scale can show."""
+
+NOT_VALID = 255
+
+FULL, COARSE = RESOLUTION, RESOLUTION // 2
+"""Voxels a side of the two levels of detail."""
+
+
+def encode_asset(asset: StoredAsset, max_distance: float, side: int) -> bytes:
+    """Return an asset's voxels for the 3D view.
+
+    Parameters
+    ----------
+    asset : StoredAsset
+        From a store.
+    max_distance : float
+        Distance [voxel] at the end of its scale.
+    side : int
+        `FULL`, or `COARSE`: then one voxel of each 2 x 2 x 2 stands for all.
+
+    Returns
+    -------
+    bytes
+        See the module.
+    """
+    step = RESOLUTION // side
+    cells = asset.coords.astype(np.intp) // step
+    # The first voxel of each cell stands for it; sorted by cell, that is C order.
+    _, first = np.unique(np.ravel_multi_index(tuple(cells.T), (side,) * 3), return_index=True)
+    grid, material = _boundary_of(asset.grid_material)
+    there = grid // step
+    _, chosen = np.unique(np.ravel_multi_index(tuple(there.T), (side,) * 3), return_index=True)
+    scalars = np.column_stack(
+        [(asset.properties[first] + 1.0) / 2.0, asset.distance[first] / max_distance]
+    )
+    scalars[~asset.valid[first], :3] = np.nan
+    parts = [
+        _bits(cells[first], side),
+        _bits(there[chosen], side),
+        asset.material[first].tobytes(),
+        *(_quantised(column).tobytes() for column in scalars.T),
+        material[chosen].tobytes(),
+    ]
+    deflate = zlib.compressobj(6, zlib.DEFLATED, -zlib.MAX_WBITS)
+    return deflate.compress(b"".join(parts)) + deflate.flush()
+
+
+def _boundary_of(grid_material: NDArray[np.uint8]) -> tuple[NDArray[np.intp], NDArray[np.uint8]]:
+    """Return the outer surface (K, 3) of a field and the class (K,) of its voxels."""
+    occupancy = grid_material != BACKGROUND
+    surface = boundary(filled(occupancy)) & occupancy
+    material = grid_material[surface]
+    return np.argwhere(surface), np.where(material == UNANNOTATED, NOT_VALID, material)
+
+
+def _bits(voxels: NDArray[np.intp], side: int) -> bytes:
+    if side == RESOLUTION:
+        return np.packbits(occupancy_of(voxels)).tobytes()
+    occupancy = np.zeros((side,) * 3, dtype=bool)
+    occupancy[tuple(voxels.T)] = True
+    return np.packbits(occupancy).tobytes()
+
+
+def _quantised(share: NDArray[np.float64]) -> NDArray[np.uint8]:
+    """Return shares 0..1 in `LEVELS` steps; not-a-number as `NOT_VALID`."""
+    known = np.isfinite(share)
+    steps = np.round(np.clip(np.where(known, share, 0.0), 0.0, 1.0) * (LEVELS - 1))
+    return np.where(known, steps, NOT_VALID).astype(np.uint8)

@@ -1,0 +1,153 @@
+"""Is a store what it says it is? Every fault is found and named.
+
+`verify_store` goes from the outside in: metadata against the contract, files
+against their digests, then every asset's values and record, and on request
+the sources that the records name.
+"""
+
+from __future__ import annotations
+
+import uuid
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+from slatprep.errors import StoreError
+from slatprep.inspect.verify.assets import SourceRoots, asset_findings
+from slatprep.inspect.verify.files import file_findings, metadata_findings
+from slatprep.inspect.verify.index import index_findings
+from slatprep.inspect.verify.manifests import manifest_findings, source_roots, usual_manifests
+from slatprep.storage.remote import as_path
+from slatprep.storage.versions import current_version
+from slatprep.store.contract import Finding
+from slatprep.store.reader import Store, open_store
+from slatprep.workers.local import Jobs, require_shared, run_unordered
+
+__all__ = ["Finding", "SourceRoots", "Verification", "verify_store"]
+
+ASSETS_IN_TASK = 8
+
+Progress = Callable[[int, int], None]
+"""Called with the assets done and the assets in all."""
+
+
+@dataclass(frozen=True)
+class Verification:
+    """What a verification found.
+
+    Attributes
+    ----------
+    store : Path
+        The store.
+    assets : int
+        Assets whose values were checked.
+    files : int
+        Files whose digest was compared.
+    sources : int
+        Source files whose digest was compared.
+    manifests : Path or None
+        Folder of the records that were compared; None where there are none.
+    findings : tuple of Finding
+        Everything that is wrong, sorted by file.
+    """
+
+    store: Path
+    assets: int
+    files: int
+    sources: int
+    manifests: Path | None
+    findings: tuple[Finding, ...]
+
+    @property
+    def ok(self) -> bool:
+        """Whether nothing is wrong."""
+        return not self.findings
+
+
+def verify_store(
+    path: str | Path,
+    *,
+    manifests: Path | None = None,
+    sources: bool = False,
+    roots: SourceRoots | None = None,
+    jobs: Jobs = 1,
+    progress: Progress | None = None,
+) -> Verification:
+    """Check everything about a store that can be checked.
+
+    Parameters
+    ----------
+    path : Path
+        The store; on an object store its current version is checked.
+    manifests : Path, optional
+        Folder of the build's records; by default the one beside the store, if
+        there is one.
+    sources : bool
+        Whether to compare the source files with the records.
+    roots : SourceRoots, optional
+        Where the sources lie now; by default where ``build.json`` says they lay.
+    jobs : int or Workers
+        Worker processes, or a `slatprep.workers.dask.Cluster`.
+    progress : callable, optional
+        See `Progress`.
+
+    Returns
+    -------
+    Verification
+        All findings; they do not depend on `jobs`.
+
+    Raises
+    ------
+    StoreError
+        If there is no store at all, or sources are asked for and nobody says
+        where they lie.
+    """
+    path = current_version(as_path(path))
+    try:
+        store = open_store(path.absolute())  # workers may stand in another folder
+    except StoreError as error:
+        if not _is_file(path / "zarr.json"):
+            raise
+        finding = Finding("zarr.json", "", str(error), "the metadata of a slatprep store")
+        return Verification(path, 0, 0, 0, None, (finding,))
+    folder = manifests or usual_manifests(path)
+    if sources and roots is None:
+        roots = source_roots(folder)
+    needed = [roots.pixieverse, roots.slat] if sources and roots else []
+    require_shared(jobs, [store.path / "zarr.json", *needed])
+    findings = set(metadata_findings(path))
+    digests, found = file_findings(store, jobs)
+    findings |= found
+    try:
+        findings |= set(index_findings(store))
+        total = len(store)
+    except StoreError as error:
+        findings.add(Finding("asset", "", str(error), "readable ids and offsets"))
+        total = 0
+    hashed = 0
+    for done, (own, count) in enumerate(_assets(store, roots if sources else None, total, jobs), 1):
+        findings |= set(own)
+        hashed += count
+        if progress:
+            progress(min(done * ASSETS_IN_TASK, total), total)
+    if folder is not None:
+        findings |= set(manifest_findings(store, folder))
+    return Verification(path, total, digests, hashed, folder, tuple(sorted(findings)))
+
+
+def _is_file(path: Path) -> bool:
+    try:
+        return path.is_file()
+    except OSError:  # An object store that does not answer.
+        return False
+
+
+def _assets(
+    store: Store, roots: SourceRoots | None, total: int, jobs: Jobs
+) -> Iterator[tuple[list[Finding], int]]:
+    run = uuid.uuid4().hex
+    tasks = (
+        (store.path, range(first, min(first + ASSETS_IN_TASK, total)), roots, run)
+        for first in range(0, total, ASSETS_IN_TASK)
+    )
+    return run_unordered(asset_findings, tasks, jobs)

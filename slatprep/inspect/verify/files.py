@@ -1,0 +1,129 @@
+"""The files of a store: their metadata against the contract, their bytes against the digests."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+from slatprep.errors import StoreError
+from slatprep.storage.files import file_digest, list_files
+from slatprep.store.contract import (
+    Finding,
+    array_findings,
+    attribute_findings,
+    dimension_sizes,
+    read_metadata,
+)
+from slatprep.store.digests import ATTRIBUTES, attributes_digest, is_own
+from slatprep.store.layout import ARRAYS
+from slatprep.store.reader import Store
+from slatprep.workers.local import Jobs, run_unordered
+
+_GROUPS = ("asset", "voxel", "grid", "file")
+
+
+def metadata_findings(path: Path) -> Iterator[Finding]:
+    """Yield where the metadata differ from the contract, or their two copies from each other."""
+    root = read_metadata(path / "zarr.json")
+    yield from attribute_findings(root["attributes"])
+    extra = {key: root.get(key) for key in ("zarr_format", "node_type")}
+    if extra != {"zarr_format": 3, "node_type": "group"}:
+        yield Finding("zarr.json", "", f"says {extra}", "a group of Zarr format 3")
+    gathered = root.get("consolidated_metadata")
+    copies = gathered.get("metadata") if isinstance(gathered, dict) else None
+    frame = {**gathered, "metadata": 0} if isinstance(gathered, dict) else None
+    if not isinstance(copies, dict) or frame != _CONSOLIDATED:
+        yield Finding("zarr.json", "", "has no consolidated metadata", "those of every array")
+        copies = {}
+    arrays: dict[str, Any] = {}
+    there = {name.removesuffix("/zarr.json") for name in list_files(path) if _is_metadata(name)}
+    for name in sorted({*there, *copies, *(layout.name for layout in ARRAYS), *_GROUPS}):
+        where = f"{name}/zarr.json"
+        if name not in there:
+            yield Finding(where, "", "is missing", "the metadata of an array or group")
+            continue
+        try:
+            arrays[name] = read_metadata(path / where)
+        except StoreError as error:
+            yield Finding(where, "", str(error), "readable metadata")
+            continue
+        if not _same(arrays[name], copies.get(name)):
+            yield Finding(where, "", "differs from its copy in zarr.json", "the same metadata")
+    try:
+        sizes = dimension_sizes(arrays)
+    except StoreError as error:
+        yield Finding("zarr.json", "", str(error), "shapes of the arrays")
+        return
+    for layout in ARRAYS:
+        if layout.name in arrays:
+            yield from array_findings(layout.name, arrays[layout.name], sizes)
+
+
+def file_findings(store: Store, jobs: Jobs) -> tuple[int, set[Finding]]:
+    """Compare every file of a store with its digest.
+
+    Returns
+    -------
+    files : int
+        How many digests were compared.
+    findings : set of Finding
+        Missing, additional and changed files.
+    """
+    try:
+        names, sizes, digests = (
+            store.read_rows(f"file/{name}", 0, store.shape("file/name")[0])
+            for name in ("name", "size", "sha256")
+        )
+    except StoreError as error:
+        return 0, {Finding("file", "", str(error), "a digest of every file")}
+    expected = {str(n): (int(s), str(d)) for n, s, d in zip(names, sizes, digests, strict=True)}
+    findings = set()
+    attributes = expected.pop(ATTRIBUTES, (0, ""))
+    if attributes_digest(store.attributes) != attributes[1]:
+        findings.add(Finding("zarr.json", "", "the attributes changed", f"SHA-256 {attributes[1]}"))
+    there = {name for name in list_files(store.path) if name != "zarr.json" and not is_own(name)}
+    for name in there - expected.keys():
+        findings.add(Finding(name, "", "belongs to no array", "no such file"))
+    for name in expected.keys() - there:
+        findings.add(Finding(name, "", "is missing", f"a file of {expected[name][0]} bytes"))
+    places = {digest: name for name, (_, digest) in expected.items()}
+    common = sorted(there & expected.keys())
+    tasks = ((store.path, name, *expected[name]) for name in common)
+    for name, what, digest in run_unordered(_compare, tasks, jobs):
+        if what:
+            if digest in places:
+                what = f"holds what belongs in {places[digest]}"
+            findings.add(Finding(name, "", what, f"SHA-256 {expected[name][1]}"))
+    return len(common), findings
+
+
+def _compare(path: Path, name: str, size: int, digest: str) -> tuple[str, str, str]:
+    """Return a file's name, what is wrong with it, and its digest."""
+    file = path / name
+    if file.is_symlink():
+        return name, "is a link", ""
+    try:
+        found = file.stat().st_size
+        if found != size:
+            how = "was cut short" if found < size else "was extended"
+            return name, f"{how}: it has {found} of {size} bytes", ""
+        actual = file_digest(file)
+    except OSError as error:
+        return name, f"cannot be read ({error.strerror})", ""
+    return name, "" if actual == digest else "its bytes changed", actual
+
+
+_CONSOLIDATED = {"kind": "inline", "must_understand": False, "metadata": 0}
+
+
+def _is_metadata(name: str) -> bool:
+    return name.endswith("/zarr.json")
+
+
+def _same(own: Mapping[str, Any], copy: object) -> bool:
+    """Whether metadata equal their consolidated copy; groups may repeat an empty consolidation."""
+    if not isinstance(copy, dict):
+        return False
+    left, right = ({**m, "consolidated_metadata": None} for m in (own, copy))
+    return left == right or repr(left) == repr(right)

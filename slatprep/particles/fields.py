@@ -1,0 +1,166 @@
+"""Materials on voxels, as a store holds them or a decoder predicts them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from slatprep.errors import ConfigError, InputError
+from slatprep.geometry.frames import apply_transform, invert_transform
+from slatprep.geometry.voxels import voxels_of
+from slatprep.normalize import denormalize
+from slatprep.readers.files import ArraySpec, load_source, npz_arrays, npz_small_arrays
+from slatprep.readers.slat import check_coords
+from slatprep.records import BACKGROUND, RESOLUTION, Normalization
+from slatprep.store import Store
+
+Points = Literal["slat", "grid"]
+
+_SPECS = {
+    "coords": ArraySpec(shapes=((None, 3), (None, 4)), kinds="iu"),
+    "material": ArraySpec(shapes=((None,),), kinds="iu"),
+}
+_PROPERTIES = ArraySpec(shapes=((None, 3),), kinds="f")
+_VALID = ArraySpec(shapes=((None,),), kinds="b")
+_ANY = ArraySpec(shapes=(), kinds="biuf", max_items=16 * RESOLUTION**3)
+
+
+@dataclass(frozen=True)
+class VoxelField:
+    """Materials on voxels.
+
+    Attributes
+    ----------
+    voxels : ndarray of uint8, shape (K, 3)
+        The voxels that have a material, K >= 1, each once.
+    material : ndarray of uint8, shape (K,)
+        Class 0..6.
+    properties : ndarray of float32, shape (K, 3)
+        Young's modulus [Pa], density [kg/m^3], Poisson's ratio.
+    transform : ndarray of float64, shape (4, 4), optional
+        The voxels' frame to the SLAT frame; None where they are one.
+    """
+
+    voxels: NDArray[np.uint8]
+    material: NDArray[np.uint8]
+    properties: NDArray[np.float32]
+    transform: NDArray[np.float64] | None = None
+
+    def locate(self, points: ArrayLike) -> NDArray[np.float64]:
+        """Carry points (N, 3) of the SLAT frame into the frame of the voxels."""
+        if self.transform is None:
+            return np.asarray(points, dtype=np.float64)
+        return apply_transform(invert_transform(self.transform), points)
+
+
+def stored_field(store: Store, asset_id: str, points: Points = "slat") -> VoxelField:
+    """Return the materials of an asset in a store.
+
+    Parameters
+    ----------
+    store : Store
+        The store.
+    asset_id : str
+        The asset.
+    points : {"slat", "grid"}
+        The valid SLAT voxels, which are a surface, or the annotated voxels of
+        the PixieVerse field, which are a solid.
+
+    Raises
+    ------
+    StoreError
+        If the store cannot be read or has no such asset.
+    ConfigError
+        If no voxel of the asset has a material.
+    """
+    asset = store.asset(asset_id)
+    if points == "grid":
+        annotated = asset.grid_material < BACKGROUND
+        voxels, material = voxels_of(annotated), asset.grid_material[annotated]
+        values, transform = asset.grid_properties[:, annotated].T, asset.transform
+    else:
+        voxels, material = asset.coords[asset.valid], asset.material[asset.valid]
+        values, transform = asset.properties[asset.valid], None
+    if len(voxels) == 0:
+        raise ConfigError(
+            f"{store.path}: no voxel of {asset_id} has a material; expected an asset whose "
+            "valid_share is above 0"
+        )
+    return VoxelField(voxels, material, denormalize(values, store.normalization), transform)
+
+
+def predicted_field(path: Path, normalization: Normalization | None) -> VoxelField:
+    """Read predicted materials.
+
+    Parameters
+    ----------
+    path : Path
+        An npz with ``coords`` (N, 3) or (N, 4) integers; ``material`` (N,)
+        integers 0..6; ``properties`` (N, 3) normalised, or ``properties_si``
+        (N, 3) in Pa, kg/m^3 and 1; and, where not all voxels count, ``valid``
+        (N,) bool. What `slatprep export --format npz` writes is one.
+    normalization : Normalization or None
+        The ranges of ``properties``; None where they are not known.
+
+    Returns
+    -------
+    VoxelField
+        The valid voxels, in the SLAT frame.
+
+    Raises
+    ------
+    InputError
+        If the file cannot be used.
+    ConfigError
+        If properties are normalised and no ranges are given.
+    """
+    data, _ = load_source(path, path.parent, "slat")
+    arrays = npz_arrays(data, path, _SPECS)
+    held = npz_small_arrays(data, path, _ANY)[0]
+    coords = check_coords(arrays["coords"], path)
+    material = arrays["material"]
+    if "properties_si" in held:
+        values = npz_arrays(data, path, {"properties_si": _PROPERTIES})["properties_si"]
+    else:
+        values = npz_arrays(data, path, {"properties": _PROPERTIES})["properties"]
+        if normalization is None:
+            raise ConfigError(
+                f"{path} holds normalised properties; name their store or their ranges "
+                "(--store or --ranges), or save SI values as properties_si"
+            )
+        values = denormalize(values, normalization)
+    valid = np.ones(len(coords), dtype=bool)
+    if "valid" in held:
+        valid = npz_arrays(data, path, {"valid": _VALID})["valid"]
+    lengths = {len(coords), len(material), len(values), len(valid)}
+    if len(lengths) > 1 or not valid.any():
+        raise InputError(
+            path,
+            f"has {len(coords)} coords, {len(material)} material, {len(values)} properties, "
+            f"{np.count_nonzero(valid)} of {len(valid)} valid",
+            "as many of each, and at least one valid voxel",
+        )
+    _check_values(path, material, values, valid)
+    return VoxelField(
+        coords[valid], material[valid].astype(np.uint8), values[valid].astype(np.float32)
+    )
+
+
+def _check_values(
+    path: Path,
+    material: NDArray[np.integer],
+    values: NDArray[np.floating],
+    valid: NDArray[np.bool_],
+) -> None:
+    wrong = valid & ((material < 0) | (material >= BACKGROUND) | ~np.isfinite(values).all(axis=1))
+    if wrong.any():
+        row = int(np.argmax(wrong))
+        raise InputError(
+            path,
+            f"row {row} has material {material[row]} and properties {values[row].tolist()}",
+            "material 0..6 and finite properties in every valid row",
+        )

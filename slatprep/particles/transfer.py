@@ -1,0 +1,156 @@
+"""Carry materials from voxels to particles: those of a Gaussian PLY, or any points.
+
+What simulates is particles; what the store holds, and what a decoder
+predicts, is voxels. Each particle takes the values of the voxel nearest to it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal, get_args
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from slatprep.errors import ConfigError
+from slatprep.particles.fields import VoxelField, predicted_field, stored_field
+from slatprep.particles.read import Axes, Particles, read_particles
+from slatprep.records import BACKGROUND
+
+__all__ = [
+    "Axes",
+    "Far",
+    "Particles",
+    "Transferred",
+    "VoxelField",
+    "predicted_field",
+    "read_particles",
+    "stored_field",
+    "transfer",
+    "write_transferred",
+]
+
+Far = Literal["background", "drop", "nearest"]
+
+
+@dataclass(frozen=True)
+class Transferred:
+    """Materials at particles, in SI units.
+
+    Attributes
+    ----------
+    rows : ndarray of intp, shape (M,)
+        The particle of each row; all of them, in order, unless some were dropped.
+    material : ndarray of uint8, shape (M,)
+        Class 0..6; 7 for background.
+    properties : ndarray of float32, shape (M, 3)
+        Young's modulus [Pa], density [kg/m^3], Poisson's ratio; 0 for background.
+    distance : ndarray of float64, shape (M,)
+        To the nearest voxel, in voxels of the field.
+    far : int
+        Particles that had no voxel within `max_distance`.
+    """
+
+    rows: NDArray[np.intp]
+    material: NDArray[np.uint8]
+    properties: NDArray[np.float32]
+    distance: NDArray[np.float64]
+    far: int
+
+
+def transfer(
+    points: ArrayLike, field: VoxelField, *, max_distance: float = 2.0, far: Far = "background"
+) -> Transferred:
+    """Give each particle the material of the nearest voxel.
+
+    Parameters
+    ----------
+    points : array_like, shape (N, 3)
+        Particles in the SLAT frame, the unit cube [-0.5, 0.5]^3, z up.
+    field : VoxelField
+        The materials.
+    max_distance : float
+        Voxels; a particle without a voxel this near is far from the object.
+    far : {"background", "drop", "nearest"}
+        What becomes of such a particle: class 7 with properties 0, as empty
+        voxels of PixieVerse have; no row at all; or the nearest voxel's
+        material all the same.
+
+    Returns
+    -------
+    Transferred
+        Materials in the order of the particles.
+
+    Raises
+    ------
+    ConfigError
+        If `far` or `max_distance` makes no sense.
+    """
+    from slatprep.geometry.nearest import nearest_voxel
+
+    if far not in get_args(Far):
+        raise ConfigError(f"far is {far!r}; expected one of {', '.join(get_args(Far))}")
+    if not max_distance > 0:
+        raise ConfigError(f"max_distance is {max_distance}; expected a number above 0")
+    distance, used = nearest_voxel(field.locate(points), field.voxels)
+    near = distance <= max_distance
+    material = np.where(near | (far == "nearest"), field.material[used], np.uint8(BACKGROUND))
+    properties = np.where(
+        (near | (far == "nearest"))[:, None], field.properties[used], np.float32(0.0)
+    )
+    rows = np.flatnonzero(near) if far == "drop" else np.arange(len(near))
+    return Transferred(
+        rows, material[rows], properties[rows], distance[rows], int(np.count_nonzero(~near))
+    )
+
+
+def write_transferred(
+    path: Path, particles: Particles, result: Transferred, *, max_distance: float, in_slat: bool
+) -> None:
+    """Write materials at particles as Pixie's PLY for PhysGaussian.
+
+    Parameters
+    ----------
+    path : Path
+        The file; a material PLY that is there is replaced.
+    particles : Particles
+        The particles.
+    result : Transferred
+        What `transfer` gave them.
+    max_distance : float
+        Voxels at which ``conf`` is 0.
+    in_slat : bool
+        Whether positions are written in the SLAT frame, or as in the particles' file.
+
+    Raises
+    ------
+    ConfigError
+        If something else is at `path`.
+    SlatprepError
+        If nothing can be written there.
+    """
+    from slatprep.export import target
+    from slatprep.export.ply import write_points
+
+    if in_slat or particles.axes == "slat":
+        frame = "frame SLAT, unit cube -0.5..0.5, z up"
+    else:
+        frame = "frame TRELLIS as it saves Gaussians, unit cube -0.5..0.5, y up"
+    positions = particles.in_slat() if in_slat else particles.positions
+    with target.file(path, _is_material_ply) as new:
+        write_points(
+            new,
+            positions[result.rows],
+            result.material,
+            result.properties,
+            np.clip(1.0 - result.distance / max_distance, 0.0, 1.0),
+            frame,
+        )
+
+
+def _is_material_ply(path: Path) -> bool:
+    from slatprep.export.ply import UNITS
+
+    with path.open("rb") as stream:
+        return UNITS.encode() in stream.read(1024)

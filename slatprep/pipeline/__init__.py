@@ -1,0 +1,1 @@
+"""The stages in order, for one asset and for a dataset."""

@@ -1,0 +1,94 @@
+"""A fingerprint of the code that makes an asset's numbers.
+
+Work done by other code must be done again, but a new command, a new comment
+or a new release must not cost a day of alignment. So the fingerprint is of
+the statements, without comments, docstrings and layout, of the modules that
+the stages read, align and sample can reach, and of nothing else.
+"""
+
+from __future__ import annotations
+
+import ast
+import hashlib
+from collections.abc import Iterator
+from functools import lru_cache
+from pathlib import Path
+
+STAGES = (
+    "slatprep.readers.pixieverse",
+    "slatprep.readers.slat",
+    "slatprep.align",
+    "slatprep.sample",
+    "slatprep.judge",
+)
+"""Where an asset's numbers are made; a package stands for all of its modules."""
+
+# Parameters enter an asset's key as values, so their defaults may change; the
+# words of an error are no numbers; of slatprep itself it is only the version;
+# and whichever way bytes come from a disk or a network, their digest tells them.
+_NOT_NUMBERS = (
+    "slatprep",
+    "slatprep.errors",
+    "slatprep.parameters",
+    "slatprep.storage",
+    "slatprep.storage.cache",
+    "slatprep.storage.remote",
+    "slatprep.workers",
+    "slatprep.workers.local",
+)
+
+
+@lru_cache(maxsize=1)
+def code_fingerprint() -> str:
+    """Return the SHA-256, in hex, of the statements of `numeric_modules`."""
+    digest = hashlib.sha256()
+    for path in numeric_modules().values():
+        tree = _without_docstrings(ast.parse(path.read_bytes()))
+        digest.update(f"{ast.dump(tree)}\n".encode())
+    return digest.hexdigest()
+
+
+def numeric_modules() -> dict[str, Path]:
+    """Return the modules that `STAGES` reach by imports, sorted, and their files."""
+    found: dict[str, Path] = {}
+    waiting = list(STAGES)
+    while waiting:
+        name = waiting.pop()
+        if name in found or name in _NOT_NUMBERS:
+            continue
+        path = _source(name)
+        if path is None:
+            if name in STAGES:
+                raise ValueError(f"the stage {name} is no module of slatprep")
+            continue  # A name inside a module, as `from slatprep.records import Verdict` has.
+        found[name] = path
+        if path.name == "__init__.py":
+            waiting += [f"{name}.{module.stem}" for module in path.parent.glob("[!_]*.py")]
+        waiting += _imports(path)
+    return dict(sorted(found.items()))
+
+
+def _source(name: str) -> Path | None:
+    # Not by importlib, which would import, and compile, what a name is looked for in.
+    package = Path(__file__).parents[1]
+    place = package.joinpath(*name.split(".")[1:])
+    files = (place.with_name(f"{place.name}.py"), place / "__init__.py")
+    return next((file for file in files if file.is_file()), None)
+
+
+def _imports(path: Path) -> Iterator[str]:
+    for node in ast.walk(ast.parse(path.read_bytes())):
+        if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("slatprep"):
+            yield node.module or ""
+            yield from (f"{node.module}.{alias.name}" for alias in node.names)
+        elif isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names if alias.name.startswith("slatprep"))
+
+
+def _without_docstrings(tree: ast.Module) -> ast.Module:
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef):
+            first = node.body[0] if node.body else None
+            if isinstance(first, ast.Expr) and isinstance(first.value, ast.Constant):
+                node.body = node.body[1:]
+    return tree

@@ -1,0 +1,131 @@
+"""Put a new directory in the place of an old one, in one step where the system can.
+
+Nothing is exchanged before all of the new one is on the disk itself, so that
+a power failure finds the old one whole or the new one whole.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import os
+import shutil
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from slatprep.errors import StoreError
+
+_AT_FDCWD = -100
+_RENAME_EXCHANGE = 2
+
+
+def replace_directory(new: Path, target: Path) -> None:
+    """Move the directory `new` to `target`; what was there is removed afterwards.
+
+    On Linux the two directories are exchanged in one system call, so a reader
+    finds the old or the new one whole at every moment. Elsewhere, and on file
+    systems that cannot exchange, two renames leave a short moment without
+    either; `restore_directory` mends what a kill in it leaves. Both must lie
+    on one file system.
+
+    Raises
+    ------
+    OSError
+        If the directory cannot be moved; `target` is as it was.
+    """
+    flush_tree(new)
+    old = _aside(new.parent)
+    if not target.exists():
+        new.rename(target)
+    elif _exchange(new, target):
+        old = new
+    else:
+        target.rename(old)
+        try:
+            new.rename(target)
+        except OSError:
+            old.rename(target)
+            raise
+    flush(target.parent)
+    if old.exists():
+        shutil.rmtree(old, ignore_errors=True)  # The work folder goes next, with what is left.
+
+
+def restore_directory(work: Path, target: Path) -> None:
+    """Put back what a kill between the two renames of `replace_directory` left below `work`."""
+    for scratch in sorted(work.glob("*")):
+        if _aside(scratch).exists() and not target.exists():
+            _aside(scratch).rename(target)
+
+
+def flush_tree(directory: Path) -> None:
+    """Bring every file below a directory, and the names of all, onto the disk itself."""
+    for parent, _, files in os.walk(directory, topdown=False):
+        for name in files:
+            flush(Path(parent, name))
+        flush(Path(parent))
+
+
+def flush(path: Path) -> None:
+    """Bring a file's content, or a directory's names, onto the disk itself."""
+    if path.is_dir() and sys.platform == "win32":
+        return  # There a directory cannot be opened.
+    descriptor = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+def _aside(scratch: Path) -> Path:
+    return scratch / "previous"
+
+
+def _exchange(new: Path, target: Path) -> bool:
+    """Exchange two directories atomically; False where the system cannot."""
+    if sys.platform != "linux":
+        return False
+    renameat2 = getattr(ctypes.CDLL(None, use_errno=True), "renameat2", None)
+    if renameat2 is None:
+        return False
+    result = renameat2(
+        _AT_FDCWD, os.fsencode(new), _AT_FDCWD, os.fsencode(target), _RENAME_EXCHANGE
+    )
+    return int(result) == 0
+
+
+@contextmanager
+def staged(path: Path) -> Iterator[Path]:
+    """Yield a file beside `path` that takes its place, whole and on disk, when all went well.
+
+    Its name is the same each time, so what a killed process leaves is
+    overwritten by the next; two processes must not stage one path at a time.
+    """
+    path.parent.mkdir(parents=True, exist_ok=True)
+    temporary = path.with_name(f".{path.name}.partial")
+    try:
+        yield temporary
+        flush(temporary)
+        temporary.replace(path)
+        flush(path.parent)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+@contextmanager
+def writing(what: str, where: Path) -> Iterator[None]:
+    """Turn a disk's refusal into an error that names what was to be written.
+
+    Raises
+    ------
+    StoreError
+        In place of an `OSError`.
+    """
+    try:
+        yield
+    except OSError as error:
+        raise StoreError(
+            f"{what}: cannot be written to {where} ({error.strerror or error}); nothing was "
+            "replaced. Make room there and run again: what is finished is kept"
+        ) from error

@@ -1,0 +1,67 @@
+"""A folder of the local disk for what belongs to places on object stores.
+
+It holds the work folders of builds to such places, and copies of files that
+must lie on a disk to be read. All of it may be removed when nothing runs.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import tempfile
+from pathlib import Path
+
+from slatprep.storage.remote import RemotePath, in_parts, reach, telling
+
+VARIABLE = "SLATPREP_CACHE"
+"""Environment variable that says where the folder is."""
+
+
+def cache_folder() -> Path:
+    """Return the folder: ``$SLATPREP_CACHE``, else ``slatprep`` in the user's own cache."""
+    named = os.environ.get(VARIABLE)
+    if named:
+        return Path(named).expanduser().absolute()
+    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache").absolute() / "slatprep"
+
+
+def folder_for(path: RemotePath) -> Path:
+    """Return the part of the folder that belongs to a place, named so that people see whose."""
+    return cache_folder() / f"{path.name}-{_short(str(path))}"
+
+
+def on_disk(path: Path) -> Path:
+    """Return a path of the local disk with a file's content.
+
+    A local file's is its own. An object is copied; the copy serves as long as
+    the object has the same size, tag and time, and one copy is kept.
+
+    Raises
+    ------
+    OSError
+        If the object cannot be read or the disk does not take it.
+    """
+    if not isinstance(path, RemotePath):
+        return path
+    system, name = reach(path)
+    with telling(path):
+        entry = system.info(name)
+    state = [str(entry.get(key)) for key in ("size", "ETag", "etag", "LastModified", "mtime")]
+    folder = folder_for(path)
+    copy = folder / _short(" ".join(state))
+    if copy.exists():
+        return copy
+    folder.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(dir=folder) as own:
+        part = Path(own, "part")
+        with telling(path):
+            system.get_file(name, str(part), **in_parts(system))
+        part.replace(copy)
+    for older in folder.iterdir():
+        if older != copy and older.is_file():
+            older.unlink(missing_ok=True)
+    return copy
+
+
+def _short(text: str) -> str:
+    return hashlib.sha256(text.encode()).hexdigest()[:16]

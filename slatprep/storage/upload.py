@@ -1,0 +1,274 @@
+"""Put a finished store on an object store: first all of it, then, in one step, in sight.
+
+Nobody reads what the pointer does not name, so an upload that ends midway
+harms nothing. The pointer is replaced only if it is the one that was there
+when the build began: on S3 the server itself compares them.
+
+A version's name comes from its content and from the pointer it is to replace.
+So an upload that is repeated finds what the first one left; and whoever
+removes a version's objects has replaced that pointer before, which makes
+this build's own replacement fail. What remains cannot be seen half.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import warnings
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+from slatprep.errors import StoreError
+from slatprep.storage.files import file_digest, list_files
+from slatprep.storage.remote import RemotePath, in_parts, list_objects, reach, telling
+from slatprep.storage.versions import (
+    POINTER,
+    RECORDS,
+    VERSIONS,
+    Pointer,
+    is_version,
+    is_version_name,
+    read_pointer,
+)
+
+_SMALL_BYTES = 8 * 2**20
+
+_AT_ONCE = {True: 16, False: 1}
+"""Small files, held in memory whole, and large ones that are uploaded at a time."""
+
+
+@dataclass(frozen=True)
+class Base:
+    """The pointer that was there when a build began.
+
+    Attributes
+    ----------
+    target : RemotePath
+        The store.
+    pointer : Pointer or None
+        What it said; None where there was none.
+    tag : str
+        What the server calls this state of it.
+    """
+
+    target: RemotePath
+    pointer: Pointer | None
+    tag: str = ""
+
+
+def look_at(target: RemotePath) -> Base:
+    """See what a build would replace.
+
+    Raises
+    ------
+    StoreError
+        If the place cannot be reached, or holds something other than a store.
+    """
+    if is_version(target):
+        raise StoreError(f"{target} is one version of a store; expected {target.parent.parent}")
+    try:
+        # The tag first: of a pointer that moves in between it is the old one, and will not fit.
+        tag = _tag(target / POINTER)
+        pointer = read_pointer(target)
+        others = [] if pointer else [name for name in list_objects(target) if not _is_ours(name)]
+    except OSError as error:
+        raise StoreError(
+            f"{target}: cannot be reached ({error.strerror}); expected a URL in a bucket that "
+            "exists and may be written to"
+        ) from None
+    if others:
+        raise StoreError(
+            f"{target} holds {others[0]} and is not a slatprep store with versions; expected one "
+            "to replace, or a new URL"
+        )
+    return Base(target, pointer, tag)
+
+
+@dataclass(frozen=True)
+class Upload:
+    """A new version that is complete and not yet in sight; `upload_store` makes one.
+
+    Attributes
+    ----------
+    base : Base
+        What was there when the build began.
+    pointer : Pointer
+        What will be there.
+    """
+
+    base: Base
+    pointer: Pointer
+
+    @property
+    def target(self) -> RemotePath:
+        """The store."""
+        return self.base.target
+
+    @property
+    def version(self) -> RemotePath:
+        """Where its files are."""
+        return self.target / VERSIONS / self.pointer.version
+
+    def show(self) -> None:
+        """Replace the pointer, and remove the versions that nobody needs any more.
+
+        Raises
+        ------
+        StoreError
+            If another build has replaced it since this one began, or it
+            cannot be written.
+        """
+        if self.pointer == self.base.pointer:
+            return
+        try:
+            # Before the pointer moves: a build that begins then is not listed here.
+            old = self._unneeded()
+            self._replace_pointer()
+        except OSError as error:
+            raise StoreError(_refused(self.target, error)) from None
+        try:
+            _remove(self.target, old)
+        except OSError as error:
+            # The new store is complete all the same, and the next build will try again.
+            warnings.warn(
+                f"{self.target}: older versions could not be removed ({error.strerror})",
+                stacklevel=2,
+            )
+
+    def _replace_pointer(self) -> None:
+        place = self.target / POINTER
+        data = self.pointer.encode()
+        system, name = reach(place)
+        condition: dict[str, Any] = {}
+        if self.base.pointer is None:
+            condition["mode"] = "create"
+        elif "s3" in system.protocol:
+            condition["IfMatch"] = self.base.tag
+        try:
+            if read_pointer(self.target) == self.base.pointer:
+                with telling(place):
+                    system.pipe_file(name, data, **condition)
+                    return
+        except OSError:
+            now = read_pointer(self.target)
+            if now == self.base.pointer:
+                raise
+        now = read_pointer(self.target)
+        # Ours, if the server's first answer was lost; or another build made the same.
+        if now is None or now.version != self.pointer.version:
+            raise StoreError(
+                f"{self.target}: another build replaced it while this one ran (at "
+                f"{now.published if now else 'an unknown time'}); nothing was changed. Run again "
+                "to bring it up to date"
+            )
+
+    def _unneeded(self) -> list[str]:
+        keep = {self.pointer.version, self.pointer.previous}
+        names = list_objects(self.target)
+        return [name for name in names if name != POINTER and _is_ours(name, but=keep)]
+
+
+def upload_store(new: Path, base: Base) -> Upload:
+    """Upload all files of a finished store as a new version, and see that all are there.
+
+    Parameters
+    ----------
+    new : Path
+        The store, on the local disk.
+    base : Base
+        Where it belongs, and what was there when the build began. If that has
+        the same content, nothing is uploaded.
+
+    Raises
+    ------
+    StoreError
+        If something cannot be uploaded.
+    """
+    files = {name: (new / name).stat().st_size for name in list_files(new)}
+    content = _digest(f"{name} {file_digest(new / name)}\n" for name in files)
+    if base.pointer is not None and base.pointer.content == content:
+        return Upload(base, base.pointer)
+    before = base.pointer.version if base.pointer else ""
+    pointer = Pointer(
+        version=_digest((before, content))[:16],
+        previous=before,
+        content=content,
+        published=datetime.now(UTC).isoformat(timespec="seconds"),
+    )
+    upload = Upload(base, pointer)
+    try:
+        there = list_objects(upload.version)
+        missing = [name for name in files if not _is_same(there.get(name), new / name)]
+        for small, at_once in _AT_ONCE.items():
+            chosen = [name for name in missing if (files[name] <= _SMALL_BYTES) == small]
+            _put(new, upload.version, chosen, at_once)
+        there = list_objects(upload.version)
+    except OSError as error:
+        raise StoreError(_refused(base.target, error)) from None
+    for name, size in files.items():
+        if there.get(name, {}).get("size") != size:
+            raise StoreError(
+                f"{upload.version / name}: is not there as it was uploaded; nothing was replaced. "
+                "If another build has just replaced the store, run again"
+            )
+    return upload
+
+
+def _put(new: Path, version: RemotePath, names: list[str], at_once: int) -> None:
+    if not names:
+        return
+    system, root = reach(version)
+    options = in_parts(system) | ({"batch_size": at_once} if system.async_impl else {})
+    with telling(version):
+        system.put([str(new / name) for name in names], [f"{root}/{n}" for n in names], **options)
+
+
+def _is_same(entry: Mapping[str, Any] | None, file: Path) -> bool:
+    """Whether an object is known to hold what a file holds: S3 tags most by their MD5."""
+    if entry is None or entry["size"] != file.stat().st_size:
+        return False
+    with file.open("rb") as content:
+        return bool(_etag(entry) == hashlib.file_digest(content, "md5").hexdigest())
+
+
+def _remove(target: RemotePath, names: list[str]) -> None:
+    if names:
+        system, root = reach(target)
+        with telling(target):
+            system.rm([f"{root}/{name}" for name in names])
+
+
+def _is_ours(name: str, but: Iterable[str] = ()) -> bool:
+    """Whether an object below a store is part of some version or its records."""
+    kind, _, rest = name.partition("/")
+    version = rest.partition("/")[0]
+    return kind in (VERSIONS, RECORDS) and is_version_name(version) and version not in but
+
+
+def _tag(place: RemotePath) -> str:
+    system, name = reach(place)
+    try:
+        with telling(place):
+            return str(system.info(name).get("ETag", ""))
+    except FileNotFoundError:
+        return ""
+
+
+def _etag(entry: Mapping[str, Any]) -> str:
+    return str(entry.get("ETag", "")).strip('"')
+
+
+def _digest(parts: Iterable[str]) -> str:
+    digest = hashlib.sha256()
+    for part in parts:
+        digest.update(part.encode())
+    return digest.hexdigest()
+
+
+def _refused(target: RemotePath, error: OSError) -> str:
+    return (
+        f"{target}: cannot be written ({error.strerror}); nothing was replaced. Run again when it "
+        "can: what is finished is kept"
+    )

@@ -1,0 +1,360 @@
+"""Rows of an array, read straight from its shards.
+
+A shard is a file of chunks with an index at its end (Zarr format 3,
+"sharding_indexed" codec): for each chunk where it begins and how long it is,
+as little-endian uint64, then a CRC32C of the index. The chunks of one asset
+lie side by side, so this reader asks the file for them and for nothing else;
+zarr-python reads the same bytes with far more work around them.
+"""
+
+from __future__ import annotations
+
+import errno
+import os
+import stat
+import threading
+from collections.abc import Mapping
+from dataclasses import dataclass
+from io import FileIO
+from itertools import groupby
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from slatprep.errors import StoreError
+from slatprep.storage.remote import RemoteFile, RemotePath
+from slatprep.store.codecs import MAX_TEXT_BYTES, ChunkDecoder, crc32c_holds
+
+MISSING = 2**64 - 1
+"""Offset and length of a chunk that was never written: it holds the fill value."""
+
+OPEN_SHARDS = 32
+"""Shards of one array that stay open at a time."""
+
+_INDEX_CODECS = ["bytes", "crc32c"]
+
+
+MAX_CHUNK_BYTES = 256 * 2**20
+"""What one chunk may unpack to; a grid's takes 3 MiB."""
+
+
+MAX_CHUNKS = 2**20
+"""Chunks of one shard, whose index is held in memory."""
+
+
+class DamagedFileError(StoreError):
+    """A file of a store that is missing, cut short or damaged.
+
+    Parameters
+    ----------
+    folder : str
+        The store.
+    file : str
+        The file, below the store.
+    fault : str
+        What is wrong with it.
+    expected : str
+        What should be there.
+    """
+
+    def __init__(self, folder: str, file: str, fault: str, expected: str) -> None:
+        super().__init__(
+            f"{folder}/{file}: {fault}; expected {expected}. Copy the store again, or build it"
+        )
+        self.folder, self.file, self.fault, self.expected = folder, file, fault, expected
+
+    def __reduce__(self) -> tuple[type, tuple[str, str, str, str]]:
+        return (type(self), (self.folder, self.file, self.fault, self.expected))
+
+
+class Folder:
+    """An open directory: what is read below it stays of one store, even if that is replaced."""
+
+    def __init__(self, path: str | os.PathLike[str]) -> None:
+        self.path = os.fspath(path)
+        self._descriptor = os.open(self.path, os.O_RDONLY) if _AT else None
+
+    def open(self, name: str) -> LocalFile:
+        """Open a file for reading, without buffer."""
+        if self._descriptor is None:
+            return LocalFile(os.path.join(self.path, name))  # noqa: PTH118 - the hot path
+        return LocalFile(name, opener=self._open_at)
+
+    def _open_at(self, name: str, flags: int) -> int:
+        # A pipe in a shard's place must not make the reader wait for a writer.
+        return os.open(name, flags | os.O_NONBLOCK, dir_fd=self._descriptor)
+
+    def __del__(self) -> None:
+        if getattr(self, "_descriptor", None) is not None:
+            os.close(self._descriptor)  # type: ignore[arg-type]
+
+
+_AT = os.open in os.supports_dir_fd
+
+
+class RemoteFolder:
+    """A version of a store on an object store, which stays of one store because it never changes.
+
+    Parameters
+    ----------
+    path : RemotePath
+        Its URL.
+    """
+
+    def __init__(self, path: RemotePath) -> None:
+        self.path = str(path)
+        self._root = path
+
+    def open(self, name: str) -> RemoteFile:
+        """Open a file for reading; nothing is asked yet."""
+        return RemoteFile(self._root / name)
+
+
+class LocalFile(FileIO):
+    """A file of the local disk; threads may share it."""
+
+    def size(self) -> int:
+        """Return its length in bytes.
+
+        Raises
+        ------
+        OSError
+            If it is a folder, pipe or device.
+        """
+        state = os.fstat(self.fileno())
+        if not stat.S_ISREG(state.st_mode):
+            raise OSError(errno.EINVAL, "it is no regular file")
+        return state.st_size
+
+    def pread(self, length: int, offset: int) -> bytes:
+        """Read up to `length` bytes from a place on."""
+        return os.pread(self.fileno(), length, offset)
+
+
+HELD_BYTES = 64 * 2**20
+"""What is asked of an object store at once; more is asked for chunk by chunk."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Shard:
+    """An open shard and its index: offset and length of each chunk."""
+
+    file: LocalFile | RemoteFile | None
+    index: NDArray[np.uint64]
+
+
+class RowReader:
+    """Reads rows of one array; safe to share between threads and across a fork.
+
+    Parameters
+    ----------
+    folder : Folder or RemoteFolder
+        The store.
+    name : str
+        Name of the array, such as ``voxel/feats``.
+    shape : tuple of int
+        Shape of the array.
+    shard_rows : int
+        Rows of one file.
+    sharded : bool
+        Whether the file has an index, or is one chunk.
+    decoder : ChunkDecoder
+        For its chunks.
+    fill_value : object
+        What a chunk that was never written holds.
+    """
+
+    def __init__(
+        self,
+        folder: Folder | RemoteFolder,
+        name: str,
+        shape: tuple[int, ...],
+        shard_rows: int,
+        sharded: bool,
+        decoder: ChunkDecoder,
+        fill_value: Any,
+    ) -> None:
+        self.folder = folder
+        self.name = name
+        self.shape = shape
+        self.dtype = decoder.dtype
+        self.shard_rows = shard_rows
+        self.chunk_rows = decoder.shape[0]
+        self.sharded = sharded
+        self.decoder = decoder
+        self.fill_value = fill_value
+        self.chunks_per_shard = shard_rows // self.chunk_rows
+        # Zarr leaves out files of fill values alone, as a column of empty strings is.
+        self.optional = name.startswith("asset/") and name != "asset/offset"
+        self._shards: dict[int, _Shard] = {}
+        self._local = threading.local()
+
+    @classmethod
+    def of(
+        cls, folder: Folder | RemoteFolder, name: str, metadata: Mapping[str, Any]
+    ) -> RowReader | None:
+        """Return a reader for an array with this ``zarr.json``, or None if it is of another kind.
+
+        Raises
+        ------
+        StoreError
+            If the metadata make no sense.
+        """
+        try:
+            return cls._of(folder, name, metadata)
+        except (KeyError, TypeError, ValueError, AttributeError, IndexError) as error:
+            raise StoreError(f"{folder.path}/{name}: bad metadata ({error!r})") from None
+
+    @classmethod
+    def _of(
+        cls, folder: Folder | RemoteFolder, name: str, metadata: Mapping[str, Any]
+    ) -> RowReader | None:
+        text = metadata["data_type"] == "string"
+        if not text and metadata["data_type"] not in _DTYPES:
+            return None
+        dtype = np.dtype(object) if text else np.dtype(metadata["data_type"]).newbyteorder("<")
+        shape = tuple(map(int, metadata["shape"]))
+        outer = tuple(map(int, metadata["chunk_grid"]["configuration"]["chunk_shape"]))
+        codecs, inner = metadata["codecs"], outer
+        sharded = codecs[0]["name"] == "sharding_indexed"
+        if sharded:
+            sharding = codecs[0]["configuration"]
+            inner, codecs = tuple(map(int, sharding["chunk_shape"])), sharding["codecs"]
+            index_codecs = [codec["name"] for codec in sharding["index_codecs"]]
+            at_end = sharding.get("index_location", "end") == "end"
+            if index_codecs != _INDEX_CODECS or not at_end or len(metadata["codecs"]) > 1:
+                return None
+        whole_rows = outer[1:] == inner[1:] == shape[1:] and inner[0] > 0 == outer[0] % inner[0]
+        if not whole_rows or metadata["chunk_key_encoding"] not in _KEYS:
+            return None
+        fill_value = np.array(metadata["fill_value"], object).astype(dtype)
+        decoder = ChunkDecoder.of(dtype, inner, codecs)
+        if decoder is None:
+            return None
+        if decoder.nbytes > MAX_CHUNK_BYTES or outer[0] // inner[0] > MAX_CHUNKS:
+            raise ValueError(f"chunks of {inner} in shards of {outer}")
+        return cls(folder, name, shape, outer[0], sharded, decoder, fill_value)
+
+    def key(self, shard: int) -> str:
+        """Return the name of a shard's file below the store."""
+        return f"{self.name}/c/{shard}" + "/0" * (len(self.shape) - 1)
+
+    def read(self, start: int, stop: int) -> NDArray[Any]:
+        """Read rows.
+
+        Parameters
+        ----------
+        start, stop : int
+            First row, and the one after the last; ``0 <= start <= stop <= len``.
+
+        Returns
+        -------
+        ndarray, shape (stop - start, ...)
+            Fresh memory in native byte order.
+
+        Raises
+        ------
+        StoreError
+            If a file is missing, cut short or damaged; the message names it.
+        """
+        if not 0 <= start <= stop <= self.shape[0]:
+            raise StoreError(f"{self.name} has {self.shape[0]} rows, not {start} to {stop}")
+        out = np.empty((stop - start, *self.shape[1:]), self.dtype)
+        rows, per_shard = self.chunk_rows, self.chunks_per_shard
+        if isinstance(self.folder, RemoteFolder):
+            self._hold(range(start // rows, -(-stop // rows)))
+        for chunk in range(start // rows, -(-stop // rows)):
+            base = chunk * rows
+            first, last = max(start, base), min(stop, base + rows)
+            target = out[first - start : last - start]
+            if last - first == rows:
+                self._chunk(*divmod(chunk, per_shard), target)
+            else:
+                whole = self._scratch()
+                self._chunk(*divmod(chunk, per_shard), whole)
+                target[...] = whole[first - base : last - base]
+        return out
+
+    def _chunk(self, number: int, place: int, out: NDArray[Any]) -> None:
+        shard = self._shards.get(number) or self._open(number)
+        offset, length = shard.index[place].tolist()
+        if shard.file is None or offset == length == MISSING:
+            out[...] = self.fill_value
+            return
+        try:
+            data = shard.file.pread(length, offset)
+            if len(data) != length:
+                raise StoreError("the file ends before it does")
+            self.decoder.decode(data, out)
+        except StoreError as error:
+            raise self._damaged(number, f"chunk {place} is damaged: {error}") from None
+        except OSError as error:
+            raise self._damaged(number, f"cannot be read ({error.strerror})") from None
+
+    def _hold(self, chunks: range) -> None:
+        """Ask once for the chunks of each shard, which lie side by side, and not once for each."""
+        for number, own in groupby(chunks, lambda chunk: chunk // self.chunks_per_shard):
+            shard = self._shards.get(number) or self._open(number)
+            index = shard.index[[chunk % self.chunks_per_shard for chunk in own]]
+            offset, length = index[index[:, 0] != MISSING].astype(np.int64).T
+            if len(offset) > 1 and isinstance(shard.file, RemoteFile):
+                begin, end = int(offset.min()), int((offset + length).max())
+                if end - begin <= HELD_BYTES:
+                    try:
+                        shard.file.hold(end - begin, begin)
+                    except OSError as error:
+                        fault = f"cannot be read ({error.strerror})"
+                        raise self._damaged(number, fault) from None
+
+    def _scratch(self) -> NDArray[Any]:
+        """Return memory for a chunk of which only some rows are wanted, one for each thread."""
+        scratch: NDArray[Any] | None = getattr(self._local, "scratch", None)
+        if scratch is None:
+            scratch = self._local.scratch = np.empty(self.decoder.shape, self.dtype)
+        return scratch
+
+    def _open(self, number: int) -> _Shard:
+        try:
+            file = self.folder.open(self.key(number))
+            size = file.size()
+        except FileNotFoundError:
+            if self.optional:
+                return _Shard(None, np.array([[MISSING, MISSING]], np.uint64))
+            raise self._damaged(number, "is missing (was the store replaced?)") from None
+        except OSError as error:
+            raise self._damaged(number, f"cannot be read ({error.strerror})") from None
+        shard = _Shard(file, self._index(number, file, size))
+        # Two threads may both have opened it; whichever is kept is as good.
+        self._shards[number] = shard
+        for oldest in list(self._shards)[:-OPEN_SHARDS]:
+            self._shards.pop(oldest, None)
+        return shard
+
+    def _index(self, number: int, file: LocalFile | RemoteFile, size: int) -> NDArray[np.uint64]:
+        # No packed chunk is much larger than its values; strings have their own bound.
+        limit = MAX_TEXT_BYTES if self.decoder.text else 2 * self.decoder.nbytes + 65_536
+        if not self.sharded:
+            index = np.array([[0, size]], np.uint64)
+        else:
+            length = 16 * self.chunks_per_shard + 4
+            data = file.pread(length, size - length) if size >= length else b""
+            if not crc32c_holds(data):
+                raise self._damaged(number, "has no sound index; it is damaged or cut short")
+            index = np.frombuffer(data, "<u8", 2 * self.chunks_per_shard).reshape(-1, 2)
+            size -= length
+        there = index[~(index == MISSING).all(axis=1)]
+        offset, length_of = there.T
+        if (offset > size).any() or (length_of > np.minimum(size, limit)).any():
+            raise self._damaged(number, "its index leads out of it")
+        return index
+
+    def _damaged(self, number: int, fault: str) -> DamagedFileError:
+        return DamagedFileError(self.folder.path, self.key(number), fault, "the file as written")
+
+
+_DTYPES = ("bool", "uint8", "int64", "float32", "float64")
+_KEYS = (
+    {"name": "default"},
+    {"name": "default", "configuration": {"separator": "/"}},
+)

@@ -1,0 +1,108 @@
+"""Frames, transforms and voxel sets."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from slatprep.geometry.frames import (
+    apply_transform,
+    displacement,
+    invert_transform,
+    make_transform,
+    split_transform,
+    voxel_centres,
+)
+from slatprep.geometry.voxels import boundary, bounding_box, occupancy_of, voxels_of
+
+numbers = st.floats(-2, 2)
+poses = st.tuples(
+    st.tuples(numbers, numbers, numbers), st.tuples(numbers, numbers, numbers), st.floats(0.3, 3)
+).map(
+    lambda p: make_transform(Rotation.from_rotvec(np.array(p[0])).as_matrix(), np.array(p[1]), p[2])
+)
+
+
+def test_the_first_and_last_voxel_lie_half_a_voxel_inside_the_cube() -> None:
+    centres = voxel_centres([[0, 0, 0], [63, 63, 63], [31, 32, 0]])
+    half = 1 / 128
+    np.testing.assert_array_equal(
+        centres,
+        [[-0.5 + half] * 3, [0.5 - half] * 3, [-half, half, -0.5 + half]],
+    )
+
+
+@given(poses)
+def test_an_inverse_undoes_a_transform(transform: np.ndarray) -> None:
+    points = np.array([[0.1, 0.2, 0.3], [-0.5, 0.5, 0.0]])
+    there = apply_transform(transform, points)
+    np.testing.assert_allclose(
+        apply_transform(invert_transform(transform), there), points, atol=1e-9
+    )
+    np.testing.assert_allclose(invert_transform(transform), np.linalg.inv(transform), atol=1e-9)
+
+
+@given(poses)
+def test_splitting_and_making_are_inverse(transform: np.ndarray) -> None:
+    np.testing.assert_allclose(make_transform(*split_transform(transform)), transform, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    "matrix",
+    [
+        np.eye(3),
+        np.diag([1.0, 1.0, -1.0, 1.0]),  # a mirror
+        np.diag([1.0, 1.0, 0.0, 1.0]),  # flat
+        np.diag([1.0, 1.0, 2.0, 1.0]),  # no uniform scale
+        np.full((4, 4), np.nan),
+    ],
+)
+def test_what_is_no_similarity_is_refused(matrix: np.ndarray) -> None:
+    with pytest.raises(ValueError, match="a transform"):
+        split_transform(matrix)
+
+
+def test_the_boundary_of_a_box_by_counting() -> None:
+    box = np.zeros((64, 64, 64), dtype=bool)
+    box[10:20, 10:22, 10:24] = True
+    assert boundary(box).sum() == 10 * 12 * 14 - 8 * 10 * 12
+    full = np.ones((64, 64, 64), dtype=bool)
+    assert boundary(full).sum() == 64**3 - 62**3
+    single = occupancy_of([[5, 6, 7]])
+    np.testing.assert_array_equal(boundary(single), single)
+
+
+def test_a_cavity_s_wall_is_boundary() -> None:
+    box = np.zeros((64, 64, 64), dtype=bool)
+    box[10:20, 10:20, 10:20] = True
+    box[15, 15, 15] = False
+    assert boundary(box).sum() == 10**3 - 8**3 + 6
+
+
+@given(st.sets(st.tuples(*[st.integers(0, 63)] * 3), min_size=1, max_size=50))
+def test_voxels_and_occupancy_are_two_forms_of_one_set(voxels: set[tuple[int, ...]]) -> None:
+    occupancy = occupancy_of(np.array(sorted(voxels)))
+    assert {tuple(v) for v in voxels_of(occupancy).tolist()} == voxels
+    box = bounding_box(occupancy)
+    assert occupancy[box].sum() == len(voxels)
+    table = np.array(sorted(voxels))
+    assert [s.start for s in box] == table.min(axis=0).tolist()
+    assert [s.stop for s in box] == (table.max(axis=0) + 1).tolist()
+
+
+def test_an_empty_set_has_no_box() -> None:
+    with pytest.raises(ValueError, match="empty"):
+        bounding_box(np.zeros((64, 64, 64), dtype=bool))
+
+
+def test_displacement_by_hand() -> None:
+    shifted = make_transform(np.eye(3), [3 / 64, 4 / 64, 0])
+    assert displacement(shifted, np.eye(4), [[1, 2, 3], [60, 5, 9]]) == pytest.approx(5.0)
+    # Scaled by 2, the inverse looks half as far from the centre: 0.5 voxel at
+    # the voxel whose centre is one voxel off on one axis... and root 3 of it on all.
+    doubled = make_transform(np.eye(3), scale=2.0)
+    voxel = [[32, 32, 32]]  # centred half a voxel off on each axis
+    assert displacement(doubled, np.eye(4), voxel) == pytest.approx(np.sqrt(3) * 0.25)

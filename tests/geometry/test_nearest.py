@@ -1,0 +1,87 @@
+"""Nearest voxels and votes, against a kd-tree and by hand."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial import cKDTree
+
+from slatprep.geometry.frames import voxel_centres
+from slatprep.geometry.nearest import Lattice, nearest_voxel
+
+
+@settings(deadline=None, max_examples=40)
+@given(st.integers(1, 3000), st.integers(0, 2**32 - 1), st.floats(0.2, 1.5))
+def test_the_nearest_voxel_is_a_kd_tree_s(count: int, seed: int, spread: float) -> None:
+    rng = np.random.default_rng(seed)
+    voxels = np.unique(rng.integers(0, 64, (count, 3)), axis=0).astype(np.uint8)
+    points = rng.uniform(-spread, spread, (200, 3))
+    points[:50] = np.round(points[:50] * 128) / 128  # on voxels, faces and edges
+    distance, index = nearest_voxel(points, voxels)
+    expected, _ = cKDTree(voxel_centres(voxels)).query(points)
+    np.testing.assert_allclose(distance, expected * 64, atol=1e-9)
+    apart = np.linalg.norm(points - voxel_centres(voxels[index]), axis=1) * 64
+    np.testing.assert_allclose(apart, distance, atol=1e-9)
+
+
+def test_of_equally_near_voxels_the_first_is_taken() -> None:
+    voxels = np.array([[11, 10, 10], [9, 10, 10], [10, 11, 10]], dtype=np.uint8)
+    for order in ([0, 1, 2], [2, 0, 1], [1, 2, 0]):
+        _, index = nearest_voxel(voxel_centres([[10, 10, 10]]), voxels[order])
+        assert index.tolist() == [0]
+
+
+def test_beyond_the_limit_nothing_is_found() -> None:
+    voxels = np.array([[0, 0, 0]], dtype=np.uint8)
+    points = voxel_centres([[2, 0, 0], [3, 0, 0], [63, 63, 63]])
+    distance, index = nearest_voxel(points, voxels, limit=2.0)
+    assert distance.tolist() == [2.0, np.inf, np.inf]
+    assert index.tolist() == [0, -1, -1]
+
+
+def test_an_empty_set_is_refused() -> None:
+    with pytest.raises(ValueError, match="empty"):
+        nearest_voxel(np.zeros((1, 3)), np.zeros((0, 3), dtype=np.uint8))
+
+
+def test_two_voters_outvote_a_nearer_one() -> None:
+    # The point sits 0.4 of the way from voxel 30 to 31: class 2 is nearest, but
+    # class 5 speaks from x = 31 and from both sides in y.
+    voxels = np.array([[30, 20, 20], [31, 20, 20], [31, 21, 20], [31, 19, 20]], dtype=np.uint8)
+    labels = np.array([2, 5, 5, 5], dtype=np.uint8)
+    point = voxel_centres([[30, 20, 20]]) + np.array([[0.4, 0, 0]]) / 64
+    weight = {2: np.exp(-2 * 0.4**2), 5: np.exp(-2 * 0.6**2) + 2 * np.exp(-2 * (0.6**2 + 1))}
+    assert weight[5] < weight[2]  # with a width of 0.5 the nearest one still holds
+    assert Lattice(voxels).vote(point, labels, 0.5).tolist() == [0]
+    assert Lattice(voxels).vote(point, labels, 1.0).tolist() == [1]  # with 1.0 it does not
+
+
+def test_a_vote_without_voters_is_empty() -> None:
+    voxels = np.array([[0, 0, 0]], dtype=np.uint8)
+    assert Lattice(voxels).vote(
+        voxel_centres([[5, 5, 5]]), np.zeros(1, np.uint8), 0.5
+    ).tolist() == [-1]
+
+
+@settings(deadline=None, max_examples=25)
+@given(st.integers(0, 2**32 - 1), st.floats(0.3, 1.0))
+def test_votes_are_those_of_a_plain_count(seed: int, width: float) -> None:
+    rng = np.random.default_rng(seed)
+    voxels = np.unique(rng.integers(20, 26, (80, 3)), axis=0).astype(np.uint8)
+    labels = rng.integers(0, 7, len(voxels)).astype(np.uint8)
+    points = voxel_centres(rng.integers(19, 27, (20, 3))) + rng.uniform(-0.5, 0.5, (20, 3)) / 64
+    spokesmen = Lattice(voxels).vote(points, labels, width)
+    for point, spokesman in zip(points, spokesmen, strict=True):
+        index = (point + 0.5) * 64 - 0.5
+        around = np.abs(voxels - np.rint(index)).max(axis=1) <= 1
+        square = ((voxels - index) ** 2).sum(axis=1)
+        if not around.any():
+            assert spokesman == -1
+            continue
+        weights = np.zeros(7)
+        np.add.at(weights, labels[around], np.exp(-0.5 * square[around] / width**2))
+        assert weights[labels[spokesman]] == pytest.approx(weights.max())
+        same = around & (labels == labels[spokesman])
+        assert square[spokesman] == pytest.approx(square[same].min())

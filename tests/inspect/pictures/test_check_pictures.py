@@ -1,0 +1,255 @@
+"""`slatprep check-alignment` draws what the store holds, of the assets that were meant."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import zarr
+from click.testing import CliRunner, Result
+from matplotlib.image import imread
+from support.synthetic import QUARTER_TURN
+
+from slatprep.cli.commands import slatprep
+from slatprep.errors import StoreError
+from slatprep.geometry.frames import apply_transform, invert_transform, voxel_centres
+from slatprep.inspect.check import check_alignment, choose_assets
+from slatprep.inspect.pictures.alignment import HEIGHT, WIDTH, panels
+from slatprep.inspect.pictures.scene import FARTHEST, distance_colours, scene_of, views
+from slatprep.inspect.pictures.viewer import cube_mesh, has_screen, meshes
+from slatprep.inspect.pictures.write import write_pictures
+from slatprep.pipeline.dataset import BuildSummary
+from slatprep.provenance.candidates import candidates_of
+from slatprep.store import open_store
+
+
+def run(*arguments: str | Path) -> Result:
+    return CliRunner().invoke(slatprep, ["check-alignment", *map(str, arguments)])
+
+
+@pytest.fixture
+def copy(mixed_build: BuildSummary, tmp_path: Path) -> Path:
+    """Return a store that may be damaged, with its records."""
+    assert mixed_build.store is not None
+    shutil.copytree(mixed_build.records.parent, tmp_path / "copy.manifests")
+    return Path(shutil.copytree(mixed_build.store, tmp_path / "copy.zarr"))
+
+
+def misplace(path: Path, row: int, shift: float) -> None:
+    transform = QUARTER_TURN.copy()
+    transform[0, 3] = shift
+    zarr.open_group(path, mode="r+")["asset/transform"][row] = transform
+
+
+# -- the picture ----------------------------------------------------------------
+
+
+def test_the_picture_is_whole_and_the_same_each_time(copy: Path, tmp_path: Path) -> None:
+    files = [tmp_path / "one.png", tmp_path / "two.PNG"]
+    for file in files:
+        result = run("--asset", "ant", "--store", copy, "--picture", file)
+        assert result.exit_code == 0, result.output
+        assert f"picture: {file}" in result.stdout
+    assert files[0].read_bytes() == files[1].read_bytes()
+    image = imread(files[0])
+    assert image.shape[:2] == (HEIGHT, WIDTH)
+    # No region is blank: the three rows, each of the four columns, each part beside them.
+    for top in (142, 456, 770):
+        for left in (48, 362, 676, 990, 1350):
+            assert image[top : top + 300, left : left + 300, :3].std() > 0.05, (top, left)
+
+
+def test_a_wrong_transform_is_drawn_worse(copy: Path) -> None:
+    store = open_store(copy)
+    scene = scene_of(store.asset("ant"))
+    misplace(copy, 0, 0.1)
+    wrong = scene_of(open_store(copy).asset("ant"))
+    assert scene.error.max() < 0.01
+    assert wrong.error.mean() > 2
+    for right, bad in zip(views(scene, 80), views(wrong, 80), strict=True):
+        # The scale of distances goes from light to dark.
+        ink_right, ink_bad = (1 - panels(s, v)[3] for s, v in ((scene, right), (wrong, bad)))
+        assert ink_bad.sum() > 1.5 * ink_right.sum()
+
+
+def test_the_error_is_the_distance_to_the_nearest_surface_voxel(copy: Path) -> None:
+    misplace(copy, 0, 0.03)
+    scene = scene_of(open_store(copy).asset("ant"))
+    points = apply_transform(invert_transform(scene.transform), voxel_centres(scene.surface))
+    here = voxel_centres(scene.pixieverse)
+    some = slice(0, None, 40)
+    expected = [np.linalg.norm(here - point, axis=1).min() * 64 for point in points[some]]
+    np.testing.assert_allclose(scene.error[some], expected, atol=1e-9)
+    colours = distance_colours(np.array([0.0, FARTHEST, 99.0]))
+    np.testing.assert_array_equal(colours[1], colours[2])
+    assert colours[0].sum() > colours[1].sum()
+
+
+def test_a_broken_store_is_drawn_all_the_same_and_fails(copy: Path) -> None:
+    misplace(copy, 0, 0.4)
+    result = run("--asset", "ant", "--store", copy)
+    assert result.exit_code == 1
+    assert imread(copy.with_name("copy.pictures") / "ant.png").shape[:2] == (HEIGHT, WIDTH)
+
+
+def test_a_place_that_cannot_be_written_is_named(copy: Path, tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    result = run("--asset", "ant", "--store", copy, "--picture", tmp_path / "file" / "x")
+    assert result.exit_code == 1
+    assert "cannot be written" in result.stderr and "--picture" in result.stderr
+
+
+# -- the candidates -------------------------------------------------------------
+
+
+def test_candidates_come_from_the_records(mixed_build: BuildSummary) -> None:
+    store = open_store(mixed_build.store)
+    lines = mixed_build.records.read_text("utf-8").splitlines()
+    truth = {record["asset_id"]: record for record in map(json.loads, lines)}
+    found = candidates_of(store, ["dog", "ant"])
+    for asset_id, candidates in found.items():
+        assert not isinstance(candidates, str)
+        expected = truth[asset_id]["alignment"]["candidates"]
+        assert [c.fitness for c in candidates] == [c["fitness"] for c in expected]
+
+
+def test_records_of_another_build_are_not_believed(copy: Path, tmp_path: Path) -> None:
+    if "asset/record" in open_store(copy).group:
+        pytest.skip("the records travel inside the store")
+    build = copy.with_name("copy.manifests") / "build.json"
+    build.write_text(json.dumps({**json.loads(build.read_text("utf-8")), "id": "other"}), "utf-8")
+    (told,) = candidates_of(open_store(copy), ["ant"]).values()
+    assert isinstance(told, str) and "not found" in told
+    result = run("--asset", "ant", "--store", copy)
+    assert result.exit_code == 0
+    with pytest.raises(StoreError, match="no records of the build"):
+        candidates_of(open_store(copy), ["ant"], build.parent)
+
+
+# -- which assets ---------------------------------------------------------------
+
+
+def test_worst_and_ambiguous_choose_by_the_stores_figures(copy: Path) -> None:
+    group = zarr.open_group(copy, mode="r+")
+    assert list(group["asset/id"][:]) == ["ant", "bear.front", "bear.side", "cup", "dog"]
+    group["asset/fitness"][:] = [0.9, 0.5, 1.0, np.nan, 0.7]
+    group["asset/fitness_backward"][:] = [0.3, 0.9, 1.0, 1.0, 0.6]
+    group["asset/ambiguity"][:] = [0.0, 0.2, 0.9, 0.05, 0.01]
+    store = open_store(copy)
+    assert choose_assets(store, worst=3) == ["cup", "ant", "bear.front"]
+    assert choose_assets(store, worst=99) == ["cup", "ant", "bear.front", "dog", "bear.side"]
+    assert choose_assets(store, ambiguous=True) == ["bear.side", "bear.front"]
+    chosen = choose_assets(store, ["dog", "ant"], worst=2, ambiguous=True)
+    assert chosen == ["dog", "ant", "cup", "bear.side", "bear.front"]
+    with pytest.raises(StoreError, match="no asset"):
+        choose_assets(store, ["nobody"], worst=1)
+
+
+def test_several_assets_get_a_file_each_and_a_contact_sheet(copy: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "pictures"
+    result = run("--worst", "1", "--asset", "cup", "--store", copy, "--picture", folder, "--json")
+    assert result.exit_code == 0, result.output
+    told = json.loads(result.stdout)
+    assert len(told) == 2 and told[0]["asset_id"] == "cup"
+    assert {Path(one["picture"]) for one in told} | {folder / "sheet.png"} == set(folder.iterdir())
+    for asset in told:
+        passes = {figure["name"]: figure["passes"] for figure in asset["figures"]}
+        assert passes["fitness"] is True and passes["overlap"] is None
+    sheet = imread(folder / "sheet.png")
+    assert sheet[84:284, 40:240].std() > 0.05 and sheet[84:284, 680:880].std() > 0.05
+
+
+def test_one_file_cannot_hold_several_assets(copy: Path) -> None:
+    result = run("--worst", "2", "--store", copy, "--picture", "all.png")
+    assert result.exit_code == 2 and "folder" in result.stderr
+
+
+def test_no_ambiguous_asset_is_no_failure(copy: Path) -> None:
+    zarr.open_group(copy, mode="r+")["asset/ambiguity"][:] = 0.0
+    result = run("--ambiguous", "--store", copy)
+    assert result.exit_code == 0 and "no asset is ambiguous" in result.stdout
+    assert not copy.with_name("copy.pictures").exists()
+
+
+def test_an_id_becomes_a_safe_file_name(copy: Path, tmp_path: Path) -> None:
+    names = zarr.open_group(copy, mode="r+")["asset/id"]
+    names[:] = np.array(["../ant", *names[1:]], dtype=object)
+    store = open_store(copy)
+    (file,), sheet = write_pictures(store, [check_alignment(store, "../ant")], tmp_path / "safe")
+    assert file.parent == tmp_path / "safe" and file.exists() and sheet is None
+
+
+# -- the terminal ---------------------------------------------------------------
+
+
+def test_numbers_stand_beside_their_thresholds(copy: Path) -> None:
+    told = run("--asset", "ant", "--store", copy, "--picture", "none").stdout
+    rows = {line.split()[0]: line.split()[1:] for line in told.splitlines() if "  " in line}
+    assert rows["fitness"][1:4] == [">=", "0.8", "yes"]
+    assert rows["ambiguity"][1:4] == ["<=", "0.05", "yes"]
+    assert "100.0% of the SLAT boundary lie within 1 voxel" in told
+    assert "\x1b" not in told
+
+
+def test_without_a_screen_show_says_where_the_picture_is(
+    copy: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    if sys.platform != "linux":
+        pytest.skip("a screen is always taken to be there")
+    monkeypatch.delenv("DISPLAY", raising=False)
+    monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
+    file = tmp_path / "ant.png"
+    shown = run("--asset", "ant", "--store", copy, "--picture", file, "--show")
+    assert shown.exit_code == 0
+    assert "no screen" in shown.stderr and str(file) in shown.stderr
+    misplace(copy, 0, 0.4)
+    assert run("--asset", "ant", "--store", copy, "--picture", file, "--show").exit_code == 1
+
+
+def test_a_screen_is_known_by_its_variables() -> None:
+    assert not has_screen({}, "linux")
+    assert has_screen({"DISPLAY": ":0"}, "linux")
+    assert has_screen({"WAYLAND_DISPLAY": "wayland-0"}, "linux")
+    assert has_screen({}, "darwin")
+
+
+def test_help_does_not_load_matplotlib() -> None:
+    script = (
+        "import sys\n"
+        "sys.argv = ['slatprep', 'check-alignment', '--help']\n"
+        "try:\n    from slatprep.cli import main; main()\n"
+        "except SystemExit: pass\n"
+        "assert not {'matplotlib', 'numpy', 'zarr'} & set(sys.modules)\n"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", script], capture_output=True, text=True, env=os.environ.copy()
+    )
+    assert done.returncode == 0, done.stderr
+    assert "Exit codes" in done.stdout
+
+
+# -- the viewer's meshes --------------------------------------------------------
+
+
+def test_a_mesh_encloses_the_volume_of_its_voxels() -> None:
+    voxels = np.argwhere(np.ones((2, 3, 4))).astype(np.uint8) + np.uint8(9)
+    transform = QUARTER_TURN.copy()
+    transform[:3, :3] *= 1.5
+    vertices, triangles, colours = cube_mesh(voxels, np.full((24, 3), 0.5), transform)
+    assert len(vertices) == len(colours) == 4 * 2 * (6 + 8 + 12)
+    a, b, c = (vertices[triangles[:, k]] for k in range(3))
+    # The divergence theorem: positive, as the triangles turn outwards.
+    volume = np.einsum("ij,ij->i", a, np.cross(b, c)).sum() / 6
+    assert volume == pytest.approx(24 / 64**3 * 1.5**3)
+
+
+def test_the_viewer_gets_four_parts_side_by_side(mixed_build: BuildSummary) -> None:
+    parts = meshes(scene_of(open_store(mixed_build.store).asset("ant")))
+    middles = [vertices[:, 0].mean() for vertices, _, _ in parts]
+    assert len(parts) == 4 and (np.diff(middles) > 0.8).all()

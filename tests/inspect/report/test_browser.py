@@ -1,0 +1,160 @@
+"""The page in a real browser, opened from disk."""
+
+from __future__ import annotations
+
+import io
+import time
+from collections.abc import Callable
+from typing import TYPE_CHECKING
+
+import pytest
+from PIL import Image
+from support.pages import HOSTILE, Report
+
+if TYPE_CHECKING:
+    from selenium.webdriver import Chrome
+
+pytest.importorskip("selenium")
+
+PATIENCE = 60  # A loaded machine draws 3D slowly without a graphics card.
+
+
+def wait(condition: Callable[[], object]) -> None:
+    end = time.monotonic() + PATIENCE
+    while not condition():
+        assert time.monotonic() < end, "the page did not get there"
+        time.sleep(0.05)
+
+
+def open_page(browser: Chrome, report: Report) -> None:
+    browser.get("about:blank")  # else a change of the address' end loads nothing
+    browser.get(report.path.as_uri())
+    ready = "return performance.getEntriesByName('slatprep-ready').length"
+    wait(lambda: browser.execute_script(ready))
+
+
+@pytest.fixture
+def opened(browser: Chrome, hostile: Report) -> Chrome:
+    open_page(browser, hostile)
+    return browser
+
+
+def rows(browser: Chrome) -> list[str]:
+    script = "return [...document.querySelectorAll('td.id')].map(cell => cell.textContent)"
+    return list(browser.execute_script(script))
+
+
+def click(browser: Chrome, selector: str) -> None:
+    browser.execute_script("document.querySelector(arguments[0]).click()", selector)
+
+
+def assert_quiet(browser: Chrome) -> None:
+    """Nothing went wrong, nothing was fetched, and no data was run."""
+    assert browser.get_log("browser") == []
+    assert browser.execute_script("return typeof window.broken") == "undefined"
+    assert browser.execute_script("return document.querySelectorAll('img').length") == 0
+    fetched = "return performance.getEntriesByType('resource').map(entry => entry.name)"
+    assert [name for name in browser.execute_script(fetched) if name[:5] != "blob:"] == []
+
+
+def test_it_opens_sorts_and_filters(opened: Chrome) -> None:
+    from selenium.webdriver.common.keys import Keys
+
+    everything = {"ant", "bear.front", "bear.side", "cup", "dog", "lone", "torn"}
+    assert set(rows(opened)) == everything
+    click(opened, "[data-sort=id]")
+    assert rows(opened) == sorted(everything)
+    click(opened, "[data-sort=id]")
+    assert rows(opened) == sorted(everything, reverse=True)
+    click(opened, "[data-sort=voxels]")  # Those not in the store have none, and come last.
+    assert set(rows(opened)[-2:]) == {"lone", "torn"}
+
+    click(opened, "#state-chips [data-state=skipped]")
+    assert rows(opened) == ["lone"]
+    click(opened, "#state-chips [data-state=skipped]")
+    search = opened.find_element("id", "search")
+    search.send_keys("BEAR")
+    assert set(rows(opened)) == {"bear.front", "bear.side"}
+    assert opened.find_element("id", "count").text == "2 of 7 assets"
+    search.send_keys(Keys.CONTROL, "a", Keys.NULL, Keys.BACKSPACE)
+    search.send_keys("onerror=")
+    assert set(rows(opened)) == {"ant", "cup", "torn"}
+    search.send_keys(Keys.CONTROL, "a", Keys.NULL, Keys.BACKSPACE)
+    choose = (
+        "const s = document.getElementById('category'); s.value = '=' + arguments[0];"
+        "s.dispatchEvent(new Event('change'))"
+    )
+    opened.execute_script(choose, HOSTILE)
+    assert rows(opened) == ["cup"]
+    opened.execute_script(choose.replace("'=' + arguments[0]", "'*'"))
+    click(opened, "[data-key=fitness] .bin")
+    assert 0 < len(rows(opened)) < 7
+    click(opened, "#applied .chip")
+    assert set(rows(opened)) == everything
+    assert HOSTILE in opened.find_element("id", "balance").text
+    assert HOSTILE in opened.find_element("id", "why").text
+    assert_quiet(opened)
+
+
+def test_it_opens_an_asset_that_turns(opened: Chrome) -> None:
+    from selenium.webdriver.common.keys import Keys
+
+    click(opened, "[data-sort=id]")
+    row = opened.find_element("css selector", "tbody tr:not(.space)")
+    row.send_keys(Keys.ARROW_DOWN)
+    opened.switch_to.active_element.send_keys(Keys.ENTER)
+    title = opened.find_element("id", "asset-title")
+    assert title.text.startswith("bear.front")
+    canvas = opened.find_element("id", "canvas")
+
+    def pixels() -> bytes:
+        return bytes(canvas.screenshot_as_png)
+
+    wait(lambda: len(Image.open(io.BytesIO(pixels())).convert("P").getcolors() or ()) > 8)
+    front = pixels()
+    assert opened.find_element("id", "scale").text.split() == ["jelly", "metal"]
+    canvas.send_keys(Keys.ARROW_RIGHT * 4)
+    wait(lambda: pixels() != front)
+    still = pixels()
+    click(opened, "[data-mode=youngs_modulus]")
+    wait(lambda: pixels() != still)
+    assert "Pa" in opened.find_element("id", "scale").text
+    click(opened, "[data-switch=turning]")
+    moving = pixels()
+    wait(lambda: pixels() != moving)
+    click(opened, "[data-switch=turning]")
+    for switch in ("field", "before", "before", "slat"):
+        before = pixels()
+        click(opened, f"[data-switch={switch}]")
+        wait(lambda before=before: pixels() != before)
+    click(opened, "#next")
+    wait(lambda: title.text.startswith("bear.side"))
+    assert opened.current_url.endswith("#asset=bear.side")
+    canvas.send_keys(Keys.ESCAPE)
+    wait(lambda: not opened.execute_script("return document.getElementById('asset').open"))
+    assert_quiet(opened)
+
+
+def test_an_asset_without_a_picture_says_why_it_is_not_there(opened: Chrome) -> None:
+    click(opened, "#state-chips [data-state='not built']")
+    click(opened, "tbody tr:not(.space)")
+    assert "no 3D view" in opened.find_element("id", "message").text
+    assert HOSTILE in opened.find_element("id", "asset-reasons").text
+    assert_quiet(opened)
+
+
+@pytest.mark.parametrize(("theme", "other"), [("dark", "light"), ("light", "dark")])
+def test_light_and_dark(browser: Chrome, hostile: Report, theme: str, other: str) -> None:
+    feature = {"name": "prefers-color-scheme", "value": theme}
+    browser.execute_cdp_cmd("Emulation.setEmulatedMedia", {"features": [feature]})
+    open_page(browser, hostile)
+    ground = "return getComputedStyle(document.body).backgroundColor"
+    button = browser.find_element("id", "theme")
+    here = browser.execute_script(ground)
+    assert button.get_attribute("aria-label") == f"Use {other} colours"
+    click(browser, "#theme")
+    assert browser.execute_script(ground) != here
+    assert button.get_attribute("aria-label") == f"Use {theme} colours"
+    click(browser, "#theme")
+    assert browser.execute_script(ground) == here
+    assert_quiet(browser)

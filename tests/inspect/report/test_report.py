@@ -1,0 +1,252 @@
+"""What a page says, held against the store by numpy, zlib and an HTML parser alone."""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import io
+import json
+import re
+import zlib
+from pathlib import Path
+
+import numpy as np
+import pytest
+import slatprep.report
+import zarr
+from click.testing import CliRunner
+from PIL import Image
+from scipy.spatial.transform import Rotation
+from support.pages import HOSTILE, Page, Report
+from support.synthetic import QUARTER_TURN
+
+from slatprep.cli.commands import slatprep as command
+from slatprep.errors import StoreError
+from slatprep.inspect.report import write_report
+from slatprep.inspect.report.outcomes import kind_of
+from slatprep.inspect.report.statistics import nearest_quarter_turn, quarter_turns
+from slatprep.pipeline.dataset import BuildSummary
+from slatprep.store import open_store
+
+IDS = ["ant", "bear.front", "bear.side", "cup", "dog"]
+
+
+def unpack(page: Page, index: int) -> dict[str, np.ndarray]:
+    """Undo the voxels of an asset as the page's script does."""
+    side = page.content["detail"]["side"]
+    packed = page.blocks["pack-0"][1].split("\n")[index]
+    data = np.frombuffer(zlib.decompress(base64.b64decode(packed), -zlib.MAX_WBITS), np.uint8)
+    slat, field = (
+        np.argwhere(np.unpackbits(bits).reshape(side, side, side))
+        for bits in (data[: side**3 // 8], data[side**3 // 8 : side**3 // 4])
+    )
+    columns = data[side**3 // 4 :][: 5 * len(slat)].reshape(5, len(slat))
+    rest = data[side**3 // 4 + 5 * len(slat) :]
+    assert len(rest) == len(field)
+    return {"slat": slat, "field": field, "columns": columns, "field_material": rest}
+
+
+# -- what it lists ------------------------------------------------------------
+
+
+def test_every_asset_is_listed_with_its_state_and_why(page: Page) -> None:
+    assets = page.content["assets"]
+    assert assets["id"] == [*IDS, "lone", "torn"]
+    assert assets["state"] == ["good"] * 5 + ["skipped", "not built"]
+    assert assets["reasons"][0] == [HOSTILE]
+    assert assets["reasons"][1] == []
+    assert "SLAT" in assets["reasons"][5][0]
+    assert assets["picture"] == [0, 1, 2, 3, 4, None, None]
+    assert {len(column) for column in assets.values()} == {7}
+
+
+def test_figures_are_the_store_s(page: Page, hostile: Report) -> None:
+    group = zarr.open_group(hostile.store, mode="r")
+    assets = page.content["assets"]
+    for name in ("fitness", "inlier_rmse", "valid_share", "overlap", "ambiguity"):
+        np.testing.assert_allclose(assets[name][:5], group[f"asset/{name}"][:], atol=1e-5)
+        assert assets[name][5:] == [None, None]
+    assert assets["voxels"][:5] == np.diff(group["asset/offset"][:]).tolist()
+    assert page.content["voxels"] == group["voxel/coords"].shape[0]
+    assert {quarter_turns()[turn] for turn in assets["turn"][:5]} == {"x→+y y→\u2212x z→+z"}
+
+
+def test_distributions_count_every_voxel_in_its_bin(page: Page, hostile: Report) -> None:
+    group = zarr.open_group(hostile.store, mode="r")
+    material, values = group["voxel/material"][:], group["voxel/properties"][:]
+    grid, fields = group["grid/material"][:], group["grid/properties"][:]
+    for k, entry in enumerate(page.content["properties"]):
+        for kind in range(7):
+            expected, _ = np.histogram(values[material == kind, k], bins=64, range=(-1, 1))
+            assert entry["slat"][kind] == expected.tolist()
+            expected, _ = np.histogram(fields[:, k][grid == kind], bins=64, range=(-1, 1))
+            assert entry["field"][kind] == expected.tolist()
+        stored = group.attrs["normalization"][entry["name"]]
+        assert (entry["lo"], entry["hi"]) == (stored["lo"], stored["hi"])
+
+
+def test_class_balance_is_by_category(page: Page, hostile: Report) -> None:
+    group = zarr.open_group(hostile.store, mode="r")
+    offsets, material = group["asset/offset"][:], group["voxel/material"][:]
+    rows = {row["category"]: row for row in page.content["balance"]}
+    assert {name: row["assets"] for name, row in rows.items()} == {
+        "animal": 3,
+        HOSTILE: 1,
+        "vessel": 1,
+    }
+    animals = material[: offsets[3]]
+    expected = [int((animals == kind).sum()) for kind in range(7)]
+    assert rows["animal"]["classes"] == [*expected, int((animals == 255).sum())]
+
+
+# -- pictures -----------------------------------------------------------------
+
+
+@pytest.mark.parametrize("index", [0, 3])
+def test_voxels_of_the_view_are_the_store_s(page: Page, hostile: Report, index: int) -> None:
+    asset = open_store(hostile.store).asset(IDS[index])
+    order = np.lexsort(asset.coords.T[::-1])
+    seen = unpack(page, index)
+    np.testing.assert_array_equal(seen["slat"], asset.coords[order])
+    np.testing.assert_array_equal(seen["columns"][0], asset.material[order])
+    for k in range(3):
+        shown = seen["columns"][1 + k] / 63 * 2 - 1
+        assert np.abs(shown - asset.properties[order, k]).max() <= 1 / 63 + 1e-6
+    # The boundary is that of the field, which the transform lays on the SLAT exactly.
+    moved = (seen["field"] + 0.5) / 64 - 0.5
+    moved = moved @ asset.transform[:3, :3].T + asset.transform[:3, 3]
+    moved = np.rint((moved + 0.5) * 64 - 0.5).astype(int)
+    assert {tuple(v) for v in moved.tolist()} == {tuple(v) for v in seen["slat"].tolist()}
+
+
+def test_thumbnails_show_three_silhouettes(page: Page, hostile: Report) -> None:
+    asset = open_store(hostile.store).asset("cup")
+    detail = page.content["detail"]
+    sheet = Image.open(io.BytesIO(base64.b64decode(page.blocks["sheet-0"][1])))
+    assert sheet.info["transparency"] == 0
+    side = sheet.width // detail["columns"] // detail["views"]
+    left = IDS.index("cup") * side * detail["views"]
+    pixels = np.asarray(sheet)[:side, left : left + 3 * side]
+    margin = (side - 64) // 2
+    x, y, z = asset.coords.T.astype(int)
+    for view, (columns, rows) in enumerate([(x, 63 - z), (y, 63 - z), (x, 63 - y)]):
+        expected = np.zeros((side, side), dtype=bool)
+        expected[rows + margin, columns + margin] = True
+        np.testing.assert_array_equal(pixels[:, view * side :][:, :side] > 0, expected)
+
+
+def test_a_store_too_large_is_shown_in_part_and_coarsely(
+    hostile: Report, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(slatprep.inspect.report, "ASSETS_IN_DETAIL", 3)
+    monkeypatch.setattr(slatprep.inspect.report, "VOXEL_BYTES", 100)
+    summary = write_report(open_store(hostile.store), tmp_path / "page.html")
+    page = Page(tmp_path / "page.html")
+    assert (summary.assets, summary.in_detail, summary.side) == (5, 3, 32)
+    assert page.content["assets"]["picture"] == [0, None, 1, None, 2]
+    dog = open_store(hostile.store).asset("dog")
+    np.testing.assert_array_equal(unpack(page, 2)["slat"], np.unique(dog.coords // 2, axis=0))
+
+
+@pytest.mark.parametrize(("angle", "expected"), [(0.0, 0.0), (10.0, 10.0), (44.0, 44.0)])
+def test_nearest_quarter_turn(angle: float, expected: float) -> None:
+    transform = QUARTER_TURN.copy()
+    tilt = Rotation.from_rotvec([np.radians(angle), 0, 0]).as_matrix()
+    transform[:3, :3] = 0.8 * tilt @ QUARTER_TURN[:3, :3]
+    index, found = nearest_quarter_turn(transform)
+    assert quarter_turns()[index] == "x→+y y→\u2212x z→+z"
+    assert found == pytest.approx(expected, abs=1e-4)
+    assert len(set(quarter_turns())) == 24
+
+
+# -- a page that is safe and whole --------------------------------------------
+
+
+def test_data_never_becomes_markup(page: Page) -> None:
+    assert not [tag for tag, _ in page.elements if tag in ("img", "iframe", "object", "link")]
+    tags = [tag for tag, _ in page.elements]
+    assert tags.count("script") == 5  # content, script, library, one sheet, one pack
+    assert not [name for _, attributes in page.elements for name in attributes if name[:2] == "on"]
+    assert page.content["assets"]["category"][3] == HOSTILE
+
+
+def test_nothing_is_fetched_and_no_other_script_may_run(page: Page) -> None:
+    for _, attributes in page.elements:
+        assert not attributes.get("src")
+        assert (attributes.get("href") or "#").startswith("#")
+    [policy] = [a["content"] for _, a in page.elements if a.get("http-equiv")]
+    assert policy is not None
+    rules = dict(rule.strip().split(" ", 1) for rule in policy.split(";"))
+    assert rules["default-src"] == "'none'"
+    assert rules["img-src"] == "blob:"
+    run = [text for kind, text in page.blocks.values() if kind == "script"]
+    run.append(page.blocks["library"][1])
+    hashes = {base64.b64encode(hashlib.sha256(t.encode()).digest()).decode() for t in run}
+    assert set(re.findall(r"sha256-([^']+)", rules["script-src"])) == hashes
+
+
+def test_the_bytes_do_not_depend_on_the_jobs(hostile: Report, tmp_path: Path) -> None:
+    write_report(
+        open_store(hostile.store), tmp_path / "two.html", manifests=hostile.manifests, jobs=2
+    )
+    assert (tmp_path / "two.html").read_bytes() == hostile.path.read_bytes()
+
+
+# -- records ------------------------------------------------------------------
+
+
+def test_without_records_the_page_says_so(hostile: Report, tmp_path: Path) -> None:
+    write_report(open_store(hostile.store), tmp_path / "page.html")
+    content = Page(tmp_path / "page.html").content
+    assert content["records"] is False
+    assert content["assets"]["id"] == IDS
+    assert content["assets"]["tied"] == [None] * 5
+
+
+@pytest.mark.parametrize(
+    ("file", "text", "message"),
+    [
+        ("build.json", '{"id": "0123"}', "records of build '0123'"),
+        ("build.json", "[]", "expected a JSON object"),
+        ("assets.jsonl", "", "no record of 5 assets"),
+        ("assets.jsonl", '{"asset_id": "ant"}\n', "line 1: not a record"),
+        ("assets.jsonl", "{", "line 1: no JSON"),
+    ],
+)
+def test_other_records_are_refused(
+    hostile: Report, tmp_path: Path, file: str, text: str, message: str
+) -> None:
+    for name in ("build.json", "assets.jsonl"):
+        (tmp_path / name).write_bytes((hostile.manifests / name).read_bytes())
+    (tmp_path / file).write_text(text)
+    with pytest.raises(StoreError, match=re.escape(message)):
+        write_report(open_store(hostile.store), tmp_path / "page.html", manifests=tmp_path)
+    assert not (tmp_path / "page.html").exists()
+
+
+@pytest.mark.parametrize(
+    ("reason", "kind"),
+    [
+        ("only 76.1% of it lies within 1 voxel", "only N% of it lies within N voxel"),
+        ("a/b.npz: holds 1,024 rows; expected 3", "holds N rows"),
+        ("internal error, please report: KeyError: 'x'", None),
+    ],
+)
+def test_reasons_are_grouped_without_files_and_numbers(reason: str, kind: str | None) -> None:
+    assert kind_of(reason) == (reason if kind is None else kind)
+
+
+# -- the command --------------------------------------------------------------
+
+
+def test_the_command_finds_the_records_beside_the_store(mixed_build: BuildSummary) -> None:
+    store = mixed_build.store
+    assert store is not None
+    done = CliRunner().invoke(command, ["report", str(store), "--json"])
+    assert done.exit_code == 0, done.output
+    document = json.loads(done.stdout)
+    path = store.with_name("mixed.html")
+    assert document["path"] == str(path)
+    assert document["size"] == path.stat().st_size
+    assert (document["assets"], document["in_detail"], document["side"]) == (7, 5, 64)
+    assert Page(path).content["records"] is True

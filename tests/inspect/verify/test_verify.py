@@ -1,0 +1,340 @@
+"""Whatever is wrong with a store is found, and named."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+import zarr
+from click.testing import CliRunner
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from support.synthetic import Dataset
+
+from slatprep.cli.commands import slatprep
+from slatprep.errors import StoreError
+from slatprep.inspect.verify import Finding, SourceRoots, verify_store
+from slatprep.pipeline.dataset import BuildSummary
+from slatprep.storage.files import list_files
+from slatprep.store import open_store
+
+
+@pytest.fixture
+def store(mixed_build: BuildSummary, tmp_path: Path) -> Path:
+    """Copy the mixed store, and its records beside it, to damage them."""
+    original = mixed_build.store
+    assert original is not None
+    shutil.copytree(original, tmp_path / "s.zarr")
+    shutil.copytree(original.with_suffix(".manifests"), tmp_path / "s.manifests")
+    return tmp_path / "s.zarr"
+
+
+def found(store: Path, **options: object) -> tuple[Finding, ...]:
+    return verify_store(store, **options).findings  # type: ignore[arg-type]
+
+
+def of_file(findings: tuple[Finding, ...], file: str) -> list[Finding]:
+    return [finding for finding in findings if finding.file == file]
+
+
+def change(store: Path, name: str, edit: Callable[[bytearray], object]) -> None:
+    data = bytearray((store / name).read_bytes())
+    edit(data)
+    (store / name).write_bytes(data)
+
+
+def rewrite(store: Path, array: str, rows: object, values: object) -> None:
+    """Change values the proper way, by zarr: checksums are right, digests are not."""
+    zarr.open_group(store, mode="r+", use_consolidated=False)[array][rows] = values
+
+
+def test_a_sound_store_has_no_findings(mixed_build: BuildSummary) -> None:
+    one, two = (verify_store(mixed_build.store, jobs=jobs) for jobs in (1, 2))
+    assert one.ok
+    assert one == two
+    assert one.assets == 5
+    assert one.files > 50
+    assert one.manifests == mixed_build.records.parent
+
+
+SHARDS = [
+    "voxel/coords/c/0/0",
+    "voxel/feats/c/1/0",
+    "voxel/properties/c/0/0",
+    "voxel/material/c/0",
+    "voxel/valid/c/0",
+    "voxel/distance/c/1",
+    "grid/properties/c/0/0/0/0/0",
+    "grid/material/c/1/0/0/0",
+]
+
+
+@pytest.mark.parametrize("name", SHARDS)
+def test_a_flipped_bit_names_the_file_and_the_assets(store: Path, name: str) -> None:
+    def flip(data: bytearray) -> None:
+        data[20] ^= 8
+
+    change(store, name, flip)
+    findings = of_file(found(store), name)
+    assert any("its bytes changed" in finding.what for finding in findings)
+    assert any(finding.asset and "chunk 0 is damaged" in finding.what for finding in findings)
+
+
+@pytest.mark.parametrize("name", SHARDS)
+def test_a_flipped_bit_of_an_index_is_found(store: Path, name: str) -> None:
+    def flip(data: bytearray) -> None:
+        data[-6] ^= 1
+
+    change(store, name, flip)
+    findings = of_file(found(store), name)
+    assert any(finding.asset and "no sound index" in finding.what for finding in findings)
+
+
+@pytest.mark.parametrize("name", SHARDS)
+def test_a_truncated_shard_is_found(store: Path, name: str) -> None:
+    size = (store / name).stat().st_size
+    change(store, name, lambda data: data.__delitem__(slice(-7, None)))
+    findings = of_file(found(store), name)
+    assert f"was cut short: it has {size - 7} of {size} bytes" in [f.what for f in findings]
+
+
+@pytest.mark.parametrize("name", [*SHARDS, "asset/id/c/0", "asset/fitness/c/0", "asset/zarr.json"])
+def test_a_deleted_file_is_found(store: Path, name: str) -> None:
+    (store / name).unlink()
+    findings = of_file(found(store), name)
+    assert any(finding.what.startswith("is missing") for finding in findings)
+
+
+def test_swapped_shards_are_named_as_such(store: Path) -> None:
+    """Each is sound in itself: every checksum within is right."""
+    first, second = store / "voxel/feats/c/0/0", store / "voxel/feats/c/1/0"
+    first.rename(store / "aside")
+    second.rename(first)
+    (store / "aside").rename(second)
+    findings = found(store)
+    sizes = first.stat().st_size, second.stat().st_size
+    assert [f.file for f in findings] == ["voxel/feats/c/0/0", "voxel/feats/c/1/0"]
+    if sizes[0] == sizes[1]:
+        assert findings[0].what == "holds what belongs in voxel/feats/c/1/0"
+
+
+def test_an_extra_file_is_found(store: Path) -> None:
+    shutil.copy(store / "voxel/feats/c/1/0", store / "voxel/feats/c/99")
+    (finding,) = found(store)
+    assert finding.file == "voxel/feats/c/99"
+    assert finding.what == "belongs to no array"
+
+
+def test_a_link_in_place_of_a_file_is_found(store: Path, tmp_path: Path) -> None:
+    shard = store / "voxel/feats/c/1/0"
+    shard.rename(tmp_path / "elsewhere")
+    shard.symlink_to(tmp_path / "elsewhere")
+    (finding,) = found(store)
+    assert finding.file == "voxel/feats/c/1/0"
+    assert finding.what == "is a link"
+
+
+@pytest.mark.parametrize(
+    ("array", "rows", "value", "what"),
+    [
+        ("voxel/coords", 3, (64, 0, 0), "a coordinate above 63"),
+        ("voxel/feats", (5, 2), np.inf, "NaN or infinite"),
+        ("voxel/properties", (4, 1), 1.5, "a property that does not go with valid"),
+        ("voxel/properties", (4, 1), np.nan, "a property that does not go with valid"),
+        ("voxel/properties", (4, 1), 0.123, "1 of "),
+        ("voxel/material", 4, 5, "1 of "),
+        ("voxel/material", 4, 7, "a class that does not go with valid"),
+        ("voxel/distance", 4, -1.0, "negative or NaN"),
+        ("voxel/distance", 4, 2.5, "1 of "),
+        ("grid/material", (0, 0, 0, 0), 9, "an unknown class"),
+        ("grid/properties", (0, 0, 0, 0, 0), 0.5, "a property that does not go with grid"),
+        ("asset/offset", 1, -5, "-5 rows"),
+        ("asset/transform", (0, 1, 1), np.nan, "is no similarity transform"),
+        ("asset/transform", (0, 0, 3), np.inf, "is no similarity transform"),
+        ("asset/fitness", 0, 1.5, "is 1.5"),
+        ("asset/verdict", 0, "fine", "'fine'"),
+        ("asset/id", 0, "zebra", "comes after 'zebra'"),
+        ("asset/id", 1, "ant", "occurs twice"),
+    ],
+)
+def test_values_out_of_the_contract_are_found(
+    store: Path, array: str, rows: object, value: object, what: str
+) -> None:
+    rewrite(store, "asset/model", 0, "similarity")
+    rewrite(store, array, rows, value)
+    findings = of_file(found(store), array)
+    assert any(what in f.what and (f.asset or "offset" in array) for f in findings), findings
+
+
+def test_a_voxel_that_is_not_valid_but_labelled_is_found(store: Path) -> None:
+    rewrite(store, "voxel/valid", 4, False)
+    files = {finding.file for finding in found(store) if finding.asset == "ant"}
+    assert {"voxel/material", "voxel/properties"} <= files
+
+
+def test_a_row_that_its_record_does_not_tell_of_is_found(store: Path) -> None:
+    rewrite(store, "asset/fitness", 0, 0.123)
+    findings = [f for f in found(store) if f.file == "asset/record"]
+    assert [(f.asset, "alignment/quality/fitness" in f.what) for f in findings] == [("ant", True)]
+
+
+def test_a_record_that_breaks_its_schema_is_found(store: Path) -> None:
+    record = json.loads(str(open_store(store).read_rows("asset/record", 1, 2)[0]))
+    record["sources"][0]["sha256"] = "beef"
+    rewrite(store, "asset/record", 1, json.dumps(record))
+    findings = of_file(found(store), "asset/record")
+    assert [f.asset for f in findings] == ["bear.front"]
+    assert findings[0].what.startswith('sources/0/sha256: "beef" does not match')
+
+
+def edit_json(path: Path, edit: Callable[[dict], object]) -> None:
+    document = json.loads(path.read_text())
+    edit(document)
+    path.write_text(json.dumps(document))
+
+
+@pytest.mark.parametrize(
+    ("edit", "what"),
+    [
+        (lambda d: d["attributes"].update(resolution=32), "attribute resolution is 32"),
+        (lambda d: d["attributes"].update(manifest="0" * 64), "the attributes changed"),
+        (lambda d: d["attributes"]["normalization"]["density"].update(lo=99), "normalization"),
+        (lambda d: d["attributes"]["build"].update(name="other"), "the attributes changed"),
+        (lambda d: d.pop("consolidated_metadata"), "has no consolidated metadata"),
+    ],
+)
+def test_edited_root_metadata_are_found(store: Path, edit: Callable, what: str) -> None:
+    edit_json(store / "zarr.json", edit)
+    assert any(what in finding.what for finding in of_file(found(store), "zarr.json"))
+
+
+def test_a_root_that_is_no_json_is_a_finding(store: Path) -> None:
+    (store / "zarr.json").write_text("{")
+    assert [finding.file for finding in found(store)] == ["zarr.json"]
+
+
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [
+        ("shape", [7]),
+        ("data_type", "float32"),
+        ("dimension_names", ["row"]),
+        ("fill_value", 1.0),
+    ],
+)
+def test_edited_metadata_of_an_array_are_found(store: Path, key: str, value: object) -> None:
+    edit_json(store / "asset/fitness/zarr.json", lambda document: document.update({key: value}))
+    findings = of_file(found(store), "asset/fitness/zarr.json")
+    assert any("differs from its copy" in finding.what for finding in findings)
+
+
+def test_edited_manifests_are_found(store: Path) -> None:
+    records = store.with_suffix(".manifests") / "assets.jsonl"
+    lines = records.read_text().splitlines()
+    records.write_text("\n".join(line.replace('"cup"', '"cop"') for line in lines) + "\n")
+    findings = of_file(found(store), str(records))
+    assert any(finding.asset == "cop" for finding in findings)
+    assert any("its content has the id" in finding.what for finding in findings)
+
+    build = store.with_suffix(".manifests") / "build.json"
+    edit_json(build, lambda document: document.update(id="0" * 64))
+    assert any(finding.what.startswith("id is") for finding in of_file(found(store), str(build)))
+
+
+def test_changed_and_missing_sources_are_found(store: Path, mixed: Dataset, tmp_path: Path) -> None:
+    parameters = mixed.parameters()
+    roots = SourceRoots(tmp_path / "pixieverse", tmp_path / "slat")
+    shutil.copytree(parameters.pixieverse.root, roots.pixieverse)
+    shutil.copytree(parameters.slat.root, roots.slat)
+    result = verify_store(store, sources=True, roots=roots)
+    assert result.ok
+    assert result.sources == 10
+    grid = next(path for path in roots.pixieverse.rglob("*.npy") if "ant" in str(path))
+    data = bytearray(grid.read_bytes())
+    data[1000] ^= 1
+    grid.write_bytes(data)
+    slat = next(path for path in roots.slat.rglob("*cup*") if path.is_file())
+    slat.unlink()
+    findings = found(store, sources=True, roots=roots)
+    assert [(f.file, f.asset, f.what) for f in findings] == [
+        (str(grid), "ant", "its bytes changed"),
+        (str(slat), "cup", "does not exist"),
+    ]
+
+
+def test_a_second_look_remembers_nothing_of_the_first(
+    store: Path, mixed: Dataset, tmp_path: Path
+) -> None:
+    parameters = mixed.parameters()
+    roots = SourceRoots(parameters.pixieverse.root, tmp_path / "slat")
+    shutil.copytree(parameters.slat.root, roots.slat)
+    assert verify_store(store, roots=roots, sources=True).ok
+    slat = roots.slat / "ant.npz"
+    times = slat.stat().st_atime_ns, slat.stat().st_mtime_ns
+    data = bytearray(slat.read_bytes())
+    data[300] ^= 1
+    slat.write_bytes(data)
+    os.utime(slat, ns=times)
+    rewrite(store, "asset/id", 4, "zebra")
+    findings = found(store, roots=roots, sources=True)
+    assert {"its bytes changed"} <= {f.what for f in of_file(findings, str(slat))}
+    assert any(finding.asset == "zebra" for finding in findings)
+
+
+def test_sources_that_nobody_knows_of_are_asked_for(store: Path) -> None:
+    shutil.rmtree(store.with_suffix(".manifests"))
+    assert verify_store(store).ok
+    with pytest.raises(StoreError, match="--pixieverse and --slat"):
+        verify_store(store, sources=True)
+
+
+def test_the_command_names_findings_and_sets_the_exit_code(store: Path) -> None:
+    good = CliRunner().invoke(slatprep, ["verify", str(store), "-q"])
+    assert (good.exit_code, good.stdout) == (0, f"{store}: nothing is wrong\n")
+    (store / "voxel/feats/c/1/0").unlink()
+    bad = CliRunner().invoke(slatprep, ["verify", str(store), "--json", "-q"])
+    assert bad.exit_code == 1
+    document = json.loads(bad.stdout)
+    assert document["ok"] is False
+    assert {"voxel/feats/c/1/0"} == {finding["file"] for finding in document["findings"]}
+
+
+def meaning(path: Path) -> object:
+    return json.loads(path.read_text()) if path.name == "zarr.json" else None
+
+
+@pytest.fixture(scope="module")
+def shared(mixed_build: BuildSummary, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    assert mixed_build.store is not None
+    return shutil.copytree(mixed_build.store, tmp_path_factory.mktemp("flipped") / "s.zarr")
+
+
+@settings(
+    max_examples=40,
+    deadline=None,
+    derandomize=True,
+    database=None,
+    suppress_health_check=[HealthCheck.function_scoped_fixture],
+)
+@given(data=st.data())
+def test_any_changed_byte_is_found(shared: Path, data: st.DataObject) -> None:
+    """Of the root's zarr.json only the layout may change: spaces between its words."""
+    names = sorted(list_files(shared))
+    name = data.draw(st.sampled_from(names))
+    original = (shared / name).read_bytes()
+    at = data.draw(st.integers(0, len(original) - 1))
+    byte = data.draw(st.integers(0, 255).filter(lambda value: value != original[at]))
+    try:
+        before = meaning(shared / name)
+        (shared / name).write_bytes(original[:at] + bytes([byte]) + original[at + 1 :])
+        findings = found(shared)
+        if not any(finding.file == name or finding.file.startswith("file") for finding in findings):
+            assert name == "zarr.json"
+            assert meaning(shared / name) == before
+    finally:
+        (shared / name).write_bytes(original)

@@ -1,0 +1,222 @@
+"""Materials reach particles: against brute force, and read back by other programs."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import plyfile
+import pytest
+from click.testing import CliRunner
+from support.synthetic import JELLY, METAL, Dataset
+
+from slatprep.cli.commands import slatprep
+from slatprep.errors import ConfigError, InputError
+from slatprep.export import export_store
+from slatprep.particles.transfer import VoxelField, predicted_field, read_particles, transfer
+from slatprep.pipeline.dataset import BuildSummary
+
+# As TRELLIS names and orders the fields of a Gaussian (`construct_list_of_attributes`).
+GAUSSIAN = [
+    "x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2", "opacity",
+    "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3",
+]  # fmt: skip
+
+
+def write_gaussians(path: Path, slat_positions: np.ndarray) -> np.ndarray:
+    """Write Gaussians as TRELLIS does; return the positions that the file has."""
+    x, y, z = slat_positions.T
+    saved = np.column_stack([x, -z, y])  # [[1, 0, 0], [0, 0, -1], [0, 1, 0]] @ (x, y, z)
+    rows = np.zeros(len(saved), dtype=[(name, "f4") for name in GAUSSIAN])
+    for axis, name in enumerate("xyz"):
+        rows[name] = saved[:, axis]
+    plyfile.PlyData([plyfile.PlyElement.describe(rows, "vertex")]).write(path)
+    return saved.astype(np.float32)
+
+
+def run(*words: object) -> dict[str, object]:
+    result = CliRunner().invoke(slatprep, [*map(str, words), "--json", "-q"])
+    assert result.exit_code == 0, result.output
+    return json.loads(result.stdout)
+
+
+def run_wrong(*words: object) -> str:
+    result = CliRunner().invoke(slatprep, ["transfer", *map(str, words)])
+    assert result.exit_code in (1, 2), result.output
+    assert len(result.stderr.splitlines()) == 1
+    return result.stderr
+
+
+@pytest.fixture
+def store(mixed_build: BuildSummary) -> Path:
+    assert mixed_build.store is not None
+    return mixed_build.store
+
+
+@pytest.fixture(scope="module")
+def true_parts(mixed: Dataset) -> tuple[np.ndarray, np.ndarray]:
+    """Return the SLAT voxels of `cup` with their true class, from its grid."""
+    asset = mixed.assets["cup"]
+    x, y, z = asset.coords.T.astype(int)
+    return asset.coords, asset.grid[y, 63 - x, z, 3].astype(int)  # the quarter turn undone
+
+
+def particles_near(coords: np.ndarray, count: int, reach: float) -> np.ndarray:
+    rng = np.random.default_rng(0)
+    chosen = coords[rng.integers(len(coords), size=count)]
+    return (chosen + 0.5 + rng.uniform(-reach, reach, (count, 3))) / 64 - 0.5
+
+
+def test_gaussians_get_the_material_of_their_voxel(
+    store: Path, true_parts: tuple[np.ndarray, np.ndarray], tmp_path: Path
+) -> None:
+    coords, material = true_parts
+    positions = particles_near(coords, 3000, 0.45)
+    saved = write_gaussians(tmp_path / "g.ply", positions)
+    summary = run("transfer", tmp_path / "g.ply", "--store", store, "--asset", "cup",
+                  "--out", tmp_path / "m.ply")  # fmt: skip
+    assert summary["axes"] == "trellis" and summary["far"] == 0
+
+    vertex = plyfile.PlyData.read(tmp_path / "m.ply")["vertex"]
+    # Row for row the Gaussians of the file, so that the two lie on each other.
+    np.testing.assert_array_equal(np.column_stack([vertex[a] for a in "xyz"]), saved)
+    voxel = {tuple(c): m for c, m in zip(coords.tolist(), material.tolist(), strict=True)}
+    truth = [voxel[tuple(v)] for v in np.floor((positions + 0.5) * 64).astype(int).tolist()]
+    np.testing.assert_array_equal(vertex["material_id"], truth)
+    assert set(truth) == {0, 1}
+    for number, modulus, density, ratio in (JELLY, METAL):
+        here = vertex["material_id"] == number
+        np.testing.assert_allclose(vertex["E"][here], modulus, rtol=1e-4)
+        np.testing.assert_allclose(vertex["density"][here], density, rtol=1e-4)
+        np.testing.assert_allclose(vertex["nu"][here], ratio, rtol=1e-4)
+
+
+def test_open3d_reads_the_same_points(
+    store: Path, true_parts: tuple[np.ndarray, np.ndarray], tmp_path: Path
+) -> None:
+    import open3d
+
+    positions = particles_near(true_parts[0], 200, 0.4)
+    saved = write_gaussians(tmp_path / "g.ply", positions)
+    for frame, expected in (("file", saved), ("slat", positions)):
+        run("transfer", tmp_path / "g.ply", "--store", store, "--asset", "cup",
+            "--out", tmp_path / "m.ply", "--frame", frame)  # fmt: skip
+        cloud = open3d.t.io.read_point_cloud(str(tmp_path / "m.ply"))
+        np.testing.assert_allclose(cloud.point.positions.numpy(), expected, atol=1e-7)
+        vertex = plyfile.PlyData.read(tmp_path / "m.ply")["vertex"]
+        for name in ("E", "density", "nu", "conf", "material_id"):
+            np.testing.assert_array_equal(cloud.point[name].numpy()[:, 0], vertex[name])
+
+
+def test_nearest_is_nearest_by_brute_force() -> None:
+    rng = np.random.default_rng(1)
+    cells = rng.choice(64**3, size=400, replace=False)
+    voxels = np.stack(np.unravel_index(cells, (64,) * 3), axis=1).astype(np.uint8)
+    modulus = np.arange(400, dtype=np.float32)
+    field = VoxelField(
+        voxels, (cells % 7).astype(np.uint8), np.stack([modulus] * 3, axis=1).astype(np.float32)
+    )
+    points = rng.uniform(-0.6, 0.6, (700, 3))
+    apart = np.linalg.norm(points[:, None] - ((voxels + 0.5) / 64 - 0.5)[None], axis=2) * 64
+    result = transfer(points, field, max_distance=6.0, far="nearest")
+    np.testing.assert_array_equal(result.properties[:, 0], apart.argmin(axis=1))
+    np.testing.assert_allclose(result.distance, apart.min(axis=1), atol=1e-9)
+    far = apart.min(axis=1) > 6.0
+    assert result.far == far.sum() and 0 < result.far < len(points)
+
+    kept = transfer(points, field, max_distance=6.0)
+    assert (kept.material[far] == 7).all() and not kept.properties[far].any()
+    np.testing.assert_array_equal(kept.material[~far], result.material[~far])
+    dropped = transfer(points, field, max_distance=6.0, far="drop")
+    np.testing.assert_array_equal(dropped.rows, np.flatnonzero(~far))
+    np.testing.assert_array_equal(dropped.properties, result.properties[~far])
+
+
+def test_grid_reaches_inside_the_object(store: Path, mixed: Dataset, tmp_path: Path) -> None:
+    grid = mixed.assets["cup"].grid
+    solid = np.argwhere(grid[..., 3] != 7)
+    turned = np.stack([63 - solid[:, 1], solid[:, 0], solid[:, 2]], axis=1)  # the quarter turn
+    np.save(tmp_path / "solid.npy", (turned + 0.5) / 64 - 0.5)
+    run("transfer", tmp_path / "solid.npy", "--store", store, "--asset", "cup",
+        "--points", "grid", "--out", tmp_path / "m.ply")  # fmt: skip
+    vertex = plyfile.PlyData.read(tmp_path / "m.ply")["vertex"]
+    np.testing.assert_array_equal(vertex["material_id"], grid[tuple(solid.T)][:, 3])
+    np.testing.assert_allclose(vertex["E"], grid[tuple(solid.T)][:, 1], rtol=1e-4)
+
+
+def test_prediction_is_transferred_as_the_store_is(store: Path, tmp_path: Path) -> None:
+    """What `export --format npz` writes has the form of a prediction."""
+    export_store(store, tmp_path / "npz", "npz", assets=["cup"])
+    prediction = tmp_path / "npz" / "cup.npz"
+    with np.load(prediction) as held:
+        np.savez(tmp_path / "points.npz", positions=particles_near(held["coords"], 100, 0.5))
+    for name, words in (
+        ("stored", ("--store", store, "--asset", "cup")),
+        ("predicted", ("--store", store, "--prediction", prediction)),
+    ):
+        run("transfer", tmp_path / "points.npz", *words, "--out", tmp_path / f"{name}.ply")
+    assert (tmp_path / "stored.ply").read_bytes() == (tmp_path / "predicted.ply").read_bytes()
+
+
+def test_prediction_in_si_needs_no_ranges(tmp_path: Path) -> None:
+    coords = np.array([[0, 1, 2, 3], [0, 4, 5, 6]], np.int32)
+    properties = np.array([[1e5, 1e3, 0.3], [np.nan] * 3], np.float32)
+    np.savez(tmp_path / "p.npz", coords=coords, properties_si=properties,
+             material=np.array([2, 255]), valid=np.array([True, False]))  # fmt: skip
+    field = predicted_field(tmp_path / "p.npz", None)
+    np.testing.assert_array_equal(field.voxels, [[1, 2, 3]])
+    np.testing.assert_array_equal(field.properties, properties[:1])
+    np.savez(tmp_path / "n.npz", coords=coords, properties=properties, material=np.array([2, 2]))
+    with pytest.raises(ConfigError, match="--ranges"):
+        predicted_field(tmp_path / "n.npz", None)
+    np.savez(tmp_path / "w.npz", coords=coords, properties_si=properties, material=np.array([2, 2]))
+    with pytest.raises(InputError, match="row 1 has material 2 and properties"):
+        predicted_field(tmp_path / "w.npz", None)
+
+
+def test_plain_points_are_taken_as_they_lie(tmp_path: Path) -> None:
+    positions = np.array([[0.1, 0.2, 0.3], [-0.1, 0.0, 0.4]])
+    rows = np.array([tuple(p) for p in positions], dtype=[(a, "f8") for a in "xyz"])
+    element = plyfile.PlyElement.describe(rows, "vertex")
+    plyfile.PlyData([element], text=True).write(tmp_path / "plain.ply")
+    write_gaussians(tmp_path / "g.ply", positions)
+    np.save(tmp_path / "p.npy", positions)
+    for name in ("plain.ply", "g.ply", "p.npy"):
+        np.testing.assert_allclose(
+            read_particles(tmp_path / name).in_slat(), positions, atol=1e-7, err_msg=name
+        )
+    turned = read_particles(tmp_path / "p.npy", axes="trellis")
+    np.testing.assert_allclose(turned.in_slat(), positions[:, [0, 2, 1]] * [1, 1, -1])
+
+
+@pytest.mark.parametrize("fault", ["junk", "cut", "empty", "nan", "flat", "faces"])
+def test_particles_that_cannot_be_used_are_named(fault: str, tmp_path: Path) -> None:
+    path = tmp_path / "p.ply"
+    write_gaussians(path, np.full((0 if fault == "empty" else 5, 3), 0.1))
+    if fault == "junk":
+        path.write_bytes(b"not a ply")
+    elif fault == "cut":
+        path.write_bytes(path.read_bytes()[:-30])
+    elif fault == "nan":
+        write_gaussians(path, np.array([[0.0, 0.0, 0.0], [0.0, np.inf, 0.0]]))
+    elif fault == "flat":
+        path = tmp_path / "p.npy"
+        np.save(path, np.zeros((5, 2)))
+    elif fault == "faces":
+        path.write_bytes(b"ply\nformat ascii 1.0\nelement face 0\nend_header\n")
+    with pytest.raises(InputError, match=path.name):
+        read_particles(path)
+
+
+def test_wrong_calls_are_refused_and_nothing_is_lost(store: Path, tmp_path: Path) -> None:
+    particles = tmp_path / "g.ply"
+    write_gaussians(particles, np.zeros((1, 3)))
+    before = particles.read_bytes()
+    stored = ("--store", store, "--asset", "cup")
+    assert "not an export" in run_wrong(particles, *stored, "--out", particles)
+    assert particles.read_bytes() == before
+    out = ("--out", tmp_path / "m.ply")
+    assert "either --asset" in run_wrong(particles, "--store", store, *out)
+    assert "cup" in run_wrong(particles, "--store", store, "--asset", "cuo", *out)
+    assert not (tmp_path / "m.ply").exists()

@@ -1,0 +1,308 @@
+import json
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from support.synthetic import JELLY, METAL, Dataset
+from support.trees import tree
+
+from slatprep.errors import ConfigError, InputError, MissingPartnerError, StoreError
+from slatprep.normalize import PIXIE_RANGES
+from slatprep.pipeline import asset as process
+from slatprep.pipeline.dataset import BuildSummary, align_pairs, build_store, default_manifests
+from slatprep.records import AssetPair, MaterialField
+from slatprep.store import open_store
+
+MakeDataset = Callable[..., Dataset]
+
+
+def records_of(summary: BuildSummary) -> dict[str, dict]:
+    lines = summary.records.read_text().splitlines()
+    return {record["asset_id"]: record for record in map(json.loads, lines)}
+
+
+def test_bad_assets_are_told_and_the_others_go_in(mixed_build: BuildSummary) -> None:
+    assert mixed_build.statuses == {"ok": 5, "failed": 1, "skipped": 1}
+    assert mixed_build.verdicts == {"good": 5}
+    assert not mixed_build.complete
+    problems = dict(mixed_build.problems)
+    assert set(problems) == {"lone", "torn"}
+    assert "no SLAT for id 'lone'" in problems["lone"]
+    assert "torn.npz" in problems["torn"]
+    assert "expected" in problems["torn"]
+    assert all("\n" not in reason for reason in problems.values())
+    assert list(records_of(mixed_build)) == sorted(records_of(mixed_build))
+
+
+def test_two_jobs_write_the_same_bytes_as_one(
+    mixed: Dataset, mixed_build: BuildSummary, tmp_path: Path
+) -> None:
+    again = build_store(mixed.parameters(), tmp_path / "two.zarr", jobs=2)
+    assert again.manifest == mixed_build.manifest
+    assert tree(again.store) == tree(mixed_build.store)
+    one, two = records_of(mixed_build), records_of(again)
+    for record in (*one.values(), *two.values()):
+        del record["duration_s"]
+    assert one == two
+
+
+def test_the_dataset_can_lie_elsewhere(make_dataset: MakeDataset, tmp_path: Path) -> None:
+    dataset = make_dataset("a")
+    first = build_store(dataset.parameters(), tmp_path / "first.zarr")
+    dataset.root = dataset.root.rename(tmp_path / "moved")
+    second = build_store(dataset.parameters(), tmp_path / "second.zarr")
+    assert tree(second.store) == tree(first.store)
+
+
+def test_progress_counts_every_asset(mixed: Dataset, tmp_path: Path) -> None:
+    seen: list[tuple[int, int]] = []
+    align_pairs(mixed.parameters(), tmp_path / "a.jsonl", progress=lambda *done: seen.append(done))
+    assert seen == [(k, 7) for k in range(1, 8)]
+
+
+def test_strict_stops_at_the_first(make_dataset: MakeDataset, tmp_path: Path) -> None:
+    dataset = make_dataset("a", "c")
+    dataset.write_grid("b", np.zeros((64, 64, 63, 4), np.float32))
+    with pytest.raises(MissingPartnerError, match="no SLAT for id 'b'"):
+        build_store(dataset.parameters(), tmp_path / "s.zarr", strict=True)
+    dataset.write_slat("b.npz", np.zeros((1, 3), np.uint8), np.zeros((1, 8), np.float32))
+    with pytest.raises(InputError, match=r"material_grid\.npy"):
+        align_pairs(dataset.parameters(), tmp_path / "a.jsonl", strict=True)
+    # What was finished stays for the next build, and nothing else.
+    left = {path.name for path in tmp_path.iterdir()}
+    assert left == {"sources", ".s.zarr.work", ".a.jsonl.work"}
+
+
+def test_an_error_of_our_own_is_marked_and_costs_one_asset(
+    make_dataset: MakeDataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    read_field = process.read_field
+
+    def fails_for_b(pair: AssetPair) -> MaterialField:
+        if pair.asset_id == "b":
+            raise ZeroDivisionError("division\nby zero")
+        return read_field(pair)
+
+    monkeypatch.setattr(process, "read_field", fails_for_b)
+    summary = build_store(make_dataset("a", "b").parameters(), tmp_path / "s.zarr")
+    assert summary.statuses == {"ok": 1, "failed": 1, "skipped": 0}
+    reason = "internal error, please report: ZeroDivisionError: division by zero"
+    assert summary.problems == (("b", reason),)
+    assert "fails_for_b" in records_of(summary)["b"]["traceback"]
+
+
+def test_no_usable_asset_is_an_error_and_keeps_the_old_store(
+    make_dataset: MakeDataset, tmp_path: Path
+) -> None:
+    dataset = make_dataset("a")
+    summary = build_store(dataset.parameters(), tmp_path / "s.zarr")
+    before = tree(tmp_path / "s.zarr"), tree(tmp_path / "s.manifests")
+    dataset.write_slat("a.npz", np.zeros((1, 3), np.uint8), np.zeros((1, 7), np.float32))
+    with pytest.raises(StoreError, match=r"none of 1 assets can be used.*\n  a: .*a\.npz"):
+        build_store(dataset.parameters(), tmp_path / "s.zarr")
+    assert (tree(tmp_path / "s.zarr"), tree(tmp_path / "s.manifests")) == before
+    assert len(open_store(summary.store)) == 1
+
+
+def test_a_build_that_is_stopped_midway_leaves_the_old_store(
+    make_dataset: MakeDataset, tmp_path: Path
+) -> None:
+    dataset = make_dataset("a", "b")
+    build_store(dataset.parameters(), tmp_path / "s.zarr")
+    before = tree(tmp_path)
+
+    def stop(done: int, total: int) -> None:
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        build_store(dataset.parameters("pixie"), tmp_path / "s.zarr", progress=stop)
+    after = tree(tmp_path)
+    assert {name: after[name] for name in before} == before
+
+
+KILLED = """
+import os, signal, sys
+from pathlib import Path
+from slatprep.pipeline import dataset as build, pack
+from slatprep.parameters import *
+
+root, out, when = sys.argv[1:]
+def kill(*_, **__): os.kill(os.getpid(), signal.SIGKILL)
+progress = kill if when == "aligning" else None
+if when == "packing": pack.create_store = kill
+if when == "replacing": build.replace_directory = kill
+parameters = BuildParameters(
+    PixieverseSource(Path(root) / "pixieverse"), SlatSource(Path(root) / "slat"),
+    normalize=NormalizeParameters("pixie"),
+)
+build.build_store(parameters, Path(out), progress=progress)
+"""
+
+
+@pytest.mark.parametrize("when", ["aligning", "packing", "replacing"])
+def test_a_killed_build_leaves_the_old_store_and_the_next_one_succeeds(
+    make_dataset: MakeDataset, tmp_path: Path, when: str
+) -> None:
+    dataset, out = make_dataset("a"), tmp_path / "s.zarr"
+    build_store(dataset.parameters(), out)
+    store, manifests = tree(out), default_manifests(out)
+    build_file, records = (manifests / "build.json").read_bytes(), manifests / "assets.jsonl"
+    lines = records.read_bytes()
+
+    command = [sys.executable, "-c", KILLED, str(dataset.root), str(out), when]
+    killed = subprocess.run(command, env={**os.environ, "OMP_NUM_THREADS": "1"}, check=False)
+    assert killed.returncode == -signal.SIGKILL
+
+    assert tree(out) == store
+    assert (manifests / "build.json").read_bytes() == build_file
+    assert records.read_bytes() == lines
+    summary = build_store(dataset.parameters("pixie"), out)
+    assert open_store(out).normalization == PIXIE_RANGES
+    assert open_store(out).attributes["manifest"] == summary.manifest
+
+
+def test_what_is_not_a_store_is_never_replaced(make_dataset: MakeDataset, tmp_path: Path) -> None:
+    (tmp_path / "thesis").mkdir()
+    (tmp_path / "thesis" / "chapter.tex").write_text("years of work")
+    with pytest.raises(StoreError, match="is not a slatprep store"):
+        build_store(make_dataset("a").parameters(), tmp_path / "thesis")
+    assert (tmp_path / "thesis" / "chapter.tex").exists()
+    (tmp_path / "empty").mkdir()
+    assert build_store(make_dataset("a").parameters(), tmp_path / "empty").complete
+
+
+def test_a_link_stays_a_link(make_dataset: MakeDataset, tmp_path: Path) -> None:
+    parameters, link = make_dataset("a").parameters(), tmp_path / "link.zarr"
+    (tmp_path / "disk").mkdir()
+    link.symlink_to(tmp_path / "disk" / "real.zarr")
+    for _ in range(2):
+        build_store(parameters, link)
+        assert link.is_symlink()
+        assert [path.name for path in (tmp_path / "disk").iterdir()] == ["real.zarr"]
+        assert open_store(link).ids == ["a"]
+
+
+def test_a_place_that_cannot_be_written_is_named(make_dataset: MakeDataset, tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    with pytest.raises(StoreError, match=r"file: cannot write there \("):
+        build_store(make_dataset("a").parameters(), tmp_path / "file" / "s.zarr")
+
+
+def test_ranges_by_name_clip_and_count(make_dataset: MakeDataset, tmp_path: Path) -> None:
+    dataset = make_dataset("a")
+    summary = build_store(dataset.parameters("pixie"), tmp_path / "s.zarr")
+    # Pixie's ranges: log10 E to 10.88 (metal has 11.3), log10 density to 3.87 (metal has 3.90).
+    asset = open_store(summary.store).asset("a")
+    metal = asset.material == METAL[0]
+    assert 0 < metal.sum() < len(metal)
+    assert (asset.properties[metal, :2] == 1.0).all()
+    assert asset.properties[~metal, 0] == pytest.approx(
+        2 * (5.0 - 3.0183002948760986) / (10.881680488586426 - 3.0183002948760986) - 1, abs=1e-6
+    )
+    in_voxels = int(metal.sum())
+    in_grid = int((dataset.assets["a"].grid[..., 3] == METAL[0]).sum())
+    assert summary.clipped == {
+        "youngs_modulus": in_voxels,
+        "density": in_voxels,
+        "poissons_ratio": 0,
+    }
+    clipped = records_of(summary)["a"]["counts"]["clipped"]
+    assert clipped["voxel"] == summary.clipped
+    assert clipped["grid"] == {"youngs_modulus": in_grid, "density": in_grid, "poissons_ratio": 0}
+
+
+def test_ranges_from_a_file(make_dataset: MakeDataset, tmp_path: Path) -> None:
+    ranges = tmp_path / "ranges.toml"
+    ranges.write_text(
+        "[youngs_modulus]\nlo = 3.0\nhi = 13.0\n[density]\nlo = 1.0\nhi = 5.0\n"
+        "[poissons_ratio]\nlo = 0.0\nhi = 0.5\n"
+    )
+    dataset = make_dataset("a")
+    summary = build_store(dataset.parameters(str(ranges)), tmp_path / "s.zarr")
+    asset = open_store(summary.store).asset("a")
+    jelly = asset.properties[asset.material == JELLY[0]]
+    # log10: (5 - 3) / 10 -> -0.6; (3 - 1) / 4 -> 0; 0.3 / 0.5 -> 0.2.
+    assert np.allclose(jelly, [-0.6, 0.0, 0.2], atol=1e-6)
+    assert sum(summary.clipped.values()) == 0
+    assert open_store(summary.store).normalization.source == "ranges.toml"
+
+
+def test_ranges_that_cannot_be_read_are_told_before_any_work(
+    make_dataset: MakeDataset, tmp_path: Path
+) -> None:
+    def never(done: int, total: int) -> None:
+        raise AssertionError("an asset was aligned first")
+
+    parameters = make_dataset("a").parameters(str(tmp_path / "none.toml"))
+    with pytest.raises(ConfigError, match=r"none\.toml: cannot read ranges"):
+        build_store(parameters, tmp_path / "s.zarr", progress=never)
+
+
+def test_islands_without_annotation_stay_occupied(
+    make_dataset: MakeDataset, tmp_path: Path
+) -> None:
+    dataset = make_dataset("a")
+    grid = dataset.assets["a"].grid
+    grid[30, 25:28, 28, 3] = -1
+    dataset.write_grid("a", grid)
+    summary = build_store(dataset.parameters(), tmp_path / "s.zarr")
+    asset = open_store(summary.store).asset("a")
+    assert (asset.grid_material[30, 25:28, 28] == 255).all()
+    assert np.isnan(asset.grid_properties[:, 30, 25:28, 28]).all()
+    assert (asset.material < 7).all()
+    counts = records_of(summary)["a"]["counts"]
+    assert counts["unannotated"] == 3
+    assert counts["occupied"] == counts["annotated"] + 3 == (grid[..., 3] != 7).sum()
+
+
+def test_voxels_too_far_from_an_annotation_are_not_valid(
+    make_dataset: MakeDataset, tmp_path: Path
+) -> None:
+    dataset = make_dataset("a")
+    made = dataset.assets["a"]
+    far = np.array([[1, 1, 1], [2, 1, 1]], np.uint8)
+    coords = np.concatenate([far, made.coords])
+    dataset.write_slat("a.npz", coords, np.zeros((len(coords), 8), np.float32))
+    summary = build_store(dataset.parameters(), tmp_path / "s.zarr")
+    asset = open_store(summary.store).asset("a")
+    assert asset.valid.tolist() == [False, False] + [True] * len(made.coords)
+    assert asset.material[:2].tolist() == [255, 255]
+    assert np.isnan(asset.properties[:2]).all()
+    assert (asset.distance[:2] > 3.0).all()
+    assert summary.n_valid == summary.n_voxels - 2
+
+
+def test_manifests_go_where_asked(make_dataset: MakeDataset, tmp_path: Path) -> None:
+    parameters = make_dataset("a").parameters()
+    build_store(parameters, tmp_path / "s.zarr", manifests=tmp_path / "elsewhere" / "records")
+    names = {path.name for path in (tmp_path / "elsewhere" / "records").iterdir()}
+    assert names == {"assets.jsonl", "build.json"}
+    assert not default_manifests(tmp_path / "s.zarr").exists()
+
+
+def test_alignment_alone_gives_the_stores_transforms(
+    mixed: Dataset, mixed_build: BuildSummary, tmp_path: Path
+) -> None:
+    summary = align_pairs(mixed.parameters(), tmp_path / "out" / "mixed.jsonl")
+    assert summary.store is None
+    assert summary.statuses == mixed_build.statuses
+    aligned, built = records_of(summary), records_of(mixed_build)
+    assert list(aligned) == list(built)
+    for asset_id, record in aligned.items():
+        assert record["alignment"] == built[asset_id]["alignment"]
+        assert record["normalization"] is None
+    assert [path.name for path in (tmp_path / "out").iterdir()] == ["mixed.jsonl"]
+
+
+def test_other_parameters_make_another_manifest(make_dataset: MakeDataset, tmp_path: Path) -> None:
+    parameters = make_dataset("a").parameters()
+    first = align_pairs(parameters, tmp_path / "1.jsonl").manifest
+    assert align_pairs(parameters, tmp_path / "2.jsonl").manifest == first
+    nearer = replace(parameters, sample=replace(parameters.sample, max_distance=2.0))
+    assert align_pairs(nearer, tmp_path / "3.jsonl").manifest != first

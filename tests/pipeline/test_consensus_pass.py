@@ -1,0 +1,110 @@
+"""A build's second pass, on demo data with a planted common rotation."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import zarr
+
+from slatprep.bench.truth import score_against_truth
+from slatprep.config import load_parameters
+from slatprep.demo import make_demo
+from slatprep.parameters import BuildParameters, ConsensusParameters
+from slatprep.pipeline.dataset import build_store, plan_build
+from slatprep.provenance.record import alignment_of
+
+
+@pytest.fixture(scope="module")
+def habitual(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, BuildParameters]:
+    """Make fourteen assets, one a category, that all have one quarter turn in common."""
+    root = tmp_path_factory.mktemp("habitual")
+    make_demo(root, assets=14, seed=5, levels=(0,), habitual_share=1.0)
+    return root, load_parameters(root / "dataset.toml", {})
+
+
+@pytest.fixture(scope="module")
+def stores(habitual: tuple[Path, BuildParameters]) -> tuple[Path, Path]:
+    root, parameters = habitual
+    alone, together = root / "alone.zarr", root / "together.zarr"
+    build_store(parameters, alone)
+    build_store(replace(parameters, consensus=ConsensusParameters(settle=True)), together)
+    return alone, together
+
+
+def _records(store: Path) -> dict[str, dict]:
+    lines = store.with_suffix(".manifests") / "assets.jsonl"
+    records = map(json.loads, lines.read_text().splitlines())
+    return {record["asset_id"]: record for record in records}
+
+
+def test_more_symmetric_assets_are_placed_right_and_no_other_changes(
+    habitual: tuple[Path, BuildParameters], stores: tuple[Path, Path]
+) -> None:
+    truth = habitual[0] / "truth"
+    before, after = (score_against_truth(store, truth).assets for store in stores)
+    symmetric = [k for k, score in enumerate(before) if score.symmetric]
+    right = [sum(scores[k].displacement < 1.5 for k in symmetric) for scores in (before, after)]
+    assert len(symmetric) >= 2
+    assert right[1] == len(symmetric)
+    assert right[0] < right[1]
+    accuracy = [
+        np.mean([scores[k].label_accuracy for k in symmetric]) for scores in (before, after)
+    ]
+    assert accuracy[1] >= accuracy[0]
+
+    alone, together = (_records(store) for store in stores)
+    groups = [zarr.open_group(store, mode="r") for store in stores]
+    for row, asset_id in enumerate(alone):
+        if not alone[asset_id]["alignment"]["placements"]:
+            assert together[asset_id]["alignment"] == alone[asset_id]["alignment"]
+            first, last = groups[0]["asset/offset"][row : row + 2]
+            for name in ("properties", "material", "valid", "distance"):
+                np.testing.assert_array_equal(
+                    groups[0][f"voxel/{name}"][first:last], groups[1][f"voxel/{name}"][first:last]
+                )
+
+
+def test_what_was_settled_is_recorded_and_can_be_undone(stores: tuple[Path, Path]) -> None:
+    alone, together = (_records(store) for store in stores)
+    settled = [k for k, record in together.items() if record["alignment"]["settled_by"]]
+    assert settled
+    for asset_id in settled:
+        entry = together[asset_id]["alignment"]
+        assert entry["settled_by"]["agreeing"] >= 5
+        assert entry["placements"][0]["transform"] == alone[asset_id]["alignment"]["transform"]
+        assert alignment_of(entry).transform.tolist() == entry["transform"]
+    assert not any(record["alignment"]["settled_by"] for record in alone.values())
+
+
+def test_building_without_it_brings_the_first_placements_back(
+    habitual: tuple[Path, BuildParameters], stores: tuple[Path, Path], tmp_path: Path
+) -> None:
+    _, parameters = habitual
+    with_it = replace(parameters, consensus=ConsensusParameters(settle=True))
+    store = tmp_path / "store.zarr"
+    build_store(with_it, store, jobs=2)
+    assert _tree(store) == _tree(stores[1])  # whatever the jobs
+    plan = plan_build(parameters, store)
+    assert {asset.action for asset in plan.assets} == {"reuse"}  # no asset is aligned again
+    build_store(parameters, store)
+    assert _tree(store) == _tree(stores[0])
+    build_store(with_it, store)
+    assert _tree(store) == _tree(stores[1])
+
+
+def test_a_settled_store_that_is_built_again_is_found_unchanged(
+    habitual: tuple[Path, BuildParameters], stores: tuple[Path, Path]
+) -> None:
+    with_it = replace(habitual[1], consensus=ConsensusParameters(settle=True))
+    times = {path: path.stat().st_mtime_ns for path in stores[1].rglob("*")}
+    build_store(with_it, stores[1])
+    assert {path: path.stat().st_mtime_ns for path in stores[1].rglob("*")} == times
+
+
+def _tree(store: Path) -> dict[str, bytes]:
+    files = sorted(path for path in store.rglob("*") if path.is_file())
+    return {path.relative_to(store).as_posix(): path.read_bytes() for path in files}

@@ -1,0 +1,64 @@
+import ast
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from slatprep.pipeline import fingerprint
+from slatprep.pipeline.fingerprint import code_fingerprint, numeric_modules
+
+
+def fingerprint_of(monkeypatch: pytest.MonkeyPatch, path: Path) -> str:
+    monkeypatch.setattr(fingerprint, "numeric_modules", lambda: {"m": path})
+    return code_fingerprint.__wrapped__()
+
+
+def test_statements_count_and_words_do_not(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    module = tmp_path / "m.py"
+
+    def of(text: str) -> str:
+        module.write_text(text)
+        return fingerprint_of(monkeypatch, module)
+
+    first = of('"""Words."""\n\n\ndef f(x):\n    """More."""\n    return x + 1  # why\n')
+    assert of("def f(x):\n    return (x +\n            1)\n") == first
+    assert of("def f(x):\n    return x + 2\n") != first
+
+
+def test_it_is_the_same_in_another_process() -> None:
+    code = "from slatprep.pipeline.fingerprint import code_fingerprint; print(code_fingerprint())"
+    told = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert told.stdout.strip() == code_fingerprint()
+
+
+def test_it_covers_every_module_that_an_asset_runs_through() -> None:
+    """Trace what is loaded for one asset, in a process that has loaded nothing else."""
+    code = (
+        "import sys; from slatprep.readers.pixieverse import read_field; "
+        "from slatprep.readers.slat import read_latents; from slatprep.sample import sample; "
+        "from slatprep.judge import judge; from slatprep.align import quality, field; "
+        "print(*(m for m in sys.modules if m.startswith('slatprep')))"
+    )
+    told = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    loaded = set(told.stdout.split())
+    # Packages that only gather names, words of errors, and values that the key holds.
+    uncounted = {
+        "slatprep",
+        "slatprep.readers",
+        "slatprep.storage",
+        "slatprep.errors",
+        "slatprep.parameters",
+    }
+    finding = {"slatprep.readers.pairing", "slatprep.readers.joins"}  # finds files, reads none
+    # Whichever way bytes come, their digests tell them.
+    carrying = {"slatprep.storage.remote", "slatprep.storage.cache"}
+    assert loaded - set(numeric_modules()) <= uncounted | finding | carrying
+
+
+def test_what_makes_no_numbers_is_not_in_it() -> None:
+    names = set(numeric_modules())
+    assert not {n for n in names if n.startswith(("slatprep.cli", "slatprep.store"))}
+    assert "slatprep.pipeline.dataset" not in names
+    for path in numeric_modules().values():
+        ast.parse(path.read_text())

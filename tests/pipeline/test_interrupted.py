@@ -1,0 +1,426 @@
+"""Builds that are killed, starved or refused: each by doing it to a real build."""
+
+from __future__ import annotations
+
+import json
+import os
+import random
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+from support.synthetic import Dataset, make_asset
+from support.trees import tree
+
+from slatprep.errors import StoreError
+from slatprep.pipeline.dataset import build_store
+from slatprep.pipeline.work import work_beside
+from slatprep.storage import atomic as replace
+from slatprep.store import open_store
+
+BUILD = """
+import json, os, resource, signal, sys
+from pathlib import Path
+
+import slatprep.pipeline.dataset as build
+import slatprep.pipeline.asset as process
+from slatprep.errors import SlatprepError
+from slatprep.parameters import *
+
+root, out, jobs = Path(sys.argv[1]), Path(sys.argv[2]), int(sys.argv[3])
+
+
+def kill_self(*_, **__):
+    os.kill(os.getpid(), signal.SIGKILL)
+
+
+{fault}
+parameters = BuildParameters(
+    PixieverseSource(root / "pixieverse"),
+    SlatSource(root / "slat"),
+    normalize=NormalizeParameters("pixie"),
+    store=StoreParameters(voxel_chunk=128, voxel_chunks_per_shard=4, grid_assets_per_shard=2),
+)
+if __name__ == "__main__":
+    try:
+        summary = build.build_store(parameters, out, jobs=jobs)
+    except SlatprepError as error:
+        sys.exit(f"refused: {{error}}")
+    print(json.dumps([summary.statuses, dict(summary.problems)]))
+"""
+
+KILL_AT = """
+def kill_after(module, name, calls=1):
+    function, left = getattr(module, name), [calls]
+    def wrapped(*args, **kwargs):
+        left[0] -= 1
+        if left[0] < 0:
+            kill_self()
+        return function(*args, **kwargs)
+    setattr(module, name, wrapped)
+"""
+
+
+def run(
+    script: Path, dataset: Dataset, out: Path, fault: str = "", in_workers: str = "", jobs: int = 1
+) -> subprocess.CompletedProcess[str]:
+    command = prepared(script, dataset, out, fault, in_workers, jobs)
+    return subprocess.run(
+        command, env=environment(script), check=False, capture_output=True, text=True
+    )
+
+
+def prepared(
+    script: Path, dataset: Dataset, out: Path, fault: str = "", in_workers: str = "", jobs: int = 1
+) -> list[str]:
+    """Write a build with a fault, in its own process or in all, and return its command."""
+    script.write_text(BUILD.format(fault=KILL_AT + fault))
+    if in_workers:
+        # Workers are processes of their own, which import this before anything else.
+        (script.parent / "sitecustomize.py").write_text(
+            f"import os, signal, sys\nimport slatprep.pipeline.asset as process\n{in_workers}"
+        )
+    return [sys.executable, str(script), str(dataset.root), str(out), str(jobs)]
+
+
+def environment(script: Path) -> dict[str, str]:
+    paths = (str(script.parent), os.environ.get("PYTHONPATH", ""))
+    return {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": os.pathsep.join(paths)}
+
+
+@pytest.fixture
+def script(tmp_path: Path) -> Path:
+    (tmp_path / "script").mkdir()
+    return tmp_path / "script" / "run_build.py"
+
+
+@pytest.fixture(scope="module")
+def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> tuple[Dataset, Path]:
+    """Three assets, and the store that an undisturbed build makes of them."""
+    folder = tmp_path_factory.mktemp("undisturbed")
+    dataset = Dataset(folder / "sources")
+    for seed, object_id in enumerate("abc"):
+        dataset.add(object_id, seed)
+    build_store(dataset.parameters("pixie"), folder / "s.zarr")
+    return dataset, folder / "s.zarr"
+
+
+@pytest.fixture
+def reference(undisturbed: tuple[Dataset, Path], tmp_path: Path) -> tuple[Dataset, dict[str, str]]:
+    """Three assets that may be changed, and the hashes of what is to come of them."""
+    dataset, store = undisturbed
+    shutil.copytree(dataset.root, tmp_path / "sources")
+    return Dataset(tmp_path / "sources", dataset.assets), tree(store)
+
+
+@pytest.fixture(scope="module")
+def old_store(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("old")
+    dataset = Dataset(folder / "sources")
+    dataset.add("z", seed=3)
+    build_store(dataset.parameters("pixie"), folder / "s.zarr")
+    return folder / "s.zarr"
+
+
+def ends_well(dataset: Dataset, out: Path, expected: dict[str, str]) -> None:
+    """Run the build again and hold the result against what no fault has touched."""
+    summary = build_store(dataset.parameters("pixie"), out)
+    assert tree(out) == expected
+    names = {path.name for path in out.parent.iterdir()}
+    assert {name for name in names if name.lstrip(".").startswith("s.")} == {
+        "s.zarr",
+        "s.manifests",
+    }
+    manifests = out.with_name(f"{out.stem}.manifests")
+    assert {path.name for path in manifests.iterdir()} == {"assets.jsonl", "build.json"}
+    assert json.loads((manifests / "build.json").read_text())["id"] == summary.manifest
+    assert len((manifests / "assets.jsonl").read_text().splitlines()) == 3
+
+
+@pytest.mark.parametrize(
+    "where",
+    [
+        "kill_after(build, 'finish_asset', 2)",
+        "import slatprep.pipeline.pack as p; kill_after(p, 'write_shard', 3)",
+        "import slatprep.storage.atomic as r; kill_after(r, '_exchange', 0)",
+        "import slatprep.storage.atomic as r; kill_after(r.shutil, 'rmtree', 0)",
+        "kill_after(build, 'replace_directory', 1); kill_after(build, 'publish_manifests', 0)",
+        "import slatprep.pipeline.publish as p; kill_after(p, 'write_build_record', 0)",
+    ],
+)
+def test_killed_at_every_step(
+    reference: tuple[Dataset, dict[str, str]],
+    old_store: Path,
+    script: Path,
+    tmp_path: Path,
+    where: str,
+) -> None:
+    dataset, expected = reference
+    out = tmp_path / "s.zarr"
+    shutil.copytree(old_store, out)
+    before = tree(out)
+
+    killed = run(script, dataset, out, where)
+    assert killed.returncode == -signal.SIGKILL, killed.stderr
+
+    assert tree(out) in (before, expected)
+    ends_well(dataset, out, expected)
+
+
+def test_what_was_finished_is_not_done_again(
+    reference: tuple[Dataset, dict[str, str]], script: Path, tmp_path: Path
+) -> None:
+    dataset, expected = reference
+    killed = run(script, dataset, tmp_path / "s.zarr", "kill_after(build, 'finish_asset', 2)")
+    assert killed.returncode == -signal.SIGKILL
+    # A torn file, as a power failure leaves it, is known and done again.
+    torn, *_ = sorted((tmp_path / ".s.zarr.work" / "spool").rglob("*.npz"))
+    torn.write_bytes(torn.read_bytes()[:-2000])
+    again = run(
+        script,
+        dataset,
+        tmp_path / "s.zarr",
+        "kill_after(process, 'align', 2)",  # One was finished, so two alignments are enough.
+    )
+    assert again.returncode == 0, again.stderr
+    assert tree(tmp_path / "s.zarr") == expected
+
+
+def test_a_kill_between_two_renames_is_mended(
+    reference: tuple[Dataset, dict[str, str]], tmp_path: Path
+) -> None:
+    """Where directories cannot be exchanged, there is a moment without a store."""
+    dataset, expected = reference
+    out = tmp_path / "s.zarr"
+    build_store(dataset.parameters("pixie"), out)
+    work = tmp_path / ".s.zarr.work"
+    (work / "build-x").mkdir(parents=True)
+    out.rename(replace._aside(work / "build-x"))
+    with work_beside(out):
+        assert tree(out) == expected
+    assert not work.exists()
+
+
+def test_a_worker_that_dies_costs_nothing(
+    reference: tuple[Dataset, dict[str, str]], script: Path, tmp_path: Path
+) -> None:
+    dataset, expected = reference
+    fault = """
+read_field = process.read_field
+def dies_once(pair):
+    if pair.asset_id == "b" and not os.path.exists("DIED"):
+        open("DIED", "w").close()
+        os.kill(os.getpid(), signal.SIGKILL)
+    return read_field(pair)
+process.read_field = dies_once
+"""
+    fault = fault.replace("DIED", str(tmp_path / "died"))
+    done = run(script, dataset, tmp_path / "s.zarr", in_workers=fault, jobs=2)
+    assert done.returncode == 0, done.stderr
+    assert (tmp_path / "died").exists()
+    assert tree(tmp_path / "s.zarr") == expected
+
+
+def test_an_asset_that_kills_its_worker_is_named_and_the_others_go_in(
+    reference: tuple[Dataset, dict[str, str]], script: Path, tmp_path: Path
+) -> None:
+    dataset, expected = reference
+    fault = """
+read_field = process.read_field
+def dies(pair):
+    if pair.asset_id == "b":
+        os.kill(os.getpid(), signal.SIGKILL)
+    return read_field(pair)
+process.read_field = dies
+"""
+    done = run(script, dataset, tmp_path / "s.zarr", in_workers=fault, jobs=2)
+    assert done.returncode == 0, done.stderr
+    statuses, problems = json.loads(done.stdout)
+    assert statuses == {"ok": 2, "failed": 1, "skipped": 0}
+    assert "worker process was killed twice" in problems["b"]
+    assert open_store(tmp_path / "s.zarr").ids == ["a", "c"]
+    ends_well(dataset, tmp_path / "s.zarr", expected)
+
+
+def test_memory_that_runs_out_is_told_of_the_asset(
+    reference: tuple[Dataset, dict[str, str]], script: Path, tmp_path: Path
+) -> None:
+    dataset, expected = reference
+    fault = """
+import slatprep.align.field, numpy
+read_latents = process.read_latents
+def greedy(pair):
+    if pair.asset_id == "b":
+        used = int(open("/proc/self/statm").read().split()[0]) * os.sysconf("SC_PAGE_SIZE")
+        before = resource.getrlimit(resource.RLIMIT_AS)
+        resource.setrlimit(resource.RLIMIT_AS, (used + 2**26, before[1]))
+        try:
+            numpy.ones(2**26)
+        finally:
+            resource.setrlimit(resource.RLIMIT_AS, before)
+    return read_latents(pair)
+process.read_latents = greedy
+"""
+    done = run(script, dataset, tmp_path / "s.zarr", fault)
+    assert done.returncode == 0, done.stderr
+    _, problems = json.loads(done.stdout)
+    assert problems["b"].startswith("memory ran out")
+    ends_well(dataset, tmp_path / "s.zarr", expected)
+
+
+@pytest.mark.parametrize("limit", [4_000, 60_000], ids=["at an asset", "at a shard"])
+def test_a_disk_that_takes_no_more(
+    reference: tuple[Dataset, dict[str, str]], script: Path, tmp_path: Path, limit: int
+) -> None:
+    """A limit on the size of files stands in for a full disk: the same error at a write."""
+    dataset, expected = reference
+    out = tmp_path / "s.zarr"
+    step = "write_shard" if limit > 10_000 else "finish_asset"
+    fault = f"""
+import slatprep.pipeline.pack as pack
+module = pack if "{step}" == "write_shard" else build
+function = module.{step}
+def full(*args):
+    resource.setrlimit(resource.RLIMIT_FSIZE, (100, resource.RLIM_INFINITY))
+    return function(*args)
+module.{step} = full
+"""
+    done = run(script, dataset, out, fault)
+    assert done.returncode == 1
+    assert done.stderr.startswith("refused: ")
+    assert "cannot be written to" in done.stderr
+    assert "File too large" in done.stderr
+    if step == "finish_asset":
+        assert "refused: a: " in done.stderr
+    assert not out.exists()
+    ends_well(dataset, out, expected)
+
+
+def test_a_source_that_vanishes_midway(
+    reference: tuple[Dataset, dict[str, str]], script: Path, tmp_path: Path
+) -> None:
+    dataset, expected = reference
+    fault = """
+finish_asset = build.finish_asset
+def vanishing(pair, *rest):
+    if pair.asset_id == "b":
+        pair.slat.unlink()
+    return finish_asset(pair, *rest)
+build.finish_asset = vanishing
+"""
+    done = run(script, dataset, tmp_path / "s.zarr", fault)
+    statuses, problems = json.loads(done.stdout)
+    assert statuses == {"ok": 2, "failed": 1, "skipped": 0}
+    assert "b.npz: does not exist" in problems["b"]
+    made = make_asset(1)
+    dataset.write_slat("b.npz", made.coords, dataset.assets["b"].feats)
+    ends_well(dataset, tmp_path / "s.zarr", expected)
+
+
+def test_a_target_that_is_read_only(
+    reference: tuple[Dataset, dict[str, str]], script: Path, tmp_path: Path
+) -> None:
+    dataset, expected = reference
+    folder = tmp_path / "locked"
+    folder.mkdir()
+    folder.chmod(0o555)
+    # Root may write anywhere, so it becomes nobody first.
+    fault = "import fcntl; os.geteuid() or os.seteuid(65534)"
+    for path in (tmp_path, *tmp_path.parents[:3]):  # one more under pytest-xdist
+        path.chmod(path.stat().st_mode | 0o755)
+    done = run(script, dataset, folder / "s.zarr", fault)
+    assert done.returncode == 1
+    assert "locked: cannot write there (Permission denied)" in done.stderr
+    folder.chmod(0o755)
+    ends_well(dataset, folder / "s.zarr", expected)
+
+
+def test_a_target_that_may_not_even_be_looked_at(
+    reference: tuple[Dataset, dict[str, str]], script: Path, tmp_path: Path
+) -> None:
+    dataset, _ = reference
+    folder = tmp_path / "hidden"
+    folder.mkdir()
+    folder.chmod(0o000)
+    fault = "import fcntl; os.geteuid() or os.seteuid(65534)"
+    for path in (tmp_path, *tmp_path.parents[:3]):
+        path.chmod(path.stat().st_mode | 0o755)
+    done = run(script, dataset, folder / "s.zarr", fault)
+    folder.chmod(0o755)
+    assert done.returncode == 1
+    assert "s.zarr: cannot be looked at (Permission denied)" in done.stderr
+    assert "Traceback" not in done.stderr
+
+
+def test_the_second_of_two_builds_is_refused_and_told_of_the_first(
+    reference: tuple[Dataset, dict[str, str]], script: Path, tmp_path: Path
+) -> None:
+    dataset, expected = reference
+    out = tmp_path / "s.zarr"
+    sleeping = "import time; import slatprep.pipeline.pack as p; p.create_store = lambda *_: time.sleep(600)"
+    first = subprocess.Popen(prepared(script, dataset, out, sleeping), env=environment(script))
+    try:
+        lock = tmp_path / ".s.zarr.work" / "lock"
+        while not lock.exists() or not lock.read_text():
+            time.sleep(0.05)
+        with pytest.raises(
+            StoreError, match=rf"another build is writing it \(process {first.pid} on"
+        ):
+            build_store(dataset.parameters("pixie"), out)
+    finally:
+        first.kill()
+        first.wait()
+    assert lock.exists()  # A killed build leaves the file, but not the lock.
+    ends_well(dataset, out, expected)
+
+
+def test_workers_do_not_outlive_a_killed_build(
+    reference: tuple[Dataset, dict[str, str]], script: Path, tmp_path: Path
+) -> None:
+    dataset, _ = reference
+    fault = """
+def endless(*_):
+    import time
+    open(f"PIDS/{os.getpid()}", "w").close()
+    time.sleep(600)
+process.read_field = endless
+"""
+    (tmp_path / "pids").mkdir()
+    fault = fault.replace("PIDS", str(tmp_path / "pids"))
+    command = prepared(script, dataset, tmp_path / "s.zarr", in_workers=fault, jobs=2)
+    build = subprocess.Popen(command, env=environment(script))
+    while len(list((tmp_path / "pids").iterdir())) < 2:
+        time.sleep(0.05)
+    build.kill()
+    build.wait()
+    pids = [int(path.name) for path in (tmp_path / "pids").iterdir()]
+    end = time.monotonic() + 60
+    while any(Path(f"/proc/{pid}/stat").exists() for pid in pids):
+        assert time.monotonic() < end, "a worker is still there"
+        time.sleep(0.1)
+
+
+def test_a_few_kills_at_random_times(
+    reference: tuple[Dataset, dict[str, str]], script: Path, tmp_path: Path
+) -> None:
+    """The short version of ``benchmarks/soak_kills.py``."""
+    dataset, expected = reference
+    out = tmp_path / "s.zarr"
+    build_store(dataset.parameters("pixie"), out)
+    chance = random.Random(0)
+    for turn in range(4):
+        dataset.add("d", seed=turn)
+        command = prepared(script, dataset, out, jobs=2)
+        build = subprocess.Popen(command, env=environment(script), start_new_session=True)
+        time.sleep(chance.uniform(0.5, 5.0))
+        os.killpg(build.pid, signal.SIGKILL)
+        build.wait()
+        stored = open_store(out)
+        assert [stored.asset(i).asset_id for i in stored.ids] == stored.ids
+    shutil.rmtree(dataset.root / "pixieverse" / "d")
+    (dataset.root / "slat" / "d.npz").unlink()
+    ends_well(dataset, out, expected)

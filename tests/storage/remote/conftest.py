@@ -1,0 +1,130 @@
+"""A real S3 server on loopback, a bucket a test, and made assets to put there."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import uuid
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import fsspec
+import pytest
+from s3fs.core import S3FileSystem
+from support.synthetic import Dataset
+
+from slatprep.pipeline.dataset import build_store
+
+SERVER = """
+import sys
+from moto.server import ThreadedMotoServer
+server = ThreadedMotoServer(ip_address="127.0.0.1", port=0, verbose=False)
+server.start()
+print("http://%s:%s" % server.get_host_and_port(), flush=True)
+sys.stdin.read()  # Until the tests end, however they do.
+"""
+
+
+@pytest.fixture(scope="session")
+def server() -> Iterator[str]:
+    """Run moto's S3 in a process of its own; return its address."""
+    with subprocess.Popen(
+        [sys.executable, "-c", SERVER],
+        stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True,
+    ) as process:  # fmt: skip
+        assert process.stdout is not None
+        yield process.stdout.readline().strip()
+        process.kill()
+
+
+@pytest.fixture(scope="session", autouse=True)
+def environment(server: str, tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    """Say where the server is, and let nobody's own settings in."""
+    none = str(tmp_path_factory.mktemp("aws") / "none")
+    with pytest.MonkeyPatch.context() as monkeypatch:
+        for name, value in {
+            "AWS_ENDPOINT_URL": server,
+            "AWS_ACCESS_KEY_ID": "key",
+            "AWS_SECRET_ACCESS_KEY": "secret",
+            "AWS_DEFAULT_REGION": "us-east-1",
+            "AWS_EC2_METADATA_DISABLED": "true",
+            "AWS_CONFIG_FILE": none,
+            "AWS_SHARED_CREDENTIALS_FILE": none,
+        }.items():
+            monkeypatch.setenv(name, value)
+        yield
+
+
+@pytest.fixture(autouse=True)
+def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Give each test a cache of its own."""
+    monkeypatch.setenv("SLATPREP_CACHE", str(tmp_path / "cache"))
+
+
+@pytest.fixture
+def new_clients(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[], None]]:
+    """Return what makes fsspec forget its clients: they keep the credentials they began with."""
+    yield S3FileSystem.clear_instance_cache
+    monkeypatch.undo()
+    S3FileSystem.clear_instance_cache()
+
+
+@pytest.fixture
+def s3() -> Any:
+    """Return a client that sees what others have just written."""
+    return fsspec.filesystem("s3", use_listings_cache=False)
+
+
+@pytest.fixture
+def bucket(s3: Any) -> str:
+    """Make a bucket of one test."""
+    name = f"bucket-{uuid.uuid4().hex[:12]}"
+    s3.mkdir(name)
+    return name
+
+
+@pytest.fixture(scope="session")
+def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> tuple[Dataset, Path]:
+    """Return three assets, and the store that a local build makes of them."""
+    folder = tmp_path_factory.mktemp("undisturbed")
+    dataset = Dataset(folder / "sources")
+    for seed, object_id in enumerate("abc"):
+        dataset.add(object_id, seed)
+    build_store(dataset.parameters("pixie"), folder / "s.zarr")
+    return dataset, folder / "s.zarr"
+
+
+@pytest.fixture(scope="session")
+def another(tmp_path_factory: pytest.TempPathFactory) -> tuple[Dataset, Path]:
+    """Return one other asset, and the store of it."""
+    folder = tmp_path_factory.mktemp("another")
+    dataset = Dataset(folder / "sources")
+    dataset.add("z", seed=3)
+    build_store(dataset.parameters("pixie"), folder / "s.zarr")
+    return dataset, folder / "s.zarr"
+
+
+class Requests:
+    """Counts what is asked of the server from this process, by operation and key."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        call = S3FileSystem._call_s3
+        self.made: list[tuple[str, str]] = []
+
+        async def counting(filesystem: Any, method: str, *args: Any, **options: Any) -> Any:
+            listed = f"{options.get('Prefix')}*{options.get('Delimiter')}"
+            self.made.append((method, str(options.get("Key", listed))))
+            return await call(filesystem, method, *args, **options)
+
+        monkeypatch.setattr(S3FileSystem, "_call_s3", counting)
+
+    def of(self, method: str) -> list[str]:
+        """Return the keys that a method was called with; of listings prefix*delimiter."""
+        return [key for name, key in self.made if name == method]
+
+
+@pytest.fixture
+def requests(monkeypatch: pytest.MonkeyPatch) -> Requests:
+    """Count requests from here on."""
+    return Requests(monkeypatch)

@@ -1,0 +1,144 @@
+"""Builds whose sources lie on S3."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import h5py
+import pytest
+from support.synthetic import Dataset
+from support.trees import tree
+
+from slatprep.config import load_parameters
+from slatprep.errors import ConfigError
+from slatprep.parameters import BuildParameters, PairingParameters, PixieverseSource, SlatSource
+from slatprep.pipeline.dataset import build_store, plan_build
+from slatprep.readers import discover
+from slatprep.readers.names import listed_once
+from slatprep.store import open_store
+
+
+@pytest.fixture
+def uploaded(s3: Any, bucket: str, undisturbed: tuple[Dataset, Path]) -> BuildParameters:
+    """Put the sources of three assets into the bucket; return the parameters to build them."""
+    dataset, _ = undisturbed
+    s3.put(f"{dataset.root}/", f"{bucket}/data/", recursive=True)
+    return replace(
+        dataset.parameters("pixie"),
+        pixieverse=PixieverseSource(f"s3://{bucket}/data/pixieverse"),  # type: ignore[arg-type]
+        slat=SlatSource(f"s3://{bucket}/data/slat"),  # type: ignore[arg-type]
+    )
+
+
+def test_the_store_is_the_one_that_local_sources_give(
+    uploaded: BuildParameters, undisturbed: tuple[Dataset, Path], tmp_path: Path
+) -> None:
+    summary = build_store(uploaded, tmp_path / "s.zarr")
+    assert tree(tmp_path / "s.zarr") == tree(undisturbed[1])
+    build = json.loads(summary.records.with_name("build.json").read_text())
+    assert build["parameters"]["slat"]["root"] == str(uploaded.slat.root)
+    assert plan_build(uploaded, tmp_path / "s.zarr").actions["reuse"] == 3
+
+
+def test_each_place_is_listed_once_and_each_file_fetched_once(
+    uploaded: BuildParameters, tmp_path: Path, requests: Any
+) -> None:
+    build_store(uploaded, tmp_path / "s.zarr", progress=lambda done, total: None)
+    fetched = requests.of("get_object")
+    assert len(fetched) == len(set(fetched)) == 6
+    whole = [listed for listed in requests.of("list_objects_v2") if listed.endswith("*")]
+    assert sorted(whole) == ["data/pixieverse/*", "data/slat/*"]
+    assert len(requests.made) < 6 + 2 + 20  # and some to see what the roots are
+
+
+def test_a_definition_may_name_urls(
+    uploaded: BuildParameters, s3: Any, bucket: str, tmp_path: Path
+) -> None:
+    s3.pipe_file(f"{bucket}/map.csv", b"object_id,slat_id\na,b\n")
+    categories = {name: {"obj_class": "cup"} for name in "abc"}
+    s3.pipe_file(f"{bucket}/categories.json", json.dumps(categories).encode())
+    (tmp_path / "dataset.toml").write_text(
+        f"""
+        [pixieverse]
+        root = "{uploaded.pixieverse.root}"
+        [slat]
+        root = "{uploaded.slat.root}"
+        [pairing]
+        map = "s3://{bucket}/map.csv"
+        categories = "s3://{bucket}/categories.json"
+        """
+    )
+    pairs = {pair.asset_id: pair for pair in discover(load_parameters(tmp_path / "dataset.toml"))}
+    assert str(pairs["a"].slat) == f"{uploaded.slat.root}/b.npz"
+    assert pairs["a"].category == "cup"
+    assert "no SLAT" in pairs["b"].problem
+
+
+@pytest.mark.parametrize("place", ["s3://no-such-bucket/x", "s3://{bucket}/none"])
+def test_a_root_that_is_not_there_is_named(
+    uploaded: BuildParameters, bucket: str, place: str, tmp_path: Path
+) -> None:
+    place = place.format(bucket=bucket)
+    parameters = replace(uploaded, slat=SlatSource(place))  # type: ignore[arg-type]
+    with pytest.raises(ConfigError, match=f"^{place}: does not exist"):
+        build_store(parameters, tmp_path / "s.zarr")
+    with pytest.raises(ConfigError, match=f"slat.root: {place} does not exist"):
+        load_parameters(
+            None, {"pixieverse": {"root": str(uploaded.pixieverse.root)}, "slat": {"root": place}}
+        )
+
+
+def test_objects_that_are_torn_or_gone_are_named_and_the_others_go_in(
+    uploaded: BuildParameters, s3: Any, bucket: str, tmp_path: Path
+) -> None:
+    torn = s3.cat_file(f"{bucket}/data/slat/b.npz")[:1000]
+    s3.pipe_file(f"{bucket}/data/slat/b.npz", torn)
+    with listed_once():
+        list(discover(uploaded))
+        s3.rm(f"{bucket}/data/pixieverse/c/sample_0/material_grid.npy")  # After it was listed.
+        summary = build_store(uploaded, tmp_path / "s.zarr")
+    problems = dict(summary.problems)
+    assert open_store(tmp_path / "s.zarr").ids == ["a"]
+    assert f"s3://{bucket}/data/slat/b.npz: is no readable npz archive" in problems["b"]
+    grid = f"s3://{bucket}/data/pixieverse/c/sample_0/material_grid.npy"
+    assert problems["c"].startswith(f"{grid}: does not exist")
+
+
+def test_one_hdf5_file_of_many_assets_is_copied_once(
+    uploaded: BuildParameters,
+    undisturbed: tuple[Dataset, Path],
+    s3: Any,
+    bucket: str,
+    tmp_path: Path,
+    requests: Any,
+) -> None:
+    dataset, expected = undisturbed
+    with h5py.File(tmp_path / "all.h5", "w") as file:
+        for asset_id, asset in dataset.assets.items():
+            file[f"{asset_id}/coords"], file[f"{asset_id}/feats"] = asset.coords, asset.feats
+    place = f"s3://{bucket}/all.h5"
+    s3.put_file(str(tmp_path / "all.h5"), place)
+    parameters = replace(uploaded, slat=SlatSource(place))  # type: ignore[arg-type]
+    requests.made.clear()
+    build_store(parameters, tmp_path / "s.zarr")
+    assert requests.of("get_object").count("all.h5") == 1
+    built, known = open_store(tmp_path / "s.zarr"), open_store(expected)
+    assert built.ids == known.ids
+    for row in range(3):
+        assert (built.read(row)["feats"] == known.read(row)["feats"]).all()
+    assert plan_build(parameters, tmp_path / "s.zarr").actions["reuse"] == 3
+
+
+def test_a_pairing_may_lie_elsewhere_than_its_sources(
+    undisturbed: tuple[Dataset, Path], s3: Any, bucket: str
+) -> None:
+    s3.pipe_file(f"{bucket}/map.csv", b"object_id,slat_id\na,b\n")
+    parameters = replace(
+        undisturbed[0].parameters(),
+        pairing=PairingParameters(map=f"s3://{bucket}/map.csv"),  # type: ignore[arg-type]
+    )
+    pairs = {pair.asset_id: pair for pair in discover(parameters)}
+    assert pairs["a"].slat == undisturbed[0].root / "slat" / "b.npz"

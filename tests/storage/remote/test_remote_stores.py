@@ -1,0 +1,513 @@
+"""Stores that lie on S3: made, replaced in one step, interrupted, read and verified."""
+
+from __future__ import annotations
+
+import json
+import multiprocessing
+import os
+import signal
+import threading
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import fsspec
+import numpy as np
+import pytest
+import zarr
+from s3fs.core import S3FileSystem
+from support.objects import contents
+from support.synthetic import Dataset
+from support.trees import tree
+
+from slatprep.errors import StoreError
+from slatprep.inspect.verify import verify_store
+from slatprep.parameters import StoreParameters
+from slatprep.pipeline import dataset as build
+from slatprep.pipeline.dataset import build_store, plan_build
+from slatprep.storage import upload
+from slatprep.storage.copies import local_copy
+from slatprep.storage.remote import as_path
+from slatprep.storage.upload import look_at, upload_store
+from slatprep.storage.versions import Pointer, read_pointer
+from slatprep.store import Store, open_store
+
+Made = tuple[Dataset, Path]
+
+
+@pytest.fixture
+def url(bucket: str) -> str:
+    return f"s3://{bucket}/stores/demo.zarr"
+
+
+def put(store: Path, url: str) -> Path:
+    """Publish a finished store; return where its version lies."""
+    made = upload_store(store, look_at(as_path(url)))  # type: ignore[arg-type]
+    made.show()
+    return made.version
+
+
+def current(s3: Any, url: str) -> dict[str, str]:
+    """Return what is in sight: the hashes of the version that the pointer names."""
+    pointer = json.loads(s3.cat_file(f"{url}/current.json"))
+    return contents(s3, f"{url}/versions/{pointer['version']}")
+
+
+@pytest.fixture
+def change_client(monkeypatch: pytest.MonkeyPatch, new_clients: Any) -> Callable[[str, Any], None]:
+    """Return what has the client of this process do something else."""
+
+    def change(name: str, method: Any) -> None:
+        monkeypatch.setattr(S3FileSystem, name, method)
+        new_clients()
+
+    return change
+
+
+def versions(s3: Any, url: str) -> set[str]:
+    return {name.split("/")[1] for name in contents(s3, url) if name.startswith("versions/")}
+
+
+def test_a_store_is_built_from_s3_to_s3_and_equals_the_local_one(
+    s3: Any, bucket: str, url: str, undisturbed: Made, tmp_path: Path
+) -> None:
+    dataset, expected = undisturbed
+    s3.put(f"{dataset.root}/", f"{bucket}/data/", recursive=True)
+    parameters = Dataset(as_path(f"s3://{bucket}/data")).parameters("pixie")
+    summary = build_store(parameters, url, jobs=2)  # type: ignore[arg-type]
+    assert summary.complete
+    assert str(summary.store) == url
+    assert current(s3, url) == tree(expected)
+    assert summary.records.read_text().count("\n") == 3
+    store = open_store(url)
+    assert store.name == "demo.zarr"
+    assert_same(store, open_store(expected))
+    # Plain zarr knows nothing of pointers, and needs none.
+    group = zarr.open_group(str(store.path), mode="r")
+    assert (group["voxel/coords"][:] == zarr.open_group(expected)["voxel/coords"][:]).all()
+    assert verify_store(url, sources=True).findings == ()
+    assert not any((tmp_path / "cache").rglob("*.npz"))
+
+
+def assert_same(left: Store, right: Store) -> None:
+    assert left.ids == right.ids
+    for row, asset_id in enumerate(left.ids):
+        for name, values in left.read(row).items():
+            np.testing.assert_array_equal(values, right.read(row)[name])
+        np.testing.assert_array_equal(
+            left.asset(asset_id).grid_properties, right.asset(asset_id).grid_properties
+        )
+
+
+def test_opening_costs_the_pointer_and_one_more_read(
+    url: str, undisturbed: Made, requests: Any, tmp_path: Path
+) -> None:
+    shards = StoreParameters(voxel_chunk=128)  # One of each array, a dozen chunks an asset.
+    build_store(replace(undisturbed[0].parameters("pixie"), store=shards), tmp_path / "s.zarr")
+    put(tmp_path / "s.zarr", url)
+    requests.made.clear()
+    store = open_store(url)
+    assert [method for method, _ in requests.made] == ["get_object"] * 2
+    store.read(0)
+    requests.made.clear()
+    store.read(1)
+    # The chunks of an asset lie side by side and come at once, of each of three arrays.
+    assert [method for method, _ in requests.made] == ["get_object"] * 3
+
+
+def test_what_did_not_change_is_neither_aligned_nor_uploaded_again(
+    s3: Any, url: str, make_dataset: Any, requests: Any, tmp_path: Path
+) -> None:
+    dataset = make_dataset("a", "b")
+    build_store(dataset.parameters("pixie"), url)
+    first = contents(s3, url)
+    requests.made.clear()
+    summary = build_store(dataset.parameters("pixie"), url)
+    assert summary.statuses["ok"] == 2
+    assert requests.of("put_object") == []
+    # All done again, from nothing, gives the same bytes, which are there already.
+    build_store(dataset.parameters("pixie"), url, fresh=True)
+    assert {Path(key).name for key in requests.of("put_object")} <= {"assets.jsonl", "build.json"}
+    assert contents(s3, url).keys() == first.keys()
+
+    dataset.add("c", seed=2)
+    plan = plan_build(dataset.parameters("pixie"), url).actions
+    assert (plan["reuse"], plan["align"]) == (2, 1)
+    build_store(dataset.parameters("pixie"), url)
+    build_store(dataset.parameters("pixie"), tmp_path / "local.zarr")
+    assert current(s3, url) == tree(tmp_path / "local.zarr")
+
+
+def test_one_older_version_is_kept_for_who_reads_it(
+    s3: Any, url: str, undisturbed: Made, another: Made
+) -> None:
+    first = put(another[1], url)
+    reader, known = open_store(url), open_store(another[1])
+    put(undisturbed[1], url)
+    np.testing.assert_array_equal(reader.read(0)["feats"], known.read(0)["feats"])
+    assert first.name in versions(s3, url)
+    third = put(another[1], url)
+    assert third.name != first.name
+    assert len(versions(s3, url)) == 2
+    assert first.name not in versions(s3, url)
+    with pytest.raises(StoreError, match=r"voxel/distance/c/0: .*was the store replaced"):
+        reader.read(0, ("distance",))
+    assert_same(open_store(url), known)
+
+
+def test_who_opens_it_while_it_is_replaced_finds_one_or_the_other_whole(
+    url: str, undisturbed: Made, another: Made
+) -> None:
+    stores = {tuple(open_store(path).ids): open_store(path) for _, path in (undisturbed, another)}
+    put(undisturbed[1], url)
+    seen: list[tuple[str, ...]] = []
+    faults: list[BaseException] = []
+    stop = threading.Event()
+
+    def read() -> None:
+        try:
+            while not stop.is_set():
+                store = open_store(url)
+                expected = stores[tuple(store.ids)]
+                np.testing.assert_array_equal(store.read(0)["feats"], expected.read(0)["feats"])
+                seen.append(tuple(store.ids))
+        except BaseException as error:
+            faults.append(error)
+
+    reader = threading.Thread(target=read)
+    reader.start()
+    for path in (another[1], undisturbed[1], another[1]):
+        count = len(seen)
+        put(path, url)
+        while len(seen) < count + 3 and not faults:
+            stop.wait(0.01)
+    stop.set()
+    reader.join()
+    assert faults == []
+    assert set(seen) == set(stores)
+
+
+def kill_self(*_: Any, **__: Any) -> None:
+    os.kill(os.getpid(), signal.SIGKILL)
+
+
+def kill_midway() -> None:
+    """Let this process be killed at its twentieth object."""
+    put_file, left = S3FileSystem._put_file, [20]
+
+    async def dies(*args: Any, **options: Any) -> Any:
+        left[0] -= 1
+        if left[0] < 0:
+            kill_self()
+        return await put_file(*args, **options)
+
+    S3FileSystem._put_file = dies
+
+
+def kill_before() -> None:
+    upload.Upload._replace_pointer = kill_self  # type: ignore[method-assign]
+
+
+def kill_after() -> None:
+    upload._remove = kill_self
+
+
+def build_and_be_killed(fault: Callable[[], None], dataset: Dataset, url: str) -> None:
+    """Build in a process of its own that kills itself with signal 9 where `fault` has it."""
+
+    def run() -> None:
+        fault()
+        build_store(dataset.parameters("pixie"), url)  # type: ignore[arg-type]
+
+    child = multiprocessing.get_context("fork").Process(target=run)
+    child.start()
+    child.join(120)
+    assert child.exitcode == -signal.SIGKILL
+
+
+@pytest.mark.parametrize(
+    ("fault", "shown"),
+    [
+        (kill_midway, False),
+        (kill_before, False),
+        (kill_after, True),
+    ],
+    ids=["while it uploads", "before the pointer", "after the pointer"],
+)
+def test_a_build_that_is_killed_leaves_a_whole_store_and_the_next_one_completes(
+    s3: Any, url: str, undisturbed: Made, another: Made, fault: Any, shown: bool, requests: Any
+) -> None:
+    (_, old), (dataset, new) = undisturbed, another
+    put(old, url)
+    build_and_be_killed(fault, dataset, url)
+    assert current(s3, url) == tree(new if shown else old)
+    there = len(contents(s3, f"{url}/versions"))
+    requests.made.clear()
+    summary = build_store(dataset.parameters("pixie"), url)
+    assert summary.complete
+    assert current(s3, url) == tree(new)
+    # Nothing was uploaded twice, and nothing is left but the version before.
+    uploaded = [key for key in requests.of("put_object") if "/versions/" in key]
+    assert len(uploaded) == len(tree(old)) + len(tree(new)) - there
+    pointer = read_pointer(as_path(url))  # type: ignore[arg-type]
+    assert versions(s3, url) == {pointer.version, pointer.previous}  # type: ignore[union-attr]
+
+
+def test_what_a_killed_build_uploaded_goes_when_the_sources_changed_since(
+    s3: Any, url: str, undisturbed: Made, another: Made
+) -> None:
+    (_, expected), (dataset, _) = undisturbed, another
+    build_and_be_killed(kill_midway, dataset, url)
+    assert 0 < len(contents(s3, url)) < 30
+    assert not s3.exists(f"{url}/current.json")
+    with pytest.raises(StoreError, match="does not exist"):
+        open_store(url)
+    put(expected, url)
+    assert current(s3, url) == tree(expected)
+    assert len(versions(s3, url)) == 1
+
+
+def test_a_build_is_refused_that_another_has_overtaken(
+    s3: Any,
+    url: str,
+    undisturbed: Made,
+    another: Made,
+    monkeypatch: pytest.MonkeyPatch,
+    tmp_path: Path,
+) -> None:
+    """The other runs on another machine: no lock of this one's disk keeps it out."""
+    pack = build.pack_store
+
+    def overtaken(*args: Any) -> Any:
+        with pytest.MonkeyPatch.context() as there:
+            there.setattr(build, "pack_store", pack)
+            there.setenv("SLATPREP_CACHE", str(tmp_path / "elsewhere"))
+            build_store(another[0].parameters("pixie"), url)
+        return pack(*args)
+
+    monkeypatch.setattr(build, "pack_store", overtaken)
+    with pytest.raises(StoreError, match=f"^{url}: another build replaced it while this one ran"):
+        build_store(undisturbed[0].parameters("pixie"), url)
+    assert current(s3, url) == tree(another[1])
+    monkeypatch.undo()
+
+
+def test_the_second_build_on_one_machine_is_refused_at_once(
+    url: str, undisturbed: Made, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    parameters = undisturbed[0].parameters("pixie")
+    pack = build.pack_store
+
+    def twice(*args: Any) -> Any:
+        with pytest.raises(StoreError, match=f"^{url}: another build is writing it"):
+            build_store(parameters, url)
+        return pack(*args)
+
+    monkeypatch.setattr(build, "pack_store", twice)
+    assert build_store(parameters, url).complete
+
+
+@pytest.mark.parametrize("first", [True, False], ids=["none before", "one before"])
+def test_the_server_itself_refuses_a_pointer_that_moved_at_the_last_moment(
+    s3: Any,
+    url: str,
+    undisturbed: Made,
+    another: Made,
+    change_client: Any,
+    first: bool,
+    tmp_path: Path,
+) -> None:
+    if not first:
+        (tmp_path / "old.zarr").mkdir()
+        (tmp_path / "old.zarr" / "zarr.json").write_text("{}")
+        put(tmp_path / "old.zarr", url)
+    late = upload_store(undisturbed[1], look_at(as_path(url)))  # type: ignore[arg-type]
+    early = upload_store(another[1], look_at(as_path(url)))  # type: ignore[arg-type]
+    pipe = S3FileSystem._pipe_file
+
+    async def overtaken(filesystem: Any, path: str, data: bytes, **options: Any) -> Any:
+        await pipe(filesystem, path, early.pointer.encode())
+        return await pipe(filesystem, path, data, **options)
+
+    change_client("_pipe_file", overtaken)
+    with pytest.raises(StoreError, match="another build replaced it"):
+        late.show()
+    assert current(s3, url) == tree(another[1])
+
+
+def test_an_answer_that_is_lost_does_not_make_a_failure_of_a_success(
+    s3: Any, url: str, undisturbed: Made, another: Made, change_client: Any
+) -> None:
+    put(another[1], url)
+    made = upload_store(undisturbed[1], look_at(as_path(url)))  # type: ignore[arg-type]
+    pipe, lost = S3FileSystem._pipe_file, []
+
+    async def deaf(*args: Any, **options: Any) -> Any:
+        lost.append(await pipe(*args, **options))
+        raise OSError("connection lost")
+
+    change_client("_pipe_file", deaf)
+    made.show()
+    assert len(lost) == 1
+    assert current(s3, url) == tree(undisturbed[1])
+
+
+def test_older_versions_that_must_not_be_removed_are_told(
+    url: str, undisturbed: Made, another: Made, change_client: Any, s3: Any
+) -> None:
+    put(another[1], url)
+    put(undisturbed[1], url)
+    made = upload_store(another[1], look_at(as_path(url)))  # type: ignore[arg-type]
+
+    async def denied(*_: Any, **__: Any) -> None:
+        raise PermissionError("Access Denied")
+
+    change_client("_rm", denied)
+    with pytest.warns(UserWarning, match=r"older versions could not be removed \(Access Denied\)"):
+        made.show()
+    assert current(s3, url) == tree(another[1])
+
+
+def test_each_fault_of_a_store_is_named(
+    s3: Any, url: str, undisturbed: Made, tmp_path: Path
+) -> None:
+    version = put(undisturbed[1], url)
+    s3.rm(f"{version}/voxel/coords/c/0/0")
+    shard = bytearray(s3.cat_file(f"{version}/voxel/feats/c/0/0"))
+    shard[100] ^= 1
+    s3.pipe_file(f"{version}/voxel/feats/c/0/0", bytes(shard))
+    s3.pipe_file(f"{version}/asset/fitness/c/0", s3.cat_file(f"{version}/asset/fitness/c/0")[:-3])
+    s3.pipe_file(f"{version}/stray", b"x")
+    found = {(finding.file, finding.what) for finding in verify_store(url, jobs=1).findings}
+    assert ("voxel/coords/c/0/0", "is missing") in found
+    assert ("voxel/feats/c/0/0", "its bytes changed") in found
+    assert ("stray", "belongs to no array") in found
+    assert any(name == "asset/fitness/c/0" and "cut short" in what for name, what in found)
+    store = open_store(url)
+    with pytest.raises(StoreError, match=f"{version}/voxel/coords/c/0/0: is missing"):
+        store.read(0, ("coords",))
+    with pytest.raises(StoreError, match=f"{version}/voxel/feats/c/0/0: chunk 0 is damaged"):
+        store.read(0, ("feats",))
+    s3.rm(f"{version}/zarr.json")
+    with pytest.raises(StoreError, match=f"{version}/zarr.json does not exist"):
+        verify_store(url)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        b"",
+        b"{",
+        b"[]",
+        b'{"format": "other"}',
+        Pointer("../../other/x", "", "", "").encode(),
+        Pointer("0123456789abcdef", "..", "", "").encode(),
+        b"[" * 100_000,
+    ],
+)
+def test_a_pointer_that_is_none_is_refused(
+    s3: Any, url: str, text: bytes, undisturbed: Made
+) -> None:
+    s3.pipe_file(f"{url}/current.json", text)
+    for refused in (
+        lambda: open_store(url),
+        lambda: build_store(undisturbed[0].parameters("pixie"), url),
+    ):
+        with pytest.raises(StoreError, match=f"^{url}/current.json: names no version"):
+            refused()
+    assert s3.cat_file(f"{url}/current.json") == text
+
+
+def test_places_that_cannot_be_written_are_told_before_the_work(
+    s3: Any, bucket: str, undisturbed: Made, monkeypatch: pytest.MonkeyPatch, new_clients: Any
+) -> None:
+    parameters = undisturbed[0].parameters("pixie")
+    monkeypatch.setattr(build, "_finish_all", None)  # Nothing is aligned.
+    with pytest.raises(StoreError, match=r"^s3://no-such/a.zarr: cannot be reached .*bucket does"):
+        build_store(parameters, "s3://no-such/a.zarr")
+    s3.pipe_file(f"{bucket}/mine/notes.txt", b"keep")
+    with pytest.raises(StoreError, match=f"^s3://{bucket}/mine holds notes.txt and is not"):
+        build_store(parameters, f"s3://{bucket}/mine")
+    version = put(undisturbed[1], f"s3://{bucket}/a.zarr")
+    with pytest.raises(StoreError, match=f"is one version .* expected s3://{bucket}/a.zarr$"):
+        build_store(parameters, version)
+    with pytest.raises(StoreError, match="expected a local folder for the records"):
+        build_store(parameters, f"s3://{bucket}/a.zarr", manifests=as_path(f"s3://{bucket}/m"))
+    monkeypatch.delenv("AWS_SECRET_ACCESS_KEY")
+    monkeypatch.delenv("AWS_ACCESS_KEY_ID")
+    new_clients()
+    for refused in (
+        lambda: build_store(parameters, f"s3://{bucket}/a.zarr"),
+        lambda: open_store(f"s3://{bucket}/a.zarr"),
+    ):
+        with pytest.raises(StoreError, match=r"cannot be reached .*Unable to locate credentials"):
+            refused()
+
+
+def test_records_may_be_kept_on_the_local_disk(
+    s3: Any, url: str, make_dataset: Any, tmp_path: Path
+) -> None:
+    parameters = make_dataset("a").parameters("pixie")
+    summary = build_store(parameters, url, manifests=tmp_path / "records")
+    assert summary.records == tmp_path / "records" / "assets.jsonl"
+    assert not any(name.startswith("records/") for name in contents(s3, url))
+    assert verify_store(url, manifests=tmp_path / "records").findings == ()
+    # Asked for there as well, they are put there.
+    again = build_store(parameters, url)
+    assert again.manifest == summary.manifest
+    assert again.records.read_text().count("\n") == 1
+
+
+def test_a_forked_process_reads_on(url: str, undisturbed: Made) -> None:
+    put(undisturbed[1], url)
+    store = open_store(url)
+    store.read(0)
+    context = multiprocessing.get_context("fork")
+    queue = context.Queue()
+    child = context.Process(target=lambda: queue.put(store.read(1)["feats"]))
+    child.start()
+    feats = queue.get(timeout=30)
+    child.join()
+    np.testing.assert_array_equal(feats, open_store(undisturbed[1]).read(1)["feats"])
+
+
+def test_a_copy_is_made_once_and_holds_no_name_that_leads_out(
+    s3: Any, url: str, undisturbed: Made, requests: Any, tmp_path: Path
+) -> None:
+    version = put(undisturbed[1], url)
+    for name in ("../../../../escaped", "../escaped", "a/../../escaped"):
+        s3.pipe_file(f"{version}/{name}", b"x")
+    store = open_store(url, copy=True)
+    assert store.path.is_relative_to(tmp_path / "cache")
+    assert store.name == "demo.zarr"
+    assert tree(store.path) == tree(undisturbed[1])
+    assert not list(tmp_path.rglob("escaped"))
+    requests.made.clear()
+    assert_same(open_store(url, copy=True), open_store(undisturbed[1]))
+    assert [key for _, key in requests.made] == ["stores/demo.zarr/current.json"]
+    assert local_copy(undisturbed[1]) == undisturbed[1]
+
+
+def test_a_store_that_was_copied_there_as_it_is_can_be_read(
+    s3: Any, bucket: str, undisturbed: Made
+) -> None:
+    s3.put(f"{undisturbed[1]}/", f"{bucket}/plain.zarr/", recursive=True)
+    assert_same(open_store(f"s3://{bucket}/plain.zarr"), open_store(undisturbed[1]))
+    with pytest.raises(StoreError, match="lies there without versions"):
+        open_store(f"s3://{bucket}/plain.zarr", copy=True)
+    with pytest.raises(StoreError, match="is not a slatprep store with versions"):
+        build_store(undisturbed[0].parameters("pixie"), f"s3://{bucket}/plain.zarr")
+
+
+def test_other_file_systems_of_fsspec_do_as_well(make_dataset: Any, tmp_path: Path) -> None:
+    dataset = make_dataset("a")
+    place = "memory://stores/demo.zarr"
+    fsspec.filesystem("memory").rm("/", recursive=True)
+    build_store(dataset.parameters("pixie"), place)
+    dataset.add("b", seed=1)
+    build_store(dataset.parameters("pixie"), place)
+    build_store(dataset.parameters("pixie"), f"file://{tmp_path}/local.zarr")
+    assert_same(open_store(place), open_store(tmp_path / "local.zarr"))
+    assert verify_store(place).findings == ()
+    assert plan_build(dataset.parameters("pixie"), place).actions["reuse"] == 2

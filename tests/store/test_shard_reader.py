@@ -1,0 +1,207 @@
+"""Rows read straight from shards, against zarr-python, from threads and processes, and hostile."""
+
+import json
+import multiprocessing
+import os
+import pickle
+import shutil
+import subprocess
+import sys
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import numpy as np
+import pytest
+import zarr
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from slatprep.errors import StoreError
+from slatprep.pipeline.dataset import BuildSummary
+from slatprep.store import Store, open_store
+from slatprep.store.layout import ARRAYS
+
+
+@pytest.fixture(scope="module")
+def store(mixed_build: BuildSummary) -> Store:
+    return open_store(mixed_build.store)
+
+
+@pytest.fixture
+def copy(mixed_build: BuildSummary, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(mixed_build.store, tmp_path / "s.zarr"))
+
+
+@settings(max_examples=60, deadline=None, derandomize=True, database=None)
+@given(data=st.data())
+def test_any_rows_are_those_that_zarr_reads(store: Store, data: st.DataObject) -> None:
+    name = data.draw(st.sampled_from([layout.name for layout in ARRAYS]))
+    rows = store.shape(name)[0]
+    start = data.draw(st.integers(0, rows))
+    stop = data.draw(st.integers(start, min(rows, start + 700)))
+    if name.startswith("grid/"):
+        stop = min(stop, start + 2)
+    ours, theirs = store.read_rows(name, start, stop), store.group[name][start:stop]
+    if theirs.dtype.kind in "TO":
+        assert ours.tolist() == theirs.tolist()
+    else:
+        assert ours.dtype == theirs.dtype
+        assert ours.tobytes() == np.ascontiguousarray(theirs).tobytes()
+
+
+def test_rows_that_are_not_there_are_refused(store: Store) -> None:
+    with pytest.raises(StoreError, match="has 5 rows, not 3 to 6"):
+        store.read_rows("asset/fitness", 3, 6)
+    with pytest.raises(StoreError, match="has no asset 5"):
+        store.read(5)
+    with pytest.raises(StoreError, match="lacks the array voxel/colour"):
+        store.read(0, ("colour",))
+
+
+def digest(store: Store, index: int) -> list[bytes]:
+    return [array.tobytes() for array in store.read(index).values()]
+
+
+def test_threads_share_a_store(store: Store) -> None:
+    expected = [digest(store, index) for index in range(5)]
+    fresh = open_store(store.path)
+    with ThreadPoolExecutor(8) as pool:
+        assert list(pool.map(lambda k: digest(fresh, k % 5), range(200))) == expected * 40
+
+
+@pytest.mark.parametrize("method", ["fork", "spawn"])
+def test_processes_share_a_store(store: Store, method: str) -> None:
+    expected = [digest(store, index) for index in range(5)]
+    with multiprocessing.get_context(method).Pool(2) as pool:
+        assert pool.starmap(digest, [(store, index % 5) for index in range(20)]) == expected * 4
+
+
+def test_a_pickled_store_is_a_path(store: Store) -> None:
+    store.ids  # noqa: B018 - whatever has been read stays behind
+    assert len(pickle.dumps(store)) < 500
+    assert digest(pickle.loads(pickle.dumps(store)), 1) == digest(store, 1)
+
+
+def test_a_replaced_store_is_not_mixed_with_the_new_one(copy: Path) -> None:
+    old = open_store(copy)
+    assert len(old) == 5
+    copy.rename(copy.with_name("gone"))
+    shutil.copytree(copy.with_name("gone"), copy)
+    shutil.rmtree(copy.with_name("gone"))
+    with pytest.raises(StoreError, match="was the store replaced"):
+        old.read(0)
+
+
+def test_opening_reads_one_file_and_reading_needs_no_zarr(store: Store) -> None:
+    code = f"""
+import sys
+opened = []
+sys.addaudithook(lambda event, args: event == "open" and opened.append(str(args[0])))
+from slatprep.store import open_store
+store = open_store({str(store.path)!r})
+# The folder itself is opened, too, so that what is read stays of one store.
+files = [name for name in opened if name != {str(store.path)!r} and {str(store.path)!r} in name]
+assert files == [{str(store.path / "zarr.json")!r}], files
+assert store.read(2)["feats"].shape[1] == 8
+assert "zarr" not in sys.modules
+"""
+    subprocess.run([sys.executable, "-c", code], check=True)
+
+
+def edit(path: Path, change: dict[str, object]) -> None:
+    document = json.loads(path.read_text())
+    for place, value in change.items():
+        target = document
+        *keys, last = place.split("|")
+        for key in keys:
+            target = target[int(key) if key.isdigit() else key]
+        target[int(last) if last.isdigit() else last] = value
+    path.write_text(json.dumps(document))
+
+
+META = "consolidated_metadata|metadata|"
+COORDS, ID, FEATS = META + "voxel/coords|", META + "asset/id|", META + "voxel/feats|"
+SHARDING = "codecs|0|configuration|"
+
+HOSTILE = {
+    "more voxels than files": {COORDS + "shape": [10**9, 3]},
+    "a number of rows beyond reason": {COORDS + "shape": [10**15, 3]},
+    "more assets than files": {
+        META + f"{layout.name}|shape|0": 10**7 + (layout.name == "asset/offset")
+        for layout in ARRAYS
+        if layout.name.startswith("asset/")
+    },
+    "huge chunks": {
+        FEATS + SHARDING + "chunk_shape": [2**40, 8],
+        FEATS + "chunk_grid|configuration|chunk_shape": [2**40, 8],
+    },
+    "huge shards": {FEATS + "chunk_grid|configuration|chunk_shape": [2**50, 8]},
+    "chunks of nothing": {FEATS + SHARDING + "chunk_shape": [0, 8]},
+    "negative chunks": {FEATS + SHARDING + "chunk_shape": [-128, 8]},
+    "wide rows": {FEATS + "shape": [10, 10**9]},
+    "no shape": {FEATS + "shape": None},
+    "no codecs": {FEATS + "codecs": []},
+    "other metadata": {META + "voxel/feats": "feats"},
+}
+
+
+@pytest.mark.parametrize("case", HOSTILE)
+def test_hostile_metadata_cost_neither_memory_nor_sense(copy: Path, case: str) -> None:
+    edit(copy / "zarr.json", HOSTILE[case])
+    code = f"""
+import resource
+from slatprep.errors import StoreError
+from slatprep.store import open_store
+import numpy, numcodecs, google_crc32c, slatprep.inspect.check
+before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+try:
+    store = open_store({str(copy)!r})
+    store.read(0)
+    store.asset(store.ids[0])
+    print("read")
+except StoreError as error:
+    print(error)
+print((resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) // 1024)
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    message, grown = done.stdout.splitlines()
+    assert str(copy) in message
+    assert int(grown) < 100
+
+
+def test_offsets_that_lead_astray_are_refused(copy: Path) -> None:
+    root = zarr.open_group(copy, mode="r+", use_consolidated=False)
+    for first, message in ((10**12, "asset 0 has rows 0 to"), (-5, "asset 0 has rows 0 to -5")):
+        root["asset/offset"][1] = first
+        with pytest.raises(StoreError, match=message):
+            open_store(copy).read(0)
+    root["asset/offset"][:] = np.arange(6) + 10**6
+    with pytest.raises(StoreError, match=r"voxel/coords has \d+ rows, not 1000000 to 1000001"):
+        open_store(copy).read(0)
+
+
+def test_a_chunk_that_claims_to_be_huge_is_not_unpacked(copy: Path) -> None:
+    """A store of bombs: every checksum is right, each chunk unpacks to a gigabyte."""
+    from google_crc32c import value as crc32c
+    from numcodecs import Zstd
+
+    bomb = Zstd(1).encode(bytes(2**30))
+    bomb += crc32c(bytes(bomb)).to_bytes(4, "little")
+    (copy / "asset/id/c/0").write_bytes(bomb)
+    (copy / "asset/fitness/c/0").write_bytes(bomb)
+    store = open_store(copy)
+    for name in ("id", "fitness"):
+        with pytest.raises(StoreError, match="it holds 1073741824 bytes; expected"):
+            store.column(name)
+
+
+def test_a_shard_that_is_a_pipe_or_a_folder_does_not_hang(copy: Path) -> None:
+    shard = copy / "voxel/coords/c/0/0"
+    shard.unlink()
+    shard.mkdir()
+    with pytest.raises(StoreError, match="voxel/coords/c/0/0: "):
+        open_store(copy).read(0)
+    shard.rmdir()
+    os.mkfifo(shard)
+    with pytest.raises(StoreError, match="no regular file"):
+        open_store(copy).read(0)

@@ -1,0 +1,1 @@
+"""What several tests share: made datasets, shapes, trees of files, pages."""

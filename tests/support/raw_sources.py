@@ -1,0 +1,21 @@
+"""Small sources whose content is written down by hand."""
+
+from __future__ import annotations
+
+import numpy as np
+
+COORDS = np.array([[0, 0, 0], [63, 1, 2], [5, 63, 63]], dtype=np.uint8)
+FEATS = np.arange(24, dtype=np.float32).reshape(3, 8) / 8 - 1
+
+
+def raw_grid() -> np.ndarray:
+    """Return three voxels of jelly, metal and stationary in a grid of background.
+
+    Channels are in the files' order: density, Young's modulus, Poisson's ratio, class.
+    """
+    grid = np.zeros((64, 64, 64, 4), dtype=np.float32)
+    grid[..., 3] = 7
+    grid[1, 2, 3] = 1000.0, 2.0e6, 0.25, 0
+    grid[1, 2, 4] = 7850.0, 2.0e11, 0.30, 1
+    grid[60, 0, 63] = 500.0, 1.0e5, 0.45, 6
+    return grid

@@ -1,0 +1,51 @@
+"""Shapes of which everything is known by construction."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from slatprep.bench.truth import Truth
+from slatprep.geometry.voxels import boundary, occupancy_of, voxels_of
+from slatprep.records import MaterialField, StructuredLatents
+
+Case = tuple[MaterialField, StructuredLatents, Truth]
+
+GRID = np.stack(np.meshgrid(*[np.arange(64)] * 3, indexing="ij"), axis=-1)
+
+
+def field_of(occupancy: np.ndarray, material: np.ndarray | None = None) -> MaterialField:
+    """Make a field of a solid; `material` (64, 64, 64) gives classes, else all is class 1."""
+    voxels = voxels_of(occupancy)
+    classes = np.ones(len(voxels), dtype=np.uint8)
+    if material is not None:
+        classes = material[tuple(voxels.T.astype(int))].astype(np.uint8)
+    # Class c has E = 10^(5+c), density 100 (c+1), nu 0.2 + c/100.
+    c = classes.astype(np.float64)
+    properties = np.stack([10.0 ** (5 + c), 100.0 * (c + 1), 0.2 + c / 100], axis=1)
+    return MaterialField(occupancy, voxels, classes, properties.astype(np.float32))
+
+
+def latents_of(voxels: np.ndarray) -> StructuredLatents:
+    """Make a SLAT of given voxels."""
+    coords = np.asarray(voxels).reshape(-1, 3).astype(np.uint8)
+    return StructuredLatents(coords, np.zeros((len(coords), 8), dtype=np.float32))
+
+
+def surface_latents(occupancy: np.ndarray) -> StructuredLatents:
+    return latents_of(voxels_of(boundary(occupancy)))
+
+
+def chair() -> np.ndarray:
+    """A solid without any symmetry: a box, a back on one side, one arm, one ball."""
+    solid = np.zeros((64, 64, 64), dtype=bool)
+    solid[14:44, 18:42, 20:30] = True
+    solid[14:20, 18:42, 30:54] = True
+    solid[20:40, 18:22, 30:38] = True
+    solid |= ((GRID - np.array([40, 38, 33])) ** 2).sum(axis=-1) < 25
+    return solid
+
+
+def turned(occupancy: np.ndarray, rotation: np.ndarray) -> np.ndarray:
+    """Turn a grid by a signed permutation about the cube's centre."""
+    doubled = 2 * np.argwhere(occupancy) - 63
+    return occupancy_of((doubled @ rotation.T.astype(int) + 63) // 2)

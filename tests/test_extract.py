@@ -1,0 +1,264 @@
+"""Our side of the extraction, against an object with the interface of TRELLIS's pipeline.
+
+The stand-in draws from a generator that `manual_seed` seeds, as torch's does,
+so that order and number of the calls matter as they do with the real one.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import sys
+from pathlib import Path
+from types import ModuleType, SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from PIL import Image
+from support.synthetic import make_asset
+
+from slatprep import extract as work
+from slatprep.cli.commands import slatprep
+from slatprep.errors import ConfigError, InputError
+from slatprep.parameters import BuildParameters, PixieverseSource, SlatSource
+from slatprep.pipeline.dataset import build_store
+
+MEAN, STD = [0.5] * 8, [2.0] * 8
+
+
+class Tensor:
+    """As much of a torch tensor as latents are read by."""
+
+    def __init__(self, values: np.ndarray) -> None:
+        self.values = values
+
+    def detach(self) -> Tensor:
+        return self
+
+    cpu = float = detach
+
+    def numpy(self) -> np.ndarray:
+        return self.values
+
+
+class Torch(ModuleType):
+    """Seeds, and knows whether gradients are off."""
+
+    def __init__(self) -> None:
+        super().__init__("torch")
+        self.__version__ = "2.0"
+        self.rng, self.gradients = np.random.default_rng(), True
+
+    def manual_seed(self, seed: int) -> None:
+        self.rng = np.random.default_rng(seed)
+
+    @contextlib.contextmanager
+    def no_grad(self) -> Any:
+        self.gradients = False
+        yield
+        self.gradients = True
+
+    def device(self, name: str) -> str:
+        return f"device {name}"
+
+
+class Pipeline:
+    """TRELLIS's interface; the object in the image is an L of `voxels` voxels."""
+
+    def __init__(self, torch: Torch, voxels: int | None = None) -> None:
+        self.torch, self.voxels, self.seen = torch, voxels, []
+        self.sparse_structure_sampler_params = {"steps": 12, "cfg_strength": 7.5}
+        self.slat_sampler_params = {"steps": 12, "cfg_strength": 3.0, "cfg_interval": [0.5, 1.0]}
+        self.slat_normalization = {"mean": MEAN, "std": STD}
+
+    def to(self, device: str) -> None:
+        self.device = device
+
+    def preprocess_image(self, input: Image.Image) -> Image.Image:
+        self.seen.append("cropped")
+        return input.resize((518, 518))
+
+    def get_cond(self, image: list[Image.Image]) -> dict[str, Any]:
+        assert not self.torch.gradients
+        self.seen.append(image[0].size)
+        self.torch.rng.normal(size=3)  # what is drawn before the seed is set must not matter
+        return {"cond": float(np.asarray(image[0]).mean()), "neg_cond": 0.0}
+
+    def sample_sparse_structure(
+        self, cond: dict, num_samples: int = 1, sampler_params: dict | None = None
+    ) -> np.ndarray:
+        assert num_samples == 1 and not sampler_params and not self.torch.gradients
+        coords = make_asset(0).coords[: self.voxels]
+        return np.insert(self.torch.rng.permutation(coords).astype(np.int64), 0, 0, axis=1)
+
+    def sample_slat(
+        self, cond: dict, coords: np.ndarray, sampler_params: dict | None = None
+    ) -> Any:
+        drawn = self.torch.rng.normal(size=(len(coords), 8)) + cond["cond"]
+        feats = drawn * STD + MEAN
+        return SimpleNamespace(coords=Tensor(coords), feats=Tensor(feats))
+
+
+@pytest.fixture
+def session() -> work.Session:
+    torch = Torch()
+    return work.Session(Pipeline(torch), torch, {"name": "m", "revision": "abc"})
+
+
+@pytest.fixture
+def images(tmp_path: Path) -> list[Path]:
+    paths = []
+    for number, name in enumerate(("cup", "bear")):
+        paths.append(tmp_path / "images" / f"{name}.png")
+        paths[-1].parent.mkdir(exist_ok=True)
+        Image.new("RGB", (40, 30), (50 * number, 10, 10)).save(paths[-1])
+    return paths
+
+
+def run(session: work.Session, jobs: list[work.Job], **options: Any) -> list[Any]:
+    return list(work.extract(session, jobs, **options))
+
+
+def test_latents_are_what_the_pipeline_returns(
+    session: work.Session, images: list[Path], tmp_path: Path
+) -> None:
+    [result] = run(session, work.plan(images[:1], tmp_path / "slat", [7], False))
+    with np.load(tmp_path / "slat" / "cup.npz") as saved:
+        coords, feats = saved["coords"], saved["feats"]
+    assert (coords.dtype, feats.dtype) == (np.int32, np.float32)
+    # What a person who calls the pipeline by hand after seeding it would get.
+    torch = Torch()
+    pipeline = Pipeline(torch)
+    with torch.no_grad():
+        cond = pipeline.get_cond([pipeline.preprocess_image(Image.open(images[0]))])
+        torch.manual_seed(7)
+        slat = pipeline.sample_slat(cond, pipeline.sample_sparse_structure(cond))
+    np.testing.assert_array_equal(coords, slat.coords.numpy())
+    np.testing.assert_array_equal(feats, slat.feats.numpy().astype(np.float32))
+    assert result.voxels == len(coords) and session.pipeline.seen == ["cropped", (518, 518)]
+
+
+def test_provenance_says_how_to_do_it_again(
+    session: work.Session, images: list[Path], tmp_path: Path
+) -> None:
+    import hashlib
+
+    run(session, work.plan(images[:1], tmp_path / "slat", [7], False))
+    record = json.loads((tmp_path / "slat" / "cup.json").read_text("utf-8"))
+    assert record["seed"] == 7 and record["model"] == {"name": "m", "revision": "abc"}
+    assert record["image"]["sha256"] == hashlib.sha256(images[0].read_bytes()).hexdigest()
+    assert record["slat_normalization"] == {"mean": MEAN, "std": STD}
+    assert record["sparse_structure_sampler_params"]["cfg_strength"] == 7.5
+    slat = (tmp_path / "slat" / "cup.npz").read_bytes()
+    assert record["slat"]["sha256"] == hashlib.sha256(slat).hexdigest()
+
+
+def test_build_store_reads_what_is_extracted(
+    session: work.Session, images: list[Path], tmp_path: Path
+) -> None:
+    assert len(run(session, work.plan(images, tmp_path / "slat", [0, 1], False))) == 4
+    for name in ("cup", "bear"):
+        grid = tmp_path / "pixieverse" / name / "sample_0" / "material_grid.npy"
+        grid.parent.mkdir(parents=True)
+        np.save(grid, make_asset(0).grid)
+    summary = build_store(
+        BuildParameters(PixieverseSource(tmp_path / "pixieverse"), SlatSource(tmp_path / "slat")),
+        tmp_path / "s.zarr",
+    )
+    from slatprep.store import open_store
+
+    assert summary.store is not None
+    store = open_store(summary.store)
+    assert store.ids == ["bear.seed-0", "bear.seed-1", "cup.seed-0", "cup.seed-1"]
+    with np.load(tmp_path / "slat" / "cup" / "seed-1.npz") as saved:
+        np.testing.assert_array_equal(store.asset("cup.seed-1").feats, saved["feats"])
+
+
+def test_same_seed_gives_the_same_bytes_and_is_not_drawn_twice(
+    session: work.Session, images: list[Path], tmp_path: Path
+) -> None:
+    for folder in ("a", "b"):
+        run(session, work.plan(images, tmp_path / folder, [3], False))
+    for path in (tmp_path / "a").iterdir():
+        assert path.read_bytes() == (tmp_path / "b" / path.name).read_bytes()
+    calls = len(session.pipeline.seen)
+    again = run(session, work.plan(images, tmp_path / "a", [3], False))
+    assert all(result.kept for result in again) and len(session.pipeline.seen) == calls
+    other = run(session, work.plan(images, tmp_path / "a", [4], False))
+    assert all(isinstance(result, InputError) for result in other)
+    assert (tmp_path / "a" / "cup.npz").read_bytes() == (tmp_path / "b" / "cup.npz").read_bytes()
+
+
+def test_names(tmp_path: Path) -> None:
+    images = [tmp_path / "bear" / "front.png", tmp_path / "bear" / "side.png"]
+
+    def names(seeds: list[int], by_folder: bool) -> list[str]:
+        jobs = work.plan(images, tmp_path, seeds, by_folder)
+        return [job.slat.relative_to(tmp_path).as_posix() for job in jobs]
+
+    assert names([1], False) == ["front.npz", "side.npz"]
+    assert names([1], True) == ["bear/front.npz", "bear/side.npz"]
+    assert names([1, 2], False)[:2] == ["front/seed-1.npz", "front/seed-2.npz"]
+    assert names([1, 2], True)[1] == "bear/front-seed-2.npz"
+    with pytest.raises(ConfigError, match="would both be"):
+        work.plan([images[0], tmp_path / "cup" / "front.png"], tmp_path, [1], False)
+    with pytest.raises(ConfigError, match="cannot be an id"):
+        work.plan([tmp_path / ".hidden.png"], tmp_path, [1], False)
+
+
+def test_a_bad_image_does_not_stop_the_others(images: list[Path], tmp_path: Path) -> None:
+    images[0].write_bytes(b"no image")
+    torch = Torch()
+    session = work.Session(Pipeline(torch), torch, {})
+    bad, good = run(session, work.plan(images, tmp_path / "slat", [0], False))
+    assert isinstance(bad, InputError) and "cup.png" in str(bad) and good.voxels > 0
+    empty = work.Session(Pipeline(torch, voxels=0), torch, {})
+    [nothing] = run(empty, work.plan(images[1:], tmp_path / "none", [0], False))
+    assert isinstance(nothing, InputError) and not (tmp_path / "none" / "bear.npz").exists()
+
+
+def test_without_trellis_the_command_says_what_to_install(
+    images: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "trellis.pipelines", None)
+    words = ["extract-slat", str(images[0]), "--out", str(tmp_path / "slat")]
+    result = CliRunner().invoke(slatprep, words)
+    assert result.exit_code == 1 and len(result.stderr.splitlines()) == 1
+    assert "install TRELLIS as https://github.com/microsoft/TRELLIS says" in result.stderr
+    assert not (tmp_path / "slat").exists()
+
+
+def test_command_loads_one_commit_of_the_model(
+    images: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    torch, commit = Torch(), "0123abcd"
+    pipeline, asked = Pipeline(torch), []
+
+    def snapshot_download(name: str, revision: str | None) -> str:
+        asked.append((name, revision))
+        return str(tmp_path / commit)
+
+    def from_pretrained(path: str) -> Pipeline:
+        asked.append(path)
+        return pipeline
+
+    fakes = {
+        "torch": torch,
+        "trellis": ModuleType("trellis"),
+        "trellis.pipelines": SimpleNamespace(
+            TrellisImageTo3DPipeline=SimpleNamespace(from_pretrained=from_pretrained)
+        ),
+        "huggingface_hub": SimpleNamespace(snapshot_download=snapshot_download),
+    }
+    for name, module in fakes.items():
+        monkeypatch.setitem(sys.modules, name, module)
+    words = ["extract-slat", *map(str, images), "--out", str(tmp_path / "slat"), "--json", "-q",
+             "--revision", "v1", "--no-preprocess"]  # fmt: skip
+    result = CliRunner().invoke(slatprep, words)
+    assert result.exit_code == 0, result.output
+    document = json.loads(result.stdout)
+    assert document["model"]["revision"] == commit and document["extracted"] == 2
+    assert asked == [("microsoft/TRELLIS-image-large", "v1"), str(tmp_path / commit)]
+    assert pipeline.device == "device cuda" and "cropped" not in pipeline.seen

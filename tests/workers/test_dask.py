@@ -1,0 +1,394 @@
+"""Builds on a real Dask cluster: a scheduler and three workers, processes of their own."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+from click.testing import CliRunner
+from distributed import Client, LocalCluster
+from support.synthetic import Dataset
+from support.trees import tree
+
+import slatprep
+from slatprep.cli.commands import slatprep as command
+from slatprep.errors import SlatprepError
+from slatprep.inspect.verify import verify_store
+from slatprep.parameters import BuildParameters, PixieverseSource, SlatSource
+from slatprep.pipeline.dataset import align_pairs, build_store, plan_build
+from slatprep.workers import dask as module
+from slatprep.workers.dask import Cluster
+from slatprep.workers.local import run_unordered
+
+FAULTS = """
+import os, signal, time
+from pathlib import Path
+
+import slatprep.pipeline.asset as process
+
+faults = Path(os.environ["FAULTS"])
+
+
+def faulty(pair, read_field=process.read_field):
+    if (faults / f"deadly-{pair.asset_id}").exists():
+        os.kill(os.getpid(), signal.SIGKILL)
+    try:
+        (faults / f"hold-{pair.asset_id}").unlink()
+    except FileNotFoundError:
+        return read_field(pair)
+    (faults / "held.partial").write_text(str(os.getpid()))
+    (faults / "held.partial").rename(faults / "held")
+    time.sleep(600)  # until it is killed
+
+
+process.read_field = faulty
+"""
+
+
+class Processes:
+    """Dask's own commands, in a folder that tells them how to fail."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        (folder / "faults.py").write_text(FAULTS)
+        self._started: list[subprocess.Popen[bytes]] = []
+
+    def scheduler(self) -> str:
+        """Start a scheduler at a free port and return its address."""
+        file = self.folder / "scheduler.json"
+        self._start(
+            "scheduler", "--host", "127.0.0.1", "--port", "0", "--no-dashboard",
+            "--dashboard-address", "127.0.0.1:0", "--scheduler-file", str(file),
+        )  # fmt: skip
+        wait_until(lambda: file.exists() and file.read_text().endswith("}"))
+        return str(json.loads(file.read_text())["address"])
+
+    def worker(self, address: str, *options: str, path: str = "") -> subprocess.Popen[bytes]:
+        """Start a worker of one thread, unless options say otherwise."""
+        return self._start(
+            "worker", address, "--nthreads", "1", "--no-dashboard", "--preload", "faults.py",
+            "--local-directory", str(self.folder), *options, path=path,
+        )  # fmt: skip
+
+    def stop(self) -> None:
+        """End all of them."""
+        for process in self._started:
+            end(process)
+
+    def _start(self, *arguments: str, path: str = "") -> subprocess.Popen[bytes]:
+        paths = (path, str(Path(__file__).parent), os.environ.get("PYTHONPATH", ""))
+        environment = {
+            **os.environ,
+            "FAULTS": str(self.folder),
+            "OMP_NUM_THREADS": "1",
+            "PYTHONPATH": os.pathsep.join(filter(None, paths)),
+            # Two dead workers are enough to give a task up; by default it takes four.
+            "DASK_DISTRIBUTED__SCHEDULER__ALLOWED_FAILURES": "1",
+        }
+        with (self.folder / f"{arguments[0]}-{len(self._started)}.log").open("wb") as log:
+            process = subprocess.Popen(
+                [sys.executable, "-m", "distributed.cli.dask_" + arguments[0], *arguments[1:]],
+                env=environment, cwd=self.folder, stdout=log, stderr=log, start_new_session=True,
+            )  # fmt: skip
+        self._started.append(process)
+        return process
+
+
+def end(process: subprocess.Popen[bytes]) -> None:
+    """Kill a command and the workers that its nanny started."""
+    try:
+        os.killpg(process.pid, signal.SIGKILL)
+    except ProcessLookupError:
+        return
+    process.wait()
+
+
+def wait_until(condition: object, seconds: float = 180.0) -> None:
+    deadline = time.monotonic() + seconds
+    while not condition():  # type: ignore[operator]
+        assert time.monotonic() < deadline, "waited too long"
+        time.sleep(0.05)
+
+
+@pytest.fixture
+def processes(tmp_path: Path) -> Iterator[Processes]:
+    (tmp_path / "dask").mkdir()
+    started = Processes(tmp_path / "dask")
+    yield started
+    started.stop()
+
+
+@pytest.fixture(scope="module")
+def shared(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Processes, str]]:
+    """One cluster for all tests that leave it as it was."""
+    started = Processes(tmp_path_factory.mktemp("dask"))
+    address = started.scheduler()
+    for _ in range(3):
+        started.worker(address)
+    with Client(address, set_as_default=False) as client:
+        client.wait_for_workers(3, timeout=180)
+    yield started, address
+    started.stop()
+
+
+@pytest.fixture
+def address(shared: tuple[Processes, str]) -> str:
+    with Client(shared[1], set_as_default=False) as client:
+        client.wait_for_workers(3, timeout=180)  # One may have been killed just now.
+    return shared[1]
+
+
+@pytest.fixture(scope="module")
+def local(tmp_path_factory: pytest.TempPathFactory) -> tuple[Dataset, Path]:
+    """Six assets, and the store that one process makes of them."""
+    folder = tmp_path_factory.mktemp("local")
+    dataset = Dataset(folder / "sources")
+    for seed, object_id in enumerate("abcdef"):
+        dataset.add(object_id, seed)
+    build_store(dataset.parameters("pixie"), folder / "s.zarr", jobs=1)
+    return dataset, folder / "s.zarr"
+
+
+@contextmanager
+def threads_for_workers(workers: int, threads: int = 1) -> Iterator[LocalCluster]:
+    """A cluster within this process, for what does not depend on its being outside."""
+    with LocalCluster(
+        n_workers=workers, threads_per_worker=threads, processes=False,
+        protocol="tcp://", dashboard_address=None,
+    ) as started:  # fmt: skip
+        yield started
+
+
+# -- a build ----------------------------------------------------------------
+
+
+def test_a_build_whose_worker_is_killed_gives_the_same_bytes(
+    shared: tuple[Processes, str], address: str, local: tuple[Dataset, Path], tmp_path: Path
+) -> None:
+    dataset, expected = local
+    faults = shared[0].folder
+    (faults / "hold-c").touch()
+    parameters = dataset.root.parent / "dataset.toml"
+    parameters.write_text(
+        '[pixieverse]\nroot = "sources/pixieverse"\n[slat]\nroot = "sources/slat"\n'
+        '[normalize]\nranges = "pixie"\n[store]\nvoxel_chunk = 128\nvoxel_chunks_per_shard = 4\n'
+        "grid_assets_per_shard = 2\ncompression_level = 1\n"
+    )
+    build = subprocess.Popen(
+        [sys.executable, "-m", "slatprep.cli", "build-store", "--config", str(parameters),
+         "--out", "s.zarr", "--scheduler", address],
+        cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+    )  # fmt: skip
+    wait_until((faults / "held").exists)
+    os.kill(int((faults / "held").read_text()), signal.SIGKILL)
+    (faults / "held").unlink()
+
+    _, errors = build.communicate(timeout=120)
+    assert build.returncode == 0, errors
+    assert errors == f"{address}: 3 workers\n"
+    assert tree(tmp_path / "s.zarr") == tree(expected)
+
+
+def test_an_asset_that_kills_every_worker_is_named_and_the_others_go_in(
+    shared: tuple[Processes, str], address: str, local: tuple[Dataset, Path], tmp_path: Path
+) -> None:
+    dataset, expected = local
+    deadly = shared[0].folder / "deadly-b"
+    deadly.touch()
+    try:
+        with Cluster(address) as cluster:
+            summary = build_store(dataset.parameters("pixie"), tmp_path / "s.zarr", jobs=cluster)
+    finally:
+        deadly.unlink()
+    assert summary.statuses == {"ok": 5, "failed": 1, "skipped": 0}
+    assert "worker process was killed twice" in dict(summary.problems)["b"]
+    # What the cluster left is what this machine goes on from, and the other way round.
+    build_store(dataset.parameters("pixie"), tmp_path / "s.zarr", jobs=1)
+    assert tree(tmp_path / "s.zarr") == tree(expected)
+
+
+def test_the_other_commands_find_the_same(
+    address: str, local: tuple[Dataset, Path], tmp_path: Path
+) -> None:
+    dataset, store = local
+    parameters = dataset.parameters("pixie")
+    damaged = tmp_path / "damaged.zarr"
+    shutil.copytree(store, damaged)
+    shard = max((damaged / "voxel" / "feats").rglob("*"), key=lambda path: path.stat().st_size)
+    content = bytearray(shard.read_bytes())
+    content[100] ^= 1
+    shard.write_bytes(content)
+    with Cluster(address) as cluster:
+        aligned = align_pairs(parameters, tmp_path / "cluster.jsonl", jobs=cluster)
+        plan = plan_build(parameters, store, jobs=cluster)
+        findings = verify_store(damaged, jobs=cluster).findings
+    assert aligned.manifest == align_pairs(parameters, tmp_path / "here.jsonl").manifest
+    assert plan.actions["reuse"] == 6
+    assert findings == verify_store(damaged).findings
+    result = CliRunner().invoke(command, ["verify", str(store), "-q", "--scheduler", address])
+    assert result.exit_code == 0, result.output
+
+
+# -- what a worker must have ------------------------------------------------
+
+
+def test_workers_that_do_not_see_the_sources_are_named(
+    address: str, local: tuple[Dataset, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The folder of this process is not that of a worker, though both have the same path."""
+    dataset, _ = local
+    monkeypatch.chdir(dataset.root)
+    parameters = BuildParameters(
+        PixieverseSource(Path("/proc/self/cwd/pixieverse")),
+        SlatSource(Path("/proc/self/cwd/slat")),
+    )
+    message = r"worker tcp://127.0.0.1:\d+ on .*: sees nothing .* at /proc/self/cwd/pixieverse"
+    with Cluster(address) as cluster, pytest.raises(SlatprepError, match=message):
+        build_store(parameters, tmp_path / "s.zarr", jobs=cluster)
+    assert not list(tmp_path.iterdir())
+
+
+def test_workers_that_do_not_see_the_folder_of_the_work_are_named(
+    address: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "build-1").mkdir()
+    with Cluster(address) as cluster:
+        cluster.require_shared([tmp_path / "build-1"])
+        with pytest.raises(SlatprepError, match="a folder that may be written to where"):
+            cluster.require_shared([Path("/proc/self/cwd/build-1")])
+        with pytest.raises(SlatprepError, match="relative path"):
+            cluster.require_shared([Path("build-1")])
+
+
+def test_a_worker_that_is_not_fit_is_refused_even_when_it_joins_late(
+    shared: tuple[Processes, str], address: str
+) -> None:
+    with Cluster(address) as cluster:
+        results = cluster.run_unordered(time.sleep, ((0.2,) for _ in range(10**6)))
+        next(results)
+        unfit = shared[0].worker(address, "--nthreads", "2")
+        try:
+            with pytest.raises(SlatprepError, match=r"worker tcp://.* has 2 threads; expected one"):
+                list(results)
+            with pytest.raises(SlatprepError, match="has 2 threads"), Cluster(address):
+                pass
+        finally:
+            end(unfit)
+
+
+def test_a_worker_with_other_code_is_refused(processes: Processes, tmp_path: Path) -> None:
+    copy = tmp_path / "other" / "slatprep"
+    shutil.copytree(Path(slatprep.__file__).parent, copy)
+    with (copy / "store" / "spool.py").open("a") as file:
+        file.write("\nOTHER = True\n")
+    address = processes.scheduler()
+    processes.worker(address, "--no-nanny", path=str(copy.parent))
+    expected = r"worker tcp://.* has slatprep's code [0-9a-f]+, where .* expected the same env"
+    with pytest.raises(SlatprepError, match=expected), Cluster(address):
+        pass
+
+
+# -- a scheduler that fails -------------------------------------------------
+
+
+def test_a_scheduler_that_nobody_reaches(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(module, "ANSWER_SECONDS", 1.5)
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        nobody = f"tcp://127.0.0.1:{free.getsockname()[1]}"
+        with pytest.raises(SlatprepError, match=f"{nobody}: no Dask scheduler answers there"):
+            Cluster(nobody).__enter__()
+        free.listen()  # Now somebody takes the call, but does not speak.
+        with pytest.raises(SlatprepError, match="did not speak within 2 s"):
+            Cluster(nobody).__enter__()
+    for wrong in ("", "127.0.0.1", "http://127.0.0.1:80"):
+        with pytest.raises(SlatprepError, match="expected an address such as tcp://host:8786"):
+            Cluster(wrong).__enter__()
+
+
+def test_a_scheduler_that_is_killed_ends_the_run_and_nothing_hangs(
+    processes: Processes, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(module, "ANSWER_SECONDS", 3)
+    scheduler = processes.scheduler()
+    processes.worker(scheduler, "--no-nanny")
+    with Cluster(scheduler) as cluster:
+        results = cluster.run_unordered(time.sleep, ((0.2,) for _ in range(10**6)))
+        next(results)
+        end(processes._started[0])
+        with pytest.raises(SlatprepError, match="connection to the scheduler was lost; what was"):
+            list(results)
+        with pytest.raises(SlatprepError, match="connection to the scheduler was lost"):
+            list(cluster.run_unordered(time.sleep, [(0,)]))
+
+
+def test_the_first_worker_is_waited_for() -> None:
+    with threads_for_workers(0) as started:
+        lines: list[str] = []
+
+        def note(line: str) -> None:
+            lines.append(line)
+            started.scale(1)
+
+        with Cluster(started.scheduler_address, note) as cluster:
+            assert list(run_unordered(divmod, [(7, 2)], cluster)) == [(3, 1)]
+        address = started.scheduler_address
+    assert lines == [
+        f"{address}: has no worker yet; waiting for the first",
+        f"{address}: 1 worker",
+    ]
+
+
+def test_jobs_and_scheduler_exclude_each_other() -> None:
+    options = ["--jobs", "2", "--scheduler", "tcp://127.0.0.1:1", "--out", "s.zarr"]
+    result = CliRunner().invoke(command, ["build-store", *options])
+    assert result.exit_code == 2
+    assert "--jobs is for this machine" in result.output
+
+
+# -- tasks ------------------------------------------------------------------
+
+
+def test_one_worker_computes_and_not_this_thread() -> None:
+    """Joblib by itself would do the work of a cluster of one in the process that asks."""
+    with threads_for_workers(1) as started, Cluster(started.scheduler_address) as cluster:
+        idents = set(cluster.run_unordered(threading.get_ident, [()] * 5))
+        assert threading.get_ident() not in idents
+        variables = [(name,) for name in ("OMP_NUM_THREADS", "NUMBA_NUM_THREADS")]
+        assert list(cluster.run_unordered(os.getenv, variables)) == ["1", "1"]
+
+
+def test_tasks_are_taken_as_workers_come_free() -> None:
+    taken = 0
+
+    def tasks() -> Iterator[tuple[float]]:
+        nonlocal taken
+        while taken < 100_000:
+            taken += 1
+            yield (0.05,)
+
+    with threads_for_workers(2) as started, Cluster(started.scheduler_address) as cluster:
+        results = cluster.run_unordered(time.sleep, tasks())
+        next(results)
+        results.close()  # type: ignore[attr-defined]
+        assert taken < 2 * module.IN_FLIGHT
+
+
+def test_an_error_of_a_task_arrives_as_it_is() -> None:
+    with threads_for_workers(2) as started, Cluster(started.scheduler_address) as cluster:
+        with pytest.raises(ZeroDivisionError):
+            list(cluster.run_unordered(divmod, [(1, 1), (1, 0)]))
+        with pytest.raises(FileNotFoundError, match="no-such-file"):
+            list(cluster.run_unordered(os.stat, [("no-such-file",)]))

@@ -1,0 +1,73 @@
+import os
+import time
+import warnings
+from collections.abc import Iterator
+
+import pytest
+
+from slatprep.errors import SlatprepError
+from slatprep.workers.local import run_unordered, single_threaded
+
+
+@pytest.mark.parametrize("jobs", [1, 2])
+def test_every_task_is_done_once(jobs: int) -> None:
+    results = run_unordered(divmod, ((n, 7) for n in range(100)), jobs)
+    assert sorted(results) == sorted(divmod(n, 7) for n in range(100))
+
+
+@pytest.mark.parametrize("jobs", [1, 2])
+def test_tasks_are_taken_as_workers_come_free(jobs: int) -> None:
+    taken = 0
+
+    def tasks() -> Iterator[tuple[float]]:
+        nonlocal taken
+        while taken < 100_000:
+            taken += 1
+            yield (0.05,)  # long enough that a hundred cannot be done before the first is seen
+
+    results = run_unordered(time.sleep, tasks(), jobs)
+    next(results)
+    assert taken < 100
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        results.close()
+
+
+@pytest.mark.parametrize("jobs", [1, 2])
+def test_an_error_of_a_task_arrives(jobs: int) -> None:
+    with pytest.raises(ZeroDivisionError):
+        list(run_unordered(divmod, [(1, 1), (1, 0)], jobs))
+
+
+def test_a_killed_worker_is_an_error_in_words() -> None:
+    with pytest.raises(SlatprepError, match="memory ran out"):
+        list(run_unordered(os._exit, [(9,), (9,)], jobs=2))
+
+
+def test_workers_are_told_to_use_one_thread() -> None:
+    assert set(run_unordered(os.getenv, [("OMP_NUM_THREADS",)] * 4, jobs=2)) == {"1"}
+    assert set(run_unordered(os.getenv, [("OMP_NUM_THREADS",)] * 4, jobs=1)) == {"1"}
+
+
+def test_single_threaded_holds_and_gives_back(monkeypatch: pytest.MonkeyPatch) -> None:
+    from threadpoolctl import threadpool_info
+
+    monkeypatch.setenv("OMP_NUM_THREADS", "2")
+    monkeypatch.delenv("MKL_NUM_THREADS", raising=False)
+    with single_threaded():
+        assert {pool["num_threads"] for pool in threadpool_info()} == {1}
+        assert os.environ["MKL_NUM_THREADS"] == "1"
+    assert os.environ["OMP_NUM_THREADS"] == "2"
+    assert "MKL_NUM_THREADS" not in os.environ
+
+
+def die_at(number: int, deadly: int) -> int:
+    if number == deadly:
+        os._exit(9)
+    return number
+
+
+def test_a_task_that_kills_its_worker_even_alone_is_answered_for() -> None:
+    tasks = [(number, 5) for number in range(20)]
+    results = run_unordered(die_at, tasks, 2, died=lambda number, deadly: -number)
+    assert sorted(results) == sorted(-n if n == 5 else n for n in range(20))
