@@ -361,7 +361,9 @@ def test_the_second_of_two_builds_is_refused_and_told_of_the_first(
 ) -> None:
     dataset, expected = reference
     out = tmp_path / "s.zarr"
-    sleeping = "import time; import slatprep.pipeline.pack as p; p.create_store = lambda *_: time.sleep(600)"
+    sleeping = (
+        "import time, slatprep.pipeline.pack as p\np.create_store = lambda *_: time.sleep(600)"
+    )
     first = subprocess.Popen(prepared(script, dataset, out, sleeping), env=environment(script))
     try:
         lock = tmp_path / ".s.zarr.work" / "lock"
