@@ -21,7 +21,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from slatprep.torch import FEATS_MEAN, FEATS_STD, IGNORED, SlatDataset
+from slatprep.learn import FEATS_MEAN, FEATS_STD, IGNORED, SlatDataset
 
 COLUMNS = ("coords", "feats", "properties", "material", "valid")
 _MEAN, _STD = np.array(FEATS_MEAN, np.float32), np.array(FEATS_STD, np.float32)

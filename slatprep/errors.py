@@ -42,9 +42,5 @@ class ConfigError(SlatprepError):
     """A dataset definition or option that makes no sense."""
 
 
-class AlignmentError(SlatprepError):
-    """Two voxel sets that no engine can align, for a reason worth naming."""
-
-
 class StoreError(SlatprepError):
     """A store that cannot be read, written or trusted."""

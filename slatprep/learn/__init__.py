@@ -1,13 +1,30 @@
 """What the store is for: load it into PyTorch, train the paper's decoder, measure it.
 
-`splits`, `predictions` and `metrics` need numpy alone. Everything else needs
-PyTorch, which ``pip install slatprep[train]`` brings; `slatprep.torch` is the
-door to the loader.
+``pip install slatprep[train]`` brings PyTorch, which the loader needs;
+`splits`, `predictions` and `metrics` need numpy alone.
+
+>>> from slatprep.learn import SlatDataset, SlatLoader  # doctest: +SKIP
+>>> train = SlatDataset("demo.zarr", "train", verdicts=("good",))  # doctest: +SKIP
+>>> loader = SlatLoader(train, batch_size=4, shuffle=True, workers=2)  # doctest: +SKIP
+>>> batch = next(iter(loader))  # doctest: +SKIP
+>>> batch.coords.shape, batch.feats.shape  # doctest: +SKIP
+(torch.Size([21234, 4]), torch.Size([21234, 8]))
 """
 
-from __future__ import annotations
+import lazy_loader
 
 from slatprep.errors import SlatprepError
+
+_load, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
+
+
+def __getattr__(name: str) -> object:
+    try:
+        return _load(name)
+    except ModuleNotFoundError as error:
+        if error.name == "torch":
+            require_torch()
+        raise
 
 
 def require_torch() -> None:

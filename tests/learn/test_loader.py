@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import hashlib
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -14,9 +16,7 @@ from hypothesis import strategies as st
 
 from slatprep import ConfigError, open_store
 from slatprep.geometry.frames import voxel_centres
-from slatprep.learn.augment import lattice_symmetries, move
-from slatprep.learn.splits import select_assets
-from slatprep.torch import (
+from slatprep.learn import (
     FEATS_MEAN,
     FEATS_STD,
     IGNORED,
@@ -27,8 +27,22 @@ from slatprep.torch import (
     collate,
     split_of,
 )
+from slatprep.learn.augment import lattice_symmetries, move
+from slatprep.learn.splits import select_assets
 
 THIRDS = Shares(0.4, 0.3, 0.3)
+
+
+def test_without_pytorch_scores_work_and_the_loader_says_what_to_install() -> None:
+    script = (
+        "import sys; sys.modules['torch'] = None\n"
+        "from slatprep.learn import Shares\nimport slatprep.learn.metrics\n"
+        "try: from slatprep.learn import SlatDataset\n"
+        "except Exception as error: print(type(error).__name__, error)"
+    )
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
+    assert done.stdout.startswith("SlatprepError"), done.stderr
+    assert "pip install slatprep[train]" in done.stdout
 
 
 @given(st.text(), st.tuples(st.integers(0, 100), st.integers(1, 100), st.integers(1, 100)))
