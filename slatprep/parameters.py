@@ -9,15 +9,27 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import ClassVar, Literal
+from typing import Annotated, ClassVar, Literal
+
+from annotated_types import Ge, Gt, Le
 
 from slatprep.storage.remote import as_path
 
-_FORBID_UNKNOWN: dict[str, str] = {"extra": "forbid"}
+Positive = Annotated[float, Gt(0)]
+"""A number above 0; never infinite, as in every group."""
+
+PositiveInt = Annotated[int, Gt(0)]
+"""A whole number above 0."""
+
+
+class _Group:
+    """What `slatprep.config` has pydantic refuse in every group."""
+
+    __pydantic_config__: ClassVar[dict[str, object]] = {"extra": "forbid", "allow_inf_nan": False}
 
 
 @dataclass(frozen=True)
-class PixieverseSource:
+class PixieverseSource(_Group):
     """Where the PixieVerse side lies.
 
     Patterns are relative to `root` and name ``{id}`` (one path component) and
@@ -25,8 +37,6 @@ class PixieverseSource:
     an object is used. `sample` chooses among several samples of an object;
     left empty, an object with more than one sample is a fault.
     """
-
-    __pydantic_config__: ClassVar[dict[str, str]] = _FORBID_UNKNOWN
 
     root: Path
     grid: tuple[str, ...] = (
@@ -42,15 +52,13 @@ class PixieverseSource:
 
 
 @dataclass(frozen=True)
-class SlatSource:
+class SlatSource(_Group):
     """Where the SLAT side lies.
 
     Patterns are relative to `root` and name ``{id}`` and optionally
     ``{view}``. Where `root` is an HDF5 file, or a pattern names no ``{id}``,
     the file holds one group an asset, named by `group`.
     """
-
-    __pydantic_config__: ClassVar[dict[str, str]] = _FORBID_UNKNOWN
 
     root: Path
     pattern: tuple[str, ...] = (
@@ -68,15 +76,13 @@ class SlatSource:
 
 
 @dataclass(frozen=True)
-class PairingParameters:
+class PairingParameters(_Group):
     """How names of the two sides are joined, where they differ.
 
     `map` is a CSV with columns ``object_id`` and ``slat_id`` (and optionally
     ``view``), or TRELLIS's ``metadata.csv`` (``sha256``, ``file_identifier``);
     `categories` is Pixie's ``obj_ids_metadata.json``.
     """
-
-    __pydantic_config__: ClassVar[dict[str, str]] = _FORBID_UNKNOWN
 
     map: Path | None = None
     categories: Path | None = None
@@ -88,7 +94,7 @@ class PairingParameters:
 
 
 @dataclass(frozen=True)
-class AlignParameters:
+class AlignParameters(_Group):
     """How the transform between the frames is found.
 
     `model` is ``rigid`` (the paper's SE(3)), ``similarity`` (one scale more)
@@ -97,18 +103,16 @@ class AlignParameters:
     in voxels. No engine draws anything at random.
     """
 
-    __pydantic_config__: ClassVar[dict[str, str]] = _FORBID_UNKNOWN
-
     engine: Literal["field", "open3d", "small_gicp"] = "field"
     model: Literal["auto", "rigid", "similarity"] = "auto"
-    scale_bounds: tuple[float, float] = (0.6, 1.6)
-    radius: float = 1.0
-    icp_radius: float = 3.2
-    icp_iterations: int = 60
+    scale_bounds: tuple[Annotated[float, Gt(0), Le(1)], Annotated[float, Ge(1)]] = (0.6, 1.6)
+    radius: Positive = 1.0
+    icp_radius: Positive = 3.2
+    icp_iterations: PositiveInt = 60
 
 
 @dataclass(frozen=True)
-class ConsensusParameters:
+class ConsensusParameters(_Group):
     """Whether ties are settled by the rotation that the dataset has in common.
 
     With `settle`, a second pass gives each asset whose geometry cannot tell
@@ -116,13 +120,11 @@ class ConsensusParameters:
     a tie share.
     """
 
-    __pydantic_config__: ClassVar[dict[str, str]] = _FORBID_UNKNOWN
-
     settle: bool = False
 
 
 @dataclass(frozen=True)
-class SampleParameters:
+class SampleParameters(_Group):
     """How annotations are looked up at SLAT voxels.
 
     `method` is ``nearest`` (the paper's: the nearest annotated voxel) or
@@ -132,39 +134,31 @@ class SampleParameters:
     frame) from the nearest annotated voxel a SLAT voxel is not valid.
     """
 
-    __pydantic_config__: ClassVar[dict[str, str]] = _FORBID_UNKNOWN
-
     method: Literal["vote", "nearest"] = "vote"
-    max_distance: float = 3.0
-    vote_width: float = 0.5
+    max_distance: Positive = 3.0
+    vote_width: Positive = 0.5
 
 
 @dataclass(frozen=True)
-class NormalizeParameters:
+class NormalizeParameters(_Group):
     """Where the ranges come from: ``dataset``, ``pixie``, or the path of a TOML or JSON file."""
-
-    __pydantic_config__: ClassVar[dict[str, str]] = _FORBID_UNKNOWN
 
     ranges: str = "dataset"
 
 
 @dataclass(frozen=True)
-class StoreParameters:
+class StoreParameters(_Group):
     """Chunks and shards of the store, in rows (voxel arrays) and assets (grid arrays)."""
 
-    __pydantic_config__: ClassVar[dict[str, str]] = _FORBID_UNKNOWN
-
-    voxel_chunk: int = 4_096
-    voxel_chunks_per_shard: int = 4_096
-    grid_assets_per_shard: int = 512
-    compression_level: int = 1
+    voxel_chunk: PositiveInt = 4_096
+    voxel_chunks_per_shard: PositiveInt = 4_096
+    grid_assets_per_shard: PositiveInt = 512
+    compression_level: Annotated[int, Ge(0), Le(22)] = 1
 
 
 @dataclass(frozen=True)
-class BuildParameters:
+class BuildParameters(_Group):
     """Everything that decides the content of a store."""
-
-    __pydantic_config__: ClassVar[dict[str, str]] = _FORBID_UNKNOWN
 
     pixieverse: PixieverseSource
     slat: SlatSource
@@ -179,7 +173,7 @@ class BuildParameters:
 
 @dataclass(frozen=True)
 class Preset:
-    """Named parameters of the stages that decide what a SLAT voxel is told."""
+    """Named parameters of the stages that decide which annotation a SLAT voxel gets."""
 
     align: AlignParameters = AlignParameters()
     sample: SampleParameters = SampleParameters()
@@ -192,4 +186,4 @@ PRESETS: dict[str, Preset] = {
         sample=SampleParameters(method="nearest"),
     ),
 }
-"""``paper`` is the protocol of SLAT-Phys, the reference that all else is held against."""
+"""``paper`` is the protocol of SLAT-Phys, the reference for comparisons."""

@@ -203,7 +203,7 @@ def test_config_error_is_one_line_and_exit_code_two(tmp_path: Path) -> None:
     config.write_text('[pixieverse]\nrot = "x"\n')
     result = run("build-store", "--config", config, "--out", tmp_path / "s.zarr")
     assert result.exit_code == 2
-    assert result.stderr.startswith(f"slatprep: error: {config}:2: pixieverse.rot: unknown key")
+    assert result.stderr.startswith(f"slatprep: error: {config}: pixieverse.rot: unknown key")
     assert "did you mean 'root'" in result.stderr
     assert len(result.stderr.splitlines()) == 1
 

@@ -12,7 +12,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import slatprep.report
 import zarr
 from click.testing import CliRunner
 from PIL import Image
@@ -22,6 +21,7 @@ from support.synthetic import QUARTER_TURN
 
 from slatprep.cli.commands import slatprep as command
 from slatprep.errors import StoreError
+from slatprep.inspect import report
 from slatprep.inspect.report import write_report
 from slatprep.inspect.report.outcomes import kind_of
 from slatprep.inspect.report.statistics import nearest_quarter_turn, quarter_turns
@@ -138,8 +138,8 @@ def test_thumbnails_show_three_silhouettes(page: Page, hostile: Report) -> None:
 def test_a_store_too_large_is_shown_in_part_and_coarsely(
     hostile: Report, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(slatprep.inspect.report, "ASSETS_IN_DETAIL", 3)
-    monkeypatch.setattr(slatprep.inspect.report, "VOXEL_BYTES", 100)
+    monkeypatch.setattr(report, "ASSETS_IN_DETAIL", 3)
+    monkeypatch.setattr(report, "VOXEL_BYTES", 100)
     summary = write_report(open_store(hostile.store), tmp_path / "page.html")
     page = Page(tmp_path / "page.html")
     assert (summary.assets, summary.in_detail, summary.side) == (5, 3, 32)
