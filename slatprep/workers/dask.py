@@ -323,7 +323,7 @@ def _agree(common: _Common, worker: Any) -> None:
 @lru_cache(maxsize=1)
 def _software() -> tuple[tuple[str, str], ...]:
     """Return what makes the bytes of a store: Python, all of slatprep's code, the libraries."""
-    package = Path(__file__).parent
+    package = Path(__file__).parents[1]
     code = hashlib.sha256()
     for path in sorted(package.rglob("*.py")):
         code.update(f"{path.relative_to(package)}\n".encode() + path.read_bytes())

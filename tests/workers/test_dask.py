@@ -291,7 +291,7 @@ def test_a_worker_that_is_not_fit_is_refused_even_when_it_joins_late(
 def test_a_worker_with_other_code_is_refused(processes: Processes, tmp_path: Path) -> None:
     copy = tmp_path / "other" / "slatprep"
     shutil.copytree(Path(slatprep.__file__).parent, copy)
-    with (copy / "store" / "spool.py").open("a") as file:
+    with (copy / "sample.py").open("a") as file:
         file.write("\nOTHER = True\n")
     address = processes.scheduler()
     processes.worker(address, "--no-nanny", path=str(copy.parent))

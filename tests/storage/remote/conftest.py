@@ -11,6 +11,7 @@ from typing import Any
 
 import fsspec
 import pytest
+from joblib.externals.loky import get_reusable_executor
 from s3fs.core import S3FileSystem
 from support.synthetic import Dataset
 
@@ -53,6 +54,8 @@ def environment(server: str, tmp_path_factory: pytest.TempPathFactory) -> Iterat
             "AWS_SHARED_CREDENTIALS_FILE": none,
         }.items():
             monkeypatch.setenv(name, value)
+        # Worker processes that other tests left would not have these.
+        get_reusable_executor().shutdown(wait=True)
         yield
 
 
