@@ -19,7 +19,6 @@ from scipy.spatial.transform import Rotation
 from support.pages import HOSTILE, Page, Report
 from support.synthetic import QUARTER_TURN
 
-import slatprep.inspect.report
 from slatprep.cli.commands import slatprep as command
 from slatprep.errors import StoreError
 from slatprep.inspect import report
