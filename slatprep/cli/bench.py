@@ -2,20 +2,18 @@
 
 from __future__ import annotations
 
-import dataclasses
 import tempfile
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
 
-from slatprep.cli.bench_read import read
+from slatprep.cli.options import FOLDER, POSITIVE, ChoiceOf, chosen_store, option, store_argument
 from slatprep.cli.output import Output, output_options
 
 if TYPE_CHECKING:
     from slatprep.bench.align import AlignBench
-
-_ENGINES = ("field", "small_gicp", "open3d", "open3d-64")
+    from slatprep.bench.read import ReadBench
 
 
 @click.group(
@@ -28,9 +26,6 @@ def bench() -> None:
     """Measure slatprep on this machine, side by side with what else there is."""
 
 
-bench.add_command(read)
-
-
 @bench.command(
     "align",
     epilog="""\b
@@ -39,26 +34,25 @@ Example:
   slatprep bench align --data demo --engine field --engine open3d-64
 """,
 )
-@click.option(
+@option(
     "--data",
-    type=click.Path(path_type=Path, exists=True, file_okay=False),
-    metavar="DIR",
-    help="Folder with pixieverse/, slat/ and truth/, or of such folders.  [default: demo data]",
+    "Folder with pixieverse/, slat/ and truth/, or of such folders.  [default: demo data]",
+    FOLDER,
 )
-@click.option(
+@option(
     "--engine",
-    "engines",
+    "Engine to measure; may be repeated.  [default: all]",
+    ChoiceOf("slatprep.bench.align:ENGINES"),
+    name="engines",
     multiple=True,
-    type=click.Choice(_ENGINES),
-    help="Engine to measure; may be repeated.  [default: all]",
 )
-@click.option(
+@option(
     "--assets",
-    type=click.IntRange(min=1),
-    help="At most so many assets of each folder.  [default: 25 of the demo, all of --data]",
+    "At most so many assets of each folder.  [default: 25 of the demo, all of --data]",
+    POSITIVE,
 )
-@click.option("--repeats", type=click.IntRange(min=1), default=3, show_default=True)
-@click.option("--seed", type=int, default=0, show_default=True, help="Seed of the demo data.")
+@option("--repeats", "How often each is measured.", POSITIVE, 3)
+@option("--seed", "Seed of the demo data.", int, 0)
 @output_options
 def align(
     output: Output,
@@ -75,7 +69,7 @@ def align(
     the same without repeated rotations (the preset 'paper'), small_gicp GICP
     from the same rotations, field the default engine.
     """
-    from slatprep.bench.align import bench_align
+    from slatprep.bench.align import ENGINES, bench_align
     from slatprep.demo import make_demo
 
     with tempfile.TemporaryDirectory() as temporary, output.progress("alignments") as progress:
@@ -83,34 +77,104 @@ def align(
             data = Path(temporary) / "demo"
             make_demo(data, assets or 25, seed)
         result = bench_align(
-            data, engines=engines or _ENGINES, repeats=repeats, limit=assets, progress=progress
+            data, engines=engines or ENGINES, repeats=repeats, limit=assets, progress=progress
         )
-    output.result(dataclasses.asdict(result), lambda: _show(output, result))
+    output.result(result, lambda: _show_align(output, result))
 
 
-def _show(output: Output, result: AlignBench) -> None:
+def _show_align(output: Output, result: AlignBench) -> None:
     output.table(
         f"Accuracy, non-symmetric of {result.assets} assets (displacement in voxels)",
         ("engine", "level", "assets", "success", "displacement", "p90", "labels", "truth's own"),
         [
-            (e.engine, f"L{s.level}", s.assets, s.success, s.displacement_median,
-             s.displacement_p90, s.label_accuracy, s.truth_own)
+            (
+                e.engine,
+                f"L{s.level}",
+                s.assets,
+                s.success,
+                s.displacement_median,
+                s.displacement_p90,
+                s.label_accuracy,
+                s.truth_own,
+            )
             for e in result.engines
             for s in e.levels
         ],
-    )  # fmt: skip
+    )
     output.table(
         f"Processor seconds an asset, {result.repeats} repeats "
         "(5-95: percentiles; ratio: over the default engine's, pair by pair)",
         ("engine", "median", "5-95", "ratio", "ratio 5-95", "start-up", "compiling"),
         [
-            (e.engine, round(e.seconds, 4), f"{e.seconds_low:.3f}-{e.seconds_high:.3f}",
-             round(e.ratio, 1), f"{e.ratio_low:.1f}-{e.ratio_high:.1f}", round(e.start_up, 1),
-             round(e.compiling, 1))
+            (
+                e.engine,
+                round(e.seconds, 4),
+                f"{e.seconds_low:.3f}-{e.seconds_high:.3f}",
+                round(e.ratio, 1),
+                f"{e.ratio_low:.1f}-{e.ratio_high:.1f}",
+                round(e.start_up, 1),
+                round(e.compiling, 1),
+            )
             for e in result.engines
         ],
-    )  # fmt: skip
+    )
     output.note(
         f"the floor: reading both files {result.reading * 1e3:.1f} ms, "
         f"their distance fields {result.fields * 1e3:.1f} ms"
     )
+
+
+@bench.command(
+    "read",
+    epilog="""\b
+Example:
+  slatprep bench read data/demo.zarr
+  slatprep bench read data/demo.zarr --assets 400 --repeats 9
+""",
+)
+@store_argument
+@option("--assets", "At most so many.  [default: all]", POSITIVE)
+@option("--repeats", "How often each is measured.", POSITIVE, 5)
+@option("--seed", "Of the order of reading.", int, 0)
+@output_options
+def read(output: Output, store: Path | None, assets: int | None, repeats: int, seed: int) -> None:
+    """Read shuffled whole assets (coords, feats, properties) as training does.
+
+    Compares slatprep's reader with npz (one file an asset, plain and
+    compressed), one HDF5 file, zarr-python, and zarrs and tensorstore where
+    they are installed. 'cold' is after asking the system to forget the files.
+    """
+    path = chosen_store(store)
+    from slatprep.bench.read import bench_read
+
+    with (
+        tempfile.TemporaryDirectory(dir=path.resolve().parent) as temporary,
+        output.progress("passes") as progress,
+    ):
+        result = bench_read(
+            path, Path(temporary), limit=assets, repeats=repeats, seed=seed, progress=progress
+        )
+    output.result(result, lambda: _show_read(output, result))
+
+
+def _show_read(output: Output, result: ReadBench) -> None:
+    output.table(
+        f"Assets a second, {result.assets} assets of {result.voxels // result.assets} voxels, "
+        f"best of {result.repeats} (processor ms an asset and its ratio to npz: medians)",
+        ("way", "MB", "files", "warm", "warm, two", "cold", "ms", "ratio"),
+        [
+            (
+                way.name,
+                round(way.size / 1e6, 1),
+                way.files,
+                round(way.warm),
+                round(way.warm_two),
+                None if way.cold is None else round(way.cold),
+                round(way.seconds * 1e3, 3),
+                round(way.ratio, 2),
+            )
+            for way in result.ways
+        ],
+    )
+    for name in result.left_out:
+        output.note(f"{name}: not installed")

@@ -8,7 +8,15 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from slatprep.cli.options import PLACE, parameters_of, source_options, workers_options
+from slatprep.cli.options import (
+    NEW_FILE,
+    NEW_FOLDER,
+    PLACE,
+    option,
+    parameters_of,
+    source_options,
+    workers_options,
+)
 from slatprep.cli.output import EXIT_INCOMPLETE, Output, output_options
 from slatprep.cli.overview import show_quality
 
@@ -16,13 +24,10 @@ if TYPE_CHECKING:
     from slatprep.pipeline.dataset import BuildPlan, BuildSummary
     from slatprep.workers.local import Jobs
 
-_MANIFESTS = click.option(
-    "--manifests",
-    type=click.Path(path_type=Path, file_okay=False),
-    metavar="DIR",
-    help="Folder for the records.  [default: beside the store]",
+_MANIFESTS = option(
+    "--manifests", "Folder for the records.  [default: beside the store]", NEW_FOLDER
 )
-_STRICT = click.option("--strict", is_flag=True, help="Stop at the first asset that cannot go in.")
+_STRICT = option("--strict", "Stop at the first asset that cannot go in.", is_flag=True)
 
 
 @click.command(
@@ -36,27 +41,23 @@ Example:
 """,
 )
 @source_options
-@click.option(
+@option(
     "--out",
+    "The store, a path or URL; one that is there is updated, and replaced in one step.",
+    PLACE,
     required=True,
-    type=PLACE,
     metavar="STORE.zarr",
-    help="The store, a path or URL; one that is there is updated, and replaced in one step.",
 )
 @_MANIFESTS
 @_STRICT
-@click.option(
-    "--consensus",
-    is_flag=True,
-    help="Settle ties by the rotation that most assets have in common, in a second pass.",
-)
-@click.option("--fresh", is_flag=True, help="Do everything, whatever was done before.")
-@click.option(
+@option("--consensus", "Settle ties by the rotation that most assets share.", is_flag=True)
+@option("--fresh", "Do everything, whatever was done before.", is_flag=True)
+@option(
     "--keep-work",
+    "Keep all assets' arrays beside the store, about 1 MB each; the next build is faster.",
     is_flag=True,
-    help="Keep all assets' arrays beside the store, about 1 MB each; the next build is faster.",
 )
-@click.option("--dry-run", is_flag=True, help="Say what would be done, and why; write nothing.")
+@option("--dry-run", "Say what would be done, and why; write nothing.", is_flag=True)
 @output_options
 @workers_options
 def build_store(
@@ -109,12 +110,12 @@ Example:
 """
 )
 @source_options
-@click.option(
+@option(
     "--out",
+    "One JSON record an asset: transform, quality, candidates.",
+    NEW_FILE,
     required=True,
-    type=click.Path(path_type=Path, dir_okay=False),
     metavar="FILE.jsonl",
-    help="One JSON record an asset: transform, quality, candidates.",
 )
 @_STRICT
 @output_options

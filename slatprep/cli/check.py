@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from slatprep.cli.options import beside, chosen_store, store_option
+from slatprep.cli.options import FOLDER, POSITIVE, beside, chosen_store, option, store_option
 from slatprep.cli.output import EXIT_INCOMPLETE, Cell, Output, output_options
 from slatprep.errors import ConfigError, StoreError
 
@@ -34,33 +34,17 @@ Example:
   slatprep check-alignment --asset 0a1b2c --asset 3d4e5f --json --picture none
 """,
 )
-@click.option(
-    "--asset", "asset_ids", multiple=True, metavar="ID", help="An asset; may be repeated."
-)
-@click.option(
-    "--worst",
-    type=click.IntRange(min=1),
-    metavar="N",
-    help="The N assets of the lowest fitness, of both ways the lower.",
-)
-@click.option(
-    "--ambiguous",
-    is_flag=True,
-    help="Every asset whose classes depend on a choice among ties, most of all first.",
-)
+@option("--asset", "An asset; may be repeated.", name="asset_ids", multiple=True, metavar="ID")
+@option("--worst", "N assets of the lowest fitness, either way.", POSITIVE)
+@option("--ambiguous", "Assets whose classes depend on a choice among ties.", is_flag=True)
 @store_option
-@click.option(
+@option(
     "--picture",
+    "A .png for one asset, else a folder.  [default: NAME.pictures beside the store]",
     metavar="PATH|none",
-    help="A .png for one asset, else a folder.  [default: NAME.pictures beside the store]",
 )
-@click.option("--show", is_flag=True, help="Open it in Open3D's viewer, where there is a screen.")
-@click.option(
-    "--manifests",
-    type=click.Path(path_type=Path, exists=True, file_okay=False),
-    metavar="DIR",
-    help="Folder of the build's records, if neither in nor beside the store.",
-)
+@option("--show", "Open it in Open3D's viewer, where there is a screen.", is_flag=True)
+@option("--manifests", "Folder of the build's records, if neither in nor beside the store.", FOLDER)
 @output_options
 def check_alignment(
     output: Output,
@@ -137,11 +121,15 @@ def _print(output: Output, checks: list[AlignmentCheck]) -> None:
             "Alignments (rmse in voxels)",
             ("asset", "verdict", *_COLUMNS, "consistent"),
             [
-                (one.asset_id, str(one.verdict), *(one.figure(n).value for n in _COLUMNS),
-                 one.consistent)
+                (
+                    one.asset_id,
+                    str(one.verdict),
+                    *(one.figure(n).value for n in _COLUMNS),
+                    one.consistent,
+                )
                 for one in checks
             ],
-        )  # fmt: skip
+        )
     for one in checks:
         if len(checks) == 1 or output.verbosity > 0:
             _print_figures(output, one)
@@ -180,8 +168,12 @@ def _documents(checks: list[AlignmentCheck], pictures: list[Path]) -> list[dict[
         {
             **dataclasses.asdict(one),
             "figures": [
-                {**dataclasses.asdict(figure), "ok": figure.ok, "good": figure.threshold_text,
-                 "passes": figure.passes}
+                {
+                    **dataclasses.asdict(figure),
+                    "ok": figure.ok,
+                    "good": figure.threshold_text,
+                    "passes": figure.passes,
+                }
                 for figure in one.figures
             ],
             "consistent": one.consistent,
@@ -189,7 +181,7 @@ def _documents(checks: list[AlignmentCheck], pictures: list[Path]) -> list[dict[
             "picture": file,
         }
         for one, file in zip(checks, files, strict=True)
-    ]  # fmt: skip
+    ]
 
 
 def _show(output: Output, store: Store, asset_ids: list[str], file: Path | None) -> None:

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import dataclasses
 from pathlib import Path
 from typing import Any
 
 import click
 
-from slatprep.cli.options import jobs_option
+from slatprep.cli.options import NEW_FOLDER, POSITIVE, ChoiceOf, jobs_option, option
 from slatprep.cli.output import Output, output_options
 
 
@@ -21,29 +20,49 @@ Example:
   slatprep make-demo other --assets 4 --seed 2 --grid-form prediction --slat-form hdf5
 """,
 )
-@click.argument("directory", type=click.Path(path_type=Path, file_okay=False))
-@click.option("--assets", type=click.IntRange(min=1), default=25, show_default=True,
-              help="Number of objects; fourteen hold every category once.")  # fmt: skip
-@click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True,
-              help="Seed of everything random; the same seed gives the same bytes.")  # fmt: skip
-@click.option("--level", "levels", type=click.IntRange(0, 4), multiple=True,
-              help="Difficulty, 0 (quarter turns) to 4 (warped); may be repeated, levels take "
-              "turns.  [default: all]")  # fmt: skip
-@click.option("--views", type=click.IntRange(min=1), default=1, show_default=True,
-              help="SLATs of each object.")  # fmt: skip
-@click.option("--habitual-share", type=click.FloatRange(0, 1), default=0.0, show_default=True,
-              help="Share of the objects that have one quarter turn in common.")  # fmt: skip
-@click.option("--latents", type=click.Choice(["placeholder", "material"]), default="placeholder",
-              show_default=True, help="What the latents are made of: noise with TRELLIS's "
-              "statistics, or something that depends on the material.")  # fmt: skip
-@click.option("--grid-form", type=click.Choice(["raw", "prediction", "prediction-ids"]),
-              default="raw", show_default=True,
-              help="Raw grids, or predictions of 11 or 4 channels.")  # fmt: skip
-@click.option("--slat-form", type=click.Choice(["npz", "npz-batch", "hdf5", "hdf5-groups"]),
-              default="npz", show_default=True,
-              help="Files of (N,3) or (N,4) coordinates, HDF5, or one HDF5 for all.")  # fmt: skip
-@click.option("--slat-names", type=click.Choice(["id", "sha256"]), default="id", show_default=True,
-              help="Name SLATs by object, or by sha256 with a metadata.csv.")  # fmt: skip
+@click.argument("directory", type=NEW_FOLDER)
+@option("--assets", "Objects; fourteen hold every category once.", POSITIVE, 25)
+@option("--seed", "The same seed gives the same bytes.", click.IntRange(min=0), 0)
+@option(
+    "--level",
+    "Difficulty, 0 (quarter turns) to 4 (warped); may be repeated, levels take turns.  "
+    "[default: all]",
+    click.IntRange(0, 4),
+    name="levels",
+    multiple=True,
+)
+@option("--views", "SLATs of each object.", POSITIVE, 1)
+@option(
+    "--habitual-share",
+    "Share of the objects that have one quarter turn in common.",
+    click.FloatRange(0, 1),
+    0.0,
+)
+@option(
+    "--latents",
+    "What the latents are made of: noise with TRELLIS's statistics, or something that "
+    "depends on the material.",
+    ChoiceOf("slatprep.demo.latents:LatentKind"),
+    "placeholder",
+)
+@option(
+    "--grid-form",
+    "Raw grids, or predictions of 11 or 4 channels.",
+    ChoiceOf("slatprep.demo.write:GridForm"),
+    "raw",
+)
+@option(
+    "--slat-form",
+    "Files of (N,3) or (N,4) coordinates, HDF5, or one HDF5 for all.",
+    ChoiceOf("slatprep.demo.write:SlatForm"),
+    "npz",
+)
+@option(
+    "--slat-names",
+    "Name SLATs by object, or by sha256 with a metadata.csv.",
+    ChoiceOf("slatprep.demo.write:SlatNames"),
+    "id",
+)
 @jobs_option
 @output_options
 def make_demo(output: Output, directory: Path, levels: tuple[int, ...], **recipe: Any) -> None:
@@ -70,4 +89,4 @@ def make_demo(output: Output, directory: Path, levels: tuple[int, ...], **recipe
             f"next: slatprep build-store --config {summary.config} --out {summary.directory}.zarr"
         )
 
-    output.result(dataclasses.asdict(summary), show)
+    output.result(summary, show)

@@ -7,29 +7,33 @@ from pathlib import Path
 
 import click
 
-from slatprep.cli.options import STORE
+from slatprep.cli.options import EXISTING_FOLDER, NEW_FILE, option
 from slatprep.cli.output import Output, output_options
 
 
 @click.command(
+    # What is not stated is left out: an empty default says nothing.
+    context_settings={"show_default": False},
     epilog="""\b
 Example:
   slatprep describe demo.zarr
   slatprep describe demo.zarr --out demo.croissant.json --name demo
-"""
+""",
 )
-@click.argument("store", type=STORE)
-@click.option("--out", type=click.Path(path_type=Path, dir_okay=False), metavar="FILE.json",
-              help="Where to write it.  [default: standard output]")  # fmt: skip
-@click.option("--location", default="", metavar="URL", help="Where its readers will find the "
-              "store.  [default: its path, as seen from the description]")  # fmt: skip
-@click.option("--name", default="", help="Name of the dataset.  [default: the store's]")
-@click.option("--license", "license_", default="", metavar="URL", help="Its licence.")
-@click.option("--url", default="", help="Its home page.")
-@click.option("--cite-as", default="", metavar="TEXT", help="How to cite it.")
-@click.option("--dataset-version", default="1.0.0", show_default=True, metavar="X.Y.Z",
-              help="Its version.")  # fmt: skip
-@click.option("--date-published", default="", metavar="YYYY-MM-DD", help="When it was published.")
+@click.argument("store", type=EXISTING_FOLDER)
+@option("--out", "The file.  [default: standard output]", NEW_FILE, metavar="FILE.json")
+@option(
+    "--location",
+    "Where its readers will find the store.  [default: its path, as seen from the description]",
+    default="",
+    metavar="URL",
+)
+@option("--name", "Name of the dataset.  [default: the store's]", default="")
+@option("--license", "Its licence.", default="", name="license_", metavar="URL")
+@option("--url", "Its home page.", default="")
+@option("--cite-as", "How to cite it.", default="", metavar="TEXT")
+@option("--dataset-version", "Its version.  [default: 1.0.0]", default="1.0.0", metavar="X.Y.Z")
+@option("--date-published", "When it was published.", default="", metavar="YYYY-MM-DD")
 @output_options
 def describe(
     output: Output,

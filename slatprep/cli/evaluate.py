@@ -8,7 +8,14 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from slatprep.cli.learn import STORE, shares_of, shares_option
+from slatprep.cli.options import (
+    EXISTING_FOLDER,
+    NEW_FILE,
+    ChoiceOf,
+    option,
+    shares_of,
+    shares_option,
+)
 from slatprep.cli.output import EXIT_INCOMPLETE, Output, output_options
 
 if TYPE_CHECKING:
@@ -25,23 +32,35 @@ Example:
 """
 )
 @click.argument("predictions", type=click.Path(path_type=Path, exists=True))
-@click.option("--store", type=STORE, required=True, metavar="STORE.zarr",
-              help="The store that has the truth.")  # fmt: skip
-@click.option("--split", type=click.Choice(["train", "val", "test", "all"]), default="test",
-              show_default=True, help="Objects to measure on.")  # fmt: skip
+@option("--store", "Has the truth.", EXISTING_FOLDER, required=True, metavar="STORE.zarr")
+@option(
+    "--split", "Objects to measure on.", ChoiceOf("slatprep.learn.splits:SPLITS", "all"), "test"
+)
 @shares_option
-@click.option("--spread", type=click.Choice(["se", "sd"]), default="se", show_default=True,
-              help="Standard error or standard deviation over objects.")  # fmt: skip
-@click.option("--csv", "csv_file", type=click.Path(path_type=Path, dir_okay=False),
-              help="Also write the table there.")  # fmt: skip
-@click.option("--beside", metavar="pixie|FILE.csv",
-              help="Also print Pixie's published table, which has NeRF2Physics too, or one of your "
-              "own: a name, then columns named as here.")  # fmt: skip
+@option(
+    "--spread",
+    "Standard error or standard deviation over objects.",
+    ChoiceOf("slatprep.learn.metrics:Spread"),
+    "se",
+)
+@option("--csv", "Also write the table there.", NEW_FILE, name="csv_file")
+@option(
+    "--beside",
+    "Also print Pixie's published table, which has NeRF2Physics too, or one of your "
+    "own: a name, then columns named as here.",
+    metavar="pixie|FILE.csv",
+)
 @output_options
 def evaluate(
-    output: Output, predictions: Path, store: Path, split: Any, shares: str, spread: Any,
-    csv_file: Path | None, beside: str | None,
-) -> None:  # fmt: skip
+    output: Output,
+    predictions: Path,
+    store: Path,
+    split: Any,
+    shares: str,
+    spread: Any,
+    csv_file: Path | None,
+    beside: str | None,
+) -> None:
     """Measure PREDICTIONS by Pixie's protocol.
 
     PREDICTIONS is a directory of npz files, one an asset, or a Zarr or HDF5
@@ -60,8 +79,8 @@ def evaluate(
         predictions, store, None if split == "all" else split, shares_of(shares), spread
     )
     rows = _rows(result)
-    header = ("category", "objects", *(f"{name}{end}" for name in result.overall.means
-                                       for end in ("", f" {spread}")))  # fmt: skip
+    names = (name for mean in result.overall.means for name in (mean, f"{mean} {spread}"))
+    header = ("category", "objects", *names)
     if csv_file is not None:
         import csv
 
@@ -74,9 +93,7 @@ def evaluate(
             _show_beside(output, result, others, beside)
 
     document = dataclasses.asdict(result)
-    if beside is not None:
-        document["beside"] = [dataclasses.asdict(score) for score in others]
-    output.result(document, show)
+    output.result(document | ({"beside": others} if beside is not None else {}), show)
     for asset_id in result.missing:
         output.problem(f"{predictions}: no prediction of {asset_id}")
     if result.missing:
@@ -105,7 +122,10 @@ def _show_beside(
 def _rows(result: Evaluation) -> list[tuple[str | int | float, ...]]:
     measures: dict[str, Measure] = {**result.categories, "all": result.overall}
     return [
-        (name or "(none)", m.objects,
-         *(value for key in m.means for value in (m.means[key], m.spreads[key])))
+        (
+            name or "(none)",
+            m.objects,
+            *(x for key in m.means for x in (m.means[key], m.spreads[key])),
+        )
         for name, m in measures.items()
-    ]  # fmt: skip
+    ]

@@ -2,13 +2,19 @@
 
 from __future__ import annotations
 
-import dataclasses
 from pathlib import Path
 from typing import Any
 
 import click
 
-from slatprep.cli.options import STORE, jobs_option
+from slatprep.cli.options import (
+    EXISTING_FOLDER,
+    POSITIVE,
+    ChoiceOf,
+    jobs_option,
+    option,
+    verdicts_option,
+)
 from slatprep.cli.output import Output, output_options
 from slatprep.errors import ConfigError
 
@@ -40,27 +46,43 @@ Example:
   slatprep export demo.zarr --format npz --out latents
 """
 )
-@click.argument("store", type=STORE)
-@click.option("--format", "kind", required=True,
-              type=click.Choice(["ply", "hdf5", "webdataset", "npz"]),
-              help="Point clouds with Pixie's fields, one HDF5 file, tar shards, or TRELLIS's "
-              "npz with the targets added.")  # fmt: skip
-@click.option("--out", required=True, type=click.Path(path_type=Path), metavar="PATH",
-              help="The file (hdf5) or folder (all others); an export that is there is replaced "
-              "when the new one is complete.")  # fmt: skip
-@click.option("--asset", "assets", multiple=True, metavar="ID", shell_complete=_complete_asset,
-              help="The asset; may be repeated.  [default: all]")  # fmt: skip
-@click.option("--verdict", "verdicts", multiple=True,
-              type=click.Choice(["good", "doubtful", "failed"]),
-              help="Only assets with this verdict; may be repeated.  [default: all]")  # fmt: skip
-@click.option("--points", type=click.Choice(["slat", "grid"]),
-              help="ply: SLAT voxels, or the voxels of the PixieVerse field."
-              "  [default: slat]")  # fmt: skip
-@click.option("--frame", type=click.Choice(["slat", "pixieverse"]),
-              help="ply: the SLAT's unit cube, or PixieVerse's world."
-              "  [default: slat]")  # fmt: skip
-@click.option("--shard-size", type=click.IntRange(min=1), metavar="N",
-              help="webdataset: assets in one shard.  [default: 256]")  # fmt: skip
+@click.argument("store", type=EXISTING_FOLDER)
+@option(
+    "--format",
+    "Point clouds with Pixie's fields, one HDF5 file, tar shards, or TRELLIS's npz "
+    "with the targets added.",
+    ChoiceOf("slatprep.export:FORMATS"),
+    name="kind",
+    required=True,
+)
+@option(
+    "--out",
+    "The file (hdf5) or folder (all others); an export that is there is replaced when "
+    "the new one is complete.",
+    click.Path(path_type=Path),
+    required=True,
+    metavar="PATH",
+)
+@option(
+    "--asset",
+    "The asset; may be repeated.  [default: all]",
+    name="assets",
+    multiple=True,
+    metavar="ID",
+    shell_complete=_complete_asset,
+)
+@verdicts_option
+@option(
+    "--points",
+    "ply: SLAT voxels, or the voxels of the PixieVerse field.  [default: slat]",
+    ChoiceOf("slatprep.export.ply:Points"),
+)
+@option(
+    "--frame",
+    "ply: the SLAT's unit cube, or PixieVerse's world.  [default: slat]",
+    ChoiceOf("slatprep.export.ply:Frame"),
+)
+@option("--shard-size", "webdataset: assets a shard.  [default: 256]", POSITIVE)
 @jobs_option
 @output_options
 def export(
@@ -101,10 +123,18 @@ def export(
         output.table(
             f"Exported to {summary.path}",
             ("format", "assets", "points", "files", "MB", "seconds"),
-            [(summary.format, summary.assets, summary.points, summary.files,
-              summary.size / 1e6, summary.seconds)],
-        )  # fmt: skip
+            [
+                (
+                    summary.format,
+                    summary.assets,
+                    summary.points,
+                    summary.files,
+                    summary.size / 1e6,
+                    summary.seconds,
+                )
+            ],
+        )
 
     for note in summary.notes:
         output.note(note)
-    output.result(dataclasses.asdict(summary), show)
+    output.result(summary, show)

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import click
 
+from slatprep.cli.options import FILE, NEW_FOLDER, option
 from slatprep.cli.output import EXIT_INCOMPLETE, Output, output_options
 from slatprep.errors import InputError
 
@@ -18,19 +19,23 @@ Example:
   slatprep extract-slat renders/*/*.png --by-folder --out slat --seed 0 --seed 1
 """,
 )
-@click.argument("images", nargs=-1, required=True,
-                type=click.Path(path_type=Path, exists=True, dir_okay=False))  # fmt: skip
-@click.option("--out", required=True, type=click.Path(path_type=Path, file_okay=False),
-              metavar="DIR", help="Folder of the latents, the --slat of build-store.")  # fmt: skip
-@click.option("--seed", "seeds", type=click.IntRange(min=0), multiple=True, default=(42,),
-              help="Seed of what is drawn; may be repeated, each seed is a view."
-              "  [default: 42]")  # fmt: skip
-@click.option("--by-folder", is_flag=True, help="Images are named <id>/<view>, not <id>.")
-@click.option("--model", default="microsoft/TRELLIS-image-large", show_default=True,
-              help="Name of the model's repository, or a folder that holds it.")  # fmt: skip
-@click.option("--revision", metavar="COMMIT", help="Revision of the model.  [default: newest]")
-@click.option("--device", default="cuda", show_default=True, help="Where to run it.")
-@click.option("--no-preprocess", is_flag=True, help="Images are cut out and cropped already.")
+@click.argument("images", nargs=-1, required=True, type=FILE)
+@option("--out", "The --slat of build-store.", NEW_FOLDER, required=True)
+@option(
+    "--seed",
+    "Seed of what is drawn; may be repeated, each seed is a view.",
+    click.IntRange(min=0),
+    (42,),
+    name="seeds",
+    multiple=True,
+)
+@option("--by-folder", "Images are named <id>/<view>, not <id>.", is_flag=True)
+@option(
+    "--model", "Repository of the model, or its folder.", default="microsoft/TRELLIS-image-large"
+)
+@option("--revision", "Revision of the model.  [default: newest]", metavar="COMMIT")
+@option("--device", "Where to run it.", default="cuda")
+@option("--no-preprocess", "Images are cut out and cropped already.", is_flag=True)
 @output_options
 def extract_slat(
     output: Output,

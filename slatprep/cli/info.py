@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from pathlib import Path
 
 import click
@@ -52,4 +51,4 @@ def info(output: Output, store: Path | None) -> None:
         show_quality(output, overview)
         show_normalization(output, overview)
 
-    output.result(dataclasses.asdict(overview), show)
+    output.result(overview, show)

@@ -1,11 +1,12 @@
-"""The options that say where the data are, shared by `build-store` and `align`."""
+"""Options that several commands share: their types, sources, stores, jobs and shares."""
 
 from __future__ import annotations
 
 import functools
+import pkgutil
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar, get_args
 
 import click
 
@@ -13,11 +14,20 @@ from slatprep.cli.output import Output
 from slatprep.storage.remote import RemotePath, as_path
 
 if TYPE_CHECKING:
+    from slatprep.learn.splits import Shares
     from slatprep.parameters import BuildParameters
+
+    _Choice = click.Choice[str]
+else:
+    _Choice = click.Choice
 
 _Command = TypeVar("_Command", bound=Callable[..., object])
 
-_FILE = click.Path(path_type=Path, exists=True, dir_okay=False)
+POSITIVE = click.IntRange(min=1)
+FILE = click.Path(path_type=Path, exists=True, dir_okay=False)
+FOLDER = click.Path(path_type=Path, exists=True, file_okay=False)
+NEW_FILE = click.Path(path_type=Path, dir_okay=False)
+NEW_FOLDER = click.Path(path_type=Path, file_okay=False)
 
 
 class PlaceType(click.Path):
@@ -33,60 +43,93 @@ class PlaceType(click.Path):
         return super().convert(str(place), parameter, context)
 
 
+class ChoiceOf(_Choice):
+    """One of the words that a module lists; it is imported when the words are needed.
+
+    ``slatprep --help`` loads every command, and must not load numpy with them.
+
+    Parameters
+    ----------
+    name : str
+        Of an enum, a Literal, a mapping or a sequence of words, as
+        ``package.module:NAME``.
+    *others : str
+        More words that the option takes.
+    """
+
+    def __init__(self, name: str, *others: str) -> None:
+        self._source = name
+        self._others = others
+        self.case_sensitive = True
+
+    @property
+    def choices(self) -> tuple[str, ...]:  # type: ignore[override]
+        """Return the words."""
+        listed = pkgutil.resolve_name(self._source)
+        return (*map(str, get_args(listed) or listed), *self._others)
+
+
+def option(
+    flag: str,
+    text: str,
+    kind: Any = None,
+    default: Any = None,
+    *,
+    name: str | None = None,
+    **others: Any,
+) -> Callable[[_Command], _Command]:
+    """Declare an option: its flag, help text, type and default, in this order.
+
+    `name` is the parameter of the function that takes the value, where it is
+    not the flag's name; all other arguments are `click.option`'s.
+    """
+    if default is not None:
+        others["default"] = default
+    return click.option(*filter(None, (flag, name)), type=kind, help=text, **others)
+
+
 PLACE = PlaceType(path_type=Path)
-STORE = PlaceType(path_type=Path, exists=True, file_okay=False)
+"""A path or a URL, of something that need not exist."""
+
+EXISTING_FOLDER = PlaceType(path_type=Path, exists=True, file_okay=False)
+"""A folder that exists, a store as well, or a URL."""
 
 
 def source_options(command: _Command) -> _Command:
     """Add the options that decide the parameters of a build."""
     options = (
-        click.option(
-            "--config",
-            type=_FILE,
-            help="Dataset definition (TOML); options win over it.",
+        option("--config", "Dataset definition (TOML); options win over it.", FILE),
+        option(
+            "--pixieverse", "Root of the PixieVerse grids or predictions, a folder or a URL.", PLACE
         ),
-        click.option(
-            "--pixieverse",
-            type=PLACE,
-            metavar="DIR",
-            help="Root of the PixieVerse grids or predictions, a folder or a URL.",
-        ),
-        click.option(
-            "--slat",
-            type=PLACE,
-            metavar="DIR",
-            help="Root of the TRELLIS latents, or one HDF5 file; a path or a URL.",
-        ),
-        click.option(
+        option("--slat", "Root of the TRELLIS latents, or one HDF5 file, or a URL.", PLACE),
+        option(
             "--map",
-            "pairing_map",
-            type=PLACE,
-            metavar="CSV",
-            help="CSV that joins the ids of the two sides, or TRELLIS's metadata.csv.",
+            "CSV that joins the ids of the two sides, or TRELLIS's metadata.csv.",
+            PLACE,
+            name="pairing_map",
         ),
-        click.option(
+        option(
             "--ranges",
+            "Where the normalisation ranges come from.  [default: dataset]",
             metavar="dataset|pixie|FILE",
-            help="Where the normalisation ranges come from.  [default: dataset]",
         ),
-        click.option(
+        option(
             "--preset",
-            type=click.Choice(["default", "paper"]),
-            help="Named alignment parameters; 'paper' is the protocol of SLAT-Phys.",
+            "Named alignment parameters; 'paper' is the protocol of SLAT-Phys.",
+            ChoiceOf("slatprep.parameters:PRESETS"),
         ),
     )
-    for option in reversed(options):
-        command = option(command)
-    return command
+    return functools.reduce(lambda decorated, add: add(decorated), reversed(options), command)
 
 
-store_argument = click.argument("store", required=False, type=STORE)
+store_argument = click.argument("store", required=False, type=EXISTING_FOLDER)
 
-store_option = click.option(
+store_option = option(
     "--store",
-    type=STORE,
+    "The store.  [default: the one built last under data/]",
+    EXISTING_FOLDER,
     metavar="STORE.zarr",
-    help="The store.  [default: the one built last under data/]",
 )
 
 
@@ -106,13 +149,15 @@ def beside(store: Path, suffix: str) -> Path:
     return Path(name) if isinstance(store, RemotePath) else store.with_name(name)
 
 
-jobs_option = click.option(
-    "--jobs",
-    type=click.IntRange(min=1),
-    default=1,
-    show_default=True,
-    help="Assets computed at a time, each in a process of one thread.",
+verdicts_option = option(
+    "--verdict",
+    "Only assets with this verdict; may be repeated.  [default: all]",
+    ChoiceOf("slatprep.records:Verdict"),
+    name="verdicts",
+    multiple=True,
 )
+
+jobs_option = option("--jobs", "Worker processes, of one thread each.", POSITIVE, 1)
 
 
 def workers_options(command: _Command) -> _Command:
@@ -122,10 +167,10 @@ def workers_options(command: _Command) -> _Command:
     """
 
     @jobs_option
-    @click.option(
+    @option(
         "--scheduler",
+        "Compute on the Dask cluster of this scheduler, as tcp://host:8786, instead of here.",
         metavar="ADDRESS",
-        help="Compute on the Dask cluster of this scheduler, as tcp://host:8786, instead of here.",
     )
     @functools.wraps(command)
     def with_workers(output: Output, *, jobs: int, scheduler: str | None, **options: Any) -> object:
@@ -148,26 +193,43 @@ def workers_options(command: _Command) -> _Command:
 def parameters_of(
     *,
     config: Path | None,
-    pixieverse: Path | None,
-    slat: Path | None,
-    pairing_map: Path | None,
-    ranges: str | None,
     preset: str | None,
     consensus: bool = False,
-    **_other: Any,
+    **sources: Path | str | None,
 ) -> BuildParameters:
     """Return the parameters that the options of `source_options` ask for."""
     from slatprep.config import load_parameters
 
     given: dict[str, dict[str, object]] = {}
-    for group, key, value in (
-        ("pixieverse", "root", pixieverse),
-        ("slat", "root", slat),
-        ("pairing", "map", pairing_map),
-        ("normalize", "ranges", ranges),
+    for option_name, group, key in (
+        ("pixieverse", "pixieverse", "root"),
+        ("slat", "slat", "root"),
+        ("pairing_map", "pairing", "map"),
+        ("ranges", "normalize", "ranges"),
     ):
-        if value is not None:
+        if (value := sources[option_name]) is not None:
             given[group] = {key: str(value.absolute()) if isinstance(value, Path) else value}
     if consensus:
         given["consensus"] = {"settle": True}
     return load_parameters(config, given, preset)
+
+
+shares_option = option(
+    "--shares",
+    "Shares of the objects; a hash of the id decides where one goes.",
+    default="0.8,0.1,0.1",
+    metavar="TRAIN,VAL,TEST",
+)
+
+
+def shares_of(text: str) -> Shares:
+    """Return the shares that ``--shares`` gives; they must be three numbers."""
+    from slatprep.learn.splits import Shares
+
+    try:
+        train, val, test = (float(part) for part in text.split(","))
+    except ValueError as error:
+        raise click.BadParameter(
+            f"{text!r} is not three numbers such as 0.8,0.1,0.1", param_hint="--shares"
+        ) from error
+    return Shares(train, val, test)

@@ -8,7 +8,6 @@ aligned columns; with ``--json`` standard output is one JSON document.
 from __future__ import annotations
 
 import functools
-import json
 import math
 import sys
 import time
@@ -55,7 +54,7 @@ class Output:
     def result(self, document: object, show: Callable[[], None]) -> None:
         """Print a result: the document as JSON, or what `show` prints for people."""
         if self.as_json:
-            click.echo(json.dumps(plain(document), indent=2, ensure_ascii=False, allow_nan=False))
+            click.echo(as_json(document))
         else:
             show()
 
@@ -105,9 +104,7 @@ class Output:
 def output_options(command: _Command) -> _Command:
     """Add ``--json``, ``-q`` and ``-v``; the command gets an `Output` as its first argument."""
 
-    @click.option(
-        "--json", "as_json", is_flag=True, help="Print one JSON document instead of tables."
-    )
+    @click.option("--json", "as_json", is_flag=True, help="Print JSON instead of tables.")
     @click.option("-q", "--quiet", is_flag=True, help="Print errors and results alone.")
     @click.option("-v", "--verbose", is_flag=True, help="Print more than the usual.")
     @functools.wraps(command)
@@ -128,17 +125,18 @@ def _local(value: Any) -> Any:
     return path
 
 
-def plain(value: Any) -> Any:
-    """Return a value as JSON has it: paths as strings, not-a-number as null."""
-    if isinstance(value, dict):
-        return {str(key): plain(item) for key, item in value.items()}
-    if isinstance(value, list | tuple | set):
-        return [plain(item) for item in value]
-    if hasattr(value, "tolist"):
-        return plain(value.tolist())
-    if isinstance(value, float):
-        return value if math.isfinite(value) else None
-    return value if value is None or isinstance(value, bool | int | str) else str(value)
+def as_json(document: object) -> str:
+    """Return a result as JSON: paths and URLs as strings, not-a-number as null."""
+    import orjson
+
+    options = orjson.OPT_INDENT_2 | orjson.OPT_SERIALIZE_NUMPY | orjson.OPT_NON_STR_KEYS
+    return orjson.dumps(document, default=_jsonable, option=options).decode()
+
+
+def _jsonable(value: object) -> object:
+    if isinstance(value, Path):
+        return str(value)
+    raise TypeError(f"{type(value).__name__} in a result")
 
 
 def _is_number(cell: Cell) -> bool:

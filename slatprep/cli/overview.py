@@ -16,12 +16,12 @@ def show_quality(output: Output, overview: StoreOverview) -> None:
     ``back`` is the fitness from SLAT to PixieVerse; ``tied`` counts assets
     whose tied placements differ in class somewhere.
     """
+    verdicts = tuple(overview.total.verdicts)
     output.table(
         "Alignments (medians; rmse in voxels)",
-        ("category", "assets", "good", "doubtful", "failed", "fitness", "back",
-         "rmse", "valid", "tied"),
+        ("category", "assets", *verdicts, "fitness", "back", "rmse", "valid", "tied"),
         [_quality_row(group) for group in (*overview.categories, overview.total)],
-    )  # fmt: skip
+    )
 
 
 def show_normalization(output: Output, overview: StoreOverview) -> None:

@@ -2,12 +2,19 @@
 
 from __future__ import annotations
 
-import dataclasses
 from pathlib import Path
 
 import click
 
-from slatprep.cli.options import beside, chosen_store, jobs_option, store_argument
+from slatprep.cli.options import (
+    FOLDER,
+    NEW_FILE,
+    beside,
+    chosen_store,
+    jobs_option,
+    option,
+    store_argument,
+)
 from slatprep.cli.output import Output, output_options
 
 
@@ -19,17 +26,11 @@ Example:
 """
 )
 @store_argument
-@click.option(
-    "--out",
-    type=click.Path(path_type=Path, dir_okay=False),
-    metavar="FILE.html",
-    help="The page.  [default: beside the store]",
-)
-@click.option(
+@option("--out", "The page.  [default: beside the store]", NEW_FILE, metavar="FILE.html")
+@option(
     "--manifests",
-    type=click.Path(path_type=Path, exists=True, file_okay=False),
-    metavar="DIR",
-    help="Folder of the build's records.  [default: beside the store, or manifests/build/NAME]",
+    "Folder of the build's records.  [default: beside the store, or manifests/build/NAME]",
+    FOLDER,
 )
 @jobs_option
 @output_options
@@ -60,15 +61,11 @@ def report(
         )
     with output.progress("report") as progress:
         summary = write_report(
-            opened,
-            out or beside(path, ".html"),
-            manifests=manifests,
-            jobs=jobs,
-            progress=progress,
+            opened, out or beside(path, ".html"), manifests=manifests, jobs=jobs, progress=progress
         )
 
     def show() -> None:
         click.echo(f"page:   {summary.path} ({summary.size / 1e6:,.1f} MB)")
         click.echo(f"assets: {summary.assets:,}, {summary.in_detail:,} of them with a 3D view")
 
-    output.result(dataclasses.asdict(summary), show)
+    output.result(summary, show)

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import dataclasses
 from pathlib import Path
 
 import click
 
-from slatprep.cli.options import STORE
+from slatprep.cli.options import EXISTING_FOLDER, FOLDER
 from slatprep.cli.output import EXIT_INCOMPLETE, Output, output_options
 
 
@@ -17,8 +16,8 @@ Example:
   slatprep score demo.zarr demo/truth
 """
 )
-@click.argument("store", type=STORE)
-@click.argument("truth_dir", type=click.Path(path_type=Path, exists=True, file_okay=False))
+@click.argument("store", type=EXISTING_FOLDER)
+@click.argument("truth_dir", type=FOLDER)
 @output_options
 def score(output: Output, store: Path, truth_dir: Path) -> None:
     """Score STORE against known truth.
@@ -57,7 +56,7 @@ def score(output: Output, store: Path, truth_dir: Path) -> None:
             ],
         )  # fmt: skip
 
-    output.result(dataclasses.asdict(report), show)
+    output.result(report, show)
     for asset_id in report.missing:
         output.problem(f"{truth_dir / asset_id}.npz: its asset is not in {store}")
     if report.missing:

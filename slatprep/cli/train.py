@@ -9,11 +9,22 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from slatprep.cli.learn import STORE, shares_of, shares_option
+from slatprep.cli.options import (
+    EXISTING_FOLDER,
+    NEW_FOLDER,
+    POSITIVE,
+    ChoiceOf,
+    option,
+    shares_of,
+    shares_option,
+    verdicts_option,
+)
 from slatprep.cli.output import Output, output_options
 
 if TYPE_CHECKING:
     from slatprep.learn.train import TrainSummary
+
+_SIZES = ("small", "medium", "large")
 
 
 @click.command(
@@ -23,44 +34,52 @@ Example:
   slatprep train demo.zarr --out runs/sizes --all-sizes
 """
 )
-@click.argument("store", type=STORE)
-@click.option("--out", type=click.Path(path_type=Path, file_okay=False), required=True,
-              help="Directory of the run; one that was stopped goes on.")  # fmt: skip
-@click.option("--size", type=click.Choice(["small", "medium", "large"]), default="large",
-              show_default=True, help="0.20, 1.19 or 6.32 million parameters.")  # fmt: skip
-@click.option("--all-sizes", is_flag=True, help="Train all three, each in its own directory.")
-@click.option("--epochs", type=click.IntRange(min=1), default=100, show_default=True,
-              help="Passes over the training objects.")  # fmt: skip
-@click.option("--batch-size", type=click.IntRange(min=1), default=1, show_default=True,
-              help="Assets in a batch.")  # fmt: skip
-@click.option("--accumulate", type=click.IntRange(min=1), default=1, show_default=True,
-              help="Batches in a step of the optimiser.")  # fmt: skip
-@click.option("--learning-rate", type=click.FloatRange(min=0, min_open=True), default=1e-4,
-              show_default=True, help="Of AdamW, before the cosine.")  # fmt: skip
-@click.option("--precision", type=click.Choice(["fp32", "bf16"]), default="bf16",
-              show_default=True, help="bf16 is mixed precision.")  # fmt: skip
-@click.option("--patience", type=click.IntRange(min=1), default=10, show_default=True,
-              help="Epochs without a better validation loss before stopping.")  # fmt: skip
-@click.option("--augment", type=click.Choice(["none", "upright", "all"]), default="none",
-              show_default=True, help="Quarter turns and flips: of 8 or 48 kinds.")  # fmt: skip
-@click.option("--verdict", "verdicts", type=click.Choice(["good", "doubtful", "failed"]),
-              multiple=True, help="Verdicts to use; may be repeated.  [default: all]")  # fmt: skip
-@click.option("--max-ambiguity", type=float, help="Leave out assets that are more ambiguous.")
+@click.argument("store", type=EXISTING_FOLDER)
+@option("--out", "Folder of the run; a stopped one goes on.", NEW_FOLDER, required=True)
+@option("--size", "0.20, 1.19 or 6.32 million weights.", click.Choice(_SIZES), "large")
+@option("--all-sizes", "Train all three, each in its own directory.", is_flag=True)
+@option("--epochs", "Passes over the training objects.", POSITIVE, 100)
+@option("--batch-size", "Assets in a batch.", POSITIVE, 1)
+@option("--accumulate", "Batches in a step of the optimiser.", POSITIVE, 1)
+@option(
+    "--learning-rate", "Of AdamW, before the cosine.", click.FloatRange(min=0, min_open=True), 1e-4
+)
+@option("--precision", "bf16: mixed precision.", click.Choice(["fp32", "bf16"]), "bf16")
+@option("--patience", "Stop after so many epochs without progress.", POSITIVE, 10)
+@option(
+    "--augment",
+    "Quarter turns and flips: of 8 or 48 kinds.",
+    ChoiceOf("slatprep.learn.augment:Augmentation"),
+    "none",
+)
+@verdicts_option
+@option("--max-ambiguity", "Leave out assets that are more ambiguous.", float)
 @shares_option
-@click.option("--seed", type=int, default=0, show_default=True,
-              help="Of weights, order and augmentation.")  # fmt: skip
-@click.option("--device", type=click.Choice(["cpu", "cuda"]), default="cpu", show_default=True,
-              help="Where to compute.")  # fmt: skip
-@click.option("--workers", type=click.IntRange(min=0), default=0, show_default=True,
-              help="Processes that read ahead.")  # fmt: skip
-@click.option("--threads", type=click.IntRange(min=1), default=lambda: os.cpu_count() or 1,
-              show_default="all cores", help="Threads to compute with.")  # fmt: skip
+@option("--seed", "Of weights, order and augmentation.", int, 0)
+@option("--device", "Where to compute.", click.Choice(["cpu", "cuda"]), "cpu")
+@option("--workers", "Processes that read ahead.", click.IntRange(min=0), 0)
+@option(
+    "--threads",
+    "Threads to compute with.",
+    POSITIVE,
+    lambda: os.cpu_count() or 1,
+    show_default="all cores",
+)
 @output_options
 def train(
-    output: Output, store: Path, out: Path, size: str, all_sizes: bool, shares: str,
-    augment: Any, verdicts: tuple[str, ...], device: str, workers: int, threads: int,
+    output: Output,
+    store: Path,
+    out: Path,
+    size: str,
+    all_sizes: bool,
+    shares: str,
+    augment: Any,
+    verdicts: tuple[str, ...],
+    device: str,
+    workers: int,
+    threads: int,
     **parameters: Any,
-) -> None:  # fmt: skip
+) -> None:
     """Train SLAT-Phys's decoder on STORE.
 
     Writes run.json, log.csv, curve.png, checkpoints and the predictions of
@@ -77,10 +96,13 @@ def train(
 
     torch.set_num_threads(threads)
     chosen = TrainParameters(
-        size=size, augmentation=augment, shares=shares_of(shares), **parameters,
+        size=size,
+        augmentation=augment,
+        shares=shares_of(shares),
         verdicts=verdicts or TrainParameters.verdicts,
-    )  # fmt: skip
-    runs = {name: out / name for name in ("small", "medium", "large")} if all_sizes else {size: out}
+        **parameters,
+    )
+    runs = {name: out / name for name in _SIZES} if all_sizes else {size: out}
     summaries = {}
     for name, directory in runs.items():
         summaries[name] = run(
@@ -94,8 +116,7 @@ def train(
                 f"{r.val_loss:.4f}, MSE {r.val_mse:.4f}, accuracy {r.val_accuracy:.3f}"
             ),
         )
-    document = {name: dataclasses.asdict(summary) for name, summary in summaries.items()}
-    output.result(document, lambda: _show_training(output, summaries))
+    output.result(summaries, lambda: _show_training(output, summaries))
     output.note(f"runs:    {', '.join(str(directory) for directory in runs.values())}")
     first = next(iter(summaries.values()))
     output.note(f"next:    slatprep evaluate {first.predictions} --store {store} --shares {shares}")

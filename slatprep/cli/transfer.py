@@ -7,14 +7,12 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from slatprep.cli.options import store_option
+from slatprep.cli.options import FILE, NEW_FILE, ChoiceOf, option, store_option
 from slatprep.cli.output import Output, output_options
 from slatprep.errors import ConfigError
 
 if TYPE_CHECKING:
     from slatprep.particles.transfer import VoxelField
-
-_FILE = click.Path(path_type=Path, exists=True, dir_okay=False)
 
 
 @click.command(
@@ -25,31 +23,57 @@ Example:
   slatprep transfer gaussians.ply --prediction 0a1b2c.npz --store demo.zarr --out predicted.ply
 """
 )
-@click.argument("particles", type=_FILE)
+@click.argument("particles", type=FILE)
 @store_option
-@click.option("--asset", metavar="ID", help="The asset of the store.")
-@click.option("--prediction", type=_FILE, metavar="FILE.npz",
-              help="Predicted materials instead of an asset: coords, material, and properties "
-              "(normalised as --store or --ranges says) or properties_si.")  # fmt: skip
-@click.option("--ranges", metavar="pixie|FILE", help="Ranges of a prediction's properties.")
-@click.option("--out", required=True, type=click.Path(path_type=Path, dir_okay=False),
-              metavar="FILE.ply",
-              help="Where to write the particles with their materials.")  # fmt: skip
-@click.option("--points", type=click.Choice(["slat", "grid"]), default="slat", show_default=True,
-              help="Take an asset's materials from its SLAT voxels, a surface, or from its "
-              "PixieVerse field, a solid.")  # fmt: skip
-@click.option("--axes", type=click.Choice(["trellis", "slat"]),
-              help="Frame of the particles: turned as TRELLIS saves Gaussians, or the SLAT's."
-              "  [default: trellis for a PLY of Gaussians, else slat]")  # fmt: skip
-@click.option("--frame", type=click.Choice(["file", "slat"]), default="file", show_default=True,
-              help="Write positions as the particles' file has them, or in the SLAT "
-              "frame.")  # fmt: skip
-@click.option("--max-distance", type=click.FloatRange(min=0, min_open=True), default=2.0,
-              show_default=True, metavar="VOXELS",
-              help="A particle without a voxel this near is far.")  # fmt: skip
-@click.option("--far", type=click.Choice(["background", "drop", "nearest"]), default="background",
-              show_default=True, help="Give far particles class 7 and properties 0, leave them "
-              "out, or give them the nearest material.")  # fmt: skip
+@option("--asset", "The asset of the store.", metavar="ID")
+@option(
+    "--prediction",
+    "Predicted materials instead of an asset: coords, material, and properties "
+    "(normalised as --store or --ranges says) or properties_si.",
+    FILE,
+    metavar="FILE.npz",
+)
+@option("--ranges", "Ranges of a prediction's properties.", metavar="pixie|FILE")
+@option(
+    "--out",
+    "Where to write the particles with their materials.",
+    NEW_FILE,
+    required=True,
+    metavar="FILE.ply",
+)
+@option(
+    "--points",
+    "Take an asset's materials from its SLAT voxels, a surface, or from its PixieVerse "
+    "field, a solid.",
+    ChoiceOf("slatprep.particles.fields:Points"),
+    "slat",
+)
+@option(
+    "--axes",
+    "Frame of the particles: turned as TRELLIS saves Gaussians, or the SLAT's.  "
+    "[default: trellis for a PLY of Gaussians, else slat]",
+    ChoiceOf("slatprep.particles.read:Axes"),
+)
+@option(
+    "--frame",
+    "Write positions as the particles' file has them, or in the SLAT frame.",
+    click.Choice(["file", "slat"]),
+    "file",
+)
+@option(
+    "--max-distance",
+    "A particle without a voxel this near is far.",
+    click.FloatRange(min=0, min_open=True),
+    2.0,
+    metavar="VOXELS",
+)
+@option(
+    "--far",
+    "Give far particles class 7 and properties 0, leave them out, or give them the "
+    "nearest material.",
+    ChoiceOf("slatprep.particles.transfer:Far"),
+    "background",
+)
 @output_options
 def transfer(
     output: Output,

@@ -8,7 +8,13 @@ from typing import TYPE_CHECKING
 
 import click
 
-from slatprep.cli.options import STORE, chosen_store, store_argument, workers_options
+from slatprep.cli.options import (
+    EXISTING_FOLDER,
+    chosen_store,
+    option,
+    store_argument,
+    workers_options,
+)
 from slatprep.cli.output import EXIT_INCOMPLETE, Output, output_options
 
 if TYPE_CHECKING:
@@ -23,19 +29,18 @@ Example:
 """
 )
 @store_argument
-@click.option(
-    "--manifests", type=STORE, metavar="DIR",
-    help="Folder of the records.  [default: beside the store]",
-)  # fmt: skip
-@click.option("--sources", is_flag=True, help="Compare the source files with the records, too.")
-@click.option(
-    "--pixieverse", type=STORE, metavar="DIR",
-    help="Where the PixieVerse files lie now.  [default: where they lay]",
-)  # fmt: skip
-@click.option(
-    "--slat", type=STORE, metavar="DIR",
-    help="Where the latents lie now, or their one HDF5 file does.  [default: where they lay]",
-)  # fmt: skip
+@option("--manifests", "Folder of the records.  [default: beside the store]", EXISTING_FOLDER)
+@option("--sources", "Compare the source files with the records, too.", is_flag=True)
+@option(
+    "--pixieverse",
+    "Where the PixieVerse files lie now.  [default: where they lay]",
+    EXISTING_FOLDER,
+)
+@option(
+    "--slat",
+    "Where the latents lie now, or their one HDF5 file does.  [default: where they lay]",
+    EXISTING_FOLDER,
+)
 @output_options
 @workers_options
 def verify(
@@ -78,8 +83,8 @@ def verify(
             f"{result.assets:,} assets, {result.files:,} files, {result.sources:,} sources; "
             f"records: {records}"
         )
-        click.echo(f"{path}: {len(result.findings):,} findings" if result.findings else
-                   f"{path}: nothing is wrong")  # fmt: skip
+        found = f"{len(result.findings):,} findings" if result.findings else "nothing is wrong"
+        click.echo(f"{path}: {found}")
 
     output.result({**dataclasses.asdict(result), "ok": result.ok}, show)
     if not result.ok:

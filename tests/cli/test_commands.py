@@ -271,7 +271,7 @@ def test_stopped_build_leaves_the_older_store_and_nothing_else(
     shutil.copytree(demo / "demo.zarr", store)
     before = {path: path.read_bytes() for path in store.rglob("*") if path.is_file()}
     build = subprocess.Popen(
-        [sys.executable, "-m", "slatprep.cli", "build-store", "--config",
+        [sys.executable, "-m", "slatprep", "build-store", "--config",
          demo / "demo" / "dataset.toml", "--out", store, "--jobs", "2", "--fresh"],
         stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True,
     )  # fmt: skip

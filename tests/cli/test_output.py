@@ -5,11 +5,14 @@ from __future__ import annotations
 import io
 import json
 import sys
+from pathlib import Path
 
+import numpy as np
 import pytest
 
 from slatprep.cli import output as module
-from slatprep.cli.output import Output, plain
+from slatprep.cli.output import Output, as_json
+from slatprep.records import PropertyRange, Verdict
 
 
 class Terminal(io.StringIO):
@@ -96,15 +99,23 @@ def test_verbosity(capsys: pytest.CaptureFixture[str]) -> None:
     ]
 
 
-def test_plain_refuses_nothing_that_results_hold(tmp_path: object) -> None:
-    import numpy as np
-
-    assert plain({"a": np.float32(0.5), "b": np.arange(2), 3: {"c": float("inf")}}) == {
+def test_json_holds_all_that_results_do(tmp_path: Path) -> None:
+    document = {
+        "a": np.float32(0.5),
+        "b": np.arange(2),
+        3: {"c": float("inf"), "d": (Verdict.GOOD, True)},
+        "e": PropertyRange("density", True, 1.0, float("nan")),
+        "f": tmp_path,
+    }
+    assert json.loads(as_json(document)) == {
         "a": 0.5,
         "b": [0, 1],
-        "3": {"c": None},
+        "3": {"c": None, "d": ["good", True]},
+        "e": {"name": "density", "log10": True, "lo": 1.0, "hi": None},
+        "f": str(tmp_path),
     }
-    assert plain(tmp_path) == str(tmp_path)
+    with pytest.raises(TypeError, match="object"):
+        as_json({"g": object()})
 
 
 def test_time_left_in_a_log_comes_from_all_assets_done(

@@ -186,7 +186,7 @@ def test_a_build_whose_worker_is_killed_gives_the_same_bytes(
         "grid_assets_per_shard = 2\ncompression_level = 1\n"
     )
     build = subprocess.Popen(
-        [sys.executable, "-m", "slatprep.cli", "build-store", "--config", str(parameters),
+        [sys.executable, "-m", "slatprep", "build-store", "--config", str(parameters),
          "--out", "s.zarr", "--scheduler", address],
         cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
     )  # fmt: skip

@@ -1,4 +1,4 @@
-"""Allow `python -m slatprep.cli`."""
+"""Allow `python -m slatprep`."""
 
 from slatprep.cli import main
 
