@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 from importlib import import_module, metadata
+from importlib.util import find_spec
 from typing import Protocol, cast
 
+from slatprep.errors import SlatprepError
 from slatprep.parameters import AlignParameters
 from slatprep.records import Alignment, MaterialField, StructuredLatents
 
@@ -14,6 +16,9 @@ _ENGINES = {
     "open3d": ("slatprep.align.open3d_icp", ("numpy", "open3d-cpu", "open3d")),
     "small_gicp": ("slatprep.align.gicp", ("numpy", "small_gicp")),
 }
+
+_EXTRAS = {"open3d": "paper", "small_gicp": "bench"}
+"""Engines that are packages of their own, and the extra that installs each."""
 
 
 class Engine(Protocol):
@@ -45,12 +50,51 @@ def align(
     Alignment
         The transform with its quality and every candidate's score.
     """
+    require_engine(parameters)
     module, _ = _ENGINES[parameters.engine]
     return cast(Engine, import_module(module)).align(field, latents, parameters)
 
 
+def require_engine(parameters: AlignParameters) -> None:
+    """Make sure that an engine's package is installed.
+
+    Parameters
+    ----------
+    parameters : AlignParameters
+        Which engine.
+
+    Raises
+    ------
+    SlatprepError
+        If it is not; the message says what to install.
+    """
+    extra = _EXTRAS.get(parameters.engine)
+    if extra is not None and find_spec(parameters.engine) is None:
+        raise SlatprepError(
+            f"the engine {parameters.engine} needs the package of that name, which is not "
+            f"installed: pip install 'slatprep[{extra}]'"
+        )
+
+
 def engine_versions(parameters: AlignParameters) -> dict[str, str]:
-    """Return the versions of the libraries that make an engine's numbers."""
+    """Return the versions of the libraries that make an engine's numbers.
+
+    Parameters
+    ----------
+    parameters : AlignParameters
+        Which engine.
+
+    Returns
+    -------
+    dict of str to str
+        Package and version.
+
+    Raises
+    ------
+    SlatprepError
+        If the engine is not installed.
+    """
+    require_engine(parameters)
     versions = {}
     for package in _ENGINES[parameters.engine][1]:
         try:

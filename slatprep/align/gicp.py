@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 
 from slatprep.align.quality import compare, measure_quality
 from slatprep.align.starts import candidates_of, distinct_starts
-from slatprep.errors import SlatprepError
 from slatprep.geometry.frames import VOXEL_SIZE, make_transform, voxel_centres
 from slatprep.geometry.voxels import boundary, voxels_of
 from slatprep.parameters import AlignParameters
@@ -30,12 +29,7 @@ def align(
     field: MaterialField, latents: StructuredLatents, parameters: AlignParameters
 ) -> Alignment:
     """Align by GICP; see `slatprep.align.align`."""
-    try:
-        import small_gicp
-    except ImportError as error:
-        raise SlatprepError(
-            "the engine small_gicp needs the package of that name: pip install 'slatprep[bench]'"
-        ) from error
+    import small_gicp
 
     surface = voxels_of(boundary(field.occupancy))
     points, goal = (voxel_centres(v) * RESOLUTION for v in (surface, latents.coords))

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import sys
+
 import numpy as np
 import pytest
 from support.shapes import chair, field_of, surface_latents, turned
 
-from slatprep.align import align
+from slatprep.align import align, engine_versions
 from slatprep.align.starts import distinct_starts
+from slatprep.api import align_voxels
+from slatprep.errors import SlatprepError
 from slatprep.geometry.frames import displacement, make_transform, split_transform
 from slatprep.parameters import PRESETS, AlignParameters
 
@@ -41,3 +45,17 @@ def test_the_paper_s_protocol_gives_the_same_bits_again() -> None:
     once, again = (align(field_of(solid), latents, PRESETS["paper"].align) for _ in range(2))
     assert once.transform.tobytes() == again.transform.tobytes()
     assert once.candidates == again.candidates
+
+
+@pytest.mark.parametrize(("engine", "extra"), [("open3d", "paper"), ("small_gicp", "bench")])
+def test_an_engine_that_is_not_installed_names_its_extra(
+    monkeypatch: pytest.MonkeyPatch, engine: str, extra: str
+) -> None:
+    monkeypatch.setitem(sys.modules, engine, None)  # as an import finds a package that is missing
+    parameters = ENGINES[engine]
+    for call in (
+        lambda: engine_versions(parameters),  # what a build asks before its first asset
+        lambda: align_voxels([[1, 2, 3]], [[1, 2, 3]], parameters),
+    ):
+        with pytest.raises(SlatprepError, match=rf"{engine}.*slatprep\[{extra}\]"):
+            call()

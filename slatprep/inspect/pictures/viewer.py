@@ -41,8 +41,12 @@ def show_alignment(scene: Scene, title: str) -> bool:
     bool
         False if no window could be opened.
     """
-    import open3d
+    from slatprep.align import require_engine
+    from slatprep.align.open3d_icp import load_open3d
+    from slatprep.parameters import PRESETS
 
+    require_engine(PRESETS["paper"].align)  # which brings the window, too
+    open3d = load_open3d()
     window = open3d.visualization.Visualizer()
     if not window.create_window(window_name=title, width=1600, height=700):
         return False
