@@ -1,7 +1,7 @@
 # `make` alone lists what there is; every target sets up what it needs.
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help align test lint clean
+.PHONY: help align test lint docs wheel lock clean
 
 PYTHON ?= python3
 VENV   ?= .venv
@@ -11,20 +11,25 @@ DATA   ?= manifests/demo.toml
 ASSETS ?= 25
 SEED   ?= 0
 PRESET ?= default
+LOCKED ?= yes
 
 NAME      := $(notdir $(basename $(DATA)))
 STORE     ?= data/$(NAME).zarr
 MANIFESTS ?= manifests/build/$(NAME)
 DEMO      := data/demo
 BIN       := $(VENV)/bin
+SITE      := build/site
 
 help:
 	@echo "slatprep: aligned, normalised physics supervision for TRELLIS latents"
 	@echo
 	@echo "  make align            make demo data, align it, build the store, say how good it is"
 	@echo "  make align DATA=FILE  the same on your own data (see manifests/mine.example.toml)"
-	@echo "  make test             linter, type checker and tests"
-	@echo "  make lint             linter and type checker alone"
+	@echo "  make test             linters, type checker, documentation, wheel and tests"
+	@echo "  make lint             linters and type checker alone"
+	@echo "  make docs             the documentation as a site, in $(SITE)"
+	@echo "  make wheel            a wheel, in dist, tried from another folder"
+	@echo "  make lock             resolve the versions in requirements/ anew"
 	@echo "  make clean            remove the environment, the demo data and caches; never your stores"
 	@echo
 	@echo "Settings, as in 'make align JOBS=4':"
@@ -32,46 +37,63 @@ help:
 	@echo "  PRESET=$(PRESET)     alignment parameters: default, or paper (the protocol of SLAT-Phys)"
 	@echo "  ASSETS=$(ASSETS) SEED=$(SEED)  size and seed of the demo data"
 	@echo "  PYTHON=$(PYTHON)    Python 3.11 or newer, from which $(VENV) is made"
+	@echo "  LOCKED=$(LOCKED)         no: what pyproject.toml allows instead of requirements/*.txt"
 
 # -- what it is for ---------------------------------------------------------
 
-ifeq ($(DATA),manifests/demo.toml)
-align: $(VENV)/.installed $(DEMO)/.assets-$(ASSETS)-seed-$(SEED)
-else
-align: $(VENV)/.installed
-endif
-	$(BIN)/slatprep build-store --config $(DATA) --out $(STORE) --manifests $(MANIFESTS) \
-	    --jobs $(JOBS) $(if $(filter-out default,$(PRESET)),--preset $(PRESET))
-ifeq ($(DATA),manifests/demo.toml)
-	@$(BIN)/slatprep score $(STORE) $(DEMO)/truth
-endif
-	@$(BIN)/slatprep report $(STORE) --manifests $(MANIFESTS) --out data/$(NAME).html --quiet
-	@echo "results: $(STORE) (the store), $(MANIFESTS) (a record of every asset)"
-	@echo "look:    open data/$(NAME).html in a browser"
-	@echo "next:    $(BIN)/slatprep info $(STORE)"
+INSTALLED := $(VENV)/.installed$(if $(filter paper,$(PRESET)),-paper)
 
-$(DEMO)/.assets-$(ASSETS)-seed-$(SEED): | $(VENV)/.installed
+# A file that could not be used fails `make` in the end, but not before the page is drawn.
+ifeq ($(DATA),manifests/demo.toml)
+align: $(INSTALLED) $(DEMO)/.assets-$(ASSETS)-seed-$(SEED)
+else
+align: $(INSTALLED)
+endif
+	@status=0; \
+	$(BIN)/slatprep build-store --config $(DATA) --out $(STORE) --manifests $(MANIFESTS) \
+	    --jobs $(JOBS) $(if $(filter-out default,$(PRESET)),--preset $(PRESET)) || status=$$?; \
+	[ $$status -le 1 ] && [ -e $(STORE) ] || exit $$status; \
+	$(if $(filter manifests/demo.toml,$(DATA)),$(BIN)/slatprep score $(STORE) $(DEMO)/truth;) \
+	$(BIN)/slatprep report $(STORE) --manifests $(MANIFESTS) --out data/$(NAME).html --quiet; \
+	echo "results: $(STORE) (the store), $(MANIFESTS) (a record of every asset)"; \
+	echo "look:    open data/$(NAME).html in a browser"; \
+	echo "next:    . $(BIN)/activate && slatprep info $(STORE)"; \
+	exit $$status
+
+$(DEMO)/.assets-$(ASSETS)-seed-$(SEED): | $(INSTALLED)
 	rm -rf $(DEMO)
 	$(BIN)/slatprep make-demo $(DEMO) --assets $(ASSETS) --seed $(SEED) --quiet
 	@touch $@
 
 # -- development ------------------------------------------------------------
 
-LINT = $(BIN)/ruff check . && $(BIN)/ruff format --check . && $(BIN)/mypy
+lint: $(VENV)/.installed-dev
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/lint-imports
+	$(BIN)/deptry slatprep
+	$(BIN)/mypy
 
-# The tests run whatever the linters say, and their closing line comes last.
+# Whatever one of them finds, the others run, and the tests' closing line comes last.
 test: $(VENV)/.installed-dev
 	@status=0; \
-	$(LINT) || status=1; \
+	for check in lint docs wheel; do $(MAKE) --no-print-directory $$check || status=1; done; \
 	$(BIN)/python -m pytest -n $(JOBS) || status=1; \
 	exit $$status
 
-lint: $(VENV)/.installed-dev
-	$(LINT)
+docs: $(VENV)/.installed-dev
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet --site-dir $(SITE)
+	@echo "documentation: $(SITE)/index.html"
+
+wheel: $(VENV)/.installed-dev
+	sh tools/try-wheel.sh $(BIN)/python dist
+
+lock: $(VENV)/.installed-dev
+	sh tools/lock.sh $(VENV)
 
 clean:
-	rm -rf $(VENV) $(DEMO) data/demo.zarr build slatprep.egg-info
-	rm -rf .pytest_cache .hypothesis .ruff_cache .mypy_cache
+	rm -rf $(VENV) $(DEMO) data/demo.zarr build dist slatprep.egg-info
+	rm -rf .pytest_cache .hypothesis .ruff_cache .mypy_cache .import_linter_cache
 
 # -- environment ------------------------------------------------------------
 
@@ -79,14 +101,15 @@ $(VENV)/.made:
 	@sh tools/make-venv.sh $(PYTHON) $(VENV)
 	@touch $@
 
-$(VENV)/.installed: pyproject.toml | $(VENV)/.made
-	$(BIN)/python -m pip install --disable-pip-version-check --quiet --editable .
+$(VENV)/.installed: pyproject.toml requirements/run.txt tools/install.sh | $(VENV)/.made
+	@LOCKED=$(LOCKED) sh tools/install.sh $(VENV) run
 	@touch $@
 
-# The tests of training run with this one; first, so that nothing pulls in another.
-TORCH := torch==2.13.0
-
-$(VENV)/.installed-dev: pyproject.toml | $(VENV)/.made
-	$(BIN)/python -m pip install --disable-pip-version-check --quiet $(TORCH)
-	$(BIN)/python -m pip install --disable-pip-version-check --quiet --editable '.[dev]'
+# Open3D is as large as all else, so only the preset that needs it brings it.
+$(VENV)/.installed-paper: pyproject.toml requirements/test.txt tools/install.sh | $(VENV)/.made
+	@LOCKED=$(LOCKED) sh tools/install.sh $(VENV) paper
 	@touch $@ $(VENV)/.installed
+
+$(VENV)/.installed-dev: pyproject.toml $(wildcard requirements/*.txt) tools/install.sh | $(VENV)/.made
+	@LOCKED=$(LOCKED) sh tools/install.sh $(VENV) test
+	@touch $@ $(VENV)/.installed $(VENV)/.installed-paper
