@@ -8,7 +8,6 @@ complete.
 from __future__ import annotations
 
 import functools
-import itertools
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
@@ -17,16 +16,10 @@ from typing import Any, Literal, get_args
 
 from slatprep.errors import ConfigError
 from slatprep.export import target
-from slatprep.export.assets import (
-    ExportedAsset,
-    describe_columns,
-    file_name,
-    read_assets,
-    select_assets,
-)
+from slatprep.export.assets import Exported, choose_ids, describe_columns
 from slatprep.export.bounds import Bounds, read_bounds
 from slatprep.export.ply import Frame, Points
-from slatprep.store import Store, open_store
+from slatprep.store import Store, StoredAsset, open_store
 from slatprep.workers.local import run_unordered
 
 __all__ = ["FORMATS", "ExportOptions", "ExportSummary", "export_store"]
@@ -39,7 +32,10 @@ Progress = Callable[[int, int], None]
 """Called with the assets done and the assets in all."""
 
 _BATCH = 16
-"""Assets a worker takes at a time, so that opening the store is not felt."""
+"""Assets a worker takes at a time, so that opening the store does not count."""
+
+_Write = Callable[[Path, int, Iterable[StoredAsset]], Iterable[Exported]]
+"""Writes the assets of a batch, which has a number, below a directory."""
 
 _Entry = dict[str, Any]
 """An asset in the index of an export: its id, its file, its number of points."""
@@ -134,15 +130,30 @@ def export_store(
     opened = open_store(store)
     if store.resolve() in out.resolve().parents:
         raise ConfigError(f"{out} lies inside the store; expected a path outside {store}")
-    ids = select_assets(opened, assets, verdicts)
-    job = _Job(opened, ids, options, jobs, progress)
+    ids = choose_ids(opened, assets, verdicts)
+    tell = progress or (lambda done, total: None)
+    entries: list[_Entry] = []
     notes: tuple[str, ...] = ()
     if format == "hdf5":
-        entries = _export_hdf5(job, out)
+        from slatprep.export import hdf5
+
+        with target.file(out, hdf5.is_export) as file:
+            about = _about(opened, format)
+            for written in hdf5.write(file, about, map(opened.asset, ids)):
+                entries.append(_entry(written))
+                tell(len(entries), len(ids))
     else:
         with target.directory(out) as directory:
-            entries, notes = _WRITERS[format](job, directory)
-            about = {**describe_store(opened, format), "notes": list(notes)}
+            write, batch, notes = _writer(format, opened, ids, options)
+            tasks = (
+                (write, opened, directory, number, batched)
+                for number, batched in enumerate(_batches(ids, batch))
+            )
+            for part in run_unordered(_write_batch, tasks, jobs):
+                entries += part
+                tell(len(entries), len(ids))
+            entries.sort(key=lambda entry: str(entry["asset_id"]))
+            about = {**_about(opened, format), "notes": notes}
             target.write_index(directory, about, entries)
     files = [out] if out.is_file() else [path for path in out.rglob("*") if path.is_file()]
     return ExportSummary(
@@ -157,7 +168,42 @@ def export_store(
     )
 
 
-def describe_store(store: Store, format: str) -> dict[str, Any]:
+def _writer(
+    format: Format, store: Store, ids: Sequence[str], options: ExportOptions
+) -> tuple[_Write, int, tuple[str, ...]]:
+    """Return what writes a batch, how many assets a batch has, and what a person should know."""
+    from slatprep.export import npz, ply, webdataset
+
+    if format == "npz":
+        return npz.write, _BATCH, ()
+    if format == "webdataset":
+        return webdataset.write, options.shard_size, ()
+    bounds: dict[str, Bounds] = {}
+    notes: tuple[str, ...] = ()
+    if options.frame == "pixieverse":
+        bounds, notes = read_bounds(store, ids)
+    write = functools.partial(
+        ply.write,
+        points=options.points,
+        frame=options.frame,
+        bounds=bounds,
+        max_distance=float(store.attributes["build"]["parameters"]["sample"]["max_distance"]),
+    )
+    return write, _BATCH, notes
+
+
+def _write_batch(
+    write: _Write, store: Store, directory: Path, number: int, ids: Sequence[str]
+) -> list[_Entry]:
+    """Write a batch of assets, in a worker."""
+    return [_entry(written) for written in write(directory, number, map(store.asset, ids))]
+
+
+def _entry(written: Exported) -> _Entry:
+    return {**describe_columns(written.asset), "file": written.file, "points": written.points}
+
+
+def _about(store: Store, format: Format) -> dict[str, Any]:
     """Return what every export says of the store it was made from, JSON-ready."""
     attributes = store.attributes
     return {
@@ -174,128 +220,5 @@ def describe_store(store: Store, format: str) -> dict[str, Any]:
     }
 
 
-@dataclass(frozen=True)
-class _Job:
-    """The assets to write, and how."""
-
-    store: Store
-    ids: list[str]
-    options: ExportOptions
-    jobs: int
-    progress: Progress | None
-
-    def run(
-        self, function: Callable[..., list[_Entry]], tasks: Iterable[tuple[Any, ...]]
-    ) -> list[_Entry]:
-        """Run tasks, each of which returns its assets' entries; return all, sorted by id."""
-        entries: list[_Entry] = []
-        for part in run_unordered(function, tasks, self.jobs):
-            entries += part
-            if self.progress:
-                self.progress(len(entries), len(self.ids))
-        return sorted(entries, key=lambda entry: str(entry["asset_id"]))
-
-
-def _export_files(job: _Job, write: Callable[..., int], directory: Path, suffix: str,
-                  grid: bool = False) -> list[_Entry]:  # fmt: skip
-    tasks = (
-        (job.store.path, batch, directory, suffix, write, grid)
-        for batch in _batches(job.ids, _BATCH)
-    )
-    return job.run(_write_files, tasks)
-
-
-def _write_files(
-    store: Path,
-    ids: Sequence[str],
-    directory: Path,
-    suffix: str,
-    write: Callable[[Path, ExportedAsset], int],
-    grid: bool,
-) -> list[_Entry]:
-    """Write one file an asset, in a worker."""
-    entries = []
-    for asset in read_assets(open_store(store), ids, grid=grid):
-        name = file_name(asset.asset_id) + suffix
-        points = write(directory / name, asset)
-        entries.append(_entry(asset, name, points))
-    return entries
-
-
-def _export_ply(job: _Job, directory: Path) -> tuple[list[_Entry], tuple[str, ...]]:
-    from slatprep.export import ply
-
-    options = job.options
-    bounds: dict[str, Bounds] = {}
-    notes: tuple[str, ...] = ()
-    if options.frame == "pixieverse":
-        bounds, notes = read_bounds(job.store, job.ids)
-    write = functools.partial(
-        ply.write_asset,
-        points=options.points,
-        frame=options.frame,
-        bounds=bounds,
-        max_distance=_max_distance(job.store),
-    )
-    return _export_files(job, write, directory, ".ply", options.points == "grid"), notes
-
-
-def _export_npz(job: _Job, directory: Path) -> tuple[list[_Entry], tuple[str, ...]]:
-    from slatprep.export import npz
-
-    return _export_files(job, npz.write_asset, directory, ".npz"), ()
-
-
-def _export_webdataset(job: _Job, directory: Path) -> tuple[list[_Entry], tuple[str, ...]]:
-    tasks = (
-        (job.store.path, batch, directory, f"shard-{number:06d}.tar")
-        for number, batch in enumerate(_batches(job.ids, job.options.shard_size))
-    )
-    return job.run(_write_shard, tasks), ()
-
-
-def _write_shard(store: Path, ids: Sequence[str], directory: Path, name: str) -> list[_Entry]:
-    """Write one shard, in a worker."""
-    from slatprep.export import webdataset
-
-    entries = []
-    with webdataset.ShardWriter(directory / name) as shard:
-        for asset in read_assets(open_store(store), ids):
-            shard.add(asset)
-            entries.append(_entry(asset, name, len(asset.coords)))
-    return entries
-
-
-def _export_hdf5(job: _Job, out: Path) -> list[_Entry]:
-    from slatprep.export import hdf5
-
-    entries = []
-    with target.file(out, hdf5.is_export) as path, hdf5.Writer(path) as writer:
-        writer.describe(describe_store(job.store, "hdf5"))
-        for asset in read_assets(job.store, job.ids):
-            writer.add(asset)
-            entries.append(_entry(asset, out.name, len(asset.coords)))
-            if job.progress:
-                job.progress(len(entries), len(job.ids))
-    return entries
-
-
-_WRITERS: dict[str, Callable[[_Job, Path], tuple[list[_Entry], tuple[str, ...]]]] = {
-    "ply": _export_ply,
-    "npz": _export_npz,
-    "webdataset": _export_webdataset,
-}
-
-
-def _entry(asset: ExportedAsset, name: str, points: int) -> _Entry:
-    return {**describe_columns(asset), "file": name, "points": points}
-
-
-def _max_distance(store: Store) -> float:
-    return float(store.attributes["build"]["parameters"]["sample"]["max_distance"])
-
-
-def _batches(ids: Sequence[str], size: int) -> Iterator[list[str]]:
-    iterator = iter(ids)
-    while batch := list(itertools.islice(iterator, size)):
-        yield batch
+def _batches(ids: Sequence[str], size: int) -> Iterator[Sequence[str]]:
+    return (ids[start : start + size] for start in range(0, len(ids), size))

@@ -1,22 +1,18 @@
-"""Choose assets of a store, and read what exports need of each."""
+"""Choose assets of a store, and what all exports say of each."""
 
 from __future__ import annotations
 
 import hashlib
 from collections import Counter
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
-from typing import Any
+from collections.abc import Sequence
+from typing import Any, NamedTuple
 from urllib.parse import quote
 
 import numpy as np
-from numpy.typing import NDArray
 
 from slatprep.errors import ConfigError, StoreError
-from slatprep.geometry.voxels import voxels_of
-from slatprep.normalize import denormalize
-from slatprep.records import BACKGROUND, Verdict
-from slatprep.store import Store
+from slatprep.records import Verdict
+from slatprep.store import Store, StoredAsset
 
 COLUMNS = (
     "object_id",
@@ -31,50 +27,21 @@ COLUMNS = (
 )
 """The columns of ``asset/*`` that travel with an exported asset."""
 
-_ARRAYS = ("coords", "feats", "properties", "material", "valid", "distance")
+TARGETS = ("properties", "material", "valid")
+"""What a decoder is trained on, beside coordinates and latents."""
+
 _LONGEST_NAME = 180
 
 
-@dataclass(frozen=True)
-class ExportedAsset:
-    """An asset with all that an export may write of it.
+class Exported(NamedTuple):
+    """What was written of an asset: the name of its file, and its number of points."""
 
-    Attributes
-    ----------
-    asset_id : str
-        Id of the row.
-    coords, feats : ndarray
-        The SLAT: (N, 3) uint8 and (N, 8) float32.
-    properties, properties_si : ndarray of float32, shape (N, 3)
-        Young's modulus, density, Poisson's ratio: in [-1, 1], and in Pa,
-        kg/m^3 and 1. NaN where not valid.
-    material, valid, distance : ndarray
-        (N,) uint8, bool, float32 as the store holds them.
-    transform : ndarray of float64, shape (4, 4)
-        PixieVerse frame to SLAT frame.
-    columns : dict
-        `COLUMNS` of the asset.
-    grid_voxels, grid_material, grid_properties_si : ndarray or None
-        The annotated voxels of the PixieVerse field, where they were asked
-        for: (K, 3) uint8, (K,) uint8, (K, 3) float32 in SI units.
-    """
-
-    asset_id: str
-    coords: NDArray[np.uint8]
-    feats: NDArray[np.float32]
-    properties: NDArray[np.float32]
-    properties_si: NDArray[np.float32]
-    material: NDArray[np.uint8]
-    valid: NDArray[np.bool_]
-    distance: NDArray[np.float32]
-    transform: NDArray[np.float64]
-    columns: dict[str, Any]
-    grid_voxels: NDArray[np.uint8] | None = None
-    grid_material: NDArray[np.uint8] | None = None
-    grid_properties_si: NDArray[np.float32] | None = None
+    asset: StoredAsset
+    file: str
+    points: int
 
 
-def select_assets(store: Store, assets: Sequence[str], verdicts: Sequence[str]) -> list[str]:
+def choose_ids(store: Store, assets: Sequence[str], verdicts: Sequence[str]) -> list[str]:
     """Return the ids that were asked for, sorted.
 
     Parameters
@@ -97,7 +64,7 @@ def select_assets(store: Store, assets: Sequence[str], verdicts: Sequence[str]) 
     try:
         rows = sorted({store.find(asset_id) for asset_id in assets}) or range(len(store))
     except StoreError as error:
-        # A name that is not there is a wrong call; nothing is wrong with the store.
+        # An unknown name is the caller's mistake; nothing is wrong with the store.
         raise ConfigError(str(error)) from None
     verdict = store.column("verdict")
     chosen = [store.ids[row] for row in rows if not verdicts or verdict[row] in verdicts]
@@ -111,38 +78,10 @@ def select_assets(store: Store, assets: Sequence[str], verdicts: Sequence[str]) 
     return chosen
 
 
-def read_assets(store: Store, ids: Sequence[str], *, grid: bool = False) -> Iterator[ExportedAsset]:
-    """Read assets one after the other, their PixieVerse fields only if `grid`."""
-    transforms = store.column("transform")
-    table = {name: store.column(name).tolist() for name in COLUMNS}
-    normalization = store.normalization
-    for asset_id in ids:
-        row = store.find(asset_id)
-        arrays = store.read(row, _ARRAYS)
-        yield ExportedAsset(
-            asset_id=asset_id,
-            properties_si=denormalize(arrays["properties"], normalization),
-            transform=transforms[row],
-            columns={name: values[row] for name, values in table.items()},
-            **arrays,
-            **(_read_grid(store, asset_id) if grid else {}),
-        )
-
-
-def _read_grid(store: Store, asset_id: str) -> dict[str, NDArray[Any]]:
-    asset = store.asset(asset_id)
-    material, properties = asset.grid_material, asset.grid_properties
-    annotated = material < BACKGROUND
-    return {
-        "grid_voxels": voxels_of(annotated),
-        "grid_material": material[annotated],
-        "grid_properties_si": denormalize(properties[:, annotated].T, store.normalization),
-    }
-
-
-def describe_columns(asset: ExportedAsset) -> dict[str, Any]:
-    """Return an asset's id and columns as a JSON object."""
-    return {"asset_id": asset.asset_id, **asset.columns}
+def describe_columns(asset: StoredAsset) -> dict[str, Any]:
+    """Return an asset's id and its `COLUMNS`, as Python's own numbers and words."""
+    columns = {name: np.asarray(asset.columns[name]).tolist() for name in COLUMNS}
+    return {"asset_id": asset.asset_id, **columns}
 
 
 def file_name(asset_id: str, *, dots: bool = True) -> str:

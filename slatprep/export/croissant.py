@@ -14,49 +14,31 @@ from collections.abc import Mapping
 from typing import Any
 
 from slatprep.errors import StoreError
-from slatprep.provenance.jsonable import jsonable
 from slatprep.store import Store
 
 CONFORMS_TO = "http://mlcommons.org/croissant/1.0"
 
-# The context that the specification prescribes, word for word.
+_TERMS = (
+    "citeAs column equivalentProperty extract field fileProperty fileObject fileSet format "
+    "includes isLiveDataset jsonPath key md5 parentField path recordSet references regex "
+    "repeated replace samplingRate separator source subField transform"
+)
+"""Croissant's terms that need no more than their name."""
+
+# The context that the specification prescribes. The package mlcroissant writes it
+# too, but is needed for nothing else here and brings pandas.
 _CONTEXT: dict[str, Any] = {
     "@language": "en",
     "@vocab": "https://schema.org/",
-    "citeAs": "cr:citeAs",
-    "column": "cr:column",
-    "conformsTo": "dct:conformsTo",
     "cr": "http://mlcommons.org/croissant/",
+    "dct": "http://purl.org/dc/terms/",
     "rai": "http://mlcommons.org/croissant/RAI/",
+    "sc": "https://schema.org/",
+    "conformsTo": "dct:conformsTo",
     "data": {"@id": "cr:data", "@type": "@json"},
     "dataType": {"@id": "cr:dataType", "@type": "@vocab"},
-    "dct": "http://purl.org/dc/terms/",
-    "equivalentProperty": "cr:equivalentProperty",
     "examples": {"@id": "cr:examples", "@type": "@json"},
-    "extract": "cr:extract",
-    "field": "cr:field",
-    "fileProperty": "cr:fileProperty",
-    "fileObject": "cr:fileObject",
-    "fileSet": "cr:fileSet",
-    "format": "cr:format",
-    "includes": "cr:includes",
-    "isLiveDataset": "cr:isLiveDataset",
-    "jsonPath": "cr:jsonPath",
-    "key": "cr:key",
-    "md5": "cr:md5",
-    "parentField": "cr:parentField",
-    "path": "cr:path",
-    "recordSet": "cr:recordSet",
-    "references": "cr:references",
-    "regex": "cr:regex",
-    "repeated": "cr:repeated",
-    "replace": "cr:replace",
-    "samplingRate": "cr:samplingRate",
-    "sc": "https://schema.org/",
-    "separator": "cr:separator",
-    "source": "cr:source",
-    "subField": "cr:subField",
-    "transform": "cr:transform",
+    **{term: f"cr:{term}" for term in _TERMS.split()},
 }
 
 ZARR = "https://zarr-specs.readthedocs.io/en/latest/v3/core/index.html"
@@ -251,7 +233,11 @@ _ASSET_FIELDS = {
 
 
 def _assets(store: Store) -> dict[str, Any]:
-    columns = {name: jsonable(store.column(name)) for name in _ASSET_FIELDS}
+    columns = {
+        # NaN, which is not equal to itself, has no word in JSON.
+        name: [value if value == value else None for value in store.column(name).tolist()]
+        for name in _ASSET_FIELDS
+    }
     group: Any = store.group["asset"]
     fields = [
         _field("assets", name, kind, group[name].attrs["description"])

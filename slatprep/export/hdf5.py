@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Iterable, Iterator
 from pathlib import Path
-from types import TracebackType
-from typing import Any, Self
+from typing import Any
 
-from slatprep.export.assets import ExportedAsset, describe_columns, file_name
+from slatprep.export.assets import Exported, describe_columns, file_name
 from slatprep.export.target import FORMAT
 from slatprep.records import PROPERTY_COLUMNS
+from slatprep.store import StoredAsset
 
 _DATASETS: dict[str, dict[str, Any]] = {
     "coords": {"description": "SLAT coordinate, x, y, z", "units": "voxel"},
@@ -32,45 +33,36 @@ _DATASETS: dict[str, dict[str, Any]] = {
 }
 
 
-class Writer:
-    """An HDF5 export that is being written; a context manager.
+def write(path: Path, about: dict[str, Any], assets: Iterable[StoredAsset]) -> Iterator[Exported]:
+    """Write a file with a group an asset, whose columns are the group's attributes.
 
     Parameters
     ----------
     path : Path
         The file.
+    about : dict
+        Attributes of the root; what is nested becomes JSON.
+    assets : iterable of StoredAsset
+        The assets.
+
+    Yields
+    ------
+    Exported
+        What was written of each.
     """
+    import h5py
 
-    def __init__(self, path: Path) -> None:
-        import h5py
-
-        self._file = h5py.File(path, "w")
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        self._file.close()
-
-    def describe(self, about: dict[str, Any]) -> None:
-        """Write the attributes of the root; what is nested becomes JSON."""
+    with h5py.File(path, "w") as file:
         for name, value in about.items():
-            self._file.attrs[name] = json.dumps(value) if isinstance(value, dict) else value
-
-    def add(self, asset: ExportedAsset) -> None:
-        """Write an asset as a group of datasets, with its columns as attributes."""
-        group = self._file.create_group(file_name(asset.asset_id))
-        group.attrs.update(describe_columns(asset))
-        for name, attributes in _DATASETS.items():
-            array = getattr(asset, name)
-            packing = {} if name == "transform" else {"compression": "gzip", "shuffle": True}
-            dataset = group.create_dataset(name, data=array, **packing)
-            dataset.attrs.update(attributes)
+            file.attrs[name] = json.dumps(value) if isinstance(value, dict) else value
+        for asset in assets:
+            group = file.create_group(file_name(asset.asset_id))
+            group.attrs.update(describe_columns(asset))
+            for name, attributes in _DATASETS.items():
+                packing = {} if name == "transform" else {"compression": "gzip", "shuffle": True}
+                dataset = group.create_dataset(name, data=getattr(asset, name), **packing)
+                dataset.attrs.update(attributes)
+            yield Exported(asset, path.name, len(asset.coords))
 
 
 def is_export(path: Path) -> bool:

@@ -2,26 +2,34 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 import numpy as np
 
-from slatprep.export.assets import ExportedAsset
+from slatprep.export.assets import TARGETS, Exported, file_name
+from slatprep.store import StoredAsset
 
 
-def write_asset(path: Path, asset: ExportedAsset) -> int:
-    """Write an asset; return its number of voxels.
+def write(directory: Path, number: int, assets: Iterable[StoredAsset]) -> Iterator[Exported]:
+    """Write one npz an asset: TRELLIS's ``coords`` and ``feats``, and the `TARGETS`.
 
-    ``coords`` (N, 3) uint8 and ``feats`` (N, 8) float32 are TRELLIS's own;
-    ``properties`` (N, 3) float32 in [-1, 1] with NaN where not valid,
-    ``material`` (N,) uint8 and ``valid`` (N,) bool are the targets.
+    Parameters
+    ----------
+    directory : Path
+        Where to.
+    number : int
+        Of the batch; unused, as each asset has its own file.
+    assets : iterable of StoredAsset
+        The assets of the batch.
+
+    Yields
+    ------
+    Exported
+        What was written of each.
     """
-    np.savez_compressed(
-        path,
-        coords=asset.coords,
-        feats=asset.feats,
-        properties=asset.properties,
-        material=asset.material,
-        valid=asset.valid,
-    )
-    return len(asset.coords)
+    for asset in assets:
+        name = f"{file_name(asset.asset_id)}.npz"
+        arrays = {key: getattr(asset, key) for key in ("coords", "feats", *TARGETS)}
+        np.savez_compressed(directory / name, **arrays)
+        yield Exported(asset, name, len(asset.coords))

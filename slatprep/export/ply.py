@@ -6,18 +6,19 @@ which its fork of PhysGaussian's solver loads (``load_point_cloud``).
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from slatprep.export.assets import ExportedAsset
-from slatprep.export.bounds import LAST, UNIT_CUBE, Bounds
+from slatprep.export.assets import Exported, file_name
+from slatprep.export.bounds import LAST, Bounds
 from slatprep.geometry.frames import apply_transform, invert_transform, voxel_centres
 from slatprep.inspect.pictures.palette import MATERIAL_COLOURS
 from slatprep.records import RESOLUTION
+from slatprep.store import StoredAsset
 
 Points = Literal["slat", "grid"]
 Frame = Literal["slat", "pixieverse"]
@@ -43,23 +44,26 @@ _COMMENTS = {
 }
 
 
-def write_asset(
-    path: Path,
-    asset: ExportedAsset,
+def write(
+    directory: Path,
+    number: int,
+    assets: Iterable[StoredAsset],
     *,
     points: Points,
     frame: Frame,
     bounds: Mapping[str, Bounds],
     max_distance: float,
-) -> int:
-    """Write an asset's annotated points; return how many there are.
+) -> Iterator[Exported]:
+    """Write one PLY an asset, of its annotated points.
 
     Parameters
     ----------
-    path : Path
-        The file.
-    asset : ExportedAsset
-        The asset; with its grid where `points` is ``grid``.
+    directory : Path
+        Where to.
+    number : int
+        Of the batch; unused, as each asset has its own file.
+    assets : iterable of StoredAsset
+        The assets of the batch.
     points : {"slat", "grid"}
         Which points.
     frame : {"slat", "pixieverse"}
@@ -69,31 +73,36 @@ def write_asset(
     max_distance : float
         Voxels to an annotation at which ``conf`` is 0.
 
+    Yields
+    ------
+    Exported
+        What was written of each.
+
     Notes
     -----
     ``conf`` falls from 1 to 0 with the distance to the annotation used; a
     point of the grid is its own annotation and has 1. ``part_label`` is the
     class, as it is in what Pixie itself predicts.
     """
-    if points == "grid":
-        material, values = asset.grid_material, asset.grid_properties_si
-        if asset.grid_voxels is None or material is None or values is None:
-            raise ValueError(f"{asset.asset_id}: points of the grid need the grid")
-        in_pixieverse = voxel_centres(asset.grid_voxels)
-        conf = np.ones(len(material), dtype=np.float32)
-        in_slat = apply_transform(asset.transform, in_pixieverse)
-    else:
-        valid = asset.valid
-        material, values = asset.material[valid], asset.properties_si[valid]
-        in_slat = voxel_centres(asset.coords[valid])
-        conf = np.clip(1.0 - asset.distance[valid] / max_distance, 0.0, 1.0)
-        in_pixieverse = apply_transform(invert_transform(asset.transform), in_slat)
-    if frame == "pixieverse":
-        positions = to_world(in_pixieverse, bounds.get(asset.asset_id, UNIT_CUBE))
-    else:
+    for asset in assets:
+        if points == "grid":
+            field = asset.field
+            material, values = field.material, field.properties
+            in_pixieverse = voxel_centres(field.voxels)
+            conf = np.ones(len(material))
+            in_slat = apply_transform(asset.transform, in_pixieverse)
+        else:
+            valid = asset.valid
+            material, values = asset.material[valid], asset.properties_si[valid]
+            in_slat = voxel_centres(asset.coords[valid])
+            conf = np.clip(1.0 - asset.distance[valid] / max_distance, 0.0, 1.0)
+            in_pixieverse = apply_transform(invert_transform(asset.transform), in_slat)
         positions = in_slat
-    write_points(path, positions, material, values, conf, _COMMENTS[frame])
-    return len(material)
+        if frame == "pixieverse":
+            positions = to_world(in_pixieverse, bounds[asset.asset_id])
+        name = f"{file_name(asset.asset_id)}.ply"
+        write_points(directory / name, positions, material, values, conf, _COMMENTS[frame])
+        yield Exported(asset, name, len(material))
 
 
 def write_points(

@@ -10,8 +10,9 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+import orjson
+
 from slatprep.errors import ConfigError, SlatprepError
-from slatprep.provenance.jsonable import jsonable
 from slatprep.storage.atomic import replace_directory, staged
 
 FORMAT = "slatprep-export"
@@ -34,10 +35,7 @@ def directory(out: Path) -> Iterator[Path]:
     # What a link points at is replaced, not the link.
     out = out.resolve()
     if out.exists() and not _may_be_replaced(out):
-        raise ConfigError(
-            f"{out} exists and is not an export of slatprep; expected an export to replace, "
-            "or a new path"
-        )
+        raise _not_an_export(out)
     with _writable(out):
         out.parent.mkdir(parents=True, exist_ok=True)
         work = Path(tempfile.mkdtemp(prefix=f".{out.name}.", dir=out.parent))
@@ -64,22 +62,16 @@ def file(out: Path, is_export: Callable[[Path], bool]) -> Iterator[Path]:
     """
     out = out.resolve()
     if out.exists() and not (out.is_file() and is_export(out)):
-        raise ConfigError(
-            f"{out} exists and is not an export of slatprep; expected an export to replace, "
-            "or a new path"
-        )
+        raise _not_an_export(out)
     with _writable(out), staged(out) as path:
         yield path
 
 
 def write_index(path: Path, about: dict[str, Any], entries: Sequence[dict[str, Any]]) -> None:
     """Write what an exported directory holds, one asset a line."""
-    head = json.dumps(jsonable(about), indent=1, ensure_ascii=False)
-    rows = ",\n  ".join(
-        json.dumps(jsonable(entry), allow_nan=False, ensure_ascii=False) for entry in entries
-    )
-    text = f'{head[:-2]},\n "assets": [\n  {rows}\n ]\n}}\n'
-    (path / INDEX).write_text(text, encoding="utf-8")
+    head = orjson.dumps(about, option=orjson.OPT_INDENT_2).removesuffix(b"\n}")
+    rows = b",\n    ".join(map(orjson.dumps, entries))
+    (path / INDEX).write_bytes(head + b',\n  "assets": [\n    ' + rows + b"\n  ]\n}\n")
 
 
 def _may_be_replaced(out: Path) -> bool:
@@ -92,6 +84,13 @@ def _may_be_replaced(out: Path) -> bool:
     except (OSError, ValueError):
         return False
     return isinstance(index, dict) and index.get("format") == FORMAT
+
+
+def _not_an_export(out: Path) -> ConfigError:
+    return ConfigError(
+        f"{out} exists and is not an export of slatprep; expected an export to replace, "
+        "or a new path"
+    )
 
 
 @contextmanager

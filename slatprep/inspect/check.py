@@ -12,18 +12,11 @@ from numpy.typing import NDArray
 from slatprep.align.quality import measure_quality
 from slatprep.errors import StoreError
 from slatprep.judge import THRESHOLDS, judge
-from slatprep.normalize import denormalize, normalize
+from slatprep.normalize import normalize
 from slatprep.parameters import SampleParameters
-from slatprep.records import (
-    BACKGROUND,
-    Ambiguity,
-    MaterialField,
-    Normalization,
-    StructuredLatents,
-    Verdict,
-)
+from slatprep.records import Ambiguity, StructuredLatents, Verdict
 from slatprep.sample import sample
-from slatprep.store.reader import Store, StoredAsset
+from slatprep.store.reader import Store
 
 QUALITY_TOLERANCE = 1e-3
 """Quality computed anew differs less than this; one voxel at the radius may round either way."""
@@ -161,7 +154,7 @@ def check_alignment(store: Store, asset_id: str) -> AlignmentCheck:
     """
     asset = store.asset(asset_id)
     parameters = _parameters(store)
-    field = stored_field(asset, store.normalization)
+    field = asset.field
     latents = StructuredLatents(asset.coords, asset.feats)
     radius = float(parameters["align"]["radius"])
     quality = measure_quality(field, latents, asset.transform, radius)
@@ -248,24 +241,6 @@ def choose_assets(
         order = np.argsort(-share, kind="stable")
         rows += order[share[order] > THRESHOLDS.good_ambiguity].tolist()
     return [store.ids[row] for row in dict.fromkeys(rows)]
-
-
-def stored_field(asset: StoredAsset, normalization: Normalization) -> MaterialField:
-    """Return the PixieVerse field that a store holds, in SI units again."""
-    material = asset.grid_material.reshape(-1)
-    cells = np.flatnonzero(material < BACKGROUND)
-    values = asset.grid_properties.reshape(3, -1)[:, cells]
-    return MaterialField(
-        occupancy=asset.grid_material != BACKGROUND,
-        voxels=np.stack(
-            np.unravel_index(cells, asset.grid_material.shape),
-            axis=1,
-            dtype=np.uint8,
-            casting="unsafe",
-        ),
-        material=material[cells],
-        properties=denormalize(values.T, normalization),
-    )
 
 
 def _parameters(store: Store) -> dict[str, Any]:

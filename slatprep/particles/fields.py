@@ -11,7 +11,6 @@ from numpy.typing import ArrayLike, NDArray
 
 from slatprep.errors import ConfigError, InputError
 from slatprep.geometry.frames import apply_transform, invert_transform
-from slatprep.geometry.voxels import voxels_of
 from slatprep.normalize import denormalize
 from slatprep.readers.files import ArraySpec, load_source, npz_arrays, npz_small_arrays
 from slatprep.readers.slat import check_coords
@@ -79,18 +78,17 @@ def stored_field(store: Store, asset_id: str, points: Points = "slat") -> VoxelF
     """
     asset = store.asset(asset_id)
     if points == "grid":
-        annotated = asset.grid_material < BACKGROUND
-        voxels, material = voxels_of(annotated), asset.grid_material[annotated]
-        values, transform = asset.grid_properties[:, annotated].T, asset.transform
+        grid = asset.field
+        field = VoxelField(grid.voxels, grid.material, grid.properties, asset.transform)
     else:
-        voxels, material = asset.coords[asset.valid], asset.material[asset.valid]
-        values, transform = asset.properties[asset.valid], None
-    if len(voxels) == 0:
+        valid = asset.valid
+        field = VoxelField(asset.coords[valid], asset.material[valid], asset.properties_si[valid])
+    if len(field.voxels) == 0:
         raise ConfigError(
             f"{store.path}: no voxel of {asset_id} has a material; expected an asset whose "
             "valid_share is above 0"
         )
-    return VoxelField(voxels, material, denormalize(values, store.normalization), transform)
+    return field
 
 
 def predicted_field(path: Path, normalization: Normalization | None) -> VoxelField:

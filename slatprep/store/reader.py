@@ -13,7 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slatprep.errors import StoreError
-from slatprep.records import Normalization, PropertyRange
+from slatprep.geometry.voxels import voxels_of
+from slatprep.normalize import denormalize
+from slatprep.records import BACKGROUND, MaterialField, Normalization, PropertyRange
 from slatprep.storage.copies import local_copy
 from slatprep.storage.remote import RemotePath, as_path
 from slatprep.storage.versions import current_version, is_version
@@ -32,13 +34,28 @@ if TYPE_CHECKING:
 TRAINING_COLUMNS = ("coords", "feats", "properties")
 """What `Store.read` reads unless told otherwise."""
 
+_BY_GROUP = [layout.name.split("/") for layout in ARRAYS]
+_VOXEL_COLUMNS = [name for group, name in _BY_GROUP if group == "voxel"]
+_ASSET_COLUMNS = [
+    name
+    for group, name in _BY_GROUP
+    if group == "asset" and name not in ("id", "offset", "transform")
+]
 
-@dataclass(frozen=True)
+
+@dataclass(frozen=True, eq=False)
 class StoredAsset:
     """One asset as the store holds it; properties are normalised.
 
+    The PixieVerse side, `grid_properties`, `grid_material` and `field`, is read
+    when it is first asked for, and may then raise `StoreError`.
+
     Attributes
     ----------
+    store : Store
+        The store it was read from.
+    index : int
+        Its row in the store.
     asset_id : str
         Id of the row.
     coords : ndarray of uint8, shape (N, 3)
@@ -55,15 +72,13 @@ class StoredAsset:
         Voxels to the annotation used.
     transform : ndarray of float64, shape (4, 4)
         PixieVerse frame to SLAT frame.
-    grid_properties : ndarray of float32, shape (3, 64, 64, 64)
-        The PixieVerse field in [-1, 1]; NaN where not annotated.
-    grid_material : ndarray of uint8, shape (64, 64, 64)
-        Class 0..6, 7 background, 255 occupied but not annotated.
     columns : dict
         The asset's row of every other ``asset/*`` array, by the array's last
         name: ``fitness``, ``verdict``, ``category``, ...
     """
 
+    store: Store
+    index: int
     asset_id: str
     coords: NDArray[np.uint8]
     feats: NDArray[np.float32]
@@ -72,9 +87,34 @@ class StoredAsset:
     valid: NDArray[np.bool_]
     distance: NDArray[np.float32]
     transform: NDArray[np.float64]
-    grid_properties: NDArray[np.float32]
-    grid_material: NDArray[np.uint8]
     columns: dict[str, Any]
+
+    @cached_property
+    def properties_si(self) -> NDArray[np.float32]:
+        """Young's modulus [Pa], density [kg/m^3], Poisson's ratio, (N, 3); NaN where not valid."""
+        return denormalize(self.properties, self.store.normalization)
+
+    @cached_property
+    def grid_properties(self) -> NDArray[np.float32]:
+        """The PixieVerse field in [-1, 1], (3, 64, 64, 64); NaN where not annotated."""
+        return np.asarray(self.store.read_rows("grid/properties", self.index, self.index + 1)[0])
+
+    @cached_property
+    def grid_material(self) -> NDArray[np.uint8]:
+        """Class 0..6, 7 background, 255 occupied but not annotated, (64, 64, 64)."""
+        return np.asarray(self.store.read_rows("grid/material", self.index, self.index + 1)[0])
+
+    @cached_property
+    def field(self) -> MaterialField:
+        """The PixieVerse field that the asset was made of, in SI units."""
+        annotated = self.grid_material < BACKGROUND
+        values = self.grid_properties[:, annotated].T
+        return MaterialField(
+            occupancy=self.grid_material != BACKGROUND,
+            voxels=voxels_of(annotated),
+            material=self.grid_material[annotated],
+            properties=denormalize(values, self.store.normalization),
+        )
 
 
 class Store:
@@ -218,7 +258,7 @@ class Store:
         return start, stop
 
     def asset(self, asset_id: str) -> StoredAsset:
-        """Read everything about one asset.
+        """Return one asset; its grid is read when it is first asked for.
 
         Raises
         ------
@@ -226,18 +266,13 @@ class Store:
             If the store has no such asset, or a file is missing or damaged.
         """
         index = self.find(asset_id)
-        names: dict[str, list[str]] = {}
-        for layout in ARRAYS:
-            group, _, name = layout.name.partition("/")
-            names.setdefault(group, []).append(name)
-        columns = {n: self._column(n)[index] for n in names["asset"] if n not in _NOT_COLUMNS}
         return StoredAsset(
+            store=self,
+            index=index,
             asset_id=asset_id,
             transform=np.asarray(self._column("transform")[index]),
-            grid_properties=self.read_rows("grid/properties", index, index + 1)[0],
-            grid_material=self.read_rows("grid/material", index, index + 1)[0],
-            columns=columns,
-            **self.read(index, names["voxel"]),
+            columns={name: self._column(name)[index] for name in _ASSET_COLUMNS},
+            **self.read(index, _VOXEL_COLUMNS),
         )
 
     @cached_property
@@ -302,9 +337,6 @@ class Store:
         if not file.exists():
             raise StoreError(f"{self.path} lacks the array {name}; build it again")
         return read_metadata(file)
-
-
-_NOT_COLUMNS = ("id", "offset", "transform")
 
 
 def open_store(path: str | Path, *, copy: bool = False) -> Store:

@@ -22,6 +22,7 @@ from slatprep.export.ply import VERTEX
 from slatprep.parameters import PixieverseSource, SlatSource
 from slatprep.pipeline.dataset import BuildSummary, build_store
 from slatprep.readers import discover, read_latents
+from slatprep.store import Store
 
 # What an asset's points may be: material id to E, density, nu.
 TRUTH = {stuff[0]: stuff[1:] for stuff in (JELLY, METAL)}
@@ -312,8 +313,6 @@ def test_a_link_stays_and_the_store_is_left_alone(format: Any, store: Path, tmp_
 def test_a_failed_export_leaves_the_old_one(
     format: Any, store: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from slatprep.export import assets
-
     out = tmp_path / "export"
     export_store(store, out, format, assets=["cup"])
     before = bytes_of(out)
@@ -321,7 +320,7 @@ def test_a_failed_export_leaves_the_old_one(
     def fail(*_: object) -> None:
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(assets, "denormalize", fail)
+    monkeypatch.setattr(Store, "asset", fail)
     with pytest.raises(SlatprepError, match=r"cannot write there \(No space left"):
         export_store(store, out, format)
     assert bytes_of(out) == before

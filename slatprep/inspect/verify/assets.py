@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from slatprep.errors import InputError, StoreError
 from slatprep.geometry.voxels import flat_index
-from slatprep.inspect.check import DISTANCE_TOLERANCE, PROPERTY_TOLERANCE, stored_field
+from slatprep.inspect.check import DISTANCE_TOLERANCE, PROPERTY_TOLERANCE
 from slatprep.normalize import normalize
 from slatprep.parameters import SampleParameters
 from slatprep.provenance.record import load_schema
@@ -136,8 +136,7 @@ def lookup_findings(asset: StoredAsset, store: Store) -> Iterator[Finding]:
     """Yield where an annotation is not what the grid and the transform give."""
     try:
         parameters = SampleParameters(**store.attributes["build"]["parameters"]["sample"])
-        field = stored_field(asset, store.normalization)
-        annotation = sample(field, asset.coords, asset.transform, parameters)
+        annotation = sample(asset.field, asset.coords, asset.transform, parameters)
     except (KeyError, TypeError, ValueError, np.linalg.LinAlgError) as error:
         yield Finding("asset", asset.asset_id, f"cannot be sampled ({error})", "sound parameters")
         return
