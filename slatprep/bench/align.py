@@ -11,7 +11,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -33,6 +33,7 @@ from slatprep.parameters import (
 from slatprep.readers import discover, read_field, read_latents
 from slatprep.records import Alignment, AssetPair, MaterialField, StructuredLatents
 from slatprep.sample import sample
+from slatprep.workers import Progress
 from slatprep.workers.local import single_threaded
 
 ENGINES = ("field", "small_gicp", "open3d", "open3d-64")
@@ -40,8 +41,6 @@ ENGINES = ("field", "small_gicp", "open3d", "open3d-64")
 without repeated rotations (``--preset paper``), and as published."""
 
 REFERENCE = "field"
-
-Progress = Callable[[int, int], None]
 
 
 @dataclass(frozen=True)

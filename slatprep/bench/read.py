@@ -23,12 +23,12 @@ from numpy.typing import NDArray
 from slatprep.errors import StoreError
 from slatprep.store import open_store
 from slatprep.store.reader import TRAINING_COLUMNS
+from slatprep.workers import Progress
 from slatprep.workers.local import single_threaded
 
 STORED_COLUMNS = ("coords", "feats", "properties", "material", "valid", "distance")
 """What every way holds of an asset; `TRAINING_COLUMNS` of it are read."""
 
-Progress = Callable[[int, int], None]
 Arrays = dict[str, NDArray[Any]]
 Reader = Callable[[int], Arrays]
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from slatprep.cli.options import FOLDER, POSITIVE, ChoiceOf, chosen_store, option, store_argument
+from slatprep.cli.options import FOLDER, POSITIVE, ChoiceOf, option, store_argument
 from slatprep.cli.output import Output, output_options
 
 if TYPE_CHECKING:
@@ -137,22 +137,21 @@ Example:
 @option("--repeats", "How often each is measured.", POSITIVE, 5)
 @option("--seed", "Of the order of reading.", int, 0)
 @output_options
-def read(output: Output, store: Path | None, assets: int | None, repeats: int, seed: int) -> None:
+def read(output: Output, store: Path, assets: int | None, repeats: int, seed: int) -> None:
     """Read shuffled whole assets (coords, feats, properties) as training does.
 
     Compares slatprep's reader with npz (one file an asset, plain and
     compressed), one HDF5 file, zarr-python, and zarrs and tensorstore where
     they are installed. 'cold' is after asking the system to forget the files.
     """
-    path = chosen_store(store)
     from slatprep.bench.read import bench_read
 
     with (
-        tempfile.TemporaryDirectory(dir=path.resolve().parent) as temporary,
+        tempfile.TemporaryDirectory(dir=store.resolve().parent) as temporary,
         output.progress("passes") as progress,
     ):
         result = bench_read(
-            path, Path(temporary), limit=assets, repeats=repeats, seed=seed, progress=progress
+            store, Path(temporary), limit=assets, repeats=repeats, seed=seed, progress=progress
         )
     output.result(result, lambda: _show_read(output, result))
 

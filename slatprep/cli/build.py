@@ -17,12 +17,11 @@ from slatprep.cli.options import (
     source_options,
     workers_options,
 )
-from slatprep.cli.output import EXIT_INCOMPLETE, Output, output_options
+from slatprep.cli.output import Output, output_options
 from slatprep.cli.overview import show_quality
 
 if TYPE_CHECKING:
     from slatprep.pipeline.dataset import BuildPlan, BuildSummary
-    from slatprep.workers.local import Jobs
 
 _MANIFESTS = option(
     "--manifests", "Folder for the records.  [default: beside the store]", NEW_FOLDER
@@ -60,17 +59,7 @@ Example:
 @option("--dry-run", "Say what would be done, and why; write nothing.", is_flag=True)
 @output_options
 @workers_options
-def build_store(
-    output: Output,
-    out: Path,
-    jobs: Jobs,
-    manifests: Path | None,
-    strict: bool,
-    fresh: bool,
-    keep_work: bool,
-    dry_run: bool,
-    **sources: Any,
-) -> None:
+def build_store(output: Output, out: Path, dry_run: bool, **options: Any) -> None:
     """Build one store of aligned, normalised supervision, or bring it up to date.
 
     Pairs the assets of both sides by id, aligns them, looks the material and
@@ -81,25 +70,18 @@ def build_store(
     Assets whose sources, parameters and code did not change are not aligned
     again, and a build that was interrupted goes on where it stopped.
     """
-    parameters = parameters_of(**sources)
+    parameters = parameters_of(options)
     from slatprep.pipeline import dataset as build
 
     if dry_run:
         with output.progress("compare") as progress:
-            plan = build.plan_build(parameters, out, jobs=jobs, fresh=fresh, progress=progress)
+            plan = build.plan_build(
+                parameters, out, jobs=options["jobs"], fresh=options["fresh"], progress=progress
+            )
         _show_plan(output, plan)
         return
     with output.progress("build") as progress:
-        summary = build.build_store(
-            parameters,
-            out,
-            manifests=manifests,
-            jobs=jobs,
-            strict=strict,
-            fresh=fresh,
-            keep_work=keep_work,
-            progress=progress,
-        )
+        summary = build.build_store(parameters, out, progress=progress, **options)
     _report(output, summary)
 
 
@@ -120,17 +102,17 @@ Example:
 @_STRICT
 @output_options
 @workers_options
-def align(output: Output, out: Path, jobs: Jobs, strict: bool, **sources: Any) -> None:
+def align(output: Output, out: Path, **options: Any) -> None:
     """Align without building a store.
 
     Writes one JSON record an asset: the transform, its quality, and the score
     of every candidate.
     """
-    parameters = parameters_of(**sources)
+    parameters = parameters_of(options)
     from slatprep.pipeline import dataset as build
 
     with output.progress("align") as progress:
-        summary = build.align_pairs(parameters, out, jobs=jobs, strict=strict, progress=progress)
+        summary = build.align_pairs(parameters, out, progress=progress, **options)
     _report(output, summary)
 
 
@@ -168,16 +150,16 @@ def _report(output: Output, summary: BuildSummary) -> None:
 
     def show() -> None:
         if summary.store is not None:
-            from slatprep.inspect.overview import describe_store
+            from slatprep.inspect.overview import overview_of
             from slatprep.store import open_store
 
-            show_quality(output, describe_store(open_store(summary.store)))
+            show_quality(output, overview_of(open_store(summary.store)))
         others = ", ".join(f"{count:,} {status}" for status, count in summary.statuses.items())
         click.echo(f"assets:  {total:,} ({others}) in {summary.seconds:,.1f} s")
         if summary.store is not None:
             click.echo(f"store:   {summary.store}")
         click.echo(f"records: {summary.records}")
 
-    output.result({**dataclasses.asdict(summary), "complete": summary.complete}, show)
-    if not summary.complete:
-        click.get_current_context().exit(EXIT_INCOMPLETE)
+    output.result(
+        {**dataclasses.asdict(summary), "complete": summary.complete}, show, summary.complete
+    )

@@ -16,7 +16,7 @@ from slatprep.cli.options import (
     shares_of,
     shares_option,
 )
-from slatprep.cli.output import EXIT_INCOMPLETE, Output, output_options
+from slatprep.cli.output import Output, output_options
 
 if TYPE_CHECKING:
     from slatprep.learn.metrics import Evaluation, Measure
@@ -93,11 +93,10 @@ def evaluate(
             _show_beside(output, result, others, beside)
 
     document = dataclasses.asdict(result)
-    output.result(document | ({"beside": others} if beside is not None else {}), show)
     for asset_id in result.missing:
         output.problem(f"{predictions}: no prediction of {asset_id}")
-    if result.missing:
-        click.get_current_context().exit(EXIT_INCOMPLETE)
+    document |= {"beside": others} if beside is not None else {}
+    output.result(document, show, complete=not result.missing)
 
 
 def _show_beside(

@@ -7,7 +7,7 @@ from pathlib import Path
 import click
 
 from slatprep.cli.options import FILE, NEW_FOLDER, option
-from slatprep.cli.output import EXIT_INCOMPLETE, Output, output_options
+from slatprep.cli.output import Output, output_options
 from slatprep.errors import InputError
 
 
@@ -78,6 +78,5 @@ def extract_slat(
     def show() -> None:
         output.table(f"Latents in {out}", tuple(counts), [tuple(counts.values())])
 
-    output.result({"path": out, "model": session.model, **counts, "problems": problems}, show)
-    if problems:
-        click.get_current_context().exit(EXIT_INCOMPLETE)
+    document = {"path": out, "model": session.model, **counts, "problems": problems}
+    output.result(document, show, complete=not problems)

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import click
 
-from slatprep.cli.options import chosen_store, store_argument
+from slatprep.cli.options import store_argument
 from slatprep.cli.output import Output, output_options
 from slatprep.cli.overview import show_normalization, show_quality
 
@@ -19,16 +19,15 @@ Example:
 )
 @store_argument
 @output_options
-def info(output: Output, store: Path | None) -> None:
+def info(output: Output, store: Path) -> None:
     """Say what is in STORE, and how good its alignments are.
 
     Without STORE, the one that `make align` built last under data/ is taken.
     """
-    path = chosen_store(store)
-    from slatprep.inspect.overview import describe_store
+    from slatprep.inspect.overview import overview_of
     from slatprep.store import open_store
 
-    overview = describe_store(open_store(path))
+    overview = overview_of(open_store(store))
 
     def show() -> None:
         total = overview.total

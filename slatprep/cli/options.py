@@ -123,16 +123,6 @@ def source_options(command: _Command) -> _Command:
     return functools.reduce(lambda decorated, add: add(decorated), reversed(options), command)
 
 
-store_argument = click.argument("store", required=False, type=EXISTING_FOLDER)
-
-store_option = option(
-    "--store",
-    "The store.  [default: the one built last under data/]",
-    EXISTING_FOLDER,
-    metavar="STORE.zarr",
-)
-
-
 def chosen_store(store: Path | None) -> Path:
     """Return the store that was named, else the one that `make align` built last."""
     if store is not None:
@@ -141,6 +131,22 @@ def chosen_store(store: Path | None) -> Path:
     if not built:
         raise click.UsageError("there is no store under data/; name one, or run `make align`")
     return built[-1]
+
+
+store_argument = click.argument(
+    "store",
+    required=False,
+    type=EXISTING_FOLDER,
+    callback=lambda _context, _parameter, store: chosen_store(store),
+)
+"""The store, by default the one built last."""
+
+store_option = option(
+    "--store",
+    "The store.  [default: the one built last under data/]",
+    EXISTING_FOLDER,
+    metavar="STORE.zarr",
+)
 
 
 def beside(store: Path, suffix: str) -> Path:
@@ -190,14 +196,14 @@ def workers_options(command: _Command) -> _Command:
     return with_workers  # type: ignore[return-value]
 
 
-def parameters_of(
-    *,
-    config: Path | None,
-    preset: str | None,
-    consensus: bool = False,
-    **sources: Path | str | None,
-) -> BuildParameters:
-    """Return the parameters that the options of `source_options` ask for."""
+def parameters_of(options: dict[str, Any]) -> BuildParameters:
+    """Take the options of `source_options`, and ``--consensus``, out of those given.
+
+    Returns
+    -------
+    BuildParameters
+        What they ask for.
+    """
     from slatprep.config import load_parameters
 
     given: dict[str, dict[str, object]] = {}
@@ -207,11 +213,11 @@ def parameters_of(
         ("pairing_map", "pairing", "map"),
         ("ranges", "normalize", "ranges"),
     ):
-        if (value := sources[option_name]) is not None:
+        if (value := options.pop(option_name)) is not None:
             given[group] = {key: str(value.absolute()) if isinstance(value, Path) else value}
-    if consensus:
+    if options.pop("consensus", False):
         given["consensus"] = {"settle": True}
-    return load_parameters(config, given, preset)
+    return load_parameters(options.pop("config"), given, options.pop("preset"))
 
 
 shares_option = option(

@@ -19,14 +19,13 @@ from typing import Any, TypeVar
 import click
 
 from slatprep.storage.remote import RemotePath, as_path
+from slatprep.workers import Progress
 
 EXIT_INCOMPLETE = 1
 EXIT_USAGE = 2
 EXIT_INTERRUPTED = 130
 
 Cell = str | int | float | bool | None
-ProgressCallback = Callable[[int, int], None]
-"""Called with the assets done and the assets in all."""
 
 _Command = TypeVar("_Command", bound=Callable[..., object])
 
@@ -51,12 +50,17 @@ class Output:
         self.as_json = as_json
         self.verbosity = verbosity
 
-    def result(self, document: object, show: Callable[[], None]) -> None:
-        """Print a result: the document as JSON, or what `show` prints for people."""
+    def result(self, document: object, show: Callable[[], None], complete: bool = True) -> None:
+        """Print a result: the document as JSON, or what `show` prints for people.
+
+        Where the result is not `complete`, end with the exit code that says so.
+        """
         if self.as_json:
             click.echo(as_json(document))
         else:
             show()
+        if not complete:
+            click.get_current_context().exit(EXIT_INCOMPLETE)
 
     def note(self, message: str) -> None:
         """Tell a person something on standard error, unless quiet."""
@@ -85,7 +89,7 @@ class Output:
             _plain_table(title, columns, cells, numeric)
 
     @contextmanager
-    def progress(self, label: str) -> Iterator[ProgressCallback]:
+    def progress(self, label: str) -> Iterator[Progress]:
         """Show how far a job is, on standard error, and how long it will still take.
 
         The time left comes from the assets that are done, none of which is
@@ -188,7 +192,7 @@ def _plain_table(
     click.echo()
 
 
-def _progress_lines(label: str) -> ProgressCallback:
+def _progress_lines(label: str) -> Progress:
     start = last = time.monotonic()
 
     def update(done: int, total: int) -> None:
@@ -203,24 +207,17 @@ def _progress_lines(label: str) -> ProgressCallback:
 
 
 @contextmanager
-def _progress_bar(label: str) -> Iterator[ProgressCallback]:
+def _progress_bar(label: str) -> Iterator[Progress]:
+    from rich import progress as rich
     from rich.console import Console
-    from rich.progress import (
-        BarColumn,
-        MofNCompleteColumn,
-        Progress,
-        TextColumn,
-        TimeElapsedColumn,
-        TimeRemainingColumn,
-    )
 
-    with Progress(
-        TextColumn("{task.description}"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TimeElapsedColumn(),
-        TextColumn("left"),
-        TimeRemainingColumn(),
+    with rich.Progress(
+        rich.TextColumn("{task.description}"),
+        rich.BarColumn(),
+        rich.MofNCompleteColumn(),
+        rich.TimeElapsedColumn(),
+        rich.TextColumn("left"),
+        rich.TimeRemainingColumn(),
         console=Console(stderr=True),
         # Assets differ in size by ten times, so a short memory would make the
         # estimate jump; this one remembers all of them.

@@ -10,7 +10,6 @@ from slatprep.cli.options import (
     FOLDER,
     NEW_FILE,
     beside,
-    chosen_store,
     jobs_option,
     option,
     store_argument,
@@ -35,7 +34,7 @@ Example:
 @jobs_option
 @output_options
 def report(
-    output: Output, store: Path | None, out: Path | None, manifests: Path | None, jobs: int
+    output: Output, store: Path, out: Path | None, manifests: Path | None, jobs: int
 ) -> None:
     """Write one page about STORE that opens in a browser.
 
@@ -44,24 +43,23 @@ def report(
     and a table of all assets that opens each in 3D. Without STORE, the one
     that `make align` built last under data/ is taken.
     """
-    path = chosen_store(store)
     from slatprep.inspect.report import write_report
     from slatprep.pipeline.dataset import default_manifests
     from slatprep.store import open_store
 
-    opened = open_store(path)
-    name = path.name.removesuffix(".zarr")
+    opened = open_store(store)
+    name = store.name.removesuffix(".zarr")
     if manifests is None:
         usual = (default_manifests(opened.path), Path("manifests/build") / name)
         manifests = next((folder for folder in usual if folder.is_dir()), None)
     if manifests is None:
         output.problem(
-            f"no records of {path} found; the page cannot say what did not go in, and why. "
+            f"no records of {store} found; the page cannot say what did not go in, and why. "
             "Name their folder with --manifests"
         )
     with output.progress("report") as progress:
         summary = write_report(
-            opened, out or beside(path, ".html"), manifests=manifests, jobs=jobs, progress=progress
+            opened, out or beside(store, ".html"), manifests=manifests, jobs=jobs, progress=progress
         )
 
     def show() -> None:

@@ -4,21 +4,17 @@ from __future__ import annotations
 
 import dataclasses
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import Any
 
 import click
 
 from slatprep.cli.options import (
     EXISTING_FOLDER,
-    chosen_store,
     option,
     store_argument,
     workers_options,
 )
-from slatprep.cli.output import EXIT_INCOMPLETE, Output, output_options
-
-if TYPE_CHECKING:
-    from slatprep.workers.local import Jobs
+from slatprep.cli.output import Output, output_options
 
 
 @click.command(
@@ -45,12 +41,11 @@ Example:
 @workers_options
 def verify(
     output: Output,
-    store: Path | None,
-    manifests: Path | None,
+    store: Path,
     sources: bool,
     pixieverse: Path | None,
     slat: Path | None,
-    jobs: Jobs,
+    **options: Any,
 ) -> None:
     """Check that STORE is whole, unchanged and consistent.
 
@@ -61,18 +56,12 @@ def verify(
     """
     if (pixieverse is None) != (slat is None):
         raise click.UsageError("--pixieverse and --slat go together: name both, or neither")
-    path = chosen_store(store)
     from slatprep.inspect.verify import SourceRoots, verify_store
 
     roots = SourceRoots(pixieverse, slat) if pixieverse and slat else None
     with output.progress("verify") as progress:
         result = verify_store(
-            path,
-            manifests=manifests,
-            sources=sources or roots is not None,
-            roots=roots,
-            jobs=jobs,
-            progress=progress,
+            store, sources=sources or roots is not None, roots=roots, progress=progress, **options
         )
 
     def show() -> None:
@@ -84,8 +73,6 @@ def verify(
             f"records: {records}"
         )
         found = f"{len(result.findings):,} findings" if result.findings else "nothing is wrong"
-        click.echo(f"{path}: {found}")
+        click.echo(f"{store}: {found}")
 
-    output.result({**dataclasses.asdict(result), "ok": result.ok}, show)
-    if not result.ok:
-        click.get_current_context().exit(EXIT_INCOMPLETE)
+    output.result({**dataclasses.asdict(result), "ok": result.ok}, show, complete=result.ok)

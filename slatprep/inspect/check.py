@@ -16,17 +16,23 @@ from slatprep.normalize import normalize
 from slatprep.parameters import SampleParameters
 from slatprep.records import Ambiguity, StructuredLatents, Verdict
 from slatprep.sample import sample
-from slatprep.store.reader import Store
+from slatprep.store.reader import Store, StoredAsset
 
 QUALITY_TOLERANCE = 1e-3
 """Quality computed anew differs less than this; one voxel at the radius may round either way."""
 
-PROPERTY_TOLERANCE = 1e-5
-"""Normalised properties computed anew differ less than this: float32 through SI and back."""
+TOLERANCES = {
+    "voxel/valid": 0.0,
+    "voxel/material": 0.0,
+    "voxel/properties": 1e-5,
+    "voxel/distance": 1e-3,
+}
+"""Largest difference between an array and the same computed anew, by name.
 
-DISTANCE_TOLERANCE = 1e-3
-"""Distances [voxel] computed anew differ less than this."""
+Properties are normalised: float32 went through SI and back. Distances are in voxels.
+"""
 
+_QUALITY = ("fitness", "inlier_rmse", "fitness_backward", "inlier_rmse_backward", "overlap")
 
 AT_LEAST = {
     "fitness": THRESHOLDS.good_fitness,
@@ -153,15 +159,10 @@ def check_alignment(store: Store, asset_id: str) -> AlignmentCheck:
         If the store has no such asset, or does not say how it was made.
     """
     asset = store.asset(asset_id)
-    parameters = _parameters(store)
-    field = asset.field
+    radius = float(_parameters(store)["align"]["radius"])
+    valid_share, differs = look_up_again(asset)
     latents = StructuredLatents(asset.coords, asset.feats)
-    radius = float(parameters["align"]["radius"])
-    quality = measure_quality(field, latents, asset.transform, radius)
-    annotation = sample(
-        field, asset.coords, asset.transform, SampleParameters(**parameters["sample"])
-    )
-    properties, _ = normalize(annotation.properties, store.normalization)
+    quality = measure_quality(asset.field, latents, asset.transform, radius)
     columns = asset.columns
     change = columns["property_ambiguity"]
     ambiguity = Ambiguity(
@@ -169,41 +170,63 @@ def check_alignment(store: Store, asset_id: str) -> AlignmentCheck:
         property_change=(float(change[0]), float(change[1]), float(change[2])),
         margin=float(columns["margin"]),
     )
-    valid_share = float(annotation.valid.mean())
     verdict, reasons = judge(quality, valid_share, ambiguity)
-    both = annotation.valid & asset.valid
     figures = [
         Figure(name, getattr(quality, name), float(columns[name]), QUALITY_TOLERANCE)
-        for name in (
-            "fitness",
-            "inlier_rmse",
-            "fitness_backward",
-            "inlier_rmse_backward",
-            "overlap",
-        )
+        for name in _QUALITY
     ]
     figures += [
         Figure("valid_share", valid_share, float(columns["valid_share"]), QUALITY_TOLERANCE),
         Figure("ambiguity", ambiguity.material_share, ambiguity.material_share, 0),
         Figure("margin", ambiguity.margin, ambiguity.margin, 0),
-        Figure("voxels with another valid", _count(annotation.valid != asset.valid), 0, 0),
-        Figure("voxels with another material", _count(annotation.material != asset.material), 0, 0),
-        Figure(
-            "largest difference of a property",
-            _largest(properties[both] - asset.properties[both]),
-            0,
-            PROPERTY_TOLERANCE,
-        ),
-        Figure(
-            "largest difference of a distance",
-            _largest(annotation.distance - asset.distance),
-            0,
-            DISTANCE_TOLERANCE,
+        Figure("voxels with another valid", differs["voxel/valid"].sum(), 0, 0),
+        Figure("voxels with another material", differs["voxel/material"].sum(), 0, 0),
+        *(
+            Figure(
+                f"largest difference of a {name}",
+                differs[array].max(initial=0.0),
+                0,
+                TOLERANCES[array],
+            )
+            for name, array in (("property", "voxel/properties"), ("distance", "voxel/distance"))
         ),
     ]
     return AlignmentCheck(
         asset_id, verdict, reasons, str(columns["verdict"]), tuple(figures), asset.transform, radius
     )
+
+
+def look_up_again(asset: StoredAsset) -> tuple[float, dict[str, NDArray[np.float64]]]:
+    """Sample an asset's annotation again from the stored grid, and compare.
+
+    Returns
+    -------
+    valid_share : float
+        Share of the SLAT voxels that get an annotation now.
+    differences : dict of str to ndarray of float64, shape (N,)
+        How much each SLAT voxel differs, by array, named as in `TOLERANCES`:
+        1 where valid or material is another one, the largest difference of
+        the three normalised properties where both are valid (0 elsewhere),
+        and that of the distance [voxel]. NaN is a difference, too.
+
+    Raises
+    ------
+    StoreError
+        If the store does not say how it was made.
+    """
+    parameters = SampleParameters(**_parameters(asset.store)["sample"])
+    annotation = sample(asset.field, asset.coords, asset.transform, parameters)
+    properties, _ = normalize(annotation.properties, asset.store.normalization)
+    changes = np.abs(properties - asset.properties).max(axis=1)
+    differences = {
+        "voxel/valid": annotation.valid != asset.valid,
+        "voxel/material": annotation.material != asset.material,
+        "voxel/properties": np.where(annotation.valid & asset.valid, changes, 0.0),
+        "voxel/distance": np.abs(annotation.distance - asset.distance),
+    }
+    return float(annotation.valid.mean()), {
+        name: difference.astype(np.float64) for name, difference in differences.items()
+    }
 
 
 def choose_assets(
@@ -251,11 +274,3 @@ def _parameters(store: Store) -> dict[str, Any]:
             f"{store.path} does not say with what parameters it was built; build it again"
         ) from None
     return parameters
-
-
-def _count(differs: np.ndarray) -> float:
-    return float(differs.sum())
-
-
-def _largest(difference: np.ndarray) -> float:
-    return float(np.abs(difference).max(initial=0.0))

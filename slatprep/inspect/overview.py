@@ -58,8 +58,8 @@ class StoreOverview:
     categories: tuple[GroupOverview, ...]
 
 
-def describe_store(store: Store) -> StoreOverview:
-    """Sum a store up; only its ``asset/*`` arrays are read.
+def overview_of(store: Store) -> StoreOverview:
+    """Return what a store holds; only its ``asset/*`` arrays are read.
 
     Parameters
     ----------
@@ -85,9 +85,9 @@ def describe_store(store: Store) -> StoreOverview:
         engines=_counts(columns["engine"]),
         models=_counts(columns["model"]),
         normalization=store.normalization,
-        total=_describe("all", columns, np.ones(len(categories), dtype=bool)),
+        total=_group("all", columns, np.ones(len(categories), dtype=bool)),
         categories=tuple(
-            _describe(name or "(unknown)", columns, categories == name)
+            _group(name or "(unknown)", columns, categories == name)
             for name in sorted(set(categories))
         ),
     )
@@ -99,9 +99,7 @@ def _file_sizes(path: Path) -> list[int]:
     return [file.stat().st_size for file in path.rglob("*") if file.is_file()]
 
 
-def _describe(
-    name: str, columns: dict[str, NDArray[Any]], chosen: NDArray[np.bool_]
-) -> GroupOverview:
+def _group(name: str, columns: dict[str, NDArray[Any]], chosen: NDArray[np.bool_]) -> GroupOverview:
     own = {column: values[chosen] for column, values in columns.items()}
     voxels = int(own["voxels"].sum())
     verdicts = _counts(own["verdict"])

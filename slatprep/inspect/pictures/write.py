@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from urllib.parse import quote
 
@@ -13,6 +13,7 @@ from slatprep.inspect.pictures.scene import Scene, scene_of
 from slatprep.inspect.pictures.sheet import MOST, draw_sheet
 from slatprep.provenance.candidates import candidates_of
 from slatprep.store.reader import Store, StoredAsset
+from slatprep.workers import Progress
 
 SHEET = "sheet.png"
 """Name of the contact sheet in a folder of pictures."""
@@ -24,7 +25,7 @@ def write_pictures(
     target: Path,
     *,
     manifests: Path | None = None,
-    progress: Callable[[int, int], None] | None = None,
+    progress: Progress | None = None,
 ) -> tuple[list[Path], Path | None]:
     """Draw alignments and write them as PNG files.
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import base64
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slatprep.errors import StoreError
-from slatprep.inspect.report.content import describe
+from slatprep.inspect.report.content import page_content
 from slatprep.inspect.report.outcomes import Outcome, read_outcomes
 from slatprep.inspect.report.page import write_page
 from slatprep.inspect.report.statistics import Tally, no_tally, tally
@@ -21,6 +21,7 @@ from slatprep.records import Verdict
 from slatprep.storage.atomic import staged
 from slatprep.store import open_store
 from slatprep.store.reader import Store
+from slatprep.workers import Progress
 from slatprep.workers.local import run_unordered
 
 __all__ = ["ReportSummary", "write_report"]
@@ -33,9 +34,6 @@ VOXEL_BYTES = 36_000_000
 
 TASK_ASSETS = 16
 """Assets that a worker draws at a time."""
-
-Progress = Callable[[int, int], None]
-"""Called with the assets done and the assets in all."""
 
 
 @dataclass(frozen=True)
@@ -99,7 +97,7 @@ def write_report(
     jobs : int
         Worker processes. The page's bytes do not depend on it.
     progress : callable, optional
-        See `Progress`.
+        Called with the assets done and the assets in all.
 
     Returns
     -------
@@ -118,7 +116,7 @@ def write_report(
     chosen = _chosen(store)
     details = _details(store, chosen, jobs, progress)
     side = details.side()
-    content = describe(store, outcomes, details.tallies, chosen, side)
+    content = page_content(store, outcomes, details.tallies, chosen, side)
     with staged(Path(out)) as temporary:
         with temporary.open("w", encoding="utf-8", newline="\n") as file:
             write_page(

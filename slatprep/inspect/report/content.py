@@ -27,7 +27,7 @@ _FIGURES = ("fitness", "fitness_backward", "inlier_rmse", "overlap", "valid_shar
 _DIGITS = 5
 
 
-def describe(
+def page_content(
     store: Store,
     outcomes: Sequence[Outcome] | None,
     tallies: Mapping[str, Tally],

@@ -35,7 +35,7 @@ def write_page(
     title : str
         Of the page.
     content : mapping
-        From `slatprep.inspect.report.content.describe`.
+        From `slatprep.inspect.report.content.page_content`.
     sheets : iterable of bytes
         PNG files of thumbnails.
     packs : iterable of list of str

@@ -16,9 +16,6 @@ from slatprep.store import StoredAsset
 BINS = 64
 """Bins of the histograms of normalised properties, over [-1, 1]."""
 
-CLASSES = BACKGROUND
-"""Material classes that a voxel can have: 0..6."""
-
 
 @dataclass(frozen=True)
 class Tally:
@@ -44,20 +41,20 @@ class Tally:
 
 def no_tally() -> Tally:
     """Return the tally of nothing."""
-    shape = (len(PROPERTY_COLUMNS), CLASSES, BINS)
+    shape = (len(PROPERTY_COLUMNS), BACKGROUND, BINS)
     return Tally(
-        np.zeros(shape, np.int64), np.zeros(shape, np.int64), np.zeros(CLASSES + 1, np.int64)
+        np.zeros(shape, np.int64), np.zeros(shape, np.int64), np.zeros(BACKGROUND + 1, np.int64)
     )
 
 
 def tally(asset: StoredAsset) -> Tally:
     """Count the classes and property values of one asset's voxels."""
     annotated = asset.grid_material < BACKGROUND
-    classes = np.where(asset.material == UNANNOTATED, CLASSES, asset.material)
+    classes = np.where(asset.material == UNANNOTATED, BACKGROUND, asset.material)
     return Tally(
         field=_histograms(asset.grid_properties[:, annotated].T, asset.grid_material[annotated]),
         slat=_histograms(asset.properties[asset.valid], asset.material[asset.valid]),
-        classes=np.bincount(classes, minlength=CLASSES + 1).astype(np.int64),
+        classes=np.bincount(classes, minlength=BACKGROUND + 1).astype(np.int64),
     )
 
 
@@ -108,6 +105,6 @@ def _histograms(properties: NDArray[np.float32], material: NDArray[np.uint8]) ->
     bins = np.clip(((properties + 1.0) * (BINS / 2)).astype(np.int64), 0, BINS - 1)
     flat = material.astype(np.int64)[:, None] * BINS + bins
     counts: Sequence[NDArray[np.int64]] = [
-        np.bincount(column, minlength=CLASSES * BINS) for column in flat.T
+        np.bincount(column, minlength=BACKGROUND * BINS) for column in flat.T
     ]
-    return np.stack(counts).reshape(len(counts), CLASSES, BINS).astype(np.int64)
+    return np.stack(counts).reshape(len(counts), BACKGROUND, BINS).astype(np.int64)

@@ -8,7 +8,7 @@ the sources that the records name.
 from __future__ import annotations
 
 import uuid
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -21,14 +21,12 @@ from slatprep.storage.remote import as_path
 from slatprep.storage.versions import current_version
 from slatprep.store.contract import Finding
 from slatprep.store.reader import Store, open_store
+from slatprep.workers import Progress
 from slatprep.workers.local import Jobs, require_shared, run_unordered
 
 __all__ = ["Finding", "SourceRoots", "Verification", "verify_store"]
 
 ASSETS_IN_TASK = 8
-
-Progress = Callable[[int, int], None]
-"""Called with the assets done and the assets in all."""
 
 
 @dataclass(frozen=True)
@@ -89,7 +87,7 @@ def verify_store(
     jobs : int or Workers
         Worker processes, or a `slatprep.workers.dask.Cluster`.
     progress : callable, optional
-        See `Progress`.
+        Called with the assets done and the assets in all.
 
     Returns
     -------

@@ -14,13 +14,10 @@ from numpy.typing import NDArray
 
 from slatprep.errors import InputError, StoreError
 from slatprep.geometry.voxels import flat_index
-from slatprep.inspect.check import DISTANCE_TOLERANCE, PROPERTY_TOLERANCE
-from slatprep.normalize import normalize
-from slatprep.parameters import SampleParameters
+from slatprep.inspect.check import TOLERANCES, look_up_again
 from slatprep.provenance.record import load_schema
 from slatprep.readers.files import resolve_inside
 from slatprep.records import BACKGROUND, RESOLUTION, UNANNOTATED
-from slatprep.sample import sample
 from slatprep.storage.files import file_digest
 from slatprep.store.contract import Finding
 from slatprep.store.layout import normalization_attribute
@@ -68,7 +65,7 @@ def asset_findings(
         asset_id = store.ids[row]
         try:
             asset = store.asset(asset_id)
-            own = list(value_findings(asset)) or list(lookup_findings(asset, store))
+            own = list(value_findings(asset)) or list(lookup_findings(asset))
             findings += own
         except DamagedFileError as error:
             findings.append(Finding(error.file, asset_id, error.fault, error.expected))
@@ -132,28 +129,21 @@ def value_findings(asset: StoredAsset) -> Iterator[Finding]:
         yield Finding("voxel/coords", asset.asset_id, "a coordinate occurs twice", "each once")
 
 
-def lookup_findings(asset: StoredAsset, store: Store) -> Iterator[Finding]:
+def lookup_findings(asset: StoredAsset) -> Iterator[Finding]:
     """Yield where an annotation is not what the grid and the transform give."""
     try:
-        parameters = SampleParameters(**store.attributes["build"]["parameters"]["sample"])
-        annotation = sample(asset.field, asset.coords, asset.transform, parameters)
+        _, differences = look_up_again(asset)
     except (KeyError, TypeError, ValueError, np.linalg.LinAlgError) as error:
         yield Finding("asset", asset.asset_id, f"cannot be sampled ({error})", "sound parameters")
         return
-    properties, _ = normalize(annotation.properties, store.normalization)
-    both = annotation.valid & asset.valid
-    difference = np.abs(properties[both] - asset.properties[both])
-    for where, wrong in (
-        ("voxel/valid", annotation.valid != asset.valid),
-        ("voxel/material", annotation.material != asset.material),
-        ("voxel/properties", (difference > PROPERTY_TOLERANCE).any(axis=1)),
-        ("voxel/distance", np.abs(annotation.distance - asset.distance) > DISTANCE_TOLERANCE),
-    ):
-        if wrong.any():
+    for where, difference in differences.items():
+        # A NaN is no difference within bounds.
+        wrong = np.count_nonzero(~(difference <= TOLERANCES[where]))
+        if wrong:
             yield Finding(
                 where,
                 asset.asset_id,
-                f"{np.count_nonzero(wrong)} of {len(wrong)} voxels differ",
+                f"{wrong} of {len(difference)} voxels differ",
                 "what the grid, the transform and the parameters give",
             )
 

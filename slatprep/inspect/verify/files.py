@@ -126,4 +126,5 @@ def _same(own: Mapping[str, Any], copy: object) -> bool:
     if not isinstance(copy, dict):
         return False
     left, right = ({**m, "consolidated_metadata": None} for m in (own, copy))
+    # A fill value of NaN does not equal its copy, but is written like it.
     return left == right or repr(left) == repr(right)
