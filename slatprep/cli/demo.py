@@ -25,9 +25,9 @@ Example:
 @option("--seed", "The same seed gives the same bytes.", click.IntRange(min=0), 0)
 @option(
     "--level",
-    "Difficulty, 0 (quarter turns) to 4 (warped); may be repeated, levels take turns.  "
-    "[default: all]",
-    click.IntRange(0, 4),
+    "Difficulty, 0 (quarter turns) to 4 (warped), 5 (a generated shape), 6 (a NeRF's field), "
+    "7 (both); may be repeated, levels take turns.  [default: 0 to 4]",
+    click.IntRange(0, 7),
     name="levels",
     multiple=True,
 )

@@ -1,8 +1,9 @@
 """Demo data: procedural assets with exactly known truth, in the layouts of real ones.
 
 `shapes` and `materials` are what objects are built of, `catalogue` lists the
-objects, `voxelise` and `difficulty` are how two pipelines see them, `asset`
-puts both sides and the truth together, `write` lays them out on disk.
+objects, `voxelise`, `difficulty`, `generated` and `nerf` are how two pipelines
+see them, `asset` puts both sides and the truth together, `write` lays them out
+on disk.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from slatprep.demo.asset import DemoAsset, make_asset
-from slatprep.demo.difficulty import LEVELS
+from slatprep.demo.difficulty import LEVELS, SAME_SHAPE_LEVELS
 from slatprep.demo.latents import LatentKind
 from slatprep.demo.write import (
     GridForm,
@@ -66,7 +67,7 @@ def make_demo(
     assets: int,
     seed: int,
     *,
-    levels: tuple[int, ...] = tuple(LEVELS),
+    levels: tuple[int, ...] = SAME_SHAPE_LEVELS,
     views: int = 1,
     latents: LatentKind = "placeholder",
     habitual_share: float = 0.0,
@@ -92,7 +93,9 @@ def make_demo(
     assets, seed : int
         Number of objects, and the seed of everything random.
     levels : tuple of int
-        Levels of difficulty, gone through in turn; see `slatprep.demo.difficulty`.
+        Levels of difficulty, gone through in turn; see `slatprep.demo.difficulty`. The
+        default has those whose sides show one clean shape; 5 to 7, a generated shape, a
+        NeRF's field and both, are made where they are named.
     views : int
         SLATs of each object; with several, rows are named ``<object id>.<view>``.
     latents : {"placeholder", "material"}

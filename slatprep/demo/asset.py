@@ -12,20 +12,28 @@ from slatprep.demo.catalogue import CATALOGUE
 from slatprep.demo.difficulty import (
     LEVELS,
     QUARTER_TURNS,
+    SAME_SHAPE_LEVELS,
     UNLABELLED,
     Frames,
     damage,
     draw_frames,
+    generate,
 )
+from slatprep.demo.generated import nearest_similarity
 from slatprep.demo.latents import LatentKind, make_latents
+from slatprep.demo.nerf import nerf_field
 from slatprep.demo.shapes import Solid
 from slatprep.demo.voxelise import voxelise
 from slatprep.geometry.frames import voxel_centres
+from slatprep.geometry.voxels import boundary
 from slatprep.records import BACKGROUND, RESOLUTION
 
 # Each random choice has a stream of its own, so that one option of the demo
 # does not change what another one draws.
-_SHAPE, _FRAME, _DAMAGE, _LATENTS, _HABIT = range(5)
+_SHAPE, _FRAME, _DAMAGE, _LATENTS, _HABIT, _GENERATED = range(6)
+
+# A bent shape is looked at over a longer way, since its distances are less certain.
+_GENERATED_REACH = 0.16
 
 
 @dataclass(frozen=True)
@@ -41,11 +49,15 @@ class DemoView:
     feats : ndarray of float32, shape (N, 8)
         Latents.
     transform : ndarray of float64, shape (4, 4)
-        PixieVerse frame to SLAT frame.
+        PixieVerse frame to SLAT frame; of a generated shape, the similarity that takes
+        `places` onto the SLAT voxels with least squares.
     material : ndarray of uint8, shape (N,)
         True class of each SLAT voxel.
     properties : ndarray of float32, shape (N, 3)
         True Young's modulus, density and Poisson's ratio of each, SI.
+    places : ndarray of float64, shape (N, 3), or None
+        Where the centre of each SLAT voxel truly lies in the PixieVerse frame; None
+        on the levels whose transform says it.
     """
 
     view: str
@@ -54,6 +66,7 @@ class DemoView:
     transform: NDArray[np.float64]
     material: NDArray[np.uint8]
     properties: NDArray[np.float32]
+    places: NDArray[np.float64] | None = None
 
 
 @dataclass(frozen=True)
@@ -79,7 +92,7 @@ def make_asset(
     seed: int,
     index: int,
     *,
-    levels: tuple[int, ...] = tuple(LEVELS),
+    levels: tuple[int, ...] = SAME_SHAPE_LEVELS,
     views: int = 1,
     latents: LatentKind = "placeholder",
     habitual_share: float = 0.0,
@@ -95,7 +108,8 @@ def make_asset(
     levels : tuple of int
         The levels that the dataset goes through in turn.
     views : int
-        SLATs of the object; from the second on the SLAT side is turned about z.
+        SLATs of the object; from the second on the SLAT side is turned about z, and
+        where shapes are generated, each is another one.
     latents : {"placeholder", "material"}
         What the latents are made of.
     habitual_share : float
@@ -113,22 +127,30 @@ def make_asset(
     # The added turn keeps a category from meeting one level only.
     level = levels[(index + turn) % len(levels)]
     model = CATALOGUE[category](np.random.default_rng([seed, index, _SHAPE]), turn)
-    solid = Solid(model.parts)
+    difficulty = LEVELS[level]
+    solid = Solid(model.parts, *([_GENERATED_REACH] if difficulty.generated else []))
 
     rng = np.random.default_rng([seed, index, _FRAME])
     quarter = int(rng.integers(len(QUARTER_TURNS)))
     if rng.uniform() < habitual_share:
         quarter = int(np.random.default_rng([seed, _HABIT]).integers(len(QUARTER_TURNS)))
-    frames = draw_frames(rng, solid, LEVELS[level], QUARTER_TURNS[quarter])
+    frames = draw_frames(rng, solid, difficulty, QUARTER_TURNS[quarter])
     stuff = _pixieverse_side(solid, frames)
-    if LEVELS[level].damaged:
-        rng = np.random.default_rng([seed, index, _DAMAGE])
+    skin = frames.pixieverse.to_object(voxel_centres(np.argwhere(boundary(stuff >= 0))))
+    rng = np.random.default_rng([seed, index, _DAMAGE])
+    if difficulty.nerf:
+        stuff = nerf_field(rng, stuff, frames.pixieverse.rotation[:, 2], len(solid.stuffs))
+    elif difficulty.damaged:
         stuff = damage(rng, stuff, frames.pixieverse_distance(solid), len(solid.stuffs))
     made = []
     for v in range(views):
         seen = replace(frames, slat=replace(frames.slat, rotation=_heading(v)))
+        if difficulty.generated:
+            rng = np.random.default_rng([seed, index, _GENERATED, v])
+            seen = generate(rng, seen, difficulty, solid, skin)
         rng = np.random.default_rng([seed, index, _LATENTS, v])
-        made.append(_slat_side(rng, f"view_{v}" if views > 1 else "", solid, seen, latents))
+        view = _slat_side(rng, f"view_{v}" if views > 1 else "", solid, seen, latents)
+        made.append(_with_places(view, seen) if difficulty.has_places else view)
     return DemoAsset(
         object_id(seed, index),
         model.name,
@@ -177,3 +199,11 @@ def _slat_side(
     stuff = solid.stuff_at(frames.slat_to_object(voxel_centres(coords)))
     feats = make_latents(rng, latents, coords, material[stuff], properties[stuff])
     return DemoView(view, coords, feats, frames.transform(), material[stuff], properties[stuff])
+
+
+def _with_places(view: DemoView, frames: Frames) -> DemoView:
+    centres = voxel_centres(view.coords)
+    places = frames.places(centres)
+    # Where the shape is the object's own, its transform leads to the places exactly.
+    transform = nearest_similarity(places, centres) if frames.distortion else view.transform
+    return replace(view, places=places, transform=transform)

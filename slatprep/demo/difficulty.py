@@ -8,18 +8,25 @@ level   the PixieVerse side against the SLAT side
 2       plus a scale mismatch of 2 to 10 percent, bites and floaters
 3       any rotation, both sides scaled by their own bounding boxes, damage as 2
 4       as 1, plus a smooth warp of the SLAT side of about one voxel
+5       tilt and shift as 1, the SLAT side a generated shape (`slatprep.demo.generated`),
+        bites and floaters
+6       tilt and shift as 1, the PixieVerse side a NeRF's field (`slatprep.demo.nerf`)
+7       both in any rotation
 ======  ==========================================================================
+
+From level 5 on each side is scaled by its own bounding box.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import permutations, product
 
 import numpy as np
 from numpy.typing import NDArray
 
+from slatprep.demo.generated import Distortion, draw_distortion
 from slatprep.demo.shapes import Solid, bounding_box
 from slatprep.geometry.frames import VOXEL_SIZE, make_transform, voxel_centres
 from slatprep.geometry.voxels import boundary
@@ -38,7 +45,12 @@ UNLABELLED = -2
 
 @dataclass(frozen=True)
 class Difficulty:
-    """What makes one level: angles in degrees, lengths in voxels, scale as a share."""
+    """What makes one level: angles in degrees, lengths in voxels, scale as a share.
+
+    ``proportions`` and ``bend`` are of a generated shape, see
+    `slatprep.demo.generated.draw_distortion`; ``room`` is what a NeRF's field needs
+    on each side of the grid.
+    """
 
     tilt: float = 0.0
     shift: float = 0.0
@@ -46,6 +58,21 @@ class Difficulty:
     any_rotation: bool = False
     damaged: bool = False
     warp: float = 0.0
+    own_boxes: bool = False
+    proportions: tuple[float, float] = (0.0, 0.0)
+    bend: float = 0.0
+    nerf: bool = False
+    room: float = 0.0
+
+    @property
+    def generated(self) -> bool:
+        """Whether the SLAT side is a shape of its own."""
+        return self.bend > 0.0
+
+    @property
+    def has_places(self) -> bool:
+        """Whether the truth names a place for each SLAT voxel."""
+        return self.generated or self.nerf
 
 
 LEVELS: dict[int, Difficulty] = {
@@ -54,7 +81,17 @@ LEVELS: dict[int, Difficulty] = {
     2: Difficulty(tilt=15.0, shift=1.5, scale=(0.02, 0.10), damaged=True),
     3: Difficulty(any_rotation=True, damaged=True),
     4: Difficulty(tilt=15.0, shift=1.5, warp=1.0),
+    5: Difficulty(
+        tilt=15.0, shift=1.5, own_boxes=True, damaged=True, proportions=(0.10, 0.25), bend=2.0
+    ),
+    6: Difficulty(tilt=15.0, shift=1.5, own_boxes=True, nerf=True, room=2.0),
+    7: Difficulty(
+        any_rotation=True, own_boxes=True, proportions=(0.10, 0.25), bend=2.0, nerf=True, room=2.0
+    ),
 }
+
+SAME_SHAPE_LEVELS = (0, 1, 2, 3, 4)
+"""Levels whose sides show one clean shape: what a demo has where nothing else is asked for."""
 
 
 def _quarter_turns() -> tuple[Array, ...]:
@@ -91,6 +128,11 @@ class Pose:
         mapped: Array = (points - self.shift) / self.scale @ self.rotation + self.centre
         return mapped
 
+    def from_object(self, points: Array) -> Array:
+        """Map points (P, 3) of the object to the frame."""
+        mapped: Array = self.scale * (points - self.centre) @ self.rotation.T + self.shift
+        return mapped
+
 
 @dataclass(frozen=True)
 class Warp:
@@ -123,14 +165,15 @@ class Warp:
 
 @dataclass(frozen=True)
 class Frames:
-    """The two poses of one asset, and the warp of its SLAT side (none where None)."""
+    """The two poses of one asset, and how its SLAT side was warped or generated (if not None)."""
 
     pixieverse: Pose
     slat: Pose
     warp: Warp | None
+    distortion: Distortion | None = None
 
     def transform(self) -> Array:
-        """Return the true transform, PixieVerse frame to SLAT frame; the warp is not in it."""
+        """Return the transform of the poses, PixieVerse frame to SLAT frame, and of these alone."""
         slat, pixieverse = self.slat, self.pixieverse
         rotation = slat.rotation @ pixieverse.rotation.T
         scale = slat.scale / pixieverse.scale
@@ -139,11 +182,18 @@ class Frames:
 
     def slat_to_object(self, points: Array) -> Array:
         """Map points (P, 3) of the SLAT frame to the object."""
-        return self.slat.to_object(self.warp(points) if self.warp else points)
+        mapped = self.slat.to_object(self.warp(points) if self.warp else points)
+        return self.distortion(mapped) if self.distortion else mapped
+
+    def places(self, points: Array) -> Array:
+        """Map points (P, 3) of the SLAT frame to the PixieVerse frame."""
+        return self.pixieverse.from_object(self.slat_to_object(points))
 
     def slat_distance(self, solid: Solid) -> Callable[[Array], Array]:
         """Return the distance bound of a solid in the SLAT frame."""
         factor = self.slat.scale / (self.warp.stretch if self.warp else 1.0)
+        if self.distortion:
+            factor /= self.distortion.stretch
         return lambda points: factor * solid.distance(self.slat_to_object(points))
 
     def pixieverse_distance(self, solid: Solid) -> Callable[[Array], Array]:
@@ -175,12 +225,13 @@ def draw_frames(rng: Rng, solid: Solid, difficulty: Difficulty, quarter: Array) 
     warp = _draw_warp(rng, difficulty.warp) if difficulty.warp else None
     room = _FULL - 2.0 * warp.reach if warp else _FULL
     slat_scale = room / float((solid.extent[1] - solid.extent[0]).max())
+    full = _FULL - 2.0 * difficulty.room * VOXEL_SIZE
 
     if difficulty.any_rotation:
         rotation = _any_rotation(rng)
         box = bounding_box(solid.shapes, rotation)
         pixieverse = Pose(
-            rotation, _FULL / float((box[1] - box[0]).max()), rotation.T @ box.mean(0), np.zeros(3)
+            rotation, full / float((box[1] - box[0]).max()), rotation.T @ box.mean(0), np.zeros(3)
         )
         return Frames(pixieverse, Pose(np.eye(3), slat_scale, middle, np.zeros(3)), warp)
 
@@ -190,7 +241,13 @@ def draw_frames(rng: Rng, solid: Solid, difficulty: Difficulty, quarter: Array) 
         shift = _direction(rng) * rng.uniform(0.0, difficulty.shift) * VOXEL_SIZE
     box = bounding_box(solid.shapes, rotation) - rotation @ middle
     # The largest scale at which neither side of the shifted box leaves the cube.
-    largest = float(np.min(np.stack([_FULL / 2 + shift, _FULL / 2 - shift]) / np.abs(box)))
+    largest = float(np.min(np.stack([full / 2 + shift, full / 2 - shift]) / np.abs(box)))
+    if difficulty.own_boxes:
+        return Frames(
+            Pose(rotation, largest, middle, shift),
+            Pose(np.eye(3), slat_scale, middle, np.zeros(3)),
+            warp,
+        )
     mismatch = 1.0
     if difficulty.scale[1]:
         mismatch += rng.choice([-1.0, 1.0]) * rng.uniform(*difficulty.scale)
@@ -200,6 +257,39 @@ def draw_frames(rng: Rng, solid: Solid, difficulty: Difficulty, quarter: Array) 
         Pose(np.eye(3), slat_scale, middle, np.zeros(3)),
         warp,
     )
+
+
+def generate(
+    rng: Rng, frames: Frames, difficulty: Difficulty, solid: Solid, skin: Array
+) -> Frames:
+    """Replace the SLAT side of an asset by a generated shape that fills the cube.
+
+    Parameters
+    ----------
+    rng : numpy.random.Generator
+        Source of the random parts.
+    frames : Frames
+        Of the same asset, without a warp; the rotation of its SLAT side is kept.
+    difficulty : Difficulty
+        What its level asks for.
+    solid : Solid
+        The object.
+    skin : ndarray of float64, shape (K, 3)
+        Points of the object's skin, no part of it farther than a voxel from one.
+
+    Returns
+    -------
+    Frames
+        The same with a distortion, and with the SLAT's pose fitted to it.
+    """
+    distortion = draw_distortion(rng, solid.extent, difficulty.proportions, difficulty.bend)
+    turned = distortion.inverse(skin) @ frames.slat.rotation.T
+    low, high = turned.min(axis=0), turned.max(axis=0)
+    # What lies between the points of the skin may reach a voxel farther.
+    size = (_FULL - 2.0 * VOXEL_SIZE) / float((high - low).max())
+    middle = frames.slat.rotation.T @ ((low + high) / 2.0)
+    pose = Pose(frames.slat.rotation, size, middle, np.zeros(3))
+    return replace(frames, slat=pose, distortion=distortion)
 
 
 def _direction(rng: Rng) -> Array:

@@ -221,15 +221,17 @@ class Solid:
     ----------
     parts : sequence of Part
         At least one.
+    reach : float
+        Distances are known up to this share of the largest edge of the solid's box.
     """
 
-    def __init__(self, parts: Sequence[Part]) -> None:
+    def __init__(self, parts: Sequence[Part], reach: float = 0.08) -> None:
         self.parts = tuple(parts)
         self.shapes = tuple(part.shape for part in self.parts)
         self.extent = bounding_box(self.shapes, np.eye(3))
         # A part is looked at only near its own box; elsewhere it is at least
         # this far, which is all that the voxelisation has to know.
-        self.reach = 0.08 * float((self.extent[1] - self.extent[0]).max())
+        self.reach = reach * float((self.extent[1] - self.extent[0]).max())
         self._boxes = [shape.box() for shape in self.shapes]
         self.stuffs: list[Stuff] = []
         self._first_stuff: list[int] = []

@@ -101,6 +101,7 @@ def write_truth(root: Path, asset: DemoAsset) -> None:
     """Write what is true of each row of an asset to ``<root>/<row id>.npz``."""
     root.mkdir(parents=True, exist_ok=True)
     for view in asset.views:
+        places = {} if view.places is None else {"places": view.places}
         np.savez(
             root / f"{row_id(asset, view)}.npz",
             transform=view.transform,
@@ -109,6 +110,7 @@ def write_truth(root: Path, asset: DemoAsset) -> None:
             symmetric=np.bool_(asset.symmetric),
             name=np.str_(asset.name),
             level=np.int64(asset.level),
+            **places,
         )
 
 

@@ -1,0 +1,162 @@
+"""The shape that a generator makes up from one image of an object.
+
+Its proportions are off, it is bent, and most of all on the side that the image
+does not see. A `Distortion` leads from a point of the generated shape back to
+the same point of the object, so that the true place of a SLAT voxel is
+evaluated, not fitted.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from slatprep.demo.model import direction
+from slatprep.geometry.frames import VOXEL_SIZE
+
+Rng = np.random.Generator
+Array = NDArray[np.float64]
+
+_LARGEST_SLOPE = 0.75
+"""Bound on how much a bend changes over a way, as a share of it; below 1 nothing folds."""
+
+_EDGE = 4.0
+"""How quickly a bend grows from the seen side to the unseen one, per size of the object."""
+
+
+@dataclass(frozen=True)
+class Distortion:
+    """A smooth map from the generated shape to the object, both in object coordinates.
+
+    With ``q = (y - middle) / size``, a point ``y`` of the generated shape is the
+    object's point ``middle + size * (q + w(q) b(q)) / proportions``, where ``b`` is
+    a sum of plane sine waves and ``w`` grows from 2/3 on the side that the image
+    sees to 4/3 on the other one.
+
+    Attributes
+    ----------
+    middle : ndarray of float64, shape (3,)
+        Centre of the object's bounding box.
+    size : float
+        Largest edge of that box.
+    proportions : ndarray of float64, shape (3,)
+        Stretch of the generated shape along each axis of the object.
+    amplitude, wave : ndarray of float64, shape (W, 3)
+        Of each sine wave, in sizes of the object and radians across it.
+    phase : ndarray of float64, shape (W,)
+        Of each sine wave, in radians.
+    away : ndarray of float64, shape (3,)
+        Unit vector that points away from the image's camera.
+    """
+
+    middle: Array
+    size: float
+    proportions: Array
+    amplitude: Array
+    wave: Array
+    phase: Array
+    away: Array
+
+    def __call__(self, points: Array) -> Array:
+        """Map points (P, 3) of the generated shape to the object."""
+        q = (points - self.middle) / self.size
+        moved: Array = self.middle + self.size * (q + self._bend(q)) / self.proportions
+        return moved
+
+    def inverse(self, points: Array, iterations: int = 40) -> Array:
+        """Map points (P, 3) of the object to the generated shape.
+
+        By fixed-point iteration: the bend is a contraction by construction, and
+        each step reduces the error at least by `_LARGEST_SLOPE`.
+        """
+        target = self.proportions * (points - self.middle) / self.size
+        q = target
+        for _ in range(iterations):
+            q = target - self._bend(q)
+        mapped: Array = self.middle + self.size * q
+        return mapped
+
+    @property
+    def stretch(self) -> float:
+        """No distance grows by more than this factor from the generated shape to the object."""
+        return (1.0 + _slope(self.amplitude, self.wave)) / float(self.proportions.min())
+
+    def _bend(self, q: Array) -> Array:
+        growth = 1.0 + np.tanh(_EDGE * (q @ self.away)) / 3.0
+        bend: Array = growth[:, None] * (np.sin(q @ self.wave.T + self.phase) @ self.amplitude)
+        return bend
+
+
+def _slope(amplitude: Array, wave: Array) -> float:
+    """Bound the change of a bend over a way: that of its waves, and that of its growth."""
+    size = np.linalg.norm(amplitude, axis=1)
+    return float(4.0 / 3.0 * size @ np.linalg.norm(wave, axis=1) + _EDGE / 3.0 * size.sum())
+
+
+def draw_distortion(
+    rng: Rng, extent: Array, proportions: tuple[float, float], bend: float, waves: int = 3
+) -> Distortion:
+    """Draw what a generator makes of an object.
+
+    Parameters
+    ----------
+    rng : numpy.random.Generator
+        Source of the random parts.
+    extent : ndarray of float64, shape (2, 3)
+        The object's bounding box.
+    proportions : tuple of float
+        Least and greatest error of the proportions along one axis, as a share.
+    bend : float
+        Root mean square of the smooth part, in voxels of a grid that the object fills.
+    waves : int
+        How many sine waves make it up.
+
+    Returns
+    -------
+    Distortion
+        One that folds nowhere.
+    """
+    stretch = np.ones(3)
+    stretch[rng.integers(3)] += rng.choice([-1.0, 1.0]) * rng.uniform(*proportions)
+    size = bend * VOXEL_SIZE * np.sqrt(2.0 / waves)
+    amplitude = np.stack([size * direction(rng) for _ in range(waves)])
+    wave = np.stack([2.0 * np.pi * rng.uniform(0.6, 1.1) * direction(rng) for _ in range(waves)])
+    phase = rng.uniform(0.0, 2.0 * np.pi, waves)
+    # The image is taken from somewhere around the object, a little above it or below.
+    angle, height = rng.uniform(0.0, 2.0 * np.pi), rng.uniform(-0.3, 0.5)
+    away = np.array([-np.cos(angle), -np.sin(angle), -height])
+    return Distortion(
+        middle=extent.mean(axis=0),
+        size=float((extent[1] - extent[0]).max()),
+        proportions=stretch,
+        amplitude=amplitude * min(1.0, _LARGEST_SLOPE / _slope(amplitude, wave)),
+        wave=wave,
+        phase=phase,
+        away=away / np.linalg.norm(away),
+    )
+
+
+def nearest_similarity(source: NDArray[np.floating[Any]], target: Array) -> Array:
+    """Return the similarity (4, 4) that maps points onto others with least squares.
+
+    Parameters
+    ----------
+    source, target : ndarray of float64, shape (P, 3)
+        The points, at least three that are not on a line, and where they should go.
+
+    References
+    ----------
+    S. Umeyama, "Least-squares estimation of transformation parameters between
+    two point patterns", IEEE TPAMI 13(4), 1991.
+    """
+    a, b = source - source.mean(axis=0), target - target.mean(axis=0)
+    u, values, v = np.linalg.svd(b.T @ a)
+    signs = np.array([1.0, 1.0, np.sign(np.linalg.det(u @ v))])
+    linear = (u * signs) @ v * (float(values @ signs) / float((a * a).sum()))
+    transform = np.eye(4)
+    transform[:3, :3] = linear
+    transform[:3, 3] = target.mean(axis=0) - linear @ source.mean(axis=0)
+    return transform

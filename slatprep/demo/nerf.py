@@ -1,0 +1,135 @@
+"""An object as a NeRF's density has it, on the grid of PixieVerse.
+
+The field is thicker than the object and rough, has hollows inside and blobs
+afloat, lacks some of what is thin, and now and then shows a piece of the ground
+that the object stood on.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from slatprep.demo.difficulty import UNLABELLED
+from slatprep.geometry.frames import VOXEL_SIZE, voxel_centres
+from slatprep.records import RESOLUTION
+
+Rng = np.random.Generator
+
+THICKENING = 0.7
+"""How far [voxel] the surface lies outside the object's."""
+
+ROUGHNESS = 0.6
+"""Standard deviation [voxel] of the surface; it stays within `_MOST_ROUGH` of them."""
+
+GROUND_SHARE = 1.0 / 3.0
+"""Share of the assets with a slab of ground."""
+
+_MOST_ROUGH = 2.0
+_THIN = 1.5  # Half the thickness [voxel] below which a part may be lost.
+_MOST_LOST = 0.15  # Share of an object that is lost at most with its thin parts.
+
+
+def nerf_field(
+    rng: Rng, stuff: NDArray[np.int16], up: NDArray[np.float64], stuffs: int
+) -> NDArray[np.int16]:
+    """Make of an exact grid what a NeRF would have left of it.
+
+    Parameters
+    ----------
+    rng : numpy.random.Generator
+        Source of the random parts.
+    stuff : ndarray of int16, shape (64, 64, 64)
+        Index of the stuff of each voxel, -1 where empty.
+    up : ndarray of float64, shape (3,)
+        Unit vector of the grid's frame that points up from the ground.
+    stuffs : int
+        How many stuffs the asset has; blobs and ground are of any.
+
+    Returns
+    -------
+    ndarray of int16, shape (64, 64, 64)
+        The grid, in the same frame: what is left of the object lies where it lay.
+        `UNLABELLED` marks the voxels of one blob that carry no label.
+    """
+    kept = _without_thin_parts(rng, stuff >= 0)
+    away, nearest = ndimage.distance_transform_edt(~kept, return_indices=True)
+    depth = ndimage.distance_transform_edt(kept)
+    signed = np.where(kept, 0.5 - depth, away - 0.5)
+    rough = ROUGHNESS * np.clip(_smooth_noise(rng, 1.5), -_MOST_ROUGH, _MOST_ROUGH)
+    field = np.where(signed <= THICKENING + rough, stuff[tuple(nearest)], np.int16(-1))
+    _hollow(rng, field, depth)
+    if rng.uniform() < GROUND_SHARE:
+        _add_ground(rng, field, kept, up, int(rng.integers(stuffs)))
+    _add_blobs(rng, field, away, stuffs)
+    return field.astype(np.int16)
+
+
+def _smooth_noise(rng: Rng, sigma: float) -> NDArray[np.float64]:
+    """Return noise (64, 64, 64) of mean 0 and deviation 1, smooth over `sigma` voxels."""
+    noise = ndimage.gaussian_filter(rng.normal(size=(RESOLUTION,) * 3), sigma)
+    scaled: NDArray[np.float64] = (noise - noise.mean()) / noise.std()
+    return scaled
+
+
+def _without_thin_parts(rng: Rng, occupied: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Remove some of what a ball of radius `_THIN` does not fit into, piece by piece."""
+    core = ndimage.distance_transform_edt(occupied) > _THIN
+    opened = ndimage.distance_transform_edt(~core) <= _THIN
+    thin = occupied & ~opened & (_smooth_noise(rng, 4.0) > 0.0)
+    pieces, count = ndimage.label(thin, np.ones((3, 3, 3)))
+    sizes = np.bincount(pieces.ravel(), minlength=count + 1)[1:]
+    order = rng.permutation(count)
+    # Where most is thin, as of grass, an object must stay what it is.
+    lost = order[np.cumsum(sizes[order]) <= _MOST_LOST * occupied.sum()]
+    left: NDArray[np.bool_] = occupied & ~np.isin(pieces, lost + 1)
+    return left
+
+
+def _ball(centre: NDArray[np.integer], radii: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Return the voxels (64, 64, 64) of an ellipsoid with axes along the grid's, in voxels."""
+    x, y, z = (
+        ((np.arange(RESOLUTION) - c) / r) ** 2 for c, r in zip(centre, radii, strict=True)
+    )
+    inside: NDArray[np.bool_] = x[:, None, None] + y[:, None] + z < 1.0
+    return inside
+
+
+def _hollow(rng: Rng, field: NDArray[np.int16], depth: NDArray[np.float64]) -> None:
+    """Empty a few places well below the surface."""
+    deep = np.argwhere(depth > 3.5)
+    for _ in range(rng.integers(1, 4) if len(deep) else 0):
+        hollow = _ball(deep[rng.integers(len(deep))], rng.uniform(2.0, 6.0, 3))
+        field[hollow & (depth > 2.0)] = -1
+
+
+def _add_ground(
+    rng: Rng,
+    field: NDArray[np.int16],
+    occupied: NDArray[np.bool_],
+    up: NDArray[np.float64],
+    stuff: int,
+) -> None:
+    """Add a round slab at the object's foot, as far as the grid reaches."""
+    centres = voxel_centres(np.argwhere(np.ones_like(occupied))) / VOXEL_SIZE
+    height = (centres @ up).reshape(occupied.shape)
+    foot = float(height[occupied].min())
+    middle = centres[occupied.ravel()].mean(axis=0)
+    aside = centres - middle
+    aside -= np.outer(aside @ up, up)
+    distance = np.linalg.norm(aside, axis=1).reshape(occupied.shape)
+    radius = rng.uniform(0.9, 1.4) * float(np.quantile(distance[occupied], 0.95))
+    top, thickness = foot + rng.uniform(0.0, 1.5), rng.uniform(2.0, 4.0)
+    slab = (height <= top) & (height > top - thickness) & (distance < radius)
+    field[slab & (field == -1)] = stuff
+
+
+def _add_blobs(
+    rng: Rng, field: NDArray[np.int16], away: NDArray[np.float64], stuffs: int
+) -> None:
+    """Add blobs in empty space, one of them without a label."""
+    free = np.argwhere((away > 4.5) & (field == -1))
+    for k in range(rng.integers(3, 8) if len(free) else 0):
+        blob = _ball(free[rng.integers(len(free))], rng.uniform(1.0, 3.0, 3))
+        field[blob & (field == -1)] = UNLABELLED if k == 0 else rng.integers(stuffs)
