@@ -24,10 +24,11 @@ def score(output: Output, store: Path, truth_dir: Path) -> None:
 
     TRUTH_DIR holds an npz an asset, as make-demo writes it. Each level's
     figures are over assets that have one right placement only: success is a
-    mean displacement below 1.5 voxels; displacement is the median, p90 the
-    90th percentile; labels is the share of right classes, beside what the
-    truth's own transform would give. Exit code 1 says that an asset with a
-    truth is not in the store.
+    mean displacement less than 1.5 voxels above that of the best similarity
+    (0 where the shapes are the same); displacement is the median, p90 the 90th
+    percentile; labels is the share of right classes, beside what the best
+    similarity and the true places themselves would give. Exit code 1 says that
+    an asset with a truth is not in the store.
     """
     from slatprep.bench.truth import score_against_truth
 
@@ -37,21 +38,30 @@ def score(output: Output, store: Path, truth_dir: Path) -> None:
         if output.verbosity > 0:
             output.table(
                 "Assets against truth",
-                ("asset", "name", "level", "symmetric", "displacement", "labels",
-                 "truth's own", "valid"),
+                ("asset", "name", "level", "symmetric", "displacement", "best similarity",
+                 "labels", "best similarity", "true places", "valid"),
                 [
-                    (s.asset_id, s.name, s.level, s.symmetric, s.displacement, s.label_accuracy,
+                    (s.asset_id, s.name, s.level, s.symmetric, s.displacement,
+                     s.similarity_displacement, s.label_accuracy, s.similarity_accuracy,
                      s.truth_own, s.valid_share)
                     for s in report.assets
                 ],
             )  # fmt: skip
         output.table(
-            "Against truth (non-symmetric assets; displacement in voxels)",
-            ("level", "assets", "success", "displacement", "p90", "labels", "truth's own",
-             "valid"),
+            "Places against truth (non-symmetric assets; displacement in voxels)",
+            ("level", "assets", "success", "displacement", "p90", "best similarity"),
             [
                 (f"L{s.level}", s.assets, s.success, s.displacement_median, s.displacement_p90,
-                 s.label_accuracy, s.truth_own, s.valid_share)
+                 s.similarity_displacement)
+                for s in report.levels
+            ],
+        )  # fmt: skip
+        output.table(
+            "Labels against truth (of the same assets; shares)",
+            ("level", "labels", "best similarity", "true places", "valid"),
+            [
+                (f"L{s.level}", s.label_accuracy, s.similarity_accuracy, s.truth_own,
+                 s.valid_share)
                 for s in report.levels
             ],
         )  # fmt: skip
