@@ -268,10 +268,7 @@ def compare_with_truth(
     tree = cKDTree(voxel_centres(annotated))
     distance, nearest = tree.query(true_places)
     answerable = distance / VOXEL_SIZE <= ANSWERABLE_DISTANCE
-    if truth.places is None:
-        similarity_nearest = nearest
-    else:
-        similarity_nearest = tree.query(by_similarity)[1]
+    similarity_nearest = nearest if truth.places is None else tree.query(by_similarity)[1]
 
     def right(chosen: NDArray[np.intp]) -> float:
         return _share((annotated_material[chosen] == truth.material)[answerable])

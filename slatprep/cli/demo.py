@@ -17,6 +17,7 @@ from slatprep.cli.output import Output, output_options
 Example:
   slatprep make-demo demo --assets 14 --seed 0
   slatprep make-demo hard --assets 6 --seed 1 --level 3 --level 4
+  slatprep make-demo shapes --assets 6 --seed 1 --level 5 --level 6 --level 7
   slatprep make-demo other --assets 4 --seed 2 --grid-form prediction --slat-form hdf5
 """,
 )

@@ -33,7 +33,7 @@ from slatprep.records import BACKGROUND, RESOLUTION
 _SHAPE, _FRAME, _DAMAGE, _LATENTS, _HABIT, _GENERATED = range(6)
 
 # A bent shape is looked at over a longer way, since its distances are less certain.
-_GENERATED_REACH = 0.16
+_GENERATED_REACH = 0.12
 
 
 @dataclass(frozen=True)

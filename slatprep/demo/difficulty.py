@@ -259,9 +259,7 @@ def draw_frames(rng: Rng, solid: Solid, difficulty: Difficulty, quarter: Array) 
     )
 
 
-def generate(
-    rng: Rng, frames: Frames, difficulty: Difficulty, solid: Solid, skin: Array
-) -> Frames:
+def generate(rng: Rng, frames: Frames, difficulty: Difficulty, solid: Solid, skin: Array) -> Frames:
     """Replace the SLAT side of an asset by a generated shape that fills the cube.
 
     Parameters

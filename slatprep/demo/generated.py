@@ -20,8 +20,11 @@ from slatprep.geometry.frames import VOXEL_SIZE
 Rng = np.random.Generator
 Array = NDArray[np.float64]
 
-_LARGEST_SLOPE = 0.75
-"""Bound on how much a bend changes over a way, as a share of it; below 1 nothing folds."""
+_LARGEST_SLOPE = 0.7
+"""No bend changes by more than this share of a way; below 1 nothing folds."""
+
+_REACH = 0.75
+"""Half edge, in sizes of the object, of the cube in which a bend is bounded; it holds any shape."""
 
 _EDGE = 4.0
 """How quickly a bend grows from the seen side to the unseen one, per size of the object."""
@@ -50,6 +53,8 @@ class Distortion:
         Of each sine wave, in radians.
     away : ndarray of float64, shape (3,)
         Unit vector that points away from the image's camera.
+    slope : float
+        Bound on how much the bend changes over a way, as a share of it.
     """
 
     middle: Array
@@ -59,6 +64,7 @@ class Distortion:
     wave: Array
     phase: Array
     away: Array
+    slope: float
 
     def __call__(self, points: Array) -> Array:
         """Map points (P, 3) of the generated shape to the object."""
@@ -70,7 +76,7 @@ class Distortion:
         """Map points (P, 3) of the object to the generated shape.
 
         By fixed-point iteration: the bend is a contraction by construction, and
-        each step reduces the error at least by `_LARGEST_SLOPE`.
+        each step reduces the error at least to the share `slope`.
         """
         target = self.proportions * (points - self.middle) / self.size
         q = target
@@ -82,18 +88,44 @@ class Distortion:
     @property
     def stretch(self) -> float:
         """No distance grows by more than this factor from the generated shape to the object."""
-        return (1.0 + _slope(self.amplitude, self.wave)) / float(self.proportions.min())
+        return (1.0 + self.slope) / float(self.proportions.min())
 
     def _bend(self, q: Array) -> Array:
-        growth = 1.0 + np.tanh(_EDGE * (q @ self.away)) / 3.0
-        bend: Array = growth[:, None] * (np.sin(q @ self.wave.T + self.phase) @ self.amplitude)
-        return bend
+        return _bend(q, self.amplitude, self.wave, self.phase, self.away)[0]
 
 
-def _slope(amplitude: Array, wave: Array) -> float:
-    """Bound the change of a bend over a way: that of its waves, and that of its growth."""
-    size = np.linalg.norm(amplitude, axis=1)
-    return float(4.0 / 3.0 * size @ np.linalg.norm(wave, axis=1) + _EDGE / 3.0 * size.sum())
+def _bend(
+    q: Array, amplitude: Array, wave: Array, phase: Array, away: Array
+) -> tuple[Array, Array, Array]:
+    """Return the bend (P, 3), and its two factors: the growth (P,) and the waves (P, 3)."""
+    growth = 1.0 + np.tanh(_EDGE * (q @ away)) / 3.0
+    waves = np.sin(q @ wave.T + phase) @ amplitude
+    return growth[:, None] * waves, growth, waves
+
+
+def _slope(amplitude: Array, wave: Array, phase: Array, away: Array) -> float:
+    """Bound the spectral norm of a bend's derivative in the cube of half edge `_REACH`.
+
+    It is taken on a lattice; between its points it changes by no more than the
+    second derivative allows.
+    """
+    steps = 36
+    axis = np.linspace(-_REACH, _REACH, steps)
+    q = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), axis=-1).reshape(-1, 3)
+    _, growth, waves = _bend(q, amplitude, wave, phase, away)
+    ripple = (growth[:, None] * np.cos(q @ wave.T + phase)) @ np.einsum(
+        "wi,wj->wij", amplitude, wave
+    ).reshape(len(wave), 9)
+    rise = (_EDGE / 3.0) * (1.0 - (3.0 * (growth - 1.0)) ** 2)
+    slopes = ripple.reshape(-1, 3, 3) + rise[:, None, None] * waves[:, :, None] * away
+    size, turn = np.linalg.norm(amplitude, axis=1), np.linalg.norm(wave, axis=1)
+    # The growth is at most 4/3, its derivative _EDGE / 3, its second one 0.77 _EDGE^2 / 3.
+    second = float(
+        4.0 / 3.0 * size @ turn**2 + 2.0 * _EDGE / 3.0 * size @ turn + 0.26 * _EDGE**2 * size.sum()
+    )
+    half_diagonal = float(np.sqrt(3.0)) * _REACH / (steps - 1)
+    steepest = float(np.linalg.norm(slopes, 2, axis=(1, 2)).max())
+    return steepest + second * half_diagonal
 
 
 def draw_distortion(
@@ -128,14 +160,18 @@ def draw_distortion(
     # The image is taken from somewhere around the object, a little above it or below.
     angle, height = rng.uniform(0.0, 2.0 * np.pi), rng.uniform(-0.3, 0.5)
     away = np.array([-np.cos(angle), -np.sin(angle), -height])
+    away /= np.linalg.norm(away)
+    slope = _slope(amplitude, wave, phase, away)
+    less = float(min(1.0, _LARGEST_SLOPE / slope))
     return Distortion(
         middle=extent.mean(axis=0),
         size=float((extent[1] - extent[0]).max()),
         proportions=stretch,
-        amplitude=amplitude * min(1.0, _LARGEST_SLOPE / _slope(amplitude, wave)),
+        amplitude=less * amplitude,
         wave=wave,
         phase=phase,
-        away=away / np.linalg.norm(away),
+        away=away,
+        slope=less * slope,
     )
 
 

@@ -17,8 +17,12 @@ from slatprep.records import RESOLUTION
 
 Rng = np.random.Generator
 
-THICKENING = 0.7
-"""How far [voxel] the surface lies outside the object's."""
+THICKENING = 0.5
+"""How far [voxel] the surface lies outside that of the exact grid.
+
+That one is thicker than the object already, since every voxel that the object's
+surface meets is filled.
+"""
 
 ROUGHNESS = 0.6
 """Standard deviation [voxel] of the surface; it stays within `_MOST_ROUGH` of them."""
@@ -89,9 +93,7 @@ def _without_thin_parts(rng: Rng, occupied: NDArray[np.bool_]) -> NDArray[np.boo
 
 def _ball(centre: NDArray[np.integer], radii: NDArray[np.float64]) -> NDArray[np.bool_]:
     """Return the voxels (64, 64, 64) of an ellipsoid with axes along the grid's, in voxels."""
-    x, y, z = (
-        ((np.arange(RESOLUTION) - c) / r) ** 2 for c, r in zip(centre, radii, strict=True)
-    )
+    x, y, z = (((np.arange(RESOLUTION) - c) / r) ** 2 for c, r in zip(centre, radii, strict=True))
     inside: NDArray[np.bool_] = x[:, None, None] + y[:, None] + z < 1.0
     return inside
 
@@ -125,9 +127,7 @@ def _add_ground(
     field[slab & (field == -1)] = stuff
 
 
-def _add_blobs(
-    rng: Rng, field: NDArray[np.int16], away: NDArray[np.float64], stuffs: int
-) -> None:
+def _add_blobs(rng: Rng, field: NDArray[np.int16], away: NDArray[np.float64], stuffs: int) -> None:
     """Add blobs in empty space, one of them without a label."""
     free = np.argwhere((away > 4.5) & (field == -1))
     for k in range(rng.integers(3, 8) if len(free) else 0):

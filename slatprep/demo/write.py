@@ -7,7 +7,7 @@ import hashlib
 import json
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -101,17 +101,18 @@ def write_truth(root: Path, asset: DemoAsset) -> None:
     """Write what is true of each row of an asset to ``<root>/<row id>.npz``."""
     root.mkdir(parents=True, exist_ok=True)
     for view in asset.views:
-        places = {} if view.places is None else {"places": view.places}
-        np.savez(
-            root / f"{row_id(asset, view)}.npz",
-            transform=view.transform,
-            material=view.material,
-            properties=view.properties,
-            symmetric=np.bool_(asset.symmetric),
-            name=np.str_(asset.name),
-            level=np.int64(asset.level),
-            **places,
-        )
+        truth: dict[str, NDArray[Any]] = {
+            "transform": view.transform,
+            "material": view.material,
+            "properties": view.properties,
+            "symmetric": np.array(asset.symmetric, dtype=bool),
+            "name": np.array(asset.name),
+            "level": np.array(asset.level, dtype=np.int64),
+        }
+        if view.places is not None:
+            truth["places"] = view.places
+        path = root / f"{row_id(asset, view)}.npz"
+        np.savez(path, allow_pickle=False, **truth)
 
 
 def write_categories(path: Path, entries: Iterable[tuple[str, str]]) -> None:

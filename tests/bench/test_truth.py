@@ -2,14 +2,20 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import numpy as np
 import pytest
 import zarr
+from click.testing import CliRunner
 
+import slatprep
 from slatprep.bench.truth import TruthScore, score_against_truth, summarise
+from slatprep.cli.commands import slatprep as slatprep_command
 from slatprep.errors import InputError
+from slatprep.geometry.frames import make_transform
+from slatprep.parameters import BuildParameters, PixieverseSource, SlatSource
 
 # A rod of two materials along x in the PixieVerse frame.
 ROD = np.array([[x, 32, 32] for x in range(20, 40)])
@@ -76,7 +82,7 @@ def test_exact_alignment_scores_zero_and_one(tmp_path: Path) -> None:
     write_store(tmp_path / "s.zarr", {"a": rod_asset()})
     write_truth(tmp_path / "truth", "a")
     report = score_against_truth(tmp_path / "s.zarr", tmp_path / "truth")
-    assert report.assets == (TruthScore("a", "rod", 1, False, 0.0, 1.0, 1.0, 1.0),)
+    assert report.assets == (TruthScore("a", "rod", 1, False, 0.0, 1.0, 1.0, 1.0, 0.0, 1.0),)
     assert report.missing == ()
 
 
@@ -134,11 +140,11 @@ def test_unannotated_voxels_are_no_answer(tmp_path: Path) -> None:
 
 def test_level_figures_leave_symmetric_assets_out() -> None:
     scores = [
-        TruthScore("a", "", 0, False, 0.1, 1.0, 1.0, 1.0),
-        TruthScore("b", "", 0, False, 0.3, 0.8, 0.9, 0.5),
-        TruthScore("c", "", 0, False, 1.5, 0.6, 0.8, 0.6),
-        TruthScore("d", "", 0, True, 40.0, 0.0, 0.0, 0.0),
-        TruthScore("e", "", 3, True, 40.0, 0.0, 0.0, 0.0),
+        TruthScore("a", "", 0, False, 0.1, 1.0, 1.0, 1.0, 0.0, 1.0),
+        TruthScore("b", "", 0, False, 0.3, 0.8, 0.9, 0.5, 0.0, 0.9),
+        TruthScore("c", "", 0, False, 1.5, 0.6, 0.8, 0.6, 0.0, 0.8),
+        TruthScore("d", "", 0, True, 40.0, 0.0, 0.0, 0.0, 0.0, 0.0),
+        TruthScore("e", "", 3, True, 40.0, 0.0, 0.0, 0.0, 0.0, 0.0),
     ]
     (level,) = summarise(scores)
     assert (level.level, level.assets) == (0, 3)
@@ -147,6 +153,147 @@ def test_level_figures_leave_symmetric_assets_out() -> None:
     assert level.label_accuracy == pytest.approx(0.8)
     assert level.truth_own == pytest.approx(0.9)
     assert level.valid_share == pytest.approx(0.7)
+
+
+def test_right_is_within_a_voxel_and_a_half_of_the_best_similarity() -> None:
+    scores = [
+        TruthScore("a", "", 5, False, 3.4, 0.9, 1.0, 1.0, 2.0, 0.95),
+        TruthScore("b", "", 5, False, 3.5, 0.9, 1.0, 1.0, 2.0, 0.85),
+        TruthScore("c", "", 5, False, 0.2, 0.9, 1.0, 1.0, 4.0, 0.81),
+    ]
+    (level,) = summarise(scores)
+    assert level.success == pytest.approx(2 / 3)
+    assert level.similarity_displacement == 2.0
+    assert level.similarity_accuracy == pytest.approx(0.87)
+
+
+# A rod that a generator stretched to twice its length: SLAT voxel x truly lies at x / 2 + 15.
+LONG = np.array([[x, 32, 32] for x in range(10, 50)])
+LONG_PLACES = np.column_stack([(LONG[:, 0] + 0.5) / 2 + 15, np.full((40, 2), 32.5)]) / 64 - 0.5
+LONG_MATERIAL = np.where(LONG_PLACES[:, 0] * 64 + 32 < 30, 1, 5).astype(np.uint8)
+
+
+def write_long_truth(folder: Path, **changes: object) -> None:
+    truth = {"material": LONG_MATERIAL, "places": LONG_PLACES, "level": 5}
+    write_truth(folder, "a", **(truth | changes))
+
+
+def long_asset(**changes: np.ndarray) -> dict[str, np.ndarray]:
+    looked_up = {"coords": LONG, "material": LONG_MATERIAL, "valid": np.ones(40, dtype=bool)}
+    return rod_asset(**(looked_up | changes))
+
+
+def test_displacement_is_from_the_true_places(tmp_path: Path) -> None:
+    write_store(tmp_path / "s.zarr", {"a": long_asset()})
+    write_long_truth(tmp_path / "truth")
+    (score,) = score_against_truth(tmp_path / "s.zarr", tmp_path / "truth").assets
+    # The identity leaves voxel x at x + 0.5 where x / 2 + 15.25 is right.
+    apart = np.abs(LONG[:, 0] + 0.5 - (LONG[:, 0] + 0.5) / 2 - 15)
+    assert score.displacement == pytest.approx(apart.mean())
+    assert score.similarity_displacement == pytest.approx(apart.mean())
+    assert score.label_accuracy == 1.0
+    assert score.truth_own == 1.0
+    # The identity asks the rod of 20 voxels from 20 to 39, which changes at 30 as well.
+    assert score.similarity_accuracy == pytest.approx(1.0)
+    write_long_truth(tmp_path / "truth", transform=make_transform(np.eye(3), (5 / 64, 0, 0)))
+    (score,) = score_against_truth(tmp_path / "s.zarr", tmp_path / "truth").assets
+    # Back by five voxels, voxels 30 to 34 ask for the other material.
+    assert score.similarity_accuracy == pytest.approx(35 / 40)
+    assert score.displacement == pytest.approx(apart.mean())
+    moved = np.abs(LONG[:, 0] + 0.5 - 5 - (LONG[:, 0] + 0.5) / 2 - 15)
+    assert score.similarity_displacement == pytest.approx(moved.mean())
+
+
+def test_places_of_the_store_are_what_counts_where_it_has_them(tmp_path: Path) -> None:
+    write_store(tmp_path / "s.zarr", {"a": long_asset(), "b": rod_asset()})
+    write_long_truth(tmp_path / "truth")
+    write_truth(tmp_path / "truth", "b")
+    rod_places = (ROD + 0.5) / 64 - 0.5 + [0.0, 0.0, 3 / 64]
+    aside = np.array([0.0, 1 / 64, 0.0])
+    stored = np.concatenate([LONG_PLACES + aside, rod_places]).astype(np.float32)
+    zarr.open_group(tmp_path / "s.zarr").create_array("voxel/place", data=stored)
+    first, second = score_against_truth(tmp_path / "s.zarr", tmp_path / "truth").assets
+    assert first.displacement == pytest.approx(1.0, abs=1e-5)
+    assert second.displacement == pytest.approx(3.0, abs=1e-5)
+    assert second.similarity_displacement == 0.0
+
+
+def test_places_that_do_not_fit_are_named(tmp_path: Path) -> None:
+    write_store(tmp_path / "s.zarr", {"a": long_asset()})
+    write_long_truth(tmp_path / "truth", places=LONG_PLACES[:-1])
+    with pytest.raises(InputError, match=r"a\.npz: places has shape \(39, 3\)"):
+        score_against_truth(tmp_path / "s.zarr", tmp_path / "truth")
+
+
+def independent_score(store: Path, truth_path: Path) -> dict[str, float]:
+    """Compute the same by comparing every place with every annotated voxel."""
+    root = zarr.open_group(store, mode="r")
+    k = [str(i) for i in root["asset/id"][:]].index(truth_path.stem)
+    first, last = (int(v) for v in root["asset/offset"][k : k + 2])
+    truth = np.load(truth_path)
+    grid = root["grid/material"][k]
+    voxels = np.stack(np.nonzero(grid <= 6), axis=1)
+    classes = grid[grid <= 6]
+
+    def back(matrix: np.ndarray) -> np.ndarray:
+        homogeneous = np.ones((last - first, 4))
+        homogeneous[:, :3] = (root["voxel/coords"][first:last] + 0.5) / 64 - 0.5
+        return np.linalg.solve(matrix, homogeneous.T).T[:, :3]
+
+    def nearest(places: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        asked = (places + 0.5) * 64 - 0.5
+        distance, label = [], []
+        for some in np.array_split(asked, 1 + len(asked) // 400):
+            squared = (voxels**2).sum(axis=1) - 2 * some @ voxels.T + (some**2).sum(axis=1)[:, None]
+            distance.append(np.sqrt(np.maximum(squared.min(axis=1), 0)))
+            label.append(classes[squared.argmin(axis=1)])
+        return np.concatenate(distance), np.concatenate(label)
+
+    true, best = truth["places"], back(truth["transform"])
+    distance, at_true = nearest(true)
+    asked = distance <= 2
+    valid = root["voxel/valid"][first:last]
+    stored = root["voxel/material"][first:last]
+    off = lambda places: 64 * np.sqrt(((places - true) ** 2).sum(axis=1)).mean()  # noqa: E731
+    return {
+        "displacement": off(back(root["asset/transform"][k])),
+        "similarity_displacement": off(best),
+        "label_accuracy": ((stored == truth["material"]) & valid)[asked].mean(),
+        "similarity_accuracy": (nearest(best)[1] == truth["material"])[asked].mean(),
+        "truth_own": (at_true == truth["material"])[asked].mean(),
+        "valid_share": valid.mean(),
+    }
+
+
+def test_scores_of_a_built_demo_equal_an_independent_computation(tmp_path: Path) -> None:
+    demo = slatprep.make_demo(tmp_path / "demo", assets=1, seed=5, levels=(7,))
+    parameters = BuildParameters(
+        pixieverse=PixieverseSource(root=demo.directory / "pixieverse"),
+        slat=SlatSource(root=demo.directory / "slat"),
+    )
+    slatprep.build_store(parameters, tmp_path / "s.zarr")
+    report = score_against_truth(tmp_path / "s.zarr", demo.directory / "truth")
+    assert len(report.assets) == 1
+    for score in report.assets:
+        expected = independent_score(
+            tmp_path / "s.zarr", demo.directory / "truth" / f"{score.asset_id}.npz"
+        )
+        for name, value in expected.items():
+            assert getattr(score, name) == pytest.approx(value, abs=1e-6), name
+
+
+def test_a_printed_score_fits_a_terminal(tmp_path: Path) -> None:
+    write_store(tmp_path / "s.zarr", {"a": long_asset(), "b": rod_asset()})
+    write_long_truth(tmp_path / "truth")
+    write_truth(tmp_path / "truth", "b")
+    command = ["score", str(tmp_path / "s.zarr"), str(tmp_path / "truth")]
+    printed = CliRunner().invoke(slatprep_command, command)
+    assert printed.exit_code == 0
+    assert max(map(len, printed.output.splitlines())) <= 80
+    assert [line[:2] for line in printed.output.splitlines()].count("L5") == 2
+    document = json.loads(CliRunner().invoke(slatprep_command, [*command, "--json"]).output)
+    (level,) = [entry for entry in document["levels"] if entry["level"] == 5]
+    assert level["similarity_displacement"] == pytest.approx(level["displacement_median"])
 
 
 def test_assets_without_row_or_truth(tmp_path: Path) -> None:
