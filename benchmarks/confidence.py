@@ -37,13 +37,14 @@ from typing import Any
 
 import numpy as np
 from joblib import Parallel, delayed
+from slatprep.align.ambiguity import measure_ambiguity
+from slatprep.parallel import single_threaded
 
 from slatprep.align import align
-from slatprep.align.ambiguity import measure_ambiguity
 from slatprep.align.quality import judge, measure_quality
+from slatprep.bench.truth import SUCCESS_DISPLACEMENT, Truth, compare_with_truth, read_truth
 from slatprep.demo import make_demo
-from slatprep.geometry import split_transform
-from slatprep.parallel import single_threaded
+from slatprep.geometry.frames import split_transform
 from slatprep.parameters import (
     AlignParameters,
     BuildParameters,
@@ -54,7 +55,6 @@ from slatprep.parameters import (
 from slatprep.readers import discover, read_field, read_latents
 from slatprep.records import Alignment, MaterialField, StructuredLatents
 from slatprep.sample import sample
-from slatprep.truth import SUCCESS_DISPLACEMENT, Truth, compare_with_truth, read_truth
 
 _FEW = 4
 """Tuples and arrays of up to so many numbers are columns; of longer ones only the length is."""
