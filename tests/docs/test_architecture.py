@@ -1,0 +1,64 @@
+"""What docs/architecture.md and its picture say of the code is so."""
+
+from __future__ import annotations
+
+import importlib
+import re
+import tomllib
+import xml.etree.ElementTree as ET
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[2]
+PAGE = (ROOT / "docs" / "architecture.md").read_text("utf-8")
+LAYERS = [
+    {room.strip() for room in layer.split("|")}
+    for layer in tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["tool"][
+        "importlinter"
+    ]["contracts"][0]["layers"]
+]
+NAMES = sorted(set(re.findall(r"`(slatprep(?:\.\w+)+)`", PAGE)))
+PATHS = sorted(set(re.findall(r"`((?:slatprep|tests|docs)/[\w/.]*|[\w.]+\.(?:toml|yml))`", PAGE)))
+
+
+def test_the_page_names_modules_and_paths() -> None:
+    assert len(NAMES) > 30 and len(PATHS) > 20
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_every_name_exists(name: str) -> None:
+    parts = name.split(".")
+    found = importlib.import_module(parts[0])
+    for index, part in enumerate(parts[1:], 2):
+        if not hasattr(found, part):
+            importlib.import_module(".".join(parts[:index]))
+        found = getattr(found, part)
+
+
+@pytest.mark.parametrize("path", PATHS)
+def test_every_path_exists(path: str) -> None:
+    assert (ROOT / path).exists()
+
+
+def test_every_room_has_its_line() -> None:
+    section = PAGE.split("## The rooms")[1].split("\n## ")[0]
+    told = set(re.findall(r"`slatprep/(\w+)(?:/|\.py)`", section))
+    assert told == set().union(*LAYERS)
+
+
+def test_the_picture_has_the_floors_that_are_checked() -> None:
+    svg = "{http://www.w3.org/2000/svg}"
+    picture = ET.parse(ROOT / "docs" / "images" / "house.svg")
+    floors = [
+        {room.text for room in floor.iter(f"{svg}tspan") if room.get("class") == "room"}
+        for floor in picture.iter(f"{svg}g")
+        if floor.get("class") == "floor"
+    ]
+    assert floors == LAYERS
+
+
+def test_the_index_lists_every_page() -> None:
+    index = (ROOT / "docs" / "index.md").read_text("utf-8")
+    pages = {path.name for path in (ROOT / "docs").glob("*.md")} - {"index.md"}
+    assert pages <= set(re.findall(r"\]\(([\w.]+)\)", index))
