@@ -26,8 +26,8 @@ import fsspec
 import numpy as np
 from s3fs.core import S3FileSystem
 
-from slatprep.storage.remote import as_path
-from slatprep.storage.upload import look_at, upload_store
+from slatprep.storage.place import place_of
+from slatprep.storage.upload import published_state, upload_store
 from slatprep.store import Store, open_store
 
 SERVER = """
@@ -97,7 +97,7 @@ def main() -> None:
             store.read(index)
 
     def publish() -> None:
-        upload_store(arguments.store, look_at(as_path(URL))).show()  # type: ignore[arg-type]
+        upload_store(arguments.store, published_state(place_of(URL))).publish()  # type: ignore[arg-type]
 
     with server(arguments.latency):
         report("publish", publish)

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple, get_args, get_type_hints
 
 from slatprep.errors import ConfigError
 from slatprep.parameters import PRESETS, BuildParameters
-from slatprep.storage.remote import RemotePath, as_path
+from slatprep.storage.place import place_of
 
 if TYPE_CHECKING:
     from pydantic_core import ErrorDetails
@@ -124,9 +124,7 @@ def _read(path: Path) -> dict[str, Any]:
         table = data.get(group)
         value = table.get(key) if isinstance(table, dict) else None
         if isinstance(value, str) and value and (key != "ranges" or value not in NAMED_RANGES):
-            place = as_path(value).expanduser()
-            place = place if isinstance(place, RemotePath) else (folder / place).resolve()
-            data[group][key] = str(place)
+            data[group][key] = str(place_of(value, folder))
     return data
 
 
@@ -167,7 +165,7 @@ def _check_paths(parameters: BuildParameters, origin: _Origin) -> None:
         if value is None or value in NAMED_RANGES:
             continue
         try:
-            if as_path(value).exists():
+            if place_of(value).exists():
                 continue
             fault = "does not exist"
         except OSError as error:

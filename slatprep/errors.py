@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 
 class SlatprepError(Exception):
     """Base of every error that slatprep raises on purpose."""
@@ -14,7 +12,7 @@ class InputError(SlatprepError):
 
     Parameters
     ----------
-    path : str or Path
+    path : str or Place
         The file (or dataset inside a file) at fault.
     fault : str
         What is wrong with it, with the value at fault.
@@ -22,7 +20,7 @@ class InputError(SlatprepError):
         What is allowed, or what to do.
     """
 
-    def __init__(self, path: str | Path, fault: str, expected: str) -> None:
+    def __init__(self, path: object, fault: str, expected: str) -> None:
         super().__init__(f"{path}: {fault}; expected {expected}")
         self.path = str(path)
         self.fault = fault

@@ -8,12 +8,12 @@ provenance records them with each result.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from pathlib import Path
-from typing import Annotated, ClassVar, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 from annotated_types import Ge, Gt, Le
 
-from slatprep.storage.remote import as_path
+from slatprep.records import Place
+from slatprep.storage.place import place_of
 
 Positive = Annotated[float, Gt(0)]
 """A number above 0; never infinite, as in every group."""
@@ -28,6 +28,17 @@ class _Group:
     __pydantic_config__: ClassVar[dict[str, object]] = {"extra": "forbid", "allow_inf_nan": False}
 
 
+class _Text:
+    """Has pydantic take a place as text, of which the group itself makes the place."""
+
+    @staticmethod
+    def __get_pydantic_core_schema__(_source: Any, handler: Any) -> Any:
+        return handler(str)
+
+
+PlaceText = Annotated[Place, _Text]
+
+
 @dataclass(frozen=True)
 class PixieverseSource(_Group):
     """Where the PixieVerse side lies.
@@ -38,7 +49,7 @@ class PixieverseSource(_Group):
     left empty, an object with more than one sample is a fault.
     """
 
-    root: Path
+    root: PlaceText
     grid: tuple[str, ...] = (
         "{id}/sample_{sample}/material_grid.npy",
         "{id}/sample_{sample}_pred.npy",
@@ -48,7 +59,7 @@ class PixieverseSource(_Group):
     sample: str = ""
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "root", as_path(self.root))
+        object.__setattr__(self, "root", place_of(self.root))
 
 
 @dataclass(frozen=True)
@@ -60,7 +71,7 @@ class SlatSource(_Group):
     the file holds one group an asset, named by `group`.
     """
 
-    root: Path
+    root: PlaceText
     pattern: tuple[str, ...] = (
         "{id}.npz",
         "{id}.h5",
@@ -72,7 +83,7 @@ class SlatSource(_Group):
     group: str = "{id}"
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "root", as_path(self.root))
+        object.__setattr__(self, "root", place_of(self.root))
 
 
 @dataclass(frozen=True)
@@ -84,13 +95,13 @@ class PairingParameters(_Group):
     `categories` is Pixie's ``obj_ids_metadata.json``.
     """
 
-    map: Path | None = None
-    categories: Path | None = None
+    map: PlaceText | None = None
+    categories: PlaceText | None = None
 
     def __post_init__(self) -> None:
         for name in ("map", "categories"):
             place = getattr(self, name)
-            object.__setattr__(self, name, None if place is None else as_path(place))
+            object.__setattr__(self, name, None if place is None else place_of(place))
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from enum import StrEnum
-from pathlib import Path
+from typing import IO, Any, Protocol, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -58,6 +58,58 @@ class Status(StrEnum):
     SKIPPED = "skipped"
 
 
+class Place(Protocol):
+    """Where a file or a folder lies: a `pathlib.Path`, or a URL as a `RemotePlace`.
+
+    `slatprep.storage.place.place_of` makes one. This is all that both offer
+    alike; for the rest, `slatprep.storage.place.storage_of` tells them apart.
+    """
+
+    @property
+    def name(self) -> str:
+        """Its last component."""
+
+    @property
+    def suffix(self) -> str:
+        """The extension of its name, with the dot."""
+
+    @property
+    def parent(self) -> Self:
+        """The folder that holds it."""
+
+    def __hash__(self) -> int:
+        """Equal places have the same."""
+
+    def __truediv__(self, key: str, /) -> Self:
+        """Return the place of this name below it."""
+
+    def with_name(self, name: str, /) -> Self:
+        """Return the place of this name beside it."""
+
+    def absolute(self) -> Self:
+        """Return it independent of the working folder."""
+
+    def exists(self) -> bool:
+        """Whether there is a file or a folder."""
+
+    def is_dir(self) -> bool:
+        """Whether there is a folder."""
+
+    def is_file(self) -> bool:
+        """Whether there is a file."""
+
+    def open(
+        self, mode: str, *, encoding: str | None = None, newline: str | None = None
+    ) -> IO[Any]:
+        """Open a file; on an object store for reading only."""
+
+    def read_bytes(self) -> bytes:
+        """Read a file whole."""
+
+    def read_text(self, encoding: str | None = None) -> str:
+        """Read a file whole, as text."""
+
+
 @dataclass(frozen=True)
 class SourceFile:
     """A file that was read, as the provenance remembers it.
@@ -87,11 +139,11 @@ class AssetPair:
         The image or seed the SLAT was made from; empty where there is one only.
     category : str
         PixieVerse category; empty where unknown.
-    pixieverse_root, slat_root : Path
+    pixieverse_root, slat_root : Place
         The roots below which the files must lie.
-    grid, mask, bounds : Path or None
+    grid, mask, bounds : Place or None
         PixieVerse files, absolute; ``grid`` is None where the partner is missing.
-    slat : Path or None
+    slat : Place or None
         SLAT file, absolute; None where the partner is missing.
     slat_group : str
         Group inside an HDF5 file that holds many assets; empty otherwise.
@@ -104,12 +156,12 @@ class AssetPair:
     object_id: str
     view: str
     category: str
-    pixieverse_root: Path
-    slat_root: Path
-    grid: Path | None
-    mask: Path | None
-    bounds: Path | None
-    slat: Path | None
+    pixieverse_root: Place
+    slat_root: Place
+    grid: Place | None
+    mask: Place | None
+    bounds: Place | None
+    slat: Place | None
     slat_group: str = ""
     problem: str = ""
 

@@ -24,7 +24,7 @@ from slatprep.geometry.frames import (
     invert_transform,
     voxel_centres,
 )
-from slatprep.records import BACKGROUND
+from slatprep.records import BACKGROUND, Place
 from slatprep.store import Store, StoredAsset, open_store
 
 SUCCESS_DISPLACEMENT = 1.5
@@ -124,12 +124,12 @@ class TruthReport:
     missing: tuple[str, ...]
 
 
-def score_against_truth(store: Path, truth_dir: Path) -> TruthReport:
+def score_against_truth(store: Place, truth_dir: Path) -> TruthReport:
     """Compare every asset of a store with its truth.
 
     Parameters
     ----------
-    store : Path
+    store : Place
         A store of `slatprep build-store`; only its published layout is read.
     truth_dir : Path
         Folder of truth files; assets of the store without one are left out.

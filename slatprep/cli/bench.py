@@ -10,10 +10,12 @@ import click
 
 from slatprep.cli.options import FOLDER, POSITIVE, ChoiceOf, option, store_argument
 from slatprep.cli.output import Output, output_options
+from slatprep.storage.place import storage_of
 
 if TYPE_CHECKING:
     from slatprep.bench.align import AlignBench
     from slatprep.bench.read import ReadBench
+    from slatprep.records import Place
 
 
 @click.group(
@@ -137,21 +139,24 @@ Example:
 @option("--repeats", "How often each is measured.", POSITIVE, 5)
 @option("--seed", "Of the order of reading.", int, 0)
 @output_options
-def read(output: Output, store: Path, assets: int | None, repeats: int, seed: int) -> None:
+def read(output: Output, store: Place, assets: int | None, repeats: int, seed: int) -> None:
     """Read shuffled whole assets (coords, feats, properties) as training does.
 
     Compares slatprep's reader with npz (one file an asset, plain and
     compressed), one HDF5 file, zarr-python, and zarrs and tensorstore where
     they are installed. 'cold' is after asking the system to forget the files.
     """
+    path = storage_of(store).local
+    if path is None:
+        raise click.UsageError(f"{store}: expected a store on the local disk")
     from slatprep.bench.read import bench_read
 
     with (
-        tempfile.TemporaryDirectory(dir=store.resolve().parent) as temporary,
+        tempfile.TemporaryDirectory(dir=path.resolve().parent) as temporary,
         output.progress("passes") as progress,
     ):
         result = bench_read(
-            store, Path(temporary), limit=assets, repeats=repeats, seed=seed, progress=progress
+            path, Path(temporary), limit=assets, repeats=repeats, seed=seed, progress=progress
         )
     output.result(result, lambda: _show_read(output, result))
 

@@ -14,6 +14,7 @@ from slatprep.errors import ConfigError, StoreError
 
 if TYPE_CHECKING:
     from slatprep.inspect.check import AlignmentCheck
+    from slatprep.records import Place
     from slatprep.store import Store
 
 _COLUMNS = ("fitness", "fitness_backward", "inlier_rmse", "valid_share", "ambiguity")
@@ -51,7 +52,7 @@ def check_alignment(
     asset_ids: tuple[str, ...],
     worst: int | None,
     ambiguous: bool,
-    store: Path | None,
+    store: Place | None,
     picture: str | None,
     show: bool,
     manifests: Path | None,
@@ -102,7 +103,7 @@ def check_alignment(
         click.get_current_context().exit(EXIT_INCOMPLETE)
 
 
-def _target(store: Path, picture: str | None, assets: int) -> Path | None:
+def _target(store: Place, picture: str | None, assets: int) -> Path | None:
     if picture == "none":
         return None
     if picture is None:

@@ -4,11 +4,16 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import click
 
 from slatprep.cli.options import EXISTING_FOLDER, NEW_FILE, option
 from slatprep.cli.output import Output, output_options
+from slatprep.storage.place import storage_of
+
+if TYPE_CHECKING:
+    from slatprep.records import Place
 
 
 @click.command(
@@ -37,7 +42,7 @@ Example:
 @output_options
 def describe(
     output: Output,
-    store: Path,
+    store: Place,
     out: Path | None,
     location: str,
     license_: str,
@@ -55,7 +60,8 @@ def describe(
     from slatprep.store import open_store
 
     if not location:
-        location = Path(os.path.relpath(store, out.parent if out else Path())).as_posix()
+        local, beside = storage_of(store).local, out.parent if out else Path()
+        location = Path(os.path.relpath(local, beside)).as_posix() if local else str(store)
     text = croissant.to_json(
         croissant.describe(
             open_store(store),

@@ -21,6 +21,7 @@ from slatprep.cli.output import Output, output_options
 if TYPE_CHECKING:
     from slatprep.learn.metrics import Evaluation, Measure
     from slatprep.learn.published import PublishedScore
+    from slatprep.records import Place
 
 
 @click.command(
@@ -54,7 +55,7 @@ Example:
 def evaluate(
     output: Output,
     predictions: Path,
-    store: Path,
+    store: Place,
     split: Any,
     shares: str,
     spread: Any,

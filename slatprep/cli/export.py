@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -17,6 +17,9 @@ from slatprep.cli.options import (
 )
 from slatprep.cli.output import Output, output_options
 from slatprep.errors import ConfigError
+
+if TYPE_CHECKING:
+    from slatprep.records import Place
 
 # Which options belong to which format; an option without effect is a mistake.
 _ONLY_FOR = {"points": "ply", "frame": "ply", "shard_size": "webdataset"}
@@ -87,7 +90,7 @@ Example:
 @output_options
 def export(
     output: Output,
-    store: Path,
+    store: Place,
     kind: Any,
     out: Path,
     assets: tuple[str, ...],

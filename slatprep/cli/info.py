@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
-from pathlib import Path
+from typing import TYPE_CHECKING
 
 import click
 
 from slatprep.cli.options import store_argument
 from slatprep.cli.output import Output, output_options
 from slatprep.cli.overview import show_normalization, show_quality
+
+if TYPE_CHECKING:
+    from slatprep.records import Place
 
 
 @click.command(
@@ -19,7 +22,7 @@ Example:
 )
 @store_argument
 @output_options
-def info(output: Output, store: Path) -> None:
+def info(output: Output, store: Place) -> None:
     """Say what is in STORE, and how good its alignments are.
 
     Without STORE, the one that `make align` built last under data/ is taken.

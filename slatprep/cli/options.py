@@ -11,11 +11,12 @@ from typing import TYPE_CHECKING, Any, TypeVar, get_args
 import click
 
 from slatprep.cli.output import Output
-from slatprep.storage.remote import RemotePath, as_path
+from slatprep.storage.place import place_of, storage_of
 
 if TYPE_CHECKING:
     from slatprep.learn.splits import Shares
     from slatprep.parameters import BuildParameters
+    from slatprep.records import Place
 
     _Choice = click.Choice[str]
 else:
@@ -36,9 +37,9 @@ class PlaceType(click.Path):
     def convert(
         self, value: Any, parameter: click.Parameter | None, context: click.Context | None
     ) -> Any:
-        """Return a `Path`."""
-        place = as_path(value)
-        if isinstance(place, RemotePath):
+        """Return a place."""
+        place = place_of(value)
+        if storage_of(place).local is None:
             return place
         return super().convert(str(place), parameter, context)
 
@@ -123,7 +124,7 @@ def source_options(command: _Command) -> _Command:
     return functools.reduce(lambda decorated, add: add(decorated), reversed(options), command)
 
 
-def chosen_store(store: Path | None) -> Path:
+def chosen_store(store: Place | None) -> Place:
     """Return the store that was named, else the one that `make align` built last."""
     if store is not None:
         return store
@@ -149,10 +150,11 @@ store_option = option(
 )
 
 
-def beside(store: Path, suffix: str) -> Path:
+def beside(store: Place, suffix: str) -> Path:
     """Return NAME`suffix` beside NAME.zarr; in the working folder if that is on no local disk."""
     name = f"{store.name.removesuffix('.zarr')}{suffix}"
-    return Path(name) if isinstance(store, RemotePath) else store.with_name(name)
+    local = storage_of(store).local
+    return local.with_name(name) if local else Path(name)
 
 
 verdicts_option = option(
@@ -214,7 +216,7 @@ def parameters_of(options: dict[str, Any]) -> BuildParameters:
         ("ranges", "normalize", "ranges"),
     ):
         if (value := options.pop(option_name)) is not None:
-            given[group] = {key: str(value.absolute()) if isinstance(value, Path) else value}
+            given[group] = {key: value if isinstance(value, str) else str(value.absolute())}
     if options.pop("consensus", False):
         given["consensus"] = {"settle": True}
     return load_parameters(options.pop("config"), given, options.pop("preset"))

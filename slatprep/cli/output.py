@@ -18,7 +18,7 @@ from typing import Any, TypeVar
 
 import click
 
-from slatprep.storage.remote import RemotePath, as_path
+from slatprep.storage.place import is_place, place_of, storage_of
 from slatprep.workers import Progress
 
 EXIT_INCOMPLETE = 1
@@ -121,12 +121,12 @@ def output_options(command: _Command) -> _Command:
 
 def _local(value: Any) -> Any:
     """Return an option's value; of a URL that was taken for a path, say that it is none."""
-    if not isinstance(value, Path) or isinstance(value, RemotePath):
-        return value  # Options that may be a URL make it one themselves.
-    path = as_path(value)
-    if isinstance(path, RemotePath):
-        raise click.UsageError(f"{path}: expected a path of the local disk")
-    return path
+    if not isinstance(value, Path):
+        return value  # Options that may be a URL make a place of it themselves.
+    place = place_of(value)
+    if storage_of(place).local is None:
+        raise click.UsageError(f"{place}: expected a path of the local disk")
+    return place
 
 
 def as_json(document: object) -> str:
@@ -138,7 +138,7 @@ def as_json(document: object) -> str:
 
 
 def _jsonable(value: object) -> object:
-    if isinstance(value, Path):
+    if is_place(value):
         return str(value)
     raise TypeError(f"{type(value).__name__} in a result")
 

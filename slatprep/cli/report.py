@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import click
 
@@ -15,6 +16,9 @@ from slatprep.cli.options import (
     store_argument,
 )
 from slatprep.cli.output import Output, output_options
+
+if TYPE_CHECKING:
+    from slatprep.records import Place
 
 
 @click.command(
@@ -34,7 +38,7 @@ Example:
 @jobs_option
 @output_options
 def report(
-    output: Output, store: Path, out: Path | None, manifests: Path | None, jobs: int
+    output: Output, store: Place, out: Path | None, manifests: Place | None, jobs: int
 ) -> None:
     """Write one page about STORE that opens in a browser.
 

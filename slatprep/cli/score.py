@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import click
 
 from slatprep.cli.options import EXISTING_FOLDER, FOLDER
 from slatprep.cli.output import EXIT_INCOMPLETE, Output, output_options
+
+if TYPE_CHECKING:
+    from slatprep.records import Place
 
 
 @click.command(
@@ -19,7 +23,7 @@ Example:
 @click.argument("store", type=EXISTING_FOLDER)
 @click.argument("truth_dir", type=FOLDER)
 @output_options
-def score(output: Output, store: Path, truth_dir: Path) -> None:
+def score(output: Output, store: Place, truth_dir: Path) -> None:
     """Score STORE against known truth.
 
     TRUTH_DIR holds an npz an asset, as make-demo writes it. Each level's

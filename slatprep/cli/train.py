@@ -23,6 +23,7 @@ from slatprep.cli.output import Output, output_options
 
 if TYPE_CHECKING:
     from slatprep.learn.train import TrainSummary
+    from slatprep.records import Place
 
 _SIZES = ("small", "medium", "large")
 
@@ -68,7 +69,7 @@ Example:
 @output_options
 def train(
     output: Output,
-    store: Path,
+    store: Place,
     out: Path,
     size: str,
     all_sizes: bool,

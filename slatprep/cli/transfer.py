@@ -13,6 +13,7 @@ from slatprep.errors import ConfigError
 
 if TYPE_CHECKING:
     from slatprep.particles.transfer import VoxelField
+    from slatprep.records import Place
 
 
 @click.command(
@@ -78,7 +79,7 @@ Example:
 def transfer(
     output: Output,
     particles: Path,
-    store: Path | None,
+    store: Place | None,
     asset: str | None,
     prediction: Path | None,
     ranges: str | None,
@@ -120,7 +121,7 @@ def transfer(
 
 
 def _field(
-    store: Path | None, asset: str | None, prediction: Path | None, ranges: str | None, points: Any
+    store: Place | None, asset: str | None, prediction: Path | None, ranges: str | None, points: Any
 ) -> VoxelField:
     from slatprep.normalize import PIXIE_RANGES
     from slatprep.particles.transfer import predicted_field, stored_field

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -15,6 +14,9 @@ from slatprep.cli.options import (
     workers_options,
 )
 from slatprep.cli.output import Output, output_options
+
+if TYPE_CHECKING:
+    from slatprep.records import Place
 
 
 @click.command(
@@ -41,10 +43,10 @@ Example:
 @workers_options
 def verify(
     output: Output,
-    store: Path,
+    store: Place,
     sources: bool,
-    pixieverse: Path | None,
-    slat: Path | None,
+    pixieverse: Place | None,
+    slat: Place | None,
     **options: Any,
 ) -> None:
     """Check that STORE is whole, unchanged and consistent.

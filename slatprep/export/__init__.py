@@ -19,6 +19,8 @@ from slatprep.export import target
 from slatprep.export.assets import Exported, choose_ids, describe_columns
 from slatprep.export.bounds import Bounds, read_bounds
 from slatprep.export.ply import Frame, Points
+from slatprep.records import Place
+from slatprep.storage.place import place_of, storage_of
 from slatprep.store import Store, StoredAsset, open_store
 from slatprep.workers.local import run_unordered
 
@@ -76,7 +78,7 @@ class ExportSummary:
 
 
 def export_store(
-    store: str | Path,
+    store: str | Place,
     out: str | Path,
     format: Format,
     *,
@@ -90,7 +92,7 @@ def export_store(
 
     Parameters
     ----------
-    store : str or Path
+    store : str or Place
         The store.
     out : str or Path
         The file (``hdf5``) or directory (all others) to write. An export that
@@ -126,9 +128,10 @@ def export_store(
     begin = time.perf_counter()
     if format not in FORMATS:
         raise ConfigError(f"format is {format!r}; expected one of {', '.join(FORMATS)}")
-    options, store, out = options or ExportOptions(), Path(store), Path(out)
+    options, store, out = options or ExportOptions(), place_of(store), Path(out)
     opened = open_store(store)
-    if store.resolve() in out.resolve().parents:
+    local = storage_of(store).local
+    if local is not None and local.resolve() in out.resolve().parents:
         raise ConfigError(f"{out} lies inside the store; expected a path outside {store}")
     ids = choose_ids(opened, assets, verdicts)
     tell = progress or (lambda done, total: None)

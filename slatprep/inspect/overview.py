@@ -5,14 +5,13 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from slatprep.records import Normalization, Verdict
-from slatprep.storage.remote import RemotePath, list_objects
+from slatprep.records import Normalization, Place, Verdict
+from slatprep.storage.place import storage_of
 from slatprep.store import Store
 
 
@@ -46,7 +45,7 @@ class StoreOverview:
     in alphabetical order; ``files`` and ``size`` [byte] are what it takes on disk.
     """
 
-    path: Path
+    path: Place
     format_version: int
     manifest: str
     files: int
@@ -75,13 +74,13 @@ def overview_of(store: Store) -> StoreOverview:
     columns = {name: store.column(name) for name in names}
     columns["voxels"] = np.diff(store.offsets)
     categories = np.array([str(category) for category in columns["category"]])
-    sizes = _file_sizes(store.path)
+    sizes = storage_of(store.path).files()
     return StoreOverview(
         path=store.path,
         format_version=int(store.attributes["format_version"]),
         manifest=str(store.attributes["manifest"]),
         files=len(sizes),
-        size=sum(sizes),
+        size=sum(sizes.values()),
         engines=_counts(columns["engine"]),
         models=_counts(columns["model"]),
         normalization=store.normalization,
@@ -91,12 +90,6 @@ def overview_of(store: Store) -> StoreOverview:
             for name in sorted(set(categories))
         ),
     )
-
-
-def _file_sizes(path: Path) -> list[int]:
-    if isinstance(path, RemotePath):
-        return [int(entry["size"]) for entry in list_objects(path).values()]
-    return [file.stat().st_size for file in path.rglob("*") if file.is_file()]
 
 
 def _group(name: str, columns: dict[str, NDArray[Any]], chosen: NDArray[np.bool_]) -> GroupOverview:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass, fields, replace
-from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -15,7 +14,7 @@ from torch.utils.data import DataLoader, Dataset, Sampler
 from slatprep.errors import ConfigError
 from slatprep.learn.augment import Augmentation, lattice_symmetries, move
 from slatprep.learn.splits import Shares, Split, select_assets
-from slatprep.records import UNANNOTATED
+from slatprep.records import UNANNOTATED, Place
 from slatprep.store import Store, open_store
 
 FEATS_MEAN = (-2.1688, -0.0043, -0.1335, -0.0842, -0.5271, 0.7239, -1.1414, 1.2039)
@@ -136,7 +135,7 @@ class SlatDataset(Dataset[Item]):
 
     def __init__(
         self,
-        store: Store | str | Path,
+        store: Store | str | Place,
         split: Split | None = None,
         *,
         shares: Shares = Shares(),  # noqa: B008 (immutable)

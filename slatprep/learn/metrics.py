@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from slatprep.errors import InputError
 from slatprep.learn.predictions import VoxelPrediction, check_prediction, open_predictions
 from slatprep.learn.splits import Shares, Split, select_assets
+from slatprep.records import Place
 from slatprep.store import open_store
 
 METRICS = ("log10 E", "log10 density", "nu", "mean", "accuracy")
@@ -150,7 +151,7 @@ def summarise(
 
 def evaluate_store(
     predictions: Path,
-    store_path: Path,
+    store_path: Place,
     split: Split | None = "test",
     shares: Shares = Shares(),  # noqa: B008 (immutable)
     spread: Spread = "se",

@@ -20,6 +20,7 @@ from slatprep.learn.dataset import IGNORED, SlatDataset, SlatLoader, SparseBatch
 from slatprep.learn.decoder import SIZES, PhysicsDecoder, Prediction, make_decoder
 from slatprep.learn.runs import BEST, LAST, EpochRecord, Run
 from slatprep.learn.splits import Shares, Split
+from slatprep.records import Place
 
 PROPERTY_WEIGHT = 1.0
 CLASS_WEIGHT = 0.5
@@ -112,7 +113,7 @@ def loss_of(prediction: Prediction, batch: SparseBatch) -> Tensor:
 
 
 def train(
-    store: Path,
+    store: Place,
     out: Path,
     parameters: TrainParameters,
     *,
@@ -128,7 +129,7 @@ def train(
 
     Parameters
     ----------
-    store : Path
+    store : Place
         The store.
     out : Path
         Directory of the run, see `slatprep.learn.runs.Run`.
@@ -281,7 +282,7 @@ class _Session:
         return loss_of(self._predict(batch), batch)
 
 
-def _dataset(store: Path, split: Split, parameters: TrainParameters) -> SlatDataset:
+def _dataset(store: Place, split: Split, parameters: TrainParameters) -> SlatDataset:
     return SlatDataset(
         store,
         split,

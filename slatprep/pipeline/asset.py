@@ -11,7 +11,6 @@ import time
 import traceback
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Any
 
 from slatprep.align import align
@@ -29,6 +28,7 @@ from slatprep.records import (
     AssetPair,
     AssetResult,
     MaterialField,
+    Place,
     Status,
     StructuredLatents,
 )
@@ -96,7 +96,7 @@ class Bench:
         What they and the code come to.
     spool : Spool
         Where finished assets go.
-    previous : (Path, str) or None
+    previous : (Place, str) or None
         The store that is there, and its build's id.
     strict : bool
         Raise an asset's fault instead of noting it.
@@ -105,7 +105,7 @@ class Bench:
     parameters: BuildParameters
     recipe: Recipe
     spool: Spool
-    previous: tuple[Path, str] | None
+    previous: tuple[Place, str] | None
     strict: bool
 
 

@@ -40,11 +40,11 @@ from slatprep.pipeline.work import work_beside, work_directory
 from slatprep.provenance import record as provenance
 from slatprep.provenance.places import manifests_of
 from slatprep.readers import discover
-from slatprep.readers.names import listed_once
-from slatprep.records import AssetPair, Normalization, Status
+from slatprep.records import AssetPair, Normalization, Place, Status
 from slatprep.storage.atomic import replace_directory, staged, writing
-from slatprep.storage.remote import RemotePath, as_path
-from slatprep.storage.upload import look_at, upload_store
+from slatprep.storage.place import place_of
+from slatprep.storage.remote import RemotePlace
+from slatprep.storage.upload import published_state, upload_store
 from slatprep.store.writer import finish_store
 from slatprep.workers.local import Jobs, require_shared, run_unordered
 
@@ -65,12 +65,11 @@ Progress = Callable[[int, int], None]
 _OTHERS = tuple(action for action in Action if action is not Action.REUSE)
 
 
-@listed_once()
 def build_store(
     parameters: BuildParameters,
-    out: Path,
+    out: str | Place,
     *,
-    manifests: Path | None = None,
+    manifests: str | Place | None = None,
     jobs: Jobs = 1,
     strict: bool = False,
     fresh: bool = False,
@@ -83,10 +82,10 @@ def build_store(
     ----------
     parameters : BuildParameters
         Sources and methods.
-    out : Path
+    out : str or Place
         The store. One that is there is replaced, in one step, when the new
         one is finished; assets that did not change are not aligned again.
-    manifests : Path, optional
+    manifests : str or Path, optional
         Directory of ``assets.jsonl`` and ``build.json``; by default beside the
         store, see `default_manifests`.
     jobs : int or Workers
@@ -116,14 +115,14 @@ def build_store(
         With `strict`, for the first asset that cannot be used.
     """
     begin = time.perf_counter()
-    out = as_path(out)
+    out = place_of(out)
     target, manifests = places_of(out, manifests)
     given = given_ranges(parameters.normalize)
     with work_beside(target, keep=keep_work) as work:
         if fresh:
             work.spool.keep_only(set())
         require_shared(jobs, [work.scratch, *_some_sources(parameters)])
-        base = look_at(target) if isinstance(target, RemotePath) else None
+        base = published_state(target) if isinstance(target, RemotePlace) else None
         previous = None if fresh else previous_build(target)
         bench = Bench(parameters, recipe_of(parameters), work.spool, previous, strict)
         plan = _plan_if_any(bench, jobs, progress)
@@ -150,7 +149,7 @@ def build_store(
             records = _completed_records(work.spool, assets, normalization, clipped)
             manifest = write_all_records(new, records_file, records)
             finish_store(new, normalization, manifest, provenance.origin(parameters))
-            if not isinstance(target, RemotePath):
+            if isinstance(target, Path):
                 replace_directory(new, target)
         upload = None if base is None else upload_store(new, base)
         folder = manifests or default_manifests(upload.version if upload else out)
@@ -165,16 +164,15 @@ def build_store(
         )
         publish_manifests(records_file, summary, parameters)
         if upload is not None:
-            upload.show()
+            upload.publish()
         if keep_work:
             work.spool.keep_only({asset.key for asset in usable_assets})
     return summary
 
 
-@listed_once()
 def plan_build(
     parameters: BuildParameters,
-    out: Path,
+    out: str | Place,
     *,
     jobs: Jobs = 1,
     fresh: bool = False,
@@ -192,7 +190,7 @@ def plan_build(
     BuildPlan
         An entry an asset.
     """
-    out = as_path(out)
+    out = place_of(out)
     target, _ = places_of(out, None)
     directory = work_directory(target) / "spool"
     spool = Spool(directory) if directory.is_dir() and not fresh else None
@@ -202,7 +200,6 @@ def plan_build(
     return BuildPlan(out, tuple(sorted(assets, key=lambda asset: asset.asset_id)))
 
 
-@listed_once()
 def align_pairs(
     parameters: BuildParameters,
     out: Path,
@@ -248,7 +245,7 @@ def align_pairs(
     return summarise(assets, records=out, manifest=manifest, seconds=seconds)
 
 
-def default_manifests(store: Path) -> Path:
+def default_manifests(store: Place) -> Place:
     """Return the directory of a store's records: ``demo.manifests`` beside ``demo.zarr``."""
     return manifests_of(store)
 
@@ -264,7 +261,7 @@ def _plan_if_any(
     return {asset.asset_id: asset for asset in assets}
 
 
-def _some_sources(parameters: BuildParameters) -> Iterator[Path]:
+def _some_sources(parameters: BuildParameters) -> Iterator[Place]:
     """Yield the files of a pair, by which to see that a worker has the sources."""
     for pair in discover(parameters):
         if pair.grid and pair.slat:

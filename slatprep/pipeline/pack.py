@@ -17,7 +17,7 @@ from slatprep.parameters import NormalizeParameters, StoreParameters
 from slatprep.pipeline.spool import Spool, SpooledAsset
 from slatprep.readers.ranges import read_ranges
 from slatprep.records import PROPERTY_COLUMNS, Normalization
-from slatprep.storage.remote import as_path
+from slatprep.storage.place import place_of
 from slatprep.store.layout import (
     ARRAYS,
     overlaps,
@@ -110,7 +110,9 @@ def given_ranges(parameters: NormalizeParameters) -> Normalization | None:
     """Return ranges that do not depend on the dataset, or None; read first, to fail early."""
     if parameters.ranges == "dataset":
         return None
-    return PIXIE_RANGES if parameters.ranges == "pixie" else read_ranges(as_path(parameters.ranges))
+    if parameters.ranges == "pixie":
+        return PIXIE_RANGES
+    return read_ranges(place_of(parameters.ranges))
 
 
 def dataset_ranges(usable: Sequence[SpooledAsset]) -> Normalization:

@@ -11,7 +11,6 @@ from collections import Counter
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from enum import StrEnum
-from pathlib import Path
 from typing import Any
 
 from slatprep.errors import SlatprepError
@@ -21,7 +20,7 @@ from slatprep.pipeline.spool import Spool
 from slatprep.provenance.jsonable import jsonable
 from slatprep.readers import discover
 from slatprep.readers.identity import hash_sources
-from slatprep.records import AssetPair, SourceFile
+from slatprep.records import AssetPair, Place, SourceFile
 from slatprep.store.records import StoredRecords, stored_records
 from slatprep.workers.local import Jobs, run_unordered
 
@@ -71,13 +70,13 @@ class BuildPlan:
 
     Attributes
     ----------
-    store : Path
+    store : Place
         The store to make or replace.
     assets : tuple of PlannedAsset
         Sorted by id.
     """
 
-    store: Path
+    store: Place
     assets: tuple[PlannedAsset, ...]
 
     @property
@@ -91,7 +90,7 @@ def plan_assets(
     parameters: BuildParameters,
     recipe: Recipe,
     spool: Spool | None,
-    previous: tuple[Path, str] | None,
+    previous: tuple[Place, str] | None,
     jobs: Jobs,
     progress: Callable[[int, int], None] | None = None,
 ) -> Iterator[PlannedAsset]:
@@ -105,7 +104,7 @@ def plan_assets(
         What the build's parameters and code come to.
     spool : Spool or None
         What an interrupted build left.
-    previous : (Path, str) or None
+    previous : (Place, str) or None
         The store that is there, and its build's id.
     jobs : int or Workers
         Worker processes, or a cluster's.
@@ -128,7 +127,7 @@ def plan_assets(
 
 
 def plan_asset(
-    pair: AssetPair, recipe: Recipe, spool: Spool | None, previous: tuple[Path, str] | None
+    pair: AssetPair, recipe: Recipe, spool: Spool | None, previous: tuple[Place, str] | None
 ) -> PlannedAsset:
     """Say what will be done with one asset, and why."""
     try:
@@ -162,12 +161,12 @@ def _new_names(
     return {name: value for name, value in names.items() if record[name] != value}
 
 
-def previous_record(previous: tuple[Path, str] | None, asset_id: str) -> dict[str, Any] | None:
+def previous_record(previous: tuple[Place, str] | None, asset_id: str) -> dict[str, Any] | None:
     """Return what is recorded of an asset of the store that is there, as the first pass left it."""
     records = _records(previous)
     record = records.find(asset_id) if records else None
     return record and {**record, **(record["before_settling"] or {})}
 
 
-def _records(previous: tuple[Path, str] | None) -> StoredRecords | None:
+def _records(previous: tuple[Place, str] | None) -> StoredRecords | None:
     return stored_records(*previous) if previous else None

@@ -5,9 +5,7 @@ from __future__ import annotations
 import json
 import platform
 import shutil
-import tempfile
 from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -19,8 +17,7 @@ from slatprep.provenance import record as provenance
 from slatprep.provenance.jsonable import jsonable
 from slatprep.provenance.record import BUILD_RECORD, RECORD_VERSION, origin
 from slatprep.records import Status
-from slatprep.storage.atomic import staged
-from slatprep.storage.remote import RemotePath
+from slatprep.storage.place import storage_of
 from slatprep.store.records import RecordWriter
 
 
@@ -81,8 +78,8 @@ def publish_manifests(records: Path, summary: BuildSummary, parameters: BuildPar
     folder = summary.records.parent
     try:
         with (
-            _staged(summary.records) as records_file,
-            _staged(folder / "build.json") as build_file,
+            storage_of(summary.records).staged() as records_file,
+            storage_of(folder / "build.json").staged() as build_file,
         ):
             shutil.copyfile(records, records_file)
             write_build_record(build_file, summary, parameters)
@@ -91,16 +88,3 @@ def publish_manifests(records: Path, summary: BuildSummary, parameters: BuildPar
             f"{folder}: the records cannot be written there ({error.strerror or error}); the store "
             "is complete and holds those of its assets. Run again to write them here"
         ) from error
-
-
-@contextmanager
-def _staged(path: Path) -> Iterator[Path]:
-    """Yield a local file that takes its place at `path` when it is whole."""
-    if not isinstance(path, RemotePath):
-        with staged(path) as file:
-            yield file
-        return
-    with tempfile.TemporaryDirectory() as folder:
-        file = Path(folder, path.name)
-        yield file
-        path.upload(file)

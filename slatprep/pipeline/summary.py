@@ -5,10 +5,9 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from pathlib import Path
 
 from slatprep.pipeline.spool import SpooledAsset
-from slatprep.records import Normalization, Status
+from slatprep.records import Normalization, Place, Status
 
 PROBLEMS_LISTED = 100
 """How many problems a summary lists; the records hold all."""
@@ -20,7 +19,7 @@ class BuildSummary:
 
     Attributes
     ----------
-    records : Path
+    records : Place
         The JSON Lines file of asset records.
     manifest : str
         Id of the build, a hash of the records' content.
@@ -34,7 +33,7 @@ class BuildSummary:
         SLAT voxels of those assets, and how many found an annotation.
     problems : tuple of (str, str)
         Asset id and reason of the first `PROBLEMS_LISTED` that are not ``ok``.
-    store : Path or None
+    store : Place or None
         The store; None where only alignments were written.
     normalization : Normalization or None
         Ranges of the properties.
@@ -42,7 +41,7 @@ class BuildSummary:
         By property, values of ``voxel/properties`` that lay outside its range.
     """
 
-    records: Path
+    records: Place
     manifest: str
     seconds: float
     statuses: dict[str, int]
@@ -50,7 +49,7 @@ class BuildSummary:
     n_voxels: int
     n_valid: int
     problems: tuple[tuple[str, str], ...]
-    store: Path | None = None
+    store: Place | None = None
     normalization: Normalization | None = None
     clipped: Mapping[str, int] = field(default_factory=dict)
 
@@ -63,10 +62,10 @@ class BuildSummary:
 def summarise(
     assets: Sequence[SpooledAsset],
     *,
-    records: Path,
+    records: Place,
     manifest: str,
     seconds: float,
-    store: Path | None = None,
+    store: Place | None = None,
     normalization: Normalization | None = None,
     clipped: Mapping[str, int] | None = None,
 ) -> BuildSummary:

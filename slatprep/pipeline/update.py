@@ -21,18 +21,16 @@ from slatprep.pipeline.publish import publish_manifests
 from slatprep.pipeline.spool import SpooledAsset, spooled
 from slatprep.pipeline.summary import BuildSummary, problems_of, summarise
 from slatprep.provenance import record as provenance
-from slatprep.records import PROPERTY_COLUMNS, Normalization, Status
+from slatprep.records import PROPERTY_COLUMNS, Normalization, Place, Status
 from slatprep.storage.atomic import writing
-from slatprep.storage.remote import RemotePath, as_path
+from slatprep.storage.place import place_of, storage_of
 from slatprep.store.reader import Store, is_store, open_store
 from slatprep.store.records import StoredRecords
 
 
-def previous_build(target: Path) -> tuple[Path, str] | None:
+def previous_build(target: Place) -> tuple[Place, str] | None:
     """Return a store that later builds can go on from, and the id of its build."""
     try:
-        if not is_store(target):
-            return None
         store = open_store(target)
         return store.path, store.attributes["manifest"]
     except (StoreError, KeyError):
@@ -72,7 +70,7 @@ def is_current(
 
 
 def repeat_summary(
-    others: Sequence[SpooledAsset], bench: Bench, *, store: Path, manifests: Path, seconds: float
+    others: Sequence[SpooledAsset], bench: Bench, *, store: Place, manifests: Place, seconds: float
 ) -> BuildSummary:
     """Sum up a store that is current; write its records anew if they are not beside it."""
     previous = _previous(bench)
@@ -115,10 +113,11 @@ def _previous(bench: Bench) -> Store:
     return open_store(bench.previous[0])
 
 
-def _published(manifests: Path, manifest: str) -> bool:
+def _published(manifests: Place, manifest: str) -> bool:
     try:
         build = json.loads((manifests / "build.json").read_text(encoding="utf-8"))
-        return bool(build["id"] == manifest) and (manifests / "assets.jsonl").stat().st_size > 0
+        assets = storage_of(manifests / "assets.jsonl")
+        return bool(build["id"] == manifest) and assets.size() > 0
     except (OSError, ValueError, KeyError, TypeError):
         return False
 
@@ -136,16 +135,18 @@ def nothing_usable(assets: Sequence[SpooledAsset], parameters: BuildParameters) 
     return f"none of {len(problems)} assets can be used, so there is no store:{listed}{more}"
 
 
-def places_of(out: Path, manifests: Path | None) -> tuple[Path, Path | None]:
+def places_of(out: Place, manifests: str | Place | None) -> tuple[Place, Path | None]:
     """Return where the store really lies, and the directory of its records if one is named."""
-    manifests = None if manifests is None else as_path(manifests)
-    if isinstance(manifests, RemotePath):
+    folder = None if manifests is None else storage_of(place_of(manifests)).local
+    if manifests is not None and folder is None:
         raise StoreError(f"{manifests}: expected a local folder for the records")
-    if isinstance(out, RemotePath):
-        return out, manifests
+    path = storage_of(out).local
+    if path is None:
+        return out, folder
     try:
-        taken = out.exists() and not is_store(out) and not (out.is_dir() and not any(out.iterdir()))
-        target = out.resolve()  # What a link points to is replaced, not the link.
+        empty = path.is_dir() and not any(path.iterdir())
+        taken = path.exists() and not is_store(path) and not empty
+        target = path.resolve()  # What a link points to is replaced, not the link.
     except OSError as error:
         raise StoreError(
             f"{out}: cannot be looked at ({error.strerror}); expected a path that may be read and "
@@ -155,4 +156,4 @@ def places_of(out: Path, manifests: Path | None) -> tuple[Path, Path | None]:
         raise StoreError(
             f"{out} exists and is not a slatprep store; expected a store to replace, or a new path"
         )
-    return target, manifests
+    return target, folder

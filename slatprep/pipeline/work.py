@@ -21,9 +21,9 @@ from pathlib import Path
 
 from slatprep.errors import StoreError
 from slatprep.pipeline.spool import Spool
+from slatprep.records import Place
 from slatprep.storage.atomic import restore_directory
-from slatprep.storage.cache import folder_for
-from slatprep.storage.remote import RemotePath
+from slatprep.storage.place import storage_of
 
 
 @dataclass(frozen=True)
@@ -43,12 +43,12 @@ class Work:
 
 
 @contextmanager
-def work_beside(target: Path, *, arrays: bool = True, keep: bool = False) -> Iterator[Work]:
+def work_beside(target: Place, *, arrays: bool = True, keep: bool = False) -> Iterator[Work]:
     """Make the work folder of a target, hold its lock, and clean up.
 
     Parameters
     ----------
-    target : Path
+    target : Place
         What is to be made or replaced.
     arrays : bool
         Whether the spool keeps arrays, or records alone.
@@ -72,13 +72,13 @@ def work_beside(target: Path, *, arrays: bool = True, keep: bool = False) -> Ite
     finished = False
     spool = Spool(directory / "spool", arrays)
     try:
-        restore_directory(directory, target)
+        _restore(directory, target)
         _remove(directory, but=("lock", "spool"))
         spool.directory.mkdir(exist_ok=True)
         yield Work(spool, Path(tempfile.mkdtemp(prefix="build-", dir=directory)))
         finished = True
     finally:
-        restore_directory(directory, target)
+        _restore(directory, target)
         if (finished and not keep) or not spool.holds_any():
             shutil.rmtree(directory, ignore_errors=True)
         else:
@@ -86,14 +86,18 @@ def work_beside(target: Path, *, arrays: bool = True, keep: bool = False) -> Ite
         os.close(lock)
 
 
-def work_directory(target: Path) -> Path:
+def work_directory(target: Place) -> Path:
     """Return the work folder of a target: beside it, or in the cache if it is on no local disk."""
-    if isinstance(target, RemotePath):
-        return folder_for(target) / "work"
-    return target.with_name(f".{target.name}.work")
+    return storage_of(target).work_folder()
 
 
-def _locked(directory: Path, target: Path) -> int:
+def _restore(directory: Path, target: Place) -> None:
+    local = storage_of(target).local
+    if local is not None:
+        restore_directory(directory, local)
+
+
+def _locked(directory: Path, target: Place) -> int:
     """Return a descriptor that holds the lock until it is closed, if only by a kill."""
     import fcntl  # No such module on Windows, where `--help` must work all the same.
 
@@ -130,7 +134,7 @@ def _is_at(descriptor: int, path: Path) -> bool:
         return False
 
 
-def _refusal(target: Path, holder: bytes) -> str:
+def _refusal(target: Place, holder: bytes) -> str:
     try:
         told = json.loads(holder)
         who = f"process {told['pid']} on {told['host']}, since {told['since']}"

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from slatprep.errors import StoreError
-from slatprep.records import Candidate
+from slatprep.records import Candidate, Place
 from slatprep.store.reader import Store
 
 
@@ -51,7 +51,7 @@ def candidates_of(
                 f"{manifests} holds no records of the build that made {store.path}; expected "
                 f"build.json with the id {store.attributes['manifest']!r}, and assets.jsonl"
             )
-        folder: Path | None = manifests
+        folder: Place | None = manifests
     else:
         folder = next((place for place in usual_manifests(store.path) if _made(place, store)), None)
     if folder is None:
@@ -61,18 +61,18 @@ def candidates_of(
     return {name: found.get(name, "not known: the records leave it out") for name in asset_ids}
 
 
-def usual_manifests(store: Path) -> tuple[Path, ...]:
+def usual_manifests(store: Place) -> tuple[Place, ...]:
     """Return where a build's records lie: beside the store, or where `make align` puts them."""
     name = store.name.removesuffix(".zarr")
-    made = Path("manifests") / "build" / name
+    made = f"manifests/build/{name}"
     return (
         store.with_name(f"{name}.manifests"),
         store.absolute().parent.parent / made,
-        made,
+        Path(made),
     )
 
 
-def _made(folder: Path, store: Store) -> bool:
+def _made(folder: Place, store: Store) -> bool:
     """Whether a folder's records are those of the build that made the store."""
     try:
         build = json.loads((folder / "build.json").read_text("utf-8"))
@@ -82,10 +82,10 @@ def _made(folder: Path, store: Store) -> bool:
     return same and (folder / "assets.jsonl").is_file()
 
 
-def _records(folder: Path, asset_ids: Sequence[str]) -> Iterator[dict[str, Any]]:
+def _records(folder: Place, asset_ids: Sequence[str]) -> Iterator[dict[str, Any]]:
     # Parsing a record takes a hundred times as long as seeing that it is another's.
     mark, decoder, wanted = '"asset_id":', json.JSONDecoder(), set(asset_ids)
-    with (folder / "assets.jsonl").open(encoding="utf-8") as lines:
+    with (folder / "assets.jsonl").open("r", encoding="utf-8") as lines:
         for line in lines:
             asset_id, _ = decoder.raw_decode(line, line.index(mark) + len(mark))
             if asset_id in wanted:

@@ -6,10 +6,11 @@ import math
 from collections.abc import Mapping
 from dataclasses import fields, is_dataclass
 from enum import Enum
-from pathlib import Path
 from typing import Any
 
 import numpy as np
+
+from slatprep.storage.place import is_place
 
 
 def jsonable(value: object) -> Any:
@@ -29,8 +30,8 @@ def jsonable(value: object) -> Any:
         return [jsonable(item) for item in value]
     if isinstance(value, Enum):
         return value.value
-    if isinstance(value, Path):
-        return value.as_posix()
+    if is_place(value):
+        return str(value)
     if isinstance(value, bool | int | str):
         return value
     raise TypeError(f"a record cannot hold {type(value).__name__} {value!r}")

@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
-from slatprep.storage.remote import RemotePath
-from slatprep.storage.versions import RECORDS, is_version
+from slatprep.records import Place
+from slatprep.storage.versions import MANIFESTS, is_version
 
 
-def manifests_of(store: Path) -> Path:
+def manifests_of(store: Place) -> Place:
     """Return the folder of a store's records: ``demo.manifests`` beside ``demo.zarr``.
 
     Those of a version on an object store lie beside all versions.
     """
-    if isinstance(store, RemotePath) and is_version(store):
-        return store.parent.parent / RECORDS / store.name
+    if is_version(store):
+        return store.parent.parent / MANIFESTS / store.name
     return store.with_name(f"{store.name.removesuffix('.zarr')}.manifests")

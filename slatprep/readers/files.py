@@ -11,22 +11,19 @@ from __future__ import annotations
 import hashlib
 import io
 import math
-import os
-import stat
 import tokenize
 import zipfile
 import zlib
 from collections.abc import Mapping
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from slatprep.errors import InputError, MissingPartnerError
-from slatprep.records import RESOLUTION, AssetPair, SourceFile
-from slatprep.storage.remote import RemoteFile, RemotePath
+from slatprep.records import RESOLUTION, AssetPair, Place, SourceFile
+from slatprep.storage.place import storage_of
 
 MAX_FILE_BYTES = 128 * 2**20
 """No file of one asset is larger; the largest form, an 11-channel float64 grid, takes 22 MiB."""
@@ -89,7 +86,7 @@ class ArraySpec:
     kinds: str
     max_items: int = 64
 
-    def check(self, where: str | Path, shape: tuple[int, ...], dtype: np.dtype[Any]) -> None:
+    def check(self, where: str | Place, shape: tuple[int, ...], dtype: np.dtype[Any]) -> None:
         """Raise InputError, naming `where`, unless shape and dtype are allowed."""
         if dtype.hasobject:
             raise InputError(
@@ -121,7 +118,7 @@ def _shape_text(shape: tuple[int | None, ...]) -> str:
     return f"({text},)" if len(shape) == 1 else f"({text})"
 
 
-def require_complete(pair: AssetPair) -> tuple[Path, Path]:
+def require_complete(pair: AssetPair) -> tuple[Place, Place]:
     """Return the paths of grid and SLAT.
 
     Raises
@@ -141,60 +138,14 @@ def require_complete(pair: AssetPair) -> tuple[Path, Path]:
     return pair.grid, pair.slat
 
 
-def resolve_inside(path: Path, root: Path) -> tuple[Path, str]:
-    """Resolve a path and make sure that the file lies below its root.
-
-    Parameters
-    ----------
-    path : Path
-        A file, named by way of `root`.
-    root : Path
-        Folder that the file must not leave, by ``..`` or by a link.
-
-    Returns
-    -------
-    tuple of Path and str
-        The resolved file, and its name relative to `root` with forward slashes.
-
-    Raises
-    ------
-    InputError
-        If the path leaves the root, does not exist, or is not a regular file.
-    """
-    try:
-        relative = path.relative_to(root)
-        if isinstance(path, RemotePath):  # An object store has no links that could lead out.
-            return _require_plain(path, relative)
-        resolved = path.resolve(strict=True)
-        inside = ".." not in relative.parts and resolved.is_relative_to(root.resolve())
-        regular = stat.S_ISREG(resolved.stat().st_mode)
-    except FileNotFoundError:
-        raise InputError(path, "does not exist", "a readable file") from None
-    except (OSError, RuntimeError, ValueError) as error:  # link loops, NUL, other roots
-        raise InputError(path, f"cannot be opened ({error})", f"a file below {root}") from None
-    if not inside:
-        raise InputError(
-            path, f"leads to {resolved}, out of its root", f"a file below {root.resolve()}"
-        )
-    if not regular:
-        raise InputError(path, "is not a regular file", "a readable file")
-    return resolved, relative.as_posix()
-
-
-def _require_plain(path: RemotePath, relative: Path) -> tuple[Path, str]:
-    if {".", ".."} & set(relative.parts) or not relative.parts:
-        raise InputError(path, "is no plain name below its root", "a name without '..'")
-    return path, "/".join(relative.parts)
-
-
-def load_source(path: Path, root: Path, role: str) -> tuple[bytes, SourceFile]:
+def load_source(path: Place, root: Place, role: str) -> tuple[bytes, SourceFile]:
     """Read a whole file once; return its bytes and what the provenance keeps of it.
 
     Parameters
     ----------
-    path : Path
+    path : Place
         File to read, below `root`.
-    root : Path
+    root : Place
         Folder that it must not leave.
     role : str
         Role of the file in the pair: ``grid``, ``mask``, ``bounds`` or ``slat``.
@@ -204,14 +155,14 @@ def load_source(path: Path, root: Path, role: str) -> tuple[bytes, SourceFile]:
     InputError
         If the file cannot be read, is empty, or is larger than `MAX_FILE_BYTES`.
     """
-    resolved, name = resolve_inside(path, root)
+    file, name = storage_of(root).locate(path)
     try:
-        data, size = _read(resolved)
+        data = storage_of(file).read(MAX_FILE_BYTES)
     except FileNotFoundError:
         raise InputError(path, "does not exist", "a readable file") from None
     except OSError as error:
         raise InputError(path, f"cannot be read ({error.strerror})", "a readable file") from None
-    if size > MAX_FILE_BYTES:
+    if len(data) > MAX_FILE_BYTES:
         raise InputError(
             path,
             f"is larger than {MAX_FILE_BYTES >> 20} MiB",
@@ -222,25 +173,14 @@ def load_source(path: Path, root: Path, role: str) -> tuple[bytes, SourceFile]:
     return data, SourceFile(role, name, len(data), hashlib.sha256(data).hexdigest())
 
 
-def _read(path: Path) -> tuple[bytes, int]:
-    """Return what a file holds and its size; nothing, or too much, where it is too large."""
-    if isinstance(path, RemotePath):
-        data = RemoteFile(path).pread(MAX_FILE_BYTES + 1, 0)
-        return data, len(data)
-    with path.open("rb") as file:
-        size = os.fstat(file.fileno()).st_size
-        # read() would set aside all that it is allowed to return.
-        return (b"" if size > MAX_FILE_BYTES else file.read(size)), size
-
-
-def npy_array(data: bytes, where: str | Path, spec: ArraySpec) -> NDArray[Any]:
+def npy_array(data: bytes, where: str | Place, spec: ArraySpec) -> NDArray[Any]:
     """Read the bytes of an npy file, in native byte order.
 
     Parameters
     ----------
     data : bytes
         The whole file.
-    where : str or Path
+    where : str or Place
         What errors call it.
     spec : ArraySpec
         What the array may look like.
@@ -259,7 +199,7 @@ def npy_array(data: bytes, where: str | Path, spec: ArraySpec) -> NDArray[Any]:
 
 
 def npz_arrays(
-    data: bytes, where: str | Path, specs: Mapping[str, ArraySpec]
+    data: bytes, where: str | Place, specs: Mapping[str, ArraySpec]
 ) -> dict[str, NDArray[Any]]:
     """Read the named arrays from the bytes of an npz file.
 
@@ -267,7 +207,7 @@ def npz_arrays(
     ----------
     data : bytes
         The whole file.
-    where : str or Path
+    where : str or Place
         What errors call it.
     specs : mapping of str to ArraySpec
         The arrays wanted and what they may look like.
@@ -300,7 +240,7 @@ def npz_arrays(
 
 
 def npz_small_arrays(
-    data: bytes, where: str | Path, spec: ArraySpec
+    data: bytes, where: str | Place, spec: ArraySpec
 ) -> tuple[dict[str, NDArray[Any]], list[InputError]]:
     """Read whatever arrays of an npz file are as `spec` wants them.
 
@@ -325,7 +265,7 @@ def npz_small_arrays(
     return arrays, faults
 
 
-def _open_zip(data: bytes, where: str | Path) -> zipfile.ZipFile:
+def _open_zip(data: bytes, where: str | Place) -> zipfile.ZipFile:
     expected = "an intact npz archive, as numpy.savez writes it; copy or make it again"
     # zipfile makes an object for every directory entry before one can ask how many there are.
     if data.count(b"PK\x01\x02") > MAX_MEMBERS:
@@ -339,7 +279,7 @@ def _open_zip(data: bytes, where: str | Path) -> zipfile.ZipFile:
 def _read_member(
     archive: zipfile.ZipFile,
     info: zipfile.ZipInfo,
-    where: str | Path,
+    where: str | Place,
     name: str,
     spec: ArraySpec,
 ) -> NDArray[Any]:
@@ -364,7 +304,7 @@ def _read_member(
         ) from None
 
 
-def _array(data: bytes, size: int, where: str | Path, spec: ArraySpec) -> NDArray[Any]:
+def _array(data: bytes, size: int, where: str | Place, spec: ArraySpec) -> NDArray[Any]:
     """Return the array whose npy header and values `data` holds."""
     shape, fortran, dtype, offset = _header(data, size, where, spec)
     wanted = math.prod(shape)
@@ -379,7 +319,7 @@ def _array(data: bytes, size: int, where: str | Path, spec: ArraySpec) -> NDArra
 
 
 def _header(
-    prefix: bytes, size: int, where: str | Path, spec: ArraySpec
+    prefix: bytes, size: int, where: str | Place, spec: ArraySpec
 ) -> tuple[tuple[int, ...], bool, np.dtype[Any], int]:
     """Check an npy header before its data is read; return shape, order, dtype and its length.
 

@@ -7,7 +7,6 @@ than those that are undone here with a bound.
 
 from __future__ import annotations
 
-import hashlib
 import math
 import zlib
 from collections.abc import Iterator, Mapping
@@ -20,10 +19,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slatprep.errors import InputError
-from slatprep.readers.files import ArraySpec, load_source, resolve_inside
+from slatprep.readers.files import ArraySpec, load_source
 from slatprep.readers.patterns import component_regex
-from slatprep.records import SourceFile
-from slatprep.storage.cache import on_disk
+from slatprep.records import Place, SourceFile
+from slatprep.storage.files import file_digest
+from slatprep.storage.place import storage_of
 
 if TYPE_CHECKING:
     import h5py
@@ -51,13 +51,13 @@ HDF5_ERRORS = (
 
 
 def load_datasets(
-    path: Path, root: Path, group: str, specs: Mapping[str, ArraySpec]
+    path: Place, root: Place, group: str, specs: Mapping[str, ArraySpec]
 ) -> tuple[dict[str, NDArray[Any]], SourceFile]:
     """Read the named datasets of a group, and hash the file.
 
     Parameters
     ----------
-    path, root : Path
+    path, root : Place
         The file, and the folder that it must not leave.
     group : str
         Group with the datasets; empty for a file that holds one asset.
@@ -74,7 +74,7 @@ def load_datasets(
     try:
         if group:
             source = _hash_shared(path, root)
-            file = h5py.File(on_disk(path), "r", locking=False)
+            file = h5py.File(storage_of(path).on_disk(), "r", locking=False)
         else:
             data, source = load_source(path, root, "slat")
             file = h5py.File(h5py.h5f.open_file_image(data))
@@ -97,13 +97,13 @@ def load_datasets(
 
 
 def find_groups(
-    path: Path, root: Path, pattern: str, known: Mapping[str, str]
+    path: Place, root: Place, pattern: str, known: Mapping[str, str]
 ) -> Iterator[tuple[dict[str, str], str]]:
     """Find the groups of a file whose names match a pattern such as ``{id}/{view}``.
 
     Parameters
     ----------
-    path, root : Path
+    path, root : Place
         The file, and the folder that it must not leave.
     pattern : str
         Group names by levels; see `slatprep.readers.patterns`.
@@ -122,10 +122,10 @@ def find_groups(
     """
     import h5py
 
-    resolved, _ = resolve_inside(path, root)
+    file, _ = storage_of(root).locate(path)
     try:
-        with h5py.File(on_disk(resolved), "r", locking=False) as file:
-            yield from _walk_groups(file, pattern.strip("/").split("/"), dict(known), "")
+        with h5py.File(storage_of(file).on_disk(), "r", locking=False) as groups:
+            yield from _walk_groups(groups, pattern.strip("/").split("/"), dict(known), "")
     except HDF5_ERRORS as error:
         raise InputError(
             path, f"is no readable HDF5 file ({_reason(error)})", "groups named by asset"
@@ -268,15 +268,14 @@ def _reason(error: BaseException) -> str:
     return str(error).splitlines()[0][:160] if str(error) else type(error).__name__
 
 
-def _hash_shared(path: Path, root: Path) -> SourceFile:
+def _hash_shared(path: Place, root: Place) -> SourceFile:
     """Describe a file that many assets share; it is hashed once a process, not once an asset."""
-    resolved, name = resolve_inside(path, root)
-    copy = on_disk(resolved)
+    file, name = storage_of(root).locate(path)
+    copy = storage_of(file).on_disk()
     state = copy.stat()
     return SourceFile("slat", name, state.st_size, _sha256(copy, state.st_size, state.st_mtime_ns))
 
 
 @lru_cache(maxsize=64)
 def _sha256(path: Path, size: int, mtime_ns: int) -> str:
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
+    return file_digest(path)

@@ -6,9 +6,10 @@ import csv
 import json
 import re
 from collections.abc import Collection
-from pathlib import Path
 
 from slatprep.errors import ConfigError
+from slatprep.records import Place
+from slatprep.storage.place import storage_of
 
 MAX_JSON_BYTES = 256 * 2**20
 """No list of categories is larger; one of 500,000 objects takes 50 MB."""
@@ -17,13 +18,13 @@ _UID = re.compile(r"([0-9a-f]{32})/?$")
 
 
 def read_map(
-    path: Path, objects: Collection[str], slats: Collection[str]
+    path: Place, objects: Collection[str], slats: Collection[str]
 ) -> dict[str, list[tuple[str, str]]]:
     """Read which SLATs belong to which object.
 
     Parameters
     ----------
-    path : Path
+    path : Place
         CSV with columns ``object_id``, ``slat_id`` and optionally ``view``; or
         TRELLIS's ``metadata.csv``, whose ``sha256`` names the SLAT and whose
         ``file_identifier`` is a URL that ends in the object's uid.
@@ -43,7 +44,7 @@ def read_map(
     """
     claims: dict[str, dict[tuple[str, str], None]] = {}
     try:
-        with path.open(newline="", encoding="utf-8-sig") as file:
+        with path.open("r", newline="", encoding="utf-8-sig") as file:
             reader = csv.DictReader(file)
             columns = set(reader.fieldnames or ())
             if {"object_id", "slat_id"} <= columns:
@@ -70,7 +71,7 @@ def read_map(
     return {object_id: list(named) for object_id, named in claims.items()}
 
 
-def read_categories(path: Path) -> dict[str, str]:
+def read_categories(path: Place) -> dict[str, str]:
     """Read the category of each object from Pixie's ``obj_ids_metadata.json``.
 
     Raises
@@ -79,9 +80,10 @@ def read_categories(path: Path) -> dict[str, str]:
         If the file cannot be read or an entry has no ``obj_class``.
     """
     try:
-        if path.stat().st_size > MAX_JSON_BYTES:
+        data = storage_of(path).read(MAX_JSON_BYTES)
+        if len(data) > MAX_JSON_BYTES:
             raise ConfigError(f"{path}: is larger than {MAX_JSON_BYTES >> 20} MiB")
-        entries = json.loads(path.read_text(encoding="utf-8"))
+        entries = json.loads(data)
     except (OSError, ValueError, RecursionError) as error:
         raise ConfigError(f"{path}: cannot be read as JSON ({error})") from None
     if not isinstance(entries, dict):

@@ -8,14 +8,14 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from itertools import groupby
-from pathlib import Path
 from urllib.parse import quote
 
 from slatprep.errors import ConfigError, InputError
 from slatprep.parameters import BuildParameters, PixieverseSource, SlatSource
 from slatprep.readers.joins import read_categories, read_map
-from slatprep.readers.patterns import NAME, fill, find_files
-from slatprep.records import AssetPair
+from slatprep.readers.patterns import NAME, fill, find_files, list_below
+from slatprep.records import AssetPair, Place
+from slatprep.storage.listing import Listing
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,6 +46,17 @@ class _Row:
     object_id: str
     view: str
     slats: tuple[_Slat, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class _Found:
+    """What of a dataset is there, by names; `listing` is that of the PixieVerse root."""
+
+    parameters: BuildParameters
+    listing: Listing
+    one_file: bool
+    grids: Mapping[str, list[_Grid]]
+    categories: Mapping[str, str]
 
 
 def discover(parameters: BuildParameters) -> Iterator[AssetPair]:
@@ -80,22 +91,23 @@ def discover(parameters: BuildParameters) -> Iterator[AssetPair]:
         one_file = slat.root.is_file()
     except OSError as error:
         raise ConfigError(f"{error.filename}: cannot be looked at ({error.strerror})") from None
-    grids = _find_grids(pixieverse)
+    listing = list_below(pixieverse.root)
+    grids = _find_grids(pixieverse, listing)
     slats = _find_slats(slat, one_file)
     claims = {} if pairing.map is None else read_map(pairing.map, grids, slats)
     categories = {} if pairing.categories is None else read_categories(pairing.categories)
     rows = sorted(_rows(grids, slats, claims), key=lambda row: (row.asset_id, row.object_id))
-    return _pairs(rows, grids, categories, parameters, one_file)
+    return _pairs(rows, _Found(parameters, listing, one_file, grids, categories))
 
 
-def _find_grids(source: PixieverseSource) -> dict[str, list[_Grid]]:
+def _find_grids(source: PixieverseSource, listing: Listing) -> dict[str, list[_Grid]]:
     """Return the grids of each object, all found by the first pattern that matches any."""
     chosen = {"sample": source.sample} if source.sample else {}
     grids: dict[str, list[_Grid]] = {}
     for rank, pattern in enumerate(source.grid):
         if "{id}" not in pattern:
             raise ConfigError(f"grid pattern {pattern!r} names no {{id}}")
-        for fields, path in find_files(source.root, pattern, chosen):
+        for fields, path in find_files(listing, pattern, chosen):
             found = grids.setdefault(fields["id"], [])
             if not found or found[0].rank == rank:
                 found.append(_Grid(rank, fields.get("sample", ""), path))
@@ -121,8 +133,9 @@ def _each_slat(source: SlatSource, one_file: bool) -> Iterator[_Slat]:
     if one_file:
         yield from _each_group(source, source.root.parent, source.root.name)
         return
+    listing = list_below(source.root)
     for pattern in source.pattern:
-        for fields, path in find_files(source.root, pattern, {}):
+        for fields, path in find_files(listing, pattern, {}):
             if "id" in fields:
                 yield _Slat(fields["id"], fields.get("view", ""), path)
             else:
@@ -130,7 +143,7 @@ def _each_slat(source: SlatSource, one_file: bool) -> Iterator[_Slat]:
 
 
 def _each_group(
-    source: SlatSource, root: Path, path: str, known: Mapping[str, str] | None = None
+    source: SlatSource, root: Place, path: str, known: Mapping[str, str] | None = None
 ) -> Iterator[_Slat]:
     """Return the SLATs that lie as groups in one HDF5 file."""
     from slatprep.readers.hdf5 import find_groups
@@ -195,13 +208,7 @@ def _safe(name: str) -> str:
     return quote(name.encode(errors="surrogateescape"), safe="").replace("~", "%7E")
 
 
-def _pairs(
-    rows: list[_Row],
-    grids: Mapping[str, list[_Grid]],
-    categories: Mapping[str, str],
-    parameters: BuildParameters,
-    one_file: bool,
-) -> Iterator[AssetPair]:
+def _pairs(rows: list[_Row], there: _Found) -> Iterator[AssetPair]:
     for asset_id, group in groupby(rows, key=lambda row: row.asset_id):
         same = list(group)
         shared = ""
@@ -211,24 +218,15 @@ def _pairs(
                 for row in same
             )
             shared = f"asset id {asset_id!r} would stand for {names}; rename one"
-        row = same[0]
-        found = grids.get(row.object_id, [])
-        yield _pair(row, found, categories, parameters, one_file, shared)
+        yield _pair(same[0], there, shared)
 
 
-def _pair(
-    row: _Row,
-    grids: list[_Grid],
-    categories: Mapping[str, str],
-    parameters: BuildParameters,
-    one_file: bool,
-    shared: str,
-) -> AssetPair:
-    source, slat_source = parameters.pixieverse, parameters.slat
+def _pair(row: _Row, there: _Found, shared: str) -> AssetPair:
+    source, slat_source = there.parameters.pixieverse, there.parameters.slat
     problems = [shared, *_name_problems(row), *(slat.problem for slat in row.slats)]
     grid = mask = bounds = None
+    grids = sorted(there.grids.get(row.object_id, ()), key=lambda found: found.path)
     if grids:
-        grids = sorted(grids, key=lambda found: found.path)
         grid = source.root / grids[0].path
         if len(grids) > 1:
             problems.append(_several_grids(row.object_id, grids))
@@ -237,9 +235,9 @@ def _pair(
             sample = grids[0].sample or source.sample
             if sample:
                 known["sample"] = sample
-            mask, problem = _find_one(source.root, source.mask, known, "mask")
+            mask, problem = _find_one(there, source.mask, known, "mask")
             problems.append(problem)
-            bounds, problem = _find_one(source.root, source.bounds, known, "bounds")
+            bounds, problem = _find_one(there, source.bounds, known, "bounds")
             problems.append(problem)
     else:
         chosen = {"id": row.object_id}
@@ -251,19 +249,19 @@ def _pair(
         )
     found = [slat for slat in row.slats if slat.path]
     if not found:
-        problems.append(_no_slat(row, slat_source, one_file))
+        problems.append(_no_slat(row, slat_source, there.one_file))
     elif len(found) > 1:
         files = ", ".join(slat.path + (f" [{slat.group}]" if slat.group else "") for slat in found)
         problems.append(
             f"{len(found)} SLATs for one id {row.asset_id!r} ({files}); expected one, "
             "or a pattern with {view}"
         )
-    slat_root = slat_source.root.parent if one_file else slat_source.root
+    slat_root = slat_source.root.parent if there.one_file else slat_source.root
     return AssetPair(
         asset_id=row.asset_id,
         object_id=_safe(row.object_id),
         view=_safe(row.view),
-        category=categories.get(row.object_id, ""),
+        category=there.categories.get(row.object_id, ""),
         pixieverse_root=source.root,
         slat_root=slat_root,
         grid=grid,
@@ -301,16 +299,16 @@ def _no_slat(row: _Row, source: SlatSource, one_file: bool) -> str:
 
 
 def _find_one(
-    root: Path, patterns: Iterable[str], known: Mapping[str, str], role: str
-) -> tuple[Path | None, str]:
+    there: _Found, patterns: Iterable[str], known: Mapping[str, str], role: str
+) -> tuple[Place | None, str]:
     """Return the file that the first matching pattern finds, and what is wrong if it finds more."""
     for pattern in patterns:
-        paths = sorted(path for _, path in find_files(root, pattern, known))
+        paths = sorted(path for _, path in find_files(there.listing, pattern, known))
         if paths:
             problem = ""
             if len(paths) > 1:
                 problem = f"{len(paths)} {role} files for one id ({', '.join(paths)}); expected one"
-            return root / paths[0], problem
+            return there.parameters.pixieverse.root / paths[0], problem
     return None, ""
 
 

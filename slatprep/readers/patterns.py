@@ -9,11 +9,11 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator, Mapping
 from functools import lru_cache
-from pathlib import Path
 
 from slatprep.errors import ConfigError
-from slatprep.readers.names import LocalNames, RemoteNames
-from slatprep.storage.remote import RemotePath
+from slatprep.records import Place
+from slatprep.storage.listing import Listing
+from slatprep.storage.place import storage_of
 
 FIELDS = ("id", "sample", "view")
 
@@ -21,15 +21,29 @@ NAME = re.compile(r"[A-Za-z0-9_-][A-Za-z0-9._-]*")
 """What an id or a view may be: one plain path component that is not hidden."""
 
 
+def list_below(root: Place) -> Listing:
+    """Return the names below a root: those of an object store are all asked for here.
+
+    Raises
+    ------
+    ConfigError
+        If it cannot be listed.
+    """
+    try:
+        return storage_of(root).listing()
+    except OSError as error:
+        raise ConfigError(f"{root}: cannot be listed ({error.strerror})") from None
+
+
 def find_files(
-    root: Path, pattern: str, known: Mapping[str, str]
+    names: Listing, pattern: str, known: Mapping[str, str]
 ) -> Iterator[tuple[dict[str, str], str]]:
     """Find the files below a folder that match a pattern.
 
     Parameters
     ----------
-    root : Path
-        Folder to search.
+    names : Listing
+        What lies below the folder; `list_below` makes one.
     pattern : str
         Relative path with fields, such as ``{id}/sample_{sample}/material_grid.npy``.
     known : mapping of str to str
@@ -39,7 +53,7 @@ def find_files(
     ------
     tuple of dict and str
         The fields of a match (names are not checked against `NAME`), and its
-        path relative to `root`. In no particular order.
+        path relative to the folder. In no particular order.
 
     Raises
     ------
@@ -51,8 +65,10 @@ def find_files(
         raise ConfigError(
             f"pattern {pattern!r} is not a path below its root; write it relative, without '..'"
         )
-    names = RemoteNames.of(root) if isinstance(root, RemotePath) else LocalNames(root)
-    yield from _walk(names, "", components, dict(known))
+    try:
+        yield from _walk(names, "", components, dict(known))
+    except OSError as error:
+        raise ConfigError(f"{error.filename}: cannot be listed ({error.strerror})") from None
 
 
 def fill(pattern: str, known: Mapping[str, str]) -> str:
@@ -92,7 +108,7 @@ def _compile(component: str, known: tuple[tuple[str, str], ...]) -> re.Pattern[s
 
 
 def _walk(
-    names: LocalNames | RemoteNames, prefix: str, components: list[str], known: dict[str, str]
+    names: Listing, prefix: str, components: list[str], known: dict[str, str]
 ) -> Iterator[tuple[dict[str, str], str]]:
     component, rest = components[0], components[1:]
     regex = component_regex(component, known)

@@ -7,7 +7,6 @@ slatprep orders them as `PROPERTY_COLUMNS` does, Young's modulus first.
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -29,6 +28,7 @@ from slatprep.records import (
     RESOLUTION,
     AssetPair,
     MaterialField,
+    Place,
     SourceFile,
 )
 
@@ -117,7 +117,7 @@ def read_field(pair: AssetPair) -> MaterialField:
     )
 
 
-def _read_mask(values: NDArray[Any], path: Path, warnings: list[str]) -> NDArray[np.bool_]:
+def _read_mask(values: NDArray[Any], path: Place, warnings: list[str]) -> NDArray[np.bool_]:
     bad = ~((values >= 0) & (values <= 1))  # NaN is bad as well
     if bad.any():
         voxel = _first(bad)
@@ -133,7 +133,7 @@ def _read_mask(values: NDArray[Any], path: Path, warnings: list[str]) -> NDArray
     return mask
 
 
-def _classes_of_ids(ids: NDArray[Any], path: Path) -> NDArray[np.int8]:
+def _classes_of_ids(ids: NDArray[Any], path: Place) -> NDArray[np.int8]:
     known = (ids >= UNLABELLED) & (ids <= BACKGROUND) & (ids == np.rint(ids))
     if not known.all():
         voxel = _first(~known)
@@ -148,7 +148,7 @@ def _classes_of_ids(ids: NDArray[Any], path: Path) -> NDArray[np.int8]:
 def _classes_of_scores(
     scores: NDArray[Any],
     mask: NDArray[np.bool_] | None,
-    path: Path,
+    path: Place,
     warnings: list[str],
 ) -> NDArray[np.int8]:
     """Return the class of the highest score; voxels outside the mask do not matter."""
@@ -178,7 +178,7 @@ def _annotated(
     occupancy: NDArray[np.bool_],
     material: NDArray[np.int8],
     masked: bool,
-    path: Path,
+    path: Place,
     warnings: list[str],
 ) -> NDArray[np.bool_]:
     background = material == BACKGROUND
@@ -211,7 +211,7 @@ def _gather(channels: NDArray[Any], where: NDArray[np.bool_]) -> NDArray[np.floa
     return np.stack(columns, axis=1)
 
 
-def _require_finite(channels: NDArray[Any], occupancy: NDArray[np.bool_], path: Path) -> None:
+def _require_finite(channels: NDArray[Any], occupancy: NDArray[np.bool_], path: Place) -> None:
     properties = _gather(channels, occupancy)
     if not np.isfinite(properties).all():
         row, column = _first(~np.isfinite(properties))
@@ -225,7 +225,7 @@ def _require_finite(channels: NDArray[Any], occupancy: NDArray[np.bool_], path: 
 
 
 def _require_physical(
-    properties: NDArray[np.float32], voxels: NDArray[np.intp], path: Path
+    properties: NDArray[np.float32], voxels: NDArray[np.intp], path: Place
 ) -> None:
     youngs_modulus, density, poissons_ratio = properties.T
     for name, values, good, expected in (
@@ -253,7 +253,7 @@ def _to_si(values: NDArray[np.float32], warnings: list[str]) -> NDArray[np.float
 
 
 def _read_bounds(
-    path: Path, root: Path, sources: list[SourceFile], warnings: list[str]
+    path: Place, root: Place, sources: list[SourceFile], warnings: list[str]
 ) -> dict[str, object] | None:
     """Return what ``clip_features.npz`` says, JSON-ready; a fault is a warning only.
 

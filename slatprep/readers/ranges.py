@@ -5,15 +5,14 @@ from __future__ import annotations
 import json
 import math
 import tomllib
-from pathlib import Path
 from typing import TypeGuard
 
 from slatprep.errors import ConfigError
 from slatprep.normalize import LOG10
-from slatprep.records import PROPERTY_COLUMNS, Normalization, PropertyRange
+from slatprep.records import PROPERTY_COLUMNS, Normalization, Place, PropertyRange
 
 
-def read_ranges(path: Path) -> Normalization:
+def read_ranges(path: Place) -> Normalization:
     """Read ranges from a TOML or JSON file.
 
     The file has one table a property with ``lo`` and ``hi`` in mapped units
@@ -29,8 +28,8 @@ def read_ranges(path: Path) -> Normalization:
         If the file cannot be read, lacks a property or has an empty range.
     """
     try:
-        text = Path(path).read_text(encoding="utf-8")
-        table = json.loads(text) if Path(path).suffix == ".json" else tomllib.loads(text)
+        text = path.read_text(encoding="utf-8")
+        table = json.loads(text) if path.suffix == ".json" else tomllib.loads(text)
     except (OSError, UnicodeDecodeError, ValueError) as error:
         raise ConfigError(f"{path}: cannot read ranges ({error})") from error
     ranges = []
@@ -43,7 +42,7 @@ def read_ranges(path: Path) -> Normalization:
                 f"finite lo < hi{' in log10 of the SI value' if log10 else ''}"
             )
         ranges.append(PropertyRange(name, log10, float(lo), float(hi)))
-    return Normalization((ranges[0], ranges[1], ranges[2]), source=Path(path).name)
+    return Normalization((ranges[0], ranges[1], ranges[2]), source=path.name)
 
 
 def _is_number(value: object) -> TypeGuard[float]:

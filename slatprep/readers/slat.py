@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -12,7 +11,7 @@ from slatprep.errors import InputError
 from slatprep.geometry.voxels import flat_index
 from slatprep.readers.files import ArraySpec, load_source, npz_arrays, require_complete
 from slatprep.readers.hdf5 import SUFFIXES, load_datasets
-from slatprep.records import RESOLUTION, AssetPair, StructuredLatents
+from slatprep.records import RESOLUTION, AssetPair, Place, StructuredLatents
 
 LATENT_CHANNELS = 8
 
@@ -65,7 +64,7 @@ def read_latents(pair: AssetPair) -> StructuredLatents:
     )
 
 
-def check_coords(coords: NDArray[Any], where: str | Path) -> NDArray[np.uint8]:
+def check_coords(coords: NDArray[Any], where: str | Place) -> NDArray[np.uint8]:
     """Return SLAT coordinates as (N, 3) uint8, without the batch column where there is one.
 
     Raises
@@ -106,7 +105,7 @@ def check_coords(coords: NDArray[Any], where: str | Path) -> NDArray[np.uint8]:
 
 
 def _check_feats(
-    feats: NDArray[Any], where: str | Path, warnings: list[str]
+    feats: NDArray[Any], where: str | Place, warnings: list[str]
 ) -> NDArray[np.float32]:
     if feats.dtype.itemsize > 4:
         warnings.append(f"feats: {feats.dtype.name} rounded to float32")

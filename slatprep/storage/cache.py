@@ -11,7 +11,7 @@ import os
 import tempfile
 from pathlib import Path
 
-from slatprep.storage.remote import RemotePath, in_parts, reach, telling
+from slatprep.storage.remote import RemotePlace, filesystem_of, multipart_options, os_errors
 
 VARIABLE = "SLATPREP_CACHE"
 """Environment variable that says where the folder is."""
@@ -25,37 +25,35 @@ def cache_folder() -> Path:
     return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache").absolute() / "slatprep"
 
 
-def folder_for(path: RemotePath) -> Path:
+def folder_for(place: RemotePlace) -> Path:
     """Return the part of the folder that belongs to a place, named so that people see whose."""
-    return cache_folder() / f"{path.name}-{_short(str(path))}"
+    return cache_folder() / f"{place.name}-{_short(str(place))}"
 
 
-def on_disk(path: Path) -> Path:
-    """Return a path of the local disk with a file's content.
+def cached_file(place: RemotePlace) -> Path:
+    """Return a path of the local disk with an object's content.
 
-    A local file's is its own. An object is copied; the copy serves as long as
-    the object has the same size, tag and time, and one copy is kept.
+    The copy serves as long as the object has the same size, tag and time, and
+    one copy is kept.
 
     Raises
     ------
     OSError
         If the object cannot be read or the disk does not take it.
     """
-    if not isinstance(path, RemotePath):
-        return path
-    system, name = reach(path)
-    with telling(path):
+    system, name = filesystem_of(place)
+    with os_errors(place):
         entry = system.info(name)
     state = [str(entry.get(key)) for key in ("size", "ETag", "etag", "LastModified", "mtime")]
-    folder = folder_for(path)
+    folder = folder_for(place)
     copy = folder / _short(" ".join(state))
     if copy.exists():
         return copy
     folder.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(dir=folder) as own:
         part = Path(own, "part")
-        with telling(path):
-            system.get_file(name, str(part), **in_parts(system))
+        with os_errors(place):
+            system.get_file(name, str(part), **multipart_options(system))
         part.replace(copy)
     for older in folder.iterdir():
         if older != copy and older.is_file():

@@ -1,32 +1,119 @@
-"""The files below a folder, and their digests."""
+"""Files of the local disk: read by ranges, listed, and their digests."""
 
 from __future__ import annotations
 
+import errno
 import hashlib
 import os
-from collections.abc import Iterator
+import stat
+from io import BytesIO, FileIO
 from pathlib import Path
+from typing import TYPE_CHECKING, Protocol, cast
 
-from slatprep.storage.remote import RemotePath, list_objects
+if TYPE_CHECKING:
+    from slatprep.records import Place
 
 
-def list_files(path: Path) -> Iterator[str]:
-    """Yield the name of every file below a folder, with forward slashes, sorted by folder.
+_AT = os.open in os.supports_dir_fd
 
-    Links are listed, and not followed.
+
+class RangeFile(Protocol):
+    """A file that is read by ranges, which threads may share."""
+
+    def size(self) -> int:
+        """Return its length in bytes; an `OSError` if it is no file."""
+
+    def pread(self, length: int, offset: int, /) -> bytes:
+        """Read up to `length` bytes from an offset on."""
+
+    def prefetch(self, length: int, offset: int, /) -> None:
+        """Announce a range that will be read piece by piece."""
+
+
+class Folder(Protocol):
+    """A folder whose files are read by ranges, and stay those of one store.
+
+    Attributes
+    ----------
+    path : str
+        What errors call it.
+    prefetch_bytes : int
+        The longest range worth a `RangeFile.prefetch`; 0 where none is.
     """
-    if isinstance(path, RemotePath):
-        yield from list_objects(path)
-        return
+
+    path: str
+    prefetch_bytes: int
+
+    def open(self, name: str, /) -> RangeFile:
+        """Open a file below it."""
+
+
+class LocalFile(FileIO):
+    """A file of the local disk, without buffer; see `RangeFile`."""
+
+    def size(self) -> int:
+        """Return its length in bytes.
+
+        Raises
+        ------
+        OSError
+            If it is a folder, pipe or device.
+        """
+        state = os.fstat(self.fileno())
+        if not stat.S_ISREG(state.st_mode):
+            raise OSError(errno.EINVAL, "it is no regular file")
+        return state.st_size
+
+    def pread(self, length: int, offset: int) -> bytes:
+        """Read up to `length` bytes from an offset on."""
+        return os.pread(self.fileno(), length, offset)
+
+    def prefetch(self, length: int, offset: int) -> None:
+        """Do nothing: the system reads ahead by itself."""
+
+
+class LocalFolder:
+    """An open directory: what is read below it stays of one store, even if that is replaced."""
+
+    prefetch_bytes = 0
+
+    def __init__(self, path: str | os.PathLike[str]) -> None:
+        self.path = os.fspath(path)
+        self._descriptor = os.open(self.path, os.O_RDONLY) if _AT else None
+
+    def open(self, name: str) -> LocalFile:
+        """Open a file for reading, without buffer."""
+        if self._descriptor is None:
+            return LocalFile(os.path.join(self.path, name))  # noqa: PTH118 - the hot path
+        return LocalFile(name, opener=self._open_at)
+
+    def _open_at(self, name: str, flags: int) -> int:
+        # A pipe in a shard's place must not make the reader wait for a writer.
+        return os.open(name, flags | os.O_NONBLOCK, dir_fd=self._descriptor)
+
+    def __del__(self) -> None:
+        if getattr(self, "_descriptor", None) is not None:
+            os.close(self._descriptor)  # type: ignore[arg-type]
+
+
+def local_files(path: Path) -> dict[str, int]:
+    """Return every file below a folder and its size in bytes.
+
+    Names have forward slashes and are sorted by folder. Links are not followed;
+    their size is -1.
+    """
+    found = {}
     for folder, folders, files in os.walk(path):
         folders.sort()
-        relative = Path(folder).relative_to(path)
-        links = [name for name in folders if (Path(folder) / name).is_symlink()]
+        links = [name for name in folders if Path(folder, name).is_symlink()]
         for name in sorted([*files, *links]):
-            yield (relative / name).as_posix()
+            file = Path(folder, name)
+            size = -1 if file.is_symlink() else file.stat().st_size
+            found[file.relative_to(path).as_posix()] = size
+    return found
 
 
-def file_digest(path: Path) -> str:
+def file_digest(place: Place) -> str:
     """Return the SHA-256 of a file, in hex."""
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
+    with place.open("rb") as file:
+        return hashlib.file_digest(cast(BytesIO, file), "sha256").hexdigest()

@@ -1,9 +1,7 @@
-"""Places on object stores: URLs that stand where a path of the local disk may stand.
+"""Places on object stores, which are reached through fsspec.
 
-A `RemotePath` is a path, so it goes wherever paths go: into parameters,
-records, messages and to workers. What asks it something asks the object store
-through fsspec. Nothing can be changed at one but by `RemotePath.upload`;
-what else pathlib offers is refused, with the place named.
+A `RemotePlace` has the few methods of `slatprep.records.Place` and no others.
+Nothing can be changed at one but by `RemotePlace.upload`.
 
 Credentials and endpoints are the libraries' own matter: those of S3, for
 instance, come from ``AWS_*`` variables or ``~/.aws``.
@@ -13,174 +11,151 @@ from __future__ import annotations
 
 import errno
 import io
-import re
-import stat
 from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import cached_property
-from os import stat_result
-from pathlib import Path, PosixPath
-from typing import TYPE_CHECKING, Any, NoReturn
+from pathlib import Path, PurePosixPath
+from typing import IO, Any
 
 from slatprep.errors import ConfigError
-
-if TYPE_CHECKING:
-    from typing import Self
 
 BUFFER_BYTES = 8 * 2**20
 """What one request of a file that is read from its beginning asks for."""
 
-# pathlib makes one slash of two, and one letter is a drive.
-_URL = re.compile(r"([a-z][a-z0-9+.-]+):/+(.*)", re.DOTALL)
 
-_LOCAL = ("file", "local")
+class RemotePlace:
+    """The URL of an object, or of all objects below it.
 
-
-def as_path(place: str | Path) -> Path:
-    """Return a path, a `RemotePath` where it is the URL of an object store.
+    `slatprep.storage.place.place_of` makes one. Names are joined as those of a
+    path are; what pathlib offers besides is missing here.
 
     Parameters
     ----------
-    place : str or Path
-        A path, a URL, or a URL that was made a path.
-
-    Examples
-    --------
-    >>> print(as_path("s3://bucket/demo.zarr") / "zarr.json")
-    s3://bucket/demo.zarr/zarr.json
-    >>> print(as_path("file:///data/demo.zarr"))
-    /data/demo.zarr
-    """
-    if isinstance(place, RemotePath):
-        return place
-    url = _URL.fullmatch(str(place))
-    if url is None:
-        return Path(place)
-    protocol, rest = url.groups()
-    return Path("/", rest) if protocol in _LOCAL else RemotePath(f"{protocol}:", rest)
-
-
-class RemotePath(PosixPath):
-    """A URL of an object, or of all objects below it; `as_path` makes one.
+    protocol : str
+        Such as ``s3``.
+    path : PurePosixPath
+        Bucket and key.
 
     Raises
     ------
     OSError
         By every method that asks the object store, which may refuse or not
-        answer; libraries' own errors are told as one.
+        answer; whatever the libraries raise is turned into one.
     ConfigError
         By the same, if a library is missing or the protocol is unknown.
     """
 
+    def __init__(self, protocol: str, path: PurePosixPath) -> None:
+        self.protocol, self.path = protocol, path
+
+    def __repr__(self) -> str:
+        return f"RemotePlace({str(self)!r})"
+
+    def __eq__(self, other: object) -> bool:
+        return type(other) is RemotePlace and str(self) == str(other)
+
+    def __hash__(self) -> int:
+        return hash(str(self))
+
     def __str__(self) -> str:
-        parts = self.parts
-        if self.is_absolute():
-            return f"{parts[0]}//{'/'.join(parts[1:])}"
-        return "/".join(parts) or "."
+        return f"{self.protocol}://{'/'.join(self.path.parts)}"
 
-    def resolve(self, strict: bool = False) -> Self:
-        """Return the same: an object store has no links."""
-        return self
+    @property
+    def name(self) -> str:
+        """Its last component."""
+        return self.path.name
 
-    def absolute(self) -> Self:
+    @property
+    def suffix(self) -> str:
+        """The extension of its name, with the dot."""
+        return self.path.suffix
+
+    @property
+    def parent(self) -> RemotePlace:
+        """The place that holds it."""
+        return RemotePlace(self.protocol, self.path.parent)
+
+    def __truediv__(self, key: str) -> RemotePlace:
+        # Not as pathlib has it, for which a key with a slash in front leads elsewhere.
+        return RemotePlace(self.protocol, PurePosixPath(f"{self.path}/{key}"))
+
+    def with_name(self, name: str) -> RemotePlace:
+        """Return the place of this name beside it."""
+        return RemotePlace(self.protocol, self.path.with_name(name))
+
+    def absolute(self) -> RemotePlace:
         """Return the same."""
         return self
 
-    def is_absolute(self) -> bool:
-        """Whether it is a URL, and not the rest of one."""
-        return self.parts[:1] != () and self.parts[0].endswith(":")
-
-    def expanduser(self) -> Self:
-        """Return the same."""
-        return self
-
-    def is_symlink(self) -> bool:
-        """Return False: an object store has no links."""
-        return False
-
-    def exists(self, *, follow_symlinks: bool = True) -> bool:
+    def exists(self) -> bool:
         """Whether there is an object, or any below."""
         return self._kind() != ""
 
-    def is_dir(self, *, follow_symlinks: bool = True) -> bool:
+    def is_dir(self) -> bool:
         """Whether there is any object below, but none of this name."""
         return self._kind() == "directory"
 
-    def is_file(self, *, follow_symlinks: bool = True) -> bool:
+    def is_file(self) -> bool:
         """Whether there is an object."""
         return self._kind() == "file"
 
-    def stat(self, *, follow_symlinks: bool = True) -> stat_result:
-        """Return the size of an object; times are not told."""
-        return stat_result((stat.S_IFREG, 0, 0, 1, 0, 0, RemoteFile(self).size(), 0, 0, 0))
-
     def open(
-        self, mode: str = "r", buffering: int = -1, encoding: str | None = None,
-        errors: str | None = None, newline: str | None = None,
-    ) -> Any:  # fmt: skip
+        self, mode: str = "r", *, encoding: str | None = None, newline: str | None = None
+    ) -> IO[Any]:
         """Open an object for reading, from its beginning."""
         if mode not in ("r", "rt", "rb"):
-            self._refuse()
+            raise io.UnsupportedOperation(f"{self}: mode {mode!r}; expected 'r' or 'rb'")
         file = io.BufferedReader(RemoteFile(self), BUFFER_BYTES)
-        return file if mode == "rb" else io.TextIOWrapper(file, encoding, errors, newline)
+        return file if mode == "rb" else io.TextIOWrapper(file, encoding, newline=newline)
 
     def read_bytes(self) -> bytes:
         """Read an object whole."""
         with self.open("rb") as file:
             return bytes(file.read())
 
-    def read_text(
-        self, encoding: str | None = None, errors: str | None = None, newline: str | None = None
-    ) -> str:
+    def read_text(self, encoding: str | None = None) -> str:
         """Read an object whole, as text."""
-        with self.open("r", -1, encoding, errors, newline) as file:
+        with self.open("r", encoding=encoding) as file:
             return str(file.read())
 
     def upload(self, local: Path) -> None:
         """Put a file of the local disk here; it is seen whole or not at all."""
-        system, name = reach(self)
-        with telling(self):
-            system.put_file(str(local), name, **in_parts(system))
+        system, name = filesystem_of(self)
+        with os_errors(self):
+            system.put_file(str(local), name, **multipart_options(system))
 
     def _kind(self) -> str:
         # Not by isdir, which lists all that is below.
-        system, name = reach(self)
+        system, name = filesystem_of(self)
         try:
-            with telling(self):
+            with os_errors(self):
                 return str(system.info(name)["type"])
         except FileNotFoundError:
             return ""
-
-    def _refuse(self, *_: Any, **__: Any) -> NoReturn:
-        raise OSError(errno.ENOTSUP, "this is possible at a local path only", str(self))
-
-    chmod = glob = hardlink_to = iterdir = lstat = mkdir = _refuse
-    rename = replace = rglob = rmdir = symlink_to = touch = unlink = _refuse
-    write_bytes = write_text = _refuse
 
 
 class RemoteFile(io.RawIOBase):
     """An object open for reading; may be shared between threads by those who use `pread` alone."""
 
-    def __init__(self, path: RemotePath) -> None:
+    def __init__(self, place: RemotePlace) -> None:
         super().__init__()
-        self.path = path
+        self.place = place
         self._position, self._ended = 0, False
-        self._held = (0, b"")
+        self._prefetched = (0, b"")
 
     def size(self) -> int:
         """Return its length in bytes."""
         return self._size
 
     def pread(self, length: int, offset: int) -> bytes:
-        """Read up to `length` bytes from a place on, with one request if they are not held."""
-        begin, held = self._held
-        if begin <= offset and offset + length <= begin + len(held):
-            return held[offset - begin : offset - begin + length]
+        """Read up to `length` bytes from an offset on: prefetched ones, or with one request."""
+        begin, data = self._prefetched
+        if begin <= offset and offset + length <= begin + len(data):
+            return data[offset - begin : offset - begin + length]
         # Asked for anew: a connection does not survive a fork, and fsspec keeps one a process.
-        system, name = reach(self.path)
+        system, name = filesystem_of(self.place)
         try:
-            with telling(self.path):
+            with os_errors(self.place):
                 return bytes(system.cat_file(name, start=offset, end=offset + length))
         except (FileNotFoundError, PermissionError):
             raise
@@ -189,9 +164,9 @@ class RemoteFile(io.RawIOBase):
                 raise
             return b""  # Servers refuse a range that begins behind the end.
 
-    def hold(self, length: int, offset: int) -> None:
-        """Read bytes that will be asked for piece by piece; they are held until the next."""
-        self._held = (offset, self.pread(length, offset))
+    def prefetch(self, length: int, offset: int) -> None:
+        """Read a range with one request, and keep it until the next."""
+        self._prefetched = (offset, self.pread(length, offset))
 
     def readable(self) -> bool:
         """Return True."""
@@ -209,22 +184,42 @@ class RemoteFile(io.RawIOBase):
 
     @cached_property
     def _size(self) -> int:
-        system, name = reach(self.path)
-        with telling(self.path):
+        system, name = filesystem_of(self.place)
+        with os_errors(self.place):
             entry = system.info(name)
         if entry["type"] != "file":
-            raise OSError(errno.EISDIR, "is no object, but a folder of them", str(self.path))
+            raise OSError(errno.EISDIR, "is no object, but a folder of them", str(self.place))
         return int(entry["size"])
 
 
-def list_objects(path: RemotePath) -> dict[str, dict[str, Any]]:
+class RemoteFolder:
+    """A version of a store on an object store, which stays of one store because it never changes.
+
+    Parameters
+    ----------
+    place : RemotePlace
+        Its URL.
+    """
+
+    prefetch_bytes = 64 * 2**20
+
+    def __init__(self, place: RemotePlace) -> None:
+        self.path = str(place)
+        self._place = place
+
+    def open(self, name: str) -> RemoteFile:
+        """Open a file for reading; nothing is asked yet."""
+        return RemoteFile(self._place / name)
+
+
+def list_objects(place: RemotePlace) -> dict[str, dict[str, Any]]:
     """Return what fsspec says of every object below a place, by its name relative to that.
 
     Objects are left out whose names no path could have: with empty parts, or
     with ``.`` or ``..`` for one. There may be none at all.
     """
-    system, name = reach(path)
-    with telling(path):
+    system, name = filesystem_of(place)
+    with os_errors(place):
         found = system.find(name, detail=True)
     base = name.rstrip("/") + "/"
     below = {
@@ -239,7 +234,7 @@ def _is_plain(name: str) -> bool:
     return not {"", ".", ".."} & set(name.split("/")) and "\\" not in name and "\0" not in name
 
 
-def reach(path: RemotePath) -> tuple[Any, str]:
+def filesystem_of(place: RemotePlace) -> tuple[Any, str]:
     """Return the fsspec file system of a place, and what the place is called there.
 
     Raises
@@ -251,25 +246,29 @@ def reach(path: RemotePath) -> tuple[Any, str]:
         from fsspec.core import url_to_fs
 
         # Without the cache of listings: what others write must be seen.
-        system, name = url_to_fs(str(path), use_listings_cache=False)
+        system, name = url_to_fs(str(place), use_listings_cache=False)
     except (ImportError, ValueError) as error:
         raise ConfigError(
-            f"{path}: cannot be reached ({error}); pip install 'slatprep[remote]' brings s3://, "
+            f"{place}: cannot be reached ({error}); pip install 'slatprep[remote]' brings s3://, "
             "and gcsfs gs://"
         ) from None
     return system, str(name)
 
 
-def in_parts(system: Any) -> dict[str, int]:
-    """Return options that bound what a transfer of one file holds in memory, to 64 MiB on S3.
+def multipart_options(system: Any, files_at_once: int | None = None) -> dict[str, int]:
+    """Return options that bound what a transfer holds in memory, to 64 MiB a file on S3.
 
-    S3 takes 10,000 parts, and so 160 GiB a file.
+    S3 takes 10,000 parts, and so 160 GiB a file. `files_at_once` is for
+    transfers of several files.
     """
-    return {"chunksize": 2**24, "max_concurrency": 4} if "s3" in system.protocol else {}
+    parts = {"chunksize": 2**24, "max_concurrency": 4} if "s3" in system.protocol else {}
+    if files_at_once is None or not system.async_impl:
+        return parts
+    return parts | {"batch_size": files_at_once}
 
 
 @contextmanager
-def telling(path: RemotePath) -> Iterator[None]:
+def os_errors(place: RemotePlace) -> Iterator[None]:
     """Turn whatever a file system raises into an `OSError` that names the place.
 
     Raises
@@ -285,12 +284,12 @@ def telling(path: RemotePath) -> Iterator[None]:
             number = errno.ENOENT
         elif isinstance(error, PermissionError):
             number = errno.EACCES
-        raise OSError(number, _words(error.strerror or error), str(path)) from error
+        raise OSError(number, _words(error.strerror or error), str(place)) from error
     except Exception as error:
         # botocore, aiohttp and google.auth have errors of their own, with no base in common.
         if type(error).__module__ == "builtins":
             raise
-        raise OSError(errno.EIO, _words(error), str(path)) from error
+        raise OSError(errno.EIO, _words(error), str(place)) from error
 
 
 def _words(error: object) -> str:

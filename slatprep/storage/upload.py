@@ -1,4 +1,4 @@
-"""Put a finished store on an object store: first all of it, then, in one step, in sight.
+"""Put a finished store on an object store: upload all of it, then publish it in one step.
 
 Nobody reads what the pointer does not name, so an upload that ends midway
 harms nothing. The pointer is replaced only if it is the one that was there
@@ -21,11 +21,17 @@ from pathlib import Path
 from typing import Any
 
 from slatprep.errors import StoreError
-from slatprep.storage.files import file_digest, list_files
-from slatprep.storage.remote import RemotePath, in_parts, list_objects, reach, telling
+from slatprep.storage.files import file_digest, local_files
+from slatprep.storage.remote import (
+    RemotePlace,
+    filesystem_of,
+    list_objects,
+    multipart_options,
+    os_errors,
+)
 from slatprep.storage.versions import (
+    MANIFESTS,
     POINTER,
-    RECORDS,
     VERSIONS,
     Pointer,
     is_version,
@@ -33,19 +39,17 @@ from slatprep.storage.versions import (
     read_pointer,
 )
 
-_SMALL_BYTES = 8 * 2**20
-
-_AT_ONCE = {True: 16, False: 1}
-"""Small files, held in memory whole, and large ones that are uploaded at a time."""
+# A small file is held in memory whole while it is uploaded.
+_SMALL_BYTES, _SMALL_FILES_AT_ONCE = 8 * 2**20, 16
 
 
 @dataclass(frozen=True)
-class Base:
+class PublishedState:
     """The pointer that was there when a build began.
 
     Attributes
     ----------
-    target : RemotePath
+    target : RemotePlace
         The store.
     pointer : Pointer or None
         What it said; None where there was none.
@@ -53,12 +57,12 @@ class Base:
         What the server calls this state of it.
     """
 
-    target: RemotePath
+    target: RemotePlace
     pointer: Pointer | None
     tag: str = ""
 
 
-def look_at(target: RemotePath) -> Base:
+def published_state(target: RemotePlace) -> PublishedState:
     """See what a build would replace.
 
     Raises
@@ -83,35 +87,35 @@ def look_at(target: RemotePath) -> Base:
             f"{target} holds {others[0]} and is not a slatprep store with versions; expected one "
             "to replace, or a new URL"
         )
-    return Base(target, pointer, tag)
+    return PublishedState(target, pointer, tag)
 
 
 @dataclass(frozen=True)
 class Upload:
-    """A new version that is complete and not yet in sight; `upload_store` makes one.
+    """A new version that is complete and not yet published; `upload_store` makes one.
 
     Attributes
     ----------
-    base : Base
+    before : PublishedState
         What was there when the build began.
     pointer : Pointer
         What will be there.
     """
 
-    base: Base
+    before: PublishedState
     pointer: Pointer
 
     @property
-    def target(self) -> RemotePath:
+    def target(self) -> RemotePlace:
         """The store."""
-        return self.base.target
+        return self.before.target
 
     @property
-    def version(self) -> RemotePath:
+    def version(self) -> RemotePlace:
         """Where its files are."""
         return self.target / VERSIONS / self.pointer.version
 
-    def show(self) -> None:
+    def publish(self) -> None:
         """Replace the pointer, and remove the versions that nobody needs any more.
 
         Raises
@@ -120,7 +124,7 @@ class Upload:
             If another build has replaced it since this one began, or it
             cannot be written.
         """
-        if self.pointer == self.base.pointer:
+        if self.pointer == self.before.pointer:
             return
         try:
             # Before the pointer moves: a build that begins then is not listed here.
@@ -140,20 +144,20 @@ class Upload:
     def _replace_pointer(self) -> None:
         place = self.target / POINTER
         data = self.pointer.encode()
-        system, name = reach(place)
+        system, name = filesystem_of(place)
         condition: dict[str, Any] = {}
-        if self.base.pointer is None:
+        if self.before.pointer is None:
             condition["mode"] = "create"
         elif "s3" in system.protocol:
-            condition["IfMatch"] = self.base.tag
+            condition["IfMatch"] = self.before.tag
         try:
-            if read_pointer(self.target) == self.base.pointer:
-                with telling(place):
+            if read_pointer(self.target) == self.before.pointer:
+                with os_errors(place):
                     system.pipe_file(name, data, **condition)
                     return
         except OSError:
             now = read_pointer(self.target)
-            if now == self.base.pointer:
+            if now == self.before.pointer:
                 raise
         now = read_pointer(self.target)
         # Ours, if the server's first answer was lost; or another build made the same.
@@ -170,14 +174,14 @@ class Upload:
         return [name for name in names if name != POINTER and _is_ours(name, but=keep)]
 
 
-def upload_store(new: Path, base: Base) -> Upload:
+def upload_store(new: Path, before: PublishedState) -> Upload:
     """Upload all files of a finished store as a new version, and see that all are there.
 
     Parameters
     ----------
     new : Path
         The store, on the local disk.
-    base : Base
+    before : PublishedState
         Where it belongs, and what was there when the build began. If that has
         the same content, nothing is uploaded.
 
@@ -186,27 +190,28 @@ def upload_store(new: Path, base: Base) -> Upload:
     StoreError
         If something cannot be uploaded.
     """
-    files = {name: (new / name).stat().st_size for name in list_files(new)}
+    files = local_files(new)
     content = _digest(f"{name} {file_digest(new / name)}\n" for name in files)
-    if base.pointer is not None and base.pointer.content == content:
-        return Upload(base, base.pointer)
-    before = base.pointer.version if base.pointer else ""
+    if before.pointer is not None and before.pointer.content == content:
+        return Upload(before, before.pointer)
+    previous = before.pointer.version if before.pointer else ""
     pointer = Pointer(
-        version=_digest((before, content))[:16],
-        previous=before,
+        version=_digest((previous, content))[:16],
+        previous=previous,
         content=content,
         published=datetime.now(UTC).isoformat(timespec="seconds"),
     )
-    upload = Upload(base, pointer)
+    upload = Upload(before, pointer)
     try:
         there = list_objects(upload.version)
         missing = [name for name in files if not _is_same(there.get(name), new / name)]
-        for small, at_once in _AT_ONCE.items():
-            chosen = [name for name in missing if (files[name] <= _SMALL_BYTES) == small]
-            _put(new, upload.version, chosen, at_once)
+        small = [name for name in missing if files[name] <= _SMALL_BYTES]
+        large = [name for name in missing if files[name] > _SMALL_BYTES]
+        _put(new, upload.version, small, at_once=_SMALL_FILES_AT_ONCE)
+        _put(new, upload.version, large, at_once=1)
         there = list_objects(upload.version)
     except OSError as error:
-        raise StoreError(_refused(base.target, error)) from None
+        raise StoreError(_refused(before.target, error)) from None
     for name, size in files.items():
         if there.get(name, {}).get("size") != size:
             raise StoreError(
@@ -216,12 +221,12 @@ def upload_store(new: Path, base: Base) -> Upload:
     return upload
 
 
-def _put(new: Path, version: RemotePath, names: list[str], at_once: int) -> None:
+def _put(new: Path, version: RemotePlace, names: list[str], at_once: int) -> None:
     if not names:
         return
-    system, root = reach(version)
-    options = in_parts(system) | ({"batch_size": at_once} if system.async_impl else {})
-    with telling(version):
+    system, root = filesystem_of(version)
+    options = multipart_options(system, files_at_once=at_once)
+    with os_errors(version):
         system.put([str(new / name) for name in names], [f"{root}/{n}" for n in names], **options)
 
 
@@ -233,10 +238,10 @@ def _is_same(entry: Mapping[str, Any] | None, file: Path) -> bool:
         return bool(_etag(entry) == hashlib.file_digest(content, "md5").hexdigest())
 
 
-def _remove(target: RemotePath, names: list[str]) -> None:
+def _remove(target: RemotePlace, names: list[str]) -> None:
     if names:
-        system, root = reach(target)
-        with telling(target):
+        system, root = filesystem_of(target)
+        with os_errors(target):
             system.rm([f"{root}/{name}" for name in names])
 
 
@@ -244,13 +249,13 @@ def _is_ours(name: str, but: Iterable[str] = ()) -> bool:
     """Whether an object below a store is part of some version or its records."""
     kind, _, rest = name.partition("/")
     version = rest.partition("/")[0]
-    return kind in (VERSIONS, RECORDS) and is_version_name(version) and version not in but
+    return kind in (VERSIONS, MANIFESTS) and is_version_name(version) and version not in but
 
 
-def _tag(place: RemotePath) -> str:
-    system, name = reach(place)
+def _tag(place: RemotePlace) -> str:
+    system, name = filesystem_of(place)
     try:
-        with telling(place):
+        with os_errors(place):
             return str(system.info(name).get("ETag", ""))
     except FileNotFoundError:
         return ""
@@ -267,7 +272,7 @@ def _digest(parts: Iterable[str]) -> str:
     return digest.hexdigest()
 
 
-def _refused(target: RemotePath, error: OSError) -> str:
+def _refused(target: RemotePlace, error: OSError) -> str:
     return (
         f"{target}: cannot be written ({error.strerror}); nothing was replaced. Run again when it "
         "can: what is finished is kept"

@@ -4,7 +4,7 @@ Below the store's URL lie
 
 - ``current.json``, the pointer, which is replaced in one step;
 - ``versions/NAME/``, a store as it would lie on a disk, never changed;
-- ``records/NAME/``, the records of the build that made it.
+- ``manifests/NAME/``, the records of the build that made it.
 
 Plain zarr opens a version's own URL.
 """
@@ -14,12 +14,15 @@ from __future__ import annotations
 import json
 import re
 from dataclasses import asdict, dataclass
-from pathlib import Path
+from typing import TYPE_CHECKING
 
 from slatprep.errors import StoreError
-from slatprep.storage.remote import RemoteFile, RemotePath
+from slatprep.storage.remote import RemotePlace
 
-POINTER, VERSIONS, RECORDS = "current.json", "versions", "records"
+if TYPE_CHECKING:
+    from slatprep.records import Place
+
+POINTER, VERSIONS, MANIFESTS = "current.json", "versions", "manifests"
 
 FORMAT = "slatprep-store-pointer"
 
@@ -79,7 +82,7 @@ class Pointer:
         return pointer
 
 
-def read_pointer(store: RemotePath) -> Pointer | None:
+def read_pointer(store: RemotePlace) -> Pointer | None:
     """Read which version of a store is current; None where there is no pointer.
 
     Raises
@@ -90,7 +93,8 @@ def read_pointer(store: RemotePath) -> Pointer | None:
         If what is there is no pointer.
     """
     try:
-        data = RemoteFile(store / POINTER).pread(_MAX_POINTER_BYTES, 0)
+        with (store / POINTER).open("rb") as file:
+            data = file.read(_MAX_POINTER_BYTES)
     except FileNotFoundError:
         return None
     try:
@@ -102,21 +106,20 @@ def read_pointer(store: RemotePath) -> Pointer | None:
         ) from None
 
 
-def current_version(store: Path) -> Path:
-    """Return where the files of a store lie: of a local one where it lies itself.
+def current_version(store: RemotePlace) -> RemotePlace:
+    """Return where the files of a store lie.
 
     Parameters
     ----------
-    store : Path
-        A store; on an object store also one of its versions, or a store that
-        was copied there as it was.
+    store : RemotePlace
+        A store, one of its versions, or a store that was copied there as it was.
 
     Raises
     ------
     StoreError
         If the pointer cannot be reached or is none.
     """
-    if not isinstance(store, RemotePath) or is_version(store):
+    if is_version(store):
         return store
     try:
         pointer = read_pointer(store)
@@ -125,9 +128,14 @@ def current_version(store: Path) -> Path:
     return store / VERSIONS / pointer.version if pointer else store
 
 
-def is_version(path: RemotePath) -> bool:
-    """Whether a URL is that of a version of a store."""
-    return path.parent.name == VERSIONS and is_version_name(path.name)
+def is_version(place: Place) -> bool:
+    """Whether a place is that of a version of a store."""
+    return place.parent.name == VERSIONS and is_version_name(place.name)
+
+
+def store_name(place: Place) -> str:
+    """Return the name of a store, or of the one that a place is a version of."""
+    return (place.parent.parent if is_version(place) else place.absolute()).name
 
 
 def is_version_name(name: str) -> bool:

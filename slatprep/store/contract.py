@@ -10,11 +10,10 @@ import json
 import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 from slatprep.errors import StoreError
-from slatprep.records import MATERIAL_CLASSES, PROPERTY_COLUMNS, RESOLUTION
+from slatprep.records import MATERIAL_CLASSES, PROPERTY_COLUMNS, RESOLUTION, Place
 from slatprep.store.layout import (
     ARRAYS,
     ASSET_CHUNK,
@@ -61,7 +60,7 @@ class Finding:
         return f"{self.file}{of}: {self.what}; expected {self.expected}"
 
 
-def read_metadata(path: Path) -> dict[str, Any]:
+def read_metadata(path: Place) -> dict[str, Any]:
     """Read a ``zarr.json``.
 
     Raises

@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from slatprep.storage.files import file_digest, list_files
+from slatprep.storage.files import file_digest, local_files
 
 GROUP = "file"
 
@@ -36,8 +36,8 @@ def write_digests(path: Path) -> None:
     import zarr
 
     root = zarr.open_group(path, mode="r+", zarr_format=3, use_consolidated=False)
-    names = [name for name in list_files(path) if _is_covered(name)]
-    sizes = [(path / name).stat().st_size for name in names]
+    files = {name: size for name, size in local_files(path).items() if _is_covered(name)}
+    names, sizes = list(files), list(files.values())
     digests = [file_digest(path / name) for name in names]
     attributes = dict(root.attrs)
     names.append(ATTRIBUTES)

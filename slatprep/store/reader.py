@@ -6,7 +6,6 @@ import difflib
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -15,10 +14,9 @@ from numpy.typing import NDArray
 from slatprep.errors import StoreError
 from slatprep.geometry.voxels import voxels_of
 from slatprep.normalize import denormalize
-from slatprep.records import BACKGROUND, MaterialField, Normalization, PropertyRange
-from slatprep.storage.copies import local_copy
-from slatprep.storage.remote import RemotePath, as_path
-from slatprep.storage.versions import current_version, is_version
+from slatprep.records import BACKGROUND, MaterialField, Normalization, Place, PropertyRange
+from slatprep.storage.place import place_of, storage_of
+from slatprep.storage.versions import store_name
 from slatprep.store.contract import (
     MAX_VOXELS,
     dimension_sizes,
@@ -26,7 +24,7 @@ from slatprep.store.contract import (
     size_findings,
 )
 from slatprep.store.layout import ARRAYS, FORMAT, FORMAT_VERSION
-from slatprep.store.shard_reader import Folder, RemoteFolder, RowReader
+from slatprep.store.shard_reader import RowReader
 
 if TYPE_CHECKING:
     import zarr
@@ -125,16 +123,16 @@ class Store:
 
     Parameters
     ----------
-    path : Path
+    path : Place
         Where it lies.
     document : dict
         The root's ``zarr.json``.
     """
 
-    def __init__(self, path: Path, document: dict[str, Any]) -> None:
+    def __init__(self, path: Place, document: dict[str, Any]) -> None:
         self.path = path
         self.attributes: dict[str, Any] = document["attributes"]
-        self._folder = RemoteFolder(path) if isinstance(path, RemotePath) else Folder(path)
+        self._folder = storage_of(path).folder()
         self._metadata = _consolidated(document)
         self._columns: dict[str, NDArray[Any]] = {}
         self._readers: dict[str, RowReader | None] = {}
@@ -151,8 +149,7 @@ class Store:
     @property
     def name(self) -> str:
         """The last part of its path, or of its URL without the version."""
-        remote = isinstance(self.path, RemotePath) and is_version(self.path)
-        return (self.path.parent.parent if remote else self.path.absolute()).name
+        return store_name(self.path)
 
     @cached_property
     def group(self) -> zarr.Group:
@@ -339,12 +336,12 @@ class Store:
         return read_metadata(file)
 
 
-def open_store(path: str | Path, *, copy: bool = False) -> Store:
+def open_store(path: str | Place, *, copy: bool = False) -> Store:
     """Open a store for reading.
 
     Parameters
     ----------
-    path : str or Path
+    path : str or Place
         The store's directory, or its URL on an object store. There the version
         that is current now is opened, and stays open when it is replaced.
     copy : bool
@@ -361,9 +358,9 @@ def open_store(path: str | Path, *, copy: bool = False) -> Store:
     StoreError
         If there is nothing, something else, or a store of a newer format.
     """
-    path = current_version(as_path(path))
+    path = storage_of(place_of(path)).current_version()
     if copy:
-        path = local_copy(path)
+        path = storage_of(path).copied_version()
     document = _root_document(path)
     if not document:
         _require_there(path)
@@ -382,15 +379,15 @@ def open_store(path: str | Path, *, copy: bool = False) -> Store:
     return Store(path, document)
 
 
-def is_store(path: Path) -> bool:
-    """Whether a path holds a slatprep store of any version."""
-    document = _root_document(current_version(path))
+def is_store(path: Place) -> bool:
+    """Whether a slatprep store of any format version lies at a place itself."""
+    document = _root_document(path)
     return bool(document.get("attributes", {}).get("format") == FORMAT)
 
 
-def _require_there(path: Path) -> None:
+def _require_there(path: Place) -> None:
     """Raise StoreError if there is nothing at all, or nobody can tell."""
-    needed = path / "zarr.json" if isinstance(path, RemotePath) else path
+    needed = path / "zarr.json"
     try:
         there = needed.exists()
     except OSError as error:
@@ -399,7 +396,7 @@ def _require_there(path: Path) -> None:
         raise StoreError(f"{needed} does not exist; build a store with `slatprep build-store`")
 
 
-def _root_document(path: Path) -> dict[str, Any]:
+def _root_document(path: Place) -> dict[str, Any]:
     try:
         document = read_metadata(path / "zarr.json")
     except StoreError:

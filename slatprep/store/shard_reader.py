@@ -9,13 +9,9 @@ zarr-python reads the same bytes with far more work around them.
 
 from __future__ import annotations
 
-import errno
-import os
-import stat
 import threading
 from collections.abc import Mapping
 from dataclasses import dataclass
-from io import FileIO
 from itertools import groupby
 from typing import Any
 
@@ -23,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slatprep.errors import StoreError
-from slatprep.storage.remote import RemoteFile, RemotePath
+from slatprep.storage.files import Folder, RangeFile
 from slatprep.store.codecs import MAX_TEXT_BYTES, ChunkDecoder, crc32c_holds
 
 MISSING = 2**64 - 1
@@ -68,79 +64,11 @@ class DamagedFileError(StoreError):
         return (type(self), (self.folder, self.file, self.fault, self.expected))
 
 
-class Folder:
-    """An open directory: what is read below it stays of one store, even if that is replaced."""
-
-    def __init__(self, path: str | os.PathLike[str]) -> None:
-        self.path = os.fspath(path)
-        self._descriptor = os.open(self.path, os.O_RDONLY) if _AT else None
-
-    def open(self, name: str) -> LocalFile:
-        """Open a file for reading, without buffer."""
-        if self._descriptor is None:
-            return LocalFile(os.path.join(self.path, name))  # noqa: PTH118 - the hot path
-        return LocalFile(name, opener=self._open_at)
-
-    def _open_at(self, name: str, flags: int) -> int:
-        # A pipe in a shard's place must not make the reader wait for a writer.
-        return os.open(name, flags | os.O_NONBLOCK, dir_fd=self._descriptor)
-
-    def __del__(self) -> None:
-        if getattr(self, "_descriptor", None) is not None:
-            os.close(self._descriptor)  # type: ignore[arg-type]
-
-
-_AT = os.open in os.supports_dir_fd
-
-
-class RemoteFolder:
-    """A version of a store on an object store, which stays of one store because it never changes.
-
-    Parameters
-    ----------
-    path : RemotePath
-        Its URL.
-    """
-
-    def __init__(self, path: RemotePath) -> None:
-        self.path = str(path)
-        self._root = path
-
-    def open(self, name: str) -> RemoteFile:
-        """Open a file for reading; nothing is asked yet."""
-        return RemoteFile(self._root / name)
-
-
-class LocalFile(FileIO):
-    """A file of the local disk; threads may share it."""
-
-    def size(self) -> int:
-        """Return its length in bytes.
-
-        Raises
-        ------
-        OSError
-            If it is a folder, pipe or device.
-        """
-        state = os.fstat(self.fileno())
-        if not stat.S_ISREG(state.st_mode):
-            raise OSError(errno.EINVAL, "it is no regular file")
-        return state.st_size
-
-    def pread(self, length: int, offset: int) -> bytes:
-        """Read up to `length` bytes from a place on."""
-        return os.pread(self.fileno(), length, offset)
-
-
-HELD_BYTES = 64 * 2**20
-"""What is asked of an object store at once; more is asked for chunk by chunk."""
-
-
 @dataclass(frozen=True, slots=True)
 class _Shard:
     """An open shard and its index: offset and length of each chunk."""
 
-    file: LocalFile | RemoteFile | None
+    file: RangeFile | None
     index: NDArray[np.uint64]
 
 
@@ -149,7 +77,7 @@ class RowReader:
 
     Parameters
     ----------
-    folder : Folder or RemoteFolder
+    folder : Folder
         The store.
     name : str
         Name of the array, such as ``voxel/feats``.
@@ -167,7 +95,7 @@ class RowReader:
 
     def __init__(
         self,
-        folder: Folder | RemoteFolder,
+        folder: Folder,
         name: str,
         shape: tuple[int, ...],
         shard_rows: int,
@@ -191,9 +119,7 @@ class RowReader:
         self._local = threading.local()
 
     @classmethod
-    def of(
-        cls, folder: Folder | RemoteFolder, name: str, metadata: Mapping[str, Any]
-    ) -> RowReader | None:
+    def of(cls, folder: Folder, name: str, metadata: Mapping[str, Any]) -> RowReader | None:
         """Return a reader for an array with this ``zarr.json``, or None if it is of another kind.
 
         Raises
@@ -207,9 +133,7 @@ class RowReader:
             raise StoreError(f"{folder.path}/{name}: bad metadata ({error!r})") from None
 
     @classmethod
-    def _of(
-        cls, folder: Folder | RemoteFolder, name: str, metadata: Mapping[str, Any]
-    ) -> RowReader | None:
+    def _of(cls, folder: Folder, name: str, metadata: Mapping[str, Any]) -> RowReader | None:
         text = metadata["data_type"] == "string"
         if not text and metadata["data_type"] not in _DTYPES:
             return None
@@ -262,8 +186,8 @@ class RowReader:
             raise StoreError(f"{self.name} has {self.shape[0]} rows, not {start} to {stop}")
         out = np.empty((stop - start, *self.shape[1:]), self.dtype)
         rows, per_shard = self.chunk_rows, self.chunks_per_shard
-        if isinstance(self.folder, RemoteFolder):
-            self._hold(range(start // rows, -(-stop // rows)))
+        if self.folder.prefetch_bytes:
+            self._prefetch(range(start // rows, -(-stop // rows)))
         for chunk in range(start // rows, -(-stop // rows)):
             base = chunk * rows
             first, last = max(start, base), min(stop, base + rows)
@@ -292,17 +216,17 @@ class RowReader:
         except OSError as error:
             raise self._damaged(number, f"cannot be read ({error.strerror})") from None
 
-    def _hold(self, chunks: range) -> None:
+    def _prefetch(self, chunks: range) -> None:
         """Ask once for the chunks of each shard, which lie side by side, and not once for each."""
         for number, own in groupby(chunks, lambda chunk: chunk // self.chunks_per_shard):
             shard = self._shards.get(number) or self._open(number)
             index = shard.index[[chunk % self.chunks_per_shard for chunk in own]]
             offset, length = index[index[:, 0] != MISSING].astype(np.int64).T
-            if len(offset) > 1 and isinstance(shard.file, RemoteFile):
+            if len(offset) > 1 and shard.file is not None:
                 begin, end = int(offset.min()), int((offset + length).max())
-                if end - begin <= HELD_BYTES:
+                if end - begin <= self.folder.prefetch_bytes:
                     try:
-                        shard.file.hold(end - begin, begin)
+                        shard.file.prefetch(end - begin, begin)
                     except OSError as error:
                         fault = f"cannot be read ({error.strerror})"
                         raise self._damaged(number, fault) from None
@@ -331,7 +255,7 @@ class RowReader:
             self._shards.pop(oldest, None)
         return shard
 
-    def _index(self, number: int, file: LocalFile | RemoteFile, size: int) -> NDArray[np.uint64]:
+    def _index(self, number: int, file: RangeFile, size: int) -> NDArray[np.uint64]:
         # No packed chunk is much larger than its values; strings have their own bound.
         limit = MAX_TEXT_BYTES if self.decoder.text else 2 * self.decoder.nbytes + 65_536
         if not self.sharded:

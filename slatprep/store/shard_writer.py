@@ -15,9 +15,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from slatprep.storage.files import LocalFolder
 from slatprep.store.codecs import single_threaded_blosc
 from slatprep.store.contract import read_metadata
-from slatprep.store.shard_reader import MISSING, Folder, RowReader
+from slatprep.store.shard_reader import MISSING, RowReader
 
 _SHUFFLES = {"noshuffle": 0, "shuffle": 1, "bitshuffle": 2}
 
@@ -37,7 +38,7 @@ class ShardWriter:
 
     def __init__(self, store: Path, name: str, start: int) -> None:
         metadata = read_metadata(store / name / "zarr.json")
-        layout = RowReader.of(Folder(store), name, metadata)
+        layout = RowReader.of(LocalFolder(store), name, metadata)
         if layout is None or not layout.sharded:
             raise ValueError(f"{name} is not laid out as slatprep lays arrays out")
         self._encode = _encoder(metadata["codecs"][0]["configuration"]["codecs"])

@@ -22,10 +22,10 @@ from functools import lru_cache
 from importlib import metadata
 from pathlib import Path
 from types import TracebackType
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from slatprep.errors import ConfigError, SlatprepError
-from slatprep.storage.remote import as_path
+from slatprep.storage.place import place_of, storage_of
 from slatprep.workers.local import (
     WORKER_DIED,
     Handout,
@@ -33,6 +33,9 @@ from slatprep.workers.local import (
     results_of,
     single_threaded,
 )
+
+if TYPE_CHECKING:
+    from slatprep.records import Place
 
 try:
     import distributed
@@ -136,7 +139,7 @@ class Cluster:
             for task in suspects.unfinished():
                 yield result_of_death(task, died)
 
-    def require_shared(self, paths: Iterable[Path]) -> None:
+    def require_shared(self, paths: Iterable[Place]) -> None:
         """Raise `SlatprepError` unless every worker sees these files and folders as we do.
 
         Workers that join later are asked before their first task, until other
@@ -144,7 +147,7 @@ class Cluster:
         """
         files = {}
         for path in paths:
-            if not path.is_absolute():
+            if path != path.absolute():
                 raise SlatprepError(
                     f"{path}: is a relative path, and workers may stand in another folder; "
                     "expected an absolute path"
@@ -312,7 +315,7 @@ def _agree(common: _Common, worker: Any) -> None:
                 f"it is {version or 'absent'}; expected the same environment on all workers"
             )
     for path, look in common.files:
-        seen = _look(as_path(path))
+        seen = _look(place_of(path))
         if seen != look:
             raise SlatprepError(
                 f"{name}: sees {seen} at {path}, which is {look} where the build was started; "
@@ -336,12 +339,13 @@ def _software() -> tuple[tuple[str, str], ...]:
     return tuple(versions.items())
 
 
-def _look(path: Path) -> str:
-    """Return what lies at a path, as far as workers must agree on it."""
+def _look(place: Place) -> str:
+    """Return what lies at a place, as far as workers must agree on it."""
+    storage = storage_of(place)
     try:
-        if stat.S_ISREG(path.stat().st_mode):
-            return f"a file of {path.stat().st_size} bytes"
-        writable = os.access(path, os.W_OK)
+        if storage.local is None or stat.S_ISREG(storage.local.stat().st_mode):
+            return f"a file of {storage.size()} bytes"
+        writable = os.access(storage.local, os.W_OK)
         return f"a folder that {'may' if writable else 'must not'} be written to"
     except OSError as error:
         return f"nothing it may read ({error.strerror})"

@@ -8,10 +8,12 @@ import time
 import warnings
 from collections.abc import Callable, Generator, Iterable, Iterator
 from contextlib import contextmanager
-from pathlib import Path
-from typing import Any, Protocol, TypeVar
+from typing import TYPE_CHECKING, Any, Protocol, TypeVar
 
 from slatprep.errors import SlatprepError
+
+if TYPE_CHECKING:
+    from slatprep.records import Place
 
 Result = TypeVar("Result")
 
@@ -42,7 +44,7 @@ class Workers(Protocol):
         """Do what the function `run_unordered` promises."""
         ...
 
-    def require_shared(self, paths: Iterable[Path]) -> None:
+    def require_shared(self, paths: Iterable[Place]) -> None:
         """Raise `SlatprepError` unless every worker sees these files and folders as we do."""
         ...
 
@@ -98,7 +100,7 @@ def run_unordered(
             yield from _run_alone(function, source.unfinished(), died)
 
 
-def require_shared(jobs: Jobs, paths: Iterable[Path]) -> None:
+def require_shared(jobs: Jobs, paths: Iterable[Place]) -> None:
     """Raise `SlatprepError` unless all workers see these files; those of this machine do."""
     if not isinstance(jobs, int):
         jobs.require_shared(paths)

@@ -17,7 +17,8 @@ from support.raw_sources import COORDS, FEATS, raw_grid
 
 from slatprep.errors import InputError
 from slatprep.readers import read_field, read_latents
-from slatprep.readers.files import ArraySpec, load_source, npy_array, npz_arrays, resolve_inside
+from slatprep.readers.files import ArraySpec, load_source, npy_array, npz_arrays
+from slatprep.storage.place import storage_of
 
 ROWS = {"feats": ArraySpec(shapes=((None, 8),), kinds="f")}
 
@@ -80,8 +81,8 @@ def test_paths_that_are_no_file_of_the_root(tmp_path):
         with pytest.raises(InputError, match=fault):
             load_source(tmp_path / name, tmp_path, "grid")
     with pytest.raises(InputError, match="cannot be opened"):
-        resolve_inside(tmp_path / "inside", tmp_path / "folder")
-    assert resolve_inside(tmp_path / "link", tmp_path)[1] == "link"
+        storage_of(tmp_path / "folder").locate(tmp_path / "inside")
+    assert storage_of(tmp_path).locate(tmp_path / "link")[1] == "link"
 
 
 def test_file_that_is_too_large_is_not_read(tmp_path):

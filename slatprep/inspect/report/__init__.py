@@ -17,7 +17,7 @@ from slatprep.inspect.report.page import write_page
 from slatprep.inspect.report.statistics import Tally, no_tally, tally
 from slatprep.inspect.report.thumbnails import PER_SHEET, sheet, thumbnail
 from slatprep.inspect.report.voxels import COARSE, FULL, encode_asset
-from slatprep.records import Verdict
+from slatprep.records import Place, Verdict
 from slatprep.storage.atomic import staged
 from slatprep.store import open_store
 from slatprep.store.reader import Store
@@ -79,7 +79,7 @@ def write_report(
     store: Store,
     out: Path,
     *,
-    manifests: Path | None = None,
+    manifests: Place | None = None,
     jobs: int = 1,
     progress: Progress | None = None,
 ) -> ReportSummary:
@@ -130,7 +130,7 @@ def write_report(
     return ReportSummary(Path(out), size, len(content["assets"]["id"]), len(chosen), side)
 
 
-def _refuse_other_records(store: Store, outcomes: Sequence[Outcome], manifests: Path) -> None:
+def _refuse_other_records(store: Store, outcomes: Sequence[Outcome], manifests: Place) -> None:
     missing = set(store.ids) - {outcome.asset_id for outcome in outcomes}
     if missing:
         raise StoreError(

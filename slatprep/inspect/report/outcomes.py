@@ -6,11 +6,10 @@ import json
 import re
 from collections.abc import Iterator
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 from slatprep.errors import StoreError
-from slatprep.records import Status
+from slatprep.records import Place, Status
 
 
 @dataclass(frozen=True)
@@ -43,7 +42,7 @@ class Outcome:
     clipped: tuple[int, ...]
 
 
-def read_outcomes(manifests: Path, manifest: str) -> Iterator[Outcome]:
+def read_outcomes(manifests: Place, manifest: str) -> Iterator[Outcome]:
     """Yield the outcome of every asset of a build, in the order of its records.
 
     Parameters
@@ -66,7 +65,7 @@ def read_outcomes(manifests: Path, manifest: str) -> Iterator[Outcome]:
         )
     path = manifests / "assets.jsonl"
     try:
-        with path.open(encoding="utf-8") as lines:
+        with path.open("r", encoding="utf-8") as lines:
             for number, line in enumerate(lines, start=1):
                 where = f"{path}, line {number}"
                 try:
@@ -92,14 +91,14 @@ def kind_of(reason: str) -> str:
     return re.sub(r"\d[\d,]*(\.\d+)?(e[-+]?\d+)?", "N", kind)
 
 
-def _read(path: Path) -> str:
+def _read(path: Place) -> str:
     try:
         return path.read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:
         raise StoreError(f"{path}: cannot be read ({error})") from error
 
 
-def _document(where: Path | str, text: str) -> dict[str, Any]:
+def _document(where: Place | str, text: str) -> dict[str, Any]:
     try:
         document = json.loads(text)
     except ValueError as error:

@@ -10,15 +10,14 @@ from __future__ import annotations
 import uuid
 from collections.abc import Iterator
 from dataclasses import dataclass
-from pathlib import Path
 
 from slatprep.errors import StoreError
 from slatprep.inspect.verify.assets import SourceRoots, asset_findings
 from slatprep.inspect.verify.files import file_findings, metadata_findings
 from slatprep.inspect.verify.index import index_findings
 from slatprep.inspect.verify.manifests import manifest_findings, source_roots, usual_manifests
-from slatprep.storage.remote import as_path
-from slatprep.storage.versions import current_version
+from slatprep.records import Place
+from slatprep.storage.place import place_of, storage_of
 from slatprep.store.contract import Finding
 from slatprep.store.reader import Store, open_store
 from slatprep.workers import Progress
@@ -35,7 +34,7 @@ class Verification:
 
     Attributes
     ----------
-    store : Path
+    store : Place
         The store.
     assets : int
         Assets whose values were checked.
@@ -43,17 +42,17 @@ class Verification:
         Files whose digest was compared.
     sources : int
         Source files whose digest was compared.
-    manifests : Path or None
+    manifests : Place or None
         Folder of the records that were compared; None where there are none.
     findings : tuple of Finding
         Everything that is wrong, sorted by file.
     """
 
-    store: Path
+    store: Place
     assets: int
     files: int
     sources: int
-    manifests: Path | None
+    manifests: Place | None
     findings: tuple[Finding, ...]
 
     @property
@@ -63,9 +62,9 @@ class Verification:
 
 
 def verify_store(
-    path: str | Path,
+    path: str | Place,
     *,
-    manifests: Path | None = None,
+    manifests: Place | None = None,
     sources: bool = False,
     roots: SourceRoots | None = None,
     jobs: Jobs = 1,
@@ -75,9 +74,9 @@ def verify_store(
 
     Parameters
     ----------
-    path : Path
+    path : Place
         The store; on an object store its current version is checked.
-    manifests : Path, optional
+    manifests : Place, optional
         Folder of the build's records; by default the one beside the store, if
         there is one.
     sources : bool
@@ -100,7 +99,7 @@ def verify_store(
         If there is no store at all, or sources are asked for and nobody says
         where they lie.
     """
-    path = current_version(as_path(path))
+    path = storage_of(place_of(path)).current_version()
     try:
         store = open_store(path.absolute())  # workers may stand in another folder
     except StoreError as error:
@@ -133,7 +132,7 @@ def verify_store(
     return Verification(path, total, digests, hashed, folder, tuple(sorted(findings)))
 
 
-def _is_file(path: Path) -> bool:
+def _is_file(path: Place) -> bool:
     try:
         return path.is_file()
     except OSError:  # An object store that does not answer.

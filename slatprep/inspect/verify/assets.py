@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from functools import lru_cache
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -16,9 +15,9 @@ from slatprep.errors import InputError, StoreError
 from slatprep.geometry.voxels import flat_index
 from slatprep.inspect.check import TOLERANCES, look_up_again
 from slatprep.provenance.record import load_schema
-from slatprep.readers.files import resolve_inside
-from slatprep.records import BACKGROUND, RESOLUTION, UNANNOTATED
+from slatprep.records import BACKGROUND, RESOLUTION, UNANNOTATED, Place
 from slatprep.storage.files import file_digest
+from slatprep.storage.place import storage_of
 from slatprep.store.contract import Finding
 from slatprep.store.layout import normalization_attribute
 from slatprep.store.reader import Store, StoredAsset, open_store
@@ -30,18 +29,18 @@ from slatprep.store.shard_reader import DamagedFileError
 class SourceRoots:
     """Where the sources lie: PixieVerse's root, and the folder of SLATs or of their one file."""
 
-    pixieverse: Path
-    slat: Path
+    pixieverse: Place
+    slat: Place
 
 
 def asset_findings(
-    path: Path, rows: range, roots: SourceRoots | None, run: str
+    path: Place, rows: range, roots: SourceRoots | None, run: str
 ) -> tuple[list[Finding], int]:
     """Check some assets of a store.
 
     Parameters
     ----------
-    path : Path
+    path : Place
         The store.
     rows : range
         Which assets, by index.
@@ -172,11 +171,11 @@ def source_findings(record: Mapping[str, Any], roots: SourceRoots, run: str) -> 
         path = root / source["path"]
         expected = f"SHA-256 {source['sha256']}"
         try:
-            resolved, _ = resolve_inside(path, root)
-            state = resolved.stat()
-            if state.st_size != source["size"]:
-                what = f"has {state.st_size} of {source['size']} bytes"
-            elif _digest(resolved, run) != source["sha256"]:
+            file, _ = storage_of(root).locate(path)
+            size = storage_of(file).size()
+            if size != source["size"]:
+                what = f"has {size} of {source['size']} bytes"
+            elif _digest(file, run) != source["sha256"]:
                 what = "its bytes changed"
             else:
                 continue
@@ -270,7 +269,7 @@ def schema_findings(
 
 
 @lru_cache(maxsize=1)
-def _opened(path: Path, run: str) -> Store:
+def _opened(path: Place, run: str) -> Store:
     return open_store(path)
 
 
@@ -282,6 +281,6 @@ def _validator(schema: str) -> Any:
 
 
 @lru_cache(maxsize=64)
-def _digest(path: Path, run: str) -> str:
+def _digest(path: Place, run: str) -> str:
     # One file may hold the SLATs of many assets.
     return file_digest(path)

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from pathlib import Path
 from typing import Any
 
 from slatprep.errors import StoreError
-from slatprep.storage.files import file_digest, list_files
+from slatprep.records import Place
+from slatprep.storage.files import file_digest
+from slatprep.storage.place import storage_of
 from slatprep.store.contract import (
     Finding,
     array_findings,
@@ -23,7 +24,7 @@ from slatprep.workers.local import Jobs, run_unordered
 _GROUPS = ("asset", "voxel", "grid", "file")
 
 
-def metadata_findings(path: Path) -> Iterator[Finding]:
+def metadata_findings(path: Place) -> Iterator[Finding]:
     """Yield where the metadata differ from the contract, or their two copies from each other."""
     root = read_metadata(path / "zarr.json")
     yield from attribute_findings(root["attributes"])
@@ -37,7 +38,8 @@ def metadata_findings(path: Path) -> Iterator[Finding]:
         yield Finding("zarr.json", "", "has no consolidated metadata", "those of every array")
         copies = {}
     arrays: dict[str, Any] = {}
-    there = {name.removesuffix("/zarr.json") for name in list_files(path) if _is_metadata(name)}
+    files = storage_of(path).files()
+    there = {name.removesuffix("/zarr.json") for name in files if _is_metadata(name)}
     for name in sorted({*there, *copies, *(layout.name for layout in ARRAYS), *_GROUPS}):
         where = f"{name}/zarr.json"
         if name not in there:
@@ -82,14 +84,15 @@ def file_findings(store: Store, jobs: Jobs) -> tuple[int, set[Finding]]:
     attributes = expected.pop(ATTRIBUTES, (0, ""))
     if attributes_digest(store.attributes) != attributes[1]:
         findings.add(Finding("zarr.json", "", "the attributes changed", f"SHA-256 {attributes[1]}"))
-    there = {name for name in list_files(store.path) if name != "zarr.json" and not is_own(name)}
+    files = storage_of(store.path).files()
+    there = {name for name in files if name != "zarr.json" and not is_own(name)}
     for name in there - expected.keys():
         findings.add(Finding(name, "", "belongs to no array", "no such file"))
     for name in expected.keys() - there:
         findings.add(Finding(name, "", "is missing", f"a file of {expected[name][0]} bytes"))
     places = {digest: name for name, (_, digest) in expected.items()}
     common = sorted(there & expected.keys())
-    tasks = ((store.path, name, *expected[name]) for name in common)
+    tasks = ((store.path, name, files[name], *expected[name]) for name in common)
     for name, what, digest in run_unordered(_compare, tasks, jobs):
         if what:
             if digest in places:
@@ -98,17 +101,15 @@ def file_findings(store: Store, jobs: Jobs) -> tuple[int, set[Finding]]:
     return len(common), findings
 
 
-def _compare(path: Path, name: str, size: int, digest: str) -> tuple[str, str, str]:
+def _compare(path: Place, name: str, found: int, size: int, digest: str) -> tuple[str, str, str]:
     """Return a file's name, what is wrong with it, and its digest."""
-    file = path / name
-    if file.is_symlink():
+    if found < 0:
         return name, "is a link", ""
+    if found != size:
+        how = "was cut short" if found < size else "was extended"
+        return name, f"{how}: it has {found} of {size} bytes", ""
     try:
-        found = file.stat().st_size
-        if found != size:
-            how = "was cut short" if found < size else "was extended"
-            return name, f"{how}: it has {found} of {size} bytes", ""
-        actual = file_digest(file)
+        actual = file_digest(path / name)
     except OSError as error:
         return name, f"cannot be read ({error.strerror})", ""
     return name, "" if actual == digest else "its bytes changed", actual

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 from collections import Counter
 from collections.abc import Iterator
-from pathlib import Path
 from typing import Any
 
 import orjson
@@ -14,20 +13,21 @@ from slatprep.errors import StoreError
 from slatprep.inspect.verify.assets import SourceRoots, schema_findings, stored_record
 from slatprep.provenance.places import manifests_of
 from slatprep.provenance.record import records_id
-from slatprep.storage.remote import as_path
+from slatprep.records import Place
+from slatprep.storage.place import place_of
 from slatprep.store.contract import MAX_METADATA_BYTES, Finding
 from slatprep.store.reader import Store
 
 BUILD, ASSETS = "build.json", "assets.jsonl"
 
 
-def usual_manifests(store: Path) -> Path | None:
+def usual_manifests(store: Place) -> Place | None:
     """Return the folder of a store's records beside it, if there is one."""
     folder = manifests_of(store)
     return folder if (folder / BUILD).exists() or (folder / ASSETS).exists() else None
 
 
-def source_roots(manifests: Path | None) -> SourceRoots:
+def source_roots(manifests: Place | None) -> SourceRoots:
     """Return where the sources lay when the store was built.
 
     Raises
@@ -40,15 +40,15 @@ def source_roots(manifests: Path | None) -> SourceRoots:
         raise StoreError(f"no records beside the store say where its sources lie; {advice}")
     try:
         parameters = json.loads((manifests / BUILD).read_text(encoding="utf-8"))["parameters"]
-        pixieverse = as_path(parameters["pixieverse"]["root"])
-        slat = as_path(parameters["slat"]["root"])
+        pixieverse = place_of(parameters["pixieverse"]["root"])
+        slat = place_of(parameters["slat"]["root"])
         slat = slat.parent if slat.is_file() else slat
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise StoreError(f"{manifests / BUILD}: names no sources ({error}); {advice}") from None
     return SourceRoots(pixieverse, slat)
 
 
-def manifest_findings(store: Store, folder: Path) -> Iterator[Finding]:
+def manifest_findings(store: Store, folder: Place) -> Iterator[Finding]:
     """Yield where the records of a build break their schemas or disagree with the store."""
     build_file, assets_file = str(folder / BUILD), str(folder / ASSETS)
     try:
@@ -89,7 +89,7 @@ def _in_store(store: Store, row: int) -> dict[str, Any] | None:
 
 
 def _checked(
-    store: Store, path: Path, seen: Counter[str], faults: list[Finding]
+    store: Store, path: Place, seen: Counter[str], faults: list[Finding]
 ) -> Iterator[dict[str, Any]]:
     """Yield the records of a file one by one, and note what is wrong with each."""
     rows = {asset_id: row for row, asset_id in enumerate(store.ids)}

@@ -1,7 +1,8 @@
-"""URLs that stand where paths stand."""
+"""Places on object stores, which stand where paths of the local disk stand."""
 
 from __future__ import annotations
 
+import os
 import pickle
 import subprocess
 import sys
@@ -12,8 +13,9 @@ import pytest
 
 from slatprep.errors import ConfigError
 from slatprep.readers.files import load_source
-from slatprep.readers.names import RemoteNames
-from slatprep.storage.remote import RemotePath, as_path, list_objects
+from slatprep.records import Place
+from slatprep.storage.place import place_of, storage_of
+from slatprep.storage.remote import RemotePlace
 
 
 @pytest.mark.parametrize(
@@ -25,13 +27,13 @@ from slatprep.storage.remote import RemotePath, as_path, list_objects
         ("memory://a/", "memory://a"),
     ],
 )
-def test_a_url_is_a_path_that_shows_as_a_url(place: str | Path, shown: str) -> None:
-    path = as_path(place)
-    assert isinstance(path, RemotePath)
+def test_a_url_is_a_place_that_shows_as_a_url(place: str | Path, shown: str) -> None:
+    path = place_of(place)
+    assert isinstance(path, RemotePlace)
     assert str(path) == shown
-    assert as_path(str(path)) == path
+    assert place_of(str(path)) == path
     again = pickle.loads(pickle.dumps(path))
-    assert isinstance(again, RemotePath)
+    assert isinstance(again, RemotePlace)
     assert again == path
 
 
@@ -46,58 +48,64 @@ def test_a_url_is_a_path_that_shows_as_a_url(place: str | Path, shown: str) -> N
     ],
 )
 def test_all_else_is_a_local_path(place: str | Path, local: str) -> None:
-    assert as_path(place) == Path(local)
-    assert not isinstance(as_path(place), RemotePath)
+    assert place_of(place) == Path(local)
+    assert not isinstance(place_of(place), RemotePlace)
 
 
-def test_paths_of_a_url_are_made_as_of_any_path() -> None:
-    path = as_path("s3://bucket/a/demo.zarr")
+def test_places_below_a_url_are_named_as_paths_are() -> None:
+    path = place_of("s3://bucket/a/demo.zarr")
     assert str(path / "x" / "y") == "s3://bucket/a/demo.zarr/x/y"
     assert str(path.parent) == "s3://bucket/a"
     assert str(path.with_name("other")) == "s3://bucket/a/other"
-    assert (path / "x/y").relative_to(path).parts == ("x", "y")
-    assert path.is_absolute()
-    assert path.absolute() == path.resolve() == path.expanduser() == path
+    assert str(path / "/x") == "s3://bucket/a/demo.zarr/x"
+    assert (path.name, path.suffix) == ("demo.zarr", ".zarr")
+    assert path.absolute() == path
+    assert len({path, place_of(str(path)), path.parent}) == 2
 
 
 def test_an_object_is_read_as_a_file(s3: Any, bucket: str) -> None:
     s3.pipe_file(f"{bucket}/folder/text.txt", "Grüße\n".encode())
     s3.pipe_file(f"{bucket}/empty", b"")
-    path = as_path(f"s3://{bucket}") / "folder" / "text.txt"
+    path = place_of(f"s3://{bucket}") / "folder" / "text.txt"
     assert path.read_text("utf-8") == "Grüße\n"
     assert path.exists()
     assert path.is_file()
     assert not path.is_dir()
     assert path.parent.is_dir()
-    assert path.stat().st_size == 8
-    with path.open(encoding="utf-8") as lines:
+    assert storage_of(path).size() == 8
+    with path.open("r", encoding="utf-8") as lines:
         assert list(lines) == ["Grüße\n"]
-    assert as_path(f"s3://{bucket}/empty").read_bytes() == b""
-    assert not as_path(f"s3://{bucket}/none").exists()
+    assert place_of(f"s3://{bucket}/empty").read_bytes() == b""
+    assert not place_of(f"s3://{bucket}/none").exists()
 
 
-def test_nothing_is_made_or_removed_by_a_path(tmp_path: Path, monkeypatch: Any) -> None:
-    monkeypatch.chdir(tmp_path)
-    path = as_path("s3://bucket/new")
+def test_what_a_path_offers_and_a_place_does_not_is_an_error() -> None:
+    place = place_of("s3://bucket/new")
+    offered = {name for name in dir(Path) if not name.startswith("_")}
+    assert {name for name in offered if hasattr(place, name)} == offered & set(dir(Place))
+
+
+def test_a_remote_place_is_not_taken_for_a_path() -> None:
+    place = place_of("s3://bucket/new")
     for refused in (
-        lambda: path.mkdir(parents=True),
-        lambda: path.write_text("x"),
-        lambda: path.open("w"),
-        lambda: path.unlink(missing_ok=True),
-        lambda: list(path.iterdir()),
+        lambda: Path("/a") / place,
+        lambda: Path(place),
+        lambda: os.fspath(place),
+        lambda: storage_of("s3://bucket/new"),
     ):
-        with pytest.raises(OSError, match="possible at a local path only: 's3://bucket/new'"):
+        with pytest.raises(TypeError):
             refused()
-    assert list(tmp_path.iterdir()) == []
+    with pytest.raises(OSError, match="s3://bucket/new: mode 'w'; expected 'r' or 'rb'"):
+        place.open("w")
 
 
 def test_what_cannot_be_read_is_named(s3: Any, bucket: str) -> None:
     with pytest.raises(FileNotFoundError, match=f"key does not exist: 's3://{bucket}/none'"):
-        as_path(f"s3://{bucket}/none").read_bytes()
+        place_of(f"s3://{bucket}/none").read_bytes()
     with pytest.raises(FileNotFoundError, match="bucket does not exist: 's3://no-such/none'"):
-        as_path("s3://no-such/none").read_bytes()
+        place_of("s3://no-such/none").read_bytes()
     with pytest.raises(ConfigError, match=r"s4://bucket/x: cannot be reached .*not known"):
-        as_path("s4://bucket/x").read_bytes()
+        place_of("s4://bucket/x").read_bytes()
 
 
 def test_missing_credentials_are_told_of_the_place(
@@ -106,17 +114,16 @@ def test_missing_credentials_are_told_of_the_place(
     monkeypatch.delenv("AWS_ACCESS_KEY_ID")
     new_clients()
     with pytest.raises(OSError, match=f"Unable to locate credentials: 's3://{bucket}/x'"):
-        as_path(f"s3://{bucket}/x").read_bytes()
+        place_of(f"s3://{bucket}/x").read_bytes()
 
 
 def test_objects_that_no_path_could_name_are_left_out(s3: Any, bucket: str) -> None:
     for key in ("a", "b/c", "../up", "b/../../up", "d//e", "./f", "g/", "back\\slash"):
         s3.pipe_file(f"{bucket}/root/{key}", b"x")
     s3.pipe_file(f"{bucket}/rooted", b"x")
-    root = as_path(f"s3://{bucket}/root")
-    assert isinstance(root, RemotePath)
-    assert list(list_objects(root)) == ["a", "b/c"]
-    names = RemoteNames.of(root)
+    root = place_of(f"s3://{bucket}/root")
+    assert storage_of(root).files() == {"a": 1, "b/c": 1}
+    names = storage_of(root).listing()
     assert set(names.of_folder("")) == {"a", "b"}
     assert names.is_file("b/c")
     assert not names.is_file("b")
@@ -126,7 +133,7 @@ def test_objects_that_no_path_could_name_are_left_out(s3: Any, bucket: str) -> N
 
 def test_a_file_that_is_too_large_is_not_read_whole(s3: Any, bucket: str, monkeypatch: Any) -> None:
     monkeypatch.setattr("slatprep.readers.files.MAX_FILE_BYTES", 2**20)
-    root = as_path(f"s3://{bucket}")
+    root = place_of(f"s3://{bucket}")
     s3.pipe_file(f"{bucket}/fits", bytes(2**20))
     s3.pipe_file(f"{bucket}/large", bytes(2**20 + 1))
     s3.pipe_file(f"{bucket}/empty", b"")

@@ -17,7 +17,6 @@ from slatprep.errors import ConfigError
 from slatprep.parameters import BuildParameters, PairingParameters, PixieverseSource, SlatSource
 from slatprep.pipeline.dataset import build_store, plan_build
 from slatprep.readers import discover
-from slatprep.readers.names import listed_once
 from slatprep.store import open_store
 
 
@@ -28,8 +27,8 @@ def uploaded(s3: Any, bucket: str, undisturbed: tuple[Dataset, Path]) -> BuildPa
     s3.put(f"{dataset.root}/", f"{bucket}/data/", recursive=True)
     return replace(
         dataset.parameters("pixie"),
-        pixieverse=PixieverseSource(f"s3://{bucket}/data/pixieverse"),  # type: ignore[arg-type]
-        slat=SlatSource(f"s3://{bucket}/data/slat"),  # type: ignore[arg-type]
+        pixieverse=PixieverseSource(f"s3://{bucket}/data/pixieverse"),
+        slat=SlatSource(f"s3://{bucket}/data/slat"),
     )
 
 
@@ -82,7 +81,7 @@ def test_a_root_that_is_not_there_is_named(
     uploaded: BuildParameters, bucket: str, place: str, tmp_path: Path
 ) -> None:
     place = place.format(bucket=bucket)
-    parameters = replace(uploaded, slat=SlatSource(place))  # type: ignore[arg-type]
+    parameters = replace(uploaded, slat=SlatSource(place))
     with pytest.raises(ConfigError, match=f"^{place}: does not exist"):
         build_store(parameters, tmp_path / "s.zarr")
     with pytest.raises(ConfigError, match=f"slat.root: {place} does not exist"):
@@ -96,14 +95,16 @@ def test_objects_that_are_torn_or_gone_are_named_and_the_others_go_in(
 ) -> None:
     torn = s3.cat_file(f"{bucket}/data/slat/b.npz")[:1000]
     s3.pipe_file(f"{bucket}/data/slat/b.npz", torn)
-    with listed_once():
-        list(discover(uploaded))
-        s3.rm(f"{bucket}/data/pixieverse/c/sample_0/material_grid.npy")  # After it was listed.
-        summary = build_store(uploaded, tmp_path / "s.zarr")
+    grid = f"s3://{bucket}/data/pixieverse/c/sample_0/material_grid.npy"
+
+    def remove_once_listed(done: int, total: int) -> None:
+        if done == 1:
+            s3.rm(grid)
+
+    summary = build_store(uploaded, tmp_path / "s.zarr", progress=remove_once_listed)
     problems = dict(summary.problems)
     assert open_store(tmp_path / "s.zarr").ids == ["a"]
     assert f"s3://{bucket}/data/slat/b.npz: is no readable npz archive" in problems["b"]
-    grid = f"s3://{bucket}/data/pixieverse/c/sample_0/material_grid.npy"
     assert problems["c"].startswith(f"{grid}: does not exist")
 
 
@@ -121,7 +122,7 @@ def test_one_hdf5_file_of_many_assets_is_copied_once(
             file[f"{asset_id}/coords"], file[f"{asset_id}/feats"] = asset.coords, asset.feats
     place = f"s3://{bucket}/all.h5"
     s3.put_file(str(tmp_path / "all.h5"), place)
-    parameters = replace(uploaded, slat=SlatSource(place))  # type: ignore[arg-type]
+    parameters = replace(uploaded, slat=SlatSource(place))
     requests.made.clear()
     build_store(parameters, tmp_path / "s.zarr")
     assert requests.of("get_object").count("all.h5") == 1
@@ -138,7 +139,7 @@ def test_a_pairing_may_lie_elsewhere_than_its_sources(
     s3.pipe_file(f"{bucket}/map.csv", b"object_id,slat_id\na,b\n")
     parameters = replace(
         undisturbed[0].parameters(),
-        pairing=PairingParameters(map=f"s3://{bucket}/map.csv"),  # type: ignore[arg-type]
+        pairing=PairingParameters(map=f"s3://{bucket}/map.csv"),
     )
     pairs = {pair.asset_id: pair for pair in discover(parameters)}
     assert pairs["a"].slat == undisturbed[0].root / "slat" / "b.npz"

@@ -27,9 +27,8 @@ from slatprep.parameters import StoreParameters
 from slatprep.pipeline import dataset as build
 from slatprep.pipeline.dataset import build_store, plan_build
 from slatprep.storage import upload
-from slatprep.storage.copies import local_copy
-from slatprep.storage.remote import as_path
-from slatprep.storage.upload import look_at, upload_store
+from slatprep.storage.place import place_of, storage_of
+from slatprep.storage.upload import published_state, upload_store
 from slatprep.storage.versions import Pointer, read_pointer
 from slatprep.store import Store, open_store
 
@@ -43,8 +42,8 @@ def url(bucket: str) -> str:
 
 def put(store: Path, url: str) -> Path:
     """Publish a finished store; return where its version lies."""
-    made = upload_store(store, look_at(as_path(url)))  # type: ignore[arg-type]
-    made.show()
+    made = upload_store(store, published_state(place_of(url)))
+    made.publish()
     return made.version
 
 
@@ -74,8 +73,8 @@ def test_a_store_is_built_from_s3_to_s3_and_equals_the_local_one(
 ) -> None:
     dataset, expected = undisturbed
     s3.put(f"{dataset.root}/", f"{bucket}/data/", recursive=True)
-    parameters = Dataset(as_path(f"s3://{bucket}/data")).parameters("pixie")
-    summary = build_store(parameters, url, jobs=2)  # type: ignore[arg-type]
+    parameters = Dataset(place_of(f"s3://{bucket}/data")).parameters("pixie")
+    summary = build_store(parameters, url, jobs=2)
     assert summary.complete
     assert str(summary.store) == url
     assert current(s3, url) == tree(expected)
@@ -218,7 +217,7 @@ def build_and_be_killed(fault: Callable[[], None], dataset: Dataset, url: str) -
 
     def run() -> None:
         fault()
-        build_store(dataset.parameters("pixie"), url)  # type: ignore[arg-type]
+        build_store(dataset.parameters("pixie"), url)
 
     child = multiprocessing.get_context("fork").Process(target=run)
     child.start()
@@ -250,7 +249,7 @@ def test_a_build_that_is_killed_leaves_a_whole_store_and_the_next_one_completes(
     # Nothing was uploaded twice, and nothing is left but the version before.
     uploaded = [key for key in requests.of("put_object") if "/versions/" in key]
     assert len(uploaded) == len(tree(old)) + len(tree(new)) - there
-    pointer = read_pointer(as_path(url))  # type: ignore[arg-type]
+    pointer = read_pointer(place_of(url))
     assert versions(s3, url) == {pointer.version, pointer.previous}  # type: ignore[union-attr]
 
 
@@ -322,8 +321,8 @@ def test_the_server_itself_refuses_a_pointer_that_moved_at_the_last_moment(
         (tmp_path / "old.zarr").mkdir()
         (tmp_path / "old.zarr" / "zarr.json").write_text("{}")
         put(tmp_path / "old.zarr", url)
-    late = upload_store(undisturbed[1], look_at(as_path(url)))  # type: ignore[arg-type]
-    early = upload_store(another[1], look_at(as_path(url)))  # type: ignore[arg-type]
+    late = upload_store(undisturbed[1], published_state(place_of(url)))
+    early = upload_store(another[1], published_state(place_of(url)))
     pipe = S3FileSystem._pipe_file
 
     async def overtaken(filesystem: Any, path: str, data: bytes, **options: Any) -> Any:
@@ -332,7 +331,7 @@ def test_the_server_itself_refuses_a_pointer_that_moved_at_the_last_moment(
 
     change_client("_pipe_file", overtaken)
     with pytest.raises(StoreError, match="another build replaced it"):
-        late.show()
+        late.publish()
     assert current(s3, url) == tree(another[1])
 
 
@@ -340,7 +339,7 @@ def test_an_answer_that_is_lost_does_not_make_a_failure_of_a_success(
     s3: Any, url: str, undisturbed: Made, another: Made, change_client: Any
 ) -> None:
     put(another[1], url)
-    made = upload_store(undisturbed[1], look_at(as_path(url)))  # type: ignore[arg-type]
+    made = upload_store(undisturbed[1], published_state(place_of(url)))
     pipe, lost = S3FileSystem._pipe_file, []
 
     async def deaf(*args: Any, **options: Any) -> Any:
@@ -348,7 +347,7 @@ def test_an_answer_that_is_lost_does_not_make_a_failure_of_a_success(
         raise OSError("connection lost")
 
     change_client("_pipe_file", deaf)
-    made.show()
+    made.publish()
     assert len(lost) == 1
     assert current(s3, url) == tree(undisturbed[1])
 
@@ -358,14 +357,14 @@ def test_older_versions_that_must_not_be_removed_are_told(
 ) -> None:
     put(another[1], url)
     put(undisturbed[1], url)
-    made = upload_store(another[1], look_at(as_path(url)))  # type: ignore[arg-type]
+    made = upload_store(another[1], published_state(place_of(url)))
 
     async def denied(*_: Any, **__: Any) -> None:
         raise PermissionError("Access Denied")
 
     change_client("_rm", denied)
     with pytest.warns(UserWarning, match=r"older versions could not be removed \(Access Denied\)"):
-        made.show()
+        made.publish()
     assert current(s3, url) == tree(another[1])
 
 
@@ -433,7 +432,7 @@ def test_places_that_cannot_be_written_are_told_before_the_work(
     with pytest.raises(StoreError, match=f"is one version .* expected s3://{bucket}/a.zarr$"):
         build_store(parameters, version)
     with pytest.raises(StoreError, match="expected a local folder for the records"):
-        build_store(parameters, f"s3://{bucket}/a.zarr", manifests=as_path(f"s3://{bucket}/m"))
+        build_store(parameters, f"s3://{bucket}/a.zarr", manifests=place_of(f"s3://{bucket}/m"))
     monkeypatch.delenv("AWS_SECRET_ACCESS_KEY")
     monkeypatch.delenv("AWS_ACCESS_KEY_ID")
     new_clients()
@@ -451,7 +450,7 @@ def test_records_may_be_kept_on_the_local_disk(
     parameters = make_dataset("a").parameters("pixie")
     summary = build_store(parameters, url, manifests=tmp_path / "records")
     assert summary.records == tmp_path / "records" / "assets.jsonl"
-    assert not any(name.startswith("records/") for name in contents(s3, url))
+    assert not any(name.startswith("manifests/") for name in contents(s3, url))
     assert verify_store(url, manifests=tmp_path / "records").findings == ()
     # Asked for there as well, they are put there.
     again = build_store(parameters, url)
@@ -486,7 +485,7 @@ def test_a_copy_is_made_once_and_holds_no_name_that_leads_out(
     requests.made.clear()
     assert_same(open_store(url, copy=True), open_store(undisturbed[1]))
     assert [key for _, key in requests.made] == ["stores/demo.zarr/current.json"]
-    assert local_copy(undisturbed[1]) == undisturbed[1]
+    assert storage_of(undisturbed[1]).copied_version() == undisturbed[1]
 
 
 def test_a_store_that_was_copied_there_as_it_is_can_be_read(

@@ -1,0 +1,234 @@
+"""Places on the local disk and on object stores, behind one protocol.
+
+Where a place only has a name, or is read whole, `slatprep.records.Place` is
+enough: `pathlib.Path` and `RemotePlace` both are one. What has to be done in
+two ways is a method of `Storage`, and only `storage_of` asks which it is.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import stat
+import tempfile
+from collections.abc import Iterator
+from contextlib import AbstractContextManager, contextmanager
+from pathlib import Path, PurePosixPath
+from typing import TYPE_CHECKING, Protocol, TypeGuard
+
+from slatprep.errors import InputError
+from slatprep.storage.atomic import staged
+from slatprep.storage.cache import cached_file, folder_for
+from slatprep.storage.copies import copied_version
+from slatprep.storage.files import Folder, LocalFolder, local_files
+from slatprep.storage.listing import Listing, LocalListing, RemoteListing
+from slatprep.storage.remote import RemoteFile, RemoteFolder, RemotePlace, list_objects
+from slatprep.storage.versions import current_version
+
+if TYPE_CHECKING:
+    from slatprep.records import Place
+
+# pathlib makes one slash of two, and one letter is a drive.
+_URL = re.compile(r"([a-z][a-z0-9+.-]+):/+(.*)", re.DOTALL)
+
+_LOCAL = ("file", "local")
+
+
+def place_of(text: str | Place, folder: Path | None = None) -> Place:
+    """Return a path of the local disk, or a `RemotePlace` for the URL of an object store.
+
+    Parameters
+    ----------
+    text : str or Place
+        A path, a URL, or a URL that was made a path.
+    folder : Path, optional
+        What a relative path starts from; links in it are then resolved, and
+        ``~`` stands for the user's folder.
+
+    Examples
+    --------
+    >>> print(place_of("s3://bucket/demo.zarr") / "zarr.json")
+    s3://bucket/demo.zarr/zarr.json
+    >>> print(place_of("file:///data/demo.zarr"))
+    /data/demo.zarr
+    """
+    url = _URL.fullmatch(str(text))
+    if url and url[1] not in _LOCAL:
+        return RemotePlace(url[1], PurePosixPath(url[2]))
+    path = Path("/", url[2]) if url else Path(str(text))
+    return path if folder is None else (folder / path.expanduser()).resolve()
+
+
+def is_place(value: object) -> TypeGuard[Place]:
+    """Whether a value is a path, or a URL as `place_of` returns it."""
+    return isinstance(value, Path | RemotePlace)
+
+
+class Storage(Protocol):
+    """What a disk and an object store do in different ways, for one place."""
+
+    @property
+    def local(self) -> Path | None:
+        """The place as a path; None where it is not on the local disk."""
+
+    def files(self) -> dict[str, int]:
+        """Return the names of all files below the place, and their bytes; -1 for a link."""
+
+    def listing(self) -> Listing:
+        """Return the names below the place as they are looked up one by one."""
+
+    def folder(self) -> Folder:
+        """Return the place as a folder whose files are read by ranges."""
+
+    def locate(self, file: Place) -> tuple[Place, str]:
+        """Return a file below the place without links on its way, and its name relative to it.
+
+        Raises
+        ------
+        InputError
+            If it leads out of the place, does not exist, or is no regular file.
+        """
+
+    def read(self, limit: int) -> bytes:
+        """Read a file up to one byte more than `limit`, by which one that is larger is known."""
+
+    def size(self) -> int:
+        """Return the bytes of a file."""
+
+    def on_disk(self) -> Path:
+        """Return a path of the local disk with the file's content."""
+
+    def current_version(self) -> Place:
+        """Return where the files of the store at the place lie now.
+
+        Raises
+        ------
+        StoreError
+            If it cannot be reached.
+        """
+
+    def copied_version(self) -> Path:
+        """Return a path of the local disk with the store, of which this is a version, if remote."""
+
+    def staged(self) -> AbstractContextManager[Path]:
+        """Yield a local file that becomes the place's content, whole, when all went well."""
+
+    def work_folder(self) -> Path:
+        """Return where, on the local disk, to work on what belongs to the place."""
+
+
+def storage_of(place: Place) -> Storage:
+    """Return what can be done at a place."""
+    if isinstance(place, RemotePlace):
+        return _ObjectStore(place)
+    if isinstance(place, Path):
+        return _Disk(place)
+    raise TypeError(f"{place!r} is no place; expected what `place_of` returns")
+
+
+class _Disk:
+    """See `Storage`."""
+
+    def __init__(self, path: Path) -> None:
+        self.local: Path = path
+
+    def files(self) -> dict[str, int]:
+        return local_files(self.local)
+
+    def listing(self) -> Listing:
+        return LocalListing(self.local)
+
+    def folder(self) -> Folder:
+        return LocalFolder(self.local)
+
+    def locate(self, file: Place) -> tuple[Place, str]:
+        path, root = Path(str(file)), self.local
+        try:
+            relative = path.relative_to(root)
+            resolved = path.resolve(strict=True)
+            inside = ".." not in relative.parts and resolved.is_relative_to(root.resolve())
+            regular = stat.S_ISREG(resolved.stat().st_mode)
+        except FileNotFoundError:
+            raise InputError(path, "does not exist", "a readable file") from None
+        except (OSError, RuntimeError, ValueError) as error:  # link loops, NUL, other roots
+            raise InputError(path, f"cannot be opened ({error})", f"a file below {root}") from None
+        if not inside:
+            raise InputError(
+                path, f"leads to {resolved}, out of its root", f"a file below {root.resolve()}"
+            )
+        if not regular:
+            raise InputError(path, "is not a regular file", "a readable file")
+        return resolved, relative.as_posix()
+
+    def read(self, limit: int) -> bytes:
+        with self.local.open("rb") as file:
+            # read() would allocate all that it is allowed to return.
+            return file.read(min(os.fstat(file.fileno()).st_size, limit + 1))
+
+    def size(self) -> int:
+        return self.local.stat().st_size
+
+    def on_disk(self) -> Path:
+        return self.local
+
+    def current_version(self) -> Place:
+        return self.local
+
+    def copied_version(self) -> Path:
+        return self.local
+
+    def staged(self) -> AbstractContextManager[Path]:
+        return staged(self.local)
+
+    def work_folder(self) -> Path:
+        return self.local.with_name(f".{self.local.name}.work")
+
+
+class _ObjectStore:
+    """See `Storage`."""
+
+    local: None = None
+
+    def __init__(self, place: RemotePlace) -> None:
+        self.place = place
+
+    def files(self) -> dict[str, int]:
+        return {name: int(entry["size"]) for name, entry in list_objects(self.place).items()}
+
+    def listing(self) -> Listing:
+        return RemoteListing(list_objects(self.place))
+
+    def folder(self) -> Folder:
+        return RemoteFolder(self.place)
+
+    def locate(self, file: Place) -> tuple[Place, str]:
+        # An object store has no links that could lead out.
+        name = str(file).removeprefix(f"{self.place}/")
+        if name == str(file) or {".", ".."} & set(name.split("/")):
+            raise InputError(file, "is no plain name below its root", "a name without '..'")
+        return file, name
+
+    def read(self, limit: int) -> bytes:
+        return RemoteFile(self.place).pread(limit + 1, 0)
+
+    def size(self) -> int:
+        return RemoteFile(self.place).size()
+
+    def on_disk(self) -> Path:
+        return cached_file(self.place)
+
+    def current_version(self) -> Place:
+        return current_version(self.place)
+
+    def copied_version(self) -> Path:
+        return copied_version(self.place)
+
+    @contextmanager
+    def staged(self) -> Iterator[Path]:
+        with tempfile.TemporaryDirectory() as folder:
+            file = Path(folder, self.place.name)
+            yield file
+            self.place.upload(file)
+
+    def work_folder(self) -> Path:
+        return folder_for(self.place) / "work"
