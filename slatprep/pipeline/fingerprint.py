@@ -24,15 +24,11 @@ STAGES = (
 """Where an asset's numbers are made; a package stands for all of its modules."""
 
 # Parameters enter an asset's key as values, so their defaults may change; the
-# words of an error are no numbers; of slatprep itself it is only the version;
-# and whichever way bytes come from a disk or a network, their digest tells them.
+# words of an error are no numbers; and of slatprep itself it is only the version.
 _NOT_NUMBERS = (
     "slatprep",
     "slatprep.errors",
     "slatprep.parameters",
-    "slatprep.storage",
-    "slatprep.storage.cache",
-    "slatprep.storage.remote",
     "slatprep.workers",
     "slatprep.workers.local",
 )
@@ -54,7 +50,8 @@ def numeric_modules() -> dict[str, Path]:
     waiting = list(STAGES)
     while waiting:
         name = waiting.pop()
-        if name in found or name in _NOT_NUMBERS:
+        # Whichever way bytes come from a disk or a network, their digest tells them.
+        if name in found or name in _NOT_NUMBERS or name.startswith("slatprep.storage"):
             continue
         path = _source(name)
         if path is None:
