@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import json
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -31,6 +31,7 @@ from slatprep.demo.write import (
     write_truth,
 )
 from slatprep.errors import ConfigError
+from slatprep.workers.local import run_unordered
 
 __all__ = ["DemoAsset", "DemoSummary", "make_asset", "make_demo"]
 
@@ -132,11 +133,15 @@ def make_demo(
     _check(recipe)
     root = Path(directory)
     _claim(root, recipe)
-    entries = []
-    for entry in _made(root, recipe, jobs):
-        entries.append(entry)
+    tasks = ((root, recipe, index) for index in range(assets))
+    # One file for all assets has one writer.
+    writers = 1 if slat_form == "hdf5-groups" else jobs
+    made = {}
+    for index, entry in run_unordered(_make_one, tasks, writers):
+        made[index] = entry
         if progress is not None:
-            progress(len(entries), assets)
+            progress(len(made), assets)
+    entries = [made[index] for index in range(assets)]
     _write_definition(root, recipe, entries)
     _write_json(root / "demo.json", {"recipe": asdict(recipe), "assets": entries})
     return DemoSummary(
@@ -189,20 +194,8 @@ def _recipe_in(mark: Path) -> object:
         return None
 
 
-def _made(root: Path, recipe: _Recipe, jobs: int) -> Iterator[dict[str, Any]]:
-    """Make and write every asset, in order."""
-    # One file for all assets has one writer.
-    if jobs == 1 or recipe.slat_form == "hdf5-groups":
-        yield from (_make_one(root, recipe, index) for index in range(recipe.assets))
-    else:
-        from joblib import Parallel, delayed
-
-        yield from Parallel(n_jobs=jobs, return_as="generator")(
-            delayed(_make_one)(root, recipe, index) for index in range(recipe.assets)
-        )
-
-
-def _make_one(root: Path, recipe: _Recipe, index: int) -> dict[str, Any]:
+def _make_one(root: Path, recipe: _Recipe, index: int) -> tuple[int, dict[str, Any]]:
+    """Make and write one asset; return its number, and what is known of it."""
     asset = make_asset(
         recipe.seed,
         index,
@@ -214,7 +207,7 @@ def _make_one(root: Path, recipe: _Recipe, index: int) -> dict[str, Any]:
     write_pixieverse(root / "pixieverse", asset, recipe.grid_form)
     write_slat(root / "slat", asset, recipe.slat_form, recipe.slat_names)
     write_truth(root / "truth", asset)
-    return {
+    return index, {
         "id": asset.object_id,
         "name": asset.name,
         "category": asset.category,

@@ -1,4 +1,4 @@
-"""Tasks on a Dask cluster that the user has, handed out by joblib's own Dask backend.
+"""Tasks on a Dask cluster that the user has.
 
 The cluster decides which worker does what, and what is done again when one
 dies. What it cannot know is made sure here: that every worker, those that join
@@ -14,8 +14,9 @@ import logging
 import os
 import platform
 import stat
+import time
 from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import CancelledError, Future, ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import lru_cache
@@ -26,22 +27,14 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 from slatprep.errors import ConfigError, SlatprepError
 from slatprep.storage.place import place_of, storage_of
-from slatprep.workers.local import (
-    WORKER_DIED,
-    Handout,
-    result_of_death,
-    results_of,
-    single_threaded,
-)
+from slatprep.workers.local import single_threaded
+from slatprep.workers.pool import Pool, run_in_pools
 
 if TYPE_CHECKING:
     from slatprep.records import Place
 
 try:
     import distributed
-    from distributed.scheduler import KilledWorker
-    from joblib._dask import DaskDistributedBackend
-    from tornado.ioloop import PeriodicCallback
 except ImportError as error:
     raise ConfigError(
         f"Dask cannot be imported ({error}); install it with `pip install 'slatprep[cluster]'`"
@@ -52,8 +45,13 @@ Result = TypeVar("Result")
 ANSWER_SECONDS = 15.0
 """How long a scheduler may take to answer, and three times as long as to be found at all."""
 
-IN_FLIGHT = 1000
-"""Tasks the cluster has at a time: enough for workers that join midway, and few to remember."""
+BATCHES_A_CORE = 3
+"""Batches that a cluster has at a time: one under way, and others that wait for a free worker."""
+
+BATCHES_A_SECOND = 200.0
+"""How many a scheduler is asked to hand out, where it could hand out some 500."""
+
+SHORTEST_BATCH_SECONDS = 0.25
 
 _LIBRARIES = (
     "numpy", "scipy", "numba", "open3d", "open3d-cpu", "small_gicp",
@@ -108,7 +106,7 @@ class Cluster:
         except BaseException:
             self._client.close()
             raise
-        self._note(f"{self.scheduler}: {workers} worker{'s'[: workers != 1]}")
+        self._note(f"{self.scheduler}: {workers} {'worker' if workers == 1 else 'workers'}")
         return self
 
     def __exit__(
@@ -127,17 +125,12 @@ class Cluster:
     ) -> Iterator[Result]:
         """Do what `slatprep.workers.local.run_unordered` promises, on the cluster.
 
-        Dask does a task again whose worker died, and gives it up when several
-        have. As it blames whatever else waited at those workers too, tasks
-        given up are done again at the end, alone on the whole cluster.
+        Dask itself does a task again whose worker died, and gives it up when
+        several have.
         """
         with self._connected():
-            source = Handout(tasks)
-            yield from self._run(function, source, IN_FLIGHT)
-            suspects = Handout(source.unfinished())
-            yield from self._run(function, suspects, 1)
-            for task in suspects.unfinished():
-                yield result_of_death(task, died)
+            pool = _Pool(self._client, self._common)
+            yield from run_in_pools(pool, pool, function, tasks, died)
 
     def require_shared(self, paths: Iterable[Place]) -> None:
         """Raise `SlatprepError` unless every worker sees these files and folders as we do.
@@ -156,20 +149,6 @@ class Cluster:
         self._common = replace(self._common, files=tuple(files.items()))
         with self._connected():
             self._check_workers()
-
-    def _run(
-        self, function: Callable[..., Result], source: Handout, in_flight: int
-    ) -> Iterator[Result]:
-        from joblib import Parallel, delayed
-
-        calls = (delayed(_do)(self._common, number, function, task) for number, task in source)
-        parallel = Parallel(
-            backend=_Backend(client=self._client),
-            return_as="generator_unordered",
-            batch_size=1,
-            pre_dispatch=in_flight,
-        )
-        yield from results_of(parallel(calls), source)
 
     def _check_workers(self) -> int:
         """Wait for a first worker, without limit; raise unless all are fit, or say how many."""
@@ -197,7 +176,7 @@ class Cluster:
         """Say in words that the scheduler was lost."""
         try:
             yield
-        except (OSError, distributed.CancelledError) as error:
+        except (OSError, CancelledError) as error:
             if isinstance(error, OSError) and self._client.status == "running":
                 raise  # it is a task's own
             raise SlatprepError(
@@ -239,59 +218,55 @@ async def _reach(scheduler: str) -> None:
     comm.abort()
 
 
-class _Backend(DaskDistributedBackend):  # type: ignore[misc]
-    """Joblib's backend, mended where it would compute in this process, or wait for ever."""
+class _Pool(Pool):
+    """The workers that a cluster has at the time, as `slatprep.workers.pool` uses them."""
 
-    def start_call(self) -> None:
-        """Begin a run, and watch the scheduler in it."""
-        self._waiting: set[Future[Any]] = set()
-        self._watch = PeriodicCallback(self._give_up_if_lost, 1000)
-        self.client.loop.add_callback(self._watch.start)
-        super().start_call()
+    killed = distributed.KilledWorker
 
-    def stop_call(self) -> None:
-        """End a run."""
-        self.client.loop.add_callback(self._watch.stop)
-        super().stop_call()
+    def __init__(self, client: distributed.Client, common: _Common) -> None:
+        self._client = client
+        self._common = common
+        self._executor = client.get_executor(pure=False)
+        self._cores = 0
+        self._asked = -1.0
 
-    def effective_n_jobs(self, n_jobs: int) -> int:
-        """Return the number of workers, two at least.
+    def room(self) -> int:
+        """Return more than the workers can do at once; something even for none."""
+        return BATCHES_A_CORE * max(self._known_cores(), 1)
 
-        With one, joblib would do everything in this process, not on the worker.
-        """
-        workers: int = sum(self.client.ncores().values())
-        return max(2, workers)
+    def batch_seconds(self) -> float:
+        """Return what the scheduler keeps up with, were all workers busy."""
+        return max(SHORTEST_BATCH_SECONDS, self._known_cores() / BATCHES_A_SECOND)
 
-    def submit(self, func: Any, callback: Callable[[Any], None]) -> Future[Any]:
-        """Submit a batch; call back as well where Dask itself gave up, as joblib's own does not."""
-
-        def done(future: Future[Any]) -> None:
-            self._waiting.discard(future)
-            error = future.exception()
-            if isinstance(error, KilledWorker):
-                callback([(number, WORKER_DIED) for _, (_, number, *_), _ in func.items])
-            elif error is not None:
-                callback(error)
-
-        future: Future[Any] = super().submit(func, callback)
-        self._waiting.add(future)
-        future.add_done_callback(done)
+    def submit(self, call: Callable[[], Any]) -> Future[Any]:
+        """Have a worker make a call."""
+        future: Future[Any] = self._executor.submit(_do, self._common, call)
         return future
 
-    def _give_up_if_lost(self) -> None:
-        """End the wait for results that were on their way when the connection broke."""
-        if self.client.status != "running":
-            for future in list(self._waiting):
-                future.set_exception(ConnectionError("the connection to the scheduler was lost"))
+    def check(self) -> None:
+        """Raise if the scheduler was lost: results on their way then never come."""
+        if self._client.status != "running":
+            raise ConnectionError("the connection to the scheduler was lost")
+
+    def abandon(self, calls: Iterable[Future[Any]]) -> None:
+        """Have the scheduler drop what it has not yet given to a worker."""
+        if self._client.status == "running":
+            self._executor.shutdown(wait=False)
+
+    def _known_cores(self) -> int:
+        """Return how many cores the workers have, those that joined up to a second ago."""
+        if time.monotonic() - self._asked > 1.0:
+            self.check()
+            self._cores = sum(self._client.ncores().values())
+            self._asked = time.monotonic()
+        return self._cores
 
 
-def _do(
-    common: _Common, number: int, function: Callable[..., Result], task: tuple[Any, ...]
-) -> tuple[int, Result]:
-    """Do one task, on a worker."""
+def _do(common: _Common, call: Callable[[], Result]) -> Result:
+    """Make a call, on a worker."""
     _agree(common, distributed.get_worker())
     with single_threaded():
-        return number, function(*task)
+        return call()
 
 
 def _check(common: _Common, dask_worker: Any) -> None:

@@ -3,16 +3,20 @@
 from __future__ import annotations
 
 import os
+import sys
 import threading
 import time
-import warnings
-from collections.abc import Callable, Generator, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import Future
 from contextlib import contextmanager
+from functools import lru_cache
 from typing import TYPE_CHECKING, Any, Protocol, TypeVar
 
-from slatprep.errors import SlatprepError
+from slatprep.workers.pool import Pool, run_in_pools
 
 if TYPE_CHECKING:
+    from threadpoolctl import ThreadpoolController
+
     from slatprep.records import Place
 
 Result = TypeVar("Result")
@@ -28,8 +32,8 @@ THREAD_VARIABLES = (
 )
 """What the numeric libraries read, once, when they are loaded."""
 
-WORKER_DIED = object()
-"""Stands in a pair of a task's number and its result for one that cost its workers their lives."""
+_IDLE_SECONDS = 300
+"""How long a worker process stays without work: longer than a build needs none."""
 
 
 class Workers(Protocol):
@@ -63,7 +67,7 @@ def run_unordered(
 
     Tasks are taken from the iterable only as workers come free, and each
     worker computes on one thread. When a worker is killed, whatever was under
-    way is done again, a task at a time, in a process of its own.
+    way is done again at the end, a task at a time.
 
     Parameters
     ----------
@@ -84,20 +88,13 @@ def run_unordered(
     """
     if not isinstance(jobs, int):
         yield from jobs.run_unordered(function, tasks, died)
-        return
-    if jobs == 1:
-        with single_threaded():
-            for task in tasks:
-                yield function(*task)
-        return
-    from joblib.externals.loky.process_executor import BrokenProcessPool
-
-    source = Handout(tasks)
-    while not source.exhausted:
-        try:
-            yield from _run_in_pool(function, source, jobs)
-        except BrokenProcessPool:
-            yield from _run_alone(function, source.unfinished(), died)
+    elif jobs == 1:
+        for task in tasks:
+            with single_threaded():
+                result = function(*task)
+            yield result
+    else:
+        yield from run_in_pools(_Processes(jobs), _Processes(1), function, tasks, died)
 
 
 def require_shared(jobs: Jobs, paths: Iterable[Place]) -> None:
@@ -106,110 +103,48 @@ def require_shared(jobs: Jobs, paths: Iterable[Place]) -> None:
         jobs.require_shared(paths)
 
 
-class Handout:
-    """Hands tasks out and remembers which have not come back."""
+class _Processes(Pool):
+    """Processes of this machine, which stay for whatever is run next.
 
-    def __init__(self, tasks: Iterable[tuple[Any, ...]]) -> None:
-        self._tasks = enumerate(tasks)
-        self._out: dict[int, tuple[Any, ...]] = {}
-        self._lock = threading.Lock()
-        self._turn = 0
-        self.exhausted = False
+    Tasks travel alone: ours take long enough, and in batches progress would jump.
+    """
 
-    def __iter__(self) -> Iterator[tuple[int, tuple[Any, ...]]]:
-        turn = self._turn
+    def __init__(self, number: int) -> None:
+        from joblib.externals.loky.process_executor import BrokenProcessPool
+
+        self.killed = BrokenProcessPool
+        self._number = number
+
+    def room(self) -> int:
+        """Return a call for each process, and one for it to begin with next."""
+        return 2 * self._number
+
+    def submit(self, call: Callable[[], Any]) -> Future[Any]:
+        """Have a process make a call; new ones are started where one was killed."""
         while True:
-            with self._lock:  # joblib asks from threads of its own, one of them perhaps too late
-                if turn != self._turn:
-                    return
-                number, task = next(self._tasks, (-1, ()))
-                if number < 0:
-                    self.exhausted = True
-                    return
-                self._out[number] = task
-            yield number, task
+            try:
+                future: Future[Any] = self._executor().submit(call)
+                return future
+            except self.killed:
+                continue
 
-    def back(self, number: int) -> None:
-        """Forget a task whose result has come."""
-        with self._lock:
-            del self._out[number]
+    def abandon(self, calls: Iterable[Future[Any]]) -> None:
+        """End the processes: whoever stops early does not want them to write any more."""
+        # Loky's own thread fails on calls that it has not yet passed on to the processes.
+        while not all(call.running() or call.done() for call in calls):
+            time.sleep(0.001)
+        self._executor().shutdown(kill_workers=True)
 
-    def unfinished(self) -> list[tuple[Any, ...]]:
-        """Take the tasks that were under way, in order; who iterates now gets no more."""
-        with self._lock:
-            self._turn += 1
-            tasks = [self._out[number] for number in sorted(self._out)]
-            self._out.clear()
-        return tasks
+    def _executor(self) -> Any:
+        from joblib.externals.loky import get_reusable_executor
 
-
-def results_of(
-    results: Generator[tuple[int, Result], None, None], source: Handout
-) -> Iterator[Result]:
-    """Yield what joblib yields of numbered tasks; those whose worker died stay unfinished."""
-    try:
-        for number, result in results:
-            if result is not WORKER_DIED:
-                source.back(number)
-                yield result
-    finally:
-        with warnings.catch_warnings():
-            # Whoever stops early, as a strict build does, means to waste the rest.
-            for wasted in (".*but not used", ".*have been cancelled"):
-                warnings.filterwarnings("ignore", message=wasted, category=UserWarning)
-            results.close()
-
-
-def _run_in_pool(function: Callable[..., Result], source: Handout, jobs: int) -> Iterator[Result]:
-    from joblib import Parallel, delayed, parallel_config
-
-    calls = (delayed(_numbered)(function, number, task) for number, task in source)
-    watch = {"initializer": _end_with, "initargs": (os.getpid(),)}
-    with parallel_config("loky", n_jobs=jobs, inner_max_num_threads=1, **watch):
-        # Our tasks take long enough to travel alone; in batches progress would jump.
-        parallel = Parallel(return_as="generator_unordered", batch_size=1)
-    yield from results_of(parallel(calls), source)
-
-
-def _run_alone(
-    function: Callable[..., Result],
-    tasks: Iterable[tuple[Any, ...]],
-    died: Callable[..., Result] | None,
-) -> Iterator[Result]:
-    """Yield the result of each task, one at a time in a process that does nothing else."""
-    from joblib.externals.loky import ProcessPoolExecutor
-    from joblib.externals.loky.process_executor import BrokenProcessPool
-
-    environment = dict.fromkeys(THREAD_VARIABLES, "1")
-    alone = None
-    for task in tasks:
-        if alone is None:
-            alone = ProcessPoolExecutor(
-                1, env=environment, initializer=_end_with, initargs=(os.getpid(),)
-            )
-        try:
-            yield alone.submit(function, *task).result()
-        except BrokenProcessPool:
-            alone = None
-            yield result_of_death(task, died)
-    if alone is not None:
-        alone.shutdown()
-
-
-def result_of_death(task: tuple[Any, ...], died: Callable[..., Result] | None) -> Result:
-    """Return what stands in for a task that kills its worker even alone."""
-    if died is None:
-        raise SlatprepError(
-            "a worker process was killed twice at the same task, probably because memory "
-            "ran out; nothing was replaced. Run again with fewer jobs or more memory"
+        return get_reusable_executor(
+            self._number,
+            timeout=_IDLE_SECONDS,
+            env=dict.fromkeys(THREAD_VARIABLES, "1"),
+            initializer=_end_with,
+            initargs=(os.getpid(),),
         )
-    return died(*task)
-
-
-def _numbered(
-    function: Callable[..., Result], number: int, task: tuple[Any, ...]
-) -> tuple[int, Result]:
-    return number, function(*task)
 
 
 def _end_with(parent: int) -> None:
@@ -226,12 +161,10 @@ def _end_with(parent: int) -> None:
 @contextmanager
 def single_threaded() -> Iterator[None]:
     """Hold the numeric libraries to one thread each, loaded already or loaded within."""
-    from threadpoolctl import threadpool_limits
-
     before = {name: os.environ.get(name) for name in THREAD_VARIABLES}
     os.environ.update(dict.fromkeys(THREAD_VARIABLES, "1"))
     try:
-        with threadpool_limits(limits=1):
+        with _thread_pools(len(sys.modules)).limit(limits=1):
             yield
     finally:
         for name, value in before.items():
@@ -239,3 +172,11 @@ def single_threaded() -> Iterator[None]:
                 os.environ.pop(name, None)
             else:
                 os.environ[name] = value
+
+
+@lru_cache(maxsize=1)
+def _thread_pools(modules: int) -> ThreadpoolController:
+    """Find the loaded libraries, which takes 1 to 4 ms; again where modules were imported since."""
+    from threadpoolctl import ThreadpoolController
+
+    return ThreadpoolController()

@@ -15,6 +15,7 @@ def test_every_task_is_done_once(jobs: int) -> None:
     assert sorted(results) == sorted(divmod(n, 7) for n in range(100))
 
 
+@pytest.mark.filterwarnings("error::pytest.PytestUnhandledThreadExceptionWarning")
 @pytest.mark.parametrize("jobs", [1, 2])
 def test_tasks_are_taken_as_workers_come_free(jobs: int) -> None:
     taken = 0
@@ -47,6 +48,16 @@ def test_a_killed_worker_is_an_error_in_words() -> None:
 def test_workers_are_told_to_use_one_thread() -> None:
     assert set(run_unordered(os.getenv, [("OMP_NUM_THREADS",)] * 4, jobs=2)) == {"1"}
     assert set(run_unordered(os.getenv, [("OMP_NUM_THREADS",)] * 4, jobs=1)) == {"1"}
+
+
+@pytest.mark.parametrize("jobs", [1, 2])
+def test_whoever_takes_results_keeps_the_own_environment(
+    jobs: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("OMP_NUM_THREADS", "2")
+    for seen in run_unordered(os.getenv, [("OMP_NUM_THREADS",)] * 3, jobs):
+        assert seen == "1"
+        assert os.environ["OMP_NUM_THREADS"] == "2"
 
 
 def test_single_threaded_holds_and_gives_back(monkeypatch: pytest.MonkeyPatch) -> None:

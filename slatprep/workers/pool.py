@@ -1,0 +1,154 @@
+"""Tasks handed to a pool of workers, in batches; what a killed worker had is done again, alone."""
+
+from __future__ import annotations
+
+import time
+from abc import ABC, abstractmethod
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import Future
+from functools import partial
+from itertools import islice
+from queue import Empty, SimpleQueue
+from typing import Any, TypeVar
+
+from slatprep.errors import SlatprepError
+
+Result = TypeVar("Result")
+Task = tuple[Any, ...]
+"""Positional arguments of one call."""
+
+LARGEST_BATCH = 1000
+"""Tasks in a batch at most, however short they are."""
+
+_POLL_SECONDS = 1.0
+
+
+class Pool(ABC):
+    """Workers that take calls, as a `concurrent.futures.Executor` does."""
+
+    killed: type[BaseException]
+    """What the future of a call raises whose worker was killed."""
+
+    @abstractmethod
+    def room(self) -> int:
+        """Return how many calls may be under way, waiting ones included."""
+
+    @abstractmethod
+    def submit(self, call: Callable[[], Any]) -> Future[Any]:
+        """Have a worker make a call."""
+
+    @abstractmethod
+    def abandon(self, calls: Iterable[Future[Any]]) -> None:
+        """Drop the calls that are under way, all of them given."""
+
+    def batch_seconds(self) -> float:
+        """Return how long a batch should take [s]; 0 for one task a batch."""
+        return 0.0
+
+    def check(self) -> None:  # noqa: B027 -- nothing to ask where lost calls raise by themselves
+        """Raise if no answer can come any more; asked every second while none comes."""
+
+
+def run_in_pools(
+    pool: Pool,
+    alone: Pool,
+    function: Callable[..., Result],
+    tasks: Iterable[Task],
+    died: Callable[..., Result] | None,
+) -> Iterator[Result]:
+    """Do what `slatprep.workers.local.run_unordered` promises.
+
+    A killed worker takes down, or brings under suspicion, whatever else waited
+    beside it. So all of that is done again at the end, a task at a time.
+
+    Parameters
+    ----------
+    pool, alone : Pool
+        Where tasks are done, and where one at a time is that was with a killed worker.
+    function, tasks, died
+        As `slatprep.workers.local.run_unordered` takes them.
+    """
+    suspects: list[Task] = []
+    yield from _attempt(pool, function, tasks, suspects)
+    for suspect in suspects:
+        killers: list[Task] = []
+        yield from _attempt(alone, function, [suspect], killers)
+        for killer in killers:
+            if died is None:
+                raise SlatprepError(
+                    "a worker process was killed twice at the same task, probably because memory "
+                    "ran out; nothing was replaced. Run again with fewer jobs or more memory"
+                )
+            yield died(*killer)
+
+
+def _attempt(
+    pool: Pool, function: Callable[..., Result], tasks: Iterable[Task], suspects: list[Task]
+) -> Iterator[Result]:
+    """Yield results as they come; add the tasks that were with a killed worker to `suspects`."""
+    source = iter(tasks)
+    given_back: deque[Task] = deque()
+    under_way: dict[Future[Any], list[Task]] = {}
+    finished: SimpleQueue[Future[Any]] = SimpleQueue()
+    results: list[Result] = []
+    size = 1
+    try:
+        while True:
+            seconds = pool.batch_seconds()
+            while len(under_way) < pool.room():
+                batch = [given_back.popleft() for _ in range(min(size, len(given_back)))]
+                batch.extend(islice(source, size - len(batch)))
+                if not batch:
+                    break
+                future = pool.submit(partial(_do_batch, function, batch, seconds))
+                under_way[future] = batch
+                future.add_done_callback(finished.put)
+            yield from results  # workers have their next batches while the caller is busy
+            if not under_way:
+                return
+            future = _next(finished, pool)
+            batch = under_way.pop(future)
+            try:
+                results, spent = future.result()
+            except pool.killed:
+                results = []
+                suspects.extend(batch)
+            else:
+                given_back.extend(batch[len(results) :])
+                in_time = len(results) * seconds / max(spent, 1e-9)
+                size = int(min(max(in_time, 1), LARGEST_BATCH))
+    finally:
+        if under_way:
+            pool.abandon(under_way)
+
+
+def _next(finished: SimpleQueue[Future[Any]], pool: Pool) -> Future[Any]:
+    while True:
+        try:
+            return finished.get(timeout=_POLL_SECONDS)
+        except Empty:
+            pool.check()
+
+
+def _do_batch(
+    function: Callable[..., Result], tasks: list[Task], seconds: float
+) -> tuple[list[Result], float]:
+    """Return the results of the first task and of those that follow in time, and the time taken.
+
+    What is left is handed out again, so that no task waits for long behind a
+    slow one. So is a task that raises, unless it is the first: its error then
+    arrives as it is, after the results of those before it.
+    """
+    begin = time.perf_counter()
+    results: list[Result] = []
+    for task in tasks:
+        try:
+            results.append(function(*task))
+        except Exception:
+            if not results:
+                raise
+            break
+        if time.perf_counter() - begin >= seconds:
+            break
+    return results, time.perf_counter() - begin
