@@ -20,7 +20,7 @@ from slatprep.cli.commands import slatprep
 from slatprep.errors import StoreError
 from slatprep.inspect.verify import Finding, SourceRoots, verify_store
 from slatprep.pipeline.dataset import BuildSummary
-from slatprep.storage.files import list_files
+from slatprep.storage.files import local_files
 from slatprep.store import open_store
 
 
@@ -324,7 +324,7 @@ def shared(mixed_build: BuildSummary, tmp_path_factory: pytest.TempPathFactory) 
 @given(data=st.data())
 def test_any_changed_byte_is_found(shared: Path, data: st.DataObject) -> None:
     """Of the root's zarr.json only the layout may change: spaces between its words."""
-    names = sorted(list_files(shared))
+    names = sorted(local_files(shared))
     name = data.draw(st.sampled_from(names))
     original = (shared / name).read_bytes()
     at = data.draw(st.integers(0, len(original) - 1))
