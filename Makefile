@@ -82,7 +82,7 @@ test: $(VENV)/.installed-dev
 	exit $$status
 
 docs: $(VENV)/.installed-dev
-	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet --site-dir $(SITE)
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --site-dir $(SITE)
 	@echo "documentation: $(SITE)/index.html"
 
 wheel: $(VENV)/.installed-dev
