@@ -78,12 +78,12 @@ Example:
 @option(
     "--points",
     "ply: SLAT voxels, or the voxels of the PixieVerse field.  [default: slat]",
-    ChoiceOf("slatprep.export.ply:Points"),
+    ChoiceOf("slatprep.export.formats:Points"),
 )
 @option(
     "--frame",
     "ply: the SLAT's unit cube, or PixieVerse's world.  [default: slat]",
-    ChoiceOf("slatprep.export.ply:Frame"),
+    ChoiceOf("slatprep.export.formats:Frame"),
 )
 @option("--shard-size", "webdataset: assets a shard.  [default: 256]", POSITIVE)
 @jobs_option

@@ -7,60 +7,41 @@ complete.
 
 from __future__ import annotations
 
-import functools
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
+from importlib import import_module
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Any
 
 from slatprep.errors import ConfigError
 from slatprep.export import target
 from slatprep.export.assets import Exported, choose_ids, describe_columns
-from slatprep.export.bounds import Bounds, read_bounds
-from slatprep.export.ply import Frame, Points
+from slatprep.export.formats import ExportOptions, Writer
 from slatprep.records import Place
 from slatprep.storage.place import place_of, storage_of
-from slatprep.store import Store, StoredAsset, open_store
+from slatprep.store import Store, open_store
 from slatprep.workers.local import run_unordered
 
 __all__ = ["FORMATS", "ExportOptions", "ExportSummary", "export_store"]
 
-Format = Literal["ply", "hdf5", "webdataset", "npz"]
-FORMATS: tuple[str, ...] = get_args(Format)
-"""Names of the formats."""
+FORMATS = {
+    "ply": "slatprep.export.ply",
+    "hdf5": "slatprep.export.hdf5",
+    "webdataset": "slatprep.export.webdataset",
+    "npz": "slatprep.export.npz",
+}
+"""Name of each format and its module; to add one, add its line here.
+
+The module's ``writer`` takes the open store, the ids that go out and the
+`ExportOptions`, and returns a `Writer`.
+"""
 
 Progress = Callable[[int, int], None]
 """Called with the assets done and the assets in all."""
 
-_BATCH = 16
-"""Assets a worker takes at a time, so that opening the store does not count."""
-
-_Write = Callable[[Path, int, Iterable[StoredAsset]], Iterable[Exported]]
-"""Writes the assets of a batch, which has a number, below a directory."""
-
 _Entry = dict[str, Any]
 """An asset in the index of an export: its id, its file, its number of points."""
-
-
-@dataclass(frozen=True)
-class ExportOptions:
-    """What only some formats ask for.
-
-    Attributes
-    ----------
-    points : {"slat", "grid"}
-        PLY: the SLAT's voxels with the annotations found for them, or the
-        annotated voxels of the PixieVerse field.
-    frame : {"slat", "pixieverse"}
-        PLY: the unit cube of the SLAT, or the world of PixieVerse's bounds.
-    shard_size : int
-        WebDataset: assets in one shard.
-    """
-
-    points: Points = "slat"
-    frame: Frame = "slat"
-    shard_size: int = 256
 
 
 @dataclass(frozen=True)
@@ -80,7 +61,7 @@ class ExportSummary:
 def export_store(
     store: str | Place,
     out: str | Path,
-    format: Format,
+    format: str,
     *,
     assets: Sequence[str] = (),
     verdicts: Sequence[str] = (),
@@ -135,29 +116,25 @@ def export_store(
         raise ConfigError(f"{out} lies inside the store; expected a path outside {store}")
     ids = choose_ids(opened, assets, verdicts)
     tell = progress or (lambda done, total: None)
+    writer: Writer = import_module(FORMATS[format]).writer(opened, ids, options)
+    about = _about(opened, format)
     entries: list[_Entry] = []
-    notes: tuple[str, ...] = ()
-    if format == "hdf5":
-        from slatprep.export import hdf5
-
-        with target.file(out, hdf5.is_export) as file:
-            about = _about(opened, format)
-            for written in hdf5.write(file, about, map(opened.asset, ids)):
+    if writer.is_export is not None:
+        with target.file(out, writer.is_export) as file:
+            for written in writer.write(file, about, map(opened.asset, ids)):
                 entries.append(_entry(written))
                 tell(len(entries), len(ids))
     else:
         with target.directory(out) as directory:
-            write, batch, notes = _writer(format, opened, ids, options)
             tasks = (
-                (write, opened, directory, number, batched)
-                for number, batched in enumerate(_batches(ids, batch))
+                (writer.write, opened, directory, number, batched)
+                for number, batched in enumerate(_batches(ids, writer.batch))
             )
             for part in run_unordered(_write_batch, tasks, jobs):
                 entries += part
                 tell(len(entries), len(ids))
             entries.sort(key=lambda entry: str(entry["asset_id"]))
-            about = {**_about(opened, format), "notes": notes}
-            target.write_index(directory, about, entries)
+            target.write_index(directory, {**about, "notes": writer.notes}, entries)
     files = [out] if out.is_file() else [path for path in out.rglob("*") if path.is_file()]
     return ExportSummary(
         format=format,
@@ -167,36 +144,16 @@ def export_store(
         files=len(files),
         size=sum(path.stat().st_size for path in files),
         seconds=time.perf_counter() - begin,
-        notes=notes,
+        notes=writer.notes,
     )
-
-
-def _writer(
-    format: Format, store: Store, ids: Sequence[str], options: ExportOptions
-) -> tuple[_Write, int, tuple[str, ...]]:
-    """Return what writes a batch, how many assets a batch has, and what a person should know."""
-    from slatprep.export import npz, ply, webdataset
-
-    if format == "npz":
-        return npz.write, _BATCH, ()
-    if format == "webdataset":
-        return webdataset.write, options.shard_size, ()
-    bounds: dict[str, Bounds] = {}
-    notes: tuple[str, ...] = ()
-    if options.frame == "pixieverse":
-        bounds, notes = read_bounds(store, ids)
-    write = functools.partial(
-        ply.write,
-        points=options.points,
-        frame=options.frame,
-        bounds=bounds,
-        max_distance=float(store.attributes["build"]["parameters"]["sample"]["max_distance"]),
-    )
-    return write, _BATCH, notes
 
 
 def _write_batch(
-    write: _Write, store: Store, directory: Path, number: int, ids: Sequence[str]
+    write: Callable[..., Iterable[Exported]],
+    store: Store,
+    directory: Path,
+    number: int,
+    ids: Sequence[str],
 ) -> list[_Entry]:
     """Write a batch of assets, in a worker."""
     return [_entry(written) for written in write(directory, number, map(store.asset, ids))]
@@ -206,7 +163,7 @@ def _entry(written: Exported) -> _Entry:
     return {**describe_columns(written.asset), "file": written.file, "points": written.points}
 
 
-def _about(store: Store, format: Format) -> dict[str, Any]:
+def _about(store: Store, format: str) -> dict[str, Any]:
     """Return what every export says of the store it was made from, JSON-ready."""
     attributes = store.attributes
     return {

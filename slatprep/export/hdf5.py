@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
 from slatprep.export.assets import Exported, describe_columns, file_name
+from slatprep.export.formats import ExportOptions, Writer
 from slatprep.export.target import FORMAT
 from slatprep.records import PROPERTY_COLUMNS
-from slatprep.store import StoredAsset
+from slatprep.store import Store, StoredAsset
 
 _DATASETS: dict[str, dict[str, Any]] = {
     "coords": {"description": "SLAT coordinate, x, y, z", "units": "voxel"},
@@ -31,6 +32,11 @@ _DATASETS: dict[str, dict[str, Any]] = {
         "description": "PixieVerse frame to SLAT frame, both the unit cube [-0.5, 0.5]^3"
     },
 }
+
+
+def writer(store: Store, ids: Sequence[str], options: ExportOptions) -> Writer:
+    """Return what writes all assets into one file; see `slatprep.export.FORMATS`."""
+    return Writer(write, is_export=is_export)
 
 
 def write(path: Path, about: dict[str, Any], assets: Iterable[StoredAsset]) -> Iterator[Exported]:

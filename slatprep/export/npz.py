@@ -2,13 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
 
 from slatprep.export.assets import TARGETS, Exported, file_name
-from slatprep.store import StoredAsset
+from slatprep.export.formats import ExportOptions, Writer
+from slatprep.store import Store, StoredAsset
+
+
+def writer(store: Store, ids: Sequence[str], options: ExportOptions) -> Writer:
+    """Return what writes one npz an asset; see `slatprep.export.FORMATS`."""
+    return Writer(write)
 
 
 def write(directory: Path, number: int, assets: Iterable[StoredAsset]) -> Iterator[Exported]:

@@ -6,22 +6,20 @@ which its fork of PhysGaussian's solver loads (``load_point_cloud``).
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+import functools
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from slatprep.export.assets import Exported, file_name
-from slatprep.export.bounds import LAST, Bounds
+from slatprep.export.bounds import LAST, Bounds, read_bounds
+from slatprep.export.formats import ExportOptions, Frame, Points, Writer
 from slatprep.geometry.frames import apply_transform, invert_transform, voxel_centres
 from slatprep.inspect.pictures.palette import MATERIAL_COLOURS
 from slatprep.records import RESOLUTION
-from slatprep.store import StoredAsset
-
-Points = Literal["slat", "grid"]
-Frame = Literal["slat", "pixieverse"]
+from slatprep.store import Store, StoredAsset
 
 VERTEX = np.dtype(
     [
@@ -42,6 +40,20 @@ _COMMENTS = {
     "slat": "frame SLAT, unit cube -0.5..0.5, z up",
     "pixieverse": "frame PixieVerse, world coordinates of its bounds",
 }
+
+
+def writer(store: Store, ids: Sequence[str], options: ExportOptions) -> Writer:
+    """Return what writes one PLY an asset; see `slatprep.export.FORMATS`."""
+    bounds, notes = read_bounds(store, ids) if options.frame == "pixieverse" else ({}, ())
+    parameters = store.attributes["build"]["parameters"]
+    one = functools.partial(
+        write,
+        points=options.points,
+        frame=options.frame,
+        bounds=bounds,
+        max_distance=float(parameters["sample"]["max_distance"]),
+    )
+    return Writer(one, notes=notes)
 
 
 def write(

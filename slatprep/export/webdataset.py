@@ -4,14 +4,20 @@ from __future__ import annotations
 
 import io
 import tarfile
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
 import orjson
 
 from slatprep.export.assets import TARGETS, Exported, describe_columns, file_name
-from slatprep.store import StoredAsset
+from slatprep.export.formats import ExportOptions, Writer
+from slatprep.store import Store, StoredAsset
+
+
+def writer(store: Store, ids: Sequence[str], options: ExportOptions) -> Writer:
+    """Return what writes a shard of `options.shard_size` assets; see `slatprep.export.FORMATS`."""
+    return Writer(write, batch=options.shard_size)
 
 
 def write(directory: Path, number: int, assets: Iterable[StoredAsset]) -> Iterator[Exported]:
