@@ -1,7 +1,7 @@
 # `make` alone lists what there is; every target sets up what it needs.
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help align test lint docs wheel lock clean
+.PHONY: help align test lint docs schema wheel lock clean
 
 PYTHON ?= python3
 VENV   ?= .venv
@@ -28,6 +28,7 @@ help:
 	@echo "  make test             linters, type checker, documentation, wheel and tests"
 	@echo "  make lint             linters and type checker alone"
 	@echo "  make docs             the documentation as a site, in $(SITE)"
+	@echo "  make schema           the JSON Schemas of the records, from their classes"
 	@echo "  make wheel            a wheel, in dist, tried from another folder"
 	@echo "  make lock             resolve the versions in requirements/ anew"
 	@echo "  make clean            remove the environment, the demo data and caches; never your stores"
@@ -84,6 +85,9 @@ test: $(VENV)/.installed-dev
 docs: $(VENV)/.installed-dev
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --site-dir $(SITE)
 	@echo "documentation: $(SITE)/index.html"
+
+schema: $(VENV)/.installed-dev
+	$(BIN)/python -m slatprep.provenance.schemas
 
 wheel: $(VENV)/.installed-dev
 	sh tools/try-wheel.sh $(BIN)/python dist

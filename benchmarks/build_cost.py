@@ -30,7 +30,7 @@ from slatprep.pipeline import dataset as build
 from slatprep.readers import discover
 from slatprep.store.layout import create_arrays
 
-STEPS = ("read_field", "read_latents", "align", "sample", "measure_ambiguity", "judge")
+STEPS = ("read_field", "read_latents", "align", "sample", "judge")
 
 
 def main() -> None:
@@ -48,13 +48,13 @@ def main() -> None:
 
 
 def measure(parameters: BuildParameters, folder: Path, jobs: bool) -> dict[str, Any]:
-    pairs = list(discover(parameters))
+    pairs = discover(parameters)
     for pair in pairs[:3]:
         process.process_asset(pair, parameters)
     steps: dict[str, float] = defaultdict(float)
     for name in STEPS:
         setattr(process, name, timed(getattr(process, name), steps, name))
-    for name in ("finish_asset", "_pack", "replace_directory"):
+    for name in ("finish_asset", "pack_store", "replace_directory"):
         setattr(build, name, timed(getattr(build, name), steps, name))
     begin = cpu()
     summary = build.build_store(parameters, folder / "s.zarr")
@@ -74,7 +74,7 @@ def measure(parameters: BuildParameters, folder: Path, jobs: bool) -> dict[str, 
         "ratio": round(whole / least, 2),
         **{f"{name} [CPU ms/asset]": per_asset(steps[name]) for name in STEPS},
         "spool and records [CPU ms/asset]": per_asset(steps["finish_asset"] - inside),
-        "pack [CPU ms/asset]": per_asset(steps["_pack"]),
+        "pack [CPU ms/asset]": per_asset(steps["pack_store"]),
         "flush and replace [CPU ms/asset]": per_asset(steps["replace_directory"]),
         "peak memory of this process [MB]": round(
             resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024

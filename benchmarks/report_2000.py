@@ -27,7 +27,7 @@ import zarr
 
 from slatprep.inspect.report import write_report
 from slatprep.parameters import StoreParameters
-from slatprep.pipeline.dataset import default_manifests
+from slatprep.provenance.places import manifests_of
 from slatprep.store import open_store
 from slatprep.store.layout import ARRAYS, create_arrays
 
@@ -86,10 +86,10 @@ def repeat_store(source: Path, folder: Path, assets: int, noise: float) -> tuple
                 values += rng.normal(scale=noise, size=values.shape).astype(np.float32)
                 np.clip(values, -1, 1, out=values)
             root[name][:] = values
-    manifests = default_manifests(path)
+    manifests = manifests_of(path)
     manifests.mkdir()
-    shutil.copy(default_manifests(source) / "build.json", manifests)
-    with (default_manifests(source) / "assets.jsonl").open(encoding="utf-8") as lines:
+    shutil.copy(manifests_of(source) / "build.json", manifests)
+    with (manifests_of(source) / "assets.jsonl").open(encoding="utf-8") as lines:
         records = {record["asset_id"]: record for record in map(json.loads, lines)}
     with (manifests / "assets.jsonl").open("w", encoding="utf-8") as file:
         for asset_id, k in zip(ids, chosen, strict=True):

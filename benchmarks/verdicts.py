@@ -31,7 +31,7 @@ from slatprep.align import align, field
 from slatprep.align.quality import measure_quality
 from slatprep.bench.truth import read_truth
 from slatprep.geometry.frames import displacement
-from slatprep.judge import judge
+from slatprep.judge import verdict_of
 from slatprep.parameters import (
     AlignParameters,
     BuildParameters,
@@ -63,7 +63,7 @@ def main(folders: list[str]) -> None:
     def judged(kind: str, material_field, latents, transform) -> None:
         quality = measure_quality(material_field, latents, transform, 1.0)
         annotation = sample(material_field, latents.coords, transform, SampleParameters())
-        verdict, _ = judge(quality, float(annotation.valid.mean()), None)
+        verdict, _ = verdict_of(quality, float(annotation.valid.mean()))
         verdicts[kind][str(verdict)] += 1
         lower[kind].append(min(quality.fitness, quality.fitness_backward))
 

@@ -16,10 +16,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
+import orjson
 from numpy.typing import NDArray
 
 from slatprep.errors import ConfigError, InputError, SlatprepError
-from slatprep.provenance.jsonable import jsonable
 from slatprep.readers.patterns import NAME
 from slatprep.readers.slat import LATENT_CHANNELS, check_coords
 from slatprep.storage.atomic import staged
@@ -218,21 +218,22 @@ def extract(
 def _extract(session: Session, job: Job, preprocess: bool) -> Extracted:
     data, image = _read_image(job.image)
     pipeline = session.pipeline
-    record: dict[str, Any] = jsonable(
-        {
-            "format": FORMAT,
-            "format_version": 1,
-            "slatprep": metadata.version("slatprep"),
-            "image": {"name": job.image.name, "sha256": hashlib.sha256(data).hexdigest()},
-            "seed": job.seed,
-            "preprocessed": preprocess,
-            "model": session.model,
-            "sparse_structure_sampler_params": dict(pipeline.sparse_structure_sampler_params),
-            "slat_sampler_params": dict(pipeline.slat_sampler_params),
-            "slat_normalization": dict(pipeline.slat_normalization),
-            "feats": _LATENTS,
-        }
-    )
+    document = {
+        "format": FORMAT,
+        "format_version": 1,
+        "slatprep": metadata.version("slatprep"),
+        "image": {"name": job.image.name, "sha256": hashlib.sha256(data).hexdigest()},
+        "seed": job.seed,
+        "preprocessed": preprocess,
+        "model": session.model,
+        "sparse_structure_sampler_params": dict(pipeline.sparse_structure_sampler_params),
+        "slat_sampler_params": dict(pipeline.slat_sampler_params),
+        "slat_normalization": dict(pipeline.slat_normalization),
+        "feats": _LATENTS,
+    }
+    # As it is read again, to be compared with: lists for tuples and arrays.
+    text = orjson.dumps(document, option=orjson.OPT_SERIALIZE_NUMPY)
+    record: dict[str, Any] = orjson.loads(text)
     if job.slat.exists():
         return _kept(job, record)
     coords, feats = _run(session, image, job.seed, preprocess)

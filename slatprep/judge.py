@@ -1,4 +1,4 @@
-"""What distinct, about equally good placements mean for the supervision."""
+"""What an alignment is worth: what ties would change in the labels, and a verdict in one word."""
 
 from __future__ import annotations
 
@@ -12,12 +12,74 @@ from slatprep.records import (
     Alignment,
     Ambiguity,
     Annotation,
+    Judgement,
     MaterialField,
     Quality,
     StructuredLatents,
     Verdict,
 )
 from slatprep.sample import Lookup
+
+
+@dataclass(frozen=True)
+class Thresholds:
+    """Where the verdicts part; docs/quality.md says how the numbers were chosen.
+
+    Attributes
+    ----------
+    good_fitness, failed_fitness : float
+        The lower one of the two fitnesses: at least the first is good, below
+        the second is failed.
+    good_valid_share : float
+        Share of SLAT voxels with an annotation; below it the asset is doubtful.
+    good_ambiguity : float
+        Share of SLAT voxels whose class depends on the choice among placements
+        that fit equally well; above it the asset is doubtful.
+    """
+
+    good_fitness: float = 0.8
+    failed_fitness: float = 0.65
+    good_valid_share: float = 0.9
+    good_ambiguity: float = 0.05
+
+
+THRESHOLDS = Thresholds()
+"""The thresholds of `verdict_of`."""
+
+
+def judge(
+    field: MaterialField,
+    latents: StructuredLatents,
+    alignment: Alignment,
+    annotation: Annotation,
+    parameters: SampleParameters,
+) -> Judgement:
+    """Say what the alignment of an asset is worth.
+
+    Parameters
+    ----------
+    field, latents : MaterialField, StructuredLatents
+        The two sides of the asset.
+    alignment : Alignment
+        Its alignment; ``placements`` are the ones that tie with the best.
+    annotation : Annotation
+        What was looked up under its transform.
+    parameters : SampleParameters
+        How annotations are looked up.
+
+    Returns
+    -------
+    Judgement
+        What ties would change, the verdict, and what kept it from being good.
+    """
+    ambiguity = measure_ambiguity(field, latents, alignment, annotation, parameters)
+    verdict, reasons = verdict_of(
+        alignment.quality,
+        float(annotation.valid.mean()),
+        ambiguity.material_share,
+        len(alignment.placements),
+    )
+    return Judgement(ambiguity, verdict, reasons)
 
 
 def measure_ambiguity(
@@ -62,39 +124,11 @@ def measure_ambiguity(
     return Ambiguity(
         material_share=float(differs.mean()),
         property_change=(float(change[0]), float(change[1]), float(change[2])),
-        margin=alignment.margin,
-        placements=alignment.placements,
     )
 
 
-@dataclass(frozen=True)
-class Thresholds:
-    """Where the verdicts part; docs/quality.md says how the numbers were chosen.
-
-    Attributes
-    ----------
-    good_fitness, failed_fitness : float
-        The lower one of the two fitnesses: at least the first is good, below
-        the second is failed.
-    good_valid_share : float
-        Share of SLAT voxels with an annotation; below it the asset is doubtful.
-    good_ambiguity : float
-        Share of SLAT voxels whose class depends on the choice among placements
-        that fit equally well; above it the asset is doubtful.
-    """
-
-    good_fitness: float = 0.8
-    failed_fitness: float = 0.65
-    good_valid_share: float = 0.9
-    good_ambiguity: float = 0.05
-
-
-THRESHOLDS = Thresholds()
-"""The thresholds of `judge`."""
-
-
-def judge(
-    quality: Quality, valid_share: float, ambiguity: Ambiguity | None
+def verdict_of(
+    quality: Quality, valid_share: float, ambiguity: float = 0.0, ties: int = 0
 ) -> tuple[Verdict, tuple[str, ...]]:
     """Say what an alignment is worth, and why.
 
@@ -104,8 +138,10 @@ def judge(
         How well the two surfaces lie on each other.
     valid_share : float
         Share of SLAT voxels that got an annotation, 0..1.
-    ambiguity : Ambiguity or None
-        What tied placements would change; None where it was not measured.
+    ambiguity : float
+        Share of SLAT voxels whose class depends on the choice among ties, 0..1.
+    ties : int
+        How many placements tie with the one chosen; 0 where that is not known.
 
     Returns
     -------
@@ -133,12 +169,11 @@ def judge(
             f"only {valid_share:.1%} of the SLAT voxels found an annotation "
             f"(good: {limits.good_valid_share:.0%})"
         )
-    if ambiguity is not None and ambiguity.material_share > limits.good_ambiguity:
-        # A store holds the ambiguity without the placements it comes from.
-        count = f"{len(ambiguity.placements)} other" if ambiguity.placements else "other"
+    if ambiguity > limits.good_ambiguity:
+        count = f"{ties} other" if ties else "other"
         reasons.append(
             f"{count} placements fit about as well and would change the "
-            f"class of {ambiguity.material_share:.1%} of the voxels "
+            f"class of {ambiguity:.1%} of the voxels "
             f"(good: {limits.good_ambiguity:.0%})"
         )
     if failed:

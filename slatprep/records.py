@@ -2,7 +2,8 @@
 
 Two source files become rows of the store through read, align, sample,
 normalise and pack. Each stage takes the records of the one before it and
-returns its own; none of these classes touches a disk.
+returns its own; none of these classes touches a disk. Classes that hold arrays
+compare by identity.
 
 Frames: the *PixieVerse frame* and the *SLAT frame* are both the unit cube
 [-0.5, 0.5]^3 with voxel ``i`` centred at ``(i + 0.5) / 64 - 0.5`` on each axis.
@@ -10,11 +11,12 @@ Frames: the *PixieVerse frame* and the *SLAT frame* are both the unit cube
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from enum import StrEnum
-from typing import IO, Any, Protocol, Self
+from typing import IO, Annotated, Any, Literal, Protocol, Self
 
 import numpy as np
+from annotated_types import Ge, Le
 from numpy.typing import NDArray
 
 RESOLUTION = 64
@@ -40,6 +42,76 @@ UNANNOTATED = 255
 
 PROPERTY_COLUMNS = ("youngs_modulus", "density", "poissons_ratio")
 """Order of the property columns everywhere in slatprep; SI units are Pa, kg/m^3, none."""
+
+
+@dataclass(frozen=True)
+class InJson:
+    """How pydantic reads an annotated field: by a core schema, and a function on its result."""
+
+    schema: Any
+    then: Any = None
+
+    def __get_pydantic_core_schema__(self, source: object, handler: object) -> Any:
+        """Return the schema; see pydantic's documentation of custom types."""
+        if self.then is None:
+            return self.schema
+        function = {"type": "no-info", "function": self.then}
+        return {"type": "function-after", "function": function, "schema": self.schema}
+
+
+def _matrix(size: int) -> InJson:
+    row = {"type": "list", "items_schema": {"type": "float"}}
+    length = {"min_length": size, "max_length": size}
+    return InJson({"type": "list", "items_schema": row | length} | length, np.array)
+
+
+def _one_of(*words: str) -> InJson:
+    return InJson({"type": "literal", "expected": list(words)})
+
+
+def _null_is_nan(value: float | None) -> float:
+    return float("nan") if value is None else value
+
+
+Share = Annotated[float, Ge(0), Le(1)]
+"""A share, 0 to 1."""
+
+Count = Annotated[int, Ge(0)]
+"""How many."""
+
+Number = Annotated[float, InJson({"type": "nullable", "schema": {"type": "float"}}, _null_is_nan)]
+"""A number that may be NaN, which is null in JSON."""
+
+Digest = Annotated[str, InJson({"type": "str", "pattern": "^[0-9a-f]{64}$"})]
+"""SHA-256 in hex."""
+
+Transform = Annotated[NDArray[np.float64], _matrix(4)]
+"""Homogeneous, (4, 4): PixieVerse frame to SLAT frame."""
+
+Rotation = Annotated[NDArray[np.float64], _matrix(3)]
+"""(3, 3), orthogonal."""
+
+
+class Engine(StrEnum):
+    """What finds the transform."""
+
+    FIELD = "field"
+    OPEN3D = "open3d"
+    SMALL_GICP = "small_gicp"
+
+
+class Model(StrEnum):
+    """Which transforms are allowed: with the scale fixed at one, or free."""
+
+    RIGID = "rigid"
+    SIMILARITY = "similarity"
+
+
+class Search(StrEnum):
+    """The start orientations that were needed: 64 quarter turns, or all orientations."""
+
+    EULER64 = "euler64"
+    SO3 = "so3"
 
 
 class Verdict(StrEnum):
@@ -112,19 +184,23 @@ class Place(Protocol):
 
 @dataclass(frozen=True)
 class SourceFile:
-    """A file that was read, as the provenance remembers it.
+    """A file that was read; ``path`` is relative to its source's root, with forward slashes."""
 
-    ``path`` is relative to the root of its source, with forward slashes;
-    ``role`` is one of ``grid``, ``mask``, ``bounds``, ``slat``.
-    """
-
-    role: str
+    role: Annotated[str, _one_of("grid", "mask", "bounds", "slat")]
     path: str
-    size: int
-    sha256: str
+    size: Count
+    sha256: Digest
 
 
 @dataclass(frozen=True)
+class SourceRoots:
+    """The folders below which all files of the two sources lie."""
+
+    pixieverse: Place
+    slat: Place
+
+
+@dataclass(frozen=True, slots=True)
 class AssetPair:
     """Where the two sides of one row of the store lie; nothing has been read yet.
 
@@ -139,8 +215,8 @@ class AssetPair:
         The image or seed the SLAT was made from; empty where there is one only.
     category : str
         PixieVerse category; empty where unknown.
-    pixieverse_root, slat_root : Place
-        The roots below which the files must lie.
+    roots : SourceRoots
+        The roots below which the files must lie; one object for all pairs.
     grid, mask, bounds : Place or None
         PixieVerse files, absolute; ``grid`` is None where the partner is missing.
     slat : Place or None
@@ -156,8 +232,7 @@ class AssetPair:
     object_id: str
     view: str
     category: str
-    pixieverse_root: Place
-    slat_root: Place
+    roots: SourceRoots
     grid: Place | None
     mask: Place | None
     bounds: Place | None
@@ -166,7 +241,7 @@ class AssetPair:
     problem: str = ""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class MaterialField:
     """A PixieVerse field: what occupies the grid and what it is made of, in SI units.
 
@@ -197,7 +272,7 @@ class MaterialField:
     warnings: tuple[str, ...] = ()
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class StructuredLatents:
     """A TRELLIS SLAT: occupied surface voxels and their latents.
 
@@ -220,11 +295,11 @@ class Candidate:
     computed in its stead, or None. Fitness is in 0..1, rmse in voxels.
     """
 
-    index: int
+    index: Count
     euler_degrees: tuple[float, float, float] | None
-    fitness: float
-    inlier_rmse: float
-    same_as: int | None = None
+    fitness: Number
+    inlier_rmse: Number
+    same_as: Count | None = None
 
 
 @dataclass(frozen=True)
@@ -237,21 +312,25 @@ class Quality:
     SLAT frame.
     """
 
-    fitness: float
+    fitness: Share
     inlier_rmse: float
-    fitness_backward: float
+    fitness_backward: Share
     inlier_rmse_backward: float
-    overlap: float
+    overlap: Share
     radius: float
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Placement:
-    """A distinct placement that fits about as well as the best one."""
+    """A distinct placement that fits about as well as the best one.
 
-    transform: NDArray[np.float64]
-    score: float
-    displacement: float
+    ``displacement`` is the largest distance, in voxels, between a SLAT voxel's
+    positions in the two.
+    """
+
+    transform: Transform
+    score: Number
+    displacement: Number
 
 
 @dataclass(frozen=True)
@@ -260,27 +339,33 @@ class Ambiguity:
 
     ``material_share`` is the share of SLAT voxels whose class differs in any
     of them from the best placement's; ``property_change`` is the largest mean
-    absolute change of each normalised property (Young's modulus, density,
-    Poisson's ratio). ``margin`` is the score's distance to the next distinct
-    placement, tied or not. Both are 0 where nothing is tied.
+    absolute change of log10 Young's modulus, log10 density and Poisson's
+    ratio. All are 0 where nothing is tied.
     """
 
-    material_share: float
-    property_change: tuple[float, float, float]
-    margin: float
-    placements: tuple[Placement, ...] = ()
+    material_share: Share
+    property_change: tuple[Number, Number, Number]
 
 
 @dataclass(frozen=True)
+class Judgement:
+    """What an alignment is worth; ``reasons`` say what kept it from being good."""
+
+    ambiguity: Ambiguity
+    verdict: Verdict
+    reasons: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, eq=False)
 class Consensus:
     """The rotation (3, 3) that `agreeing` of `winners` assets without a tie have in common."""
 
-    rotation: NDArray[np.float64]
-    winners: int
-    agreeing: int
+    rotation: Rotation
+    winners: Annotated[int, Ge(1)]
+    agreeing: Annotated[int, Ge(1)]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Alignment:
     """The transform from the PixieVerse frame to the SLAT frame, and how it was found.
 
@@ -289,12 +374,12 @@ class Alignment:
     transform : ndarray of float64, shape (4, 4)
         Homogeneous, PixieVerse frame to SLAT frame (a column vector is
         multiplied from the left).
-    engine : str
-        Name of the engine that found it.
-    model : str
-        ``rigid`` or ``similarity``.
-    search : str
-        ``euler64`` or ``so3``: the starts that were needed.
+    engine : Engine
+        The engine that found it.
+    model : Model
+        Whether the scale is one.
+    search : Search
+        The starts that were needed.
     quality : Quality
         How well the two voxel sets lie on each other.
     candidates : tuple of Candidate
@@ -310,19 +395,19 @@ class Alignment:
         The dataset's common rotation, where it chose among tied placements.
     """
 
-    transform: NDArray[np.float64]
-    engine: str
-    model: str
-    search: str
+    transform: Transform
+    engine: Engine
+    model: Model
+    search: Search
     quality: Quality
     candidates: tuple[Candidate, ...] = ()
-    margin: float = float("nan")
+    margin: Number = float("nan")
     placements: tuple[Placement, ...] = ()
-    score: float = float("nan")
+    score: Number = float("nan")
     settled_by: Consensus | None = None
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Annotation:
     """Material and properties looked up at every SLAT voxel, in SI units.
 
@@ -346,7 +431,7 @@ class PropertyRange:
     ``log10`` is true, the SI value itself otherwise.
     """
 
-    name: str
+    name: Annotated[str, _one_of(*PROPERTY_COLUMNS)]
     log10: bool
     lo: float
     hi: float
@@ -363,23 +448,27 @@ class Normalization:
     source: str
 
 
-@dataclass(frozen=True)
-class AssetResult:
-    """What one asset's task hands to the packing stage.
+@dataclass(frozen=True, eq=False)
+class Finished:
+    """An asset that went through all stages; properties in SI units."""
 
-    Everything from `field` on is None where ``status`` is not ``ok``; then
-    ``reason`` says in one line why. ``record`` is the asset's provenance,
-    JSON-ready.
+    pair: AssetPair
+    field: MaterialField
+    latents: StructuredLatents
+    alignment: Alignment
+    annotation: Annotation
+    judgement: Judgement
+
+
+@dataclass(frozen=True)
+class Failed:
+    """An asset that cannot go in.
+
+    ``reason`` says why in one line; ``traceback`` where, if slatprep itself is
+    at fault.
     """
 
     pair: AssetPair
-    status: Status
-    reason: str = ""
-    record: dict[str, object] = field(default_factory=dict)
-    field: MaterialField | None = None
-    latents: StructuredLatents | None = None
-    alignment: Alignment | None = None
-    annotation: Annotation | None = None
-    ambiguity: Ambiguity | None = None
-    verdict: Verdict | None = None
-    verdict_reasons: tuple[str, ...] = ()
+    status: Literal[Status.FAILED, Status.SKIPPED]
+    reason: str
+    traceback: str = ""

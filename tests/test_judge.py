@@ -8,30 +8,32 @@ from support.shapes import GRID, chair, field_of, surface_latents
 from slatprep.align import align
 from slatprep.judge import measure_ambiguity
 from slatprep.parameters import AlignParameters, SampleParameters
-from slatprep.records import Ambiguity
+from slatprep.records import Alignment, Ambiguity
 from slatprep.sample import sample
 
 BALL = ((GRID - 31.5) ** 2).sum(axis=-1) < 20**2
 
 
-def _ambiguity(occupancy: np.ndarray, material: np.ndarray | None = None) -> Ambiguity:
+def _ambiguity(
+    occupancy: np.ndarray, material: np.ndarray | None = None
+) -> tuple[Alignment, Ambiguity]:
     field, latents = field_of(occupancy, material), surface_latents(occupancy)
     alignment = align(field, latents, AlignParameters())
     annotation = sample(field, latents.coords, alignment.transform, SampleParameters())
-    return measure_ambiguity(field, latents, alignment, annotation, SampleParameters())
+    return alignment, measure_ambiguity(field, latents, alignment, annotation, SampleParameters())
 
 
 def test_a_ball_of_one_material_is_ambiguous_and_harmless() -> None:
-    ambiguity = _ambiguity(BALL)
-    assert len(ambiguity.placements) == 23  # all other quarter turns
-    assert ambiguity.margin < 1e-6
+    alignment, ambiguity = _ambiguity(BALL)
+    assert len(alignment.placements) == 23  # all other quarter turns
+    assert alignment.margin < 1e-6
     assert ambiguity.material_share == 0.0
     assert ambiguity.property_change == (0.0, 0.0, 0.0)
 
 
 def test_a_ball_with_a_painted_half_is_not_harmless() -> None:
     painted = np.where(GRID[..., 2] < 32, 1, 3)
-    ambiguity = _ambiguity(BALL, painted)
+    _, ambiguity = _ambiguity(BALL, painted)
     # Turned upside down every voxel changes class: E by two decades, density
     # from 200 to 400, Poisson's ratio by 0.02.
     assert ambiguity.material_share == 1.0
@@ -44,16 +46,16 @@ def test_a_box_with_a_painted_end_by_hand() -> None:
     box = np.zeros((64, 64, 64), dtype=bool)
     box[12:52, 22:42, 27:37] = True
     painted = np.where(GRID[..., 0] < 20, 2, 1)  # 8 of 40 layers
-    ambiguity = _ambiguity(box, painted)
-    assert len(ambiguity.placements) == 3
-    assert all(p.displacement > 5 for p in ambiguity.placements)
+    alignment, ambiguity = _ambiguity(box, painted)
+    assert len(alignment.placements) == 3
+    assert all(p.displacement > 5 for p in alignment.placements)
     surface = surface_latents(box).coords
     expected = ((surface[:, 0] < 20) | (surface[:, 0] >= 44)).mean()
     assert ambiguity.material_share == np.float64(expected)
 
 
 def test_a_chair_has_one_placement() -> None:
-    ambiguity = _ambiguity(chair(), np.where(GRID[..., 2] < 32, 1, 3))
-    assert ambiguity.placements == ()
+    alignment, ambiguity = _ambiguity(chair(), np.where(GRID[..., 2] < 32, 1, 3))
+    assert alignment.placements == ()
     assert ambiguity.material_share == 0.0
-    assert ambiguity.margin > 0.1
+    assert alignment.margin > 0.1

@@ -27,8 +27,11 @@ from slatprep.geometry.voxels import occupancy_of
 from slatprep.parameters import AlignParameters
 from slatprep.records import (
     Alignment,
+    Engine,
     MaterialField,
+    Model,
     Placement,
+    Search,
     StructuredLatents,
 )
 
@@ -100,9 +103,9 @@ def align(
     starts = distinct_starts()
     fits = pair.refine(pair.poses(s.rotation for s in starts), COARSE_SAMPLES, COARSE_TAUS, 0.02)
     poses = pair.polish(fits)
-    search = "euler64"
+    search = Search.EULER64
     if _is_poor(poses):
-        search = "so3"
+        search = Search.SO3
         wide = pair.polish(pair.search_all())
         if wide[0].score > poses[0].score + WIDER_GAIN:
             poses = pair.distinct([*poses, *wide])
@@ -116,7 +119,7 @@ def align(
     transform = best.transform
     return Alignment(
         transform=transform,
-        engine="field",
+        engine=Engine.FIELD,
         model=model,
         search=search,
         quality=compare(pair.pixie.boundary, pair.slat.boundary, transform, parameters.radius),
@@ -211,17 +214,17 @@ class _Pair:
         survivors = survivors[: min(max(SURVIVORS, len(likely)), MOST_SURVIVORS)]
         return self.distinct(self.refine(survivors, POLISH_SAMPLES, POLISH_TAUS, 0.01))
 
-    def simplest(self, pose: Pose) -> tuple[Pose, str]:
+    def simplest(self, pose: Pose) -> tuple[Pose, Model]:
         """Return the pose with its scale set to one where that fits as well, and the model."""
         model = self.parameters.model
         if model != "auto":
-            return pose, model
+            return pose, Model(model)
         if abs(pose.scale - 1.0) < RIGID_IF_SCALE_WITHIN:
             start = Pose(pose.rotation, self._rescaled_shift(pose), 1.0, pose.offset)
             (rigid,) = self.refine([start], FINE_SAMPLES, FINE_TAUS, 0.002, free_scale=False)
             if rigid.score >= pose.score - RIGID_LOSS:
-                return rigid, "rigid"
-        return pose, "similarity"
+                return rigid, Model.RIGID
+        return pose, Model.SIMILARITY
 
     def _rescaled_shift(self, pose: Pose) -> NDArray[np.float64]:
         centre = self._mean

@@ -19,7 +19,15 @@ from slatprep.align.starts import candidates_of, distinct_starts
 from slatprep.geometry.frames import VOXEL_SIZE, make_transform, voxel_centres
 from slatprep.geometry.voxels import boundary, voxels_of
 from slatprep.parameters import AlignParameters
-from slatprep.records import RESOLUTION, Alignment, MaterialField, StructuredLatents
+from slatprep.records import (
+    RESOLUTION,
+    Alignment,
+    Engine,
+    MaterialField,
+    Model,
+    Search,
+    StructuredLatents,
+)
 
 THINNED = 2.0
 """Voxels; the starts run on clouds thinned to one point in a cube of this edge."""
@@ -58,9 +66,9 @@ def align(
     transform = _in_unit_cube(gicp(target, source, fits[best][2]))
     return Alignment(
         transform=transform,
-        engine="small_gicp",
-        model="rigid",
-        search="euler64",
+        engine=Engine.SMALL_GICP,
+        model=Model.RIGID,
+        search=Search.EULER64,
         quality=measure_quality(field, latents, transform, parameters.radius),
         candidates=candidates_of({index: fit[:2] for index, fit in fits.items()}),
     )

@@ -21,7 +21,14 @@ from slatprep.align.starts import Start, candidates_of, distinct_starts
 from slatprep.geometry.frames import VOXEL_SIZE, make_transform, voxel_centres
 from slatprep.geometry.voxels import boundary, voxels_of
 from slatprep.parameters import AlignParameters
-from slatprep.records import Alignment, MaterialField, StructuredLatents
+from slatprep.records import (
+    Alignment,
+    Engine,
+    MaterialField,
+    Model,
+    Search,
+    StructuredLatents,
+)
 from slatprep.workers.local import single_threaded
 
 
@@ -71,9 +78,9 @@ def _align(
 
     return Alignment(
         transform=transform,
-        engine="open3d",
-        model="rigid",
-        search="euler64",
+        engine=Engine.OPEN3D,
+        model=Model.RIGID,
+        search=Search.EULER64,
         quality=measure_quality(field, latents, transform, parameters.radius),
         candidates=candidates_of({index: fit[:2] for index, fit in fits.items()}),
     )

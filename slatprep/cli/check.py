@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from slatprep.cli.options import FOLDER, POSITIVE, beside, chosen_store, option, store_option
+from slatprep.cli.options import POSITIVE, beside, chosen_store, option, store_option
 from slatprep.cli.output import EXIT_INCOMPLETE, Cell, Output, output_options
 from slatprep.errors import ConfigError, StoreError
 
@@ -45,7 +45,6 @@ Example:
     metavar="PATH|none",
 )
 @option("--show", "Open it in Open3D's viewer, where there is a screen.", is_flag=True)
-@option("--manifests", "Folder of the build's records, if neither in nor beside the store.", FOLDER)
 @output_options
 def check_alignment(
     output: Output,
@@ -55,7 +54,6 @@ def check_alignment(
     store: Place | None,
     picture: str | None,
     show: bool,
-    manifests: Path | None,
 ) -> None:
     """Say and show whether the alignment of an asset is good.
 
@@ -84,9 +82,7 @@ def check_alignment(
         from slatprep.inspect.pictures.write import write_pictures
 
         with output.progress("pictures") as progress:
-            pictures, sheet = write_pictures(
-                opened, checks, target, manifests=manifests, progress=progress
-            )
+            pictures, sheet = write_pictures(opened, checks, target, progress=progress)
 
     def print_all() -> None:
         _print(output, checks)

@@ -48,13 +48,13 @@ def report(
     that `make align` built last under data/ is taken.
     """
     from slatprep.inspect.report import write_report
-    from slatprep.pipeline.dataset import default_manifests
+    from slatprep.provenance.places import manifests_of
     from slatprep.store import open_store
 
     opened = open_store(store)
     name = store.name.removesuffix(".zarr")
     if manifests is None:
-        usual = (default_manifests(opened.path), Path("manifests/build") / name)
+        usual = (manifests_of(opened.path), Path("manifests/build") / name)
         manifests = next((folder for folder in usual if folder.is_dir()), None)
     if manifests is None:
         output.problem(

@@ -40,12 +40,12 @@ def read_bounds(store: Store, ids: Sequence[str]) -> tuple[dict[str, Bounds], tu
     StoreError
         If a record's bounds make no sense.
     """
-    from slatprep.store.records import StoredRecords
+    from slatprep.provenance.stored import StoredRecords
 
     records = StoredRecords(store)
     bounds, missing = {}, 0
     for asset_id in ids:
-        stated = (records.find(asset_id) or {}).get("bounds")
+        stated = records.of(asset_id).bounds
         missing += not stated
         bounds[asset_id] = _bounds(stated, store, asset_id) if stated else UNIT_CUBE
     notes: tuple[str, ...] = ()

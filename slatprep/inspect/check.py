@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 
 from slatprep.align.quality import measure_quality
 from slatprep.errors import StoreError
-from slatprep.judge import THRESHOLDS, judge
+from slatprep.judge import THRESHOLDS, verdict_of
 from slatprep.normalize import normalize
 from slatprep.parameters import SampleParameters
-from slatprep.records import Ambiguity, StructuredLatents, Verdict
+from slatprep.records import StructuredLatents, Verdict
 from slatprep.sample import sample
 from slatprep.store.reader import Store, StoredAsset
 
@@ -164,21 +164,16 @@ def check_alignment(store: Store, asset_id: str) -> AlignmentCheck:
     latents = StructuredLatents(asset.coords, asset.feats)
     quality = measure_quality(asset.field, latents, asset.transform, radius)
     columns = asset.columns
-    change = columns["property_ambiguity"]
-    ambiguity = Ambiguity(
-        material_share=float(columns["ambiguity"]),
-        property_change=(float(change[0]), float(change[1]), float(change[2])),
-        margin=float(columns["margin"]),
-    )
-    verdict, reasons = judge(quality, valid_share, ambiguity)
+    ambiguity, margin = float(columns["ambiguity"]), float(columns["margin"])
+    verdict, reasons = verdict_of(quality, valid_share, ambiguity)
     figures = [
         Figure(name, getattr(quality, name), float(columns[name]), QUALITY_TOLERANCE)
         for name in _QUALITY
     ]
     figures += [
         Figure("valid_share", valid_share, float(columns["valid_share"]), QUALITY_TOLERANCE),
-        Figure("ambiguity", ambiguity.material_share, ambiguity.material_share, 0),
-        Figure("margin", ambiguity.margin, ambiguity.margin, 0),
+        Figure("ambiguity", ambiguity, ambiguity, 0),
+        Figure("margin", margin, margin, 0),
         Figure("voxels with another valid", differs["voxel/valid"].sum(), 0, 0),
         Figure("voxels with another material", differs["voxel/material"].sum(), 0, 0),
         *(

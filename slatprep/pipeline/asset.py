@@ -9,33 +9,27 @@ from __future__ import annotations
 
 import time
 import traceback
-from collections.abc import Mapping
-from dataclasses import dataclass, replace
-from typing import Any
 
 from slatprep.align import align
 from slatprep.errors import MissingPartnerError, SlatprepError
-from slatprep.judge import judge, measure_ambiguity
+from slatprep.judge import judge
 from slatprep.parameters import BuildParameters
-from slatprep.pipeline.plan import Action, PlannedAsset, previous_record
+from slatprep.pipeline.context import BuildContext
+from slatprep.pipeline.plan import Action, PlannedAsset
 from slatprep.pipeline.recipe import Recipe
-from slatprep.pipeline.spool import Spool, SpooledAsset, key_of_failed
-from slatprep.provenance import record as provenance
+from slatprep.pipeline.spool import FailedAsset, Spool, SpooledAsset
+from slatprep.provenance.make import record_of, record_of_failed
+from slatprep.provenance.record import AssetRecord
 from slatprep.readers import read_field, read_latents
 from slatprep.readers.identity import source_digests
-from slatprep.records import (
-    Alignment,
-    AssetPair,
-    AssetResult,
-    MaterialField,
-    Place,
-    Status,
-    StructuredLatents,
-)
+from slatprep.records import AssetPair, Failed, Finished, Status
 from slatprep.sample import sample
+from slatprep.storage.faults import reached
 
 
-def process_asset(pair: AssetPair, parameters: BuildParameters) -> AssetResult:
+def process_asset(
+    pair: AssetPair, parameters: BuildParameters, known: AssetRecord | None = None
+) -> Finished:
     """Take one asset from its two source files to annotated SLAT voxels.
 
     Parameters
@@ -44,10 +38,13 @@ def process_asset(pair: AssetPair, parameters: BuildParameters) -> AssetResult:
         Where its files lie.
     parameters : BuildParameters
         How to align and to look up.
+    known : AssetRecord, optional
+        What an earlier build found with the same sources, parameters and code;
+        its alignment and judgement are taken over.
 
     Returns
     -------
-    AssetResult
+    Finished
         With properties in SI units: ranges come from the whole dataset.
 
     Raises
@@ -56,60 +53,21 @@ def process_asset(pair: AssetPair, parameters: BuildParameters) -> AssetResult:
         If a source cannot be used or a partner is missing.
     """
     field, latents = read_field(pair), read_latents(pair)
-    alignment = align(field, latents, parameters.align)
-    return annotate_asset(pair, field, latents, alignment, parameters)
-
-
-def annotate_asset(
-    pair: AssetPair,
-    field: MaterialField,
-    latents: StructuredLatents,
-    alignment: Alignment,
-    parameters: BuildParameters,
-) -> AssetResult:
-    """Look an aligned asset up, and say what its alignment is worth."""
+    reached("asset read", pair.asset_id)
+    alignment = known.alignment if known else align(field, latents, parameters.align)
+    reached("asset reused" if known else "asset aligned", pair.asset_id)
     annotation = sample(field, latents.coords, alignment.transform, parameters.sample)
-    ambiguity = measure_ambiguity(field, latents, alignment, annotation, parameters.sample)
-    verdict, reasons = judge(alignment.quality, float(annotation.valid.mean()), ambiguity)
-    return AssetResult(
-        pair=pair,
-        status=Status.OK,
-        field=field,
-        latents=latents,
-        alignment=alignment,
-        annotation=annotation,
-        ambiguity=ambiguity,
-        verdict=verdict,
-        verdict_reasons=reasons,
+    judgement = (
+        known.judgement
+        if known
+        else judge(field, latents, alignment, annotation, parameters.sample)
     )
+    return Finished(pair, field, latents, alignment, annotation, judgement)
 
 
-@dataclass(frozen=True)
-class Bench:
-    """What every task of a build has in common.
-
-    Attributes
-    ----------
-    parameters : BuildParameters
-        The build's.
-    recipe : Recipe
-        What they and the code come to.
-    spool : Spool
-        Where finished assets go.
-    previous : (Place, str) or None
-        The store that is there, and its build's id.
-    strict : bool
-        Raise an asset's fault instead of noting it.
-    """
-
-    parameters: BuildParameters
-    recipe: Recipe
-    spool: Spool
-    previous: tuple[Place, str] | None
-    strict: bool
-
-
-def finish_asset(pair: AssetPair, planned: PlannedAsset | None, bench: Bench) -> SpooledAsset:
+def finish_asset(
+    pair: AssetPair, planned: PlannedAsset | None, context: BuildContext
+) -> SpooledAsset | FailedAsset:
     """Bring one asset into the spool, with no more work than it needs.
 
     Parameters
@@ -118,13 +76,13 @@ def finish_asset(pair: AssetPair, planned: PlannedAsset | None, bench: Bench) ->
         Where its files lie.
     planned : PlannedAsset or None
         What was found of earlier work; None where there is none.
-    bench : Bench
+    context : BuildContext
         The rest.
 
     Returns
     -------
-    SpooledAsset
-        An asset that cannot go in has a status that says so.
+    SpooledAsset or FailedAsset
+        What the parent keeps of it.
 
     Raises
     ------
@@ -134,87 +92,77 @@ def finish_asset(pair: AssetPair, planned: PlannedAsset | None, bench: Bench) ->
         With `strict`, the asset's own fault.
     """
     begin = time.perf_counter()
+    reached("asset begun", pair.asset_id)
     if planned is not None and planned.action is Action.RESUME:
-        finished = _resumed(planned, bench)
-        if finished is not None:
-            return finished
+        resumed = _resumed(planned, context.spool)
+        if resumed is not None:
+            return resumed
     try:
-        result, key, alignment = _result_of(pair, planned, bench)
+        asset, key = _processed(pair, planned, context)
     except Exception as error:
         # A fault in one asset, even of slatprep's own, must not cost the others.
-        if bench.strict:
+        if context.strict:
             raise
-        status = Status.SKIPPED if isinstance(error, MissingPartnerError) else Status.FAILED
-        reason, trace = _reason(error)
-        return put_failure(pair, status, reason, bench, time.perf_counter() - begin, trace)
+        return _failed(_failure(pair, error), context, time.perf_counter() - begin)
     seconds = time.perf_counter() - begin
-    code = bench.recipe.code
-    record = provenance.asset_record(
-        result, bench.parameters, seconds, code=code, key=key, alignment=alignment
-    )
-    return bench.spool.put(replace(result, record=record), key)
+    record = record_of(asset, context.parameters, context.recipe.code, key, seconds)
+    return context.spool.put(record, asset.field, asset.latents, asset.annotation)
 
 
-def worker_died(pair: AssetPair, planned: PlannedAsset | None, bench: Bench) -> SpooledAsset:
+def fail_asset(pair: AssetPair, planned: PlannedAsset | None, context: BuildContext) -> FailedAsset:
     """Note an asset that twice cost the worker its life, the second time alone."""
     reason = "its worker process was killed twice, probably because memory ran out"
-    if bench.strict:
+    if context.strict:
         raise SlatprepError(f"{pair.asset_id}: {reason}")
-    return put_failure(pair, Status.FAILED, reason, bench)
+    return _failed(Failed(pair, Status.FAILED, reason), context)
 
 
-def put_failure(
-    pair: AssetPair,
-    status: Status,
-    reason: str,
-    bench: Bench,
-    seconds: float = 0.0,
-    trace: str = "",
-) -> SpooledAsset:
-    """Leave the record of an asset that cannot go in."""
-    result = AssetResult(pair, status, reason)
-    record = provenance.asset_record(
-        result, bench.parameters, seconds, code=bench.recipe.code, traceback=trace
-    )
-    return bench.spool.put(replace(result, record=record), key_of_failed(pair.asset_id))
+def _processed(
+    pair: AssetPair, planned: PlannedAsset | None, context: BuildContext
+) -> tuple[Finished, str]:
+    """Return an asset and its key; what is known of it is used if its files are the same."""
+    known = None
+    if context.previous is not None and planned is not None and planned.action is Action.REUSE:
+        known = context.previous.record(pair.asset_id)
+    asset = process_asset(pair, context.parameters, known)
+    key = _key(asset, context.recipe)
+    if known is not None and known.key != key:  # The files have changed since the plan.
+        asset = process_asset(pair, context.parameters)
+        key = _key(asset, context.recipe)
+    return asset, key
 
 
-def _result_of(
-    pair: AssetPair, planned: PlannedAsset | None, bench: Bench
-) -> tuple[AssetResult, str, Mapping[str, Any] | None]:
-    """Return an asset's result, its key, and the alignment that a record told, if one did."""
-    field, latents = read_field(pair), read_latents(pair)
-    digests = source_digests(
-        (*field.sources, *latents.sources), latents if pair.slat_group else None
-    )
-    key = bench.recipe.key(pair.asset_id, digests)
-    record = None
-    if planned is not None and planned.action is Action.REUSE:
-        record = previous_record(bench.previous, pair.asset_id)
-    if record is None or record["key"] != key:  # The files may have changed since the plan.
-        alignment = align(field, latents, bench.parameters.align)
-        return annotate_asset(pair, field, latents, alignment, bench.parameters), key, None
-    transform = record["alignment"]["transform"]
-    annotation = sample(field, latents.coords, transform, bench.parameters.sample)
-    result = AssetResult(pair, Status.OK, field=field, latents=latents, annotation=annotation)
-    return result, key, record["alignment"]
+def _key(asset: Finished, recipe: Recipe) -> str:
+    sources = asset.field.sources + asset.latents.sources
+    shared = asset.latents if asset.pair.slat_group else None
+    return recipe.key(asset.pair.asset_id, source_digests(sources, shared))
 
 
-def _resumed(planned: PlannedAsset, bench: Bench) -> SpooledAsset | None:
+def _resumed(planned: PlannedAsset, spool: Spool) -> SpooledAsset | None:
     """Return what an interrupted build finished, under the names things have now."""
-    finished = bench.spool.find(planned.key)
-    if finished is None or not planned.names:
-        return finished
-    bench.spool.amend(planned.key, planned.names)
-    return bench.spool.find(planned.key)
+    if planned.names is not None:
+        found = spool.find(planned.key)
+        if found is None:
+            return None
+        spool.amend(planned.names.applied(found[0]))
+    again = spool.find(planned.key)
+    return again and again[1]
 
 
-def _reason(error: Exception) -> tuple[str, str]:
-    """Return why an asset cannot go in, in one line, and where slatprep itself is at fault."""
+def _failed(asset: Failed, context: BuildContext, seconds: float = 0.0) -> FailedAsset:
+    record = record_of_failed(asset, context.parameters, context.recipe.code, seconds)
+    return context.spool.put_failed(record)
+
+
+def _failure(pair: AssetPair, error: Exception) -> Failed:
+    """Say why an asset cannot go in, in one line, and where slatprep itself is at fault."""
     line = " ".join(str(error).split())
+    if isinstance(error, MissingPartnerError):
+        return Failed(pair, Status.SKIPPED, line)
     if isinstance(error, SlatprepError):
-        return line, ""
+        return Failed(pair, Status.FAILED, line)
     if isinstance(error, MemoryError):
-        return f"memory ran out ({line or 'no more could be had'}); run with fewer jobs", ""
-    reason = f"internal error, please report: {type(error).__name__}: {line}"
-    return reason, traceback.format_exc()
+        line = f"memory ran out ({line or 'no more could be had'}); run with fewer jobs"
+        return Failed(pair, Status.FAILED, line)
+    line = f"internal error, please report: {type(error).__name__}: {line}"
+    return Failed(pair, Status.FAILED, line, traceback.format_exc())

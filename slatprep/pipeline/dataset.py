@@ -1,50 +1,34 @@
 """Build a store: every asset of a dataset, brought to one scale and packed.
 
-`slatprep.pipeline.asset` tells the way of one asset; `build_store` runs it over a
+`slatprep.pipeline.asset` is the way of one asset; `build_store` runs it over a
 dataset, for what is new or changed, and replaces the store in one step.
 """
 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
-
-import numpy as np
-from numpy.typing import NDArray
 
 from slatprep.errors import StoreError
 from slatprep.parameters import BuildParameters
-from slatprep.pipeline.asset import Bench, finish_asset, process_asset, worker_died
-from slatprep.pipeline.consensus import settle_ties
-from slatprep.pipeline.pack import (
-    by_property,
-    dataset_ranges,
-    given_ranges,
-    pack_store,
-)
+from slatprep.pipeline.asset import fail_asset, finish_asset, process_asset
+from slatprep.pipeline.consensus import apply_consensus
+from slatprep.pipeline.context import BuildContext
+from slatprep.pipeline.pack import dataset_ranges, given_ranges, pack_store
 from slatprep.pipeline.plan import Action, BuildPlan, PlannedAsset, plan_assets
-from slatprep.pipeline.publish import publish_manifests, write_all_records
+from slatprep.pipeline.previous import previous_build
+from slatprep.pipeline.publish import Destination, publish_manifests, write_all_records
 from slatprep.pipeline.recipe import recipe_of
-from slatprep.pipeline.spool import Spool, SpooledAsset
-from slatprep.pipeline.summary import BuildSummary, summarise
-from slatprep.pipeline.update import (
-    is_current,
-    nothing_usable,
-    places_of,
-    previous_build,
-    repeat_summary,
-)
+from slatprep.pipeline.spool import FailedAsset, Spool, SpooledAsset
+from slatprep.pipeline.summary import BuildSummary, clipped_of, nothing_usable, summarise_build
+from slatprep.pipeline.update import is_current, repeat_summary
 from slatprep.pipeline.work import work_beside, work_directory
-from slatprep.provenance import record as provenance
-from slatprep.provenance.places import manifests_of
+from slatprep.provenance.make import complete_record, origin
+from slatprep.provenance.record import AssetRecord, Clipped, Record, write_records
 from slatprep.readers import discover
-from slatprep.records import AssetPair, Normalization, Place, Status
-from slatprep.storage.atomic import replace_directory, staged, writing
-from slatprep.storage.place import place_of
-from slatprep.storage.remote import RemotePlace
-from slatprep.storage.upload import published_state, upload_store
+from slatprep.records import AssetPair, Normalization, Place
+from slatprep.storage.atomic import staged, writing
 from slatprep.store.writer import finish_store
 from slatprep.workers.local import Jobs, require_shared, run_unordered
 
@@ -54,15 +38,12 @@ __all__ = [
     "Progress",
     "align_pairs",
     "build_store",
-    "default_manifests",
     "plan_build",
     "process_asset",
 ]
 
 Progress = Callable[[int, int], None]
 """Called with the assets done and the assets in all."""
-
-_OTHERS = tuple(action for action in Action if action is not Action.REUSE)
 
 
 def build_store(
@@ -83,11 +64,11 @@ def build_store(
     parameters : BuildParameters
         Sources and methods.
     out : str or Place
-        The store. One that is there is replaced, in one step, when the new
+        The store, a path or URL. One that is there is replaced, in one step, when the new
         one is finished; assets that did not change are not aligned again.
     manifests : str or Path, optional
         Directory of ``assets.jsonl`` and ``build.json``; by default beside the
-        store, see `default_manifests`.
+        store, see `slatprep.provenance.places.manifests_of`.
     jobs : int or Workers
         Worker processes, or a `slatprep.workers.dask.Cluster`. The store's bytes do
         not depend on it.
@@ -115,58 +96,51 @@ def build_store(
         With `strict`, for the first asset that cannot be used.
     """
     begin = time.perf_counter()
-    out = place_of(out)
-    target, manifests = places_of(out, manifests)
+    place = Destination(out, manifests)
     given = given_ranges(parameters.normalize)
-    with work_beside(target, keep=keep_work) as work:
+    with work_beside(place.store, keep=keep_work) as work:
         if fresh:
             work.spool.keep_only(set())
-        require_shared(jobs, [work.scratch, *_some_sources(parameters)])
-        base = published_state(target) if isinstance(target, RemotePlace) else None
-        previous = None if fresh else previous_build(target)
-        bench = Bench(parameters, recipe_of(parameters), work.spool, previous, strict)
-        plan = _plan_if_any(bench, jobs, progress)
-        assets = _finish_all(bench, plan, _OTHERS, jobs, progress)
-        usable = any(asset.status is Status.OK for asset in assets)
-        if not usable and previous and is_current(plan, assets, bench, given):
-            folder = manifests or default_manifests(out if base is None else previous[0])
-            return repeat_summary(
-                assets, bench, store=out, manifests=folder, seconds=time.perf_counter() - begin
-            )
-        assets += _finish_all(bench, plan, (Action.REUSE,), jobs, progress)
+        place.look()
+        context = _context(parameters, work.spool, None if fresh else place.store, strict)
+        pairs = discover(parameters)
+        require_shared(jobs, [work.scratch, *_some_sources(pairs)])
+
+        plan = _plan(pairs, context, jobs, progress)
+        new, unchanged = _split(pairs, plan)
+        assets = _finish(new, plan, context, jobs, progress)
+        if is_current(plan, assets, context, given):
+            return repeat_summary(assets, context, place, time.perf_counter() - begin)
+        assets += _finish(unchanged, plan, context, jobs, progress)
         assets.sort(key=lambda asset: asset.asset_id)
-        if parameters.consensus.settle:
-            assets = settle_ties(assets, work.spool, parameters, jobs)
-        usable_assets = [asset for asset in assets if asset.status is Status.OK]
-        if not usable_assets:
+        usable = [asset for asset in assets if isinstance(asset, SpooledAsset)]
+        failed = [asset for asset in assets if isinstance(asset, FailedAsset)]
+        if not usable:
             raise StoreError(nothing_usable(assets, parameters))
-        normalization = given or dataset_ranges(usable_assets)
-        new, records_file = work.scratch / "store.zarr", work.scratch / "assets.jsonl"
-        with writing(str(out), work_directory(target).parent):
-            clipped = pack_store(
-                new, work.spool, usable_assets, normalization, parameters.store, jobs
-            )
-            records = _completed_records(work.spool, assets, normalization, clipped)
-            manifest = write_all_records(new, records_file, records)
-            finish_store(new, normalization, manifest, provenance.origin(parameters))
-            if isinstance(target, Path):
-                replace_directory(new, target)
-        upload = None if base is None else upload_store(new, base)
-        folder = manifests or default_manifests(upload.version if upload else out)
-        summary = summarise(
-            assets,
-            store=out,
-            records=folder / "assets.jsonl",
-            manifest=manifest,
-            normalization=normalization,
-            clipped=by_property(clipped["voxel"]),
+        if parameters.consensus.settle:
+            usable = apply_consensus(usable, work.spool, parameters, jobs)
+        normalization = given or dataset_ranges(usable)
+
+        store, records = work.scratch / "store.zarr", work.scratch / "assets.jsonl"
+        with writing(str(place.out), work_directory(place.store).parent):
+            clipped = pack_store(store, work.spool, usable, normalization, parameters.store, jobs)
+            completed = _completed_records(work.spool, usable, failed, normalization, clipped)
+            build_id = write_all_records(store, records, completed)
+            finish_store(store, normalization, build_id, origin(parameters))
+            place.replace(store)
+        summary = summarise_build(
+            [*usable, *failed],
+            store=place.out,
+            records=place.records(),
+            manifest=build_id,
             seconds=time.perf_counter() - begin,
+            normalization=normalization,
+            clipped=clipped_of(clipped),
         )
-        publish_manifests(records_file, summary, parameters)
-        if upload is not None:
-            upload.publish()
+        publish_manifests(records, summary, parameters)
+        place.publish()
         if keep_work:
-            work.spool.keep_only({asset.key for asset in usable_assets})
+            work.spool.keep_only({asset.key for asset in usable})
     return summary
 
 
@@ -190,19 +164,17 @@ def plan_build(
     BuildPlan
         An entry an asset.
     """
-    out = place_of(out)
-    target, _ = places_of(out, None)
-    directory = work_directory(target) / "spool"
-    spool = Spool(directory) if directory.is_dir() and not fresh else None
-    require_shared(jobs, _some_sources(parameters))
-    previous = None if fresh else previous_build(target)
-    assets = plan_assets(parameters, recipe_of(parameters), spool, previous, jobs, progress)
-    return BuildPlan(out, tuple(sorted(assets, key=lambda asset: asset.asset_id)))
+    place = Destination(out)
+    spool = Spool(work_directory(place.store) / ("nothing" if fresh else "spool"))
+    context = _context(parameters, spool, None if fresh else place.store)
+    pairs = discover(parameters)
+    require_shared(jobs, _some_sources(pairs))
+    return BuildPlan(place.out, tuple(plan_assets(pairs, context, jobs, progress)))
 
 
 def align_pairs(
     parameters: BuildParameters,
-    out: Path,
+    out: str | Path,
     *,
     jobs: Jobs = 1,
     strict: bool = False,
@@ -214,7 +186,7 @@ def align_pairs(
     ----------
     parameters : BuildParameters
         Sources and methods.
-    out : Path
+    out : str or Path
         JSON Lines file of asset records, sorted by asset id, in the form of a
         build's ``assets.jsonl``; ``normalization`` is null.
     jobs, strict, progress
@@ -233,79 +205,82 @@ def align_pairs(
     begin = time.perf_counter()
     out = Path(out)
     with work_beside(out.absolute(), arrays=False) as work:
-        require_shared(jobs, [work.scratch, *_some_sources(parameters)])
-        bench = Bench(parameters, recipe_of(parameters), work.spool, None, strict)
-        plan = _plan_if_any(bench, jobs, progress)
-        assets = _finish_all(bench, plan, tuple(Action), jobs, progress)
+        context = _context(parameters, work.spool, None, strict)
+        pairs = discover(parameters)
+        require_shared(jobs, [work.scratch, *_some_sources(pairs)])
+        plan = _plan(pairs, context, jobs, progress)
+        assets = _finish(pairs, plan, context, jobs, progress)
         assets.sort(key=lambda asset: asset.asset_id)
         with writing(str(out), out.parent), staged(out) as file:
-            records = (work.spool.record(asset.key) for asset in assets)
-            manifest = provenance.write_records(file, records)
+            build_id = write_records(file, (work.spool.record(asset.key) for asset in assets))
     seconds = time.perf_counter() - begin
-    return summarise(assets, records=out, manifest=manifest, seconds=seconds)
+    return summarise_build(assets, records=out, manifest=build_id, seconds=seconds)
 
 
-def default_manifests(store: Place) -> Place:
-    """Return the directory of a store's records: ``demo.manifests`` beside ``demo.zarr``."""
-    return manifests_of(store)
+def _context(
+    parameters: BuildParameters, spool: Spool, store: Place | None, strict: bool = False
+) -> BuildContext:
+    previous = None if store is None else previous_build(store)
+    return BuildContext(parameters, recipe_of(parameters), spool, previous, strict)
 
 
-def _plan_if_any(
-    bench: Bench, jobs: Jobs, progress: Progress | None
-) -> dict[str, PlannedAsset] | None:
-    """Return what is to be done by asset id, or None where nothing was done before."""
-    if bench.previous is None and not bench.spool.holds_any():
-        return None
-    spool = bench.spool if bench.spool.holds_any() else None
-    assets = plan_assets(bench.parameters, bench.recipe, spool, bench.previous, jobs, progress)
-    return {asset.asset_id: asset for asset in assets}
+def _plan(
+    pairs: Sequence[AssetPair], context: BuildContext, jobs: Jobs, progress: Progress | None
+) -> dict[str, PlannedAsset]:
+    """Return what is to be done by asset id; nothing where nothing was done before."""
+    if context.previous is None and not context.spool.holds_any():
+        return {}
+    return {asset.asset_id: asset for asset in plan_assets(pairs, context, jobs, progress)}
 
 
-def _some_sources(parameters: BuildParameters) -> Iterator[Place]:
-    """Yield the files of a pair, by which to see that a worker has the sources."""
-    for pair in discover(parameters):
-        if pair.grid and pair.slat:
-            yield from (pair.grid, pair.slat)
-            return
+def _split(
+    pairs: Iterable[AssetPair], plan: Mapping[str, PlannedAsset]
+) -> tuple[list[AssetPair], list[AssetPair]]:
+    """Return the pairs that are new or changed, and those whose alignment is in the store."""
+    split: tuple[list[AssetPair], list[AssetPair]] = ([], [])
+    for pair in pairs:
+        planned = plan.get(pair.asset_id)
+        split[planned is not None and planned.action is Action.REUSE].append(pair)
+    return split
 
 
-def _finish_all(
-    bench: Bench,
-    plan: dict[str, PlannedAsset] | None,
-    actions: tuple[Action, ...],
+def _finish(
+    pairs: Sequence[AssetPair],
+    plan: Mapping[str, PlannedAsset],
+    context: BuildContext,
     jobs: Jobs,
     progress: Progress | None,
-) -> list[SpooledAsset]:
-    """Bring every asset with one of these actions into the spool; return what is kept of each."""
-
-    def chosen() -> Iterator[tuple[AssetPair, PlannedAsset | None]]:
-        for pair in discover(bench.parameters):
-            planned = plan.get(pair.asset_id) if plan else None
-            if planned is None or planned.action in actions:
-                yield pair, planned
-
-    if plan is None and Action.ALIGN not in actions:
-        return []
-    # Listing names twice is cheap; holding a list of all pairs is not.
-    total = sum(1 for _ in chosen()) if progress else 0
-    tasks = ((pair, planned, bench) for pair, planned in chosen())
-    assets = []
-    for asset in run_unordered(finish_asset, tasks, jobs, worker_died):
+) -> list[SpooledAsset | FailedAsset]:
+    """Bring assets into the spool; return what is kept of each, in no order."""
+    tasks = ((pair, plan.get(pair.asset_id), context) for pair in pairs)
+    assets: list[SpooledAsset | FailedAsset] = []
+    for asset in run_unordered(finish_asset, tasks, jobs, fail_asset):
         assets.append(asset)
         if progress:
-            progress(len(assets), max(total, len(assets)))
+            progress(len(assets), len(pairs))
     return assets
+
+
+def _some_sources(pairs: Iterable[AssetPair]) -> list[Place]:
+    """Return the files of a pair, by which to see that a worker has the sources."""
+    for pair in pairs:
+        if pair.grid and pair.slat:
+            return [pair.grid, pair.slat]
+    return []
 
 
 def _completed_records(
     spool: Spool,
-    assets: Sequence[SpooledAsset],
+    usable: Sequence[SpooledAsset],
+    failed: Sequence[FailedAsset],
     normalization: Normalization,
-    clipped: dict[str, NDArray[np.int64]],
-) -> Iterator[dict[str, Any]]:
-    counts = zip(clipped["voxel"], clipped["grid"], strict=True)
-    for asset in assets:
+    clipped: Sequence[Clipped],
+) -> Iterator[Record]:
+    """Yield the records of a build by asset id, with the ranges and what they clip."""
+    clips = dict(zip((asset.asset_id for asset in usable), clipped, strict=True))
+    everything: list[SpooledAsset | FailedAsset] = [*usable, *failed]
+    for asset in sorted(everything, key=lambda asset: asset.asset_id):
         record = spool.record(asset.key)
-        if asset.status is Status.OK:
-            record = provenance.complete_record(record, normalization, *next(counts))
+        if isinstance(record, AssetRecord):
+            record = complete_record(record, normalization, clips[asset.asset_id])
         yield record

@@ -15,15 +15,17 @@ from slatprep.geometry.voxels import flat_index
 from slatprep.normalize import PIXIE_RANGES, normalize, normalize_change, ranges_from_extents
 from slatprep.parameters import NormalizeParameters, StoreParameters
 from slatprep.pipeline.spool import Spool, SpooledAsset
+from slatprep.provenance.record import Clipped, property_counts
 from slatprep.readers.ranges import read_ranges
-from slatprep.records import PROPERTY_COLUMNS, Normalization
+from slatprep.records import BACKGROUND, UNANNOTATED, Normalization
+from slatprep.storage.faults import reached
 from slatprep.storage.place import place_of
 from slatprep.store.layout import (
     ARRAYS,
     overlaps,
 )
 from slatprep.store.shard_writer import ShardWriter
-from slatprep.store.writer import Shard, _open, create_store, shards
+from slatprep.store.writer import Shard, create_store, open_for_writing, shards
 from slatprep.workers.local import Jobs, run_unordered
 
 Rows = tuple[int, dict[str, NDArray[Any]], NDArray[np.int64]]
@@ -53,6 +55,8 @@ def write_shard(
     clipped : ndarray of int64, shape (len(shard.keys), 3)
         How many of the values written lay outside the range, by property.
     """
+    name = f"{shard.group} {shard.rows[0]}"
+    reached("shard begun", name)
     clipped = np.zeros((len(shard.keys), 3), dtype=np.int64)
     with ExitStack() as stack:
         writers = {
@@ -65,8 +69,9 @@ def write_shard(
         read = _grid_rows if shard.group == "grid" else _voxel_rows
         for asset, arrays, counts in read(spool, shard, normalization):
             clipped[asset] = counts
-            for name, rows in arrays.items():
-                writers[name].append(rows)
+            for array, rows in arrays.items():
+                writers[array].append(rows)
+    reached("shard written", name)
     return shard, clipped
 
 
@@ -79,10 +84,12 @@ def _voxel_rows(spool: Spool, shard: Shard, normalization: Normalization) -> Ite
 
 def _grid_rows(spool: Spool, shard: Shard, normalization: Normalization) -> Iterator[Rows]:
     for asset, key in enumerate(shard.keys):
-        material, voxels, values = spool.grid(key)
+        field = spool.field(key)
+        cells = flat_index(field.voxels)
+        material = np.where(field.occupancy, np.uint8(UNANNOTATED), np.uint8(BACKGROUND))
+        material.reshape(-1)[cells] = field.material
         properties = np.full((3, material.size), np.nan, dtype=np.float32)
-        normalized, clipped = normalize(values, normalization)
-        cells = flat_index(voxels)
+        normalized, clipped = normalize(field.properties, normalization)
         for plane, column in zip(properties, normalized.T, strict=True):
             plane[cells] = column
         properties = properties.reshape(1, 3, *material.shape)
@@ -93,12 +100,13 @@ def write_assets(
     path: Path, assets: Sequence[SpooledAsset], offsets: Sequence[int], normalization: Normalization
 ) -> None:
     """Write every ``asset/*`` array."""
-    rows = [asset.columns or {} for asset in assets]
-    columns: dict[str, Any] = {name: [row[name] for row in rows] for name in rows[0]}
+    columns: dict[str, Any] = {
+        name: [asset.columns[name] for asset in assets] for name in assets[0].columns
+    }
     columns["id"] = [asset.asset_id for asset in assets]
     columns["offset"] = offsets
     columns["property_ambiguity"] = normalize_change(columns["property_ambiguity"], normalization)
-    group = _open(path)["asset"]
+    group = open_for_writing(path)["asset"]
     for layout in ARRAYS:
         where, _, name = layout.name.partition("/")
         if where == "asset":
@@ -117,7 +125,7 @@ def given_ranges(parameters: NormalizeParameters) -> Normalization | None:
 
 def dataset_ranges(usable: Sequence[SpooledAsset]) -> Normalization:
     """Return the ranges that the usable assets span."""
-    return ranges_from_extents([asset.extent for asset in usable if asset.extent is not None])
+    return ranges_from_extents([asset.extent for asset in usable])
 
 
 def pack_store(
@@ -127,19 +135,16 @@ def pack_store(
     normalization: Normalization,
     parameters: StoreParameters,
     jobs: Jobs,
-) -> dict[str, NDArray[np.int64]]:
-    """Write the store's arrays, a task a shard; return the values clipped, by group and asset."""
+) -> list[Clipped]:
+    """Write the store's arrays, a task a shard; return the values clipped, by asset."""
     keys = [asset.key for asset in assets]
     offsets = [0, *accumulate(asset.n_voxels for asset in assets)]
     create_store(path, len(keys), offsets[-1], parameters)
+    reached("store created", path.name)
     write_assets(path, assets, offsets, normalization)
     clipped = {group: np.zeros((len(keys), 3), dtype=np.int64) for group in ("voxel", "grid")}
     tasks = ((path, spool, shard, normalization) for shard in shards(keys, offsets, parameters))
     for shard, counts in run_unordered(write_shard, tasks, jobs):
         clipped[shard.group][shard.first : shard.first + len(shard.keys)] += counts
-    return clipped
-
-
-def by_property(clipped: NDArray[np.int64]) -> dict[str, int]:
-    """Return the clipped values by property."""
-    return dict(zip(PROPERTY_COLUMNS, clipped.sum(axis=0).tolist(), strict=True))
+    both = zip(clipped["voxel"], clipped["grid"], strict=True)
+    return [Clipped(property_counts(voxel), property_counts(grid)) for voxel, grid in both]

@@ -8,20 +8,15 @@ aligning takes.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, fields, replace
 from enum import StrEnum
-from typing import Any
 
 from slatprep.errors import SlatprepError
-from slatprep.parameters import BuildParameters
-from slatprep.pipeline.recipe import Recipe
-from slatprep.pipeline.spool import Spool
-from slatprep.provenance.jsonable import jsonable
-from slatprep.readers import discover
+from slatprep.pipeline.context import BuildContext
+from slatprep.provenance.record import AssetRecord, RecordError
 from slatprep.readers.identity import hash_sources
 from slatprep.records import AssetPair, Place, SourceFile
-from slatprep.store.records import StoredRecords, stored_records
 from slatprep.workers.local import Jobs, run_unordered
 
 
@@ -33,6 +28,25 @@ class Action(StrEnum):
     RESUME = "resume"
     REFUSE = "refuse"
     REMOVE = "remove"
+
+
+@dataclass(frozen=True, slots=True)
+class Names:
+    """What an asset and its files are called now: no part of the work."""
+
+    object_id: str
+    view: str
+    category: str
+    sources: tuple[SourceFile, ...]
+
+    def changed(self, record: AssetRecord) -> list[str]:
+        """Return the names of the fields in which a record differs."""
+        names = (field.name for field in fields(self))
+        return [name for name in names if getattr(record, name) != getattr(self, name)]
+
+    def applied(self, record: AssetRecord) -> AssetRecord:
+        """Return a record with these names."""
+        return replace(record, **{field.name: getattr(self, field.name) for field in fields(self)})
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,16 +66,15 @@ class PlannedAsset:
         Why, in one line.
     key : str
         See `slatprep.pipeline.recipe`; empty where the sources cannot be read.
-    names : dict
-        Entries of the record that differ from what is known of the asset,
-        though its content does not: its category, paths of its files.
+    names : Names or None
+        Where its record has other ones: its category, paths of its files.
     """
 
     asset_id: str
     action: Action
     reason: str
     key: str = ""
-    names: dict[str, Any] = field(default_factory=dict)
+    names: Names | None = None
 
 
 @dataclass(frozen=True)
@@ -87,86 +100,65 @@ class BuildPlan:
 
 
 def plan_assets(
-    parameters: BuildParameters,
-    recipe: Recipe,
-    spool: Spool | None,
-    previous: tuple[Place, str] | None,
+    pairs: Sequence[AssetPair],
+    context: BuildContext,
     jobs: Jobs,
     progress: Callable[[int, int], None] | None = None,
-) -> Iterator[PlannedAsset]:
-    """Yield what will be done with each asset, in no order, those to be removed last.
+) -> list[PlannedAsset]:
+    """Say what will be done with each asset, and why.
 
     Parameters
     ----------
-    parameters : BuildParameters
-        Where the sources lie.
-    recipe : Recipe
-        What the build's parameters and code come to.
-    spool : Spool or None
-        What an interrupted build left.
-    previous : (Place, str) or None
-        The store that is there, and its build's id.
+    pairs : sequence of AssetPair
+        The dataset.
+    context : BuildContext
+        The build.
     jobs : int or Workers
         Worker processes, or a cluster's.
     progress : callable, optional
         Called with the assets done and the assets in all.
+
+    Returns
+    -------
+    list of PlannedAsset
+        Sorted by asset id; those to be removed as well.
     """
-    # Listing names twice is cheap; holding a list of all pairs is not.
-    total = sum(1 for _ in discover(parameters)) if progress else 0
-    tasks = ((pair, recipe, spool, previous) for pair in discover(parameters))
-    seen = set()
+    tasks = ((pair, context) for pair in pairs)
+    plan = []
     for planned in run_unordered(plan_asset, tasks, jobs):
-        seen.add(planned.asset_id)
+        plan.append(planned)
         if progress:
-            progress(len(seen), total)
-        yield planned
-    records = _records(previous)
-    for asset_id in records.ids if records else ():
-        if asset_id not in seen:
-            yield PlannedAsset(asset_id, Action.REMOVE, "no longer among the sources")
+            progress(len(plan), len(pairs))
+    gone = context.previous.ids - {pair.asset_id for pair in pairs} if context.previous else ()
+    why = "no longer among the sources"
+    plan += [PlannedAsset(asset_id, Action.REMOVE, why) for asset_id in gone]
+    return sorted(plan, key=lambda asset: asset.asset_id)
 
 
-def plan_asset(
-    pair: AssetPair, recipe: Recipe, spool: Spool | None, previous: tuple[Place, str] | None
-) -> PlannedAsset:
+def plan_asset(pair: AssetPair, context: BuildContext) -> PlannedAsset:
     """Say what will be done with one asset, and why."""
+    asset_id, recipe = pair.asset_id, context.recipe
     try:
         sources, digests = hash_sources(pair)
     except SlatprepError as error:
-        return PlannedAsset(pair.asset_id, Action.REFUSE, " ".join(str(error).split()))
-    key = recipe.key(pair.asset_id, digests)
-    if spool is not None and spool.find(key) is not None:
-        reason = "finished by an earlier build"
-        names = _new_names(spool.record(key), pair, sources)
-        return PlannedAsset(pair.asset_id, Action.RESUME, reason, key, names)
-    record = previous_record(previous, pair.asset_id)
+        return PlannedAsset(asset_id, Action.REFUSE, " ".join(str(error).split()))
+    key = recipe.key(asset_id, digests)
+    names = Names(pair.object_id, pair.view, pair.category, sources)
+    found = context.spool.find(key)
+    if found is not None:
+        other = names if names.changed(found[0]) else None
+        return PlannedAsset(asset_id, Action.RESUME, "finished by an earlier build", key, other)
+    try:
+        record = context.previous.record(asset_id) if context.previous else None
+    except RecordError as error:
+        why = f"its record cannot be read: {error.faults[0]}"
+        return PlannedAsset(asset_id, Action.ALIGN, why, key)
     if record is None:
-        return PlannedAsset(pair.asset_id, Action.ALIGN, "not in the store", key)
-    if record["key"] == key:
-        names = _new_names(record, pair, sources)
-        reason = f"unchanged, but for {', '.join(names)}" if names else "unchanged"
-        return PlannedAsset(pair.asset_id, Action.REUSE, reason, key, names)
-    return PlannedAsset(pair.asset_id, Action.ALIGN, recipe.difference(record, sources), key)
-
-
-def _new_names(
-    record: dict[str, Any], pair: AssetPair, sources: tuple[SourceFile, ...]
-) -> dict[str, Any]:
-    names = {
-        "object_id": pair.object_id,
-        "view": pair.view,
-        "category": pair.category,
-        "sources": jsonable(sources),
-    }
-    return {name: value for name, value in names.items() if record[name] != value}
-
-
-def previous_record(previous: tuple[Place, str] | None, asset_id: str) -> dict[str, Any] | None:
-    """Return what is recorded of an asset of the store that is there, as the first pass left it."""
-    records = _records(previous)
-    record = records.find(asset_id) if records else None
-    return record and {**record, **(record["before_settling"] or {})}
-
-
-def _records(previous: tuple[Place, str] | None) -> StoredRecords | None:
-    return stored_records(*previous) if previous else None
+        return PlannedAsset(asset_id, Action.ALIGN, "not in the store", key)
+    if record.key != key:
+        return PlannedAsset(asset_id, Action.ALIGN, recipe.difference(record, sources), key)
+    changed = names.changed(record)
+    if not changed:
+        return PlannedAsset(asset_id, Action.REUSE, "unchanged", key)
+    why = f"unchanged, but for {', '.join(changed)}"
+    return PlannedAsset(asset_id, Action.REUSE, why, key, names)

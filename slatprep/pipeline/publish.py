@@ -1,70 +1,130 @@
-"""Publish a build: its records in the store and beside it."""
+"""Publish a build: its store where it belongs, its records within it and beside it.
+
+The store and its records are replaced in one step, because the records are an
+array of it. The files beside it are copies; a build that was killed before it
+could write them is noticed by the next one, which writes them then.
+"""
 
 from __future__ import annotations
 
-import json
 import platform
 import shutil
 from collections.abc import Iterable, Iterator
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any
 
 from slatprep.errors import StoreError
 from slatprep.parameters import BuildParameters
 from slatprep.pipeline.summary import BuildSummary
-from slatprep.provenance import record as provenance
-from slatprep.provenance.jsonable import jsonable
-from slatprep.provenance.record import BUILD_RECORD, RECORD_VERSION, origin
-from slatprep.records import Status
-from slatprep.storage.place import storage_of
+from slatprep.provenance.make import build_versions
+from slatprep.provenance.places import manifests_of
+from slatprep.provenance.record import (
+    AssetRecord,
+    BuildCounts,
+    BuildRecord,
+    PropertyCounts,
+    Record,
+    to_json,
+    write_records,
+)
+from slatprep.records import Place
+from slatprep.storage.atomic import replace_directory
+from slatprep.storage.faults import reached
+from slatprep.storage.place import place_of, storage_of
+from slatprep.storage.remote import RemotePlace
+from slatprep.storage.upload import PublishedState, Upload, published_state, upload_store
+from slatprep.store.reader import is_store
 from slatprep.store.records import RecordWriter
+from slatprep.store.writer import open_for_writing
 
 
-def write_build_record(path: Path, summary: BuildSummary, parameters: BuildParameters) -> None:
-    """Write the record of a build as one JSON document."""
-    record = {
-        "format": BUILD_RECORD,
-        "format_version": RECORD_VERSION,
-        "id": summary.manifest,
-        "name": parameters.name,
-        "created": datetime.now(UTC).isoformat(timespec="seconds"),
-        "duration_s": round(summary.seconds, 3),
-        "platform": platform.platform(),
-        "store": summary.store.name if summary.store else None,
-        "records": summary.records.name,
-        "parameters": jsonable(parameters),
-        "versions": origin(parameters)["versions"],
-        "normalization": jsonable(summary.normalization),
-        "statuses": summary.statuses,
-        "verdicts": summary.verdicts,
-        "counts": {
-            "voxels": summary.n_voxels,
-            "valid": summary.n_valid,
-            "clipped": dict(summary.clipped),
-        },
-    }
-    path.write_text(
-        json.dumps(record, indent=2, allow_nan=False, ensure_ascii=False) + "\n", encoding="utf-8"
-    )
+class Destination:
+    """Where a build goes: a folder that is replaced, or a new version on an object store.
+
+    Parameters
+    ----------
+    out : str or Place
+        The store, as its user names it.
+    manifests : str or Path, optional
+        Folder of its records, if not beside it.
+
+    Attributes
+    ----------
+    store : Place
+        Where the store really lies: what a link points to is replaced, not the link.
+
+    Raises
+    ------
+    StoreError
+        If there is something other than a store.
+    """
+
+    def __init__(self, out: str | Place, manifests: str | Place | None = None) -> None:
+        self.out = place_of(out)
+        self._manifests = None if manifests is None else storage_of(place_of(manifests)).local
+        if manifests is not None and self._manifests is None:
+            raise StoreError(f"{manifests}: expected a local folder for the records")
+        path = storage_of(self.out).local
+        self.store: Place = self.out if path is None else _replaceable(path)
+        self._before: PublishedState | None = None
+        self._upload: Upload | None = None
+
+    def look(self) -> None:
+        """See, on an object store, what is published; raise `StoreError` if none may be there."""
+        if isinstance(self.store, RemotePlace):
+            self._before = published_state(self.store)
+
+    def replace(self, new: Path) -> None:
+        """Put a finished store in place; on an object store it is not published yet."""
+        if isinstance(self.store, Path):
+            replace_directory(new, self.store)
+        elif self._before is not None:
+            self._upload = upload_store(new, self._before)
+        reached("store replaced", str(self.store))
+
+    def publish(self) -> None:
+        """Make the new version on an object store the current one."""
+        if self._upload is not None:
+            self._upload.publish()
+
+    def records(self, version: Place | None = None) -> Place:
+        """Return the file of asset records, of the new store or of a version that is there."""
+        if self._upload is not None:
+            version = self._upload.version
+        beside = self.out if isinstance(self.store, Path) or version is None else version
+        return (self._manifests or manifests_of(beside)) / "assets.jsonl"
 
 
-def write_all_records(store: Path, path: Path, records: Iterable[dict[str, Any]]) -> str:
+def _replaceable(out: Path) -> Path:
+    try:
+        taken = out.exists() and not is_store(out) and not (out.is_dir() and not any(out.iterdir()))
+        target = out.resolve()
+    except OSError as error:
+        raise StoreError(
+            f"{out}: cannot be looked at ({error.strerror}); expected a path that may be read and "
+            "written"
+        ) from error
+    if taken:
+        raise StoreError(
+            f"{out} exists and is not a slatprep store; expected a store to replace, or a new path"
+        )
+    return target
+
+
+def write_all_records(store: Path, path: Path, records: Iterable[Record]) -> str:
     """Write all records to a file, and those of rows into the new store; return the build's id."""
-    import zarr
+    writer = RecordWriter(open_for_writing(store))
 
-    root = zarr.open_group(store, mode="r+", zarr_format=3, use_consolidated=False)
-    writer = RecordWriter(root)
-
-    def passing() -> Iterator[dict[str, Any]]:
+    def passing() -> Iterator[Record]:
         for record in records:
-            if record["status"] == Status.OK:
-                writer.add(record)
+            if isinstance(record, AssetRecord):
+                writer.add(to_json(record.without_duration()))
             yield record
 
-    manifest = provenance.write_records(path, passing())
+    build_id = write_records(path, passing())
     writer.flush()
-    return manifest
+    reached("records written", str(path))
+    return build_id
 
 
 def publish_manifests(records: Path, summary: BuildSummary, parameters: BuildParameters) -> None:
@@ -82,9 +142,33 @@ def publish_manifests(records: Path, summary: BuildSummary, parameters: BuildPar
             storage_of(folder / "build.json").staged() as build_file,
         ):
             shutil.copyfile(records, records_file)
-            write_build_record(build_file, summary, parameters)
+            reached("manifests written", str(folder))
+            document = to_json(build_record(summary, parameters), indent=True)
+            build_file.write_bytes(document + b"\n")
+        reached("manifests published", str(folder))
     except OSError as error:
         raise StoreError(
             f"{folder}: the records cannot be written there ({error.strerror or error}); the store "
             "is complete and holds those of its assets. Run again to write them here"
         ) from error
+
+
+def build_record(summary: BuildSummary, parameters: BuildParameters) -> BuildRecord:
+    """Return the record of a build that made a store."""
+    if summary.store is None or summary.normalization is None:
+        raise ValueError("a build without a store has no record")
+    return BuildRecord(
+        id=summary.manifest,
+        name=parameters.name,
+        created=datetime.now(UTC).replace(microsecond=0),
+        duration_s=round(summary.seconds, 3),
+        platform=platform.platform(),
+        store=summary.store.name,
+        records=summary.records.name,
+        parameters=parameters,
+        versions=build_versions(parameters),
+        normalization=summary.normalization,
+        statuses=summary.statuses,
+        verdicts=summary.verdicts,
+        counts=BuildCounts(summary.n_voxels, summary.n_valid, PropertyCounts(**summary.clipped)),
+    )

@@ -10,13 +10,15 @@ of files are no part of it.
 from __future__ import annotations
 
 import hashlib
-import json
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import asdict, dataclass
+
+import orjson
 
 from slatprep.parameters import BuildParameters
 from slatprep.pipeline.fingerprint import code_fingerprint
+from slatprep.provenance.record import AssetRecord, StageParameters
+from slatprep.provenance.versions import numeric_versions
 from slatprep.records import SourceFile
 
 
@@ -26,49 +28,46 @@ class Recipe:
 
     Attributes
     ----------
-    parameters : dict
-        Groups ``align`` and ``sample``, JSON-ready.
+    parameters : StageParameters
+        Those that touch an asset.
     versions : dict of str to str
         Libraries that make the numbers.
     code : str
         Fingerprint of the code.
     """
 
-    parameters: dict[str, Any]
+    parameters: StageParameters
     versions: dict[str, str]
     code: str
 
     def key(self, asset_id: str, digests: Mapping[str, str]) -> str:
         """Return the key of an asset, SHA-256 in hex, from the digests of its sources."""
         parts = [asset_id, digests, self.parameters, self.versions, self.code]
-        return hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()
+        return hashlib.sha256(orjson.dumps(parts, option=orjson.OPT_SORT_KEYS)).hexdigest()
 
-    def difference(self, record: Mapping[str, Any], sources: Iterable[SourceFile]) -> str:
+    def difference(self, record: AssetRecord, sources: Iterable[SourceFile]) -> str:
         """Say in one line why an asset with an older record has another key now."""
-        for group, values in self.parameters.items():
+        before = asdict(record.parameters)
+        for group, values in asdict(self.parameters).items():
             for name, value in values.items():
-                before = record["parameters"].get(group, {}).get(name)
-                if before != value:
-                    return f"parameters changed: {group}.{name} was {before}, is {value}"
+                if before[group][name] != value:
+                    was = before[group][name]
+                    return f"parameters changed: {group}.{name} was {was}, is {value}"
         for name, version in self.versions.items():
-            before = record["versions"].get(name)
-            if before != version:
-                return f"libraries changed: {name} was {before}, is {version}"
-        if record["code"] != self.code:
+            if record.versions.get(name) != version:
+                return f"libraries changed: {name} was {record.versions.get(name)}, is {version}"
+        if record.code != self.code:
             return "code changed"
-        before = {source["role"]: source["sha256"] for source in record["sources"]}
-        after = {source.role: source.sha256 for source in sources}
-        roles = sorted(r for r in before | after if before.get(r) != after.get(r))
+        old = {source.role: source.sha256 for source in record.sources}
+        new = {source.role: source.sha256 for source in sources}
+        roles = sorted(role for role in old | new if old.get(role) != new.get(role))
         return f"sources changed: {', '.join(roles)}"
 
 
 def recipe_of(parameters: BuildParameters) -> Recipe:
     """Return the recipe of a build."""
-    from slatprep.provenance.record import content_parameters
-    from slatprep.provenance.versions import numeric_versions
-
     return Recipe(
-        parameters=content_parameters(parameters),
+        parameters=StageParameters(parameters.align, parameters.sample),
         versions=numeric_versions(parameters.align),
         code=code_fingerprint(),
     )

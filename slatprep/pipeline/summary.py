@@ -6,8 +6,10 @@ from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 
-from slatprep.pipeline.spool import SpooledAsset
-from slatprep.records import Normalization, Place, Status
+from slatprep.parameters import BuildParameters
+from slatprep.pipeline.spool import FailedAsset, SpooledAsset
+from slatprep.provenance.record import Clipped
+from slatprep.records import PROPERTY_COLUMNS, Normalization, Place, Status
 
 PROBLEMS_LISTED = 100
 """How many problems a summary lists; the records hold all."""
@@ -59,8 +61,8 @@ class BuildSummary:
         return all(count == 0 for status, count in self.statuses.items() if status != Status.OK)
 
 
-def summarise(
-    assets: Sequence[SpooledAsset],
+def summarise_build(
+    assets: Sequence[SpooledAsset | FailedAsset],
     *,
     records: Place,
     manifest: str,
@@ -70,23 +72,43 @@ def summarise(
     clipped: Mapping[str, int] | None = None,
 ) -> BuildSummary:
     """Count what became of the assets."""
-    statuses = Counter(str(asset.status) for asset in assets)
-    verdicts = Counter(asset.columns["verdict"] for asset in assets if asset.columns)
+    usable = [asset for asset in assets if isinstance(asset, SpooledAsset)]
+    failed = [asset for asset in assets if isinstance(asset, FailedAsset)]
+    statuses = Counter(str(asset.status) for asset in failed) + Counter(ok=len(usable))
+    verdicts = Counter(str(asset.columns["verdict"]) for asset in usable)
     return BuildSummary(
         records=records,
         manifest=manifest,
         seconds=seconds,
         statuses={str(status): statuses[str(status)] for status in Status},
         verdicts=dict(sorted(verdicts.items())),
-        n_voxels=sum(asset.n_voxels for asset in assets),
-        n_valid=sum(asset.n_valid for asset in assets),
-        problems=tuple(problems_of(assets))[:PROBLEMS_LISTED],
+        n_voxels=sum(asset.n_voxels for asset in usable),
+        n_valid=sum(asset.n_valid for asset in usable),
+        problems=tuple((asset.asset_id, asset.reason) for asset in failed[:PROBLEMS_LISTED]),
         store=store,
         normalization=normalization,
         clipped=dict(clipped or {}),
     )
 
 
-def problems_of(assets: Iterable[SpooledAsset]) -> list[tuple[str, str]]:
-    """Return id and reason of each asset that is not ``ok``."""
-    return [(asset.asset_id, asset.reason) for asset in assets if asset.status is not Status.OK]
+def clipped_of(clipped: Iterable[Clipped]) -> dict[str, int]:
+    """Return the clipped values of ``voxel/properties`` of all assets, by property."""
+    counts = [asset.voxel for asset in clipped]
+    return {name: sum(getattr(count, name) for count in counts) for name in PROPERTY_COLUMNS}
+
+
+def nothing_usable(
+    assets: Sequence[SpooledAsset | FailedAsset], parameters: BuildParameters
+) -> str:
+    """Say why there is no store."""
+    problems = [f"\n  {a.asset_id}: {a.reason}" for a in assets if isinstance(a, FailedAsset)]
+    if not problems:
+        return (
+            f"no asset found in {parameters.pixieverse.root} and {parameters.slat.root}; "
+            "expected files that match the patterns of the dataset definition"
+        )
+    more = f"\n  and {len(problems) - 5} more" if len(problems) > 5 else ""
+    return (
+        f"none of {len(problems)} assets can be used, so there is no store:"
+        f"{''.join(problems[:5])}{more}"
+    )

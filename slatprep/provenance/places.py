@@ -14,3 +14,10 @@ def manifests_of(store: Place) -> Place:
     if is_version(store):
         return store.parent.parent / MANIFESTS / store.name
     return store.with_name(f"{store.name.removesuffix('.zarr')}.manifests")
+
+
+def manifests_beside(store: Place) -> Place | None:
+    """Return the folder of a store's records if there is one."""
+    folder = manifests_of(store)
+    files = (folder / "build.json", folder / "assets.jsonl")
+    return folder if any(file.exists() for file in files) else None

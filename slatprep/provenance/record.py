@@ -1,264 +1,401 @@
-"""Provenance: what each row of a store was made from, by what, and how well.
+"""The records of an asset and of a build: what was made from what, by what, and how well.
 
-One JSON record an asset, as lines of one file, and one record of the build
-over them; both follow the JSON Schemas in ``slatprep/provenance/schema``.
+They are written by `to_json` and read by `read_record` and its siblings, and
+nowhere else. A record that is read is checked: unknown keys, types, ranges and
+digests. ``slatprep/provenance/schema`` holds the JSON Schemas, which
+`slatprep.provenance.schemas` makes from these classes.
 """
 
 from __future__ import annotations
 
 import hashlib
-import json
-from collections.abc import Iterable, Iterator, Mapping
-from importlib import metadata, resources
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, replace
+from datetime import datetime
+from functools import lru_cache
 from pathlib import Path
-from typing import Any, cast
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Final, Literal
 
 import numpy as np
 import orjson
+from annotated_types import Ge, MinLen
 
-from slatprep.geometry.voxels import boundary
-from slatprep.parameters import BuildParameters
-from slatprep.provenance.jsonable import jsonable
-from slatprep.provenance.versions import library_versions
+from slatprep.errors import StoreError
+from slatprep.parameters import AlignParameters, BuildParameters, SampleParameters
 from slatprep.records import (
     PROPERTY_COLUMNS,
     Alignment,
-    AssetResult,
-    Candidate,
-    Consensus,
+    Count,
+    Digest,
+    InJson,
+    Judgement,
     Normalization,
-    Placement,
-    Quality,
+    SourceFile,
+    Status,
+    Verdict,
 )
 
-ASSET_RECORD = "slatprep-asset-record"
-BUILD_RECORD = "slatprep-build-record"
-RECORD_VERSION = 1
+if TYPE_CHECKING:
+    from pydantic import TypeAdapter, ValidationError
 
-# These differ between runs, machines or folders without the content differing,
-# so a build's id leaves them out.
-_NOT_CONTENT = ("duration_s", "reason", "traceback")
+RECORD_VERSION: Final = 2
 
-_SORTED_LINE = orjson.OPT_SORT_KEYS | orjson.OPT_APPEND_NEWLINE
-
-
-def content_parameters(parameters: BuildParameters) -> dict[str, Any]:
-    """Return the parameters that decide an asset's row, without where its files lie."""
-    return {"align": jsonable(parameters.align), "sample": jsonable(parameters.sample)}
+_CHECKED: dict[str, object] = {
+    "extra": "forbid",
+    "allow_inf_nan": False,
+    "use_attribute_docstrings": True,
+}
 
 
-def asset_record(
-    result: AssetResult,
-    parameters: BuildParameters,
-    duration: float,
-    *,
-    traceback: str = "",
-    code: str = "",
-    key: str = "",
-    alignment: Mapping[str, Any] | None = None,
-) -> dict[str, Any]:
-    """Return the record of one asset.
+def _named(versions: dict[str, str]) -> dict[str, str]:
+    missing = {"slatprep", "python", "numpy", "scipy"} - versions.keys()
+    if missing:
+        raise ValueError(f"no version of {', '.join(sorted(missing))}")
+    return versions
+
+
+_TEXTS = {"type": "dict", "keys_schema": {"type": "str"}, "values_schema": {"type": "str"}}
+
+Versions = Annotated[dict[str, str], InJson(_TEXTS, _named)]
+"""Versions of slatprep, Python and the libraries that made the numbers, by name."""
+
+Seconds = Annotated[float, Ge(0)]
+
+
+@dataclass(frozen=True)
+class StageParameters:
+    """The parameters that decide an asset's row, without where its files lie."""
+
+    align: AlignParameters
+    sample: SampleParameters
+
+
+@dataclass(frozen=True)
+class PropertyCounts:
+    """How many values, by property."""
+
+    youngs_modulus: Count
+    density: Count
+    poissons_ratio: Count
+
+
+@dataclass(frozen=True)
+class Clipped:
+    """Values outside the ranges in ``voxel/properties`` and in ``grid/properties``."""
+
+    voxel: PropertyCounts
+    grid: PropertyCounts
+
+
+@dataclass(frozen=True)
+class VoxelCounts:
+    """Voxels of an asset."""
+
+    occupied: Count
+    """Occupied PixieVerse voxels."""
+    annotated: Count
+    """Those with a class 0..6."""
+    unannotated: Count
+    """Those without."""
+    boundary: Count
+    """Those that touch an empty voxel by a face."""
+    slat_voxels: Count
+    """SLAT voxels."""
+    valid: Count
+    """SLAT voxels with an annotation near enough."""
+    clipped: Clipped | None = None
+    """Values outside the ranges; null where no store was built."""
+
+
+@dataclass(frozen=True, eq=False)
+class FirstPass:
+    """What was found for an asset alone, before the consensus of the dataset."""
+
+    key: Digest
+    alignment: Alignment
+    judgement: Judgement
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class AssetRecord:
+    """What one row of a store was made from, by what, and how well.
+
+    Lengths are in voxels, angles in degrees, times in seconds.
+    """
+
+    __pydantic_config__: ClassVar[dict[str, object]] = _CHECKED
+
+    format: Literal["slatprep-asset-record"] = "slatprep-asset-record"
+    format_version: Literal[2] = RECORD_VERSION
+    asset_id: Annotated[str, MinLen(1)]
+    """Id of the row."""
+    object_id: str
+    """PixieVerse id of the object."""
+    view: str
+    """Image or seed the SLAT was made from; empty where there is one only."""
+    category: str
+    """PixieVerse category; empty where unknown."""
+    status: Literal[Status.OK]
+    """The asset is in the store."""
+    sources: Annotated[tuple[SourceFile, ...], MinLen(2)]
+    """The files that were read."""
+    bounds: dict[str, object] | None
+    """World bounds as clip_features.npz states them."""
+    parameters: StageParameters
+    """The parameters that decide this row."""
+    versions: Versions
+    """Versions of slatprep and of the libraries that made the numbers."""
+    code: Digest
+    """Fingerprint of the code that made the numbers."""
+    key: Digest
+    """What decides this row, as one hash: sources, parameters, libraries and code."""
+    alignment: Alignment
+    """The transform, how it was found, and how well it fits."""
+    judgement: Judgement
+    """What ties would change in the labels, the verdict and its reasons."""
+    before_consensus: FirstPass | None = None
+    """What was found for the asset alone, where the dataset's common rotation chose another."""
+    normalization: Normalization | None = None
+    """The ranges of the properties; null where no store was built."""
+    counts: VoxelCounts
+    """Voxels of the asset."""
+    warnings: tuple[str, ...]
+    """What a person should know about the sources."""
+    duration_s: Seconds = 0.0
+    """Seconds spent on the asset; 0 inside a store, where equal builds are equal bytes."""
+
+    def without_duration(self) -> AssetRecord:
+        """Return the record as a store holds it, the same in two builds of the same."""
+        return replace(self, duration_s=0.0)
+
+    def of_first_pass(self) -> AssetRecord:
+        """Return the record as it was before the consensus of the dataset."""
+        first = self.before_consensus
+        if first is None:
+            return self
+        return replace(
+            self,
+            key=first.key,
+            alignment=first.alignment,
+            judgement=first.judgement,
+            before_consensus=None,
+        )
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class FailedRecord:
+    """Why an asset is not in the store."""
+
+    __pydantic_config__: ClassVar[dict[str, object]] = _CHECKED
+
+    format: Literal["slatprep-asset-record"] = "slatprep-asset-record"
+    format_version: Literal[2] = RECORD_VERSION
+    asset_id: Annotated[str, MinLen(1)]
+    """Id that its row would have."""
+    object_id: str
+    """PixieVerse id of the object."""
+    view: str
+    """Image or seed the SLAT was made from; empty where there is one only."""
+    category: str
+    """PixieVerse category; empty where unknown."""
+    status: Literal[Status.FAILED, Status.SKIPPED]
+    """``skipped`` where a partner is missing, ``failed`` otherwise."""
+    reason: Annotated[str, MinLen(1)]
+    """Why the asset did not go in, in one line."""
+    traceback: str = ""
+    """Where an error of slatprep's own arose; empty otherwise."""
+    parameters: StageParameters
+    """The parameters of the build."""
+    versions: Versions
+    """Versions of slatprep and of the libraries that were used."""
+    code: Digest
+    """Fingerprint of the code."""
+    duration_s: Seconds = 0.0
+    """Seconds spent on the asset."""
+
+
+Record = AssetRecord | FailedRecord
+"""A line of ``assets.jsonl``; ``status`` says which."""
+
+
+@dataclass(frozen=True)
+class BuildCounts:
+    """Voxels of a whole build."""
+
+    voxels: Count
+    """SLAT voxels."""
+    valid: Count
+    """SLAT voxels with an annotation near enough."""
+    clipped: PropertyCounts
+    """Values of ``voxel/properties`` outside the ranges."""
+
+
+def _word(words: Iterable[str]) -> InJson:
+    return InJson({"type": "literal", "expected": [str(word) for word in words]})
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class BuildRecord:
+    """One build of a store, over its asset records."""
+
+    __pydantic_config__: ClassVar[dict[str, object]] = _CHECKED
+
+    format: Literal["slatprep-build-record"] = "slatprep-build-record"
+    format_version: Literal[2] = RECORD_VERSION
+    id: Digest
+    """SHA-256 of the asset records' content; the store's attribute ``manifest``."""
+    name: str
+    """Name of the dataset."""
+    created: datetime
+    """When the build ended."""
+    duration_s: Seconds
+    """Seconds that the build took."""
+    platform: str
+    """The machine's operating system."""
+    store: str
+    """Name of the store's directory."""
+    records: str
+    """Name of the file of asset records, beside this one."""
+    parameters: BuildParameters
+    """All parameters, with where the sources lay."""
+    versions: Versions
+    """Versions of slatprep and of its libraries."""
+    normalization: Normalization
+    """The ranges of the properties."""
+    statuses: dict[Annotated[str, _word(Status)], Count]
+    """Assets by status."""
+    verdicts: dict[Annotated[str, _word(Verdict)], Count]
+    """Assets in the store by verdict."""
+    counts: BuildCounts
+    """Voxels of the store."""
+
+
+class RecordError(StoreError):
+    """A record that cannot be read.
 
     Parameters
     ----------
-    result : AssetResult
-        What became of it.
-    parameters : BuildParameters
-        The build's parameters.
-    duration : float
-        Seconds spent on it.
-    traceback : str
-        Where an error of slatprep's own arose; empty otherwise.
-    code : str
-        Fingerprint of the code that made the numbers.
-    key : str
-        What the asset was made from and how, see `slatprep.pipeline.recipe`; empty
-        where there is no result.
-    alignment : mapping, optional
-        What an older record of the same key says of the alignment.
-
-    Returns
-    -------
-    dict
-        JSON-ready; ``normalization`` and the clipped counts are filled in by
-        `complete_record` once the whole dataset is known.
+    where : str
+        The file, and the line or row in it.
+    faults : tuple of str
+        What is wrong, each with its place in the record and the value there.
     """
-    pair, field, latents = result.pair, result.field, result.latents
-    sources = (field.sources if field else ()) + (latents.sources if latents else ())
-    warnings = (field.warnings if field else ()) + (latents.warnings if latents else ())
-    return {
-        "format": ASSET_RECORD,
-        "format_version": RECORD_VERSION,
-        "asset_id": pair.asset_id,
-        "object_id": pair.object_id,
-        "view": pair.view,
-        "category": pair.category,
-        "status": str(result.status),
-        "reason": result.reason,
-        "traceback": traceback,
-        "sources": jsonable(sources),
-        "bounds": jsonable(field.bounds) if field else None,
-        "parameters": content_parameters(parameters),
-        "versions": library_versions(parameters.align),
-        "code": code,
-        "key": key,
-        "alignment": alignment_entry(result) if alignment is None else dict(alignment),
-        "before_settling": None,
-        "normalization": None,
-        "counts": counts_entry(result),
-        "warnings": list(warnings),
-        "duration_s": round(duration, 4),
-    }
+
+    def __init__(self, where: str, faults: tuple[str, ...]) -> None:
+        super().__init__(
+            f"{where}: not a record that this version of slatprep reads ({'; '.join(faults[:3])}); "
+            "build again to have it written anew"
+        )
+        self.faults = faults
 
 
-def complete_record(
-    record: dict[str, Any],
-    normalization: Normalization,
-    clipped_voxels: Iterable[int],
-    clipped_grid: Iterable[int],
-) -> dict[str, Any]:
-    """Return a record with what only the whole dataset could tell: ranges and clipped values."""
-    clipped = {
-        "voxel": dict(zip(PROPERTY_COLUMNS, map(int, clipped_voxels), strict=True)),
-        "grid": dict(zip(PROPERTY_COLUMNS, map(int, clipped_grid), strict=True)),
-    }
-    return {
-        **record,
-        "normalization": jsonable(normalization),
-        "counts": {**record["counts"], "clipped": clipped},
-    }
+def to_json(record: Record | BuildRecord, *, indent: bool = False) -> bytes:
+    """Return a record as JSON in UTF-8: in one line, or indented; NaN becomes null."""
+    option = orjson.OPT_SERIALIZE_NUMPY | (orjson.OPT_INDENT_2 if indent else 0)
+    return orjson.dumps(record, default=_plain, option=option)
 
 
-def origin(parameters: BuildParameters) -> dict[str, Any]:
-    """Return the parameters and versions that decide a store's bytes, without where files lie."""
-    return {
-        "name": parameters.name,
-        "parameters": {
-            **content_parameters(parameters),
-            "consensus": jsonable(parameters.consensus),
-            "normalize": jsonable(parameters.normalize),
-            "store": jsonable(parameters.store),
-        },
-        "versions": {
-            **library_versions(parameters.align),
-            "zarr": metadata.version("zarr"),
-            "joblib": metadata.version("joblib"),
-        },
-    }
-
-
-def write_records(path: Path, records: Iterable[Mapping[str, Any]]) -> str:
-    """Write records as JSON Lines and return the id of their content.
+def read_record(text: bytes | str, where: str) -> Record:
+    """Read a line of ``assets.jsonl``.
 
     Parameters
     ----------
-    path : Path
-        The file; use one from `staged` so that no half of it is ever seen.
-    records : iterable of mapping
-        In the order of their asset ids.
+    text : bytes or str
+        JSON.
+    where : str
+        What errors call it.
 
-    Returns
-    -------
-    str
-        SHA-256, in hex, of all that the records say except how long things
-        took and in what words they failed.
+    Raises
+    ------
+    RecordError
+        If it is no record of this version, or breaks its schema.
     """
-
-    def writing() -> Iterator[Mapping[str, Any]]:
-        for record in records:
-            file.write(orjson.dumps(record, option=orjson.OPT_APPEND_NEWLINE))
-            yield record
-
-    with path.open("wb") as file:
-        return records_id(writing())
+    record: Record = _read(Record, text, where)
+    return record
 
 
-def records_id(records: Iterable[Mapping[str, Any]]) -> str:
-    """Return the id of a build whose records these are, in the order of their asset ids."""
+def read_asset_record(text: bytes | str, where: str) -> AssetRecord:
+    """Read the record of a row; see `read_record`."""
+    record: AssetRecord = _read(AssetRecord, text, where)
+    return record
+
+
+def read_build_record(text: bytes | str, where: str) -> BuildRecord:
+    """Read ``build.json``; see `read_record`."""
+    record: BuildRecord = _read(BuildRecord, text, where)
+    return record
+
+
+def records_id(records: Iterable[Record]) -> str:
+    """Return the id of a build: SHA-256, in hex, of its records in the order of asset ids.
+
+    How long things took and in what words they failed are left out: they
+    differ between runs, machines and folders without the content differing.
+    """
     digest = hashlib.sha256()
     for record in records:
-        content = {k: v for k, v in record.items() if k not in _NOT_CONTENT}
-        digest.update(orjson.dumps(content, option=_SORTED_LINE))
+        if isinstance(record, AssetRecord):
+            content: Record = record.without_duration()
+        else:
+            content = replace(record, duration_s=0.0, reason="", traceback="")
+        digest.update(to_json(content))
     return digest.hexdigest()
 
 
-def load_schema(name: str) -> dict[str, Any]:
-    """Return a published JSON Schema, ``asset_record`` or ``build_record``."""
-    text = (
-        resources.files("slatprep.provenance")
-        .joinpath("schema", f"{name}.schema.json")
-        .read_text("utf-8")
-    )
-    return cast(dict[str, Any], json.loads(text))
+def write_records(path: Path, records: Iterable[Record]) -> str:
+    """Write records, in the order of their asset ids, as JSON Lines; return `records_id`."""
+
+    def passing() -> Iterator[Record]:
+        for record in records:
+            file.write(to_json(record) + b"\n")
+            yield record
+
+    with path.open("wb") as file:
+        return records_id(passing())
 
 
-def alignment_entry(result: AssetResult) -> dict[str, Any] | None:
-    """Return what a record says of an alignment; None where there is none."""
-    alignment, ambiguity = result.alignment, result.ambiguity
-    if alignment is None or ambiguity is None:
-        return None
-    return {
-        "transform": jsonable(alignment.transform),
-        "engine": alignment.engine,
-        "model": alignment.model,
-        "search": alignment.search,
-        "quality": jsonable(alignment.quality),
-        "candidates": jsonable(alignment.candidates),
-        "score": jsonable(alignment.score),
-        "placements": jsonable(alignment.placements),
-        "settled_by": jsonable(alignment.settled_by),
-        "ambiguity": {
-            "material_share": jsonable(ambiguity.material_share),
-            "property_change": jsonable(ambiguity.property_change),
-            "margin": jsonable(ambiguity.margin),
-        },
-        "verdict": str(result.verdict),
-        "verdict_reasons": list(result.verdict_reasons),
-    }
+def property_counts(counts: Iterable[int]) -> PropertyCounts:
+    """Return counts in the order of ``PROPERTY_COLUMNS`` by name."""
+    return PropertyCounts(**dict(zip(PROPERTY_COLUMNS, map(int, counts), strict=True)))
 
 
-def counts_entry(result: AssetResult) -> dict[str, Any] | None:
-    """Return what a record counts, clipped values left out; None where there is no result."""
-    field, latents, annotation = result.field, result.latents, result.annotation
-    if field is None or latents is None or annotation is None:
-        return None
-    occupied = int(np.count_nonzero(field.occupancy))
-    return {
-        "occupied": occupied,
-        "annotated": len(field.voxels),
-        "unannotated": occupied - len(field.voxels),
-        "boundary": int(np.count_nonzero(boundary(field.occupancy))),
-        "slat_voxels": len(latents.coords),
-        "valid": int(np.count_nonzero(annotation.valid)),
-        "clipped": None,
-    }
+@lru_cache(maxsize=4)
+def adapter_of(kind: Any) -> TypeAdapter[Any]:
+    """Return what reads a kind of record, and knows its JSON Schema."""
+    # Late: pydantic takes a third of a second that a command without records does not have.
+    from pydantic import Field, TypeAdapter
+
+    if kind is Record:
+        return TypeAdapter(Annotated[Record, Field(discriminator="status")])
+    return TypeAdapter(kind)
 
 
-def alignment_of(entry: Mapping[str, Any]) -> Alignment:
-    """Return the alignment that a record describes."""
-    settled_by = entry["settled_by"]
-    return Alignment(
-        transform=np.array(entry["transform"]),
-        engine=entry["engine"],
-        model=entry["model"],
-        search=entry["search"],
-        quality=Quality(**entry["quality"]),
-        candidates=tuple(
-            Candidate(**{**c, "euler_degrees": c["euler_degrees"] and tuple(c["euler_degrees"])})
-            for c in entry["candidates"]
-        ),
-        margin=_number(entry["ambiguity"]["margin"]),
-        placements=tuple(
-            Placement(np.array(p["transform"]), p["score"], p["displacement"])
-            for p in entry["placements"]
-        ),
-        score=_number(entry["score"]),
-        settled_by=settled_by
-        and Consensus(
-            np.array(settled_by["rotation"]), settled_by["winners"], settled_by["agreeing"]
-        ),
-    )
+def _read(kind: Any, text: bytes | str, where: str) -> Any:
+    from pydantic import ValidationError
+
+    try:
+        return adapter_of(kind).validate_json(text, strict=True)
+    except ValidationError as error:
+        raise RecordError(where, _faults(error)) from None
 
 
-def _number(value: float | None) -> float:
-    return float("nan") if value is None else value
+def _faults(error: ValidationError) -> tuple[str, ...]:
+    faults = []
+    found_at = [fault["loc"] for fault in error.errors(include_input=False)]
+    for fault in error.errors(include_url=False):
+        at = fault["loc"]
+        if any(other[: len(at)] == at and other != at for other in found_at):
+            continue  # A list that is too short without the faulty item is no fault of its own.
+        # Of a record that may be one of two kinds the first step names the kind.
+        steps = [str(step) for step in at if step not in tuple(Status)]
+        found = "" if fault["type"] == "missing" else f", found {str(fault['input'])[:60]!r}"
+        faults.append(f"{'/'.join(steps) or 'it'}: {fault['msg']}{found}")
+    return tuple(faults)
+
+
+def _plain(value: object) -> Any:
+    if isinstance(value, np.ndarray):  # not contiguous
+        return value.tolist()
+    if isinstance(value, Path):
+        return str(value)
+    raise TypeError(f"a record cannot hold {type(value).__name__} {value!r}")

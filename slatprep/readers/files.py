@@ -129,7 +129,7 @@ def require_complete(pair: AssetPair) -> tuple[Place, Place]:
         If the pair has another problem, such as two files for one id.
     """
     if pair.grid is None or pair.slat is None:
-        root = pair.pixieverse_root if pair.grid is None else pair.slat_root
+        root = pair.roots.pixieverse if pair.grid is None else pair.roots.slat
         raise MissingPartnerError(
             root, pair.problem or f"nothing for id {pair.asset_id!r}", "a grid and a SLAT per id"
         )

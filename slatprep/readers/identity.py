@@ -34,15 +34,15 @@ def hash_sources(pair: AssetPair) -> tuple[tuple[SourceFile, ...], dict[str, str
     """
     grid, slat = require_complete(pair)
     files = [(grid, "grid")] + ([(pair.mask, "mask")] if pair.mask else [])
-    sources = [load_source(path, pair.pixieverse_root, role)[1] for path, role in files]
+    sources = [load_source(path, pair.roots.pixieverse, role)[1] for path, role in files]
     if pair.bounds:
         with suppress(InputError):  # The supervision does without, and so does the reader.
-            sources.append(load_source(pair.bounds, pair.pixieverse_root, "bounds")[1])
+            sources.append(load_source(pair.bounds, pair.roots.pixieverse, "bounds")[1])
     latents = read_latents(pair) if pair.slat_group else None
     if latents is not None:
         sources += latents.sources
     else:
-        sources.append(load_source(slat, pair.slat_root, "slat")[1])
+        sources.append(load_source(slat, pair.roots.slat, "slat")[1])
     return tuple(sources), source_digests(sources, latents if pair.slat_group else None)
 
 

@@ -14,7 +14,7 @@ from slatprep.errors import ConfigError, InputError
 from slatprep.parameters import BuildParameters, PixieverseSource, SlatSource
 from slatprep.readers.joins import read_categories, read_map
 from slatprep.readers.patterns import NAME, fill, find_files, list_below
-from slatprep.records import AssetPair, Place
+from slatprep.records import AssetPair, Place, SourceRoots
 from slatprep.storage.listing import Listing
 
 
@@ -53,13 +53,14 @@ class _Found:
     """What of a dataset is there, by names; `listing` is that of the PixieVerse root."""
 
     parameters: BuildParameters
+    roots: SourceRoots
     listing: Listing
     one_file: bool
     grids: Mapping[str, list[_Grid]]
     categories: Mapping[str, str]
 
 
-def discover(parameters: BuildParameters) -> Iterator[AssetPair]:
+def discover(parameters: BuildParameters) -> list[AssetPair]:
     """Find the pairs of a dataset.
 
     Parameters
@@ -69,10 +70,9 @@ def discover(parameters: BuildParameters) -> Iterator[AssetPair]:
 
     Returns
     -------
-    iterator of AssetPair
+    list of AssetPair
         Sorted by `asset_id`, each id once. A pair that cannot be used is
-        returned too, and says why in `problem`. Masks and bounds are looked
-        up as the iterator proceeds.
+        returned too, and says why in `problem`. An entry takes about 1 kB.
 
     Raises
     ------
@@ -97,7 +97,8 @@ def discover(parameters: BuildParameters) -> Iterator[AssetPair]:
     claims = {} if pairing.map is None else read_map(pairing.map, grids, slats)
     categories = {} if pairing.categories is None else read_categories(pairing.categories)
     rows = sorted(_rows(grids, slats, claims), key=lambda row: (row.asset_id, row.object_id))
-    return _pairs(rows, _Found(parameters, listing, one_file, grids, categories))
+    roots = SourceRoots(pixieverse.root, slat.root.parent if one_file else slat.root)
+    return list(_pairs(rows, _Found(parameters, roots, listing, one_file, grids, categories)))
 
 
 def _find_grids(source: PixieverseSource, listing: Listing) -> dict[str, list[_Grid]]:
@@ -256,18 +257,16 @@ def _pair(row: _Row, there: _Found, shared: str) -> AssetPair:
             f"{len(found)} SLATs for one id {row.asset_id!r} ({files}); expected one, "
             "or a pattern with {view}"
         )
-    slat_root = slat_source.root.parent if there.one_file else slat_source.root
     return AssetPair(
         asset_id=row.asset_id,
         object_id=_safe(row.object_id),
         view=_safe(row.view),
         category=there.categories.get(row.object_id, ""),
-        pixieverse_root=source.root,
-        slat_root=slat_root,
+        roots=there.roots,
         grid=grid,
         mask=mask,
         bounds=bounds,
-        slat=slat_root / found[0].path if found else None,
+        slat=there.roots.slat / found[0].path if found else None,
         slat_group=found[0].group if found else "",
         problem="; ".join(problem for problem in problems if problem),
     )

@@ -73,14 +73,14 @@ def read_field(pair: AssetPair) -> MaterialField:
         If a file cannot be used; the message names file, value and voxel.
     """
     path, _ = require_complete(pair)
-    data, source = load_source(path, pair.pixieverse_root, "grid")
+    data, source = load_source(path, pair.roots.pixieverse, "grid")
     grid = npy_array(data, path, GRID)
     sources = [source]
     warnings: list[str] = []
 
     mask = None
     if pair.mask is not None:
-        data, source = load_source(pair.mask, pair.pixieverse_root, "mask")
+        data, source = load_source(pair.mask, pair.roots.pixieverse, "mask")
         sources.append(source)
         mask = _read_mask(npy_array(data, pair.mask, MASK), pair.mask, warnings)
 
@@ -105,7 +105,7 @@ def read_field(pair: AssetPair) -> MaterialField:
 
     bounds = None
     if pair.bounds is not None:
-        bounds = _read_bounds(pair.bounds, pair.pixieverse_root, sources, warnings)
+        bounds = _read_bounds(pair.bounds, pair.roots.pixieverse, sources, warnings)
     return MaterialField(
         occupancy=occupancy,
         voxels=voxels.astype(np.uint8),

@@ -43,9 +43,9 @@ def read_latents(pair: AssetPair) -> StructuredLatents:
     """
     _, path = require_complete(pair)
     if pair.slat_group or path.suffix.lower() in SUFFIXES:
-        arrays, source = load_datasets(path, pair.slat_root, pair.slat_group, SPECS)
+        arrays, source = load_datasets(path, pair.roots.slat, pair.slat_group, SPECS)
     else:
-        data, source = load_source(path, pair.slat_root, "slat")
+        data, source = load_source(path, pair.roots.slat, "slat")
         arrays = npz_arrays(data, path, SPECS)
     where = f"{path} [{pair.slat_group}]" if pair.slat_group else path
     coords, feats = arrays["coords"], arrays["feats"]

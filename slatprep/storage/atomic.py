@@ -15,6 +15,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from slatprep.errors import StoreError
+from slatprep.storage.faults import reached
 
 _AT_FDCWD = -100
 _RENAME_EXCHANGE = 2
@@ -35,6 +36,7 @@ def replace_directory(new: Path, target: Path) -> None:
         If the directory cannot be moved; `target` is as it was.
     """
     flush_tree(new)
+    reached("directory flushed", str(target))
     old = _aside(new.parent)
     if not target.exists():
         new.rename(target)
@@ -48,6 +50,7 @@ def replace_directory(new: Path, target: Path) -> None:
             old.rename(target)
             raise
     flush(target.parent)
+    reached("directory exchanged", str(target))
     if old.exists():
         shutil.rmtree(old, ignore_errors=True)  # The work folder goes next, with what is left.
 

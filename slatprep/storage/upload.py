@@ -21,6 +21,7 @@ from pathlib import Path
 from typing import Any
 
 from slatprep.errors import StoreError
+from slatprep.storage.faults import reached
 from slatprep.storage.files import file_digest, local_files
 from slatprep.storage.remote import (
     RemotePlace,
@@ -132,6 +133,7 @@ class Upload:
             self._replace_pointer()
         except OSError as error:
             raise StoreError(_refused(self.target, error)) from None
+        reached("pointer replaced", str(self.target))
         try:
             _remove(self.target, old)
         except OSError as error:

@@ -2,22 +2,15 @@
 
 ``asset/record`` holds, as JSON, what ``assets.jsonl`` says of each asset in
 the store, save how long it took, which is not the same in two builds. It is
-replaced in one step with the arrays it speaks of, and it is what the next
-build compares with.
+replaced in one step with the arrays it belongs to, and it is what the next
+build compares with. What a record says is `slatprep.provenance`'s matter.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
-from functools import cached_property, lru_cache
-from pathlib import Path
 from typing import Any
 
 import numpy as np
-import orjson
-
-from slatprep.errors import StoreError
-from slatprep.store.reader import Store, open_store
 
 RECORD_ARRAY = "asset/record"
 
@@ -57,10 +50,9 @@ class RecordWriter:
         self._start = 0
         self._texts: list[str] = []
 
-    def add(self, record: Mapping[str, Any]) -> None:
-        """Take the next row's record."""
-        content = {name: value for name, value in record.items() if name != "duration_s"}
-        self._texts.append(orjson.dumps(content).decode())
+    def add(self, record: bytes) -> None:
+        """Take the next row's record, JSON in UTF-8."""
+        self._texts.append(record.decode())
         if len(self._texts) == RECORDS_IN_SHARD:
             self.flush()
 
@@ -70,63 +62,3 @@ class RecordWriter:
         if self._texts:
             self._array[self._start : stop] = np.array(self._texts, dtype=object)
         self._start, self._texts = stop, []
-
-
-class StoredRecords:
-    """The records of a store that is there, by asset id.
-
-    Parameters
-    ----------
-    store : Store
-        Any store; one without records has none to give.
-    """
-
-    def __init__(self, store: Store) -> None:
-        self.store = store
-
-    def __iter__(self) -> Iterator[dict[str, Any]]:
-        for start in range(0, len(self.store) if self._array is not None else 0, RECORDS_IN_CHUNK):
-            yield from self._chunk(start // RECORDS_IN_CHUNK)
-
-    def find(self, asset_id: str) -> dict[str, Any] | None:
-        """Return an asset's record, or None where there is none."""
-        row = self._rows.get(asset_id)
-        if row is None:
-            return None
-        chunk, position = divmod(row, RECORDS_IN_CHUNK)
-        return self._chunk(chunk)[position]
-
-    @cached_property
-    def ids(self) -> list[str]:
-        """Ids of the assets that have a record, sorted."""
-        return self.store.ids if self._array is not None else []
-
-    @cached_property
-    def _rows(self) -> dict[str, int]:
-        return {asset_id: row for row, asset_id in enumerate(self.ids)}
-
-    @cached_property
-    def _array(self) -> Any:
-        return self.store.group.get(RECORD_ARRAY)
-
-    def _chunk(self, number: int) -> list[dict[str, Any]]:
-        # Assets are asked for nearly in order: the last chunk answers most of the time.
-        if self._last[0] != number:
-            rows = slice(number * RECORDS_IN_CHUNK, (number + 1) * RECORDS_IN_CHUNK)
-            self._last = (number, [orjson.loads(str(text)) for text in self._array[rows]])
-        return self._last[1]
-
-    _last: tuple[int, list[dict[str, Any]]] = (-1, [])
-
-
-@lru_cache(maxsize=1)
-def stored_records(path: Path, manifest: str) -> StoredRecords | None:
-    """Return the records of the store at a path, or None if there is none that can be read.
-
-    `manifest`, the id of the build, keeps a process that lives on from
-    answering with what it read of an older store.
-    """
-    try:
-        return StoredRecords(open_store(path))
-    except StoreError:
-        return None

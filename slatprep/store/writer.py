@@ -75,7 +75,7 @@ def shards(
 
 
 def finish_store(
-    path: Path, normalization: Normalization, manifest: str, build: Mapping[str, object]
+    path: Path, normalization: Normalization, build_id: str, build: Mapping[str, object]
 ) -> None:
     """Write the root's attributes and all files' digests; gather all metadata in one file.
 
@@ -85,14 +85,14 @@ def finish_store(
         The store.
     normalization : Normalization
         Ranges of the properties.
-    manifest : str
+    build_id : str
         Id of the build.
     build : mapping
         Parameters and versions that made the content.
     """
     import zarr
 
-    _open(path).attrs.update(root_attributes(normalization, manifest, build))
+    open_for_writing(path).attrs.update(root_attributes(normalization, build_id, build))
     write_coordinates(path)
     write_digests(path)
     with warnings.catch_warnings():
@@ -102,7 +102,8 @@ def finish_store(
         zarr.consolidate_metadata(str(path), zarr_format=3)
 
 
-def _open(path: Path) -> Any:
+def open_for_writing(path: Path) -> Any:
+    """Open a new store's root, without its consolidated metadata."""
     import zarr
 
     return zarr.open_group(path, mode="r+", zarr_format=3, use_consolidated=False)

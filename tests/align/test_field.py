@@ -17,7 +17,7 @@ from support.shapes import GRID, Case, chair, field_of, latents_of, surface_late
 from slatprep.align import align, engine_versions
 from slatprep.align.starts import distinct_starts
 from slatprep.geometry.frames import displacement, make_transform, split_transform
-from slatprep.judge import judge, measure_ambiguity
+from slatprep.judge import judge
 from slatprep.parameters import AlignParameters, SampleParameters
 from slatprep.records import Verdict
 from slatprep.sample import sample
@@ -151,8 +151,8 @@ def test_odd_shapes_get_a_finite_answer_and_a_verdict(name: str) -> None:
     for latents in (own, latents_of(DEGENERATE["a dozen"]), surface_latents(BALL)):
         alignment = align(field, latents, DEFAULT)
         annotation = sample(field, latents.coords, alignment.transform, SampleParameters())
-        ambiguity = measure_ambiguity(field, latents, alignment, annotation, SampleParameters())
-        verdict, reasons = judge(alignment.quality, float(annotation.valid.mean()), ambiguity)
+        judgement = judge(field, latents, alignment, annotation, SampleParameters())
+        ambiguity = judgement.ambiguity
         numbers = [
             *alignment.transform.ravel(),
             alignment.score,
@@ -166,8 +166,8 @@ def test_odd_shapes_get_a_finite_answer_and_a_verdict(name: str) -> None:
             *ambiguity.property_change,
         ]
         assert np.isfinite(numbers).all()
-        assert isinstance(verdict, Verdict)
-        assert (verdict is Verdict.GOOD) == (not reasons)
+        assert isinstance(judgement.verdict, Verdict)
+        assert (judgement.verdict is Verdict.GOOD) == (not judgement.reasons)
     if name in ("a dozen", "two far blobs"):
         same = align(field, own, DEFAULT)
         assert displacement(same.transform, np.eye(4), own.coords) < 0.01

@@ -8,8 +8,8 @@ from support.shapes import chair, field_of, surface_latents
 
 from slatprep.align.quality import compare, measure_quality
 from slatprep.geometry.frames import make_transform
-from slatprep.judge import THRESHOLDS, judge
-from slatprep.records import Ambiguity, Placement, Quality, Verdict
+from slatprep.judge import THRESHOLDS, verdict_of
+from slatprep.records import Quality, Verdict
 
 LINE = np.array([[i, 30, 30] for i in range(10)], dtype=np.uint8)
 
@@ -60,28 +60,24 @@ def _quality(fitness: float, backward: float = 1.0) -> Quality:
     return Quality(fitness, 0.5, backward, 0.5, 0.9, 1.0)
 
 
-def _ambiguity(share: float) -> Ambiguity:
-    return Ambiguity(share, (0.0, 0.0, 0.0), 0.0, (Placement(np.eye(4), 0.9, 5.0),))
-
-
 @pytest.mark.parametrize(
     ("quality", "valid", "ambiguity", "verdict", "word"),
     [
-        (_quality(0.95), 1.0, None, Verdict.GOOD, ""),
-        (_quality(THRESHOLDS.good_fitness), 1.0, None, Verdict.GOOD, ""),
-        (_quality(0.79), 1.0, None, Verdict.DOUBTFUL, "PixieVerse boundary"),
-        (_quality(1.0, 0.79), 1.0, None, Verdict.DOUBTFUL, "SLAT boundary"),
-        (_quality(1.0, 0.64), 1.0, None, Verdict.FAILED, "SLAT boundary"),
-        (_quality(0.64), 1.0, None, Verdict.FAILED, "64.0%"),
-        (_quality(1.0), 0.89, None, Verdict.DOUBTFUL, "annotation"),
-        (_quality(1.0), 1.0, _ambiguity(0.05), Verdict.GOOD, ""),
-        (_quality(1.0), 1.0, _ambiguity(0.3), Verdict.DOUBTFUL, "30.0%"),
+        (_quality(0.95), 1.0, 0.0, Verdict.GOOD, ""),
+        (_quality(THRESHOLDS.good_fitness), 1.0, 0.0, Verdict.GOOD, ""),
+        (_quality(0.79), 1.0, 0.0, Verdict.DOUBTFUL, "PixieVerse boundary"),
+        (_quality(1.0, 0.79), 1.0, 0.0, Verdict.DOUBTFUL, "SLAT boundary"),
+        (_quality(1.0, 0.64), 1.0, 0.0, Verdict.FAILED, "SLAT boundary"),
+        (_quality(0.64), 1.0, 0.0, Verdict.FAILED, "64.0%"),
+        (_quality(1.0), 0.89, 0.0, Verdict.DOUBTFUL, "annotation"),
+        (_quality(1.0), 1.0, 0.05, Verdict.GOOD, ""),
+        (_quality(1.0), 1.0, 0.3, Verdict.DOUBTFUL, "30.0%"),
     ],
 )
 def test_verdicts(
-    quality: Quality, valid: float, ambiguity: Ambiguity | None, verdict: Verdict, word: str
+    quality: Quality, valid: float, ambiguity: float, verdict: Verdict, word: str
 ) -> None:
-    given, reasons = judge(quality, valid, ambiguity)
+    given, reasons = verdict_of(quality, valid, ambiguity, ties=1)
     assert given is verdict
     assert word in " ".join(reasons)
     assert bool(reasons) == (verdict is not Verdict.GOOD)

@@ -13,6 +13,7 @@ import time
 from pathlib import Path
 
 import pytest
+from support.faults import environment
 from support.synthetic import Dataset, make_asset
 from support.trees import tree
 
@@ -23,22 +24,15 @@ from slatprep.storage import atomic as replace
 from slatprep.store import open_store
 
 BUILD = """
-import json, os, resource, signal, sys
+import json, sys
 from pathlib import Path
 
-import slatprep.pipeline.dataset as build
-import slatprep.pipeline.asset as process
 from slatprep.errors import SlatprepError
 from slatprep.parameters import *
+from slatprep.pipeline.dataset import build_store
 
 root, out, jobs = Path(sys.argv[1]), Path(sys.argv[2]), int(sys.argv[3])
-
-
-def kill_self(*_, **__):
-    os.kill(os.getpid(), signal.SIGKILL)
-
-
-{fault}
+{before}
 parameters = BuildParameters(
     PixieverseSource(root / "pixieverse"),
     SlatSource(root / "slat"),
@@ -47,49 +41,41 @@ parameters = BuildParameters(
 )
 if __name__ == "__main__":
     try:
-        summary = build.build_store(parameters, out, jobs=jobs)
+        summary = build_store(parameters, out, jobs=jobs)
     except SlatprepError as error:
         sys.exit(f"refused: {{error}}")
     print(json.dumps([summary.statuses, dict(summary.problems)]))
 """
 
-KILL_AT = """
-def kill_after(module, name, calls=1):
-    function, left = getattr(module, name), [calls]
-    def wrapped(*args, **kwargs):
-        left[0] -= 1
-        if left[0] < 0:
-            kill_self()
-        return function(*args, **kwargs)
-    setattr(module, name, wrapped)
+
+def kill_at(step: str, calls: int = 0) -> str:
+    """Return the fault that ends the process when a step is reached after `calls` others."""
+    return f"""
+if step == {step!r}:
+    seen.append(name)
+    if len(seen) > {calls}:
+        kill_self()
 """
 
 
 def run(
-    script: Path, dataset: Dataset, out: Path, fault: str = "", in_workers: str = "", jobs: int = 1
+    script: Path, dataset: Dataset, out: Path, fault: str = "", jobs: int = 1, before: str = ""
 ) -> subprocess.CompletedProcess[str]:
-    command = prepared(script, dataset, out, fault, in_workers, jobs)
     return subprocess.run(
-        command, env=environment(script), check=False, capture_output=True, text=True
+        prepared(script, dataset, out, jobs, before),
+        env=environment(script.parent, fault),
+        check=False,
+        capture_output=True,
+        text=True,
     )
 
 
 def prepared(
-    script: Path, dataset: Dataset, out: Path, fault: str = "", in_workers: str = "", jobs: int = 1
+    script: Path, dataset: Dataset, out: Path, jobs: int = 1, before: str = ""
 ) -> list[str]:
-    """Write a build with a fault, in its own process or in all, and return its command."""
-    script.write_text(BUILD.format(fault=KILL_AT + fault))
-    if in_workers:
-        # Workers are processes of their own, which import this before anything else.
-        (script.parent / "sitecustomize.py").write_text(
-            f"import os, signal, sys\nimport slatprep.pipeline.asset as process\n{in_workers}"
-        )
+    """Write a build and return its command."""
+    script.write_text(BUILD.format(before=before))
     return [sys.executable, str(script), str(dataset.root), str(out), str(jobs)]
-
-
-def environment(script: Path) -> dict[str, str]:
-    paths = (str(script.parent), os.environ.get("PYTHONPATH", ""))
-    return {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": os.pathsep.join(paths)}
 
 
 @pytest.fixture
@@ -142,14 +128,14 @@ def ends_well(dataset: Dataset, out: Path, expected: dict[str, str]) -> None:
 
 
 @pytest.mark.parametrize(
-    "where",
+    ("step", "calls"),
     [
-        "kill_after(build, 'finish_asset', 2)",
-        "import slatprep.pipeline.pack as p; kill_after(p, 'write_shard', 3)",
-        "import slatprep.storage.atomic as r; kill_after(r, '_exchange', 0)",
-        "import slatprep.storage.atomic as r; kill_after(r.shutil, 'rmtree', 0)",
-        "kill_after(build, 'replace_directory', 1); kill_after(build, 'publish_manifests', 0)",
-        "import slatprep.pipeline.publish as p; kill_after(p, 'write_build_record', 0)",
+        ("asset begun", 2),
+        ("shard begun", 3),
+        ("directory flushed", 0),
+        ("directory exchanged", 0),
+        ("store replaced", 0),
+        ("manifests written", 0),
     ],
 )
 def test_killed_at_every_step(
@@ -157,14 +143,15 @@ def test_killed_at_every_step(
     old_store: Path,
     script: Path,
     tmp_path: Path,
-    where: str,
+    step: str,
+    calls: int,
 ) -> None:
     dataset, expected = reference
     out = tmp_path / "s.zarr"
     shutil.copytree(old_store, out)
     before = tree(out)
 
-    killed = run(script, dataset, out, where)
+    killed = run(script, dataset, out, kill_at(step, calls))
     assert killed.returncode == -signal.SIGKILL, killed.stderr
 
     assert tree(out) in (before, expected)
@@ -175,17 +162,13 @@ def test_what_was_finished_is_not_done_again(
     reference: tuple[Dataset, dict[str, str]], script: Path, tmp_path: Path
 ) -> None:
     dataset, expected = reference
-    killed = run(script, dataset, tmp_path / "s.zarr", "kill_after(build, 'finish_asset', 2)")
+    killed = run(script, dataset, tmp_path / "s.zarr", kill_at("asset begun", 2))
     assert killed.returncode == -signal.SIGKILL
     # A torn file, as a power failure leaves it, is known and done again.
     torn, *_ = sorted((tmp_path / ".s.zarr.work" / "spool").rglob("*.npz"))
     torn.write_bytes(torn.read_bytes()[:-2000])
-    again = run(
-        script,
-        dataset,
-        tmp_path / "s.zarr",
-        "kill_after(process, 'align', 2)",  # One was finished, so two alignments are enough.
-    )
+    # One was finished, so two alignments are enough.
+    again = run(script, dataset, tmp_path / "s.zarr", kill_at("asset aligned", 2))
     assert again.returncode == 0, again.stderr
     assert tree(tmp_path / "s.zarr") == expected
 
@@ -209,35 +192,29 @@ def test_a_worker_that_dies_costs_nothing(
     reference: tuple[Dataset, dict[str, str]], script: Path, tmp_path: Path
 ) -> None:
     dataset, expected = reference
-    fault = """
-read_field = process.read_field
-def dies_once(pair):
-    if pair.asset_id == "b" and not os.path.exists("DIED"):
-        open("DIED", "w").close()
-        os.kill(os.getpid(), signal.SIGKILL)
-    return read_field(pair)
-process.read_field = dies_once
+    died = str(tmp_path / "died")
+    fault = f"""
+if (step, name) == ("asset begun", "b") and not os.path.exists({died!r}):
+    open({died!r}, "w").close()
+    kill_self()
 """
-    fault = fault.replace("DIED", str(tmp_path / "died"))
-    done = run(script, dataset, tmp_path / "s.zarr", in_workers=fault, jobs=2)
+    done = run(script, dataset, tmp_path / "s.zarr", fault, jobs=2)
     assert done.returncode == 0, done.stderr
-    assert (tmp_path / "died").exists()
+    assert Path(died).exists()
     assert tree(tmp_path / "s.zarr") == expected
+
+
+DIES_OF_B = """
+if (step, name) == ("asset begun", "b"):
+    kill_self()
+"""
 
 
 def test_an_asset_that_kills_its_worker_is_named_and_the_others_go_in(
     reference: tuple[Dataset, dict[str, str]], script: Path, tmp_path: Path
 ) -> None:
     dataset, expected = reference
-    fault = """
-read_field = process.read_field
-def dies(pair):
-    if pair.asset_id == "b":
-        os.kill(os.getpid(), signal.SIGKILL)
-    return read_field(pair)
-process.read_field = dies
-"""
-    done = run(script, dataset, tmp_path / "s.zarr", in_workers=fault, jobs=2)
+    done = run(script, dataset, tmp_path / "s.zarr", DIES_OF_B, jobs=2)
     assert done.returncode == 0, done.stderr
     statuses, problems = json.loads(done.stdout)
     assert statuses == {"ok": 2, "failed": 1, "skipped": 0}
@@ -251,19 +228,15 @@ def test_memory_that_runs_out_is_told_of_the_asset(
 ) -> None:
     dataset, expected = reference
     fault = """
-import slatprep.align.field, numpy
-read_latents = process.read_latents
-def greedy(pair):
-    if pair.asset_id == "b":
-        used = int(open("/proc/self/statm").read().split()[0]) * os.sysconf("SC_PAGE_SIZE")
-        before = resource.getrlimit(resource.RLIMIT_AS)
-        resource.setrlimit(resource.RLIMIT_AS, (used + 2**26, before[1]))
-        try:
-            numpy.ones(2**26)
-        finally:
-            resource.setrlimit(resource.RLIMIT_AS, before)
-    return read_latents(pair)
-process.read_latents = greedy
+import numpy, resource
+if (step, name) == ("asset read", "b"):
+    used = int(open("/proc/self/statm").read().split()[0]) * os.sysconf("SC_PAGE_SIZE")
+    before = resource.getrlimit(resource.RLIMIT_AS)
+    resource.setrlimit(resource.RLIMIT_AS, (used + 2**26, before[1]))
+    try:
+        numpy.ones(2**26)
+    finally:
+        resource.setrlimit(resource.RLIMIT_AS, before)
 """
     done = run(script, dataset, tmp_path / "s.zarr", fault)
     assert done.returncode == 0, done.stderr
@@ -272,29 +245,24 @@ process.read_latents = greedy
     ends_well(dataset, tmp_path / "s.zarr", expected)
 
 
-@pytest.mark.parametrize("limit", [4_000, 60_000], ids=["at an asset", "at a shard"])
+@pytest.mark.parametrize("step", ["asset aligned", "shard begun"])
 def test_a_disk_that_takes_no_more(
-    reference: tuple[Dataset, dict[str, str]], script: Path, tmp_path: Path, limit: int
+    reference: tuple[Dataset, dict[str, str]], script: Path, tmp_path: Path, step: str
 ) -> None:
     """A limit on the size of files stands in for a full disk: the same error at a write."""
     dataset, expected = reference
     out = tmp_path / "s.zarr"
-    step = "write_shard" if limit > 10_000 else "finish_asset"
     fault = f"""
-import slatprep.pipeline.pack as pack
-module = pack if "{step}" == "write_shard" else build
-function = module.{step}
-def full(*args):
+import resource
+if step == {step!r}:
     resource.setrlimit(resource.RLIMIT_FSIZE, (100, resource.RLIM_INFINITY))
-    return function(*args)
-module.{step} = full
 """
     done = run(script, dataset, out, fault)
     assert done.returncode == 1
     assert done.stderr.startswith("refused: ")
     assert "cannot be written to" in done.stderr
     assert "File too large" in done.stderr
-    if step == "finish_asset":
+    if step == "asset aligned":
         assert "refused: a: " in done.stderr
     assert not out.exists()
     ends_well(dataset, out, expected)
@@ -304,13 +272,10 @@ def test_a_source_that_vanishes_midway(
     reference: tuple[Dataset, dict[str, str]], script: Path, tmp_path: Path
 ) -> None:
     dataset, expected = reference
-    fault = """
-finish_asset = build.finish_asset
-def vanishing(pair, *rest):
-    if pair.asset_id == "b":
-        pair.slat.unlink()
-    return finish_asset(pair, *rest)
-build.finish_asset = vanishing
+    slat = str(dataset.root / "slat" / "b.npz")
+    fault = f"""
+if (step, name) == ("asset begun", "b"):
+    os.unlink({slat!r})
 """
     done = run(script, dataset, tmp_path / "s.zarr", fault)
     statuses, problems = json.loads(done.stdout)
@@ -329,10 +294,10 @@ def test_a_target_that_is_read_only(
     folder.mkdir()
     folder.chmod(0o555)
     # Root may write anywhere, so it becomes nobody first.
-    fault = "import fcntl; os.geteuid() or os.seteuid(65534)"
+    nobody = "import fcntl, os; os.geteuid() or os.seteuid(65534)"
     for path in (tmp_path, *tmp_path.parents[:3]):  # one more under pytest-xdist
         path.chmod(path.stat().st_mode | 0o755)
-    done = run(script, dataset, folder / "s.zarr", fault)
+    done = run(script, dataset, folder / "s.zarr", before=nobody)
     assert done.returncode == 1
     assert "locked: cannot write there (Permission denied)" in done.stderr
     folder.chmod(0o755)
@@ -346,10 +311,10 @@ def test_a_target_that_may_not_even_be_looked_at(
     folder = tmp_path / "hidden"
     folder.mkdir()
     folder.chmod(0o000)
-    fault = "import fcntl; os.geteuid() or os.seteuid(65534)"
+    nobody = "import fcntl, os; os.geteuid() or os.seteuid(65534)"
     for path in (tmp_path, *tmp_path.parents[:3]):
         path.chmod(path.stat().st_mode | 0o755)
-    done = run(script, dataset, folder / "s.zarr", fault)
+    done = run(script, dataset, folder / "s.zarr", before=nobody)
     folder.chmod(0o755)
     assert done.returncode == 1
     assert "s.zarr: cannot be looked at (Permission denied)" in done.stderr
@@ -361,10 +326,12 @@ def test_the_second_of_two_builds_is_refused_and_told_of_the_first(
 ) -> None:
     dataset, expected = reference
     out = tmp_path / "s.zarr"
-    sleeping = (
-        "import time, slatprep.pipeline.pack as p\np.create_store = lambda *_: time.sleep(600)"
-    )
-    first = subprocess.Popen(prepared(script, dataset, out, sleeping), env=environment(script))
+    sleeping = """
+if step == "store created":
+    time.sleep(600)
+"""
+    command = prepared(script, dataset, out)
+    first = subprocess.Popen(command, env=environment(script.parent, sleeping))
     try:
         lock = tmp_path / ".s.zarr.work" / "lock"
         while not lock.exists() or not lock.read_text():
@@ -384,24 +351,22 @@ def test_workers_do_not_outlive_a_killed_build(
     reference: tuple[Dataset, dict[str, str]], script: Path, tmp_path: Path
 ) -> None:
     dataset, _ = reference
-    fault = """
-def endless(*_):
-    import time
-    open(f"PIDS/{os.getpid()}", "w").close()
+    pids = tmp_path / "pids"
+    pids.mkdir()
+    endless = f"""
+if step == "asset begun":
+    open(f"{pids}/{{os.getpid()}}", "w").close()
     time.sleep(600)
-process.read_field = endless
 """
-    (tmp_path / "pids").mkdir()
-    fault = fault.replace("PIDS", str(tmp_path / "pids"))
-    command = prepared(script, dataset, tmp_path / "s.zarr", in_workers=fault, jobs=2)
-    build = subprocess.Popen(command, env=environment(script))
-    while len(list((tmp_path / "pids").iterdir())) < 2:
+    command = prepared(script, dataset, tmp_path / "s.zarr", jobs=2)
+    build = subprocess.Popen(command, env=environment(script.parent, endless))
+    while len(list(pids.iterdir())) < 2:
         time.sleep(0.05)
     build.kill()
     build.wait()
-    pids = [int(path.name) for path in (tmp_path / "pids").iterdir()]
+    workers = [int(path.name) for path in pids.iterdir()]
     end = time.monotonic() + 60
-    while any(Path(f"/proc/{pid}/stat").exists() for pid in pids):
+    while any(Path(f"/proc/{pid}/stat").exists() for pid in workers):
         assert time.monotonic() < end, "a worker is still there"
         time.sleep(0.1)
 
@@ -417,12 +382,12 @@ def test_a_few_kills_at_random_times(
     for turn in range(4):
         dataset.add("d", seed=turn)
         command = prepared(script, dataset, out, jobs=2)
-        build = subprocess.Popen(command, env=environment(script), start_new_session=True)
+        build = subprocess.Popen(command, env=environment(script.parent), start_new_session=True)
         time.sleep(chance.uniform(0.5, 5.0))
         os.killpg(build.pid, signal.SIGKILL)
         build.wait()
         stored = open_store(out)
-        assert [stored.asset(i).asset_id for i in stored.ids] == stored.ids
+        assert all(len(stored.asset(asset_id).coords) for asset_id in stored.ids)
     shutil.rmtree(dataset.root / "pixieverse" / "d")
     (dataset.root / "slat" / "d.npz").unlink()
     ends_well(dataset, out, expected)

@@ -4,18 +4,18 @@ from __future__ import annotations
 
 import json
 import shutil
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
 import h5py
 import numpy as np
 import pytest
+from support.faults import inject
 from support.synthetic import Dataset, make_asset
 from support.trees import tree
 
 from slatprep.parameters import AlignParameters, BuildParameters, SampleParameters
-from slatprep.pipeline import asset as process
 from slatprep.pipeline.dataset import build_store, plan_build
 from slatprep.store import open_store
 
@@ -23,16 +23,10 @@ MakeDataset = Callable[..., Dataset]
 
 
 @pytest.fixture
-def aligned(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[int]]:
-    """Count the SLAT voxels of each call of the alignment; the alignment itself is real."""
-    seen: list[int] = []
-    align = process.align
-
-    def counting(field, latents, parameters):  # type: ignore[no-untyped-def]
-        seen.append(len(latents.coords))
-        return align(field, latents, parameters)
-
-    monkeypatch.setattr(process, "align", counting)
+def aligned(monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """Note the assets that are aligned."""
+    seen: list[str] = []
+    inject(monkeypatch, lambda step, name: step == "asset aligned" and seen.append(name))
     return seen
 
 
@@ -56,7 +50,7 @@ def fresh_tree(parameters: BuildParameters, tmp_path: Path) -> dict[str, str]:
     return hashes
 
 
-def test_nothing_changed_writes_nothing(built: tuple[Dataset, Path], aligned: list[int]) -> None:
+def test_nothing_changed_writes_nothing(built: tuple[Dataset, Path], aligned: list[str]) -> None:
     dataset, out = built
     inodes = {path: path.stat().st_ino for path in out.parent.rglob("*") if path.is_file()}
     summary = build_store(dataset.parameters(), out)
@@ -74,7 +68,7 @@ def test_nothing_changed_writes_nothing(built: tuple[Dataset, Path], aligned: li
 
 
 def test_new_changed_and_removed(
-    built: tuple[Dataset, Path], aligned: list[int], tmp_path: Path
+    built: tuple[Dataset, Path], aligned: list[str], tmp_path: Path
 ) -> None:
     dataset, out = built
     dataset.add("d", seed=3)
@@ -114,7 +108,7 @@ def test_a_change_that_keeps_size_and_times_is_seen(built: tuple[Dataset, Path])
 
 
 def test_moved_ranges_renormalise_without_aligning(
-    built: tuple[Dataset, Path], aligned: list[int], tmp_path: Path
+    built: tuple[Dataset, Path], aligned: list[str], tmp_path: Path
 ) -> None:
     dataset, out = built
     pixie = dataset.parameters("pixie")
@@ -125,7 +119,7 @@ def test_moved_ranges_renormalise_without_aligning(
 
 
 def test_other_shards_need_no_alignment(
-    built: tuple[Dataset, Path], aligned: list[int], tmp_path: Path
+    built: tuple[Dataset, Path], aligned: list[str], tmp_path: Path
 ) -> None:
     dataset, out = built
     parameters = dataset.parameters()
@@ -136,7 +130,7 @@ def test_other_shards_need_no_alignment(
 
 
 def test_parameters_that_touch_an_asset_redo_it(
-    built: tuple[Dataset, Path], aligned: list[int], tmp_path: Path
+    built: tuple[Dataset, Path], aligned: list[str], tmp_path: Path
 ) -> None:
     dataset, out = built
     nearer = replace(dataset.parameters(), sample=SampleParameters(max_distance=2.0))
@@ -160,7 +154,7 @@ def test_other_code_redoes_an_asset(
 
 
 def test_a_category_is_no_part_of_the_work(
-    built: tuple[Dataset, Path], aligned: list[int], tmp_path: Path
+    built: tuple[Dataset, Path], aligned: list[str], tmp_path: Path
 ) -> None:
     dataset, out = built
     categories = tmp_path / "categories.json"
@@ -173,7 +167,7 @@ def test_a_category_is_no_part_of_the_work(
 
 
 def test_one_file_of_all_slats_may_grow(
-    make_dataset: MakeDataset, aligned: list[int], tmp_path: Path
+    make_dataset: MakeDataset, aligned: list[str], tmp_path: Path
 ) -> None:
     dataset = make_dataset("a", "b")
     dataset.write_grid("c", make_asset(2).grid)
@@ -200,7 +194,7 @@ def test_one_file_of_all_slats_may_grow(
 
 
 def test_an_asset_that_cannot_go_in_does_not_make_the_store_old(
-    built: tuple[Dataset, Path], aligned: list[int]
+    built: tuple[Dataset, Path], aligned: list[str]
 ) -> None:
     dataset, out = built
     dataset.write_grid("lone", make_asset(4).grid)
@@ -227,7 +221,7 @@ def test_missing_or_older_manifests_are_written_again(built: tuple[Dataset, Path
         assert {**old, "duration_s": 0.0} == new
 
 
-def test_fresh_does_everything(built: tuple[Dataset, Path], aligned: list[int]) -> None:
+def test_fresh_does_everything(built: tuple[Dataset, Path], aligned: list[str]) -> None:
     dataset, out = built
     before = tree(out)
     build_store(dataset.parameters(), out, fresh=True)
@@ -236,24 +230,22 @@ def test_fresh_does_everything(built: tuple[Dataset, Path], aligned: list[int]) 
 
 
 def test_kept_work_is_used_and_holds_no_more_than_the_store(
-    built: tuple[Dataset, Path], aligned: list[int], monkeypatch: pytest.MonkeyPatch
+    built: tuple[Dataset, Path], aligned: list[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     dataset, out = built
     build_store(dataset.parameters("pixie"), out, keep_work=True)
     kept = out.with_name(".s.zarr.work") / "spool"
     assert len(list(kept.rglob("*.npz"))) == 3
 
-    def never(*_: object) -> None:
-        raise AssertionError("a source was parsed again")
-
-    monkeypatch.setattr(process, "read_field", never)
+    read: list[str] = []
+    inject(monkeypatch, lambda step, name: step == "asset read" and read.append(name))
     shutil.rmtree(dataset.root / "pixieverse" / "c")
     (dataset.root / "slat" / "c.npz").unlink()
     assert reasons(dataset.parameters(), out)["a"] == ("resume", "finished by an earlier build")
     build_store(dataset.parameters(), out, keep_work=True)
     assert open_store(out).ids == ["a", "b"]
     assert len(list(kept.rglob("*.npz"))) == 2
-    assert aligned == []
+    assert aligned == read == []
 
 
 def test_a_dry_run_writes_nothing(built: tuple[Dataset, Path]) -> None:

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from support.raw_sources import COORDS, FEATS, raw_grid
 
-from slatprep.records import AssetPair
+from slatprep.records import AssetPair, SourceRoots
 
 
 @pytest.fixture
@@ -37,8 +37,7 @@ def make_pair(tmp_path: Path) -> Callable[..., AssetPair]:
             object_id="a",
             view="",
             category="",
-            pixieverse_root=tmp_path / "pixieverse",
-            slat_root=tmp_path / "slat",
+            roots=SourceRoots(tmp_path / "pixieverse", tmp_path / "slat"),
             grid=folder / "grid.npy",
             mask=None if mask is None else folder / "mask.npy",
             bounds=None if bounds is None else folder / "bounds.npz",

@@ -16,7 +16,7 @@ from support.raw_sources import COORDS, FEATS, raw_grid
 
 from slatprep.errors import InputError
 from slatprep.readers import read_field, read_latents
-from slatprep.records import AssetPair
+from slatprep.records import AssetPair, SourceRoots
 
 SETTINGS = settings(
     max_examples=150,
@@ -91,8 +91,7 @@ def pair(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], AssetPair]
             object_id="a",
             view="",
             category="",
-            pixieverse_root=root,
-            slat_root=root,
+            roots=SourceRoots(root, root),
             grid=root / "grid.npy",
             mask=root / "mask.npy",
             bounds=None,

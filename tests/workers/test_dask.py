@@ -35,24 +35,21 @@ FAULTS = """
 import os, signal, time
 from pathlib import Path
 
-import slatprep.pipeline.asset as process
-
-faults = Path(os.environ["FAULTS"])
+faults = Path(__file__).parent
 
 
-def faulty(pair, read_field=process.read_field):
-    if (faults / f"deadly-{pair.asset_id}").exists():
+def reached(step, name):
+    if step != "asset begun":
+        return
+    if (faults / f"deadly-{name}").exists():
         os.kill(os.getpid(), signal.SIGKILL)
     try:
-        (faults / f"hold-{pair.asset_id}").unlink()
+        (faults / f"hold-{name}").unlink()
     except FileNotFoundError:
-        return read_field(pair)
+        return
     (faults / "held.partial").write_text(str(os.getpid()))
     (faults / "held.partial").rename(faults / "held")
     time.sleep(600)  # until it is killed
-
-
-process.read_field = faulty
 """
 
 
@@ -77,7 +74,7 @@ class Processes:
     def worker(self, address: str, *options: str, path: str = "") -> subprocess.Popen[bytes]:
         """Start a worker of one thread, unless options say otherwise."""
         return self._start(
-            "worker", address, "--nthreads", "1", "--no-dashboard", "--preload", "faults.py",
+            "worker", address, "--nthreads", "1", "--no-dashboard",
             "--local-directory", str(self.folder), *options, path=path,
         )  # fmt: skip
 
@@ -87,10 +84,15 @@ class Processes:
             end(process)
 
     def _start(self, *arguments: str, path: str = "") -> subprocess.Popen[bytes]:
-        paths = (path, str(Path(__file__).parent), os.environ.get("PYTHONPATH", ""))
+        paths = (
+            path,
+            str(self.folder),
+            str(Path(__file__).parent),
+            os.environ.get("PYTHONPATH", ""),
+        )
         environment = {
             **os.environ,
-            "FAULTS": str(self.folder),
+            "SLATPREP_FAULTS": "faults:reached",
             "OMP_NUM_THREADS": "1",
             "PYTHONPATH": os.pathsep.join(filter(None, paths)),
             # Two dead workers are enough to give a task up; by default it takes four.

@@ -11,7 +11,7 @@ from slatprep.inspect.check import AlignmentCheck
 from slatprep.inspect.pictures.alignment import draw_alignment
 from slatprep.inspect.pictures.scene import Scene, scene_of
 from slatprep.inspect.pictures.sheet import MOST, draw_sheet
-from slatprep.provenance.candidates import candidates_of
+from slatprep.provenance.stored import StoredRecords
 from slatprep.store.reader import Store, StoredAsset
 from slatprep.workers import Progress
 
@@ -24,7 +24,6 @@ def write_pictures(
     checks: Sequence[AlignmentCheck],
     target: Path,
     *,
-    manifests: Path | None = None,
     progress: Progress | None = None,
 ) -> tuple[list[Path], Path | None]:
     """Draw alignments and write them as PNG files.
@@ -38,8 +37,6 @@ def write_pictures(
     target : Path
         A file that ends in ``.png`` for one asset, a folder otherwise: it gets
         a file an asset, named by its id, and a contact sheet of several.
-    manifests : Path, optional
-        Folder of the build's records, which hold the candidates.
     progress : callable, optional
         Called with the assets done and the assets in all.
 
@@ -53,17 +50,18 @@ def write_pictures(
     Raises
     ------
     StoreError
-        If a file cannot be written, or the records are of another build.
+        If a file cannot be written, or a record cannot be read.
     """
     alone = len(checks) == 1 and target.suffix.lower() == ".png"
-    candidates = candidates_of(store, [check.asset_id for check in checks], manifests)
+    records = StoredRecords(store)
     pictures: list[Path] = []
     scenes: list[Scene] = []
     titles: list[str] = []
     for number, check in enumerate(checks):
         asset = store.asset(check.asset_id)
         scene, title = scene_of(asset), title_of(asset)
-        drawn = draw_alignment(scene, check, title, subtitle_of(asset), candidates[check.asset_id])
+        candidates = records.of(check.asset_id).alignment.candidates
+        drawn = draw_alignment(scene, check, title, subtitle_of(asset), candidates)
         # An id may hold characters that a file name must not.
         pictures.append(target if alone else target / f"{quote(check.asset_id, safe=' ')}.png")
         _write(pictures[-1], drawn)

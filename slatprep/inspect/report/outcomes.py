@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import json
 import re
 from collections.abc import Iterator
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import astuple, dataclass
 
 from slatprep.errors import StoreError
+from slatprep.provenance.record import FailedRecord, Record, read_build_record, read_record
 from slatprep.records import Place, Status
 
 
@@ -57,22 +56,19 @@ def read_outcomes(manifests: Place, manifest: str) -> Iterator[Outcome]:
     StoreError
         If the records cannot be read or belong to another build.
     """
-    found = _document(manifests / "build.json", _read(manifests / "build.json")).get("id")
-    if found != manifest:
-        raise StoreError(
-            f"{manifests} holds the records of build {str(found)[:12]!r}, the store was written by "
-            f"{manifest[:12]!r}; name the folder of its own records with --manifests"
-        )
-    path = manifests / "assets.jsonl"
+    path = manifests / "build.json"
     try:
-        with path.open("r", encoding="utf-8") as lines:
+        found = read_build_record(path.read_bytes(), str(path)).id
+        if found != manifest:
+            raise StoreError(
+                f"{manifests} holds the records of build {found[:12]!r}, the store was written by "
+                f"{manifest[:12]!r}; name the folder of its own records with --manifests"
+            )
+        path = manifests / "assets.jsonl"
+        with path.open("rb") as lines:
             for number, line in enumerate(lines, start=1):
-                where = f"{path}, line {number}"
-                try:
-                    yield _outcome(_document(where, line))
-                except (KeyError, TypeError, ValueError) as error:
-                    raise StoreError(f"{where}: not a record of an asset ({error!r})") from error
-    except (OSError, UnicodeDecodeError) as error:
+                yield _outcome(read_record(line, f"{path}, line {number}"))
+    except OSError as error:
         raise StoreError(f"{path}: cannot be read ({error})") from error
 
 
@@ -91,35 +87,15 @@ def kind_of(reason: str) -> str:
     return re.sub(r"\d[\d,]*(\.\d+)?(e[-+]?\d+)?", "N", kind)
 
 
-def _read(path: Place) -> str:
-    try:
-        return path.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        raise StoreError(f"{path}: cannot be read ({error})") from error
-
-
-def _document(where: Place | str, text: str) -> dict[str, Any]:
-    try:
-        document = json.loads(text)
-    except ValueError as error:
-        raise StoreError(f"{where}: no JSON document ({error})") from error
-    if not isinstance(document, dict):
-        raise StoreError(f"{where}: expected a JSON object, found {type(document).__name__}")
-    return document
-
-
-def _outcome(record: dict[str, Any]) -> Outcome:
-    alignment = record["alignment"]
-    placements = alignment["placements"] if alignment else []
-    displacements = [float(placement["displacement"]) for placement in placements]
-    reasons = alignment["verdict_reasons"] if alignment else [record["reason"]]
-    clipped = ((record["counts"] or {}).get("clipped") or {}).get("voxel", {})
+def _outcome(record: Record) -> Outcome:
+    names = record.asset_id, record.category, record.status
+    if isinstance(record, FailedRecord):
+        return Outcome(*names, reasons=(record.reason,), tied=0, displacement=None, clipped=())
+    placements, clipped = record.alignment.placements, record.counts.clipped
     return Outcome(
-        asset_id=str(record["asset_id"]),
-        category=str(record["category"]),
-        status=Status(record["status"]),
-        reasons=tuple(str(reason) for reason in reasons),
+        *names,
+        reasons=record.judgement.reasons,
         tied=len(placements),
-        displacement=max(displacements, default=None),
-        clipped=tuple(int(count) for count in clipped.values()),
+        displacement=max((placement.displacement for placement in placements), default=None),
+        clipped=astuple(clipped.voxel) if clipped else (),
     )

@@ -12,11 +12,12 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 from slatprep.errors import StoreError
-from slatprep.inspect.verify.assets import SourceRoots, asset_findings
+from slatprep.inspect.verify.assets import asset_findings
 from slatprep.inspect.verify.files import file_findings, metadata_findings
 from slatprep.inspect.verify.index import index_findings
-from slatprep.inspect.verify.manifests import manifest_findings, source_roots, usual_manifests
-from slatprep.records import Place
+from slatprep.inspect.verify.manifests import manifest_findings, source_roots
+from slatprep.provenance.places import manifests_beside
+from slatprep.records import Place, SourceRoots
 from slatprep.storage.place import place_of, storage_of
 from slatprep.store.contract import Finding
 from slatprep.store.reader import Store, open_store
@@ -107,7 +108,7 @@ def verify_store(
             raise
         finding = Finding("zarr.json", "", str(error), "the metadata of a slatprep store")
         return Verification(path, 0, 0, 0, None, (finding,))
-    folder = manifests or usual_manifests(path)
+    folder = manifests or manifests_beside(path)
     if sources and roots is None:
         roots = source_roots(folder)
     needed = [roots.pixieverse, roots.slat] if sources and roots else []

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from collections.abc import Iterator
 from functools import lru_cache
-from typing import Any
 
 import numpy as np
 import orjson
@@ -14,23 +12,17 @@ from numpy.typing import NDArray
 from slatprep.errors import InputError, StoreError
 from slatprep.geometry.voxels import flat_index
 from slatprep.inspect.check import TOLERANCES, look_up_again
-from slatprep.provenance.record import load_schema
-from slatprep.records import BACKGROUND, RESOLUTION, UNANNOTATED, Place
+from slatprep.normalize import normalize_change
+from slatprep.provenance.columns import columns_of
+from slatprep.provenance.record import AssetRecord, RecordError
+from slatprep.provenance.stored import StoredRecords
+from slatprep.records import BACKGROUND, RESOLUTION, UNANNOTATED, Place, SourceRoots
 from slatprep.storage.files import file_digest
 from slatprep.storage.place import storage_of
 from slatprep.store.contract import Finding
-from slatprep.store.layout import normalization_attribute
 from slatprep.store.reader import Store, StoredAsset, open_store
 from slatprep.store.records import RECORD_ARRAY
 from slatprep.store.shard_reader import DamagedFileError
-
-
-@dataclass(frozen=True)
-class SourceRoots:
-    """Where the sources lie: PixieVerse's root, and the folder of SLATs or of their one file."""
-
-    pixieverse: Place
-    slat: Place
 
 
 def asset_findings(
@@ -57,7 +49,7 @@ def asset_findings(
     sources : int
         How many source files were compared.
     """
-    store = _opened(path, run)
+    store, records = _opened(path, run)
     findings: list[Finding] = []
     sources = 0
     for row in rows:
@@ -73,14 +65,17 @@ def asset_findings(
             findings.append(Finding("asset", asset_id, str(error), "an asset that can be read"))
             continue
         try:
-            record = stored_record(store, row)
-        except (StoreError, ValueError) as error:
+            record = records.read(row)
+        except RecordError as error:
+            findings += fault_findings(RECORD_ARRAY, asset_id, error)
+            continue
+        except StoreError as error:
             findings.append(Finding(RECORD_ARRAY, asset_id, f"no record ({error})", "one a row"))
             continue
         findings += record_findings(asset, record, store)
         if roots is not None:
             findings += source_findings(record, roots, run)
-            sources += len(record.get("sources", ()))
+            sources += len(record.sources)
     return findings, sources
 
 
@@ -147,35 +142,32 @@ def lookup_findings(asset: StoredAsset) -> Iterator[Finding]:
             )
 
 
-def record_findings(
-    asset: StoredAsset, record: Mapping[str, Any], store: Store
-) -> Iterator[Finding]:
-    """Yield where an asset's record breaks its schema or disagrees with the row."""
-    # How long it took is left out of the store: it is not the same in two builds.
-    complete = {**record, "duration_s": 0.0}
-    faults = schema_findings(RECORD_ARRAY, asset.asset_id, "asset_record", complete)
-    yield from faults
-    if faults:
-        return
+def fault_findings(where: str, asset_id: str, error: RecordError) -> list[Finding]:
+    """Return what is wrong with a record that cannot be read, three faults at most."""
+    return [Finding(where, asset_id, fault, "the published schema") for fault in error.faults[:3]]
+
+
+def record_findings(asset: StoredAsset, record: AssetRecord, store: Store) -> Iterator[Finding]:
+    """Yield where an asset's record disagrees with its row."""
     for name, said, held in _claims(asset, record, store):
-        if said != held:
+        if not _equal(said, held):
             yield Finding(
                 RECORD_ARRAY, asset.asset_id, f"{name} is {said!r}", f"{held!r}, as the store has"
             )
 
 
-def source_findings(record: Mapping[str, Any], roots: SourceRoots, run: str) -> Iterator[Finding]:
+def source_findings(record: AssetRecord, roots: SourceRoots, run: str) -> Iterator[Finding]:
     """Yield sources of an asset that are gone or are not what its record says."""
-    for source in record.get("sources", ()):
-        root = roots.slat if source["role"] == "slat" else roots.pixieverse
-        path = root / source["path"]
-        expected = f"SHA-256 {source['sha256']}"
+    for source in record.sources:
+        root = roots.slat if source.role == "slat" else roots.pixieverse
+        path = root / source.path
+        expected = f"SHA-256 {source.sha256}"
         try:
             file, _ = storage_of(root).locate(path)
             size = storage_of(file).size()
-            if size != source["size"]:
-                what = f"has {size} of {source['size']} bytes"
-            elif _digest(file, run) != source["sha256"]:
+            if size != source.size:
+                what = f"has {size} of {source.size} bytes"
+            elif _digest(file, run) != source.sha256:
                 what = "its bytes changed"
             else:
                 continue
@@ -183,7 +175,7 @@ def source_findings(record: Mapping[str, Any], roots: SourceRoots, run: str) -> 
             what = error.fault
         except OSError as error:
             what = f"cannot be read ({error.strerror})"
-        yield Finding(str(path), record["asset_id"], what, expected)
+        yield Finding(str(path), record.asset_id, what, expected)
 
 
 _IS_GRID_CLASS = np.isin(np.arange(256), (*range(BACKGROUND + 1), UNANNOTATED))
@@ -196,23 +188,17 @@ def _normalised(values: NDArray[np.float32], where: NDArray[np.bool_]) -> bool:
 
 
 def _claims(
-    asset: StoredAsset, record: Mapping[str, Any], store: Store
-) -> Iterator[tuple[str, Any, Any]]:
+    asset: StoredAsset, record: AssetRecord, store: Store
+) -> Iterator[tuple[str, object, object]]:
     """Yield what a record says and what the store holds, by name."""
-    columns, alignment, counts = asset.columns, record["alignment"], record["counts"]
-    yield "asset_id", record["asset_id"], asset.asset_id
-    yield "status", record["status"], "ok"
-    for name in ("object_id", "view", "category"):
-        yield name, record[name], str(columns[name])
-    for name in ("engine", "model", "search", "verdict"):
-        yield f"alignment/{name}", alignment[name], str(columns[name])
-    yield "alignment/transform", alignment["transform"], asset.transform.tolist()
-    for name in ("fitness", "inlier_rmse", "fitness_backward", "inlier_rmse_backward", "overlap"):
-        yield f"alignment/quality/{name}", alignment["quality"][name], _number(columns[name])
-    ambiguity = alignment["ambiguity"]
-    yield "alignment/ambiguity/margin", ambiguity["margin"], _number(columns["margin"])
-    share = ambiguity["material_share"]
-    yield "alignment/ambiguity/material_share", share, _number(columns["ambiguity"])
+    yield "asset_id", record.asset_id, asset.asset_id
+    columns = columns_of(record)
+    del columns["property_ambiguity"]
+    change = record.judgement.ambiguity.property_change
+    said = normalize_change([change], store.normalization)[0]
+    yield "property_ambiguity", said, asset.columns["property_ambiguity"]
+    for name, column in columns.items():
+        yield name, column, asset.transform if name == "transform" else asset.columns[name]
     grid = asset.grid_material
     for name, count in (
         ("slat_voxels", len(asset.coords)),
@@ -220,64 +206,24 @@ def _claims(
         ("annotated", (grid < BACKGROUND).sum()),
         ("occupied", (grid != BACKGROUND).sum()),
     ):
-        yield f"counts/{name}", counts[name], int(count)
-    yield "valid_share", counts["valid"] / counts["slat_voxels"], float(columns["valid_share"])
-    normalization = record["normalization"] or {"ranges": [], "source": ""}
-    said = {
-        entry["name"]: {k: entry[k] for k in ("log10", "lo", "hi")}
-        | {"source": normalization["source"]}
-        for entry in normalization["ranges"]
-    }
-    yield "normalization", said, normalization_attribute(store.normalization)
+        yield f"counts/{name}", getattr(record.counts, name), int(count)
+    yield "normalization", record.normalization, store.normalization
+    parameters = store.attributes["build"]["parameters"]
     for name in ("align", "sample"):
-        held = store.attributes["build"]["parameters"].get(name)
-        yield f"parameters/{name}", record["parameters"].get(name), held
+        said_parameters = orjson.loads(orjson.dumps(getattr(record.parameters, name)))
+        yield f"parameters/{name}", said_parameters, parameters.get(name)
 
 
-def _number(value: Any) -> float | None:
-    return float(value) if np.isfinite(value) else None
-
-
-def stored_record(store: Store, row: int) -> dict[str, Any]:
-    """Return the record of a row.
-
-    Raises
-    ------
-    StoreError, ValueError
-        If it cannot be read, or is no JSON object.
-    """
-    record = orjson.loads(str(store.read_rows(RECORD_ARRAY, row, row + 1)[0]))
-    if not isinstance(record, dict):
-        raise ValueError("no JSON object")
-    return record
-
-
-def schema_findings(
-    where: str, asset_id: str, schema: str, record: Mapping[str, Any]
-) -> list[Finding]:
-    """Return where a record breaks a published schema, three faults at most."""
-    faults = sorted(_validator(schema).iter_errors(record), key=str)[:3]
-    return [
-        Finding(
-            where,
-            asset_id,
-            f"{'/'.join(map(str, fault.instance_path)) or 'it'}: {fault.message[:120]}",
-            "the published schema",
-        )
-        for fault in faults
-    ]
+def _equal(said: object, held: object) -> bool:
+    if isinstance(said, np.ndarray | float | tuple):
+        return np.array_equal(np.asarray(said), np.asarray(held), equal_nan=True)
+    return bool(said == held)
 
 
 @lru_cache(maxsize=1)
-def _opened(path: Place, run: str) -> Store:
-    return open_store(path)
-
-
-@lru_cache(maxsize=2)
-def _validator(schema: str) -> Any:
-    from jsonschema_rs import Draft202012Validator
-
-    return Draft202012Validator(load_schema(schema))
+def _opened(path: Place, run: str) -> tuple[Store, StoredRecords]:
+    store = open_store(path)
+    return store, StoredRecords(store)
 
 
 @lru_cache(maxsize=64)

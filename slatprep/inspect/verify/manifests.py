@@ -2,29 +2,28 @@
 
 from __future__ import annotations
 
-import json
 from collections import Counter
 from collections.abc import Iterator
-from typing import Any
 
 import orjson
 
 from slatprep.errors import StoreError
-from slatprep.inspect.verify.assets import SourceRoots, schema_findings, stored_record
-from slatprep.provenance.places import manifests_of
-from slatprep.provenance.record import records_id
-from slatprep.records import Place
-from slatprep.storage.place import place_of
+from slatprep.inspect.verify.assets import fault_findings
+from slatprep.provenance.record import (
+    AssetRecord,
+    Record,
+    RecordError,
+    read_build_record,
+    read_record,
+    records_id,
+    to_json,
+)
+from slatprep.provenance.stored import StoredRecords
+from slatprep.records import Place, SourceRoots, Status
 from slatprep.store.contract import MAX_METADATA_BYTES, Finding
 from slatprep.store.reader import Store
 
 BUILD, ASSETS = "build.json", "assets.jsonl"
-
-
-def usual_manifests(store: Place) -> Place | None:
-    """Return the folder of a store's records beside it, if there is one."""
-    folder = manifests_of(store)
-    return folder if (folder / BUILD).exists() or (folder / ASSETS).exists() else None
 
 
 def source_roots(manifests: Place | None) -> SourceRoots:
@@ -39,73 +38,82 @@ def source_roots(manifests: Place | None) -> SourceRoots:
     if manifests is None:
         raise StoreError(f"no records beside the store say where its sources lie; {advice}")
     try:
-        parameters = json.loads((manifests / BUILD).read_text(encoding="utf-8"))["parameters"]
-        pixieverse = place_of(parameters["pixieverse"]["root"])
-        slat = place_of(parameters["slat"]["root"])
+        build = read_build_record((manifests / BUILD).read_bytes(), str(manifests / BUILD))
+        slat = build.parameters.slat.root
         slat = slat.parent if slat.is_file() else slat
-    except (OSError, ValueError, KeyError, TypeError) as error:
+    except (OSError, StoreError) as error:
         raise StoreError(f"{manifests / BUILD}: names no sources ({error}); {advice}") from None
-    return SourceRoots(pixieverse, slat)
+    return SourceRoots(build.parameters.pixieverse.root, slat)
 
 
 def manifest_findings(store: Store, folder: Place) -> Iterator[Finding]:
     """Yield where the records of a build break their schemas or disagree with the store."""
     build_file, assets_file = str(folder / BUILD), str(folder / ASSETS)
+    manifest, build = store.attributes.get("manifest"), None
     try:
-        build = json.loads((folder / BUILD).read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
+        text = (folder / BUILD).read_bytes()
+        build = read_build_record(text, build_file)
+        build_id: object = build.id
+    except RecordError as error:
+        yield from fault_findings(build_file, "", error)
+        build_id = _stated_id(text)
+    except OSError as error:
         yield Finding(build_file, "", f"cannot be read ({error})", "the record of the build")
-        build = {}
-    if build:
-        yield from schema_findings(build_file, "", "build_record", build)
-    manifest = store.attributes.get("manifest")
-    if build and build.get("id") != manifest:
-        yield Finding(build_file, "", f"id is {build.get('id')!r}", f"{manifest!r}, the store's")
+        build_id = manifest
+    if build_id != manifest:
+        yield Finding(build_file, "", f"id is {build_id!r}", f"{manifest!r}, the store's")
         return
-    seen: Counter[str] = Counter()
+    seen: Counter[str] = Counter({str(status): 0 for status in Status})
     faults: list[Finding] = []
     try:
         found = records_id(_checked(store, folder / ASSETS, seen, faults))
-    except (OSError, ValueError) as error:
+    except OSError as error:
         yield Finding(assets_file, "", f"cannot be read ({error})", "a JSON record a line")
         return
     yield from faults
     if found != manifest:
         yield Finding(assets_file, "", f"its content has the id {found}", f"{manifest}")
-    if build and build.get("statuses") != {**dict.fromkeys(_STATUSES, 0), **seen}:
-        yield Finding(build_file, "", f"statuses are {build.get('statuses')}", f"{dict(seen)}")
-    if build and build.get("counts", {}).get("voxels") != store.shape("voxel/coords")[0]:
+    if build and build.statuses != dict(seen):
+        yield Finding(build_file, "", f"statuses are {build.statuses}", f"{dict(seen)}")
+    if build and build.counts.voxels != store.shape("voxel/coords")[0]:
         yield Finding(build_file, "", "counts other voxels", f"{store.shape('voxel/coords')[0]}")
 
 
-_STATUSES = ("ok", "failed", "skipped")
-
-
-def _in_store(store: Store, row: int) -> dict[str, Any] | None:
+def _stated_id(text: bytes) -> object:
+    """Return the id that a faulty record of a build states."""
     try:
-        return stored_record(store, row)
-    except (StoreError, ValueError):
+        document = orjson.loads(text)
+    except ValueError:
         return None
+    return document.get("id") if isinstance(document, dict) else None
 
 
 def _checked(
     store: Store, path: Place, seen: Counter[str], faults: list[Finding]
-) -> Iterator[dict[str, Any]]:
+) -> Iterator[Record]:
     """Yield the records of a file one by one, and note what is wrong with each."""
     rows = {asset_id: row for row, asset_id in enumerate(store.ids)}
+    stored = StoredRecords(store)
     with path.open("rb") as file:
+        number = 0
         while line := file.readline(MAX_METADATA_BYTES):
-            record = orjson.loads(line)
-            if not isinstance(record, dict):
-                raise ValueError("a line that is no JSON object")
-            asset_id = str(record.get("asset_id", ""))
-            seen[str(record.get("status"))] += 1
-            content = {k: v for k, v in record.items() if k != "duration_s"}
-            row = rows.get(asset_id)
-            # One that equals the store's own has been held against the schema there.
-            if row is None or content != _in_store(store, row):
-                faults += schema_findings(str(path), asset_id, "asset_record", record)
-                if record.get("status") == "ok":
+            number += 1
+            try:
+                record = read_record(line, f"{path}, line {number}")
+            except RecordError as error:
+                faults += fault_findings(f"{path}", f"line {number}", error)
+                continue
+            seen[str(record.status)] += 1
+            if isinstance(record, AssetRecord):
+                row = rows.get(record.asset_id)
+                if row is None or not _same(record, stored, row):
                     what = "differs from asset/record"
-                    faults.append(Finding(str(path), asset_id, what, "the same record"))
+                    faults.append(Finding(str(path), record.asset_id, what, "the same record"))
             yield record
+
+
+def _same(record: AssetRecord, stored: StoredRecords, row: int) -> bool:
+    try:
+        return to_json(record.without_duration()) == to_json(stored.read(row))
+    except StoreError:
+        return False

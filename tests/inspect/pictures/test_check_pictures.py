@@ -25,7 +25,6 @@ from slatprep.inspect.pictures.scene import FARTHEST, distance_colours, scene_of
 from slatprep.inspect.pictures.viewer import cube_mesh, has_screen, meshes
 from slatprep.inspect.pictures.write import write_pictures
 from slatprep.pipeline.dataset import BuildSummary
-from slatprep.provenance.candidates import candidates_of
 from slatprep.store import open_store
 
 
@@ -103,33 +102,6 @@ def test_a_place_that_cannot_be_written_is_named(copy: Path, tmp_path: Path) -> 
     result = run("--asset", "ant", "--store", copy, "--picture", tmp_path / "file" / "x")
     assert result.exit_code == 1
     assert "cannot be written" in result.stderr and "--picture" in result.stderr
-
-
-# -- the candidates -------------------------------------------------------------
-
-
-def test_candidates_come_from_the_records(mixed_build: BuildSummary) -> None:
-    store = open_store(mixed_build.store)
-    lines = mixed_build.records.read_text("utf-8").splitlines()
-    truth = {record["asset_id"]: record for record in map(json.loads, lines)}
-    found = candidates_of(store, ["dog", "ant"])
-    for asset_id, candidates in found.items():
-        assert not isinstance(candidates, str)
-        expected = truth[asset_id]["alignment"]["candidates"]
-        assert [c.fitness for c in candidates] == [c["fitness"] for c in expected]
-
-
-def test_records_of_another_build_are_not_believed(copy: Path, tmp_path: Path) -> None:
-    if "asset/record" in open_store(copy).group:
-        pytest.skip("the records travel inside the store")
-    build = copy.with_name("copy.manifests") / "build.json"
-    build.write_text(json.dumps({**json.loads(build.read_text("utf-8")), "id": "other"}), "utf-8")
-    (told,) = candidates_of(open_store(copy), ["ant"]).values()
-    assert isinstance(told, str) and "not found" in told
-    result = run("--asset", "ant", "--store", copy)
-    assert result.exit_code == 0
-    with pytest.raises(StoreError, match="no records of the build"):
-        candidates_of(open_store(copy), ["ant"], build.parent)
 
 
 # -- which assets ---------------------------------------------------------------

@@ -37,7 +37,7 @@ def hostile(mixed_build: BuildSummary, tmp_path_factory: pytest.TempPathFactory)
         if record["status"] == "failed":
             record["reason"] = HOSTILE
         if record["asset_id"] == "ant":
-            record["alignment"]["verdict_reasons"] = [HOSTILE]
+            record["judgement"]["reasons"] = [HOSTILE]
     lines = "".join(json.dumps(record) + "\n" for record in records)
     (manifests / "assets.jsonl").write_text(lines, "utf-8")
     path = folder / "page.html"

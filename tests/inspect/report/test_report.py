@@ -203,14 +203,21 @@ def test_without_records_the_page_says_so(hostile: Report, tmp_path: Path) -> No
     assert content["assets"]["tied"] == [None] * 5
 
 
+def test_records_of_another_build_are_refused(hostile: Report, tmp_path: Path) -> None:
+    build = json.loads((hostile.manifests / "build.json").read_text("utf-8"))
+    (tmp_path / "build.json").write_text(json.dumps(build | {"id": "0123" * 16}), "utf-8")
+    with pytest.raises(StoreError, match="records of build '012301230123'"):
+        write_report(open_store(hostile.store), tmp_path / "x.html", manifests=tmp_path)
+
+
 @pytest.mark.parametrize(
     ("file", "text", "message"),
     [
-        ("build.json", '{"id": "0123"}', "records of build '0123'"),
-        ("build.json", "[]", "expected a JSON object"),
+        ("build.json", '{"id": "0123"}', "build.json: not a record"),
+        ("build.json", "[]", "build.json: not a record"),
         ("assets.jsonl", "", "no record of 5 assets"),
         ("assets.jsonl", '{"asset_id": "ant"}\n', "line 1: not a record"),
-        ("assets.jsonl", "{", "line 1: no JSON"),
+        ("assets.jsonl", "{", "line 1: not a record"),
     ],
 )
 def test_other_records_are_refused(

@@ -17,6 +17,7 @@ import numpy as np
 import pytest
 import zarr
 from s3fs.core import S3FileSystem
+from support.faults import inject, kill_self
 from support.objects import contents
 from support.synthetic import Dataset
 from support.trees import tree
@@ -24,9 +25,7 @@ from support.trees import tree
 from slatprep.errors import StoreError
 from slatprep.inspect.verify import verify_store
 from slatprep.parameters import StoreParameters
-from slatprep.pipeline import dataset as build
 from slatprep.pipeline.dataset import build_store, plan_build
-from slatprep.storage import upload
 from slatprep.storage.place import place_of, storage_of
 from slatprep.storage.upload import published_state, upload_store
 from slatprep.storage.versions import Pointer, read_pointer
@@ -187,11 +186,10 @@ def test_who_opens_it_while_it_is_replaced_finds_one_or_the_other_whole(
     assert set(seen) == set(stores)
 
 
-def kill_self(*_: Any, **__: Any) -> None:
-    os.kill(os.getpid(), signal.SIGKILL)
+Fault = Callable[[str, str], object]
 
 
-def kill_midway() -> None:
+def kill_midway() -> Fault:
     """Let this process be killed at its twentieth object."""
     put_file, left = S3FileSystem._put_file, [20]
 
@@ -202,21 +200,22 @@ def kill_midway() -> None:
         return await put_file(*args, **options)
 
     S3FileSystem._put_file = dies
+    return lambda step, name: None
 
 
-def kill_before() -> None:
-    upload.Upload._replace_pointer = kill_self  # type: ignore[method-assign]
+def kill_before() -> Fault:
+    return lambda step, name: step == "manifests published" and kill_self()
 
 
-def kill_after() -> None:
-    upload._remove = kill_self
+def kill_after() -> Fault:
+    return lambda step, name: step == "pointer replaced" and kill_self()
 
 
-def build_and_be_killed(fault: Callable[[], None], dataset: Dataset, url: str) -> None:
+def build_and_be_killed(fault: Callable[[], Fault], dataset: Dataset, url: str) -> None:
     """Build in a process of its own that kills itself with signal 9 where `fault` has it."""
 
     def run() -> None:
-        fault()
+        inject(pytest.MonkeyPatch(), fault())
         build_store(dataset.parameters("pixie"), url)
 
     child = multiprocessing.get_context("fork").Process(target=run)
@@ -276,34 +275,31 @@ def test_a_build_is_refused_that_another_has_overtaken(
     tmp_path: Path,
 ) -> None:
     """The other runs on another machine: no lock of this one's disk keeps it out."""
-    pack = build.pack_store
+    elsewhere = str(tmp_path / "elsewhere")
 
-    def overtaken(*args: Any) -> Any:
-        with pytest.MonkeyPatch.context() as there:
-            there.setattr(build, "pack_store", pack)
-            there.setenv("SLATPREP_CACHE", str(tmp_path / "elsewhere"))
-            build_store(another[0].parameters("pixie"), url)
-        return pack(*args)
+    def overtaken(step: str, name: str) -> None:
+        if step == "store created" and os.environ["SLATPREP_CACHE"] != elsewhere:
+            with pytest.MonkeyPatch.context() as there:
+                there.setenv("SLATPREP_CACHE", elsewhere)
+                build_store(another[0].parameters("pixie"), url)
 
-    monkeypatch.setattr(build, "pack_store", overtaken)
+    inject(monkeypatch, overtaken)
     with pytest.raises(StoreError, match=f"^{url}: another build replaced it while this one ran"):
         build_store(undisturbed[0].parameters("pixie"), url)
     assert current(s3, url) == tree(another[1])
-    monkeypatch.undo()
 
 
 def test_the_second_build_on_one_machine_is_refused_at_once(
     url: str, undisturbed: Made, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     parameters = undisturbed[0].parameters("pixie")
-    pack = build.pack_store
 
-    def twice(*args: Any) -> Any:
-        with pytest.raises(StoreError, match=f"^{url}: another build is writing it"):
-            build_store(parameters, url)
-        return pack(*args)
+    def twice(step: str, name: str) -> None:
+        if step == "store created":
+            with pytest.raises(StoreError, match=f"^{url}: another build is writing it"):
+                build_store(parameters, url)
 
-    monkeypatch.setattr(build, "pack_store", twice)
+    inject(monkeypatch, twice)
     assert build_store(parameters, url).complete
 
 
@@ -422,7 +418,8 @@ def test_places_that_cannot_be_written_are_told_before_the_work(
     s3: Any, bucket: str, undisturbed: Made, monkeypatch: pytest.MonkeyPatch, new_clients: Any
 ) -> None:
     parameters = undisturbed[0].parameters("pixie")
-    monkeypatch.setattr(build, "_finish_all", None)  # Nothing is aligned.
+    begun: list[str] = []
+    inject(monkeypatch, lambda step, name: step == "asset begun" and begun.append(name))
     with pytest.raises(StoreError, match=r"^s3://no-such/a.zarr: cannot be reached .*bucket does"):
         build_store(parameters, "s3://no-such/a.zarr")
     s3.pipe_file(f"{bucket}/mine/notes.txt", b"keep")
@@ -442,6 +439,7 @@ def test_places_that_cannot_be_written_are_told_before_the_work(
     ):
         with pytest.raises(StoreError, match=r"cannot be reached .*Unable to locate credentials"):
             refused()
+    assert begun == []
 
 
 def test_records_may_be_kept_on_the_local_disk(

@@ -1,0 +1,130 @@
+"""Make the records of assets."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from importlib import metadata
+
+import numpy as np
+import orjson
+
+from slatprep.geometry.voxels import boundary
+from slatprep.parameters import BuildParameters
+from slatprep.provenance.record import (
+    AssetRecord,
+    Clipped,
+    FailedRecord,
+    StageParameters,
+    VoxelCounts,
+)
+from slatprep.provenance.versions import library_versions
+from slatprep.records import Failed, Finished, Normalization, Status
+
+
+def record_of(
+    asset: Finished, parameters: BuildParameters, code: str, key: str, seconds: float = 0.0
+) -> AssetRecord:
+    """Return the record of an asset that went through all stages.
+
+    Parameters
+    ----------
+    asset : Finished
+        The asset.
+    parameters : BuildParameters
+        The build's parameters.
+    code : str
+        Fingerprint of the code that made the numbers.
+    key : str
+        What the asset was made from and how, see `slatprep.pipeline.recipe`.
+    seconds : float
+        Spent on it.
+
+    Returns
+    -------
+    AssetRecord
+        `complete_record` adds what only the whole dataset can tell.
+    """
+    pair, field, latents = asset.pair, asset.field, asset.latents
+    return AssetRecord(
+        asset_id=pair.asset_id,
+        object_id=pair.object_id,
+        view=pair.view,
+        category=pair.category,
+        status=Status.OK,
+        sources=field.sources + latents.sources,
+        bounds=field.bounds,
+        parameters=StageParameters(parameters.align, parameters.sample),
+        versions=library_versions(parameters.align),
+        code=code,
+        key=key,
+        alignment=asset.alignment,
+        judgement=asset.judgement,
+        counts=counts_of(asset),
+        warnings=field.warnings + latents.warnings,
+        duration_s=round(seconds, 4),
+    )
+
+
+def record_of_failed(
+    asset: Failed, parameters: BuildParameters, code: str, seconds: float = 0.0
+) -> FailedRecord:
+    """Return the record of an asset that cannot go in."""
+    pair = asset.pair
+    return FailedRecord(
+        asset_id=pair.asset_id,
+        object_id=pair.object_id,
+        view=pair.view,
+        category=pair.category,
+        status=asset.status,
+        reason=asset.reason,
+        traceback=asset.traceback,
+        parameters=StageParameters(parameters.align, parameters.sample),
+        versions=library_versions(parameters.align),
+        code=code,
+        duration_s=round(seconds, 4),
+    )
+
+
+def counts_of(asset: Finished) -> VoxelCounts:
+    """Count the voxels of an asset."""
+    occupied = int(np.count_nonzero(asset.field.occupancy))
+    return VoxelCounts(
+        occupied=occupied,
+        annotated=len(asset.field.voxels),
+        unannotated=occupied - len(asset.field.voxels),
+        boundary=int(np.count_nonzero(boundary(asset.field.occupancy))),
+        slat_voxels=len(asset.latents.coords),
+        valid=int(np.count_nonzero(asset.annotation.valid)),
+    )
+
+
+def complete_record(
+    record: AssetRecord, normalization: Normalization, clipped: Clipped
+) -> AssetRecord:
+    """Return a record with what only the whole dataset can tell: ranges and clipped values."""
+    counts = replace(record.counts, clipped=clipped)
+    return replace(record, normalization=normalization, counts=counts)
+
+
+def origin(parameters: BuildParameters) -> dict[str, object]:
+    """Return what decides a store's bytes, without where files lie: its attribute ``build``."""
+    groups = ("align", "sample", "consensus", "normalize", "store")
+    document: dict[str, object] = orjson.loads(
+        orjson.dumps(
+            {
+                "name": parameters.name,
+                "parameters": {group: getattr(parameters, group) for group in groups},
+                "versions": build_versions(parameters),
+            }
+        )
+    )
+    return document
+
+
+def build_versions(parameters: BuildParameters) -> dict[str, str]:
+    """Return the versions of everything that makes a store's bytes."""
+    return {
+        **library_versions(parameters.align),
+        "zarr": metadata.version("zarr"),
+        "joblib": metadata.version("joblib"),
+    }

@@ -1,0 +1,55 @@
+"""Read the records that a store holds of its rows."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+from slatprep.provenance.record import AssetRecord, read_asset_record
+from slatprep.store.reader import Store
+from slatprep.store.records import RECORD_ARRAY, RECORDS_IN_CHUNK
+
+
+class StoredRecords:
+    """The records of a store, by row or in order.
+
+    Parameters
+    ----------
+    store : Store
+        The store.
+    """
+
+    def __init__(self, store: Store) -> None:
+        self.store = store
+        self._chunk: tuple[int, list[str]] = (-1, [])
+
+    def __iter__(self) -> Iterator[AssetRecord]:
+        return (self.read(row) for row in range(len(self.store)))
+
+    def of(self, asset_id: str) -> AssetRecord:
+        """Return an asset's record.
+
+        Raises
+        ------
+        StoreError
+            If the store has no such asset, or its record cannot be read.
+        """
+        return self.read(self.store.find(asset_id))
+
+    def read(self, row: int) -> AssetRecord:
+        """Return the record of a row.
+
+        Raises
+        ------
+        StoreError
+            If it cannot be read.
+        """
+        chunk, position = divmod(row, RECORDS_IN_CHUNK)
+        # Assets are asked for nearly in order: the last chunk answers most of the time.
+        if self._chunk[0] != chunk:
+            start = chunk * RECORDS_IN_CHUNK
+            stop = min(start + RECORDS_IN_CHUNK, len(self.store))
+            texts = self.store.read_rows(RECORD_ARRAY, start, stop)
+            self._chunk = (chunk, [str(text) for text in texts])
+        return read_asset_record(
+            self._chunk[1][position], f"{self.store.path}: {RECORD_ARRAY}, row {row}"
+        )

@@ -1,0 +1,55 @@
+"""Faults injected into builds, through the seam of `slatprep.storage.faults`."""
+
+from __future__ import annotations
+
+import os
+import signal
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from slatprep.storage.faults import VARIABLE
+
+Fault = Callable[[str, str], object]
+
+_here: list[Fault] = []
+
+
+def call(step: str, name: str) -> None:
+    """Stand at the seam of this process."""
+    for fault in _here:
+        fault(step, name)
+
+
+def inject(monkeypatch: pytest.MonkeyPatch, fault: Fault) -> None:
+    """Have builds in this process call a function at each of their steps."""
+    monkeypatch.setattr(f"{__name__}._here", [*_here, fault])
+    monkeypatch.setenv(VARIABLE, f"{__name__}:call")
+
+
+def kill_self() -> None:
+    """End this process as the kernel would."""
+    os.kill(os.getpid(), signal.SIGKILL)
+
+
+def environment(folder: Path, fault: str = "") -> dict[str, str]:
+    """Return the environment of a process, and of its workers, with a fault.
+
+    Parameters
+    ----------
+    folder : Path
+        Where a module for it is written.
+    fault : str
+        The body of ``def reached(step, name)``; empty for none.
+    """
+    folder.mkdir(exist_ok=True)
+    here = str(Path(__file__).parents[1])
+    paths = (str(folder), here, os.environ.get("PYTHONPATH", ""))
+    variables = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": os.pathsep.join(paths)}
+    if fault:
+        head = "import os, time\nfrom support.faults import kill_self\n\nseen = []\n\n\n"
+        body = "".join(f"    {line}\n" for line in fault.strip("\n").splitlines())
+        (folder / "faulty.py").write_text(f"{head}def reached(step, name):\n{body}")
+        variables[VARIABLE] = "faulty:reached"
+    return variables
