@@ -22,21 +22,18 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from slatprep.align import align
+from slatprep.bench.align import pairs_with_truth
 from slatprep.geometry.frames import RESOLUTION, apply_transform, invert_transform, voxel_centres
 from slatprep.normalize import to_mapped
-from slatprep.parameters import AlignParameters, BuildParameters, PixieverseSource, SlatSource
-from slatprep.readers import discover, read_field, read_latents
+from slatprep.parameters import AlignParameters
+from slatprep.readers import read_field, read_latents
 
 
 def main(folders: list[str]) -> None:
     sums: dict[tuple[int, str], list[np.ndarray]] = defaultdict(list)
     for folder in map(Path, folders):
-        parameters = BuildParameters(
-            pixieverse=PixieverseSource(root=folder / "pixieverse"),
-            slat=SlatSource(root=folder / "slat"),
-        )
-        for pair in discover(parameters):
-            with np.load(folder / "truth" / f"{pair.asset_id}.npz") as file:
+        for pair, path in pairs_with_truth(folder):
+            with np.load(path) as file:
                 truth = {key: file[key] for key in ("material", "properties", "level", "symmetric")}
             if truth["symmetric"]:
                 continue

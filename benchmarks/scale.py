@@ -21,9 +21,7 @@ import time
 from pathlib import Path
 
 import numpy as np
-
-sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
-
+from checkout import environment
 from support.synthetic import Dataset, make_asset
 
 VARIANTS = 8
@@ -32,7 +30,7 @@ import json, resource, sys
 from pathlib import Path
 from dataclasses import replace
 from support.synthetic import Dataset
-from slatprep.pipeline import build_store
+from slatprep import build_store
 from slatprep.parameters import StoreParameters
 parameters = replace(Dataset(Path(sys.argv[1])).parameters(), store=StoreParameters())
 build_store(parameters, Path(sys.argv[2]), jobs=2)
@@ -117,11 +115,6 @@ def build(sources: Path, out: Path) -> tuple[float, list[float]]:
     after = resource.getrusage(resource.RUSAGE_CHILDREN)
     spent = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
     return spent, json.loads(told.stdout.splitlines()[-1])
-
-
-def environment() -> dict[str, str]:
-    here = Path(__file__).parents[1]
-    return {**os.environ, "PYTHONPATH": f"{here}:{here / 'tests'}", "OMP_NUM_THREADS": "1"}
 
 
 if __name__ == "__main__":

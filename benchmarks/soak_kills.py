@@ -27,9 +27,7 @@ from collections import Counter
 from pathlib import Path
 
 import zarr
-
-sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
-
+from checkout import environment
 from support.synthetic import Dataset
 from support.trees import tree
 
@@ -39,7 +37,7 @@ BUILD = """
 import sys
 from pathlib import Path
 from support.synthetic import Dataset
-from slatprep.pipeline import build_store
+from slatprep import build_store
 build_store(Dataset(Path(sys.argv[1])).parameters(), Path(sys.argv[2]), jobs=2)
 """
 
@@ -162,11 +160,6 @@ def read_whole(path: Path) -> None:
 
 def build_command(sources: Path, out: Path) -> list[str]:
     return [sys.executable, "-c", BUILD, str(sources), str(out)]
-
-
-def environment() -> dict[str, str]:
-    here = Path(__file__).parents[1]
-    return {**os.environ, "PYTHONPATH": f"{here}:{here / 'tests'}", "OMP_NUM_THREADS": "1"}
 
 
 def fingerprint(hashes: dict[str, str]) -> str:

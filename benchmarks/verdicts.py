@@ -23,23 +23,21 @@ from __future__ import annotations
 
 import sys
 from collections import Counter, defaultdict
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
+from unittest import mock
 
 import numpy as np
 
 from slatprep.align import align, field
 from slatprep.align.quality import measure_quality
+from slatprep.bench.align import pairs_with_truth
 from slatprep.bench.truth import read_truth
 from slatprep.geometry.frames import displacement
 from slatprep.judge import verdict_of
-from slatprep.parameters import (
-    AlignParameters,
-    BuildParameters,
-    PixieverseSource,
-    SampleParameters,
-    SlatSource,
-)
-from slatprep.readers import discover, read_field, read_latents
+from slatprep.parameters import AlignParameters, SampleParameters
+from slatprep.readers import read_field, read_latents
 from slatprep.sample import sample
 
 OTHERS = 4
@@ -49,13 +47,8 @@ OTHERS = 4
 def main(folders: list[str]) -> None:
     assets = []
     for folder in map(Path, folders):
-        parameters = BuildParameters(
-            pixieverse=PixieverseSource(root=folder / "pixieverse"),
-            slat=SlatSource(root=folder / "slat"),
-        )
-        for pair in discover(parameters):
-            truth = read_truth(folder / "truth" / f"{pair.asset_id}.npz")
-            assets.append((read_field(pair), read_latents(pair), truth))
+        for pair, path in pairs_with_truth(folder):
+            assets.append((read_field(pair), read_latents(pair), read_truth(path)))
     rng = np.random.default_rng(0)
     verdicts: dict[str, Counter[str]] = defaultdict(Counter)
     lower: dict[str, list[float]] = defaultdict(list)
@@ -68,8 +61,7 @@ def main(folders: list[str]) -> None:
         lower[kind].append(min(quality.fitness, quality.fitness_backward))
 
     for material_field, latents, truth in assets:
-        polished = []
-        with _spying(polished):
+        with _kept_poses() as polished:
             found = align(material_field, latents, AlignParameters())
         if not truth.symmetric:
             apart = displacement(found.transform, truth.transform, latents.coords)
@@ -100,24 +92,19 @@ def main(folders: list[str]) -> None:
             )
 
 
-class _spying:  # noqa: N801 - reads as a verb
-    """Keep every pose that the default engine polishes."""
+@contextmanager
+def _kept_poses() -> Iterator[list]:
+    """Yield a list to which every pose is added that the default engine polishes."""
+    kept: list = []
+    polish = field._Pair.polish
 
-    def __init__(self, kept: list) -> None:
-        self.kept = kept
+    def keep(pair, poses):
+        polished = polish(pair, poses)
+        kept.extend(polished)
+        return polished
 
-    def __enter__(self) -> None:
-        self.polish = field._Pair.polish
-
-        def polish(pair, poses):
-            polished = self.polish(pair, poses)
-            self.kept.extend(polished)
-            return polished
-
-        field._Pair.polish = polish
-
-    def __exit__(self, *_: object) -> None:
-        field._Pair.polish = self.polish
+    with mock.patch.object(field._Pair, "polish", keep):
+        yield kept
 
 
 if __name__ == "__main__":

@@ -109,7 +109,7 @@ def bench_align(
         them, or several such folders.
     engines : sequence of str
         Some of `ENGINES`; the first one of them that is timed is the default
-        engine, whatever the order given.
+        engine, in any order.
     repeats : int
         How often each asset is aligned by each engine.
     limit : int, optional
@@ -126,7 +126,7 @@ def bench_align(
     if unknown:
         raise ConfigError(f"no engine {sorted(unknown)}; expected some of {', '.join(ENGINES)}")
     chosen = [REFERENCE, *(e for e in ENGINES if e in engines and e != REFERENCE)]
-    pairs = list(_pairs(folder, limit))
+    pairs = list(pairs_with_truth(folder, limit))
     if not pairs:
         raise ConfigError(
             f"{folder}: no asset with truth; expected pixieverse/, slat/ and truth/ in it, "
@@ -184,7 +184,16 @@ def bench_align(
     )
 
 
-def _pairs(folder: Path, limit: int | None) -> Iterator[tuple[AssetPair, Path]]:
+def pairs_with_truth(folder: Path, limit: int | None = None) -> Iterator[tuple[AssetPair, Path]]:
+    """Yield the assets of a dataset that have a truth, and where it is.
+
+    Parameters
+    ----------
+    folder : Path
+        Holds ``pixieverse/``, ``slat/`` and ``truth/``, or several such folders.
+    limit : int, optional
+        At most so many assets of each folder.
+    """
     folders = [folder, *sorted(path for path in folder.iterdir() if path.is_dir())]
     for root in folders:
         if not (root / "truth").is_dir():

@@ -123,7 +123,7 @@ def bench_read(
     ReadBench
         Sizes and speeds of every way whose library is installed.
     """
-    # A name may hold a link, which a second process would resolve anew.
+    # A second process would resolve a link in the path again.
     store = store.resolve()
     opened = open_store(store)
     assets = min(limit or len(opened), len(opened))
@@ -246,7 +246,7 @@ def _worker(name: str, directory: Path, order: Sequence[int], start: Any) -> Non
                 read(row)
             start.wait()
     except BaseException:
-        start.abort()  # or the others would wait for ever
+        start.abort()  # Otherwise the other processes wait without end.
         raise
 
 

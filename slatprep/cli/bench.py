@@ -25,7 +25,7 @@ Example:
 """
 )
 def bench() -> None:
-    """Measure slatprep on this machine, side by side with what else there is."""
+    """Measure slatprep on this machine, side by side with the alternatives."""
 
 
 @bench.command(

@@ -42,7 +42,7 @@ Example:
 @source_options
 @option(
     "--out",
-    "The store, a path or URL; one that is there is updated, and replaced in one step.",
+    "The store, a path or URL; an existing one is updated, and replaced in one step.",
     PLACE,
     required=True,
     metavar="STORE.zarr",
@@ -50,7 +50,7 @@ Example:
 @_MANIFESTS
 @_STRICT
 @option("--consensus", "Settle ties by the rotation that most assets share.", is_flag=True)
-@option("--fresh", "Do everything, whatever was done before.", is_flag=True)
+@option("--fresh", "Reuse nothing of an earlier build.", is_flag=True)
 @option(
     "--keep-work",
     "Keep all assets' arrays beside the store, about 1 MB each; the next build is faster.",

@@ -26,7 +26,7 @@ _COLUMNS = ("fitness", "fitness_backward", "inlier_rmse", "valid_share", "ambigu
 Exit codes:
   0  all assets are good and the store is consistent
   1  one is not, or a picture cannot be written
-  2  wrong use: an option, or an asset that is not there
+  2  wrong use: an option, or an unknown asset
 
 \b
 Example:
@@ -57,8 +57,8 @@ def check_alignment(
 ) -> None:
     """Say and show whether the alignment of an asset is good.
 
-    Its quality is computed anew from what the store holds, and compared with
-    what the store says. A picture shows both sides before and after from three
+    Its quality is recomputed from the stored arrays, and compared with the
+    stored figures. A picture shows both sides before and after from three
     directions, the error of every voxel, the scores of the candidates and the
     verdict. --asset, --worst and --ambiguous may be combined.
     """
@@ -72,7 +72,7 @@ def check_alignment(
     try:
         chosen = check.choose_assets(opened, asset_ids, worst or 0, ambiguous)
     except StoreError as error:
-        # A name that is not there is a wrong call, not a failed check.
+        # An unknown name is wrong use, not a failed check.
         raise ConfigError(str(error)) from None
     target = _target(path, picture, len(chosen))
     checks = [check.check_alignment(opened, asset_id) for asset_id in chosen]

@@ -44,7 +44,7 @@ Example:
     ChoiceOf("slatprep.learn.metrics:Spread"),
     "se",
 )
-@option("--csv", "Also write the table there.", NEW_FILE, name="csv_file")
+@option("--csv", "Also write the table to this file.", NEW_FILE, name="csv_file")
 @option(
     "--beside",
     "Also print Pixie's published table, which has NeRF2Physics too, or one of your "

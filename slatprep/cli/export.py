@@ -60,7 +60,7 @@ Example:
 )
 @option(
     "--out",
-    "The file (hdf5) or folder (all others); an export that is there is replaced when "
+    "The file (hdf5) or folder (all others); an existing export is replaced when "
     "the new one is complete.",
     click.Path(path_type=Path),
     required=True,

@@ -52,8 +52,8 @@ def extract_slat(
 
     Every image and seed gives <id>.npz, or <id>/<view>.npz where there are
     views, in the form that build-store reads, and a JSON beside it that says
-    image, seed, model and revision. What is there already is kept, so that a
-    stopped run goes on. TRELLIS itself must be installed.
+    image, seed, model and revision. Existing files are kept, so that a stopped
+    run goes on. TRELLIS itself must be installed.
     """
     from slatprep import extract as work
 

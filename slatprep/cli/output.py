@@ -63,13 +63,8 @@ class Output:
             click.get_current_context().exit(EXIT_INCOMPLETE)
 
     def note(self, message: str) -> None:
-        """Tell a person something on standard error, unless quiet."""
+        """Print a line on standard error, unless quiet."""
         if self.verbosity >= 0:
-            click.echo(message, err=True)
-
-    def detail(self, message: str) -> None:
-        """Tell a person more on standard error, where ``-v`` asks for it."""
-        if self.verbosity > 0:
             click.echo(message, err=True)
 
     def problem(self, message: str) -> None:

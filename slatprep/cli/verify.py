@@ -31,12 +31,12 @@ Example:
 @option("--sources", "Compare the source files with the records, too.", is_flag=True)
 @option(
     "--pixieverse",
-    "Where the PixieVerse files lie now.  [default: where they lay]",
+    "Root of the PixieVerse files now.  [default: as at the build]",
     EXISTING_FOLDER,
 )
 @option(
     "--slat",
-    "Where the latents lie now, or their one HDF5 file does.  [default: where they lay]",
+    "Folder of the latents, or of their one HDF5 file, now.  [default: as at the build]",
     EXISTING_FOLDER,
 )
 @output_options

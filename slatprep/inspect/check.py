@@ -1,4 +1,4 @@
-"""Is an asset's alignment good? The answer from what the store holds, computed anew."""
+"""Is an asset's alignment good? The answer, recomputed from the store alone."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from slatprep.sample import sample
 from slatprep.store.reader import Store, StoredAsset
 
 QUALITY_TOLERANCE = 1e-3
-"""Quality computed anew differs less than this; one voxel at the radius may round either way."""
+"""Recomputed quality differs less than this; one voxel at the radius may round either way."""
 
 TOLERANCES = {
     "voxel/valid": 0.0,
@@ -27,7 +27,7 @@ TOLERANCES = {
     "voxel/properties": 1e-5,
     "voxel/distance": 1e-3,
 }
-"""Largest difference between an array and the same computed anew, by name.
+"""Largest difference between an array and its recomputed values, by name.
 
 Properties are normalised: float32 went through SI and back. Distances are in voxels.
 """
@@ -94,7 +94,7 @@ class AlignmentCheck:
         The verdict that the store holds.
     figures : tuple of Figure
         Every number, computed now and as stored. Ambiguity and margin are
-        taken from the store: the placements they come from are not there.
+        taken from the store: it does not hold the placements they come from.
     transform : ndarray of float64, shape (4, 4)
         PixieVerse frame to SLAT frame.
     radius : float
@@ -160,7 +160,7 @@ def check_alignment(store: Store, asset_id: str) -> AlignmentCheck:
     """
     asset = store.asset(asset_id)
     radius = float(_parameters(store)["align"]["radius"])
-    valid_share, differs = look_up_again(asset)
+    valid_share, differs = recompute_annotation(asset)
     latents = StructuredLatents(asset.coords, asset.feats)
     quality = measure_quality(asset.field, latents, asset.transform, radius)
     columns = asset.columns
@@ -191,7 +191,7 @@ def check_alignment(store: Store, asset_id: str) -> AlignmentCheck:
     )
 
 
-def look_up_again(asset: StoredAsset) -> tuple[float, dict[str, NDArray[np.float64]]]:
+def recompute_annotation(asset: StoredAsset) -> tuple[float, dict[str, NDArray[np.float64]]]:
     """Sample an asset's annotation again from the stored grid, and compare.
 
     Returns

@@ -87,14 +87,12 @@ def test_verbosity(capsys: pytest.CaptureFixture[str]) -> None:
     for verbosity in (-1, 0, 1):
         printer = Output(verbosity=verbosity)
         printer.note(f"note {verbosity}")
-        printer.detail(f"detail {verbosity}")
         printer.problem(f"problem {verbosity}")
     assert capsys.readouterr().err.split("\n")[:-1] == [
         "problem -1",
         "note 0",
         "problem 0",
         "note 1",
-        "detail 1",
         "problem 1",
     ]
 

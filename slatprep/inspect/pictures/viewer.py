@@ -1,4 +1,8 @@
-"""An alignment in Open3D's viewer, to be turned by hand."""
+"""An alignment in Open3D's viewer, to be turned by hand.
+
+The viewer turns triangles on the graphics card, `pictures.voxels` draws pixels
+of one view by numpy: the two share the voxels' colours, but no drawing.
+"""
 
 from __future__ import annotations
 
@@ -20,7 +24,7 @@ APART = 1.25
 
 
 def has_screen(environment: Mapping[str, str] = os.environ, platform: str = sys.platform) -> bool:
-    """Whether a window can be opened, as far as the environment tells."""
+    """Whether the environment names a display on which a window can be opened."""
     if platform in ("darwin", "win32"):
         return True
     return bool(environment.get("DISPLAY") or environment.get("WAYLAND_DISPLAY"))

@@ -41,6 +41,7 @@ class Tally:
 
 def no_tally() -> Tally:
     """Return the tally of nothing."""
+    # The classes of a material are those below BACKGROUND.
     shape = (len(PROPERTY_COLUMNS), BACKGROUND, BINS)
     return Tally(
         np.zeros(shape, np.int64), np.zeros(shape, np.int64), np.zeros(BACKGROUND + 1, np.int64)

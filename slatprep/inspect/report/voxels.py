@@ -54,15 +54,15 @@ def encode_asset(asset: StoredAsset, max_distance: float, side: int) -> bytes:
     # The first voxel of each cell stands for it; sorted by cell, that is C order.
     _, first = np.unique(np.ravel_multi_index(tuple(cells.T), (side,) * 3), return_index=True)
     grid, material = _boundary_of(asset.grid_material)
-    there = grid // step
-    _, chosen = np.unique(np.ravel_multi_index(tuple(there.T), (side,) * 3), return_index=True)
+    grid_cells = grid // step
+    _, chosen = np.unique(np.ravel_multi_index(tuple(grid_cells.T), (side,) * 3), return_index=True)
     scalars = np.column_stack(
         [(asset.properties[first] + 1.0) / 2.0, asset.distance[first] / max_distance]
     )
     scalars[~asset.valid[first], :3] = np.nan
     parts = [
         _bits(cells[first], side),
-        _bits(there[chosen], side),
+        _bits(grid_cells[chosen], side),
         asset.material[first].tobytes(),
         *(_quantised(column).tobytes() for column in scalars.T),
         material[chosen].tobytes(),

@@ -83,7 +83,7 @@ def verify_store(
     sources : bool
         Whether to compare the source files with the records.
     roots : SourceRoots, optional
-        Where the sources lie now; by default where ``build.json`` says they lay.
+        Where the sources lie now; by default the roots that ``build.json`` names.
     jobs : int or Workers
         Worker processes, or a `slatprep.workers.dask.Cluster`.
     progress : callable, optional

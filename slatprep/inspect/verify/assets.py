@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from slatprep.errors import InputError, StoreError
 from slatprep.geometry.voxels import flat_index
-from slatprep.inspect.check import TOLERANCES, look_up_again
+from slatprep.inspect.check import TOLERANCES, recompute_annotation
 from slatprep.normalize import normalize_change
 from slatprep.provenance.columns import columns_of
 from slatprep.provenance.record import AssetRecord, RecordError
@@ -39,8 +39,8 @@ def asset_findings(
     roots : SourceRoots or None
         Where the sources lie, if they are to be compared.
     run : str
-        Something unique to this verification: whatever a process remembers of
-        an earlier one, of files that may have changed since, is not used.
+        Unique to this verification: a worker caches opened stores and digests,
+        and must not use those of an earlier run, as files may have changed.
 
     Returns
     -------
@@ -126,7 +126,7 @@ def value_findings(asset: StoredAsset) -> Iterator[Finding]:
 def lookup_findings(asset: StoredAsset) -> Iterator[Finding]:
     """Yield where an annotation is not what the grid and the transform give."""
     try:
-        _, differences = look_up_again(asset)
+        _, differences = recompute_annotation(asset)
     except (KeyError, TypeError, ValueError, np.linalg.LinAlgError) as error:
         yield Finding("asset", asset.asset_id, f"cannot be sampled ({error})", "sound parameters")
         return

@@ -39,10 +39,10 @@ def metadata_findings(path: Place) -> Iterator[Finding]:
         copies = {}
     arrays: dict[str, Any] = {}
     files = storage_of(path).files()
-    there = {name.removesuffix("/zarr.json") for name in files if _is_metadata(name)}
-    for name in sorted({*there, *copies, *(layout.name for layout in ARRAYS), *_GROUPS}):
+    present = {name.removesuffix("/zarr.json") for name in files if _is_metadata(name)}
+    for name in sorted({*present, *copies, *(layout.name for layout in ARRAYS), *_GROUPS}):
         where = f"{name}/zarr.json"
-        if name not in there:
+        if name not in present:
             yield Finding(where, "", "is missing", "the metadata of an array or group")
             continue
         try:
@@ -85,13 +85,13 @@ def file_findings(store: Store, jobs: Jobs) -> tuple[int, set[Finding]]:
     if attributes_digest(store.attributes) != attributes[1]:
         findings.add(Finding("zarr.json", "", "the attributes changed", f"SHA-256 {attributes[1]}"))
     files = storage_of(store.path).files()
-    there = {name for name in files if name != "zarr.json" and not is_own(name)}
-    for name in there - expected.keys():
+    present = {name for name in files if name != "zarr.json" and not is_own(name)}
+    for name in present - expected.keys():
         findings.add(Finding(name, "", "belongs to no array", "no such file"))
-    for name in expected.keys() - there:
+    for name in expected.keys() - present:
         findings.add(Finding(name, "", "is missing", f"a file of {expected[name][0]} bytes"))
     places = {digest: name for name, (_, digest) in expected.items()}
-    common = sorted(there & expected.keys())
+    common = sorted(present & expected.keys())
     tasks = ((store.path, name, files[name], *expected[name]) for name in common)
     for name, what, digest in run_unordered(_compare, tasks, jobs):
         if what:

@@ -1,0 +1,17 @@
+"""What scripts share that build in processes of their own, from the made data of the tests."""
+
+from __future__ import annotations
+
+import os
+import sys
+from pathlib import Path
+
+ROOT = Path(__file__).parents[1]
+
+# The made data (`support.synthetic`) are part of the tests, not of the package.
+sys.path.insert(0, str(ROOT / "tests"))
+
+
+def environment() -> dict[str, str]:
+    """Return the environment in which such a process finds this checkout and its tests."""
+    return {**os.environ, "PYTHONPATH": f"{ROOT}:{ROOT / 'tests'}", "OMP_NUM_THREADS": "1"}
