@@ -216,7 +216,7 @@ def test_config_error_is_one_line_and_exit_code_two(tmp_path: Path) -> None:
         ("build-store", "--pixieverse", ".", "--slat", "."),  # no --out
         ("align", "--out", "x.jsonl"),  # no sources
         ("make-demo", "x", "--assets", "0"),
-        ("make-demo", "x", "--level", "5"),
+        ("make-demo", "x", "--level", "8"),
         ("info", "no-such-store.zarr"),
         ("check-alignment", "--store", "."),  # no --asset
     ],
