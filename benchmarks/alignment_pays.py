@@ -31,7 +31,7 @@ from slatprep.learn.metrics import METRICS, measure, score_asset
 from slatprep.learn.predictions import VoxelPrediction
 from slatprep.learn.splits import Shares
 from slatprep.learn.train import TrainParameters, train
-from slatprep.normalize import normalize
+from slatprep.normalize import normalize_properties
 from slatprep.pipeline.dataset import build_store
 from slatprep.store import open_store
 
@@ -106,7 +106,9 @@ def write_truth_store(source: Path, out: Path, truths: Path) -> None:
     store = open_store(source)
     truth = [read_truth(truths, asset_id) for asset_id in store.ids]
     root = zarr.open_group(partial, mode="r+")
-    properties = np.concatenate([normalize(t["properties"], store.normalization)[0] for t in truth])
+    properties = np.concatenate(
+        [normalize_properties(t["properties"], store.normalization) for t in truth]
+    )
     root["voxel/properties"][:] = properties
     root["voxel/material"][:] = np.concatenate([t["material"] for t in truth])
     root["voxel/valid"][:] = True
@@ -142,7 +144,7 @@ def against_truth(run: Path, trained_on: Path, test: Path, truths: Path) -> list
         prediction = VoxelPrediction(
             predicted.properties.double().numpy(), predicted.logits.argmax(1).numpy()
         )
-        target, _ = normalize(truth["properties"], normalization)
+        target = normalize_properties(truth["properties"], normalization)
         everywhere = np.ones(len(target), dtype=bool)
         scores.append(score_asset(prediction, target, truth["material"], everywhere))
     return list(measure(np.array(scores), "sd").means.values())

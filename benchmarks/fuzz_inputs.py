@@ -39,7 +39,7 @@ import numpy as np
 from slatprep.demo import make_demo
 from slatprep.errors import ConfigError, InputError, StoreError
 from slatprep.inspect.verify import verify_store
-from slatprep.normalize import PIXIE_RANGES, denormalize
+from slatprep.normalize import PIXIE_RANGES, denormalize_properties
 from slatprep.parameters import (
     BuildParameters,
     PairingParameters,
@@ -152,7 +152,7 @@ def check_field(pair: AssetPair) -> None:
         wanted = values[place][:, (1, 0, 2)].astype(np.float32)
     else:
         wanted = np.stack([values[k][place] for k in (1, 0, 2)], axis=1).astype(np.float32)
-        wanted = denormalize(np.clip(wanted, -1, 1), PIXIE_RANGES)
+        wanted = denormalize_properties(np.clip(wanted, -1, 1), PIXIE_RANGES)
     require(np.array_equal(wanted, field.properties), "properties differ from numpy's")
 
 

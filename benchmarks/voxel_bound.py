@@ -20,7 +20,7 @@ import numpy as np
 from slatprep.demo.latents import NOISE, clean_latents
 from slatprep.learn.dataset import Item, SlatDataset
 from slatprep.learn.splits import Shares
-from slatprep.normalize import denormalize
+from slatprep.normalize import denormalize_properties
 
 
 def main() -> None:
@@ -55,7 +55,7 @@ def score(item: Item, stuffs: np.ndarray, counts: np.ndarray, normalization) -> 
     """Return the squared errors (3,) and the accuracy of the posterior on one asset."""
     coords, feats = item.coords.numpy().astype(np.uint8), item.feats.numpy()
     chances = np.empty((len(feats), len(stuffs)))
-    si = denormalize(stuffs[:, :3], normalization)
+    si = denormalize_properties(stuffs[:, :3], normalization)
     for k, stuff in enumerate(stuffs):
         same = np.full(len(feats), int(stuff[3]), np.uint8)
         clean = clean_latents(coords, same, np.broadcast_to(si[k], (len(feats), 3)).copy())

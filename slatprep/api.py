@@ -9,14 +9,12 @@ from numpy.typing import ArrayLike, NDArray
 
 from slatprep.align import align
 from slatprep.geometry.voxels import occupancy_of, voxels_of
-from slatprep.normalize import PIXIE_RANGES, denormalize, normalize
 from slatprep.parameters import AlignParameters, SampleParameters
 from slatprep.records import (
     RESOLUTION,
     Alignment,
     Annotation,
     MaterialField,
-    Normalization,
     StructuredLatents,
 )
 from slatprep.sample import sample
@@ -111,56 +109,6 @@ def annotate_voxels(
         If `coords` are no voxels, or `transform` no similarity.
     """
     return sample(field, _voxels(coords, "coords"), transform, parameters or SampleParameters())
-
-
-def normalize_properties(
-    properties: ArrayLike, normalization: Normalization = PIXIE_RANGES
-) -> NDArray[np.float32]:
-    """Bring Young's modulus, density and Poisson's ratio to [-1, 1].
-
-    Parameters
-    ----------
-    properties : array_like, shape (N, 3)
-        Young's modulus [Pa], density [kg/m^3], Poisson's ratio; NaN passes.
-    normalization : Normalization
-        The ranges; Pixie's published ones by default, a store's own are
-        ``store.normalization``.
-
-    Returns
-    -------
-    ndarray of float32, shape (N, 3)
-        Clipped to [-1, 1].
-
-    Examples
-    --------
-    >>> values = normalize_properties([[1e7, 1000.0, 0.3]])
-    >>> values.round(3).tolist() == np.float32([[0.013, 0.196, -0.249]]).tolist()
-    True
-    >>> denormalize_properties(values).round(3).tolist()
-    [[10000000.0, 1000.0, 0.30000001192092896]]
-    """
-    return normalize(properties, normalization)[0]
-
-
-def denormalize_properties(
-    values: ArrayLike, normalization: Normalization = PIXIE_RANGES
-) -> NDArray[np.float32]:
-    """Bring normalised properties back to SI units, the inverse of `normalize_properties`.
-
-    Parameters
-    ----------
-    values : array_like, shape (N, 3)
-        Normalised Young's modulus, density and Poisson's ratio.
-    normalization : Normalization
-        The ranges they were normalised with.
-
-    Returns
-    -------
-    ndarray of float32, shape (N, 3)
-        Young's modulus [Pa], density [kg/m^3], Poisson's ratio. What had been
-        clipped comes back as the end of its range.
-    """
-    return denormalize(values, normalization)
 
 
 def _voxels(voxels: ArrayLike, name: str) -> NDArray[np.uint8]:

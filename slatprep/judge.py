@@ -18,7 +18,7 @@ from slatprep.records import (
     StructuredLatents,
     Verdict,
 )
-from slatprep.sample import Lookup
+from slatprep.sample import sample
 
 
 @dataclass(frozen=True)
@@ -112,10 +112,9 @@ def measure_ambiguity(
     differs = np.zeros(len(latents.coords), dtype=bool)
     change = np.zeros(3)
     if alignment.placements:
-        lookup = Lookup(field, parameters)
         mapped = to_mapped(annotation.properties)
         for placement in alignment.placements:
-            other = lookup.at(latents.coords, placement.transform)
+            other = sample(field, latents.coords, placement.transform, parameters)
             differs |= other.material != annotation.material
             both = annotation.valid & other.valid
             if both.any():

@@ -88,31 +88,39 @@ def ranges_from_extents(extents: ArrayLike) -> Normalization:
     return Normalization((first, second, third), source="dataset")
 
 
-def normalize(
-    properties: ArrayLike, normalization: Normalization
-) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
-    """Bring SI properties to [-1, 1].
+def normalize_properties(
+    properties: ArrayLike, normalization: Normalization = PIXIE_RANGES
+) -> NDArray[np.float32]:
+    """Bring Young's modulus, density and Poisson's ratio to [-1, 1].
 
     Parameters
     ----------
-    properties : array_like of float32, shape (N, 3)
+    properties : array_like, shape (N, 3)
         Young's modulus [Pa], density [kg/m^3], Poisson's ratio; NaN passes through.
     normalization : Normalization
-        The ranges.
+        The ranges; Pixie's published ones by default, a store's own are
+        ``store.normalization``.
 
     Returns
     -------
-    values : ndarray of float32, shape (N, 3)
-        Normalised properties, clipped to [-1, 1].
-    clipped : ndarray of int64, shape (3,)
-        How many values of each property lay outside its range.
+    ndarray of float32, shape (N, 3)
+        Clipped to [-1, 1].
 
     Examples
     --------
-    >>> values, clipped = normalize([[1e7, 1000.0, 0.3]], PIXIE_RANGES)
-    >>> [round(float(v), 4) for v in values[0]], clipped.tolist()
-    ([0.0127, 0.1962, -0.2492], [0, 0, 0])
+    >>> values = normalize_properties([[1e7, 1000.0, 0.3]])
+    >>> values.round(3).tolist() == np.float32([[0.013, 0.196, -0.249]]).tolist()
+    True
+    >>> denormalize_properties(values).round(3).tolist()
+    [[10000000.0, 1000.0, 0.30000001192092896]]
     """
+    return normalize_and_count(properties, normalization)[0]
+
+
+def normalize_and_count(
+    properties: ArrayLike, normalization: Normalization
+) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
+    """Normalise as `normalize_properties`, and count per property (3,) what was clipped."""
     given = np.asarray(properties)
     values = np.empty(given.shape, dtype=np.float32)
     clipped = np.zeros(len(PROPERTY_COLUMNS), dtype=np.int64)
@@ -127,8 +135,10 @@ def normalize(
     return values, clipped
 
 
-def denormalize(values: ArrayLike, normalization: Normalization) -> NDArray[np.float32]:
-    """Bring normalised properties back to SI, the inverse of `normalize`.
+def denormalize_properties(
+    values: ArrayLike, normalization: Normalization = PIXIE_RANGES
+) -> NDArray[np.float32]:
+    """Bring normalised properties back to SI units, the inverse of `normalize_properties`.
 
     Parameters
     ----------
@@ -140,7 +150,8 @@ def denormalize(values: ArrayLike, normalization: Normalization) -> NDArray[np.f
     Returns
     -------
     ndarray of float32, shape (N, 3)
-        Young's modulus [Pa], density [kg/m^3], Poisson's ratio.
+        Young's modulus [Pa], density [kg/m^3], Poisson's ratio. What had been
+        clipped comes back as the end of its range.
     """
     given = np.asarray(values)
     properties = np.empty(given.shape, dtype=np.float32)
@@ -152,10 +163,5 @@ def denormalize(values: ArrayLike, normalization: Normalization) -> NDArray[np.f
 
 def normalize_change(change: ArrayLike, normalization: Normalization) -> NDArray[np.float64]:
     """Scale differences of mapped properties to differences of normalised ones."""
-    lo, hi = _limits(normalization)
-    return np.asarray(change, dtype=np.float64) * 2.0 / (hi - lo)
-
-
-def _limits(normalization: Normalization) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    ranges = normalization.ranges
-    return np.array([r.lo for r in ranges]), np.array([r.hi for r in ranges])
+    spans = np.array([one.hi - one.lo for one in normalization.ranges])
+    return np.asarray(change, dtype=np.float64) * 2.0 / spans

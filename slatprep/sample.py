@@ -21,8 +21,8 @@ def sample(
     Each SLAT voxel is carried into the PixieVerse frame and takes the values of
     an annotated voxel there: the nearest one (SLAT-Phys, "Physics-to-SLAT
     Annotation Alignment"), or the nearest one of the class that the annotated
-    voxels around it vote for. Background and unannotated voxels are never
-    anyone's label.
+    voxels around it vote for. Background and unannotated voxels are
+    never taken.
 
     Parameters
     ----------
@@ -41,31 +41,19 @@ def sample(
         In SI units; NaN and 255 where not valid. ``distance`` is to the voxel
         whose values were taken, or to the nearest where not valid.
     """
-    return Lookup(field, parameters).at(coords, transform)
+    from slatprep.geometry.nearest import Lattice
 
-
-class Lookup:
-    """A field that is looked up more than once; see `sample`."""
-
-    def __init__(self, field: MaterialField, parameters: SampleParameters) -> None:
-        from slatprep.geometry.nearest import Lattice
-
-        self._field, self._parameters = field, parameters
-        self._lattice = Lattice(field.voxels)
-
-    def at(self, coords: NDArray[np.uint8], transform: ArrayLike) -> Annotation:
-        """Look material and properties up at SLAT voxels under a transform."""
-        field, parameters = self._field, self._parameters
-        points = apply_transform(invert_transform(transform), voxel_centres(coords))
-        distance, used = self._lattice.nearest(points)
-        valid = distance <= parameters.max_distance
-        if parameters.method == "vote":
-            voted = self._lattice.vote(points, field.material, parameters.vote_width)
-            changed = valid & (voted >= 0) & (voted != used)
-            used = np.where(changed, voted, used)
-            apart = points[changed] - voxel_centres(field.voxels[used[changed]])
-            distance[changed] = np.linalg.norm(apart, axis=1) * RESOLUTION
-        properties, material = field.properties[used], field.material[used]
-        properties[~valid] = np.nan
-        material[~valid] = UNANNOTATED
-        return Annotation(properties, material, valid, distance.astype(np.float32))
+    lattice = Lattice(field.voxels)
+    points = apply_transform(invert_transform(transform), voxel_centres(coords))
+    distance, used = lattice.nearest(points)
+    valid = distance <= parameters.max_distance
+    if parameters.method == "vote":
+        voted = lattice.vote(points, field.material, parameters.vote_width)
+        changed = valid & (voted >= 0) & (voted != used)
+        used = np.where(changed, voted, used)
+        apart = points[changed] - voxel_centres(field.voxels[used[changed]])
+        distance[changed] = np.linalg.norm(apart, axis=1) * RESOLUTION
+    properties, material = field.properties[used], field.material[used]
+    properties[~valid] = np.nan
+    material[~valid] = UNANNOTATED
+    return Annotation(properties, material, valid, distance.astype(np.float32))

@@ -13,8 +13,8 @@ from hypothesis import strategies as st
 from slatprep.errors import ConfigError
 from slatprep.normalize import (
     PIXIE_RANGES,
-    denormalize,
-    normalize,
+    denormalize_properties,
+    normalize_and_count,
     normalize_change,
     property_extent,
     ranges_from_extents,
@@ -34,14 +34,14 @@ DECADES = Normalization(
 
 def test_by_hand() -> None:
     # 10^4..10^12: 10^6 lies a quarter of the way, 2 * 0.25 - 1 = -0.5.
-    values, clipped = normalize([[1e6, 1e3, 0.35]], DECADES)
+    values, clipped = normalize_and_count([[1e6, 1e3, 0.35]], DECADES)
     np.testing.assert_allclose(values, [[-0.5, 0.0, 0.5]], atol=1e-6)
     assert clipped.tolist() == [0, 0, 0]
     assert values.dtype == np.float32
 
 
 def test_the_ends_are_not_clipped_and_what_lies_beyond_is_counted() -> None:
-    values, clipped = normalize(
+    values, clipped = normalize_and_count(
         [[1e4, 1e2, 0.2], [1e12, 1e4, 0.4], [1e3, 1e5, 0.3], [1e13, 1e3, 0.5]], DECADES
     )
     np.testing.assert_array_equal(values[:2], [[-1, -1, -1], [1, 1, 1]])
@@ -50,7 +50,7 @@ def test_the_ends_are_not_clipped_and_what_lies_beyond_is_counted() -> None:
 
 
 def test_nan_passes_through_uncounted() -> None:
-    values, clipped = normalize([[np.nan, np.nan, np.nan]], DECADES)
+    values, clipped = normalize_and_count([[np.nan, np.nan, np.nan]], DECADES)
     assert np.isnan(values).all()
     assert clipped.tolist() == [0, 0, 0]
 
@@ -64,17 +64,17 @@ def test_nan_passes_through_uncounted() -> None:
 )
 def test_the_inverse_is_exact_to_float32(rows: list[tuple[float, float, float]]) -> None:
     properties = np.array(rows, dtype=np.float32)
-    values, clipped = normalize(properties, PIXIE_RANGES)
+    values, clipped = normalize_and_count(properties, PIXIE_RANGES)
     assert clipped.sum() == 0
     # Half a step of float32 near 1 is 3e-8; eight decades of E stretch it to
     # 3e-8 * 4 ln 10 of the value.
-    np.testing.assert_allclose(denormalize(values, PIXIE_RANGES), properties, rtol=1e-6)
+    np.testing.assert_allclose(denormalize_properties(values, PIXIE_RANGES), properties, rtol=1e-6)
 
 
 @given(st.lists(st.tuples(*[st.floats(-1, 1, width=32)] * 3), min_size=1, max_size=20))
 def test_the_other_way_round_too(rows: list[tuple[float, float, float]]) -> None:
     values = np.array(rows, dtype=np.float32)
-    again, _ = normalize(denormalize(values, DECADES), DECADES)
+    again, _ = normalize_and_count(denormalize_properties(values, DECADES), DECADES)
     np.testing.assert_allclose(again, values, atol=5e-7)
 
 
@@ -109,7 +109,9 @@ def test_dataset_ranges_span_all_assets() -> None:
 
 def test_one_value_in_all_the_dataset_becomes_zero() -> None:
     field = _field([[1e5, 100, 0.3]])
-    values, clipped = normalize(field.properties, ranges_from_extents([property_extent(field)]))
+    values, clipped = normalize_and_count(
+        field.properties, ranges_from_extents([property_extent(field)])
+    )
     np.testing.assert_allclose(values, [[0, 0, 0]], atol=1e-6)
     assert clipped.sum() == 0
 

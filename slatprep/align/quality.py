@@ -65,16 +65,16 @@ def compare(
         Fitness and inlier rmse both ways; overlap is the share of both
         boundaries' voxels together that have a partner.
     """
-    from slatprep.geometry.nearest import nearest_voxel
+    from slatprep.geometry.nearest import Lattice
 
     # Both ways the points are carried to the other side's lattice, where the
     # nearest voxel is found without a tree; the scale turns distances in the
     # PixieVerse frame into voxels of the SLAT frame.
     _, _, scale = split_transform(transform)
     carried = apply_transform(transform, voxel_centres(pixieverse))
-    forward, _ = nearest_voxel(carried, slat, limit=radius)
+    forward, _ = Lattice(slat).nearest(carried, limit=radius)
     carried = apply_transform(invert_transform(transform), voxel_centres(slat))
-    backward, _ = nearest_voxel(carried, pixieverse, limit=radius / scale)
+    backward, _ = Lattice(pixieverse).nearest(carried, limit=radius / scale)
     near, near_back = np.isfinite(forward), np.isfinite(backward)
     return Quality(
         fitness=float(near.mean()),

@@ -100,13 +100,6 @@ class Lattice:
         return spokesman
 
 
-def nearest_voxel(
-    points: NDArray[np.float64], voxels: NDArray[np.uint8], limit: float = np.inf
-) -> tuple[NDArray[np.float64], NDArray[np.intp]]:
-    """Find the nearest voxel of a set for each point; see `Lattice` and `Lattice.nearest`."""
-    return Lattice(voxels).nearest(points, limit)
-
-
 def _in_voxels(points: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return positions in index units, where voxel i is centred at i."""
     return np.ascontiguousarray((np.asarray(points, dtype=np.float64) + 0.5) * RESOLUTION - 0.5)
@@ -172,43 +165,32 @@ def _search(position, row, offsets, floors, limit):  # type: ignore[no-untyped-d
 def _vote(position, row, labels, n_labels, steepness):  # type: ignore[no-untyped-def]
     count, size = position.shape[0], row.shape[0]
     spokesman = np.full(count, -1, dtype=np.intp)
-    votes = np.zeros(n_labels)
     nearest, nearest_square = np.zeros(n_labels, dtype=np.intp), np.zeros(n_labels)
+    voter_label, voter_square = np.zeros(27, dtype=np.intp), np.zeros(27)
+    votes = np.zeros(n_labels)
     for m in range(count):
         x, y, z = position[m, 0], position[m, 1], position[m, 2]
         a, b, c = int(np.rint(x)), int(np.rint(y)), int(np.rint(z))
-        low = (max(a - 1, 0), max(b - 1, 0), max(c - 1, 0))
-        high = (min(a + 2, size), min(b + 2, size), min(c + 2, size))
-        # Away from borders all voters agree, and only the nearest is looked for.
-        winner, unanimous, best = -1, True, np.inf
-        for i in range(low[0], high[0]):
-            for j in range(low[1], high[1]):
-                for k in range(low[2], high[2]):
-                    voxel = row[i, j, k]
-                    if voxel < 0:
-                        continue
-                    if winner < 0:
-                        winner = labels[voxel]
-                    unanimous = unanimous and labels[voxel] == winner
-                    square = (x - i) ** 2 + (y - j) ** 2 + (z - k) ** 2
-                    if square < best or (square == best and voxel < spokesman[m]):
-                        best, spokesman[m] = square, voxel
-        if unanimous:
-            continue
-        votes[:] = 0.0
+        voters, parties = 0, 0
         nearest_square[:] = np.inf
-        for i in range(low[0], high[0]):
-            for j in range(low[1], high[1]):
-                for k in range(low[2], high[2]):
+        for i in range(max(a - 1, 0), min(a + 2, size)):
+            for j in range(max(b - 1, 0), min(b + 2, size)):
+                for k in range(max(c - 1, 0), min(c + 2, size)):
                     voxel = row[i, j, k]
                     if voxel < 0:
                         continue
-                    square = (x - i) ** 2 + (y - j) ** 2 + (z - k) ** 2
-                    label = labels[voxel]
-                    votes[label] += math.exp(-square * steepness)
-                    if square < nearest_square[label] or (
-                        square == nearest_square[label] and voxel < nearest[label]
-                    ):
+                    label, square = labels[voxel], (x - i) ** 2 + (y - j) ** 2 + (z - k) ** 2
+                    voter_label[voters], voter_square[voters] = label, square
+                    voters += 1
+                    best = nearest_square[label]
+                    parties += best == np.inf
+                    if square < best or (square == best and voxel < nearest[label]):
                         nearest_square[label], nearest[label] = square, voxel
-        spokesman[m] = nearest[np.argmax(votes)]
+        if parties == 1:  # Away from borders all voters agree.
+            spokesman[m] = nearest[voter_label[0]]
+        elif parties > 1:
+            votes[:] = 0.0
+            for voter in range(voters):
+                votes[voter_label[voter]] += math.exp(-voter_square[voter] * steepness)
+            spokesman[m] = nearest[np.argmax(votes)]
     return spokesman

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from slatprep.align.quality import measure_quality
 from slatprep.errors import StoreError
 from slatprep.judge import THRESHOLDS, verdict_of
-from slatprep.normalize import normalize
+from slatprep.normalize import normalize_properties
 from slatprep.parameters import SampleParameters
 from slatprep.records import StructuredLatents, Verdict
 from slatprep.sample import sample
@@ -211,7 +211,7 @@ def recompute_annotation(asset: StoredAsset) -> tuple[float, dict[str, NDArray[n
     """
     parameters = SampleParameters(**_parameters(asset.store)["sample"])
     annotation = sample(asset.field, asset.coords, asset.transform, parameters)
-    properties, _ = normalize(annotation.properties, asset.store.normalization)
+    properties = normalize_properties(annotation.properties, asset.store.normalization)
     changes = np.abs(properties - asset.properties).max(axis=1)
     differences = {
         "voxel/valid": annotation.valid != asset.valid,

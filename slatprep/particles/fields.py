@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from slatprep.errors import ConfigError, InputError
 from slatprep.geometry.frames import apply_transform, invert_transform
-from slatprep.normalize import denormalize
+from slatprep.normalize import denormalize_properties
 from slatprep.readers.files import ArraySpec, load_source, npz_arrays, npz_small_arrays
 from slatprep.readers.slat import check_coords
 from slatprep.records import BACKGROUND, RESOLUTION, Normalization
@@ -130,7 +130,7 @@ def predicted_field(path: Path, normalization: Normalization | None) -> VoxelFie
                 f"{path} holds normalised properties; name their store or their ranges "
                 "(--store or --ranges), or save SI values as properties_si"
             )
-        values = denormalize(values, normalization)
+        values = denormalize_properties(values, normalization)
     valid = np.ones(len(coords), dtype=bool)
     if "valid" in held:
         valid = npz_arrays(data, path, {"valid": _VALID})["valid"]

@@ -87,13 +87,13 @@ def transfer(
     ConfigError
         If `far` or `max_distance` makes no sense.
     """
-    from slatprep.geometry.nearest import nearest_voxel
+    from slatprep.geometry.nearest import Lattice
 
     if far not in get_args(Far):
         raise ConfigError(f"far is {far!r}; expected one of {', '.join(get_args(Far))}")
     if not max_distance > 0:
         raise ConfigError(f"max_distance is {max_distance}; expected a number above 0")
-    distance, used = nearest_voxel(field.locate(points), field.voxels)
+    distance, used = Lattice(field.voxels).nearest(field.locate(points))
     near = distance <= max_distance
     material = np.where(near | (far == "nearest"), field.material[used], np.uint8(BACKGROUND))
     properties = np.where(

@@ -12,7 +12,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slatprep.geometry.voxels import flat_index
-from slatprep.normalize import PIXIE_RANGES, normalize, normalize_change, ranges_from_extents
+from slatprep.normalize import (
+    PIXIE_RANGES,
+    normalize_and_count,
+    normalize_change,
+    ranges_from_extents,
+)
 from slatprep.parameters import NormalizeParameters, StoreParameters
 from slatprep.pipeline.spool import Spool, SpooledAsset
 from slatprep.provenance.record import Clipped, property_counts
@@ -78,7 +83,7 @@ def write_shard(
 def _voxel_rows(spool: Spool, shard: Shard, normalization: Normalization) -> Iterator[Rows]:
     for asset, own in overlaps(shard.offsets, *shard.rows):
         arrays = {name: array[own] for name, array in spool.voxels(shard.keys[asset]).items()}
-        arrays["properties"], clipped = normalize(arrays["properties"], normalization)
+        arrays["properties"], clipped = normalize_and_count(arrays["properties"], normalization)
         yield asset, arrays, clipped
 
 
@@ -89,7 +94,7 @@ def _grid_rows(spool: Spool, shard: Shard, normalization: Normalization) -> Iter
         material = np.where(field.occupancy, np.uint8(UNANNOTATED), np.uint8(BACKGROUND))
         material.reshape(-1)[cells] = field.material
         properties = np.full((3, material.size), np.nan, dtype=np.float32)
-        normalized, clipped = normalize(field.properties, normalization)
+        normalized, clipped = normalize_and_count(field.properties, normalization)
         for plane, column in zip(properties, normalized.T, strict=True):
             plane[cells] = column
         properties = properties.reshape(1, 3, *material.shape)

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slatprep.errors import InputError
-from slatprep.normalize import PIXIE_RANGES, denormalize
+from slatprep.normalize import PIXIE_RANGES, denormalize_properties
 from slatprep.readers.files import (
     ArraySpec,
     load_source,
@@ -249,7 +249,7 @@ def _to_si(values: NDArray[np.float32], warnings: list[str]) -> NDArray[np.float
     for name, count in zip(PROPERTY_COLUMNS, outside, strict=True):
         if count:
             warnings.append(f"prediction: {count} values of {name} clipped to [-1, 1]")
-    return denormalize(np.clip(values, -1, 1), PIXIE_RANGES)
+    return denormalize_properties(np.clip(values, -1, 1), PIXIE_RANGES)
 
 
 def _read_bounds(

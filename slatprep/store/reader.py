@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from slatprep.errors import StoreError
 from slatprep.geometry.voxels import voxels_of
-from slatprep.normalize import denormalize
+from slatprep.normalize import denormalize_properties
 from slatprep.records import BACKGROUND, MaterialField, Normalization, Place, PropertyRange
 from slatprep.storage.place import place_of, storage_of
 from slatprep.storage.versions import store_name
@@ -90,7 +90,7 @@ class StoredAsset:
     @cached_property
     def properties_si(self) -> NDArray[np.float32]:
         """Young's modulus [Pa], density [kg/m^3], Poisson's ratio, (N, 3); NaN where not valid."""
-        return denormalize(self.properties, self.store.normalization)
+        return denormalize_properties(self.properties, self.store.normalization)
 
     @cached_property
     def grid_properties(self) -> NDArray[np.float32]:
@@ -111,7 +111,7 @@ class StoredAsset:
             occupancy=self.grid_material != BACKGROUND,
             voxels=voxels_of(annotated),
             material=self.grid_material[annotated],
-            properties=denormalize(values, self.store.normalization),
+            properties=denormalize_properties(values, self.store.normalization),
         )
 
 

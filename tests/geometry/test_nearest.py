@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from scipy.spatial import cKDTree
 
 from slatprep.geometry.frames import voxel_centres
-from slatprep.geometry.nearest import Lattice, nearest_voxel
+from slatprep.geometry.nearest import Lattice
 
 
 @settings(deadline=None, max_examples=40)
@@ -19,7 +19,7 @@ def test_the_nearest_voxel_is_a_kd_tree_s(count: int, seed: int, spread: float) 
     voxels = np.unique(rng.integers(0, 64, (count, 3)), axis=0).astype(np.uint8)
     points = rng.uniform(-spread, spread, (200, 3))
     points[:50] = np.round(points[:50] * 128) / 128  # on voxels, faces and edges
-    distance, index = nearest_voxel(points, voxels)
+    distance, index = Lattice(voxels).nearest(points)
     expected, _ = cKDTree(voxel_centres(voxels)).query(points)
     np.testing.assert_allclose(distance, expected * 64, atol=1e-9)
     apart = np.linalg.norm(points - voxel_centres(voxels[index]), axis=1) * 64
@@ -29,21 +29,21 @@ def test_the_nearest_voxel_is_a_kd_tree_s(count: int, seed: int, spread: float) 
 def test_of_equally_near_voxels_the_first_is_taken() -> None:
     voxels = np.array([[11, 10, 10], [9, 10, 10], [10, 11, 10]], dtype=np.uint8)
     for order in ([0, 1, 2], [2, 0, 1], [1, 2, 0]):
-        _, index = nearest_voxel(voxel_centres([[10, 10, 10]]), voxels[order])
+        _, index = Lattice(voxels[order]).nearest(voxel_centres([[10, 10, 10]]))
         assert index.tolist() == [0]
 
 
 def test_beyond_the_limit_nothing_is_found() -> None:
     voxels = np.array([[0, 0, 0]], dtype=np.uint8)
     points = voxel_centres([[2, 0, 0], [3, 0, 0], [63, 63, 63]])
-    distance, index = nearest_voxel(points, voxels, limit=2.0)
+    distance, index = Lattice(voxels).nearest(points, limit=2.0)
     assert distance.tolist() == [2.0, np.inf, np.inf]
     assert index.tolist() == [0, -1, -1]
 
 
 def test_an_empty_set_is_refused() -> None:
     with pytest.raises(ValueError, match="empty"):
-        nearest_voxel(np.zeros((1, 3)), np.zeros((0, 3), dtype=np.uint8))
+        Lattice(np.zeros((0, 3), dtype=np.uint8))
 
 
 def test_two_voters_outvote_a_nearer_one() -> None:

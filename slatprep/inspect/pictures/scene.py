@@ -96,11 +96,11 @@ def surface_distance(
     ndarray of float64, shape (M,)
         Voxels of the SLAT frame.
     """
-    from slatprep.geometry.nearest import nearest_voxel
+    from slatprep.geometry.nearest import Lattice
 
     _, _, scale = split_transform(transform)
     points = apply_transform(invert_transform(transform), voxel_centres(slat))
-    distance, _ = nearest_voxel(points, pixieverse)
+    distance, _ = Lattice(pixieverse).nearest(points)
     scaled: NDArray[np.float64] = distance * scale
     return scaled
 
