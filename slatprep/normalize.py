@@ -164,4 +164,5 @@ def denormalize_properties(
 def normalize_change(change: ArrayLike, normalization: Normalization) -> NDArray[np.float64]:
     """Scale differences of mapped properties to differences of normalised ones."""
     spans = np.array([one.hi - one.lo for one in normalization.ranges])
-    return np.asarray(change, dtype=np.float64) * 2.0 / spans
+    scaled: NDArray[np.float64] = np.asarray(change, dtype=np.float64) * 2.0 / spans
+    return scaled

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from slatprep.demo.catalogue import CATALOGUE
 from slatprep.demo.difficulty import (
+    EMPTY,
     LEVELS,
     QUARTER_TURNS,
     SAME_SHAPE_LEVELS,
@@ -158,7 +159,7 @@ def make_asset(
         level,
         model.symmetric,
         _material_grid(solid, stuff),
-        stuff != -1,
+        stuff != EMPTY,
         tuple(made),
     )
 
@@ -170,9 +171,9 @@ def _heading(view: int) -> NDArray[np.float64]:
 
 
 def _pixieverse_side(solid: Solid, frames: Frames) -> NDArray[np.int16]:
-    """Return the index of the stuff of each voxel (64, 64, 64), -1 where empty."""
+    """Return the index of the stuff of each voxel (64, 64, 64), `EMPTY` where there is none."""
     filled = np.argwhere(voxelise(frames.pixieverse_distance(solid))[1])
-    stuff = np.full((RESOLUTION,) * 3, -1, dtype=np.int16)
+    stuff = np.full((RESOLUTION,) * 3, EMPTY, dtype=np.int16)
     centres = frames.pixieverse.to_object(voxel_centres(filled))
     stuff[tuple(filled.T)] = solid.stuff_at(centres)
     return stuff

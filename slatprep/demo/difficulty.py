@@ -21,14 +21,14 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from itertools import permutations, product
 
 import numpy as np
 from numpy.typing import NDArray
 
 from slatprep.demo.generated import Distortion, draw_distortion
+from slatprep.demo.model import direction
 from slatprep.demo.shapes import Solid, bounding_box
-from slatprep.geometry.frames import VOXEL_SIZE, make_transform, voxel_centres
+from slatprep.geometry.frames import VOXEL_SIZE, cube_symmetries, make_transform, voxel_centres
 from slatprep.geometry.voxels import boundary
 from slatprep.records import RESOLUTION
 
@@ -38,9 +38,8 @@ Array = NDArray[np.float64]
 # A hair less than the cube, so that no surface lies on its very faces.
 _FULL = 1.0 - 1e-4
 
-
-UNLABELLED = -2
-"""Marks the occupied voxels of a damaged grid that carry no label (-1 in PixieVerse)."""
+EMPTY, UNLABELLED = -1, -2
+"""Stuff of an empty voxel, and of one that is occupied but has no label."""
 
 
 @dataclass(frozen=True)
@@ -94,18 +93,7 @@ SAME_SHAPE_LEVELS = (0, 1, 2, 3, 4)
 """Levels whose sides show one clean shape: what a demo has where nothing else is asked for."""
 
 
-def _quarter_turns() -> tuple[Array, ...]:
-    matrices = []
-    for order in permutations(range(3)):
-        for signs in product((1.0, -1.0), repeat=3):
-            matrix = np.zeros((3, 3))
-            matrix[range(3), order] = signs
-            if np.linalg.det(matrix) > 0:
-                matrices.append(matrix)
-    return tuple(matrices)
-
-
-QUARTER_TURNS = _quarter_turns()
+QUARTER_TURNS = tuple(turn.astype(float) for turn in cube_symmetries() if np.linalg.det(turn) > 0)
 """The 24 rotations of a cube."""
 
 
@@ -238,7 +226,7 @@ def draw_frames(rng: Rng, solid: Solid, difficulty: Difficulty, quarter: Array) 
     rotation = _tilt(rng, difficulty.tilt) @ quarter if difficulty.tilt else quarter
     shift = np.zeros(3)
     if difficulty.shift:
-        shift = _direction(rng) * rng.uniform(0.0, difficulty.shift) * VOXEL_SIZE
+        shift = direction(rng) * rng.uniform(0.0, difficulty.shift) * VOXEL_SIZE
     box = bounding_box(solid.shapes, rotation) - rotation @ middle
     # The largest scale at which neither side of the shifted box leaves the cube.
     largest = float(np.min(np.stack([full / 2 + shift, full / 2 - shift]) / np.abs(box)))
@@ -290,15 +278,9 @@ def generate(rng: Rng, frames: Frames, difficulty: Difficulty, solid: Solid, ski
     return replace(frames, slat=pose, distortion=distortion)
 
 
-def _direction(rng: Rng) -> Array:
-    vector = rng.normal(size=3)
-    unit: Array = vector / np.linalg.norm(vector)
-    return unit
-
-
 def _tilt(rng: Rng, degrees: float) -> Array:
     """Return a rotation about any axis by up to `degrees` (Rodrigues' formula)."""
-    x, y, z = _direction(rng)
+    x, y, z = direction(rng)
     angle = np.radians(rng.uniform(0.0, degrees))
     cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
     tilt: Array = np.eye(3) + np.sin(angle) * cross + (1.0 - np.cos(angle)) * cross @ cross
@@ -320,8 +302,8 @@ def _any_rotation(rng: Rng) -> Array:
 def _draw_warp(rng: Rng, voxels: float, waves: int = 3) -> Warp:
     """Return a warp whose root mean square displacement is about `voxels`."""
     size = voxels * VOXEL_SIZE * np.sqrt(2.0 / waves)
-    amplitude = np.stack([size * _direction(rng) for _ in range(waves)])
-    wave = np.stack([2.0 * np.pi * rng.uniform(0.7, 1.3) * _direction(rng) for _ in range(waves)])
+    amplitude = np.stack([size * direction(rng) for _ in range(waves)])
+    wave = np.stack([2.0 * np.pi * rng.uniform(0.7, 1.3) * direction(rng) for _ in range(waves)])
     return Warp(amplitude, wave, rng.uniform(0.0, 2.0 * np.pi, waves))
 
 
@@ -335,7 +317,7 @@ def damage(
     rng : numpy.random.Generator
         Source of the random parts.
     stuff : ndarray of int16, shape (64, 64, 64)
-        Index of the stuff of each voxel, -1 where empty.
+        Index of the stuff of each voxel, `EMPTY` where there is none.
     distance : callable
         Distance bound of the solid in the grid's frame.
     stuffs : int
@@ -344,15 +326,14 @@ def damage(
     Returns
     -------
     ndarray of int16, shape (64, 64, 64)
-        The damaged grid; `UNLABELLED` marks the occupied voxels of one floater that
-        carries no label.
+        The damaged grid; one floater is `UNLABELLED`.
     """
     damaged = stuff.copy()
     index = np.argwhere(np.ones(stuff.shape, dtype=bool))
     skin = np.argwhere(boundary(stuff >= 0))
     for _ in range(rng.integers(1, 4)):
         centre, radius = skin[rng.integers(len(skin))], rng.uniform(2.5, 5.0)
-        damaged[tuple(index[((index - centre) ** 2).sum(axis=1) < radius**2].T)] = -1
+        damaged[tuple(index[((index - centre) ** 2).sum(axis=1) < radius**2].T)] = EMPTY
 
     wanted = int(rng.integers(2, 5))
     places = rng.integers(3, RESOLUTION - 3, (200, 3))
@@ -360,6 +341,6 @@ def damage(
     for k, centre in enumerate(free):
         radii = rng.uniform(1.0, 2.5, 3)
         blob = index[(((index - centre) / radii) ** 2).sum(axis=1) < 1.0]
-        empty = blob[damaged[tuple(blob.T)] == -1]
+        empty = blob[damaged[tuple(blob.T)] == EMPTY]
         damaged[tuple(empty.T)] = UNLABELLED if k == 0 else rng.integers(stuffs)
     return damaged

@@ -7,6 +7,8 @@ that map points of the PixieVerse frame to points of the SLAT frame.
 
 from __future__ import annotations
 
+import itertools
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
@@ -116,3 +118,12 @@ def displacement(transform: ArrayLike, reference: ArrayLike, slat_voxels: ArrayL
     here = apply_transform(invert_transform(transform), points)
     there = apply_transform(invert_transform(reference), points)
     return float(np.linalg.norm(here - there, axis=1).mean() * RESOLUTION)
+
+
+def cube_symmetries() -> NDArray[np.int64]:
+    """Return the 48 symmetries of a cube as signed permutation matrices, the identity first."""
+    matrices = np.zeros((48, 3, 3), np.int64)
+    orders, flips = itertools.permutations(range(3)), itertools.product((1, -1), repeat=3)
+    for matrix, (order, signs) in zip(matrices, itertools.product(orders, flips), strict=True):
+        matrix[range(3), order] = signs
+    return matrices

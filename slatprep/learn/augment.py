@@ -13,12 +13,12 @@ here, which is why augmentation is off unless asked for.
 
 from __future__ import annotations
 
-import itertools
 from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
+from slatprep.geometry.frames import cube_symmetries
 from slatprep.records import RESOLUTION
 
 Augmentation = Literal["none", "upright", "all"]
@@ -38,13 +38,7 @@ def lattice_symmetries(kind: Augmentation) -> NDArray[np.int64]:
     ndarray of int64, shape (S, 3, 3)
         The identity is the first.
     """
-    matrices = []
-    for order in itertools.permutations(range(3)):
-        for signs in itertools.product((1, -1), repeat=3):
-            matrix = np.zeros((3, 3), np.int64)
-            matrix[range(3), order] = signs
-            matrices.append(matrix)
-    symmetries = np.stack(matrices)
+    symmetries = cube_symmetries()
     if kind == "none":
         return symmetries[:1]
     return symmetries[symmetries[:, 2, 2] == 1] if kind == "upright" else symmetries

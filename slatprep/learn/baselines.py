@@ -7,10 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from slatprep.geometry.frames import voxel_centres
 from slatprep.learn.dataset import Item, SlatDataset
-from slatprep.records import RESOLUTION
-
-_CLASSES = 8
+from slatprep.learn.predictions import CLASSES
 
 
 @dataclass(frozen=True)
@@ -34,7 +33,7 @@ class VoxelBaseline:
 
 def fit_linear(dataset: SlatDataset) -> VoxelBaseline:
     """Fit by least squares over all valid voxels, each weighted alike."""
-    products = np.zeros((12, 12)), np.zeros((12, 3 + _CLASSES))
+    products = np.zeros((12, 12)), np.zeros((12, 3 + CLASSES))
     for item in (dataset[k] for k in range(len(dataset))):
         valid = item.valid.numpy()
         inputs, targets = _inputs(item)[valid], _targets(item)[valid]
@@ -46,21 +45,21 @@ def fit_linear(dataset: SlatDataset) -> VoxelBaseline:
 
 def fit_mean(dataset: SlatDataset) -> VoxelBaseline:
     """Return the model that predicts the mean, and the most frequent class, everywhere."""
-    total, count = np.zeros(3 + _CLASSES), 0
+    total, count = np.zeros(3 + CLASSES), 0
     for item in (dataset[k] for k in range(len(dataset))):
         valid = item.valid.numpy()
         total += _targets(item)[valid].sum(axis=0)
         count += int(valid.sum())
-    weights = np.zeros((12, 3 + _CLASSES))
+    weights = np.zeros((12, 3 + CLASSES))
     weights[-1] = total / count
     return VoxelBaseline(weights)
 
 
 def _inputs(item: Item) -> NDArray[np.float64]:
-    position = (item.coords.numpy() + 0.5) / RESOLUTION - 0.5
+    position = voxel_centres(item.coords.numpy())
     return np.hstack([item.feats.numpy(), position, np.ones((len(position), 1))])
 
 
 def _targets(item: Item) -> NDArray[np.float64]:
-    indicators = item.material.numpy()[:, None] == np.arange(_CLASSES)
+    indicators = item.material.numpy()[:, None] == np.arange(CLASSES)
     return np.hstack([item.properties.numpy(), indicators])

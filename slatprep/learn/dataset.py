@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Sequence
-from dataclasses import dataclass, fields, replace
+from collections.abc import Callable, Collection, Iterator, Sequence
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -94,14 +94,14 @@ class SparseBatch:
 
     def to(self, device: torch.device | str) -> SparseBatch:
         """Return the batch on a device."""
-        tensors = {f.name: getattr(self, f.name) for f in fields(self) if f.name != "asset_ids"}
-        moved = {name: tensor.to(device, non_blocking=True) for name, tensor in tensors.items()}
-        return replace(self, **moved)
+        return self._each(lambda tensor: tensor.to(device, non_blocking=True))
 
     def pin_memory(self) -> SparseBatch:
         """Return the batch in pinned memory; `DataLoader` calls this."""
-        tensors = {f.name: getattr(self, f.name) for f in fields(self) if f.name != "asset_ids"}
-        return replace(self, **{name: tensor.pin_memory() for name, tensor in tensors.items()})
+        return self._each(Tensor.pin_memory)
+
+    def _each(self, change: Callable[[Tensor], Tensor]) -> SparseBatch:
+        return SparseBatch(self.asset_ids, *(change(getattr(self, name)) for name in _COLUMNS))
 
 
 class SlatDataset(Dataset[Item]):
@@ -183,7 +183,7 @@ class SlatDataset(Dataset[Item]):
         )
 
     def _symmetry(self, asset_id: str, draw: Draw) -> np.ndarray:
-        # Not from a worker's own generator: the draw must not depend on how many there are.
+        # Not from a worker's own generator: the draw must not depend on the number of workers.
         words = np.frombuffer(asset_id.encode("utf-8").ljust(4, b"\0"), np.uint8)
         rng = np.random.default_rng([self.seed, draw.epoch, *words.tolist()])
         return np.asarray(self._symmetries[rng.integers(len(self._symmetries))])

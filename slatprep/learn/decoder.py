@@ -17,11 +17,10 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from slatprep.records import RESOLUTION
+from slatprep.learn.predictions import CLASSES
+from slatprep.readers.slat import LATENT_CHANNELS
+from slatprep.records import PROPERTY_COLUMNS, RESOLUTION
 
-LATENTS = 8
-PROPERTIES = 3
-CLASSES = 8
 WINDOW = 8
 
 _BUCKETS = (8, 16, 32, 48, 64, 96, 128, 192, 256, 384, 512)
@@ -201,12 +200,12 @@ class PhysicsDecoder(nn.Module):
     def __init__(self, size: DecoderSize, window: int = WINDOW) -> None:
         super().__init__()
         self.size, self.window = size, window
-        self.embed = nn.Linear(LATENTS, size.channels)
+        self.embed = nn.Linear(LATENT_CHANNELS, size.channels)
         self.blocks = nn.ModuleList(
             SwinBlock(size.channels, size.heads) for _ in range(size.blocks)
         )
         self.norm = nn.LayerNorm(size.channels, eps=1e-6, elementwise_affine=False)
-        self.regression = nn.Linear(size.channels, PROPERTIES)
+        self.regression = nn.Linear(size.channels, len(PROPERTY_COLUMNS))
         self.classification = nn.Linear(size.channels, CLASSES)
         for module in self.modules():
             if isinstance(module, nn.Linear):
@@ -241,8 +240,3 @@ class PhysicsDecoder(nn.Module):
 def make_decoder(size: str) -> PhysicsDecoder:
     """Return a decoder by the name of its size: small, medium or large."""
     return PhysicsDecoder(SIZES[size])
-
-
-def count_parameters(model: nn.Module) -> int:
-    """Return the number of trainable parameters."""
-    return sum(p.numel() for p in model.parameters() if p.requires_grad)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from enum import StrEnum
 from pathlib import Path
 from typing import Literal
 
@@ -16,8 +17,22 @@ from slatprep.learn.splits import Shares, Split, select_assets
 from slatprep.records import Place
 from slatprep.store import open_store
 
-METRICS = ("log10 E", "log10 density", "nu", "mean", "accuracy")
-"""Mean squared errors in normalised space, the mean of the three, and class accuracy."""
+
+class Metric(StrEnum):
+    """Mean squared errors in normalised space, the mean of the three, and class accuracy.
+
+    The values are the columns of tables and CSV files.
+    """
+
+    YOUNGS_MODULUS = "log10 E"
+    DENSITY = "log10 density"
+    POISSONS_RATIO = "nu"
+    MEAN = "mean"
+    ACCURACY = "accuracy"
+
+
+METRICS = tuple(metric.value for metric in Metric)
+"""The columns, in the order of `Metric`."""
 
 Spread = Literal["se", "sd"]
 
@@ -94,7 +109,7 @@ def score_asset(
 
 
 def measure(scores: NDArray[np.float64], spread: Spread) -> Measure:
-    """Summarise objects.
+    """Take mean and spread over objects.
 
     Parameters
     ----------
@@ -115,7 +130,7 @@ def measure(scores: NDArray[np.float64], spread: Spread) -> Measure:
     )
 
 
-def summarise(
+def average_objects(
     scores: Sequence[NDArray[np.float64]],
     objects: Sequence[str],
     categories: Sequence[str],
@@ -200,7 +215,7 @@ def evaluate_store(
             f"has no prediction of an asset of split {split or 'all'}",
             f"asset ids as names, such as {', '.join(missing[:3]) or 'none: the split is empty'}",
         )
-    overall, groups = summarise(
+    overall, groups = average_objects(
         scores,
         [str(object_ids[k]) for k in scored],
         [str(categories[k]) for k in scored],

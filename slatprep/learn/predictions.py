@@ -12,8 +12,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slatprep.errors import InputError
+from slatprep.geometry.voxels import flat_index
+from slatprep.records import MATERIAL_CLASSES, RESOLUTION
 
-CLASSES = 8
+CLASSES = len(MATERIAL_CLASSES)
+"""Classes that a decoder scores; background is one of them, though no voxel has it."""
 
 _FORMS = "a directory of <asset id>.npz, a Zarr group or an HDF5 file with a group an asset"
 
@@ -109,9 +112,9 @@ def check_prediction(
 
 
 def _order(source: str, ours: NDArray[Any], theirs: NDArray[np.uint8]) -> NDArray[np.int64]:
-    keys = [voxels.astype(np.int64) @ (4096, 64, 1) for voxels in (ours, theirs)]
-    if ours.size and not 0 <= ours.min() <= ours.max() < 64:
-        raise InputError(source, f"has a coordinate {ours.max()}", "0 to 63")
+    if ours.size and not 0 <= ours.min() <= ours.max() < RESOLUTION:
+        raise InputError(source, f"has a coordinate {ours.max()}", f"0 to {RESOLUTION - 1}")
+    keys = flat_index(ours), flat_index(theirs)
     mine, stored = (np.argsort(key, kind="stable") for key in keys)
     if not np.array_equal(keys[0][mine], keys[1][stored]):
         raise InputError(source, "has other voxels than the store", "the store's voxel/coords")

@@ -18,6 +18,9 @@ from slatprep.errors import ConfigError, InputError
 
 LAST, BEST = "last.pt", "best.pt"
 
+INK, MUTED = "#1F2328", "#6B7280"
+"""Colours of the curve: text and data, and what they are compared with."""
+
 
 @dataclasses.dataclass(frozen=True)
 class EpochRecord:
@@ -116,8 +119,6 @@ class Run:
         from matplotlib.backends.backend_agg import FigureCanvasAgg
         from matplotlib.figure import Figure
         from matplotlib.ticker import MaxNLocator
-
-        from slatprep.inspect.pictures.palette import INK, MUTED
 
         figure = Figure(figsize=(6.6, 3.6), layout="constrained")
         FigureCanvasAgg(figure)

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slatprep.errors import ConfigError
+from slatprep.records import Verdict
 from slatprep.store import Store
 
 Split = Literal["train", "val", "test"]
@@ -107,11 +108,9 @@ def select_assets(
         raise ConfigError(f"there is no split {split!r}; expected one of {', '.join(SPLITS)}")
     chosen = store.column("valid_share") > 0
     if verdicts is not None:
-        unknown = set(verdicts) - {"good", "doubtful", "failed"}
+        unknown = sorted(set(verdicts) - set(Verdict))
         if unknown:
-            raise ConfigError(
-                f"there is no verdict {sorted(unknown)[0]!r}; expected good, doubtful or failed"
-            )
+            raise ConfigError(f"verdict is {unknown[0]!r}; expected one of {', '.join(Verdict)}")
         chosen &= np.isin(store.column("verdict").astype(str), sorted(verdicts))
     if max_ambiguity is not None:
         chosen &= store.column("ambiguity") <= max_ambiguity

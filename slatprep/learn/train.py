@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from slatprep.errors import ConfigError
+from slatprep.errors import ConfigError, InputError
 from slatprep.learn.augment import Augmentation
 from slatprep.learn.baselines import VoxelBaseline, fit_linear, fit_mean
 from slatprep.learn.dataset import IGNORED, SlatDataset, SlatLoader, SparseBatch
@@ -174,7 +174,8 @@ def train(
     }
     run.draw(session.history, references)
     best = run.load(BEST)
-    assert best is not None
+    if best is None:
+        raise InputError(run.path / BEST, "is missing", "the best model; train anew")
     session.model.load_state_dict(best["model"])
     _predict(session.model, test_set, run, device)
     return TrainSummary(session.history, session.best_epoch, references, out / "predictions")

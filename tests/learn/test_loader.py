@@ -78,7 +78,7 @@ def test_filters(learn_store: Path) -> None:
     limit = float(np.median(store.column("ambiguity")))
     kept = select_assets(store, max_ambiguity=limit)
     assert kept.tolist() == np.flatnonzero(store.column("ambiguity") <= limit).tolist()
-    with pytest.raises(ConfigError, match="expected good, doubtful or failed"):
+    with pytest.raises(ConfigError, match="expected one of good, doubtful, failed"):
         select_assets(store, verdicts=("fine",))
     with pytest.raises(ConfigError, match="add up to 1"):
         Shares(0.5, 0.1, 0.1)

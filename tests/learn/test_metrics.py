@@ -14,7 +14,7 @@ from click.testing import CliRunner
 
 from slatprep import InputError, open_store
 from slatprep.cli.commands import slatprep
-from slatprep.learn.metrics import METRICS, evaluate_store, measure, score_asset, summarise
+from slatprep.learn.metrics import METRICS, average_objects, evaluate_store, measure, score_asset
 from slatprep.learn.predictions import VoxelPrediction
 from slatprep.learn.published import PIXIE_TABLE, read_scores
 
@@ -33,7 +33,7 @@ def test_one_asset_by_hand() -> None:
 
 def test_objects_count_alike_whatever_their_views() -> None:
     scores = [np.full(5, value) for value in (0.0, 2.0, 4.0)]
-    overall, groups = summarise(scores, ["a", "a", "b"], ["x", "x", "y"], "sd")
+    overall, groups = average_objects(scores, ["a", "a", "b"], ["x", "x", "y"], "sd")
     # a is (0 + 2) / 2 = 1, b is 4: mean 2.5, sample deviation 3 / sqrt(2).
     assert overall.objects == 2
     assert overall.means["nu"] == 2.5
