@@ -167,8 +167,8 @@ def _check_paths(parameters: BuildParameters, origin: _Origin) -> None:
         try:
             if place_of(value).exists():
                 continue
-            fault = "does not exist"
+            fault = "does not exist; expected a path"
         except OSError as error:
-            fault = f"cannot be looked at ({error.strerror})"
+            fault = f"cannot be looked at ({error.strerror}); expected a path"
         named = f", or one of {', '.join(NAMED_RANGES)}" if name == "normalize.ranges" else ""
-        raise ConfigError(f"{origin.of(name)}: {name}: {value} {fault}; expected a path{named}")
+        raise ConfigError(f"{origin.of(name)}: {name}: {value} {fault}{named}")

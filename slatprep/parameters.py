@@ -12,7 +12,7 @@ from typing import Annotated, Any, ClassVar, Literal
 
 from annotated_types import Ge, Gt, Le
 
-from slatprep.records import Place
+from slatprep.records import Engine, Place
 from slatprep.storage.place import place_of
 
 Positive = Annotated[float, Gt(0)]
@@ -114,7 +114,7 @@ class AlignParameters(_Group):
     in voxels. No engine draws anything at random.
     """
 
-    engine: Literal["field", "open3d", "small_gicp"] = "field"
+    engine: Engine = Engine.FIELD
     model: Literal["auto", "rigid", "similarity"] = "auto"
     scale_bounds: tuple[Annotated[float, Gt(0), Le(1)], Annotated[float, Ge(1)]] = (0.6, 1.6)
     radius: Positive = 1.0
@@ -193,7 +193,7 @@ class Preset:
 PRESETS: dict[str, Preset] = {
     "default": Preset(),
     "paper": Preset(
-        align=AlignParameters(engine="open3d", model="rigid"),
+        align=AlignParameters(engine=Engine.OPEN3D, model="rigid"),
         sample=SampleParameters(method="nearest"),
     ),
 }

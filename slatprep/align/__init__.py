@@ -21,7 +21,7 @@ _EXTRAS = {"open3d": "paper", "small_gicp": "bench"}
 """Engines that are packages of their own, and the extra that installs each."""
 
 
-class Engine(Protocol):
+class EngineModule(Protocol):
     """What a module of this package offers to be an engine."""
 
     def align(
@@ -52,7 +52,7 @@ def align(
     """
     require_engine(parameters)
     module, _ = _ENGINES[parameters.engine]
-    return cast(Engine, import_module(module)).align(field, latents, parameters)
+    return cast(EngineModule, import_module(module)).align(field, latents, parameters)
 
 
 def require_engine(parameters: AlignParameters) -> None:

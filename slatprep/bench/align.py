@@ -31,7 +31,7 @@ from slatprep.parameters import (
     SlatSource,
 )
 from slatprep.readers import discover, read_field, read_latents
-from slatprep.records import Alignment, AssetPair, MaterialField, StructuredLatents
+from slatprep.records import Alignment, AssetPair, Engine, MaterialField, StructuredLatents
 from slatprep.sample import sample
 from slatprep.workers import Progress
 from slatprep.workers.local import single_threaded
@@ -218,7 +218,7 @@ def _align(engine: str, field: MaterialField, latents: StructuredLatents) -> Ali
     if engine == "open3d":
         return align(field, latents, PRESETS["paper"].align)
     if engine == "small_gicp":
-        return align(field, latents, AlignParameters(engine="small_gicp", model="rigid"))
+        return align(field, latents, AlignParameters(engine=Engine.SMALL_GICP, model="rigid"))
     return align(field, latents, PRESETS["default"].align)
 
 
