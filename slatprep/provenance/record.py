@@ -34,6 +34,7 @@ from slatprep.records import (
     Status,
     Verdict,
 )
+from slatprep.storage.place import is_place
 
 if TYPE_CHECKING:
     from pydantic import TypeAdapter, ValidationError
@@ -396,6 +397,6 @@ def _faults(error: ValidationError) -> tuple[str, ...]:
 def _plain(value: object) -> Any:
     if isinstance(value, np.ndarray):  # not contiguous
         return value.tolist()
-    if isinstance(value, Path):
+    if is_place(value):
         return str(value)
     raise TypeError(f"a record cannot hold {type(value).__name__} {value!r}")
