@@ -27,6 +27,7 @@ from slatprep.config import load_parameters
 from slatprep.parameters import BuildParameters
 from slatprep.pipeline import asset as process
 from slatprep.pipeline import dataset as build
+from slatprep.pipeline import publish
 from slatprep.readers import discover
 from slatprep.store.layout import create_arrays
 
@@ -54,8 +55,9 @@ def measure(parameters: BuildParameters, folder: Path, jobs: bool) -> dict[str, 
     steps: dict[str, float] = defaultdict(float)
     for name in STEPS:
         setattr(process, name, timed(getattr(process, name), steps, name))
-    for name in ("finish_asset", "pack_store", "replace_directory"):
-        setattr(build, name, timed(getattr(build, name), steps, name))
+    rooms = {"finish_asset": build, "pack_store": build, "replace_directory": publish}
+    for name, room in rooms.items():
+        setattr(room, name, timed(getattr(room, name), steps, name))
     begin = cpu()
     summary = build.build_store(parameters, folder / "s.zarr")
     whole = cpu() - begin
