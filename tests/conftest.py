@@ -44,3 +44,14 @@ def mixed_build(mixed: Dataset, tmp_path_factory: pytest.TempPathFactory) -> Bui
     """Build `mixed` on one core; nobody may change the store."""
     out = tmp_path_factory.mktemp("built") / "mixed.zarr"
     return build_store(mixed.parameters(), out)
+
+
+@pytest.fixture(scope="session")
+def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> tuple[Dataset, Path]:
+    """Return three assets and the store of an undisturbed build; nobody may change them."""
+    folder = tmp_path_factory.mktemp("undisturbed")
+    dataset = Dataset(folder / "sources")
+    for seed, object_id in enumerate("abc"):
+        dataset.add(object_id, seed)
+    build_store(dataset.parameters("pixie"), folder / "s.zarr")
+    return dataset, folder / "s.zarr"

@@ -111,7 +111,7 @@ def measure(
         if not passes(folder, tests, limit=600.0):
             raise SystemExit(f"{module}: its tests fail without any mutant; mend them first")
         limits[module] = 10.0 * (time.monotonic() - begin) + 10.0
-        queues[module] = list(mutants_of(module))
+        queues[module] = list(mutants_of(folder, module))
         order.shuffle(queues[module])
         score[module] = {"mutants": len(queues[module]), "tried": 0, "caught": 0}
     while any(queues.values()) and time.monotonic() < end:
@@ -133,9 +133,9 @@ def measure(
     return {**score, "all": total}
 
 
-def mutants_of(module: str) -> Iterator[Mutant]:
+def mutants_of(folder: Path, module: str) -> Iterator[Mutant]:
     """Yield every change to a module; not to annotations, decorators and what errors say."""
-    tree = ast.parse((ROOT / "slatprep" / f"{module}.py").read_text("utf-8"))
+    tree = ast.parse((folder / "slatprep" / f"{module}.py").read_text("utf-8"))
     for node in told_apart(tree):
         for changed in changes_of(node):
             before = ast.unparse(node)

@@ -86,7 +86,10 @@ def test_without_newton_it_says_what_to_install(monkeypatch: pytest.MonkeyPatch)
         drop(CUBE, ONE_PART, STUFF, SPACING)
 
 
-@pytest.mark.skipif(importlib.util.find_spec("newton") is None, reason="newton is not installed")
+# Newton with warp-lang is 0.5 GB, and compiling its kernels for a CPU takes a minute of it.
+@pytest.mark.skipif(
+    importlib.util.find_spec("newton") is None, reason="needs the extra `simulate`, 0.5 GB"
+)
 def test_steel_on_jelly_falls_as_galileo_says_and_the_jelly_gives_way() -> None:
     tower = np.argwhere(np.ones((6, 6, 9))) * SPACING
     top = tower[:, 2] > 5.5 * SPACING

@@ -1,4 +1,3 @@
-import json
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -7,7 +6,7 @@ import numpy as np
 import pytest
 from support.faults import inject
 from support.synthetic import JELLY, METAL, Dataset
-from support.trees import tree
+from support.trees import records_of, tree
 
 from slatprep.errors import ConfigError, InputError, MissingPartnerError, StoreError
 from slatprep.pipeline.dataset import BuildSummary, align_pairs, build_store
@@ -15,11 +14,6 @@ from slatprep.provenance.places import manifests_of
 from slatprep.store import open_store
 
 MakeDataset = Callable[..., Dataset]
-
-
-def records_of(summary: BuildSummary) -> dict[str, dict]:
-    lines = summary.records.read_text().splitlines()
-    return {record["asset_id"]: record for record in map(json.loads, lines)}
 
 
 def test_bad_assets_are_told_and_the_others_go_in(mixed_build: BuildSummary) -> None:
@@ -32,7 +26,7 @@ def test_bad_assets_are_told_and_the_others_go_in(mixed_build: BuildSummary) -> 
     assert "torn.npz" in problems["torn"]
     assert "expected" in problems["torn"]
     assert all("\n" not in reason for reason in problems.values())
-    assert list(records_of(mixed_build)) == sorted(records_of(mixed_build))
+    assert list(records_of(mixed_build.records)) == sorted(records_of(mixed_build.records))
 
 
 def test_two_jobs_write_the_same_bytes_as_one(
@@ -41,7 +35,7 @@ def test_two_jobs_write_the_same_bytes_as_one(
     again = build_store(mixed.parameters(), tmp_path / "two.zarr", jobs=2)
     assert again.manifest == mixed_build.manifest
     assert tree(again.store) == tree(mixed_build.store)
-    one, two = records_of(mixed_build), records_of(again)
+    one, two = records_of(mixed_build.records), records_of(again.records)
     for record in (*one.values(), *two.values()):
         del record["duration_s"]
     assert one == two
@@ -86,7 +80,7 @@ def test_an_error_of_our_own_is_marked_and_costs_one_asset(
     assert summary.statuses == {"ok": 1, "failed": 1, "skipped": 0}
     reason = "internal error, please report: ZeroDivisionError: division by zero"
     assert summary.problems == (("b", reason),)
-    assert "fails_for_b" in records_of(summary)["b"]["traceback"]
+    assert "fails_for_b" in records_of(summary.records)["b"]["traceback"]
 
 
 def test_no_usable_asset_is_an_error_and_keeps_the_old_store(
@@ -163,7 +157,7 @@ def test_ranges_by_name_clip_and_count(make_dataset: MakeDataset, tmp_path: Path
         "density": in_voxels,
         "poissons_ratio": 0,
     }
-    clipped = records_of(summary)["a"]["counts"]["clipped"]
+    clipped = records_of(summary.records)["a"]["counts"]["clipped"]
     assert clipped["voxel"] == summary.clipped
     assert clipped["grid"] == {"youngs_modulus": in_grid, "density": in_grid, "poissons_ratio": 0}
 
@@ -207,7 +201,7 @@ def test_islands_without_annotation_stay_occupied(
     assert (asset.grid_material[30, 25:28, 28] == 255).all()
     assert np.isnan(asset.grid_properties[:, 30, 25:28, 28]).all()
     assert (asset.material < 7).all()
-    counts = records_of(summary)["a"]["counts"]
+    counts = records_of(summary.records)["a"]["counts"]
     assert counts["unannotated"] == 3
     assert counts["occupied"] == counts["annotated"] + 3 == (grid[..., 3] != 7).sum()
 
@@ -243,7 +237,7 @@ def test_alignment_alone_gives_the_stores_transforms(
     summary = align_pairs(mixed.parameters(), tmp_path / "out" / "mixed.jsonl")
     assert summary.store is None
     assert summary.statuses == mixed_build.statuses
-    aligned, built = records_of(summary), records_of(mixed_build)
+    aligned, built = records_of(summary.records), records_of(mixed_build.records)
     assert list(aligned) == list(built)
     for asset_id, record in aligned.items():
         assert record.get("alignment") == built[asset_id].get("alignment")

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import zarr
+from support.trees import records_of, tree
 
 from slatprep.bench.truth import score_against_truth
 from slatprep.config import load_parameters
@@ -34,10 +35,8 @@ def stores(habitual: tuple[Path, BuildParameters]) -> tuple[Path, Path]:
     return alone, together
 
 
-def _records(store: Path) -> dict[str, dict]:
-    lines = store.with_suffix(".manifests") / "assets.jsonl"
-    records = map(json.loads, lines.read_text().splitlines())
-    return {record["asset_id"]: record for record in records}
+def records_beside(store: Path) -> dict[str, dict[str, Any]]:
+    return records_of(store.with_suffix(".manifests") / "assets.jsonl")
 
 
 def test_more_symmetric_assets_are_placed_right_and_no_other_changes(
@@ -55,7 +54,9 @@ def test_more_symmetric_assets_are_placed_right_and_no_other_changes(
     ]
     assert accuracy[1] >= accuracy[0]
 
-    alone, together = (_records(store) for store in stores)
+    alone, together = (
+        records_of(store.with_suffix(".manifests") / "assets.jsonl") for store in stores
+    )
     groups = [zarr.open_group(store, mode="r") for store in stores]
     for row, asset_id in enumerate(alone):
         if not alone[asset_id]["alignment"]["placements"]:
@@ -68,7 +69,9 @@ def test_more_symmetric_assets_are_placed_right_and_no_other_changes(
 
 
 def test_what_was_settled_is_recorded_and_can_be_undone(stores: tuple[Path, Path]) -> None:
-    alone, together = (_records(store) for store in stores)
+    alone, together = (
+        records_of(store.with_suffix(".manifests") / "assets.jsonl") for store in stores
+    )
     settled = [k for k, record in together.items() if record["alignment"]["settled_by"]]
     assert settled
     for asset_id in settled:
@@ -86,13 +89,13 @@ def test_building_without_it_brings_the_first_placements_back(
     with_it = replace(parameters, consensus=ConsensusParameters(settle=True))
     store = tmp_path / "store.zarr"
     build_store(with_it, store, jobs=2)
-    assert _tree(store) == _tree(stores[1])  # whatever the jobs
+    assert tree(store) == tree(stores[1])  # whatever the jobs
     plan = plan_build(parameters, store)
     assert {asset.action for asset in plan.assets} == {"reuse"}  # no asset is aligned again
     build_store(parameters, store)
-    assert _tree(store) == _tree(stores[0])
+    assert tree(store) == tree(stores[0])
     build_store(with_it, store)
-    assert _tree(store) == _tree(stores[1])
+    assert tree(store) == tree(stores[1])
 
 
 def test_a_settled_store_that_is_built_again_is_found_unchanged(
@@ -102,8 +105,3 @@ def test_a_settled_store_that_is_built_again_is_found_unchanged(
     times = {path: path.stat().st_mtime_ns for path in stores[1].rglob("*")}
     build_store(with_it, stores[1])
     assert {path: path.stat().st_mtime_ns for path in stores[1].rglob("*")} == times
-
-
-def _tree(store: Path) -> dict[str, bytes]:
-    files = sorted(path for path in store.rglob("*") if path.is_file())
-    return {path.relative_to(store).as_posix(): path.read_bytes() for path in files}

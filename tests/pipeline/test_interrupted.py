@@ -84,17 +84,6 @@ def script(tmp_path: Path) -> Path:
     return tmp_path / "script" / "run_build.py"
 
 
-@pytest.fixture(scope="module")
-def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> tuple[Dataset, Path]:
-    """Three assets, and the store that an undisturbed build makes of them."""
-    folder = tmp_path_factory.mktemp("undisturbed")
-    dataset = Dataset(folder / "sources")
-    for seed, object_id in enumerate("abc"):
-        dataset.add(object_id, seed)
-    build_store(dataset.parameters("pixie"), folder / "s.zarr")
-    return dataset, folder / "s.zarr"
-
-
 @pytest.fixture
 def reference(undisturbed: tuple[Dataset, Path], tmp_path: Path) -> tuple[Dataset, dict[str, str]]:
     """Three assets that may be changed, and the hashes of what is to come of them."""

@@ -8,6 +8,7 @@ import pytest
 import zarr
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from support.trees import tree
 
 from slatprep.parameters import StoreParameters
 from slatprep.store.layout import ARRAYS
@@ -51,17 +52,9 @@ def test_a_shard_in_parts_is_zarrs_byte_for_byte(
         with ShardWriter(folder / "ours", name, start) as writer:
             for first, last in pairwise(edges):
                 writer.append(values[first:last])
-    ours, theirs = (files(folder / store / name / "c") for store in ("ours", "zarrs"))
+    ours, theirs = (tree(folder / store / name / "c") for store in ("ours", "zarrs"))
     assert ours == theirs
     assert ours
-
-
-def files(folder: Path) -> dict[str, bytes]:
-    return {
-        str(path.relative_to(folder)): path.read_bytes()
-        for path in folder.rglob("*")
-        if path.is_file()
-    }
 
 
 def test_a_shard_is_there_whole_or_not_at_all(tmp_path: Path) -> None:

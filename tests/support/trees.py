@@ -1,9 +1,11 @@
-"""What lies below a directory, to compare it with what lay there before."""
+"""What lies in a directory or on an object store, and what a build's records say."""
 
 from __future__ import annotations
 
 import hashlib
+import json
 from pathlib import Path
+from typing import Any
 
 
 def tree(directory: Path | None) -> dict[str, str]:
@@ -14,3 +16,18 @@ def tree(directory: Path | None) -> dict[str, str]:
         for path in directory.rglob("*")
         if path.is_file()
     }
+
+
+def contents(s3: Any, place: str) -> dict[str, str]:
+    """Return the hash of every object below a place, by its name relative to that."""
+    base = place.removeprefix("s3://").rstrip("/") + "/"
+    return {
+        name.removeprefix(base): hashlib.sha256(s3.cat_file(name)).hexdigest()
+        for name in s3.find(base)
+    }
+
+
+def records_of(lines: Path) -> dict[str, dict[str, Any]]:
+    """Return the records of a build's ``assets.jsonl`` by their asset's id, in its order."""
+    records = map(json.loads, lines.read_text("utf-8").splitlines())
+    return {record["asset_id"]: record for record in records}

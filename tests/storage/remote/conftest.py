@@ -88,17 +88,6 @@ def bucket(s3: Any) -> str:
 
 
 @pytest.fixture(scope="session")
-def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> tuple[Dataset, Path]:
-    """Return three assets, and the store that a local build makes of them."""
-    folder = tmp_path_factory.mktemp("undisturbed")
-    dataset = Dataset(folder / "sources")
-    for seed, object_id in enumerate("abc"):
-        dataset.add(object_id, seed)
-    build_store(dataset.parameters("pixie"), folder / "s.zarr")
-    return dataset, folder / "s.zarr"
-
-
-@pytest.fixture(scope="session")
 def another(tmp_path_factory: pytest.TempPathFactory) -> tuple[Dataset, Path]:
     """Return one other asset, and the store of it."""
     folder = tmp_path_factory.mktemp("another")

@@ -18,9 +18,8 @@ import pytest
 import zarr
 from s3fs.core import S3FileSystem
 from support.faults import inject, kill_self
-from support.objects import contents
 from support.synthetic import Dataset
-from support.trees import tree
+from support.trees import contents, tree
 
 from slatprep.errors import StoreError
 from slatprep.inspect.verify import verify_store

@@ -1,4 +1,4 @@
-"""What others' tools make of a store: mlcroissant, xarray, tensorstore, zarr-python."""
+"""What mlcroissant makes of a store's description, and where its files are found."""
 
 from __future__ import annotations
 
@@ -9,8 +9,6 @@ from pathlib import Path
 import mlcroissant
 import numpy as np
 import pytest
-import tensorstore
-import xarray
 import zarr
 from click.testing import CliRunner
 
@@ -32,9 +30,6 @@ STATED = {
 def store(mixed_build: BuildSummary) -> Path:
     assert mixed_build.store is not None
     return mixed_build.store
-
-
-# -- Croissant --------------------------------------------------------------
 
 
 def test_croissant_is_valid_without_a_warning(
@@ -103,51 +98,3 @@ def test_describe_writes_where_the_files_are_found(store: Path, tmp_path: Path) 
     )
     (root, *_) = json.loads(printed.stdout)["distribution"]
     assert root["contentUrl"] == "https://example.org/s.zarr/zarr.json"
-
-
-# -- xarray, tensorstore, zarr-python ---------------------------------------
-
-
-@pytest.mark.parametrize("group", ["asset", "voxel", "grid"])
-def test_xarray_opens_every_group_with_named_dimensions(store: Path, group: str) -> None:
-    with xarray.open_zarr(store, group=group) as dataset:
-        for layout in ARRAYS:
-            where, _, name = layout.name.partition("/")
-            if where == group:
-                assert dataset[name].dims == layout.dimensions
-                assert dataset[name].attrs["description"] == layout.description
-                np.testing.assert_array_equal(
-                    dataset[name].values, zarr.open_group(store, mode="r")[layout.name][:]
-                )
-
-
-@pytest.mark.parametrize(
-    "layout", [layout for layout in ARRAYS if layout.dtype != "str"], ids=lambda layout: layout.name
-)
-def test_tensorstore_reads_the_same_numbers(store: Path, layout: object) -> None:
-    name = layout.name  # type: ignore[attr-defined]
-    spec = {"driver": "zarr3", "kvstore": {"driver": "file", "path": f"{store / name}/"}}
-    array = tensorstore.open(spec, read=True, open=True).result()
-    ours = zarr.open_group(store, mode="r")[name]
-    assert array.domain.labels == ours.metadata.dimension_names
-    assert array.dtype.numpy_dtype == ours.dtype
-    read = array.read().result()
-    assert read.size > 0
-    np.testing.assert_array_equal(read, ours[...])
-
-
-def test_coordinates_name_rows_columns_and_places(store: Path) -> None:
-    group = zarr.open_group(store, mode="r")
-    with xarray.open_zarr(store, group="asset") as assets:
-        assert set(assets.coords) == {"id", "object_id", "view", "category", "property"}
-        row = int(np.flatnonzero(assets["id"].values == "dog")[0])
-        assert assets["fitness"][row] == group["asset/fitness"][row]
-    with xarray.open_zarr(store, group="voxel") as voxels:
-        density = voxels["properties"].sel(property="density")
-        np.testing.assert_array_equal(density.values, group["voxel/properties"][:, 1])
-        assert list(voxels["axis"].values) == ["x", "y", "z"]
-    with xarray.open_zarr(store, group="grid") as grids:
-        assert set(grids.coords) == {"property", "x", "y", "z"}
-        assert grids["x"].values[0] == -0.5 + 0.5 / 64
-        there = grids["material"].sel(x=0.1, y=-0.1, z=0.02, method="nearest")
-        np.testing.assert_array_equal(there.values, group["grid/material"][:, 38, 25, 33])

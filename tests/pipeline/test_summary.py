@@ -1,0 +1,50 @@
+"""What a build says of itself at the end."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from slatprep.parameters import BuildParameters, PixieverseSource, SlatSource
+from slatprep.pipeline.spool import FailedAsset, SpooledAsset
+from slatprep.pipeline.summary import nothing_usable, summarise_build
+from slatprep.records import Status
+
+PARAMETERS = BuildParameters(PixieverseSource(Path("/grids")), SlatSource(Path("/slats")))
+
+
+def failed(number: int, status: Status = Status.FAILED) -> FailedAsset:
+    return FailedAsset(f"a{number:03d}", "", status, f"reason {number}")
+
+
+def finished(name: str, verdict: str) -> SpooledAsset:
+    return SpooledAsset(name, "", 10, 7, 1, np.zeros((3, 2)), {"verdict": verdict})
+
+
+def test_assets_are_counted_and_the_first_hundred_problems_listed() -> None:
+    assets = [
+        finished("x", "good"),
+        *map(failed, range(120)),
+        failed(120, Status.SKIPPED),
+        finished("y", "doubtful"),
+        finished("z", "good"),
+    ]
+    summary = summarise_build(assets, records=Path("r"), manifest="id", seconds=1.0)
+    assert summary.statuses == {"ok": 3, "failed": 120, "skipped": 1}
+    assert summary.verdicts == {"doubtful": 1, "good": 2}
+    assert (summary.n_voxels, summary.n_valid) == (30, 21)
+    assert summary.problems[0] == ("a000", "reason 0")
+    assert len(summary.problems) == 100
+    assert not summary.complete
+    clean = summarise_build(assets[-1:], records=Path("r"), manifest="id", seconds=1.0)
+    assert clean.complete
+
+
+def test_nothing_usable_names_five_and_counts_the_rest() -> None:
+    five = nothing_usable([failed(n) for n in range(5)], PARAMETERS)
+    assert "none of 5 assets can be used" in five
+    assert five.splitlines()[1:] == [f"  a00{n}: reason {n}" for n in range(5)]
+    seven = nothing_usable([failed(n) for n in range(7)], PARAMETERS)
+    assert seven.splitlines()[-1] == "  and 2 more"
+    assert "no asset found in /grids and /slats" in nothing_usable([], PARAMETERS)
