@@ -45,10 +45,14 @@ TESTS = {
     "geometry/nearest": ["geometry/test_nearest.py"],
     "geometry/fill": ["geometry/test_fill.py"],
     "geometry/distance": ["geometry/test_distance.py"],
-    "store/reader": ["store/test_reader.py", "store/test_contract.py"],
+    "store/reader": [
+        "store/test_reader.py",
+        "store/test_contract.py",
+        "store/test_shard_reader.py",
+    ],
     "store/shard_reader": ["store/test_shard_reader.py", "store/test_reader.py"],
     "store/shard_writer": ["store/test_shard_writer.py"],
-    "store/writer": ["store", "pipeline/test_update.py"],
+    "store/writer": ["store/test_writer.py", "store/test_layout.py", "pipeline/test_update.py"],
 }
 """Modules of the package, and the tests that are to catch what is wrong in them."""
 

@@ -69,3 +69,9 @@ def test_a_subset_is_even_and_repeatable() -> None:
     np.testing.assert_array_equal(some.points, surface.subset(300).points)
     assert np.abs(some.centroid - surface.centroid).max() < 1.0
     assert len(surface.subset(10**9).points) == len(surface.points)
+
+
+def test_positions_are_counted_from_the_centre_of_the_cube() -> None:
+    middle = np.zeros((64, 64, 64), dtype=bool)
+    middle[20:44, 22:42, 30:34] = True  # as far from either end, so its centre is the cube's
+    np.testing.assert_allclose(surface_of(middle).centroid, 0.0, atol=1e-12)
