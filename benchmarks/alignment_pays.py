@@ -23,7 +23,6 @@ import numpy as np
 import torch
 import zarr
 
-from slatprep.config import load_parameters
 from slatprep.demo import make_demo
 from slatprep.learn.dataset import SlatDataset, SlatLoader
 from slatprep.learn.decoder import make_decoder
@@ -32,6 +31,7 @@ from slatprep.learn.predictions import VoxelPrediction
 from slatprep.learn.splits import Shares
 from slatprep.learn.train import TrainParameters, train
 from slatprep.normalize import normalize_properties
+from slatprep.parameters.files import load_parameters
 from slatprep.pipeline.dataset import build_store
 from slatprep.store import open_store
 

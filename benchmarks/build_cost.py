@@ -23,8 +23,8 @@ from typing import Any
 import numpy as np
 import zarr
 
-from slatprep.config import load_parameters
 from slatprep.parameters import BuildParameters
+from slatprep.parameters.files import load_parameters
 from slatprep.pipeline import asset as process
 from slatprep.pipeline import dataset as build
 from slatprep.pipeline import publish

@@ -31,8 +31,8 @@ from pathlib import Path
 
 import psutil
 
-from slatprep.config import load_parameters
 from slatprep.parameters import BuildParameters
+from slatprep.parameters.files import load_parameters
 from slatprep.pipeline.dataset import build_store
 from slatprep.workers.dask import Cluster
 from slatprep.workers.local import Jobs, run_unordered

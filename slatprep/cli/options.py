@@ -206,7 +206,7 @@ def parameters_of(options: dict[str, Any]) -> BuildParameters:
     BuildParameters
         What they ask for.
     """
-    from slatprep.config import load_parameters
+    from slatprep.parameters.files import load_parameters
 
     given: dict[str, dict[str, object]] = {}
     for option_name, group, key in (

@@ -17,8 +17,7 @@ from slatprep.export.assets import Exported, file_name
 from slatprep.export.bounds import LAST, Bounds, read_bounds
 from slatprep.export.formats import ExportOptions, Frame, Points, Writer
 from slatprep.geometry.frames import apply_transform, invert_transform, voxel_centres
-from slatprep.inspect.pictures.palette import MATERIAL_COLOURS
-from slatprep.records import RESOLUTION
+from slatprep.records import MATERIAL_COLOURS, RESOLUTION
 from slatprep.store import Store, StoredAsset
 
 VERTEX = np.dtype(

@@ -14,8 +14,8 @@ from typing import get_type_hints
 
 import pytest
 
-from slatprep.config import load_parameters
 from slatprep.parameters import BuildParameters
+from slatprep.parameters.files import load_parameters
 from slatprep.store.layout import ARRAYS
 
 ROOT = Path(__file__).parents[2]

@@ -12,9 +12,9 @@ import zarr
 from support.trees import records_of, tree
 
 from slatprep.bench.truth import score_against_truth
-from slatprep.config import load_parameters
 from slatprep.demo import make_demo
 from slatprep.parameters import BuildParameters, ConsensusParameters
+from slatprep.parameters.files import load_parameters
 from slatprep.pipeline.dataset import build_store, plan_build
 
 

@@ -22,7 +22,7 @@ from slatprep.inspect.pictures.scene import (
     views,
 )
 from slatprep.inspect.pictures.voxels import Drawing, View, draw_voxels
-from slatprep.records import MATERIAL_CLASSES, RESOLUTION, UNANNOTATED, Candidate
+from slatprep.records import MATERIAL_CLASSES, MATERIAL_COLOURS, RESOLUTION, UNANNOTATED, Candidate
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -216,7 +216,7 @@ def _legend(figure: Figure, scene: Scene) -> None:
         name = "no annotation" if index == UNANNOTATED else MATERIAL_CLASSES[index]
         box = Rectangle(
             (x / WIDTH, 1 - (y + 1) / HEIGHT), 13 / WIDTH, 13 / HEIGHT,
-            facecolor=palette.MATERIAL_COLOURS[int(index)], edgecolor=palette.MUTED, linewidth=0.5,
+            facecolor=MATERIAL_COLOURS[int(index)], edgecolor=palette.MUTED, linewidth=0.5,
         )  # fmt: skip
         figure.add_artist(box)
         label = f"{name}  {share[index]:.1%}"

@@ -1,35 +1,6 @@
-"""The colours of every picture: material classes, verdicts, and a scale for distances.
-
-The class colours stay apart for people who do not tell red from green, or
-blue from green: simulated after Machado, Oliveira and Fernandes ("A
-Physiologically-based Model for Simulation of Color Vision Deficiency", IEEE
-TVCG 2009), any two of them differ by more than 20 in CIELAB.
-"""
+"""The colours of every picture beside those of the classes: verdicts, distances, text."""
 
 from __future__ import annotations
-
-from slatprep.records import MATERIAL_CLASSES, UNANNOTATED
-
-CLASS_COLOURS = {
-    "jelly": "#5A9A5A",
-    "metal": "#4327AC",
-    "sand": "#F7AE38",
-    "visplas": "#901A0A",
-    "fluid": "#2E9FF5",
-    "snow": "#C592C6",
-    "stationary": "#544856",
-    "background": "#EAEAEA",
-}
-"""Colour of each of PhysGaussian's material classes, by name."""
-
-UNANNOTATED_COLOUR = "#FFFFFF"
-"""Colour of an occupied voxel without an annotation."""
-
-MATERIAL_COLOURS = {
-    **{index: CLASS_COLOURS[name] for index, name in enumerate(MATERIAL_CLASSES)},
-    UNANNOTATED: UNANNOTATED_COLOUR,
-}
-"""The same by material id, as the store holds it."""
 
 VERDICT_COLOURS = {"good": "#1B7F4B", "doubtful": "#B26A00", "failed": "#B3261E"}
 """Colour of each verdict; every verdict is also written out, as colour alone is no sign."""

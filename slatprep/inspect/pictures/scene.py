@@ -15,9 +15,9 @@ from slatprep.geometry.frames import (
     voxel_centres,
 )
 from slatprep.geometry.voxels import boundary, occupancy_of, outer_boundary, voxels_of
-from slatprep.inspect.pictures.palette import DISTANCE_COLOURS, MATERIAL_COLOURS
+from slatprep.inspect.pictures.palette import DISTANCE_COLOURS
 from slatprep.inspect.pictures.voxels import View, view_rotation
-from slatprep.records import BACKGROUND
+from slatprep.records import BACKGROUND, MATERIAL_COLOURS
 from slatprep.store.reader import StoredAsset
 
 FARTHEST = 3.0

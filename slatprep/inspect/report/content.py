@@ -7,14 +7,21 @@ from typing import Any
 
 import numpy as np
 
-from slatprep.inspect.pictures.palette import CLASS_COLOURS, DISTANCE_COLOURS, UNANNOTATED_COLOUR
+from slatprep.inspect.pictures.palette import DISTANCE_COLOURS
 from slatprep.inspect.report.outcomes import Outcome, kind_of
 from slatprep.inspect.report.statistics import Tally, nearest_quarter_turn, no_tally, quarter_turns
 from slatprep.inspect.report.thumbnails import COLUMNS, PER_SHEET, VIEWS
 from slatprep.inspect.report.voxels import LEVELS
 from slatprep.judge import THRESHOLDS
 from slatprep.normalize import PIXIE_RANGES
-from slatprep.records import BACKGROUND, MATERIAL_CLASSES, Normalization, Status
+from slatprep.records import (
+    BACKGROUND,
+    CLASS_COLOURS,
+    MATERIAL_CLASSES,
+    UNANNOTATED_COLOUR,
+    Normalization,
+    Status,
+)
 from slatprep.store.reader import Store
 
 # Matplotlib's viridis (CC0) at even steps: light and dark tell the values apart

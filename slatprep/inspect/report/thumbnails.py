@@ -15,8 +15,14 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from slatprep.inspect.pictures.palette import CLASS_COLOURS, UNANNOTATED_COLOUR
-from slatprep.records import BACKGROUND, MATERIAL_CLASSES, RESOLUTION, UNANNOTATED
+from slatprep.records import (
+    BACKGROUND,
+    CLASS_COLOURS,
+    MATERIAL_CLASSES,
+    RESOLUTION,
+    UNANNOTATED,
+    UNANNOTATED_COLOUR,
+)
 from slatprep.store import StoredAsset
 
 VIEWS = 3

@@ -9,7 +9,7 @@ import pytest
 
 from slatprep.inspect.pictures import palette
 from slatprep.inspect.pictures.scene import rgb
-from slatprep.records import MATERIAL_CLASSES
+from slatprep.records import CLASS_COLOURS, MATERIAL_CLASSES
 
 # Machado, Oliveira, Fernandes 2009, severity 1.0, on linear RGB.
 SEEN_BY = {
@@ -36,12 +36,12 @@ def lab(colour: str, seen_by: str) -> np.ndarray:
 
 
 def test_every_class_has_a_colour() -> None:
-    assert set(palette.CLASS_COLOURS) == set(MATERIAL_CLASSES)
+    assert set(CLASS_COLOURS) == set(MATERIAL_CLASSES)
 
 
 @pytest.mark.parametrize("seen_by", SEEN_BY)
 def test_classes_differ_for_everyone(seen_by: str) -> None:
-    seen = {name: lab(colour, seen_by) for name, colour in palette.CLASS_COLOURS.items()}
+    seen = {name: lab(colour, seen_by) for name, colour in CLASS_COLOURS.items()}
     for one, other in itertools.combinations(seen, 2):
         assert np.linalg.norm(seen[one] - seen[other]) > 20, (one, other)
 

@@ -13,9 +13,9 @@ from support.faults import inject
 from support.synthetic import Dataset
 from support.trees import tree
 
-from slatprep.config import load_parameters
 from slatprep.errors import ConfigError
 from slatprep.parameters import BuildParameters, PairingParameters, PixieverseSource, SlatSource
+from slatprep.parameters.files import load_parameters
 from slatprep.pipeline.dataset import build_store, plan_build
 from slatprep.readers import discover
 from slatprep.store import open_store

@@ -1,6 +1,6 @@
 """The parameters of a build, in a handful of typed groups with defaults.
 
-These are plain dataclasses: `slatprep.config` fills and checks them from a
+These are plain dataclasses: `slatprep.parameters.files` fills and checks them from a
 TOML file and options, the stages take the group that concerns them, and the
 provenance records them with each result.
 """
@@ -23,7 +23,7 @@ PositiveInt = Annotated[int, Gt(0)]
 
 
 class _Group:
-    """What `slatprep.config` has pydantic refuse in every group."""
+    """What `slatprep.parameters.files` has pydantic refuse in every group."""
 
     __pydantic_config__: ClassVar[dict[str, object]] = {"extra": "forbid", "allow_inf_nan": False}
 

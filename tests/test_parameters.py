@@ -6,9 +6,9 @@ from pathlib import Path
 
 import pytest
 
-from slatprep.config import load_parameters
 from slatprep.errors import ConfigError
 from slatprep.parameters import PRESETS, AlignParameters
+from slatprep.parameters.files import load_parameters
 
 MINIMAL = """name = "mine"
 
