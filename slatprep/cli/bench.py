@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import tempfile
+from operator import attrgetter
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
 
-from slatprep.cli.options import FOLDER, POSITIVE, ChoiceOf, option, store_argument
-from slatprep.cli.output import Output, output_options
+from slatprep.cli.options import FOLDER, POSITIVE, ChoiceOf, command, option, store_argument
+from slatprep.cli.output import Output
 from slatprep.storage.place import storage_of
 
 if TYPE_CHECKING:
@@ -18,44 +19,12 @@ if TYPE_CHECKING:
     from slatprep.records import Place
 
 
-@click.group(
-    epilog="""\b
-Example:
-  slatprep bench align
-"""
-)
-def bench() -> None:
-    """Measure slatprep on this machine, side by side with the alternatives."""
-
-
-@bench.command(
-    "align",
-    epilog="""\b
-Example:
-  slatprep bench align --assets 14 --repeats 3
-  slatprep bench align --data demo --engine field --engine open3d-64
-""",
-)
-@option(
-    "--data",
-    "Folder with pixieverse/, slat/ and truth/, or of such folders.  [default: demo data]",
-    FOLDER,
-)
-@option(
-    "--engine",
-    "Engine to measure; may be repeated.  [default: all]",
-    ChoiceOf("slatprep.bench.align:ENGINES"),
-    name="engines",
-    multiple=True,
-)
-@option(
-    "--assets",
-    "At most so many assets of each folder.  [default: 25 of the demo, all of --data]",
-    POSITIVE,
-)
-@option("--repeats", "How often each is measured.", POSITIVE, 3)
-@option("--seed", "Seed of the demo data.", int, 0)
-@output_options
+@command("align")
+@option("--data", FOLDER)
+@option("--engine", ChoiceOf("slatprep.bench.align:ENGINES"), name="engines", multiple=True)
+@option("--assets", POSITIVE)
+@option("--repeats", POSITIVE, 3)
+@option("--seed", int, 0)
 def align(
     output: Output,
     data: Path | None,
@@ -70,6 +39,19 @@ def align(
     each asset in turn. open3d-64 is the paper's protocol as published, open3d
     the same without repeated rotations (the preset 'paper'), small_gicp GICP
     from the same rotations, field the default engine.
+
+    Options
+    -------
+    --data: Folder with pixieverse/, slat/ and truth/, or of such folders. [default: demo data]
+    --engine: Engine to measure; may be repeated. [default: all]
+    --assets: At most so many assets of each folder. [default: 25 of the demo, all of --data]
+    --repeats: How often each is measured.
+    --seed: Seed of the demo data.
+
+    Example
+    -------
+    slatprep bench align --assets 14 --repeats 3
+    slatprep bench align --data demo --engine field --engine open3d-64
     """
     from slatprep.bench.align import ENGINES, bench_align
     from slatprep.demo import make_demo
@@ -85,23 +67,18 @@ def align(
 
 
 def _show_align(output: Output, result: AlignBench) -> None:
+    accuracy = attrgetter(
+        "assets",
+        "success",
+        "displacement_median",
+        "displacement_p90",
+        "label_accuracy",
+        "truth_own",
+    )
     output.table(
         f"Accuracy, non-symmetric of {result.assets} assets (displacement in voxels)",
         ("engine", "level", "assets", "success", "displacement", "p90", "labels", "truth's own"),
-        [
-            (
-                e.engine,
-                f"L{s.level}",
-                s.assets,
-                s.success,
-                s.displacement_median,
-                s.displacement_p90,
-                s.label_accuracy,
-                s.truth_own,
-            )
-            for e in result.engines
-            for s in e.levels
-        ],
+        [(e.engine, f"L{s.level}", *accuracy(s)) for e in result.engines for s in e.levels],
     )
     output.table(
         f"Processor seconds an asset, {result.repeats} repeats "
@@ -126,25 +103,28 @@ def _show_align(output: Output, result: AlignBench) -> None:
     )
 
 
-@bench.command(
-    "read",
-    epilog="""\b
-Example:
-  slatprep bench read data/demo.zarr
-  slatprep bench read data/demo.zarr --assets 400 --repeats 9
-""",
-)
+@command("read")
 @store_argument
-@option("--assets", "At most so many.  [default: all]", POSITIVE)
-@option("--repeats", "How often each is measured.", POSITIVE, 5)
-@option("--seed", "Of the order of reading.", int, 0)
-@output_options
+@option("--assets", POSITIVE)
+@option("--repeats", POSITIVE, 5)
+@option("--seed", int, 0)
 def read(output: Output, store: Place, assets: int | None, repeats: int, seed: int) -> None:
     """Read shuffled whole assets (coords, feats, properties) as training does.
 
     Compares slatprep's reader with npz (one file an asset, plain and
     compressed), one HDF5 file, zarr-python, and zarrs and tensorstore where
     they are installed. 'cold' is after asking the system to forget the files.
+
+    Options
+    -------
+    --assets: At most so many. [default: all]
+    --repeats: How often each is measured.
+    --seed: Of the order of reading.
+
+    Example
+    -------
+    slatprep bench read data/demo.zarr
+    slatprep bench read data/demo.zarr --assets 400 --repeats 9
     """
     path = storage_of(store).local
     if path is None:
@@ -182,3 +162,11 @@ def _show_read(output: Output, result: ReadBench) -> None:
     )
     for name in result.left_out:
         output.note(f"{name}: not installed")
+
+
+bench = click.Group(
+    "bench",
+    commands=[align, read],
+    help="Measure slatprep on this machine, side by side with the alternatives.",
+    epilog="\b\nExample:\n  slatprep bench align",
+)

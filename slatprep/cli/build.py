@@ -8,56 +8,32 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from slatprep.cli.info import show_quality
 from slatprep.cli.options import (
     NEW_FILE,
     NEW_FOLDER,
     PLACE,
+    command,
     option,
     parameters_of,
     source_options,
     workers_options,
 )
-from slatprep.cli.output import Output, output_options
-from slatprep.cli.overview import show_quality
+from slatprep.cli.output import Output
 
 if TYPE_CHECKING:
     from slatprep.pipeline.dataset import BuildPlan, BuildSummary
 
-_MANIFESTS = option(
-    "--manifests", "Folder for the records.  [default: beside the store]", NEW_FOLDER
-)
-_STRICT = option("--strict", "Stop at the first asset that cannot go in.", is_flag=True)
 
-
-@click.command(
-    name="build-store",
-    epilog="""\b
-Example:
-  slatprep build-store --pixieverse demo/pixieverse --slat demo/slat --out demo.zarr --jobs 2
-  slatprep build-store --config manifests/demo.toml --preset paper --out data/demo.zarr
-  slatprep build-store --config manifests/demo.toml --out data/demo.zarr --dry-run
-  slatprep build-store --config manifests/demo.toml --out data/demo.zarr --scheduler tcp://node7:8786
-""",
-)
+@command("build-store")
 @source_options
-@option(
-    "--out",
-    "The store, a path or URL; an existing one is updated, and replaced in one step.",
-    PLACE,
-    required=True,
-    metavar="STORE.zarr",
-)
-@_MANIFESTS
-@_STRICT
-@option("--consensus", "Settle ties by the rotation that most assets share.", is_flag=True)
-@option("--fresh", "Reuse nothing of an earlier build.", is_flag=True)
-@option(
-    "--keep-work",
-    "Keep all assets' arrays beside the store, about 1 MB each; the next build is faster.",
-    is_flag=True,
-)
-@option("--dry-run", "Say what would be done, and why; write nothing.", is_flag=True)
-@output_options
+@option("--out", PLACE, required=True, metavar="STORE.zarr")
+@option("--manifests", NEW_FOLDER)
+@option("--strict", is_flag=True)
+@option("--consensus", is_flag=True)
+@option("--fresh", is_flag=True)
+@option("--keep-work", is_flag=True)
+@option("--dry-run", is_flag=True)
 @workers_options
 def build_store(output: Output, out: Path, dry_run: bool, **options: Any) -> None:
     """Build one store of aligned, normalised supervision, or bring it up to date.
@@ -69,6 +45,24 @@ def build_store(output: Output, out: Path, dry_run: bool, **options: Any) -> Non
 
     Assets whose sources, parameters and code did not change are not aligned
     again, and a build that was interrupted goes on where it stopped.
+
+    Options
+    -------
+    --out: The store, a path or URL; an existing one is updated, and replaced in one step.
+    --manifests: Folder for the records. [default: beside the store]
+    --strict: Stop at the first asset that cannot go in.
+    --consensus: Settle ties by the rotation that most assets share.
+    --fresh: Reuse nothing of an earlier build.
+    --keep-work: Keep all assets' arrays beside the store, about 1 MB each; the next build is
+        faster.
+    --dry-run: Say what would be done, and why; write nothing.
+
+    Example
+    -------
+    slatprep build-store --pixieverse demo/pixieverse --slat demo/slat --out demo.zarr --jobs 2
+    slatprep build-store --config manifests/demo.toml --preset paper --out data/demo.zarr
+    slatprep build-store --config manifests/demo.toml --out data/demo.zarr --dry-run
+    slatprep build-store --config manifests/demo.toml --out data/demo.zarr --scheduler tcp://node7:8786
     """
     parameters = parameters_of(options)
     from slatprep.pipeline import dataset as build
@@ -85,28 +79,25 @@ def build_store(output: Output, out: Path, dry_run: bool, **options: Any) -> Non
     _report(output, summary)
 
 
-@click.command(
-    epilog="""\b
-Example:
-  slatprep align --pixieverse demo/pixieverse --slat demo/slat --out demo.jsonl --jobs 2
-"""
-)
+@command()
 @source_options
-@option(
-    "--out",
-    "One JSON record an asset: transform, quality, candidates.",
-    NEW_FILE,
-    required=True,
-    metavar="FILE.jsonl",
-)
-@_STRICT
-@output_options
+@option("--out", NEW_FILE, required=True, metavar="FILE.jsonl")
+@option("--strict", is_flag=True)
 @workers_options
 def align(output: Output, out: Path, **options: Any) -> None:
     """Align without building a store.
 
     Writes one JSON record an asset: the transform, its quality, and the score
     of every candidate.
+
+    Options
+    -------
+    --out: One JSON record an asset: transform, quality, candidates.
+    --strict: Stop at the first asset that cannot go in.
+
+    Example
+    -------
+    slatprep align --pixieverse demo/pixieverse --slat demo/slat --out demo.jsonl --jobs 2
     """
     parameters = parameters_of(options)
     from slatprep.pipeline import dataset as build
@@ -135,8 +126,7 @@ def _show_plan(output: Output, plan: BuildPlan) -> None:
         {"asset_id": asset.asset_id, "action": str(asset.action), "reason": asset.reason}
         for asset in plan.assets
     ]
-    document = {"store": plan.store, "actions": plan.actions, "assets": assets}
-    output.result(document, show)
+    output.result({"store": plan.store, "actions": plan.actions, "assets": assets}, show)
 
 
 def _report(output: Output, summary: BuildSummary) -> None:

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import dataclasses
+from itertools import zip_longest
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
-from slatprep.cli.options import POSITIVE, beside, chosen_store, option, store_option
-from slatprep.cli.output import EXIT_INCOMPLETE, Cell, Output, output_options
+from slatprep.cli.options import POSITIVE, beside, chosen_store, command, option, store_option
+from slatprep.cli.output import EXIT_INCOMPLETE, Output
 from slatprep.errors import ConfigError, StoreError
 
 if TYPE_CHECKING:
@@ -20,32 +21,13 @@ if TYPE_CHECKING:
 _COLUMNS = ("fitness", "fitness_backward", "inlier_rmse", "valid_share", "ambiguity")
 
 
-@click.command(
-    name="check-alignment",
-    epilog="""\b
-Exit codes:
-  0  all assets are good and the store is consistent
-  1  one is not, or a picture cannot be written
-  2  wrong use: an option, or an unknown asset
-
-\b
-Example:
-  slatprep check-alignment --asset 0a1b2c --store data/demo.zarr
-  slatprep check-alignment --worst 12 --ambiguous --picture pictures
-  slatprep check-alignment --asset 0a1b2c --asset 3d4e5f --json --picture none
-""",
-)
-@option("--asset", "An asset; may be repeated.", name="asset_ids", multiple=True, metavar="ID")
-@option("--worst", "N assets of the lowest fitness, either way.", POSITIVE)
-@option("--ambiguous", "Assets whose classes depend on a choice among ties.", is_flag=True)
+@command("check-alignment")
+@option("--asset", name="asset_ids", multiple=True, metavar="ID")
+@option("--worst", POSITIVE)
+@option("--ambiguous", is_flag=True)
 @store_option
-@option(
-    "--picture",
-    "A .png for one asset, else a folder.  [default: NAME.pictures beside the store]",
-    metavar="PATH|none",
-)
-@option("--show", "Open it in Open3D's viewer, where there is a screen.", is_flag=True)
-@output_options
+@option("--picture", metavar="PATH|none")
+@option("--show", is_flag=True)
 def check_alignment(
     output: Output,
     asset_ids: tuple[str, ...],
@@ -61,6 +43,26 @@ def check_alignment(
     stored figures. A picture shows both sides before and after from three
     directions, the error of every voxel, the scores of the candidates and the
     verdict. --asset, --worst and --ambiguous may be combined.
+
+    Options
+    -------
+    --asset: An asset; may be repeated.
+    --worst: N assets of the lowest fitness, either way.
+    --ambiguous: Assets whose classes depend on a choice among ties.
+    --picture: A .png for one asset, else a folder. [default: NAME.pictures beside the store]
+    --show: Open it in Open3D's viewer, where there is a screen.
+
+    Exit codes
+    ----------
+    0  all assets are good and the store is consistent
+    1  one is not, or a picture cannot be written
+    2  wrong use: an option, or an unknown asset
+
+    Example
+    -------
+    slatprep check-alignment --asset 0a1b2c --store data/demo.zarr
+    slatprep check-alignment --worst 12 --ambiguous --picture pictures
+    slatprep check-alignment --asset 0a1b2c --asset 3d4e5f --json --picture none
     """
     if not (asset_ids or worst or ambiguous):
         raise click.UsageError("say which assets: --asset ID, --worst N or --ambiguous")
@@ -88,8 +90,8 @@ def check_alignment(
         _print(output, checks)
         if sheet is not None:
             click.echo(f"pictures: {target} ({len(pictures)}), all in one: {sheet}")
-        for file in pictures if sheet is None else ():
-            click.echo(f"picture: {file}")
+        elif pictures:
+            click.echo(f"picture: {pictures[0]}")
         output.note(f"store: {path}")
 
     output.result(_documents(checks, pictures), print_all)
@@ -120,7 +122,7 @@ def _print(output: Output, checks: list[AlignmentCheck]) -> None:
             [
                 (
                     one.asset_id,
-                    str(one.verdict),
+                    one.verdict,
                     *(one.figure(n).value for n in _COLUMNS),
                     one.consistent,
                 )
@@ -129,7 +131,22 @@ def _print(output: Output, checks: list[AlignmentCheck]) -> None:
         )
     for one in checks:
         if len(checks) == 1 or output.verbosity > 0:
-            _print_figures(output, one)
+            output.table(
+                f"{one.asset_id}: alignment {one.verdict}",
+                ("figure", "computed", "good", "is good", "stored", "may differ by", "agrees"),
+                [
+                    (
+                        figure.name,
+                        float(figure.value),
+                        figure.threshold_text,
+                        "" if figure.passes is None else figure.passes,
+                        float(figure.stored),
+                        f"{figure.limit:g}",
+                        figure.ok,
+                    )
+                    for figure in one.figures
+                ],
+            )
         for words in one.reasons if len(checks) > 1 else one.words:
             click.echo(f"{one.asset_id}: {words}")
         if not one.consistent:
@@ -139,28 +156,7 @@ def _print(output: Output, checks: list[AlignmentCheck]) -> None:
             )
 
 
-def _print_figures(output: Output, check: AlignmentCheck) -> None:
-    rows: list[tuple[Cell, ...]] = [
-        (
-            figure.name,
-            float(figure.value),
-            figure.threshold_text,
-            figure.passes if figure.passes is not None else "",
-            float(figure.stored),
-            f"{figure.limit:g}",
-            figure.ok,
-        )
-        for figure in check.figures
-    ]
-    output.table(
-        f"{check.asset_id}: alignment {check.verdict}",
-        ("figure", "computed", "good", "is good", "stored", "may differ by", "agrees"),
-        rows,
-    )
-
-
 def _documents(checks: list[AlignmentCheck], pictures: list[Path]) -> list[dict[str, Any]]:
-    files: list[Path | None] = [*pictures] or [None] * len(checks)
     return [
         {
             **dataclasses.asdict(one),
@@ -177,7 +173,7 @@ def _documents(checks: list[AlignmentCheck], pictures: list[Path]) -> list[dict[
             "ok": one.ok,
             "picture": file,
         }
-        for one, file in zip(checks, files, strict=True)
+        for one, file in zip_longest(checks, pictures)
     ]
 
 

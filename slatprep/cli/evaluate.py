@@ -12,11 +12,12 @@ from slatprep.cli.options import (
     EXISTING_FOLDER,
     NEW_FILE,
     ChoiceOf,
+    command,
     option,
     shares_of,
     shares_option,
 )
-from slatprep.cli.output import Output, output_options
+from slatprep.cli.output import Output
 
 if TYPE_CHECKING:
     from slatprep.learn.metrics import Evaluation, Measure
@@ -24,34 +25,14 @@ if TYPE_CHECKING:
     from slatprep.records import Place
 
 
-@click.command(
-    epilog="""\b
-Example:
-  slatprep evaluate runs/small/predictions --store demo.zarr
-  slatprep evaluate predictions.h5 --store demo.zarr --split all --spread sd --csv scores.csv
-  slatprep evaluate runs/large/predictions --store pixieverse.zarr --beside pixie
-"""
-)
+@command()
 @click.argument("predictions", type=click.Path(path_type=Path, exists=True))
-@option("--store", "Has the truth.", EXISTING_FOLDER, required=True, metavar="STORE.zarr")
-@option(
-    "--split", "Objects to measure on.", ChoiceOf("slatprep.learn.splits:SPLITS", "all"), "test"
-)
+@option("--store", EXISTING_FOLDER, required=True, metavar="STORE.zarr")
+@option("--split", ChoiceOf("slatprep.learn.splits:SPLITS", "all"), "test")
 @shares_option
-@option(
-    "--spread",
-    "Standard error or standard deviation over objects.",
-    ChoiceOf("slatprep.learn.metrics:Spread"),
-    "se",
-)
-@option("--csv", "Also write the table to this file.", NEW_FILE, name="csv_file")
-@option(
-    "--beside",
-    "Also print Pixie's published table, which has NeRF2Physics too, or one of your "
-    "own: a name, then columns named as here.",
-    metavar="pixie|FILE.csv",
-)
-@output_options
+@option("--spread", ChoiceOf("slatprep.learn.metrics:Spread"), "se")
+@option("--csv", NEW_FILE, name="csv_file")
+@option("--beside", metavar="pixie|FILE.csv")
 def evaluate(
     output: Output,
     predictions: Path,
@@ -69,6 +50,21 @@ def evaluate(
     space, and may have material (N,) or logits (N,8), and coords (N,3). Errors are means over
     valid voxels, then over objects. Exit code 1 says that an asset of the
     split has no prediction.
+
+    Options
+    -------
+    --store: Has the truth.
+    --split: Objects to measure on.
+    --spread: Standard error or standard deviation over objects.
+    --csv: Also write the table to this file.
+    --beside: Also print Pixie's published table, which has NeRF2Physics too, or one of your
+        own: a name, then columns named as here.
+
+    Example
+    -------
+    slatprep evaluate runs/small/predictions --store demo.zarr
+    slatprep evaluate predictions.h5 --store demo.zarr --split all --spread sd --csv scores.csv
+    slatprep evaluate runs/large/predictions --store pixieverse.zarr --beside pixie
     """
     from slatprep.learn.metrics import evaluate_store
     from slatprep.learn.published import PIXIE_TABLE, read_scores
@@ -122,10 +118,6 @@ def _show_beside(
 def _rows(result: Evaluation) -> list[tuple[str | int | float, ...]]:
     measures: dict[str, Measure] = {**result.categories, "all": result.overall}
     return [
-        (
-            name or "(none)",
-            m.objects,
-            *(x for key in m.means for x in (m.means[key], m.spreads[key])),
-        )
+        (name or "(none)", m.objects, *(s[key] for key in m.means for s in (m.means, m.spreads)))
         for name, m in measures.items()
     ]

@@ -11,11 +11,12 @@ from slatprep.cli.options import (
     EXISTING_FOLDER,
     POSITIVE,
     ChoiceOf,
+    command,
     jobs_option,
     option,
     verdicts_option,
 )
-from slatprep.cli.output import Output, output_options
+from slatprep.cli.output import Cell, Output
 from slatprep.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -39,105 +40,60 @@ def _complete_asset(
     return []
 
 
-@click.command(
-    epilog="""\b
-Example:
-  slatprep export demo.zarr --format ply --out demo.ply.d --verdict good
-  slatprep export demo.zarr --format ply --out world --points grid --frame pixieverse
-  slatprep export demo.zarr --format hdf5 --out demo.h5 --asset 0a1b2c --asset 3d4e5f
-  slatprep export demo.zarr --format webdataset --out shards --shard-size 128 --jobs 2
-  slatprep export demo.zarr --format npz --out latents
-"""
-)
+@command()
 @click.argument("store", type=EXISTING_FOLDER)
-@option(
-    "--format",
-    "Point clouds with Pixie's fields, one HDF5 file, tar shards, or TRELLIS's npz "
-    "with the targets added.",
-    ChoiceOf("slatprep.export:FORMATS"),
-    name="kind",
-    required=True,
-)
-@option(
-    "--out",
-    "The file (hdf5) or folder (all others); an existing export is replaced when "
-    "the new one is complete.",
-    click.Path(path_type=Path),
-    required=True,
-    metavar="PATH",
-)
-@option(
-    "--asset",
-    "The asset; may be repeated.  [default: all]",
-    name="assets",
-    multiple=True,
-    metavar="ID",
-    shell_complete=_complete_asset,
-)
+@option("--format", ChoiceOf("slatprep.export:FORMATS"), name="kind", required=True)
+@option("--out", click.Path(path_type=Path), required=True, metavar="PATH")
+@option("--asset", name="assets", multiple=True, metavar="ID", shell_complete=_complete_asset)
 @verdicts_option
-@option(
-    "--points",
-    "ply: SLAT voxels, or the voxels of the PixieVerse field.  [default: slat]",
-    ChoiceOf("slatprep.export.formats:Points"),
-)
-@option(
-    "--frame",
-    "ply: the SLAT's unit cube, or PixieVerse's world.  [default: slat]",
-    ChoiceOf("slatprep.export.formats:Frame"),
-)
-@option("--shard-size", "webdataset: assets a shard.  [default: 256]", POSITIVE)
+@option("--points", ChoiceOf("slatprep.export.formats:Points"))
+@option("--frame", ChoiceOf("slatprep.export.formats:Frame"))
+@option("--shard-size", POSITIVE)
 @jobs_option
-@output_options
-def export(
-    output: Output,
-    store: Place,
-    kind: Any,
-    out: Path,
-    assets: tuple[str, ...],
-    verdicts: tuple[str, ...],
-    jobs: int,
-    **given: Any,
-) -> None:
+def export(output: Output, store: Place, kind: Any, out: Path, **others: Any) -> None:
     """Write assets of STORE in a format of other tools.
 
     Properties are in SI units in PLY, normalised in WebDataset and npz, and
     both in HDF5. Every folder gets an index.json that says what is in it.
+
+    Options
+    -------
+    --format: Point clouds with Pixie's fields, one HDF5 file, tar shards, or TRELLIS's npz with
+        the targets added.
+    --out: The file (hdf5) or folder (all others); an existing export is replaced when the new
+        one is complete.
+    --asset: The asset; may be repeated. [default: all]
+    --points: ply: SLAT voxels, or the voxels of the PixieVerse field. [default: slat]
+    --frame: ply: the SLAT's unit cube, or PixieVerse's world. [default: slat]
+    --shard-size: webdataset: assets a shard. [default: 256]
+
+    Example
+    -------
+    slatprep export demo.zarr --format ply --out demo.ply.d --verdict good
+    slatprep export demo.zarr --format ply --out world --points grid --frame pixieverse
+    slatprep export demo.zarr --format hdf5 --out demo.h5 --asset 0a1b2c --asset 3d4e5f
+    slatprep export demo.zarr --format webdataset --out shards --shard-size 128 --jobs 2
+    slatprep export demo.zarr --format npz --out latents
     """
-    options = {name: value for name, value in given.items() if value is not None}
+    options = {name: value for name in _ONLY_FOR if (value := others.pop(name)) is not None}
     for name in options:
         if _ONLY_FOR[name] != kind:
-            option = f"--{name.replace('_', '-')}"
-            raise ConfigError(f"{option} is for --format {_ONLY_FOR[name]}, not {kind}")
+            flag = f"--{name.replace('_', '-')}"
+            raise ConfigError(f"{flag} is for --format {_ONLY_FOR[name]}, not {kind}")
     from slatprep.export import ExportOptions, export_store
 
     with output.progress("export") as progress:
-        summary = export_store(
-            store,
-            out,
-            kind,
-            assets=assets,
-            verdicts=verdicts,
-            options=ExportOptions(**options),
-            jobs=jobs,
-            progress=progress,
-        )
+        chosen = ExportOptions(**options)
+        summary = export_store(store, out, kind, options=chosen, progress=progress, **others)
 
-    def show() -> None:
-        output.table(
-            f"Exported to {summary.path}",
-            ("format", "assets", "points", "files", "MB", "seconds"),
-            [
-                (
-                    summary.format,
-                    summary.assets,
-                    summary.points,
-                    summary.files,
-                    summary.size / 1e6,
-                    summary.seconds,
-                )
-            ],
-        )
-
+    cells: dict[str, Cell] = {
+        "format": summary.format,
+        "assets": summary.assets,
+        "points": summary.points,
+        "files": summary.files,
+        "MB": summary.size / 1e6,
+        "seconds": summary.seconds,
+    }
     for note in summary.notes:
         output.note(note)
-    output.result(summary, show)
+    output.result(summary, lambda: output.record(f"Exported to {summary.path}", cells))

@@ -6,37 +6,20 @@ from pathlib import Path
 
 import click
 
-from slatprep.cli.options import FILE, NEW_FOLDER, option
-from slatprep.cli.output import Output, output_options
+from slatprep.cli.options import FILE, NEW_FOLDER, command, option
+from slatprep.cli.output import Output
 from slatprep.errors import InputError
 
 
-@click.command(
-    name="extract-slat",
-    epilog="""\b
-Example:
-  slatprep extract-slat renders/*.png --out slat
-  slatprep extract-slat renders/*/*.png --by-folder --out slat --seed 0 --seed 1
-""",
-)
+@command("extract-slat")
 @click.argument("images", nargs=-1, required=True, type=FILE)
-@option("--out", "The --slat of build-store.", NEW_FOLDER, required=True)
-@option(
-    "--seed",
-    "Seed of what is drawn; may be repeated, each seed is a view.",
-    click.IntRange(min=0),
-    (42,),
-    name="seeds",
-    multiple=True,
-)
-@option("--by-folder", "Images are named <id>/<view>, not <id>.", is_flag=True)
-@option(
-    "--model", "Repository of the model, or its folder.", default="microsoft/TRELLIS-image-large"
-)
-@option("--revision", "Revision of the model.  [default: newest]", metavar="COMMIT")
-@option("--device", "Where to run it.", default="cuda")
-@option("--no-preprocess", "Images are cut out and cropped already.", is_flag=True)
-@output_options
+@option("--out", NEW_FOLDER, required=True)
+@option("--seed", click.IntRange(min=0), (42,), name="seeds", multiple=True)
+@option("--by-folder", is_flag=True)
+@option("--model", default="microsoft/TRELLIS-image-large")
+@option("--revision", metavar="COMMIT")
+@option("--device", default="cuda")
+@option("--no-preprocess", is_flag=True)
 def extract_slat(
     output: Output,
     images: tuple[Path, ...],
@@ -54,6 +37,21 @@ def extract_slat(
     views, in the form that build-store reads, and a JSON beside it that says
     image, seed, model and revision. Existing files are kept, so that a stopped
     run goes on. TRELLIS itself must be installed.
+
+    Options
+    -------
+    --out: The --slat of build-store.
+    --seed: Seed of what is drawn; may be repeated, each seed is a view.
+    --by-folder: Images are named <id>/<view>, not <id>.
+    --model: Repository of the model, or its folder.
+    --revision: Revision of the model. [default: newest]
+    --device: Where to run it.
+    --no-preprocess: Images are cut out and cropped already.
+
+    Example
+    -------
+    slatprep extract-slat renders/*.png --out slat
+    slatprep extract-slat renders/*/*.png --by-folder --out slat --seed 0 --seed 1
     """
     from slatprep import extract as work
 
@@ -75,8 +73,7 @@ def extract_slat(
         "voxels": sum(result.voxels for result in done),
     }
 
-    def show() -> None:
-        output.table(f"Latents in {out}", tuple(counts), [tuple(counts.values())])
-
     document = {"path": out, "model": session.model, **counts, "problems": problems}
-    output.result(document, show, complete=not problems)
+    output.result(
+        document, lambda: output.record(f"Latents in {out}", counts), complete=not problems
+    )

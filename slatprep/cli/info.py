@@ -2,30 +2,27 @@
 
 from __future__ import annotations
 
+from operator import attrgetter
 from typing import TYPE_CHECKING
 
-import click
-
-from slatprep.cli.options import store_argument
-from slatprep.cli.output import Output, output_options
-from slatprep.cli.overview import show_normalization, show_quality
+from slatprep.cli.options import command, store_argument
+from slatprep.cli.output import Cell, Output
 
 if TYPE_CHECKING:
+    from slatprep.inspect.overview import StoreOverview
     from slatprep.records import Place
 
 
-@click.command(
-    epilog="""\b
-Example:
-  slatprep info data/demo.zarr
-"""
-)
+@command()
 @store_argument
-@output_options
 def info(output: Output, store: Place) -> None:
     """Say what is in STORE, and how good its alignments are.
 
     Without STORE, the one that `make align` built last under data/ is taken.
+
+    Example
+    -------
+    slatprep info data/demo.zarr
     """
     from slatprep.inspect.overview import overview_of
     from slatprep.store import open_store
@@ -33,24 +30,51 @@ def info(output: Output, store: Place) -> None:
     overview = overview_of(open_store(store))
 
     def show() -> None:
-        total = overview.total
+        contents: dict[str, Cell] = {
+            "assets": overview.total.assets,
+            "voxels": overview.total.voxels,
+            "valid": overview.total.valid_share,
+            "files": overview.files,
+            "MB": overview.size / 1e6,
+            "format": overview.format_version,
+            "engine": ", ".join(overview.engines),
+            "model": ", ".join(overview.models),
+        }
+        output.record(f"Store {overview.path}", contents)
+        show_quality(output, overview)
         output.table(
-            f"Store {overview.path}",
-            ("assets", "voxels", "valid", "files", "MB", "format", "engine", "model"),
+            f"Normalisation to [-1, 1] (ranges: {overview.normalization.source})",
+            ("property", "scale", "lo", "hi"),
             [
-                (
-                    total.assets,
-                    total.voxels,
-                    total.valid_share,
-                    overview.files,
-                    overview.size / 1e6,
-                    overview.format_version,
-                    ", ".join(overview.engines),
-                    ", ".join(overview.models),
-                )
+                (entry.name, "log10" if entry.log10 else "linear", entry.lo, entry.hi)
+                for entry in overview.normalization.ranges
             ],
         )
-        show_quality(output, overview)
-        show_normalization(output, overview)
 
     output.result(overview, show)
+
+
+def show_quality(output: Output, overview: StoreOverview) -> None:
+    """Print how good the alignments of a store are, by category and in all.
+
+    ``back`` is the fitness from SLAT to PixieVerse; ``tied`` counts assets
+    whose tied placements differ in class somewhere.
+    """
+    medians = attrgetter("fitness", "fitness_backward", "inlier_rmse", "valid_share", "ambiguous")
+    output.table(
+        "Alignments (medians; rmse in voxels)",
+        (
+            "category",
+            "assets",
+            *overview.total.verdicts,
+            "fitness",
+            "back",
+            "rmse",
+            "valid",
+            "tied",
+        ),
+        [
+            (group.name, group.assets, *group.verdicts.values(), *medians(group))
+            for group in (*overview.categories, overview.total)
+        ],
+    )

@@ -1,16 +1,19 @@
-"""Options that several commands share: their types, sources, stores, jobs and shares."""
+"""How a command declares itself and its options, and the options that several share."""
 
 from __future__ import annotations
 
 import functools
+import inspect
 import pkgutil
+import re
 from collections.abc import Callable
 from pathlib import Path
+from textwrap import indent
 from typing import TYPE_CHECKING, Any, TypeVar, get_args
 
 import click
 
-from slatprep.cli.output import Output
+from slatprep.cli.output import OUTPUT_OPTIONS, Output, with_output
 from slatprep.storage.place import place_of, storage_of
 
 if TYPE_CHECKING:
@@ -22,7 +25,10 @@ if TYPE_CHECKING:
 else:
     _Choice = click.Choice
 
-_Command = TypeVar("_Command", bound=Callable[..., object])
+_Function = TypeVar("_Function", bound=Callable[..., object])
+
+_SECTION = re.compile(r"^(\w[\w ]*)\n-+\n", re.M)
+_OPTION = re.compile(r"^(--[\w-]+): (.*(?:\n .*)*)", re.M)
 
 POSITIVE = click.IntRange(min=1)
 FILE = click.Path(path_type=Path, exists=True, dir_okay=False)
@@ -72,14 +78,14 @@ class ChoiceOf(_Choice):
 
 def option(
     flag: str,
-    text: str,
     kind: Any = None,
     default: Any = None,
+    text: str | None = None,
     *,
     name: str | None = None,
     **others: Any,
-) -> Callable[[_Command], _Command]:
-    """Declare an option: its flag, help text, type and default, in this order.
+) -> Callable[[_Function], _Function]:
+    """Declare an option: its flag, type, default and, where commands share it, its help.
 
     `name` is the parameter of the function that takes the value, where it is
     not the flag's name; all other arguments are `click.option`'s.
@@ -89,6 +95,44 @@ def option(
     return click.option(*filter(None, (flag, name)), type=kind, help=text, **others)
 
 
+def command(name: str | None = None, **settings: Any) -> Callable[[_Function], click.Command]:
+    """Make a command of a function, whose docstring is its help.
+
+    A section ``Options`` of the docstring says what each option does; every
+    other section, such as ``Example``, is printed below the options. The
+    function gets an `Output` as its first argument, and the command the
+    options ``--json``, ``-q`` and ``-v`` that it is made from.
+
+    Raises
+    ------
+    ValueError
+        If the docstring and the declared options do not name the same ones.
+    """
+
+    def declare(function: _Function) -> click.Command:
+        text, *sections = _SECTION.split(inspect.getdoc(function) or "")
+        described = dict(zip(sections[::2], sections[1::2], strict=True))
+        helps = dict(_OPTION.findall(described.pop("Options", "")))
+        below = [f"\b\n{title}:\n{indent(body, '  ')}" for title, body in described.items()]
+        declared = click.command(
+            name, click.Command, help=text, epilog="\n\n".join(below), **settings
+        )
+        made = declared(with_output(function))
+        made.params += OUTPUT_OPTIONS
+        undescribed = False
+        for parameter in made.params:
+            if isinstance(parameter, click.Option) and parameter.help is None:
+                words = " ".join(helps.pop(parameter.opts[0], "").split())
+                parameter.help = words.replace(" [default:", "  [default:")
+                undescribed |= not words
+        # Python's -OO leaves no docstrings, and no help.
+        if function.__doc__ and (helps or undescribed):
+            raise ValueError(f"{made.name}: its docstring does not describe its options")
+        return made
+
+    return declare
+
+
 PLACE = PlaceType(path_type=Path)
 """A path or a URL, of something that need not exist."""
 
@@ -96,30 +140,22 @@ EXISTING_FOLDER = PlaceType(path_type=Path, exists=True, file_okay=False)
 """A folder that exists, a store as well, or a URL."""
 
 
-def source_options(command: _Command) -> _Command:
+_PIXIEVERSE = "Root of the PixieVerse grids or predictions, a folder or a URL."
+_MAP = "CSV that joins the ids of the two sides, or TRELLIS's metadata.csv."
+_RANGES = "Where the normalisation ranges come from.  [default: dataset]"
+_PRESET = "Named alignment parameters; 'paper' is the protocol of SLAT-Phys."
+
+
+def source_options(command: _Function) -> _Function:
     """Add the options that decide the parameters of a build."""
+    preset = ChoiceOf("slatprep.parameters:PRESETS")
     options = (
-        option("--config", "Dataset definition (TOML); options win over it.", FILE),
-        option(
-            "--pixieverse", "Root of the PixieVerse grids or predictions, a folder or a URL.", PLACE
-        ),
-        option("--slat", "Root of the TRELLIS latents, or one HDF5 file, or a URL.", PLACE),
-        option(
-            "--map",
-            "CSV that joins the ids of the two sides, or TRELLIS's metadata.csv.",
-            PLACE,
-            name="pairing_map",
-        ),
-        option(
-            "--ranges",
-            "Where the normalisation ranges come from.  [default: dataset]",
-            metavar="dataset|pixie|FILE",
-        ),
-        option(
-            "--preset",
-            "Named alignment parameters; 'paper' is the protocol of SLAT-Phys.",
-            ChoiceOf("slatprep.parameters:PRESETS"),
-        ),
+        option("--config", FILE, text="Dataset definition (TOML); options win over it."),
+        option("--pixieverse", PLACE, text=_PIXIEVERSE),
+        option("--slat", PLACE, text="Root of the TRELLIS latents, or one HDF5 file, or a URL."),
+        option("--map", PLACE, text=_MAP, name="pairing_map"),
+        option("--ranges", text=_RANGES, metavar="dataset|pixie|FILE"),
+        option("--preset", preset, text=_PRESET),
     )
     return functools.reduce(lambda decorated, add: add(decorated), reversed(options), command)
 
@@ -144,8 +180,8 @@ store_argument = click.argument(
 
 store_option = option(
     "--store",
-    "The store.  [default: the one built last under data/]",
     EXISTING_FOLDER,
+    text="The store.  [default: the one built last under data/]",
     metavar="STORE.zarr",
 )
 
@@ -159,16 +195,16 @@ def beside(store: Place, suffix: str) -> Path:
 
 verdicts_option = option(
     "--verdict",
-    "Only assets with this verdict; may be repeated.  [default: all]",
     ChoiceOf("slatprep.records:Verdict"),
+    text="Only assets with this verdict; may be repeated.  [default: all]",
     name="verdicts",
     multiple=True,
 )
 
-jobs_option = option("--jobs", "Worker processes, of one thread each.", POSITIVE, 1)
+jobs_option = option("--jobs", POSITIVE, 1, "Worker processes, of one thread each.")
 
 
-def workers_options(command: _Command) -> _Command:
+def workers_options(command: _Function) -> _Function:
     """Add ``--jobs`` and ``--scheduler``, of which the command gets what was chosen as `jobs`.
 
     It stands below `output_options`, whose `Output` it takes and hands on.
@@ -177,7 +213,7 @@ def workers_options(command: _Command) -> _Command:
     @jobs_option
     @option(
         "--scheduler",
-        "Compute on the Dask cluster of this scheduler, as tcp://host:8786, instead of here.",
+        text="Compute on the Dask cluster of this scheduler, as tcp://host:8786, instead of here.",
         metavar="ADDRESS",
     )
     @functools.wraps(command)
@@ -224,8 +260,8 @@ def parameters_of(options: dict[str, Any]) -> BuildParameters:
 
 shares_option = option(
     "--shares",
-    "Shares of the objects; a hash of the id decides where one goes.",
     default="0.8,0.1,0.1",
+    text="Shares of the objects; a hash of the id decides where one goes.",
     metavar="TRAIN,VAL,TEST",
 )
 

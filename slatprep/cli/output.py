@@ -11,7 +11,7 @@ import functools
 import math
 import sys
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, TypeVar
@@ -71,17 +71,18 @@ class Output:
         """Print one line on standard error about something that did not go in."""
         click.echo(message, err=True)
 
-    def table(self, title: str, columns: Sequence[str], rows: Sequence[Sequence[Cell]]) -> None:
+    def table(self, title: str, columns: Sequence[str], rows: Iterable[Sequence[Cell]]) -> None:
         """Print a table; columns of numbers are aligned to the right."""
+        rows = list(rows)
         numeric = [
-            bool(rows) and all(row[k] is None or _is_number(row[k]) for row in rows)
-            for k in range(len(columns))
+            bool(rows) and all(_is_number(row[k]) for row in rows) for k in range(len(columns))
         ]
-        cells = [[_text(cell) for cell in row] for row in rows]
-        if sys.stdout.isatty():
-            _rich_table(title, columns, cells, numeric)
-        else:
-            _plain_table(title, columns, cells, numeric)
+        draw = _rich_table if sys.stdout.isatty() else _plain_table
+        draw(title, columns, [[_text(cell) for cell in row] for row in rows], numeric)
+
+    def record(self, title: str, cells: Mapping[str, Cell]) -> None:
+        """Print a table of one row, whose cells are given by column."""
+        self.table(title, tuple(cells), [tuple(cells.values())])
 
     @contextmanager
     def progress(self, label: str) -> Iterator[Progress]:
@@ -100,18 +101,23 @@ class Output:
                 yield update
 
 
-def output_options(command: _Command) -> _Command:
-    """Add ``--json``, ``-q`` and ``-v``; the command gets an `Output` as its first argument."""
+OUTPUT_OPTIONS = (
+    click.Option(["--json", "as_json"], is_flag=True, help="Print JSON instead of tables."),
+    click.Option(["-q", "--quiet"], is_flag=True, help="Print errors and results alone."),
+    click.Option(["-v", "--verbose"], is_flag=True, help="Print more than the usual."),
+)
+"""What every command takes, and `with_output` reads."""
 
-    @click.option("--json", "as_json", is_flag=True, help="Print JSON instead of tables.")
-    @click.option("-q", "--quiet", is_flag=True, help="Print errors and results alone.")
-    @click.option("-v", "--verbose", is_flag=True, help="Print more than the usual.")
+
+def with_output(command: _Command) -> _Command:
+    """Give a command an `Output` as its first argument, in place of `OUTPUT_OPTIONS`."""
+
     @functools.wraps(command)
-    def with_output(*, as_json: bool, quiet: bool, verbose: bool, **options: Any) -> object:
+    def run(*, as_json: bool, quiet: bool, verbose: bool, **options: Any) -> object:
         given = {name: _local(value) for name, value in options.items()}
         return command(Output(as_json, int(verbose) - int(quiet)), **given)
 
-    return with_output  # type: ignore[return-value]
+    return run  # type: ignore[return-value]
 
 
 def _local(value: Any) -> Any:
@@ -139,7 +145,8 @@ def _jsonable(value: object) -> object:
 
 
 def _is_number(cell: Cell) -> bool:
-    return isinstance(cell, int | float) and not isinstance(cell, bool)
+    """Whether a cell may stand in a column of numbers."""
+    return cell is None or (isinstance(cell, int | float) and not isinstance(cell, bool))
 
 
 def _text(cell: Cell) -> str:

@@ -11,32 +11,22 @@ from slatprep.cli.options import (
     FOLDER,
     NEW_FILE,
     beside,
+    command,
     jobs_option,
     option,
     store_argument,
 )
-from slatprep.cli.output import Output, output_options
+from slatprep.cli.output import Output
 
 if TYPE_CHECKING:
     from slatprep.records import Place
 
 
-@click.command(
-    epilog="""\b
-Example:
-  slatprep report data/demo.zarr
-  slatprep report data/demo.zarr --out demo.html --manifests manifests/build/demo
-"""
-)
+@command()
 @store_argument
-@option("--out", "The page.  [default: beside the store]", NEW_FILE, metavar="FILE.html")
-@option(
-    "--manifests",
-    "Folder of the build's records.  [default: beside the store, or manifests/build/NAME]",
-    FOLDER,
-)
+@option("--out", NEW_FILE, metavar="FILE.html")
+@option("--manifests", FOLDER)
 @jobs_option
-@output_options
 def report(
     output: Output, store: Place, out: Path | None, manifests: Place | None, jobs: int
 ) -> None:
@@ -46,6 +36,17 @@ def report(
     state and why, the spread of quality, orientations, classes and properties,
     and a table of all assets that opens each in 3D. Without STORE, the one
     that `make align` built last under data/ is taken.
+
+    Options
+    -------
+    --out: The page. [default: beside the store]
+    --manifests: Folder of the build's records. [default: beside the store, or
+        manifests/build/NAME]
+
+    Example
+    -------
+    slatprep report data/demo.zarr
+    slatprep report data/demo.zarr --out demo.html --manifests manifests/build/demo
     """
     from slatprep.inspect.report import write_report
     from slatprep.provenance.places import manifests_of

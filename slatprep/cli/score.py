@@ -2,27 +2,22 @@
 
 from __future__ import annotations
 
+from operator import attrgetter
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
 
-from slatprep.cli.options import EXISTING_FOLDER, FOLDER
-from slatprep.cli.output import EXIT_INCOMPLETE, Output, output_options
+from slatprep.cli.options import EXISTING_FOLDER, FOLDER, command
+from slatprep.cli.output import Output
 
 if TYPE_CHECKING:
     from slatprep.records import Place
 
 
-@click.command(
-    epilog="""\b
-Example:
-  slatprep score demo.zarr demo/truth
-"""
-)
+@command()
 @click.argument("store", type=EXISTING_FOLDER)
 @click.argument("truth_dir", type=FOLDER)
-@output_options
 def score(output: Output, store: Place, truth_dir: Path) -> None:
     """Score STORE against known truth.
 
@@ -33,6 +28,10 @@ def score(output: Output, store: Place, truth_dir: Path) -> None:
     percentile; labels is the share of right classes, beside what the best
     similarity and the true places themselves would give. Exit code 1 says that
     an asset with a truth is not in the store.
+
+    Example
+    -------
+    slatprep score demo.zarr demo/truth
     """
     from slatprep.bench.truth import score_against_truth
 
@@ -44,12 +43,11 @@ def score(output: Output, store: Place, truth_dir: Path) -> None:
                 "Assets against truth",
                 ("asset", "name", "level", "symmetric", "displacement", "best similarity",
                  "labels", "best similarity", "true places", "valid"),
-                [
-                    (s.asset_id, s.name, s.level, s.symmetric, s.displacement,
-                     s.similarity_displacement, s.label_accuracy, s.similarity_accuracy,
-                     s.truth_own, s.valid_share)
-                    for s in report.assets
-                ],
+                map(
+                    attrgetter("asset_id", "name", "level", "symmetric", "displacement",
+                               "similarity_displacement", *labels),
+                    report.assets,
+                ),
             )  # fmt: skip
         output.table(
             "Places against truth (non-symmetric assets; displacement in voxels)",
@@ -63,15 +61,10 @@ def score(output: Output, store: Place, truth_dir: Path) -> None:
         output.table(
             "Labels against truth (of the same assets; shares)",
             ("level", "labels", "best similarity", "true places", "valid"),
-            [
-                (f"L{s.level}", s.label_accuracy, s.similarity_accuracy, s.truth_own,
-                 s.valid_share)
-                for s in report.levels
-            ],
-        )  # fmt: skip
+            [(f"L{s.level}", *attrgetter(*labels)(s)) for s in report.levels],
+        )
 
-    output.result(report, show)
+    labels = ("label_accuracy", "similarity_accuracy", "truth_own", "valid_share")
     for asset_id in report.missing:
         output.problem(f"{truth_dir / asset_id}.npz: its asset is not in {store}")
-    if report.missing:
-        click.get_current_context().exit(EXIT_INCOMPLETE)
+    output.result(report, show, complete=not report.missing)

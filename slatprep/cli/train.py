@@ -14,12 +14,13 @@ from slatprep.cli.options import (
     NEW_FOLDER,
     POSITIVE,
     ChoiceOf,
+    command,
     option,
     shares_of,
     shares_option,
     verdicts_option,
 )
-from slatprep.cli.output import Output, output_options
+from slatprep.cli.output import Output
 
 if TYPE_CHECKING:
     from slatprep.learn.train import TrainSummary
@@ -28,45 +29,25 @@ if TYPE_CHECKING:
 _SIZES = ("small", "medium", "large")
 
 
-@click.command(
-    epilog="""\b
-Example:
-  slatprep train demo.zarr --out runs/small --size small --epochs 8 --learning-rate 0.003
-  slatprep train demo.zarr --out runs/sizes --all-sizes
-"""
-)
+@command()
 @click.argument("store", type=EXISTING_FOLDER)
-@option("--out", "Folder of the run; a stopped one goes on.", NEW_FOLDER, required=True)
-@option("--size", "0.20, 1.19 or 6.32 million weights.", click.Choice(_SIZES), "large")
-@option("--all-sizes", "Train all three, each in its own directory.", is_flag=True)
-@option("--epochs", "Passes over the training objects.", POSITIVE, 100)
-@option("--batch-size", "Assets in a batch.", POSITIVE, 1)
-@option("--accumulate", "Batches in a step of the optimiser.", POSITIVE, 1)
-@option(
-    "--learning-rate", "Of AdamW, before the cosine.", click.FloatRange(min=0, min_open=True), 1e-4
-)
-@option("--precision", "bf16: mixed precision.", click.Choice(["fp32", "bf16"]), "bf16")
-@option("--patience", "Stop after so many epochs without progress.", POSITIVE, 10)
-@option(
-    "--augment",
-    "Quarter turns and flips: of 8 or 48 kinds.",
-    ChoiceOf("slatprep.learn.augment:Augmentation"),
-    "none",
-)
+@option("--out", NEW_FOLDER, required=True)
+@option("--size", click.Choice(_SIZES), "large")
+@option("--all-sizes", is_flag=True)
+@option("--epochs", POSITIVE, 100)
+@option("--batch-size", POSITIVE, 1)
+@option("--accumulate", POSITIVE, 1)
+@option("--learning-rate", click.FloatRange(min=0, min_open=True), 0.0001)
+@option("--precision", click.Choice(["fp32", "bf16"]), "bf16")
+@option("--patience", POSITIVE, 10)
+@option("--augment", ChoiceOf("slatprep.learn.augment:Augmentation"), "none", name="augmentation")
 @verdicts_option
-@option("--max-ambiguity", "Leave out assets that are more ambiguous.", float)
+@option("--max-ambiguity", float)
 @shares_option
-@option("--seed", "Of weights, order and augmentation.", int, 0)
-@option("--device", "Where to compute.", click.Choice(["cpu", "cuda"]), "cpu")
-@option("--workers", "Processes that read ahead.", click.IntRange(min=0), 0)
-@option(
-    "--threads",
-    "Threads to compute with.",
-    POSITIVE,
-    lambda: os.cpu_count() or 1,
-    show_default="all cores",
-)
-@output_options
+@option("--seed", int, 0)
+@option("--device", click.Choice(["cpu", "cuda"]), "cpu")
+@option("--workers", click.IntRange(min=0), 0)
+@option("--threads", POSITIVE, lambda: os.cpu_count() or 1, show_default="all cores")
 def train(
     output: Output,
     store: Place,
@@ -74,7 +55,6 @@ def train(
     size: str,
     all_sizes: bool,
     shares: str,
-    augment: Any,
     verdicts: tuple[str, ...],
     device: str,
     workers: int,
@@ -86,6 +66,29 @@ def train(
     Writes run.json, log.csv, curve.png, checkpoints and the predictions of
     the test objects, which `slatprep evaluate` measures. Needs PyTorch: pip
     install slatprep[train].
+
+    Options
+    -------
+    --out: Folder of the run; a stopped one goes on.
+    --size: 0.20, 1.19 or 6.32 million weights.
+    --all-sizes: Train all three, each in its own directory.
+    --epochs: Passes over the training objects.
+    --batch-size: Assets in a batch.
+    --accumulate: Batches in a step of the optimiser.
+    --learning-rate: Of AdamW, before the cosine.
+    --precision: bf16: mixed precision.
+    --patience: Stop after so many epochs without progress.
+    --augment: Quarter turns and flips: of 8 or 48 kinds.
+    --max-ambiguity: Leave out assets that are more ambiguous.
+    --seed: Of weights, order and augmentation.
+    --device: Where to compute.
+    --workers: Processes that read ahead.
+    --threads: Threads to compute with.
+
+    Example
+    -------
+    slatprep train demo.zarr --out runs/small --size small --epochs 8 --learning-rate 0.003
+    slatprep train demo.zarr --out runs/sizes --all-sizes
     """
     from slatprep.learn import require_torch
 
@@ -98,7 +101,6 @@ def train(
     torch.set_num_threads(threads)
     chosen = TrainParameters(
         size=size,
-        augmentation=augment,
         shares=shares_of(shares),
         verdicts=verdicts or TrainParameters.verdicts,
         **parameters,
@@ -124,14 +126,13 @@ def train(
 
 
 def _show_training(output: Output, summaries: dict[str, TrainSummary]) -> None:
-    rows: list[tuple[str, int | None, float, float | None]] = []
-    for name, summary in summaries.items():
-        best = summary.history[summary.best_epoch]
-        rows.append((f"decoder, {name}", best.epoch, best.val_mse, best.val_accuracy))
+    best = {name: summary.history[summary.best_epoch] for name, summary in summaries.items()}
     references = next(iter(summaries.values())).references
-    rows.extend((name, None, error, None) for name, error in references.items())
     output.table(
         "Validation (mean squared error in normalised space, mean over assets)",
         ("model", "epoch", "mse", "accuracy"),
-        rows,
+        [
+            *((f"decoder, {n}", e.epoch, e.val_mse, e.val_accuracy) for n, e in best.items()),
+            *((name, None, error, None) for name, error in references.items()),
+        ],
     )

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from slatprep.cli.options import FILE, NEW_FILE, ChoiceOf, option, store_option
-from slatprep.cli.output import Output, output_options
+from slatprep.cli.options import FILE, NEW_FILE, ChoiceOf, command, option, store_option
+from slatprep.cli.output import Output
 from slatprep.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -16,89 +16,59 @@ if TYPE_CHECKING:
     from slatprep.records import Place
 
 
-@click.command(
-    epilog="""\b
-Example:
-  slatprep transfer gaussians.ply --store demo.zarr --asset 0a1b2c --out materials.ply
-  slatprep transfer solid.npy --store demo.zarr --asset 0a1b2c --points grid --out solid.ply
-  slatprep transfer gaussians.ply --prediction 0a1b2c.npz --store demo.zarr --out predicted.ply
-"""
-)
+@command()
 @click.argument("particles", type=FILE)
 @store_option
-@option("--asset", "The asset of the store.", metavar="ID")
-@option(
-    "--prediction",
-    "Predicted materials instead of an asset: coords, material, and properties "
-    "(normalised as --store or --ranges says) or properties_si.",
-    FILE,
-    metavar="FILE.npz",
-)
-@option("--ranges", "Ranges of a prediction's properties.", metavar="pixie|FILE")
-@option(
-    "--out",
-    "Where to write the particles with their materials.",
-    NEW_FILE,
-    required=True,
-    metavar="FILE.ply",
-)
-@option(
-    "--points",
-    "Take an asset's materials from its SLAT voxels, a surface, or from its PixieVerse "
-    "field, a solid.",
-    ChoiceOf("slatprep.particles.fields:Points"),
-    "slat",
-)
-@option(
-    "--axes",
-    "Frame of the particles: turned as TRELLIS saves Gaussians, or the SLAT's.  "
-    "[default: trellis for a PLY of Gaussians, else slat]",
-    ChoiceOf("slatprep.particles.read:Axes"),
-)
-@option(
-    "--frame",
-    "Write positions as the particles' file has them, or in the SLAT frame.",
-    click.Choice(["file", "slat"]),
-    "file",
-)
-@option(
-    "--max-distance",
-    "A particle without a voxel this near is far.",
-    click.FloatRange(min=0, min_open=True),
-    2.0,
-    metavar="VOXELS",
-)
-@option(
-    "--far",
-    "Give far particles class 7 and properties 0, leave them out, or give them the "
-    "nearest material.",
-    ChoiceOf("slatprep.particles.transfer:Far"),
-    "background",
-)
-@output_options
+@option("--asset", metavar="ID")
+@option("--prediction", FILE, metavar="FILE.npz")
+@option("--ranges", metavar="pixie|FILE")
+@option("--out", NEW_FILE, required=True, metavar="FILE.ply")
+@option("--points", ChoiceOf("slatprep.particles.fields:Points"), "slat")
+@option("--axes", ChoiceOf("slatprep.particles.read:Axes"))
+@option("--frame", click.Choice(["file", "slat"]), "file")
+@option("--max-distance", click.FloatRange(min=0, min_open=True), 2.0, metavar="VOXELS")
+@option("--far", ChoiceOf("slatprep.particles.transfer:Far"), "background")
 def transfer(
     output: Output,
     particles: Path,
-    store: Place | None,
-    asset: str | None,
-    prediction: Path | None,
-    ranges: str | None,
     out: Path,
-    points: Any,
     axes: Any,
     frame: str,
     max_distance: float,
     far: Any,
+    **source: Any,
 ) -> None:
     """Give each particle of PARTICLES the material of the nearest voxel.
 
     PARTICLES is a PLY of Gaussians as TRELLIS saves it, any other PLY with
     x, y and z, or an npy or npz of positions. What is written is a PLY with
     the fields of Pixie's material fields, in SI units, for PhysGaussian.
+
+    Options
+    -------
+    --asset: The asset of the store.
+    --prediction: Predicted materials instead of an asset: coords, material, and properties
+        (normalised as --store or --ranges says) or properties_si.
+    --ranges: Ranges of a prediction's properties.
+    --out: Where to write the particles with their materials.
+    --points: Take an asset's materials from its SLAT voxels, a surface, or from its PixieVerse
+        field, a solid.
+    --axes: Frame of the particles: turned as TRELLIS saves Gaussians, or the SLAT's. [default:
+        trellis for a PLY of Gaussians, else slat]
+    --frame: Write positions as the particles' file has them, or in the SLAT frame.
+    --max-distance: A particle without a voxel this near is far.
+    --far: Give far particles class 7 and properties 0, leave them out, or give them the nearest
+        material.
+
+    Example
+    -------
+    slatprep transfer gaussians.ply --store demo.zarr --asset 0a1b2c --out materials.ply
+    slatprep transfer solid.npy --store demo.zarr --asset 0a1b2c --points grid --out solid.ply
+    slatprep transfer gaussians.ply --prediction 0a1b2c.npz --store demo.zarr --out predicted.ply
     """
     from slatprep.particles import transfer as work
 
-    field = _field(store, asset, prediction, ranges, points)
+    field = _field(**source)
     read = work.read_particles(particles, axes)
     result = work.transfer(read.in_slat(), field, max_distance=max_distance, far=far)
     work.write_transferred(out, read, result, max_distance=max_distance, in_slat=frame == "slat")
@@ -113,11 +83,7 @@ def transfer(
         "written": len(result.rows),
         "far": result.far,
     }
-
-    def show() -> None:
-        output.table(f"Transferred to {out}", tuple(counts), [tuple(counts.values())])
-
-    output.result({"path": out, **counts}, show)
+    output.result({"path": out, **counts}, lambda: output.record(f"Transferred to {out}", counts))
 
 
 def _field(

@@ -7,39 +7,19 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from slatprep.cli.options import (
-    EXISTING_FOLDER,
-    option,
-    store_argument,
-    workers_options,
-)
-from slatprep.cli.output import Output, output_options
+from slatprep.cli.options import EXISTING_FOLDER, command, option, store_argument, workers_options
+from slatprep.cli.output import Output
 
 if TYPE_CHECKING:
     from slatprep.records import Place
 
 
-@click.command(
-    epilog="""\b
-Example:
-  slatprep verify data/demo.zarr --jobs 2
-  slatprep verify data/demo.zarr --sources --json
-"""
-)
+@command()
 @store_argument
-@option("--manifests", "Folder of the records.  [default: beside the store]", EXISTING_FOLDER)
-@option("--sources", "Compare the source files with the records, too.", is_flag=True)
-@option(
-    "--pixieverse",
-    "Root of the PixieVerse files now.  [default: as at the build]",
-    EXISTING_FOLDER,
-)
-@option(
-    "--slat",
-    "Folder of the latents, or of their one HDF5 file, now.  [default: as at the build]",
-    EXISTING_FOLDER,
-)
-@output_options
+@option("--manifests", EXISTING_FOLDER)
+@option("--sources", is_flag=True)
+@option("--pixieverse", EXISTING_FOLDER)
+@option("--slat", EXISTING_FOLDER)
 @workers_options
 def verify(
     output: Output,
@@ -55,6 +35,18 @@ def verify(
     against its checksum, values against their ranges, annotations against what
     the stored grid and transform give, records against their schema and the
     rows. Every fault is named. Exit code 0: nothing is wrong; 1: something is.
+
+    Options
+    -------
+    --manifests: Folder of the records. [default: beside the store]
+    --sources: Compare the source files with the records, too.
+    --pixieverse: Root of the PixieVerse files now. [default: as at the build]
+    --slat: Folder of the latents, or of their one HDF5 file, now. [default: as at the build]
+
+    Example
+    -------
+    slatprep verify data/demo.zarr --jobs 2
+    slatprep verify data/demo.zarr --sources --json
     """
     if (pixieverse is None) != (slat is None):
         raise click.UsageError("--pixieverse and --slat go together: name both, or neither")
