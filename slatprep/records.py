@@ -182,9 +182,6 @@ class Place(Protocol):
     def __truediv__(self, key: str, /) -> Self:
         """Return the place of this name below it."""
 
-    def with_name(self, name: str, /) -> Self:
-        """Return the place of this name beside it."""
-
     def absolute(self) -> Self:
         """Return it independent of the working folder."""
 

@@ -31,7 +31,6 @@ from slatprep.records import Place
 from slatprep.storage.atomic import replace_directory
 from slatprep.storage.faults import reached
 from slatprep.storage.place import place_of, storage_of
-from slatprep.storage.remote import RemotePlace
 from slatprep.storage.upload import PublishedState, Upload, published_state, upload_store
 from slatprep.store.reader import is_store
 from slatprep.store.records import RecordWriter
@@ -64,22 +63,22 @@ class Destination:
         self._manifests = None if manifests is None else storage_of(place_of(manifests)).local
         if manifests is not None and self._manifests is None:
             raise StoreError(f"{manifests}: expected a local folder for the records")
-        path = storage_of(self.out).local
+        path, self._remote = storage_of(self.out).local, storage_of(self.out).remote
         self.store: Place = self.out if path is None else _replaceable(path)
         self._before: PublishedState | None = None
         self._upload: Upload | None = None
 
     def look(self) -> None:
         """See, on an object store, what is published; raise `StoreError` if none may be there."""
-        if isinstance(self.store, RemotePlace):
-            self._before = published_state(self.store)
+        if self._remote is not None:
+            self._before = published_state(self._remote)
 
     def replace(self, new: Path) -> None:
         """Put a finished store in place; on an object store it is not published yet."""
-        if isinstance(self.store, Path):
-            replace_directory(new, self.store)
-        elif self._before is not None:
+        if self._before is not None:
             self._upload = upload_store(new, self._before)
+        elif (path := storage_of(self.store).local) is not None:
+            replace_directory(new, path)
         reached("store replaced", str(self.store))
 
     def publish(self) -> None:
@@ -91,7 +90,7 @@ class Destination:
         """Return the file of asset records, of the new store or of a version that is there."""
         if self._upload is not None:
             version = self._upload.version
-        beside = self.out if isinstance(self.store, Path) or version is None else version
+        beside = self.out if self._remote is None or version is None else version
         return (self._manifests or manifests_of(beside)) / "assets.jsonl"
 
 

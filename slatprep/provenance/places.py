@@ -13,7 +13,7 @@ def manifests_of(store: Place) -> Place:
     """
     if is_version(store):
         return store.parent.parent / MANIFESTS / store.name
-    return store.with_name(f"{store.name.removesuffix('.zarr')}.manifests")
+    return store.parent / f"{store.name.removesuffix('.zarr')}.manifests"
 
 
 def manifests_beside(store: Place) -> Place | None:

@@ -14,7 +14,8 @@ import math
 import tokenize
 import zipfile
 import zlib
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
 
@@ -41,30 +42,35 @@ _KIND_NAMES = {
     "U": "text",
 }
 
-# What numpy's header parser lets through for text that is no header.
-_HEADER_ERRORS = (
-    ValueError,
-    TypeError,
-    KeyError,
-    IndexError,
-    AttributeError,
-    OverflowError,
-    SyntaxError,
-    tokenize.TokenError,
-    RecursionError,
-    MemoryError,
-)
+_COMPLETE = "a complete file; copy or make it again"
+_INTACT_NPZ = "an intact npz archive, as numpy.savez writes it; copy or make it again"
 
-# What zipfile raises for archives that are damaged, encrypted or of another make.
-_ZIP_ERRORS = (
+# What numpy, zipfile, zlib and h5py raise for bytes that are damaged or of another make.
+_DAMAGE = (
+    ArithmeticError,
+    AttributeError,
+    EOFError,
+    LookupError,
+    MemoryError,
+    OSError,
+    RuntimeError,
+    SyntaxError,
+    TypeError,
+    ValueError,
+    tokenize.TokenError,
     zipfile.BadZipFile,
     zlib.error,
-    EOFError,
-    OSError,
-    ValueError,
-    RuntimeError,
-    OverflowError,
 )
+
+
+@contextmanager
+def refusing(where: str | Place, fault: str, expected: str) -> Iterator[None]:
+    """Turn what libraries raise for damaged bytes into an `InputError` that gives their reason."""
+    try:
+        yield
+    except _DAMAGE as error:
+        reason = str(error).splitlines()[0][:160] if str(error) else type(error).__name__
+        raise InputError(where, f"{fault} ({reason})", expected) from None
 
 
 @dataclass(frozen=True)
@@ -169,7 +175,7 @@ def load_source(path: Place, root: Place, role: str) -> tuple[bytes, SourceFile]
             "the files of one asset, which are smaller",
         )
     if not data:
-        raise InputError(path, "has zero bytes", "a complete file; copy or make it again")
+        raise InputError(path, "has zero bytes", _COMPLETE)
     return data, SourceFile(role, name, len(data), hashlib.sha256(data).hexdigest())
 
 
@@ -195,7 +201,10 @@ def npy_array(data: bytes, where: str | Place, spec: ArraySpec) -> NDArray[Any]:
     InputError
         If the bytes are no such array.
     """
-    return _array(data, len(data), where, spec)
+    shape, fortran, dtype, offset = _header(data, len(data), where, spec)
+    values = np.frombuffer(data, dtype, math.prod(shape), offset)
+    array = values.reshape(shape, order="F" if fortran else "C")
+    return array.astype(dtype.newbyteorder("="), copy=False)
 
 
 def npz_arrays(
@@ -266,14 +275,11 @@ def npz_small_arrays(
 
 
 def _open_zip(data: bytes, where: str | Place) -> zipfile.ZipFile:
-    expected = "an intact npz archive, as numpy.savez writes it; copy or make it again"
     # zipfile makes an object for every directory entry before one can ask how many there are.
     if data.count(b"PK\x01\x02") > MAX_MEMBERS:
-        raise InputError(where, f"has more than {MAX_MEMBERS} members", expected)
-    try:
+        raise InputError(where, f"has more than {MAX_MEMBERS} members", _INTACT_NPZ)
+    with refusing(where, "is no readable npz archive", _INTACT_NPZ):
         return zipfile.ZipFile(io.BytesIO(data))
-    except _ZIP_ERRORS as error:
-        raise InputError(where, f"is no readable npz archive ({error})", expected) from None
 
 
 def _read_member(
@@ -291,31 +297,12 @@ def _read_member(
             f"uses zip compression {info.compress_type}",
             "stored or deflated members, as numpy.savez and numpy.savez_compressed write",
         )
-    try:
-        with archive.open(info) as stream:
-            prefix = stream.read(_MAX_HEADER_BYTES)
-            _header(prefix, info.file_size, member, spec)
-            # Now that the size is known to be what spec allows, the rest may be inflated.
-            data = prefix + stream.read(max(0, info.file_size - len(prefix)))
-        return _array(data, info.file_size, member, spec)
-    except _ZIP_ERRORS as error:
-        raise InputError(
-            member, f"is damaged ({error})", "an intact npz archive; copy or make it again"
-        ) from None
-
-
-def _array(data: bytes, size: int, where: str | Place, spec: ArraySpec) -> NDArray[Any]:
-    """Return the array whose npy header and values `data` holds."""
-    shape, fortran, dtype, offset = _header(data, size, where, spec)
-    wanted = math.prod(shape)
-    if len(data) - offset != wanted * dtype.itemsize:
-        raise InputError(
-            where,
-            f"is truncated: {len(data) - offset} of {wanted * dtype.itemsize} bytes of data",
-            "a complete file; copy or make it again",
-        )
-    array = np.frombuffer(data, dtype, wanted, offset).reshape(shape, order="F" if fortran else "C")
-    return array.astype(dtype.newbyteorder("="), copy=False)
+    with refusing(member, "is damaged", _INTACT_NPZ), archive.open(info) as stream:
+        prefix = stream.read(_MAX_HEADER_BYTES)
+        _header(prefix, info.file_size, member, spec)
+        # Now that the size is known to be what spec allows, the rest may be inflated.
+        data = prefix + stream.read(max(0, info.file_size - len(prefix)))
+    return npy_array(data, member, spec)
 
 
 def _header(
@@ -327,7 +314,7 @@ def _header(
     """
     # No more than a bounded prefix is parsed: the header's length field may claim 4 GB.
     start = io.BytesIO(prefix[:_MAX_HEADER_BYTES])
-    try:
+    with refusing(where, "is no readable npy array", "an array as numpy.save writes it"):
         version = np.lib.format.read_magic(start)
         if version == (1, 0):
             shape, fortran, dtype = np.lib.format.read_array_header_1_0(start)
@@ -335,11 +322,6 @@ def _header(
             shape, fortran, dtype = np.lib.format.read_array_header_2_0(start)
         else:  # 3.0 is for field names, which no plain array has
             raise ValueError(f"format version {version}")
-    except _HEADER_ERRORS as error:
-        reason = str(error).splitlines()[0][:120] if str(error) else type(error).__name__
-        raise InputError(
-            where, f"is no readable npy array ({reason})", "an array as numpy.save writes it"
-        ) from None
     spec.check(where, shape, dtype)
     wanted = math.prod(shape) * dtype.itemsize
     held = size - start.tell()
@@ -347,6 +329,6 @@ def _header(
         raise InputError(
             where,
             f"is truncated or damaged: its header announces {wanted} bytes of data, it has {held}",
-            "a complete file; copy or make it again",
+            _COMPLETE,
         )
     return shape, fortran, dtype, start.tell()

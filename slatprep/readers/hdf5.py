@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slatprep.errors import InputError
-from slatprep.readers.files import ArraySpec, load_source
+from slatprep.readers.files import ArraySpec, load_source, refusing
 from slatprep.readers.patterns import component_regex
 from slatprep.records import Place, SourceFile
 from slatprep.storage.files import file_digest
@@ -32,22 +32,10 @@ SUFFIXES = (".h5", ".hdf5")
 
 _DEFLATE, _SHUFFLE, _FLETCHER32 = 1, 2, 3
 _FILTER_NAMES = {_DEFLATE: "gzip", _SHUFFLE: "shuffle", _FLETCHER32: "fletcher32"}
+_UNREADABLE = "is no readable HDF5 file"
 _WRITTEN = "a completely written dataset; make it again"
 _MAX_CHUNKS = 65_536
 _MAX_CHUNK_BYTES = 2**26
-
-# What h5py and zlib raise for files that are damaged.
-HDF5_ERRORS = (
-    zlib.error,
-    OSError,
-    RuntimeError,
-    KeyError,
-    ValueError,
-    TypeError,
-    AttributeError,
-    OverflowError,
-    MemoryError,
-)
 
 
 def load_datasets(
@@ -71,7 +59,9 @@ def load_datasets(
     """
     import h5py
 
-    try:
+    where = f"{path} [{group}]" if group else path
+    expected = f"an intact HDF5 file with datasets {', '.join(specs)}; copy or make it again"
+    with refusing(where, _UNREADABLE, expected):
         if group:
             source = _hash_shared(path, root)
             file = h5py.File(storage_of(path).on_disk(), "r", locking=False)
@@ -87,12 +77,6 @@ def load_datasets(
                 where = f"{path} [{'/'.join(filter(None, (group, name)))}]"
                 dataset = _child(holder, name, where, h5py.Dataset, "dataset")
                 arrays[name] = _read_dataset(dataset, where, spec)
-    except HDF5_ERRORS as error:
-        raise InputError(
-            f"{path} [{group}]" if group else path,
-            f"is no readable HDF5 file ({_reason(error)})",
-            f"an intact HDF5 file with datasets {', '.join(specs)}; copy or make it again",
-        ) from None
     return arrays, source
 
 
@@ -123,13 +107,11 @@ def find_groups(
     import h5py
 
     file, _ = storage_of(root).locate(path)
-    try:
-        with h5py.File(storage_of(file).on_disk(), "r", locking=False) as groups:
-            yield from _walk_groups(groups, pattern.strip("/").split("/"), dict(known), "")
-    except HDF5_ERRORS as error:
-        raise InputError(
-            path, f"is no readable HDF5 file ({_reason(error)})", "groups named by asset"
-        ) from None
+    with (
+        refusing(path, _UNREADABLE, "groups named by asset"),
+        h5py.File(storage_of(file).on_disk(), "r", locking=False) as groups,
+    ):
+        yield from _walk_groups(groups, pattern.strip("/").split("/"), dict(known), "")
 
 
 def _walk_groups(
@@ -262,10 +244,6 @@ def _undo(filters: list[int], data: bytes, chunk_bytes: int, itemsize: int) -> b
         else:
             return b""
     return data
-
-
-def _reason(error: BaseException) -> str:
-    return str(error).splitlines()[0][:160] if str(error) else type(error).__name__
 
 
 def _hash_shared(path: Place, root: Place) -> SourceFile:

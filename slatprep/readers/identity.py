@@ -39,11 +39,8 @@ def hash_sources(pair: AssetPair) -> tuple[tuple[SourceFile, ...], dict[str, str
         with suppress(InputError):  # The supervision does without, and so does the reader.
             sources.append(load_source(pair.bounds, pair.roots.pixieverse, "bounds")[1])
     latents = read_latents(pair) if pair.slat_group else None
-    if latents is not None:
-        sources += latents.sources
-    else:
-        sources.append(load_source(slat, pair.roots.slat, "slat")[1])
-    return tuple(sources), source_digests(sources, latents if pair.slat_group else None)
+    sources += latents.sources if latents else [load_source(slat, pair.roots.slat, "slat")[1]]
+    return tuple(sources), source_digests(sources, latents)
 
 
 def source_digests(

@@ -20,9 +20,8 @@ from slatprep.storage.listing import Listing
 
 @dataclass(frozen=True, slots=True)
 class _Grid:
-    """A grid file of an object, found by the pattern of that rank."""
+    """A grid file of an object."""
 
-    rank: int
     sample: str
     path: str
 
@@ -103,15 +102,15 @@ def discover(parameters: BuildParameters) -> list[AssetPair]:
 
 def _find_grids(source: PixieverseSource, listing: Listing) -> dict[str, list[_Grid]]:
     """Return the grids of each object, all found by the first pattern that matches any."""
-    chosen = {"sample": source.sample} if source.sample else {}
+    chosen = _settled(sample=source.sample)
     grids: dict[str, list[_Grid]] = {}
-    for rank, pattern in enumerate(source.grid):
+    for pattern in source.grid:
         if "{id}" not in pattern:
             raise ConfigError(f"grid pattern {pattern!r} names no {{id}}")
+        found: dict[str, list[_Grid]] = {}
         for fields, path in find_files(listing, pattern, chosen):
-            found = grids.setdefault(fields["id"], [])
-            if not found or found[0].rank == rank:
-                found.append(_Grid(rank, fields.get("sample", ""), path))
+            found.setdefault(fields["id"], []).append(_Grid(fields.get("sample", ""), path))
+        grids = found | grids
     if not grids:
         raise ConfigError(f"{source.root}: no grid found; looked for {_tried(source.grid, chosen)}")
     return grids
@@ -170,9 +169,7 @@ def _rows(
         for label, slat in _slats_of(object_id, slats, claims, claimed):
             labelled.setdefault(label, []).append(slat)
         if len(labelled) <= 1:
-            found = [slat for group in labelled.values() for slat in group]
-            yield _Row(_safe(object_id), object_id, "", _ordered(found))
-            continue
+            labelled = {"": [slat for group in labelled.values() for slat in group]}
         for label, group in labelled.items():
             asset_id = f"{object_id}.{label}" if label else object_id
             yield _Row(_safe(asset_id), object_id, label, _ordered(group))
@@ -232,22 +229,12 @@ def _pair(row: _Row, there: _Found, shared: str) -> AssetPair:
         if len(grids) > 1:
             problems.append(_several_grids(row.object_id, grids))
         if NAME.fullmatch(row.object_id):
-            known = {"id": row.object_id}
-            sample = grids[0].sample or source.sample
-            if sample:
-                known["sample"] = sample
-            mask, problem = _find_one(there, source.mask, known, "mask")
-            problems.append(problem)
-            bounds, problem = _find_one(there, source.bounds, known, "bounds")
-            problems.append(problem)
+            known = _settled(id=row.object_id, sample=grids[0].sample or source.sample)
+            mask = _find_one(there, source.mask, known, "mask", problems)
+            bounds = _find_one(there, source.bounds, known, "bounds", problems)
     else:
-        chosen = {"id": row.object_id}
-        if source.sample:
-            chosen["sample"] = source.sample
-        problems.append(
-            f"no grid for id {row.object_id!r}; looked for {_tried(source.grid, chosen)} "
-            f"below {source.root}"
-        )
+        tried = _tried(source.grid, _settled(id=row.object_id, sample=source.sample))
+        problems.append(f"no grid for id {row.object_id!r}; looked for {tried} below {source.root}")
     found = [slat for slat in row.slats if slat.path]
     if not found:
         problems.append(_no_slat(row, slat_source, there.one_file))
@@ -298,17 +285,26 @@ def _no_slat(row: _Row, source: SlatSource, one_file: bool) -> str:
 
 
 def _find_one(
-    there: _Found, patterns: Iterable[str], known: Mapping[str, str], role: str
-) -> tuple[Place | None, str]:
-    """Return the file that the first matching pattern finds, and what is wrong if it finds more."""
+    there: _Found,
+    patterns: Iterable[str],
+    known: Mapping[str, str],
+    role: str,
+    problems: list[str],
+) -> Place | None:
+    """Return the file that the first matching pattern finds; if it finds more, add a problem."""
     for pattern in patterns:
         paths = sorted(path for _, path in find_files(there.listing, pattern, known))
+        if len(paths) > 1:
+            found = ", ".join(paths)
+            problems.append(f"{len(paths)} {role} files for one id ({found}); expected one")
         if paths:
-            problem = ""
-            if len(paths) > 1:
-                problem = f"{len(paths)} {role} files for one id ({', '.join(paths)}); expected one"
-            return there.parameters.pixieverse.root / paths[0], problem
-    return None, ""
+            return there.parameters.pixieverse.root / paths[0]
+    return None
+
+
+def _settled(**fields: str) -> dict[str, str]:
+    """Return the fields of a pattern that have a value."""
+    return {name: value for name, value in fields.items() if value}
 
 
 def _tried(patterns: Iterable[str], known: Mapping[str, str]) -> str:

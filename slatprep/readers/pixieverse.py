@@ -93,7 +93,7 @@ def read_field(pair: AssetPair) -> MaterialField:
     occupancy = material != BACKGROUND if mask is None else mask
     if not occupancy.any():
         raise InputError(path, "no voxel is occupied: all are background", "an occupied voxel")
-    annotated = _annotated(occupancy, material, mask is not None, path, warnings)
+    annotated = _annotated(occupancy, material, path, warnings)
 
     _require_finite(channels, occupancy, path)
     voxels = np.argwhere(annotated)
@@ -166,9 +166,8 @@ def _classes_of_scores(
     # first would label the voxel jelly for no reason.
     tied = (inside == top).sum(axis=0) > 1
     best[tied] = np.where(inside[BACKGROUND, tied] == top[tied], BACKGROUND, UNLABELLED)
-    count = int(np.count_nonzero(tied & (best == UNLABELLED)))
-    if count:
-        warnings.append(f"{count} voxels have no single highest class score; not annotated")
+    no_single = tied & (best == UNLABELLED)
+    _note(warnings, no_single, "voxels have no single highest class score; not annotated")
     material = np.full(_CUBE, BACKGROUND, dtype=np.int8)
     material[where] = best
     return material
@@ -177,7 +176,6 @@ def _classes_of_scores(
 def _annotated(
     occupancy: NDArray[np.bool_],
     material: NDArray[np.int8],
-    masked: bool,
     path: Place,
     warnings: list[str],
 ) -> NDArray[np.bool_]:
@@ -190,18 +188,17 @@ def _annotated(
             f"none of the {np.count_nonzero(occupancy)} occupied voxels is annotated",
             "an occupied voxel of class 0 to 6",
         )
-    if unlabelled.any():
-        warnings.append(
-            f"{np.count_nonzero(unlabelled)} occupied voxels have no class (-1); not annotated"
-        )
-    if masked:
-        empty = int(np.count_nonzero(occupancy & background))
-        outside = int(np.count_nonzero(~occupancy & ~background))
-        if empty:
-            warnings.append(f"{empty} voxels of the mask are background; not annotated")
-        if outside:
-            warnings.append(f"{outside} voxels with a class lie outside the mask; left out")
+    _note(warnings, unlabelled, "occupied voxels have no class (-1); not annotated")
+    # Without a mask what is background is not occupied, and of these there are none.
+    empty, outside = occupancy & background, ~occupancy & ~background
+    _note(warnings, empty, "voxels of the mask are background; not annotated")
+    _note(warnings, outside, "voxels with a class lie outside the mask; left out")
     return annotated
+
+
+def _note(warnings: list[str], voxels: NDArray[np.bool_], what: str) -> None:
+    if voxels.any():
+        warnings.append(f"{np.count_nonzero(voxels)} {what}")
 
 
 def _gather(channels: NDArray[Any], where: NDArray[np.bool_]) -> NDArray[np.float32]:

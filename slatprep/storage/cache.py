@@ -11,7 +11,7 @@ import os
 import tempfile
 from pathlib import Path
 
-from slatprep.storage.remote import RemotePlace, filesystem_of, multipart_options, os_errors
+from slatprep.storage.remote import RemotePlace, connected, multipart_options
 
 VARIABLE = "SLATPREP_CACHE"
 """Environment variable that says where the folder is."""
@@ -41,8 +41,7 @@ def cached_file(place: RemotePlace) -> Path:
     OSError
         If the object cannot be read or the disk does not take it.
     """
-    system, name = filesystem_of(place)
-    with os_errors(place):
+    with connected(place) as (system, name):
         entry = system.info(name)
     state = [str(entry.get(key)) for key in ("size", "ETag", "etag", "LastModified", "mtime")]
     folder = folder_for(place)
@@ -52,7 +51,7 @@ def cached_file(place: RemotePlace) -> Path:
     folder.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(dir=folder) as own:
         part = Path(own, "part")
-        with os_errors(place):
+        with connected(place) as (system, name):
             system.get_file(name, str(part), **multipart_options(system))
         part.replace(copy)
     for older in folder.iterdir():

@@ -7,13 +7,7 @@ from pathlib import Path
 
 from slatprep.errors import StoreError
 from slatprep.storage.cache import folder_for
-from slatprep.storage.remote import (
-    RemotePlace,
-    filesystem_of,
-    list_objects,
-    multipart_options,
-    os_errors,
-)
+from slatprep.storage.remote import RemotePlace, connected, list_objects, multipart_options
 from slatprep.storage.versions import is_version
 
 
@@ -45,8 +39,7 @@ def copied_version(place: RemotePlace) -> Path:
         folder.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(dir=folder) as own:
             part = Path(own, "part")
-            system, root = filesystem_of(place)
-            with os_errors(place):
+            with connected(place) as (system, root):
                 system.get(
                     [f"{root}/{name}" for name in objects],
                     [str(part / name) for name in objects],

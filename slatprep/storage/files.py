@@ -8,7 +8,7 @@ import os
 import stat
 from io import BytesIO, FileIO
 from pathlib import Path
-from typing import TYPE_CHECKING, Protocol, cast
+from typing import TYPE_CHECKING, cast
 
 if TYPE_CHECKING:
     from slatprep.records import Place
@@ -17,39 +17,8 @@ if TYPE_CHECKING:
 _AT = os.open in os.supports_dir_fd
 
 
-class RangeFile(Protocol):
-    """A file that is read by ranges, which threads may share."""
-
-    def size(self) -> int:
-        """Return its length in bytes; an `OSError` if it is no file."""
-
-    def pread(self, length: int, offset: int, /) -> bytes:
-        """Read up to `length` bytes from an offset on."""
-
-    def prefetch(self, length: int, offset: int, /) -> None:
-        """Announce a range that will be read piece by piece."""
-
-
-class Folder(Protocol):
-    """A folder whose files are read by ranges, and stay those of one store.
-
-    Attributes
-    ----------
-    path : str
-        What errors call it.
-    prefetch_bytes : int
-        The longest range worth a `RangeFile.prefetch`; 0 where none is.
-    """
-
-    path: str
-    prefetch_bytes: int
-
-    def open(self, name: str, /) -> RangeFile:
-        """Open a file below it."""
-
-
 class LocalFile(FileIO):
-    """A file of the local disk, without buffer; see `RangeFile`."""
+    """A file of the local disk, without buffer; threads may share it."""
 
     def size(self) -> int:
         """Return its length in bytes.
@@ -73,7 +42,15 @@ class LocalFile(FileIO):
 
 
 class LocalFolder:
-    """An open directory: what is read below it stays of one store, even if that is replaced."""
+    """An open directory: what is read below it stays of one store, even if that is replaced.
+
+    Attributes
+    ----------
+    path : str
+        What errors call it.
+    prefetch_bytes : int
+        The longest range worth a `prefetch` of its files; 0 where none is.
+    """
 
     prefetch_bytes = 0
 

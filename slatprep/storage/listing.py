@@ -9,11 +9,21 @@ from __future__ import annotations
 import os
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Protocol
 
 
-class Listing(Protocol):
-    """What lies below a root, by names relative to it, with forward slashes."""
+class Listing:
+    """Names below a folder of the local disk, as they are whenever one asks.
+
+    Names are relative to the folder, with forward slashes.
+
+    Parameters
+    ----------
+    root : Path
+        The folder.
+    """
+
+    def __init__(self, root: Path) -> None:
+        self._root = root
 
     def of_folder(self, folder: str) -> Iterable[str]:
         """Return the names in a folder, given with a slash at its end; none if there is none.
@@ -23,37 +33,18 @@ class Listing(Protocol):
         OSError
             If it cannot be listed.
         """
-
-    def is_file(self, path: str) -> bool:
-        """Whether there is a file of this name."""
-
-
-class LocalListing:
-    """Names below a folder of the local disk, as they are whenever one asks.
-
-    Parameters
-    ----------
-    root : Path
-        The folder.
-    """
-
-    def __init__(self, root: Path) -> None:
-        self.root = root
-
-    def of_folder(self, folder: str) -> list[str]:
-        """See `Listing`."""
         try:
-            with os.scandir(self.root / folder) as entries:
+            with os.scandir(self._root / folder) as entries:
                 return [entry.name for entry in entries]
         except (FileNotFoundError, NotADirectoryError):
             return []
 
     def is_file(self, path: str) -> bool:
-        """See `Listing`."""
-        return os.path.isfile(os.path.join(self.root, path))  # noqa: PTH113, PTH118 - half a million times
+        """Whether there is a file of this name."""
+        return os.path.isfile(os.path.join(self._root, path))  # noqa: PTH113, PTH118 - half a million times
 
 
-class RemoteListing:
+class RemoteListing(Listing):
     """Names below a place on an object store, as they were when it was listed.
 
     Parameters

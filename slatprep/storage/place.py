@@ -2,7 +2,7 @@
 
 Where a place only has a name, or is read whole, `slatprep.records.Place` is
 enough: `pathlib.Path` and `RemotePlace` both are one. What has to be done in
-two ways is a method of `Storage`, and only `storage_of` asks which it is.
+two ways is a method of `Storage`, and only this module asks which it is.
 """
 
 from __future__ import annotations
@@ -14,14 +14,14 @@ import tempfile
 from collections.abc import Iterator
 from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path, PurePosixPath
-from typing import TYPE_CHECKING, Protocol, TypeGuard
+from typing import TYPE_CHECKING, TypeGuard
 
 from slatprep.errors import InputError
 from slatprep.storage.atomic import staged
 from slatprep.storage.cache import cached_file, folder_for
 from slatprep.storage.copies import copied_version
-from slatprep.storage.files import Folder, LocalFolder, local_files
-from slatprep.storage.listing import Listing, LocalListing, RemoteListing
+from slatprep.storage.files import LocalFile, LocalFolder, local_files
+from slatprep.storage.listing import Listing, RemoteListing
 from slatprep.storage.remote import RemoteFile, RemoteFolder, RemotePlace, list_objects
 from slatprep.storage.versions import current_version
 
@@ -32,6 +32,12 @@ if TYPE_CHECKING:
 _URL = re.compile(r"([a-z][a-z0-9+.-]+):/+(.*)", re.DOTALL)
 
 _LOCAL = ("file", "local")
+
+RangeFile = LocalFile | RemoteFile
+"""A file that is read by ranges, which threads may share."""
+
+Folder = LocalFolder | RemoteFolder
+"""A folder whose files are read by ranges, and stay those of one store."""
 
 
 def place_of(text: str | Place, folder: Path | None = None) -> Place:
@@ -59,26 +65,46 @@ def place_of(text: str | Place, folder: Path | None = None) -> Place:
     return path if folder is None else (folder / path.expanduser()).resolve()
 
 
-def is_place(value: object) -> TypeGuard[Place]:
+def is_place(value: object) -> TypeGuard[Path | RemotePlace]:
     """Whether a value is a path, or a URL as `place_of` returns it."""
     return isinstance(value, Path | RemotePlace)
 
 
-class Storage(Protocol):
-    """What a disk and an object store do in different ways, for one place."""
+def storage_of(place: Place) -> Storage:
+    """Return what can be done at a place."""
+    if not is_place(place):
+        raise TypeError(f"{place!r} is no place; expected what `place_of` returns")
+    return Storage(place) if isinstance(place, Path) else _ObjectStore(place)
 
-    @property
-    def local(self) -> Path | None:
-        """The place as a path; None where it is not on the local disk."""
+
+class Storage:
+    """What is done at a place; here on the local disk, below on an object store.
+
+    Attributes
+    ----------
+    local : Path or None
+        The place as a path; None where it is not on the local disk.
+    remote : RemotePlace or None
+        The place as that of an object store; None where it is on the local disk.
+    """
+
+    local: Path | None
+    remote: RemotePlace | None = None
+
+    def __init__(self, path: Path) -> None:
+        self.local = self._path = path
 
     def files(self) -> dict[str, int]:
         """Return the names of all files below the place, and their bytes; -1 for a link."""
+        return local_files(self._path)
 
     def listing(self) -> Listing:
         """Return the names below the place as they are looked up one by one."""
+        return Listing(self._path)
 
     def folder(self) -> Folder:
         """Return the place as a folder whose files are read by ranges."""
+        return LocalFolder(self._path)
 
     def locate(self, file: Place) -> tuple[Place, str]:
         """Return a file below the place without links on its way, and its name relative to it.
@@ -88,61 +114,7 @@ class Storage(Protocol):
         InputError
             If it leads out of the place, does not exist, or is no regular file.
         """
-
-    def read(self, limit: int) -> bytes:
-        """Read a file up to one byte more than `limit`, by which one that is larger is known."""
-
-    def size(self) -> int:
-        """Return the bytes of a file."""
-
-    def on_disk(self) -> Path:
-        """Return a path of the local disk with the file's content."""
-
-    def current_version(self) -> Place:
-        """Return where the files of the store at the place lie now.
-
-        Raises
-        ------
-        StoreError
-            If it cannot be reached.
-        """
-
-    def copied_version(self) -> Path:
-        """Return a path of the local disk with the store, of which this is a version, if remote."""
-
-    def staged(self) -> AbstractContextManager[Path]:
-        """Yield a local file that becomes the place's content, whole, when all went well."""
-
-    def work_folder(self) -> Path:
-        """Return where, on the local disk, to work on what belongs to the place."""
-
-
-def storage_of(place: Place) -> Storage:
-    """Return what can be done at a place."""
-    if isinstance(place, RemotePlace):
-        return _ObjectStore(place)
-    if isinstance(place, Path):
-        return _Disk(place)
-    raise TypeError(f"{place!r} is no place; expected what `place_of` returns")
-
-
-class _Disk:
-    """See `Storage`."""
-
-    def __init__(self, path: Path) -> None:
-        self.local: Path = path
-
-    def files(self) -> dict[str, int]:
-        return local_files(self.local)
-
-    def listing(self) -> Listing:
-        return LocalListing(self.local)
-
-    def folder(self) -> Folder:
-        return LocalFolder(self.local)
-
-    def locate(self, file: Place) -> tuple[Place, str]:
-        path, root = Path(str(file)), self.local
+        path, root = Path(str(file)), self._path
         try:
             relative = path.relative_to(root)
             resolved = path.resolve(strict=True)
@@ -161,36 +133,47 @@ class _Disk:
         return resolved, relative.as_posix()
 
     def read(self, limit: int) -> bytes:
-        with self.local.open("rb") as file:
+        """Read a file up to one byte more than `limit`, by which one that is larger is known."""
+        with self._path.open("rb") as file:
             # read() would allocate all that it is allowed to return.
             return file.read(min(os.fstat(file.fileno()).st_size, limit + 1))
 
     def size(self) -> int:
-        return self.local.stat().st_size
+        """Return the bytes of a file."""
+        return self._path.stat().st_size
 
     def on_disk(self) -> Path:
-        return self.local
+        """Return a path of the local disk with the file's content."""
+        return self._path
 
     def current_version(self) -> Place:
-        return self.local
+        """Return where the files of the store at the place lie now.
+
+        Raises
+        ------
+        StoreError
+            If it cannot be reached.
+        """
+        return self._path
 
     def copied_version(self) -> Path:
-        return self.local
+        """Return a path of the local disk with the store, of which this is a version, if remote."""
+        return self._path
 
     def staged(self) -> AbstractContextManager[Path]:
-        return staged(self.local)
+        """Yield a local file that becomes the place's content, whole, when all went well."""
+        return staged(self._path)
 
     def work_folder(self) -> Path:
-        return self.local.with_name(f".{self.local.name}.work")
+        """Return where, on the local disk, to work on what belongs to the place."""
+        return self._path.with_name(f".{self._path.name}.work")
 
 
-class _ObjectStore:
+class _ObjectStore(Storage):
     """See `Storage`."""
 
-    local: None = None
-
     def __init__(self, place: RemotePlace) -> None:
-        self.place = place
+        self.local, self.remote, self.place = None, place, place
 
     def files(self) -> dict[str, int]:
         return {name: int(entry["size"]) for name, entry in list_objects(self.place).items()}

@@ -13,6 +13,7 @@ import errno
 import io
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path, PurePosixPath
 from typing import IO, Any
@@ -23,6 +24,7 @@ BUFFER_BYTES = 8 * 2**20
 """What one request of a file that is read from its beginning asks for."""
 
 
+@dataclass(frozen=True, repr=False)
 class RemotePlace:
     """The URL of an object, or of all objects below it.
 
@@ -45,17 +47,11 @@ class RemotePlace:
         By the same, if a library is missing or the protocol is unknown.
     """
 
-    def __init__(self, protocol: str, path: PurePosixPath) -> None:
-        self.protocol, self.path = protocol, path
+    protocol: str
+    path: PurePosixPath
 
     def __repr__(self) -> str:
         return f"RemotePlace({str(self)!r})"
-
-    def __eq__(self, other: object) -> bool:
-        return type(other) is RemotePlace and str(self) == str(other)
-
-    def __hash__(self) -> int:
-        return hash(str(self))
 
     def __str__(self) -> str:
         return f"{self.protocol}://{'/'.join(self.path.parts)}"
@@ -78,10 +74,6 @@ class RemotePlace:
     def __truediv__(self, key: str) -> RemotePlace:
         # Not as pathlib has it, for which a key with a slash in front leads elsewhere.
         return RemotePlace(self.protocol, PurePosixPath(f"{self.path}/{key}"))
-
-    def with_name(self, name: str) -> RemotePlace:
-        """Return the place of this name beside it."""
-        return RemotePlace(self.protocol, self.path.with_name(name))
 
     def absolute(self) -> RemotePlace:
         """Return the same."""
@@ -120,15 +112,13 @@ class RemotePlace:
 
     def upload(self, local: Path) -> None:
         """Put a file of the local disk here; it is seen whole or not at all."""
-        system, name = filesystem_of(self)
-        with os_errors(self):
+        with connected(self) as (system, name):
             system.put_file(str(local), name, **multipart_options(system))
 
     def _kind(self) -> str:
         # Not by isdir, which lists all that is below.
-        system, name = filesystem_of(self)
         try:
-            with os_errors(self):
+            with connected(self) as (system, name):
                 return str(system.info(name)["type"])
         except FileNotFoundError:
             return ""
@@ -153,9 +143,8 @@ class RemoteFile(io.RawIOBase):
         if begin <= offset and offset + length <= begin + len(data):
             return data[offset - begin : offset - begin + length]
         # Asked for anew: a connection does not survive a fork, and fsspec keeps one a process.
-        system, name = filesystem_of(self.place)
         try:
-            with os_errors(self.place):
+            with connected(self.place) as (system, name):
                 return bytes(system.cat_file(name, start=offset, end=offset + length))
         except (FileNotFoundError, PermissionError):
             raise
@@ -184,8 +173,7 @@ class RemoteFile(io.RawIOBase):
 
     @cached_property
     def _size(self) -> int:
-        system, name = filesystem_of(self.place)
-        with os_errors(self.place):
+        with connected(self.place) as (system, name):
             entry = system.info(name)
         if entry["type"] != "file":
             raise OSError(errno.EISDIR, "is no object, but a folder of them", str(self.place))
@@ -218,8 +206,7 @@ def list_objects(place: RemotePlace) -> dict[str, dict[str, Any]]:
     Objects are left out whose names no path could have: with empty parts, or
     with ``.`` or ``..`` for one. There may be none at all.
     """
-    system, name = filesystem_of(place)
-    with os_errors(place):
+    with connected(place) as (system, name):
         found = system.find(name, detail=True)
     base = name.rstrip("/") + "/"
     below = {
@@ -232,27 +219,6 @@ def list_objects(place: RemotePlace) -> dict[str, dict[str, Any]]:
 
 def _is_plain(name: str) -> bool:
     return not {"", ".", ".."} & set(name.split("/")) and "\\" not in name and "\0" not in name
-
-
-def filesystem_of(place: RemotePlace) -> tuple[Any, str]:
-    """Return the fsspec file system of a place, and what the place is called there.
-
-    Raises
-    ------
-    ConfigError
-        If a library is missing or the protocol is unknown.
-    """
-    try:
-        from fsspec.core import url_to_fs
-
-        # Without the cache of listings: what others write must be seen.
-        system, name = url_to_fs(str(place), use_listings_cache=False)
-    except (ImportError, ValueError) as error:
-        raise ConfigError(
-            f"{place}: cannot be reached ({error}); pip install 'slatprep[remote]' brings s3://, "
-            "and gcsfs gs://"
-        ) from None
-    return system, str(name)
 
 
 def multipart_options(system: Any, files_at_once: int | None = None) -> dict[str, int]:
@@ -268,16 +234,29 @@ def multipart_options(system: Any, files_at_once: int | None = None) -> dict[str
 
 
 @contextmanager
-def os_errors(place: RemotePlace) -> Iterator[None]:
-    """Turn whatever a file system raises into an `OSError` that names the place.
+def connected(place: RemotePlace) -> Iterator[tuple[Any, str]]:
+    """Yield the fsspec file system of a place, and what the place is called there.
 
     Raises
     ------
     OSError
-        Of the same kind (`FileNotFoundError`, `PermissionError`), with its words.
+        For whatever the file system raises meanwhile: of the same kind
+        (`FileNotFoundError`, `PermissionError`), with its words and the place.
+    ConfigError
+        If a library is missing or the protocol is unknown.
     """
     try:
-        yield
+        from fsspec.core import url_to_fs
+
+        # Without the cache of listings: what others write must be seen.
+        system, name = url_to_fs(str(place), use_listings_cache=False)
+    except (ImportError, ValueError) as error:
+        raise ConfigError(
+            f"{place}: cannot be reached ({error}); pip install 'slatprep[remote]' brings s3://, "
+            "and gcsfs gs://"
+        ) from None
+    try:
+        yield system, str(name)
     except OSError as error:
         number = error.errno or errno.EIO
         if isinstance(error, FileNotFoundError):

@@ -23,13 +23,7 @@ from typing import Any
 from slatprep.errors import StoreError
 from slatprep.storage.faults import reached
 from slatprep.storage.files import file_digest, local_files
-from slatprep.storage.remote import (
-    RemotePlace,
-    filesystem_of,
-    list_objects,
-    multipart_options,
-    os_errors,
-)
+from slatprep.storage.remote import RemotePlace, connected, list_objects, multipart_options
 from slatprep.storage.versions import (
     MANIFESTS,
     POINTER,
@@ -135,7 +129,9 @@ class Upload:
             raise StoreError(_refused(self.target, error)) from None
         reached("pointer replaced", str(self.target))
         try:
-            _remove(self.target, old)
+            if old:
+                with connected(self.target) as (system, root):
+                    system.rm([f"{root}/{name}" for name in old])
         except OSError as error:
             # The new store is complete all the same, and the next build will try again.
             warnings.warn(
@@ -144,18 +140,15 @@ class Upload:
             )
 
     def _replace_pointer(self) -> None:
-        place = self.target / POINTER
-        data = self.pointer.encode()
-        system, name = filesystem_of(place)
-        condition: dict[str, Any] = {}
-        if self.before.pointer is None:
-            condition["mode"] = "create"
-        elif "s3" in system.protocol:
-            condition["IfMatch"] = self.before.tag
         try:
             if read_pointer(self.target) == self.before.pointer:
-                with os_errors(place):
-                    system.pipe_file(name, data, **condition)
+                with connected(self.target / POINTER) as (system, name):
+                    condition: dict[str, Any] = {}
+                    if self.before.pointer is None:
+                        condition["mode"] = "create"
+                    elif "s3" in system.protocol:
+                        condition["IfMatch"] = self.before.tag
+                    system.pipe_file(name, self.pointer.encode(), **condition)
                     return
         except OSError:
             now = read_pointer(self.target)
@@ -226,9 +219,8 @@ def upload_store(new: Path, before: PublishedState) -> Upload:
 def _put(new: Path, version: RemotePlace, names: list[str], at_once: int) -> None:
     if not names:
         return
-    system, root = filesystem_of(version)
-    options = multipart_options(system, files_at_once=at_once)
-    with os_errors(version):
+    with connected(version) as (system, root):
+        options = multipart_options(system, files_at_once=at_once)
         system.put([str(new / name) for name in names], [f"{root}/{n}" for n in names], **options)
 
 
@@ -237,14 +229,8 @@ def _is_same(entry: Mapping[str, Any] | None, file: Path) -> bool:
     if entry is None or entry["size"] != file.stat().st_size:
         return False
     with file.open("rb") as content:
-        return bool(_etag(entry) == hashlib.file_digest(content, "md5").hexdigest())
-
-
-def _remove(target: RemotePlace, names: list[str]) -> None:
-    if names:
-        system, root = filesystem_of(target)
-        with os_errors(target):
-            system.rm([f"{root}/{name}" for name in names])
+        digest = hashlib.file_digest(content, "md5").hexdigest()
+    return str(entry.get("ETag", "")).strip('"') == digest
 
 
 def _is_ours(name: str, but: Iterable[str] = ()) -> bool:
@@ -255,16 +241,11 @@ def _is_ours(name: str, but: Iterable[str] = ()) -> bool:
 
 
 def _tag(place: RemotePlace) -> str:
-    system, name = filesystem_of(place)
     try:
-        with os_errors(place):
+        with connected(place) as (system, name):
             return str(system.info(name).get("ETag", ""))
     except FileNotFoundError:
         return ""
-
-
-def _etag(entry: Mapping[str, Any]) -> str:
-    return str(entry.get("ETag", "")).strip('"')
 
 
 def _digest(parts: Iterable[str]) -> str:

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from itertools import groupby
 from typing import Any
 
@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slatprep.errors import StoreError
-from slatprep.storage.files import Folder, RangeFile
+from slatprep.storage.place import Folder, RangeFile
 from slatprep.store.codecs import MAX_TEXT_BYTES, ChunkDecoder, crc32c_holds
 
 MISSING = 2**64 - 1
@@ -72,6 +72,7 @@ class _Shard:
     index: NDArray[np.uint64]
 
 
+@dataclass(eq=False)
 class RowReader:
     """Reads rows of one array; safe to share between threads and across a fork.
 
@@ -93,30 +94,22 @@ class RowReader:
         What a chunk that was never written holds.
     """
 
-    def __init__(
-        self,
-        folder: Folder,
-        name: str,
-        shape: tuple[int, ...],
-        shard_rows: int,
-        sharded: bool,
-        decoder: ChunkDecoder,
-        fill_value: Any,
-    ) -> None:
-        self.folder = folder
-        self.name = name
-        self.shape = shape
-        self.dtype = decoder.dtype
-        self.shard_rows = shard_rows
-        self.chunk_rows = decoder.shape[0]
-        self.sharded = sharded
-        self.decoder = decoder
-        self.fill_value = fill_value
-        self.chunks_per_shard = shard_rows // self.chunk_rows
+    folder: Folder
+    name: str
+    shape: tuple[int, ...]
+    shard_rows: int
+    sharded: bool
+    decoder: ChunkDecoder
+    fill_value: Any
+    _shards: dict[int, _Shard] = field(default_factory=dict, init=False)
+    _local: threading.local = field(default_factory=threading.local, init=False)
+
+    def __post_init__(self) -> None:
+        self.dtype = self.decoder.dtype
+        self.chunk_rows = self.decoder.shape[0]
+        self.chunks_per_shard = self.shard_rows // self.chunk_rows
         # Zarr leaves out files of fill values alone, as a column of empty strings is.
-        self.optional = name.startswith("asset/") and name != "asset/offset"
-        self._shards: dict[int, _Shard] = {}
-        self._local = threading.local()
+        self.optional = self.name.startswith("asset/") and self.name != "asset/offset"
 
     @classmethod
     def of(cls, folder: Folder, name: str, metadata: Mapping[str, Any]) -> RowReader | None:
