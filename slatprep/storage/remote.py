@@ -13,7 +13,6 @@ import errno
 import io
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path, PurePosixPath
 from typing import IO, Any
@@ -24,7 +23,6 @@ BUFFER_BYTES = 8 * 2**20
 """What one request of a file that is read from its beginning asks for."""
 
 
-@dataclass(frozen=True, repr=False)
 class RemotePlace:
     """The URL of an object, or of all objects below it.
 
@@ -47,11 +45,18 @@ class RemotePlace:
         By the same, if a library is missing or the protocol is unknown.
     """
 
-    protocol: str
-    path: PurePosixPath
+    # No dataclass: what writes JSON would take that for a table of its fields.
+    def __init__(self, protocol: str, path: PurePosixPath) -> None:
+        self.protocol, self.path = protocol, path
 
     def __repr__(self) -> str:
         return f"RemotePlace({str(self)!r})"
+
+    def __eq__(self, other: object) -> bool:
+        return type(other) is RemotePlace and str(self) == str(other)
+
+    def __hash__(self) -> int:
+        return hash(str(self))
 
     def __str__(self) -> str:
         return f"{self.protocol}://{'/'.join(self.path.parts)}"
