@@ -13,6 +13,7 @@ import tempfile
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from itertools import islice
 from pathlib import Path
 
 import numpy as np
@@ -23,13 +24,8 @@ from slatprep.align.surface import surface_of
 from slatprep.bench.truth import LevelScore, TruthScore, compare_with_truth, read_truth, summarise
 from slatprep.errors import ConfigError
 from slatprep.geometry.voxels import occupancy_of
-from slatprep.parameters import (
-    PRESETS,
-    AlignParameters,
-    BuildParameters,
-    PixieverseSource,
-    SlatSource,
-)
+from slatprep.parameters import PRESETS, AlignParameters
+from slatprep.parameters.files import load_parameters
 from slatprep.readers import discover, read_field, read_latents
 from slatprep.records import Alignment, AssetPair, Engine, MaterialField, StructuredLatents
 from slatprep.sample import sample
@@ -158,18 +154,17 @@ def bench_align(
                         annotation = sample(
                             field, latents.coords, alignment.transform, preset.sample
                         )
-                        scores[engine].append(
-                            compare_with_truth(
-                                pair.asset_id,
-                                truth,
-                                coords=latents.coords,
-                                transform=alignment.transform,
-                                material=annotation.material,
-                                valid=annotation.valid,
-                                annotated=field.voxels,
-                                annotated_material=field.material,
-                            )
+                        score = compare_with_truth(
+                            pair.asset_id,
+                            truth,
+                            coords=latents.coords,
+                            transform=alignment.transform,
+                            material=annotation.material,
+                            valid=annotation.valid,
+                            annotated=field.voxels,
+                            annotated_material=field.material,
                         )
+                        scores[engine].append(score)
                     if progress:
                         done = (number * repeats + repeat) * len(chosen) + position + 1
                         progress(done, len(pairs) * repeats * len(chosen))
@@ -198,16 +193,15 @@ def pairs_with_truth(folder: Path, limit: int | None = None) -> Iterator[tuple[A
     for root in folders:
         if not (root / "truth").is_dir():
             continue
-        parameters = BuildParameters(
-            pixieverse=PixieverseSource(root=root / "pixieverse"),
-            slat=SlatSource(root=root / "slat"),
+        parameters = load_parameters(
+            None, {side: {"root": str(root / side)} for side in ("pixieverse", "slat")}
         )
-        count = 0
-        for pair in discover(parameters):
-            truth = root / "truth" / f"{pair.asset_id}.npz"
-            if truth.exists() and not pair.problem and count != limit:
-                count += 1
-                yield pair, truth
+        found = (
+            (pair, truth)
+            for pair in discover(parameters)
+            if not pair.problem and (truth := root / "truth" / f"{pair.asset_id}.npz").exists()
+        )
+        yield from islice(found, limit)
 
 
 def _align(engine: str, field: MaterialField, latents: StructuredLatents) -> Alignment:
@@ -226,12 +220,9 @@ def _small_asset() -> tuple[MaterialField, StructuredLatents]:
     occupancy = np.zeros((64, 64, 64), dtype=bool)
     occupancy[20:40, 24:36, 28:40] = True
     voxels = np.argwhere(occupancy).astype(np.uint8)
-    field = MaterialField(
-        occupancy,
-        voxels,
-        np.zeros(len(voxels), dtype=np.uint8),
-        np.ones((len(voxels), 3), dtype=np.float32),
-    )
+    material = np.zeros(len(voxels), dtype=np.uint8)
+    properties = np.ones((len(voxels), 3), dtype=np.float32)
+    field = MaterialField(occupancy, voxels, material, properties)
     return field, StructuredLatents(voxels, np.zeros((len(voxels), 8), dtype=np.float32))
 
 
@@ -251,15 +242,12 @@ def _start_up(engine: str) -> tuple[float, float]:
     )
     times = []
     with tempfile.TemporaryDirectory() as cache:
+        environment = os.environ | {"NUMBA_CACHE_DIR": cache, "OMP_NUM_THREADS": "1"}
         for _ in range(2):
-            done = subprocess.run(
-                [sys.executable, "-c", code],
-                env={**os.environ, "NUMBA_CACHE_DIR": cache, "OMP_NUM_THREADS": "1"},
-                check=True,
-                capture_output=True,
-                text=True,
+            printed = subprocess.check_output(
+                [sys.executable, "-c", code], env=environment, stderr=subprocess.PIPE, text=True
             )
-            times.append(float(done.stdout.splitlines()[-1]))
+            times.append(float(printed.splitlines()[-1]))
     cold, warm = times
     return warm, max(cold - warm, 0.0)
 
@@ -271,18 +259,8 @@ def _result(
     scores: list[TruthScore],
     start_up: tuple[float, float],
 ) -> EngineResult:
-    low, middle, high = np.percentile(seconds, [5, 50, 95])
-    ratios = np.array(seconds) / np.array(reference)
-    ratio_low, ratio, ratio_high = np.percentile(ratios, [5, 50, 95])
-    return EngineResult(
-        engine=engine,
-        seconds=float(middle),
-        seconds_low=float(low),
-        seconds_high=float(high),
-        ratio=float(ratio),
-        ratio_low=float(ratio_low),
-        ratio_high=float(ratio_high),
-        start_up=start_up[0],
-        compiling=start_up[1],
-        levels=summarise(scores),
-    )
+    low, middle, high = np.percentile(seconds, [5, 50, 95]).tolist()
+    ratios = np.divide(seconds, reference)
+    ratio_low, ratio, ratio_high = np.percentile(ratios, [5, 50, 95]).tolist()
+    spread = middle, low, high, ratio, ratio_low, ratio_high
+    return EngineResult(engine, *spread, *start_up, levels=summarise(scores))

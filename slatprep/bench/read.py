@@ -38,12 +38,14 @@ class Way:
     """One way to keep a dataset and to read an asset of it.
 
     ``open`` is called in the process that reads; what it returns reads one
-    asset. ``files`` is the folder or file that holds the data.
+    asset. ``files`` is the folder or file that holds the data, and ``needs`` a
+    module that slatprep does without.
     """
 
     name: str
     open: Callable[[Path], Reader]
     files: str
+    needs: str | None = None
 
 
 @dataclass(frozen=True)
@@ -129,44 +131,40 @@ def bench_read(
     assets = min(limit or len(opened), len(opened))
     write_forms(store, directory, assets)
     (directory / "store").symlink_to(store)
-    ways = [way for way in WAYS if _installed(way)]
+    ways = [way for way in WAYS if way.needs is None or util.find_spec(way.needs)]
     for way in ways:
         _require_equal(way, directory, opened.read(assets - 1), assets - 1)
     order = np.random.default_rng(seed).permutation(assets).tolist()
-    taken: dict[str, list[float]] = {way.name: [] for way in ways}
-    wall: dict[str, list[float]] = {way.name: [] for way in ways}
-    two: dict[str, list[float]] = {way.name: [] for way in ways}
-    cold: dict[str, list[float]] = {way.name: [] for way in ways}
-    done = 0
+    measured: dict[str, list[tuple[float, ...]]] = {way.name: [] for way in ways}
+    passes = [way for _ in range(repeats) for way in ways]
     with single_threaded():
-        for _ in range(repeats):
-            for way in ways:
-                seconds, processor = _in_process(way, directory, order)
-                wall[way.name].append(seconds)
-                taken[way.name].append(processor)
-                two[way.name].append(_two_processes(way, directory, order))
-                if forget(directory / way.files):
-                    cold[way.name].append(_in_process(way, directory, order, warm_up=False)[0])
-                done += 1
-                if progress:
-                    progress(done, repeats * len(ways))
-    reference = np.array(taken[REFERENCE])
-    results = tuple(
-        WayResult(
-            name=way.name,
-            size=_size(directory, way)[0],
-            files=_size(directory, way)[1],
-            seconds=float(np.median(taken[way.name])) / assets,
-            warm=assets / min(wall[way.name]),
-            warm_two=assets / min(two[way.name]),
-            cold=assets / min(cold[way.name]) if cold[way.name] else None,
-            ratio=float(np.median(reference / np.array(taken[way.name]))),
+        for done, way in enumerate(passes, start=1):
+            wall, processor = _in_process(way, directory, order)
+            two, cold = _two_processes(way, directory, order), np.nan
+            if forget(directory / way.files):
+                cold, _ = _in_process(way, directory, order, warm_up=False)
+            measured[way.name].append((wall, two, cold, processor))
+            if progress:
+                progress(done, len(passes))
+    reference = np.array(measured[REFERENCE])[:, -1]
+    results = []
+    for way in ways:
+        warm, warm_two, cold, _ = (assets / np.min(measured[way.name], axis=0)).tolist()
+        taken = np.array(measured[way.name])[:, -1]
+        results.append(
+            WayResult(
+                way.name,
+                *_size(directory, way),
+                seconds=float(np.median(taken)) / assets,
+                warm=warm,
+                warm_two=warm_two,
+                cold=None if np.isnan(cold) else cold,
+                ratio=float(np.median(reference / taken)),
+            )
         )
-        for way in ways
-    )
-    left_out = tuple(way.name for way in WAYS if not _installed(way))
+    left_out = tuple(way.name for way in WAYS if way not in ways)
     voxels = int(opened.offsets[assets])
-    return ReadBench(store, assets, voxels, repeats, results, left_out)
+    return ReadBench(store, assets, voxels, repeats, tuple(results), left_out)
 
 
 def write_forms(store: Path, directory: Path, assets: int) -> None:
@@ -315,32 +313,21 @@ def _open_tensorstore(directory: Path) -> Reader:
     return read
 
 
-_SLATPREP = Way("slatprep", _open_slatprep, "store")
-_NPZ = Way("npz", partial(_open_npz, "npz"), "npz")
-_ZARRS = Way("zarrs under zarr-python", partial(_open_zarr, "zarrs.ZarrsCodecPipeline"), "store")
-_TENSORSTORE = Way("tensorstore", _open_tensorstore, "store")
+REFERENCE = "npz"
 
-REFERENCE = _NPZ.name
+_PYTHON = "zarr.core.codec_pipeline.BatchedCodecPipeline"
+_RUST = "zarrs.ZarrsCodecPipeline"
 
 WAYS = (
-    _SLATPREP,
-    _NPZ,
+    Way("slatprep", _open_slatprep, "store"),
+    Way(REFERENCE, partial(_open_npz, "npz"), "npz"),
     Way("npz compressed", partial(_open_npz, "npz-compressed"), "npz-compressed"),
     Way("one HDF5 file", _open_hdf5, "all.h5"),
-    Way(
-        "zarr-python",
-        partial(_open_zarr, "zarr.core.codec_pipeline.BatchedCodecPipeline"),
-        "store",
-    ),
-    _ZARRS,
-    _TENSORSTORE,
+    Way("zarr-python", partial(_open_zarr, _PYTHON), "store"),
+    Way("zarrs under zarr-python", partial(_open_zarr, _RUST), "store", needs="zarrs"),
+    Way("tensorstore", _open_tensorstore, "store", needs="tensorstore"),
 )
-"""All ways; the last two need libraries that slatprep does without."""
-
-
-def _installed(way: Way) -> bool:
-    needs = {_ZARRS.name: "zarrs", _TENSORSTORE.name: "tensorstore"}
-    return way.name not in needs or util.find_spec(needs[way.name]) is not None
+"""All ways, each measured where what it needs is installed."""
 
 
 def _require_equal(way: Way, directory: Path, expected: Arrays, row: int) -> None:

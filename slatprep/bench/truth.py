@@ -25,7 +25,7 @@ from slatprep.geometry.frames import (
     voxel_centres,
 )
 from slatprep.records import BACKGROUND, Place
-from slatprep.store import Store, StoredAsset, open_store
+from slatprep.store import Store, open_store
 
 SUCCESS_DISPLACEMENT = 1.5
 """An asset is placed right where its mean displacement [voxel] is less than this above the
@@ -150,7 +150,7 @@ def score_against_truth(store: Place, truth_dir: Path) -> TruthReport:
         raise InputError(truth_dir, "no truth in it", "a folder with one <asset id>.npz an asset")
     opened = open_store(store)
     scores = tuple(
-        _score_asset(opened.asset(asset_id), _places_in(opened, asset_id), truths[asset_id])
+        _score_asset(opened, asset_id, truths[asset_id])
         for asset_id in opened.ids
         if asset_id in truths
     )
@@ -159,44 +159,38 @@ def score_against_truth(store: Place, truth_dir: Path) -> TruthReport:
 
 def summarise(scores: Sequence[TruthScore]) -> tuple[LevelScore, ...]:
     """Return the score of each level over its assets that have one right placement only."""
-    levels = sorted({score.level for score in scores if not score.symmetric})
-    return tuple(
-        _summarise_level(level, [s for s in scores if s.level == level and not s.symmetric])
-        for level in levels
-    )
+    levels: dict[int, list[TruthScore]] = {}
+    for score in scores:
+        if not score.symmetric:
+            levels.setdefault(score.level, []).append(score)
+    return tuple(_summarise_level(level, levels[level]) for level in sorted(levels))
 
 
 def _summarise_level(level: int, scores: Sequence[TruthScore]) -> LevelScore:
-    displacements = np.array([score.displacement for score in scores])
+    def over(name: str) -> list[float]:
+        return [getattr(score, name) for score in scores]
+
+    means = ("label_accuracy", "truth_own", "valid_share", "similarity_accuracy")
     return LevelScore(
         level=level,
         assets=len(scores),
-        success=float(np.mean([score.placed for score in scores])),
-        displacement_median=float(np.median(displacements)),
-        displacement_p90=float(np.percentile(displacements, 90)),
-        label_accuracy=float(np.mean([score.label_accuracy for score in scores])),
-        truth_own=float(np.mean([score.truth_own for score in scores])),
-        valid_share=float(np.mean([score.valid_share for score in scores])),
-        similarity_displacement=float(
-            np.median([score.similarity_displacement for score in scores])
-        ),
-        similarity_accuracy=float(np.mean([score.similarity_accuracy for score in scores])),
+        success=float(np.mean(over("placed"))),
+        displacement_median=float(np.median(over("displacement"))),
+        displacement_p90=float(np.percentile(over("displacement"), 90)),
+        similarity_displacement=float(np.median(over("similarity_displacement"))),
+        **{name: float(np.mean(over(name))) for name in means},
     )
 
 
-def _places_in(store: Store, asset_id: str) -> NDArray[np.floating[Any]] | None:
-    """Return where a store says that it looked an asset's voxels up; None where it does not."""
-    if not (store.path / "voxel" / "place" / "zarr.json").exists():
-        return None
-    return store.read_rows("voxel/place", *store.rows(store.find(asset_id)))
-
-
-def _score_asset(
-    asset: StoredAsset, places: NDArray[np.floating[Any]] | None, path: Path
-) -> TruthScore:
+def _score_asset(store: Store, asset_id: str, path: Path) -> TruthScore:
+    asset = store.asset(asset_id)
     annotated = np.argwhere(asset.grid_material < BACKGROUND)
+    places = None
+    # A store need not say where it looked its voxels up.
+    if (store.path / "voxel" / "place" / "zarr.json").exists():
+        places = store.read_rows("voxel/place", *store.rows(store.find(asset_id)))
     return compare_with_truth(
-        asset.asset_id,
+        asset_id,
         read_truth(path),
         coords=asset.coords,
         transform=asset.transform,
@@ -248,21 +242,19 @@ def compare_with_truth(
     """
     from scipy.spatial import cKDTree
 
-    if truth.material.shape != material.shape:
-        raise InputError(
-            truth.path,
-            f"material has shape {truth.material.shape}",
-            f"{material.shape}, one class for each SLAT voxel of the asset",
-        )
     centres = voxel_centres(coords)
     by_similarity = apply_transform(invert_transform(truth.transform), centres)
     true_places = by_similarity if truth.places is None else truth.places
-    if true_places.shape != by_similarity.shape:
-        raise InputError(
-            truth.path,
-            f"places has shape {true_places.shape}",
-            f"{by_similarity.shape}, one place for each SLAT voxel of the asset",
-        )
+    for name, kind, found, expected in (
+        ("material", "class", truth.material, material),
+        ("places", "place", true_places, by_similarity),
+    ):
+        if found.shape != expected.shape:
+            raise InputError(
+                truth.path,
+                f"{name} has shape {found.shape}",
+                f"{expected.shape}, one {kind} for each SLAT voxel of the asset",
+            )
     if places is None:
         places = apply_transform(invert_transform(transform), centres)
     tree = cKDTree(voxel_centres(annotated))

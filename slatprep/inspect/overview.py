@@ -14,6 +14,8 @@ from slatprep.records import Normalization, Place, Verdict
 from slatprep.storage.place import storage_of
 from slatprep.store import Store
 
+_MEDIANS = ("fitness", "inlier_rmse", "fitness_backward", "overlap")
+
 
 @dataclass(frozen=True)
 class GroupOverview:
@@ -69,8 +71,7 @@ def overview_of(store: Store) -> StoreOverview:
     -------
     StoreOverview
     """
-    names = ("category", "verdict", "fitness", "inlier_rmse", "fitness_backward", "overlap",
-             "valid_share", "ambiguity", "engine", "model")  # fmt: skip
+    names = ("category", "verdict", *_MEDIANS, "valid_share", "ambiguity", "engine", "model")
     columns = {name: store.column(name) for name in names}
     columns["voxels"] = np.diff(store.offsets)
     categories = np.array([str(category) for category in columns["category"]])
@@ -101,10 +102,7 @@ def _group(name: str, columns: dict[str, NDArray[Any]], chosen: NDArray[np.bool_
         assets=int(chosen.sum()),
         voxels=voxels,
         verdicts={str(verdict): verdicts.get(str(verdict), 0) for verdict in Verdict},
-        fitness=float(np.median(own["fitness"])),
-        inlier_rmse=float(np.median(own["inlier_rmse"])),
-        fitness_backward=float(np.median(own["fitness_backward"])),
-        overlap=float(np.median(own["overlap"])),
+        **{median: float(np.median(own[median])) for median in _MEDIANS},
         valid_share=float(own["valid_share"] @ own["voxels"] / voxels),
         ambiguous=int((own["ambiguity"] > 0).sum()),
     )

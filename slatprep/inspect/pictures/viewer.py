@@ -9,7 +9,6 @@ from __future__ import annotations
 import os
 import sys
 from collections.abc import Mapping
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -54,8 +53,13 @@ def show_alignment(scene: Scene, title: str) -> bool:
     window = open3d.visualization.Visualizer()
     if not window.create_window(window_name=title, width=1600, height=700):
         return False
-    for mesh in meshes(scene):
-        window.add_geometry(_open3d_mesh(open3d, *mesh))
+    for vertices, triangles, colours in meshes(scene):
+        mesh = open3d.geometry.TriangleMesh(
+            open3d.utility.Vector3dVector(vertices), open3d.utility.Vector3iVector(triangles)
+        )
+        mesh.vertex_colors = open3d.utility.Vector3dVector(colours)
+        mesh.compute_triangle_normals()
+        window.add_geometry(mesh)
     window.run()
     window.destroy_window()
     return True
@@ -117,17 +121,3 @@ def cube_mesh(
     halves = np.array([[0, 1, 2], [0, 2, 3]], dtype=np.int32)
     triangles = np.concatenate([first + half for half in halves])
     return apply_transform(transform, points), triangles, np.concatenate(painted)
-
-
-def _open3d_mesh(
-    open3d: Any,
-    vertices: NDArray[np.float64],
-    triangles: NDArray[np.int32],
-    colours: NDArray[np.float64],
-) -> Any:
-    mesh = open3d.geometry.TriangleMesh(
-        open3d.utility.Vector3dVector(vertices), open3d.utility.Vector3iVector(triangles)
-    )
-    mesh.vertex_colors = open3d.utility.Vector3dVector(colours)
-    mesh.compute_triangle_normals()
-    return mesh

@@ -84,13 +84,8 @@ def title_of(asset: StoredAsset) -> str:
 def subtitle_of(asset: StoredAsset) -> str:
     """Return an asset's id, its size and how it was aligned, in one line."""
     columns = asset.columns
-    return "   ".join(
-        (
-            asset.asset_id,
-            f"{len(asset.coords):,} SLAT voxels",
-            f"engine {columns['engine']}, {columns['model']}, starts {columns['search']}",
-        )
-    )
+    how = f"engine {columns['engine']}, {columns['model']}, starts {columns['search']}"
+    return f"{asset.asset_id}   {len(asset.coords):,} SLAT voxels   {how}"
 
 
 def _write(path: Path, content: bytes) -> None:

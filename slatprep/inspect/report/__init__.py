@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import base64
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from operator import attrgetter
 from pathlib import Path
 
 import numpy as np
@@ -61,18 +62,13 @@ class ReportSummary:
     side: int
 
 
-@dataclass
-class Details:
-    """What is drawn of the assets: thumbnails and voxels by index, and counts over all."""
+@dataclass(frozen=True)
+class Drawn:
+    """What is drawn of an asset of the store: thumbnail, and voxels by level of detail."""
 
-    thumbnails: dict[int, NDArray[np.uint8]] = field(default_factory=dict)
-    voxels: dict[int, dict[int, bytes]] = field(default_factory=dict)
-    tallies: dict[str, Tally] = field(default_factory=dict)
-
-    def side(self) -> int:
-        """Return the finest level of detail that the page can hold."""
-        size = sum(len(levels[FULL]) for levels in self.voxels.values())
-        return FULL if size <= VOXEL_BYTES else COARSE
+    index: int
+    thumbnail: NDArray[np.uint8]
+    voxels: dict[int, bytes]
 
 
 def write_report(
@@ -114,17 +110,28 @@ def write_report(
         outcomes = list(read_outcomes(manifests, str(store.attributes["manifest"])))
         _refuse_other_records(store, outcomes, manifests)
     chosen = _chosen(store)
-    details = _details(store, chosen, jobs, progress)
-    side = details.side()
-    content = page_content(store, outcomes, details.tallies, chosen, side)
+    drawn: list[Drawn] = []
+    tallies: dict[str, Tally] = {}
+    starts = range(0, len(chosen), TASK_ASSETS)
+    tasks = ((store.path, chosen[start : start + TASK_ASSETS]) for start in starts)
+    for some, counts in run_unordered(_draw, tasks, jobs):
+        drawn += some
+        _add(tallies, counts)
+        if progress:
+            progress(len(drawn), len(chosen))
+    drawn.sort(key=attrgetter("index"))
+    full = sum(len(one.voxels[FULL]) for one in drawn)
+    side = FULL if full <= VOXEL_BYTES else COARSE
+    content = page_content(store, outcomes, tallies, chosen, side)
+    sheets = [drawn[start : start + PER_SHEET] for start in range(0, len(drawn), PER_SHEET)]
     with staged(Path(out)) as temporary:
         with temporary.open("w", encoding="utf-8", newline="\n") as file:
             write_page(
                 file,
                 str(content["title"]),
                 content,
-                sheets=_sheets(details, chosen),
-                packs=_packs(details, chosen, side),
+                sheets=(sheet([one.thumbnail for one in own]) for own in sheets),
+                packs=([_base64(one.voxels[side]) for one in own] for own in sheets),
             )
         size = temporary.stat().st_size
     return ReportSummary(Path(out), size, len(content["assets"]["id"]), len(chosen), side)
@@ -151,48 +158,24 @@ def _chosen(store: Store) -> list[int]:
     return [int(index) for index in np.union1d(doubtful, spread)]
 
 
-def _details(store: Store, chosen: Sequence[int], jobs: int, progress: Progress | None) -> Details:
-    """Draw and count the chosen assets."""
-    details = Details()
-    tasks = (
-        (store.path, chosen[start : start + TASK_ASSETS])
-        for start in range(0, len(chosen), TASK_ASSETS)
-    )
-    for part in run_unordered(_draw, tasks, jobs):
-        details.thumbnails |= part.thumbnails
-        details.voxels |= part.voxels
-        for category, counts in part.tallies.items():
-            details.tallies[category] = details.tallies.get(category, no_tally()) + counts
-        if progress:
-            progress(len(details.voxels), len(chosen))
-    return details
-
-
-def _draw(path: Path, indices: Sequence[int]) -> Details:
-    """Draw and count some assets of a store, in a worker."""
+def _draw(path: Path, indices: Sequence[int]) -> tuple[list[Drawn], dict[str, Tally]]:
+    """Draw some assets of a store, and count by category, in a worker."""
     store = open_store(path)
     max_distance = float(store.attributes["build"]["parameters"]["sample"]["max_distance"])
-    details = Details()
+    drawn: list[Drawn] = []
+    tallies: dict[str, Tally] = {}
     for index in indices:
         asset = store.asset(store.ids[index])
-        details.thumbnails[index] = thumbnail(asset)
-        details.voxels[index] = {
-            side: encode_asset(asset, max_distance, side) for side in (FULL, COARSE)
-        }
-        category = str(asset.columns["category"])
-        details.tallies[category] = details.tallies.get(category, no_tally()) + tally(asset)
-    return details
+        voxels = {side: encode_asset(asset, max_distance, side) for side in (FULL, COARSE)}
+        drawn.append(Drawn(index, thumbnail(asset), voxels))
+        _add(tallies, {str(asset.columns["category"]): tally(asset)})
+    return drawn, tallies
 
 
-def _sheets(details: Details, chosen: Sequence[int]) -> Iterator[bytes]:
-    for start in range(0, len(chosen), PER_SHEET):
-        yield sheet([details.thumbnails[index] for index in chosen[start : start + PER_SHEET]])
+def _add(tallies: dict[str, Tally], more: Mapping[str, Tally]) -> None:
+    for category, counts in more.items():
+        tallies[category] = tallies.get(category, no_tally()) + counts
 
 
-def _packs(details: Details, chosen: Sequence[int], side: int) -> Iterator[list[str]]:
-    """Yield the voxels of the assets of each sheet, in base64."""
-    for start in range(0, len(chosen), PER_SHEET):
-        yield [
-            base64.b64encode(details.voxels[index][side]).decode("ascii")
-            for index in chosen[start : start + PER_SHEET]
-        ]
+def _base64(content: bytes) -> str:
+    return base64.b64encode(content).decode("ascii")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -153,36 +153,32 @@ def _table(
     absent = [outcome for outcome in known.values() if outcome.status is not Status.OK]
     transforms = store.column("transform")
     nearest = [nearest_quarter_turn(transform) for transform in transforms]
-    blank: list[Any] = [None] * len(absent)
     pictures = {index: number for number, index in enumerate(chosen)}
-    columns: dict[str, list[Any]] = {
-        "id": [*store.ids, *(outcome.asset_id for outcome in absent)],
-        "category": [
-            *map(str, store.column("category")),
-            *(outcome.category for outcome in absent),
-        ],
-        "state": [
-            *map(str, store.column("verdict")),
-            *(_ABSENT[outcome.status] for outcome in absent),
-        ],
-        "voxels": [*np.diff(store.offsets).tolist(), *blank],
-        "model": [*map(str, store.column("model")), *blank],
-        "turn": [*(index for index, _ in nearest), *blank],
-        "tilt": [*(round(angle, 2) for _, angle in nearest), *blank],
-        "transform": [
-            *([round(float(value), 6) for value in matrix[:3].ravel()] for matrix in transforms),
-            *blank,
-        ],
-        "tied": [*(outcome.tied if outcome else None for outcome in stored), *blank],
-        "displacement": [
-            *(_number(outcome.displacement) if outcome else None for outcome in stored),
-            *blank,
-        ],
-        "reasons": [list(outcome.reasons) if outcome else [] for outcome in (*stored, *absent)],
-        "picture": [*(pictures.get(index) for index in range(len(store))), *blank],
+    of_stored: dict[str, Iterable[Any]] = {
+        "id": store.ids,
+        "category": map(str, store.column("category")),
+        "state": map(str, store.column("verdict")),
+        "voxels": np.diff(store.offsets).tolist(),
+        "model": map(str, store.column("model")),
+        "turn": (index for index, _ in nearest),
+        "tilt": (round(angle, 2) for _, angle in nearest),
+        "transform": (
+            [round(float(value), 6) for value in matrix[:3].ravel()] for matrix in transforms
+        ),
+        "tied": (outcome and outcome.tied for outcome in stored),
+        "displacement": (outcome and _number(outcome.displacement) for outcome in stored),
+        "reasons": (list(outcome.reasons) if outcome else [] for outcome in stored),
+        "picture": map(pictures.get, range(len(store))),
+        **{name: map(_number, store.column(name).tolist()) for name in _FIGURES},
     }
-    for name in _FIGURES:
-        columns[name] = [*map(_number, store.column(name).tolist()), *blank]
+    of_absent: dict[str, list[Any]] = {
+        "id": [outcome.asset_id for outcome in absent],
+        "category": [outcome.category for outcome in absent],
+        "state": [_ABSENT[outcome.status] for outcome in absent],
+        "reasons": [list(outcome.reasons) for outcome in absent],
+    }
+    blank = [None] * len(absent)
+    columns = {name: [*own, *of_absent.get(name, blank)] for name, own in of_stored.items()}
     columns["kinds"] = [[kind_of(reason) for reason in own] for own in columns["reasons"]]
     return columns
 

@@ -19,7 +19,7 @@ import zlib
 import numpy as np
 from numpy.typing import NDArray
 
-from slatprep.geometry.voxels import boundary, filled, occupancy_of
+from slatprep.geometry.voxels import boundary, filled
 from slatprep.records import BACKGROUND, RESOLUTION, UNANNOTATED
 from slatprep.store import StoredAsset
 
@@ -49,20 +49,16 @@ def encode_asset(asset: StoredAsset, max_distance: float, side: int) -> bytes:
     bytes
         See the module.
     """
-    step = RESOLUTION // side
-    cells = asset.coords.astype(np.intp) // step
-    # The first voxel of each cell stands for it; sorted by cell, that is C order.
-    _, first = np.unique(np.ravel_multi_index(tuple(cells.T), (side,) * 3), return_index=True)
+    first, occupied = _cells(asset.coords, side)
     grid, material = _boundary_of(asset.grid_material)
-    grid_cells = grid // step
-    _, chosen = np.unique(np.ravel_multi_index(tuple(grid_cells.T), (side,) * 3), return_index=True)
+    chosen, grid_occupied = _cells(grid, side)
     scalars = np.column_stack(
         [(asset.properties[first] + 1.0) / 2.0, asset.distance[first] / max_distance]
     )
     scalars[~asset.valid[first], :3] = np.nan
     parts = [
-        _bits(cells[first], side),
-        _bits(grid_cells[chosen], side),
+        occupied,
+        grid_occupied,
         asset.material[first].tobytes(),
         *(_quantised(column).tobytes() for column in scalars.T),
         material[chosen].tobytes(),
@@ -79,12 +75,13 @@ def _boundary_of(grid_material: NDArray[np.uint8]) -> tuple[NDArray[np.intp], ND
     return np.argwhere(surface), np.where(material == UNANNOTATED, NOT_VALID, material)
 
 
-def _bits(voxels: NDArray[np.intp], side: int) -> bytes:
-    if side == RESOLUTION:
-        return np.packbits(occupancy_of(voxels)).tobytes()
-    occupancy = np.zeros((side,) * 3, dtype=bool)
-    occupancy[tuple(voxels.T)] = True
-    return np.packbits(occupancy).tobytes()
+def _cells(voxels: NDArray[np.integer], side: int) -> tuple[NDArray[np.intp], bytes]:
+    """Return the first voxel of each cell, which stands for it, in C order; and the cells' bits."""
+    cells = voxels.astype(np.intp) // (RESOLUTION // side)
+    flat, first = np.unique(np.ravel_multi_index(tuple(cells.T), (side,) * 3), return_index=True)
+    occupancy = np.zeros(side**3, dtype=bool)
+    occupancy[flat] = True
+    return first, np.packbits(occupancy).tobytes()
 
 
 def _quantised(share: NDArray[np.float64]) -> NDArray[np.uint8]:
