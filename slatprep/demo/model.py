@@ -6,20 +6,13 @@ generator.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from slatprep.demo.shapes import (
-    Part,
-    Shape,
-    Stuff,
-    capsule,
-    carve,
-    cone,
-    polytope,
-)
+from slatprep.demo.shapes import Part, Shape, Stuff, capsule, carve, cone, polytope
 
 Rng = np.random.Generator
 Vector = NDArray[np.float64]
@@ -34,8 +27,16 @@ class Model:
     """
 
     name: str
-    parts: tuple[Part, ...]
+    parts: Sequence[Part]
     symmetric: bool = False
+
+
+class Parts(list[Part]):
+    """The parts of an object that is being put together."""
+
+    def add(self, stuff: Stuff, *shapes: Shape) -> None:
+        """Add shapes of one stuff."""
+        self += [Part(shape, stuff) for shape in shapes]
 
 
 def vec(*values: float) -> Vector:
@@ -63,11 +64,9 @@ def direction(rng: Rng) -> Vector:
     return unit
 
 
-def curve(points: ArrayLike, radii: ArrayLike, stuff: Stuff) -> list[Part]:
+def curve(points: Sequence[Vector] | Vector, radii: Sequence[float]) -> list[Shape]:
     """Return capsules along a polyline of points (K, 3), one radius a segment."""
-    p = np.asarray(points, dtype=np.float64)
-    r = np.asarray(radii, dtype=np.float64)
-    return [Part(capsule(a, b, k), stuff) for a, b, k in zip(p[:-1], p[1:], r, strict=True)]
+    return [capsule(a, b, k) for a, b, k in zip(points[:-1], points[1:], radii, strict=True)]
 
 
 def rock(rng: Rng, centre: ArrayLike, radii: ArrayLike) -> Shape:
@@ -105,7 +104,7 @@ def vessel(
     return carve(cone(vec(0, 0, bottom), vec(0, 0, top), radius, top_radius), hollow)
 
 
-def pot(rng: Rng, radius: float, height: float, outside: Stuff, filling: Stuff) -> list[Part]:
+def pot(rng: Rng, radius: float, height: float, outside: Stuff, filling: Stuff) -> Parts:
     """Return a pot standing on z = 0, filled up to four fifths."""
     foot = radius * rng.uniform(0.65, 0.8)
     wall = 0.13 * radius
@@ -113,4 +112,4 @@ def pot(rng: Rng, radius: float, height: float, outside: Stuff, filling: Stuff) 
     inner = foot + (radius - foot) * level / height - 0.5 * wall
     content = cone(vec(0, 0, wall), vec(0, 0, level), foot - 0.5 * wall, inner)
     shell = vessel(0.0, height, foot, radius, wall, floor=1.5 * wall)
-    return [Part(shell, outside), Part(content, filling)]
+    return Parts([Part(shell, outside), Part(content, filling)])
