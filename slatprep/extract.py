@@ -9,7 +9,7 @@ from __future__ import annotations
 import hashlib
 import io
 import json
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from importlib import metadata
 from pathlib import Path
@@ -72,20 +72,23 @@ class Session:
 
 
 @dataclass(frozen=True)
-class Job:
-    """An image, a seed, and where the latents go; paths are those of the npz and its record."""
+class Extraction:
+    """An image, a seed, and the npz that its latents go to; the record is a JSON beside it."""
 
     image: Path
     seed: int
     slat: Path
-    record: Path
+
+    @property
+    def record(self) -> Path:
+        """The file with the provenance."""
+        return self.slat.with_suffix(".json")
 
 
 @dataclass(frozen=True)
 class Extracted:
-    """What became of a job: its number of voxels, and whether it had been done before."""
+    """What came of an extraction: its number of voxels, and whether it had been done before."""
 
-    job: Job
     voxels: int
     kept: bool
 
@@ -134,11 +137,13 @@ def load_session(model: str = MODEL, revision: str | None = None, device: str = 
     about = {"name": model, "revision": taken, "torch": str(torch.__version__)}
     description = folder / "pipeline.json"
     if description.is_file():
-        about["pipeline_sha256"] = hashlib.sha256(description.read_bytes()).hexdigest()
+        about["pipeline_sha256"] = _sha256(description)
     return Session(pipeline, torch, about)
 
 
-def plan(images: Sequence[Path], out: Path, seeds: Sequence[int], by_folder: bool) -> list[Job]:
+def list_extractions(
+    images: Sequence[Path], out: Path, seeds: Sequence[int], by_folder: bool
+) -> list[Extraction]:
     """Name what each image and seed will be saved as.
 
     Parameters
@@ -154,8 +159,8 @@ def plan(images: Sequence[Path], out: Path, seeds: Sequence[int], by_folder: boo
 
     Returns
     -------
-    list of Job
-        ``<id>.npz``, or ``<id>/<view>.npz`` where there are views: folders,
+    list of Extraction
+        To ``<id>.npz``, or to ``<id>/<view>.npz`` where there are views: folders,
         several seeds, or both (``<view>-seed-<seed>``).
 
     Raises
@@ -163,41 +168,40 @@ def plan(images: Sequence[Path], out: Path, seeds: Sequence[int], by_folder: boo
     ConfigError
         If a name cannot be an id, or two images or seeds have one name.
     """
-    jobs: dict[Path, Job] = {}
+    listed: dict[Path, Extraction] = {}
     for image in images:
-        folder = image.resolve().parent.name
-        object_id, view = (folder, image.stem) if by_folder else (image.stem, "")
-        for name in filter(None, (object_id, view)):
+        names = [image.resolve().parent.name, image.stem] if by_folder else [image.stem]
+        for name in names:
             if not NAME.fullmatch(name):
                 raise ConfigError(
                     f"{image}: {name!r} cannot be an id or a view; expected letters, digits, "
                     "and . _ - that are not first"
                 )
+        object_id, *view = names
         for seed in seeds:
-            of_seed = f"seed-{seed}" if len(seeds) > 1 else ""
-            label = "-".join(filter(None, (view, of_seed)))
+            label = "-".join([*view, *([f"seed-{seed}"] if len(seeds) > 1 else [])])
             stem = f"{object_id}/{label}" if label else object_id
-            job = Job(image, seed, out / f"{stem}.npz", out / f"{stem}.json")
-            if job.slat in jobs:
+            slat = out / f"{stem}.npz"
+            if slat in listed:
                 raise ConfigError(
-                    f"{image} and {jobs[job.slat].image} would both be {stem}.npz; expected one "
+                    f"{image} and {listed[slat].image} would both be {stem}.npz; expected one "
                     "image an id (or --by-folder), and each seed once"
                 )
-            jobs[job.slat] = job
-    return list(jobs.values())
+            listed[slat] = Extraction(image, seed, slat)
+    return list(listed.values())
 
 
 def extract(
-    session: Session, jobs: Sequence[Job], *, preprocess: bool = True
+    session: Session, extractions: Iterable[Extraction], *, preprocess: bool = True
 ) -> Iterator[Extracted | InputError]:
-    """Run the pipeline and save latents with their provenance, one job after the other.
+    """Run the pipeline and save latents with their provenance, one image and seed at a time.
 
     Parameters
     ----------
     session : Session
         The loaded pipeline.
-    jobs : sequence of Job
-        What `plan` made.
+    extractions : iterable of Extraction
+        What `list_extractions` made.
     preprocess : bool
         Whether the pipeline cuts the object out and crops, as it does by
         default; images that are prepared already need it not.
@@ -205,25 +209,25 @@ def extract(
     Yields
     ------
     Extracted or InputError
-        What became of each job, or why it gave nothing; the others go on. A
-        SLAT whose record says the same image, seed and model is kept.
+        What came of each, or why it gave nothing; the others go on. A SLAT
+        whose record says the same image, seed and model is kept.
     """
-    for job in jobs:
+    for extraction in extractions:
         try:
-            yield _extract(session, job, preprocess)
+            yield _extract(session, extraction, preprocess)
         except InputError as error:
             yield error
 
 
-def _extract(session: Session, job: Job, preprocess: bool) -> Extracted:
-    data, image = _read_image(job.image)
+def _extract(session: Session, extraction: Extraction, preprocess: bool) -> Extracted:
+    data, image = _read_image(extraction.image)
     pipeline = session.pipeline
     document = {
         "format": FORMAT,
         "format_version": 1,
         "slatprep": metadata.version("slatprep"),
-        "image": {"name": job.image.name, "sha256": hashlib.sha256(data).hexdigest()},
-        "seed": job.seed,
+        "image": {"name": extraction.image.name, "sha256": hashlib.sha256(data).hexdigest()},
+        "seed": extraction.seed,
         "preprocessed": preprocess,
         "model": session.model,
         "sparse_structure_sampler_params": dict(pipeline.sparse_structure_sampler_params),
@@ -234,27 +238,26 @@ def _extract(session: Session, job: Job, preprocess: bool) -> Extracted:
     # As it is read again, to be compared with: lists for tuples and arrays.
     text = orjson.dumps(document, option=orjson.OPT_SERIALIZE_NUMPY)
     record: dict[str, Any] = orjson.loads(text)
-    if job.slat.exists():
-        return _kept(job, record)
-    coords, feats = _run(session, image, job.seed, preprocess)
-    check_coords(coords, job.image)
+    if extraction.slat.exists():
+        return _kept(extraction, record)
+    coords, feats = _run(session, image, extraction.seed, preprocess)
+    check_coords(coords, extraction.image)
     if len(coords) == 0 or feats.shape != (len(coords), LATENT_CHANNELS):
         raise InputError(
-            job.image,
+            extraction.image,
             f"gave coords {coords.shape} and feats {feats.shape}",
             f"N > 0 voxels with {LATENT_CHANNELS} channels; look at what is in the image",
         )
     if not np.isfinite(feats).all():
-        raise InputError(job.image, "gave latents that are not finite", "another seed or image")
-    with staged(job.slat) as path, path.open("wb") as stream:
+        raise InputError(
+            extraction.image, "gave latents that are not finite", "another seed or image"
+        )
+    with staged(extraction.slat) as path, path.open("wb") as stream:
         np.savez(stream, coords=coords, feats=feats)
-    record["slat"] = {
-        "voxels": len(coords),
-        "sha256": hashlib.sha256(job.slat.read_bytes()).hexdigest(),
-    }
-    with staged(job.record) as path:
+    record["slat"] = {"voxels": len(coords), "sha256": _sha256(extraction.slat)}
+    with staged(extraction.record) as path:
         path.write_text(json.dumps(record, indent=1) + "\n", encoding="utf-8")
-    return Extracted(job, len(coords), kept=False)
+    return Extracted(len(coords), kept=False)
 
 
 def _run(
@@ -276,23 +279,23 @@ def _run(
     )
 
 
-def _kept(job: Job, record: dict[str, Any]) -> Extracted:
+def _kept(extraction: Extraction, record: dict[str, Any]) -> Extracted:
     try:
-        before = json.loads(job.record.read_text("utf-8"))
+        before = json.loads(extraction.record.read_text("utf-8"))
         slat = before.pop("slat")
-        same = before == record
-        intact = hashlib.sha256(job.slat.read_bytes()).hexdigest() == slat["sha256"]
-        voxels = int(slat["voxels"])
+        if before == record and _sha256(extraction.slat) == slat["sha256"]:
+            return Extracted(int(slat["voxels"]), kept=True)
     except (OSError, ValueError, KeyError, TypeError, AttributeError):
-        same = intact = False
-        voxels = 0
-    if not (same and intact):
-        raise InputError(
-            job.slat,
-            "exists, and its record does not say that it came from this image, seed and model",
-            "a new folder, or that you move the file away",
-        )
-    return Extracted(job, voxels, kept=True)
+        pass  # a record that cannot be used says nothing of the file beside it
+    raise InputError(
+        extraction.slat,
+        "exists, and its record does not say that it came from this image, seed and model",
+        "a new folder, or that you move the file away",
+    )
+
+
+def _sha256(path: Path) -> str:
+    return hashlib.sha256(path.read_bytes()).hexdigest()
 
 
 def _read_image(path: Path) -> tuple[bytes, Image]:

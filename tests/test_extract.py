@@ -117,14 +117,14 @@ def images(tmp_path: Path) -> list[Path]:
     return paths
 
 
-def run(session: work.Session, jobs: list[work.Job], **options: Any) -> list[Any]:
-    return list(work.extract(session, jobs, **options))
+def run(session: work.Session, extractions: list[work.Extraction], **options: Any) -> list[Any]:
+    return list(work.extract(session, extractions, **options))
 
 
 def test_latents_are_what_the_pipeline_returns(
     session: work.Session, images: list[Path], tmp_path: Path
 ) -> None:
-    [result] = run(session, work.plan(images[:1], tmp_path / "slat", [7], False))
+    [result] = run(session, work.list_extractions(images[:1], tmp_path / "slat", [7], False))
     with np.load(tmp_path / "slat" / "cup.npz") as saved:
         coords, feats = saved["coords"], saved["feats"]
     assert (coords.dtype, feats.dtype) == (np.int32, np.float32)
@@ -145,7 +145,7 @@ def test_provenance_says_how_to_do_it_again(
 ) -> None:
     import hashlib
 
-    run(session, work.plan(images[:1], tmp_path / "slat", [7], False))
+    run(session, work.list_extractions(images[:1], tmp_path / "slat", [7], False))
     record = json.loads((tmp_path / "slat" / "cup.json").read_text("utf-8"))
     assert record["seed"] == 7 and record["model"] == {"name": "m", "revision": "abc"}
     assert record["image"]["sha256"] == hashlib.sha256(images[0].read_bytes()).hexdigest()
@@ -158,7 +158,7 @@ def test_provenance_says_how_to_do_it_again(
 def test_build_store_reads_what_is_extracted(
     session: work.Session, images: list[Path], tmp_path: Path
 ) -> None:
-    assert len(run(session, work.plan(images, tmp_path / "slat", [0, 1], False))) == 4
+    assert len(run(session, work.list_extractions(images, tmp_path / "slat", [0, 1], False))) == 4
     for name in ("cup", "bear"):
         grid = tmp_path / "pixieverse" / name / "sample_0" / "material_grid.npy"
         grid.parent.mkdir(parents=True)
@@ -180,13 +180,13 @@ def test_same_seed_gives_the_same_bytes_and_is_not_drawn_twice(
     session: work.Session, images: list[Path], tmp_path: Path
 ) -> None:
     for folder in ("a", "b"):
-        run(session, work.plan(images, tmp_path / folder, [3], False))
+        run(session, work.list_extractions(images, tmp_path / folder, [3], False))
     for path in (tmp_path / "a").iterdir():
         assert path.read_bytes() == (tmp_path / "b" / path.name).read_bytes()
     calls = len(session.pipeline.seen)
-    again = run(session, work.plan(images, tmp_path / "a", [3], False))
+    again = run(session, work.list_extractions(images, tmp_path / "a", [3], False))
     assert all(result.kept for result in again) and len(session.pipeline.seen) == calls
-    other = run(session, work.plan(images, tmp_path / "a", [4], False))
+    other = run(session, work.list_extractions(images, tmp_path / "a", [4], False))
     assert all(isinstance(result, InputError) for result in other)
     assert (tmp_path / "a" / "cup.npz").read_bytes() == (tmp_path / "b" / "cup.npz").read_bytes()
 
@@ -195,27 +195,27 @@ def test_names(tmp_path: Path) -> None:
     images = [tmp_path / "bear" / "front.png", tmp_path / "bear" / "side.png"]
 
     def names(seeds: list[int], by_folder: bool) -> list[str]:
-        jobs = work.plan(images, tmp_path, seeds, by_folder)
-        return [job.slat.relative_to(tmp_path).as_posix() for job in jobs]
+        listed = work.list_extractions(images, tmp_path, seeds, by_folder)
+        return [one.slat.relative_to(tmp_path).as_posix() for one in listed]
 
     assert names([1], False) == ["front.npz", "side.npz"]
     assert names([1], True) == ["bear/front.npz", "bear/side.npz"]
     assert names([1, 2], False)[:2] == ["front/seed-1.npz", "front/seed-2.npz"]
     assert names([1, 2], True)[1] == "bear/front-seed-2.npz"
     with pytest.raises(ConfigError, match="would both be"):
-        work.plan([images[0], tmp_path / "cup" / "front.png"], tmp_path, [1], False)
+        work.list_extractions([images[0], tmp_path / "cup" / "front.png"], tmp_path, [1], False)
     with pytest.raises(ConfigError, match="cannot be an id"):
-        work.plan([tmp_path / ".hidden.png"], tmp_path, [1], False)
+        work.list_extractions([tmp_path / ".hidden.png"], tmp_path, [1], False)
 
 
 def test_a_bad_image_does_not_stop_the_others(images: list[Path], tmp_path: Path) -> None:
     images[0].write_bytes(b"no image")
     torch = Torch()
     session = work.Session(Pipeline(torch), torch, {})
-    bad, good = run(session, work.plan(images, tmp_path / "slat", [0], False))
+    bad, good = run(session, work.list_extractions(images, tmp_path / "slat", [0], False))
     assert isinstance(bad, InputError) and "cup.png" in str(bad) and good.voxels > 0
     empty = work.Session(Pipeline(torch, voxels=0), torch, {})
-    [nothing] = run(empty, work.plan(images[1:], tmp_path / "none", [0], False))
+    [nothing] = run(empty, work.list_extractions(images[1:], tmp_path / "none", [0], False))
     assert isinstance(nothing, InputError) and not (tmp_path / "none" / "bear.npz").exists()
 
 

@@ -2,33 +2,22 @@
 
 from __future__ import annotations
 
-from importlib import import_module, metadata
+from importlib import metadata
 from importlib.util import find_spec
-from typing import Protocol, cast
 
 from slatprep.errors import SlatprepError
 from slatprep.parameters import AlignParameters
-from slatprep.records import Alignment, MaterialField, StructuredLatents
+from slatprep.records import Alignment, Engine, MaterialField, StructuredLatents
 
-# Engines are imported when first used: Open3D alone takes seconds.
-_ENGINES = {
-    "field": ("slatprep.align.field", ("numpy", "scipy", "numba")),
-    "open3d": ("slatprep.align.open3d_icp", ("numpy", "open3d-cpu", "open3d")),
-    "small_gicp": ("slatprep.align.gicp", ("numpy", "small_gicp")),
+_PACKAGES = {
+    "field": ("numpy", "scipy", "numba"),
+    "open3d": ("numpy", "open3d-cpu", "open3d"),
+    "small_gicp": ("numpy", "small_gicp"),
 }
+"""The packages that make each engine's numbers."""
 
 _EXTRAS = {"open3d": "paper", "small_gicp": "bench"}
 """Engines that are packages of their own, and the extra that installs each."""
-
-
-class EngineModule(Protocol):
-    """What a module of this package offers to be an engine."""
-
-    def align(
-        self, field: MaterialField, latents: StructuredLatents, parameters: AlignParameters
-    ) -> Alignment:
-        """Return the alignment of one asset."""
-        ...
 
 
 def align(
@@ -51,8 +40,20 @@ def align(
         The transform with its quality and every candidate's score.
     """
     require_engine(parameters)
-    module, _ = _ENGINES[parameters.engine]
-    return cast(EngineModule, import_module(module)).align(field, latents, parameters)
+    # Imported when first used: Open3D alone takes seconds.
+    match parameters.engine:
+        case Engine.FIELD:
+            from slatprep.align.field import align as align_field
+
+            return align_field(field, latents, parameters)
+        case Engine.OPEN3D:
+            from slatprep.align.open3d_icp import align as align_open3d
+
+            return align_open3d(field, latents, parameters)
+        case Engine.SMALL_GICP:
+            from slatprep.align.gicp import align as align_gicp
+
+            return align_gicp(field, latents, parameters)
 
 
 def require_engine(parameters: AlignParameters) -> None:
@@ -96,7 +97,7 @@ def engine_versions(parameters: AlignParameters) -> dict[str, str]:
     """
     require_engine(parameters)
     versions = {}
-    for package in _ENGINES[parameters.engine][1]:
+    for package in _PACKAGES[parameters.engine]:
         try:
             versions[package] = metadata.version(package)
         except metadata.PackageNotFoundError:

@@ -12,22 +12,13 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from slatprep.align.quality import compare, measure_quality
-from slatprep.align.starts import candidates_of, distinct_starts
-from slatprep.geometry.frames import VOXEL_SIZE, make_transform, voxel_centres
+from slatprep.align.quality import compare
+from slatprep.align.starts import Transform, search_starts
+from slatprep.geometry.frames import VOXEL_SIZE, voxel_centres
 from slatprep.geometry.voxels import boundary, voxels_of
 from slatprep.parameters import AlignParameters
-from slatprep.records import (
-    RESOLUTION,
-    Alignment,
-    Engine,
-    MaterialField,
-    Model,
-    Search,
-    StructuredLatents,
-)
+from slatprep.records import RESOLUTION, Alignment, MaterialField, StructuredLatents
 
 THINNED = 2.0
 """Voxels; the starts run on clouds thinned to one point in a cube of this edge."""
@@ -40,15 +31,22 @@ def align(
     import small_gicp
 
     surface = voxels_of(boundary(field.occupancy))
-    points, goal = (voxel_centres(v) * RESOLUTION for v in (surface, latents.coords))
-    source, target = _cloud(points, 0.25), _cloud(goal, 0.25)
-    thin_source, thin_target = _cloud(points, THINNED), _cloud(goal, THINNED)
 
-    def gicp(target: Any, source: Any, start: NDArray[np.float64]) -> NDArray[np.float64]:
-        cloud, tree = target
+    def clouds(edge: float) -> list[tuple[Any, Any]]:
+        return [
+            small_gicp.preprocess_points(
+                voxel_centres(voxels) * RESOLUTION, downsampling_resolution=edge, num_threads=1
+            )
+            for voxels in (surface, latents.coords)
+        ]
+
+    thin, all_voxels = clouds(THINNED), clouds(0.25)
+
+    def gicp(clouds: list[tuple[Any, Any]], start: Transform) -> Transform:
+        (source, _), (target, tree) = clouds
         result = small_gicp.align(
-            cloud,
-            source[0],
+            target,
+            source,
             tree,
             init_T_target_source=start,
             registration_type="GICP",
@@ -57,30 +55,18 @@ def align(
         )
         return np.array(result.T_target_source)
 
-    fits = {}
-    for start in distinct_starts():
-        pose = gicp(thin_target, thin_source, make_transform(start.rotation))
+    def first(start: Transform) -> tuple[float, float, Transform]:
+        pose = gicp(thin, start)
         quality = compare(surface, latents.coords, _in_unit_cube(pose), parameters.radius)
-        fits[start.index] = (quality.fitness, quality.inlier_rmse, pose)
-    best = max(fits, key=lambda index: (fits[index][0], -fits[index][1], -index))
-    transform = _in_unit_cube(gicp(target, source, fits[best][2]))
-    return Alignment(
-        transform=transform,
-        engine=Engine.SMALL_GICP,
-        model=Model.RIGID,
-        search=Search.EULER64,
-        quality=measure_quality(field, latents, transform, parameters.radius),
-        candidates=candidates_of({index: fit[:2] for index, fit in fits.items()}),
-    )
+        return quality.fitness, quality.inlier_rmse, pose
+
+    def last(start: Transform) -> Transform:
+        return _in_unit_cube(gicp(all_voxels, start))
+
+    return search_starts(field, latents, parameters, first, last)
 
 
-def _cloud(points: NDArray[np.float64], thinned: float) -> Any:
-    import small_gicp
-
-    return small_gicp.preprocess_points(points, downsampling_resolution=thinned, num_threads=1)
-
-
-def _in_unit_cube(pose: NDArray[np.float64]) -> NDArray[np.float64]:
+def _in_unit_cube(pose: Transform) -> Transform:
     transform = pose.copy()
     transform[:3, 3] *= VOXEL_SIZE
     return transform

@@ -16,19 +16,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from slatprep.align.quality import measure_quality
-from slatprep.align.starts import Start, candidates_of, distinct_starts
-from slatprep.geometry.frames import VOXEL_SIZE, make_transform, voxel_centres
+from slatprep.align.starts import Start, Transform, search_starts
+from slatprep.geometry.frames import VOXEL_SIZE, voxel_centres
 from slatprep.geometry.voxels import boundary, voxels_of
 from slatprep.parameters import AlignParameters
-from slatprep.records import (
-    Alignment,
-    Engine,
-    MaterialField,
-    Model,
-    Search,
-    StructuredLatents,
-)
+from slatprep.records import Alignment, MaterialField, StructuredLatents
 from slatprep.workers.local import single_threaded
 
 
@@ -43,19 +35,7 @@ def align(
     `starts` is for the benchmark, which times all 64 as published; left out,
     the 40 that repeat another rotation are not computed twice.
     """
-    # Open3D sums over threads in the order in which they finish: with one, the
-    # same input gives the same bits.
-    with single_threaded():
-        return _align(load_open3d(), field, latents, parameters, starts)
-
-
-def _align(
-    o3d: Any,
-    field: MaterialField,
-    latents: StructuredLatents,
-    parameters: AlignParameters,
-    starts: Sequence[Start] | None,
-) -> Alignment:
+    o3d = load_open3d()
     registration = o3d.pipelines.registration
     method = registration.TransformationEstimationPointToPoint()
     criteria = registration.ICPConvergenceCriteria(max_iteration=parameters.icp_iterations)
@@ -64,26 +44,19 @@ def _align(
     wide = parameters.icp_radius * VOXEL_SIZE
     tight = parameters.radius * VOXEL_SIZE
 
-    def icp(radius: float, start: NDArray[np.float64]) -> NDArray[np.float64]:
-        fit = registration.registration_icp(source, target, radius, start, method, criteria)
+    def icp(start: Transform) -> Transform:
+        fit = registration.registration_icp(source, target, wide, start, method, criteria)
         return np.array(fit.transformation)
 
-    fits: dict[int, tuple[float, float, NDArray[np.float64]]] = {}
-    for start in distinct_starts() if starts is None else starts:
-        transform = icp(wide, make_transform(start.rotation))
+    def scored(start: Transform) -> tuple[float, float, Transform]:
+        transform = icp(start)
         score = registration.evaluate_registration(source, target, tight, transform)
-        fits[start.index] = (score.fitness, score.inlier_rmse / VOXEL_SIZE, transform)
-    best = max(fits, key=lambda index: (fits[index][0], -fits[index][1], -index))
-    transform = icp(wide, fits[best][2])
+        return score.fitness, score.inlier_rmse / VOXEL_SIZE, transform
 
-    return Alignment(
-        transform=transform,
-        engine=Engine.OPEN3D,
-        model=Model.RIGID,
-        search=Search.EULER64,
-        quality=measure_quality(field, latents, transform, parameters.radius),
-        candidates=candidates_of({index: fit[:2] for index, fit in fits.items()}),
-    )
+    # Open3D sums over threads in the order in which they finish: with one, the
+    # same input gives the same bits.
+    with single_threaded():
+        return search_starts(field, latents, parameters, scored, icp, starts)
 
 
 def load_open3d() -> Any:

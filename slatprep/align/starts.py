@@ -1,8 +1,8 @@
-"""Start orientations of the alignment."""
+"""Start orientations of the alignment, and the search from the 64 of the paper."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from itertools import product
@@ -10,7 +10,12 @@ from itertools import product
 import numpy as np
 from numpy.typing import NDArray
 
-from slatprep.records import Candidate
+from slatprep.align.quality import measure_quality
+from slatprep.geometry.frames import make_transform
+from slatprep.parameters import AlignParameters
+from slatprep.records import Alignment, Candidate, MaterialField, Model, Search, StructuredLatents
+
+Transform = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -75,6 +80,49 @@ def candidates_of(fits: Mapping[int, tuple[float, float]]) -> tuple[Candidate, .
             same_as=start.same_as,
         )
         for start in euler_starts()
+    )
+
+
+def search_starts(
+    field: MaterialField,
+    latents: StructuredLatents,
+    parameters: AlignParameters,
+    first: Callable[[Transform], tuple[float, float, Transform]],
+    last: Callable[[Transform], Transform],
+    starts: Sequence[Start] | None = None,
+) -> Alignment:
+    """Register from every start, and once more from the best result.
+
+    Parameters
+    ----------
+    field, latents, parameters
+        See `slatprep.align.align`.
+    first : callable
+        Registers from a start (4, 4) and returns fitness, inlier rmse [voxel] and
+        the transform (4, 4). The highest fitness wins, then the lowest rmse.
+    last : callable
+        Registers from the winner; returns the transform in the unit cubes.
+    starts : sequence of Start, optional
+        The 24 distinct ones if not given.
+
+    Returns
+    -------
+    Alignment
+        With all 64 candidates.
+    """
+    fits = {
+        start.index: first(make_transform(start.rotation))
+        for start in (distinct_starts() if starts is None else starts)
+    }
+    best = max(fits, key=lambda index: (fits[index][0], -fits[index][1], -index))
+    transform = last(fits[best][2])
+    return Alignment(
+        transform=transform,
+        engine=parameters.engine,
+        model=Model.RIGID,
+        search=Search.EULER64,
+        quality=measure_quality(field, latents, transform, parameters.radius),
+        candidates=candidates_of({index: fit[:2] for index, fit in fits.items()}),
     )
 
 

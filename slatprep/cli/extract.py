@@ -55,17 +55,18 @@ def extract_slat(
     """
     from slatprep import extract as work
 
-    jobs = work.plan(images, out, seeds, by_folder)
+    extractions = work.list_extractions(images, out, seeds, by_folder)
     session = work.load_session(model, revision, device)
     done, problems = [], []
     with output.progress("extract-slat") as progress:
-        for number, result in enumerate(work.extract(session, jobs, preprocess=not no_preprocess)):
+        results = work.extract(session, extractions, preprocess=not no_preprocess)
+        for number, result in enumerate(results):
             if isinstance(result, InputError):
                 problems.append(str(result))
                 output.problem(f"slatprep: {result}")
             else:
                 done.append(result)
-            progress(number + 1, len(jobs))
+            progress(number + 1, len(extractions))
     counts = {
         "extracted": sum(not result.kept for result in done),
         "kept": sum(result.kept for result in done),

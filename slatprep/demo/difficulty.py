@@ -25,7 +25,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from slatprep.demo.generated import Distortion, draw_distortion
+from slatprep.demo.generated import Distortion, Warp, draw_distortion
 from slatprep.demo.model import direction
 from slatprep.demo.shapes import Solid, bounding_box
 from slatprep.geometry.frames import VOXEL_SIZE, cube_symmetries, make_transform, voxel_centres
@@ -123,35 +123,6 @@ class Pose:
 
 
 @dataclass(frozen=True)
-class Warp:
-    """A smooth displacement: a sum of plane sine waves.
-
-    ``amplitude`` and ``wave`` are (W, 3), in units of the cube and radians
-    across it; ``phase`` is (W,).
-    """
-
-    amplitude: Array
-    wave: Array
-    phase: Array
-
-    def __call__(self, points: Array) -> Array:
-        """Return the displaced points."""
-        moved: Array = points + np.sin(points @ self.wave.T + self.phase) @ self.amplitude
-        return moved
-
-    @property
-    def reach(self) -> float:
-        """No point moves farther than this."""
-        return float(np.linalg.norm(self.amplitude, axis=1).sum())
-
-    @property
-    def stretch(self) -> float:
-        """No distance grows by more than this factor."""
-        lengths = np.linalg.norm(self.amplitude, axis=1) * np.linalg.norm(self.wave, axis=1)
-        return 1.0 + float(lengths.sum())
-
-
-@dataclass(frozen=True)
 class Frames:
     """The two poses of one asset, and how its SLAT side was warped or generated (if not None)."""
 
@@ -210,41 +181,32 @@ def draw_frames(rng: Rng, solid: Solid, difficulty: Difficulty, quarter: Array) 
         Poses that keep both sides within their cubes.
     """
     middle = solid.extent.mean(axis=0)
-    warp = _draw_warp(rng, difficulty.warp) if difficulty.warp else None
+    warp = Warp.draw(rng, difficulty.warp, (0.7, 1.3)) if difficulty.warp else None
     room = _FULL - 2.0 * warp.reach if warp else _FULL
     slat_scale = room / float((solid.extent[1] - solid.extent[0]).max())
     full = _FULL - 2.0 * difficulty.room * VOXEL_SIZE
 
+    centre, shift = middle, np.zeros(3)
     if difficulty.any_rotation:
         rotation = _any_rotation(rng)
         box = bounding_box(solid.shapes, rotation)
-        pixieverse = Pose(
-            rotation, full / float((box[1] - box[0]).max()), rotation.T @ box.mean(0), np.zeros(3)
-        )
-        return Frames(pixieverse, Pose(np.eye(3), slat_scale, middle, np.zeros(3)), warp)
-
-    rotation = _tilt(rng, difficulty.tilt) @ quarter if difficulty.tilt else quarter
-    shift = np.zeros(3)
-    if difficulty.shift:
-        shift = direction(rng) * rng.uniform(0.0, difficulty.shift) * VOXEL_SIZE
-    box = bounding_box(solid.shapes, rotation) - rotation @ middle
-    # The largest scale at which neither side of the shifted box leaves the cube.
-    largest = float(np.min(np.stack([full / 2 + shift, full / 2 - shift]) / np.abs(box)))
-    if difficulty.own_boxes:
-        return Frames(
-            Pose(rotation, largest, middle, shift),
-            Pose(np.eye(3), slat_scale, middle, np.zeros(3)),
-            warp,
-        )
-    mismatch = 1.0
-    if difficulty.scale[1]:
-        mismatch += rng.choice([-1.0, 1.0]) * rng.uniform(*difficulty.scale)
-    slat_scale = min(slat_scale, largest * mismatch)
-    return Frames(
-        Pose(rotation, slat_scale / mismatch, middle, shift),
-        Pose(np.eye(3), slat_scale, middle, np.zeros(3)),
-        warp,
-    )
+        centre = rotation.T @ box.mean(0)
+        scale = full / float((box[1] - box[0]).max())
+    else:
+        rotation = _tilt(rng, difficulty.tilt) @ quarter if difficulty.tilt else quarter
+        if difficulty.shift:
+            shift = direction(rng) * rng.uniform(0.0, difficulty.shift) * VOXEL_SIZE
+        box = bounding_box(solid.shapes, rotation) - rotation @ middle
+        # The largest scale at which neither side of the shifted box leaves the cube.
+        scale = float(np.min(np.stack([full / 2 + shift, full / 2 - shift]) / np.abs(box)))
+        if not difficulty.own_boxes:
+            mismatch = 1.0
+            if difficulty.scale[1]:
+                mismatch += rng.choice([-1.0, 1.0]) * rng.uniform(*difficulty.scale)
+            slat_scale = min(slat_scale, scale * mismatch)
+            scale = slat_scale / mismatch
+    slat = Pose(np.eye(3), slat_scale, middle, np.zeros(3))
+    return Frames(Pose(rotation, scale, centre, shift), slat, warp)
 
 
 def generate(rng: Rng, frames: Frames, difficulty: Difficulty, solid: Solid, skin: Array) -> Frames:
@@ -297,14 +259,6 @@ def _any_rotation(rng: Rng) -> Array:
             [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
         ]
     )
-
-
-def _draw_warp(rng: Rng, voxels: float, waves: int = 3) -> Warp:
-    """Return a warp whose root mean square displacement is about `voxels`."""
-    size = voxels * VOXEL_SIZE * np.sqrt(2.0 / waves)
-    amplitude = np.stack([size * direction(rng) for _ in range(waves)])
-    wave = np.stack([2.0 * np.pi * rng.uniform(0.7, 1.3) * direction(rng) for _ in range(waves)])
-    return Warp(amplitude, wave, rng.uniform(0.0, 2.0 * np.pi, waves))
 
 
 def damage(

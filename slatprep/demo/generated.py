@@ -8,8 +8,8 @@ evaluated, not fitted.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, replace
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,6 +31,55 @@ _EDGE = 4.0
 
 
 @dataclass(frozen=True)
+class Warp:
+    """A smooth displacement: a sum of plane sine waves.
+
+    ``amplitude`` and ``wave`` are (W, 3), in units of the points and radians
+    across one unit; ``phase`` is (W,).
+    """
+
+    amplitude: Array
+    wave: Array
+    phase: Array
+
+    @classmethod
+    def draw(cls, rng: Rng, voxels: float, turns: tuple[float, float], waves: int = 3) -> Self:
+        """Draw a displacement of about `voxels` root mean square.
+
+        `turns` bounds how many periods a wave has across the cube.
+        """
+        size = voxels * VOXEL_SIZE * np.sqrt(2.0 / waves)
+        amplitude = np.stack([size * direction(rng) for _ in range(waves)])
+        wave = [2.0 * np.pi * rng.uniform(*turns) * direction(rng) for _ in range(waves)]
+        return cls(amplitude, np.stack(wave), rng.uniform(0.0, 2.0 * np.pi, waves))
+
+    def displacement(self, points: Array) -> Array:
+        """Return by how much points (P, 3) are moved."""
+        moved: Array = np.sin(points @ self.wave.T + self.phase) @ self.amplitude
+        return moved
+
+    def __call__(self, points: Array) -> Array:
+        """Return the displaced points."""
+        return points + self.displacement(points)
+
+    @property
+    def sizes(self) -> tuple[Array, Array]:
+        """Length of each amplitude and of each wave vector, (W,)."""
+        return np.linalg.norm(self.amplitude, axis=1), np.linalg.norm(self.wave, axis=1)
+
+    @property
+    def reach(self) -> float:
+        """No point moves farther than this."""
+        return float(self.sizes[0].sum())
+
+    @property
+    def stretch(self) -> float:
+        """No distance grows by more than this factor."""
+        amplitude, wave = self.sizes
+        return 1.0 + float((amplitude * wave).sum())
+
+
+@dataclass(frozen=True)
 class Distortion:
     """A smooth map from the generated shape to the object, both in object coordinates.
 
@@ -47,10 +96,8 @@ class Distortion:
         Largest edge of that box.
     proportions : ndarray of float64, shape (3,)
         Stretch of the generated shape along each axis of the object.
-    amplitude, wave : ndarray of float64, shape (W, 3)
-        Of each sine wave, in sizes of the object and radians across it.
-    phase : ndarray of float64, shape (W,)
-        Of each sine wave, in radians.
+    waves : Warp
+        The sine waves, in sizes of the object.
     away : ndarray of float64, shape (3,)
         Unit vector that points away from the image's camera.
     slope : float
@@ -60,16 +107,14 @@ class Distortion:
     middle: Array
     size: float
     proportions: Array
-    amplitude: Array
-    wave: Array
-    phase: Array
+    waves: Warp
     away: Array
     slope: float
 
     def __call__(self, points: Array) -> Array:
         """Map points (P, 3) of the generated shape to the object."""
         q = (points - self.middle) / self.size
-        moved: Array = self.middle + self.size * (q + self._bend(q)) / self.proportions
+        moved: Array = self.middle + self.size * (q + self.bend(q)) / self.proportions
         return moved
 
     def inverse(self, points: Array, iterations: int = 40) -> Array:
@@ -81,7 +126,7 @@ class Distortion:
         target = self.proportions * (points - self.middle) / self.size
         q = target
         for _ in range(iterations):
-            q = target - self._bend(q)
+            q = target - self.bend(q)
         mapped: Array = self.middle + self.size * q
         return mapped
 
@@ -90,20 +135,17 @@ class Distortion:
         """No distance grows by more than this factor from the generated shape to the object."""
         return (1.0 + self.slope) / float(self.proportions.min())
 
-    def _bend(self, q: Array) -> Array:
-        return _bend(q, self.amplitude, self.wave, self.phase, self.away)[0]
+    def bend(self, q: Array) -> Array:
+        """Return the bend (P, 3) at points in sizes of the object."""
+        return _growth(q, self.away)[:, None] * self.waves.displacement(q)
 
 
-def _bend(
-    q: Array, amplitude: Array, wave: Array, phase: Array, away: Array
-) -> tuple[Array, Array, Array]:
-    """Return the bend (P, 3), and its two factors: the growth (P,) and the waves (P, 3)."""
-    growth = 1.0 + np.tanh(_EDGE * (q @ away)) / 3.0
-    waves = np.sin(q @ wave.T + phase) @ amplitude
-    return growth[:, None] * waves, growth, waves
+def _growth(q: Array, away: Array) -> Array:
+    """Return the factor (P,) of the bend, which grows towards the unseen side."""
+    return np.asarray(1.0 + np.tanh(_EDGE * (q @ away)) / 3.0)
 
 
-def _slope(amplitude: Array, wave: Array, phase: Array, away: Array) -> float:
+def _slope(waves: Warp, away: Array) -> float:
     """Bound the spectral norm of a bend's derivative in the cube of half edge `_REACH`.
 
     It is taken on a lattice; between its points it changes by no more than the
@@ -112,13 +154,12 @@ def _slope(amplitude: Array, wave: Array, phase: Array, away: Array) -> float:
     steps = 36
     axis = np.linspace(-_REACH, _REACH, steps)
     q = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), axis=-1).reshape(-1, 3)
-    _, growth, waves = _bend(q, amplitude, wave, phase, away)
-    ripple = (growth[:, None] * np.cos(q @ wave.T + phase)) @ np.einsum(
-        "wi,wj->wij", amplitude, wave
-    ).reshape(len(wave), 9)
+    growth, moved = _growth(q, away), waves.displacement(q)
+    outer = np.einsum("wi,wj->wij", waves.amplitude, waves.wave).reshape(-1, 9)
+    ripple = (growth[:, None] * np.cos(q @ waves.wave.T + waves.phase)) @ outer
     rise = (_EDGE / 3.0) * (1.0 - (3.0 * (growth - 1.0)) ** 2)
-    slopes = ripple.reshape(-1, 3, 3) + rise[:, None, None] * waves[:, :, None] * away
-    size, turn = np.linalg.norm(amplitude, axis=1), np.linalg.norm(wave, axis=1)
+    slopes = ripple.reshape(-1, 3, 3) + rise[:, None, None] * moved[:, :, None] * away
+    size, turn = waves.sizes
     # The growth is at most 4/3, its derivative _EDGE / 3, its second one 0.77 _EDGE^2 / 3.
     second = float(
         4.0 / 3.0 * size @ turn**2 + 2.0 * _EDGE / 3.0 * size @ turn + 0.26 * _EDGE**2 * size.sum()
@@ -129,7 +170,7 @@ def _slope(amplitude: Array, wave: Array, phase: Array, away: Array) -> float:
 
 
 def draw_distortion(
-    rng: Rng, extent: Array, proportions: tuple[float, float], bend: float, waves: int = 3
+    rng: Rng, extent: Array, proportions: tuple[float, float], bend: float
 ) -> Distortion:
     """Draw what a generator makes of an object.
 
@@ -143,8 +184,6 @@ def draw_distortion(
         Least and greatest error of the proportions along one axis, as a share.
     bend : float
         Root mean square of the smooth part, in voxels of a grid that the object fills.
-    waves : int
-        How many sine waves make it up.
 
     Returns
     -------
@@ -153,23 +192,18 @@ def draw_distortion(
     """
     stretch = np.ones(3)
     stretch[rng.integers(3)] += rng.choice([-1.0, 1.0]) * rng.uniform(*proportions)
-    size = bend * VOXEL_SIZE * np.sqrt(2.0 / waves)
-    amplitude = np.stack([size * direction(rng) for _ in range(waves)])
-    wave = np.stack([2.0 * np.pi * rng.uniform(0.6, 1.1) * direction(rng) for _ in range(waves)])
-    phase = rng.uniform(0.0, 2.0 * np.pi, waves)
+    waves = Warp.draw(rng, bend, (0.6, 1.1))
     # The image is taken from somewhere around the object, a little above it or below.
     angle, height = rng.uniform(0.0, 2.0 * np.pi), rng.uniform(-0.3, 0.5)
     away = np.array([-np.cos(angle), -np.sin(angle), -height])
     away /= np.linalg.norm(away)
-    slope = _slope(amplitude, wave, phase, away)
+    slope = _slope(waves, away)
     less = float(min(1.0, _LARGEST_SLOPE / slope))
     return Distortion(
         middle=extent.mean(axis=0),
         size=float((extent[1] - extent[0]).max()),
         proportions=stretch,
-        amplitude=less * amplitude,
-        wave=wave,
-        phase=phase,
+        waves=replace(waves, amplitude=less * waves.amplitude),
         away=away,
         slope=less * slope,
     )

@@ -64,7 +64,7 @@ def direction(rng: Rng) -> Vector:
     return unit
 
 
-def curve(points: Sequence[Vector] | Vector, radii: Sequence[float]) -> list[Shape]:
+def curve(points: Sequence[Vector] | Vector, radii: Sequence[float] | Vector) -> list[Shape]:
     """Return capsules along a polyline of points (K, 3), one radius a segment."""
     return [capsule(a, b, k) for a, b, k in zip(points[:-1], points[1:], radii, strict=True)]
 

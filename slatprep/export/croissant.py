@@ -10,10 +10,11 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 from slatprep.errors import StoreError
+from slatprep.export.assets import COLUMNS
 from slatprep.store import Store
 
 CONFORMS_TO = "http://mlcommons.org/croissant/1.0"
@@ -109,6 +110,8 @@ def describe(
 
 def _distribution(store: Store, location: str) -> list[dict[str, Any]]:
     """Describe the root's metadata as a file, and each array as a set of files."""
+    import zarr
+
     path = store.path / "zarr.json"
     try:
         content = path.read_bytes()
@@ -125,14 +128,9 @@ def _distribution(store: Store, location: str) -> list[dict[str, Any]]:
         "encodingFormat": "application/json",
         "sha256": hashlib.sha256(content).hexdigest(),
     }
-    return [root, *(_file_set(name, array, location) for name, array in _arrays(store))]
-
-
-def _arrays(store: Store) -> list[tuple[str, Any]]:
-    import zarr
-
-    members = store.group.members(max_depth=None)
-    return sorted((name, node) for name, node in members if isinstance(node, zarr.Array))
+    arrays = sorted(store.group.members(max_depth=None))
+    sets = [_file_set(name, one, location) for name, one in arrays if isinstance(one, zarr.Array)]
+    return [root, *sets]
 
 
 def _file_set(name: str, array: Any, location: str) -> dict[str, Any]:
@@ -141,45 +139,46 @@ def _file_set(name: str, array: Any, location: str) -> dict[str, Any]:
         f"{dimension} {size}"
         for dimension, size in zip(array.metadata.dimension_names, array.shape, strict=True)
     )
+    kind = "str" if array.dtype.kind in "OTU" else str(array.dtype)
     units = f" [{attributes['units']}]" if "units" in attributes else ""
     return {
         "@type": "cr:FileSet",
         "@id": name,
         "name": name,
         "description": f"{attributes.get('description', '')}{units}. "
-        f"Zarr array of {_type_name(array)}: {dimensions}.",
+        f"Zarr array of {kind}: {dimensions}.",
         "encodingFormat": ZARR,
         "includes": f"{location}/{name}/**",
     }
 
 
-def _type_name(array: Any) -> str:
-    return "str" if array.dtype.kind in "OTU" else str(array.dtype)
-
-
-def _field(record_set: str, name: str, kind: str, description: str) -> dict[str, Any]:
-    return {
-        "@type": "cr:Field",
-        "@id": f"{record_set}/{name}",
-        "name": name,
-        "description": description,
-        "dataType": kind,
-    }
-
-
 def _record_set(
-    name: str, description: str, fields: list[dict[str, Any]], rows: list[dict[str, Any]],
-    key: str, **more: Any,
-) -> dict[str, Any]:  # fmt: skip
+    name: str,
+    description: str,
+    fields: Mapping[str, tuple[str, str]],
+    rows: Iterable[Iterable[Any]],
+    **more: Any,
+) -> dict[str, Any]:
+    """Describe a table: type and meaning of each field, the first of which is the key."""
+    ids = [f"{name}/{field}" for field in fields]
     return {
         "@type": "cr:RecordSet",
         "@id": name,
         "name": name,
         "description": description,
         **more,
-        "key": {"@id": f"{name}/{key}"},
-        "field": fields,
-        "data": [{f"{name}/{field}": value for field, value in row.items()} for row in rows],
+        "key": {"@id": ids[0]},
+        "field": [
+            {
+                "@type": "cr:Field",
+                "@id": f"{name}/{field}",
+                "name": field,
+                "description": meaning,
+                "dataType": kind,
+            }
+            for field, (kind, meaning) in fields.items()
+        ],
+        "data": [dict(zip(ids, row, strict=True)) for row in rows],
     }
 
 
@@ -187,76 +186,44 @@ def _classes(store: Store) -> dict[str, Any]:
     return _record_set(
         "materials",
         "PhysGaussian's material classes, the values of voxel/material and grid/material.",
-        [
-            _field("materials", "id", "sc:Integer", "value in the arrays"),
-            _field("materials", "name", "sc:Text", "name of the class"),
-        ],
-        [{"id": index, "name": name}
-         for index, name in enumerate(store.attributes["material_classes"])],
-        "id",
+        {"id": ("sc:Integer", "value in the arrays"), "name": ("sc:Text", "name of the class")},
+        enumerate(store.attributes["material_classes"]),
         dataType="sc:Enumeration",
-    )  # fmt: skip
+    )
 
 
 def _properties(store: Store) -> dict[str, Any]:
+    ranges = zip(store.normalization.ranges, ("Pa", "kg/m^3", "1"), strict=True)
     return _record_set(
         "properties",
         "The columns of voxel/properties and the channels of grid/properties: a normalised value "
         "v is m = lo + (v + 1) / 2 * (hi - lo), and 10**m where log10 is true, in SI units.",
-        [
-            _field("properties", "name", "sc:Text", "name of the property"),
-            _field("properties", "unit", "sc:Text", "SI unit"),
-            _field("properties", "log10", "sc:Boolean", "whether lo and hi are log10 of it"),
-            _field("properties", "lo", "sc:Float", "value that becomes -1"),
-            _field("properties", "hi", "sc:Float", "value that becomes 1"),
-        ],
-        [
-            {"name": one.name, "unit": unit, "log10": one.log10, "lo": one.lo, "hi": one.hi}
-            for one, unit in zip(store.normalization.ranges, ("Pa", "kg/m^3", "1"), strict=True)
-        ],
-        "name",
+        {
+            "name": ("sc:Text", "name of the property"),
+            "unit": ("sc:Text", "SI unit"),
+            "log10": ("sc:Boolean", "whether lo and hi are log10 of it"),
+            "lo": ("sc:Float", "value that becomes -1"),
+            "hi": ("sc:Float", "value that becomes 1"),
+        },
+        ((one.name, unit, one.log10, one.lo, one.hi) for one, unit in ranges),
     )
-
-
-_ASSET_FIELDS = {
-    "id": "sc:Text",
-    "object_id": "sc:Text",
-    "view": "sc:Text",
-    "category": "sc:Text",
-    "verdict": "sc:Text",
-    "fitness": "sc:Float",
-    "fitness_backward": "sc:Float",
-    "inlier_rmse": "sc:Float",
-    "ambiguity": "sc:Float",
-    "valid_share": "sc:Float",
-}
 
 
 def _assets(store: Store) -> dict[str, Any]:
-    columns = {
-        # NaN, which is not equal to itself, has no word in JSON.
-        name: [value if value == value else None for value in store.column(name).tolist()]
-        for name in _ASSET_FIELDS
-    }
     group: Any = store.group["asset"]
-    fields = [
-        _field("assets", name, kind, group[name].attrs["description"])
-        for name, kind in _ASSET_FIELDS.items()
-    ]
-    fields += [
-        _field("assets", "first_row", "sc:Integer", "its first row of voxel/*"),
-        _field("assets", "end_row", "sc:Integer", "the row after its last"),
-    ]
+    fields, columns = {}, []
+    for name in ("id", *COLUMNS):
+        column = store.column(name)
+        kind = "sc:Float" if column.dtype.kind == "f" else "sc:Text"
+        fields[name] = kind, group[name].attrs["description"]
+        # NaN, which is not equal to itself, has no word in JSON.
+        columns.append([value if value == value else None for value in column.tolist()])
+    fields["first_row"] = "sc:Integer", "its first row of voxel/*"
+    fields["end_row"] = "sc:Integer", "the row after its last"
     offsets = store.offsets.tolist()
-    rows = [
-        {**dict(zip(columns, values, strict=True)), "first_row": first, "end_row": end}
-        for *values, first, end in zip(
-            *columns.values(), offsets[:-1], offsets[1:], strict=True
-        )
-    ]  # fmt: skip
-    return _record_set(
-        "assets", "One row an asset: what it is, and how good its alignment is.", fields, rows, "id"
-    )
+    rows = zip(*columns, offsets[:-1], offsets[1:], strict=True)
+    description = "One row an asset: what it is, and how good its alignment is."
+    return _record_set("assets", description, fields, rows)
 
 
 def to_json(description: Mapping[str, Any]) -> str:

@@ -31,28 +31,25 @@ class VoxelBaseline:
         return np.clip(outputs[:, :3], -1, 1), outputs[:, 3:].argmax(axis=1)
 
 
-def fit_linear(dataset: SlatDataset) -> VoxelBaseline:
-    """Fit by least squares over all valid voxels, each weighted alike."""
-    products = np.zeros((12, 12)), np.zeros((12, 3 + CLASSES))
+def fit_baselines(dataset: SlatDataset) -> tuple[VoxelBaseline, VoxelBaseline]:
+    """Fit both references in one pass over all valid voxels, each weighted alike.
+
+    Returns
+    -------
+    mean, linear : VoxelBaseline
+        The mean and the most frequent class everywhere; least squares.
+    """
+    squares, products = np.zeros((12, 12)), np.zeros((12, 3 + CLASSES))
     for item in (dataset[k] for k in range(len(dataset))):
         valid = item.valid.numpy()
         inputs, targets = _inputs(item)[valid], _targets(item)[valid]
-        products[0][...] += inputs.T @ inputs
-        products[1][...] += inputs.T @ targets
-    solution = np.linalg.lstsq(*products, rcond=None)[0]
-    return VoxelBaseline(np.asarray(solution, np.float64))
-
-
-def fit_mean(dataset: SlatDataset) -> VoxelBaseline:
-    """Return the model that predicts the mean, and the most frequent class, everywhere."""
-    total, count = np.zeros(3 + CLASSES), 0
-    for item in (dataset[k] for k in range(len(dataset))):
-        valid = item.valid.numpy()
-        total += _targets(item)[valid].sum(axis=0)
-        count += int(valid.sum())
-    weights = np.zeros((12, 3 + CLASSES))
-    weights[-1] = total / count
-    return VoxelBaseline(weights)
+        squares += inputs.T @ inputs
+        products += inputs.T @ targets
+    # The last input is 1, so its products are the sum of the targets and the count.
+    mean = np.zeros_like(products)
+    mean[-1] = products[-1] / squares[-1, -1]
+    linear = np.linalg.lstsq(squares, products, rcond=None)[0]
+    return VoxelBaseline(mean), VoxelBaseline(np.asarray(linear, np.float64))
 
 
 def _inputs(item: Item) -> NDArray[np.float64]:

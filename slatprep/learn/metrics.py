@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from enum import StrEnum
 from pathlib import Path
 from typing import Literal
 
@@ -17,22 +16,11 @@ from slatprep.learn.splits import Shares, Split, select_assets
 from slatprep.records import Place
 from slatprep.store import open_store
 
+METRICS = ("log10 E", "log10 density", "nu", "mean", "accuracy")
+"""Mean squared errors in normalised space, the mean of the three, and class accuracy.
 
-class Metric(StrEnum):
-    """Mean squared errors in normalised space, the mean of the three, and class accuracy.
-
-    The values are the columns of tables and CSV files.
-    """
-
-    YOUNGS_MODULUS = "log10 E"
-    DENSITY = "log10 density"
-    POISSONS_RATIO = "nu"
-    MEAN = "mean"
-    ACCURACY = "accuracy"
-
-
-METRICS = tuple(metric.value for metric in Metric)
-"""The columns, in the order of `Metric`."""
+The names are the columns of tables and CSV files.
+"""
 
 Spread = Literal["se", "sd"]
 
@@ -114,7 +102,7 @@ def measure(scores: NDArray[np.float64], spread: Spread) -> Measure:
     Parameters
     ----------
     scores : ndarray of float64, shape (objects, 5)
-        `METRICS` of each.
+        `METRICS` of each; one object at least.
     spread : {"se", "sd"}
         Standard error of the mean, or standard deviation.
     """
@@ -122,12 +110,11 @@ def measure(scores: NDArray[np.float64], spread: Spread) -> Measure:
     deviation = np.full(len(METRICS), np.nan)
     if count > 1:
         deviation = scores.std(axis=0, ddof=1) / (np.sqrt(count) if spread == "se" else 1.0)
-    mean = scores.mean(axis=0) if count else deviation
-    return Measure(
-        count,
-        dict(zip(METRICS, mean.tolist(), strict=True)),
-        dict(zip(METRICS, deviation.tolist(), strict=True)),
+    mean, deviation = (
+        dict(zip(METRICS, figures.tolist(), strict=True))
+        for figures in (scores.mean(axis=0), deviation)
     )
+    return Measure(count, mean, deviation)
 
 
 def average_objects(
@@ -147,21 +134,14 @@ def average_objects(
     spread : {"se", "sd"}
         As in `measure`.
     """
-    views: dict[str, list[NDArray[np.float64]]] = {}
-    for score, object_id in zip(scores, objects, strict=True):
-        views.setdefault(object_id, []).append(score)
-    per_object = {object_id: np.mean(rows, axis=0) for object_id, rows in views.items()}
-    category_of = dict(zip(objects, categories, strict=True))
-
-    def over(chosen: list[str]) -> Measure:
-        rows = np.array([per_object[object_id] for object_id in chosen])
-        return measure(rows.reshape(-1, len(METRICS)), spread)
-
+    _, first, number = np.unique(objects, return_index=True, return_inverse=True)
+    rows = np.array(scores)
+    per_object = np.array([rows[number == k].mean(axis=0) for k in range(len(first))])
+    category = np.array(categories)[first]
     groups = {
-        category: over([o for o in per_object if category_of[o] == category])
-        for category in sorted(set(categories))
+        str(name): measure(per_object[category == name], spread) for name in np.unique(category)
     }
-    return over(list(per_object)), groups
+    return measure(per_object, spread), groups
 
 
 def evaluate_store(

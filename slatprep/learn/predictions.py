@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import ExitStack, contextmanager
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -55,19 +55,19 @@ def open_predictions(path: Path) -> Iterator[ReadAsset]:
     InputError
         If it is none of these.
     """
-    with ExitStack() as stack:
-        if path.is_dir() and any((path / name).exists() for name in ("zarr.json", ".zgroup")):
-            import zarr
+    if path.is_dir() and any((path / name).exists() for name in ("zarr.json", ".zgroup")):
+        import zarr
 
-            yield _grouped(zarr.open_group(path, mode="r"))
-        elif path.is_dir():
-            yield lambda asset_id: _npz(path / f"{asset_id}.npz")
-        else:
-            import h5py
+        yield _grouped(zarr.open_group(path, mode="r"))
+    elif path.is_dir():
+        yield lambda asset_id: _npz(path / f"{asset_id}.npz")
+    else:
+        import h5py
 
-            if not h5py.is_hdf5(path):
-                raise InputError(path, "is not in a form that is known", _FORMS)
-            yield _grouped(stack.enter_context(h5py.File(path, "r")))
+        if not h5py.is_hdf5(path):
+            raise InputError(path, "is not in a form that is known", _FORMS)
+        with h5py.File(path, "r") as file:
+            yield _grouped(file)
 
 
 def check_prediction(

@@ -10,11 +10,10 @@ from pathlib import Path
 from pickle import UnpicklingError
 from typing import Any
 
-import numpy as np
 import torch
-from numpy.typing import NDArray
 
 from slatprep.errors import ConfigError, InputError
+from slatprep.storage.atomic import staged
 
 LAST, BEST = "last.pt", "best.pt"
 
@@ -68,9 +67,8 @@ class Run:
 
     def save(self, name: str, state: dict[str, Any]) -> None:
         """Write a checkpoint; the old one stays until the new one is whole."""
-        partial = self.path / f"{name}.partial"
-        torch.save(state, partial)
-        partial.replace(self.path / name)
+        with staged(self.path / name) as path:
+            torch.save(state, path)
 
     def load(self, name: str) -> dict[str, Any] | None:
         """Read a checkpoint, None if there is none.
@@ -114,23 +112,18 @@ class Run:
         history : sequence of EpochRecord
             One epoch at least.
         references : dict of str to float
-            Name and mean squared error of each reference.
+            Name and mean squared error of each of the two references.
         """
-        from matplotlib.backends.backend_agg import FigureCanvasAgg
         from matplotlib.figure import Figure
         from matplotlib.ticker import MaxNLocator
 
         figure = Figure(figsize=(6.6, 3.6), layout="constrained")
-        FigureCanvasAgg(figure)
         axes = figure.add_subplot()
         errors = [record.val_mse for record in history]
         axes.plot([record.epoch + 1 for record in history], errors, "o-", color=INK, ms=4)
-        lines = {"decoder": errors[-1]} | references
-        for style, error in zip(
-            ("--", ":", "-.") * len(references), references.values(), strict=False
-        ):
+        for style, error in zip(("--", ":"), references.values(), strict=True):
             axes.axhline(error, color=MUTED, linestyle=style)
-        for name, error in lines.items():
+        for name, error in {"decoder": errors[-1], **references}.items():
             axes.annotate(name, (1.0, error), (6, 0), va="center", textcoords="offset points",
                           xycoords=("axes fraction", "data"), fontsize=9, color=INK)  # fmt: skip
         axes.set(xlabel="passes over the training objects", ylabel="validation MSE (normalised)")
@@ -138,17 +131,3 @@ class Run:
         axes.xaxis.set_major_locator(MaxNLocator(integer=True))
         axes.spines[["top", "right"]].set_visible(False)
         figure.savefig(self.path / "curve.png", dpi=120)
-
-    def write_prediction(
-        self,
-        asset_id: str,
-        coords: NDArray[np.uint8],
-        properties: NDArray[np.float32],
-        material: NDArray[np.uint8],
-    ) -> None:
-        """Write what `slatprep evaluate` reads: ``predictions/<asset_id>.npz``."""
-        folder = self.path / "predictions"
-        folder.mkdir(exist_ok=True)
-        np.savez_compressed(
-            folder / f"{asset_id}.npz", coords=coords, properties=properties, material=material
-        )

@@ -15,7 +15,7 @@ from torch.nn import functional
 
 from slatprep.errors import ConfigError, InputError
 from slatprep.learn.augment import Augmentation
-from slatprep.learn.baselines import VoxelBaseline, fit_linear, fit_mean
+from slatprep.learn.baselines import VoxelBaseline, fit_baselines
 from slatprep.learn.dataset import IGNORED, SlatDataset, SlatLoader, SparseBatch
 from slatprep.learn.decoder import SIZES, PhysicsDecoder, Prediction, make_decoder
 from slatprep.learn.runs import BEST, LAST, EpochRecord, Run
@@ -161,24 +161,24 @@ def train(
     while not session.finished and session.epoch != stop_after:
         train_loss, rate = session.run_epoch()
         record = EpochRecord(session.epoch, rate, train_loss, *session.validate(val_set))
-        better = session.note(record)
+        session.history.append(record)
         run.save(LAST, session.state())
-        if better:
+        if session.best_epoch == record.epoch:
             run.save(BEST, {"size": parameters.size, "model": session.model.state_dict()})
         run.log(session.history)
         if progress is not None:
             progress(record)
-    references = {
-        "mean of the training voxels": _reference(fit_mean(train_set), val_set),
-        "linear in each voxel": _reference(fit_linear(train_set), val_set),
-    }
+    names = "mean of the training voxels", "linear in each voxel"
+    baselines = zip(names, fit_baselines(train_set), strict=True)
+    references = {name: _reference(baseline, val_set) for name, baseline in baselines}
     run.draw(session.history, references)
     best = run.load(BEST)
     if best is None:
         raise InputError(run.path / BEST, "is missing", "the best model; train anew")
     session.model.load_state_dict(best["model"])
-    _predict(session.model, test_set, run, device)
-    return TrainSummary(session.history, session.best_epoch, references, out / "predictions")
+    predictions = run.path / "predictions"
+    _write_predictions(session.model, test_set, predictions, device)
+    return TrainSummary(session.history, session.best_epoch, references, predictions)
 
 
 class _Session:
@@ -192,12 +192,9 @@ class _Session:
         self.parameters, self.device = parameters, device
         self.model = make_decoder(parameters.size).to(device)
         self.optimizer = torch.optim.AdamW(self.model.parameters(), lr=parameters.learning_rate)
+        pinned = device != "cpu"
         self.loader = SlatLoader(
-            dataset,
-            parameters.batch_size,
-            shuffle=True,
-            workers=workers,
-            pin_memory=device != "cpu",
+            dataset, parameters.batch_size, shuffle=True, workers=workers, pin_memory=pinned
         )
         self.steps = math.ceil(len(self.loader) / parameters.accumulate)
         self.history: list[EpochRecord] = []
@@ -222,7 +219,8 @@ class _Session:
         self.loader.set_epoch(self.epoch)
         accumulate, losses, rate = self.parameters.accumulate, [], 0.0
         for number, batch in enumerate(self.loader):
-            loss = self._loss(batch.to(self.device))
+            moved = batch.to(self.device)
+            loss = loss_of(self._predict(moved), moved)
             # The last step of an epoch may have fewer batches.
             first = number - number % accumulate
             (loss / min(accumulate, len(self.loader) - first)).backward()  # type: ignore[no-untyped-call]
@@ -250,11 +248,6 @@ class _Session:
         loss, error, accuracy = np.mean(scores, axis=0).tolist()
         return loss, error, accuracy
 
-    def note(self, record: EpochRecord) -> bool:
-        """Remember an epoch; return whether it is the best so far."""
-        self.history.append(record)
-        return self.best_epoch == record.epoch
-
     def state(self) -> dict[str, Any]:
         return {
             "model": self.model.state_dict(),
@@ -279,9 +272,6 @@ class _Session:
             prediction: Prediction = self.model(batch.coords, batch.feats)
         return prediction
 
-    def _loss(self, batch: SparseBatch) -> Tensor:
-        return loss_of(self._predict(batch), batch)
-
 
 def _dataset(store: Place, split: Split, parameters: TrainParameters) -> SlatDataset:
     return SlatDataset(
@@ -305,14 +295,18 @@ def _reference(baseline: VoxelBaseline, dataset: SlatDataset) -> float:
 
 
 @torch.no_grad()
-def _predict(model: PhysicsDecoder, dataset: SlatDataset, run: Run, device: str) -> None:
+def _write_predictions(
+    model: PhysicsDecoder, dataset: SlatDataset, folder: Path, device: str
+) -> None:
+    """Write what `slatprep evaluate` reads: ``<asset_id>.npz``."""
+    folder.mkdir(exist_ok=True)
     model.eval()
     for batch in SlatLoader(dataset):
         moved = batch.to(device)
         prediction: Prediction = model(moved.coords, moved.feats)
-        run.write_prediction(
-            batch.asset_ids[0],
-            batch.coords[:, 1:].numpy().astype(np.uint8),
-            prediction.properties.cpu().numpy(),
-            prediction.logits.argmax(1).cpu().numpy().astype(np.uint8),
+        np.savez_compressed(
+            folder / f"{batch.asset_ids[0]}.npz",
+            coords=batch.coords[:, 1:].numpy().astype(np.uint8),
+            properties=prediction.properties.cpu().numpy(),
+            material=prediction.logits.argmax(1).cpu().numpy().astype(np.uint8),
         )

@@ -85,6 +85,7 @@ def test_places_are_where_the_maps_inverted_by_numbers_put_them():
     skin = rng.uniform(*solid.extent, (500, 3))
     frames = generate(rng, frames, LEVELS[5], solid, skin)
     shape, slat = frames.distortion, frames.slat.matrix()
+    waves = shape.waves
     wanted = skin[:20]
 
     def object_of(y):
@@ -92,7 +93,7 @@ def test_places_are_where_the_maps_inverted_by_numbers_put_them():
         growth = 1.0 + np.tanh(4.0 * (shape.away @ q)) / 3.0
         bend = sum(
             a * np.sin(k @ q + p)
-            for a, k, p in zip(shape.amplitude, shape.wave, shape.phase, strict=True)
+            for a, k, p in zip(waves.amplitude, waves.wave, waves.phase, strict=True)
         )
         return shape.middle + shape.size * (q + growth * bend) / shape.proportions
 

@@ -15,7 +15,7 @@ from click.testing import CliRunner
 
 from slatprep import ConfigError, InputError
 from slatprep.cli.commands import slatprep
-from slatprep.learn.baselines import fit_linear, fit_mean
+from slatprep.learn.baselines import fit_baselines
 from slatprep.learn.dataset import IGNORED, SlatDataset, SparseBatch, collate
 from slatprep.learn.decoder import Prediction, make_decoder
 from slatprep.learn.runs import BEST, LAST
@@ -140,8 +140,9 @@ def test_baselines_are_what_numpy_finds(learn_store: Path) -> None:
     places = np.concatenate([(item.coords.numpy() + 0.5) / 64 - 0.5 for item in items])
     inputs = np.hstack([feats, places, np.ones((len(feats), 1))])[valid]
     solution = np.linalg.lstsq(inputs, targets, rcond=None)[0]
-    np.testing.assert_allclose(fit_linear(dataset).weights[:, :3], solution, atol=1e-6)
-    mean, classes = fit_mean(dataset).predict(items[0])
+    constant, linear = fit_baselines(dataset)
+    np.testing.assert_allclose(linear.weights[:, :3], solution, atol=1e-6)
+    mean, classes = constant.predict(items[0])
     np.testing.assert_allclose(mean[0], targets.mean(axis=0), atol=1e-9)
     material = np.concatenate([item.material.numpy() for item in items])[valid]
     assert (classes == np.bincount(material).argmax()).all()
