@@ -110,11 +110,11 @@ def measure(scores: NDArray[np.float64], spread: Spread) -> Measure:
     deviation = np.full(len(METRICS), np.nan)
     if count > 1:
         deviation = scores.std(axis=0, ddof=1) / (np.sqrt(count) if spread == "se" else 1.0)
-    mean, deviation = (
+    means, spreads = (
         dict(zip(METRICS, figures.tolist(), strict=True))
         for figures in (scores.mean(axis=0), deviation)
     )
-    return Measure(count, mean, deviation)
+    return Measure(count, means, spreads)
 
 
 def average_objects(
