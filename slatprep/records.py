@@ -34,6 +34,10 @@ MATERIAL_CLASSES = (
 )
 """PhysGaussian's material classes, by id."""
 
+FEATS_MEAN = (-2.1688, -0.0043, -0.1335, -0.0842, -0.5271, 0.7239, -1.1414, 1.2039)
+FEATS_STD = (2.3777, 2.3864, 2.1244, 2.1749, 2.6639, 2.3712, 2.6217, 2.6845)
+"""Of each latent channel, as TRELLIS publishes them for ``slat_flow_img_dit_L_64l8p2_fp16``."""
+
 BACKGROUND = 7
 """Material id of an empty voxel."""
 

@@ -151,7 +151,7 @@ def make_asset(
             seen = generate(rng, seen, difficulty, solid, skin)
         rng = np.random.default_rng([seed, index, _LATENTS, v])
         view = _slat_side(rng, f"view_{v}" if views > 1 else "", solid, seen, latents)
-        made.append(_with_places(view, seen) if difficulty.has_places else view)
+        made.append(view if difficulty.has_places else replace(view, places=None))
     return DemoAsset(
         object_id(seed, index),
         model.name,
@@ -196,15 +196,11 @@ def _slat_side(
 ) -> DemoView:
     surface = voxelise(frames.slat_distance(solid))[0]
     coords = np.argwhere(surface).astype(np.uint8)
+    centres = voxel_centres(coords)
     material, properties = solid.table()
-    stuff = solid.stuff_at(frames.slat_to_object(voxel_centres(coords)))
+    stuff = solid.stuff_at(frames.slat_to_object(centres))
     feats = make_latents(rng, latents, coords, material[stuff], properties[stuff])
-    return DemoView(view, coords, feats, frames.transform(), material[stuff], properties[stuff])
-
-
-def _with_places(view: DemoView, frames: Frames) -> DemoView:
-    centres = voxel_centres(view.coords)
     places = frames.places(centres)
     # Where the shape is the object's own, its transform leads to the places exactly.
-    transform = nearest_similarity(places, centres) if frames.distortion else view.transform
-    return replace(view, places=places, transform=transform)
+    transform = nearest_similarity(places, centres) if frames.distortion else frames.transform()
+    return DemoView(view, coords, feats, transform, material[stuff], properties[stuff], places)

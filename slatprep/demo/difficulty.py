@@ -26,14 +26,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slatprep.demo.generated import Distortion, Warp, draw_distortion
-from slatprep.demo.model import direction
+from slatprep.demo.model import Array, Rng, direction
 from slatprep.demo.shapes import Solid, bounding_box
 from slatprep.geometry.frames import VOXEL_SIZE, cube_symmetries, make_transform, voxel_centres
 from slatprep.geometry.voxels import boundary
 from slatprep.records import RESOLUTION
-
-Rng = np.random.Generator
-Array = NDArray[np.float64]
 
 # A hair less than the cube, so that no surface lies on its very faces.
 _FULL = 1.0 - 1e-4

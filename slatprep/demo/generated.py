@@ -14,11 +14,8 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from slatprep.demo.model import direction
+from slatprep.demo.model import Array, Rng, direction
 from slatprep.geometry.frames import VOXEL_SIZE
-
-Rng = np.random.Generator
-Array = NDArray[np.float64]
 
 _LARGEST_SLOPE = 0.7
 """No bend changes by more than this share of a way; below 1 nothing folds."""

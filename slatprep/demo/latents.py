@@ -1,7 +1,6 @@
 """Stand-ins for the eight latent channels of a SLAT.
 
-Mean and standard deviation of each channel are those that TRELLIS publishes
-for ``slat_flow_img_dit_L_64l8p2_fp16``.
+Mean and standard deviation of each channel are TRELLIS's, see `slatprep.records`.
 """
 
 from __future__ import annotations
@@ -12,11 +11,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slatprep.geometry.frames import voxel_centres
+from slatprep.records import FEATS_MEAN, FEATS_STD
 
 LatentKind = Literal["placeholder", "material"]
 
-MEAN = np.array([-2.1688, -0.0043, -0.1335, -0.0842, -0.5271, 0.7239, -1.1414, 1.2039])
-STD = np.array([2.3777, 2.3864, 2.1244, 2.1749, 2.6639, 2.3712, 2.6217, 2.6845])
+MEAN, STD = np.array(FEATS_MEAN), np.array(FEATS_STD)
 
 NOISE = 0.5
 """Share of noise (as a standard deviation) in latents that follow the material."""

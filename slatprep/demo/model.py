@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 from slatprep.demo.shapes import Part, Shape, Stuff, capsule, carve, cone, polytope
 
 Rng = np.random.Generator
-Vector = NDArray[np.float64]
+Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -39,32 +39,32 @@ class Parts(list[Part]):
         self += [Part(shape, stuff) for shape in shapes]
 
 
-def vec(*values: float) -> Vector:
+def vec(*values: float) -> Array:
     """Return a vector of float64."""
     return np.array(values, dtype=np.float64)
 
 
-def around(angle: float, radius: float, z: float) -> Vector:
+def around(angle: float, radius: float, z: float) -> Array:
     """Return a point in cylindrical coordinates (angle in radians)."""
     return vec(radius * np.cos(angle), radius * np.sin(angle), z)
 
 
-def orient(angle: float, tilt: float = 0.0) -> Vector:
+def orient(angle: float, tilt: float = 0.0) -> Array:
     """Return a rotation (3, 3) about z by `angle` after tilting about y by `tilt` (radians)."""
     c, s, ct, st = np.cos(angle), np.sin(angle), np.cos(tilt), np.sin(tilt)
     heading = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
-    lean: Vector = heading @ np.array([[ct, 0, st], [0, 1, 0], [-st, 0, ct]])
+    lean: Array = heading @ np.array([[ct, 0, st], [0, 1, 0], [-st, 0, ct]])
     return lean
 
 
-def direction(rng: Rng) -> Vector:
+def direction(rng: Rng) -> Array:
     """Draw a unit vector uniformly."""
     vector = rng.normal(size=3)
-    unit: Vector = vector / np.linalg.norm(vector)
+    unit: Array = vector / np.linalg.norm(vector)
     return unit
 
 
-def curve(points: Sequence[Vector] | Vector, radii: Sequence[float] | Vector) -> list[Shape]:
+def curve(points: Sequence[Array] | Array, radii: Sequence[float] | Array) -> list[Shape]:
     """Return capsules along a polyline of points (K, 3), one radius a segment."""
     return [capsule(a, b, k) for a, b, k in zip(points[:-1], points[1:], radii, strict=True)]
 

@@ -12,10 +12,9 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from slatprep.demo.difficulty import UNLABELLED
+from slatprep.demo.model import Rng
 from slatprep.geometry.frames import VOXEL_SIZE, voxel_centres
 from slatprep.records import RESOLUTION
-
-Rng = np.random.Generator
 
 THICKENING = 0.5
 """How far [voxel] the surface lies outside that of the exact grid.

@@ -9,14 +9,16 @@ from __future__ import annotations
 import functools
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from slatprep.errors import StoreError
 from slatprep.export.assets import Exported, file_name
-from slatprep.export.bounds import LAST, Bounds, read_bounds
 from slatprep.export.formats import ExportOptions, Frame, Points, Writer
 from slatprep.geometry.frames import apply_transform, invert_transform, voxel_centres
+from slatprep.provenance.stored import StoredRecords
 from slatprep.records import MATERIAL_COLOURS, RESOLUTION
 from slatprep.store import Store, StoredAsset
 
@@ -39,6 +41,13 @@ _COMMENTS = {
     "slat": "frame SLAT, unit cube -0.5..0.5, z up",
     "pixieverse": "frame PixieVerse, world coordinates of its bounds",
 }
+
+
+Bounds = NDArray[np.float64]
+"""Smallest and largest world coordinate of a field: (2, 3), columns x, y, z."""
+
+UNIT_CUBE: Bounds = np.array([[-0.5] * 3, [0.5] * 3])
+"""Pixie's own default bounds."""
 
 
 def writer(store: Store, ids: Sequence[str], options: ExportOptions) -> Writer:
@@ -154,15 +163,63 @@ def write_points(
     _write(path, vertices, (frame, UNITS))
 
 
-def to_world(points: ArrayLike, bounds: Bounds) -> NDArray[np.float64]:
+def read_bounds(store: Store, ids: Sequence[str]) -> tuple[dict[str, Bounds], tuple[str, ...]]:
+    """Read the world bounds of assets from their records.
+
+    Parameters
+    ----------
+    store : Store
+        The store.
+    ids : sequence of str
+        The assets.
+
+    Returns
+    -------
+    bounds : dict
+        By asset id; `UNIT_CUBE` where the sources stated none.
+    notes : tuple of str
+        What a person should know.
+
+    Raises
+    ------
+    StoreError
+        If a record's bounds make no sense.
+    """
+    records = StoredRecords(store)
+    stated = {asset_id: records.of(asset_id).bounds for asset_id in ids}
+    bounds = {
+        asset_id: _bounds(one, f"{store.path}: {asset_id}") if one else UNIT_CUBE
+        for asset_id, one in stated.items()
+    }
+    missing = sum(not one for one in stated.values())
+    if not missing:
+        return bounds, ()
+    note = f"{missing:,} assets have no world bounds; Pixie's default -0.5..0.5 was taken"
+    return bounds, (note,)
+
+
+def _bounds(stated: dict[str, Any], where: str) -> Bounds:
+    try:
+        bounds = np.array([stated["min_bounds"], stated["max_bounds"]], dtype=np.float64)
+        if bounds.shape != (2, 3) or not (bounds[0] < bounds[1]).all():
+            raise ValueError
+    except (KeyError, TypeError, ValueError):
+        raise StoreError(
+            f"{where} has bounds {stated}; expected min_bounds and max_bounds of "
+            "three numbers each, min below max"
+        ) from None
+    return bounds
+
+
+def to_world(points: ArrayLike, bounds: ArrayLike) -> NDArray[np.float64]:
     """Carry points of the PixieVerse frame to world coordinates.
 
     Parameters
     ----------
     points : array_like, shape (N, 3)
         Points of the unit cube in which voxel i is centred at (i + 0.5)/64 - 0.5.
-    bounds : Bounds
-        What ``clip_features.npz`` states.
+    bounds : array_like, shape (2, 3)
+        What ``clip_features.npz`` states: the least and the greatest corner.
 
     Returns
     -------
@@ -177,7 +234,7 @@ def to_world(points: ArrayLike, bounds: Bounds) -> NDArray[np.float64]:
     """
     lo, hi = np.asarray(bounds, dtype=np.float64)
     index = (np.asarray(points, dtype=np.float64) + 0.5) * RESOLUTION - 0.5
-    world: NDArray[np.float64] = lo + index * (hi - lo) / LAST
+    world: NDArray[np.float64] = lo + index * (hi - lo) / (RESOLUTION - 1)
     return world
 
 

@@ -14,12 +14,10 @@ from torch.utils.data import DataLoader, Dataset, Sampler
 from slatprep.errors import ConfigError
 from slatprep.learn.augment import Augmentation, lattice_symmetries, move
 from slatprep.learn.splits import Shares, Split, select_assets
+from slatprep.records import FEATS_MEAN as FEATS_MEAN
+from slatprep.records import FEATS_STD as FEATS_STD
 from slatprep.records import UNANNOTATED, Place
 from slatprep.store import Store, open_store
-
-FEATS_MEAN = (-2.1688, -0.0043, -0.1335, -0.0842, -0.5271, 0.7239, -1.1414, 1.2039)
-FEATS_STD = (2.3777, 2.3864, 2.1244, 2.1749, 2.6639, 2.3712, 2.6217, 2.6845)
-"""What TRELLIS publishes for ``slat_flow_img_dit_L_64l8p2_fp16``."""
 
 IGNORED = -100
 """Class of a voxel without annotation: what `torch.nn.functional.cross_entropy` passes over."""
@@ -201,14 +199,8 @@ def collate(items: Sequence[Item]) -> SparseBatch:
         torch.nn.functional.pad(item.coords, (1, 0), value=number)
         for number, item in enumerate(items)
     ]
-    return SparseBatch(
-        [item.asset_id for item in items],
-        torch.cat(coords),
-        *(
-            torch.cat([getattr(item, name) for item in items])
-            for name in ("feats", "properties", "material", "valid")
-        ),
-    )
+    others = (torch.cat([getattr(item, name) for item in items]) for name in _COLUMNS[1:])
+    return SparseBatch([item.asset_id for item in items], torch.cat(coords), *others)
 
 
 class EpochSampler(Sampler[Draw]):
