@@ -32,7 +32,7 @@ from slatprep.geometry.frames import VOXEL_SIZE, cube_symmetries, make_transform
 from slatprep.geometry.voxels import boundary
 from slatprep.records import RESOLUTION
 
-# A hair less than the cube, so that no surface lies on its very faces.
+# Slightly smaller than the cube, so that no surface lies exactly on its faces.
 _FULL = 1.0 - 1e-4
 
 EMPTY, UNLABELLED = -1, -2

@@ -37,7 +37,7 @@ _MOST_LOST = 0.15  # Share of an object that is lost at most with its thin parts
 def nerf_field(
     rng: Rng, stuff: NDArray[np.int16], up: NDArray[np.float64], stuffs: int
 ) -> NDArray[np.int16]:
-    """Make of an exact grid what a NeRF would have left of it.
+    """Degrade an exact grid as the density of a NeRF would.
 
     Parameters
     ----------

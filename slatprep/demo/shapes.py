@@ -229,8 +229,8 @@ class Solid:
         self.parts = tuple(parts)
         self.shapes = tuple(part.shape for part in self.parts)
         self.extent = bounding_box(self.shapes, np.eye(3))
-        # A part is looked at only near its own box; elsewhere it is at least
-        # this far, which is all that the voxelisation has to know.
+        # A part is evaluated only near its own box; elsewhere its distance is at
+        # least this, which is all that the voxelisation needs.
         self.reach = reach * float((self.extent[1] - self.extent[0]).max())
         self._boxes = [shape.box() for shape in self.shapes]
         self.stuffs: list[Stuff] = []

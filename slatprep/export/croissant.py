@@ -216,7 +216,7 @@ def _assets(store: Store) -> dict[str, Any]:
         column = store.column(name)
         kind = "sc:Float" if column.dtype.kind == "f" else "sc:Text"
         fields[name] = kind, group[name].attrs["description"]
-        # NaN, which is not equal to itself, has no word in JSON.
+        # JSON has no NaN, the one value that is not equal to itself: null stands for it.
         columns.append([value if value == value else None for value in column.tolist()])
     fields["first_row"] = "sc:Integer", "its first row of voxel/*"
     fields["end_row"] = "sc:Integer", "the row after its last"

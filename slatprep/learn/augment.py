@@ -1,4 +1,4 @@
-"""Augmentation that stays true: the symmetries of the voxel lattice.
+"""Augmentation that keeps every target valid: the symmetries of the voxel lattice.
 
 A quarter turn or a flip sends voxels to voxels, so it needs no interpolation,
 and each voxel keeps its own latents and targets. Young's modulus, density,

@@ -1,4 +1,4 @@
-"""What any decoder must beat: the training mean, and a linear model of each voxel alone."""
+"""References for a decoder: the training mean, and a linear model of each voxel alone."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a training run leaves behind: parameters, log, checkpoints, curve, predictions."""
+"""The directory of a training run: parameters, log, checkpoints, curve, predictions."""
 
 from __future__ import annotations
 
@@ -105,7 +105,7 @@ class Run:
                 board.add_scalar(name, getattr(history[-1], name), history[-1].epoch)
 
     def draw(self, history: Sequence[EpochRecord], references: dict[str, float]) -> None:
-        """Draw ``curve.png``: validation error by epoch, beside what needs no network.
+        """Draw ``curve.png``: validation error by epoch, beside the references.
 
         Parameters
         ----------
