@@ -153,7 +153,7 @@ def source_options(command: _Function) -> _Function:
         option("--config", FILE, text="Dataset definition (TOML); options win over it."),
         option("--pixieverse", PLACE, text=_PIXIEVERSE),
         option("--slat", PLACE, text="Root of the TRELLIS latents, or one HDF5 file, or a URL."),
-        option("--map", PLACE, text=_MAP, name="pairing_map"),
+        option("--map", PLACE, text=_MAP),
         option("--ranges", text=_RANGES, metavar="dataset|pixie|FILE"),
         option("--preset", preset, text=_PRESET),
     )
@@ -242,16 +242,12 @@ def parameters_of(options: dict[str, Any]) -> BuildParameters:
     BuildParameters
         What they ask for.
     """
-    from slatprep.parameters.files import load_parameters
+    from slatprep.parameters.files import OPTIONS, load_parameters
 
     given: dict[str, dict[str, object]] = {}
-    for option_name, group, key in (
-        ("pixieverse", "pixieverse", "root"),
-        ("slat", "slat", "root"),
-        ("pairing_map", "pairing", "map"),
-        ("ranges", "normalize", "ranges"),
-    ):
-        if (value := options.pop(option_name)) is not None:
+    for name, flag in OPTIONS.items():
+        if (value := options.pop(flag.removeprefix("--"))) is not None:
+            group, key = name.split(".")
             given[group] = {key: value if isinstance(value, str) else str(value.absolute())}
     if options.pop("consensus", False):
         given["consensus"] = {"settle": True}

@@ -30,12 +30,13 @@ NAMED_RANGES = ("dataset", "pixie")
 
 _UNKNOWN_KEY = "unexpected_keyword_argument"
 
-_OPTIONS = {
+OPTIONS = {
     "pixieverse.root": "--pixieverse",
     "slat.root": "--slat",
     "pairing.map": "--map",
     "normalize.ranges": "--ranges",
 }
+"""The options that give a value of the file, by its key."""
 
 _PATHS = ("pixieverse.root", "slat.root", "pairing.map", "pairing.categories", "normalize.ranges")
 
@@ -106,7 +107,7 @@ class _Origin(NamedTuple):
         group, _, key = name.partition(".")
         values = self.overrides.get(group)
         if isinstance(values, Mapping) and key in values:
-            return f"option {_OPTIONS.get(name, key)}"
+            return f"option {OPTIONS.get(name, key)}"
         return "options" if self.config is None else str(self.config)
 
 
@@ -141,7 +142,7 @@ def _explain(error: ErrorDetails, origin: _Origin) -> str:
     if error["type"] in ("missing", "missing_argument"):
         if len(keys) == 1:
             name = f"{name}.root"
-        option = _OPTIONS.get(name)
+        option = OPTIONS.get(name)
         how = f"give {option} or " if option else ""
         group, _, key = name.rpartition(".")
         return f"{where}: {name}: not given; {how}set `{key}` in the table [{group}]"
