@@ -41,6 +41,7 @@ from slatprep.align.ambiguity import measure_ambiguity
 from slatprep.parallel import single_threaded
 
 from slatprep.align import align
+from slatprep.align.deformation import map_of
 from slatprep.align.quality import judge, measure_quality
 from slatprep.bench.truth import SUCCESS_DISPLACEMENT, Truth, compare_with_truth, read_truth
 from slatprep.demo import make_demo
@@ -146,7 +147,7 @@ def _row(
     alignment: Alignment,
     truth: Truth | None,
 ) -> Row:
-    annotation = sample(field, latents.coords, alignment.transform, SampleParameters())
+    annotation = sample(field, map_of(alignment).places(latents.coords), SampleParameters())
     ambiguity = measure_ambiguity(field, latents, alignment, annotation, SampleParameters())
     valid = annotation.valid
     verdict, _ = judge(alignment.quality, float(valid.mean()), ambiguity)

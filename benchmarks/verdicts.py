@@ -34,7 +34,7 @@ from slatprep.align import align, field
 from slatprep.align.quality import measure_quality
 from slatprep.bench.align import pairs_with_truth
 from slatprep.bench.truth import read_truth
-from slatprep.geometry.frames import displacement
+from slatprep.geometry.frames import displacement, places_of
 from slatprep.judge import verdict_of
 from slatprep.parameters import AlignParameters, SampleParameters
 from slatprep.readers import read_field, read_latents
@@ -55,7 +55,9 @@ def main(folders: list[str]) -> None:
 
     def judged(kind: str, material_field, latents, transform) -> None:
         quality = measure_quality(material_field, latents, transform, 1.0)
-        annotation = sample(material_field, latents.coords, transform, SampleParameters())
+        annotation = sample(
+            material_field, places_of(latents.coords, transform), SampleParameters()
+        )
         verdict, _ = verdict_of(quality, float(annotation.valid.mean()))
         verdicts[kind][str(verdict)] += 1
         lower[kind].append(min(quality.fitness, quality.fitness_backward))

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from slatprep.align import align
+from slatprep.geometry.frames import places_of
 from slatprep.geometry.voxels import occupancy_of, voxels_of
 from slatprep.parameters import AlignParameters, SampleParameters
 from slatprep.records import (
@@ -108,7 +109,9 @@ def annotate_voxels(
     ValueError
         If `coords` are no voxels, or `transform` no similarity.
     """
-    return sample(field, _voxels(coords, "coords"), transform, parameters or SampleParameters())
+    return sample(
+        field, places_of(_voxels(coords, "coords"), transform), parameters or SampleParameters()
+    )
 
 
 def _voxels(voxels: ArrayLike, name: str) -> NDArray[np.uint8]:

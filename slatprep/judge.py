@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from slatprep.geometry.frames import places_of
 from slatprep.normalize import to_mapped
 from slatprep.parameters import SampleParameters
 from slatprep.records import (
@@ -112,9 +113,13 @@ def measure_ambiguity(
     differs = np.zeros(len(latents.coords), dtype=bool)
     change = np.zeros(3)
     if alignment.placements:
+        if alignment.deformation is not None:
+            # The others are known without a deformation: like is compared with like.
+            places = places_of(latents.coords, alignment.transform)
+            annotation = sample(field, places, parameters)
         mapped = to_mapped(annotation.properties)
         for placement in alignment.placements:
-            other = sample(field, latents.coords, placement.transform, parameters)
+            other = sample(field, places_of(latents.coords, placement.transform), parameters)
             differs |= other.material != annotation.material
             both = annotation.valid & other.valid
             if both.any():

@@ -90,10 +90,24 @@ class InJson:
         return {"type": "function-after", "function": function, "schema": self.schema}
 
 
-def _matrix(size: int) -> InJson:
-    row = {"type": "list", "items_schema": {"type": "float"}}
-    length = {"min_length": size, "max_length": size}
-    return InJson({"type": "list", "items_schema": row | length} | length, np.array)
+def _array(*shape: int | None) -> InJson:
+    schema: dict[str, Any] = {"type": "float"}
+    for size in reversed(shape):
+        length = {"min_length": size or 0, "max_length": _MAX_SIDE if size is None else size}
+        schema = {"type": "list", "items_schema": schema} | length
+
+    def array(values: list[Any]) -> NDArray[np.float64]:
+        made = np.array(values, dtype=np.float64)
+        if made.ndim < len(shape) and made.size == 0:
+            made = made.reshape([size or 0 for size in shape])
+        if made.ndim != len(shape):
+            raise ValueError("rows of different lengths")
+        return made
+
+    return InJson(schema, array)
+
+
+_MAX_SIDE = 32
 
 
 def _one_of(*words: str) -> InJson:
@@ -116,11 +130,20 @@ Number = Annotated[float, InJson({"type": "nullable", "schema": {"type": "float"
 Digest = Annotated[str, InJson({"type": "str", "pattern": "^[0-9a-f]{64}$"})]
 """SHA-256 in hex."""
 
-Transform = Annotated[NDArray[np.float64], _matrix(4)]
+Transform = Annotated[NDArray[np.float64], _array(4, 4)]
 """Homogeneous, (4, 4): PixieVerse frame to SLAT frame."""
 
-Rotation = Annotated[NDArray[np.float64], _matrix(3)]
+Rotation = Annotated[NDArray[np.float64], _array(3, 3)]
 """(3, 3), orthogonal."""
+
+AffineMap = Annotated[NDArray[np.float64], _array(3, 4)]
+"""(3, 4): x -> A x + b."""
+
+Point = Annotated[NDArray[np.float64], _array(3)]
+"""(3,), edges of the unit cube."""
+
+Lattice = Annotated[NDArray[np.float64], _array(None, None, None, 3)]
+"""(n0, n1, n2, 3): a vector at each point of a lattice of at most 32 points a side."""
 
 
 class Engine(StrEnum):
@@ -132,10 +155,12 @@ class Engine(StrEnum):
 
 
 class Model(StrEnum):
-    """Which transforms are allowed: with the scale fixed at one, or free."""
+    """Which maps are allowed: the scale fixed at one, free, and a deformation after it."""
 
     RIGID = "rigid"
     SIMILARITY = "similarity"
+    AFFINE = "affine"
+    DEFORMABLE = "deformable"
 
 
 class Search(StrEnum):
@@ -394,6 +419,84 @@ class Consensus:
 
 
 @dataclass(frozen=True, eq=False)
+class Deformation:
+    """How a SLAT's shape differs from the PixieVerse object's, beyond a similarity.
+
+    A point x of the SLAT frame belongs to ``affine @ (x, 1) + u(x)``, still in
+    the SLAT frame, from where the inverse of the alignment's transform leads to
+    the PixieVerse frame. u is a uniform cubic B-spline; lengths are in edges of
+    the unit cube. All numbers are multiples of 2^-30, so that JSON holds them
+    exactly.
+
+    Attributes
+    ----------
+    affine : ndarray of float64, shape (3, 4)
+        The smooth part of the map without bending.
+    origin : ndarray of float64, shape (3,)
+        Lower corner of the splines' domain; control point (1, 1, 1) lies there.
+    spacing : float
+        Distance of neighbouring control points.
+    coefficients : ndarray of float64, shape (n0, n1, n2, 3)
+        Displacements at the control points; (0, 0, 0, 3) where the map is affine.
+    """
+
+    affine: AffineMap
+    origin: Point
+    spacing: float
+    coefficients: Lattice
+
+
+@dataclass(frozen=True)
+class FitFigures:
+    """What the default engine measured of its own fit; material for a verdict.
+
+    Scores are means of 1 / (1 + r^2), r the residual in voxels, over samples
+    not used in the fit, 1 for a perfect fit; a score of 0.5 is an error of a
+    voxel everywhere.
+
+    Attributes
+    ----------
+    score_slat, score_pixieverse : float
+        Score over the samples of either side, under the final map.
+    score_similarity : float
+        Mean of both sides' scores under the transform alone.
+    evidence_affine, evidence_deformable : float
+        Rise of the score, in blocks of space that a trial fit had not seen, by
+        an affine map, and by a coarse deformation after it; NaN where no trial
+        was needed.
+    within : tuple of float
+        Shares of the samples of both sides with a residual within 1, 2 and 3
+        voxels, under the final map.
+    offset : float
+        Voxels by which the PixieVerse surface stands inside the SLAT's
+        (negative: it is thicker).
+    roughness : float
+        Median absolute residual in voxels, under the final map.
+    moved, moved_most : float
+        Mean and largest displacement of the SLAT's surface by the deformation,
+        in voxels; 0 without one.
+    stretch : tuple of float
+        Smallest and largest singular value of the affine part; 1 without one.
+    bending : float
+        Root mean square second derivative of the displacement over the
+        lattice, in 1 / voxel; 0 without one.
+    """
+
+    score_slat: float
+    score_pixieverse: float
+    score_similarity: float
+    evidence_affine: Number
+    evidence_deformable: Number
+    within: tuple[float, float, float]
+    offset: float
+    roughness: float
+    moved: float = 0.0
+    moved_most: float = 0.0
+    stretch: tuple[float, float] = (1.0, 1.0)
+    bending: float = 0.0
+
+
+@dataclass(frozen=True, eq=False)
 class Alignment:
     """The transform from the PixieVerse frame to the SLAT frame, and how it was found.
 
@@ -405,7 +508,7 @@ class Alignment:
     engine : Engine
         The engine that found it.
     model : Model
-        Whether the scale is one.
+        ``rigid``, ``similarity``, ``affine`` or ``deformable``.
     search : Search
         The starts that were needed.
     quality : Quality
@@ -421,6 +524,11 @@ class Alignment:
         ranks by fitness alone.
     settled_by : Consensus or None
         The dataset's common rotation, where it chose among tied placements.
+    deformation : Deformation or None
+        What comes before the inverse of `transform` on the way from the SLAT
+        frame to the PixieVerse frame; None where the model is ``rigid`` or ``similarity``.
+    figures : FitFigures or None
+        What the engine measured of its fit; None where it measures nothing.
     """
 
     transform: Transform
@@ -433,6 +541,8 @@ class Alignment:
     placements: tuple[Placement, ...] = ()
     score: Number = float("nan")
     settled_by: Consensus | None = None
+    deformation: Deformation | None = None
+    figures: FitFigures | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -442,13 +552,15 @@ class Annotation:
     ``properties`` is (N, 3) float32 (Young's modulus [Pa], density [kg/m^3],
     Poisson's ratio), NaN where not valid; ``material`` (N,) uint8, 255 where
     not valid; ``valid`` (N,) bool; ``distance`` (N,) float32, in voxels of the
-    PixieVerse frame, to the annotation used.
+    PixieVerse frame, to the annotation used; ``place`` (N, 3) float32, where the
+    voxel was looked up, in the PixieVerse frame.
     """
 
     properties: NDArray[np.float32]
     material: NDArray[np.uint8]
     valid: NDArray[np.bool_]
     distance: NDArray[np.float32]
+    place: NDArray[np.float32]
 
 
 @dataclass(frozen=True)

@@ -3,22 +3,17 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from slatprep.geometry.frames import apply_transform, invert_transform, voxel_centres
+from slatprep.geometry.frames import voxel_centres
 from slatprep.parameters import SampleParameters
 from slatprep.records import RESOLUTION, UNANNOTATED, Annotation, MaterialField
 
 
-def sample(
-    field: MaterialField,
-    coords: NDArray[np.uint8],
-    transform: ArrayLike,
-    parameters: SampleParameters,
-) -> Annotation:
+def sample(field: MaterialField, places: ArrayLike, parameters: SampleParameters) -> Annotation:
     """Look material and properties up at SLAT voxels.
 
-    Each SLAT voxel is carried into the PixieVerse frame and takes the values of
+    Each SLAT voxel, carried into the PixieVerse frame, takes the values of
     an annotated voxel there: the nearest one (SLAT-Phys, "Physics-to-SLAT
     Annotation Alignment"), or the nearest one of the class that the annotated
     voxels around it vote for. Background and unannotated voxels are
@@ -28,10 +23,11 @@ def sample(
     ----------
     field : MaterialField
         The PixieVerse field.
-    coords : ndarray of uint8, shape (N, 3)
-        SLAT voxels.
-    transform : array_like, shape (4, 4)
-        PixieVerse frame to SLAT frame.
+    places : array_like, shape (N, 3)
+        Where the SLAT voxels lie in the PixieVerse frame, points of the unit cube;
+        `slatprep.align.deformation.PlaceMap` and `slatprep.geometry.frames.places_of`
+        carry them there. They are rounded to float32 first: a store holds them
+        so, and the labels follow from what it holds.
     parameters : SampleParameters
         The method, and from which distance on a SLAT voxel is not valid.
 
@@ -44,7 +40,8 @@ def sample(
     from slatprep.geometry.nearest import Lattice
 
     lattice = Lattice(field.voxels)
-    points = apply_transform(invert_transform(transform), voxel_centres(coords))
+    place = np.asarray(places, dtype=np.float32)
+    points = place.astype(np.float64)
     distance, used = lattice.nearest(points)
     valid = distance <= parameters.max_distance
     if parameters.method == "vote":
@@ -56,4 +53,4 @@ def sample(
     properties, material = field.properties[used], field.material[used]
     properties[~valid] = np.nan
     material[~valid] = UNANNOTATED
-    return Annotation(properties, material, valid, distance.astype(np.float32))
+    return Annotation(properties, material, valid, distance.astype(np.float32), place)

@@ -6,6 +6,7 @@ import numpy as np
 from support.shapes import GRID, chair, field_of, surface_latents
 
 from slatprep.align import align
+from slatprep.align.deformation import map_of
 from slatprep.judge import measure_ambiguity
 from slatprep.parameters import AlignParameters, SampleParameters
 from slatprep.records import Alignment, Ambiguity
@@ -19,7 +20,7 @@ def _ambiguity(
 ) -> tuple[Alignment, Ambiguity]:
     field, latents = field_of(occupancy, material), surface_latents(occupancy)
     alignment = align(field, latents, AlignParameters())
-    annotation = sample(field, latents.coords, alignment.transform, SampleParameters())
+    annotation = sample(field, map_of(alignment).places(latents.coords), SampleParameters())
     return alignment, measure_ambiguity(field, latents, alignment, annotation, SampleParameters())
 
 

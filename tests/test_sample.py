@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from slatprep.geometry.frames import make_transform
+from slatprep.geometry.frames import make_transform, places_of, voxel_centres
 from slatprep.parameters import SampleParameters
 from slatprep.records import MaterialField
 from slatprep.sample import sample
@@ -28,7 +28,7 @@ def _field() -> MaterialField:
 def test_values_come_from_the_nearest_voxel_and_end_at_the_limit() -> None:
     coords = np.array([[10, 10, 10], [13, 10, 10], [14, 10, 10], [18, 11, 10]], dtype=np.uint8)
     for parameters in (NEAREST, SampleParameters()):
-        found = sample(_field(), coords, np.eye(4), parameters)
+        found = sample(_field(), voxel_centres(coords), parameters)
         assert found.valid.tolist() == [True, True, False, True]
         assert found.material.tolist() == [1, 1, 255, 4]
         np.testing.assert_allclose(found.distance, [0, 3, 4, np.sqrt(5)], rtol=1e-6)
@@ -41,7 +41,7 @@ def test_values_come_from_the_nearest_voxel_and_end_at_the_limit() -> None:
 def test_voxels_are_carried_by_the_inverse_transform() -> None:
     # (x, y, z) -> (-y, x, z): field voxel (20, 10, 10) lies at SLAT (53, 20, 10).
     turn = make_transform([[0, -1, 0], [1, 0, 0], [0, 0, 1]])
-    found = sample(_field(), np.array([[53, 20, 10]], dtype=np.uint8), turn, NEAREST)
+    found = sample(_field(), places_of([[53, 20, 10]], turn), NEAREST)
     assert found.material.tolist() == [4]
     assert found.distance.tolist() == [0.0]
 
@@ -52,7 +52,7 @@ def test_distances_are_in_voxels_of_the_pixieverse_frame() -> None:
     occupancy = np.zeros((64, 64, 64), dtype=bool)
     occupancy[31, 31, 31] = True
     field = MaterialField(occupancy, voxels, np.ones(1, np.uint8), np.ones((1, 3), np.float32))
-    found = sample(field, voxels, make_transform(np.eye(3), scale=2.0), NEAREST)
+    found = sample(field, places_of(voxels, make_transform(np.eye(3), scale=2.0)), NEAREST)
     np.testing.assert_allclose(found.distance, [np.sqrt(3) / 4], rtol=1e-6)
 
 
@@ -69,8 +69,8 @@ def test_a_vote_changes_the_class_and_takes_that_class_s_nearest_values() -> Non
     field = MaterialField(occupancy, block.astype(np.uint8), classes, properties)
     shift = make_transform(np.eye(3), np.array([0.3, 0, 0]) / 64)
     coords = np.array([[32, 32, 32]], dtype=np.uint8)  # looks at (31.7, 32, 32)
-    assert sample(field, coords, shift, NEAREST).material.tolist() == [0]
-    voted = sample(field, coords, shift, SampleParameters())
+    assert sample(field, places_of(coords, shift), NEAREST).material.tolist() == [0]
+    voted = sample(field, places_of(coords, shift), SampleParameters())
     assert voted.material.tolist() == [3]
     np.testing.assert_array_equal(voted.properties[0], properties[0])
     np.testing.assert_allclose(voted.distance, [0.7], rtol=1e-5)

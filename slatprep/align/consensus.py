@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from slatprep.align.starts import distinct_starts
 from slatprep.geometry.frames import displacement, split_transform
-from slatprep.records import Alignment, Consensus, Placement, StructuredLatents
+from slatprep.records import Alignment, Consensus, Model, Placement, StructuredLatents
 
 LEAST_WINNERS = 5
 LEAST_SHARE = 0.5
@@ -99,6 +99,10 @@ def settle(alignment: Alignment, latents: StructuredLatents, consensus: Consensu
     return replace(
         alignment,
         transform=transform,
+        # A deformation was fitted to the placement that is left.
+        model=Model.SIMILARITY if alignment.deformation is not None else alignment.model,
+        deformation=None,
+        figures=None,
         score=alignment.placements[chosen - 1].score,
         placements=placements,
         settled_by=consensus,

@@ -10,6 +10,10 @@ distance carried to the SLAT frame, the residuals are
 
 each weighted by (1 + r^2 / tau^2)^-2, the Geman-McClure estimator, so that
 bites, floaters and parts that only one side has lose their pull.
+
+The derivative by the scale leaves out that s also stretches the distances: with
+it, a smaller s would make the residuals of rough surfaces smaller, and scale
+would pay for noise (1.5 % too small on thick, rough fields).
 """
 
 from __future__ import annotations
@@ -21,7 +25,7 @@ from numba import njit
 
 UNKNOWNS = 8  # rotation 3, shift 3, log scale, offset
 
-_OFFSET_PRIOR = 0.1
+_OFFSET_PRIOR = 0.02
 _LEVER = 30.0  # voxels; what a turn or a change of scale moves at the object's rim
 _LONGEST_TURN = 0.35
 _LARGEST_GROWTH = 0.1
@@ -102,7 +106,7 @@ def _accumulate(  # type: ignore[no-untyped-def]
         jacobian[3] = sign * gx
         jacobian[4] = sign * gy
         jacobian[5] = sign * gz
-        jacobian[6] = sign * (gx * qx + gy * qy + gz * qz - carried)
+        jacobian[6] = sign * (gx * qx + gy * qy + gz * qz)
         jacobian[7] = sign
         square = residual * residual
         kernel = 1.0 / (1.0 + square / (tau * tau))

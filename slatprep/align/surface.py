@@ -69,13 +69,17 @@ class Surface:
         """Root mean square distance of the surface's samples from their centroid, in voxels."""
         return float(np.sqrt(((self.points - self.centroid) ** 2).sum(axis=1).mean()))
 
-    def subset(self, count: int) -> Surface:
-        """Return the same surface with at most `count` evenly chosen samples."""
+    def subset(self, count: int, first: int = 0) -> Surface:
+        """Return the same surface with at most `count` evenly chosen samples.
+
+        Those from the number `first` on are others than the first ones, unless
+        there are too few.
+        """
         if len(self.points) <= count:
             return self
         # Multiples of the golden ratio fill an interval evenly without the
         # regular steps that would beat with the lattice.
-        fraction = (np.arange(count) * 0.618033988749895) % 1.0
+        fraction = (np.arange(first, first + count) * 0.618033988749895) % 1.0
         chosen = np.unique((fraction * len(self.points)).astype(np.intp))
         return replace(self, points=self.points[chosen], values=self.values[chosen])
 

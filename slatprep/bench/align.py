@@ -19,6 +19,7 @@ from pathlib import Path
 import numpy as np
 
 from slatprep.align import align
+from slatprep.align.deformation import map_of
 from slatprep.align.starts import euler_starts
 from slatprep.align.surface import surface_of
 from slatprep.bench.truth import LevelScore, TruthScore, compare_with_truth, read_truth, summarise
@@ -151,14 +152,14 @@ def bench_align(
                     seconds[engine].append(time.process_time() - begin)
                     if repeat == 0:
                         preset = PRESETS["default" if engine == REFERENCE else "paper"]
-                        annotation = sample(
-                            field, latents.coords, alignment.transform, preset.sample
-                        )
+                        places = map_of(alignment).places(latents.coords)
+                        annotation = sample(field, places, preset.sample)
                         score = compare_with_truth(
                             pair.asset_id,
                             truth,
                             coords=latents.coords,
                             transform=alignment.transform,
+                            places=places,
                             material=annotation.material,
                             valid=annotation.valid,
                             annotated=field.voxels,

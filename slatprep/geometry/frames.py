@@ -108,6 +108,11 @@ def invert_transform(transform: ArrayLike) -> NDArray[np.float64]:
     return inverse
 
 
+def places_of(coords: ArrayLike, transform: ArrayLike) -> NDArray[np.float64]:
+    """Return where SLAT voxels (N, 3) lie in the PixieVerse frame, as points (N, 3)."""
+    return apply_transform(invert_transform(transform), voxel_centres(coords))
+
+
 def displacement(transform: ArrayLike, reference: ArrayLike, slat_voxels: ArrayLike) -> float:
     """Mean distance, in voxels, between where two transforms look a SLAT voxel up.
 

@@ -108,15 +108,18 @@ class PairingParameters(_Group):
 class AlignParameters(_Group):
     """How the transform between the frames is found.
 
-    `model` is ``rigid`` (the paper's SE(3)), ``similarity`` (one scale more)
-    or ``auto`` (the simplest that the data support). Scale stays within
-    `scale_bounds`; `radius` is the correspondence radius of quality figures,
-    in voxels. No engine draws anything at random.
+    `model` is ``rigid`` (the paper's SE(3)), ``similarity`` (one scale more),
+    ``affine``, ``deformable`` (a smooth free-form deformation) or ``auto`` (the
+    simplest that the data support). Scale stays within `scale_bounds`; neither
+    the affine map nor its bending moves a point of the SLAT farther than
+    `max_displacement` voxels; `radius` is the correspondence radius of quality
+    figures, in voxels. No engine draws anything at random.
     """
 
     engine: Engine = Engine.FIELD
-    model: Literal["auto", "rigid", "similarity"] = "auto"
+    model: Literal["auto", "rigid", "similarity", "affine", "deformable"] = "auto"
     scale_bounds: tuple[Annotated[float, Gt(0), Le(1)], Annotated[float, Ge(1)]] = (0.6, 1.6)
+    max_displacement: Positive = 16.0
     radius: Positive = 1.0
     icp_radius: Positive = 3.2
     icp_iterations: PositiveInt = 60

@@ -11,6 +11,7 @@ import time
 import traceback
 
 from slatprep.align import align
+from slatprep.align.deformation import map_of
 from slatprep.errors import MissingPartnerError, SlatprepError
 from slatprep.judge import judge
 from slatprep.parameters import BuildParameters
@@ -56,7 +57,7 @@ def process_asset(
     reached("asset read", pair.asset_id)
     alignment = known.alignment if known else align(field, latents, parameters.align)
     reached("asset reused" if known else "asset aligned", pair.asset_id)
-    annotation = sample(field, latents.coords, alignment.transform, parameters.sample)
+    annotation = sample(field, map_of(alignment).places(latents.coords), parameters.sample)
     judgement = (
         known.judgement
         if known

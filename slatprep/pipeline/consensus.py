@@ -12,7 +12,7 @@ import hashlib
 from collections.abc import Sequence
 from dataclasses import replace
 
-from slatprep.align.consensus import find_consensus, settle
+from slatprep.align.deformation import map_of
 from slatprep.align.quality import measure_quality
 from slatprep.judge import judge
 from slatprep.parameters import BuildParameters
@@ -71,7 +71,7 @@ def settle_asset(
     field = spool.field(asset.key)
     quality = measure_quality(field, latents, alignment.transform, parameters.align.radius)
     alignment = replace(alignment, quality=quality)
-    annotation = sample(field, latents.coords, alignment.transform, parameters.sample)
+    annotation = sample(field, map_of(alignment).places(latents.coords), parameters.sample)
     key = hashlib.sha256(f"{asset.key} {consensus.rotation.tobytes().hex()}".encode()).hexdigest()
     record = replace(
         first,

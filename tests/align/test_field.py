@@ -15,6 +15,7 @@ from hypothesis import strategies as st
 from support.shapes import GRID, Case, chair, field_of, latents_of, surface_latents, turned
 
 from slatprep.align import align, engine_versions
+from slatprep.align.deformation import map_of
 from slatprep.align.starts import distinct_starts
 from slatprep.geometry.frames import displacement, make_transform, split_transform
 from slatprep.judge import judge
@@ -56,7 +57,7 @@ def test_accuracy_on_demo_data(level: int, demo_cases: Callable[[int], list[Case
     scores = []
     for field, latents, truth in demo_cases(level):
         alignment = align(field, latents, DEFAULT)
-        annotation = sample(field, latents.coords, alignment.transform, SampleParameters())
+        annotation = sample(field, map_of(alignment).places(latents.coords), SampleParameters())
         scores.append(
             compare_with_truth(
                 truth.name,
@@ -150,7 +151,7 @@ def test_odd_shapes_get_a_finite_answer_and_a_verdict(name: str) -> None:
     own = latents_of(DEGENERATE[name][:32768])
     for latents in (own, latents_of(DEGENERATE["a dozen"]), surface_latents(BALL)):
         alignment = align(field, latents, DEFAULT)
-        annotation = sample(field, latents.coords, alignment.transform, SampleParameters())
+        annotation = sample(field, map_of(alignment).places(latents.coords), SampleParameters())
         judgement = judge(field, latents, alignment, annotation, SampleParameters())
         ambiguity = judgement.ambiguity
         numbers = [

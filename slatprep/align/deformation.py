@@ -1,0 +1,281 @@
+"""The map between the frames: a similarity, and a deformation where one was earned.
+
+The way from the SLAT frame to the PixieVerse frame is explicit, as it is the
+one of the lookup: deform, then apply the inverse of the transform. The way back
+solves for the point by Newton's method.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from itertools import product
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from slatprep.align.bspline import displacements, jacobians, least_stretch
+from slatprep.geometry.frames import apply_transform, invert_transform, voxel_centres
+from slatprep.records import RESOLUTION, Alignment, Deformation
+
+GRAIN = 2.0**-30
+"""All numbers of a deformation are multiples of this: exact in JSON, 6e-8 voxel."""
+
+LEAST_STRETCH, MOST_STRETCH = 0.6, 1.6
+"""Singular values of an affine part lie within these."""
+
+_NEWTON_STEPS = 30
+_CLOSE = 1e-9  # edges of the unit cube
+_SHRINK, _SHRINKS = 0.8, 20
+
+
+@dataclass(frozen=True)
+class PlaceMap:
+    """The map between the PixieVerse frame and the SLAT frame, both ways.
+
+    ``transform`` is (4, 4), PixieVerse frame to SLAT frame, a similarity;
+    ``deformation`` is None where that is all.
+    """
+
+    transform: NDArray[np.float64]
+    deformation: Deformation | None = None
+
+    def to_pixieverse(self, points: ArrayLike) -> NDArray[np.float64]:
+        """Map points (N, 3) of the SLAT frame to the PixieVerse frame."""
+        points = np.asarray(points, dtype=np.float64)
+        if self.deformation is not None:
+            points = deform(self.deformation, points)
+        return apply_transform(invert_transform(self.transform), points)
+
+    def to_slat(self, points: ArrayLike) -> NDArray[np.float64]:
+        """Map points (N, 3) of the PixieVerse frame to the SLAT frame."""
+        carried = apply_transform(self.transform, points)
+        if self.deformation is None:
+            return carried
+        return undeform(self.deformation, carried)
+
+    def places(self, coords: NDArray[np.uint8]) -> NDArray[np.float64]:
+        """Return where SLAT voxels (N, 3) lie in the PixieVerse frame."""
+        return self.to_pixieverse(voxel_centres(coords))
+
+
+def map_of(alignment: Alignment) -> PlaceMap:
+    """Return the map that an alignment stands for."""
+    return PlaceMap(alignment.transform, alignment.deformation)
+
+
+def deform(deformation: Deformation, points: ArrayLike) -> NDArray[np.float64]:
+    """Apply a deformation to points (N, 3) of the SLAT frame.
+
+    Beyond the splines' domain the displacement of its nearest point is added to
+    the affine part.
+    """
+    points = np.ascontiguousarray(points, dtype=np.float64)
+    affine = deformation.affine
+    moved: NDArray[np.float64] = points @ affine[:, :3].T + affine[:, 3]
+    if deformation.coefficients.size:
+        added = np.empty_like(points)
+        displacements(
+            points, deformation.origin, deformation.spacing, deformation.coefficients, added
+        )
+        moved += added
+    return moved
+
+
+def jacobian(deformation: Deformation, points: ArrayLike) -> NDArray[np.float64]:
+    """Return the derivative (N, 3, 3) of a deformation at points (N, 3) of the SLAT frame."""
+    points = np.ascontiguousarray(points, dtype=np.float64)
+    slopes = np.zeros((len(points), 3, 3))
+    if deformation.coefficients.size:
+        jacobians(points, deformation.origin, deformation.spacing, deformation.coefficients, slopes)
+    slopes += deformation.affine[:, :3]
+    return slopes
+
+
+def undeform(deformation: Deformation, points: ArrayLike) -> NDArray[np.float64]:
+    """Invert a deformation.
+
+    Parameters
+    ----------
+    deformation : Deformation
+        One that does not fold; see `is_proper`.
+    points : array_like, shape (N, 3)
+        Deformed points, in the SLAT frame.
+
+    Returns
+    -------
+    ndarray of float64, shape (N, 3)
+        The points that `deform` takes there, to 1e-9 of the cube's edge; where
+        Newton's method does not settle within 30 steps (possible only beyond
+        the splines' domain, where the derivative jumps), the nearest it came.
+    """
+    target = np.asarray(points, dtype=np.float64)
+    affine = deformation.affine
+    start = (target - affine[:, 3]) @ np.linalg.inv(affine[:, :3]).T
+    found = start.copy()
+    if not deformation.coefficients.size:
+        return found
+    best = np.full(len(target), np.inf)
+    trial, open_ones = start, np.arange(len(target))
+    for _ in range(_NEWTON_STEPS):
+        error = deform(deformation, trial) - target[open_ones]
+        length = np.linalg.norm(error, axis=1)
+        better = length < best[open_ones]
+        best[open_ones[better]] = length[better]
+        found[open_ones[better]] = trial[better]
+        left = length > _CLOSE
+        if not left.any():
+            break
+        open_ones, trial = open_ones[left], trial[left]
+        slopes = jacobian(deformation, trial)
+        trial = trial - np.linalg.solve(slopes, error[left][..., None])[..., 0]
+    return found
+
+
+def make_deformation(
+    affine: ArrayLike,
+    origin: ArrayLike,
+    spacing: float,
+    coefficients: ArrayLike,
+    box: ArrayLike,
+    max_displacement: float,
+) -> Deformation | None:
+    """Make a deformation that is bounded and does not fold.
+
+    Parameters
+    ----------
+    affine, origin, spacing, coefficients
+        As `Deformation` describes them, in edges of the unit cube.
+    box : array_like, shape (2, 3)
+        Lower and upper corner of the SLAT, in the SLAT frame.
+    max_displacement : float
+        Voxels. Neither the affine part nor the bending moves a point of the box
+        farther: coefficients are shortened to it, and a spline lies in the
+        convex hull of its coefficients.
+
+    Returns
+    -------
+    Deformation or None
+        Rounded to `GRAIN`, its bending shrunk until `is_proper` holds; None where
+        the affine part stretches or moves too far, or no shrinking helps.
+    """
+    made = Deformation(
+        _rounded(affine), _rounded(origin), float(_rounded(spacing)), _rounded(coefficients)
+    )
+    matrix = made.affine[:, :3]
+    stretches = np.linalg.svd(matrix, compute_uv=False)
+    if np.linalg.det(matrix) <= 0 or not (
+        stretches[-1] >= LEAST_STRETCH and stretches[0] <= MOST_STRETCH
+    ):
+        return None
+    limit = max_displacement / RESOLUTION
+    corners = np.array(list(product(*np.asarray(box, dtype=np.float64).T)))
+    moved = corners @ matrix.T + made.affine[:, 3] - corners
+    if np.linalg.norm(moved, axis=1).max() > limit:
+        return None
+    if not made.coefficients.size:
+        return made
+    length = np.linalg.norm(made.coefficients, axis=-1, keepdims=True)
+    # A hair less, so that rounding does not lead beyond.
+    shorter = np.minimum(1.0, (1.0 - 1e-6) * limit / np.maximum(length, 1e-12))
+    made = replace(made, coefficients=_rounded(made.coefficients * shorter))
+    for _ in range(_SHRINKS):
+        if is_proper(made):
+            return made
+        made = replace(made, coefficients=_rounded(_SHRINK * made.coefficients))
+    return None
+
+
+def is_proper(deformation: Deformation) -> bool:
+    """Say whether a deformation is certain not to fold anywhere in the splines' domain.
+
+    The smallest singular value of the derivative is bounded from below by
+    2 det / |J|^2 (Frobenius) on a grid of two points a span, or four; between
+    those it falls by no more than the largest second derivative, which the
+    second differences of the coefficients bound, times the way.
+    """
+    c, spacing = deformation.coefficients, deformation.spacing
+    if not c.size:
+        return bool(np.linalg.det(deformation.affine[:, :3]) > 0)
+    fall = _largest_second_derivative(c) / spacing**2 * np.sqrt(3.0) / 2.0 * spacing
+    return any(
+        least_stretch(deformation.affine, spacing, c, steps) > fall / steps for steps in (2, 4)
+    )
+
+
+def bending_of(deformation: Deformation) -> float:
+    """Return the rms second derivative of the displacement over the lattice, in 1 / voxel."""
+    squares = 0.0
+    for axis, second in _second_differences(deformation.coefficients):
+        squares += (1.0 if axis else 2.0) * float((second**2).sum(axis=-1).mean())
+    return float(np.sqrt(squares)) / (deformation.spacing**2 * RESOLUTION)
+
+
+def _second_differences(
+    coefficients: NDArray[np.float64],
+) -> list[tuple[bool, NDArray[np.float64]]]:
+    """Return pure (True) and mixed (False) second differences of the coefficients."""
+    pure = [(True, np.diff(coefficients, n=2, axis=axis)) for axis in range(3)]
+    mixed = [
+        (False, np.diff(np.diff(coefficients, axis=a), axis=b)) for a, b in ((0, 1), (1, 2), (0, 2))
+    ]
+    return pure + mixed
+
+
+def _largest_second_derivative(coefficients: NDArray[np.float64]) -> float:
+    """Bound the second derivative, in 1 / spacing^2, in the Frobenius norm."""
+    squares = 0.0
+    for pure, second in _second_differences(coefficients):
+        squares += (1.0 if pure else 2.0) * float((second**2).sum(axis=-1).max())
+    return float(np.sqrt(squares))
+
+
+def _rounded(values: ArrayLike) -> NDArray[np.float64]:
+    rounded: NDArray[np.float64] = np.round(np.asarray(values, dtype=np.float64) / GRAIN) * GRAIN
+    # Minus zero would be another byte in JSON.
+    return rounded + 0.0
+
+
+def to_json(deformation: Deformation) -> dict[str, Any]:
+    """Return a deformation as plain numbers; `from_json` gives back the same bits."""
+    return {
+        "affine": deformation.affine.tolist(),
+        "origin": deformation.origin.tolist(),
+        "spacing": deformation.spacing,
+        "coefficients": deformation.coefficients.tolist(),
+        "shape": list(deformation.coefficients.shape),
+    }
+
+
+def from_json(value: dict[str, Any]) -> Deformation:
+    """Return the deformation that `to_json` wrote.
+
+    Raises
+    ------
+    ValueError
+        If the numbers do not have the shapes of a deformation, or are not finite.
+    """
+    shape = tuple(int(n) for n in value["shape"])
+    deformation = Deformation(
+        np.array(value["affine"], dtype=np.float64),
+        np.array(value["origin"], dtype=np.float64),
+        float(value["spacing"]),
+        np.array(value["coefficients"], dtype=np.float64).reshape(shape),
+    )
+    numbers = [deformation.affine, deformation.origin, deformation.coefficients]
+    if (
+        deformation.affine.shape != (3, 4)
+        or deformation.origin.shape != (3,)
+        or len(shape) != 4
+        or shape[3] != 3
+        or (deformation.coefficients.size and min(shape[:3]) < 4)
+        or not all(np.isfinite(n).all() for n in numbers)
+        or not deformation.spacing > 0
+    ):
+        raise ValueError(
+            "a deformation has finite numbers: affine (3, 4), origin (3,), spacing above 0 and "
+            f"coefficients (n0, n1, n2, 3) with at least 4 a side or none; got affine "
+            f"{deformation.affine.shape}, origin {deformation.origin.shape}, "
+            f"spacing {deformation.spacing}, coefficients {shape}"
+        )
+    return deformation

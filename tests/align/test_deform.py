@@ -1,0 +1,178 @@
+"""A deformation is found where there is one, and none where there is none."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+from support.shapes import chair, field_of, latents_of, surface_latents
+
+from slatprep.align import align
+from slatprep.align.deform import Warp, halved
+from slatprep.align.deformation import is_proper, map_of, to_json
+from slatprep.geometry.frames import voxel_centres
+from slatprep.geometry.voxels import boundary, voxels_of
+from slatprep.parameters import AlignParameters
+from slatprep.records import Alignment, MaterialField, StructuredLatents
+
+DEFAULT = AlignParameters()
+Move = Callable[[np.ndarray], np.ndarray]
+
+
+def thing(points: np.ndarray) -> np.ndarray:
+    """Say which points (P, 3) of the unit cube are inside a solid without any symmetry."""
+    x, y, z = points.T * 64
+
+    def box(low: tuple[int, int, int], high: tuple[int, int, int]) -> np.ndarray:
+        inside = np.ones(len(x), dtype=bool)
+        for value, a, b in zip((x, y, z), low, high, strict=True):
+            inside &= (value >= a) & (value < b)
+        return inside
+
+    solid = box((-22, -18, -14), (20, 16, -4)) | box((-22, -18, -4), (-14, 16, 24))
+    solid |= box((2, -18, -4), (12, -10, 8))
+    return solid | ((x - 12) ** 2 + (y - 8) ** 2 + (z + 2) ** 2 < 64)
+
+
+CENTRES = voxel_centres(np.argwhere(np.ones((64, 64, 64), dtype=bool)))
+
+
+def occupancy(move: Move) -> np.ndarray:
+    """Return the grid whose voxels x are those with `move(x)` in the solid."""
+    return thing(move(CENTRES)).reshape(64, 64, 64)
+
+
+def bend(points: np.ndarray) -> np.ndarray:
+    """Move points smoothly by up to three voxels."""
+    x, y, z = points.T * 2 * np.pi * 0.8
+    return points + 3 / 64 * np.stack([np.sin(z + 0.4), np.sin(x), np.cos(y)], axis=1)
+
+
+def stretch(points: np.ndarray) -> np.ndarray:
+    return points * [1.15, 1.0, 0.95]
+
+
+def pair(move: Move) -> tuple[MaterialField, StructuredLatents]:
+    """Return the solid, and the boundary of the moved one: voxel x lies at `move(x)`."""
+    field = field_of(occupancy(lambda points: points))
+    return field, latents_of(voxels_of(boundary(occupancy(move))))
+
+
+def mistakes(alignment: Alignment, latents: StructuredLatents, move: Move) -> np.ndarray:
+    """Return how far, in voxels, each SLAT voxel is looked up from where it lies."""
+    places = map_of(alignment).places(latents.coords)
+    return np.asarray(
+        np.linalg.norm(places - move(voxel_centres(latents.coords)), axis=1) * 64, dtype=np.float64
+    )
+
+
+def test_a_known_bend_is_found() -> None:
+    field, latents = pair(bend)
+    before = align(field, latents, AlignParameters(model="similarity"))
+    after = align(field, latents, DEFAULT)
+    assert after.model == "deformable"
+    assert after.deformation is not None
+    assert is_proper(after.deformation)
+    assert before.deformation is None
+    assert mistakes(before, latents, bend).mean() > 1.2
+    assert mistakes(after, latents, bend).mean() < 0.75
+    assert after.figures is not None
+    assert after.figures.evidence_affine + after.figures.evidence_deformable > 0.05
+    assert after.figures.score_slat > after.figures.score_similarity + 0.1
+    assert after.figures.moved_most > after.figures.moved > 0.5
+    assert after.figures.bending > 0
+
+
+def test_a_known_stretch_is_found_as_an_affine_map() -> None:
+    field, latents = pair(stretch)
+    alignment = align(field, latents, DEFAULT)
+    assert alignment.model in ("affine", "deformable")
+    assert mistakes(alignment, latents, stretch).mean() < 0.4
+    affine = align(field, latents, AlignParameters(model="affine"))
+    assert affine.model == "affine"
+    assert affine.deformation is not None
+    assert affine.deformation.coefficients.size == 0
+    assert mistakes(affine, latents, stretch).mean() < 0.3
+    assert affine.figures is not None
+    low, high = affine.figures.stretch
+    # The similarity has taken the mean scale already.
+    assert high / low == pytest.approx(1.15 / 0.95, abs=0.05)
+
+
+def test_the_same_shape_is_not_deformed_and_keeps_the_bytes_of_a_rigid_fit() -> None:
+    solid = chair()
+    tilted = np.roll(solid, (2, -1, 3), axis=(0, 1, 2))
+    field, latents = field_of(solid), surface_latents(tilted)
+    alignment = align(field, latents, DEFAULT)
+    assert alignment.model == "rigid"
+    assert alignment.deformation is None
+    assert alignment.figures is not None
+    assert alignment.figures.moved == alignment.figures.bending == 0.0
+    assert np.isnan(alignment.figures.evidence_affine)  # too good to try
+    again = align(field, latents, DEFAULT)
+    assert alignment.transform.tobytes() == again.transform.tobytes()
+    places = map_of(alignment).places(latents.coords)
+    assert places.tobytes() == map_of(again).places(latents.coords).tobytes()
+
+
+def test_roughness_is_no_reason_to_deform() -> None:
+    from scipy.ndimage import distance_transform_edt, gaussian_filter
+
+    solid = occupancy(lambda points: points)
+    outside, inside = distance_transform_edt(~solid), distance_transform_edt(solid)
+    noise = gaussian_filter(np.random.default_rng(5).normal(size=solid.shape), 1.5)
+    rough = outside - inside < 0.7 + noise / noise.std()
+    latents = surface_latents(solid)
+    alignment = align(field_of(rough), latents, DEFAULT)
+    assert alignment.model in ("rigid", "similarity")
+    assert mistakes(alignment, latents, lambda points: points).mean() < 0.6
+    figures = alignment.figures
+    assert figures is not None
+    assert figures.evidence_affine + figures.evidence_deformable < 0.05
+    assert figures.offset < 0  # it is thicker
+
+
+def test_a_model_that_is_asked_for_is_fitted_and_the_bound_holds() -> None:
+    field, latents = pair(bend)
+    for model in ("rigid", "similarity"):
+        plain = align(field, latents, AlignParameters(model=model))  # type: ignore[arg-type]
+        assert plain.model == model
+        assert plain.deformation is None
+    free = align(field, latents, AlignParameters(model="deformable"))
+    assert free.deformation is not None
+    farthest = np.linalg.norm(free.deformation.coefficients, axis=-1).max() * 64
+    for limit in (farthest + 1.0, 0.5):
+        parameters = AlignParameters(model="deformable", max_displacement=limit)
+        bounded = align(field, latents, parameters)
+        if bounded.deformation is None:  # its affine part alone moves too far
+            assert bounded.model in ("rigid", "similarity")
+            assert limit == 0.5
+        else:
+            assert np.linalg.norm(bounded.deformation.coefficients, axis=-1).max() * 64 <= limit
+
+
+def test_repetition_and_the_order_of_voxels_do_not_change_a_bit() -> None:
+    field, latents = pair(bend)
+    shuffled = latents_of(np.random.default_rng(1).permutation(latents.coords))
+    one, two = align(field, latents, DEFAULT), align(field, shuffled, DEFAULT)
+    assert one.deformation is not None
+    assert two.deformation is not None
+    assert to_json(one.deformation) == to_json(two.deformation)
+    assert one.figures == two.figures
+
+
+def test_a_finer_lattice_starts_as_the_same_warp() -> None:
+    warp = Warp(np.eye(3, 4), 0.0, np.zeros(3), 32.0, np.ones((5, 5, 5, 3)))
+    finer = halved(warp)
+    assert finer.spacing == 16.0
+    assert finer.coefficients.shape == (7, 7, 7, 3)
+    assert finer.coefficients == pytest.approx(1.0)
+
+
+def test_two_different_objects_are_not_made_one() -> None:
+    grid = np.argwhere(np.ones((64, 64, 64), dtype=bool)) - 31.5
+    ball = ((grid**2).sum(axis=1) < 20**2).reshape(64, 64, 64)
+    alignment = align(field_of(chair()), surface_latents(ball), DEFAULT)
+    assert alignment.figures is not None
+    assert min(alignment.figures.score_slat, alignment.figures.score_pixieverse) < 0.6

@@ -1,0 +1,162 @@
+"""The map between the frames: both ways, bounded, without folds, the same bytes from JSON."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from support.shapes import chair, field_of, surface_latents
+
+from slatprep.align.bspline import refined
+from slatprep.align.deformation import (
+    GRAIN,
+    PlaceMap,
+    bending_of,
+    deform,
+    from_json,
+    is_proper,
+    jacobian,
+    make_deformation,
+    to_json,
+    undeform,
+)
+from slatprep.geometry.frames import make_transform, places_of
+from slatprep.parameters import SampleParameters
+from slatprep.records import Deformation
+from slatprep.sample import sample
+
+BOX = np.array([[-0.5] * 3, [0.5] * 3])
+AFFINE = np.array([[1.1, 0.03, 0.0, 0.01], [-0.02, 0.95, 0.04, 0.0], [0.01, 0.0, 1.02, -0.02]])
+IDENTITY = np.eye(3, 4)
+
+
+def bent(
+    seed: int = 0, voxels: float = 3.0, shape: tuple[int, int, int] = (7, 6, 8)
+) -> Deformation:
+    coefficients = np.random.default_rng(seed).normal(size=(*shape, 3)) * voxels / 64
+    made = make_deformation(AFFINE, [-0.5] * 3, 0.25, coefficients, BOX, 16.0)
+    assert made is not None
+    return made
+
+
+def points(count: int = 500, reach: float = 0.55, seed: int = 1) -> np.ndarray:
+    return np.random.default_rng(seed).uniform(-reach, reach, (count, 3))
+
+
+def test_a_spline_is_the_sum_of_its_basis_functions() -> None:
+    # Independent truth: scipy's B-splines, axis by axis.
+    from scipy.interpolate import BSpline
+
+    made = replace(bent(), affine=IDENTITY)
+    x = points(reach=0.24)
+    weights = []
+    for axis, n in enumerate(made.coefficients.shape[:3]):
+        position = (x[:, axis] - made.origin[axis]) / made.spacing
+        knots = np.arange(-3.0, n + 1.0)
+        weights.append(BSpline.design_matrix(position, knots, 3).toarray())
+    expected = x + np.einsum("na,nb,nc,abcd->nd", *weights, made.coefficients)
+    assert np.allclose(deform(made, x), expected, atol=1e-12)
+
+
+def test_a_point_goes_there_and_back() -> None:
+    transform = make_transform([[0, -1, 0], [1, 0, 0], [0, 0, 1]], (0.02, -0.01, 0.03), 0.9)
+    for deformation in (None, make_affine(), bent()):
+        way = PlaceMap(transform, deformation)
+        x = points(reach=0.6)
+        back = way.to_slat(way.to_pixieverse(x))
+        assert np.abs(back - x).max() * 64 < 1e-3
+
+
+def make_affine() -> Deformation:
+    made = make_deformation(AFFINE, np.zeros(3), 1.0, np.zeros((0, 0, 0, 3)), BOX, 16.0)
+    assert made is not None
+    return made
+
+
+@settings(max_examples=25, deadline=None)
+@given(seed=st.integers(0, 10_000), voxels=st.floats(0.1, 40.0))
+def test_nothing_folds_and_nothing_moves_too_far(seed: int, voxels: float) -> None:
+    made = bent(seed, voxels, (6, 5, 7))
+    assert is_proper(made)
+    x = points(4_000, 0.5)
+    assert np.linalg.det(jacobian(made, x)).min() > 0
+    moved = deform(made, x) - x @ AFFINE[:, :3].T - AFFINE[:, 3]
+    assert np.linalg.norm(moved, axis=1).max() * 64 <= 16.0
+    assert np.abs(undeform(made, deform(made, x)) - x).max() * 64 < 1e-3
+
+
+def test_a_fold_is_seen() -> None:
+    coefficients = np.zeros((7, 7, 7, 3))
+    coefficients[3, 3, 3, 0] = 1.0
+    folded = Deformation(IDENTITY, np.full(3, -0.5), 0.25, coefficients)
+    assert np.linalg.det(jacobian(folded, points(20_000, 0.5))).min() < 0
+    assert not is_proper(folded)
+
+
+def test_an_affine_part_that_flattens_mirrors_or_moves_too_far_is_refused() -> None:
+    nothing = np.zeros((0, 0, 0, 3))
+    for affine in (
+        np.diag([1.0, 1.0, 0.3]) @ IDENTITY,
+        np.diag([1.0, 1.0, -1.0]) @ IDENTITY,
+        np.hstack([np.eye(3), [[0.3], [0.0], [0.0]]]),
+    ):
+        assert make_deformation(affine, np.zeros(3), 1.0, nothing, BOX, 16.0) is None
+
+
+def test_the_derivative_is_the_derivative() -> None:
+    made, x, step = bent(), points(200, 0.24), 1e-6
+    for axis in range(3):
+        aside = step * np.eye(3)[axis]
+        numeric = (deform(made, x + aside) - deform(made, x - aside)) / (2 * step)
+        assert np.allclose(jacobian(made, x)[:, :, axis], numeric, atol=1e-6)
+
+
+def test_half_the_spacing_is_the_same_displacement() -> None:
+    made = bent()
+    fine = replace(made, spacing=made.spacing / 2, coefficients=refined(made.coefficients))
+    x = points(500, 0.24)
+    assert np.allclose(deform(made, x), deform(fine, x), atol=1e-12)
+
+
+def test_json_gives_back_the_same_bits() -> None:
+    for made in (bent(), make_affine()):
+        again = from_json(json.loads(json.dumps(to_json(made))))
+        assert again.coefficients.shape == made.coefficients.shape
+        x = points()
+        assert deform(again, x).tobytes() == deform(made, x).tobytes()
+        grains = made.coefficients / GRAIN
+        assert np.array_equal(grains, np.round(grains))
+
+
+def test_broken_numbers_are_named() -> None:
+    value = to_json(bent())
+    with pytest.raises(ValueError, match="finite numbers"):
+        from_json({**value, "spacing": 0.0})
+    with pytest.raises(ValueError, match="finite numbers"):
+        from_json({**value, "origin": [0.0, 0.0]})
+
+
+def test_only_bending_bends() -> None:
+    assert bending_of(replace(bent(), coefficients=np.full((6, 6, 6, 3), 0.1))) == 0.0
+    # u = a x^2 / 2 has the second derivative a, here in 1 / voxel.
+    index = np.arange(8.0)
+    quadratic = np.zeros((8, 8, 8, 3))
+    quadratic[..., 0] = 0.5 * 64 * 0.01 * ((index * 0.1) ** 2)[:, None, None]
+    made = Deformation(IDENTITY, np.full(3, -0.5), 0.1, quadratic)
+    assert bending_of(made) == pytest.approx(0.01)
+
+
+def test_the_lookup_goes_through_the_map() -> None:
+    solid = chair()
+    field, latents = field_of(solid), surface_latents(solid)
+    way = PlaceMap(np.eye(4), bent(voxels=1.0))
+    through = sample(field, way.places(latents.coords), SampleParameters())
+    assert through.place.tobytes() == way.places(latents.coords).astype(np.float32).tobytes()
+    plain = sample(field, places_of(latents.coords, np.eye(4)), SampleParameters())
+    none = sample(field, PlaceMap(np.eye(4)).places(latents.coords), SampleParameters())
+    assert plain.distance.tobytes() == none.distance.tobytes()
+    assert plain.distance.tobytes() != through.distance.tobytes()
