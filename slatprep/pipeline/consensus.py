@@ -12,6 +12,7 @@ import hashlib
 from collections.abc import Sequence
 from dataclasses import replace
 
+from slatprep.align.consensus import find_consensus, settle
 from slatprep.align.deformation import map_of
 from slatprep.align.quality import measure_quality
 from slatprep.judge import judge
