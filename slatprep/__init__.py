@@ -5,7 +5,8 @@ The nouns and verbs that a notebook needs, loaded when they are first used;
 
 - a store: `open_store`, `Store`, `StoredAsset`, `build_store`, `export_store`;
 - its sources: `load_parameters`, `discover`, `read_field`, `read_latents`;
-- two voxel sets: `align_voxels`, `annotate_voxels`, `apply_transform`;
+- two voxel sets: `align_voxels`, `annotate_voxels`, `apply_transform`, and
+  `map_of`, which makes of an alignment the map of points, a `PlaceMap`;
 - properties: `normalize_properties`, `denormalize_properties`, `PIXIE_RANGES`;
 - the records that travel between them: `MaterialField`, `StructuredLatents`,
   `Alignment`, `Annotation`, `Normalization`, ...

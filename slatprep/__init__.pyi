@@ -1,4 +1,8 @@
 # ruff: noqa: I001 (one import a module)
+from .align.deformation import (
+    PlaceMap as PlaceMap,
+    map_of as map_of,
+)
 from .api import (
     align_voxels as align_voxels,
     annotate_voxels as annotate_voxels,
@@ -34,6 +38,7 @@ from .records import (
     Alignment as Alignment,
     Annotation as Annotation,
     AssetPair as AssetPair,
+    Deformation as Deformation,
     MaterialField as MaterialField,
     Normalization as Normalization,
     PropertyRange as PropertyRange,

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from slatprep.align import align
-from slatprep.geometry.frames import places_of
+from slatprep.align.deformation import PlaceMap, map_of
 from slatprep.geometry.voxels import occupancy_of, voxels_of
 from slatprep.parameters import AlignParameters, SampleParameters
 from slatprep.records import (
@@ -24,7 +24,7 @@ from slatprep.sample import sample
 def align_voxels(
     pixieverse: ArrayLike, slat: ArrayLike, parameters: AlignParameters | None = None
 ) -> Alignment:
-    """Find the transform that lays one voxel set on another.
+    """Find the map that lays one voxel set on another.
 
     Parameters
     ----------
@@ -41,8 +41,9 @@ def align_voxels(
     -------
     Alignment
         ``transform`` (4, 4) takes points of the PixieVerse frame to points of
-        the SLAT frame, both the unit cube [-0.5, 0.5]^3; with ``quality``
-        and the score of every candidate.
+        the SLAT frame, both the unit cube [-0.5, 0.5]^3; with ``quality``, the
+        score of every candidate, and the ``deformation`` where the shapes differ.
+        `slatprep.map_of` makes of it the map of points, both ways.
 
     Raises
     ------
@@ -82,7 +83,7 @@ def align_voxels(
 def annotate_voxels(
     field: MaterialField,
     coords: ArrayLike,
-    transform: ArrayLike,
+    transform: Alignment | ArrayLike,
     parameters: SampleParameters | None = None,
 ) -> Annotation:
     """Look the material and its properties up at SLAT voxels.
@@ -93,7 +94,8 @@ def annotate_voxels(
         The PixieVerse field, as `read_field` gives it.
     coords : array_like, shape (N, 3)
         SLAT voxels in 0..63.
-    transform : array_like, shape (4, 4)
+    transform : Alignment, or array_like, shape (4, 4)
+        What `align_voxels` found, its deformation included; or a similarity,
         PixieVerse frame to SLAT frame.
     parameters : SampleParameters, optional
         How far an annotation may be; the defaults of a build otherwise.
@@ -101,17 +103,20 @@ def annotate_voxels(
     Returns
     -------
     Annotation
-        Properties in SI units (N, 3), material (N,), valid (N,) and distance
-        (N,) in voxels.
+        Properties in SI units (N, 3), material (N,), valid (N,), distance (N,)
+        in voxels, and place (N, 3) in the PixieVerse frame.
 
     Raises
     ------
     ValueError
-        If `coords` are no voxels, or `transform` no similarity.
+        If `coords` are no voxels, or `transform` is no similarity.
     """
-    return sample(
-        field, places_of(_voxels(coords, "coords"), transform), parameters or SampleParameters()
-    )
+    if isinstance(transform, Alignment):
+        place_map = map_of(transform)
+    else:
+        place_map = PlaceMap(np.asarray(transform, dtype=np.float64))
+    places = place_map.places(_voxels(coords, "coords"))
+    return sample(field, places, parameters or SampleParameters())
 
 
 def _voxels(voxels: ArrayLike, name: str) -> NDArray[np.uint8]:

@@ -437,13 +437,38 @@ class Deformation:
     spacing : float
         Distance of neighbouring control points.
     coefficients : ndarray of float64, shape (n0, n1, n2, 3)
-        Displacements at the control points; (0, 0, 0, 3) where the map is affine.
+        Displacements at the control points, at least 4 a side; (0, 0, 0, 3) where
+        the map is affine.
+
+    Raises
+    ------
+    ValueError
+        If the numbers do not have these shapes, or are not finite.
     """
 
     affine: AffineMap
     origin: Point
     spacing: float
     coefficients: Lattice
+
+    def __post_init__(self) -> None:
+        shape = self.coefficients.shape
+        numbers = (self.affine, self.origin, self.coefficients, np.array(self.spacing))
+        if (
+            self.affine.shape != (3, 4)
+            or self.origin.shape != (3,)
+            or len(shape) != 4
+            or shape[3] != 3
+            or (self.coefficients.size and min(shape[:3]) < 4)
+            or not all(np.isfinite(n).all() for n in numbers)
+            or not self.spacing > 0
+        ):
+            raise ValueError(
+                "a deformation has finite numbers: affine (3, 4), origin (3,), spacing above 0 "
+                "and coefficients (n0, n1, n2, 3) with at least 4 a side or none; got affine "
+                f"{self.affine.shape}, origin {self.origin.shape}, spacing {self.spacing}, "
+                f"coefficients {shape}"
+            )
 
 
 @dataclass(frozen=True)

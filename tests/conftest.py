@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from support.deformed import add_deformed
 from support.synthetic import Dataset, make_asset
 
 from slatprep.pipeline.dataset import BuildSummary, build_store
@@ -55,3 +56,11 @@ def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> tuple[Dataset, Path
         dataset.add(object_id, seed)
     build_store(dataset.parameters("pixie"), folder / "s.zarr")
     return dataset, folder / "s.zarr"
+
+
+@pytest.fixture(scope="session")
+def deformed_build(tmp_path_factory: pytest.TempPathFactory) -> BuildSummary:
+    """Build a bent and a stretched asset; nobody may change the store."""
+    dataset = Dataset(tmp_path_factory.mktemp("deformed"))
+    add_deformed(dataset)
+    return build_store(dataset.parameters(), dataset.root / "deformed.zarr")

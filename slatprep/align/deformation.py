@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from itertools import product
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -60,7 +59,18 @@ class PlaceMap:
 
 
 def map_of(alignment: Alignment) -> PlaceMap:
-    """Return the map that an alignment stands for."""
+    """Return the map between the frames that an alignment stands for.
+
+    Parameters
+    ----------
+    alignment : Alignment
+        What `slatprep.align_voxels` found, or a record holds.
+
+    Returns
+    -------
+    PlaceMap
+        Its transform, and its deformation where there is one.
+    """
     return PlaceMap(alignment.transform, alignment.deformation)
 
 
@@ -234,48 +244,3 @@ def _rounded(values: ArrayLike) -> NDArray[np.float64]:
     rounded: NDArray[np.float64] = np.round(np.asarray(values, dtype=np.float64) / GRAIN) * GRAIN
     # Minus zero would be another byte in JSON.
     return rounded + 0.0
-
-
-def to_json(deformation: Deformation) -> dict[str, Any]:
-    """Return a deformation as plain numbers; `from_json` gives back the same bits."""
-    return {
-        "affine": deformation.affine.tolist(),
-        "origin": deformation.origin.tolist(),
-        "spacing": deformation.spacing,
-        "coefficients": deformation.coefficients.tolist(),
-        "shape": list(deformation.coefficients.shape),
-    }
-
-
-def from_json(value: dict[str, Any]) -> Deformation:
-    """Return the deformation that `to_json` wrote.
-
-    Raises
-    ------
-    ValueError
-        If the numbers do not have the shapes of a deformation, or are not finite.
-    """
-    shape = tuple(int(n) for n in value["shape"])
-    deformation = Deformation(
-        np.array(value["affine"], dtype=np.float64),
-        np.array(value["origin"], dtype=np.float64),
-        float(value["spacing"]),
-        np.array(value["coefficients"], dtype=np.float64).reshape(shape),
-    )
-    numbers = [deformation.affine, deformation.origin, deformation.coefficients]
-    if (
-        deformation.affine.shape != (3, 4)
-        or deformation.origin.shape != (3,)
-        or len(shape) != 4
-        or shape[3] != 3
-        or (deformation.coefficients.size and min(shape[:3]) < 4)
-        or not all(np.isfinite(n).all() for n in numbers)
-        or not deformation.spacing > 0
-    ):
-        raise ValueError(
-            "a deformation has finite numbers: affine (3, 4), origin (3,), spacing above 0 and "
-            f"coefficients (n0, n1, n2, 3) with at least 4 a side or none; got affine "
-            f"{deformation.affine.shape}, origin {deformation.origin.shape}, "
-            f"spacing {deformation.spacing}, coefficients {shape}"
-        )
-    return deformation

@@ -26,7 +26,7 @@ from slatprep.store.reader import TRAINING_COLUMNS
 from slatprep.workers import Progress
 from slatprep.workers.local import single_threaded
 
-STORED_COLUMNS = ("coords", "feats", "properties", "material", "valid", "distance")
+STORED_COLUMNS = (*TRAINING_COLUMNS, "material", "valid", "distance", "place")
 """What every way holds of an asset; `TRAINING_COLUMNS` of it are read."""
 
 Arrays = dict[str, NDArray[Any]]
@@ -57,7 +57,7 @@ class WayResult:
     name : str
         The way.
     size, files : int
-        Bytes and files of the six ``voxel/*`` arrays on disk.
+        Bytes and files of all ``voxel/*`` arrays on disk.
     seconds : float
         Processor seconds an asset, warm, one process: the median of the repeats.
     warm : float
@@ -338,7 +338,7 @@ def _require_equal(way: Way, directory: Path, expected: Arrays, row: int) -> Non
 
 
 def _size(directory: Path, way: Way) -> tuple[int, int]:
-    """Return bytes and files that the six arrays take."""
+    """Return bytes and files that the arrays take."""
     path = (directory / way.files).resolve()
     if way.files == "store":
         path = path / "voxel"

@@ -25,7 +25,7 @@ from slatprep.geometry.frames import (
     voxel_centres,
 )
 from slatprep.records import BACKGROUND, Place
-from slatprep.store import Store, open_store
+from slatprep.store import StoredAsset, open_store
 
 SUCCESS_DISPLACEMENT = 1.5
 """An asset is placed right where its mean displacement [voxel] is less than this above the
@@ -150,7 +150,7 @@ def score_against_truth(store: Place, truth_dir: Path) -> TruthReport:
         raise InputError(truth_dir, "no truth in it", "a folder with one <asset id>.npz an asset")
     opened = open_store(store)
     scores = tuple(
-        _score_asset(opened, asset_id, truths[asset_id])
+        _score_asset(opened.asset(asset_id), truths[asset_id])
         for asset_id in opened.ids
         if asset_id in truths
     )
@@ -182,15 +182,10 @@ def _summarise_level(level: int, scores: Sequence[TruthScore]) -> LevelScore:
     )
 
 
-def _score_asset(store: Store, asset_id: str, path: Path) -> TruthScore:
-    asset = store.asset(asset_id)
+def _score_asset(asset: StoredAsset, path: Path) -> TruthScore:
     annotated = np.argwhere(asset.grid_material < BACKGROUND)
-    places = None
-    # A store need not say where it looked its voxels up.
-    if (store.path / "voxel" / "place" / "zarr.json").exists():
-        places = store.read_rows("voxel/place", *store.rows(store.find(asset_id)))
     return compare_with_truth(
-        asset_id,
+        asset.asset_id,
         read_truth(path),
         coords=asset.coords,
         transform=asset.transform,
@@ -198,7 +193,7 @@ def _score_asset(store: Store, asset_id: str, path: Path) -> TruthScore:
         valid=asset.valid,
         annotated=annotated,
         annotated_material=asset.grid_material[tuple(annotated.T)],
-        places=places,
+        places=asset.place,
     )
 
 

@@ -28,6 +28,7 @@ _DATASETS: dict[str, dict[str, Any]] = {
     "material": {"description": "class 0..6, 255 where not valid"},
     "valid": {"description": "an annotation was found near enough"},
     "distance": {"description": "distance to the annotation used", "units": "voxel"},
+    "place": {"description": "where it was looked up, PixieVerse frame, [-0.5, 0.5]^3"},
     "transform": {
         "description": "PixieVerse frame to SLAT frame, both the unit cube [-0.5, 0.5]^3"
     },

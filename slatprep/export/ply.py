@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 from slatprep.errors import StoreError
 from slatprep.export.assets import Exported, file_name
 from slatprep.export.formats import ExportOptions, Frame, Points, Writer
-from slatprep.geometry.frames import apply_transform, invert_transform, voxel_centres
+from slatprep.geometry.frames import voxel_centres
 from slatprep.provenance.stored import StoredRecords
 from slatprep.records import MATERIAL_COLOURS, RESOLUTION
 from slatprep.store import Store, StoredAsset
@@ -110,13 +110,13 @@ def write(
             material, values = field.material, field.properties
             in_pixieverse = voxel_centres(field.voxels)
             conf = np.ones(len(material))
-            in_slat = apply_transform(asset.transform, in_pixieverse)
+            in_slat = StoredRecords(asset.store).place_map(asset).to_slat(in_pixieverse)
         else:
             valid = asset.valid
             material, values = asset.material[valid], asset.properties_si[valid]
             in_slat = voxel_centres(asset.coords[valid])
             conf = np.clip(1.0 - asset.distance[valid] / max_distance, 0.0, 1.0)
-            in_pixieverse = apply_transform(invert_transform(asset.transform), in_slat)
+            in_pixieverse = asset.place[valid].astype(np.float64)
         positions = in_slat
         if frame == "pixieverse":
             positions = to_world(in_pixieverse, bounds[asset.asset_id])

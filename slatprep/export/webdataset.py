@@ -46,7 +46,7 @@ def write(directory: Path, number: int, assets: Iterable[StoredAsset]) -> Iterat
             key = file_name(asset.asset_id, dots=False)
             about = {**describe_columns(asset), "transform": asset.transform.tolist()}
             _add(tar, f"{key}.json", orjson.dumps(about))
-            names = ("coords", "feats", *TARGETS, "distance")
+            names = ("coords", "feats", *TARGETS, "distance", "place")
             # Not compressed: a training loop reads this again and again.
             packed = io.BytesIO()
             np.savez(packed, **{name: getattr(asset, name) for name in names})

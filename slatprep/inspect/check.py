@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 
 from slatprep.align.quality import measure_quality
 from slatprep.errors import StoreError
-from slatprep.geometry.frames import places_of
 from slatprep.judge import THRESHOLDS, verdict_of
 from slatprep.normalize import normalize_properties
 from slatprep.parameters import SampleParameters
@@ -211,7 +210,7 @@ def recompute_annotation(asset: StoredAsset) -> tuple[float, dict[str, NDArray[n
         If the store does not say how it was made.
     """
     parameters = SampleParameters(**_parameters(asset.store)["sample"])
-    annotation = sample(asset.field, places_of(asset.coords, asset.transform), parameters)
+    annotation = sample(asset.field, asset.place, parameters)
     properties = normalize_properties(annotation.properties, asset.store.normalization)
     changes = np.abs(properties - asset.properties).max(axis=1)
     differences = {

@@ -9,9 +9,10 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from slatprep.align.deformation import PlaceMap
 from slatprep.errors import ConfigError, InputError
-from slatprep.geometry.frames import apply_transform, invert_transform
 from slatprep.normalize import denormalize_properties
+from slatprep.provenance.stored import StoredRecords
 from slatprep.readers.files import ArraySpec, load_source, npz_arrays, npz_small_arrays
 from slatprep.readers.slat import check_coords
 from slatprep.records import BACKGROUND, RESOLUTION, Normalization
@@ -40,20 +41,20 @@ class VoxelField:
         Class 0..6.
     properties : ndarray of float32, shape (K, 3)
         Young's modulus [Pa], density [kg/m^3], Poisson's ratio.
-    transform : ndarray of float64, shape (4, 4), optional
-        The voxels' frame to the SLAT frame; None where they are one.
+    place_map : PlaceMap, optional
+        Leads from the SLAT frame to the voxels' frame; None where they are one.
     """
 
     voxels: NDArray[np.uint8]
     material: NDArray[np.uint8]
     properties: NDArray[np.float32]
-    transform: NDArray[np.float64] | None = None
+    place_map: PlaceMap | None = None
 
     def locate(self, points: ArrayLike) -> NDArray[np.float64]:
         """Carry points (N, 3) of the SLAT frame into the frame of the voxels."""
-        if self.transform is None:
+        if self.place_map is None:
             return np.asarray(points, dtype=np.float64)
-        return apply_transform(invert_transform(self.transform), points)
+        return self.place_map.to_pixieverse(points)
 
 
 def stored_field(store: Store, asset_id: str, points: Points = "slat") -> VoxelField:
@@ -79,7 +80,8 @@ def stored_field(store: Store, asset_id: str, points: Points = "slat") -> VoxelF
     asset = store.asset(asset_id)
     if points == "grid":
         grid = asset.field
-        field = VoxelField(grid.voxels, grid.material, grid.properties, asset.transform)
+        place_map = StoredRecords(store).place_map(asset)
+        field = VoxelField(grid.voxels, grid.material, grid.properties, place_map)
     else:
         valid = asset.valid
         field = VoxelField(asset.coords[valid], asset.material[valid], asset.properties_si[valid])

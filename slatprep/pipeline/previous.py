@@ -9,6 +9,7 @@ from slatprep.errors import StoreError
 from slatprep.provenance.record import AssetRecord
 from slatprep.provenance.stored import StoredRecords
 from slatprep.records import Place
+from slatprep.store.layout import FORMAT_VERSION
 from slatprep.store.reader import Store, open_store
 
 
@@ -35,6 +36,14 @@ class PreviousBuild:
     def store(self) -> Store:
         """The store, open."""
         return open_store(self.path)
+
+    @property
+    def older_format(self) -> str:
+        """Why nothing of it can be reused, in words: its format; empty where that is today's."""
+        found = self.store.format_version
+        if found == FORMAT_VERSION:
+            return ""
+        return f"the store has format {found}, and {FORMAT_VERSION} is written"
 
     @cached_property
     def records(self) -> StoredRecords:
@@ -68,4 +77,4 @@ def previous_build(target: Place) -> PreviousBuild | None:
         store = open_store(target)
         return PreviousBuild(store.path, store.attributes["manifest"])
     except (StoreError, KeyError):
-        return None  # Of another format version, or damaged: made anew.
+        return None  # Of a newer format, or damaged: made anew.

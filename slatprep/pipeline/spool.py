@@ -36,7 +36,7 @@ from slatprep.storage.faults import reached
 
 Arrays = dict[str, NDArray[Any]]
 
-_VOXEL_ARRAYS = ("coords", "feats", "properties", "material", "valid", "distance")
+_VOXEL_ARRAYS = ("coords", "feats", "properties", "material", "valid", "distance", "place")
 _TORN = (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile, StoreError)
 
 

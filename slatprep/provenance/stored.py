@@ -4,8 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
+from slatprep.align.deformation import PlaceMap
 from slatprep.provenance.record import AssetRecord, read_asset_record
-from slatprep.store.reader import Store
+from slatprep.records import Model
+from slatprep.store.reader import Store, StoredAsset
 from slatprep.store.records import RECORD_ARRAY, RECORDS_IN_CHUNK
 
 
@@ -34,6 +36,18 @@ class StoredRecords:
             If the store has no such asset, or its record cannot be read.
         """
         return self.read(self.store.find(asset_id))
+
+    def place_map(self, asset: StoredAsset) -> PlaceMap:
+        """Return the map between the frames by which an asset was looked up.
+
+        Raises
+        ------
+        StoreError
+            If the asset is deformed, and its record, which holds how, cannot be read.
+        """
+        if asset.columns["model"] in (Model.RIGID, Model.SIMILARITY):
+            return PlaceMap(asset.transform)
+        return PlaceMap(asset.transform, self.read(asset.index).alignment.deformation)
 
     def read(self, row: int) -> AssetRecord:
         """Return the record of a row.

@@ -19,7 +19,7 @@ from slatprep.store.layout import (
     ASSET_CHUNK,
     FIXED_SIZES,
     FORMAT,
-    FORMAT_VERSION,
+    READABLE_VERSIONS,
     ArrayLayout,
 )
 
@@ -85,7 +85,6 @@ def attribute_findings(attributes: Mapping[str, Any]) -> Iterator[Finding]:
     """Yield what is wrong with the root's attributes."""
     for name, expected in (
         ("format", FORMAT),
-        ("format_version", FORMAT_VERSION),
         ("resolution", RESOLUTION),
         ("material_classes", list(MATERIAL_CLASSES)),
         ("property_columns", list(PROPERTY_COLUMNS)),
@@ -93,6 +92,10 @@ def attribute_findings(attributes: Mapping[str, Any]) -> Iterator[Finding]:
         value = attributes.get(name)
         if value != expected or type(value) is not type(expected):
             yield _root(f"attribute {name} is {value!r}", repr(expected))
+    version = attributes.get("format_version")
+    if type(version) is not int or version not in READABLE_VERSIONS:
+        one_of = " or ".join(map(str, READABLE_VERSIONS))
+        yield _root(f"attribute format_version is {version!r}", one_of)
     manifest = attributes.get("manifest")
     if not (isinstance(manifest, str) and len(manifest) == 64 and _is_hex(manifest)):
         yield _root(f"attribute manifest is {manifest!r}", "a SHA-256 in hex")

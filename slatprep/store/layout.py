@@ -26,7 +26,11 @@ if TYPE_CHECKING:
     import zarr
 
 FORMAT = "slatprep-store"
-FORMAT_VERSION = 1
+FORMAT_VERSION = 2
+"""The format that is written."""
+
+READABLE_VERSIONS = (1, 2)
+"""The formats that are read. 1 has no ``voxel/place``, as it knew similarities only."""
 
 ASSET_CHUNK = 65_536
 """Assets in one chunk of the ``asset/*`` arrays."""
@@ -40,7 +44,8 @@ class ArrayLayout:
 
     `packing` is ``zstd``, the smallest, or what unpacks fastest: ``repeats``
     for values that recur, ``columns`` for rows of three bytes of which two
-    recur, ``exponents`` for floats of which little else recurs.
+    recur, ``exponents`` for floats of which little else recurs. `since` is the
+    first format version that has it.
     """
 
     name: str
@@ -50,6 +55,7 @@ class ArrayLayout:
     description: str
     unit: str = ""
     packing: str = "zstd"
+    since: int = 1
 
 
 _XYZ = ("x", "y", "z")
@@ -74,7 +80,7 @@ ARRAYS = (
         "PixieVerse frame to SLAT frame, both the unit cube [-0.5, 0.5]^3",
     ),
     ArrayLayout("asset/engine", "str", ("asset",), "", "alignment engine"),
-    ArrayLayout("asset/model", "str", ("asset",), "", "rigid or similarity"),
+    ArrayLayout("asset/model", "str", ("asset",), "", "rigid, similarity, affine or deformable"),
     ArrayLayout("asset/search", "str", ("asset",), "", "starts that were needed"),
     ArrayLayout(
         "asset/fitness",
@@ -164,6 +170,15 @@ ARRAYS = (
         packing="exponents",
     ),
     ArrayLayout(
+        "voxel/place",
+        "float32",
+        ("voxel", "axis"),
+        NAN,
+        "where it was looked up, in the PixieVerse frame's unit cube [-0.5, 0.5]^3",
+        packing="exponents",
+        since=2,
+    ),
+    ArrayLayout(
         "grid/properties",
         "float32",
         ("asset", "property", *_XYZ),
@@ -179,6 +194,12 @@ ARRAYS = (
     ),
 )
 """Every array of the store."""
+
+
+def arrays_of(version: int) -> tuple[ArrayLayout, ...]:
+    """Return the arrays that a store of a format version has."""
+    return tuple(layout for layout in ARRAYS if layout.since <= version)
+
 
 FIXED_SIZES = {
     "row": 4,

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slatprep.errors import StoreError
+from slatprep.geometry.frames import places_of
 from slatprep.geometry.voxels import voxels_of
 from slatprep.normalize import denormalize_properties
 from slatprep.records import BACKGROUND, MaterialField, Normalization, Place, PropertyRange
@@ -23,7 +24,7 @@ from slatprep.store.contract import (
     read_metadata,
     size_findings,
 )
-from slatprep.store.layout import ARRAYS, FORMAT, FORMAT_VERSION
+from slatprep.store.layout import ARRAYS, FORMAT, READABLE_VERSIONS
 from slatprep.store.shard_reader import RowReader
 
 if TYPE_CHECKING:
@@ -68,8 +69,12 @@ class StoredAsset:
         Whether an annotation was found near enough.
     distance : ndarray of float32, shape (N,)
         Voxels to the annotation used.
+    place : ndarray of float32, shape (N, 3)
+        Where each voxel was looked up, in the PixieVerse frame. A store of
+        format 1 does not hold it: there the inverse of the transform leads to it.
     transform : ndarray of float64, shape (4, 4)
-        PixieVerse frame to SLAT frame.
+        PixieVerse frame to SLAT frame, a similarity; a deformation that follows
+        it is in the record, see `slatprep.provenance.stored.StoredRecords.place_map`.
     columns : dict
         The asset's row of every other ``asset/*`` array, by the array's last
         name: ``fitness``, ``verdict``, ``category``, ...
@@ -84,6 +89,7 @@ class StoredAsset:
     material: NDArray[np.uint8]
     valid: NDArray[np.bool_]
     distance: NDArray[np.float32]
+    place: NDArray[np.float32]
     transform: NDArray[np.float64]
     columns: dict[str, Any]
 
@@ -150,6 +156,11 @@ class Store:
     def name(self) -> str:
         """The last part of its path, or of its URL without the version."""
         return store_name(self.path)
+
+    @property
+    def format_version(self) -> int:
+        """Version of the format that it was written in."""
+        return int(self.attributes["format_version"])
 
     @cached_property
     def group(self) -> zarr.Group:
@@ -221,7 +232,7 @@ class Store:
             Which asset, 0 to ``len(store) - 1``.
         columns : sequence of str
             Last names of ``voxel/*`` arrays: ``coords``, ``feats``,
-            ``properties``, ``material``, ``valid``, ``distance``.
+            ``properties``, ``material``, ``valid``, ``distance``, ``place``.
 
         Returns
         -------
@@ -234,7 +245,7 @@ class Store:
             If there is no such asset or array, or a file is missing or damaged.
         """
         start, stop = self.rows(index)
-        return {name: self.read_rows(f"voxel/{name}", start, stop) for name in columns}
+        return {name: self._voxel_rows(name, index, start, stop) for name in columns}
 
     def rows(self, index: int) -> tuple[int, int]:
         """Return the first row of an asset in ``voxel/*``, and the one after its last.
@@ -271,6 +282,12 @@ class Store:
             columns={name: self._column(name)[index] for name in _ASSET_COLUMNS},
             **self.read(index, _VOXEL_COLUMNS),
         )
+
+    def _voxel_rows(self, name: str, index: int, start: int, stop: int) -> NDArray[Any]:
+        if name == "place" and self.format_version == 1:
+            coords = self.read_rows("voxel/coords", start, stop)
+            return places_of(coords, self._column("transform")[index]).astype(np.float32)
+        return self.read_rows(f"voxel/{name}", start, stop)
 
     @cached_property
     def _index(self) -> dict[str, int]:
@@ -371,9 +388,10 @@ def open_store(path: str | Place, *, copy: bool = False) -> Store:
             "`slatprep build-store` wrote"
         )
     version = attributes.get("format_version")
-    if version != FORMAT_VERSION:
+    if type(version) is not int or version not in READABLE_VERSIONS:
+        readable = " and ".join(map(str, READABLE_VERSIONS))
         raise StoreError(
-            f"{path} has format version {version!r}; this slatprep reads {FORMAT_VERSION}. "
+            f"{path} has format version {version!r}; this slatprep reads {readable}. "
             "Use the slatprep that wrote it, or a newer one"
         )
     return Store(path, document)

@@ -61,6 +61,8 @@ def test_supervision_is_the_material_at_the_place_the_voxel_was_turned_from(
         assert np.array_equal(root["voxel/material"][rows], true_material)
         assert root["voxel/valid"][rows].all()
         assert root["voxel/distance"][rows].max() < 0.1
+        place = (np.stack([y, 63 - x, z], axis=1) + 0.5) / 64 - 0.5
+        assert np.allclose(root["voxel/place"][rows], place, atol=0.1 / 64)
         expected = np.where((true_material == 0)[:, None], by_hand(JELLY), by_hand(METAL))
         assert np.allclose(root["voxel/properties"][rows], expected, atol=1e-6)
 
@@ -78,7 +80,7 @@ def test_grid_is_the_normalised_field(root: zarr.Group, mixed: Dataset) -> None:
 def test_attributes_explain_the_store(root: zarr.Group, mixed_build: BuildSummary) -> None:
     attributes = dict(root.attrs)
     assert attributes["format"] == "slatprep-store"
-    assert attributes["format_version"] == 1
+    assert attributes["format_version"] == 2
     assert attributes["resolution"] == 64
     assert attributes["material_classes"][6:] == ["stationary", "background"]
     assert attributes["property_columns"] == ["youngs_modulus", "density", "poissons_ratio"]
@@ -100,6 +102,7 @@ def test_arrays_have_the_contracts_types_and_names_of_dimensions(root: zarr.Grou
         "voxel/material": "uint8",
         "voxel/valid": "bool",
         "voxel/distance": "float32",
+        "voxel/place": "float32",
         "grid/properties": "float32",
         "grid/material": "uint8",
     }
@@ -118,7 +121,7 @@ def test_one_file_a_shard_and_one_read_to_open(root: zarr.Group, mixed_build: Bu
     n_voxels = root["voxel/coords"].shape[0]
     shards = -(-n_voxels // (SMALL_SHARDS.voxel_chunk * SMALL_SHARDS.voxel_chunks_per_shard))
     assert shards > len(IDS)  # Assets are cut by shards, or this would show little.
-    for array in ("coords", "feats", "properties", "material", "valid", "distance"):
+    for array in ("coords", "feats", "properties", "material", "valid", "distance", "place"):
         assert len(list((store / "voxel" / array / "c").rglob("0"))) >= 1
         assert _files(store / "voxel" / array / "c") == shards
     assert _files(store / "grid" / "material" / "c") == 3

@@ -43,7 +43,7 @@ def test_what_is_no_store_is_refused_in_words(tmp_path: Path) -> None:
 
 
 def test_a_newer_format_is_refused_in_words(tmp_path: Path) -> None:
-    attributes = {"format": "slatprep-store", "format_version": 2}
+    attributes = {"format": "slatprep-store", "format_version": 3}
     (tmp_path / "zarr.json").write_text(json.dumps({"attributes": attributes}))
-    with pytest.raises(StoreError, match=r"format version 2; this slatprep reads 1"):
+    with pytest.raises(StoreError, match=r"format version 3; this slatprep reads 1 and 2"):
         open_store(tmp_path)

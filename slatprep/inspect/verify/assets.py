@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from contextlib import suppress
 from functools import lru_cache
+from typing import Any
 
 import numpy as np
 import orjson
 from numpy.typing import NDArray
 
+from slatprep.align.deformation import map_of
 from slatprep.errors import InputError, StoreError
 from slatprep.geometry.voxels import flat_index
 from slatprep.inspect.check import TOLERANCES, recompute_annotation
@@ -16,13 +19,17 @@ from slatprep.normalize import normalize_change
 from slatprep.provenance.columns import columns_of
 from slatprep.provenance.record import AssetRecord, RecordError
 from slatprep.provenance.stored import StoredRecords
-from slatprep.records import BACKGROUND, RESOLUTION, UNANNOTATED, Place, SourceRoots
+from slatprep.records import BACKGROUND, RESOLUTION, UNANNOTATED, Model, Place, SourceRoots
 from slatprep.storage.files import file_digest
 from slatprep.storage.place import storage_of
 from slatprep.store.contract import Finding
 from slatprep.store.reader import Store, StoredAsset, open_store
 from slatprep.store.records import RECORD_ARRAY
 from slatprep.store.shard_reader import DamagedFileError
+
+PLACE_TOLERANCE = 2.0**-23
+"""Edges of the unit cube by which a place may differ: the last bit of a float32, as another
+machine may round the map otherwise."""
 
 
 def asset_findings(
@@ -104,6 +111,7 @@ def value_findings(asset: StoredAsset) -> Iterator[Finding]:
             "negative or NaN",
             "a distance of 0 or more",
         ),
+        "voxel/place": (np.isfinite(asset.place).all(), "NaN or infinite", "finite points"),
         "grid/material": (
             _IS_GRID_CLASS[asset.grid_material].all(),
             "an unknown class",
@@ -124,7 +132,7 @@ def value_findings(asset: StoredAsset) -> Iterator[Finding]:
 
 
 def lookup_findings(asset: StoredAsset) -> Iterator[Finding]:
-    """Yield where an annotation is not what the grid and the transform give."""
+    """Yield where an annotation is not what the grid and the stored places give."""
     try:
         _, differences = recompute_annotation(asset)
     except (KeyError, TypeError, ValueError, np.linalg.LinAlgError) as error:
@@ -138,7 +146,7 @@ def lookup_findings(asset: StoredAsset) -> Iterator[Finding]:
                 where,
                 asset.asset_id,
                 f"{wrong} of {len(difference)} voxels differ",
-                "what the grid, the transform and the parameters give",
+                "what the grid, the places and the parameters give",
             )
 
 
@@ -148,12 +156,22 @@ def fault_findings(where: str, asset_id: str, error: RecordError) -> list[Findin
 
 
 def record_findings(asset: StoredAsset, record: AssetRecord, store: Store) -> Iterator[Finding]:
-    """Yield where an asset's record disagrees with its row."""
+    """Yield where an asset's record disagrees with its row, its map with the places included."""
     for name, said, held in _claims(asset, record, store):
         if not _equal(said, held):
             yield Finding(
                 RECORD_ARRAY, asset.asset_id, f"{name} is {said!r}", f"{held!r}, as the store has"
             )
+    alignment = record.alignment
+    bends = alignment.model in (Model.AFFINE, Model.DEFORMABLE)
+    if bends != (alignment.deformation is not None):
+        what = f"model is {str(alignment.model)!r}, {'without' if bends else 'with'} a deformation"
+        yield Finding(RECORD_ARRAY, asset.asset_id, what, "one where it is affine or deformable")
+    places = map_of(alignment).places(asset.coords)
+    wrong = np.count_nonzero(~(np.abs(places - asset.place).max(axis=1) <= PLACE_TOLERANCE))
+    if wrong:
+        what = f"{wrong} of {len(places)} voxels differ"
+        yield Finding("voxel/place", asset.asset_id, what, "where the map in the record leads")
 
 
 def source_findings(record: AssetRecord, roots: SourceRoots, run: str) -> Iterator[Finding]:
@@ -210,8 +228,16 @@ def _claims(
     yield "normalization", record.normalization, store.normalization
     parameters = store.attributes["build"]["parameters"]
     for name in ("align", "sample"):
-        said_parameters = orjson.loads(orjson.dumps(getattr(record.parameters, name)))
-        yield f"parameters/{name}", said_parameters, parameters.get(name)
+        said_parameters = getattr(record.parameters, name)
+        held = parameters.get(name)
+        with suppress(TypeError):  # Where they are no parameters at all, so not the same.
+            # What an older format did not know yet has its default on both sides.
+            held = _in_json(type(said_parameters)(**held))
+        yield f"parameters/{name}", _in_json(said_parameters), held
+
+
+def _in_json(parameters: object) -> Any:
+    return orjson.loads(orjson.dumps(parameters))
 
 
 def _equal(said: object, held: object) -> bool:

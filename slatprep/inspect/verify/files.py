@@ -17,7 +17,7 @@ from slatprep.store.contract import (
     read_metadata,
 )
 from slatprep.store.digests import ATTRIBUTES, attributes_digest, is_own
-from slatprep.store.layout import ARRAYS
+from slatprep.store.layout import READABLE_VERSIONS, arrays_of
 from slatprep.store.reader import Store
 from slatprep.workers.local import Jobs, run_unordered
 
@@ -37,10 +37,12 @@ def metadata_findings(path: Place) -> Iterator[Finding]:
     if not isinstance(copies, dict) or frame != _CONSOLIDATED:
         yield Finding("zarr.json", "", "has no consolidated metadata", "those of every array")
         copies = {}
+    version = root["attributes"].get("format_version")
+    layouts = arrays_of(version if version in READABLE_VERSIONS else READABLE_VERSIONS[-1])
     arrays: dict[str, Any] = {}
     files = storage_of(path).files()
     present = {name.removesuffix("/zarr.json") for name in files if _is_metadata(name)}
-    for name in sorted({*present, *copies, *(layout.name for layout in ARRAYS), *_GROUPS}):
+    for name in sorted({*present, *copies, *(layout.name for layout in layouts), *_GROUPS}):
         where = f"{name}/zarr.json"
         if name not in present:
             yield Finding(where, "", "is missing", "the metadata of an array or group")
@@ -57,7 +59,7 @@ def metadata_findings(path: Place) -> Iterator[Finding]:
     except StoreError as error:
         yield Finding("zarr.json", "", str(error), "shapes of the arrays")
         return
-    for layout in ARRAYS:
+    for layout in layouts:
         if layout.name in arrays:
             yield from array_findings(layout.name, arrays[layout.name], sizes)
 

@@ -7,7 +7,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from slatprep.records import Verdict
+from slatprep.records import Model, Verdict
 from slatprep.store.contract import MAX_VOXELS, Finding
 from slatprep.store.reader import Store
 
@@ -17,7 +17,10 @@ SHARES = ("fitness", "fitness_backward", "overlap", "ambiguity", "valid_share")
 DISTANCES = ("inlier_rmse", "inlier_rmse_backward", "margin")
 """Columns of numbers that are not negative, or NaN where there is nothing to tell."""
 
-WORDS = {"model": ("rigid", "similarity"), "verdict": tuple(str(v) for v in Verdict)}
+WORDS = {
+    "model": tuple(str(model) for model in Model),
+    "verdict": tuple(str(verdict) for verdict in Verdict),
+}
 """Columns of words, and those allowed."""
 
 # R of a similarity satisfies R^T R = s^2 I; rounding leaves this much.
@@ -71,13 +74,14 @@ def _transform_findings(store: Store) -> Iterator[Finding]:
         similar = np.isfinite(transform).all() and (transform[3] == (0, 0, 0, 1)).all()
         determinant = float(np.linalg.det(linear)) if similar else 0.0
         square = abs(determinant) ** (2 / 3)
+        kind = "rigid" if model == "rigid" else "similarity"
         unit = abs(determinant - 1) <= _TOLERANCE if model == "rigid" else True
         if determinant <= 0 or not unit or not _is_multiple_of_unit(linear.T @ linear, square):
             yield Finding(
                 "asset/transform",
                 asset_id,
-                f"{transform.tolist()} is no {model} transform",
-                "a rotation (scaled by one factor where similarity) and a shift, finite",
+                f"{transform.tolist()} is no {kind} transform",
+                "a rotation (scaled by one factor unless rigid) and a shift, finite",
             )
 
 

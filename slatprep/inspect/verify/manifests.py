@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections import Counter
+import hashlib
+from collections import Counter, deque
 from collections.abc import Iterator
 
 import orjson
@@ -21,6 +22,7 @@ from slatprep.provenance.record import (
 from slatprep.provenance.stored import StoredRecords
 from slatprep.records import Place, SourceRoots, Status
 from slatprep.store.contract import MAX_METADATA_BYTES, Finding
+from slatprep.store.layout import FORMAT_VERSION
 from slatprep.store.reader import Store
 
 BUILD, ASSETS = "build.json", "assets.jsonl"
@@ -66,7 +68,12 @@ def manifest_findings(store: Store, folder: Place) -> Iterator[Finding]:
     seen: Counter[str] = Counter({str(status): 0 for status in Status})
     faults: list[Finding] = []
     try:
-        found = records_id(_checked(store, folder / ASSETS, seen, faults))
+        checked = _checked(store, folder / ASSETS, seen, faults)
+        if store.format_version == FORMAT_VERSION:
+            found = records_id(checked)
+        else:
+            deque(checked, maxlen=0)
+            found = _id_of_lines(folder / ASSETS)
     except OSError as error:
         yield Finding(assets_file, "", f"cannot be read ({error})", "a JSON record a line")
         return
@@ -86,6 +93,21 @@ def _stated_id(text: bytes) -> object:
     except ValueError:
         return None
     return document.get("id") if isinstance(document, dict) else None
+
+
+def _id_of_lines(path: Place) -> str:
+    """Return what `records_id` was for records that lacked fields which they have today."""
+    digest = hashlib.sha256()
+    with path.open("rb") as file:
+        while line := file.readline(MAX_METADATA_BYTES):
+            try:
+                record = orjson.loads(line)
+            except ValueError:
+                continue  # A fault of its own.
+            left_out = {"duration_s": 0.0, "reason": "", "traceback": ""}
+            record |= {name: empty for name, empty in left_out.items() if name in record}
+            digest.update(orjson.dumps(record))
+    return digest.hexdigest()
 
 
 def _checked(
