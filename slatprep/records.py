@@ -402,11 +402,18 @@ class Ambiguity:
 
 @dataclass(frozen=True)
 class Judgement:
-    """What an alignment is worth; ``reasons`` say what kept it from being good."""
+    """What an alignment is worth; ``reasons`` say what kept it from being good.
+
+    ``confidence`` is the calibrated probability that the placement is right,
+    ``expected_accuracy`` the share of right labels to be expected among the
+    valid ones; NaN in records of builds that did not tell.
+    """
 
     ambiguity: Ambiguity
     verdict: Verdict
     reasons: tuple[str, ...] = ()
+    confidence: Number = float("nan")
+    expected_accuracy: Number = float("nan")
 
 
 @dataclass(frozen=True, eq=False)
@@ -578,7 +585,8 @@ class Annotation:
     Poisson's ratio), NaN where not valid; ``material`` (N,) uint8, 255 where
     not valid; ``valid`` (N,) bool; ``distance`` (N,) float32, in voxels of the
     PixieVerse frame, to the annotation used; ``place`` (N, 3) float32, where the
-    voxel was looked up, in the PixieVerse frame.
+    voxel was looked up, in the PixieVerse frame; ``confidence`` (N,) float32, how
+    likely the class is right, 0 where not valid, None until that is judged.
     """
 
     properties: NDArray[np.float32]
@@ -586,6 +594,7 @@ class Annotation:
     valid: NDArray[np.bool_]
     distance: NDArray[np.float32]
     place: NDArray[np.float32]
+    confidence: NDArray[np.float32] | None = None
 
 
 @dataclass(frozen=True)

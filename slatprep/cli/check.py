@@ -18,7 +18,15 @@ if TYPE_CHECKING:
     from slatprep.records import Place
     from slatprep.store import Store
 
-_COLUMNS = ("fitness", "fitness_backward", "inlier_rmse", "valid_share", "ambiguity")
+_COLUMNS = (
+    "confidence",
+    "expected_accuracy",
+    "fitness",
+    "fitness_backward",
+    "inlier_rmse",
+    "valid_share",
+    "ambiguity",
+)
 
 
 @command("check-alignment")
@@ -123,7 +131,7 @@ def _print(output: Output, checks: list[AlignmentCheck]) -> None:
                 (
                     one.asset_id,
                     one.verdict,
-                    *(one.figure(n).value for n in _COLUMNS),
+                    *(one.value(n) for n in _COLUMNS),
                     one.consistent,
                 )
                 for one in checks

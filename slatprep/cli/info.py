@@ -57,16 +57,20 @@ def info(output: Output, store: Place) -> None:
 def show_quality(output: Output, overview: StoreOverview) -> None:
     """Print how good the alignments of a store are, by category and in all.
 
-    ``back`` is the fitness from SLAT to PixieVerse; ``tied`` counts assets
-    whose tied placements differ in class somewhere.
+    ``labels`` is the share of right classes to be expected, ``back`` the
+    fitness from SLAT to PixieVerse; ``tied`` counts assets whose tied
+    placements differ in class somewhere.
     """
-    medians = attrgetter("fitness", "fitness_backward", "inlier_rmse", "valid_share", "ambiguous")
+    medians = attrgetter("confidence", "expected_accuracy", "fitness", "fitness_backward",
+                         "inlier_rmse", "valid_share", "ambiguous")  # fmt: skip
     output.table(
         "Alignments (medians; rmse in voxels)",
         (
             "category",
             "assets",
             *overview.total.verdicts,
+            "confidence",
+            "labels",
             "fitness",
             "back",
             "rmse",

@@ -44,6 +44,7 @@ _SIZES = ("small", "medium", "large")
 @verdicts_option
 @option("--max-ambiguity", float)
 @shares_option
+@option("--weigh-by-confidence", is_flag=True)
 @option("--seed", int, 0)
 @option("--device", click.Choice(["cpu", "cuda"]), "cpu")
 @option("--workers", click.IntRange(min=0), 0)
@@ -80,6 +81,7 @@ def train(
     --patience: Stop after so many epochs without progress.
     --augment: Quarter turns and flips: of 8 or 48 kinds.
     --max-ambiguity: Leave out assets that are more ambiguous.
+    --weigh-by-confidence: Weigh voxels by how likely their class is right.
     --seed: Of weights, order and augmentation.
     --device: Where to compute.
     --workers: Processes that read ahead.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any
@@ -35,8 +36,8 @@ Properties are normalised: float32 went through SI and back. Distances are in vo
 _QUALITY = ("fitness", "inlier_rmse", "fitness_backward", "inlier_rmse_backward", "overlap")
 
 AT_LEAST = {
-    "fitness": THRESHOLDS.good_fitness,
-    "fitness_backward": THRESHOLDS.good_fitness,
+    "confidence": THRESHOLDS.good_confidence,
+    "expected_accuracy": THRESHOLDS.good_accuracy,
     "valid_share": THRESHOLDS.good_valid_share,
 }
 """Figures that a good alignment reaches, by name."""
@@ -113,6 +114,10 @@ class AlignmentCheck:
         """Return the figure of that name."""
         return next(figure for figure in self.figures if figure.name == name)
 
+    def value(self, name: str) -> float:
+        """Return the value of a figure; NaN where the store does not tell."""
+        return next((figure.value for figure in self.figures if figure.name == name), math.nan)
+
     @property
     def words(self) -> tuple[str, ...]:
         """The verdict in words: why it is not better, or what makes it good."""
@@ -165,7 +170,18 @@ def check_alignment(store: Store, asset_id: str) -> AlignmentCheck:
     quality = measure_quality(asset.field, latents, asset.transform, radius)
     columns = asset.columns
     ambiguity, margin = float(columns["ambiguity"]), float(columns["margin"])
-    verdict, reasons = verdict_of(quality, valid_share, ambiguity)
+    confidence, expected = float(columns["confidence"]), float(columns["expected_accuracy"])
+    same_fit = all(
+        abs(getattr(quality, name) - float(columns[name])) <= QUALITY_TOLERANCE for name in _QUALITY
+    )
+    verdict, reasons = verdict_of(
+        quality,
+        valid_share,
+        ambiguity,
+        # Of another fit than the one that was judged the confidence says nothing.
+        confidence=confidence if same_fit else math.nan,
+        expected_accuracy=expected,
+    )
     figures = [
         Figure(name, getattr(quality, name), float(columns[name]), QUALITY_TOLERANCE)
         for name in _QUALITY
@@ -186,6 +202,9 @@ def check_alignment(store: Store, asset_id: str) -> AlignmentCheck:
             for name, array in (("property", "voxel/properties"), ("distance", "voxel/distance"))
         ),
     ]
+    if store.format_version > 1:
+        figures.append(Figure("confidence", confidence, confidence, 0))
+        figures.append(Figure("expected_accuracy", expected, expected, 0))
     return AlignmentCheck(
         asset_id, verdict, reasons, str(columns["verdict"]), tuple(figures), asset.transform, radius
     )

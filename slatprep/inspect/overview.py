@@ -14,23 +14,26 @@ from slatprep.records import Normalization, Place, Verdict
 from slatprep.storage.place import storage_of
 from slatprep.store import Store
 
-_MEDIANS = ("fitness", "inlier_rmse", "fitness_backward", "overlap")
+_MEDIANS = ("confidence", "expected_accuracy", "fitness", "inlier_rmse", "fitness_backward",
+            "overlap")  # fmt: skip
 
 
 @dataclass(frozen=True)
 class GroupOverview:
     """Some assets of a store in one line.
 
-    ``verdicts`` counts the assets by verdict. Fitness, rmse [voxel] and
-    overlap are medians over the assets; ``valid_share`` is over all their
-    voxels; ``ambiguous`` counts assets with tied placements that differ in
-    class at some voxel.
+    ``verdicts`` counts the assets by verdict. Confidence, expected
+    accuracy, fitness, rmse [voxel] and overlap are medians over the assets;
+    ``valid_share`` is over all their voxels; ``ambiguous`` counts assets with
+    tied placements that differ in class at some voxel.
     """
 
     name: str
     assets: int
     voxels: int
     verdicts: dict[str, int]
+    confidence: float
+    expected_accuracy: float
     fitness: float
     inlier_rmse: float
     fitness_backward: float

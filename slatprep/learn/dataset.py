@@ -22,7 +22,7 @@ from slatprep.store import Store, open_store
 IGNORED = -100
 """Class of a voxel without annotation: what `torch.nn.functional.cross_entropy` passes over."""
 
-_COLUMNS = ("coords", "feats", "properties", "material", "valid")
+_COLUMNS = ("coords", "feats", "properties", "material", "valid", "confidence")
 
 
 class Draw(NamedTuple):
@@ -50,6 +50,9 @@ class Item:
         Class 0..6; -100 where not valid.
     valid : Tensor of bool, shape (N,)
         Where the targets mean something.
+    confidence : Tensor of float32, shape (N,)
+        How likely the class is right; 0 where not valid, 1 elsewhere in a store
+        of format 1, which does not tell.
     """
 
     asset_id: str
@@ -58,6 +61,7 @@ class Item:
     properties: Tensor
     material: Tensor
     valid: Tensor
+    confidence: Tensor
 
 
 @dataclass
@@ -72,7 +76,7 @@ class SparseBatch:
         One for each value of the batch column.
     coords : Tensor of int32, shape (N, 4)
         Batch column, then the voxel.
-    feats, properties, material, valid : Tensor
+    feats, properties, material, valid, confidence : Tensor
         As in `Item`, of N rows.
     """
 
@@ -82,6 +86,7 @@ class SparseBatch:
     properties: Tensor
     material: Tensor
     valid: Tensor
+    confidence: Tensor
 
     @property
     def layout(self) -> list[slice]:
@@ -118,6 +123,8 @@ class SlatDataset(Dataset[Item]):
         Verdicts that are good enough; all if not given.
     max_ambiguity : float, optional
         Largest ambiguity that is good enough.
+    min_confidence : float, optional
+        Voxels whose class is less likely right are not valid.
     augmentation : {"none", "upright", "all"}
         Symmetries of the lattice to draw from, see `slatprep.learn.augment`.
     seed : int
@@ -126,7 +133,7 @@ class SlatDataset(Dataset[Item]):
     Raises
     ------
     ConfigError
-        If no asset is left.
+        If no asset is left, or confidence is asked for and the store has none.
     StoreError
         If the store cannot be read.
     """
@@ -139,6 +146,7 @@ class SlatDataset(Dataset[Item]):
         shares: Shares = Shares(),  # noqa: B008 (immutable)
         verdicts: Collection[str] | None = None,
         max_ambiguity: float | None = None,
+        min_confidence: float | None = None,
         augmentation: Augmentation = "none",
         seed: int = 0,
     ) -> None:
@@ -154,7 +162,9 @@ class SlatDataset(Dataset[Item]):
                 "where it goes, so a small dataset needs some such as 0.6,0.2,0.2)"
             )
         self.asset_ids = [self.store.ids[index] for index in self.indices]
-        self.seed = seed
+        if min_confidence is not None:
+            require_confidence(self.store)
+        self.seed, self.min_confidence = seed, min_confidence
         self._symmetries = lattice_symmetries(augmentation)
         self._mean = np.array(FEATS_MEAN, np.float32)
         self._std = np.array(FEATS_STD, np.float32)
@@ -168,7 +178,11 @@ class SlatDataset(Dataset[Item]):
             raise IndexError(f"asset {draw.number} of {len(self)}")
         rows = self.store.read(int(self.indices[draw.number]), _COLUMNS)
         asset_id = self.asset_ids[draw.number]
-        valid = rows["valid"]
+        valid, confidence = rows["valid"], rows["confidence"]
+        if self.store.format_version == 1:
+            confidence = valid.astype(np.float32)
+        if self.min_confidence is not None:
+            valid = valid & (confidence >= self.min_confidence)
         material = rows["material"].astype(np.int64)
         material[~valid | (rows["material"] == UNANNOTATED)] = IGNORED
         return Item(
@@ -178,6 +192,7 @@ class SlatDataset(Dataset[Item]):
             torch.from_numpy(np.where(valid[:, None], rows["properties"], np.float32(0))),
             torch.from_numpy(material),
             torch.from_numpy(valid),
+            torch.from_numpy(confidence),
         )
 
     def _symmetry(self, asset_id: str, draw: Draw) -> np.ndarray:
@@ -185,6 +200,21 @@ class SlatDataset(Dataset[Item]):
         words = np.frombuffer(asset_id.encode("utf-8").ljust(4, b"\0"), np.uint8)
         rng = np.random.default_rng([self.seed, draw.epoch, *words.tolist()])
         return np.asarray(self._symmetries[rng.integers(len(self._symmetries))])
+
+
+def require_confidence(store: Store) -> None:
+    """Make sure that a store tells how likely its classes are right.
+
+    Raises
+    ------
+    ConfigError
+        If it has format 1, which does not.
+    """
+    if store.format_version == 1:
+        raise ConfigError(
+            f"{store.path} has format 1, without the confidence of voxels; expected format 2 or "
+            "later: build it again"
+        )
 
 
 def collate(items: Sequence[Item]) -> SparseBatch:

@@ -16,7 +16,7 @@ from torch.nn import functional
 from slatprep.errors import ConfigError, InputError
 from slatprep.learn.augment import Augmentation
 from slatprep.learn.baselines import VoxelBaseline, fit_baselines
-from slatprep.learn.dataset import IGNORED, SlatDataset, SlatLoader, SparseBatch
+from slatprep.learn.dataset import IGNORED, SlatDataset, SlatLoader, SparseBatch, require_confidence
 from slatprep.learn.decoder import SIZES, PhysicsDecoder, Prediction, make_decoder
 from slatprep.learn.runs import BEST, LAST, EpochRecord, Run
 from slatprep.learn.splits import Shares, Split
@@ -53,6 +53,8 @@ class TrainParameters:
         Largest ambiguity that is good enough.
     shares : Shares
         Shares of train, val and test.
+    weigh_by_confidence : bool
+        Weigh each voxel's loss by how likely its class is right.
     seed : int
         Of weights, order and augmentation.
     """
@@ -68,6 +70,7 @@ class TrainParameters:
     verdicts: tuple[str, ...] = ("good", "doubtful", "failed")
     max_ambiguity: float | None = None
     shares: Shares = field(default_factory=Shares)
+    weigh_by_confidence: bool = False
     seed: int = 0
 
     def __post_init__(self) -> None:
@@ -100,14 +103,22 @@ class TrainSummary:
     predictions: Path
 
 
-def loss_of(prediction: Prediction, batch: SparseBatch) -> Tensor:
+def loss_of(prediction: Prediction, batch: SparseBatch, weigh: bool = False) -> Tensor:
     """Return SLAT-Phys's loss over the valid voxels of a batch.
 
-    The sum of the three mean squared errors, and half the cross-entropy.
+    The sum of the three mean squared errors, and half the cross-entropy. With
+    `weigh` the means are weighed by the voxels' confidence.
     """
     if not bool(batch.valid.any()):
         return prediction.properties.sum() * 0.0 + prediction.logits.sum() * 0.0
     squared = (prediction.properties - batch.properties)[batch.valid].square()
+    if weigh:
+        weights = batch.confidence[batch.valid]
+        weights = weights / weights.sum()
+        entropies = functional.cross_entropy(
+            prediction.logits[batch.valid], batch.material[batch.valid], reduction="none"
+        )
+        return PROPERTY_WEIGHT * (weights @ squared).sum() + CLASS_WEIGHT * weights @ entropies
     entropy = functional.cross_entropy(prediction.logits, batch.material, ignore_index=IGNORED)
     return PROPERTY_WEIGHT * squared.mean(dim=0).sum() + CLASS_WEIGHT * entropy
 
@@ -154,6 +165,8 @@ def train(
         If the store cannot be read.
     """
     train_set = _dataset(store, "train", parameters)
+    if parameters.weigh_by_confidence:
+        require_confidence(train_set.store)
     val_set, test_set = _dataset(store, "val", parameters), _dataset(store, "test", parameters)
     run = Run(out, asdict(parameters) | {"store": str(train_set.store.attributes["manifest"])})
     session = _Session(parameters, train_set, device, workers)
@@ -220,7 +233,7 @@ class _Session:
         accumulate, losses, rate = self.parameters.accumulate, [], 0.0
         for number, batch in enumerate(self.loader):
             moved = batch.to(self.device)
-            loss = loss_of(self._predict(moved), moved)
+            loss = loss_of(self._predict(moved), moved, self.parameters.weigh_by_confidence)
             # The last step of an epoch may have fewer batches.
             first = number - number % accumulate
             (loss / min(accumulate, len(self.loader) - first)).backward()  # type: ignore[no-untyped-call]

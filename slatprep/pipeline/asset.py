@@ -9,11 +9,12 @@ from __future__ import annotations
 
 import time
 import traceback
+from dataclasses import replace
 
 from slatprep.align import align
 from slatprep.align.deformation import map_of
 from slatprep.errors import MissingPartnerError, SlatprepError
-from slatprep.judge import judge
+from slatprep.judge import judge, voxel_confidence
 from slatprep.parameters import BuildParameters
 from slatprep.pipeline.context import BuildContext
 from slatprep.pipeline.plan import Action, PlannedAsset
@@ -63,6 +64,8 @@ def process_asset(
         if known
         else judge(field, latents, alignment, annotation, parameters.sample)
     )
+    likely = voxel_confidence(field, latents, alignment, annotation, judgement.confidence)
+    annotation = replace(annotation, confidence=likely)
     return Finished(pair, field, latents, alignment, annotation, judgement)
 
 

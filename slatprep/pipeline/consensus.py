@@ -15,7 +15,7 @@ from dataclasses import replace
 from slatprep.align.consensus import find_consensus, settle
 from slatprep.align.deformation import map_of
 from slatprep.align.quality import measure_quality
-from slatprep.judge import judge
+from slatprep.judge import judge, voxel_confidence
 from slatprep.parameters import BuildParameters
 from slatprep.pipeline.spool import Spool, SpooledAsset
 from slatprep.provenance.record import FailedRecord, FirstPass
@@ -73,12 +73,15 @@ def settle_asset(
     quality = measure_quality(field, latents, alignment.transform, parameters.align.radius)
     alignment = replace(alignment, quality=quality)
     annotation = sample(field, map_of(alignment).places(latents.coords), parameters.sample)
+    judgement = judge(field, latents, alignment, annotation, parameters.sample)
+    likely = voxel_confidence(field, latents, alignment, annotation, judgement.confidence)
+    annotation = replace(annotation, confidence=likely)
     key = hashlib.sha256(f"{asset.key} {consensus.rotation.tobytes().hex()}".encode()).hexdigest()
     record = replace(
         first,
         key=key,
         alignment=alignment,
-        judgement=judge(field, latents, alignment, annotation, parameters.sample),
+        judgement=judgement,
         before_consensus=FirstPass(first.key, first.alignment, first.judgement),
         counts=replace(first.counts, valid=int(annotation.valid.sum())),
     )

@@ -36,7 +36,8 @@ from slatprep.storage.faults import reached
 
 Arrays = dict[str, NDArray[Any]]
 
-_VOXEL_ARRAYS = ("coords", "feats", "properties", "material", "valid", "distance", "place")
+_VOXEL_ARRAYS = ("coords", "feats", "properties", "material", "valid", "distance", "place",
+                 "confidence")  # fmt: skip
 _TORN = (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile, StoreError)
 
 

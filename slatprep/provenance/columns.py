@@ -36,4 +36,6 @@ def columns_of(record: AssetRecord) -> dict[str, Column]:
         "property_ambiguity": judgement.ambiguity.property_change,
         "valid_share": counts.valid / counts.slat_voxels,
         "verdict": judgement.verdict,
+        "confidence": judgement.confidence,
+        "expected_accuracy": judgement.expected_accuracy,
     }

@@ -30,7 +30,8 @@ FORMAT_VERSION = 2
 """The format that is written."""
 
 READABLE_VERSIONS = (1, 2)
-"""The formats that are read. 1 has no ``voxel/place``, as it knew similarities only."""
+"""The formats that are read. 1 has no ``voxel/place``, as it knew similarities only,
+and no confidences."""
 
 ASSET_CHUNK = 65_536
 """Assets in one chunk of the ``asset/*`` arrays."""
@@ -121,6 +122,22 @@ ARRAYS = (
     ArrayLayout("asset/valid_share", "float64", ("asset",), NAN, "share of valid SLAT voxels"),
     ArrayLayout("asset/verdict", "str", ("asset",), "", "good, doubtful or failed"),
     ArrayLayout(
+        "asset/confidence",
+        "float64",
+        ("asset",),
+        NAN,
+        "calibrated probability that the placement is right",
+        since=2,
+    ),
+    ArrayLayout(
+        "asset/expected_accuracy",
+        "float64",
+        ("asset",),
+        NAN,
+        "share of right classes to be expected among valid voxels",
+        since=2,
+    ),
+    ArrayLayout(
         "voxel/coords",
         "uint8",
         ("voxel", "axis"),
@@ -175,6 +192,15 @@ ARRAYS = (
         ("voxel", "axis"),
         NAN,
         "where it was looked up, in the PixieVerse frame's unit cube [-0.5, 0.5]^3",
+        packing="exponents",
+        since=2,
+    ),
+    ArrayLayout(
+        "voxel/confidence",
+        "float32",
+        ("voxel",),
+        NAN,
+        "calibrated probability that the class is right, 0 where not valid",
         packing="exponents",
         since=2,
     ),

@@ -69,6 +69,9 @@ class StoredAsset:
         Whether an annotation was found near enough.
     distance : ndarray of float32, shape (N,)
         Voxels to the annotation used.
+    confidence : ndarray of float32, shape (N,)
+        How likely the class is right, 0 where not valid; NaN in a store of
+        format 1, which does not tell.
     place : ndarray of float32, shape (N, 3)
         Where each voxel was looked up, in the PixieVerse frame. A store of
         format 1 does not hold it: there the inverse of the transform leads to it.
@@ -90,6 +93,7 @@ class StoredAsset:
     valid: NDArray[np.bool_]
     distance: NDArray[np.float32]
     place: NDArray[np.float32]
+    confidence: NDArray[np.float32]
     transform: NDArray[np.float64]
     columns: dict[str, Any]
 
@@ -200,6 +204,8 @@ class Store:
             If there is no such array, or it cannot be read.
         """
         # Offsets are always written: that they are there bounds what the others may claim.
+        if self.format_version == 1 and name in ("confidence", "expected_accuracy"):
+            return np.full(len(self), np.nan)
         rows = self.shape("asset/offset")[0] if name == "offset" else len(self)
         return self.read_rows(f"asset/{name}", 0, rows)
 
@@ -232,7 +238,8 @@ class Store:
             Which asset, 0 to ``len(store) - 1``.
         columns : sequence of str
             Last names of ``voxel/*`` arrays: ``coords``, ``feats``,
-            ``properties``, ``material``, ``valid``, ``distance``, ``place``.
+            ``properties``, ``material``, ``valid``, ``distance``, ``place``,
+            ``confidence``.
 
         Returns
         -------
@@ -287,6 +294,8 @@ class Store:
         if name == "place" and self.format_version == 1:
             coords = self.read_rows("voxel/coords", start, stop)
             return places_of(coords, self._column("transform")[index]).astype(np.float32)
+        if name == "confidence" and self.format_version == 1:
+            return np.full(stop - start, np.nan, dtype=np.float32)
         return self.read_rows(f"voxel/{name}", start, stop)
 
     @cached_property

@@ -42,12 +42,16 @@ def test_loss_by_hand() -> None:
         torch.tensor([[0.0, 0.0, 0.0], [1.0, 0.0, -1.0], [0.0, 0.0, 0.0]]),
         torch.tensor([0, 1, IGNORED]),
         torch.tensor([True, True, False]),
+        torch.tensor([0.25, 0.75, 0.0]),
     )
     prediction = Prediction(
         torch.tensor([[0.5, 0.0, 0.0], [0.5, 1.0, -1.0], [1.0, 1.0, 1.0]]), torch.zeros(3, 8)
     )
     # (0.25 + 0.25) / 2 + (0 + 1) / 2 + 0, and half of ln 8 for eight equal scores.
     assert float(loss_of(prediction, batch)) == pytest.approx(0.25 + 0.5 + 0.5 * math.log(8))
+    # 0.25 * 0.25 + 0.75 * (0.25 + 1), weighed by confidence.
+    weighed = 0.0625 + 0.9375 + 0.5 * math.log(8)
+    assert float(loss_of(prediction, batch, weigh=True)) == pytest.approx(weighed)
     batch.valid[:] = False
     assert float(loss_of(prediction, batch)) == 0.0
 

@@ -39,6 +39,7 @@ def test_it_reads_as_the_same_store(old: Path, mixed_build: BuildSummary) -> Non
         expected = np.linalg.solve(before.transform, points.T).T[:, :3]
         assert before.place.dtype == np.float32
         assert np.abs(before.place - expected).max() < 1e-6
+        assert np.isnan(before.confidence).all() and np.isnan(before.columns["confidence"])
         assert store.read(before.index, ["place"])["place"].tobytes() == before.place.tobytes()
 
 

@@ -11,17 +11,22 @@ from pathlib import Path
 import numpy as np
 import zarr
 
+_NEWER = ("voxel/place", "voxel/confidence", "asset/confidence", "asset/expected_accuracy")
+
 
 def write_format_one(store: Path, out: Path) -> None:
     """Copy a store, whose models are similarities, and take from it what format 1 lacked."""
     shutil.copytree(store, out)
     root = zarr.open_group(out, mode="r+", use_consolidated=False)
-    del root["voxel/place"]
+    for name in _NEWER:
+        del root[name]
     root["asset/record"][:] = np.array([_older(text) for text in root["asset/record"][:]], object)
     build = root.attrs["build"]
     del build["parameters"]["align"]["max_displacement"]
     root.attrs.update({"format_version": 1, "build": build})
-    names = [n for n in root["file/name"][:] if not n.startswith("voxel/place/")]
+    names = [
+        n for n in root["file/name"][:] if not n.startswith(tuple(f"{newer}/" for newer in _NEWER))
+    ]
     contents = [
         json.dumps(dict(root.attrs), sort_keys=True, ensure_ascii=False).encode()
         if name.startswith("zarr.json#")
@@ -45,5 +50,7 @@ def _older(text: str) -> str:
     record = json.loads(text)
     for name in ("deformation", "figures"):
         del record["alignment"][name]
+    for name in ("confidence", "expected_accuracy"):
+        del record["judgement"][name]
     del record["parameters"]["align"]["max_displacement"]
     return json.dumps(record, separators=(",", ":"), ensure_ascii=False)

@@ -29,8 +29,8 @@ from slatprep.store.reader import Store
 _PROPERTY_COLOURS = ("#440154", "#472D7B", "#3B528B", "#2C728E", "#21918C", "#28AE80",
                      "#5EC962", "#ADDC30", "#FDE725")  # fmt: skip
 
-_FIGURES = ("fitness", "fitness_backward", "inlier_rmse", "overlap", "valid_share", "ambiguity",
-            "margin")  # fmt: skip
+_FIGURES = ("confidence", "expected_accuracy", "fitness", "fitness_backward", "inlier_rmse",
+            "overlap", "valid_share", "ambiguity", "margin")  # fmt: skip
 _DIGITS = 5
 
 
@@ -72,8 +72,8 @@ def page_content(
         "voxels": int(store.offsets[-1]),
         "engine": sorted(set(map(str, store.column("engine")))),
         "thresholds": {
-            "fitness": THRESHOLDS.good_fitness,
-            "fitness_backward": THRESHOLDS.good_fitness,
+            "confidence": THRESHOLDS.good_confidence,
+            "expected_accuracy": THRESHOLDS.good_accuracy,
             "valid_share": THRESHOLDS.good_valid_share,
             "ambiguity": THRESHOLDS.good_ambiguity,
         },

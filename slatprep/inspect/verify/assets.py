@@ -112,6 +112,12 @@ def value_findings(asset: StoredAsset) -> Iterator[Finding]:
             "a distance of 0 or more",
         ),
         "voxel/place": (np.isfinite(asset.place).all(), "NaN or infinite", "finite points"),
+        "voxel/confidence": (
+            asset.store.format_version == 1
+            or ((asset.confidence >= 0) & (asset.confidence <= valid)).all(),
+            "no probability, or one where there is no class",
+            "0 to 1 where valid, 0 elsewhere",
+        ),
         "grid/material": (
             _IS_GRID_CLASS[asset.grid_material].all(),
             "an unknown class",

@@ -14,6 +14,9 @@ from slatprep.store.reader import Store
 SHARES = ("fitness", "fitness_backward", "overlap", "ambiguity", "valid_share")
 """Columns of shares, 0 to 1."""
 
+PROBABILITIES = ("confidence", "expected_accuracy")
+"""Columns of probabilities, 0 to 1, or NaN in a store of format 1, which does not tell."""
+
 DISTANCES = ("inlier_rmse", "inlier_rmse_backward", "margin")
 """Columns of numbers that are not negative, or NaN where there is nothing to tell."""
 
@@ -37,6 +40,8 @@ def index_findings(store: Store) -> Iterator[Finding]:
     yield from _offset_findings(store)
     for name in SHARES:
         yield from _outside(store, name, 0.0, 1.0)
+    for name in PROBABILITIES:
+        yield from _outside(store, name, 0.0, 1.0, nan=store.format_version == 1)
     for name in DISTANCES:
         yield from _outside(store, name, 0.0, np.inf, nan=True)
     for name, allowed in WORDS.items():

@@ -132,7 +132,7 @@ def test_several_assets_get_a_file_each_and_a_contact_sheet(copy: Path, tmp_path
     assert {Path(one["picture"]) for one in told} | {folder / "sheet.png"} == set(folder.iterdir())
     for asset in told:
         passes = {figure["name"]: figure["passes"] for figure in asset["figures"]}
-        assert passes["fitness"] is True and passes["overlap"] is None
+        assert passes["confidence"] is True and passes["overlap"] is None
     sheet = imread(folder / "sheet.png")
     assert sheet[84:284, 40:240].std() > 0.05 and sheet[84:284, 680:880].std() > 0.05
 
@@ -163,7 +163,7 @@ def test_an_id_becomes_a_safe_file_name(copy: Path, tmp_path: Path) -> None:
 def test_numbers_stand_beside_their_thresholds(copy: Path) -> None:
     told = run("--asset", "ant", "--store", copy, "--picture", "none").stdout
     rows = {line.split()[0]: line.split()[1:] for line in told.splitlines() if "  " in line}
-    assert rows["fitness"][1:4] == [">=", "0.8", "yes"]
+    assert rows["confidence"][1:4] == [">=", "0.9", "yes"]
     assert rows["ambiguity"][1:4] == ["<=", "0.05", "yes"]
     assert "100.0% of the SLAT boundary lie within 1 voxel" in told
     assert "\x1b" not in told

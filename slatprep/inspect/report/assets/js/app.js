@@ -124,6 +124,8 @@ const Detail = (() => {
     const matrix = value("transform");
     const rows = [0, 4, 8].map((k) => matrix.slice(k, k + 4).map((x) => x.toFixed(4).replace("-", "−").padStart(8)).join(" "));
     const list = [
+      ["Confidence", fixed(value("confidence"))],
+      ["Labels expected right", Format.share(value("expected_accuracy"))],
       ["Fitness", fixed(value("fitness"))],
       ["Fitness, SLAT to PixieVerse", fixed(value("fitness_backward"))],
       ["Inlier rmse", `${fixed(value("inlier_rmse"))} voxel`],

@@ -70,7 +70,9 @@ const Sections = (() => {
     const top = (values, least, step) => Math.max(least, Math.ceil(Format.extent(values)[1] / step) * step);
     const low = (values) => Math.min(0.9, Math.floor(Format.extent(values)[0] * 20) / 20);
     const specs = [
-      { key: "fitness", title: "Fitness", text: Format.fixed(3), domain: [low(known(ASSETS.fitness)), 1], good: [CONTENT.thresholds.fitness, "good from"] },
+      known(ASSETS.confidence).length
+        ? { key: "confidence", title: "Confidence", text: Format.fixed(3), domain: [0, 1], good: [CONTENT.thresholds.confidence, "good from"] }
+        : { key: "fitness", title: "Fitness", text: Format.fixed(3), domain: [low(known(ASSETS.fitness)), 1] },
       { key: "inlier_rmse", title: "Inlier rmse [voxel]", text: Format.fixed(3), domain: [0, top(known(ASSETS.inlier_rmse), 0.5, 0.1)] },
       { key: "displacement", title: "Displacement between tied placements [voxel]", text: Format.fixed(1), domain: [0, top(known(ASSETS.displacement), 5, 5)], empty: CONTENT.records ? "No asset has tied placements." : "Unknown without the records." },
       { key: "valid_share", title: "Valid share", text: (x) => Format.share(x), domain: [low(known(ASSETS.valid_share)), 1], good: [CONTENT.thresholds.valid_share, "good from"] },

@@ -10,6 +10,8 @@ const Table = (() => {
     { key: "id", title: "Asset", width: 156, value: (i) => ASSETS.id[i] },
     { key: "category", title: "Category", width: 132, value: (i) => ASSETS.category[i] || null, text: (i) => ASSETS.category[i] || Format.NONE, wide: true },
     { key: "state", title: "State", width: 172, value: (i) => STATES.findIndex((state) => state.name === ASSETS.state[i]) },
+    { key: "confidence", title: "Sure", width: 76, ...number("confidence", 3) },
+    { key: "expected_accuracy", title: "Labels", width: 84, ...share("expected_accuracy"), wide: true },
     { key: "fitness", title: "Fitness", width: 88, ...number("fitness", 3) },
     { key: "fitness_backward", title: "Back", width: 74, ...number("fitness_backward", 3), wide: true },
     { key: "inlier_rmse", title: "rmse", width: 76, ...number("inlier_rmse", 3), wide: true },
@@ -20,6 +22,8 @@ const Table = (() => {
     { key: "voxels", title: "Voxels", width: 84, value: (i) => ASSETS.voxels[i], text: (i) => Format.count(ASSETS.voxels[i]), right: true, wide: true },
   ];
   const TITLES = {
+    confidence: "Calibrated probability that the placement is right",
+    expected_accuracy: "Share of right classes to be expected among the valid voxels",
     fitness: "Share of PixieVerse boundary voxels with a SLAT voxel within the radius",
     fitness_backward: "Share of SLAT voxels with a PixieVerse boundary voxel within the radius",
     inlier_rmse: "Root mean square distance of those, in voxels",

@@ -1,0 +1,277 @@
+"""Fit the confidences of slatprep.judge on a table of benchmarks/confidence.py, and test them.
+
+    python benchmarks/calibrate.py demo.npz ... [--module slatprep/judge/calibration.py]
+                                   [--picture docs/images/reliability.svg] [--also real.npz]
+
+Logistic regressions whose weights may only have the sign that makes sense (a better fit
+never lowers a confidence), fitted on the rows that are not held out; then a curve, from
+isotonic regression on the same rows, that sets their probabilities right. Alignments are
+weighed to the mix `PRIOR`. Everything that is printed and drawn is of the held-out rows.
+Without --module nothing is written, and the shipped numbers are tested.
+"""
+
+from __future__ import annotations
+
+import argparse
+import subprocess
+import sys
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import isotonic_regression, minimize
+from scipy.special import expit
+
+from slatprep.judge import calibration
+from slatprep.judge.confidence import VOXEL_FIGURES, voxel_figures
+from slatprep.judge.evidence import FIGURES, HARMLESS, Surroundings
+from slatprep.judge.model import Figure, Logistic
+from slatprep.judge.verdict import THRESHOLDS
+
+PRIOR = {"own": 0.9, "heading": 0.05, "other": 0.05}
+"""Of a hundred alignments: ninety as the engine makes them, on all levels alike; five whose
+right placement it was not allowed to see; five of other objects."""
+
+VOXEL_PRIOR = {"own": 0.95, "heading": 0.05}
+"""The same for voxels: what is right at one of another object has no meaning."""
+
+GROWS = {"score_slat", "score_pixieverse", "score_similarity", "within_1", "within_2", "within_3",
+         "margin", "fitness", "fitness_backward", "valid_share"}  # fmt: skip
+"""Figures that speak for a placement; all others speak against, where they are large."""
+
+RIGHT_LABELS = 0.9
+"""A placement that ties with others that have the same classes is right from this share on."""
+
+RIDGE = 3e-2
+KNOTS = 24
+
+Array = NDArray[np.float64]
+Table = dict[str, NDArray[Any]]
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("tables", type=Path, nargs="+")
+    parser.add_argument("--module", type=Path, help="where the numbers go")
+    parser.add_argument("--picture", type=Path, help="where the reliability diagram goes")
+    parser.add_argument("--also", type=Path, nargs="+", help="tables that are tested only")
+    options = parser.parse_args()
+    table = read_tables(options.tables)
+    if options.module:
+        placement = fit_placement(table)
+        voxel = fit_voxel(table, placement)
+        write_module(options.module, placement, voxel)
+    else:
+        placement, voxel = calibration.PLACEMENT, calibration.VOXEL
+    report(table, placement, voxel, options.picture)
+    if options.also:
+        print(f"\n{', '.join(map(str, options.also))}")
+        report(read_tables(options.also), placement, voxel, None)
+
+
+def read_tables(paths: Sequence[Path]) -> Table:
+    """Read tables as one, and mark what ties: ``torn`` where classes depend on the choice."""
+    tables, rows = [], 0
+    for path in paths:
+        with np.load(path, allow_pickle=False) as file:
+            tables.append({name: file[name] for name in file.files})
+        tables[-1]["voxel_row"] += rows
+        rows += len(tables[-1]["kind"])
+    table = {name: np.concatenate([t[name] for t in tables]) for name in tables[0]}
+    # Where placements that tie count as one the displacement says nothing, and labels do.
+    alike = table["harmless"] & (table["kind"] != "other")
+    table["placed"] |= alike & (table["labels"] >= RIGHT_LABELS)
+    table["known"] = ~(table["symmetric"] & (table["kind"] != "other")) | alike
+    sums = np.bincount(table["voxel_row"], table["voxel_voxels"][:, 10], len(table["kind"]))
+    counts = np.bincount(table["voxel_row"], minlength=len(table["kind"]))
+    table["torn"] = sums / np.maximum(counts, 1) > HARMLESS
+    return table
+
+
+def weights_of(table: Table, rows: NDArray[np.bool_], prior: Mapping[str, float] = PRIOR) -> Array:
+    """Weigh rows to the mix `prior`, levels alike; 0 where not in `rows`."""
+    weights = np.zeros(len(rows))
+    for kind, share in prior.items():
+        levels = np.unique(table["level"][rows])
+        for level in levels:
+            chosen = rows & (table["kind"] == kind) & (table["level"] == level)
+            weights[chosen] = share / len(levels) / max(chosen.sum(), 1)
+    return weights / weights.sum()
+
+
+def fit(
+    names: tuple[str, ...], values: Array, right: NDArray[np.bool_], weights: Array
+) -> Logistic:
+    """Fit a `Logistic` with weights of the signs that `GROWS` says."""
+    low, high = np.nanquantile(values, (0.005, 0.995), axis=0)
+    usual = np.nanmean(np.where(right[:, None], np.clip(values, low, high), np.nan), axis=0)
+    clipped = np.clip(values, low, high) - usual
+    spread = np.nanstd(clipped, axis=0) + 1e-9
+    x = np.nan_to_num(clipped / spread)
+    sign = np.array([1.0 if name in GROWS else -1.0 for name in names])
+    y = np.where(right, 1.0, -1.0)
+
+    def loss(parameters: Array) -> tuple[float, Array]:
+        w, b = parameters[:-1], parameters[-1]
+        odds = y * (x @ w + b)
+        slope = -y * expit(-odds) * weights
+        value = float((weights * np.logaddexp(0.0, -odds)).sum() + 0.5 * RIDGE * (w @ w) / len(w))
+        return value, np.append(x.T @ slope + RIDGE * w / len(w), slope.sum())
+
+    bounds = [(0, None) if s > 0 else (None, 0) for s in sign] + [(None, None)]
+    start = np.append(0.1 * sign, 1.0)
+    options = {"maxiter": 5_000, "maxfun": 20_000, "ftol": 1e-13, "gtol": 1e-9}
+    found = minimize(loss, start, jac=True, bounds=bounds, method="L-BFGS-B", options=options).x
+    figures = tuple(
+        Figure(name, *(float(f"{v:.6g}") for v in (w / s, u, a, b)))
+        for name, w, s, u, a, b in zip(names, found[:-1], spread, usual, low, high, strict=True)
+    )
+    return Logistic(figures, float(f"{found[-1]:.6g}"), ())
+
+
+def with_curve(
+    model: Logistic, values: Array, right: NDArray[np.bool_], weights: Array
+) -> Logistic:
+    """Add the curve that isotonic regression gives; its knots are denser where in doubt."""
+    odds = model.contributions(values).sum(axis=1) + model.intercept
+    order = np.argsort(odds, kind="stable")
+    likely = expit(odds[order])
+    sums = np.cumsum(weights[order] * np.sqrt(likely * (1.0 - likely)))
+    bins = np.minimum((sums / sums[-1] * KNOTS).astype(int), KNOTS - 1)
+    total = np.bincount(bins, weights[order])
+    at = np.bincount(bins, weights[order] * odds[order]) / total
+    share = np.bincount(bins, weights[order] * right[order]) / total
+    share = isotonic_regression(share, weights=total).x
+    curve = tuple((float(f"{a:.5g}"), float(f"{s:.5g}")) for a, s in zip(at, share, strict=True))
+    return Logistic(model.figures, model.intercept, curve)
+
+
+def fit_placement(table: Table) -> Logistic:
+    rows = ~table["held_out"] & table["known"]
+    weights = weights_of(table, rows)
+    return fit(FIGURES, table["figures"][rows], table["placed"][rows], weights[rows])
+
+
+def fit_voxel(table: Table, placement: Logistic) -> Logistic:
+    # What ties do is known by counting, and not fitted.
+    rows = ~table["held_out"] & ~table["torn"]
+    values, right, weights, _ = voxels_of(table, rows, placement)
+    model = fit(VOXEL_FIGURES, values, right, weights)
+    return with_curve(model, values, right, weights)
+
+
+def voxels_of(
+    table: Table, rows: NDArray[np.bool_], placement: Logistic
+) -> tuple[Array, NDArray[np.bool_], Array, Array]:
+    """Return figures, truth, weights and ties of the voxels of some rows."""
+    weights = weights_of(table, rows, VOXEL_PRIOR)
+    confidence = placement.probability(table["figures"])
+    values, share = [], []
+    for row in np.flatnonzero(rows):
+        own = table["voxel_voxels"][table["voxel_row"] == row]
+        if len(own) == 0:
+            continue
+        around = Surroundings(own[:, :4], own[:, 4:8], own[:, 8], own[:, 9], own[:, 10])
+        values.append(voxel_figures(around, float(confidence[row])))
+        share.append(np.full(len(own), weights[row] / len(own)))
+    chosen = rows[table["voxel_row"]]
+    return (
+        np.concatenate(values).astype(np.float64),
+        table["voxel_right"][chosen],
+        np.concatenate(share) / np.concatenate(share).sum(),
+        table["voxel_voxels"][chosen][:, 10].astype(np.float64),
+    )
+
+
+def reliability(
+    likely: Array, right: NDArray[np.bool_], weights: Array
+) -> list[tuple[float, float, float, int]]:
+    """Return mean probability, share of right ones, weight and count of each of ten bins."""
+    bins = np.minimum((likely * 10).astype(int), 9)
+    found = []
+    for k in range(10):
+        w = weights * (bins == k)
+        if w.sum() > 0:
+            found.append(
+                (float((w * likely).sum() / w.sum()), float((w * right).sum() / w.sum()),
+                 float(w.sum()), int((bins == k).sum()))
+            )  # fmt: skip
+    return found
+
+
+def report(table: Table, placement: Logistic, voxel: Logistic, picture: Path | None) -> None:
+    held = table["held_out"]
+    clear = held & table["known"]
+    confidence = placement.probability(table["figures"])
+    assets = reliability(confidence[clear], table["placed"][clear], weights_of(table, clear)[clear])
+    diagrams = {"placements": assets}
+    for name, rows in (("voxels", held & ~table["torn"]), ("voxels, with ties", held)):
+        values, right, weights, tied = voxels_of(table, rows, placement)
+        likely = voxel.probability(values) * (1.0 - tied)
+        diagrams[name] = reliability(likely, right, weights)
+    for name, bins in diagrams.items():
+        print(name)
+        for said, found, weight, count in bins:
+            print(f"  says {said:.3f}  is {found:.3f}  off {found - said:+.3f}"
+                  f"  weight {weight:.4f}  {count}")  # fmt: skip
+        brier = sum(w * (s - f) ** 2 for s, f, w, _ in bins)
+        print(f"  rms off {np.sqrt(brier):.4f}")
+    own = clear & (table["kind"] == "own") & ~table["symmetric"]
+    groups = {f"own, right, L{k}": own & table["placed"] & (table["level"] == k)
+              for k in np.unique(table["level"])}  # fmt: skip
+    groups |= {
+        "own, right": own & table["placed"],
+        "own, wrong": own & ~table["placed"],
+        "heading, wrong": clear & (table["kind"] == "heading") & ~table["placed"],
+        "other": held & (table["kind"] == "other"),
+        "own, alike": held & table["harmless"] & (table["kind"] == "own"),
+        "own, torn": held & table["torn"] & (table["kind"] == "own"),
+    }
+    for name, rows in groups.items():
+        c = confidence[rows]
+        if len(c):
+            print(f"{name:16s} {len(c):4d}  good {np.mean(c >= THRESHOLDS.good_confidence):.3f}  "
+                  f"failed {np.mean(c < THRESHOLDS.failed_confidence):.3f}  quantiles "
+                  f"{np.round(np.quantile(c, (0.01, 0.05, 0.5, 0.95, 0.99)), 3)}")  # fmt: skip
+    if picture:
+        draw(picture, assets, diagrams["voxels"])
+
+
+def draw(path: Path, assets: list[Any], voxels: list[Any]) -> None:
+    import matplotlib
+
+    matplotlib.use("svg")
+    matplotlib.rcParams["svg.hashsalt"] = "slatprep"
+    from matplotlib import pyplot
+
+    figure, axes = pyplot.subplots(1, 2, figsize=(7, 3.4), layout="constrained")
+    both = (("placements", assets), ("voxels' classes", voxels))
+    for ax, (name, bins) in zip(axes, both, strict=True):
+        said, found, weight, _ = np.array(bins).T
+        ax.plot([0, 1], [0, 1], color="0.7", lw=1)
+        ax.bar(said, weight, width=0.06, color="#cfd8e6", label="share of the mix")
+        ax.plot(said, found, "o-", color="#2a5caa", label="right")
+        ax.set(xlabel="confidence", ylabel="share", title=name, xlim=(0, 1), ylim=(0, 1.02))
+    axes[0].legend(frameon=False, loc="upper left")
+    path.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(path, metadata={"Date": None})
+
+
+def write_module(path: Path, placement: Logistic, voxel: Logistic) -> None:
+    """Write the numbers as a module, so that they are part of the code that makes a store."""
+    lines = [
+        '"""What the confidences weigh; written by benchmarks/calibrate.py, not by hand."""', "",
+        "from slatprep.judge.model import Figure, Logistic", "",
+        f"PLACEMENT = {placement!r}",
+        '"""Whether a placement is right."""', "",
+        f"VOXEL = {voxel!r}",
+        '"""Whether the class of a voxel is right."""',
+    ]  # fmt: skip
+    path.write_text("\n".join(lines) + "\n", encoding="utf-8")
+    subprocess.run([sys.executable, "-m", "ruff", "format", "-q", path], check=True)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,116 @@
+"""Calibrated probabilities: that a placement is right, and that a voxel's class is."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import logit
+
+from slatprep.judge.calibration import PLACEMENT, VOXEL
+from slatprep.judge.evidence import FIGURES, RADII, Surroundings
+from slatprep.judge.model import FLOOR
+
+VOXEL_FIGURES = (
+    *(f"others_{radius}" for radius in RADII),
+    *(f"others_{radius}_rough" for radius in RADII),
+    *(f"others_{radius}_unsure" for radius in RADII),
+    "distance",
+    "depth",
+    "moved",
+    "asset_unsure",
+    "asset_rough",
+    "asset_distance",
+    "asset_moved",
+)
+"""The figures of a voxel, in the order of `voxel_figures`."""
+
+_CAUSES = {
+    "placement": ("margin", "ties", "alike"),
+    "shape": ("moved", "moved_most", "bending", "stretch", "scale", "within_3", "score_similarity"),
+    "roughness": ("score_slat", "score_pixieverse", "within_1", "within_2", "offset", "distance",
+                  "depth", "fitness", "fitness_backward", "valid_share"),
+}  # fmt: skip
+"""Which figures speak for a wrong placement, for another shape and for a rough field."""
+
+
+def placement_confidence(evidence: NDArray[np.float64]) -> float:
+    """Return the probability that a placement is right.
+
+    Parameters
+    ----------
+    evidence : ndarray of float64, shape (len(FIGURES),)
+        From `slatprep.judge.evidence.evidence_of`.
+
+    Returns
+    -------
+    float
+        That the mean displacement is less than 1.5 voxels above the least that
+        a similarity can have; docs/quality.md says for which mix of data.
+    """
+    return float(PLACEMENT.probability(evidence))
+
+
+def causes_of_doubt(evidence: NDArray[np.float64]) -> dict[str, float]:
+    """Return what takes confidence away, compared with a usual right placement.
+
+    Returns
+    -------
+    dict of str to float
+        For ``placement``, ``shape`` and ``roughness`` the sum of what their
+        figures take from the logarithm of the odds; largest first.
+    """
+    added = dict(zip(FIGURES, PLACEMENT.contributions(evidence), strict=True))
+    taken = {
+        cause: float(-sum(min(added[name], 0.0) for name in names))
+        for cause, names in _CAUSES.items()
+    }
+    return dict(sorted(taken.items(), key=lambda item: -item[1]))
+
+
+def voxel_figures(around: Surroundings, confidence: float) -> NDArray[np.float32]:
+    """Return the `VOXEL_FIGURES` (N, F) of voxels by what lies around them.
+
+    Near a border of classes it matters how far off a place may be: the shares
+    of other classes count also times the asset's doubt and its roughness.
+    """
+    unsure = np.float32(-logit(np.clip(confidence, FLOOR, 1.0 - FLOOR)))
+    rough = np.float32(around.depth.std())
+    count = len(around.distance)
+    distance = np.minimum(around.distance, np.float32(5.0))
+    whole = (unsure, rough, distance.mean(), around.moved.mean())
+    return np.concatenate(
+        [
+            around.others,
+            around.others * rough,
+            around.others * unsure,
+            np.stack([distance, np.abs(around.depth), around.moved], axis=1),
+            np.broadcast_to(np.array(whole, dtype=np.float32), (count, len(whole))),
+        ],
+        axis=1,
+    )
+
+
+def class_confidence(
+    around: Surroundings, confidence: float, valid: NDArray[np.bool_]
+) -> NDArray[np.float32]:
+    """Return how likely the class of each voxel is right.
+
+    Of placements that fit equally well each is as likely as any other, which no
+    data need tell: the model's probability counts for those with the same class.
+
+    Parameters
+    ----------
+    around : Surroundings
+        Of the voxels.
+    confidence : float
+        The asset's, from `placement_confidence`.
+    valid : ndarray of bool, shape (N,)
+        Which voxels have a class.
+
+    Returns
+    -------
+    ndarray of float32, shape (N,)
+        0 where not valid.
+    """
+    likely = VOXEL.probability(voxel_figures(around, confidence)) * (1.0 - around.tied)
+    return np.where(valid, likely, 0.0).astype(np.float32)

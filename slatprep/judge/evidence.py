@@ -1,0 +1,227 @@
+"""The figures of an alignment, and of each of its voxels, from which confidence follows."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from slatprep.geometry.frames import VOXEL_SIZE, places_of, split_transform
+from slatprep.records import (
+    BACKGROUND,
+    RESOLUTION,
+    Alignment,
+    Annotation,
+    FitFigures,
+    MaterialField,
+    Placement,
+    StructuredLatents,
+)
+
+FIGURES = (
+    "score_slat",
+    "score_pixieverse",
+    "score_similarity",
+    "within_1",
+    "within_2",
+    "within_3",
+    "moved",
+    "moved_most",
+    "bending",
+    "stretch",
+    "scale",
+    "offset",
+    "margin",
+    "ties",
+    "fitness",
+    "fitness_backward",
+    "valid_share",
+    "distance",
+    "depth",
+    "alike",
+)
+"""The figures of an alignment, in the order of `evidence_of`."""
+
+RADII = (1, 2, 4, 7)
+"""Distances [voxel] at which the classes around a voxel's place are looked at."""
+
+MARGIN_CAP = 0.3
+"""Margins above this say no more."""
+
+HARMLESS = 0.05
+"""Ties that change the class of no more than this share of the voxels count as one."""
+
+
+@dataclass(frozen=True, eq=False)
+class Surroundings:
+    """What lies around the places of N voxels.
+
+    Attributes
+    ----------
+    others, solid : ndarray of float32, shape (N, 4)
+        Of the cells at `RADII`: the share that is annotated with another class
+        (of the annotated ones), and the share that is annotated at all.
+    distance : ndarray of float32, shape (N,)
+        To the annotation used, in voxels.
+    moved : ndarray of float32, shape (N,)
+        How far the deformation moves the voxel's place, in voxels.
+    tied : ndarray of float32, shape (N,)
+        Share of the placements that fit about as well, the one chosen among
+        them, that have another class at the voxel; 0 where a consensus chose.
+    """
+
+    others: NDArray[np.float32]
+    solid: NDArray[np.float32]
+    distance: NDArray[np.float32]
+    moved: NDArray[np.float32]
+    tied: NDArray[np.float32]
+
+    @property
+    def depth(self) -> NDArray[np.float32]:
+        """Share of annotated cells two voxels away, less the half that a surface has."""
+        depth: NDArray[np.float32] = self.solid[:, 1] - np.float32(0.5)
+        return depth
+
+
+def surroundings_of(
+    field: MaterialField, latents: StructuredLatents, alignment: Alignment, annotation: Annotation
+) -> Surroundings:
+    """Look at what lies around the places where voxels were looked up.
+
+    Parameters
+    ----------
+    field, latents, alignment, annotation
+        As `slatprep.judge.judge` takes them.
+
+    Returns
+    -------
+    Surroundings
+    """
+    from slatprep.geometry.surroundings import shares_around
+
+    grid = np.full((RESOLUTION,) * 3, BACKGROUND, dtype=np.uint8)
+    grid[tuple(field.voxels.T)] = field.material
+    others, solid = shares_around(grid, annotation.place, annotation.material, RADII, BACKGROUND)
+    count = len(annotation.place)
+    moved = np.zeros(count, dtype=np.float32)
+    if alignment.deformation is not None:
+        before = places_of(latents.coords, alignment.transform).astype(np.float32)
+        moved = np.linalg.norm(annotation.place - before, axis=1) / np.float32(VOXEL_SIZE)
+    tied = np.zeros(count, dtype=np.float32)
+    for placement in _open(alignment):
+        places = places_of(latents.coords, placement.transform).astype(np.float32)
+        other, there = shares_around(grid, places, annotation.material, (0,), BACKGROUND)
+        tied += np.where(there[:, 0] > 0, other[:, 0], 0.0)
+    tied /= np.float32(len(_open(alignment)) + 1)
+    return Surroundings(others, solid, annotation.distance, moved, tied)
+
+
+def _open(alignment: Alignment) -> tuple[Placement, ...]:
+    """Return the placements that tie and that nothing but chance has chosen among."""
+    return alignment.placements if alignment.settled_by is None else ()
+
+
+def evidence_of(
+    field: MaterialField,
+    latents: StructuredLatents,
+    alignment: Alignment,
+    annotation: Annotation,
+    around: Surroundings,
+    ambiguity: float,
+) -> NDArray[np.float64]:
+    """Return the `FIGURES` of an alignment, whatever engine found it.
+
+    Placements that tie and leave nearly all classes alone count as one: of a
+    ball it does not matter which it is, and neither they nor the margin say
+    anything then but that it is so (``alike``). The same where the consensus of
+    a dataset chose among them.
+
+    Parameters
+    ----------
+    field, latents, alignment, annotation
+        As `slatprep.judge.judge` takes them.
+    around : Surroundings
+        Of its voxels.
+    ambiguity : float
+        Share of the voxels whose class depends on the choice among ties.
+
+    Returns
+    -------
+    ndarray of float64, shape (len(FIGURES),)
+        All finite but for the margin, which is NaN where it says nothing.
+    """
+    count, margin = len(_open(alignment)), min(alignment.margin, MARGIN_CAP)
+    if (count and ambiguity <= HARMLESS) or alignment.settled_by is not None:
+        count, margin = 0, math.nan
+    fit = alignment.figures or measure_figures(field, latents, alignment)
+    _, _, scale = split_transform(alignment.transform)
+    return np.array(
+        [
+            fit.score_slat,
+            fit.score_pixieverse,
+            fit.score_similarity,
+            *fit.within,
+            fit.moved,
+            fit.moved_most,
+            fit.bending,
+            max(abs(math.log(stretch)) for stretch in fit.stretch),
+            abs(math.log(scale)),
+            abs(fit.offset),
+            margin,
+            math.log1p(count),
+            alignment.quality.fitness,
+            alignment.quality.fitness_backward,
+            annotation.valid.mean(),
+            np.minimum(annotation.distance, 5.0).mean(),
+            around.depth.std(),
+            float(math.isnan(margin)),
+        ],
+        dtype=np.float64,
+    )
+
+
+def measure_figures(
+    field: MaterialField, latents: StructuredLatents, alignment: Alignment
+) -> FitFigures:
+    """Measure for an engine without figures of its own what the default engine measures.
+
+    Parameters
+    ----------
+    field, latents : MaterialField, StructuredLatents
+        The two sides; only their geometry is used.
+    alignment : Alignment
+        A placement without a deformation.
+
+    Returns
+    -------
+    FitFigures
+        Under the transform, with the offset between the surfaces that suits it best.
+    """
+    from slatprep.align.deform import CHECK_SAMPLES, FIT_SAMPLES, Pairing, Similarity
+    from slatprep.align.surface import surface_of
+    from slatprep.geometry.voxels import occupancy_of
+
+    rotation, shift, scale = split_transform(alignment.transform)
+    slat, pixie = surface_of(occupancy_of(latents.coords)), surface_of(field.occupancy)
+    pose = Similarity(rotation, shift / VOXEL_SIZE, scale, 0.0)
+    pairing = Pairing(slat, pixie, pose, CHECK_SAMPLES, first=FIT_SAMPLES)
+    warp = pairing.start()
+    here, back = pairing.residuals(warp)
+    # The two sides' residuals have the offset with opposite signs.
+    offset = float(np.clip(np.median(np.concatenate([here, -back])), -2.0, 2.0))
+    here, back = pairing.residuals(replace(warp, offset=offset))
+    both = np.abs(np.concatenate([here, back]))
+    scores = [float((1.0 / (1.0 + side**2)).mean()) for side in (here, back)]
+    within = [float((both <= limit).mean()) for limit in (1.0, 2.0, 3.0)]
+    return FitFigures(
+        score_slat=scores[0],
+        score_pixieverse=scores[1],
+        score_similarity=0.5 * (scores[0] + scores[1]),
+        evidence_affine=math.nan,
+        evidence_deformable=math.nan,
+        within=(within[0], within[1], within[2]),
+        offset=offset,
+        roughness=float(np.median(both)),
+    )

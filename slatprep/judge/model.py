@@ -1,0 +1,80 @@
+"""Logistic models whose numbers are data: a figure's share in a probability can be read off."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import expit
+
+FLOOR = 1e-3
+"""No probability is nearer to 0 or to 1: the calibration has not seen enough for that."""
+
+
+@dataclass(frozen=True)
+class Figure:
+    """One figure of a model: clipped to `low`..`high`, less `usual`, times `weight`.
+
+    ``usual`` is the mean over right ones, so that the product is what the
+    figure adds to the logarithm of the odds, compared with a usual right one.
+    """
+
+    name: str
+    weight: float
+    usual: float
+    low: float
+    high: float
+
+
+@dataclass(frozen=True)
+class Logistic:
+    """A logistic regression, and a curve that sets its probabilities right.
+
+    Attributes
+    ----------
+    figures : tuple of Figure
+        What it looks at.
+    intercept : float
+        Logarithm of the odds where all figures are as usual.
+    curve : tuple of (float, float)
+        Logarithm of the odds, and share of right ones found there; straight in between.
+    """
+
+    figures: tuple[Figure, ...]
+    intercept: float
+    curve: tuple[tuple[float, float], ...]
+
+    @cached_property
+    def _table(self) -> NDArray[np.float64]:
+        return np.array([(f.weight, f.usual, f.low, f.high) for f in self.figures]).T
+
+    def contributions(self, values: NDArray[np.floating]) -> NDArray[np.float64]:
+        """Return what each figure adds to the logarithm of the odds.
+
+        Parameters
+        ----------
+        values : ndarray of float, shape (..., F)
+            Figures in the model's order; one that is NaN adds nothing.
+
+        Returns
+        -------
+        ndarray of float64, shape (..., F)
+        """
+        weight, usual, low, high = self._table
+        added: NDArray[np.float64] = weight * (np.clip(values, low, high) - usual)
+        return np.where(np.isnan(added), 0.0, added)
+
+    def probability(self, values: NDArray[np.floating]) -> NDArray[np.float64]:
+        """Return the probability for figures (..., F), within `FLOOR` of 0 and 1."""
+        return self.calibrated(self.contributions(values).sum(axis=-1) + self.intercept)
+
+    def calibrated(self, odds: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the probability for logarithms of odds, by the curve."""
+        found = expit(odds)
+        if self.curve:
+            at, share = np.array(self.curve).T
+            found = np.interp(odds, at, share)
+        clipped: NDArray[np.float64] = np.clip(found, FLOOR, 1.0 - FLOOR)
+        return clipped

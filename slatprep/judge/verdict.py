@@ -1,0 +1,225 @@
+"""The verdict in one word, from calibrated probabilities, and why it is no better."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from slatprep.judge.ambiguity import measure_ambiguity
+from slatprep.parameters import SampleParameters
+from slatprep.records import (
+    Alignment,
+    Annotation,
+    Judgement,
+    MaterialField,
+    Quality,
+    StructuredLatents,
+    Verdict,
+)
+
+
+@dataclass(frozen=True)
+class Thresholds:
+    """Where the verdicts part; docs/quality.md says how the numbers were chosen.
+
+    Attributes
+    ----------
+    good_confidence, failed_confidence : float
+        Probability that the placement is right: at least the first is good,
+        below the second is failed.
+    good_accuracy : float
+        Expected share of right labels; below it the asset is doubtful.
+    good_valid_share : float
+        Share of SLAT voxels with an annotation; below it the asset is doubtful.
+    good_ambiguity : float
+        Share of SLAT voxels whose class depends on the choice among placements
+        that fit equally well; above it the asset is doubtful.
+    good_fitness, failed_fitness : float
+        The lower one of the two fitnesses, where no confidence is known, as in
+        stores of format 1: as the confidences.
+    """
+
+    good_confidence: float = 0.9
+    failed_confidence: float = 0.5
+    good_accuracy: float = 0.75
+    good_valid_share: float = 0.9
+    good_ambiguity: float = 0.05
+    good_fitness: float = 0.8
+    failed_fitness: float = 0.65
+
+
+THRESHOLDS = Thresholds()
+"""The thresholds of `verdict_of`."""
+
+_WORDS = {
+    "placement": "another placement fits about as well",
+    "shape": "the two sides show different shapes",
+    "roughness": "the surfaces lie on each other roughly only",
+}
+
+
+def judge(
+    field: MaterialField,
+    latents: StructuredLatents,
+    alignment: Alignment,
+    annotation: Annotation,
+    parameters: SampleParameters,
+) -> Judgement:
+    """Say what the alignment of an asset is worth.
+
+    Parameters
+    ----------
+    field, latents : MaterialField, StructuredLatents
+        The two sides of the asset.
+    alignment : Alignment
+        Its alignment, of any engine; ``placements`` are the ones that tie with the best.
+    annotation : Annotation
+        What was looked up through it.
+    parameters : SampleParameters
+        How annotations are looked up.
+
+    Returns
+    -------
+    Judgement
+        What ties would change, how sure placement and labels are, the verdict,
+        and what kept it from being good.
+    """
+    from slatprep.judge.confidence import causes_of_doubt, class_confidence, placement_confidence
+    from slatprep.judge.evidence import evidence_of, surroundings_of
+
+    ambiguity = measure_ambiguity(field, latents, alignment, annotation, parameters)
+    around = surroundings_of(field, latents, alignment, annotation)
+    evidence = evidence_of(field, latents, alignment, annotation, around, ambiguity.material_share)
+    confidence = placement_confidence(evidence)
+    valid = annotation.valid
+    likely = class_confidence(around, confidence, valid)[valid]
+    expected = float(likely.mean(dtype=np.float64)) if len(likely) else 0.0
+    verdict, reasons = verdict_of(
+        alignment.quality,
+        float(valid.mean()),
+        ambiguity.material_share,
+        len(alignment.placements),
+        confidence,
+        expected,
+        next(iter(causes_of_doubt(evidence))),
+    )
+    return Judgement(ambiguity, verdict, reasons, confidence, expected)
+
+
+def voxel_confidence(
+    field: MaterialField,
+    latents: StructuredLatents,
+    alignment: Alignment,
+    annotation: Annotation,
+    confidence: float,
+) -> NDArray[np.float32]:
+    """Say how likely the class of each SLAT voxel is right.
+
+    Parameters
+    ----------
+    field, latents, alignment, annotation
+        As `judge` takes them.
+    confidence : float
+        What `judge` says of the placement.
+
+    Returns
+    -------
+    ndarray of float32, shape (N,)
+        Calibrated for the mix of data that docs/quality.md names; 0 where not valid.
+    """
+    from slatprep.judge.confidence import class_confidence
+    from slatprep.judge.evidence import surroundings_of
+
+    around = surroundings_of(field, latents, alignment, annotation)
+    return class_confidence(around, confidence, annotation.valid)
+
+
+def verdict_of(
+    quality: Quality,
+    valid_share: float,
+    ambiguity: float = 0.0,
+    ties: int = 0,
+    confidence: float = math.nan,
+    expected_accuracy: float = math.nan,
+    cause: str = "",
+) -> tuple[Verdict, tuple[str, ...]]:
+    """Say what an alignment is worth, and why.
+
+    Parameters
+    ----------
+    quality : Quality
+        How well the two surfaces lie on each other; it decides where `confidence` is NaN.
+    valid_share : float
+        Share of SLAT voxels that got an annotation, 0..1.
+    ambiguity : float
+        Share of SLAT voxels whose class depends on the choice among ties, 0..1.
+    ties : int
+        How many placements tie with the one chosen; 0 where that is not known.
+    confidence : float
+        Probability that the placement is right; NaN where it is not known.
+    expected_accuracy : float
+        Expected share of right labels among the valid ones; NaN where it is not known.
+    cause : str
+        What most speaks against the placement: ``placement``, ``shape`` or
+        ``roughness``; empty where that is not known.
+
+    Returns
+    -------
+    verdict : Verdict
+        ``good``, ``doubtful`` or ``failed``.
+    reasons : tuple of str
+        What kept it from being good; empty where it is.
+    """
+    limits = THRESHOLDS
+    reasons: list[str] = []
+    failed = False
+    if math.isnan(confidence):
+        failed = _judge_by_fitness(quality, reasons)
+    elif confidence < limits.good_confidence:
+        failed = confidence < limits.failed_confidence
+        because = f": {_WORDS[cause]}" if cause else ""
+        reasons.append(
+            f"the placement is right with a probability of {confidence:.1%} only "
+            f"(good: {limits.good_confidence:.0%}){because}"
+        )
+        if cause != "placement":
+            _judge_by_fitness(quality, reasons)
+    if expected_accuracy < limits.good_accuracy:
+        reasons.append(
+            f"only {expected_accuracy:.1%} of the labels can be expected to be right "
+            f"(good: {limits.good_accuracy:.0%})"
+        )
+    if valid_share < limits.good_valid_share:
+        reasons.append(
+            f"only {valid_share:.1%} of the SLAT voxels found an annotation "
+            f"(good: {limits.good_valid_share:.0%})"
+        )
+    if ambiguity > limits.good_ambiguity:
+        count = f"{ties} other" if ties else "other"
+        reasons.append(
+            f"{count} placements fit about as well and would change the "
+            f"class of {ambiguity:.1%} of the voxels "
+            f"(good: {limits.good_ambiguity:.0%})"
+        )
+    if failed:
+        return Verdict.FAILED, tuple(reasons)
+    return (Verdict.DOUBTFUL if reasons else Verdict.GOOD), tuple(reasons)
+
+
+def _judge_by_fitness(quality: Quality, reasons: list[str]) -> bool:
+    """Append what is low of the two fitnesses; return whether either is below failed."""
+    limits = THRESHOLDS
+    sides = (
+        ("PixieVerse boundary", quality.fitness),
+        ("SLAT boundary", quality.fitness_backward),
+    )
+    for name, fitness in sides:
+        if fitness < limits.good_fitness:
+            reasons.append(
+                f"only {fitness:.1%} of the {name} lies within {quality.radius:g} voxel of the "
+                f"other side (good: {limits.good_fitness:.0%})"
+            )
+    return any(fitness < limits.failed_fitness for _, fitness in sides)

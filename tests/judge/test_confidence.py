@@ -1,0 +1,228 @@
+"""Confidence against truth that nothing was fitted to: freshly made demo objects."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import pytest
+from support.shapes import GRID, chair, field_of, surface_latents
+
+from slatprep.align import align
+from slatprep.align.deformation import map_of
+from slatprep.bench.truth import Truth, read_truth
+from slatprep.demo import make_demo
+from slatprep.judge import THRESHOLDS, judge, verdict_of, voxel_confidence
+from slatprep.judge.calibration import PLACEMENT, VOXEL
+from slatprep.judge.confidence import VOXEL_FIGURES, causes_of_doubt
+from slatprep.judge.evidence import FIGURES, evidence_of, measure_figures, surroundings_of
+from slatprep.parameters import (
+    AlignParameters,
+    BuildParameters,
+    PixieverseSource,
+    SampleParameters,
+    SlatSource,
+)
+from slatprep.readers import discover, read_field, read_latents
+from slatprep.records import (
+    Alignment,
+    Annotation,
+    Judgement,
+    MaterialField,
+    Quality,
+    StructuredLatents,
+    Verdict,
+)
+from slatprep.sample import sample
+
+Case = tuple[MaterialField, StructuredLatents, Truth]
+Judged = tuple[Judgement, np.ndarray, Annotation]
+
+SPEAK_FOR = {"score_slat", "score_pixieverse", "score_similarity", "within_1", "within_2",
+             "within_3", "margin", "fitness", "fitness_backward", "valid_share"}  # fmt: skip
+
+
+def _judged(field: MaterialField, latents: StructuredLatents) -> Judged:
+    alignment = align(field, latents, AlignParameters())
+    annotation = sample(field, map_of(alignment).places(latents.coords), SampleParameters())
+    judgement = judge(field, latents, alignment, annotation, SampleParameters())
+    likely = voxel_confidence(field, latents, alignment, annotation, judgement.confidence)
+    return judgement, likely, annotation
+
+
+@pytest.fixture(scope="module")
+def cases(tmp_path_factory: pytest.TempPathFactory) -> list[Case]:
+    root = tmp_path_factory.mktemp("fresh")
+    make_demo(root, 8, 4_711, levels=(1, 5, 6, 7))
+    parameters = BuildParameters(
+        pixieverse=PixieverseSource(root=root / "pixieverse"), slat=SlatSource(root=root / "slat")
+    )
+    return [
+        (
+            read_field(pair),
+            read_latents(pair),
+            read_truth(Path(root / "truth" / f"{pair.asset_id}.npz")),
+        )
+        for pair in discover(parameters)
+    ]
+
+
+@pytest.fixture(scope="module")
+def judged(cases: list[Case]) -> list[Judged]:
+    return [_judged(field, latents) for field, latents, _ in cases]
+
+
+def test_labels_are_right_as_often_as_they_are_said_to_be(
+    cases: list[Case], judged: list[Judged]
+) -> None:
+    # One coin decides about all voxels of an asset whose ties differ in class.
+    settled = [
+        (truth, own, annotation)
+        for (_, _, truth), (judgement, own, annotation) in zip(cases, judged, strict=True)
+        if judgement.ambiguity.material_share == 0
+    ]
+    assert len(settled) >= 5
+    likely = np.concatenate([own[a.valid] for _, own, a in settled])
+    right = np.concatenate([(a.material == t.material)[a.valid] for t, _, a in settled])
+    assert abs(likely.mean() - right.mean()) < 0.05
+    # Voxels that are said to be surer are right more often.
+    order = np.argsort(likely, kind="stable")
+    shares = [right[part].mean() for part in np.array_split(order, 4)]
+    assert shares[0] < shares[-1] and shares[-1] > 0.97
+    for judgement, own, annotation in judged:
+        assert judgement.expected_accuracy == pytest.approx(own[annotation.valid].mean(), abs=1e-6)
+
+
+def test_own_objects_pass_and_other_objects_fail(cases: list[Case], judged: list[Judged]) -> None:
+    confidences = [judgement.confidence for judgement, _, _ in judged]
+    assert np.median(confidences) > 0.9
+    assert sum(judgement.verdict is Verdict.FAILED for judgement, _, _ in judged) <= 1
+    for k, (field, _, truth) in enumerate(cases):
+        _, latents, other = cases[(k + 3) % len(cases)]
+        assert truth.name != other.name
+        judgement, _, _ = _judged(field, latents)
+        assert judgement.confidence < THRESHOLDS.good_confidence
+        assert judgement.verdict is not Verdict.GOOD
+        assert judgement.reasons
+
+
+def test_probabilities_are_bounded_and_zero_where_not_valid(judged: list[Judged]) -> None:
+    for judgement, likely, annotation in judged:
+        assert 0.0 < judgement.confidence < 1.0
+        assert likely.dtype == np.float32
+        assert (likely[~annotation.valid] == 0).all()
+        assert ((likely[annotation.valid] > 0) & (likely[annotation.valid] < 1)).all()
+
+
+def test_the_same_input_gives_the_same_bytes(cases: list[Case], judged: list[Judged]) -> None:
+    judgement, likely, _ = _judged(*cases[1][:2])
+    assert judgement == judged[1][0]
+    assert likely.tobytes() == judged[1][1].tobytes()
+
+
+@pytest.mark.parametrize("name", FIGURES)
+def test_a_better_figure_never_lowers_confidence(name: str) -> None:
+    assert tuple(figure.name for figure in PLACEMENT.figures) == FIGURES
+    k = FIGURES.index(name)
+    usual = np.array([figure.usual for figure in PLACEMENT.figures])
+    figure = PLACEMENT.figures[k]
+    values = np.repeat(usual[None], 20, axis=0)
+    values[:, k] = np.linspace(figure.low - 0.1, figure.high + 0.1, 20)
+    confidences = PLACEMENT.probability(values)
+    if name not in SPEAK_FOR:
+        confidences = confidences[::-1]
+    assert all(before <= after for before, after in pairwise(confidences))
+
+
+def test_the_voxels_curve_rises() -> None:
+    assert tuple(figure.name for figure in VOXEL.figures) == VOXEL_FIGURES
+    odds, shares = np.array(VOXEL.curve).T
+    assert (np.diff(odds) > 0).all() and (np.diff(shares) >= 0).all()
+    assert shares[0] >= 0 and shares[-1] <= 1
+
+
+def test_a_figure_that_is_not_known_adds_nothing() -> None:
+    values = np.array([figure.usual for figure in PLACEMENT.figures])
+    known = PLACEMENT.probability(values)
+    values[FIGURES.index("margin")] = math.nan
+    assert PLACEMENT.probability(values) == known
+
+
+@pytest.fixture(scope="module")
+def of_a_chair() -> tuple[MaterialField, StructuredLatents, Alignment, Annotation]:
+    solid = chair()
+    field, latents = field_of(solid, np.where(GRID[..., 2] < 32, 1, 3)), surface_latents(solid)
+    alignment = align(field, latents, AlignParameters())
+    annotation = sample(field, map_of(alignment).places(latents.coords), SampleParameters())
+    return field, latents, alignment, annotation
+
+
+def test_any_engine_is_judged_by_the_same_figures(
+    of_a_chair: tuple[MaterialField, StructuredLatents, Alignment, Annotation],
+) -> None:
+    field, latents, alignment, annotation = of_a_chair
+    around = surroundings_of(field, latents, alignment, annotation)
+    own = evidence_of(field, latents, alignment, annotation, around, 0.0)
+    bare = replace(alignment, figures=None)
+    measured = evidence_of(field, latents, bare, annotation, around, 0.0)
+    np.testing.assert_allclose(measured, own, atol=0.05)
+    assert measure_figures(field, latents, bare).score_slat > 0.9
+
+
+def test_doubt_is_where_the_border_is(
+    of_a_chair: tuple[MaterialField, StructuredLatents, Alignment, Annotation],
+) -> None:
+    field, latents, alignment, annotation = of_a_chair
+    likely = voxel_confidence(field, latents, alignment, annotation, 0.9)
+    height = np.abs(latents.coords[:, 2] - 31.5)
+    assert likely[height < 1].mean() < likely[height > 8].mean()
+    unsure = voxel_confidence(field, latents, alignment, annotation, 0.2)
+    assert (unsure <= likely).all() and unsure.mean() < likely.mean()
+
+
+def test_a_turned_placement_is_no_longer_sure(
+    of_a_chair: tuple[MaterialField, StructuredLatents, Alignment, Annotation],
+) -> None:
+    field, latents, alignment, _ = of_a_chair
+    half_turn = np.diag([-1.0, -1.0, 1.0, 1.0])
+    wrong = replace(alignment, transform=half_turn @ alignment.transform, figures=None)
+    annotation = sample(field, map_of(wrong).places(latents.coords), SampleParameters())
+    judgement = judge(field, latents, wrong, annotation, SampleParameters())
+    assert judgement.verdict is Verdict.FAILED
+    assert judgement.confidence < THRESHOLDS.failed_confidence
+
+
+def test_what_takes_confidence_away_is_named() -> None:
+    usual = np.array([figure.usual for figure in PLACEMENT.figures])
+    assert set(causes_of_doubt(usual)) == {"placement", "shape", "roughness"}
+    assert all(taken == 0 for taken in causes_of_doubt(usual).values())
+    tied = usual.copy()
+    tied[FIGURES.index("margin")] = 0.0
+    assert next(iter(causes_of_doubt(tied))) == "placement"
+
+
+@pytest.mark.parametrize(
+    ("confidence", "accuracy", "verdict", "word"),
+    [
+        (THRESHOLDS.good_confidence, 1.0, Verdict.GOOD, ""),
+        (0.89, 1.0, Verdict.DOUBTFUL, "89.0%"),
+        (THRESHOLDS.failed_confidence, 1.0, Verdict.DOUBTFUL, "different shapes"),
+        (0.49, 1.0, Verdict.FAILED, "49.0%"),
+        (0.99, 0.7, Verdict.DOUBTFUL, "70.0% of the labels"),
+        (0.99, THRESHOLDS.good_accuracy, Verdict.GOOD, ""),
+    ],
+)
+def test_verdicts_follow_from_confidence(
+    confidence: float, accuracy: float, verdict: Verdict, word: str
+) -> None:
+    # Where the shapes differ a similarity fits badly however right it is.
+    poor = Quality(0.5, 0.5, 0.5, 0.5, 0.5, 1.0)
+    given, reasons = verdict_of(
+        poor, 1.0, confidence=confidence, expected_accuracy=accuracy, cause="shape"
+    )
+    assert given is verdict
+    assert word in " ".join(reasons)
+    assert bool(reasons) == (verdict is not Verdict.GOOD)
