@@ -41,7 +41,7 @@ def test_a_wrong_transform_is_found(copy: Path) -> None:
     assert not check.ok
     assert check.verdict is Verdict.FAILED
     assert check.reasons
-    assert {"fitness", "fitness_backward", "voxels with another valid"} <= wrong(check)
+    assert {"fitness", "fitness_backward", "overlap"} <= wrong(check)
     assert check_alignment(open_store(copy), "cup").ok
 
 
