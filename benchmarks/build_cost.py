@@ -31,7 +31,7 @@ from slatprep.pipeline import publish
 from slatprep.readers import discover
 from slatprep.store.layout import create_arrays
 
-STEPS = ("read_field", "read_latents", "align", "sample", "judge")
+STEPS = ("read_field", "read_latents", "align", "sample", "judge_with_voxels")
 
 
 def main() -> None:

@@ -3,12 +3,20 @@
 from __future__ import annotations
 
 from slatprep.judge.ambiguity import measure_ambiguity
-from slatprep.judge.verdict import THRESHOLDS, Thresholds, judge, verdict_of, voxel_confidence
+from slatprep.judge.verdict import (
+    THRESHOLDS,
+    Thresholds,
+    judge,
+    judge_with_voxels,
+    verdict_of,
+    voxel_confidence,
+)
 
 __all__ = [
     "THRESHOLDS",
     "Thresholds",
     "judge",
+    "judge_with_voxels",
     "measure_ambiguity",
     "verdict_of",
     "voxel_confidence",

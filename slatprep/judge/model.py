@@ -68,7 +68,13 @@ class Logistic:
 
     def probability(self, values: NDArray[np.floating]) -> NDArray[np.float64]:
         """Return the probability for figures (..., F), within `FLOOR` of 0 and 1."""
-        return self.calibrated(self.contributions(values).sum(axis=-1) + self.intercept)
+        odds = np.full(values.shape[:-1], self.intercept)
+        # Column by column, without those of no weight: there may be thousands of rows.
+        for figure, column in zip(self.figures, np.moveaxis(values, -1, 0), strict=True):
+            if figure.weight:
+                added = figure.weight * (np.clip(column, figure.low, figure.high) - figure.usual)
+                odds += np.where(np.isnan(added), 0.0, added)
+        return self.calibrated(odds)
 
     def calibrated(self, odds: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the probability for logarithms of odds, by the curve."""

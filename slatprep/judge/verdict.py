@@ -87,6 +87,17 @@ def judge(
         What ties would change, how sure placement and labels are, the verdict,
         and what kept it from being good.
     """
+    return judge_with_voxels(field, latents, alignment, annotation, parameters)[0]
+
+
+def judge_with_voxels(
+    field: MaterialField,
+    latents: StructuredLatents,
+    alignment: Alignment,
+    annotation: Annotation,
+    parameters: SampleParameters,
+) -> tuple[Judgement, NDArray[np.float32]]:
+    """Return what `judge` and `voxel_confidence` say, for little more than either costs."""
     from slatprep.judge.confidence import causes_of_doubt, class_confidence, placement_confidence
     from slatprep.judge.evidence import evidence_of, surroundings_of
 
@@ -95,8 +106,8 @@ def judge(
     evidence = evidence_of(field, latents, alignment, annotation, around, ambiguity.material_share)
     confidence = placement_confidence(evidence)
     valid = annotation.valid
-    likely = class_confidence(around, confidence, valid)[valid]
-    expected = float(likely.mean(dtype=np.float64)) if len(likely) else 0.0
+    likely = class_confidence(around, confidence, valid)
+    expected = float(likely[valid].mean(dtype=np.float64)) if valid.any() else 0.0
     verdict, reasons = verdict_of(
         alignment.quality,
         float(valid.mean()),
@@ -106,7 +117,7 @@ def judge(
         expected,
         next(iter(causes_of_doubt(evidence))),
     )
-    return Judgement(ambiguity, verdict, reasons, confidence, expected)
+    return Judgement(ambiguity, verdict, reasons, confidence, expected), likely
 
 
 def voxel_confidence(

@@ -14,7 +14,7 @@ from dataclasses import replace
 from slatprep.align import align
 from slatprep.align.deformation import map_of
 from slatprep.errors import MissingPartnerError, SlatprepError
-from slatprep.judge import judge, voxel_confidence
+from slatprep.judge import judge_with_voxels, voxel_confidence
 from slatprep.parameters import BuildParameters
 from slatprep.pipeline.context import BuildContext
 from slatprep.pipeline.plan import Action, PlannedAsset
@@ -59,12 +59,13 @@ def process_asset(
     alignment = known.alignment if known else align(field, latents, parameters.align)
     reached("asset reused" if known else "asset aligned", pair.asset_id)
     annotation = sample(field, map_of(alignment).places(latents.coords), parameters.sample)
-    judgement = (
-        known.judgement
-        if known
-        else judge(field, latents, alignment, annotation, parameters.sample)
-    )
-    likely = voxel_confidence(field, latents, alignment, annotation, judgement.confidence)
+    if known:
+        judgement = known.judgement
+        likely = voxel_confidence(field, latents, alignment, annotation, judgement.confidence)
+    else:
+        judgement, likely = judge_with_voxels(
+            field, latents, alignment, annotation, parameters.sample
+        )
     annotation = replace(annotation, confidence=likely)
     return Finished(pair, field, latents, alignment, annotation, judgement)
 

@@ -15,7 +15,7 @@ from dataclasses import replace
 from slatprep.align.consensus import find_consensus, settle
 from slatprep.align.deformation import map_of
 from slatprep.align.quality import measure_quality
-from slatprep.judge import judge, voxel_confidence
+from slatprep.judge import judge_with_voxels
 from slatprep.parameters import BuildParameters
 from slatprep.pipeline.spool import Spool, SpooledAsset
 from slatprep.provenance.record import FailedRecord, FirstPass
@@ -73,8 +73,7 @@ def settle_asset(
     quality = measure_quality(field, latents, alignment.transform, parameters.align.radius)
     alignment = replace(alignment, quality=quality)
     annotation = sample(field, map_of(alignment).places(latents.coords), parameters.sample)
-    judgement = judge(field, latents, alignment, annotation, parameters.sample)
-    likely = voxel_confidence(field, latents, alignment, annotation, judgement.confidence)
+    judgement, likely = judge_with_voxels(field, latents, alignment, annotation, parameters.sample)
     annotation = replace(annotation, confidence=likely)
     key = hashlib.sha256(f"{asset.key} {consensus.rotation.tobytes().hex()}".encode()).hexdigest()
     record = replace(
