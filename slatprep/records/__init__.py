@@ -1,0 +1,108 @@
+"""The typed records that travel between the stages.
+
+Two source files become rows of the store through read, align, sample,
+normalise and pack. Each stage takes the records of the one before it and
+returns its own; none of these classes touches a disk. Classes that hold arrays
+compare by identity.
+
+Frames: the *PixieVerse frame* and the *SLAT frame* are both the unit cube
+[-0.5, 0.5]^3 with voxel ``i`` centred at ``(i + 0.5) / 64 - 0.5`` on each axis.
+"""
+
+from slatprep.records.alignment import (
+    Alignment,
+    Ambiguity,
+    Candidate,
+    Consensus,
+    Deformation,
+    FitFigures,
+    Judgement,
+    Placement,
+    Quality,
+)
+from slatprep.records.json_types import (
+    AffineMap,
+    Count,
+    Digest,
+    InJson,
+    Lattice,
+    Number,
+    Point,
+    Rotation,
+    Share,
+    Transform,
+)
+from slatprep.records.results import Annotation, Failed, Finished, Normalization, PropertyRange
+from slatprep.records.sources import (
+    AssetPair,
+    MaterialField,
+    Place,
+    SourceFile,
+    SourceRoots,
+    StructuredLatents,
+)
+from slatprep.records.words import (
+    BACKGROUND,
+    CLASS_COLOURS,
+    FEATS_MEAN,
+    FEATS_STD,
+    MATERIAL_CLASSES,
+    MATERIAL_COLOURS,
+    PROPERTY_COLUMNS,
+    RESOLUTION,
+    UNANNOTATED,
+    UNANNOTATED_COLOUR,
+    Engine,
+    Model,
+    Search,
+    Status,
+    Verdict,
+)
+
+__all__ = [
+    "BACKGROUND",
+    "CLASS_COLOURS",
+    "FEATS_MEAN",
+    "FEATS_STD",
+    "MATERIAL_CLASSES",
+    "MATERIAL_COLOURS",
+    "PROPERTY_COLUMNS",
+    "RESOLUTION",
+    "UNANNOTATED",
+    "UNANNOTATED_COLOUR",
+    "AffineMap",
+    "Alignment",
+    "Ambiguity",
+    "Annotation",
+    "AssetPair",
+    "Candidate",
+    "Consensus",
+    "Count",
+    "Deformation",
+    "Digest",
+    "Engine",
+    "Failed",
+    "Finished",
+    "FitFigures",
+    "InJson",
+    "Judgement",
+    "Lattice",
+    "MaterialField",
+    "Model",
+    "Normalization",
+    "Number",
+    "Place",
+    "Placement",
+    "Point",
+    "PropertyRange",
+    "Quality",
+    "Rotation",
+    "Search",
+    "Share",
+    "SourceFile",
+    "SourceRoots",
+    "Status",
+    "StructuredLatents",
+    "Transform",
+    "Verdict",
+]

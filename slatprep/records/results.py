@@ -1,0 +1,85 @@
+"""What is looked up at SLAT voxels, the ranges it is normalised by, and what comes of an asset."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Annotated, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from slatprep.records.alignment import Alignment, Judgement
+from slatprep.records.json_types import _one_of
+from slatprep.records.sources import AssetPair, MaterialField, StructuredLatents
+from slatprep.records.words import PROPERTY_COLUMNS, Status
+
+
+@dataclass(frozen=True, eq=False)
+class Annotation:
+    """Material and properties looked up at every SLAT voxel, in SI units.
+
+    ``properties`` is (N, 3) float32 (Young's modulus [Pa], density [kg/m^3],
+    Poisson's ratio), NaN where not valid; ``material`` (N,) uint8, 255 where
+    not valid; ``valid`` (N,) bool; ``distance`` (N,) float32, in voxels of the
+    PixieVerse frame, to the annotation used; ``place`` (N, 3) float32, where the
+    voxel was looked up, in the PixieVerse frame; ``confidence`` (N,) float32, how
+    likely the class is right, 0 where not valid, None until that is judged.
+    """
+
+    properties: NDArray[np.float32]
+    material: NDArray[np.uint8]
+    valid: NDArray[np.bool_]
+    distance: NDArray[np.float32]
+    place: NDArray[np.float32]
+    confidence: NDArray[np.float32] | None = None
+
+
+@dataclass(frozen=True)
+class PropertyRange:
+    """How one property is mapped to [-1, 1].
+
+    ``lo`` and ``hi`` are in the mapped unit: log10 of the SI value where
+    ``log10`` is true, the SI value itself otherwise.
+    """
+
+    name: Annotated[str, _one_of(*PROPERTY_COLUMNS)]
+    log10: bool
+    lo: float
+    hi: float
+
+
+@dataclass(frozen=True)
+class Normalization:
+    """The three property ranges, in the order of ``PROPERTY_COLUMNS``, and where they come from.
+
+    ``source`` is ``dataset``, ``pixie`` or the name of a file.
+    """
+
+    ranges: tuple[PropertyRange, PropertyRange, PropertyRange]
+    source: str
+
+
+@dataclass(frozen=True, eq=False)
+class Finished:
+    """An asset that went through all stages; properties in SI units."""
+
+    pair: AssetPair
+    field: MaterialField
+    latents: StructuredLatents
+    alignment: Alignment
+    annotation: Annotation
+    judgement: Judgement
+
+
+@dataclass(frozen=True)
+class Failed:
+    """An asset that cannot go in.
+
+    ``reason`` says why in one line; ``traceback`` where, if slatprep itself is
+    at fault.
+    """
+
+    pair: AssetPair
+    status: Literal[Status.FAILED, Status.SKIPPED]
+    reason: str
+    traceback: str = ""

@@ -1,0 +1,164 @@
+"""Where the two sides of a pair lie, and what is read of them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import IO, Annotated, Any, Protocol, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from slatprep.records.json_types import Count, Digest, _one_of
+
+
+class Place(Protocol):
+    """Where a file or a folder lies: a `pathlib.Path`, or a URL as a `RemotePlace`.
+
+    `slatprep.storage.place.place_of` makes one. This is all that both offer
+    alike; for the rest, `slatprep.storage.place.storage_of` tells them apart.
+    """
+
+    @property
+    def name(self) -> str:
+        """Its last component."""
+
+    @property
+    def suffix(self) -> str:
+        """The extension of its name, with the dot."""
+
+    @property
+    def parent(self) -> Self:
+        """The folder that holds it."""
+
+    def __hash__(self) -> int:
+        """Equal places have the same."""
+
+    def __truediv__(self, key: str, /) -> Self:
+        """Return the place of this name below it."""
+
+    def absolute(self) -> Self:
+        """Return it independent of the working folder."""
+
+    def exists(self) -> bool:
+        """Whether there is a file or a folder."""
+
+    def is_dir(self) -> bool:
+        """Whether there is a folder."""
+
+    def is_file(self) -> bool:
+        """Whether there is a file."""
+
+    def open(
+        self, mode: str, *, encoding: str | None = None, newline: str | None = None
+    ) -> IO[Any]:
+        """Open a file; on an object store for reading only."""
+
+    def read_bytes(self) -> bytes:
+        """Read a file whole."""
+
+    def read_text(self, encoding: str | None = None) -> str:
+        """Read a file whole, as text."""
+
+
+@dataclass(frozen=True)
+class SourceFile:
+    """A file that was read; ``path`` is relative to its source's root, with forward slashes."""
+
+    role: Annotated[str, _one_of("grid", "mask", "bounds", "slat")]
+    path: str
+    size: Count
+    sha256: Digest
+
+
+@dataclass(frozen=True)
+class SourceRoots:
+    """The folders below which all files of the two sources lie."""
+
+    pixieverse: Place
+    slat: Place
+
+
+@dataclass(frozen=True, slots=True)
+class AssetPair:
+    """Where the two sides of one row of the store lie; nothing has been read yet.
+
+    Attributes
+    ----------
+    asset_id : str
+        Unique id of the row: the object id, or ``<object_id>.<view>`` where
+        one object has several SLATs.
+    object_id : str
+        PixieVerse id of the object.
+    view : str
+        The image or seed the SLAT was made from; empty where there is one only.
+    category : str
+        PixieVerse category; empty where unknown.
+    roots : SourceRoots
+        The roots below which the files must lie; one object for all pairs.
+    grid, mask, bounds : Place or None
+        PixieVerse files, absolute; ``grid`` is None where the partner is missing.
+    slat : Place or None
+        SLAT file, absolute; None where the partner is missing.
+    slat_group : str
+        Group inside an HDF5 file that holds many assets; empty otherwise.
+    problem : str
+        Why the pair cannot be used (missing partner, two files for one id);
+        empty where all is well.
+    """
+
+    asset_id: str
+    object_id: str
+    view: str
+    category: str
+    roots: SourceRoots
+    grid: Place | None
+    mask: Place | None
+    bounds: Place | None
+    slat: Place | None
+    slat_group: str = ""
+    problem: str = ""
+
+
+@dataclass(frozen=True, eq=False)
+class MaterialField:
+    """A PixieVerse field: what occupies the grid and what it is made of, in SI units.
+
+    Attributes
+    ----------
+    occupancy : ndarray of bool, shape (64, 64, 64)
+        Occupied voxels, axes x, y, z of the PixieVerse frame.
+    voxels : ndarray of uint8, shape (K, 3)
+        The annotated voxels (occupied, class 0..6), in C order of the grid.
+    material : ndarray of uint8, shape (K,)
+        Class of each annotated voxel, 0..6.
+    properties : ndarray of float32, shape (K, 3)
+        Young's modulus [Pa], density [kg/m^3] and Poisson's ratio of each.
+    bounds : dict or None
+        World bounds as ``clip_features.npz`` states them, JSON-ready.
+    sources : tuple of SourceFile
+        The files read.
+    warnings : tuple of str
+        What a person should know about this field.
+    """
+
+    occupancy: NDArray[np.bool_]
+    voxels: NDArray[np.uint8]
+    material: NDArray[np.uint8]
+    properties: NDArray[np.float32]
+    bounds: dict[str, object] | None = None
+    sources: tuple[SourceFile, ...] = ()
+    warnings: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, eq=False)
+class StructuredLatents:
+    """A TRELLIS SLAT: occupied surface voxels and their latents.
+
+    ``coords`` is (N, 3) uint8 in 0..63 in the order of the source file,
+    ``feats`` is (N, 8) float32.
+    """
+
+    coords: NDArray[np.uint8]
+    feats: NDArray[np.float32]
+    sources: tuple[SourceFile, ...] = ()
+    warnings: tuple[str, ...] = ()

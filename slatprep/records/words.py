@@ -1,0 +1,110 @@
+"""The words and constants that all records share: classes, columns, engines, verdicts."""
+
+from __future__ import annotations
+
+from enum import StrEnum
+
+RESOLUTION = 64
+"""Voxels along each axis of both frames."""
+
+
+MATERIAL_CLASSES = (
+    "jelly",
+    "metal",
+    "sand",
+    "visplas",
+    "fluid",
+    "snow",
+    "stationary",
+    "background",
+)
+"""PhysGaussian's material classes, by id."""
+
+
+FEATS_MEAN = (-2.1688, -0.0043, -0.1335, -0.0842, -0.5271, 0.7239, -1.1414, 1.2039)
+
+
+FEATS_STD = (2.3777, 2.3864, 2.1244, 2.1749, 2.6639, 2.3712, 2.6217, 2.6845)
+"""Of each latent channel, as TRELLIS publishes them for ``slat_flow_img_dit_L_64l8p2_fp16``."""
+
+
+BACKGROUND = 7
+"""Material id of an empty voxel."""
+
+
+UNANNOTATED = 255
+"""Material id of an occupied voxel that carries no annotation (-1 in raw grids)."""
+
+
+CLASS_COLOURS = {
+    "jelly": "#5A9A5A",
+    "metal": "#4327AC",
+    "sand": "#F7AE38",
+    "visplas": "#901A0A",
+    "fluid": "#2E9FF5",
+    "snow": "#C592C6",
+    "stationary": "#544856",
+    "background": "#EAEAEA",
+}
+"""Colour of each of PhysGaussian's material classes, by name.
+
+They stay apart for people who do not tell red from green, or blue from green:
+simulated after Machado, Oliveira and Fernandes ("A Physiologically-based Model
+for Simulation of Color Vision Deficiency", IEEE TVCG 2009), any two of them
+differ by more than 20 in CIELAB.
+"""
+
+
+UNANNOTATED_COLOUR = "#FFFFFF"
+"""Colour of an occupied voxel without an annotation."""
+
+
+MATERIAL_COLOURS = {
+    **{index: CLASS_COLOURS[name] for index, name in enumerate(MATERIAL_CLASSES)},
+    UNANNOTATED: UNANNOTATED_COLOUR,
+}
+"""The same by material id, as the store holds it."""
+
+
+PROPERTY_COLUMNS = ("youngs_modulus", "density", "poissons_ratio")
+"""Order of the property columns everywhere in slatprep; SI units are Pa, kg/m^3, none."""
+
+
+class Engine(StrEnum):
+    """What finds the transform."""
+
+    FIELD = "field"
+    OPEN3D = "open3d"
+    SMALL_GICP = "small_gicp"
+
+
+class Model(StrEnum):
+    """Which maps are allowed: the scale fixed at one, free, and a deformation after it."""
+
+    RIGID = "rigid"
+    SIMILARITY = "similarity"
+    AFFINE = "affine"
+    DEFORMABLE = "deformable"
+
+
+class Search(StrEnum):
+    """The start orientations that were needed: 64 quarter turns, or all orientations."""
+
+    EULER64 = "euler64"
+    SO3 = "so3"
+
+
+class Verdict(StrEnum):
+    """What an alignment is worth, in one word."""
+
+    GOOD = "good"
+    DOUBTFUL = "doubtful"
+    FAILED = "failed"
+
+
+class Status(StrEnum):
+    """What became of an asset in a build."""
+
+    OK = "ok"
+    FAILED = "failed"
+    SKIPPED = "skipped"
