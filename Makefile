@@ -69,29 +69,33 @@ $(DEMO)/.assets-$(ASSETS)-seed-$(SEED): | $(INSTALLED)
 
 # -- development ------------------------------------------------------------
 
+LINT  = $(BIN)/ruff check . && $(BIN)/ruff format --check . && $(BIN)/lint-imports && \
+        $(BIN)/deptry slatprep && $(BIN)/mypy
+DOCS  = NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --site-dir $(SITE)
+WHEEL = sh tools/try-wheel.sh $(BIN)/python dist
+
 lint: $(VENV)/.installed-dev
-	$(BIN)/ruff check .
-	$(BIN)/ruff format --check .
-	$(BIN)/lint-imports
-	$(BIN)/deptry slatprep
-	$(BIN)/mypy
+	$(LINT)
 
 # Whatever one of them finds, the others run, and the tests' closing line comes last.
+# Not by a make within make: such a line would run even under --dry-run.
 test: $(VENV)/.installed-dev
 	@status=0; \
-	for check in lint docs wheel; do $(MAKE) --no-print-directory $$check || status=1; done; \
+	{ $(LINT); } || status=1; \
+	$(DOCS) || status=1; \
+	$(WHEEL) || status=1; \
 	$(BIN)/python -m pytest -n $(JOBS) || status=1; \
 	exit $$status
 
 docs: $(VENV)/.installed-dev
-	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --site-dir $(SITE)
+	$(DOCS)
 	@echo "documentation: $(SITE)/index.html"
 
 schema: $(VENV)/.installed-dev
 	$(BIN)/python -m slatprep.provenance.schemas
 
 wheel: $(VENV)/.installed-dev
-	sh tools/try-wheel.sh $(BIN)/python dist
+	$(WHEEL)
 
 # Half an hour of one core; MUTANTS='--budget 300 judge sample' is a part of it.
 MUTANTS ?= --budget 1500 --seed 0
