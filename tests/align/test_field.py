@@ -113,9 +113,12 @@ def test_a_poor_fit_widens_the_search_and_says_so(monkeypatch: pytest.MonkeyPatc
 
 
 def test_two_different_objects_fail_after_a_search_of_all_orientations() -> None:
-    alignment = align(field_of(chair()), surface_latents(BALL), DEFAULT)
+    field, latents = field_of(chair()), surface_latents(BALL)
+    alignment = align(field, latents, DEFAULT)
     assert alignment.search == "so3"
-    assert judge(alignment.quality, 1.0, None)[0] is Verdict.FAILED
+    annotation = sample(field, map_of(alignment).places(latents.coords), SampleParameters())
+    judgement = judge(field, latents, alignment, annotation, SampleParameters())
+    assert judgement.verdict is Verdict.FAILED
 
 
 def test_a_missing_part_and_a_stray_part_do_not_pull() -> None:

@@ -213,6 +213,9 @@ def test_places_of_the_store_are_what_counts_where_it_has_them(tmp_path: Path) -
     stored = np.concatenate([LONG_PLACES + aside, rod_places]).astype(np.float32)
     root = zarr.open_group(tmp_path / "s.zarr")
     root.create_array("voxel/place", data=stored)
+    for name in ("asset/confidence", "asset/expected_accuracy"):
+        root.create_array(name, data=np.ones(2))
+    root.create_array("voxel/confidence", data=np.ones(len(stored), np.float32))
     root.attrs["format_version"] = 2
     first, second = score_against_truth(tmp_path / "s.zarr", tmp_path / "truth").assets
     assert first.displacement == pytest.approx(1.0, abs=1e-5)

@@ -87,7 +87,7 @@ def test_it_opens_sorts_and_filters(opened: Chrome) -> None:
     opened.execute_script(choose, HOSTILE)
     assert rows(opened) == ["cup"]
     opened.execute_script(choose.replace("'=' + arguments[0]", "'*'"))
-    click(opened, "[data-key=fitness] .bin")
+    click(opened, "[data-key=confidence] .bin")
     assert 0 < len(rows(opened)) < 7
     click(opened, "#applied .chip")
     assert set(rows(opened)) == everything

@@ -10,7 +10,7 @@ const Table = (() => {
     { key: "id", title: "Asset", width: 156, value: (i) => ASSETS.id[i] },
     { key: "category", title: "Category", width: 132, value: (i) => ASSETS.category[i] || null, text: (i) => ASSETS.category[i] || Format.NONE, wide: true },
     { key: "state", title: "State", width: 172, value: (i) => STATES.findIndex((state) => state.name === ASSETS.state[i]) },
-    { key: "confidence", title: "Sure", width: 76, ...number("confidence", 3) },
+    { key: "confidence", title: "Confidence", width: 96, ...number("confidence", 3) },
     { key: "expected_accuracy", title: "Labels", width: 84, ...share("expected_accuracy"), wide: true },
     { key: "fitness", title: "Fitness", width: 88, ...number("fitness", 3) },
     { key: "fitness_backward", title: "Back", width: 74, ...number("fitness_backward", 3), wide: true },
