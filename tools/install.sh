@@ -28,8 +28,9 @@ configured() {
     printf '%s' "$value" | tr '\n' ' '
 }
 
-# The default index has a CUDA build of several GB for Linux. A folder of wheels
-# that pip is told of may hold the CPU build; else torch's own index does.
+# The default index has a CUDA build of several GB for Linux. A folder of wheels or
+# an index that pip is told of (PIP_FIND_LINKS, PIP_EXTRA_INDEX_URL) may hold the
+# CPU build; torch's installation page names an index that does.
 install_torch() {
     pin=$(grep '^torch==' requirements/torch.txt)
     [ "$locked" = yes ] || pin=torch
@@ -44,7 +45,9 @@ sys.exit('$pin' not in ('torch', 'torch==' + version('torch').partition('+')[0])
     if [ "$(uname -s)" != Linux ]; then
         $pip install --quiet --no-deps "$pin"
     elif ! $pip install --quiet --no-deps --only-binary :all: "$pin+cpu" 2>/dev/null; then
-        $pip install --quiet --no-deps --extra-index-url https://download.pytorch.org/whl/cpu "$pin+cpu"
+        say "pip finds no CPU build of $pin, so the default one is taken, which is larger;"
+        say "PIP_EXTRA_INDEX_URL=INDEX make test takes it from torch's index of CPU builds"
+        $pip install --quiet "$pin"
     fi
 }
 
