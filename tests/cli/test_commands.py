@@ -281,5 +281,6 @@ def test_stopped_build_leaves_the_older_store_and_nothing_else(
     _, said = build.communicate(timeout=60)
     assert build.returncode == 130, said
     assert "stopped; nothing was replaced" in said and "Traceback" not in said
-    assert list(tmp_path.iterdir()) == [store]
+    # A worker may have finished an asset meanwhile; what is finished is kept for the next build.
+    assert {path.name for path in tmp_path.iterdir()} <= {"demo.zarr", ".demo.zarr.work"}
     assert {path: path.read_bytes() for path in store.rglob("*") if path.is_file()} == before
