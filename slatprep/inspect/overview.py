@@ -52,7 +52,7 @@ class StoreOverview:
 
     path: Place
     format_version: int
-    manifest: str
+    build_id: str
     files: int
     size: int
     engines: dict[str, int]
@@ -82,7 +82,7 @@ def overview_of(store: Store) -> StoreOverview:
     return StoreOverview(
         path=store.path,
         format_version=int(store.attributes["format_version"]),
-        manifest=str(store.attributes["manifest"]),
+        build_id=str(store.attributes["manifest"]),
         files=len(sizes),
         size=sum(sizes.values()),
         engines=_counts(columns["engine"]),

@@ -27,7 +27,7 @@ from slatprep.workers.local import Jobs, run_unordered
 def apply_consensus(
     assets: Sequence[SpooledAsset], spool: Spool, parameters: BuildParameters, jobs: Jobs
 ) -> list[SpooledAsset]:
-    """Give ambiguous assets the placement nearest to the dataset's common rotation.
+    """Give ambiguous assets the placement nearest to the dataset's common rotation, if asked to.
 
     Parameters
     ----------
@@ -36,7 +36,7 @@ def apply_consensus(
     spool : Spool
         Where they lie.
     parameters : BuildParameters
-        How annotations are looked up, and the radius of the quality figures.
+        Whether to do it, how annotations are looked up, and the radius of the quality figures.
     jobs : int or Workers
         Worker processes, or a cluster's.
 
@@ -45,6 +45,8 @@ def apply_consensus(
     list of SpooledAsset
         In the same order; those without a tie are the same objects.
     """
+    if not parameters.consensus.settle:
+        return list(assets)
     consensus = find_consensus(
         asset.columns["transform"]
         for asset in assets

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 from slatprep.errors import StoreError
@@ -21,9 +22,9 @@ from slatprep.pipeline.previous import previous_build
 from slatprep.pipeline.publish import Destination, publish_manifests, write_all_records
 from slatprep.pipeline.recipe import recipe_of
 from slatprep.pipeline.spool import FailedAsset, Spool, SpooledAsset
-from slatprep.pipeline.summary import BuildSummary, clipped_of, nothing_usable, summarise_build
+from slatprep.pipeline.summary import BuildSummary, nothing_usable, summarise_build
 from slatprep.pipeline.update import is_current, repeat_summary
-from slatprep.pipeline.work import work_beside, work_directory
+from slatprep.pipeline.work import Work, work_beside, work_directory
 from slatprep.provenance.make import complete_record, origin
 from slatprep.provenance.record import AssetRecord, Clipped, Record, write_records
 from slatprep.readers import discover
@@ -98,46 +99,31 @@ def build_store(
     begin = time.perf_counter()
     place = Destination(out, manifests)
     given = given_ranges(parameters.normalize)
-    with work_beside(place.store, keep=keep_work) as work:
-        if fresh:
-            work.spool.keep_only(set())
+    with work_beside(place.store, fresh=fresh, keep=keep_work) as work:
         place.look()
         context = _context(parameters, work.spool, None if fresh else place.store, strict)
-        pairs = discover(parameters)
-        require_shared(jobs, [work.scratch, *_some_sources(pairs)])
-
+        pairs = _discover(parameters, jobs, work.scratch)
         plan = _plan(pairs, context, jobs, progress)
         new, unchanged = _split(pairs, plan)
         assets = _finish(new, plan, context, jobs, progress)
         if is_current(plan, assets, context, given):
             return repeat_summary(assets, context, place, time.perf_counter() - begin)
         assets += _finish(unchanged, plan, context, jobs, progress)
-        assets.sort(key=lambda asset: asset.asset_id)
-        usable = [asset for asset in assets if isinstance(asset, SpooledAsset)]
-        failed = [asset for asset in assets if isinstance(asset, FailedAsset)]
-        if not usable:
-            raise StoreError(nothing_usable(assets, parameters))
-        if parameters.consensus.settle:
-            usable = apply_consensus(usable, work.spool, parameters, jobs)
-        normalization = given or dataset_ranges(usable)
-
-        store, records = work.scratch / "store.zarr", work.scratch / "assets.jsonl"
+        usable, failed = _usable_and_failed(assets, parameters)
+        usable = apply_consensus(usable, work.spool, parameters, jobs)
         with writing(str(place.out), work_directory(place.store).parent):
-            clipped = pack_store(store, work.spool, usable, normalization, parameters.store, jobs)
-            completed = _completed_records(work.spool, usable, failed, normalization, clipped)
-            build_id = write_all_records(store, records, completed)
-            finish_store(store, normalization, build_id, origin(parameters))
-            place.replace(store)
+            packed = _pack(usable, failed, given, work, parameters, jobs)
+            place.replace(packed.store)
         summary = summarise_build(
             [*usable, *failed],
             store=place.out,
             records=place.records(),
-            manifest=build_id,
+            build_id=packed.build_id,
             seconds=time.perf_counter() - begin,
-            normalization=normalization,
-            clipped=clipped_of(clipped),
+            normalization=packed.normalization,
+            clipped=packed.clipped,
         )
-        publish_manifests(records, summary, parameters)
+        publish_manifests(packed.records, summary, parameters)
         place.publish()
         if keep_work:
             work.spool.keep_only({asset.key for asset in usable})
@@ -167,8 +153,7 @@ def plan_build(
     place = Destination(out)
     spool = Spool(work_directory(place.store) / ("nothing" if fresh else "spool"))
     context = _context(parameters, spool, None if fresh else place.store)
-    pairs = discover(parameters)
-    require_shared(jobs, _some_sources(pairs))
+    pairs = _discover(parameters, jobs)
     return BuildPlan(place.out, tuple(plan_assets(pairs, context, jobs, progress)))
 
 
@@ -206,15 +191,14 @@ def align_pairs(
     out = Path(out)
     with work_beside(out.absolute(), arrays=False) as work:
         context = _context(parameters, work.spool, None, strict)
-        pairs = discover(parameters)
-        require_shared(jobs, [work.scratch, *_some_sources(pairs)])
+        pairs = _discover(parameters, jobs, work.scratch)
         plan = _plan(pairs, context, jobs, progress)
         assets = _finish(pairs, plan, context, jobs, progress)
         assets.sort(key=lambda asset: asset.asset_id)
         with writing(str(out), out.parent), staged(out) as file:
             build_id = write_records(file, (work.spool.record(asset.key) for asset in assets))
     seconds = time.perf_counter() - begin
-    return summarise_build(assets, records=out, manifest=build_id, seconds=seconds)
+    return summarise_build(assets, records=out, build_id=build_id, seconds=seconds)
 
 
 def _context(
@@ -222,6 +206,14 @@ def _context(
 ) -> BuildContext:
     previous = None if store is None else previous_build(store)
     return BuildContext(parameters, recipe_of(parameters), spool, previous, strict)
+
+
+def _discover(parameters: BuildParameters, jobs: Jobs, *shared: Path) -> list[AssetPair]:
+    """Return the pairs; see that the workers find the first one's files, and `shared`."""
+    pairs = discover(parameters)
+    sources = next(([pair.grid, pair.slat] for pair in pairs if pair.grid and pair.slat), [])
+    require_shared(jobs, [*shared, *sources])
+    return pairs
 
 
 def _plan(
@@ -261,12 +253,45 @@ def _finish(
     return assets
 
 
-def _some_sources(pairs: Iterable[AssetPair]) -> list[Place]:
-    """Return the files of a pair, by which to see that a worker has the sources."""
-    for pair in pairs:
-        if pair.grid and pair.slat:
-            return [pair.grid, pair.slat]
-    return []
+@dataclass(frozen=True)
+class _Packed:
+    """A new store that is not in place yet, and what goes into the summary of it."""
+
+    store: Path
+    records: Path
+    build_id: str
+    normalization: Normalization
+    clipped: Sequence[Clipped]
+
+
+def _usable_and_failed(
+    assets: Iterable[SpooledAsset | FailedAsset], parameters: BuildParameters
+) -> tuple[list[SpooledAsset], list[FailedAsset]]:
+    """Return the assets that go into the store and those that do not, each by id."""
+    by_id = sorted(assets, key=lambda asset: asset.asset_id)
+    usable = [asset for asset in by_id if isinstance(asset, SpooledAsset)]
+    failed = [asset for asset in by_id if isinstance(asset, FailedAsset)]
+    if not usable:
+        raise StoreError(nothing_usable(failed, parameters))
+    return usable, failed
+
+
+def _pack(
+    usable: Sequence[SpooledAsset],
+    failed: Sequence[FailedAsset],
+    given: Normalization | None,
+    work: Work,
+    parameters: BuildParameters,
+    jobs: Jobs,
+) -> _Packed:
+    """Normalise and pack the rows of a store, then its records and its root attributes."""
+    normalization = given or dataset_ranges(usable)
+    store, records = work.scratch / "store.zarr", work.scratch / "assets.jsonl"
+    clipped = pack_store(store, work.spool, usable, normalization, parameters.store, jobs)
+    completed = _completed_records(work.spool, usable, failed, normalization, clipped)
+    build_id = write_all_records(store, records, completed)
+    finish_store(store, normalization, build_id, origin(parameters))
+    return _Packed(store, records, build_id, normalization, clipped)
 
 
 def _completed_records(

@@ -157,7 +157,7 @@ def build_record(summary: BuildSummary, parameters: BuildParameters) -> BuildRec
     if summary.store is None or summary.normalization is None:
         raise ValueError("a build without a store has no record")
     return BuildRecord(
-        id=summary.manifest,
+        id=summary.build_id,
         name=parameters.name,
         created=datetime.now(UTC).replace(microsecond=0),
         duration_s=round(summary.seconds, 3),

@@ -23,7 +23,7 @@ class BuildSummary:
     ----------
     records : Place
         The JSON Lines file of asset records.
-    manifest : str
+    build_id : str
         Id of the build, a hash of the records' content.
     seconds : float
         Wall clock time.
@@ -44,7 +44,7 @@ class BuildSummary:
     """
 
     records: Place
-    manifest: str
+    build_id: str
     seconds: float
     statuses: dict[str, int]
     verdicts: dict[str, int]
@@ -65,11 +65,11 @@ def summarise_build(
     assets: Sequence[SpooledAsset | FailedAsset],
     *,
     records: Place,
-    manifest: str,
+    build_id: str,
     seconds: float,
     store: Place | None = None,
     normalization: Normalization | None = None,
-    clipped: Mapping[str, int] | None = None,
+    clipped: Iterable[Clipped] = (),
 ) -> BuildSummary:
     """Count what became of the assets."""
     usable = [asset for asset in assets if isinstance(asset, SpooledAsset)]
@@ -78,7 +78,7 @@ def summarise_build(
     verdicts = Counter(str(asset.columns["verdict"]) for asset in usable)
     return BuildSummary(
         records=records,
-        manifest=manifest,
+        build_id=build_id,
         seconds=seconds,
         statuses={str(status): statuses[str(status)] for status in Status},
         verdicts=dict(sorted(verdicts.items())),
@@ -87,21 +87,19 @@ def summarise_build(
         problems=tuple((asset.asset_id, asset.reason) for asset in failed[:PROBLEMS_LISTED]),
         store=store,
         normalization=normalization,
-        clipped=dict(clipped or {}),
+        clipped=_clipped_by_property(clipped),
     )
 
 
-def clipped_of(clipped: Iterable[Clipped]) -> dict[str, int]:
+def _clipped_by_property(clipped: Iterable[Clipped]) -> dict[str, int]:
     """Return the clipped values of ``voxel/properties`` of all assets, by property."""
     counts = [asset.voxel for asset in clipped]
     return {name: sum(getattr(count, name) for count in counts) for name in PROPERTY_COLUMNS}
 
 
-def nothing_usable(
-    assets: Sequence[SpooledAsset | FailedAsset], parameters: BuildParameters
-) -> str:
+def nothing_usable(failed: Sequence[FailedAsset], parameters: BuildParameters) -> str:
     """Say why there is no store."""
-    problems = [f"\n  {a.asset_id}: {a.reason}" for a in assets if isinstance(a, FailedAsset)]
+    problems = [f"\n  {asset.asset_id}: {asset.reason}" for asset in failed]
     if not problems:
         return (
             f"no asset found in {parameters.pixieverse.root} and {parameters.slat.root}; "

@@ -13,7 +13,7 @@ from slatprep.pipeline.plan import Action, PlannedAsset
 from slatprep.pipeline.previous import PreviousBuild
 from slatprep.pipeline.publish import Destination, publish_manifests
 from slatprep.pipeline.spool import FailedAsset, SpooledAsset, spooled
-from slatprep.pipeline.summary import BuildSummary, clipped_of, summarise_build
+from slatprep.pipeline.summary import BuildSummary, summarise_build
 from slatprep.provenance.make import origin
 from slatprep.provenance.record import (
     Clipped,
@@ -80,12 +80,12 @@ def repeat_summary(
         sorted(assets, key=lambda asset: asset.asset_id),
         store=place.out,
         records=place.records(previous.path),
-        manifest=previous.build_id,
+        build_id=previous.build_id,
         seconds=seconds,
         normalization=previous.store.normalization,
-        clipped=clipped_of(clipped),
+        clipped=clipped,
     )
-    if not _is_published(summary.records.parent, summary.manifest):
+    if not _is_published(summary.records.parent, summary.build_id):
         scratch = context.spool.directory / "assets.jsonl"
         with writing(str(place.out), scratch.parent):
             write_records(scratch, _all_records(others, previous, context))

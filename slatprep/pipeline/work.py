@@ -43,7 +43,9 @@ class Work:
 
 
 @contextmanager
-def work_beside(target: Place, *, arrays: bool = True, keep: bool = False) -> Iterator[Work]:
+def work_beside(
+    target: Place, *, arrays: bool = True, fresh: bool = False, keep: bool = False
+) -> Iterator[Work]:
     """Make the work folder of a target, hold its lock, and clean up.
 
     Parameters
@@ -52,6 +54,8 @@ def work_beside(target: Place, *, arrays: bool = True, keep: bool = False) -> It
         What is to be made or replaced.
     arrays : bool
         Whether the spool keeps arrays, or records alone.
+    fresh : bool
+        Begin with an empty spool.
     keep : bool
         Keep the spool after success as well.
 
@@ -75,6 +79,8 @@ def work_beside(target: Place, *, arrays: bool = True, keep: bool = False) -> It
         _restore(directory, target)
         _remove(directory, but=("lock", "spool"))
         spool.directory.mkdir(exist_ok=True)
+        if fresh:
+            spool.keep_only(set())
         yield Work(spool, Path(tempfile.mkdtemp(prefix="build-", dir=directory)))
         finished = True
     finally:

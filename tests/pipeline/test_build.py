@@ -33,7 +33,7 @@ def test_two_jobs_write_the_same_bytes_as_one(
     mixed: Dataset, mixed_build: BuildSummary, tmp_path: Path
 ) -> None:
     again = build_store(mixed.parameters(), tmp_path / "two.zarr", jobs=2)
-    assert again.manifest == mixed_build.manifest
+    assert again.build_id == mixed_build.build_id
     assert tree(again.store) == tree(mixed_build.store)
     one, two = records_of(mixed_build.records), records_of(again.records)
     for record in (*one.values(), *two.values()):
@@ -245,9 +245,9 @@ def test_alignment_alone_gives_the_stores_transforms(
     assert [path.name for path in (tmp_path / "out").iterdir()] == ["mixed.jsonl"]
 
 
-def test_other_parameters_make_another_manifest(make_dataset: MakeDataset, tmp_path: Path) -> None:
+def test_other_parameters_make_another_build_id(make_dataset: MakeDataset, tmp_path: Path) -> None:
     parameters = make_dataset("a").parameters()
-    first = align_pairs(parameters, tmp_path / "1.jsonl").manifest
-    assert align_pairs(parameters, tmp_path / "2.jsonl").manifest == first
+    first = align_pairs(parameters, tmp_path / "1.jsonl").build_id
+    assert align_pairs(parameters, tmp_path / "2.jsonl").build_id == first
     nearer = replace(parameters, sample=replace(parameters.sample, max_distance=2.0))
-    assert align_pairs(nearer, tmp_path / "3.jsonl").manifest != first
+    assert align_pairs(nearer, tmp_path / "3.jsonl").build_id != first

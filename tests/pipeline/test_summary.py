@@ -30,14 +30,14 @@ def test_assets_are_counted_and_the_first_hundred_problems_listed() -> None:
         finished("y", "doubtful"),
         finished("z", "good"),
     ]
-    summary = summarise_build(assets, records=Path("r"), manifest="id", seconds=1.0)
+    summary = summarise_build(assets, records=Path("r"), build_id="id", seconds=1.0)
     assert summary.statuses == {"ok": 3, "failed": 120, "skipped": 1}
     assert summary.verdicts == {"doubtful": 1, "good": 2}
     assert (summary.n_voxels, summary.n_valid) == (30, 21)
     assert summary.problems[0] == ("a000", "reason 0")
     assert len(summary.problems) == 100
     assert not summary.complete
-    clean = summarise_build(assets[-1:], records=Path("r"), manifest="id", seconds=1.0)
+    clean = summarise_build(assets[-1:], records=Path("r"), build_id="id", seconds=1.0)
     assert clean.complete
 
 

@@ -57,7 +57,7 @@ def test_nothing_changed_writes_nothing(built: tuple[Dataset, Path], aligned: li
     assert aligned == []
     assert {p: p.stat().st_ino for p in out.parent.rglob("*") if p.is_file()} == inodes
     told = json.loads((summary.records.parent / "build.json").read_text())
-    assert told["id"] == summary.manifest == open_store(out).attributes["manifest"]
+    assert told["id"] == summary.build_id == open_store(out).attributes["manifest"]
     assert told["statuses"] == summary.statuses
     assert told["verdicts"] == summary.verdicts
     assert told["counts"] == {
@@ -216,7 +216,7 @@ def test_missing_or_older_manifests_are_written_again(built: tuple[Dataset, Path
     (manifests / "assets.jsonl").unlink()
     summary = build_store(dataset.parameters(), out)
     after = (manifests / "assets.jsonl").read_text().splitlines()
-    assert json.loads((manifests / "build.json").read_text())["id"] == summary.manifest
+    assert json.loads((manifests / "build.json").read_text())["id"] == summary.build_id
     for old, new in zip(map(json.loads, before), map(json.loads, after), strict=True):
         assert {**old, "duration_s": 0.0} == new
 

@@ -48,7 +48,7 @@ def test_every_record_follows_the_published_schema(mixed_build: BuildSummary) ->
         validator.validate(json.loads(line, parse_constant=no_constants))
     build = json.loads((mixed_build.records.parent / "build.json").read_text())
     jsonschema.Draft202012Validator(published["build_record.schema.json"]).validate(build)
-    assert build["id"] == mixed_build.manifest
+    assert build["id"] == mixed_build.build_id
     assert build["statuses"] == mixed_build.statuses
 
 
@@ -195,11 +195,11 @@ def test_a_crash_while_writing_leaves_the_old_file_whole(
 
 def test_the_id_is_of_the_content_alone(mixed_build: BuildSummary) -> None:
     records = [read_record(line, "here") for line in lines_of(mixed_build)]
-    assert records_id(records) == mixed_build.manifest
+    assert records_id(records) == mixed_build.build_id
     slower = [replace(record, duration_s=9.0) for record in records]
-    assert records_id(slower) == mixed_build.manifest
+    assert records_id(slower) == mixed_build.build_id
     told = [replace(r, reason="other words") if isinstance(r, FailedRecord) else r for r in records]
-    assert records_id(told) == mixed_build.manifest
+    assert records_id(told) == mixed_build.build_id
     assert records_id([replace(record, category="other") for record in records]) != records_id(
         records
     )

@@ -84,7 +84,7 @@ def test_attributes_explain_the_store(root: zarr.Group, mixed_build: BuildSummar
     assert attributes["resolution"] == 64
     assert attributes["material_classes"][6:] == ["stationary", "background"]
     assert attributes["property_columns"] == ["youngs_modulus", "density", "poissons_ratio"]
-    assert attributes["manifest"] == mixed_build.manifest
+    assert attributes["manifest"] == mixed_build.build_id
     modulus = attributes["normalization"]["youngs_modulus"]
     assert modulus["log10"] is True
     assert modulus["source"] == "dataset"

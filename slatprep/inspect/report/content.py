@@ -66,7 +66,7 @@ def page_content(
     return {
         "title": store.name,
         "name": str(build.get("name", "")),
-        "manifest": str(store.attributes["manifest"]),
+        "build_id": str(store.attributes["manifest"]),
         "records": outcomes is not None,
         "versions": build["versions"],
         "voxels": int(store.offsets[-1]),

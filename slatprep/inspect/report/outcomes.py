@@ -41,14 +41,14 @@ class Outcome:
     clipped: tuple[int, ...]
 
 
-def read_outcomes(manifests: Place, manifest: str) -> Iterator[Outcome]:
+def read_outcomes(manifests: Place, build_id: str) -> Iterator[Outcome]:
     """Yield the outcome of every asset of a build, in the order of its records.
 
     Parameters
     ----------
     manifests : Path
         Directory of ``assets.jsonl`` and ``build.json``.
-    manifest : str
+    build_id : str
         Id of the build that wrote the store.
 
     Raises
@@ -59,10 +59,10 @@ def read_outcomes(manifests: Place, manifest: str) -> Iterator[Outcome]:
     path = manifests / "build.json"
     try:
         found = read_build_record(path.read_bytes(), str(path)).id
-        if found != manifest:
+        if found != build_id:
             raise StoreError(
                 f"{manifests} holds the records of build {found[:12]!r}, the store was written by "
-                f"{manifest[:12]!r}; name the folder of its own records with --manifests"
+                f"{build_id[:12]!r}; name the folder of its own records with --manifests"
             )
         path = manifests / "assets.jsonl"
         with path.open("rb") as lines:

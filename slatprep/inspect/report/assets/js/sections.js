@@ -212,7 +212,7 @@ const Sections = (() => {
     if (assets < inStore) notes.push(`${Format.count(assets)} of ${Format.count(inStore)} assets have a thumbnail and a 3D view, and make up the distributions: those with a doubtful or failed alignment first, the rest evenly chosen.`);
     byId("detail-hint").textContent = notes.join(" ");
     byId("detail-hint").hidden = !notes.length;
-    byId("colophon").textContent = `Made by slatprep ${CONTENT.versions.slatprep} from build ${CONTENT.manifest.slice(0, 12)}.`;
+    byId("colophon").textContent = `Made by slatprep ${CONTENT.versions.slatprep} from build ${CONTENT.build_id.slice(0, 12)}.`;
   }
 
   return { states, quality, rotations, properties, balance, colophon };
