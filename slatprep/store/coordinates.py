@@ -31,6 +31,7 @@ def write_coordinates(path: Path) -> None:
         are consolidated.
     """
     import zarr
+    from zarr.codecs import Crc32cCodec, ZstdCodec
 
     root: Any = zarr.open_group(path, mode="r+", zarr_format=3, use_consolidated=False)
     centres = voxel_centres(np.repeat(np.arange(RESOLUTION)[:, None], 3, axis=1))[:, 0]
@@ -49,6 +50,7 @@ def write_coordinates(path: Path) -> None:
                 shape=values.shape,
                 dtype=str if dimension in texts else "float64",
                 chunks=values.shape,
+                compressors=(ZstdCodec(), Crc32cCodec()),
                 dimension_names=(dimension,),
                 attributes={"description": f"coordinate of the dimension {dimension}"},
             )

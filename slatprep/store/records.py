@@ -21,7 +21,7 @@ RECORDS_IN_SHARD = 1024
 
 def create_record_array(root: Any, n_assets: int, level: int) -> None:
     """Create the array in a new store."""
-    from zarr.codecs import ZstdCodec
+    from zarr.codecs import Crc32cCodec, ZstdCodec
 
     root.create_array(
         RECORD_ARRAY,
@@ -29,7 +29,7 @@ def create_record_array(root: Any, n_assets: int, level: int) -> None:
         dtype=str,
         chunks=(RECORDS_IN_CHUNK,),
         shards=(RECORDS_IN_SHARD,),
-        compressors=ZstdCodec(level=level),
+        compressors=(ZstdCodec(level=level), Crc32cCodec()),
         fill_value="",
         dimension_names=("asset",),
         attributes={"description": "provenance of the row, as JSON"},

@@ -115,6 +115,16 @@ def test_arrays_have_the_contracts_types_and_names_of_dimensions(root: zarr.Grou
     assert root["grid/material"].metadata.dimension_names == ("asset", "x", "y", "z")
 
 
+def test_every_chunk_of_every_array_ends_with_a_checksum(root: zarr.Group) -> None:
+    arrays = [part for _, part in root.members(max_depth=None) if isinstance(part, zarr.Array)]
+    assert {array.name for array in arrays} >= {"/asset/record", "/asset/property", "/grid/x"}
+    for array in arrays:
+        codecs = array.metadata.to_dict()["codecs"]
+        if codecs[0]["name"] == "sharding_indexed":
+            codecs = codecs[0]["configuration"]["codecs"]
+        assert codecs[-1]["name"] == "crc32c", array.name
+
+
 def test_one_file_a_shard_and_one_read_to_open(root: zarr.Group, mixed_build: BuildSummary) -> None:
     store = mixed_build.store
     assert store is not None
