@@ -137,6 +137,11 @@ def _report(output: Output, summary: BuildSummary) -> None:
     unlisted = total - good - len(summary.problems)
     if unlisted:
         output.problem(f"and {unlisted:,} more: see {summary.records}")
+    if summary.n_unphysical:
+        output.problem(
+            f"{summary.n_unphysical:,} PixieVerse voxels with properties that no material has are "
+            f"not annotated; `warnings` in {summary.records} says in which assets"
+        )
 
     def show() -> None:
         if summary.store is not None:

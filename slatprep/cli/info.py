@@ -34,6 +34,7 @@ def info(output: Output, store: Place) -> None:
             "assets": overview.total.assets,
             "voxels": overview.total.voxels,
             "valid": overview.total.valid_share,
+            "unphysical": overview.total.unphysical,
             "files": overview.files,
             "MB": overview.size / 1e6,
             "format": overview.format_version,

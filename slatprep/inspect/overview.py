@@ -25,7 +25,8 @@ class GroupOverview:
     ``verdicts`` counts the assets by verdict. Confidence, expected
     accuracy, fitness, rmse [voxel] and overlap are medians over the assets;
     ``valid_share`` is over all their voxels; ``ambiguous`` counts assets with
-    tied placements that differ in class at some voxel.
+    tied placements that differ in class at some voxel; ``unphysical`` counts
+    the PixieVerse voxels that were left out, as no material has their properties.
     """
 
     name: str
@@ -40,6 +41,7 @@ class GroupOverview:
     overlap: float
     valid_share: float
     ambiguous: int
+    unphysical: int
 
 
 @dataclass(frozen=True)
@@ -74,7 +76,8 @@ def overview_of(store: Store) -> StoreOverview:
     -------
     StoreOverview
     """
-    names = ("category", "verdict", *_MEDIANS, "valid_share", "ambiguity", "engine", "model")
+    names = ("category", "verdict", *_MEDIANS, "valid_share", "ambiguity", "engine", "model",
+             "unphysical")  # fmt: skip
     columns = {name: store.column(name) for name in names}
     columns["voxels"] = np.diff(store.offsets)
     categories = np.array([str(category) for category in columns["category"]])
@@ -108,6 +111,7 @@ def _group(name: str, columns: dict[str, NDArray[Any]], chosen: NDArray[np.bool_
         **{median: float(np.median(own[median])) for median in _MEDIANS},
         valid_share=float(own["valid_share"] @ own["voxels"] / voxels),
         ambiguous=int((own["ambiguity"] > 0).sum()),
+        unphysical=int(own["unphysical"].sum()),
     )
 
 

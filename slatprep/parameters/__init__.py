@@ -146,11 +146,17 @@ class SampleParameters(_Group):
     by a Gaussian of `vote_width` voxels, and the nearest one of that class
     gives the properties. Beyond `max_distance` (voxels of the PixieVerse
     frame) from the nearest annotated voxel a SLAT voxel is not valid.
+
+    A voxel whose properties no material has (a Poisson's ratio outside
+    [0, 0.5], a modulus or density that is not finite and above 0) is not
+    annotated; an asset in which more than the share `max_unphysical` of the
+    voxels with a class are such is refused.
     """
 
     method: Literal["vote", "nearest"] = "vote"
     max_distance: Positive = 3.0
     vote_width: Positive = 0.5
+    max_unphysical: Annotated[float, Ge(0), Le(1)] = 0.1
 
 
 @dataclass(frozen=True)

@@ -54,7 +54,8 @@ def process_asset(
     InputError
         If a source cannot be used or a partner is missing.
     """
-    field, latents = read_field(pair), read_latents(pair)
+    field = read_field(pair, parameters.sample.max_unphysical)
+    latents = read_latents(pair)
     reached("asset read", pair.asset_id)
     alignment = known.alignment if known else align(field, latents, parameters.align)
     reached("asset reused" if known else "asset aligned", pair.asset_id)

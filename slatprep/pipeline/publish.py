@@ -169,5 +169,10 @@ def build_record(summary: BuildSummary, parameters: BuildParameters) -> BuildRec
         normalization=summary.normalization,
         statuses=summary.statuses,
         verdicts=summary.verdicts,
-        counts=BuildCounts(summary.n_voxels, summary.n_valid, PropertyCounts(**summary.clipped)),
+        counts=BuildCounts(
+            summary.n_voxels,
+            summary.n_valid,
+            PropertyCounts(**summary.clipped),
+            summary.n_unphysical,
+        ),
     )

@@ -6,6 +6,8 @@ from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 
+import numpy as np
+
 from slatprep.parameters import BuildParameters
 from slatprep.pipeline.spool import FailedAsset, SpooledAsset
 from slatprep.provenance.record import Clipped
@@ -33,6 +35,9 @@ class BuildSummary:
         Assets with status ``ok`` by verdict: ``good``, ``doubtful``, ``failed``.
     n_voxels, n_valid : int
         SLAT voxels of those assets, and how many found an annotation.
+    n_unphysical : int
+        PixieVerse voxels of those assets that no annotation was taken from, as no
+        material has their properties.
     problems : tuple of (str, str)
         Asset id and reason of the first `PROBLEMS_LISTED` that are not ``ok``.
     store : Place or None
@@ -50,6 +55,7 @@ class BuildSummary:
     verdicts: dict[str, int]
     n_voxels: int
     n_valid: int
+    n_unphysical: int
     problems: tuple[tuple[str, str], ...]
     store: Place | None = None
     normalization: Normalization | None = None
@@ -84,6 +90,7 @@ def summarise_build(
         verdicts=dict(sorted(verdicts.items())),
         n_voxels=sum(asset.n_voxels for asset in usable),
         n_valid=sum(asset.n_valid for asset in usable),
+        n_unphysical=int(np.sum([asset.columns["unphysical"] for asset in usable])),
         problems=tuple((asset.asset_id, asset.reason) for asset in failed[:PROBLEMS_LISTED]),
         store=store,
         normalization=normalization,

@@ -35,6 +35,7 @@ def columns_of(record: AssetRecord) -> dict[str, Column]:
         "ambiguity": judgement.ambiguity.material_share,
         "property_ambiguity": judgement.ambiguity.property_change,
         "valid_share": counts.valid / counts.slat_voxels,
+        "unphysical": counts.unphysical,
         "verdict": judgement.verdict,
         "confidence": judgement.confidence,
         "expected_accuracy": judgement.expected_accuracy,

@@ -95,6 +95,7 @@ def counts_of(asset: Finished) -> VoxelCounts:
         boundary=int(np.count_nonzero(boundary(asset.field.occupancy))),
         slat_voxels=len(asset.latents.coords),
         valid=int(np.count_nonzero(asset.annotation.valid)),
+        unphysical=asset.field.unphysical,
     )
 
 

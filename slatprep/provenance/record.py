@@ -95,15 +95,17 @@ class VoxelCounts:
     occupied: Count
     """Occupied PixieVerse voxels."""
     annotated: Count
-    """Those with a class 0..6."""
+    """Those with a class 0..6 and properties that a material can have."""
     unannotated: Count
-    """Those without."""
+    """The others."""
     boundary: Count
     """Those that touch an empty voxel by a face."""
     slat_voxels: Count
     """SLAT voxels."""
     valid: Count
     """SLAT voxels with an annotation near enough."""
+    unphysical: Count = 0
+    """Of the unannotated those with a class, but properties that no material has."""
     clipped: Clipped | None = None
     """Values outside the ranges; null where no store was built."""
 
@@ -229,6 +231,8 @@ class BuildCounts:
     """SLAT voxels with an annotation near enough."""
     clipped: PropertyCounts
     """Values of ``voxel/properties`` outside the ranges."""
+    unphysical: Count = 0
+    """PixieVerse voxels with a class, but properties that no material has."""
 
 
 def _word(words: Iterable[str]) -> InJson:

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from slatprep.errors import InputError
 from slatprep.normalize import PIXIE_RANGES, denormalize_properties
+from slatprep.parameters import SampleParameters
 from slatprep.readers.files import (
     ArraySpec,
     load_source,
@@ -47,8 +48,16 @@ UNLABELLED = -1
 # Source channel of each of PROPERTY_COLUMNS; the files begin with density.
 _CHANNEL_ORDER = (1, 0, 2)
 
+_PHYSICAL = (
+    ("Young's modulus", "a finite Young's modulus above 0 Pa"),
+    ("density", "a finite density above 0 kg/m^3"),
+    ("Poisson's ratio", "a Poisson's ratio in [0, 0.5]"),
+)
 
-def read_field(pair: AssetPair) -> MaterialField:
+
+def read_field(
+    pair: AssetPair, max_unphysical: float = SampleParameters.max_unphysical
+) -> MaterialField:
     """Read the PixieVerse side of a pair, whichever form it has.
 
     Parameters
@@ -59,13 +68,17 @@ def read_field(pair: AssetPair) -> MaterialField:
         prediction, (11, 64, 64, 64) or (4, 64, 64, 64) float: the same three
         normalised to [-1, 1] by Pixie's published ranges, then eight class
         scores or one class id. Its mask, if any, is (64, 64, 64).
+    max_unphysical : float
+        See `slatprep.parameters.SampleParameters`.
 
     Returns
     -------
     MaterialField
         Occupancy, and material and SI properties of the annotated voxels.
         Occupied is what the mask says or, without a mask, what is not
-        background; annotated is an occupied voxel of class 0 to 6.
+        background; annotated is an occupied voxel of class 0 to 6 whose
+        density and Young's modulus are finite and above 0 and whose Poisson's
+        ratio is in [0, 0.5] (of a prediction: finite).
 
     Raises
     ------
@@ -95,12 +108,25 @@ def read_field(pair: AssetPair) -> MaterialField:
         raise InputError(path, "no voxel is occupied: all are background", "an occupied voxel")
     annotated = _annotated(occupancy, material, path, warnings)
 
-    _require_finite(channels, occupancy, path)
     voxels = np.argwhere(annotated)
     properties = _gather(channels, annotated)
-    if raw:
-        _require_physical(properties, voxels, path)
-    else:
+    physical = _physical(properties, raw)
+    keep = np.asarray(physical.all(axis=1))
+    unphysical = int(np.count_nonzero(~keep))
+    if unphysical:
+        row, column = _first(~physical)
+        value = channels[_CHANNEL_ORDER[column]][tuple(voxels[row])]
+        name, expected = _PHYSICAL[column]
+        what = f"{name} {value:g} at annotated voxel {tuple(map(int, voxels[row]))}"
+        if unphysical == len(keep) or unphysical > max_unphysical * len(keep):
+            raise InputError(
+                path,
+                f"{unphysical} of {len(keep)} annotated voxels are unphysical, the first by {what}",
+                f"{expected}, in all but {max_unphysical:.4g} of them (sample.max_unphysical)",
+            )
+        warnings.append(f"{unphysical} voxels are unphysical, the first by {what}; not annotated")
+        voxels, properties = voxels[keep], properties[keep]
+    if not raw:
         properties = _to_si(properties, warnings)
 
     bounds = None
@@ -109,8 +135,9 @@ def read_field(pair: AssetPair) -> MaterialField:
     return MaterialField(
         occupancy=occupancy,
         voxels=voxels.astype(np.uint8),
-        material=material[annotated].astype(np.uint8),
+        material=material[annotated][keep].astype(np.uint8),
         properties=properties,
+        unphysical=unphysical,
         bounds=bounds,
         sources=tuple(sources),
         warnings=tuple(warnings),
@@ -208,37 +235,14 @@ def _gather(channels: NDArray[Any], where: NDArray[np.bool_]) -> NDArray[np.floa
     return np.stack(columns, axis=1)
 
 
-def _require_finite(channels: NDArray[Any], occupancy: NDArray[np.bool_], path: Place) -> None:
-    properties = _gather(channels, occupancy)
-    if not np.isfinite(properties).all():
-        row, column = _first(~np.isfinite(properties))
-        voxel = tuple(int(i) for i in np.argwhere(occupancy)[row])
-        value = channels[_CHANNEL_ORDER[column]][voxel]
-        raise InputError(
-            path,
-            f"{PROPERTY_COLUMNS[column]} is {value} at occupied voxel {voxel}",
-            "a finite value that float32 can hold",
-        )
-
-
-def _require_physical(
-    properties: NDArray[np.float32], voxels: NDArray[np.intp], path: Place
-) -> None:
-    youngs_modulus, density, poissons_ratio = properties.T
-    for name, values, good, expected in (
-        ("density", density, density > 0, "a density above 0 kg/m^3"),
-        ("Young's modulus", youngs_modulus, youngs_modulus > 0, "a Young's modulus above 0 Pa"),
-        (
-            "Poisson's ratio",
-            poissons_ratio,
-            (poissons_ratio >= -1) & (poissons_ratio <= 0.5),
-            "a Poisson's ratio in [-1, 0.5]",
-        ),
-    ):
-        if not good.all():
-            row = int(np.argmin(good))
-            voxel = tuple(int(i) for i in voxels[row])
-            raise InputError(path, f"{name} {values[row]:g} at annotated voxel {voxel}", expected)
+def _physical(properties: NDArray[np.float32], raw: bool) -> NDArray[np.bool_]:
+    """Return which properties (K, 3) a material can have; normalised ones need be finite only."""
+    good = np.isfinite(properties)
+    if raw:
+        ratio = properties[:, 2]
+        good[:, :2] &= properties[:, :2] > 0
+        good[:, 2] &= (ratio >= 0) & (ratio <= 0.5)
+    return good
 
 
 def _to_si(values: NDArray[np.float32], warnings: list[str]) -> NDArray[np.float32]:

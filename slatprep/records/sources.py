@@ -128,11 +128,13 @@ class MaterialField:
     occupancy : ndarray of bool, shape (64, 64, 64)
         Occupied voxels, axes x, y, z of the PixieVerse frame.
     voxels : ndarray of uint8, shape (K, 3)
-        The annotated voxels (occupied, class 0..6), in C order of the grid.
+        The annotated voxels (occupied, class 0..6, physical), in C order of the grid.
     material : ndarray of uint8, shape (K,)
         Class of each annotated voxel, 0..6.
     properties : ndarray of float32, shape (K, 3)
         Young's modulus [Pa], density [kg/m^3] and Poisson's ratio of each.
+    unphysical : int
+        Voxels with a class that are not annotated, as no material has their properties.
     bounds : dict or None
         World bounds as ``clip_features.npz`` states them, JSON-ready.
     sources : tuple of SourceFile
@@ -145,6 +147,7 @@ class MaterialField:
     voxels: NDArray[np.uint8]
     material: NDArray[np.uint8]
     properties: NDArray[np.float32]
+    unphysical: int = 0
     bounds: dict[str, object] | None = None
     sources: tuple[SourceFile, ...] = ()
     warnings: tuple[str, ...] = ()

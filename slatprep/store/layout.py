@@ -120,6 +120,14 @@ ARRAYS = (
         "mean change of each normalised property between placements that fit about as well",
     ),
     ArrayLayout("asset/valid_share", "float64", ("asset",), NAN, "share of valid SLAT voxels"),
+    ArrayLayout(
+        "asset/unphysical",
+        "int64",
+        ("asset",),
+        0,
+        "PixieVerse voxels left out, as no material has their properties",
+        since=2,
+    ),
     ArrayLayout("asset/verdict", "str", ("asset",), "", "good, doubtful or failed"),
     ArrayLayout(
         "asset/confidence",

@@ -40,6 +40,13 @@ _ASSET_COLUMNS = [
     for group, name in _BY_GROUP
     if group == "asset" and name not in ("id", "offset", "transform")
 ]
+_NEWER = {
+    name: layout.fill_value
+    for layout in ARRAYS
+    for group, _, name in (layout.name.partition("/"),)
+    if group == "asset" and layout.since > 1
+}
+"""What a store of format 1 says by the name of an ``asset/*`` array that it does not have."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -204,8 +211,8 @@ class Store:
             If there is no such array, or it cannot be read.
         """
         # Offsets are always written: that they are there bounds what the others may claim.
-        if self.format_version == 1 and name in ("confidence", "expected_accuracy"):
-            return np.full(len(self), np.nan)
+        if (unknown := _NEWER.get(name)) is not None and self.format_version == 1:
+            return np.full(len(self), unknown)
         rows = self.shape("asset/offset")[0] if name == "offset" else len(self)
         return self.read_rows(f"asset/{name}", 0, rows)
 

@@ -1,3 +1,4 @@
+import json
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -9,6 +10,8 @@ from support.synthetic import JELLY, METAL, Dataset
 from support.trees import records_of, tree
 
 from slatprep.errors import ConfigError, InputError, MissingPartnerError, StoreError
+from slatprep.inspect.verify import verify_store
+from slatprep.parameters import SampleParameters
 from slatprep.pipeline.dataset import BuildSummary, align_pairs, build_store
 from slatprep.provenance.places import manifests_of
 from slatprep.store import open_store
@@ -204,6 +207,37 @@ def test_islands_without_annotation_stay_occupied(
     counts = records_of(summary.records)["a"]["counts"]
     assert counts["unannotated"] == 3
     assert counts["occupied"] == counts["annotated"] + 3 == (grid[..., 3] != 7).sum()
+
+
+def test_no_asset_is_lost_to_one_unphysical_voxel(
+    make_dataset: MakeDataset, tmp_path: Path
+) -> None:
+    dataset = make_dataset("a", "b")
+    grid = dataset.assets["a"].grid
+    grid[30, 25:28, 28, 2] = 0.546
+    dataset.write_grid("a", grid)
+    summary = build_store(dataset.parameters(), tmp_path / "s.zarr")
+    assert summary.complete
+    assert summary.n_unphysical == 3
+    store = open_store(summary.store)
+    asset = store.asset("a")
+    assert (asset.grid_material[30, 25:28, 28] == 255).all()
+    assert np.isnan(asset.grid_properties[:, 30, 25:28, 28]).all()
+    assert store.column("unphysical").tolist() == [3, 0]
+    assert store.normalization.ranges[2].hi == pytest.approx(0.3)
+    record = records_of(summary.records)["a"]
+    assert record["counts"]["unphysical"] == record["counts"]["unannotated"] == 3
+    assert record["parameters"]["sample"]["max_unphysical"] == 0.1
+    assert "3 voxels are unphysical" in record["warnings"][0]
+    build = json.loads((summary.records.parent / "build.json").read_bytes())
+    assert build["counts"]["unphysical"] == 3
+    assert verify_store(summary.store, sources=True).ok
+
+    again = build_store(dataset.parameters(), tmp_path / "s.zarr")
+    assert again.n_unphysical == 3
+    strict = replace(dataset.parameters(), sample=SampleParameters(max_unphysical=0.0))
+    refused = build_store(strict, tmp_path / "s.zarr")
+    assert [asset_id for asset_id, _ in refused.problems] == ["a"]
 
 
 def test_voxels_too_far_from_an_annotation_are_not_valid(

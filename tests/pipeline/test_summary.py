@@ -19,7 +19,7 @@ def failed(number: int, status: Status = Status.FAILED) -> FailedAsset:
 
 
 def finished(name: str, verdict: str) -> SpooledAsset:
-    return SpooledAsset(name, "", 10, 7, 1, np.zeros((3, 2)), {"verdict": verdict})
+    return SpooledAsset(name, "", 10, 7, 1, np.zeros((3, 2)), {"verdict": verdict, "unphysical": 4})
 
 
 def test_assets_are_counted_and_the_first_hundred_problems_listed() -> None:
@@ -34,6 +34,7 @@ def test_assets_are_counted_and_the_first_hundred_problems_listed() -> None:
     assert summary.statuses == {"ok": 3, "failed": 120, "skipped": 1}
     assert summary.verdicts == {"doubtful": 1, "good": 2}
     assert (summary.n_voxels, summary.n_valid) == (30, 21)
+    assert summary.n_unphysical == 12
     assert summary.problems[0] == ("a000", "reason 0")
     assert len(summary.problems) == 100
     assert not summary.complete

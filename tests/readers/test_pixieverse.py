@@ -212,16 +212,16 @@ BAD_GRIDS = {
     "dtype": (np.zeros((64, 64, 64, 4), np.int32), "dtype <i4", "floating-point"),
     "complex": (np.zeros((64, 64, 64, 4), np.complex64), "dtype <c8", "floating-point"),
     "pickle": (np.full((64, 64, 64, 4), None), "pickle", "allow_pickle=False"),
-    "nan": (_with((1, 2, 3), 1, np.nan), "youngs_modulus is nan at occupied voxel (1, 2, 3)", "fi"),
+    "nan": (_with((1, 2, 3), 1, np.nan), "modulus nan at annotated voxel (1, 2, 3)", "finite Y"),
     "infinity": (
         _with((60, 0, 63), 0, np.inf),
-        "density is inf at occupied voxel (60, 0, 63)",
-        "f",
+        "density inf at annotated voxel (60, 0, 63)",
+        "a finite density",
     ),
     "too large for float32": (
         _with((1, 2, 4), 1, 1e60, lambda: raw_grid().astype(np.float64)),
-        "youngs_modulus is 1e+60 at occupied voxel (1, 2, 4)",
-        "float32",
+        "modulus 1e+60 at annotated voxel (1, 2, 4)",
+        "finite",
     ),
     "negative density": (_with((1, 2, 4), 0, -1), "density -1 at annotated voxel (1, 2, 4)", "kg"),
     "zero density": (_with((1, 2, 4), 0, 0), "density 0 at annotated voxel (1, 2, 4)", "above 0"),
@@ -231,8 +231,8 @@ BAD_GRIDS = {
         "above 0 Pa",
     ),
     "zero E": (_with((1, 2, 3), 1, 0), "modulus 0 at annotated voxel (1, 2, 3)", "above 0 Pa"),
-    "nu too large": (_with((1, 2, 3), 2, 0.51), "ratio 0.51 at", "[-1, 0.5]"),
-    "nu too small": (_with((1, 2, 3), 2, -1.5), "ratio -1.5 at", "[-1, 0.5]"),
+    "nu too large": (_with((1, 2, 3), 2, 0.51), "ratio 0.51 at", "[0, 0.5]"),
+    "nu too small": (_with((1, 2, 3), 2, -0.1), "ratio -0.1 at", "[0, 0.5]"),
     "class 8": (_with((9, 8, 7), 3, 8), "unknown class 8 at voxel (9, 8, 7)", "-1 to 7"),
     "class -2": (_with((9, 8, 7), 3, -2), "unknown class -2 at voxel (9, 8, 7)", "-1 to 7"),
     "class 1.5": (_with((9, 8, 7), 3, 1.5), "unknown class 1.5 at voxel (9, 8, 7)", "whole"),
@@ -254,8 +254,8 @@ BAD_GRIDS = {
     ),
     "predicted nan": (
         _with((2, 1, 2), 3, np.nan, lambda: prediction_of(raw_grid(), scores=True)),
-        "poissons_ratio is nan at occupied voxel (1, 2, 3)",
-        "finite",
+        "ratio nan at annotated voxel (1, 2, 3)",
+        "ratio in [0, 0.5], in all but 0.1 of them (sample.max_unphysical)",
     ),
     "predicted class": (
         _with((3, 1, 2), 3, 9, lambda: prediction_of(raw_grid(), scores=False)),
@@ -275,6 +275,63 @@ def test_bad_grid(make_pair, fault):
     assert what in caught.value.fault
     assert expected in caught.value.expected
     assert "\n" not in str(caught.value)
+
+
+UNPHYSICAL = {
+    "Poisson's ratio above 0.5": (2, 0.546, "Poisson's ratio 0.546"),
+    "negative Poisson's ratio": (2, -0.01, "Poisson's ratio -0.01"),
+    "Poisson's ratio NaN": (2, np.nan, "Poisson's ratio nan"),
+    "no density": (0, 0.0, "density 0"),
+    "endless density": (0, np.inf, "density inf"),
+    "negative modulus": (1, -5.0, "Young's modulus -5"),
+    "modulus beyond float32": (1, 1e39, "Young's modulus 1e+39"),
+}
+
+
+@pytest.mark.parametrize("case", UNPHYSICAL)
+def test_an_unphysical_voxel_is_not_annotated(make_pair, case):
+    channel, value, named = UNPHYSICAL[case]
+    grid = raw_grid().astype(np.float64)
+    grid[20:23, 20:23, 20] = 900.0, 1.0e6, 0.0, 2  # none of these is at fault
+    grid[20, 21, 20, channel] = value
+    read = read_field(make_pair(grid=grid))
+    assert [20, 21, 20] not in read.voxels.tolist()
+    assert len(read.voxels) == len(read.material) == len(read.properties) == 11
+    assert read.occupancy[20, 21, 20]
+    assert read.unphysical == 1
+    assert read.warnings == (
+        f"1 voxels are unphysical, the first by {named} at annotated voxel (20, 21, 20); "
+        "not annotated",
+    )
+
+
+def test_a_predicted_voxel_that_is_not_finite_is_not_annotated(make_pair):
+    grid = raw_grid()
+    grid[20:23, 20:23, 20] = 900.0, 1.0e6, 0.3, 2
+    prediction = prediction_of(grid, scores=True)
+    prediction[1, 20, 21, 20] = np.inf  # not a very large value that may be clipped
+    read = read_field(make_pair(grid=prediction))
+    assert len(read.voxels) == 11
+    assert read.unphysical == 1
+
+
+def test_an_asset_fails_by_the_share_of_its_unphysical_voxels(make_pair):
+    grid = raw_grid()
+    grid[1, 2, 3, 2] = 0.7
+    assert len(read_field(make_pair(grid=grid), 1 / 3).voxels) == 2
+    with pytest.raises(InputError, match=r"1 of 3 annotated voxels are unphysical.*sample\.max_un"):
+        read_field(make_pair(grid=grid), 0.33)
+    grid[..., 2] = 0.7
+    with pytest.raises(InputError, match="3 of 3 annotated voxels"):
+        read_field(make_pair(grid=grid), 1.0)
+
+
+def test_values_of_a_voxel_without_class_do_not_matter(make_pair):
+    grid = raw_grid()
+    grid[30, 30, 30] = np.nan, -1, 9, -1
+    read = read_field(make_pair(grid=grid))
+    assert read.voxels.tolist() == VOXELS
+    assert read.unphysical == 0
 
 
 def _mask_with(value):

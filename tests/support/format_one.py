@@ -11,7 +11,8 @@ from pathlib import Path
 import numpy as np
 import zarr
 
-_NEWER = ("voxel/place", "voxel/confidence", "asset/confidence", "asset/expected_accuracy")
+_NEWER = ("voxel/place", "voxel/confidence", "asset/confidence", "asset/expected_accuracy",
+          "asset/unphysical")  # fmt: skip
 
 
 def write_format_one(store: Path, out: Path) -> None:
@@ -23,6 +24,7 @@ def write_format_one(store: Path, out: Path) -> None:
     root["asset/record"][:] = np.array([_older(text) for text in root["asset/record"][:]], object)
     build = root.attrs["build"]
     del build["parameters"]["align"]["max_displacement"]
+    del build["parameters"]["sample"]["max_unphysical"]
     root.attrs.update({"format_version": 1, "build": build})
     names = [
         n for n in root["file/name"][:] if not n.startswith(tuple(f"{newer}/" for newer in _NEWER))
@@ -53,4 +55,6 @@ def _older(text: str) -> str:
     for name in ("confidence", "expected_accuracy"):
         del record["judgement"][name]
     del record["parameters"]["align"]["max_displacement"]
+    del record["parameters"]["sample"]["max_unphysical"]
+    del record["counts"]["unphysical"]
     return json.dumps(record, separators=(",", ":"), ensure_ascii=False)

@@ -159,6 +159,7 @@ def _table(
         "category": map(str, store.column("category")),
         "state": map(str, store.column("verdict")),
         "voxels": np.diff(store.offsets).tolist(),
+        "unphysical": store.column("unphysical").tolist(),
         "model": map(str, store.column("model")),
         "turn": (index for index, _ in nearest),
         "tilt": (round(angle, 2) for _, angle in nearest),

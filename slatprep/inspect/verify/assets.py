@@ -228,6 +228,7 @@ def _claims(
         ("slat_voxels", len(asset.coords)),
         ("valid", asset.valid.sum()),
         ("annotated", (grid < BACKGROUND).sum()),
+        ("unannotated", (grid == UNANNOTATED).sum()),
         ("occupied", (grid != BACKGROUND).sum()),
     ):
         yield f"counts/{name}", getattr(record.counts, name), int(count)

@@ -7,7 +7,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from slatprep.records import Model, Verdict
+from slatprep.records import RESOLUTION, Model, Verdict
 from slatprep.store.contract import MAX_VOXELS, Finding
 from slatprep.store.reader import Store
 
@@ -44,6 +44,7 @@ def index_findings(store: Store) -> Iterator[Finding]:
         yield from _outside(store, name, 0.0, 1.0, nan=store.format_version == 1)
     for name in DISTANCES:
         yield from _outside(store, name, 0.0, np.inf, nan=True)
+    yield from _outside(store, "unphysical", 0, RESOLUTION**3)
     for name, allowed in WORDS.items():
         for asset_id, word in zip(ids, store.column(name), strict=True):
             if str(word) not in allowed:

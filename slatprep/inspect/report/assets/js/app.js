@@ -136,6 +136,7 @@ const Detail = (() => {
       ["Displacement between them", value("displacement") === null ? Format.NONE : `${value("displacement").toFixed(1)} voxel`],
       ["Margin", fixed(value("margin"))],
       ["SLAT voxels", Format.count(value("voxels"))],
+      ["Unphysical voxels left out", Format.count(value("unphysical"))],
       ["Nearest quarter turn", CONTENT.turns[value("turn")]],
       ["Angle to it", `${value("tilt").toFixed(1)}°`],
       [`Transform (${value("model")})`, ""],

@@ -21,6 +21,8 @@ const Sections = (() => {
       ["median fitness", Format.fixed(3)(Format.quantile(known(ASSETS.fitness), 0.5))],
       ["median rmse, voxels", Format.fixed(3)(Format.quantile(known(ASSETS.inlier_rmse), 0.5))],
     ];
+    const unphysical = sum(known(ASSETS.unphysical));
+    if (unphysical) tiles.push(["unphysical voxels left out", Format.count(unphysical)]);
     if (CONTENT.records) tiles.push(["assets with ties", Format.count(ASSETS.tied.filter((tied) => tied > 0).length)]);
     byId("tiles").replaceChildren(...tiles.map(([name, value]) => el("div", {}, el("dt", {}, name), el("dd", {}, value))));
     const present = counts.filter((state) => state.count);
