@@ -14,13 +14,11 @@ sample, always in the same order.
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 from numba import njit
 
 from slatprep.align.bspline import bend, gather, locate, scatter, strides_of
-from slatprep.align.solver import _interpolate
+from slatprep.align.solver import interpolate, solve_symmetric
 
 _INVERSE_STEPS = 2
 
@@ -67,7 +65,7 @@ def linearise(  # type: ignore[no-untyped-def]
                 )
         if forward:
             a, b, c = q0 - shift[0], q1 - shift[1], q2 - shift[2]
-            value, ga, gb, gc = _interpolate(
+            value, ga, gb, gc = interpolate(
                 field,
                 (rotation[0, 0] * a + rotation[1, 0] * b + rotation[2, 0] * c) / scale
                 - field_origin[0],
@@ -81,7 +79,7 @@ def linearise(  # type: ignore[no-untyped-def]
             gy = rotation[1, 0] * ga + rotation[1, 1] * gb + rotation[1, 2] * gc
             gz = rotation[2, 0] * ga + rotation[2, 1] * gb + rotation[2, 2] * gc
         else:
-            value, ga, gb, gc = _interpolate(
+            value, ga, gb, gc = interpolate(
                 field,
                 places[m, 0] - field_origin[0],
                 places[m, 1] - field_origin[1],
@@ -124,29 +122,7 @@ def affine_step(  # type: ignore[no-untyped-def]
     rhs[12] -= offset_prior * offset
     for i in range(n):
         normal[i, i] += ridge * normal[i, i] + 1e-9 * places.shape[0]
-    _solve(normal, rhs, step)
-
-
-@njit(cache=True)
-def _solve(matrix, rhs, step):  # type: ignore[no-untyped-def]
-    """Solve a symmetric positive system, given in the upper half, by Cholesky's method."""
-    n = len(rhs)
-    for i in range(n):
-        for j in range(i, n):
-            total = matrix[i, j]
-            for k in range(i):
-                total -= matrix[k, i] * matrix[k, j]
-            matrix[i, j] = math.sqrt(total) if i == j else total / matrix[i, i]
-    for i in range(n):
-        total = rhs[i]
-        for k in range(i):
-            total -= matrix[k, i] * step[k]
-        step[i] = total / matrix[i, i]
-    for i in range(n - 1, -1, -1):
-        total = step[i]
-        for k in range(i + 1, n):
-            total -= matrix[i, k] * step[k]
-        step[i] = total / matrix[i, i]
+    solve_symmetric(normal, rhs, step)
 
 
 @njit(cache=True)

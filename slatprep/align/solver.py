@@ -32,7 +32,7 @@ _LARGEST_GROWTH = 0.1
 
 
 @njit(cache=True, inline="always")
-def _interpolate(f, x, y, z):  # type: ignore[no-untyped-def]
+def interpolate(f, x, y, z):  # type: ignore[no-untyped-def]
     """Trilinear value and gradient; outside the box the distance to it is added."""
     n0, n1, n2 = f.shape
     cx = min(max(x, 0.0), n0 - 1.000001)
@@ -80,7 +80,7 @@ def _accumulate(  # type: ignore[no-untyped-def]
         px, py, pz = points[m, 0], points[m, 1], points[m, 2]
         if forward:  # a SLAT sample looks up the PixieVerse distance
             ax, ay, az = px - shift[0], py - shift[1], pz - shift[2]
-            value, a, b, c = _interpolate(
+            value, a, b, c = interpolate(
                 field,
                 inverse[0, 0] * ax + inverse[0, 1] * ay + inverse[0, 2] * az - origin[0],
                 inverse[1, 0] * ax + inverse[1, 1] * ay + inverse[1, 2] * az - origin[1],
@@ -95,7 +95,7 @@ def _accumulate(  # type: ignore[no-untyped-def]
             ax = scale * (r00 * px + r01 * py + r02 * pz) + shift[0]
             ay = scale * (r10 * px + r11 * py + r12 * pz) + shift[1]
             az = scale * (r20 * px + r21 * py + r22 * pz) + shift[2]
-            value, gx, gy, gz = _interpolate(field, ax - origin[0], ay - origin[1], az - origin[2])
+            value, gx, gy, gz = interpolate(field, ax - origin[0], ay - origin[1], az - origin[2])
             px, py, pz = ax, ay, az
             carried = scale * values[m]
             residual = value - carried + offset
@@ -186,7 +186,7 @@ def solve(  # type: ignore[no-untyped-def]
                 rhs[6] = 0.0
             for i in range(UNKNOWNS):
                 normal[i, i] += 1e-4 * normal[i, i] + 1e-6 * samples
-            _solve_symmetric(normal, rhs, step)
+            solve_symmetric(normal, -rhs, step)
             angle = math.sqrt(step[0] ** 2 + step[1] ** 2 + step[2] ** 2)
             if angle > _LONGEST_TURN:
                 step[:3] *= _LONGEST_TURN / angle
@@ -229,25 +229,26 @@ def _product(matrix, vector):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def _solve_symmetric(matrix, rhs, step):  # type: ignore[no-untyped-def]
-    """Solve ``matrix @ step = -rhs`` by Cholesky's method, from and in the upper half.
+def solve_symmetric(matrix, rhs, step):  # type: ignore[no-untyped-def]
+    """Solve ``matrix @ step = rhs`` by Cholesky's method, from and in the upper half.
 
-    Eight unknowns take less time here than calling LAPACK does, and the bits
+    A dozen unknowns take less time here than calling LAPACK does, and the bits
     do not depend on which kernels a BLAS picks for the processor.
     """
-    for i in range(UNKNOWNS):
-        for j in range(i, UNKNOWNS):
+    n = len(rhs)
+    for i in range(n):
+        for j in range(i, n):
             total = matrix[i, j]
             for k in range(i):
                 total -= matrix[k, i] * matrix[k, j]
             matrix[i, j] = math.sqrt(total) if i == j else total / matrix[i, i]
-    for i in range(UNKNOWNS):
-        total = -rhs[i]
+    for i in range(n):
+        total = rhs[i]
         for k in range(i):
             total -= matrix[k, i] * step[k]
         step[i] = total / matrix[i, i]
-    for i in range(UNKNOWNS - 1, -1, -1):
+    for i in range(n - 1, -1, -1):
         total = step[i]
-        for k in range(i + 1, UNKNOWNS):
+        for k in range(i + 1, n):
             total -= matrix[i, k] * step[k]
         step[i] = total / matrix[i, i]
