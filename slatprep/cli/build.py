@@ -22,7 +22,11 @@ from slatprep.cli.options import (
 from slatprep.cli.output import Output
 
 if TYPE_CHECKING:
+    from slatprep.parameters import BuildParameters
     from slatprep.pipeline.dataset import BuildPlan, BuildSummary
+
+_ASSETS_PER_JOB = 20
+"""Assets that the default engine aligns in the time that a worker takes to start, 1.6 s."""
 
 
 @command("build-store")
@@ -75,7 +79,9 @@ def build_store(output: Output, out: Path, dry_run: bool, **options: Any) -> Non
         _show_plan(output, plan)
         return
     with output.progress("build") as progress:
-        summary = build.build_store(parameters, out, progress=progress, **options)
+        summary = build.build_store(
+            parameters, out, progress=progress, **_by_work(output, parameters), **options
+        )
     _report(output, summary)
 
 
@@ -103,8 +109,16 @@ def align(output: Output, out: Path, **options: Any) -> None:
     from slatprep.pipeline import dataset as build
 
     with output.progress("align") as progress:
-        summary = build.align_pairs(parameters, out, progress=progress, **options)
+        summary = build.align_pairs(
+            parameters, out, progress=progress, **_by_work(output, parameters), **options
+        )
     _report(output, summary)
+
+
+def _by_work(output: Output, parameters: BuildParameters) -> dict[str, Any]:
+    """Return what keeps small builds from starting workers, and what tells of long beginnings."""
+    per_job = _ASSETS_PER_JOB if parameters.align.engine == "field" else 1
+    return {"assets_per_job": per_job, "note": output.note}
 
 
 def _show_plan(output: Output, plan: BuildPlan) -> None:

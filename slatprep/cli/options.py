@@ -201,7 +201,22 @@ verdicts_option = option(
     multiple=True,
 )
 
-jobs_option = option("--jobs", POSITIVE, 1, "Worker processes, of one thread each.")
+
+def _at_most_the_cores(_context: click.Context, _parameter: click.Parameter, jobs: int) -> int:
+    if jobs == 1:
+        return jobs
+    from joblib.externals.loky import cpu_count
+
+    return min(jobs, int(cpu_count()))
+
+
+jobs_option = option(
+    "--jobs",
+    POSITIVE,
+    1,
+    "Worker processes, of one thread each; no more than there are cores.",
+    callback=_at_most_the_cores,
+)
 
 
 def workers_options(command: _Function) -> _Function:

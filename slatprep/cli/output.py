@@ -33,6 +33,8 @@ _STYLES = {"good": "green", "doubtful": "yellow", "failed": "red"}
 
 _NO_LIMIT = 10_000
 _SECONDS_BETWEEN_LINES = 30.0
+_TELLING = 2
+"""From so many on the assets that are done say how long the others will take."""
 
 
 class Output:
@@ -85,17 +87,18 @@ class Output:
         self.table(title, tuple(cells), [tuple(cells.values())])
 
     @contextmanager
-    def progress(self, label: str) -> Iterator[Progress]:
+    def progress(self, label: str, unit: str = "assets") -> Iterator[Progress]:
         """Show how far a job is, on standard error, and how long it will still take.
 
         The time left comes from the assets that are done, none of which is
-        forgotten. Where standard error is no terminal, a line is printed
+        forgotten, and is not told before two are. Nothing done is a new
+        beginning. Where standard error is no terminal, a line is printed
         every half minute instead of a bar.
         """
         if self.verbosity < 0:
             yield lambda done, total: None
         elif not sys.stderr.isatty():
-            yield _progress_lines(label)
+            yield _progress_lines(label, unit)
         else:
             with _progress_bar(label) as update:
                 yield update
@@ -194,15 +197,17 @@ def _plain_table(
     click.echo()
 
 
-def _progress_lines(label: str) -> Progress:
+def _progress_lines(label: str, unit: str) -> Progress:
     start = last = time.monotonic()
 
     def update(done: int, total: int) -> None:
-        nonlocal last
+        nonlocal start, last
         now = time.monotonic()
-        if done and now - last >= _SECONDS_BETWEEN_LINES:
-            left = (now - start) / done * (total - done)
-            click.echo(f"{label}: {done:,} of {total:,} assets, {left:,.0f} s left", err=True)
+        if done == 0:
+            start = now
+        elif done >= _TELLING and now - last >= _SECONDS_BETWEEN_LINES:
+            left = _clock((now - start) / done * (total - done))
+            click.echo(f"{label}: {done:,} of {total:,} {unit}, {left} left", err=True)
             last = now
 
     return update
@@ -212,18 +217,36 @@ def _progress_lines(label: str) -> Progress:
 def _progress_bar(label: str) -> Iterator[Progress]:
     from rich import progress as rich
     from rich.console import Console
+    from rich.text import Text
 
-    with rich.Progress(
-        rich.TextColumn("{task.description}"),
-        rich.BarColumn(),
-        rich.MofNCompleteColumn(),
-        rich.TimeElapsedColumn(),
-        rich.TextColumn("left"),
-        rich.TimeRemainingColumn(),
-        console=Console(stderr=True),
-        # Assets differ in size by ten times, so a short memory would make the
-        # estimate jump; this one remembers all of them.
-        speed_estimate_period=math.inf,
-    ) as progress:
+    class Numbers(rich.ProgressColumn):
+        """How many are done, the time taken, and the time left once it can be told."""
+
+        def render(self, task: rich.Task) -> Text:
+            if task.total is None:
+                return Text("starting ...")
+            parts = [f"{task.completed:,.0f}/{task.total:,.0f}", _clock(task.elapsed or 0.0)]
+            if _TELLING <= task.completed < task.total:
+                parts.append(
+                    f"{_clock((task.elapsed or 0.0) * (task.total / task.completed - 1))} left"
+                )
+            return Text(" · ".join(parts))
+
+    console = Console(stderr=True)
+    columns = rich.TextColumn("{task.description}"), rich.BarColumn(), Numbers()
+    with rich.Progress(*columns, console=console) as progress:
         task = progress.add_task(label, total=None)
-        yield lambda done, total: progress.update(task, completed=done, total=total)
+
+        def update(done: int, total: int) -> None:
+            if done == 0:
+                progress.reset(task, total=total)
+            progress.update(task, completed=done, total=total)
+
+        yield update
+
+
+def _clock(seconds: float) -> str:
+    """Return a time as minutes and seconds, or hours, minutes and seconds."""
+    minutes, rest = divmod(round(seconds), 60)
+    hours, minutes = divmod(minutes, 60)
+    return f"{hours}:{minutes:02d}:{rest:02d}" if hours else f"{minutes}:{rest:02d}"

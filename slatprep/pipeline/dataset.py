@@ -16,6 +16,7 @@ from slatprep.parameters import BuildParameters
 from slatprep.pipeline.asset import fail_asset, finish_asset, process_asset
 from slatprep.pipeline.consensus import apply_consensus
 from slatprep.pipeline.context import BuildContext
+from slatprep.pipeline.kernels import compile_kernels
 from slatprep.pipeline.pack import dataset_ranges, given_ranges, pack_store
 from slatprep.pipeline.plan import Action, BuildPlan, PlannedAsset, plan_assets
 from slatprep.pipeline.previous import previous_build
@@ -31,7 +32,7 @@ from slatprep.readers import discover
 from slatprep.records import AssetPair, Normalization, Place
 from slatprep.storage.atomic import staged, writing
 from slatprep.store.writer import finish_store
-from slatprep.workers.local import Jobs, require_shared, run_unordered
+from slatprep.workers.local import Jobs, at_most, require_shared, run_unordered
 
 __all__ = [
     "BuildPlan",
@@ -46,6 +47,9 @@ __all__ = [
 Progress = Callable[[int, int], None]
 """Called with the assets done and the assets in all."""
 
+Note = Callable[[str], None]
+"""Called with a line for the user."""
+
 
 def build_store(
     parameters: BuildParameters,
@@ -56,7 +60,9 @@ def build_store(
     strict: bool = False,
     fresh: bool = False,
     keep_work: bool = False,
+    assets_per_job: int = 1,
     progress: Progress | None = None,
+    note: Note | None = None,
 ) -> BuildSummary:
     """Build a store of all assets of a dataset, or bring it up to date, with the records of how.
 
@@ -80,8 +86,12 @@ def build_store(
     keep_work : bool
         Keep each asset's arrays beside the store, about a megabyte an asset,
         so that the next build does not even read unchanged assets twice.
+    assets_per_job : int
+        Start no more processes than there are so many assets for.
     progress : callable, optional
         See `Progress`.
+    note : callable, optional
+        Gets lines for the user, such as what takes long before the first asset.
 
     Returns
     -------
@@ -103,8 +113,10 @@ def build_store(
         place.look()
         context = _context(parameters, work.spool, None if fresh else place.store, strict)
         pairs = _discover(parameters, jobs, work.scratch)
+        jobs = at_most(len(pairs) // assets_per_job, jobs)
         plan = _plan(pairs, context, jobs, progress)
         new, unchanged = _split(pairs, plan)
+        _compile(plan, jobs, note)
         assets = _finish(new, plan, context, jobs, progress)
         if is_current(plan, assets, context, given):
             return repeat_summary(assets, context, place, time.perf_counter() - begin)
@@ -163,7 +175,9 @@ def align_pairs(
     *,
     jobs: Jobs = 1,
     strict: bool = False,
+    assets_per_job: int = 1,
     progress: Progress | None = None,
+    note: Note | None = None,
 ) -> BuildSummary:
     """Align all assets of a dataset and write their records, without a store.
 
@@ -174,7 +188,7 @@ def align_pairs(
     out : str or Path
         JSON Lines file of asset records, sorted by asset id, in the form of a
         build's ``assets.jsonl``; ``normalization`` is null.
-    jobs, strict, progress
+    jobs, strict, assets_per_job, progress, note
         As for `build_store`.
 
     Returns
@@ -192,7 +206,9 @@ def align_pairs(
     with work_beside(out.absolute(), arrays=False) as work:
         context = _context(parameters, work.spool, None, strict)
         pairs = _discover(parameters, jobs, work.scratch)
+        jobs = at_most(len(pairs) // assets_per_job, jobs)
         plan = _plan(pairs, context, jobs, progress)
+        _compile(plan, jobs, note)
         assets = _finish(pairs, plan, context, jobs, progress)
         assets.sort(key=lambda asset: asset.asset_id)
         with writing(str(out), out.parent), staged(out) as file:
@@ -225,6 +241,13 @@ def _plan(
     return {asset.asset_id: asset for asset in plan_assets(pairs, context, jobs, progress)}
 
 
+def _compile(plan: Mapping[str, PlannedAsset], jobs: Jobs, note: Note | None) -> None:
+    """Compile before workers of this machine start, unless nothing will be aligned."""
+    aligns = any(asset.action is Action.ALIGN for asset in plan.values())
+    if isinstance(jobs, int) and (aligns or not plan):
+        compile_kernels(note)
+
+
 def _split(
     pairs: Iterable[AssetPair], plan: Mapping[str, PlannedAsset]
 ) -> tuple[list[AssetPair], list[AssetPair]]:
@@ -246,6 +269,8 @@ def _finish(
     """Bring assets into the spool; return what is kept of each, in no order."""
     tasks = ((pair, plan.get(pair.asset_id), context) for pair in pairs)
     assets: list[SpooledAsset | FailedAsset] = []
+    if progress:
+        progress(0, len(pairs))
     for asset in run_unordered(finish_asset, tasks, jobs, fail_asset):
         assets.append(asset)
         if progress:

@@ -103,6 +103,11 @@ def require_shared(jobs: Jobs, paths: Iterable[Place]) -> None:
         jobs.require_shared(paths)
 
 
+def at_most(most: int, jobs: Jobs) -> Jobs:
+    """Return a smaller number of processes where there is less work; never less than one."""
+    return max(1, min(jobs, most)) if isinstance(jobs, int) else jobs
+
+
 class _Processes(Pool):
     """Processes of this machine, which stay for whatever is run next.
 

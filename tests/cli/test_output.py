@@ -127,9 +127,21 @@ def test_time_left_in_a_log_comes_from_all_assets_done(
         update(7, 100)
         update(50, 100)
     assert capsys.readouterr().err.splitlines() == [
-        "build: 6 of 100 assets, 940 s left",
-        "build: 50 of 100 assets, 120 s left",
+        "build: 6 of 100 assets, 15:40 left",
+        "build: 50 of 100 assets, 2:00 left",
     ]
+
+
+def test_no_time_is_told_from_one_asset_or_from_what_came_before_the_first(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    clock = iter([0.0, 3600.0, 3640.0, 3680.0])
+    monkeypatch.setattr(module.time, "monotonic", lambda: next(clock))
+    with Output().progress("train", "steps") as update:
+        update(0, 100)
+        update(1, 100)
+        update(2, 100)
+    assert capsys.readouterr().err.splitlines() == ["train: 2 of 100 steps, 1:05:20 left"]
 
 
 def test_quiet_shows_no_progress(
@@ -146,4 +158,19 @@ def test_bar_on_a_terminal_counts_assets(monkeypatch: pytest.MonkeyPatch) -> Non
     monkeypatch.setattr(sys, "stderr", Terminal())
     with Output().progress("build") as update:
         update(3, 8)
-    assert "3/8" in sys.stderr.getvalue()  # type: ignore[attr-defined]
+    shown = sys.stderr.getvalue()  # type: ignore[attr-defined]
+    assert "3/8 · 0:00 · 0:00 left" in shown
+
+
+@pytest.mark.parametrize("done", [None, 0, 1])
+def test_bar_tells_no_time_left_before_it_can(
+    monkeypatch: pytest.MonkeyPatch, done: int | None
+) -> None:
+    monkeypatch.setenv("TERM", "xterm-256color")
+    monkeypatch.setattr(sys, "stderr", Terminal())
+    with Output().progress("build") as update:
+        if done is not None:
+            update(done, 8)
+    shown = sys.stderr.getvalue()  # type: ignore[attr-defined]
+    assert "left" not in shown
+    assert ("starting" if done is None else f"{done}/8") in shown

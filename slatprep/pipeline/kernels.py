@@ -1,0 +1,64 @@
+"""Compile the kernels once, before the workers of a build start.
+
+Numba compiles a kernel when it is first called and keeps it on disk. Workers
+that start without it would each compile all of them, at the same time.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from slatprep.align import align
+from slatprep.align.deformation import map_of
+from slatprep.geometry.voxels import voxels_of
+from slatprep.judge import judge_with_voxels
+from slatprep.parameters import AlignParameters, SampleParameters
+from slatprep.records import RESOLUTION, MaterialField, StructuredLatents
+from slatprep.sample import sample
+
+
+def compile_kernels(note: Callable[[str], None] | None = None) -> None:
+    """Have all kernels of alignment, sampling and judgement on disk, compiled.
+
+    Parameters
+    ----------
+    note : callable, optional
+        Gets a line to show when something has to be compiled, which takes
+        about 20 s in all; otherwise this takes 1 s.
+    """
+    from numba.core import event
+
+    class Told(event.Listener):  # type: ignore[misc]
+        told = False
+
+        def on_start(self, event: Any) -> None:
+            if note and not self.told:
+                note("compiling the numerical kernels, once after installing: about 20 s")
+            self.told = True
+
+        def on_end(self, event: Any) -> None:
+            pass
+
+    with event.install_listener("numba:compile", Told()):
+        _process_a_bent_shape()
+
+
+def _process_a_bent_shape() -> None:
+    """Align, sample and judge an L whose SLAT is bent, so that it is deformed as well."""
+    occupied = np.zeros((RESOLUTION,) * 3, dtype=bool)
+    occupied[20:44, 22:36, 26:34] = occupied[20:26, 22:36, 34:50] = True
+    voxels = voxels_of(occupied)
+    count = len(voxels)
+    field = MaterialField(
+        occupied, voxels, np.zeros(count, np.uint8), np.ones((count, 3), np.float32)
+    )
+    bent = voxels.copy()
+    bent[:, 2] += ((bent[:, 0] - 20) ** 2 // 100).astype(np.uint8)
+    latents = StructuredLatents(bent, np.zeros((count, 8), np.float32))
+    alignment = align(field, latents, AlignParameters(model="deformable"))
+    places = map_of(alignment).places(latents.coords)
+    annotation = sample(field, places, SampleParameters())
+    judge_with_voxels(field, latents, alignment, annotation, SampleParameters())

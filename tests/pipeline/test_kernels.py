@@ -1,0 +1,75 @@
+"""Kernels are compiled once, before any worker starts, and the user is told."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from support.synthetic import Dataset
+
+from slatprep.pipeline.dataset import build_store
+from slatprep.workers import local
+from slatprep.workers.local import at_most
+
+# Numba says of every kernel that it compiles; what it finds on disk it does not name.
+SCRIPT = """
+import sys
+from pathlib import Path
+from numba.core import event
+from slatprep.demo import make_demo
+from slatprep.parameters.files import load_parameters
+from slatprep.pipeline.dataset import build_store
+from slatprep.pipeline.kernels import compile_kernels
+
+compiled = []
+
+class Listener(event.Listener):
+    def on_start(self, event):
+        compiled.append(event.data["dispatcher"].py_func.__qualname__)
+    def on_end(self, event):
+        pass
+
+root = Path(sys.argv[1])
+notes = []
+with event.install_listener("numba:compile", Listener()):
+    compile_kernels(notes.append)
+    assert compiled and len(notes) == 1, (compiled, notes)
+    compile_kernels(notes.append)
+    assert len(notes) == 1, notes
+    del compiled[:]
+    make_demo(root / "demo", 8, 3, levels=(0, 1, 2, 3, 4, 5, 6, 7))
+    build_store(load_parameters(root / "demo" / "dataset.toml"), root / "s.zarr")
+    assert not compiled, compiled
+"""
+
+
+def test_a_build_compiles_nothing_that_was_not_compiled_before_it(tmp_path: Path) -> None:
+    environment = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path / "cache")}
+    done = subprocess.run(
+        [sys.executable, "-c", SCRIPT, str(tmp_path)],
+        capture_output=True, text=True, check=False, env=environment,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+
+
+def test_jobs_are_no_more_than_there_is_work_for() -> None:
+    assert [at_most(assets // 20, 8) for assets in (0, 19, 40, 159, 1000)] == [1, 1, 2, 7, 8]
+    cluster = object()
+    assert at_most(1, cluster) is cluster  # type: ignore[arg-type]
+
+
+def test_few_assets_start_no_process(
+    make_dataset: Callable[..., Dataset], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(number: int) -> None:
+        raise AssertionError(f"{number} processes for two assets")
+
+    monkeypatch.setattr(local, "_Processes", refuse)
+    summary = build_store(
+        make_dataset("a", "b").parameters(), tmp_path / "s.zarr", jobs=4, assets_per_job=20
+    )
+    assert summary.complete
