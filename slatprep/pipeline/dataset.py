@@ -45,7 +45,7 @@ __all__ = [
 ]
 
 Progress = Callable[[int, int], None]
-"""Called with the assets done and the assets in all."""
+"""Called with the assets done and the assets in all; at the beginning with none done."""
 
 Note = Callable[[str], None]
 """Called with a line for the user."""
@@ -269,7 +269,7 @@ def _finish(
     """Bring assets into the spool; return what is kept of each, in no order."""
     tasks = ((pair, plan.get(pair.asset_id), context) for pair in pairs)
     assets: list[SpooledAsset | FailedAsset] = []
-    if progress:
+    if progress and pairs:
         progress(0, len(pairs))
     for asset in run_unordered(finish_asset, tasks, jobs, fail_asset):
         assets.append(asset)
