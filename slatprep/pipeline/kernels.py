@@ -31,7 +31,7 @@ def compile_kernels(note: Callable[[str], None] | None = None) -> None:
     """
     from numba.core import event
 
-    class Told(event.Listener):  # type: ignore[misc]
+    class Told(event.Listener):
         told = False
 
         def on_start(self, event: Any) -> None:
