@@ -215,7 +215,7 @@ def _assets(store: Store) -> dict[str, Any]:
     for name in ("id", *COLUMNS):
         column = store.column(name)
         kind = "sc:Float" if column.dtype.kind == "f" else "sc:Text"
-        fields[name] = kind, group[name].attrs["description"]
+        fields[name] = kind, str(group[name].attrs.get("description", ""))
         # JSON has no NaN, the one value that is not equal to itself: null stands for it.
         columns.append([value if value == value else None for value in column.tolist()])
     fields["first_row"] = "sc:Integer", "its first row of voxel/*"

@@ -21,6 +21,13 @@ Positive = Annotated[float, Gt(0)]
 PositiveInt = Annotated[int, Gt(0)]
 """A whole number above 0."""
 
+MAX_VOXEL_CHUNK, MAX_VOXEL_SHARD, MAX_GRID_SHARD = 2**20, 2**28, 2**16
+"""Rows of one chunk and of one shard of the voxel arrays, assets of one shard of the grids:
+what a store may have to be read, and so what it may be told to be built with."""
+
+MAX_SHARD_CHUNKS = 2**20
+"""Chunks of one shard, whose index a reader holds in memory."""
+
 
 class _Group:
     """What `slatprep.parameters.files` has pydantic refuse in every group."""
@@ -170,10 +177,17 @@ class NormalizeParameters(_Group):
 class StoreParameters(_Group):
     """Chunks and shards of the store, in rows (voxel arrays) and assets (grid arrays)."""
 
-    voxel_chunk: PositiveInt = 4_096
-    voxel_chunks_per_shard: PositiveInt = 4_096
-    grid_assets_per_shard: PositiveInt = 512
+    voxel_chunk: Annotated[int, Gt(0), Le(MAX_VOXEL_CHUNK)] = 4_096
+    voxel_chunks_per_shard: Annotated[int, Gt(0), Le(MAX_SHARD_CHUNKS)] = 4_096
+    grid_assets_per_shard: Annotated[int, Gt(0), Le(MAX_GRID_SHARD)] = 512
     compression_level: Annotated[int, Ge(0), Le(22)] = 1
+
+    def __post_init__(self) -> None:
+        if self.voxel_chunk * self.voxel_chunks_per_shard > MAX_VOXEL_SHARD:
+            raise ValueError(
+                f"voxel_chunk times voxel_chunks_per_shard is above {MAX_VOXEL_SHARD} rows; "
+                "make either smaller"
+            )
 
 
 @dataclass(frozen=True)

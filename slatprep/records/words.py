@@ -8,6 +8,10 @@ RESOLUTION = 64
 """Voxels along each axis of both frames."""
 
 
+MAX_NAME_BYTES = 1024
+"""No id, view, category or name of a file is longer, in UTF-8."""
+
+
 MATERIAL_CLASSES = (
     "jelly",
     "metal",

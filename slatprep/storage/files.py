@@ -15,6 +15,7 @@ if TYPE_CHECKING:
 
 
 _AT = os.open in os.supports_dir_fd
+_NO_WAITING = getattr(os, "O_NONBLOCK", 0)  # a pipe's reader would wait for a writer
 
 
 class LocalFile(FileIO):
@@ -65,19 +66,39 @@ class LocalFolder:
         return LocalFile(name, opener=self._open_at)
 
     def _open_at(self, name: str, flags: int) -> int:
-        # A pipe in a shard's place must not make the reader wait for a writer.
-        return os.open(name, flags | os.O_NONBLOCK, dir_fd=self._descriptor)
+        return os.open(name, flags | _NO_WAITING, dir_fd=self._descriptor)
 
     def __del__(self) -> None:
         if getattr(self, "_descriptor", None) is not None:
             os.close(self._descriptor)  # type: ignore[arg-type]
 
 
+def open_regular(path: Path) -> LocalFile:
+    """Open a regular file for reading, without buffer; whatever else lies there is not waited for.
+
+    Raises
+    ------
+    OSError
+        If there is none, or it is a folder, pipe or device.
+    """
+    file = LocalFile(os.open(path, os.O_RDONLY | _NO_WAITING))
+    try:
+        file.size()
+    except OSError:
+        file.close()
+        raise
+    return file
+
+
+LINK, OTHER = -1, -2
+"""In place of a size: a symbolic link; a pipe, device or socket."""
+
+
 def local_files(path: Path) -> dict[str, int]:
     """Return every file below a folder and its size in bytes.
 
     Names have forward slashes and are sorted by folder. Links are not followed;
-    their size is -1.
+    their size is `LINK`, that of what is no regular file `OTHER`.
     """
     found = {}
     for folder, folders, files in os.walk(path):
@@ -85,12 +106,13 @@ def local_files(path: Path) -> dict[str, int]:
         links = [name for name in folders if Path(folder, name).is_symlink()]
         for name in sorted([*files, *links]):
             file = Path(folder, name)
-            size = -1 if file.is_symlink() else file.stat().st_size
-            found[file.relative_to(path).as_posix()] = size
+            state = file.lstat()
+            size = state.st_size if stat.S_ISREG(state.st_mode) else OTHER
+            found[file.relative_to(path).as_posix()] = LINK if stat.S_ISLNK(state.st_mode) else size
     return found
 
 
 def file_digest(place: Place) -> str:
     """Return the SHA-256 of a file, in hex."""
-    with place.open("rb") as file:
+    with open_regular(place) if isinstance(place, Path) else place.open("rb") as file:
         return hashlib.file_digest(cast(BytesIO, file), "sha256").hexdigest()

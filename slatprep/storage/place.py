@@ -7,20 +7,20 @@ two ways is a method of `Storage`, and only this module asks which it is.
 
 from __future__ import annotations
 
-import os
+import io
 import re
 import stat
 import tempfile
 from collections.abc import Iterator
 from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path, PurePosixPath
-from typing import TYPE_CHECKING, TypeGuard
+from typing import IO, TYPE_CHECKING, TypeGuard
 
 from slatprep.errors import InputError
 from slatprep.storage.atomic import staged
 from slatprep.storage.cache import cached_file, folder_for
 from slatprep.storage.copies import copied_version
-from slatprep.storage.files import LocalFile, LocalFolder, local_files
+from slatprep.storage.files import LocalFile, LocalFolder, local_files, open_regular
 from slatprep.storage.listing import Listing, RemoteListing
 from slatprep.storage.remote import RemoteFile, RemoteFolder, RemotePlace, list_objects
 from slatprep.storage.versions import current_version
@@ -95,7 +95,7 @@ class Storage:
         self.local = self._path = path
 
     def files(self) -> dict[str, int]:
-        """Return the names of all files below the place, and their bytes; -1 for a link."""
+        """Return the names of all files below the place, and their bytes; see `local_files`."""
         return local_files(self._path)
 
     def listing(self) -> Listing:
@@ -132,11 +132,21 @@ class Storage:
             raise InputError(path, "is not a regular file", "a readable file")
         return resolved, relative.as_posix()
 
+    def open(self) -> IO[bytes]:
+        """Open a file for reading.
+
+        Raises
+        ------
+        OSError
+            If there is none, or it is a folder, pipe or device.
+        """
+        return io.BufferedReader(open_regular(self._path))
+
     def read(self, limit: int) -> bytes:
         """Read a file up to one byte more than `limit`, by which one that is larger is known."""
-        with self._path.open("rb") as file:
+        with open_regular(self._path) as file:
             # read() would allocate all that it is allowed to return.
-            return file.read(min(os.fstat(file.fileno()).st_size, limit + 1))
+            return file.pread(min(file.size(), limit + 1), 0)
 
     def size(self) -> int:
         """Return the bytes of a file."""
@@ -190,6 +200,9 @@ class _ObjectStore(Storage):
         if name == str(file) or {".", ".."} & set(name.split("/")):
             raise InputError(file, "is no plain name below its root", "a name without '..'")
         return file, name
+
+    def open(self) -> IO[bytes]:
+        return self.place.open("rb")
 
     def read(self, limit: int) -> bytes:
         return RemoteFile(self.place).pread(limit + 1, 0)

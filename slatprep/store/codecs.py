@@ -41,22 +41,33 @@ class ChunkDecoder:
         ``blosc``, ``zstd`` or empty.
     crc32c : bool
         Whether a checksum ends each chunk.
-    text : bool
-        Whether the chunks hold strings (``vlen-utf8``); `dtype` is object then.
+    text : int
+        Bytes that the strings (``vlen-utf8``) of a chunk may have on average; 0 where
+        the chunks hold numbers, else `dtype` is object.
     """
 
     dtype: np.dtype[Any]
     shape: tuple[int, ...]
     compressor: str
     crc32c: bool
-    text: bool = False
+    text: int = 0
 
     @classmethod
     def of(
-        cls, dtype: np.dtype[Any], shape: tuple[int, ...], codecs: Sequence[Mapping[str, Any]]
-    ) -> ChunkDecoder | None:
-        """Return the decoder for a list of codecs as ``zarr.json`` has it, or None."""
-        text = dtype.hasobject
+        cls,
+        dtype: np.dtype[Any],
+        shape: tuple[int, ...],
+        codecs: Sequence[Mapping[str, Any]],
+        max_text: int,
+    ) -> ChunkDecoder:
+        """Return the decoder for a list of codecs as ``zarr.json`` has it.
+
+        Raises
+        ------
+        ValueError
+            If the codecs are others than slatprep's, or in another order.
+        """
+        text = max_text if dtype.hasobject else 0
         first, rest = codecs[0], [codec["name"] for codec in codecs[1:]]
         little = first.get("configuration", {}).get("endian", "little") == "little"
         if first["name"] == ("vlen-utf8" if text else "bytes") and little:
@@ -64,7 +75,7 @@ class ChunkDecoder:
             compressors = rest[:-1] if crc32c else rest
             if compressors in ([], ["blosc"], ["zstd"]):
                 return cls(dtype, shape, "".join(compressors), crc32c, text)
-        return None
+        raise ValueError(f"codecs {[first['name'], *rest]}")
 
     @cached_property
     def nbytes(self) -> int:
@@ -105,8 +116,9 @@ class ChunkDecoder:
     def _strings(self, payload: memoryview, held: int) -> NDArray[Any]:
         from numcodecs import VLenUTF8
 
-        if not 4 <= held <= MAX_TEXT_BYTES:
-            raise StoreError(f"it holds {held} bytes; expected at most {MAX_TEXT_BYTES}")
+        limit = min(MAX_TEXT_BYTES, 4 + self.shape[0] * (4 + self.text))
+        if not 4 <= held <= limit:
+            raise StoreError(f"it holds {held} bytes; expected at most {limit}")
         text = np.empty(held, np.uint8)
         _unpack(payload, self.compressor, text)
         count = int(text[:4].view("<u4")[0])

@@ -6,14 +6,16 @@ A store may come from a stranger. These checks cost no read beyond the root's
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
 from slatprep.errors import StoreError
+from slatprep.parameters import MAX_GRID_SHARD, MAX_VOXEL_CHUNK, MAX_VOXEL_SHARD
 from slatprep.records import MATERIAL_CLASSES, PROPERTY_COLUMNS, RESOLUTION, Place
+from slatprep.storage.documents import read_document
+from slatprep.store.digests import GROUP
 from slatprep.store.layout import (
     ARRAYS,
     ASSET_CHUNK,
@@ -22,6 +24,7 @@ from slatprep.store.layout import (
     READABLE_VERSIONS,
     ArrayLayout,
 )
+from slatprep.store.records import RECORD_ARRAY
 
 MAX_METADATA_BYTES = 16 * 2**20
 """No zarr.json is larger: all metadata of a store take about 50 kB."""
@@ -29,8 +32,19 @@ MAX_METADATA_BYTES = 16 * 2**20
 MAX_VOXELS = RESOLUTION**3
 """Rows of one asset: each coordinate occurs once."""
 
-_MAX_CHUNK_ROWS = {"asset": ASSET_CHUNK, "voxel": 2**20, "grid": 16}
-_MAX_SHARD_ROWS = {"asset": ASSET_CHUNK, "voxel": 2**28, "grid": 2**16}
+MAX_ASSETS, MAX_FILES = 2**24, 2**20
+
+MIN_ASSET_BYTES = 256
+"""No asset takes less of a store's files: its record alone, packed, has more. By this the number
+of assets that a store claims is held against the bytes that are there."""
+
+_MAX_CHUNK_ROWS = {"asset": ASSET_CHUNK, "voxel": MAX_VOXEL_CHUNK, "grid": 16, GROUP: MAX_FILES}
+_MAX_SHARD_ROWS = {
+    "asset": ASSET_CHUNK,
+    "voxel": MAX_VOXEL_SHARD,
+    "grid": MAX_GRID_SHARD,
+    GROUP: MAX_FILES,
+}
 _ZARR_NAMES = {"str": "string"}
 
 
@@ -66,19 +80,12 @@ def read_metadata(path: Place) -> dict[str, Any]:
     Raises
     ------
     StoreError
-        If it is missing, too large, or no JSON object.
+        If it is missing, too large, nested too deeply, or no JSON object.
     """
     try:
-        with path.open("rb") as file:
-            data = file.read(MAX_METADATA_BYTES + 1)
-        if len(data) > MAX_METADATA_BYTES:
-            raise ValueError(f"larger than {MAX_METADATA_BYTES >> 20} MiB")
-        document = json.loads(data.decode("utf-8"))
-        if not isinstance(document, dict):
-            raise ValueError("no JSON object")
-    except (OSError, ValueError, RecursionError) as error:
+        return read_document(path, MAX_METADATA_BYTES)
+    except (OSError, ValueError) as error:
         raise StoreError(f"{path}: cannot be read as metadata ({error})") from None
-    return document
 
 
 def attribute_findings(attributes: Mapping[str, Any]) -> Iterator[Finding]:
@@ -165,9 +172,12 @@ def dimension_sizes(metadata: Mapping[str, Any]) -> dict[str, int]:
     """
     sizes = dict(FIXED_SIZES)
     for name, dimension, limit in (
-        ("asset/id", "asset", 2**24),
+        ("asset/id", "asset", MAX_ASSETS),
         ("voxel/coords", "voxel", 2**40),
+        (f"{GROUP}/name", "file", MAX_FILES),
     ):
+        if dimension == "file" and name not in metadata:
+            continue
         try:
             rows = metadata[name]["shape"][0]
         except (KeyError, TypeError, IndexError):
@@ -234,4 +244,14 @@ def _is_range(entry: object) -> bool:
     )
 
 
-_LAYOUTS = {layout.name: layout for layout in ARRAYS}
+_LAYOUTS = {
+    layout.name: layout
+    for layout in (
+        *ARRAYS,
+        ArrayLayout(RECORD_ARRAY, "str", ("asset",), "", ""),
+        *(
+            ArrayLayout(f"{GROUP}/{name}", dtype, ("file",), "", "")
+            for name, dtype in (("name", "str"), ("size", "int64"), ("sha256", "str"))
+        ),
+    )
+}

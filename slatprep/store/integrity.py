@@ -7,7 +7,7 @@ from typing import Any
 
 from slatprep.errors import StoreError
 from slatprep.records import Place
-from slatprep.storage.files import file_digest
+from slatprep.storage.files import LINK, file_digest
 from slatprep.storage.place import storage_of
 from slatprep.store.contract import (
     Finding,
@@ -17,11 +17,10 @@ from slatprep.store.contract import (
     read_metadata,
 )
 from slatprep.store.digests import ATTRIBUTES, attributes_digest, is_own
+from slatprep.store.gate import GROUPS, gate_findings
 from slatprep.store.layout import READABLE_VERSIONS, arrays_of
 from slatprep.store.reader import Store
 from slatprep.workers.local import Jobs, run_unordered
-
-_GROUPS = ("asset", "voxel", "grid", "file")
 
 
 def metadata_findings(path: Place) -> Iterator[Finding]:
@@ -42,7 +41,9 @@ def metadata_findings(path: Place) -> Iterator[Finding]:
     arrays: dict[str, Any] = {}
     files = storage_of(path).files()
     present = {name.removesuffix("/zarr.json") for name in files if _is_metadata(name)}
-    for name in sorted({*present, *copies, *(layout.name for layout in layouts), *_GROUPS}):
+    for name, copy in copies.items():
+        yield from gate_findings(name, copy)
+    for name in sorted({*present, *copies, *(layout.name for layout in layouts), *GROUPS}):
         where = f"{name}/zarr.json"
         if name not in present:
             yield Finding(where, "", "is missing", "the metadata of an array or group")
@@ -52,6 +53,7 @@ def metadata_findings(path: Place) -> Iterator[Finding]:
         except StoreError as error:
             yield Finding(where, "", str(error), "readable metadata")
             continue
+        yield from gate_findings(name, arrays[name])
         if not _same(arrays[name], copies.get(name)):
             yield Finding(where, "", "differs from its copy in zarr.json", "the same metadata")
     try:
@@ -106,7 +108,7 @@ def file_findings(store: Store, jobs: Jobs) -> tuple[int, set[Finding]]:
 def _compare(path: Place, name: str, found: int, size: int, digest: str) -> tuple[str, str, str]:
     """Return a file's name, what is wrong with it, and its digest."""
     if found < 0:
-        return name, "is a link", ""
+        return name, "is a link" if found == LINK else "is no regular file", ""
     if found != size:
         how = "was cut short" if found < size else "was extended"
         return name, f"{how}: it has {found} of {size} bytes", ""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import difflib
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
@@ -18,14 +18,9 @@ from slatprep.normalize import denormalize_properties
 from slatprep.records import BACKGROUND, MaterialField, Normalization, Place, PropertyRange
 from slatprep.storage.place import place_of, storage_of
 from slatprep.storage.versions import store_name
-from slatprep.store.contract import (
-    MAX_VOXELS,
-    dimension_sizes,
-    read_metadata,
-    size_findings,
-)
+from slatprep.store.arrays import Arrays
+from slatprep.store.contract import MAX_VOXELS, read_metadata
 from slatprep.store.layout import ARRAYS, FORMAT, READABLE_VERSIONS
-from slatprep.store.shard_reader import RowReader
 
 if TYPE_CHECKING:
     import zarr
@@ -149,10 +144,8 @@ class Store:
     def __init__(self, path: Place, document: dict[str, Any]) -> None:
         self.path = path
         self.attributes: dict[str, Any] = document["attributes"]
-        self._folder = storage_of(path).folder()
-        self._metadata = _consolidated(document)
+        self._arrays = Arrays(path, document)
         self._columns: dict[str, NDArray[Any]] = {}
-        self._readers: dict[str, RowReader | None] = {}
 
     def __reduce__(self) -> tuple[Any, ...]:
         return (open_store, (self.path,))
@@ -173,12 +166,16 @@ class Store:
         """Version of the format that it was written in."""
         return int(self.attributes["format_version"])
 
-    @cached_property
+    @property
     def group(self) -> zarr.Group:
-        """The root as zarr-python has it, for everything this class does not offer."""
-        import zarr
+        """The root as zarr-python has it, for everything this class does not offer.
 
-        return zarr.open_group(str(self.path), mode="r", zarr_format=3)
+        Raises
+        ------
+        StoreError
+            If its metadata name anything that `slatprep.store.gate` does not allow.
+        """
+        return self._arrays.group
 
     @cached_property
     def ids(self) -> list[str]:
@@ -322,51 +319,11 @@ class Store:
         StoreError
             If there is no such array or row, or a file is missing or damaged.
         """
-        if name not in self._readers:
-            self._readers[name] = self.reader(name)
-        reader = self._readers[name]
-        if reader is None:
-            array: Any = self.group[name]
-            return np.asarray(array[start:stop])
-        return reader.read(start, stop)
+        return self._arrays.reader(name).read(start, stop)
 
     def shape(self, name: str) -> tuple[int, ...]:
         """Return the shape of an array, from its metadata alone."""
-        self.reader(name)
-        return tuple(self._metadata[name]["shape"])
-
-    def reader(self, name: str) -> RowReader | None:
-        """Return a direct reader of an array, by its full name.
-
-        Returns
-        -------
-        RowReader or None
-            None where the array is not cut and packed as slatprep does it; then
-            zarr-python reads it.
-
-        Raises
-        ------
-        StoreError
-            If there is no such array, or its metadata claim another size than
-            the contract has, or unreasonably large chunks.
-        """
-        for needed in ("asset/id", "voxel/coords", name):
-            self._metadata.setdefault(needed, self._array_metadata(needed))
-        try:
-            sizes = dimension_sizes(self._metadata)
-        except StoreError as error:
-            raise StoreError(f"{self.path}/{error}") from None
-        for finding in size_findings(name, self._metadata[name], sizes):
-            raise StoreError(f"{self.path}/{finding}; run `slatprep verify`")
-        return RowReader.of(self._folder, name, self._metadata[name])
-
-    def _array_metadata(self, name: str) -> Mapping[str, Any]:
-        if name in self._metadata:
-            return self._metadata[name]
-        file = self.path / name / "zarr.json"
-        if not file.exists():
-            raise StoreError(f"{self.path} lacks the array {name}; build it again")
-        return read_metadata(file)
+        return self._arrays.reader(name).shape
 
 
 def open_store(path: str | Place, *, copy: bool = False) -> Store:
@@ -436,9 +393,3 @@ def _root_document(path: Place) -> dict[str, Any]:
     except StoreError:
         return {}
     return document if isinstance(document.get("attributes"), dict) else {}
-
-
-def _consolidated(document: Mapping[str, Any]) -> dict[str, Mapping[str, Any]]:
-    gathered = document.get("consolidated_metadata") or {}
-    metadata = gathered.get("metadata", {}) if isinstance(gathered, dict) else {}
-    return dict(metadata) if isinstance(metadata, dict) else {}

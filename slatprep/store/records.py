@@ -14,6 +14,9 @@ import numpy as np
 
 RECORD_ARRAY = "asset/record"
 
+MAX_RECORD_BYTES = 2**20
+"""No record is larger; most take some 10 kB."""
+
 RECORDS_IN_CHUNK = 64
 RECORDS_IN_SHARD = 1024
 """About 10 MB of text: what the parent holds at a time."""

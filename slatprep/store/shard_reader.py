@@ -19,8 +19,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slatprep.errors import StoreError
+from slatprep.parameters import MAX_SHARD_CHUNKS
+from slatprep.records import MAX_NAME_BYTES
 from slatprep.storage.place import Folder, RangeFile
 from slatprep.store.codecs import MAX_TEXT_BYTES, ChunkDecoder, crc32c_holds
+from slatprep.store.records import MAX_RECORD_BYTES, RECORD_ARRAY
 
 MISSING = 2**64 - 1
 """Offset and length of a chunk that was never written: it holds the fill value."""
@@ -35,8 +38,8 @@ MAX_CHUNK_BYTES = 256 * 2**20
 """What one chunk may unpack to; a grid's takes 3 MiB."""
 
 
-MAX_CHUNKS = 2**20
-"""Chunks of one shard, whose index is held in memory."""
+MAX_TEXT = {RECORD_ARRAY: MAX_RECORD_BYTES}
+"""What the texts of a chunk may have on average, where that is more than a name may have."""
 
 
 class DamagedFileError(StoreError):
@@ -112,13 +115,13 @@ class RowReader:
         self.optional = self.name.startswith("asset/") and self.name != "asset/offset"
 
     @classmethod
-    def of(cls, folder: Folder, name: str, metadata: Mapping[str, Any]) -> RowReader | None:
-        """Return a reader for an array with this ``zarr.json``, or None if it is of another kind.
+    def of(cls, folder: Folder, name: str, metadata: Mapping[str, Any]) -> RowReader:
+        """Return a reader for an array with this ``zarr.json``.
 
         Raises
         ------
         StoreError
-            If the metadata make no sense.
+            If the metadata make no sense, or the array is not cut and packed as slatprep does it.
         """
         try:
             return cls._of(folder, name, metadata)
@@ -126,10 +129,8 @@ class RowReader:
             raise StoreError(f"{folder.path}/{name}: bad metadata ({error!r})") from None
 
     @classmethod
-    def _of(cls, folder: Folder, name: str, metadata: Mapping[str, Any]) -> RowReader | None:
+    def _of(cls, folder: Folder, name: str, metadata: Mapping[str, Any]) -> RowReader:
         text = metadata["data_type"] == "string"
-        if not text and metadata["data_type"] not in _DTYPES:
-            return None
         dtype = np.dtype(object) if text else np.dtype(metadata["data_type"]).newbyteorder("<")
         shape = tuple(map(int, metadata["shape"]))
         outer = tuple(map(int, metadata["chunk_grid"]["configuration"]["chunk_shape"]))
@@ -141,15 +142,13 @@ class RowReader:
             index_codecs = [codec["name"] for codec in sharding["index_codecs"]]
             at_end = sharding.get("index_location", "end") == "end"
             if index_codecs != _INDEX_CODECS or not at_end or len(metadata["codecs"]) > 1:
-                return None
+                raise ValueError("shards with another index")
         whole_rows = outer[1:] == inner[1:] == shape[1:] and inner[0] > 0 == outer[0] % inner[0]
         if not whole_rows or metadata["chunk_key_encoding"] not in _KEYS:
-            return None
+            raise ValueError("chunks that are no whole rows, or files with other names")
         fill_value = np.array(metadata["fill_value"], object).astype(dtype)
-        decoder = ChunkDecoder.of(dtype, inner, codecs)
-        if decoder is None:
-            return None
-        if decoder.nbytes > MAX_CHUNK_BYTES or outer[0] // inner[0] > MAX_CHUNKS:
+        decoder = ChunkDecoder.of(dtype, inner, codecs, MAX_TEXT.get(name, MAX_NAME_BYTES))
+        if decoder.nbytes > MAX_CHUNK_BYTES or outer[0] // inner[0] > MAX_SHARD_CHUNKS:
             raise ValueError(f"chunks of {inner} in shards of {outer}")
         return cls(folder, name, shape, outer[0], sharded, decoder, fill_value)
 
@@ -270,7 +269,6 @@ class RowReader:
         return DamagedFileError(self.folder.path, self.key(number), fault, "the file as written")
 
 
-_DTYPES = ("bool", "uint8", "int64", "float32", "float64")
 _KEYS = (
     {"name": "default"},
     {"name": "default", "configuration": {"separator": "/"}},

@@ -1,0 +1,55 @@
+"""JSON documents from strangers, read with bounds on their size and their depth."""
+
+from __future__ import annotations
+
+from itertools import chain
+from typing import Any
+
+import orjson
+
+from slatprep.records import Place
+from slatprep.storage.place import storage_of
+
+MAX_DEPTH = 64
+"""Objects and lists within each other; a store's metadata have a dozen."""
+
+
+def read_bounded(place: Place, limit: int) -> bytes:
+    """Read a file whole.
+
+    Raises
+    ------
+    OSError
+        If it cannot be read, or is no regular file.
+    ValueError
+        If it has more than `limit` bytes.
+    """
+    data = storage_of(place).read(limit)
+    if len(data) > limit:
+        raise ValueError(f"larger than {limit / 2**20:g} MiB")
+    return data
+
+
+def parse_document(data: bytes | str) -> dict[str, Any]:
+    """Return a JSON object, all of whose texts are Unicode.
+
+    Raises
+    ------
+    ValueError
+        If it is none, or nested more deeply than `MAX_DEPTH`.
+    """
+    document = orjson.loads(data)
+    if not isinstance(document, dict):
+        raise ValueError("no JSON object")
+    level: list[Any] = [document]
+    for _ in range(MAX_DEPTH):
+        inner = (value.values() if isinstance(value, dict) else value for value in level)
+        level = [value for value in chain.from_iterable(inner) if isinstance(value, dict | list)]
+        if not level:
+            return document
+    raise ValueError(f"nested more deeply than {MAX_DEPTH} levels")
+
+
+def read_document(place: Place, limit: int) -> dict[str, Any]:
+    """Read a file that holds one JSON object; see `read_bounded` and `parse_document`."""
+    return parse_document(read_bounded(place, limit))

@@ -1,0 +1,107 @@
+"""The arrays of a store by name: what their metadata claim is checked before anything is read."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from functools import cached_property
+from typing import TYPE_CHECKING, Any
+
+from slatprep.errors import StoreError
+from slatprep.records import Place
+from slatprep.storage.place import storage_of
+from slatprep.store.contract import (
+    MIN_ASSET_BYTES,
+    Finding,
+    dimension_sizes,
+    read_metadata,
+    size_findings,
+)
+from slatprep.store.digests import GROUP
+from slatprep.store.gate import NAMES, gate_findings
+from slatprep.store.layout import ASSET_CHUNK
+from slatprep.store.shard_reader import RowReader
+
+if TYPE_CHECKING:
+    import zarr
+
+
+class Arrays:
+    """What is below the root of a store.
+
+    Parameters
+    ----------
+    path : Place
+        The store.
+    document : mapping
+        The root's ``zarr.json``.
+    """
+
+    def __init__(self, path: Place, document: Mapping[str, Any]) -> None:
+        self.path = path
+        self._folder = storage_of(path).folder()
+        gathered = document.get("consolidated_metadata")
+        metadata = gathered.get("metadata") if isinstance(gathered, dict) else None
+        self._metadata: dict[str, Any] = dict(metadata) if isinstance(metadata, dict) else {}
+        self._readers: dict[str, RowReader] = {}
+
+    @cached_property
+    def group(self) -> zarr.Group:
+        """The root as zarr-python has it; StoreError where `slatprep.store.gate` refuses it."""
+        import zarr
+
+        self._refuse(f for entry in self._metadata.items() for f in gate_findings(*entry))
+        try:
+            # Consolidated, so that zarr-python reads no metadata but those just looked at.
+            return zarr.open_group(str(self.path), mode="r", zarr_format=3, use_consolidated=True)
+        except (KeyError, TypeError, ValueError, AttributeError, OSError) as error:
+            raise StoreError(f"{self.path}: bad metadata ({error!r})") from None
+
+    def reader(self, name: str) -> RowReader:
+        """Return the reader of an array, by its full name.
+
+        Raises
+        ------
+        StoreError
+            If there is no such array, or its metadata claim another size than
+            the contract has, unreasonably large chunks, or codecs that slatprep does not use.
+        """
+        if name not in self._readers:
+            self._readers[name] = self._checked(name)
+        return self._readers[name]
+
+    def _checked(self, name: str) -> RowReader:
+        of_files = (f"{GROUP}/name",) if name.startswith(f"{GROUP}/") else ()
+        for needed in ("asset/id", "voxel/coords", *of_files, name):
+            if needed not in self._metadata:
+                self._metadata[needed] = self._read(needed)
+        try:
+            sizes = dimension_sizes(self._metadata)
+        except StoreError as error:
+            raise StoreError(f"{self.path}/{error}") from None
+        own = self._metadata[name]
+        self._refuse(size_findings(name, own, sizes))
+        self._refuse(gate_findings(name, own))
+        # So many assets cost memory by themselves.
+        if sizes["asset"] > ASSET_CHUNK and sizes["asset"] * MIN_ASSET_BYTES > self._bytes:
+            raise StoreError(
+                f"{self.path} has {sizes['asset']} assets in {self._bytes} bytes; expected at "
+                f"least {MIN_ASSET_BYTES} bytes an asset; run `slatprep verify`"
+            )
+        return RowReader.of(self._folder, name, own)
+
+    def _read(self, name: str) -> dict[str, Any]:
+        file = self.path / name / "zarr.json"
+        if name not in NAMES or not file.exists():
+            raise StoreError(f"{self.path} lacks the array {name}; build it again")
+        return read_metadata(file)
+
+    def _refuse(self, findings: Iterable[Finding]) -> None:
+        for finding in findings:
+            raise StoreError(f"{self.path}/{finding}; run `slatprep verify`")
+
+    @cached_property
+    def _bytes(self) -> int:
+        try:
+            return sum(max(size, 0) for size in storage_of(self.path).files().values())
+        except OSError as error:
+            raise StoreError(f"{self.path}: cannot be listed ({error.strerror})") from None

@@ -1,0 +1,87 @@
+"""What the metadata of a store may name: lists of arrays, data types and codecs that are allowed.
+
+zarr-python looks codecs and data types up by the names that it finds, among them
+some that unpickle, and takes arrays of format 2 from consolidated metadata. A
+stranger's store is held against these lists before zarr-python sees any of it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+from slatprep.store.contract import Finding
+from slatprep.store.digests import GROUP
+from slatprep.store.layout import ARRAYS
+from slatprep.store.records import RECORD_ARRAY
+
+GROUPS = ("asset", "voxel", "grid", GROUP)
+
+COORDINATES = (
+    "asset/property",
+    "voxel/axis",
+    "voxel/property",
+    "grid/property",
+    *(f"grid/{axis}" for axis in "xyz"),
+)
+
+NAMES = frozenset(
+    (
+        *(layout.name for layout in ARRAYS),
+        RECORD_ARRAY,
+        *(f"{GROUP}/{name}" for name in ("name", "size", "sha256")),
+        *COORDINATES,
+    )
+)
+"""Every array that a store may have."""
+
+DATA_TYPES = ("bool", "uint8", "int64", "float32", "float64", "string")
+
+CODECS = ("bytes", "vlen-utf8", "blosc", "zstd", "crc32c", "sharding_indexed")
+"""What a store is packed with; none of these can run code."""
+
+
+def gate_findings(name: str, metadata: object) -> Iterator[Finding]:
+    """Yield what is not allowed in the metadata of an array or a group.
+
+    Parameters
+    ----------
+    name : str
+        Where it lies below the store.
+    metadata : object
+        Its ``zarr.json``, or the copy of it in the root's.
+    """
+    where = f"{name}/zarr.json"
+    kinds = {"array": NAMES, "group": GROUPS}
+    if not isinstance(metadata, Mapping) or name not in kinds.get(
+        str(metadata.get("node_type")), ()
+    ):
+        yield Finding(
+            where, "", "is no array or group of a store", "those that docs/formats.md has"
+        )
+        return
+    found = metadata.get("zarr_format")
+    if type(found) is not int or found != 3:
+        yield Finding(where, "", f"zarr_format is {found!r}", "3")
+    if metadata["node_type"] == "group":
+        return
+    data_type = metadata.get("data_type")
+    if data_type not in DATA_TYPES:
+        yield Finding(where, "", f"data_type is {data_type!r}", f"one of {', '.join(DATA_TYPES)}")
+    axes = metadata.get("dimension_names")
+    if not isinstance(axes, list) or not all(isinstance(axis, str) for axis in axes):
+        yield Finding(where, "", f"dimension_names is {axes!r}", "a name for each dimension")
+    for codec in _codecs(metadata.get("codecs")):
+        if codec not in CODECS:
+            yield Finding(where, "", f"has the codec {codec!r}", f"some of {', '.join(CODECS)}")
+
+
+def _codecs(codecs: Any) -> Iterator[object]:
+    """Yield the names of codecs and of those within them; None where there is no name."""
+    for codec in codecs if isinstance(codecs, list) else [None]:
+        known = codec if isinstance(codec, Mapping) else {}
+        yield known.get("name")
+        if known.get("name") == "sharding_indexed":
+            inner = known.get("configuration")
+            for key in ("codecs", "index_codecs"):
+                yield from _codecs(inner.get(key) if isinstance(inner, Mapping) else None)

@@ -1,0 +1,206 @@
+"""What a stranger's store may name: nothing that runs code, nothing that waits, nothing huge."""
+
+from __future__ import annotations
+
+import json
+import os
+import pickle
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numcodecs
+import numpy as np
+import pytest
+import zarr
+from click.testing import CliRunner
+
+from slatprep.cli.commands import slatprep
+from slatprep.errors import StoreError
+from slatprep.inspect.verify import verify_store
+from slatprep.pipeline.dataset import BuildSummary
+from slatprep.store import open_store
+from slatprep.store.gate import gate_findings
+
+
+@pytest.fixture
+def store(mixed_build: BuildSummary, tmp_path: Path) -> Path:
+    assert mixed_build.store is not None
+    return Path(shutil.copytree(mixed_build.store, tmp_path / "s.zarr"))
+
+
+def edit_root(store: Path, edit: Callable[[dict[str, Any]], object]) -> None:
+    document = json.loads((store / "zarr.json").read_text())
+    edit(document)
+    (store / "zarr.json").write_text(json.dumps(document))
+
+
+class Touch:
+    """Unpickled, it makes a file."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return Path.touch, (self.path,)
+
+
+def hide_a_pickle(store: Path, ran: Path) -> None:
+    """Put an array of format 2 that is unpickled into the consolidated metadata."""
+    payload = pickle.dumps([Touch(ran)] * len(open_store(store)))
+    shutil.rmtree(store / "asset/record")
+    (store / "asset/record").mkdir()
+    (store / "asset/record/0").write_bytes(payload)
+    of_two = {
+        "shape": [len(open_store(store))],
+        "chunks": [64],
+        "dtype": "|O",
+        "fill_value": "",
+        "order": "C",
+        "filters": [{"id": "vlen-utf8"}, {"id": "pickle", "protocol": 5}],
+        "dimension_separator": ".",
+        "compressor": None,
+        "zarr_format": 2,
+        "attributes": {},
+        "node_type": "array",
+    }
+    edit_root(
+        store, lambda d: d["consolidated_metadata"]["metadata"].update({"asset/record": of_two})
+    )
+
+
+def test_a_pickle_in_format_two_is_never_read(
+    store: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # As numcodecs had it up to 0.16.5, which unpickles.
+    monkeypatch.setattr(numcodecs.Pickle, "decode", lambda self, data, out=None: pickle.loads(data))
+    ran = tmp_path / "ran"
+    hide_a_pickle(store, ran)
+    for line in (
+        ["check-alignment", "--asset", "cup", "--store", str(store)],
+        ["export", str(store), "--format", "ply", "--frame", "pixieverse", "--out", f"{ran}.e"],
+        ["describe", str(store), "--out", str(tmp_path / "d.json")],
+        ["verify", str(store)],
+    ):
+        done = CliRunner().invoke(slatprep, line)
+        assert not ran.exists(), line
+        assert done.exit_code == 1, (line, done.output)
+        assert isinstance(done.exception, SystemExit), line
+    with pytest.raises(StoreError, match="zarr_format is 2; expected 3"):
+        open_store(store).group  # noqa: B018
+
+
+def test_what_is_built_goes_through_the_gate(store: Path) -> None:
+    group = open_store(store).group
+    assert {name for name, _ in group.members(max_depth=None)} >= {
+        "asset/id",
+        "grid/x",
+        "file/name",
+    }
+    document = json.loads((store / "zarr.json").read_text())
+    for name, metadata in document["consolidated_metadata"]["metadata"].items():
+        assert not list(gate_findings(name, metadata))
+
+
+META = "consolidated_metadata"
+EDITS: dict[str, tuple[dict[str, Any], str]] = {
+    "gzip": ({"codecs": [{"name": "bytes"}, {"name": "gzip"}]}, "has the codec 'gzip'"),
+    "numcodecs": ({"codecs": [{"name": "numcodecs.pickle"}]}, "the codec 'numcodecs.pickle'"),
+    "within a shard": (
+        {"codecs": [{"name": "sharding_indexed", "configuration": {"codecs": [{"name": "x"}]}}]},
+        "has the codec 'x'",
+    ),
+    "no codec": ({"codecs": [5]}, "has the codec None"),
+    "complex": ({"data_type": "complex64"}, "data_type is 'complex64'"),
+    "named type": ({"data_type": {"name": "struct"}}, "data_type is"),
+    "format 2": ({"zarr_format": 2}, "zarr_format is 2"),
+    "no axes": ({"dimension_names": None}, "dimension_names is None"),
+    "no array": ({"node_type": "other"}, "is no array or group"),
+}
+
+
+@pytest.mark.parametrize("case", EDITS)
+def test_what_is_not_on_the_lists_is_refused_and_found(store: Path, case: str) -> None:
+    change, what = EDITS[case]
+    name = "asset/property"  # A coordinate, which the contract says nothing of.
+    edit_root(store, lambda d: d[META]["metadata"][name].update(change))
+    with pytest.raises(StoreError, match=what):
+        open_store(store).group  # noqa: B018
+    findings = verify_store(store).findings
+    assert any(f.file == f"{name}/zarr.json" and what in f.what for f in findings)
+
+
+def test_an_array_of_another_name_is_refused(store: Path) -> None:
+    edit_root(
+        store, lambda d: d[META]["metadata"].update({"voxel/../../x": {"node_type": "array"}})
+    )
+    with pytest.raises(StoreError, match=r"voxel/\.\./\.\./x/zarr.json: is no array"):
+        open_store(store).group  # noqa: B018
+    with pytest.raises(StoreError, match="is no array"):
+        open_store(store).read_rows("voxel/../../x", 0, 1)
+
+
+@pytest.mark.parametrize(
+    "pipe", ["zarr.json", "asset/id/zarr.json", "asset/record/c/0", "voxel/feats/c/0/0"]
+)
+def test_no_command_waits_for_a_pipe(store: Path, tmp_path: Path, pipe: str) -> None:
+    (store / pipe).unlink()
+    os.mkfifo(store / pipe)
+    for line in (["info"], ["verify"], ["report", "--out", str(tmp_path / "r.html")]):
+        done = CliRunner().invoke(slatprep, [line[0], str(store), *line[1:]])
+        assert done.exception is None or isinstance(done.exception, SystemExit)
+    if pipe == "zarr.json":
+        with pytest.raises(StoreError, match="is not a slatprep store"):
+            verify_store(store)
+    else:
+        findings = verify_store(store).findings
+        assert any(f.file == pipe and "no regular file" in f.what for f in findings)
+
+
+def test_metadata_are_bounded_in_depth_and_are_unicode(store: Path) -> None:
+    good = (store / "zarr.json").read_text()
+    for value in ("[" * 100_000, "[" * 500 + "]" * 500, '"\\ud800"'):
+        (store / "zarr.json").write_text(
+            good.replace('"attributes": {', '"attributes": {"x": ' + value + ",", 1)
+        )
+        with pytest.raises(StoreError):
+            open_store(store)
+        assert [finding.file for finding in verify_store(store).findings] == ["zarr.json"]
+
+
+def test_strings_are_bounded_by_how_many_there_are(store: Path) -> None:
+    """Chunks of one row each, every one of which unpacks to megabytes."""
+    root = zarr.open_group(store, mode="r+", use_consolidated=False)
+    for name, size in (("asset/category", 10_000), ("asset/record", 2**21)):
+        attributes = dict(root[name].attrs)
+        del root[name]
+        array = root.create_array(
+            name,
+            shape=(5,),
+            dtype=str,
+            chunks=(1,),
+            dimension_names=("asset",),
+            attributes=attributes,
+        )
+        array[:] = np.array(["x" * size] * 5, object)
+    zarr.consolidate_metadata(str(store), zarr_format=3)
+    opened = open_store(store)
+    for name in ("asset/category", "asset/record"):
+        with pytest.raises(StoreError, match="expected at most"):
+            opened.read_rows(name, 0, 5)
+
+
+def test_many_assets_must_have_bytes(store: Path) -> None:
+    claimed = 2**24
+
+    def claim(document: dict[str, Any]) -> None:
+        for metadata in document[META]["metadata"].values():
+            if metadata.get("dimension_names", [""])[0] == "asset":
+                metadata["shape"][0] = claimed
+        offset = document[META]["metadata"]["asset/offset"]
+        offset["shape"] = [claimed + 1]
+
+    edit_root(store, claim)
+    with pytest.raises(StoreError, match=r"has 16777216 assets in \d+ bytes"):
+        len(open_store(store))
