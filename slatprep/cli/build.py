@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -27,6 +28,9 @@ if TYPE_CHECKING:
 
 _ASSETS_PER_JOB = 20
 """Assets that the default engine aligns in the time that a worker takes to start, 1.6 s."""
+
+DAMAGES_LISTED = 10
+"""How many faults of an older store are printed; ``--json`` has all."""
 
 
 @command("build-store")
@@ -121,8 +125,17 @@ def _by_work(output: Output, parameters: BuildParameters) -> dict[str, Any]:
     return {"assets_per_job": per_job, "note": output.note}
 
 
+def _show_damaged(output: Output, damaged: Sequence[str]) -> None:
+    """Say what of the store that was there is not as it was written."""
+    for line in damaged[:DAMAGES_LISTED]:
+        output.problem(f"damaged, made anew: {line}")
+    if len(damaged) > DAMAGES_LISTED:
+        output.problem(f"and {len(damaged) - DAMAGES_LISTED:,} more: `slatprep verify` lists them")
+
+
 def _show_plan(output: Output, plan: BuildPlan) -> None:
     """Print what would be done with each asset, and why; unchanged ones are counted alone."""
+    _show_damaged(output, plan.damaged)
 
     def show() -> None:
         rows = [
@@ -140,11 +153,18 @@ def _show_plan(output: Output, plan: BuildPlan) -> None:
         {"asset_id": asset.asset_id, "action": str(asset.action), "reason": asset.reason}
         for asset in plan.assets
     ]
-    output.result({"store": plan.store, "actions": plan.actions, "assets": assets}, show)
+    document = {
+        "store": plan.store,
+        "actions": plan.actions,
+        "assets": assets,
+        "damaged": plan.damaged,
+    }
+    output.result(document, show)
 
 
 def _report(output: Output, summary: BuildSummary) -> None:
     """Print what became of the assets, name those that did not go in, and set the exit code."""
+    _show_damaged(output, summary.damaged)
     for asset_id, reason in summary.problems:
         output.problem(f"{asset_id}: {reason}")
     total, good = sum(summary.statuses.values()), summary.statuses["ok"]

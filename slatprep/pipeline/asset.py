@@ -13,11 +13,12 @@ from dataclasses import replace
 
 from slatprep.align import align
 from slatprep.align.deformation import map_of
-from slatprep.errors import MissingPartnerError, SlatprepError
+from slatprep.errors import MissingPartnerError, SlatprepError, StoreError
 from slatprep.judge import judge_with_voxels, voxel_confidence
 from slatprep.parameters import BuildParameters
 from slatprep.pipeline.context import BuildContext
 from slatprep.pipeline.plan import Action, PlannedAsset
+from slatprep.pipeline.previous import PreviousBuild
 from slatprep.pipeline.recipe import Recipe
 from slatprep.pipeline.spool import FailedAsset, Spool, SpooledAsset
 from slatprep.provenance.make import record_of, record_of_failed
@@ -104,7 +105,7 @@ def finish_asset(
         if resumed is not None:
             return resumed
     try:
-        asset, key = _processed(pair, planned, context)
+        asset, key, damaged = _processed(pair, planned, context)
     except Exception as error:
         # A fault in one asset, even of slatprep's own, must not cost the others.
         if context.strict:
@@ -112,7 +113,8 @@ def finish_asset(
         return _failed(_failure(pair, error), context, time.perf_counter() - begin)
     seconds = time.perf_counter() - begin
     record = record_of(asset, context.parameters, context.recipe.code, key, seconds)
-    return context.spool.put(record, asset.field, asset.latents, asset.annotation)
+    kept = context.spool.put(record, asset.field, asset.latents, asset.annotation)
+    return replace(kept, damaged=damaged)
 
 
 def fail_asset(pair: AssetPair, planned: PlannedAsset | None, context: BuildContext) -> FailedAsset:
@@ -125,17 +127,31 @@ def fail_asset(pair: AssetPair, planned: PlannedAsset | None, context: BuildCont
 
 def _processed(
     pair: AssetPair, planned: PlannedAsset | None, context: BuildContext
-) -> tuple[Finished, str]:
-    """Return an asset and its key; what is known of it is used if its files are the same."""
-    known = None
+) -> tuple[Finished, str, str]:
+    """Return an asset, its key, and in words why what the store has of it does not hold."""
+    damaged = ""
     if context.previous is not None and planned is not None and planned.action is Action.REUSE:
-        known = context.previous.record(pair.asset_id)
-    asset = process_asset(pair, context.parameters, known)
+        asset = _repeated(pair, planned.key, context, context.previous)
+        if asset is not None:
+            return asset, planned.key, ""
+        damaged = "what the store holds of it is not what its record and its sources give"
+    asset = process_asset(pair, context.parameters)
     key = _key(asset, context.recipe)
-    if known is not None and known.key != key:  # The files have changed since the plan.
-        asset = process_asset(pair, context.parameters)
-        key = _key(asset, context.recipe)
-    return asset, key
+    changed = planned is not None and planned.key != key  # since the plan
+    return asset, key, "" if changed else damaged
+
+
+def _repeated(
+    pair: AssetPair, key: str, context: BuildContext, previous: PreviousBuild
+) -> Finished | None:
+    """Return an asset as its record tells of it; None where that does not hold any more."""
+    try:
+        known = previous.record(pair.asset_id)
+    except StoreError:
+        return None
+    asset = process_asset(pair, context.parameters, known)
+    same = _key(asset, context.recipe) == key and previous.holds(asset)
+    return asset if same else None
 
 
 def _key(asset: Finished, recipe: Recipe) -> str:

@@ -111,14 +111,16 @@ def build_store(
     given = given_ranges(parameters.normalize)
     with work_beside(place.store, fresh=fresh, keep=keep_work) as work:
         place.look()
-        context = _context(parameters, work.spool, None if fresh else place.store, strict)
         pairs = _discover(parameters, jobs, work.scratch)
         jobs = at_most(len(pairs) // assets_per_job, jobs)
+
+        previous, damaged = (None, ()) if fresh else previous_build(place.store, jobs)
+        context = BuildContext(parameters, recipe_of(parameters), work.spool, previous, strict)
         plan = _plan(pairs, context, jobs, progress)
         new, unchanged = _split(pairs, plan)
         _compile(plan, jobs, note)
         assets = _finish(new, plan, context, jobs, progress)
-        if is_current(plan, assets, context, given):
+        if not damaged and is_current(plan, assets, context, given):
             return repeat_summary(assets, context, place, time.perf_counter() - begin)
         assets += _finish(unchanged, plan, context, jobs, progress)
         usable, failed = _usable_and_failed(assets, parameters)
@@ -134,6 +136,7 @@ def build_store(
             seconds=time.perf_counter() - begin,
             normalization=packed.normalization,
             clipped=packed.clipped,
+            damaged=damaged,
         )
         publish_manifests(packed.records, summary, parameters)
         place.publish()
@@ -164,9 +167,10 @@ def plan_build(
     """
     place = Destination(out)
     spool = Spool(work_directory(place.store) / ("nothing" if fresh else "spool"))
-    context = _context(parameters, spool, None if fresh else place.store)
     pairs = _discover(parameters, jobs)
-    return BuildPlan(place.out, tuple(plan_assets(pairs, context, jobs, progress)))
+    previous, damaged = (None, ()) if fresh else previous_build(place.store, jobs)
+    context = BuildContext(parameters, recipe_of(parameters), spool, previous, strict=False)
+    return BuildPlan(place.out, tuple(plan_assets(pairs, context, jobs, progress)), damaged)
 
 
 def align_pairs(
@@ -204,7 +208,7 @@ def align_pairs(
     begin = time.perf_counter()
     out = Path(out)
     with work_beside(out.absolute(), arrays=False) as work:
-        context = _context(parameters, work.spool, None, strict)
+        context = BuildContext(parameters, recipe_of(parameters), work.spool, None, strict)
         pairs = _discover(parameters, jobs, work.scratch)
         jobs = at_most(len(pairs) // assets_per_job, jobs)
         plan = _plan(pairs, context, jobs, progress)
@@ -215,13 +219,6 @@ def align_pairs(
             build_id = write_records(file, (work.spool.record(asset.key) for asset in assets))
     seconds = time.perf_counter() - begin
     return summarise_build(assets, records=out, build_id=build_id, seconds=seconds)
-
-
-def _context(
-    parameters: BuildParameters, spool: Spool, store: Place | None, strict: bool = False
-) -> BuildContext:
-    previous = None if store is None else previous_build(store)
-    return BuildContext(parameters, recipe_of(parameters), spool, previous, strict)
 
 
 def _discover(parameters: BuildParameters, jobs: Jobs, *shared: Path) -> list[AssetPair]:

@@ -12,7 +12,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
 from enum import StrEnum
 
-from slatprep.errors import SlatprepError
+from slatprep.errors import SlatprepError, StoreError
 from slatprep.pipeline.context import BuildContext
 from slatprep.provenance.record import AssetRecord, RecordError
 from slatprep.readers.identity import hash_sources
@@ -87,10 +87,13 @@ class BuildPlan:
         The store to make or replace.
     assets : tuple of PlannedAsset
         Sorted by id.
+    damaged : tuple of str
+        What of the store that is there is not as it was written, and will be made anew.
     """
 
     store: Place
     assets: tuple[PlannedAsset, ...]
+    damaged: tuple[str, ...] = ()
 
     @property
     def actions(self) -> dict[str, int]:
@@ -152,8 +155,9 @@ def plan_asset(pair: AssetPair, context: BuildContext) -> PlannedAsset:
         return PlannedAsset(asset_id, Action.ALIGN, older, key)
     try:
         record = context.previous.record(asset_id) if context.previous else None
-    except RecordError as error:
-        why = f"its record cannot be read: {error.faults[0]}"
+    except StoreError as error:
+        fault = error.faults[0] if isinstance(error, RecordError) else error
+        why = f"its record cannot be read: {fault}"
         return PlannedAsset(asset_id, Action.ALIGN, why, key)
     if record is None:
         return PlannedAsset(asset_id, Action.ALIGN, "not in the store", key)

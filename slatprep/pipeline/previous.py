@@ -5,12 +5,26 @@ from __future__ import annotations
 from collections.abc import Callable
 from functools import cached_property, lru_cache
 
+import numpy as np
+
+from slatprep.align.deformation import map_of
 from slatprep.errors import StoreError
 from slatprep.provenance.record import AssetRecord
 from slatprep.provenance.stored import StoredRecords
-from slatprep.records import Place
+from slatprep.records import Finished, Place
+from slatprep.storage.place import storage_of
+from slatprep.store.integrity import file_findings, metadata_findings
 from slatprep.store.layout import FORMAT_VERSION
-from slatprep.store.reader import Store, open_store
+from slatprep.store.reader import Store, is_store, open_store
+from slatprep.store.records import RECORD_ARRAY
+from slatprep.workers.local import Jobs
+
+PLACE_TOLERANCE = 2.0**-23
+"""Edges of the unit cube by which a place may differ: the last bit of a float32, as another
+machine may round the map otherwise."""
+
+# Without these no row can be told from another, or nothing be checked.
+_NEEDED = ("asset/id/", "asset/offset/", f"{RECORD_ARRAY}/zarr.json", "file")
 
 
 class PreviousBuild:
@@ -23,14 +37,17 @@ class PreviousBuild:
     build_id : str
         Id of its build: a process that lives on must not answer with what it
         read of an older store at the same path.
+    damaged : frozenset of str
+        Files of records that are not as they were written.
     """
 
-    def __init__(self, path: Place, build_id: str) -> None:
+    def __init__(self, path: Place, build_id: str, damaged: frozenset[str] = frozenset()) -> None:
         self.path = path
         self.build_id = build_id
+        self.damaged = damaged
 
-    def __reduce__(self) -> tuple[Callable[[Place, str], PreviousBuild], tuple[Place, str]]:
-        return _in_this_process, (self.path, self.build_id)
+    def __reduce__(self) -> tuple[Callable[..., PreviousBuild], tuple[object, ...]]:
+        return _in_this_process, (self.path, self.build_id, self.damaged)
 
     @cached_property
     def store(self) -> Store:
@@ -60,21 +77,75 @@ class PreviousBuild:
 
         Raises
         ------
-        RecordError
-            If another version of slatprep wrote it.
+        StoreError
+            If its file is damaged, or another version of slatprep wrote it.
         """
-        return self.records.of(asset_id).of_first_pass() if asset_id in self.ids else None
+        if asset_id not in self.ids:
+            return None
+        row, reader = self.store.find(asset_id), self.store.reader(RECORD_ARRAY)
+        file = reader.key(row // reader.shard_rows) if reader else RECORD_ARRAY
+        if reader is None or file in self.damaged:
+            raise StoreError(f"{file} is damaged")
+        return self.records.read(row).of_first_pass()
+
+    def holds(self, asset: Finished) -> bool:
+        """Whether the store's labels and places of an asset are those it has been given now.
+
+        Where the consensus of the dataset chose another alignment, the rows are of that one,
+        and its places alone are compared.
+        """
+        row = self.store.find(asset.pair.asset_id)
+        try:
+            held = self.store.read(row, ("place", "material"))
+            record = self.records.read(row)
+        except StoreError:
+            return False
+        places = np.asarray(asset.annotation.place, np.float64)
+        if record.before_consensus is not None:
+            places = map_of(record.alignment).places(asset.latents.coords)
+        elif not np.array_equal(held["material"], asset.annotation.material):
+            return False
+        same_rows = held["place"].shape == places.shape
+        return same_rows and bool((np.abs(held["place"] - places) <= PLACE_TOLERANCE).all())
 
 
 @lru_cache(maxsize=1)
-def _in_this_process(path: Place, build_id: str) -> PreviousBuild:
-    return PreviousBuild(path, build_id)
+def _in_this_process(path: Place, build_id: str, damaged: frozenset[str]) -> PreviousBuild:
+    return PreviousBuild(path, build_id, damaged)
 
 
-def previous_build(target: Place) -> PreviousBuild | None:
-    """Return the store at a path, None where there is none that a build can go on from."""
+def previous_build(target: Place, jobs: Jobs) -> tuple[PreviousBuild | None, tuple[str, ...]]:
+    """Return the store at a path, and what of it is not as it was written.
+
+    Every file is compared with its digest. On an object store, where each is a download and
+    the server keeps sums of its own, these are the files that a build reads.
+
+    Parameters
+    ----------
+    target : Place
+        Where a store may lie.
+    jobs : int or Workers
+        Worker processes, or a cluster's.
+
+    Returns
+    -------
+    previous : PreviousBuild or None
+        None where there is none that a build can go on from.
+    damaged : tuple of str
+        What is wrong with it, in words, sorted by file.
+    """
     try:
         store = open_store(target)
-        return PreviousBuild(store.path, store.attributes["manifest"])
-    except (StoreError, KeyError):
-        return None  # Of a newer format, or damaged: made anew.
+    except StoreError as error:
+        return None, (str(error),) if is_store(target) else ()
+    build_id = str(store.attributes.get("manifest"))
+    if store.format_version != FORMAT_VERSION:  # Nothing of it is taken over.
+        return PreviousBuild(store.path, build_id), ()
+    read = "" if storage_of(store.path).local else "asset/"
+    findings = sorted({*metadata_findings(store.path), *file_findings(store, jobs, read)[1]})
+    damaged = tuple(map(str, findings))
+    files = frozenset(finding.file for finding in findings)
+    if any(file.startswith(_NEEDED) for file in files):
+        return None, damaged
+    records = frozenset(file for file in files if file.startswith(RECORD_ARRAY))
+    return PreviousBuild(store.path, build_id, records), damaged

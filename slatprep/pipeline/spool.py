@@ -59,6 +59,8 @@ class SpooledAsset:
         What `slatprep.normalize.property_extent` gives.
     columns : dict
         See `slatprep.provenance.columns.columns_of`.
+    damaged : str
+        Why, in words, what an older store holds of it was not taken over.
     """
 
     asset_id: str
@@ -68,6 +70,7 @@ class SpooledAsset:
     n_placements: int
     extent: NDArray[np.float64]
     columns: dict[str, Column]
+    damaged: str = ""
 
 
 @dataclass(frozen=True, slots=True)

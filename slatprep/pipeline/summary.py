@@ -46,6 +46,8 @@ class BuildSummary:
         Ranges of the properties.
     clipped : dict
         By property, values of ``voxel/properties`` that lay outside its range.
+    damaged : tuple of str
+        What of the store that was there was not as it was written, and was made anew.
     """
 
     records: Place
@@ -60,6 +62,7 @@ class BuildSummary:
     store: Place | None = None
     normalization: Normalization | None = None
     clipped: Mapping[str, int] = field(default_factory=dict)
+    damaged: tuple[str, ...] = ()
 
     @property
     def complete(self) -> bool:
@@ -76,6 +79,7 @@ def summarise_build(
     store: Place | None = None,
     normalization: Normalization | None = None,
     clipped: Iterable[Clipped] = (),
+    damaged: Sequence[str] = (),
 ) -> BuildSummary:
     """Count what became of the assets."""
     usable = [asset for asset in assets if isinstance(asset, SpooledAsset)]
@@ -95,6 +99,7 @@ def summarise_build(
         store=store,
         normalization=normalization,
         clipped=_clipped_by_property(clipped),
+        damaged=(*damaged, *(f"{a.asset_id}: {a.damaged}" for a in usable if a.damaged)),
     )
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import heapq
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -11,20 +12,23 @@ from slatprep.errors import StoreError
 from slatprep.pipeline.context import BuildContext
 from slatprep.pipeline.plan import Action, PlannedAsset
 from slatprep.pipeline.previous import PreviousBuild
-from slatprep.pipeline.publish import Destination, publish_manifests
+from slatprep.pipeline.publish import Destination, build_record, publish_manifests
 from slatprep.pipeline.spool import FailedAsset, SpooledAsset, spooled
 from slatprep.pipeline.summary import BuildSummary, summarise_build
 from slatprep.provenance.make import origin
 from slatprep.provenance.record import (
+    BuildRecord,
     Clipped,
     Record,
     read_build_record,
+    read_record,
     records_id,
+    to_json,
     write_records,
 )
 from slatprep.records import Normalization, Place
 from slatprep.storage.atomic import writing
-from slatprep.storage.place import storage_of
+from slatprep.store.contract import MAX_METADATA_BYTES
 
 
 def is_current(
@@ -85,7 +89,7 @@ def repeat_summary(
         normalization=previous.store.normalization,
         clipped=clipped,
     )
-    if not _is_published(summary.records.parent, summary.build_id):
+    if not _are_published(summary.records, build_record(summary, context.parameters)):
         scratch = context.spool.directory / "assets.jsonl"
         with writing(str(place.out), scratch.parent):
             write_records(scratch, _all_records(others, previous, context))
@@ -103,10 +107,15 @@ def _all_records(
     return heapq.merge(stored, failed, key=lambda record: record.asset_id)
 
 
-def _is_published(manifests: Place, build_id: str) -> bool:
+def _are_published(records: Place, wanted: BuildRecord) -> bool:
+    """Whether the records beside the store are those of a build, but for when and where it ran."""
+    build_file = records.parent / "build.json"
     try:
-        file = manifests / "build.json"
-        build = read_build_record(file.read_bytes(), str(file))
-        return build.id == build_id and storage_of(manifests / "assets.jsonl").size() > 0
+        found = read_build_record(build_file.read_bytes(), str(build_file))
+        with records.open("rb") as file:
+            lines = iter(lambda: file.readline(MAX_METADATA_BYTES), b"")
+            build_id = records_id(read_record(line, str(records)) for line in lines)
     except (OSError, StoreError):
         return False
+    run = {name: getattr(found, name) for name in ("created", "duration_s", "platform")}
+    return build_id == wanted.id and to_json(found) == to_json(replace(wanted, **run))

@@ -66,8 +66,8 @@ def metadata_findings(path: Place) -> Iterator[Finding]:
             yield from array_findings(layout.name, arrays[layout.name], sizes)
 
 
-def file_findings(store: Store, jobs: Jobs) -> tuple[int, set[Finding]]:
-    """Compare every file of a store with its digest.
+def file_findings(store: Store, jobs: Jobs, below: str = "") -> tuple[int, set[Finding]]:
+    """Compare every file of a store, or those whose names begin with `below`, with its digest.
 
     Returns
     -------
@@ -95,7 +95,7 @@ def file_findings(store: Store, jobs: Jobs) -> tuple[int, set[Finding]]:
     for name in expected.keys() - present:
         findings.add(Finding(name, "", "is missing", f"a file of {expected[name][0]} bytes"))
     places = {digest: name for name, (_, digest) in expected.items()}
-    common = sorted(present & expected.keys())
+    common = sorted(name for name in present & expected.keys() if name.startswith(below))
     tasks = ((store.path, name, files[name], *expected[name]) for name in common)
     for name, what, digest in run_unordered(_compare, tasks, jobs):
         if what:

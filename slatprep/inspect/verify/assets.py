@@ -16,6 +16,7 @@ from slatprep.errors import InputError, StoreError
 from slatprep.geometry.voxels import flat_index
 from slatprep.inspect.check import TOLERANCES, recompute_annotation
 from slatprep.normalize import normalize_change
+from slatprep.pipeline.previous import PLACE_TOLERANCE
 from slatprep.provenance.columns import columns_of
 from slatprep.provenance.record import AssetRecord, RecordError
 from slatprep.provenance.stored import StoredRecords
@@ -26,10 +27,6 @@ from slatprep.store.contract import Finding
 from slatprep.store.reader import Store, StoredAsset, open_store
 from slatprep.store.records import RECORD_ARRAY
 from slatprep.store.shard_reader import DamagedFileError
-
-PLACE_TOLERANCE = 2.0**-23
-"""Edges of the unit cube by which a place may differ: the last bit of a float32, as another
-machine may round the map otherwise."""
 
 
 def asset_findings(

@@ -1,0 +1,181 @@
+"""What a build takes over from the store that is there is checked first, and else made anew."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+import zarr
+from support.faults import inject
+from support.synthetic import Dataset
+from support.trees import tree
+
+from slatprep.inspect.verify import verify_store
+from slatprep.pipeline.dataset import BuildSummary, build_store, plan_build
+from slatprep.provenance.stored import StoredRecords
+from slatprep.store import open_store
+from slatprep.store.digests import GROUP, write_digests
+
+RECORDS = "asset/record/c/0"
+
+
+@pytest.fixture
+def built(undisturbed: tuple[Dataset, Path], tmp_path: Path) -> tuple[Dataset, Path]:
+    """Three assets, and a store of them with the ranges of the dataset, to be damaged."""
+    dataset, _ = undisturbed
+    out = tmp_path / "s.zarr"
+    build_store(dataset.parameters(), out)
+    return dataset, out
+
+
+@pytest.fixture
+def aligned(monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    seen: list[str] = []
+    inject(monkeypatch, lambda step, name: step == "asset aligned" and seen.append(name))
+    return seen
+
+
+def flip(path: Path, byte: int, bit: int = 0) -> None:
+    data = bytearray(path.read_bytes())
+    data[byte] ^= 1 << bit
+    path.write_bytes(data)
+
+
+def rebuilt(built: tuple[Dataset, Path], undisturbed: tuple[Dataset, Path]) -> BuildSummary:
+    """Build with other ranges, which takes over what is sound; compare with one from nothing."""
+    dataset, out = built
+    summary = build_store(dataset.parameters("pixie"), out)
+    assert tree(out) == tree(undisturbed[1])
+    assert summary.complete
+    assert verify_store(out).ok
+    return summary
+
+
+def test_a_sound_store_is_taken_over(
+    built: tuple[Dataset, Path], undisturbed: tuple[Dataset, Path], aligned: list[str]
+) -> None:
+    assert rebuilt(built, undisturbed).damaged == ()
+    assert aligned == []
+
+
+@pytest.mark.parametrize("share", [0.1, 0.4, 0.7, 0.9])
+def test_a_flipped_bit_of_a_record_is_never_inherited(
+    built: tuple[Dataset, Path], undisturbed: tuple[Dataset, Path], aligned: list[str], share: float
+) -> None:
+    dataset, out = built
+    flip(out / RECORDS, int(share * (out / RECORDS).stat().st_size))
+    assert RECORDS in {finding.file for finding in verify_store(out).findings}
+    plan = plan_build(dataset.parameters(), out)
+    assert all(RECORDS in asset.reason for asset in plan.assets), plan.assets
+    assert plan.actions["align"] == 3
+    (told,) = rebuilt(built, undisturbed).damaged
+    assert told.startswith(f"{RECORDS}: its bytes changed")
+    assert len(aligned) == 3
+
+
+@pytest.mark.parametrize("text", ["", "{", "[]", "{}", "5", "[" * 100_000])
+def test_a_record_that_is_none_is_made_anew(
+    built: tuple[Dataset, Path], undisturbed: tuple[Dataset, Path], text: str
+) -> None:
+    _, out = built
+    zarr.open_group(out, mode="r+", use_consolidated=False)["asset/record"][1] = text
+    assert rebuilt(built, undisturbed).damaged
+
+
+@pytest.mark.parametrize(
+    ("name", "aligned_again"),
+    [
+        ("asset/fitness/c/0", 0),
+        ("voxel/feats/c/0/0", 0),
+        ("grid/material/c/0/0/0/0", 0),
+        ("asset/id/c/0", 3),
+        ("asset/offset/c/0", 3),
+        ("file/sha256/c/0", 3),
+    ],
+)
+def test_a_store_that_is_damaged_is_not_current(
+    built: tuple[Dataset, Path], aligned: list[str], name: str, aligned_again: int
+) -> None:
+    dataset, out = built
+    before = tree(out)
+    flip(out / name, (out / name).stat().st_size // 2)
+    summary = build_store(dataset.parameters(), out)
+    assert tree(out) == before
+    assert len(aligned) == aligned_again
+    assert any(name.rpartition("/c/")[0] in told or "file" in told for told in summary.damaged)
+    assert build_store(dataset.parameters(), out).damaged == ()
+
+
+def test_rows_that_are_gone_are_written_again(built: tuple[Dataset, Path]) -> None:
+    dataset, out = built
+    before = tree(out)
+    (out / "voxel/feats/c/1/0").unlink()
+    (told,) = build_store(dataset.parameters(), out).damaged
+    assert told.startswith("voxel/feats/c/1/0: is missing")
+    assert tree(out) == before
+
+
+def rewritten(out: Path, change: Callable[[zarr.Group], None]) -> None:
+    """Change a store's values and make its digests anew, as if they had always been so."""
+    root = zarr.open_group(out, mode="r+", use_consolidated=False)
+    change(root)
+    shutil.rmtree(out / GROUP)
+    write_digests(out)
+    zarr.consolidate_metadata(str(out), zarr_format=3)
+
+
+@pytest.mark.filterwarnings("ignore:Consolidated metadata")
+def test_a_transform_that_does_not_give_the_stored_labels_is_found_anew(
+    built: tuple[Dataset, Path], undisturbed: tuple[Dataset, Path], aligned: list[str]
+) -> None:
+    """Every checksum and digest is right, and yet the record is not of these rows."""
+    _, out = built
+
+    def shift(root: zarr.Group) -> None:
+        record = json.loads(str(root["asset/record"][1]))
+        record["alignment"]["transform"][0][3] += 0.25
+        root["asset/record"][1] = json.dumps(record)
+
+    rewritten(out, shift)
+    assert StoredRecords(open_store(out)).of("b").alignment.transform[0, 3] > 0.2
+    (told,) = rebuilt(built, undisturbed).damaged
+    assert told.startswith("b: ")
+    assert aligned == ["b"]
+
+
+@pytest.mark.parametrize(
+    ("file", "text"),
+    [
+        ("build.json", b"[" * 100_000),
+        ("build.json", b"[1]"),
+        ("build.json", b'{"counts": [1]}'),
+        ("assets.jsonl", b"{"),
+    ],
+)
+def test_records_beside_a_store_that_are_damaged_are_written_again(
+    built: tuple[Dataset, Path], file: str, text: bytes
+) -> None:
+    dataset, out = built
+    path = out.with_name("s.manifests") / file
+    path.write_bytes(text)
+    assert not verify_store(out).ok
+    build_store(dataset.parameters(), out)
+    assert verify_store(out).ok
+
+
+@pytest.mark.parametrize("file", ["build.json", "assets.jsonl"])
+def test_one_changed_digit_beside_a_store_is_mended(built: tuple[Dataset, Path], file: str) -> None:
+    dataset, out = built
+    path = out.with_name("s.manifests") / file
+    sound = path.read_text()
+    key = '"voxels": ' if file == "build.json" else '"slat_voxels":'
+    at = sound.index(key) + len(key)
+    path.write_text(sound[:at] + str((int(sound[at]) + 1) % 9 + 1) + sound[at + 1 :])
+    assert not verify_store(out).ok
+    build_store(dataset.parameters(), out)
+    assert verify_store(out).ok
+    assert np.all([line.startswith("{") for line in path.read_text().splitlines()[:1]])
