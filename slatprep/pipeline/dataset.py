@@ -113,7 +113,6 @@ def build_store(
         place.look()
         pairs = _discover(parameters, jobs, work.scratch)
         jobs = at_most(len(pairs) // assets_per_job, jobs)
-
         previous, damaged = (None, ()) if fresh else previous_build(place.store, jobs)
         context = BuildContext(parameters, recipe_of(parameters), work.spool, previous, strict)
         plan = _plan(pairs, context, jobs, progress)

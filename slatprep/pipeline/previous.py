@@ -16,7 +16,7 @@ from slatprep.storage.place import storage_of
 from slatprep.store.integrity import file_findings, metadata_findings
 from slatprep.store.layout import FORMAT_VERSION
 from slatprep.store.reader import Store, is_store, open_store
-from slatprep.store.records import RECORD_ARRAY
+from slatprep.store.records import RECORD_ARRAY, RECORDS_IN_SHARD
 from slatprep.workers.local import Jobs
 
 PLACE_TOLERANCE = 2.0**-23
@@ -82,9 +82,9 @@ class PreviousBuild:
         """
         if asset_id not in self.ids:
             return None
-        row, reader = self.store.find(asset_id), self.store.reader(RECORD_ARRAY)
-        file = reader.key(row // reader.shard_rows) if reader else RECORD_ARRAY
-        if reader is None or file in self.damaged:
+        row = self.store.find(asset_id)
+        file = f"{RECORD_ARRAY}/c/{row // RECORDS_IN_SHARD}"
+        if file in self.damaged:
             raise StoreError(f"{file} is damaged")
         return self.records.read(row).of_first_pass()
 

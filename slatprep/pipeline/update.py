@@ -28,6 +28,8 @@ from slatprep.provenance.record import (
 )
 from slatprep.records import Normalization, Place
 from slatprep.storage.atomic import writing
+from slatprep.storage.documents import read_bounded
+from slatprep.storage.place import storage_of
 from slatprep.store.contract import MAX_METADATA_BYTES
 
 
@@ -111,11 +113,12 @@ def _are_published(records: Place, wanted: BuildRecord) -> bool:
     """Whether the records beside the store are those of a build, but for when and where it ran."""
     build_file = records.parent / "build.json"
     try:
-        found = read_build_record(build_file.read_bytes(), str(build_file))
-        with records.open("rb") as file:
+        text = read_bounded(build_file, MAX_METADATA_BYTES)
+        found = read_build_record(text, str(build_file))
+        with storage_of(records).open() as file:
             lines = iter(lambda: file.readline(MAX_METADATA_BYTES), b"")
             build_id = records_id(read_record(line, str(records)) for line in lines)
-    except (OSError, StoreError):
+    except (OSError, ValueError, StoreError):
         return False
     run = {name: getattr(found, name) for name in ("created", "duration_s", "platform")}
     return build_id == wanted.id and to_json(found) == to_json(replace(wanted, **run))
