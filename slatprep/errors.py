@@ -3,8 +3,25 @@
 from __future__ import annotations
 
 
+def in_unicode(text: str) -> str:
+    r"""Return a text in which whatever UTF-8 cannot hold is written out.
+
+    Names of files are bytes; those that are no UTF-8 come as lone surrogates,
+    which no record, store or terminal takes.
+
+    Examples
+    --------
+    >>> print(in_unicode("a\udcff.npz"))
+    a\udcff.npz
+    """
+    return text.encode(errors="backslashreplace").decode()
+
+
 class SlatprepError(Exception):
     """Base of every error that slatprep raises on purpose."""
+
+    def __init__(self, message: str = "") -> None:
+        super().__init__(in_unicode(message))
 
 
 class InputError(SlatprepError):
@@ -22,8 +39,8 @@ class InputError(SlatprepError):
 
     def __init__(self, path: object, fault: str, expected: str) -> None:
         super().__init__(f"{path}: {fault}; expected {expected}")
-        self.path = str(path)
-        self.fault = fault
+        self.path = in_unicode(str(path))
+        self.fault = in_unicode(fault)
         self.expected = expected
 
     def __reduce__(self) -> tuple[type, tuple[str, str, str]]:

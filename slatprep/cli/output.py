@@ -18,6 +18,7 @@ from typing import Any, TypeVar
 
 import click
 
+from slatprep.errors import in_unicode
 from slatprep.storage.place import is_place, place_of, storage_of
 from slatprep.workers import Progress
 
@@ -124,7 +125,9 @@ def with_output(command: _Command) -> _Command:
 
 
 def _local(value: Any) -> Any:
-    """Return an option's value; of a URL that was taken for a path, say that it is none."""
+    """Return an option's value; refuse a path that is a URL, or that UTF-8 cannot hold."""
+    if is_place(value) and str(value) != in_unicode(str(value)):
+        raise click.UsageError(f"{in_unicode(str(value))}: expected a path in UTF-8")
     if not isinstance(value, Path):
         return value  # Options that may be a URL make a place of it themselves.
     place = place_of(value)

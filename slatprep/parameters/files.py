@@ -15,7 +15,7 @@ from dataclasses import asdict, fields, is_dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple, get_args, get_type_hints
 
-from slatprep.errors import ConfigError
+from slatprep.errors import ConfigError, in_unicode
 from slatprep.parameters import PRESETS, BuildParameters
 from slatprep.storage.place import place_of
 
@@ -83,6 +83,15 @@ def load_parameters(
         if isinstance(values, Mapping) and not isinstance(table, dict):
             raise ConfigError(f"{origin.of(group)}: {group}: expected a table [{group}]")
         data[group] = table | values if isinstance(values, Mapping) else values
+    for name in _PATHS:
+        group, _, key = name.partition(".")
+        table = data.get(group)
+        path = str(table.get(key, "")) if isinstance(table, Mapping) else ""
+        if path != in_unicode(path):
+            raise ConfigError(
+                f"{origin.of(name)}: {name}: {path} is no UTF-8, so that no record can hold it; "
+                "rename the folder"
+            )
     # Through JSON, because strict JSON takes a list for a tuple and a string
     # for a path as TOML has them, and still refuses "3" and true for 3.0.
     document = json.dumps(data, default=str)

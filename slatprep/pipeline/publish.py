@@ -13,7 +13,7 @@ from collections.abc import Iterable, Iterator
 from datetime import UTC, datetime
 from pathlib import Path
 
-from slatprep.errors import StoreError
+from slatprep.errors import StoreError, in_unicode
 from slatprep.parameters import BuildParameters
 from slatprep.pipeline.summary import BuildSummary
 from slatprep.provenance.make import build_versions
@@ -60,6 +60,8 @@ class Destination:
 
     def __init__(self, out: str | Place, manifests: str | Place | None = None) -> None:
         self.out = place_of(out)
+        if str(self.out) != in_unicode(str(self.out)):
+            raise StoreError(f"{self.out}: is no UTF-8; expected a name that records can hold")
         self._manifests = None if manifests is None else storage_of(place_of(manifests)).local
         if manifests is not None and self._manifests is None:
             raise StoreError(f"{manifests}: expected a local folder for the records")

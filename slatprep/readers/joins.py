@@ -7,7 +7,7 @@ import json
 import re
 from collections.abc import Collection
 
-from slatprep.errors import ConfigError
+from slatprep.errors import ConfigError, in_unicode
 from slatprep.records import Place
 from slatprep.storage.place import storage_of
 
@@ -93,7 +93,7 @@ def read_categories(path: Place) -> dict[str, str]:
         category = entry.get("obj_class") if isinstance(entry, dict) else None
         if not isinstance(category, str):
             raise ConfigError(f"{path}: {object_id!r} has no obj_class; expected a category")
-        categories[object_id] = category
+        categories[object_id] = in_unicode(category)
     return categories
 
 

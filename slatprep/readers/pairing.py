@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from itertools import groupby
 from urllib.parse import quote
 
-from slatprep.errors import ConfigError, InputError
+from slatprep.errors import ConfigError, InputError, in_unicode
 from slatprep.parameters import BuildParameters, PixieverseSource, SlatSource
 from slatprep.readers.joins import read_categories, read_map
 from slatprep.readers.patterns import NAME, fill, find_files, list_below
@@ -244,6 +244,12 @@ def _pair(row: _Row, there: _Found, shared: str) -> AssetPair:
             f"{len(found)} SLATs for one id {row.asset_id!r} ({files}); expected one, "
             "or a pattern with {view}"
         )
+    slat = there.roots.slat / found[0].path if found else None
+    problems += [
+        f"{file}: its name is no UTF-8, so that no record can hold it; rename it"
+        for file in (grid, mask, bounds, slat)
+        if file is not None and str(file) != in_unicode(str(file))
+    ]
     return AssetPair(
         asset_id=row.asset_id,
         object_id=_safe(row.object_id),
@@ -253,7 +259,7 @@ def _pair(row: _Row, there: _Found, shared: str) -> AssetPair:
         grid=grid,
         mask=mask,
         bounds=bounds,
-        slat=there.roots.slat / found[0].path if found else None,
+        slat=slat,
         slat_group=found[0].group if found else "",
         problem="; ".join(problem for problem in problems if problem),
     )

@@ -7,6 +7,7 @@ slatprep orders them as `PROPERTY_COLUMNS` does, Young's modulus first.
 
 from __future__ import annotations
 
+import sys
 from typing import Any
 
 import numpy as np
@@ -270,11 +271,21 @@ def _read_bounds(
     warnings += [f"bounds: {fault}" for fault in faults]
     bounds: dict[str, object] = {}
     for name, value in arrays.items():
-        if value.dtype.kind == "f" and not np.isfinite(value).all():
+        # JSON knows no number longer than a double, and no text beyond Unicode.
+        plain = value.astype(np.float64) if value.dtype.kind == "f" else value
+        if plain.dtype.kind == "f" and not np.isfinite(plain).all():
             warnings.append(f"bounds: {path} [{name}] is not finite; left out")
+        elif plain.dtype.kind == "U" and not _is_text(plain):
+            warnings.append(f"bounds: {path} [{name}] is no text; left out")
         else:
-            bounds[name] = value.tolist()
+            bounds[name] = plain.tolist()
     return bounds
+
+
+def _is_text(value: NDArray[Any]) -> bool:
+    """Whether an array of text holds characters alone, neither surrogates nor what is above."""
+    codes = np.ascontiguousarray(value).view(np.uint32)
+    return not ((codes > sys.maxunicode) | (codes >> 11 == 0xD800 >> 11)).any()
 
 
 def _first(bad: NDArray[np.bool_]) -> tuple[int, ...]:
