@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from slatprep.errors import InputError
 from slatprep.readers.files import ArraySpec, load_source, refusing
-from slatprep.readers.patterns import component_regex
+from slatprep.readers.patterns import match
 from slatprep.records import Place, SourceFile
 from slatprep.storage.files import file_digest
 from slatprep.storage.place import storage_of
@@ -119,19 +119,22 @@ def _walk_groups(
 ) -> Iterator[tuple[dict[str, str], str]]:
     import h5py
 
-    regex = component_regex(components[0], known)
-    for name in group:
-        match = regex.fullmatch(name)
+    for key in group:
+        # h5py gives bytes where a name is no UTF-8.
+        name = key.decode(errors="surrogateescape") if isinstance(key, bytes) else key
+        fields = match(components[0], known, name)
         if (
-            match
-            and group.id.links.get_info(name.encode()).type == h5py.h5l.TYPE_HARD
-            and isinstance(group[name], h5py.Group)
+            fields is not None
+            and group.id.links.get_info(name.encode(errors="surrogateescape")).type
+            == h5py.h5l.TYPE_HARD
+            and isinstance(group[key], h5py.Group)
         ):
-            fields = known | match.groupdict()
             if len(components) == 1:
-                yield fields, prefix + name
+                yield known | fields, prefix + name
             else:
-                yield from _walk_groups(group[name], components[1:], fields, f"{prefix}{name}/")
+                yield from _walk_groups(
+                    group[key], components[1:], known | fields, f"{prefix}{name}/"
+                )
 
 
 def _child(parent: h5py.Group, name: str, where: str, kind: type, kind_name: str) -> Any:

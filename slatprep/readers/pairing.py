@@ -20,10 +20,11 @@ from slatprep.storage.listing import Listing
 
 @dataclass(frozen=True, slots=True)
 class _Grid:
-    """A grid file of an object."""
+    """A grid file of an object, or the folder of one that cannot be listed."""
 
     sample: str
     path: str
+    problem: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,6 +81,9 @@ def discover(parameters: BuildParameters) -> list[AssetPair]:
         is found on one side.
     """
     pixieverse, slat, pairing = parameters.pixieverse, parameters.slat, parameters.pairing
+    for root in (pixieverse.root, slat.root):
+        if str(root) != in_unicode(str(root)):
+            raise ConfigError(f"{root}: is no UTF-8, so that no record can hold it; rename it")
     try:
         if not pixieverse.root.is_dir():
             raise ConfigError(f"{pixieverse.root}: no such folder; expected the PixieVerse root")
@@ -108,9 +112,10 @@ def _find_grids(source: PixieverseSource, listing: Listing) -> dict[str, list[_G
         if "{id}" not in pattern:
             raise ConfigError(f"grid pattern {pattern!r} names no {{id}}")
         found: dict[str, list[_Grid]] = {}
-        for fields, path in find_files(listing, pattern, chosen):
-            found.setdefault(fields["id"], []).append(_Grid(fields.get("sample", ""), path))
-        grids = found | grids
+        for fields, path, problem in find_files(listing, pattern, chosen, skip=grids):
+            grid = _Grid(fields.get("sample", ""), path, problem)
+            found.setdefault(fields.get("id", path), []).append(grid)
+        grids |= found
     if not grids:
         raise ConfigError(f"{source.root}: no grid found; looked for {_tried(source.grid, chosen)}")
     return grids
@@ -134,10 +139,16 @@ def _each_slat(source: SlatSource, one_file: bool) -> Iterator[_Slat]:
         yield from _each_group(source, source.root.parent, source.root.name)
         return
     listing = list_below(source.root)
+    unlisted: set[str] = set()
     for pattern in source.pattern:
-        for fields, path in find_files(listing, pattern, {}):
-            if "id" in fields:
-                yield _Slat(fields["id"], fields.get("view", ""), path)
+        for fields, path, problem in find_files(listing, pattern, {}):
+            if path in unlisted:
+                continue
+            if problem:
+                unlisted.add(path)
+            if problem or "id" in fields:
+                slat_id, view = fields.get("id", path), fields.get("view", "")
+                yield _Slat(slat_id, view, path, problem=problem)
             else:
                 yield from _each_group(source, source.root, path, fields)
 
@@ -221,9 +232,12 @@ def _pairs(rows: list[_Row], there: _Found) -> Iterator[AssetPair]:
 
 def _pair(row: _Row, there: _Found, shared: str) -> AssetPair:
     source, slat_source = there.parameters.pixieverse, there.parameters.slat
-    problems = [shared, *_name_problems(row), *(slat.problem for slat in row.slats)]
-    grid = mask = bounds = None
     grids = sorted(there.grids.get(row.object_id, ()), key=lambda found: found.path)
+    problems = [shared, *_name_problems(row)]
+    sides: tuple[_Grid | _Slat, ...] = (*grids, *row.slats)
+    for side in sides:
+        problems += [side.problem, _unrecordable(side.path)]
+    grid = mask = bounds = None
     if grids:
         grid = source.root / grids[0].path
         if len(grids) > 1:
@@ -244,12 +258,6 @@ def _pair(row: _Row, there: _Found, shared: str) -> AssetPair:
             f"{len(found)} SLATs for one id {row.asset_id!r} ({files}); expected one, "
             "or a pattern with {view}"
         )
-    slat = there.roots.slat / found[0].path if found else None
-    problems += [
-        f"{file}: its name is no UTF-8, so that no record can hold it; rename it"
-        for file in (grid, mask, bounds, slat)
-        if file is not None and str(file) != in_unicode(str(file))
-    ]
     return AssetPair(
         asset_id=row.asset_id,
         object_id=_safe(row.object_id),
@@ -259,9 +267,9 @@ def _pair(row: _Row, there: _Found, shared: str) -> AssetPair:
         grid=grid,
         mask=mask,
         bounds=bounds,
-        slat=slat,
+        slat=there.roots.slat / found[0].path if found else None,
         slat_group=found[0].group if found else "",
-        problem="; ".join(problem for problem in problems if problem),
+        problem="; ".join(dict.fromkeys(filter(None, problems))),
     )
 
 
@@ -272,6 +280,12 @@ def _name_problems(row: _Row) -> Iterator[str]:
                 f"{kind} {name!r} is not allowed; expected letters, digits, '.', '_' and '-', "
                 "not beginning with '.'"
             )
+
+
+def _unrecordable(path: str) -> str:
+    if path == in_unicode(path):
+        return ""
+    return f"{path}: its name is no UTF-8, so that no record can hold it; rename it"
 
 
 def _several_grids(object_id: str, grids: list[_Grid]) -> str:
@@ -299,10 +313,12 @@ def _find_one(
 ) -> Place | None:
     """Return the file that the first matching pattern finds; if it finds more, add a problem."""
     for pattern in patterns:
-        paths = sorted(path for _, path in find_files(there.listing, pattern, known))
+        found = sorted(find_files(there.listing, pattern, known), key=lambda one: one.path)
+        problems += [one.problem or _unrecordable(one.path) for one in found]
+        paths = [one.path for one in found if not one.problem]
         if len(paths) > 1:
-            found = ", ".join(paths)
-            problems.append(f"{len(paths)} {role} files for one id ({found}); expected one")
+            named = ", ".join(paths)
+            problems.append(f"{len(paths)} {role} files for one id ({named}); expected one")
         if paths:
             return there.parameters.pixieverse.root / paths[0]
     return None

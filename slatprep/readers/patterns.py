@@ -7,8 +7,9 @@ Component by component only the folders that can match are listed.
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from functools import lru_cache
+from typing import NamedTuple
 
 from slatprep.errors import ConfigError
 from slatprep.records import Place
@@ -19,6 +20,19 @@ FIELDS = ("id", "sample", "view")
 
 NAME = re.compile(r"[A-Za-z0-9_-][A-Za-z0-9._-]*")
 """What an id or a view may be: one plain path component that is not hidden."""
+
+_VARIABLE = re.compile(r"(\{[^{}]*\}|\*)")
+
+
+class Found(NamedTuple):
+    """A file that matches a pattern, or a folder on the way to some that cannot be listed."""
+
+    fields: dict[str, str]
+    """What the fields of the pattern stand for, as far as the path goes."""
+    path: str
+    """Relative to the root."""
+    problem: str = ""
+    """Why the folder cannot be listed."""
 
 
 def list_below(root: Place) -> Listing:
@@ -36,8 +50,8 @@ def list_below(root: Place) -> Listing:
 
 
 def find_files(
-    names: Listing, pattern: str, known: Mapping[str, str]
-) -> Iterator[tuple[dict[str, str], str]]:
+    names: Listing, pattern: str, known: Mapping[str, str], skip: Collection[str] = ()
+) -> Iterator[Found]:
     """Find the files below a folder that match a pattern.
 
     Parameters
@@ -48,17 +62,19 @@ def find_files(
         Relative path with fields, such as ``{id}/sample_{sample}/material_grid.npy``.
     known : mapping of str to str
         Fields that are settled already; they match their value alone.
+    skip : collection of str
+        Ids that are not looked for.
 
     Yields
     ------
-    tuple of dict and str
-        The fields of a match (names are not checked against `NAME`), and its
-        path relative to the folder. In no particular order.
+    Found
+        What is there besides folders, be it a link to nothing: whoever reads
+        it will say so. Names are not checked against `NAME`. In no particular order.
 
     Raises
     ------
     ConfigError
-        If the pattern makes no sense or a folder cannot be listed.
+        If the pattern makes no sense or the root cannot be listed.
     """
     components = pattern.split("/")
     if pattern.startswith("/") or any(part in ("", ".", "..") for part in components):
@@ -66,7 +82,7 @@ def find_files(
             f"pattern {pattern!r} is not a path below its root; write it relative, without '..'"
         )
     try:
-        yield from _walk(names, "", components, dict(known))
+        yield from _walk(names, "", components, dict(known), skip)
     except OSError as error:
         raise ConfigError(f"{error.filename}: cannot be listed ({error.strerror})") from None
 
@@ -78,47 +94,106 @@ def fill(pattern: str, known: Mapping[str, str]) -> str:
     return pattern
 
 
-def component_regex(component: str, known: Mapping[str, str]) -> re.Pattern[str]:
-    """Compile one component of a pattern; a field already known matches its value."""
-    return _compile(component, tuple(sorted(known.items())) if "{" in component else ())
+def match(component: str, known: Mapping[str, str], name: str) -> dict[str, str] | None:
+    """Match a name with one component of a pattern.
 
+    Where several ways are possible, what stands first takes as much as it can.
+    The time is linear in the name, whatever the pattern.
 
-@lru_cache(maxsize=256)
-def _compile(component: str, known: tuple[tuple[str, str], ...]) -> re.Pattern[str]:
-    values = dict(known)
-    regex = ""
-    for part in re.split(r"(\{[^{}]*\}|\*)", component):
-        field = part[1:-1]
-        if part == "*":
-            regex += ".*"
-        elif not part.startswith("{"):
-            regex += re.escape(part)
-        elif field in values:
-            regex += re.escape(values[field])
-        elif f"(?P<{field}>" in regex:
-            regex += f"(?P={field})"
-        elif field in FIELDS:
-            regex += f"(?P<{field}>.+)"
+    Parameters
+    ----------
+    component : str
+        Of a pattern; a field stands for at least one character, ``*`` also for none.
+    known : mapping of str to str
+        Fields that are settled already; they match their value alone.
+    name : str
+        A file's, folder's or group's.
+
+    Returns
+    -------
+    dict of str to str or None
+        The fields that were not known; None if the name does not match.
+
+    Raises
+    ------
+    ConfigError
+        If the component makes no sense.
+
+    Examples
+    --------
+    >>> match("{id}_{view}.npz", {}, "a_b_c.npz") == {"id": "a_b", "view": "c"}
+    True
+    """
+    texts, variables = [""], []
+    for part in _parts(component):
+        if part in known:
+            texts[-1] += known[part]
+        elif part in FIELDS or part == "*":
+            variables.append(part)
+            texts.append("")
         else:
+            texts[-1] += part[1:]
+    begin, stop = len(texts[0]), len(name) - len(texts[-1])
+    if not variables:
+        return {} if name == texts[0] else None
+    if not (begin <= stop and name.startswith(texts[0]) and name.endswith(texts[-1])):
+        return None
+    # From the last on, each takes as little as it may: the more is left to those before it.
+    fields = {}
+    for variable, text in zip(variables[:0:-1], texts[-2:0:-1], strict=True):
+        at = name.rfind(text, begin, stop - (variable != "*"))
+        if at < 0:
+            return None
+        fields[variable] = name[at + len(text) : stop]
+        stop = at
+    fields[variables[0]] = name[begin:stop]
+    fields.pop("*", None)
+    return fields if all(fields.values()) else None
+
+
+@lru_cache(maxsize=64)
+def _parts(component: str) -> tuple[str, ...]:
+    """Split a component into fields by name, ``*``, and other text with a blank before it."""
+    parts: list[str] = []
+    for part in _VARIABLE.split(component):
+        if not part.startswith("{"):
+            parts.append(part if part == "*" else f" {part}")
+        elif part[1:-1] not in FIELDS:
             raise ConfigError(
                 f"pattern component {component!r} names {part}; "
                 f"fields are {', '.join(f'{{{name}}}' for name in FIELDS)}"
             )
-    return re.compile(regex, re.DOTALL)
+        elif part[1:-1] in parts:
+            raise ConfigError(f"pattern component {component!r} names {part} twice; name it once")
+        else:
+            parts.append(part[1:-1])
+    return tuple(parts)
 
 
 def _walk(
-    names: Listing, prefix: str, components: list[str], known: dict[str, str]
-) -> Iterator[tuple[dict[str, str], str]]:
+    names: Listing,
+    prefix: str,
+    components: list[str],
+    known: dict[str, str],
+    skip: Collection[str],
+) -> Iterator[Found]:
     component, rest = components[0], components[1:]
-    regex = component_regex(component, known)
+    _parts(component)
     literal = fill(component, known)
-    for name in [literal] if "*" not in literal else names.of_folder(prefix):
-        match = regex.fullmatch(name)
-        if match is None:
+    try:
+        listed = [literal] if "*" not in literal else names.of_folder(prefix, folders=bool(rest))
+    except OSError as error:
+        if not prefix:
+            raise
+        problem = f"{error.filename}: cannot be listed ({error.strerror})"
+        yield Found(known, prefix, problem)
+        return
+    for name in listed:
+        fields = match(component, known, name)
+        if fields is None or fields.get("id") in skip:
             continue
         path = prefix + name
         if rest:
-            yield from _walk(names, path + "/", rest, known | match.groupdict())
-        elif names.is_file(path):
-            yield known | match.groupdict(), path
+            yield from _walk(names, path + "/", rest, known | fields, skip)
+        elif "*" in literal or names.is_file(path):
+            yield Found(known | fields, path)

@@ -7,12 +7,14 @@ they are, and asking for one costs as much.
 from __future__ import annotations
 
 import os
+import stat
 from collections.abc import Iterable
+from functools import cached_property
 from pathlib import Path
 
 
 class Listing:
-    """Names below a folder of the local disk, as they are whenever one asks.
+    """Names below a folder of the local disk, as they are whenever one asks; those in it but once.
 
     Names are relative to the folder, with forward slashes.
 
@@ -23,25 +25,54 @@ class Listing:
     """
 
     def __init__(self, root: Path) -> None:
-        self._root = root
+        self._root = str(root)  # os.path.join is not called so often with a Path
 
-    def of_folder(self, folder: str) -> Iterable[str]:
-        """Return the names in a folder, given with a slash at its end; none if there is none.
+    def of_folder(self, folder: str, *, folders: bool) -> Iterable[str]:
+        """Return what is in a folder, given with a slash at its end; nothing if there is none.
+
+        Parameters
+        ----------
+        folder : str
+            Its name; empty for the root.
+        folders : bool
+            Whether to return the names of its folders, or those of all else.
 
         Raises
         ------
         OSError
             If it cannot be listed.
         """
-        try:
-            with os.scandir(self._root / folder) as entries:
-                return [entry.name for entry in entries]
-        except (FileNotFoundError, NotADirectoryError):
-            return []
+        return (self._scan(folder) if folder else self._top)[folders]
 
     def is_file(self, path: str) -> bool:
-        """Whether there is a file of this name."""
-        return os.path.isfile(os.path.join(self._root, path))  # noqa: PTH113, PTH118 - half a million times
+        """Whether there is anything of this name but a folder, be it a link to nothing."""
+        full = os.path.join(self._root, path)  # noqa: PTH118 - half a million times
+        try:
+            return not stat.S_ISDIR(os.stat(full).st_mode)  # noqa: PTH116
+        except (OSError, ValueError):
+            return os.path.islink(full)  # noqa: PTH114
+
+    @cached_property
+    def _top(self) -> tuple[list[str], list[str]]:
+        return self._scan("")  # Every pattern begins there.
+
+    def _scan(self, folder: str) -> tuple[list[str], list[str]]:
+        """Return the names of all but folders in a folder, and those of the folders."""
+        found: tuple[list[str], list[str]] = ([], [])
+        try:
+            with os.scandir(os.path.join(self._root, folder)) as entries:  # noqa: PTH118
+                for entry in entries:
+                    found[_is_folder(entry)].append(entry.name)
+        except (FileNotFoundError, NotADirectoryError):
+            pass
+        return found
+
+
+def _is_folder(entry: os.DirEntry[str]) -> bool:
+    try:
+        return entry.is_dir()
+    except OSError:  # A link that leads back to itself.
+        return False
 
 
 class RemoteListing(Listing):
@@ -62,9 +93,12 @@ class RemoteListing(Listing):
                 self._folders.setdefault(folder + "/" if folder else "", {})[name] = None
                 file = folder
 
-    def of_folder(self, folder: str) -> Iterable[str]:
+    def of_folder(self, folder: str, *, folders: bool) -> Iterable[str]:
         """See `Listing`."""
-        return self._folders.get(folder, ())
+        names = self._folders.get(folder, ())
+        if folders:
+            return [name for name in names if f"{folder}{name}/" in self._folders]
+        return [name for name in names if folder + name in self.files]
 
     def is_file(self, path: str) -> bool:
         """See `Listing`."""

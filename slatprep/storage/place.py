@@ -121,7 +121,8 @@ class Storage:
             inside = ".." not in relative.parts and resolved.is_relative_to(root.resolve())
             regular = stat.S_ISREG(resolved.stat().st_mode)
         except FileNotFoundError:
-            raise InputError(path, "does not exist", "a readable file") from None
+            fault = "is a link that leads nowhere" if path.is_symlink() else "does not exist"
+            raise InputError(path, fault, "a readable file") from None
         except (OSError, RuntimeError, ValueError) as error:  # link loops, NUL, other roots
             raise InputError(path, f"cannot be opened ({error})", f"a file below {root}") from None
         if not inside:

@@ -3,6 +3,11 @@
 from __future__ import annotations
 
 import json
+import os
+import re
+from collections.abc import Iterator
+from contextlib import contextmanager
+from itertools import product
 from pathlib import Path
 
 import h5py
@@ -18,6 +23,7 @@ from slatprep.parameters import (
     SlatSource,
 )
 from slatprep.readers import discover, read_field, read_latents
+from slatprep.readers.patterns import match
 
 UID = "0123456789abcdef0123456789abcdef"
 SHA = "ab" * 32
@@ -346,6 +352,115 @@ def test_missing_roots_and_empty_roots(find, tmp_path):
     touch(tmp_path, "all.h5")
     with pytest.raises(ConfigError, match=r"all\.h5: is no readable HDF5 file"):
         find(slat={"root": tmp_path / "all.h5"})
+
+
+@contextmanager
+def without_privileges(folder: Path) -> Iterator[None]:
+    """Be nobody in particular: root may read everything."""
+    if os.geteuid():
+        yield
+        return
+    for one in (folder, *folder.parents):
+        one.chmod(one.stat().st_mode | 0o755)
+    os.seteuid(65534)
+    try:
+        yield
+    finally:
+        os.seteuid(0)
+
+
+@pytest.mark.parametrize("side", ["pixie", "slat"])
+def test_a_folder_that_cannot_be_listed_costs_its_asset_alone(find, tmp_path, side):
+    slats = ["a/1.npz", "b/1.npz", "c.npz"]
+    find([grid("a"), grid("b"), grid("c")], slats)
+    (tmp_path / side / "a").chmod(0)
+    with without_privileges(tmp_path):
+        found = {pair.asset_id: pair for pair in find()}
+    (tmp_path / side / "a").chmod(0o755)
+    assert list(found) == ["a", "b", "c"]
+    assert f"{tmp_path / side}/a/: cannot be listed (Permission denied)" in found["a"].problem
+    assert found["a"].problem.count("cannot be listed") == 1
+    assert not found["b"].problem
+    assert not found["c"].problem
+    with pytest.raises(InputError, match="cannot be listed") as caught:
+        read_field(found["a"])
+    assert type(caught.value) is InputError  # not a partner that is missing
+
+
+def test_a_folder_on_the_way_to_ids_that_cannot_be_listed_is_named(find, tmp_path):
+    patterns = {"pixieverse": {"grid": ("*/{id}.npy",)}, "slat": {"pattern": ("*/{id}.npz",)}}
+    find(["x/a.npy", "y/b.npy"], ["x/a.npz", "y/b.npz"], **patterns)
+    (tmp_path / "pixie" / "y").chmod(0)
+    with without_privileges(tmp_path):
+        found = {pair.asset_id: pair for pair in find(**patterns)}
+    (tmp_path / "pixie" / "y").chmod(0o755)
+    assert not found["a"].problem
+    assert "no grid for id 'b'" in found["b"].problem
+    assert "/y/: cannot be listed" in found["y%2F"].problem
+
+
+NO_FILES = {
+    "loop": (lambda path: path.symlink_to(path.name), "b.npz: cannot be opened"),
+    "broken link": (lambda path: path.symlink_to("gone"), "b.npz: is a link that leads nowhere"),
+    "pipe": (os.mkfifo, "b.npz: is not a regular file"),
+    "device": (lambda path: path.symlink_to("/dev/zero"), "b.npz: leads to /dev/zero, out of"),
+}
+
+
+@pytest.mark.parametrize("kind", NO_FILES)
+def test_what_is_no_file_is_named_by_its_name(find, tmp_path, kind):
+    make, message = NO_FILES[kind]
+    (tmp_path / "slat").mkdir()
+    make(tmp_path / "slat" / "b.npz")
+    first, second = find([grid("a"), grid("b")], ["a.npz"])
+    assert not first.problem
+    assert not second.problem
+    with pytest.raises(InputError, match=message):
+        read_latents(second)
+
+
+def test_a_mask_that_leads_nowhere_is_no_missing_mask(find, tmp_path):
+    find([grid("a")], ["a.npz"])
+    mask = tmp_path / "pixie/a/clip_features_mask.npy"
+    mask.symlink_to("gone")
+    (pair,) = find()
+    assert pair.mask == mask
+
+
+def test_a_group_whose_name_is_no_unicode_costs_itself_alone(find, tmp_path):
+    with h5py.File(tmp_path / "all.h5", "w") as file:
+        for name in (b"a", b"b\xff"):
+            group = h5py.Group(h5py.h5g.create(file.id, name))
+            group["coords"], group["feats"] = COORDS, FEATS
+    pairs = find([grid("a")], slat={"root": tmp_path / "all.h5"})
+    assert [pair.asset_id for pair in pairs] == ["a", "b%FF"]
+    assert not pairs[0].problem
+    assert r"id 'b\udcff' is not allowed" in pairs[1].problem
+
+
+def test_a_name_that_almost_matches_in_many_ways_takes_no_time(find):
+    find(slat={"pattern": ("*a*a*a*a*a*a*a*a*a*a*ab/{id}.npz", "{id}.npz")},
+         grids=[grid("a")], slats=["a" * 120 + "/x.npz", "a.npz"])  # fmt: skip
+
+
+def test_a_field_twice_in_a_component_is_refused(find):
+    with pytest.raises(ConfigError, match=r"names \{id\} twice"):
+        find([grid("a")], ["a_a.npz"], slat={"pattern": ("{id}_{id}.npz",)})
+
+
+def test_names_match_as_a_greedy_regular_expression_would():
+    """`re` is the truth: every pattern of up to five parts on every name of three letters."""
+    parts = {"*": ".*", "{id}": "(?P<id>.+)", "{view}": "(?P<view>.+)", "a": "a", ".": r"\."}
+    names = ["".join(letters) for n in range(6) for letters in product("a.b", repeat=n)]
+    for n in range(1, 6):
+        for chosen in product(parts, repeat=n):
+            if chosen.count("{id}") > 1 or chosen.count("{view}") > 1:
+                continue
+            expression = re.compile("".join(parts[part] for part in chosen))
+            for name in names[:: 1 + 7 * (n > 3)]:
+                expected = expression.fullmatch(name)
+                found = match("".join(chosen), {}, name)
+                assert found == (expected and expected.groupdict()), (chosen, name)
 
 
 def test_link_out_of_the_root_is_found_but_not_read(find, tmp_path):
