@@ -15,7 +15,6 @@ from slatprep.cli.options import (
     command,
     option,
     shares_of,
-    shares_option,
 )
 from slatprep.cli.output import Output
 
@@ -29,7 +28,7 @@ if TYPE_CHECKING:
 @click.argument("predictions", type=click.Path(path_type=Path, exists=True))
 @option("--store", EXISTING_FOLDER, required=True, metavar="STORE.zarr")
 @option("--split", ChoiceOf("slatprep.learn.splits:SPLITS", "all"), "test")
-@shares_option
+@option("--shares", metavar="TRAIN,VAL,TEST")
 @option("--spread", ChoiceOf("slatprep.learn.metrics:Spread"), "se")
 @option("--csv", NEW_FILE, name="csv_file")
 @option("--beside", metavar="pixie|FILE.csv")
@@ -38,7 +37,7 @@ def evaluate(
     predictions: Path,
     store: Place,
     split: Any,
-    shares: str,
+    shares: str | None,
     spread: Any,
     csv_file: Path | None,
     beside: str | None,
@@ -55,6 +54,8 @@ def evaluate(
     -------
     --store: Has the truth.
     --split: Objects to measure on.
+    --shares: Shares of the objects. [default: as the run says that the predictions are of, else
+        0.8,0.1,0.1]
     --spread: Standard error or standard deviation over objects.
     --csv: Also write the table to this file.
     --beside: Also print Pixie's published table, which has NeRF2Physics too, or one of your
@@ -67,13 +68,17 @@ def evaluate(
     slatprep evaluate runs/large/predictions --store pixieverse.zarr --beside pixie
     """
     from slatprep.learn.metrics import evaluate_store
+    from slatprep.learn.predictions import RUN_FILE, selection_of_run
     from slatprep.learn.published import PIXIE_TABLE, read_scores
 
     others: tuple[PublishedScore, ...] = ()
     if beside is not None:
         others = PIXIE_TABLE if beside == "pixie" else read_scores(Path(beside))
+    chosen = {"shares": shares_of(shares)} if shares else selection_of_run(predictions)
+    if chosen and not shares:
+        output.note(f"split:   as {predictions.absolute().parent / RUN_FILE} says")
     result = evaluate_store(
-        predictions, store, None if split == "all" else split, shares_of(shares), spread
+        predictions, store, None if split == "all" else split, spread=spread, **(chosen or {})
     )
     rows = _rows(result)
     names = (name for mean in result.overall.means for name in (mean, f"{mean} {spread}"))

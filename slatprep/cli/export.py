@@ -13,6 +13,7 @@ from slatprep.cli.options import (
     ChoiceOf,
     command,
     jobs_option,
+    note_left_out,
     option,
     verdicts_option,
 )
@@ -81,7 +82,10 @@ def export(output: Output, store: Place, kind: Any, out: Path, **others: Any) ->
             flag = f"--{name.replace('_', '-')}"
             raise ConfigError(f"{flag} is for --format {_ONLY_FOR[name]}, not {kind}")
     from slatprep.export import ExportOptions, export_store
+    from slatprep.store import open_store
 
+    if others["verdicts"] is None and not others["assets"]:
+        note_left_out(output, open_store(store))
     with output.progress("export") as progress:
         chosen = ExportOptions(**options)
         summary = export_store(store, out, kind, options=chosen, progress=progress, **others)

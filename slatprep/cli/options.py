@@ -6,6 +6,7 @@ import functools
 import inspect
 import pkgutil
 import re
+from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
 from textwrap import indent
@@ -20,6 +21,7 @@ if TYPE_CHECKING:
     from slatprep.learn.splits import Shares
     from slatprep.parameters import BuildParameters
     from slatprep.records import Place
+    from slatprep.store import Store
 
     _Choice = click.Choice[str]
 else:
@@ -195,11 +197,23 @@ def beside(store: Place, suffix: str) -> Path:
 
 verdicts_option = option(
     "--verdict",
-    ChoiceOf("slatprep.records:Verdict"),
-    text="Only assets with this verdict; may be repeated.  [default: all]",
+    ChoiceOf("slatprep.records:Verdict", "all"),
+    text="Only assets with this verdict; may be repeated.  [default: good and doubtful]",
     name="verdicts",
     multiple=True,
+    callback=lambda _context, _parameter, given: () if "all" in given else given or None,
 )
+"""The verdicts; none where all are taken, None where the option was not given."""
+
+
+def note_left_out(output: Output, store: Store) -> None:
+    """Say how many assets of a store their verdict leaves out where none is asked for."""
+    from slatprep.records import USABLE
+
+    left = Counter(str(v) for v in store.column("verdict") if v not in USABLE)
+    if left:
+        counts = ", ".join(f"{count:,} {verdict}" for verdict, count in sorted(left.items()))
+        output.note(f"left out: {counts} (--verdict all takes them)")
 
 
 def _at_most_the_cores(_context: click.Context, _parameter: click.Parameter, jobs: int) -> int:
@@ -222,7 +236,7 @@ jobs_option = option(
 def workers_options(command: _Function) -> _Function:
     """Add ``--jobs`` and ``--scheduler``, of which the command gets what was chosen as `jobs`.
 
-    It stands below `output_options`, whose `Output` it takes and hands on.
+    It stands below `command`, whose `Output` it takes and hands on.
     """
 
     @jobs_option

@@ -15,6 +15,7 @@ from slatprep.cli.options import (
     POSITIVE,
     ChoiceOf,
     command,
+    note_left_out,
     option,
     shares_of,
     shares_option,
@@ -38,7 +39,7 @@ _SIZES = ("small", "medium", "large")
 @option("--batch-size", POSITIVE, 1)
 @option("--accumulate", POSITIVE, 1)
 @option("--learning-rate", click.FloatRange(min=0, min_open=True), 0.0001)
-@option("--precision", click.Choice(["fp32", "bf16"]), "bf16")
+@option("--precision", click.Choice(["auto", "fp32", "bf16"]), "auto")
 @option("--patience", POSITIVE, 10)
 @option("--augment", ChoiceOf("slatprep.learn.augment:Augmentation"), "none", name="augmentation")
 @verdicts_option
@@ -56,7 +57,7 @@ def train(
     size: str,
     all_sizes: bool,
     shares: str,
-    verdicts: tuple[str, ...],
+    verdicts: tuple[str, ...] | None,
     device: str,
     workers: int,
     threads: int,
@@ -65,8 +66,8 @@ def train(
     """Train SLAT-Phys's decoder on STORE.
 
     Writes run.json, log.csv, curve.png, checkpoints and the predictions of
-    the test objects, which `slatprep evaluate` measures. Needs PyTorch: pip
-    install slatprep[train].
+    the test objects, which `slatprep evaluate` measures. Needs PyTorch:
+    pip install 'slatprep[train]'.
 
     Options
     -------
@@ -77,7 +78,7 @@ def train(
     --batch-size: Assets in a batch.
     --accumulate: Batches in a step of the optimiser.
     --learning-rate: Of AdamW, before the cosine.
-    --precision: bf16: mixed precision.
+    --precision: bf16: mixed precision; auto: that where the processor computes in it, else fp32.
     --patience: Stop after so many epochs without progress.
     --augment: Quarter turns and flips: of 8 or 48 kinds.
     --max-ambiguity: Leave out assets that are more ambiguous.
@@ -99,32 +100,36 @@ def train(
 
     from slatprep.learn.train import TrainParameters
     from slatprep.learn.train import train as run
+    from slatprep.records import USABLE, Verdict
+    from slatprep.store import open_store
 
     torch.set_num_threads(threads)
+    if verdicts is None:
+        verdicts = USABLE
+        note_left_out(output, open_store(store))
     chosen = TrainParameters(
-        size=size,
-        shares=shares_of(shares),
-        verdicts=verdicts or TrainParameters.verdicts,
-        **parameters,
+        size=size, shares=shares_of(shares), verdicts=verdicts or tuple(Verdict), **parameters
     )
     runs = {name: out / name for name in _SIZES} if all_sizes else {size: out}
     summaries = {}
     for name, directory in runs.items():
-        summaries[name] = run(
-            store,
-            directory,
-            dataclasses.replace(chosen, size=name),
-            device=device,
-            workers=workers,
-            progress=lambda r, name=name: output.note(  # type: ignore[misc]
-                f"{name}, epoch {r.epoch}: train loss {r.train_loss:.4f}, validation loss "
-                f"{r.val_loss:.4f}, MSE {r.val_mse:.4f}, accuracy {r.val_accuracy:.3f}"
-            ),
-        )
+        with output.progress(f"train {name}", "steps") as steps:
+            summaries[name] = run(
+                store,
+                directory,
+                dataclasses.replace(chosen, size=name),
+                device=device,
+                workers=workers,
+                steps=steps,
+                progress=lambda r, name=name: output.note(  # type: ignore[misc]
+                    f"{name}, epoch {r.epoch}: train loss {r.train_loss:.4f}, validation loss "
+                    f"{r.val_loss:.4f}, MSE {r.val_mse:.4f}, accuracy {r.val_accuracy:.3f}"
+                ),
+            )
     output.result(summaries, lambda: _show_training(output, summaries))
     output.note(f"runs:    {', '.join(str(directory) for directory in runs.values())}")
     first = next(iter(summaries.values()))
-    output.note(f"next:    slatprep evaluate {first.predictions} --store {store} --shares {shares}")
+    output.note(f"next:    slatprep evaluate {first.predictions} --store {store}")
 
 
 def _show_training(output: Output, summaries: dict[str, TrainSummary]) -> None:

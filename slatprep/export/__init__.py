@@ -18,7 +18,7 @@ from slatprep.errors import ConfigError
 from slatprep.export import target
 from slatprep.export.assets import Exported, choose_ids, describe_columns
 from slatprep.export.formats import ExportOptions, Writer
-from slatprep.records import Place
+from slatprep.records import USABLE, Place
 from slatprep.storage.place import place_of, storage_of
 from slatprep.store import Store, open_store
 from slatprep.workers.local import run_unordered
@@ -64,7 +64,7 @@ def export_store(
     format: str,
     *,
     assets: Sequence[str] = (),
-    verdicts: Sequence[str] = (),
+    verdicts: Sequence[str] | None = None,
     options: ExportOptions | None = None,
     jobs: int = 1,
     progress: Progress | None = None,
@@ -83,8 +83,10 @@ def export_store(
         What to write; docs/export.md says what is in each.
     assets : sequence of str
         Ids of the assets; empty takes all.
-    verdicts : sequence of str
-        Take only assets with one of these verdicts; empty takes all.
+    verdicts : sequence of str, optional
+        Take only assets with one of these verdicts; empty takes all. By
+        default those of `assets` whatever their verdict is, or all that are
+        good or doubtful.
     options : ExportOptions, optional
         What only some formats ask for.
     jobs : int
@@ -114,6 +116,8 @@ def export_store(
     local = storage_of(store).local
     if local is not None and local.resolve() in out.resolve().parents:
         raise ConfigError(f"{out} lies inside the store; expected a path outside {store}")
+    if verdicts is None:
+        verdicts = () if assets else USABLE
     ids = choose_ids(opened, assets, verdicts)
     tell = progress or (lambda done, total: None)
     writer: Writer = import_module(FORMATS[format]).writer(opened, ids, options)

@@ -1,6 +1,6 @@
 """What the store is for: load it into PyTorch, train the paper's decoder, measure it.
 
-``pip install slatprep[train]`` brings PyTorch, which the loader needs;
+``pip install 'slatprep[train]'`` brings PyTorch, which the loader needs;
 `splits`, `predictions` and `metrics` need numpy alone.
 
 >>> from slatprep.learn import SlatDataset, SlatLoader  # doctest: +SKIP
@@ -39,5 +39,5 @@ def require_torch() -> None:
         import torch  # noqa: F401
     except ImportError as error:
         raise SlatprepError(
-            f"PyTorch cannot be imported ({error}); install it with `pip install slatprep[train]`"
+            f"PyTorch cannot be imported ({error}); install it with `pip install 'slatprep[train]'`"
         ) from error

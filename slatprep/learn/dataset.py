@@ -116,7 +116,7 @@ class SlatDataset(Dataset[Item]):
         An open store, or where one lies. Worker processes, forked or spawned,
         each read it for themselves.
     split : {"train", "val", "test"}, optional
-        Which objects, as `slatprep.learn.splits.split_of` decides; all if not given.
+        Which objects, as `slatprep.learn.splits.split_objects` decides; all if not given.
     shares : Shares
         Shares of the splits.
     verdicts : collection of str, optional
@@ -158,8 +158,8 @@ class SlatDataset(Dataset[Item]):
             raise ConfigError(
                 f"{self.store.path} has no asset of split {split or 'all'} that passes the "
                 f"filter, of {len(self.store)} in all; expected one at least: "
-                "loosen the filter or change the shares (a hash of the object's id decides "
-                "where it goes, so a small dataset needs some such as 0.6,0.2,0.2)"
+                "loosen the filter, change the shares, or add objects (as many as splits are "
+                "the least)"
             )
         self.asset_ids = [self.store.ids[index] for index in self.indices]
         if min_confidence is not None:

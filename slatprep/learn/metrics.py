@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -150,6 +150,8 @@ def evaluate_store(
     split: Split | None = "test",
     shares: Shares = Shares(),  # noqa: B008 (immutable)
     spread: Spread = "se",
+    verdicts: Collection[str] | None = None,
+    max_ambiguity: float | None = None,
 ) -> Evaluation:
     """Measure predictions against a store.
 
@@ -165,6 +167,8 @@ def evaluate_store(
         Shares of the splits, as in training.
     spread : {"se", "sd"}
         Standard error or standard deviation over objects.
+    verdicts, max_ambiguity
+        As for `slatprep.learn.splits.select_assets`.
 
     Raises
     ------
@@ -178,8 +182,11 @@ def evaluate_store(
     scored: list[int] = []
     scores: list[NDArray[np.float64]] = []
     missing: list[str] = []
+    chosen = select_assets(
+        store, split, shares=shares, verdicts=verdicts, max_ambiguity=max_ambiguity
+    )
     with open_predictions(predictions) as read:
-        for index in select_assets(store, split, shares=shares).tolist():
+        for index in chosen.tolist():
             asset_id = store.ids[index]
             arrays = read(asset_id)
             if arrays is None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -13,10 +14,14 @@ from numpy.typing import NDArray
 
 from slatprep.errors import InputError
 from slatprep.geometry.voxels import flat_index
+from slatprep.learn.splits import Shares
 from slatprep.records import MATERIAL_CLASSES, RESOLUTION
 
 CLASSES = len(MATERIAL_CLASSES)
 """Classes that a decoder scores; background is one of them, though no voxel has it."""
+
+RUN_FILE = "run.json"
+"""What `slatprep train` writes beside the predictions: the parameters of the run."""
 
 _FORMS = "a directory of <asset id>.npz, a Zarr group or an HDF5 file with a group an asset"
 
@@ -35,6 +40,39 @@ class VoxelPrediction:
 
     properties: NDArray[np.float64]
     material: NDArray[np.int64] | None
+
+
+def selection_of_run(predictions: Path) -> dict[str, Any] | None:
+    """Return which assets a training run chose, as `slatprep.learn.splits.select_assets` takes it.
+
+    Parameters
+    ----------
+    predictions : Path
+        The folder of its predictions.
+
+    Returns
+    -------
+    dict or None
+        ``shares``, ``verdicts`` and ``max_ambiguity``; None where no run lies there.
+
+    Raises
+    ------
+    InputError
+        If the run's file does not say them.
+    """
+    file = predictions.absolute().parent / RUN_FILE
+    if not file.exists():
+        return None
+    try:
+        run = json.loads(file.read_text(encoding="utf-8"))
+        shares, verdicts = Shares(**run["shares"]), tuple(run["verdicts"])
+        return {"shares": shares, "verdicts": verdicts, "max_ambiguity": run["max_ambiguity"]}
+    except (ValueError, KeyError, TypeError) as error:
+        raise InputError(
+            file,
+            f"does not say which assets the run chose ({error!r})",
+            "what `slatprep train` wrote; or give --shares",
+        ) from error
 
 
 ReadAsset = Callable[[str], Mapping[str, NDArray[Any]] | None]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import dataclasses
 import json
+import os
 from collections.abc import Sequence
 from pathlib import Path
 from pickle import UnpicklingError
@@ -13,9 +14,12 @@ from typing import Any
 import torch
 
 from slatprep.errors import ConfigError, InputError
+from slatprep.learn.predictions import RUN_FILE
 from slatprep.storage.atomic import staged
+from slatprep.storage.lock import take_lock
 
 LAST, BEST = "last.pt", "best.pt"
+_LOCK = ".lock"
 
 INK, MUTED = "#1F2328", "#6B7280"
 """Colours of the curve: text and data, and what they are compared with."""
@@ -34,36 +38,67 @@ class EpochRecord:
 
 
 class Run:
-    """The directory of one training run.
+    """The directory of one training run; as a context it holds the directory's lock.
 
     Parameters
     ----------
     path : Path
-        New, empty, or that of a run with the same parameters, which goes on.
+        New, empty, or that of a run.
+
+    Attributes
+    ----------
     parameters : dict
-        Everything that decides the result.
+        Those of the run that is there; empty where there is none.
 
     Raises
     ------
     ConfigError
         If the directory holds something else.
+    StoreError
+        If another process trains into it.
     """
 
-    def __init__(self, path: Path, parameters: dict[str, Any]) -> None:
+    def __init__(self, path: Path) -> None:
         self.path = path
-        file = path / "run.json"
+        self.parameters: dict[str, Any] = {}
+
+    def __enter__(self) -> Run:
+        file = self.path / RUN_FILE
+        there = file.exists()
+        if not there and self.path.exists() and any(p.name != _LOCK for p in self.path.iterdir()):
+            raise ConfigError(f"{self.path} is not empty and holds no run; choose another --out")
+        self._lock = take_lock(self.path / _LOCK, f"{self.path}: another training is writing it")
+        if there:
+            self.parameters = json.loads(file.read_text(encoding="utf-8"))
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        (self.path / _LOCK).unlink(missing_ok=True)
+        os.close(self._lock)
+
+    def begin(self, parameters: dict[str, Any]) -> None:
+        """Note everything that decides the result, or go on with the run that has the same.
+
+        Raises
+        ------
+        ConfigError
+            If the run there has other parameters; the message names them.
+        """
         text = json.dumps(parameters, indent=1, sort_keys=True) + "\n"
-        if file.exists():
-            if file.read_text(encoding="utf-8") != text:
-                raise ConfigError(
-                    f"{file}: the run there has other parameters; "
-                    "repeat them to go on with it, or choose another --out"
-                )
-        elif path.exists() and any(path.iterdir()):
-            raise ConfigError(f"{path} is not empty and holds no run; choose another --out")
-        else:
-            path.mkdir(parents=True, exist_ok=True)
+        wanted, found = json.loads(text), self.parameters
+        file = self.path / RUN_FILE
+        if not found:
             file.write_text(text, encoding="utf-8")
+        elif found != wanted:
+            others = [
+                f"{name} {found.get(name)!r} instead of {wanted.get(name)!r}"
+                for name in sorted({*found, *wanted})
+                if found.get(name) != wanted.get(name)
+            ]
+            raise ConfigError(
+                f"{file}: the run there has other parameters ({', '.join(others)}); "
+                "repeat them to go on with it, or choose another --out"
+            )
 
     def save(self, name: str, state: dict[str, Any]) -> None:
         """Write a checkpoint; the old one stays until the new one is whole."""

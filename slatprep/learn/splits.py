@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Collection
+from collections import Counter
+from collections.abc import Collection, Iterable
 from dataclasses import dataclass
 from typing import Literal
 
@@ -67,6 +68,35 @@ def split_of(object_id: str, shares: Shares = Shares()) -> Split:
     return "val" if position < shares.train + shares.val else "test"
 
 
+def split_objects(object_ids: Iterable[str], shares: Shares = Shares()) -> dict[str, Split]:
+    """Return the split of every object of a dataset, none of those asked for empty.
+
+    It is the split of `split_of`, but for datasets so small that one would get
+    no object: it then takes the object whose place in [0, 1) is nearest to its
+    own, from a split that has others. That needs as many objects as splits.
+
+    Parameters
+    ----------
+    object_ids : iterable of str
+        All objects of the dataset, whatever is filtered later: the choice
+        must be the same for whoever trains and for whoever tests.
+    shares : Shares
+        Shares of the splits; one with share 0 stays empty.
+    """
+    splits = {object_id: split_of(object_id, shares) for object_id in sorted(set(object_ids))}
+    ends = {"train": 0.0, "val": shares.train, "test": shares.train + shares.val}
+    for split in SPLITS:
+        share, low = getattr(shares, split), ends[split]
+        if share == 0 or split in splits.values():
+            continue
+        counts = Counter(splits.values())
+        spare = [object_id for object_id, other in splits.items() if counts[other] > 1]
+        if spare:
+            middle = low + share / 2
+            splits[min(spare, key=lambda object_id: abs(position_of(object_id) - middle))] = split
+    return splits
+
+
 def select_assets(
     store: Store,
     split: Split | None = None,
@@ -82,7 +112,7 @@ def select_assets(
     store : Store
         An open store.
     split : {"train", "val", "test"}, optional
-        Which objects; all if not given.
+        Which objects, as `split_objects` decides; all if not given.
     shares : Shares
         Shares of the splits.
     verdicts : collection of str, optional
@@ -115,6 +145,8 @@ def select_assets(
     if max_ambiguity is not None:
         chosen &= store.column("ambiguity") <= max_ambiguity
     if split is not None:
-        objects = store.column("object_id")
-        chosen &= np.array([split_of(str(object_id), shares) == split for object_id in objects])
+        objects = [str(object_id) for object_id in store.column("object_id")]
+        usable = zip(objects, store.column("valid_share") > 0, strict=True)
+        splits = split_objects((name for name, is_usable in usable if is_usable), shares)
+        chosen &= np.array([splits.get(object_id) == split for object_id in objects])
     return np.flatnonzero(chosen)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +20,10 @@ from slatprep.learn.dataset import IGNORED, SlatDataset, SlatLoader, SparseBatch
 from slatprep.learn.decoder import SIZES, PhysicsDecoder, Prediction, make_decoder
 from slatprep.learn.runs import BEST, LAST, EpochRecord, Run
 from slatprep.learn.splits import Shares, Split
-from slatprep.records import Place
+from slatprep.records import USABLE, Place
+from slatprep.workers import Progress
+
+PRECISIONS = ("auto", "fp32", "bf16")
 
 PROPERTY_WEIGHT = 1.0
 CLASS_WEIGHT = 0.5
@@ -42,7 +45,7 @@ class TrainParameters:
     learning_rate : float
         Of AdamW, before the cosine lowers it to 0.
     precision : str
-        ``fp32``, or ``bf16`` for mixed precision.
+        ``fp32``, ``bf16`` for mixed precision, or ``auto``: see `precision_of`.
     patience : int
         Epochs without a better validation loss after which training stops.
     augmentation : str
@@ -64,17 +67,17 @@ class TrainParameters:
     batch_size: int = 1
     accumulate: int = 1
     learning_rate: float = 1e-4
-    precision: str = "bf16"
+    precision: str = "auto"
     patience: int = 10
     augmentation: Augmentation = "none"
-    verdicts: tuple[str, ...] = ("good", "doubtful", "failed")
+    verdicts: tuple[str, ...] = USABLE
     max_ambiguity: float | None = None
     shares: Shares = field(default_factory=Shares)
     weigh_by_confidence: bool = False
     seed: int = 0
 
     def __post_init__(self) -> None:
-        for name, allowed in (("size", tuple(SIZES)), ("precision", ("fp32", "bf16"))):
+        for name, allowed in (("size", tuple(SIZES)), ("precision", PRECISIONS)):
             if getattr(self, name) not in allowed:
                 raise ConfigError(
                     f"{name} is {getattr(self, name)!r}; expected one of {', '.join(allowed)}"
@@ -131,6 +134,7 @@ def train(
     device: str = "cpu",
     workers: int = 0,
     progress: Callable[[EpochRecord], None] | None = None,
+    steps: Progress | None = None,
     stop_after: int | None = None,
 ) -> TrainSummary:
     """Train a decoder, or go on with a run that was stopped.
@@ -152,6 +156,8 @@ def train(
         Processes that read ahead.
     progress : callable, optional
         Called after each epoch.
+    steps : callable, optional
+        Called with the batches done and those of all epochs, from where this call begins.
     stop_after : int, optional
         Stop when so many epochs are done, as if interrupted.
 
@@ -162,36 +168,55 @@ def train(
     InputError
         If a checkpoint is damaged.
     StoreError
-        If the store cannot be read.
+        If the store cannot be read, or another process trains into `out`.
     """
     train_set = _dataset(store, "train", parameters)
     if parameters.weigh_by_confidence:
         require_confidence(train_set.store)
     val_set, test_set = _dataset(store, "val", parameters), _dataset(store, "test", parameters)
-    run = Run(out, asdict(parameters) | {"store": str(train_set.store.attributes["manifest"])})
-    session = _Session(parameters, train_set, device, workers)
-    session.restore(run.load(LAST))
-    while not session.finished and session.epoch != stop_after:
-        train_loss, rate = session.run_epoch()
-        record = EpochRecord(session.epoch, rate, train_loss, *session.validate(val_set))
-        session.history.append(record)
-        run.save(LAST, session.state())
-        if session.best_epoch == record.epoch:
-            run.save(BEST, {"size": parameters.size, "model": session.model.state_dict()})
-        run.log(session.history)
-        if progress is not None:
-            progress(record)
-    names = "mean of the training voxels", "linear in each voxel"
-    baselines = zip(names, fit_baselines(train_set), strict=True)
-    references = {name: _reference(baseline, val_set) for name, baseline in baselines}
-    run.draw(session.history, references)
-    best = run.load(BEST)
-    if best is None:
-        raise InputError(run.path / BEST, "is missing", "the best model; train anew")
-    session.model.load_state_dict(best["model"])
-    predictions = run.path / "predictions"
-    _write_predictions(session.model, test_set, predictions, device)
+    with Run(out) as run:
+        if parameters.precision == "auto":
+            # A run goes on as it began, whatever processor it goes on with.
+            known = run.parameters.get("precision") or precision_of(device)
+            parameters = replace(parameters, precision=known)
+        run.begin(asdict(parameters) | {"store": str(train_set.store.attributes["manifest"])})
+        session = _Session(parameters, train_set, device, workers)
+        session.restore(run.load(LAST))
+        while not session.finished and session.epoch != stop_after:
+            train_loss, rate = session.run_epoch(steps)
+            record = EpochRecord(session.epoch, rate, train_loss, *session.validate(val_set))
+            session.history.append(record)
+            run.save(LAST, session.state())
+            if session.best_epoch == record.epoch:
+                run.save(BEST, {"size": parameters.size, "model": session.model.state_dict()})
+            run.log(session.history)
+            if progress is not None:
+                progress(record)
+        names = "mean of the training voxels", "linear in each voxel"
+        baselines = zip(names, fit_baselines(train_set), strict=True)
+        references = {name: _reference(baseline, val_set) for name, baseline in baselines}
+        run.draw(session.history, references)
+        best = run.load(BEST)
+        if best is None:
+            raise InputError(run.path / BEST, "is missing", "the best model; train anew")
+        session.model.load_state_dict(best["model"])
+        predictions = run.path / "predictions"
+        _write_predictions(session.model, test_set, predictions, device)
     return TrainSummary(session.history, session.best_epoch, references, predictions)
+
+
+def precision_of(device: str) -> str:
+    """Return the fastest precision of a device: ``bf16`` where it computes in it, else ``fp32``.
+
+    On a CPU without such instructions bf16 takes five times as long as fp32.
+    """
+    if device != "cpu":
+        return "bf16"
+    try:
+        flags = set(Path("/proc/cpuinfo").read_text(encoding="utf-8", errors="replace").split())
+    except OSError:
+        return "fp32"  # Nothing tells: not Linux.
+    return "bf16" if flags & {"amx_bf16", "avx512_bf16"} else "fp32"
 
 
 class _Session:
@@ -211,6 +236,7 @@ class _Session:
         )
         self.steps = math.ceil(len(self.loader) / parameters.accumulate)
         self.history: list[EpochRecord] = []
+        self.first_epoch = 0
 
     @property
     def epoch(self) -> int:
@@ -226,11 +252,15 @@ class _Session:
             return True
         return bool(self.history) and self.epoch - 1 - self.best_epoch >= self.parameters.patience
 
-    def run_epoch(self) -> tuple[float, float]:
+    def run_epoch(self, steps: Progress | None) -> tuple[float, float]:
         """Train for one epoch; return the mean loss and the last learning rate."""
         self.model.train()
         self.loader.set_epoch(self.epoch)
         accumulate, losses, rate = self.parameters.accumulate, [], 0.0
+        before = (self.epoch - self.first_epoch) * len(self.loader)
+        total = (self.parameters.epochs - self.first_epoch) * len(self.loader)
+        if steps and before == 0:
+            steps(0, total)
         for number, batch in enumerate(self.loader):
             moved = batch.to(self.device)
             loss = loss_of(self._predict(moved), moved, self.parameters.weigh_by_confidence)
@@ -244,6 +274,8 @@ class _Session:
                     group["lr"] = rate
                 self.optimizer.step()
                 self.optimizer.zero_grad(set_to_none=True)
+            if steps:
+                steps(before + number + 1, total)
         return float(np.mean(losses)), rate
 
     @torch.no_grad()
@@ -274,6 +306,7 @@ class _Session:
             self.model.load_state_dict(state["model"])
             self.optimizer.load_state_dict(state["optimizer"])
             self.history = [EpochRecord(**record) for record in state["history"]]
+            self.first_epoch = self.epoch
 
     def _rate(self, step: int) -> float:
         total = self.parameters.epochs * self.steps

@@ -8,21 +8,19 @@ and goes on from there.
 
 from __future__ import annotations
 
-import json
 import os
-import platform
 import shutil
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from datetime import UTC, datetime
 from pathlib import Path
 
 from slatprep.errors import StoreError
 from slatprep.pipeline.spool import Spool
 from slatprep.records import Place
 from slatprep.storage.atomic import restore_directory
+from slatprep.storage.lock import take_lock
 from slatprep.storage.place import storage_of
 
 
@@ -67,7 +65,7 @@ def work_beside(
     """
     directory = work_directory(target)
     try:
-        lock = _locked(directory, target)
+        lock = take_lock(directory / "lock", f"{target}: another build is writing it")
     except OSError as error:
         raise StoreError(
             f"{directory.parent}: cannot write there ({error.strerror}); "
@@ -101,55 +99,6 @@ def _restore(directory: Path, target: Place) -> None:
     local = storage_of(target).local
     if local is not None:
         restore_directory(directory, local)
-
-
-def _locked(directory: Path, target: Place) -> int:
-    """Return a descriptor that holds the lock until it is closed, if only by a kill."""
-    import fcntl  # No such module on Windows, where `--help` must work all the same.
-
-    while True:
-        directory.mkdir(parents=True, exist_ok=True)
-        path = directory / "lock"
-        try:
-            descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o666)
-        except FileNotFoundError:
-            continue  # The build before us has just removed its folder.
-        try:
-            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            holder = os.pread(descriptor, 4096, 0)
-            os.close(descriptor)
-            raise StoreError(_refusal(target, holder)) from None
-        if _is_at(descriptor, path):
-            break
-        os.close(descriptor)  # What we locked has been removed; lock what is there now.
-    os.ftruncate(descriptor, 0)
-    told = {
-        "pid": os.getpid(),
-        "host": platform.node(),
-        "since": datetime.now(UTC).isoformat(timespec="seconds"),
-    }
-    os.pwrite(descriptor, json.dumps(told).encode(), 0)
-    return descriptor
-
-
-def _is_at(descriptor: int, path: Path) -> bool:
-    try:
-        return os.path.samestat(os.fstat(descriptor), path.stat())
-    except FileNotFoundError:
-        return False
-
-
-def _refusal(target: Place, holder: bytes) -> str:
-    try:
-        told = json.loads(holder)
-        who = f"process {told['pid']} on {told['host']}, since {told['since']}"
-    except (ValueError, KeyError, TypeError):
-        who = "which has only just begun"
-    return (
-        f"{target}: another build is writing it ({who}); wait until it has ended, "
-        "or choose another path"
-    )
 
 
 def _remove(directory: Path, but: tuple[str, ...]) -> None:

@@ -106,6 +106,10 @@ class Verdict(StrEnum):
     FAILED = "failed"
 
 
+USABLE = (Verdict.GOOD, Verdict.DOUBTFUL)
+"""Verdicts of assets that go into trainings and exports unless others are asked for."""
+
+
 class Status(StrEnum):
     """What became of an asset in a build."""
 

@@ -28,7 +28,7 @@ from slatprep.learn import (
     split_of,
 )
 from slatprep.learn.augment import lattice_symmetries, move
-from slatprep.learn.splits import select_assets
+from slatprep.learn.splits import SPLITS, select_assets, split_objects
 
 THIRDS = Shares(0.4, 0.3, 0.3)
 
@@ -42,7 +42,7 @@ def test_without_pytorch_scores_work_and_the_loader_says_what_to_install() -> No
     )
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
     assert done.stdout.startswith("SlatprepError"), done.stderr
-    assert "pip install slatprep[train]" in done.stdout
+    assert "pip install 'slatprep[train]'" in done.stdout
 
 
 @given(st.text(), st.tuples(st.integers(0, 100), st.integers(1, 100), st.integers(1, 100)))
@@ -164,3 +164,26 @@ def test_augmentation_moves_coordinates_and_nothing_else(learn_store: Path) -> N
         a, b = (item.coords[::7].double() for item in (plain[k], turned[k]))
         assert torch.equal(torch.cdist(a, a).round(decimals=6), torch.cdist(b, b).round(decimals=6))
     assert moved > len(plain) // 2
+
+
+@given(st.sets(st.text(min_size=1), min_size=1, max_size=12))
+def test_no_split_is_empty_where_there_are_as_many_objects(objects: set[str]) -> None:
+    splits = split_objects(objects)
+    assert splits.keys() == objects
+    assert len(set(splits.values())) == min(len(objects), 3)
+    by_hash = {object_id: split_of(object_id) for object_id in objects}
+    if len(set(by_hash.values())) == 3:
+        assert splits == by_hash
+    assert "val" not in split_objects(objects, Shares(0.5, 0.0, 0.5)).values()
+
+
+def test_what_is_filtered_moves_no_object_to_another_split(learn_store: Path) -> None:
+    store = open_store(learn_store)
+    ambiguity = np.sort(store.column("ambiguity"))
+    for shares in (THIRDS, Shares(), Shares(0.02, 0.96, 0.02)):
+        for limit in (ambiguity[0], ambiguity[4]):
+            everything = {s: set(select_assets(store, s, shares=shares)) for s in SPLITS}
+            assert all(everything.values())
+            for split in SPLITS:
+                some = select_assets(store, split, shares=shares, max_ambiguity=float(limit))
+                assert set(some) <= everything[split]

@@ -6,21 +6,25 @@ import csv
 import dataclasses
 import json
 import math
+import os
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 from click.testing import CliRunner
+from support.synthetic import Dataset, make_asset
 
-from slatprep import ConfigError, InputError
+from slatprep import ConfigError, InputError, StoreError, build_store, open_store
 from slatprep.cli.commands import slatprep
+from slatprep.learn import train as module
 from slatprep.learn.baselines import fit_baselines
-from slatprep.learn.dataset import IGNORED, SlatDataset, SparseBatch, collate
+from slatprep.learn.dataset import IGNORED, SlatDataset, SlatLoader, SparseBatch, collate
 from slatprep.learn.decoder import Prediction, make_decoder
 from slatprep.learn.runs import BEST, LAST
 from slatprep.learn.splits import Shares, split_of
-from slatprep.learn.train import TrainParameters, loss_of, train
+from slatprep.learn.train import TrainParameters, loss_of, precision_of, train
+from slatprep.storage.lock import take_lock
 
 SHARES = Shares(0.4, 0.3, 0.3)
 SHORT = TrainParameters(
@@ -101,7 +105,7 @@ def test_wrong_runs_are_named(learn_store: Path, tmp_path: Path) -> None:
     out = tmp_path / "run"
     one = dataclasses.replace(SHORT, epochs=1)
     train(learn_store, out, one)
-    with pytest.raises(ConfigError, match="other parameters"):
+    with pytest.raises(ConfigError, match=r"other parameters \(seed 1 instead of 2\)"):
         train(learn_store, out, dataclasses.replace(one, seed=2))
     (out / LAST).write_bytes(b"not a checkpoint")
     with pytest.raises(InputError, match=r"last\.pt"):
@@ -163,12 +167,94 @@ def test_commands_train_and_evaluate(learn_store: Path, tmp_path: Path) -> None:
     history = json.loads(trained.stdout)["small"]["history"]
     assert history[1]["train_loss"] < history[0]["train_loss"]
     predictions = tmp_path / "run" / "predictions"
-    measured = CliRunner().invoke(
-        slatprep, ["evaluate", str(predictions), "--store", str(learn_store), *shares, "--json"]
-    )
+    evaluate = ["evaluate", str(predictions), "--store", str(learn_store), "--json"]
+    measured = CliRunner().invoke(slatprep, [*evaluate, *shares])
     assert measured.exit_code == 0, measured.output
     assert json.loads(measured.stdout)["missing"] == []
+    # Without shares those of the run are taken, whose test objects alone were predicted.
+    again = CliRunner().invoke(slatprep, evaluate)
+    assert again.stdout == measured.stdout
+    assert f"as {tmp_path / 'run' / 'run.json'} says" in again.stderr
+    (tmp_path / "run" / "run.json").write_text("{}")
+    refused = CliRunner().invoke(slatprep, evaluate)
+    assert refused.exit_code == 1 and "run.json" in refused.stderr
     wrong = CliRunner().invoke(
         slatprep, ["train", str(learn_store), "--out", str(tmp_path), "--shares", "1,2"]
     )
     assert wrong.exit_code == 2
+
+
+def test_a_run_is_trained_by_one_process_at_a_time(learn_store: Path, tmp_path: Path) -> None:
+    held = take_lock(tmp_path / "run" / ".lock", "by the test")
+    with pytest.raises(StoreError, match=rf"another training .* \(process {os.getpid()} on"):
+        train(learn_store, tmp_path / "run", SHORT)
+    os.close(held)
+    train(learn_store, tmp_path / "run", dataclasses.replace(SHORT, epochs=1))
+    assert not (tmp_path / "run" / ".lock").exists()
+
+
+def test_steps_are_counted_from_where_a_run_goes_on(learn_store: Path, tmp_path: Path) -> None:
+    seen: list[tuple[int, int]] = []
+    batches = len(SlatLoader(SlatDataset(learn_store, "train", shares=SHARES), SHORT.batch_size))
+    for stop_after in (1, None):
+        train(
+            learn_store, tmp_path / "run", SHORT, stop_after=stop_after,
+            steps=lambda *done: seen.append(done),
+        )  # fmt: skip
+    first = [(k, 3 * batches) for k in range(batches + 1)]
+    assert seen == [*first, *((k, 2 * batches) for k in range(2 * batches + 1))]
+
+
+@pytest.mark.parametrize(
+    ("flags", "precision"),
+    [("avx2 avx512f", "fp32"), ("avx512f avx512_bf16", "bf16"), ("amx_bf16", "bf16")],
+)
+def test_precision_is_that_of_the_processor(
+    flags: str, precision: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    text = f"processor : 0\nmodel name : any\nflags : fpu {flags}\n"
+    monkeypatch.setattr(Path, "read_text", lambda path, **_: text)
+    assert precision_of("cpu") == precision
+    assert precision_of("cuda") == "bf16"
+
+
+def test_a_run_goes_on_in_the_precision_it_began_with(
+    learn_store: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for found in ("fp32", "bf16"):  # As if it were moved to another machine.
+        monkeypatch.setattr(module, "precision_of", lambda device, found=found: found)
+        train(learn_store, tmp_path / "run", SHORT, stop_after=1)
+        assert json.loads((tmp_path / "run" / "run.json").read_text())["precision"] == "fp32"
+
+
+def test_failed_assets_are_neither_trained_on_nor_exported_unless_asked_for(
+    tmp_path: Path,
+) -> None:
+    dataset = Dataset(tmp_path / "sources")
+    for seed, object_id in enumerate("abc"):
+        dataset.add(object_id, seed)
+    rng = np.random.default_rng(0)
+    scattered = np.unique(rng.integers(0, 64, (400, 3)), axis=0).astype(np.uint8)
+    dataset.write_grid("d", make_asset(3).grid)
+    dataset.write_slat("d.npz", scattered, np.zeros((len(scattered), 8), np.float32))
+    store = tmp_path / "s.zarr"
+    build_store(dataset.parameters(), store)
+    assert list(open_store(store).column("verdict")) == ["good"] * 3 + ["failed"]
+
+    arguments = ["export", str(store), "--format", "npz", "--json", "--out"]
+    for options, count in (((), 3), (("--verdict", "all"), 4), (("--asset", "d"), 1)):
+        out = str(tmp_path / f"npz-{count}")
+        exported = CliRunner().invoke(slatprep, [*arguments, out, *options])
+        assert json.loads(exported.stdout)["assets"] == count
+        assert ("left out: 1 failed" in exported.stderr) is (count == 3)
+    trained = CliRunner().invoke(
+        slatprep,
+        ["train", str(store), "--out", str(tmp_path / "run"), "--size", "small", "--epochs", "1",
+         "--threads", "1"],
+    )  # fmt: skip
+    assert trained.exit_code == 0, trained.output
+    assert "left out: 1 failed (--verdict all takes them)" in trained.stderr
+    assert json.loads((tmp_path / "run" / "run.json").read_text())["verdicts"] == [
+        "good",
+        "doubtful",
+    ]

@@ -1,0 +1,75 @@
+"""A lock on what one process writes at a time, which its holder's end releases however it comes."""
+
+from __future__ import annotations
+
+import json
+import os
+import platform
+from datetime import UTC, datetime
+from pathlib import Path
+
+from slatprep.errors import StoreError
+
+
+def take_lock(path: Path, taken: str) -> int:
+    """Return a descriptor that holds a lock until it is closed, if only by a kill.
+
+    Parameters
+    ----------
+    path : Path
+        The file to lock; it and its folder are made. Whoever holds the lock may remove it.
+    taken : str
+        What is so where another process holds it, as ``STORE: another build is writing it``.
+
+    Raises
+    ------
+    StoreError
+        If another process holds it; the message names that process.
+    """
+    try:
+        import fcntl
+    except ImportError:  # On Windows, where `--help` and reading must work all the same.
+        raise StoreError(
+            f"{path}: cannot be locked, as Windows has no flock; expected Linux or macOS "
+            "(on Windows, the Linux subsystem WSL)"
+        ) from None
+    while True:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        try:
+            descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o666)
+        except FileNotFoundError:
+            continue  # The holder before us has just removed its folder.
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            who = _named(os.pread(descriptor, 4096, 0))
+            os.close(descriptor)
+            raise StoreError(
+                f"{taken} ({who}); wait until it has ended, or choose another path"
+            ) from None
+        if _is_at(descriptor, path):
+            break
+        os.close(descriptor)  # What we locked has been removed; lock what is there now.
+    os.ftruncate(descriptor, 0)
+    told = {
+        "pid": os.getpid(),
+        "host": platform.node(),
+        "since": datetime.now(UTC).isoformat(timespec="seconds"),
+    }
+    os.pwrite(descriptor, json.dumps(told).encode(), 0)
+    return descriptor
+
+
+def _is_at(descriptor: int, path: Path) -> bool:
+    try:
+        return os.path.samestat(os.fstat(descriptor), path.stat())
+    except FileNotFoundError:
+        return False
+
+
+def _named(holder: bytes) -> str:
+    try:
+        told = json.loads(holder)
+        return f"process {told['pid']} on {told['host']}, since {told['since']}"
+    except (ValueError, KeyError, TypeError):
+        return "which has only just begun"
