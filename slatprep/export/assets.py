@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import hashlib
 from collections import Counter
 from collections.abc import Sequence
 from typing import Any, NamedTuple
-from urllib.parse import quote
 
 import numpy as np
 
@@ -29,8 +27,6 @@ COLUMNS = (
 
 TARGETS = ("properties", "material", "valid")
 """What a decoder is trained on, beside coordinates and latents."""
-
-_LONGEST_NAME = 180
 
 
 class Exported(NamedTuple):
@@ -82,35 +78,3 @@ def describe_columns(asset: StoredAsset) -> dict[str, Any]:
     """Return an asset's id and its `COLUMNS`, as Python's own numbers and words."""
     columns = {name: np.asarray(asset.columns[name]).tolist() for name in COLUMNS}
     return {"asset_id": asset.asset_id, **columns}
-
-
-def file_name(asset_id: str, *, dots: bool = True) -> str:
-    """Return a file name for an asset, without suffix.
-
-    Plain ids stay as they are. Whatever could mean something to a shell, an
-    archive or a file system is percent-encoded, as is a leading sign; a name
-    that would be too long ends in a hash instead.
-
-    Parameters
-    ----------
-    asset_id : str
-        Any text.
-    dots : bool
-        Whether dots may stay.
-
-    Examples
-    --------
-    >>> file_name("0a1b2c.front"), file_name("0a1b2c.front", dots=False)
-    ('0a1b2c.front', '0a1b2c%2Efront')
-    >>> file_name("../a b"), file_name("-rf")
-    ('%2E.%2Fa%20b', '%2Drf')
-    """
-    name = quote(asset_id, safe="")
-    if not dots:
-        name = name.replace(".", "%2E")
-    if name.startswith((".", "_", "-", "~")):
-        name = f"%{ord(name[0]):02X}{name[1:]}"
-    if len(name) > _LONGEST_NAME:
-        digest = hashlib.sha256(asset_id.encode()).hexdigest()[:32]
-        name = f"{name[:_LONGEST_NAME]}~{digest}"
-    return name

@@ -7,10 +7,11 @@ from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
-from slatprep.export.assets import Exported, describe_columns, file_name
+from slatprep.export.assets import Exported, describe_columns
 from slatprep.export.formats import ExportOptions, Writer
 from slatprep.export.target import FORMAT
 from slatprep.records import PROPERTY_COLUMNS
+from slatprep.storage.names import file_name
 from slatprep.store import Store, StoredAsset
 
 _DATASETS: dict[str, dict[str, Any]] = {

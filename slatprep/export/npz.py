@@ -7,8 +7,9 @@ from pathlib import Path
 
 import numpy as np
 
-from slatprep.export.assets import TARGETS, Exported, file_name
+from slatprep.export.assets import TARGETS, Exported
 from slatprep.export.formats import ExportOptions, Writer
+from slatprep.storage.names import file_name
 from slatprep.store import Store, StoredAsset
 
 

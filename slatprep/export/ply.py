@@ -15,11 +15,12 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from slatprep.errors import StoreError
-from slatprep.export.assets import Exported, file_name
+from slatprep.export.assets import Exported
 from slatprep.export.formats import ExportOptions, Frame, Points, Writer
 from slatprep.geometry.frames import voxel_centres
 from slatprep.provenance.stored import StoredRecords
 from slatprep.records import MATERIAL_COLOURS, RESOLUTION
+from slatprep.storage.names import file_name
 from slatprep.store import Store, StoredAsset
 
 VERTEX = np.dtype(

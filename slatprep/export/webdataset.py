@@ -10,8 +10,9 @@ from pathlib import Path
 import numpy as np
 import orjson
 
-from slatprep.export.assets import TARGETS, Exported, describe_columns, file_name
+from slatprep.export.assets import TARGETS, Exported, describe_columns
 from slatprep.export.formats import ExportOptions, Writer
+from slatprep.storage.names import file_name
 from slatprep.store import Store, StoredAsset
 
 

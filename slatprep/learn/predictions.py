@@ -1,21 +1,31 @@
-"""Read predictions: npz files, Zarr or HDF5, by asset."""
+"""Read predictions: npz files, Zarr or HDF5, by asset.
+
+They may be a stranger's: nothing is unpickled or followed out of them, and nothing
+is read whose type or shape is not that of a prediction.
+"""
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from slatprep.errors import InputError
+from slatprep.errors import InputError, StoreError
 from slatprep.geometry.voxels import flat_index
 from slatprep.learn.splits import Shares
-from slatprep.records import MATERIAL_CLASSES, RESOLUTION
+from slatprep.learn.zarr_arrays import read_array
+from slatprep.readers.files import ArraySpec, load_source, npz_arrays, refusing
+from slatprep.readers.hdf5 import group_arrays
+from slatprep.records import MATERIAL_CLASSES, RESOLUTION, Share, Verdict
+from slatprep.storage.documents import read_document
+from slatprep.storage.names import file_name
+from slatprep.storage.place import storage_of
 
 CLASSES = len(MATERIAL_CLASSES)
 """Classes that a decoder scores; background is one of them, though no voxel has it."""
@@ -23,7 +33,20 @@ CLASSES = len(MATERIAL_CLASSES)
 RUN_FILE = "run.json"
 """What `slatprep train` writes beside the predictions: the parameters of the run."""
 
+RUN_BYTES = 2**20
+"""No such file is larger."""
+
 _FORMS = "a directory of <asset id>.npz, a Zarr group or an HDF5 file with a group an asset"
+
+_NUMBERS = "iuf"
+
+_SPECS = {
+    "properties": ArraySpec(((None, 3),), _NUMBERS),
+    "material": ArraySpec(((None,),), _NUMBERS),
+    "logits": ArraySpec(((None, CLASSES),), _NUMBERS),
+    "coords": ArraySpec(((None, 3),), _NUMBERS),
+}
+"""What a prediction may have; whatever else lies beside it is not read."""
 
 
 @dataclass(frozen=True)
@@ -40,6 +63,15 @@ class VoxelPrediction:
 
     properties: NDArray[np.float64]
     material: NDArray[np.int64] | None
+
+
+@dataclass(frozen=True)
+class _Selection:
+    """What `select_assets` takes of a ``run.json``."""
+
+    shares: Shares
+    verdicts: tuple[Verdict, ...]
+    max_ambiguity: Share | None
 
 
 def selection_of_run(predictions: Path) -> dict[str, Any] | None:
@@ -60,14 +92,16 @@ def selection_of_run(predictions: Path) -> dict[str, Any] | None:
     InputError
         If the run's file does not say them.
     """
+    from pydantic import TypeAdapter
+
     file = predictions.absolute().parent / RUN_FILE
     if not file.exists():
         return None
     try:
-        run = json.loads(file.read_text(encoding="utf-8"))
-        shares, verdicts = Shares(**run["shares"]), tuple(run["verdicts"])
-        return {"shares": shares, "verdicts": verdicts, "max_ambiguity": run["max_ambiguity"]}
-    except (ValueError, KeyError, TypeError) as error:
+        run = read_document(file, RUN_BYTES)
+        named = {name: run[name] for name in ("shares", "verdicts", "max_ambiguity")}
+        return vars(TypeAdapter(_Selection).validate_python(named))
+    except (OSError, ValueError, KeyError, TypeError) as error:
         raise InputError(
             file,
             f"does not say which assets the run chose ({error!r})",
@@ -86,26 +120,31 @@ def open_predictions(path: Path) -> Iterator[ReadAsset]:
     Parameters
     ----------
     path : Path
-        A directory of ``<asset_id>.npz``, a Zarr group, or an HDF5 file.
+        A directory of ``<asset_id>.npz``, a Zarr group of format 3, or an HDF5
+        file; ids that are no plain names are written as
+        `slatprep.storage.names.file_name` has it.
 
     Raises
     ------
     InputError
         If it is none of these.
     """
-    if path.is_dir() and any((path / name).exists() for name in ("zarr.json", ".zgroup")):
-        import zarr
+    if path.is_dir():
+        zarr = any((path / name).exists() for name in ("zarr.json", ".zgroup"))
+        yield partial(_zarr if zarr else _npz, path)
+        return
+    import h5py
 
-        yield _grouped(zarr.open_group(path, mode="r"))
-    elif path.is_dir():
-        yield lambda asset_id: _npz(path / f"{asset_id}.npz")
-    else:
-        import h5py
-
-        if not h5py.is_hdf5(path):
-            raise InputError(path, "is not in a form that is known", _FORMS)
-        with h5py.File(path, "r") as file:
-            yield _grouped(file)
+    try:
+        storage_of(path).open().close()  # HDF5 would wait for a pipe.
+    except OSError as error:
+        raise InputError(path, f"cannot be read ({error.strerror})", _FORMS) from None
+    if not h5py.is_hdf5(path):
+        raise InputError(path, "is not in a form that is known", _FORMS)
+    with refusing(path, "is no readable HDF5 file", _FORMS):
+        file = h5py.File(path, "r", locking=False)
+    with file:
+        yield partial(_hdf5, file, path)
 
 
 def check_prediction(
@@ -127,7 +166,7 @@ def check_prediction(
     Raises
     ------
     InputError
-        If an array is missing, has another shape, is not finite, or the voxels are others.
+        If an array is missing, has another type or shape, is not finite, or the voxels are others.
     """
     count = len(coords)
     if "properties" not in arrays:
@@ -137,11 +176,13 @@ def check_prediction(
         raise InputError(source, "properties are not all finite", "numbers in normalised space")
     material = None
     if "material" in arrays:
-        material = _shaped(source, "material", arrays, (count,)).astype(np.int64)
-        if material.size and not 0 <= material.min() <= material.max() < CLASSES:
-            raise InputError(source, f"has class {material.max()}", f"0 to {CLASSES - 1}")
+        material = _shaped(source, "material", arrays, (count,))
+        material = _whole(source, "class", material, CLASSES)
     elif "logits" in arrays:
-        material = _shaped(source, "logits", arrays, (count, CLASSES)).argmax(axis=1)
+        logits = _shaped(source, "logits", arrays, (count, CLASSES))
+        if np.isnan(logits).any():
+            raise InputError(source, "logits are not all numbers", "a score for each class")
+        material = logits.argmax(axis=1)
     if "coords" in arrays:
         order = _order(source, _shaped(source, "coords", arrays, (count, 3)), coords)
         properties = properties[order]
@@ -150,9 +191,7 @@ def check_prediction(
 
 
 def _order(source: str, ours: NDArray[Any], theirs: NDArray[np.uint8]) -> NDArray[np.int64]:
-    if ours.size and not 0 <= ours.min() <= ours.max() < RESOLUTION:
-        raise InputError(source, f"has a coordinate {ours.max()}", f"0 to {RESOLUTION - 1}")
-    keys = flat_index(ours), flat_index(theirs)
+    keys = flat_index(_whole(source, "coordinate", ours, RESOLUTION)), flat_index(theirs)
     mine, stored = (np.argsort(key, kind="stable") for key in keys)
     if not np.array_equal(keys[0][mine], keys[1][stored]):
         raise InputError(source, "has other voxels than the store", "the store's voxel/coords")
@@ -165,26 +204,45 @@ def _shaped(
     source: str, name: str, arrays: Mapping[str, NDArray[Any]], shape: tuple[int, ...]
 ) -> NDArray[Any]:
     array = np.asarray(arrays[name])
+    if array.dtype.kind not in _NUMBERS:
+        raise InputError(source, f"{name} has dtype {array.dtype.str}", "plain numbers")
     if array.shape != shape:
         raise InputError(source, f"{name} has shape {array.shape}", f"{shape}")
     return array
 
 
-def _npz(path: Path) -> Mapping[str, NDArray[Any]] | None:
+def _whole(source: str, what: str, values: NDArray[Any], stop: int) -> NDArray[np.int64]:
+    """Return whole numbers below a bound as integers, whatever their type."""
+    wrong = values[~((values >= 0) & (values < stop) & (values == np.floor(values)))]
+    if wrong.size:
+        raise InputError(source, f"has {what} {wrong.flat[0]:g}", f"0 to {stop - 1}")
+    return values.astype(np.int64)
+
+
+def _npz(folder: Path, asset_id: str) -> Mapping[str, NDArray[Any]] | None:
+    path = folder / f"{file_name(asset_id)}.npz"
     if not path.exists():
         return None
+    data, _ = load_source(path, folder, "prediction")
+    return npz_arrays(data, path, _SPECS, partial=True)
+
+
+def _hdf5(file: Any, path: Path, asset_id: str) -> Mapping[str, NDArray[Any]] | None:
+    group = file_name(asset_id)
+    with refusing(f"{path} [{group}]", "is damaged", _FORMS):
+        there = file.id.links.exists(group.encode())
+        return group_arrays(file, path, group, _SPECS, partial=True) if there else None
+
+
+def _zarr(root: Path, asset_id: str) -> Mapping[str, NDArray[Any]] | None:
+    group = root / file_name(asset_id)
+    if not group.is_dir():
+        return None
     try:
-        with np.load(path, allow_pickle=False) as file:
-            return {name: file[name] for name in file.files}
-    except (OSError, ValueError, EOFError, KeyError) as error:
-        raise InputError(path, f"cannot be read ({error})", "a file of numpy.savez") from error
-
-
-def _grouped(root: Any) -> ReadAsset:
-    def read(asset_id: str) -> Mapping[str, NDArray[Any]] | None:
-        if asset_id not in root:
-            return None
-        group = root[asset_id]
-        return {name: np.asarray(group[name][...]) for name in group}
-
-    return read
+        return {
+            name: read_array(group / name, spec)
+            for name, spec in _SPECS.items()
+            if (group / name).is_dir()
+        }
+    except StoreError as error:
+        raise InputError(group, f"cannot be read ({error})", _FORMS) from None

@@ -6,17 +6,22 @@ import csv
 import dataclasses
 import json
 import os
+import zipfile
 from collections.abc import Sequence
+from contextlib import AbstractContextManager
 from pathlib import Path
 from pickle import UnpicklingError
 from typing import Any
 
 import torch
 
-from slatprep.errors import ConfigError, InputError
-from slatprep.learn.predictions import RUN_FILE
+from slatprep.errors import ConfigError
+from slatprep.learn.predictions import RUN_BYTES, RUN_FILE
+from slatprep.readers.files import refusing
 from slatprep.storage.atomic import staged
+from slatprep.storage.documents import read_document
 from slatprep.storage.lock import take_lock
+from slatprep.storage.place import storage_of
 
 LAST, BEST = "last.pt", "best.pt"
 _LOCK = ".lock"
@@ -56,6 +61,8 @@ class Run:
         If the directory holds something else.
     StoreError
         If another process trains into it.
+    InputError
+        If its ``run.json`` cannot be read.
     """
 
     def __init__(self, path: Path) -> None:
@@ -69,7 +76,8 @@ class Run:
             raise ConfigError(f"{self.path} is not empty and holds no run; choose another --out")
         self._lock = take_lock(self.path / _LOCK, f"{self.path}: another training is writing it")
         if there:
-            self.parameters = json.loads(file.read_text(encoding="utf-8"))
+            with refusing(file, "cannot be read", "what `slatprep train` wrote"):
+                self.parameters = read_document(file, RUN_BYTES)
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -116,13 +124,23 @@ class Run:
         path = self.path / name
         if not path.exists():
             return None
-        try:
-            state: dict[str, Any] = torch.load(path, map_location="cpu", weights_only=True)
-        except (RuntimeError, OSError, EOFError, ValueError, UnpicklingError) as error:
-            raise InputError(
-                path, f"cannot be read ({error})", "a checkpoint of `slatprep train`"
-            ) from error
+        with self.reading(name), storage_of(path).open() as file:
+            with zipfile.ZipFile(file) as archive:
+                # torch.save stores; what is packed could unpack to any size.
+                if any(info.compress_type != zipfile.ZIP_STORED for info in archive.infolist()):
+                    raise ValueError("it is compressed")
+            file.seek(0)
+            try:
+                state = torch.load(file, map_location="cpu", weights_only=True)
+            except UnpicklingError as error:
+                raise ValueError(error) from None
+            if not isinstance(state, dict):
+                raise ValueError(f"it holds {type(state).__name__}")
         return state
+
+    def reading(self, name: str) -> AbstractContextManager[None]:
+        """Turn what a damaged or foreign checkpoint raises into an `InputError` that names it."""
+        return refusing(self.path / name, "cannot be read", "a checkpoint of this run")
 
     def log(self, history: Sequence[EpochRecord]) -> None:
         """Write ``log.csv``, and TensorBoard's events where it is installed."""

@@ -21,6 +21,7 @@ from slatprep.learn.decoder import SIZES, PhysicsDecoder, Prediction, make_decod
 from slatprep.learn.runs import BEST, LAST, EpochRecord, Run
 from slatprep.learn.splits import Shares, Split
 from slatprep.records import USABLE, Place
+from slatprep.storage.names import file_name
 from slatprep.workers import Progress
 
 PRECISIONS = ("auto", "fp32", "bf16")
@@ -181,7 +182,10 @@ def train(
             parameters = replace(parameters, precision=known)
         run.begin(asdict(parameters) | {"store": str(train_set.store.attributes["manifest"])})
         session = _Session(parameters, train_set, device, workers)
-        session.restore(run.load(LAST))
+        state = run.load(LAST)
+        if state is not None:
+            with run.reading(LAST):
+                session.restore(state)
         while not session.finished and session.epoch != stop_after:
             train_loss, rate = session.run_epoch(steps)
             record = EpochRecord(session.epoch, rate, train_loss, *session.validate(val_set))
@@ -199,7 +203,8 @@ def train(
         best = run.load(BEST)
         if best is None:
             raise InputError(run.path / BEST, "is missing", "the best model; train anew")
-        session.model.load_state_dict(best["model"])
+        with run.reading(BEST):
+            session.model.load_state_dict(best["model"])
         predictions = run.path / "predictions"
         _write_predictions(session.model, test_set, predictions, device)
     return TrainSummary(session.history, session.best_epoch, references, predictions)
@@ -300,13 +305,21 @@ class _Session:
             "history": [asdict(record) for record in self.history],
         }
 
-    def restore(self, state: dict[str, Any] | None) -> None:
+    def restore(self, state: dict[str, Any]) -> None:
+        """Go on from a checkpoint; ValueError and others where it is of another model."""
+        from pydantic import TypeAdapter
+
         # Order, augmentation and learning rate follow from seed and epoch: no more is needed.
-        if state is not None:
-            self.model.load_state_dict(state["model"])
-            self.optimizer.load_state_dict(state["optimizer"])
-            self.history = [EpochRecord(**record) for record in state["history"]]
-            self.first_epoch = self.epoch
+        self.model.load_state_dict(state["model"])
+        self.optimizer.load_state_dict(state["optimizer"])
+        for parameter, moments in self.optimizer.state.items():
+            for name in ("exp_avg", "exp_avg_sq"):
+                if moments[name].shape != parameter.shape:
+                    raise ValueError(f"{name} has shape {tuple(moments[name].shape)}")
+        self.history = TypeAdapter(list[EpochRecord]).validate_python(state["history"])
+        if not self.history:
+            raise ValueError("it has no epoch")
+        self.first_epoch = self.epoch
 
     def _rate(self, step: int) -> float:
         total = self.parameters.epochs * self.steps
@@ -344,14 +357,14 @@ def _reference(baseline: VoxelBaseline, dataset: SlatDataset) -> float:
 def _write_predictions(
     model: PhysicsDecoder, dataset: SlatDataset, folder: Path, device: str
 ) -> None:
-    """Write what `slatprep evaluate` reads: ``<asset_id>.npz``."""
+    """Write what `slatprep evaluate` reads: an npz an asset, named by `file_name`."""
     folder.mkdir(exist_ok=True)
     model.eval()
     for batch in SlatLoader(dataset):
         moved = batch.to(device)
         prediction: Prediction = model(moved.coords, moved.feats)
         np.savez_compressed(
-            folder / f"{batch.asset_ids[0]}.npz",
+            folder / f"{file_name(batch.asset_ids[0])}.npz",
             coords=batch.coords[:, 1:].numpy().astype(np.uint8),
             properties=prediction.properties.cpu().numpy(),
             material=prediction.logits.argmax(1).cpu().numpy().astype(np.uint8),

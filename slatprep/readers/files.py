@@ -208,7 +208,7 @@ def npy_array(data: bytes, where: str | Place, spec: ArraySpec) -> NDArray[Any]:
 
 
 def npz_arrays(
-    data: bytes, where: str | Place, specs: Mapping[str, ArraySpec]
+    data: bytes, where: str | Place, specs: Mapping[str, ArraySpec], *, partial: bool = False
 ) -> dict[str, NDArray[Any]]:
     """Read the named arrays from the bytes of an npz file.
 
@@ -220,6 +220,8 @@ def npz_arrays(
         What errors call it.
     specs : mapping of str to ArraySpec
         The arrays wanted and what they may look like.
+    partial : bool
+        Whether any of them may be missing.
 
     Returns
     -------
@@ -234,7 +236,8 @@ def npz_arrays(
     """
     with _open_zip(data, where) as archive:
         present = [info.filename.removesuffix(".npy") for info in archive.infolist()]
-        for name in specs:
+        wanted = [name for name in specs if not partial or name in present]
+        for name in wanted:
             if present.count(name) != 1:
                 found = ", ".join(sorted(present)[:8]) or "nothing"
                 raise InputError(
@@ -243,8 +246,10 @@ def npz_arrays(
                     f"one array each of {', '.join(specs)}",
                 )
         return {
-            name: _read_member(archive, archive.infolist()[present.index(name)], where, name, spec)
-            for name, spec in specs.items()
+            name: _read_member(
+                archive, archive.infolist()[present.index(name)], where, name, specs[name]
+            )
+            for name in wanted
         }
 
 

@@ -69,15 +69,51 @@ def load_datasets(
             data, source = load_source(path, root, "slat")
             file = h5py.File(h5py.h5f.open_file_image(data))
         with file:
-            holder = file
-            for name in filter(None, group.split("/")):
-                holder = _child(holder, name, f"{path} [{group}]", h5py.Group, "group")
-            arrays = {}
-            for name, spec in specs.items():
-                where = f"{path} [{'/'.join(filter(None, (group, name)))}]"
-                dataset = _child(holder, name, where, h5py.Dataset, "dataset")
-                arrays[name] = _read_dataset(dataset, where, spec)
+            arrays = group_arrays(file, path, group, specs)
     return arrays, source
+
+
+def group_arrays(
+    file: h5py.File,
+    path: Place,
+    group: str,
+    specs: Mapping[str, ArraySpec],
+    *,
+    partial: bool = False,
+) -> dict[str, NDArray[Any]]:
+    """Read the named datasets of a group of an open file.
+
+    Parameters
+    ----------
+    file : h5py.File
+        Open for reading.
+    path : Place
+        What errors call it.
+    group : str
+        Group with the datasets; empty for the file's root.
+    specs : mapping of str to ArraySpec
+        The datasets wanted and what they may look like.
+    partial : bool
+        Whether any of them may be missing.
+
+    Raises
+    ------
+    InputError
+        If a dataset is missing or not as wanted.
+    """
+    import h5py
+
+    holder = file
+    for name in filter(None, group.split("/")):
+        holder = _child(holder, name, f"{path} [{group}]", h5py.Group, "group")
+    arrays = {}
+    for name, spec in specs.items():
+        if partial and not holder.id.links.exists(name.encode()):
+            continue
+        where = f"{path} [{'/'.join(filter(None, (group, name)))}]"
+        dataset = _child(holder, name, where, h5py.Dataset, "dataset")
+        arrays[name] = _read_dataset(dataset, where, spec)
+    return arrays
 
 
 def find_groups(

@@ -277,8 +277,8 @@ def _name_problems(row: _Row) -> Iterator[str]:
     for kind, name in (("id", row.object_id), ("view", row.view)):
         if name and not NAME.fullmatch(name):
             yield (
-                f"{kind} {name!r} is not allowed; expected letters, digits, '.', '_' and '-', "
-                "not beginning with '.'"
+                f"{kind} {name[:300]!r} is not allowed; expected at most 255 letters, digits, "
+                "'.', '_' and '-', not beginning with '.'"
             )
 
 

@@ -18,8 +18,12 @@ from slatprep.storage.place import storage_of
 
 FIELDS = ("id", "sample", "view")
 
-NAME = re.compile(r"[A-Za-z0-9_-][A-Za-z0-9._-]*")
-"""What an id or a view may be: one plain path component that is not hidden."""
+NAME = re.compile(r"[A-Za-z0-9_-][A-Za-z0-9._-]{0,254}")
+"""What an id or a view may be: one plain path component that is not hidden, no longer than
+file systems allow."""
+
+ASSET_ID = re.compile(rf"{NAME.pattern}(\.[A-Za-z0-9._-]{{1,255}})?")
+"""What the id of a row may be: an id, or one and a view."""
 
 _VARIABLE = re.compile(r"(\{[^{}]*\}|\*)")
 

@@ -6,6 +6,7 @@ more, or less, is refused before anything is inflated.
 
 from __future__ import annotations
 
+import math
 import struct
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -80,7 +81,7 @@ class ChunkDecoder:
     @cached_property
     def nbytes(self) -> int:
         """Bytes of a decoded chunk."""
-        return int(np.prod(self.shape, dtype=np.int64)) * self.dtype.itemsize
+        return math.prod(self.shape) * self.dtype.itemsize
 
     def decode(self, data: bytes, out: NDArray[Any]) -> None:
         """Decode a chunk.

@@ -17,11 +17,11 @@ from support.synthetic import JELLY, METAL, QUARTER_TURN, Dataset
 
 from slatprep.errors import ConfigError, SlatprepError, StoreError
 from slatprep.export import FORMATS, ExportOptions, export_store
-from slatprep.export.assets import file_name
 from slatprep.export.ply import VERTEX
 from slatprep.parameters import PixieverseSource, SlatSource
 from slatprep.pipeline.dataset import BuildSummary, build_store
 from slatprep.readers import discover, read_latents
+from slatprep.storage.names import file_name
 from slatprep.store import Store
 
 # What an asset's points may be: material id to E, density, nu.

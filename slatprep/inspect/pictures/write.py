@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from urllib.parse import quote
 
 from slatprep.errors import StoreError
 from slatprep.inspect.check import AlignmentCheck
@@ -12,6 +11,7 @@ from slatprep.inspect.pictures.alignment import draw_alignment
 from slatprep.inspect.pictures.scene import Scene, scene_of
 from slatprep.inspect.pictures.sheet import MOST, draw_sheet
 from slatprep.provenance.stored import StoredRecords
+from slatprep.storage.names import file_name
 from slatprep.store.reader import Store, StoredAsset
 from slatprep.workers import Progress
 
@@ -62,8 +62,7 @@ def write_pictures(
         scene, title = scene_of(asset), title_of(asset)
         candidates = records.of(check.asset_id).alignment.candidates
         drawn = draw_alignment(scene, check, title, subtitle_of(asset), candidates)
-        # An id may hold characters that a file name must not.
-        pictures.append(target if alone else target / f"{quote(check.asset_id, safe=' ')}.png")
+        pictures.append(target if alone else target / f"{file_name(check.asset_id)}.png")
         _write(pictures[-1], drawn)
         if len(checks) > 1 and number < MOST:
             scenes.append(scene)

@@ -7,7 +7,8 @@ from itertools import pairwise
 
 import numpy as np
 
-from slatprep.records import RESOLUTION, Model, Verdict
+from slatprep.readers.patterns import ASSET_ID, NAME
+from slatprep.records import RESOLUTION, Engine, Model, Search, Verdict
 from slatprep.store.contract import MAX_VOXELS, Finding
 from slatprep.store.reader import Store
 
@@ -21,8 +22,13 @@ DISTANCES = ("inlier_rmse", "inlier_rmse_backward", "margin")
 """Columns of numbers that are not negative, or NaN where there is nothing to tell."""
 
 WORDS = {
-    "model": tuple(str(model) for model in Model),
-    "verdict": tuple(str(verdict) for verdict in Verdict),
+    name: tuple(map(str, words))
+    for name, words in (
+        ("engine", Engine),
+        ("model", Model),
+        ("search", Search),
+        ("verdict", Verdict),
+    )
 }
 """Columns of words, and those allowed."""
 
@@ -37,6 +43,13 @@ def index_findings(store: Store) -> Iterator[Finding]:
         if before >= after:
             what = "occurs twice" if before == after else f"comes after {before!r}"
             yield Finding("asset/id", after, what, "ids sorted ascending, each once")
+    for name, allowed in (("id", ASSET_ID), ("object_id", NAME), ("view", NAME)):
+        for asset_id, value in zip(ids, store.column(name), strict=True):
+            # An object with one SLAT has no view.
+            if not (allowed.fullmatch(value) or (name == "view" and value == "")):
+                yield Finding(
+                    f"asset/{name}", asset_id, f"is {value!r}", "letters, digits, '.', '_' and '-'"
+                )
     yield from _offset_findings(store)
     for name in SHARES:
         yield from _outside(store, name, 0.0, 1.0)
@@ -45,10 +58,10 @@ def index_findings(store: Store) -> Iterator[Finding]:
     for name in DISTANCES:
         yield from _outside(store, name, 0.0, np.inf, nan=True)
     yield from _outside(store, "unphysical", 0, RESOLUTION**3)
-    for name, allowed in WORDS.items():
+    for name, words in WORDS.items():
         for asset_id, word in zip(ids, store.column(name), strict=True):
-            if str(word) not in allowed:
-                yield Finding(f"asset/{name}", asset_id, repr(word), f"one of {allowed}")
+            if str(word) not in words:
+                yield Finding(f"asset/{name}", asset_id, repr(word), f"one of {words}")
     yield from _transform_findings(store)
 
 

@@ -160,6 +160,12 @@ def test_a_link_in_place_of_a_file_is_found(store: Path, tmp_path: Path) -> None
         ("asset/verdict", 0, "fine", "'fine'"),
         ("asset/id", 0, "zebra", "comes after 'zebra'"),
         ("asset/id", 1, "ant", "occurs twice"),
+        ("asset/id", 0, "../../a", "is '../../a'"),
+        ("asset/id", 0, "a\x1b[2J", "is 'a\\x1b[2J'"),
+        ("asset/id", 0, "a" * 600, "is 'aaa"),
+        ("asset/view", 1, "/etc", "is '/etc'"),
+        ("asset/object_id", 1, "", "is ''"),
+        ("asset/engine", 0, "other", "'other'"),
     ],
 )
 def test_values_out_of_the_contract_are_found(

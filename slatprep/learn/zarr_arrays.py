@@ -1,0 +1,100 @@
+"""Read one array of a Zarr hierarchy that somebody wrote, without zarr-python.
+
+zarr-python runs whatever codec the metadata name, and unpacks as much as a chunk
+claims to hold. Here codecs are slatprep's own, and what is set aside is what the
+array's shape allows.
+"""
+
+from __future__ import annotations
+
+import math
+from itertools import product
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from slatprep.errors import StoreError
+from slatprep.readers.files import ArraySpec
+from slatprep.storage.documents import read_document
+from slatprep.storage.files import LocalFolder
+from slatprep.store.codecs import ChunkDecoder
+from slatprep.store.contract import MAX_METADATA_BYTES
+from slatprep.store.shard_reader import RowReader
+
+_DTYPES = (
+    *(f"{kind}{bits}" for kind in ("int", "uint") for bits in (8, 16, 32, 64)),
+    *(f"float{bits}" for bits in (16, 32, 64)),
+)
+_MAX_CHUNK_BYTES = 2**26
+_MAX_CHUNKS = 4096
+
+
+def read_array(path: Path, spec: ArraySpec) -> NDArray[Any]:
+    """Read an array of Zarr format 3 whole.
+
+    Parameters
+    ----------
+    path : Path
+        Folder with its ``zarr.json``.
+    spec : ArraySpec
+        What it may look like.
+
+    Raises
+    ------
+    StoreError
+        If it is none, is packed in another way than with zstd, blosc or nothing,
+        or a file of it is damaged.
+    InputError
+        If its type or shape are not those of `spec`.
+    """
+    try:
+        metadata = read_document(path / "zarr.json", MAX_METADATA_BYTES)
+        if metadata["zarr_format"] != 3 or metadata["node_type"] != "array":
+            raise ValueError("no array of Zarr format 3")
+        if metadata["data_type"] not in _DTYPES:
+            raise ValueError(f"data_type is {metadata['data_type']!r}")
+        dtype = np.dtype(metadata["data_type"])
+        shape = tuple(map(int, metadata["shape"]))
+        spec.check(path, shape, dtype)
+        if metadata["codecs"][0]["name"] == "sharding_indexed":
+            return RowReader.of(LocalFolder(path.parent), path.name, metadata).read(0, shape[0])
+        return _read_chunks(path, metadata, shape, dtype.newbyteorder("<"))
+    except (OSError, KeyError, TypeError, ValueError, AttributeError, IndexError) as error:
+        raise StoreError(f"{path}: {error!r}") from None
+
+
+def _read_chunks(
+    path: Path, metadata: dict[str, Any], shape: tuple[int, ...], dtype: np.dtype[Any]
+) -> NDArray[Any]:
+    steps = tuple(map(int, metadata["chunk_grid"]["configuration"]["chunk_shape"]))
+    decoder = ChunkDecoder.of(dtype, steps, metadata["codecs"], 0)
+    corners = [range(0, n, step) for n, step in zip(shape, steps, strict=True)]
+    chunks = math.prod(map(len, corners))
+    if chunks > _MAX_CHUNKS or not 0 < decoder.nbytes <= _MAX_CHUNK_BYTES:
+        raise ValueError(f"{chunks} chunks of {steps}")
+    keys = metadata["chunk_key_encoding"]
+    separator = keys.get("configuration", {}).get("separator", "/")
+    if keys["name"] != "default" or separator not in ("/", "."):
+        raise ValueError(f"chunks named by {keys!r}")
+    folder = LocalFolder(path)
+    array = np.full(shape, metadata["fill_value"], dtype.newbyteorder("="))
+    block = np.empty(steps, dtype)
+    for corner in product(*corners):
+        places = (start // step for start, step in zip(corner, steps, strict=True))
+        try:
+            file = folder.open(separator.join(["c", *map(str, places)]))
+        except FileNotFoundError:
+            continue  # Zarr leaves out chunks of fill values alone.
+        with file:
+            # A chunk that did not shrink is only a little larger than its values.
+            if file.size() > decoder.nbytes + 65_536:
+                raise ValueError(f"a chunk of {file.size()} bytes")
+            decoder.decode(file.pread(file.size(), 0), block)
+        region = tuple(
+            slice(start, min(start + step, n))
+            for start, step, n in zip(corner, steps, shape, strict=True)
+        )
+        array[region] = block[tuple(slice(part.stop - part.start) for part in region)]
+    return array

@@ -1,0 +1,40 @@
+"""Names of files, made of ids."""
+
+from __future__ import annotations
+
+import hashlib
+from urllib.parse import quote
+
+_LONGEST_NAME = 180
+
+
+def file_name(asset_id: str, *, dots: bool = True) -> str:
+    """Return a file name for an asset, without suffix.
+
+    Plain ids stay as they are. Whatever could mean something to a shell, an
+    archive or a file system is percent-encoded, as is a leading sign; a name
+    that would be too long ends in a hash instead.
+
+    Parameters
+    ----------
+    asset_id : str
+        Any text.
+    dots : bool
+        Whether dots may stay.
+
+    Examples
+    --------
+    >>> file_name("0a1b2c.front"), file_name("0a1b2c.front", dots=False)
+    ('0a1b2c.front', '0a1b2c%2Efront')
+    >>> file_name("../a b"), file_name("-rf")
+    ('%2E.%2Fa%20b', '%2Drf')
+    """
+    name = quote(asset_id, safe="") or "%"
+    if not dots:
+        name = name.replace(".", "%2E")
+    if name.startswith((".", "_", "-", "~")):
+        name = f"%{ord(name[0]):02X}{name[1:]}"
+    if len(name) > _LONGEST_NAME:
+        digest = hashlib.sha256(asset_id.encode()).hexdigest()[:32]
+        name = f"{name[:_LONGEST_NAME]}~{digest}"
+    return name

@@ -1,0 +1,251 @@
+"""Stores, predictions and checkpoints of strangers: nothing outside, nothing huge, no traceback."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import os
+import shutil
+import zipfile
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+import pytest
+import torch
+import zarr
+from click.testing import CliRunner
+
+from slatprep.cli.commands import slatprep
+from slatprep.errors import InputError
+from slatprep.learn.metrics import evaluate_store
+from slatprep.learn.predictions import selection_of_run
+from slatprep.learn.runs import LAST
+from slatprep.learn.splits import Shares
+from slatprep.learn.train import TrainParameters, train
+from slatprep.store import open_store
+
+SHARES = Shares(0.4, 0.3, 0.3)
+SHORT = TrainParameters(size="small", epochs=1, shares=SHARES)
+
+
+@pytest.fixture
+def hostile(learn_store: Path, tmp_path: Path) -> Path:
+    """Copy the store, with ids that lead out of any folder."""
+    store = Path(shutil.copytree(learn_store, tmp_path / "s.zarr"))
+    ids = zarr.open_group(store, mode="r+", use_consolidated=False)["asset/id"]
+    out = [f"../../../../up{k}" for k in range(4)] + [f"{tmp_path}/abs{k}" for k in range(5)]
+    ids[:] = np.array(out, object)
+    return store
+
+
+def test_training_writes_nothing_outside(hostile: Path, tmp_path: Path) -> None:
+    out = tmp_path / "deep" / "runs" / "x"
+    summary = train(hostile, out, SHORT)
+    written = list(summary.predictions.iterdir())
+    assert written and all(path.name.startswith(("%2E%2E%2F", "%2F", "%2E.")) for path in written)
+    assert {path.name for path in tmp_path.iterdir()} == {"s.zarr", "deep"}
+    found = evaluate_store(summary.predictions, hostile, "test", SHARES)
+    assert found.missing == []
+
+
+def test_evaluation_reads_nothing_outside(hostile: Path, tmp_path: Path) -> None:
+    store, folder = open_store(hostile), tmp_path / "predictions"
+    folder.mkdir()
+    count = store.rows(4)[1] - store.rows(4)[0]
+    np.savez(f"{store.ids[4]}.npz", properties=np.zeros((count, 3)))
+    with pytest.raises(InputError, match="has no prediction of an asset"):
+        evaluate_store(folder, hostile, None)
+    inside = open_store(hostile).ids[0].replace("/", "%2F").replace("..", "%2E.", 1)
+    (folder / f"{inside}.npz").symlink_to(f"{store.ids[4]}.npz")
+    with pytest.raises(InputError, match="out of its root"):
+        evaluate_store(folder, hostile, None)
+
+
+@pytest.mark.parametrize(
+    ("arrays", "message"),
+    [
+        ({"properties": "x"}, "has dtype"),
+        ({"properties": 1j}, "has dtype"),
+        ({"material": "1"}, "has dtype"),
+        ({"material": 0.5}, "has class 0.5"),
+        ({"material": np.nan}, "has class nan"),
+        ({"logits": np.nan}, "not all numbers"),
+        ({"logits": 1j}, "has dtype"),
+        ({"logits": "5"}, "has dtype"),
+        ({"coords": np.nan}, "has coordinate nan"),
+        ({"coords": 1.5}, "has coordinate 1.5"),
+        ({"properties": "pairs"}, "has dtype"),
+    ],
+)
+@pytest.mark.parametrize("form", ["npz", "hdf5", "zarr"])
+def test_values_that_are_no_prediction_are_named(
+    learn_store: Path, tmp_path: Path, arrays: dict[str, Any], message: str, form: str
+) -> None:
+    count = open_store(learn_store).rows(0)[1]
+    shapes = {"properties": (count, 3), "material": (count,), "coords": (count, 3)}
+    shapes |= {"logits": (count, 8)}
+    whole = {"properties": np.zeros((count, 3))}
+    for name, value in arrays.items():
+        whole[name] = np.full(shapes[name], value)
+        if value == "pairs":
+            whole[name] = np.zeros(shapes[name], [("a", "i4"), ("b", "i4")])
+    path = tmp_path / "p"
+    if form == "npz":
+        path.mkdir()
+        np.savez(path / "a.npz", **whole)
+    elif form == "hdf5":
+        with h5py.File(path, "w") as file:
+            for name, values in whole.items():
+                text = values.astype("S") if values.dtype.kind == "U" else values
+                file[f"a/{name}"] = text
+    else:
+        root = zarr.open_group(path, mode="w").create_group("a")
+        for name, values in whole.items():
+            text = values.astype("U4") if values.dtype.kind == "U" else values
+            root.create_array(name, data=text)
+        message = rf"{message}|data_type is"
+    with pytest.raises(InputError, match=message):
+        evaluate_store(path, learn_store, None)
+
+
+def test_what_lies_beside_a_prediction_is_not_unpacked(learn_store: Path, tmp_path: Path) -> None:
+    store = open_store(learn_store)
+    for row, asset_id in enumerate(store.ids):
+        count = len(store.read(row, ("coords",))["coords"])
+        np.savez_compressed(
+            tmp_path / f"{asset_id}.npz",
+            properties=np.zeros((count, 3)),
+            beside=np.zeros(2**24, np.uint8),
+        )
+        with zipfile.ZipFile(tmp_path / f"{asset_id}.npz", "a") as archive:
+            archive.writestr("worse.npy", b"no array")
+    assert evaluate_store(tmp_path, learn_store, None).missing == []
+
+
+def test_zarr_predictions_of_any_cut_are_read(learn_store: Path, tmp_path: Path) -> None:
+    store = open_store(learn_store)
+    root = zarr.open_group(tmp_path / "p.zarr", mode="w")
+    cuts = [{}, {"chunks": (100, 2)}, {"chunks": (128, 3), "shards": (1024, 3)}]
+    cuts += [{"compressors": None}, {"compressors": zarr.codecs.BloscCodec()}]
+    for row, asset_id in enumerate(store.ids):
+        rows = store.read(row, ("properties", "material"))
+        group = root.create_group(asset_id)
+        values = np.nan_to_num(rows["properties"])
+        if cuts[row % 5]:
+            array = group.create_array(
+                "properties", shape=values.shape, dtype="float32", **cuts[row % 5]
+            )
+            array[:] = values
+        else:
+            group.create_array("properties", data=values)
+        group.create_array("material", data=np.where(rows["material"] == 255, 0, rows["material"]))
+    means = evaluate_store(tmp_path / "p.zarr", learn_store, None).overall.means
+    assert list(means.values()) == [0.0, 0.0, 0.0, 0.0, 1.0]
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"codecs": [{"name": "bytes"}, {"name": "gzip"}]}, "codecs"),
+        ({"codecs": [{"name": "numcodecs.pickle"}]}, "codecs"),
+        ({"zarr_format": 2}, "no array of Zarr format 3"),
+        ({"shape": [2**40, 3]}, "has shape"),
+        ({"chunk_grid": {"configuration": {"chunk_shape": [2**40, 2**40]}}}, "chunks of"),
+        ({"chunk_grid": {"configuration": {"chunk_shape": [1, 1]}}}, "chunks of|a chunk of"),
+        ({"chunk_grid": {"configuration": {"chunk_shape": [0, 3]}}}, "cannot be read"),
+        ({"chunk_grid": 5}, "cannot be read"),
+        ({"fill_value": "x"}, "cannot be read"),
+    ],
+)
+def test_zarr_predictions_of_other_codecs_or_sizes_are_refused(
+    learn_store: Path, tmp_path: Path, change: dict[str, Any], message: str
+) -> None:
+    count = open_store(learn_store).rows(0)[1]
+    root = zarr.open_group(tmp_path / "p.zarr", mode="w")
+    root.create_group("a").create_array("properties", data=np.ones((count, 3)))
+    file = tmp_path / "p.zarr/a/properties/zarr.json"
+    file.write_text(json.dumps(json.loads(file.read_text()) | change))
+    with pytest.raises(InputError, match=message):
+        evaluate_store(tmp_path / "p.zarr", learn_store, None)
+
+
+def test_a_pipe_is_not_waited_for(learn_store: Path, tmp_path: Path) -> None:
+    (tmp_path / "p").mkdir()
+    os.mkfifo(tmp_path / "p/a.npz")
+    os.mkfifo(tmp_path / "p.h5")
+    for path in ("p", "p.h5"):
+        done = CliRunner().invoke(
+            slatprep,
+            ["evaluate", str(tmp_path / path), "--store", str(learn_store), "--split", "all"],
+        )
+        assert done.exit_code == 1 and "regular file" in done.stderr
+
+
+@pytest.fixture(scope="module")
+def trained(learn_store: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("trained") / "run"
+    train(learn_store, out, dataclasses.replace(SHORT, epochs=2), stop_after=1)
+    return out
+
+
+def _without(key: str) -> Any:
+    return lambda state: state.pop(key)
+
+
+CHECKPOINTS: dict[str, Any] = {
+    "no model": _without("model"),
+    "no history": _without("history"),
+    "empty history": lambda state: state.update(history=[]),
+    "history of text": lambda state: state["history"][0].update(val_loss="x"),
+    "history of others": lambda state: state.update(history=[{"a": 1}]),
+    "model of others": lambda state: state.update(model={"x": torch.zeros(3)}),
+    "model no table": lambda state: state.update(model=5),
+    "optimizer of others": lambda state: state.update(optimizer={"state": {}, "param_groups": []}),
+    "moments of others": lambda state: state["optimizer"]["state"][0].update(exp_avg=torch.ones(1)),
+}
+
+
+@pytest.mark.parametrize("case", CHECKPOINTS)
+def test_checkpoints_of_others_are_named(
+    learn_store: Path, trained: Path, tmp_path: Path, case: str
+) -> None:
+    run = Path(shutil.copytree(trained, tmp_path / "run"))
+    state = torch.load(run / LAST, weights_only=True)
+    CHECKPOINTS[case](state)
+    torch.save(state, run / LAST)
+    with pytest.raises(InputError, match=r"last\.pt: cannot be read"):
+        train(learn_store, run, dataclasses.replace(SHORT, epochs=2))
+
+
+def test_compressed_foreign_and_best_checkpoints_are_named(
+    learn_store: Path, trained: Path, tmp_path: Path
+) -> None:
+    longer = dataclasses.replace(SHORT, epochs=2)
+    run = Path(shutil.copytree(trained, tmp_path / "run"))
+    with (
+        zipfile.ZipFile(trained / LAST) as old,
+        zipfile.ZipFile(run / LAST, "w", zipfile.ZIP_DEFLATED) as new,
+    ):
+        for name in old.namelist():
+            new.writestr(name, old.read(name))
+    with pytest.raises(InputError, match="it is compressed"):
+        train(learn_store, run, longer)
+    torch.save([1], run / LAST)
+    with pytest.raises(InputError, match="it holds list"):
+        train(learn_store, run, longer)
+    (run / LAST).unlink()
+    os.mkfifo(run / LAST)
+    with pytest.raises(InputError, match="no regular file"):
+        train(learn_store, run, longer)
+    run = Path(shutil.copytree(trained, tmp_path / "other"))
+    for content in (b"\xff", b"[" * 100_000, b"5"):
+        (run / "run.json").write_bytes(content)
+        with pytest.raises(InputError, match=r"run\.json: cannot be read"):
+            train(learn_store, run, longer)
+    for change in ({"shares": 5}, {"verdicts": [1]}, {"max_ambiguity": "x"}):
+        parameters = json.loads((trained / "run.json").read_text()) | change
+        (run / "run.json").write_text(json.dumps(parameters))
+        with pytest.raises(InputError, match="does not say which assets"):
+            selection_of_run(run / "predictions")
