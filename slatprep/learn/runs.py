@@ -15,7 +15,7 @@ from typing import Any
 
 import torch
 
-from slatprep.errors import ConfigError
+from slatprep.errors import ConfigError, InputError
 from slatprep.learn.predictions import RUN_BYTES, RUN_FILE
 from slatprep.readers.files import refusing
 from slatprep.storage.atomic import staged
@@ -76,8 +76,12 @@ class Run:
             raise ConfigError(f"{self.path} is not empty and holds no run; choose another --out")
         self._lock = take_lock(self.path / _LOCK, f"{self.path}: another training is writing it")
         if there:
-            with refusing(file, "cannot be read", "what `slatprep train` wrote"):
-                self.parameters = read_document(file, RUN_BYTES)
+            try:
+                with refusing(file, "cannot be read", "what `slatprep train` wrote"):
+                    self.parameters = read_document(file, RUN_BYTES)
+            except InputError:
+                self.__exit__()
+                raise
         return self
 
     def __exit__(self, *_: object) -> None:
