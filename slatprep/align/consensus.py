@@ -11,14 +11,14 @@ undone.
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from slatprep.align.settle import take
 from slatprep.align.starts import distinct_starts
-from slatprep.geometry.frames import displacement, split_transform
-from slatprep.records import Alignment, Consensus, Model, Placement, StructuredLatents
+from slatprep.geometry.frames import split_transform
+from slatprep.records import Alignment, Consensus, StructuredLatents
 
 LEAST_WINNERS = 5
 LEAST_SHARE = 0.5
@@ -76,10 +76,8 @@ def settle(alignment: Alignment, latents: StructuredLatents, consensus: Consensu
     Returns
     -------
     Alignment
-        The same object where nothing is tied or the choice stands. Otherwise
-        with the transform of the chosen placement, `settled_by` set, and the
-        placement that was left first among the placements; its quality is the
-        old one's and has to be measured again.
+        The same object where nothing is tied or the choice stands; otherwise
+        what `slatprep.align.settle.take` makes of it.
     """
     if not alignment.placements:
         return alignment
@@ -88,25 +86,7 @@ def settle(alignment: Alignment, latents: StructuredLatents, consensus: Consensu
     chosen = int(np.argmin(angles))
     if chosen == 0:
         return alignment
-    transform = choices[chosen]
-    # Scores are relative to the best fit; the one that was left had it.
-    left = Placement(alignment.transform, alignment.score, 0.0)
-    others = [p for k, p in enumerate(alignment.placements, 1) if k != chosen]
-    placements = tuple(
-        replace(p, displacement=displacement(p.transform, transform, latents.coords))
-        for p in (left, *others)
-    )
-    return replace(
-        alignment,
-        transform=transform,
-        # A deformation was fitted to the placement that is left.
-        model=Model.SIMILARITY if alignment.deformation is not None else alignment.model,
-        deformation=None,
-        figures=None,
-        score=alignment.placements[chosen - 1].score,
-        placements=placements,
-        settled_by=consensus,
-    )
+    return take(alignment, chosen - 1, latents, consensus)
 
 
 def degrees_between(rotation: ArrayLike, other: ArrayLike) -> float:

@@ -18,7 +18,7 @@ import numpy as np
 from numba import njit
 
 from slatprep.align.bspline import bend, gather, locate, scatter, strides_of
-from slatprep.align.solver import interpolate, solve_linear
+from slatprep.align.solver import interpolate, solve_symmetric
 
 _INVERSE_STEPS = 2
 
@@ -122,10 +122,7 @@ def affine_step(  # type: ignore[no-untyped-def]
     rhs[12] -= offset_prior * offset
     for i in range(n):
         normal[i, i] += ridge * normal[i, i] + 1e-9 * places.shape[0]
-    for i in range(n):
-        for j in range(i):
-            normal[i, j] = normal[j, i]
-    solve_linear(normal, rhs, step)
+    solve_symmetric(normal, rhs, step)
 
 
 @njit(cache=True)

@@ -39,6 +39,7 @@ DAMAGES_LISTED = 10
 @option("--manifests", NEW_FOLDER)
 @option("--strict", is_flag=True)
 @option("--consensus", is_flag=True)
+@option("--witness", is_flag=True)
 @option("--fresh", is_flag=True)
 @option("--keep-work", is_flag=True)
 @option("--dry-run", is_flag=True)
@@ -60,6 +61,7 @@ def build_store(output: Output, out: Path, dry_run: bool, **options: Any) -> Non
     --manifests: Folder for the records. [default: beside the store]
     --strict: Stop at the first asset that cannot go in.
     --consensus: Settle ties by the rotation that most assets share.
+    --witness: Settle ties by what the latents say, and name assets whose labels they contradict.
     --fresh: Reuse nothing of an earlier build.
     --keep-work: Keep all assets' arrays beside the store, about 1 MB each; the next build is
         faster.
@@ -168,6 +170,8 @@ def _report(output: Output, summary: BuildSummary) -> None:
     for asset_id, reason in summary.problems:
         output.problem(f"{asset_id}: {reason}")
     total, good = sum(summary.statuses.values()), summary.statuses["ok"]
+    for asset_id in summary.contradicted:
+        output.note(f"{asset_id}: its latents speak against its labels; look at it first")
     unlisted = total - good - len(summary.problems)
     if unlisted:
         output.problem(f"and {unlisted:,} more: see {summary.records}")

@@ -264,7 +264,7 @@ def workers_options(command: _Function) -> _Function:
 
 
 def parameters_of(options: dict[str, Any]) -> BuildParameters:
-    """Take the options of `source_options`, and ``--consensus``, out of those given.
+    """Take the options of `source_options`, and those of passes, out of those given.
 
     Returns
     -------
@@ -278,8 +278,9 @@ def parameters_of(options: dict[str, Any]) -> BuildParameters:
         if (value := options.pop(flag.removeprefix("--"))) is not None:
             group, key = name.split(".")
             given[group] = {key: value if isinstance(value, str) else str(value.absolute())}
-    if options.pop("consensus", False):
-        given["consensus"] = {"settle": True}
+    for name in ("consensus", "witness"):
+        if options.pop(name, False):
+            given[name] = {"settle": True}
     return load_parameters(options.pop("config"), given, options.pop("preset"))
 
 

@@ -181,6 +181,7 @@ def check_alignment(store: Store, asset_id: str) -> AlignmentCheck:
         # Of another fit than the one that was judged the confidence says nothing.
         confidence=confidence if same_fit else math.nan,
         expected_accuracy=expected,
+        contradicted=bool(columns["contradicted"]),
     )
     figures = [
         Figure(name, getattr(quality, name), float(columns[name]), QUALITY_TOLERANCE)

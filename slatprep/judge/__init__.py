@@ -6,6 +6,7 @@ from slatprep.judge.ambiguity import measure_ambiguity
 from slatprep.judge.verdict import (
     THRESHOLDS,
     Thresholds,
+    contradicted,
     judge,
     judge_with_voxels,
     verdict_of,
@@ -15,6 +16,7 @@ from slatprep.judge.verdict import (
 __all__ = [
     "THRESHOLDS",
     "Thresholds",
+    "contradicted",
     "judge",
     "judge_with_voxels",
     "measure_ambiguity",

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -59,6 +59,8 @@ _WORDS = {
     "shape": "the two sides show different shapes",
     "roughness": "the surfaces lie on each other roughly only",
 }
+
+_CONTRADICTED = "its latents speak against its labels: classes drawn by lot would be likelier"
 
 
 def judge(
@@ -120,6 +122,13 @@ def judge_with_voxels(
     return Judgement(ambiguity, verdict, reasons, confidence, expected), likely
 
 
+def contradicted(judgement: Judgement) -> Judgement:
+    """Return the judgement of an asset whose latents contradict its labels."""
+    verdict = Verdict.DOUBTFUL if judgement.verdict is Verdict.GOOD else judgement.verdict
+    reasons = (*judgement.reasons, _CONTRADICTED)
+    return replace(judgement, verdict=verdict, reasons=reasons, contradicted=True)
+
+
 def voxel_confidence(
     field: MaterialField,
     latents: StructuredLatents,
@@ -156,6 +165,7 @@ def verdict_of(
     confidence: float = math.nan,
     expected_accuracy: float = math.nan,
     cause: str = "",
+    contradicted: bool = False,
 ) -> tuple[Verdict, tuple[str, ...]]:
     """Say what an alignment is worth, and why.
 
@@ -176,6 +186,8 @@ def verdict_of(
     cause : str
         What most speaks against the placement: ``placement``, ``shape`` or
         ``roughness``; empty where that is not known.
+    contradicted : bool
+        Whether the asset's latents speak against its labels.
 
     Returns
     -------
@@ -215,6 +227,8 @@ def verdict_of(
             f"class of {ambiguity:.1%} of the voxels "
             f"(good: {limits.good_ambiguity:.0%})"
         )
+    if contradicted:
+        reasons.append(_CONTRADICTED)
     if failed:
         return Verdict.FAILED, tuple(reasons)
     return (Verdict.DOUBTFUL if reasons else Verdict.GOOD), tuple(reasons)

@@ -145,6 +145,19 @@ class ConsensusParameters(_Group):
 
 
 @dataclass(frozen=True)
+class WitnessParameters(_Group):
+    """Whether latents are heard as witnesses of labels.
+
+    With `settle`, a pass after that of the consensus lets the latents of assets
+    that are sure tell what latents are like in each class: assets whose geometry
+    cannot tell placements apart get the one whose labels their latents make
+    likelier, if that is decisive, and labels that latents contradict are named.
+    """
+
+    settle: bool = False
+
+
+@dataclass(frozen=True)
 class SampleParameters(_Group):
     """How annotations are looked up at SLAT voxels.
 
@@ -200,6 +213,7 @@ class BuildParameters(_Group):
     pairing: PairingParameters = field(default_factory=PairingParameters)
     align: AlignParameters = field(default_factory=AlignParameters)
     consensus: ConsensusParameters = field(default_factory=ConsensusParameters)
+    witness: WitnessParameters = field(default_factory=WitnessParameters)
     sample: SampleParameters = field(default_factory=SampleParameters)
     normalize: NormalizeParameters = field(default_factory=NormalizeParameters)
     store: StoreParameters = field(default_factory=StoreParameters)

@@ -1,26 +1,14 @@
-"""The second pass: ties settled by the consensus, the rotation that most assets share.
-
-It works on what the first pass left in the spool and changes nothing there: an
-asset whose placement changes is written again under a key of its own. Its
-record keeps what the first pass found, so the next build does not align it
-again, with this pass or without.
-"""
+"""The pass by which ties are settled by the consensus, the rotation that most assets share."""
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Sequence
-from dataclasses import replace
 
 from slatprep.align.consensus import find_consensus, settle
-from slatprep.align.deformation import map_of
-from slatprep.align.quality import measure_quality
-from slatprep.judge import judge_with_voxels
 from slatprep.parameters import BuildParameters
+from slatprep.pipeline.settle import Reopened
 from slatprep.pipeline.spool import Spool, SpooledAsset
-from slatprep.provenance.record import FailedRecord, FirstPass
-from slatprep.records import Consensus, StructuredLatents, Verdict
-from slatprep.sample import sample
+from slatprep.records import Consensus, Verdict
 from slatprep.workers.local import Jobs, run_unordered
 
 
@@ -36,7 +24,7 @@ def apply_consensus(
     spool : Spool
         Where they lie.
     parameters : BuildParameters
-        Whether to do it, how annotations are looked up, and the radius of the quality figures.
+        Whether to do it, and how to align and to look up.
     jobs : int or Workers
         Worker processes, or a cluster's.
 
@@ -63,27 +51,8 @@ def settle_asset(
     asset: SpooledAsset, spool: Spool, consensus: Consensus, parameters: BuildParameters
 ) -> SpooledAsset:
     """Settle one asset's tie; return it as it was where the choice stands."""
-    first = spool.record(asset.key)
-    if isinstance(first, FailedRecord):
-        raise TypeError(f"{first.asset_id}: a failed asset has no tie")
-    arrays = spool.voxels(asset.key)
-    latents = StructuredLatents(arrays["coords"], arrays["feats"])
-    alignment = settle(first.alignment, latents, consensus)
-    if alignment is first.alignment:
+    first = Reopened(asset, spool)
+    alignment = settle(first.record.alignment, first.latents, consensus)
+    if alignment is first.record.alignment:
         return asset
-    field = spool.field(asset.key)
-    quality = measure_quality(field, latents, alignment.transform, parameters.align.radius)
-    alignment = replace(alignment, quality=quality)
-    annotation = sample(field, map_of(alignment).places(latents.coords), parameters.sample)
-    judgement, likely = judge_with_voxels(field, latents, alignment, annotation, parameters.sample)
-    annotation = replace(annotation, confidence=likely)
-    key = hashlib.sha256(f"{asset.key} {consensus.rotation.tobytes().hex()}".encode()).hexdigest()
-    record = replace(
-        first,
-        key=key,
-        alignment=alignment,
-        judgement=judgement,
-        before_consensus=FirstPass(first.key, first.alignment, first.judgement),
-        counts=replace(first.counts, valid=int(annotation.valid.sum())),
-    )
-    return spool.put(record, field, latents, annotation)
+    return first.put(*first.placed(alignment, parameters))

@@ -25,6 +25,7 @@ from slatprep.pipeline.recipe import recipe_of
 from slatprep.pipeline.spool import FailedAsset, Spool, SpooledAsset
 from slatprep.pipeline.summary import BuildSummary, nothing_usable, summarise_build
 from slatprep.pipeline.update import is_current, repeat_summary
+from slatprep.pipeline.witness import apply_witness
 from slatprep.pipeline.work import Work, work_beside, work_directory
 from slatprep.provenance.make import complete_record, origin
 from slatprep.provenance.record import AssetRecord, Clipped, Record, write_records
@@ -124,6 +125,7 @@ def build_store(
         assets += _finish(unchanged, plan, context, jobs, progress)
         usable, failed = _usable_and_failed(assets, parameters)
         usable = apply_consensus(usable, work.spool, parameters, jobs)
+        usable = apply_witness(usable, work.spool, parameters, jobs)
         with writing(str(place.out), work_directory(place.store).parent):
             packed = _pack(usable, failed, given, work, parameters, jobs)
             place.replace(packed.store)

@@ -91,7 +91,7 @@ class PreviousBuild:
     def holds(self, asset: Finished) -> bool:
         """Whether the store's labels and places of an asset are those it has been given now.
 
-        Where the consensus of the dataset chose another alignment, the rows are of that one,
+        Where a pass over the whole dataset chose another alignment, the rows are of that one,
         and its places alone are compared.
         """
         row = self.store.find(asset.pair.asset_id)
@@ -101,7 +101,7 @@ class PreviousBuild:
         except StoreError:
             return False
         places = np.asarray(asset.annotation.place, np.float64)
-        if record.before_consensus is not None:
+        if record.first_pass is not None:
             places = map_of(record.alignment).places(asset.latents.coords)
         elif not np.array_equal(held["material"], asset.annotation.material):
             return False

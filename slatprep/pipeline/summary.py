@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from itertools import islice
 
 import numpy as np
 
@@ -40,6 +41,8 @@ class BuildSummary:
         material has their properties.
     problems : tuple of (str, str)
         Asset id and reason of the first `PROBLEMS_LISTED` that are not ``ok``.
+    contradicted : tuple of str
+        Ids of the first `PROBLEMS_LISTED` whose latents speak against their labels.
     store : Place or None
         The store; None where only alignments were written.
     normalization : Normalization or None
@@ -59,6 +62,7 @@ class BuildSummary:
     n_valid: int
     n_unphysical: int
     problems: tuple[tuple[str, str], ...]
+    contradicted: tuple[str, ...] = ()
     store: Place | None = None
     normalization: Normalization | None = None
     clipped: Mapping[str, int] = field(default_factory=dict)
@@ -96,6 +100,9 @@ def summarise_build(
         n_valid=sum(asset.n_valid for asset in usable),
         n_unphysical=int(np.sum([asset.columns["unphysical"] for asset in usable])),
         problems=tuple((asset.asset_id, asset.reason) for asset in failed[:PROBLEMS_LISTED]),
+        contradicted=tuple(
+            islice((a.asset_id for a in usable if a.columns["contradicted"]), PROBLEMS_LISTED)
+        ),
         store=store,
         normalization=normalization,
         clipped=_clipped_by_property(clipped),

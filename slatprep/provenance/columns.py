@@ -39,4 +39,5 @@ def columns_of(record: AssetRecord) -> dict[str, Column]:
         "verdict": judgement.verdict,
         "confidence": judgement.confidence,
         "expected_accuracy": judgement.expected_accuracy,
+        "contradicted": judgement.contradicted,
     }

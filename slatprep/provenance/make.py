@@ -109,7 +109,7 @@ def complete_record(
 
 def origin(parameters: BuildParameters) -> dict[str, object]:
     """Return what decides a store's bytes, without where files lie: its attribute ``build``."""
-    groups = ("align", "sample", "consensus", "normalize", "store")
+    groups = ("align", "sample", "consensus", "witness", "normalize", "store")
     document: dict[str, object] = orjson.loads(
         orjson.dumps(
             {

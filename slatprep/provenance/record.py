@@ -112,7 +112,7 @@ class VoxelCounts:
 
 @dataclass(frozen=True, eq=False)
 class FirstPass:
-    """What was found for an asset alone, before the consensus of the dataset."""
+    """What was found for an asset alone, before the passes over the whole dataset."""
 
     key: Digest
     alignment: Alignment
@@ -156,8 +156,8 @@ class AssetRecord:
     """The transform, how it was found, and how well it fits."""
     judgement: Judgement
     """What ties would change in the labels, the verdict and its reasons."""
-    before_consensus: FirstPass | None = None
-    """What was found for the asset alone, where the dataset's common rotation chose another."""
+    first_pass: FirstPass | None = None
+    """What was found for the asset alone, where a pass over the whole dataset changed that."""
     normalization: Normalization | None = None
     """The ranges of the properties; null where no store was built."""
     counts: VoxelCounts
@@ -172,8 +172,8 @@ class AssetRecord:
         return replace(self, duration_s=0.0)
 
     def of_first_pass(self) -> AssetRecord:
-        """Return the record as it was before the consensus of the dataset."""
-        first = self.before_consensus
+        """Return the record as it was before the passes over the whole dataset."""
+        first = self.first_pass
         if first is None:
             return self
         return replace(
@@ -181,7 +181,7 @@ class AssetRecord:
             key=first.key,
             alignment=first.alignment,
             judgement=first.judgement,
-            before_consensus=None,
+            first_pass=None,
         )
 
 

@@ -19,6 +19,7 @@ from slatprep.records.alignment import (
     Judgement,
     Placement,
     Quality,
+    Ruling,
 )
 from slatprep.records.json_types import (
     AffineMap,
@@ -101,6 +102,7 @@ __all__ = [
     "PropertyRange",
     "Quality",
     "Rotation",
+    "Ruling",
     "Search",
     "Share",
     "SourceFile",

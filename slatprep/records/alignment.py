@@ -88,7 +88,8 @@ class Judgement:
 
     ``confidence`` is the calibrated probability that the placement is right,
     ``expected_accuracy`` the share of right labels to be expected among the
-    valid ones; NaN in records of builds that did not tell.
+    valid ones; NaN in records of builds that did not tell. ``contradicted`` says
+    that the asset's latents speak against its labels, where latents were heard.
     """
 
     ambiguity: Ambiguity
@@ -96,6 +97,7 @@ class Judgement:
     reasons: tuple[str, ...] = ()
     confidence: Number = float("nan")
     expected_accuracy: Number = float("nan")
+    contradicted: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,6 +107,32 @@ class Consensus:
     rotation: Rotation
     winners: Annotated[int, Ge(1)]
     agreeing: Annotated[int, Ge(1)]
+
+
+@dataclass(frozen=True)
+class Ruling:
+    """What its latents say of an asset's tied placements.
+
+    Attributes
+    ----------
+    probability : float
+        That of the tied placements the one taken, or one with the same
+        labels, is right.
+    evidence : float
+        Logarithm of how much likelier the latents are under its labels than
+        under those of the next one, as if voxels were independent.
+    voxels : int
+        Voxels to which those two give different classes.
+    witnesses, agreeing : int
+        Other assets by which latents were tried, and those of them whose
+        latents preferred their labels to wrong ones.
+    """
+
+    probability: Share
+    evidence: float
+    voxels: Count
+    witnesses: Count
+    agreeing: Count
 
 
 @dataclass(frozen=True, eq=False)
@@ -236,8 +264,9 @@ class Alignment:
     score : float
         What the engine ranks placements by, 1 for a perfect fit; NaN where it
         ranks by fitness alone.
-    settled_by : Consensus or None
-        The dataset's common rotation, where it chose among tied placements.
+    settled_by : Consensus, Ruling or None
+        The dataset's common rotation, where it moved the asset to another of its
+        tied placements; what the latents say, where they chose among those.
     deformation : Deformation or None
         What comes before the inverse of `transform` on the way from the SLAT
         frame to the PixieVerse frame; None where the model is ``rigid`` or ``similarity``.
@@ -254,6 +283,6 @@ class Alignment:
     margin: Number = float("nan")
     placements: tuple[Placement, ...] = ()
     score: Number = float("nan")
-    settled_by: Consensus | None = None
+    settled_by: Consensus | Ruling | None = None
     deformation: Deformation | None = None
     figures: FitFigures | None = None

@@ -146,6 +146,14 @@ ARRAYS = (
         since=2,
     ),
     ArrayLayout(
+        "asset/contradicted",
+        "bool",
+        ("asset",),
+        False,
+        "the latents speak against the labels, where latents were heard",
+        since=2,
+    ),
+    ArrayLayout(
         "voxel/coords",
         "uint8",
         ("voxel", "axis"),

@@ -78,7 +78,7 @@ def test_what_was_settled_is_recorded_and_can_be_undone(stores: tuple[Path, Path
         entry = together[asset_id]["alignment"]
         assert entry["settled_by"]["agreeing"] >= 5
         assert entry["placements"][0]["transform"] == alone[asset_id]["alignment"]["transform"]
-        assert together[asset_id]["before_consensus"]["alignment"] == alone[asset_id]["alignment"]
+        assert together[asset_id]["first_pass"]["alignment"] == alone[asset_id]["alignment"]
     assert not any(record["alignment"]["settled_by"] for record in alone.values())
 
 

@@ -19,7 +19,8 @@ def failed(number: int, status: Status = Status.FAILED) -> FailedAsset:
 
 
 def finished(name: str, verdict: str) -> SpooledAsset:
-    return SpooledAsset(name, "", 10, 7, 1, np.zeros((3, 2)), {"verdict": verdict, "unphysical": 4})
+    columns = {"verdict": verdict, "unphysical": 4, "contradicted": name == "y"}
+    return SpooledAsset(name, "", 10, 7, 1, np.zeros((3, 2)), columns)
 
 
 def test_assets_are_counted_and_the_first_hundred_problems_listed() -> None:
@@ -35,6 +36,7 @@ def test_assets_are_counted_and_the_first_hundred_problems_listed() -> None:
     assert summary.verdicts == {"doubtful": 1, "good": 2}
     assert (summary.n_voxels, summary.n_valid) == (30, 21)
     assert summary.n_unphysical == 12
+    assert summary.contradicted == ("y",)
     assert summary.problems[0] == ("a000", "reason 0")
     assert len(summary.problems) == 100
     assert not summary.complete

@@ -12,7 +12,7 @@ import numpy as np
 import zarr
 
 _NEWER = ("voxel/place", "voxel/confidence", "asset/confidence", "asset/expected_accuracy",
-          "asset/unphysical")  # fmt: skip
+          "asset/unphysical", "asset/contradicted")  # fmt: skip
 
 
 def write_format_one(store: Path, out: Path) -> None:
@@ -52,7 +52,7 @@ def _older(text: str) -> str:
     record = json.loads(text)
     for name in ("deformation", "figures"):
         del record["alignment"][name]
-    for name in ("confidence", "expected_accuracy"):
+    for name in ("confidence", "expected_accuracy", "contradicted"):
         del record["judgement"][name]
     del record["parameters"]["align"]["max_displacement"]
     del record["parameters"]["sample"]["max_unphysical"]

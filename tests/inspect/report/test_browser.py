@@ -13,7 +13,6 @@ from support.pages import HOSTILE, Report
 
 if TYPE_CHECKING:
     from selenium.webdriver import Chrome
-    from selenium.webdriver.remote.webelement import WebElement
 
 pytest.importorskip("selenium")
 
@@ -134,25 +133,6 @@ def test_it_opens_an_asset_that_turns(opened: Chrome) -> None:
     canvas.send_keys(Keys.ESCAPE)
     wait(lambda: not opened.execute_script("return document.getElementById('asset').open"))
     assert_quiet(opened)
-
-
-def test_an_address_that_names_an_asset_draws_it(browser: Chrome, hostile: Report) -> None:
-    browser.get("about:blank")
-    for load in (lambda: browser.get(f"{hostile.path.as_uri()}#asset=bear.side"), browser.refresh):
-        load()
-        title, canvas = (
-            browser.find_element("id", "asset-title"),
-            browser.find_element("id", "canvas"),
-        )
-        wait(lambda title=title: title.text.startswith("bear.side"))
-
-        def colours(canvas: WebElement = canvas) -> int:
-            picture = Image.open(io.BytesIO(canvas.screenshot_as_png))
-            return len(picture.convert("P").getcolors() or ())
-
-        wait(lambda colours=colours: colours() > 8)
-        assert browser.find_element("id", "message").text == ""
-        assert_quiet(browser)
 
 
 def test_an_asset_without_a_picture_says_why_it_is_not_there(opened: Chrome) -> None:

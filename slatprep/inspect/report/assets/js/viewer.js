@@ -78,7 +78,6 @@ const Viewer = (() => {
     message.textContent = ASSETS.picture[index] === null ? "This asset has no 3D view on this page." : "";
     byId("scale").replaceChildren();
     if (ASSETS.picture[index] === null) return draw();
-    await Data.arrived; // An address may name an asset before the library has been read.
     try {
       if (!three) start();
     } catch (error) {

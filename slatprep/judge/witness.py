@@ -1,0 +1,364 @@
+"""What latents say of labels: under which of several placements they are likelier.
+
+Where geometry cannot tell placements apart, latents may, if they know of
+classes at all. Of every class a Gaussian of the latents is estimated from
+assets whose labels are sure, with one covariance for all classes (linear
+discriminant analysis); an asset is never heard by a model that has seen its
+object. What the sum of log likelihoods over a block of space is worth,
+neighbouring voxels being much alike, is calibrated on the sure assets: their
+labels against those that they would have half a turn away (Platt,
+"Probabilistic Outputs for Support Vector Machines", 1999, without a bias).
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import brentq
+from scipy.special import expit, logsumexp, softmax
+from scipy.stats import binomtest
+
+from slatprep.geometry.frames import places_of
+from slatprep.geometry.nearest import Lattice
+from slatprep.judge.evidence import HARMLESS
+from slatprep.parameters import SampleParameters
+from slatprep.records import (
+    BACKGROUND,
+    FEATS_STD,
+    RESOLUTION,
+    UNANNOTATED,
+    Alignment,
+    MaterialField,
+    Ruling,
+    StructuredLatents,
+)
+from slatprep.sample import sample
+
+FOLDS = 5
+"""Parts of a dataset, by object, each heard by a model of the others."""
+
+DECISIVE = 0.95
+"""From this probability on a placement is taken to be the right one."""
+
+CHANCE = 1e-3
+"""Latents are heard if so many sure assets agreeing would be rarer than this by chance."""
+
+MOST_TRUST = 1e4
+"""Log odds that a block of usual strength can be worth; Platt's target keeps far below."""
+
+RARE = 0.005
+"""Labels are contradicted that are less likely than those of all but this share of sure assets,
+and less likely than if their classes were drawn by lot."""
+
+OTHER_LABELS = 0.01
+"""Tied placements that change the class of more than this share of the voxels differ in labels."""
+
+BLOCK = 8
+"""Edge, in voxels, of the blocks that count as one voice each."""
+
+REACH = 6.0
+"""Voxels that half a turn may carry a place off the nearest annotated voxel."""
+
+_SHRINK = 1.0  # assets' worth of the mean of all latents in the mean of each class
+_RIDGE = 1e-3  # of a channel's usual variance
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Moments:
+    """Sums over latents, each asset's with weight one: of each class, and of all products."""
+
+    weight: Array
+    total: Array
+    products: Array
+
+    def __add__(self, other: Moments) -> Moments:
+        """Return the sums over the assets of both."""
+        return Moments(
+            self.weight + other.weight, self.total + other.total, self.products + other.products
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class LatentModel:
+    """Gaussians of latents (8 channels) by class, with one precision, and the classes' shares."""
+
+    means: Array
+    precision: Array
+    shares: Array
+
+    def log_likelihood(self, feats: NDArray[np.float32]) -> Array:
+        """Return the log likelihood (N, 7) of latents (N, 8) by class, but for a term of each row.
+
+        That term, -z P z / 2, is the same for all classes, and only differences count.
+        """
+        weights = self.precision @ self.means.T
+        likely: Array = feats.astype(np.float64) @ weights - 0.5 * (self.means.T * weights).sum(0)
+        return likely
+
+    def gain(self, feats: NDArray[np.float32], material: NDArray[np.uint8]) -> float:
+        """Return the mean log likelihood of labels (N,) less that of classes drawn by lot.
+
+        Voxels without a label do not count; 0 where none has one.
+        """
+        known = material != UNANNOTATED
+        if not known.any():
+            return 0.0
+        likely, present = self.log_likelihood(feats[known]), self.shares > 0
+        lot = logsumexp(likely[:, present], axis=1, b=self.shares[present])
+        return float((likely[np.arange(len(lot)), material[known]] - lot).mean())
+
+
+@dataclass(frozen=True, eq=False)
+class Hearing:
+    """What an asset's latents say, before it is known how much that is worth.
+
+    Attributes
+    ----------
+    support : ndarray of float64, shape (K,)
+        Sum of the log likelihoods of the voxels that have a class under all
+        placements, the one chosen first; K is 1 where nothing is tied.
+    differing : ndarray of int64, shape (K, K)
+        Of those, how many have other classes under the two placements.
+    voxels : int
+        How many those are.
+    gain : float
+        What `LatentModel.gain` says of its labels.
+    against : tuple of ndarray of float64, shape (B,)
+        Log likelihood of its labels less that of labels half a turn away, about
+        each of three axes, in B blocks; a turn that changes too few classes is
+        left out.
+    """
+
+    support: Array
+    differing: NDArray[np.int64]
+    voxels: int
+    gain: float
+    against: tuple[Array, ...]
+
+
+@dataclass(frozen=True)
+class Trial:
+    """How far latents can be trusted: what sure assets' latents said of right and wrong labels.
+
+    Attributes
+    ----------
+    witnesses, agreeing : int
+        Sure assets that could be asked, and those that preferred their own labels
+        to all others.
+    trust : float
+        By which a log likelihood is multiplied; 0 where latents are not heard.
+    least_gain : float
+        Gain below which latents contradict labels; minus infinity where they are not heard.
+    """
+
+    witnesses: int
+    agreeing: int
+    trust: float
+    least_gain: float
+
+
+def fold_of(object_id: str) -> int:
+    """Return the part of the dataset, 0..FOLDS - 1, that an object belongs to."""
+    return int(hashlib.sha256(object_id.encode()).hexdigest()[:8], 16) % FOLDS
+
+
+def moments_of(feats: NDArray[np.float32], material: NDArray[np.uint8]) -> Moments:
+    """Return the moments of one asset from its latents (N, 8) and classes (N,)."""
+    known = material < BACKGROUND
+    z, classes = feats[known].astype(np.float64), material[known]
+    one = 1.0 / max(len(z), 1)
+    total = np.zeros((BACKGROUND, z.shape[1]))
+    np.add.at(total, classes, z)
+    weight = np.bincount(classes, minlength=BACKGROUND).astype(np.float64)
+    return Moments(one * weight, one * total, one * (z.T @ z))
+
+
+def fit_models(moments: Iterable[tuple[str, Moments]]) -> list[LatentModel] | None:
+    """Estimate for each fold the latents of the classes in all others.
+
+    Parameters
+    ----------
+    moments : iterable of (str, Moments)
+        Object id and moments of each sure asset, in an order that does not
+        depend on the number of jobs.
+
+    Returns
+    -------
+    list of LatentModel or None
+        By fold; None where the assets of all other folds have less than two classes.
+    """
+    sums: dict[int, Moments] = {}
+    for object_id, some in moments:
+        fold = fold_of(object_id)
+        sums[fold] = sums[fold] + some if fold in sums else some
+    models = []
+    for fold in range(FOLDS):
+        others = [sums[other] for other in sorted(sums) if other != fold]
+        if not others:
+            return None
+        seen = others[0]
+        for other in others[1:]:
+            seen = seen + other
+        if np.count_nonzero(seen.weight) < 2:
+            return None
+        models.append(_model_of(seen))
+    return models
+
+
+def _model_of(seen: Moments) -> LatentModel:
+    assets = seen.weight.sum()
+    mean = seen.total.sum(axis=0) / assets
+    present = seen.weight > 0
+    by_class = seen.total[present]
+    between = (by_class / seen.weight[present, None]).T @ by_class
+    ridge = _RIDGE * np.diag(np.square(FEATS_STD))
+    precision: Array = np.linalg.inv((seen.products - between) / assets + ridge)
+    means = (seen.total + _SHRINK * mean) / (seen.weight[:, None] + _SHRINK)
+    return LatentModel(means, precision, seen.weight / assets)
+
+
+def hear(
+    field: MaterialField,
+    latents: StructuredLatents,
+    alignment: Alignment,
+    material: NDArray[np.uint8],
+    model: LatentModel,
+    parameters: SampleParameters,
+) -> Hearing:
+    """Ask an asset's latents about its labels, and about those it could have instead.
+
+    Parameters
+    ----------
+    field, latents, alignment
+        The asset.
+    material : ndarray of uint8, shape (N,)
+        Its labels; 255 where there is none.
+    model : LatentModel
+        Of other objects.
+    parameters : SampleParameters
+        How labels are looked up.
+    """
+    likely = model.log_likelihood(latents.feats)
+    labels = material[None]
+    if alignment.placements:
+        # Like with like: the others are known without a deformation.
+        tied = (alignment.transform, *(p.transform for p in alignment.placements))
+        places = (places_of(latents.coords, transform) for transform in tied)
+        labels = np.stack([sample(field, place, parameters).material for place in places])
+    shared = (labels != UNANNOTATED).all(axis=0)
+    rows = np.flatnonzero(shared)
+    support = np.array([likely[rows, one[rows]].sum() for one in labels])
+    differing = np.array(
+        [[np.count_nonzero(one[rows] != two[rows]) for two in labels] for one in labels]
+    )
+    return Hearing(
+        support,
+        differing,
+        len(rows),
+        model.gain(latents.feats, material),
+        tuple(_against(field, latents, alignment, material, likely)),
+    )
+
+
+def _against(
+    field: MaterialField,
+    latents: StructuredLatents,
+    alignment: Alignment,
+    material: NDArray[np.uint8],
+    likely: Array,
+) -> Iterator[Array]:
+    if len(latents.coords) < 2:
+        return  # One voxel has no axes.
+    lattice = Lattice(field.voxels)
+    places = places_of(latents.coords, alignment.transform)
+    centre = places.mean(axis=0)
+    _, axes = np.linalg.eigh(np.cov((places - centre).T))
+    steps = (RESOLUTION // BLOCK) ** np.arange(3)
+    blocks = (latents.coords // BLOCK).astype(np.intp) @ steps
+    for axis in axes.T:
+        turned = centre + (places - centre) @ (2.0 * np.outer(axis, axis) - np.eye(3))
+        _, used = lattice.nearest(turned, limit=REACH)
+        rows = np.flatnonzero((used >= 0) & (material != UNANNOTATED))
+        own, other = material[rows], field.material[used[rows]]
+        differ = own != other
+        if np.count_nonzero(differ) > HARMLESS * len(rows):
+            gains = likely[rows, own] - likely[rows, other]
+            sums = np.bincount(blocks[rows], gains)
+            yield sums[np.unique(blocks[rows[differ]])]
+
+
+def try_witnesses(hearings: Sequence[Hearing]) -> Trial:
+    """Find out from assets whose labels are sure what their latents are worth.
+
+    Parameters
+    ----------
+    hearings : sequence of Hearing
+        Of the sure assets.
+
+    Returns
+    -------
+    Trial
+        `trust` is 0 where their latents do not prefer their own labels more
+        often than chance would have it.
+    """
+    asked = [hearing.against for hearing in hearings if hearing.against]
+    agreeing = sum(min(float(blocks.sum()) for blocks in against) > 0 for against in asked)
+    trust = 0.0
+    if asked and binomtest(agreeing, len(asked), 0.5, alternative="greater").pvalue < CHANCE:
+        trust = _trust([np.concatenate(against) for against in asked])
+    gains = np.array([hearing.gain for hearing in hearings])
+    least = min(0.0, float(np.quantile(gains, RARE))) if trust else -np.inf
+    return Trial(len(asked), agreeing, trust, least)
+
+
+def _trust(asked: Sequence[Array]) -> float:
+    """Return the factor that makes blocks' log likelihoods (B,) log odds, each asset one voice."""
+    blocks = np.concatenate(asked)
+    weight = np.concatenate([np.full(len(some), 1.0 / len(some)) for some in asked])
+    unit = float(np.sqrt(np.average(blocks**2, weights=weight)))
+    # Platt's target: all agreeing is no proof that the next one will.
+    target = (len(asked) + 1.0) / (len(asked) + 2.0)
+
+    def slope(trust: float) -> float:
+        return float(np.sum(weight * blocks / unit * (target - expit(trust * blocks / unit))))
+
+    # Where nothing is asked for the slope falls from the start.
+    return brentq(slope, 0.0, MOST_TRUST) / unit if slope(0.0) > 0.0 > slope(MOST_TRUST) else 0.0
+
+
+def ruling_of(hearing: Hearing, trial: Trial) -> tuple[int, Ruling] | None:
+    """Choose among an asset's tied placements, if its latents are decisive.
+
+    Returns
+    -------
+    tuple of int and Ruling, or None
+        The number of the placement, 0 the one that the asset has, which stands
+        where its labels are those of the likeliest one; None where nothing
+        tied changes labels, or the latents do not say enough.
+    """
+    different = hearing.differing > OTHER_LABELS * max(hearing.voxels, 1)
+    best = int(np.argmax(hearing.support))
+    if trial.trust == 0.0 or not different[best].any():
+        return None
+    probability = float(softmax(trial.trust * hearing.support)[~different[best]].sum())
+    # No asset is surer than that its latents are of the kind that can be relied on.
+    probability = min(probability, (trial.agreeing + 1.0) / (trial.witnesses + 2.0))
+    if probability < DECISIVE:
+        return None
+    chosen = 0 if not different[best, 0] else best
+    rivals = np.flatnonzero(different[best])
+    rival = rivals[np.argmax(hearing.support[rivals])]
+    evidence = float(hearing.support[best] - hearing.support[rival])
+    return chosen, Ruling(
+        probability,
+        evidence,
+        int(hearing.differing[best, rival]),
+        trial.witnesses,
+        trial.agreeing,
+    )
