@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import io
 import json
 import re
 from collections.abc import Collection
@@ -44,7 +45,7 @@ def read_map(
     """
     claims: dict[str, dict[tuple[str, str], None]] = {}
     try:
-        with path.open("r", newline="", encoding="utf-8-sig") as file:
+        with io.TextIOWrapper(storage_of(path).open(), "utf-8-sig", newline="") as file:
             reader = csv.DictReader(file)
             columns = set(reader.fieldnames or ())
             if {"object_id", "slat_id"} <= columns:

@@ -10,6 +10,9 @@ from typing import TypeGuard
 from slatprep.errors import ConfigError
 from slatprep.normalize import LOG10
 from slatprep.records import PROPERTY_COLUMNS, Normalization, Place, PropertyRange
+from slatprep.storage.documents import read_bounded
+
+_MAX_BYTES = 2**20
 
 
 def read_ranges(path: Place) -> Normalization:
@@ -28,7 +31,7 @@ def read_ranges(path: Place) -> Normalization:
         If the file cannot be read, lacks a property or has an empty range.
     """
     try:
-        text = path.read_text(encoding="utf-8")
+        text = read_bounded(path, _MAX_BYTES).decode()
         table = json.loads(text) if path.suffix == ".json" else tomllib.loads(text)
     except (OSError, UnicodeDecodeError, ValueError) as error:
         raise ConfigError(f"{path}: cannot read ranges ({error})") from error

@@ -21,6 +21,10 @@ _NO_WAITING = getattr(os, "O_NONBLOCK", 0)  # a pipe's reader would wait for a w
 class LocalFile(FileIO):
     """A file of the local disk, without buffer; threads may share it."""
 
+    def __del__(self) -> None:
+        # A reader keeps its files as long as it lives; to close them then is no oversight.
+        self.close()
+
     def size(self) -> int:
         """Return its length in bytes.
 

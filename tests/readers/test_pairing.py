@@ -258,6 +258,13 @@ def test_bad_maps(find, tmp_path, text, message):
         find(map=tmp_path / "none.csv")
 
 
+@pytest.mark.parametrize("key", ["map", "categories"])
+def test_a_pipe_in_place_of_a_table_is_not_waited_for(find, tmp_path, key):
+    os.mkfifo(tmp_path / "pipe")
+    with pytest.raises(ConfigError, match="pipe: cannot be read as .*no regular file"):
+        find([grid("a")], ["a.npz"], **{key: tmp_path / "pipe"})
+
+
 def test_a_list_of_categories_beyond_reason_is_not_read(find, tmp_path):
     table = tmp_path / "huge.json"
     with table.open("wb") as file:

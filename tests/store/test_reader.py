@@ -1,4 +1,6 @@
 import json
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -47,3 +49,15 @@ def test_a_newer_format_is_refused_in_words(tmp_path: Path) -> None:
     (tmp_path / "zarr.json").write_text(json.dumps({"attributes": attributes}))
     with pytest.raises(StoreError, match=r"format version 3; this slatprep reads 1 and 2"):
         open_store(tmp_path)
+
+
+def test_a_reader_that_is_let_go_of_closes_its_files_quietly(mixed_build: BuildSummary) -> None:
+    code = (
+        "import sys; from slatprep.store import open_store; store = open_store(sys.argv[1]); "
+        "store.asset('cup').grid_properties; store.column('verdict'); del store"
+    )
+    told = subprocess.run(
+        [sys.executable, "-X", "dev", "-c", code, str(mixed_build.store)],
+        capture_output=True, text=True, check=True,
+    )  # fmt: skip
+    assert "ResourceWarning" not in told.stderr
