@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import io
 import json
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from slatprep.export.assets import Exported, describe_columns
 from slatprep.export.formats import ExportOptions, Writer
@@ -13,6 +14,9 @@ from slatprep.export.target import FORMAT
 from slatprep.records import PROPERTY_COLUMNS
 from slatprep.storage.names import file_name
 from slatprep.store import Store, StoredAsset
+
+if TYPE_CHECKING:
+    import h5py
 
 _DATASETS: dict[str, dict[str, Any]] = {
     "coords": {"description": "SLAT coordinate, x, y, z", "units": "voxel"},
@@ -60,17 +64,55 @@ def write(path: Path, about: dict[str, Any], assets: Iterable[StoredAsset]) -> I
     """
     import h5py
 
-    with h5py.File(path, "w") as file:
-        for name, value in about.items():
-            file.attrs[name] = json.dumps(value) if isinstance(value, dict) else value
-        for asset in assets:
-            group = file.create_group(file_name(asset.asset_id))
-            group.attrs.update(describe_columns(asset))
-            for name, attributes in _DATASETS.items():
-                packing = {} if name == "transform" else {"compression": "gzip", "shuffle": True}
-                dataset = group.create_dataset(name, data=getattr(asset, name), **packing)
-                dataset.attrs.update(attributes)
-            yield Exported(asset, path.name, len(asset.coords))
+    with _LateFaults(path, "w+") as raw:
+        with h5py.File(raw, "w") as file:
+            for name, value in about.items():
+                file.attrs[name] = json.dumps(value) if isinstance(value, dict) else value
+            for asset in assets:
+                _write_group(file, asset)
+                raw.raise_fault()
+                yield Exported(asset, path.name, len(asset.coords))
+        raw.raise_fault()
+
+
+def _write_group(file: h5py.File, asset: StoredAsset) -> None:
+    group = file.create_group(file_name(asset.asset_id))
+    group.attrs.update(describe_columns(asset))
+    for name, attributes in _DATASETS.items():
+        packing = {} if name == "transform" else {"compression": "gzip", "shuffle": True}
+        dataset = group.create_dataset(name, data=getattr(asset, name), **packing)
+        dataset.attrs.update(attributes)
+
+
+class _LateFaults(io.FileIO):
+    """A file that seems to take everything, and says afterwards if it did not.
+
+    HDF5 cannot close a file that a full disk has refused: it tries again for as
+    long as the process lives, and ends it by a segmentation fault.
+    """
+
+    fault: OSError | None = None
+
+    def write(self, data: Any) -> int:
+        left = memoryview(data).cast("B")
+        try:
+            while left and self.fault is None:
+                left = left[super().write(left) or 0 :]
+        except OSError as error:
+            self.fault = error
+        return memoryview(data).nbytes
+
+    def truncate(self, size: int | None = None) -> int:
+        try:
+            return super().truncate(size)
+        except OSError as error:
+            self.fault = self.fault or error
+            return size or 0
+
+    def raise_fault(self) -> None:
+        """Raise the first fault, if there was one."""
+        if self.fault is not None:
+            raise self.fault
 
 
 def is_export(path: Path) -> bool:

@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 import json
+import os
 import shutil
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Any
 
 import orjson
 
 from slatprep.errors import ConfigError, SlatprepError
-from slatprep.storage.atomic import replace_directory, staged
+from slatprep.storage.atomic import flush, flush_tree, replace_directory, staged
 
 FORMAT = "slatprep-export"
 FORMAT_VERSION = 1
@@ -25,16 +26,21 @@ INDEX = "index.json"
 def directory(out: Path) -> Iterator[Path]:
     """Yield a new directory that takes the place of `out` when all went well.
 
+    Where `out` holds more than an export, the files of the export alone are
+    replaced, one by one; otherwise all of it at once.
+
     Raises
     ------
     ConfigError
-        If `out` is there and is neither empty nor an export.
+        If `out` is there and is neither empty nor an export, or if something of
+        another origin has the name of a file to be written.
     SlatprepError
         If nothing can be written there.
     """
     # What a link points at is replaced, not the link.
     out = out.resolve()
-    if out.exists() and not _may_be_replaced(out):
+    own = _files_of_export(out) if out.exists() else frozenset()
+    if own is None:
         raise _not_an_export(out)
     with _writable(out):
         out.parent.mkdir(parents=True, exist_ok=True)
@@ -44,7 +50,10 @@ def directory(out: Path) -> Iterator[Path]:
         new.mkdir()
         with _writable(out):
             yield new
-            replace_directory(new, out)
+            if out.exists() and (others := set(_names_below(out)) - own):
+                _replace_files(new, out, own, others)
+            else:
+                replace_directory(new, out)
     finally:
         shutil.rmtree(work, ignore_errors=True)
 
@@ -74,16 +83,49 @@ def write_index(path: Path, about: dict[str, Any], entries: Sequence[dict[str, A
     (path / INDEX).write_bytes(head + b',\n  "assets": [\n    ' + rows + b"\n  ]\n}\n")
 
 
-def _may_be_replaced(out: Path) -> bool:
+def _files_of_export(out: Path) -> frozenset[str] | None:
+    """Return the names of an export's files and folders; None if it is none, nor empty."""
     if not out.is_dir():
-        return False
+        return None
     if not any(out.iterdir()):
-        return True
+        return frozenset()
     try:
         index = json.loads((out / INDEX).read_text(encoding="utf-8"))
-    except (OSError, ValueError):
-        return False
-    return isinstance(index, dict) and index.get("format") == FORMAT
+        files = [PurePosixPath(entry["file"]) for entry in index["assets"]]
+    except (OSError, ValueError, KeyError, TypeError, RecursionError):
+        return None
+    if index.get("format") != FORMAT:
+        return None
+    folders = (str(parent) for file in files for parent in file.parents[:-1])
+    return frozenset({INDEX, *map(str, files), *folders})
+
+
+def _names_below(directory: Path) -> Iterator[str]:
+    """Yield the names of all files and folders below a directory; links are not followed."""
+    for parent, folders, files in os.walk(directory):
+        for name in (*folders, *files):
+            yield Path(parent, name).relative_to(directory).as_posix()
+
+
+def _replace_files(new: Path, out: Path, own: frozenset[str], others: set[str]) -> None:
+    """Put the files of a new export in the place of the old one's, and leave all others alone."""
+    names = sorted(_names_below(new), key=lambda name: (name == INDEX, name))
+    if taken := sorted(others.intersection(names)):
+        raise ConfigError(
+            f"{out / taken[0]} is of no export of slatprep, and a file of this one would have its "
+            "name; move it away, or export to a new path"
+        )
+    flush_tree(new)
+    # Only what is there under a name of the old index: an index may say anything.
+    for name in own.intersection(_names_below(out)).difference(names):
+        if not (out / name).is_dir():
+            (out / name).unlink()
+    for name in names:  # the index last
+        if (new / name).is_dir():
+            (out / name).mkdir(exist_ok=True)
+        else:
+            (new / name).replace(out / name)
+    flush(out)
 
 
 def _not_an_export(out: Path) -> ConfigError:

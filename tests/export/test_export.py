@@ -5,6 +5,8 @@ from __future__ import annotations
 import json
 import re
 import shutil
+import subprocess
+import sys
 import tarfile
 from pathlib import Path
 from typing import Any
@@ -14,6 +16,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from support.synthetic import JELLY, METAL, QUARTER_TURN, Dataset
+from support.trees import tree
 
 from slatprep.errors import ConfigError, SlatprepError, StoreError
 from slatprep.export import FORMATS, ExportOptions, export_store
@@ -295,6 +298,62 @@ def test_what_is_no_export_is_never_replaced(format: Any, store: Path, tmp_path:
         with pytest.raises(ConfigError, match="exists and is not an export"):
             export_store(store, out, format)
     assert (folder / "thesis.txt").read_text() == file.read_text() == "years of work"
+
+
+@pytest.mark.parametrize("format", ["ply", "webdataset", "npz"])
+def test_what_lies_beside_an_export_stays(format: Any, store: Path, tmp_path: Path) -> None:
+    out, fresh = tmp_path / "export", tmp_path / "fresh"
+    export_store(store, out, format, assets=["cup", "dog"])
+    shutil.copytree(store, out / "s.zarr")
+    (out / "notes.txt").write_text("mine")
+    (out / "empty").mkdir()
+    (out / "link").symlink_to(tmp_path)
+    index = json.loads((out / "index.json").read_text())
+    index["assets"].append({"asset_id": "x", "file": "../outside.txt"})
+    (out / "index.json").write_text(json.dumps(index))
+    (tmp_path / "outside.txt").write_text("mine")
+    before = tree(store)
+
+    export_store(out / "s.zarr", out, format, assets=["dog"])
+    assert tree(out / "s.zarr") == before
+    assert (out / "notes.txt").read_text() == (tmp_path / "outside.txt").read_text() == "mine"
+    assert (out / "link").is_symlink()
+    export_store(out / "s.zarr", fresh, format, assets=["dog"])
+    kept = {"s.zarr", "notes.txt", "empty", "link"}
+    assert {path.name for path in out.iterdir()} - kept == {path.name for path in fresh.iterdir()}
+    for path in fresh.iterdir():
+        assert (out / path.name).read_bytes() == path.read_bytes()
+
+
+def test_a_file_of_another_origin_is_not_replaced(store: Path, tmp_path: Path) -> None:
+    out = tmp_path / "export"
+    export_store(store, out, "npz", assets=["cup"])
+    before = (out / "index.json").read_bytes()
+    (out / "dog.npz").write_text("mine")
+    with pytest.raises(ConfigError, match=r"dog\.npz is of no export of slatprep"):
+        export_store(store, out, "npz", assets=["dog"])
+    assert (out / "dog.npz").read_text() == "mine"
+    assert (out / "index.json").read_bytes() == before
+    assert sorted(path.name for path in out.iterdir()) == ["cup.npz", "dog.npz", "index.json"]
+
+
+@pytest.mark.parametrize("bytes_allowed", [1, 3000, 40_000, 100_000])
+def test_a_disk_that_is_full_ends_no_process(
+    bytes_allowed: int, store: Path, tmp_path: Path
+) -> None:
+    """A limit on the size of files refuses writes as a full disk does; HDF5 crashes of either."""
+    code = (
+        "import resource, signal, sys\n"
+        "from slatprep.export import export_store\n"
+        "signal.signal(signal.SIGXFSZ, signal.SIG_IGN)\n"
+        "resource.setrlimit(resource.RLIMIT_FSIZE, (int(sys.argv[3]),) * 2)\n"
+        "export_store(sys.argv[1], sys.argv[2], 'hdf5')\n"
+    )
+    command = [sys.executable, "-c", code, store, tmp_path / "e.h5", bytes_allowed]
+    told = subprocess.run([str(c) for c in command], capture_output=True, text=True, check=False)
+    assert told.returncode == 1
+    assert "cannot write there (File too large); nothing was replaced" in told.stderr
+    assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.parametrize("format", FORMATS)

@@ -261,7 +261,7 @@ def test_bad_maps(find, tmp_path, text, message):
 @pytest.mark.parametrize("key", ["map", "categories"])
 def test_a_pipe_in_place_of_a_table_is_not_waited_for(find, tmp_path, key):
     os.mkfifo(tmp_path / "pipe")
-    with pytest.raises(ConfigError, match="pipe: cannot be read as .*no regular file"):
+    with pytest.raises(ConfigError, match=r"pipe: cannot be read as .*no regular file"):
         find([grid("a")], ["a.npz"], **{key: tmp_path / "pipe"})
 
 
