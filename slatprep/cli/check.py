@@ -30,7 +30,7 @@ _COLUMNS = (
 
 
 @command("check-alignment")
-@option("--asset", name="asset_ids", multiple=True, metavar="ID")
+@option("--asset", name="asset_ids", multiple=True, metavar="ID", shell_complete=complete_asset)
 @option("--worst", POSITIVE)
 @option("--ambiguous", is_flag=True)
 @store_option
@@ -68,9 +68,9 @@ def check_alignment(
 
     Example
     -------
-    slatprep check-alignment --asset 0a1b2c --store data/demo.zarr
+    slatprep check-alignment --asset 5f61cc --store data/demo.zarr
     slatprep check-alignment --worst 12 --ambiguous --picture pictures
-    slatprep check-alignment --asset 0a1b2c --asset 3d4e5f --json --picture none
+    slatprep check-alignment --asset 5f61cc --asset 803c1a --json --picture none
     """
     if not (asset_ids or worst or ambiguous):
         raise click.UsageError("say which assets: --asset ID, --worst N or --ambiguous")

@@ -17,6 +17,7 @@ COMMANDS = {
     "check-alignment": "slatprep.cli.check:check_alignment",
     "verify": "slatprep.cli.verify:verify",
     "info": "slatprep.cli.info:info",
+    "list": "slatprep.cli.list:list_assets",
     "report": "slatprep.cli.report:report",
     "score": "slatprep.cli.score:score",
     "export": "slatprep.cli.export:export",

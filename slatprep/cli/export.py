@@ -12,6 +12,7 @@ from slatprep.cli.options import (
     POSITIVE,
     ChoiceOf,
     command,
+    complete_asset,
     jobs_option,
     note_left_out,
     option,
@@ -27,25 +28,11 @@ if TYPE_CHECKING:
 _ONLY_FOR = {"points": "ply", "frame": "ply", "shard_size": "webdataset"}
 
 
-def _complete_asset(
-    context: click.Context, parameter: click.Parameter, incomplete: str
-) -> list[str]:
-    """Offer the store's asset ids to the shell."""
-    from slatprep.store import open_store
-    from slatprep.store.reader import is_store
-
-    # An option that still lacks its value leaves the arguments unparsed.
-    for word in (context.params.get("store"), *context.args):
-        if word is not None and is_store(Path(word)):
-            return [known for known in open_store(word).ids if known.startswith(incomplete)]
-    return []
-
-
 @command()
 @click.argument("store", type=EXISTING_FOLDER)
 @option("--format", ChoiceOf("slatprep.export:FORMATS"), name="kind", required=True)
 @option("--out", click.Path(path_type=Path), required=True, metavar="PATH")
-@option("--asset", name="assets", multiple=True, metavar="ID", shell_complete=_complete_asset)
+@option("--asset", name="assets", multiple=True, metavar="ID", shell_complete=complete_asset)
 @verdicts_option
 @option("--points", ChoiceOf("slatprep.export.formats:Points"))
 @option("--frame", ChoiceOf("slatprep.export.formats:Frame"))
@@ -72,7 +59,7 @@ def export(output: Output, store: Place, kind: Any, out: Path, **others: Any) ->
     -------
     slatprep export demo.zarr --format ply --out demo.ply.d --verdict good
     slatprep export demo.zarr --format ply --out world --points grid --frame pixieverse
-    slatprep export demo.zarr --format hdf5 --out demo.h5 --asset 0a1b2c --asset 3d4e5f
+    slatprep export demo.zarr --format hdf5 --out demo.h5 --asset 5f61cc --asset 803c1a
     slatprep export demo.zarr --format webdataset --out shards --shard-size 128 --jobs 2
     slatprep export demo.zarr --format npz --out latents
     """

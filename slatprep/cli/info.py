@@ -5,6 +5,8 @@ from __future__ import annotations
 from operator import attrgetter
 from typing import TYPE_CHECKING
 
+import click
+
 from slatprep.cli.options import command, store_argument
 from slatprep.cli.output import Cell, Output
 
@@ -58,28 +60,26 @@ def info(output: Output, store: Place) -> None:
 def show_quality(output: Output, overview: StoreOverview) -> None:
     """Print how good the alignments of a store are, by category and in all.
 
-    ``labels`` is the share of right classes to be expected, ``back`` the
-    fitness from SLAT to PixieVerse; ``tied`` counts assets whose tied
-    placements differ in class somewhere.
+    ``labels`` is the share of right classes to be expected. Below the table a
+    line says how many assets to look at, and how.
     """
-    medians = attrgetter("confidence", "expected_accuracy", "fitness", "fitness_backward",
-                         "inlier_rmse", "valid_share", "ambiguous")  # fmt: skip
+    medians = attrgetter("confidence", "expected_accuracy", "fitness", "valid_share")
+    total = overview.total
     output.table(
-        "Alignments (medians; rmse in voxels)",
-        (
-            "category",
-            "assets",
-            *overview.total.verdicts,
-            "confidence",
-            "labels",
-            "fitness",
-            "back",
-            "rmse",
-            "valid",
-            "tied",
-        ),
+        "Alignments (medians)",
+        ("category", *total.verdicts, "confidence", "labels", "fitness", "valid"),
         [
-            (group.name, group.assets, *group.verdicts.values(), *medians(group))
-            for group in (*overview.categories, overview.total)
+            (group.name, *group.verdicts.values(), *medians(group))
+            for group in (*overview.categories, total)
         ],
     )
+    doubted = [name for name, count in total.verdicts.items() if count and name != "good"]
+    if doubted:
+        options = " ".join(f"--verdict {name}" for name in doubted)
+        click.echo(f"why:     slatprep list {overview.path} {options}")
+    if total.ambiguous:
+        click.echo(
+            f"tied:    {total.ambiguous:,} of {total.assets:,} have other placements that fit "
+            "about as well, with other labels"
+        )
+        click.echo(f"look:    slatprep check-alignment --ambiguous --store {overview.path}")

@@ -195,6 +195,20 @@ def beside(store: Place, suffix: str) -> Path:
     return local.with_name(name) if local else Path(name)
 
 
+def complete_asset(
+    context: click.Context, parameter: click.Parameter, incomplete: str
+) -> list[str]:
+    """Offer the store's asset ids to the shell."""
+    from slatprep.store import open_store
+    from slatprep.store.reader import is_store
+
+    # An option that still lacks its value leaves the arguments unparsed.
+    for word in (context.params.get("store"), *context.args):
+        if word is not None and is_store(Path(word)):
+            return [known for known in open_store(word).ids if known.startswith(incomplete)]
+    return []
+
+
 verdicts_option = option(
     "--verdict",
     ChoiceOf("slatprep.records:Verdict", "all"),

@@ -8,6 +8,7 @@ aligned columns; with ``--json`` standard output is one JSON document.
 from __future__ import annotations
 
 import functools
+import itertools
 import math
 import sys
 import time
@@ -32,7 +33,10 @@ _Command = TypeVar("_Command", bound=Callable[..., object])
 
 _STYLES = {"good": "green", "doubtful": "yellow", "failed": "red"}
 
-_NO_LIMIT = 10_000
+_MAY_SHRINK = ("category", "model", "why")
+"""Columns whose texts are cut, or broken between words, where a terminal is narrow."""
+_LEAST_WIDTH, _GAP = 12, 2
+_LEAST_ID = 8
 _SECONDS_BETWEEN_LINES = 30.0
 _TELLING = 2
 """From so many on the assets that are done say how long the others will take."""
@@ -82,6 +86,16 @@ class Output:
         ]
         draw = _rich_table if sys.stdout.isatty() else _plain_table
         draw(title, columns, [[_text(cell) for cell in row] for row in rows], numeric)
+
+    def id_length(self, ids: Iterable[str]) -> int | None:
+        """Return how much of ids to print: on a terminal enough to tell them apart, else all."""
+        if not sys.stdout.isatty():
+            return None
+        length, ids = _LEAST_ID, sorted(ids)
+        for one, next_one in itertools.pairwise(ids):
+            while one[:length] == next_one[:length]:
+                length += 1
+        return length
 
     def record(self, title: str, cells: Mapping[str, Cell]) -> None:
         """Print a table of one row, whose cells are given by column."""
@@ -174,14 +188,23 @@ def _rich_table(
     from rich.text import Text
 
     table = Table(box=box.SIMPLE_HEAD, collapse_padding=True, pad_edge=False, show_edge=False)
-    for column, right in zip(columns, numeric, strict=True):
-        table.add_column(Text(column), justify="right" if right else "left", no_wrap=True)
+    needed = 0
+    for k, (column, right) in enumerate(zip(columns, numeric, strict=True)):
+        fits, widest = column not in _MAY_SHRINK, max(len(row[k]) for row in [columns, *cells])
+        least = widest if fits else min(widest, _LEAST_WIDTH)
+        needed += least + _GAP
+        table.add_column(
+            Text(column),
+            justify="right" if right else "left",
+            no_wrap=fits,
+            min_width=least,
+            overflow="fold" if fits else "ellipsis",
+        )
     for row in cells:
         table.add_row(*(Text(text, style=_STYLES.get(text, "")) for text in row))
     console = Console(file=sys.stdout, highlight=False)
     # On a narrow terminal a line may wrap, but an id or a number is never cut.
-    boundless = console.options.update(width=_NO_LIMIT)
-    console.width = max(console.width, console.measure(table, options=boundless).maximum)
+    console.width = max(console.width, needed - _GAP)
     console.print(Text(title, style="bold"), table, "", sep="\n")
 
 

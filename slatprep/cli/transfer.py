@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 @command()
 @click.argument("particles", type=FILE)
 @store_option
-@option("--asset", metavar="ID")
+@option("--asset", metavar="ID", shell_complete=complete_asset)
 @option("--prediction", FILE, metavar="FILE.npz")
 @option("--ranges", metavar="pixie|FILE")
 @option("--out", NEW_FILE, required=True, metavar="FILE.ply")
@@ -62,8 +62,8 @@ def transfer(
 
     Example
     -------
-    slatprep transfer gaussians.ply --store demo.zarr --asset 0a1b2c --out materials.ply
-    slatprep transfer solid.npy --store demo.zarr --asset 0a1b2c --points grid --out solid.ply
+    slatprep transfer gaussians.ply --store demo.zarr --asset 5f61cc --out materials.ply
+    slatprep transfer solid.npy --store demo.zarr --asset 5f61cc --points grid --out solid.ply
     slatprep transfer gaussians.ply --prediction 0a1b2c.npz --store demo.zarr --out predicted.ply
     """
     from slatprep.particles import transfer as work

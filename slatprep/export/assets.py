@@ -58,7 +58,7 @@ def choose_ids(store: Store, assets: Sequence[str], verdicts: Sequence[str]) -> 
     if unknown:
         raise ConfigError(f"verdict is {unknown[0]!r}; expected one of {', '.join(Verdict)}")
     try:
-        rows = sorted({store.find(asset_id) for asset_id in assets}) or range(len(store))
+        rows = sorted({store.match(asset_id) for asset_id in assets}) or range(len(store))
     except StoreError as error:
         # An unknown name is the caller's mistake; nothing is wrong with the store.
         raise ConfigError(str(error)) from None

@@ -254,7 +254,7 @@ def choose_assets(
     store : Store
         The store; only its ``asset/*`` arrays are read.
     asset_ids : iterable of str
-        Assets by name, in this order.
+        Assets by id, or a beginning that no other has, in this order.
     worst : int
         How many of the lowest fitness, of both directions the lower.
     ambiguous : bool
@@ -269,7 +269,7 @@ def choose_assets(
     StoreError
         If the store has no asset of a name.
     """
-    rows = [store.find(asset_id) for asset_id in asset_ids]
+    rows = [store.match(asset_id) for asset_id in asset_ids]
     if worst:
         fitness = np.minimum(store.column("fitness"), store.column("fitness_backward"))
         # An asset without a number is the worst of all.

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import difflib
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -18,7 +18,7 @@ from slatprep.normalize import denormalize_properties
 from slatprep.records import BACKGROUND, MaterialField, Normalization, Place, PropertyRange
 from slatprep.storage.place import place_of, storage_of
 from slatprep.storage.versions import store_name
-from slatprep.store.arrays import Arrays
+from slatprep.store.assets import ASSET_COLUMNS, AssetTable
 from slatprep.store.contract import MAX_VOXELS, read_metadata
 from slatprep.store.layout import ARRAYS, FORMAT, READABLE_VERSIONS
 
@@ -28,23 +28,15 @@ if TYPE_CHECKING:
 TRAINING_COLUMNS = ("coords", "feats", "properties")
 """What `Store.read` reads unless told otherwise."""
 
-_BY_GROUP = [layout.name.split("/") for layout in ARRAYS]
-_VOXEL_COLUMNS = [name for group, name in _BY_GROUP if group == "voxel"]
-_ASSET_COLUMNS = [
+_VOXEL_COLUMNS = [
     name
-    for group, name in _BY_GROUP
-    if group == "asset" and name not in ("id", "offset", "transform")
-]
-_NEWER = {
-    name: layout.fill_value
     for layout in ARRAYS
     for group, _, name in (layout.name.partition("/"),)
-    if group == "asset" and layout.since > 1
-}
-"""What a store of format 1 says by the name of an ``asset/*`` array that it does not have."""
+    if group == "voxel"
+]
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class StoredAsset:
     """One asset as the store holds it; properties are normalised.
 
@@ -99,6 +91,10 @@ class StoredAsset:
     transform: NDArray[np.float64]
     columns: dict[str, Any]
 
+    def __repr__(self) -> str:
+        what = f"{self.columns['category'] or 'category unknown'}, {self.columns['verdict']}"
+        return f"<StoredAsset {self.asset_id}: {what}, {len(self.coords):,} voxels>"
+
     @cached_property
     def properties_si(self) -> NDArray[np.float32]:
         """Young's modulus [Pa], density [kg/m^3], Poisson's ratio, (N, 3); NaN where not valid."""
@@ -127,7 +123,7 @@ class StoredAsset:
         )
 
 
-class Store:
+class Store(AssetTable):
     """A store opened for reading; `open_store` makes one.
 
     Threads and forked processes may share it; pickled, it opens the same path
@@ -141,30 +137,25 @@ class Store:
         The root's ``zarr.json``.
     """
 
-    def __init__(self, path: Place, document: dict[str, Any]) -> None:
-        self.path = path
-        self.attributes: dict[str, Any] = document["attributes"]
-        self._arrays = Arrays(path, document)
-        self._columns: dict[str, NDArray[Any]] = {}
-
     def __reduce__(self) -> tuple[Any, ...]:
         return (open_store, (self.path,))
 
-    def __len__(self) -> int:
-        return len(self.offsets) - 1
-
     def __iter__(self) -> Iterator[StoredAsset]:
         return (self.asset(asset_id) for asset_id in self.ids)
+
+    def __repr__(self) -> str:
+        try:
+            verdicts = Counter(str(verdict) for verdict in self._column("verdict"))
+            counts = ", ".join(f"{count:,} {verdict}" for verdict, count in verdicts.most_common())
+            what = f"{len(self):,} assets ({counts}), {self.offsets[-1]:,} voxels"
+        except StoreError as error:
+            what = f"cannot be read ({error})"
+        return f"<Store {self.path}: {what}>"
 
     @property
     def name(self) -> str:
         """The last part of its path, or of its URL without the version."""
         return store_name(self.path)
-
-    @property
-    def format_version(self) -> int:
-        """Version of the format that it was written in."""
-        return int(self.attributes["format_version"])
 
     @property
     def group(self) -> zarr.Group:
@@ -177,16 +168,6 @@ class Store:
         """
         return self._arrays.group
 
-    @cached_property
-    def ids(self) -> list[str]:
-        """Asset ids, sorted."""
-        return [str(asset_id) for asset_id in self.column("id")]
-
-    @cached_property
-    def offsets(self) -> NDArray[np.int64]:
-        """Asset a owns rows ``offsets[a]:offsets[a+1]`` of ``voxel/*``, int64 (A+1,)."""
-        return np.asarray(self.column("offset"), np.int64)
-
     @property
     def normalization(self) -> Normalization:
         """The ranges that properties were normalised with."""
@@ -198,38 +179,6 @@ class Store:
         ]
         source = entries[ranges[0].name]["source"]
         return Normalization((ranges[0], ranges[1], ranges[2]), source)
-
-    def column(self, name: str) -> NDArray[Any]:
-        """Read one ``asset/*`` array whole, by its last name.
-
-        Raises
-        ------
-        StoreError
-            If there is no such array, or it cannot be read.
-        """
-        # Offsets are always written: that they are there bounds what the others may claim.
-        if (unknown := _NEWER.get(name)) is not None and self.format_version == 1:
-            return np.full(len(self), unknown)
-        rows = self.shape("asset/offset")[0] if name == "offset" else len(self)
-        return self.read_rows(f"asset/{name}", 0, rows)
-
-    def find(self, asset_id: str) -> int:
-        """Return the index of an asset.
-
-        Raises
-        ------
-        StoreError
-            If the store has no such asset; the message names those it might be.
-        """
-        index = self._index.get(asset_id)
-        if index is None:
-            views = [known for known in self.ids if known.startswith(f"{asset_id}.")]
-            close = views or difflib.get_close_matches(asset_id, self.ids)
-            hint = (
-                f"did you mean {' or '.join(close[:5])}?" if close else f"it has {len(self)} assets"
-            )
-            raise StoreError(f"{self.path} has no asset {asset_id!r}; {hint}")
-        return index
 
     def read(
         self, index: int, columns: Sequence[str] = TRAINING_COLUMNS
@@ -277,20 +226,22 @@ class Store:
         return start, stop
 
     def asset(self, asset_id: str) -> StoredAsset:
-        """Return one asset; its grid is read when it is first asked for.
+        """Return one asset, by its id or a beginning that no other has; see `match`.
+
+        Its grid is read when it is first asked for.
 
         Raises
         ------
         StoreError
             If the store has no such asset, or a file is missing or damaged.
         """
-        index = self.find(asset_id)
+        index = self.match(asset_id)
         return StoredAsset(
             store=self,
             index=index,
-            asset_id=asset_id,
+            asset_id=self.ids[index],
             transform=np.asarray(self._column("transform")[index]),
-            columns={name: self._column(name)[index] for name in _ASSET_COLUMNS},
+            columns={name: self._column(name)[index] for name in ASSET_COLUMNS},
             **self.read(index, _VOXEL_COLUMNS),
         )
 
@@ -301,29 +252,6 @@ class Store:
         if name == "confidence" and self.format_version == 1:
             return np.full(stop - start, np.nan, dtype=np.float32)
         return self.read_rows(f"voxel/{name}", start, stop)
-
-    @cached_property
-    def _index(self) -> dict[str, int]:
-        return {asset_id: index for index, asset_id in enumerate(self.ids)}
-
-    def _column(self, name: str) -> NDArray[Any]:
-        if name not in self._columns:
-            self._columns[name] = self.column(name)
-        return self._columns[name]
-
-    def read_rows(self, name: str, start: int, stop: int) -> NDArray[Any]:
-        """Read rows of any array by its full name, such as ``voxel/coords``.
-
-        Raises
-        ------
-        StoreError
-            If there is no such array or row, or a file is missing or damaged.
-        """
-        return self._arrays.reader(name).read(start, stop)
-
-    def shape(self, name: str) -> tuple[int, ...]:
-        """Return the shape of an array, from its metadata alone."""
-        return self._arrays.reader(name).shape
 
 
 def open_store(path: str | Place, *, copy: bool = False) -> Store:

@@ -1,4 +1,5 @@
 import json
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -61,3 +62,37 @@ def test_a_reader_that_is_let_go_of_closes_its_files_quietly(mixed_build: BuildS
         capture_output=True, text=True, check=True,
     )  # fmt: skip
     assert "ResourceWarning" not in told.stderr
+
+
+def test_store_and_assets_say_what_they_are_in_a_line(
+    mixed_build: BuildSummary, tmp_path: Path
+) -> None:
+    store = open_store(mixed_build.store)
+    assert repr(store) == (f"<Store {store.path}: 5 assets (5 good), {store.offsets[-1]:,} voxels>")
+    asset = store.asset("dog")
+    assert repr(asset) == f"<StoredAsset dog: category unknown, good, {len(asset.coords):,} voxels>"
+    shutil.copytree(store.path, tmp_path / "s.zarr")
+    for chunk in (tmp_path / "s.zarr" / "asset" / "verdict" / "c").rglob("0"):
+        chunk.write_bytes(b"torn")
+    damaged = open_store(tmp_path / "s.zarr")
+    assert "cannot be read" in repr(damaged)
+
+
+def test_the_table_of_assets_is_that_of_the_arrays(mixed_build: BuildSummary) -> None:
+    store = open_store(mixed_build.store)
+    assert "dog" in store and "do" not in store
+    assert [asset.asset_id for asset in store] == store.ids
+    frame = store.to_pandas()
+    assert list(frame.index) == store.ids
+    assert list(frame["voxels"]) == [len(asset.coords) for asset in store]
+    assert list(frame["fitness"]) == list(store.group["asset/fitness"][:])
+    change = store.group["asset/property_ambiguity"][:]
+    assert np.array_equal(frame.filter(like="property_ambiguity_").to_numpy(), change)
+
+
+def test_without_pandas_the_table_is_offered(
+    mixed_build: BuildSummary, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "pandas", None)
+    with pytest.raises(StoreError, match=r"pip install pandas, or take `Store.table\(\)`"):
+        open_store(mixed_build.store).to_pandas()

@@ -1,0 +1,81 @@
+"""`slatprep list`: the assets of a store, one a line."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import click
+
+from slatprep.cli.options import ChoiceOf, command, option, store_argument
+from slatprep.cli.output import Output
+
+if TYPE_CHECKING:
+    from slatprep.records import Place
+
+
+@command("list")
+@store_argument
+@option("--verdict", ChoiceOf("slatprep.records:Verdict"), name="verdicts", multiple=True)
+@option("--category", name="categories", multiple=True)
+@option("--max-confidence", float)
+@option("--ids", is_flag=True)
+def list_assets(
+    output: Output,
+    store: Place,
+    verdicts: tuple[str, ...],
+    categories: tuple[str, ...],
+    max_confidence: float | None,
+    ids: bool,
+) -> None:
+    """List the assets of STORE, and why one is to be doubted.
+
+    On a terminal ids are shortened, but to no less than tells them apart; wherever a
+    command takes an id, such a beginning of it will do. Without STORE, the one that
+    `make align` built last under data/ is taken.
+
+    Options
+    -------
+    --verdict: Only assets with this verdict; may be repeated. [default: all]
+    --category: Only assets of this category; may be repeated. [default: all]
+    --max-confidence: Only assets whose confidence is this or less.
+    --ids: Print whole ids alone, one a line.
+
+    Example
+    -------
+    slatprep list demo.zarr --verdict doubtful --verdict failed
+    slatprep list demo.zarr --category tree --ids
+    """
+    from slatprep.inspect.listing import list_assets as listed_of
+    from slatprep.store import open_store
+
+    opened = open_store(store)
+    listed = list(listed_of(opened, verdicts, categories, max_confidence))
+
+    def show() -> None:
+        if ids:
+            for asset in listed:
+                click.echo(asset.asset_id)
+            return
+        length = output.id_length(opened.ids)
+        output.table(
+            f"{len(listed):,} of {len(opened):,} assets",
+            ("id", "category", "verdict", "confidence", "fitness", "why"),
+            [
+                (
+                    asset.asset_id[:length],
+                    asset.category,
+                    asset.verdict,
+                    asset.confidence,
+                    asset.fitness,
+                    _in_short(asset.reasons) if length else "; ".join(asset.reasons),
+                )
+                for asset in listed
+            ],
+        )
+
+    output.result(listed, show)
+
+
+def _in_short(reasons: tuple[str, ...]) -> str:
+    more = f" (and {len(reasons) - 1} more)" if len(reasons) > 1 else ""
+    return f"{reasons[0]}{more}" if reasons else ""

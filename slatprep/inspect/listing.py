@@ -1,0 +1,67 @@
+"""The assets of a store one by one, with why they are not good."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterator
+from dataclasses import dataclass
+
+from slatprep.provenance.stored import StoredRecords
+from slatprep.records import Verdict
+from slatprep.store import Store
+
+
+@dataclass(frozen=True)
+class ListedAsset:
+    """An asset in one line; ``reasons`` say why its verdict is not ``good``."""
+
+    asset_id: str
+    category: str
+    verdict: str
+    confidence: float
+    fitness: float
+    voxels: int
+    reasons: tuple[str, ...]
+
+
+def list_assets(
+    store: Store,
+    verdicts: Collection[str] = (),
+    categories: Collection[str] = (),
+    max_confidence: float | None = None,
+) -> Iterator[ListedAsset]:
+    """Yield the assets of a store, by id.
+
+    Parameters
+    ----------
+    store : Store
+        From `slatprep.store.open_store`.
+    verdicts, categories : collection of str
+        Only assets with one of these; empty takes all.
+    max_confidence : float, optional
+        Only assets whose confidence is this or less.
+
+    Raises
+    ------
+    StoreError
+        If the store, or the record of an asset that is not good, cannot be read.
+    """
+    table, records = store.table(), StoredRecords(store)
+    for row, asset_id in enumerate(store.ids):
+        verdict, category = str(table["verdict"][row]), str(table["category"][row])
+        confidence = float(table["confidence"][row])
+        if (
+            (verdicts and verdict not in verdicts)
+            or (categories and category not in categories)
+            or (max_confidence is not None and not confidence <= max_confidence)
+        ):
+            continue
+        good = verdict == Verdict.GOOD  # A record takes a millisecond to read, and most are good.
+        yield ListedAsset(
+            asset_id,
+            category,
+            verdict,
+            confidence,
+            float(table["fitness"][row]),
+            int(table["voxels"][row]),
+            () if good else records.read(row).judgement.reasons,
+        )

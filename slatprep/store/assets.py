@@ -1,0 +1,183 @@
+"""What a store says of each asset: its id, where its voxels lie, and the ``asset/*`` columns."""
+
+from __future__ import annotations
+
+import difflib
+from functools import cached_property
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from slatprep.errors import StoreError
+from slatprep.records import Place
+from slatprep.store.arrays import Arrays
+from slatprep.store.layout import ARRAYS
+
+if TYPE_CHECKING:
+    import pandas
+
+ASSET_COLUMNS = [
+    name
+    for layout in ARRAYS
+    for group, _, name in (layout.name.partition("/"),)
+    if group == "asset" and name not in ("id", "offset", "transform")
+]
+"""Last names of the ``asset/*`` arrays that describe an asset."""
+
+_NEWER = {
+    name: layout.fill_value
+    for layout in ARRAYS
+    for group, _, name in (layout.name.partition("/"),)
+    if group == "asset" and layout.since > 1
+}
+"""What a store of format 1 says by the name of an ``asset/*`` array that it does not have."""
+
+
+class AssetTable:
+    """The assets of a store as a table, which `slatprep.store.Store` adds their voxels to.
+
+    Parameters
+    ----------
+    path : Place
+        Where the store lies.
+    document : dict
+        The root's ``zarr.json``.
+    """
+
+    def __init__(self, path: Place, document: dict[str, Any]) -> None:
+        self.path = path
+        self.attributes: dict[str, Any] = document["attributes"]
+        self._arrays = Arrays(path, document)
+        self._columns: dict[str, NDArray[Any]] = {}
+
+    def __len__(self) -> int:
+        return len(self.offsets) - 1
+
+    def __contains__(self, asset_id: object) -> bool:
+        return asset_id in self._index
+
+    @property
+    def format_version(self) -> int:
+        """Version of the format that it was written in."""
+        return int(self.attributes["format_version"])
+
+    @cached_property
+    def ids(self) -> list[str]:
+        """Asset ids, sorted."""
+        return [str(asset_id) for asset_id in self.column("id")]
+
+    @cached_property
+    def offsets(self) -> NDArray[np.int64]:
+        """Asset a owns rows ``offsets[a]:offsets[a+1]`` of ``voxel/*``, int64 (A+1,)."""
+        return np.asarray(self.column("offset"), np.int64)
+
+    def column(self, name: str) -> NDArray[Any]:
+        """Read one ``asset/*`` array whole, by its last name.
+
+        Raises
+        ------
+        StoreError
+            If there is no such array, or it cannot be read.
+        """
+        # Offsets are always written: that they are there bounds what the others may claim.
+        if (unknown := _NEWER.get(name)) is not None and self.format_version == 1:
+            return np.full(len(self), unknown)
+        rows = self.shape("asset/offset")[0] if name == "offset" else len(self)
+        return self.read_rows(f"asset/{name}", 0, rows)
+
+    def find(self, asset_id: str) -> int:
+        """Return the index of an asset.
+
+        Raises
+        ------
+        StoreError
+            If the store has no such asset; the message names those it might be.
+        """
+        index = self._index.get(asset_id)
+        if index is None:
+            views = [known for known in self.ids if known.startswith(f"{asset_id}.")]
+            close = views or difflib.get_close_matches(asset_id, self.ids)
+            hint = (
+                f"did you mean {' or '.join(close[:5])}?" if close else f"it has {len(self)} assets"
+            )
+            raise StoreError(f"{self.path} has no asset {asset_id!r}; {hint}")
+        return index
+
+    def match(self, name: str) -> int:
+        """Return the index of the asset with this id, or else of the one that begins so.
+
+        Raises
+        ------
+        StoreError
+            If there is none, or several begin so; the message names them.
+        """
+        alike = [known for known in self.ids if known.startswith(name)] if name else []
+        if name in self._index or not alike:
+            return self.find(name)
+        if len(alike) == 1:
+            return self.find(alike[0])
+        if all(known.startswith(f"{name}.") for known in alike):
+            return self.find(name)  # Views of one object: the message offers them.
+        raise StoreError(
+            f"{self.path}: {len(alike)} ids begin with {name!r}, such as {', '.join(alike[:3])}; "
+            "give more of it"
+        )
+
+    def table(self) -> dict[str, NDArray[Any]]:
+        """Return what is known of every asset, as columns of A values.
+
+        Returns
+        -------
+        dict of str to ndarray
+            ``id``, ``voxels``, and the ``asset/*`` arrays by their last names, but for
+            ``offset`` and ``transform``; of ``property_ambiguity`` one column a property.
+        """
+        columns = {"id": np.array(self.ids, dtype=object), "voxels": np.diff(self.offsets)}
+        for name in ASSET_COLUMNS:
+            values = self._column(name)
+            if values.ndim == 1:
+                columns[name] = values
+            else:
+                names = (f"{name}_{of}" for of in self.attributes["property_columns"])
+                columns |= dict(zip(names, values.T, strict=True))
+        return columns
+
+    def to_pandas(self) -> pandas.DataFrame:
+        """Return `table` as a DataFrame, indexed by id.
+
+        Raises
+        ------
+        StoreError
+            If pandas is not installed, or the store cannot be read.
+        """
+        try:
+            import pandas
+        except ImportError:
+            raise StoreError(
+                "pandas is not installed: pip install pandas, or take `Store.table()`"
+            ) from None
+        return pandas.DataFrame(self.table()).set_index("id")
+
+    @cached_property
+    def _index(self) -> dict[str, int]:
+        return {asset_id: index for index, asset_id in enumerate(self.ids)}
+
+    def _column(self, name: str) -> NDArray[Any]:
+        if name not in self._columns:
+            self._columns[name] = self.column(name)
+        return self._columns[name]
+
+    def read_rows(self, name: str, start: int, stop: int) -> NDArray[Any]:
+        """Read rows of any array by its full name, such as ``voxel/coords``.
+
+        Raises
+        ------
+        StoreError
+            If there is no such array or row, or a file is missing or damaged.
+        """
+        return self._arrays.reader(name).read(start, stop)
+
+    def shape(self, name: str) -> tuple[int, ...]:
+        """Return the shape of an array, from its metadata alone."""
+        return self._arrays.reader(name).shape
