@@ -9,7 +9,15 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from slatprep.cli.options import POSITIVE, beside, chosen_store, command, option, store_option
+from slatprep.cli.options import (
+    POSITIVE,
+    beside,
+    chosen_store,
+    command,
+    complete_asset,
+    option,
+    store_option,
+)
 from slatprep.cli.output import EXIT_INCOMPLETE, Output
 from slatprep.errors import ConfigError, StoreError
 

@@ -7,7 +7,15 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from slatprep.cli.options import FILE, NEW_FILE, ChoiceOf, command, option, store_option
+from slatprep.cli.options import (
+    FILE,
+    NEW_FILE,
+    ChoiceOf,
+    command,
+    complete_asset,
+    option,
+    store_option,
+)
 from slatprep.cli.output import Output
 from slatprep.errors import ConfigError
 
