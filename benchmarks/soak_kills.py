@@ -1,13 +1,18 @@
-"""Kill builds at random times, many of them, and look at what is left after each.
+"""Kill builds, many of them, at random times or at a phase by name; look at what is left.
 
     python benchmarks/soak_kills.py --kills 200 --assets 12
+    python benchmarks/soak_kills.py --phase pack --phase publish --minutes 20 --seed 3
+    python benchmarks/soak_kills.py --phase pack --dask --minutes 20
 
 A dataset that keeps changing (an asset appears, changes or goes before each
-build) is built into one store, and each build is killed with SIGKILL after a
-random time: the whole process group, the parent alone, or one worker. After
-every kill the store is opened with plain zarr and read whole, and must be, byte for byte,
-one of the stores that an undisturbed build wrote of an earlier or the present state. At
-the end a last build runs undisturbed and must equal one from nothing.
+build) is built into one store, and each build is killed with SIGKILL: the
+whole process group, the parent alone, or one worker; after a random time, or,
+with --phase, at a random step of that phase. With --dask two workers of a
+Dask cluster compute, which outlives the builds. After every kill the store is
+opened with plain zarr and read whole, and must be, byte for byte, one of the
+stores that an undisturbed build wrote of an earlier or the present state; of
+the present one, if the build ended well. At the end a last build runs
+undisturbed and must equal one from nothing.
 """
 
 from __future__ import annotations
@@ -24,47 +29,97 @@ import sys
 import tempfile
 import time
 from collections import Counter
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
+import aimed_kill
 import zarr
-from checkout import environment
+from checkout import ROOT, environment
 from support.synthetic import Dataset
 from support.trees import tree
+
+PHASES = {
+    "plan": ("asset compared",),
+    "finish": ("asset begun", "asset read", "asset aligned", "asset reused", "asset spooled"),
+    "pack": ("store created", "shard begun", "shard filled", "shard written", "records written"),
+    "publish": (
+        "directory flushed", "directory exchanged", "store replaced",
+        "manifests written", "manifests published",
+    ),
+}  # fmt: skip
+"""Steps of a build by phase, as `slatprep.storage.faults` names them."""
 
 STATES = 4
 ENDED = "ended before its kill, so not counted"
 BUILD = """
 import sys
+from contextlib import nullcontext
 from pathlib import Path
 from support.synthetic import Dataset
 from slatprep import build_store
-build_store(Dataset(Path(sys.argv[1])).parameters(), Path(sys.argv[2]), jobs=2)
+if sys.argv[3] == "aimed":
+    import aimed_kill
+    aimed_kill.begin()
+if sys.argv[4]:
+    from slatprep.workers.dask import Cluster
+    workers = Cluster(sys.argv[4])
+else:
+    workers = nullcontext(2)
+with workers as jobs:
+    build_store(Dataset(Path(sys.argv[1])).parameters(), Path(sys.argv[2]), jobs=jobs)
 """
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--kills", type=int, default=200)
+    parser.add_argument("--minutes", type=float, default=float("inf"), help="stop after these")
     parser.add_argument("--assets", type=int, default=12)
     parser.add_argument("--seed", type=int, default=0)
-    arguments = parser.parse_args()
-    with tempfile.TemporaryDirectory(prefix="soak-") as folder:
-        report = soak(Path(folder), arguments.kills, arguments.assets, arguments.seed)
+    parser.add_argument("--phase", action="append", choices=PHASES, help="aim at; may be repeated")
+    parser.add_argument("--dask", action="store_true", help="compute on a Dask cluster")
+    given = parser.parse_args()
+    with tempfile.TemporaryDirectory(prefix="soak-") as name:
+        folder = Path(name)
+        (folder / "aims").mkdir()
+        os.environ |= environment() | {aimed_kill.FOLDER: str(folder / "aims")}
+        os.environ["PYTHONPATH"] += f"{os.pathsep}{ROOT / 'benchmarks'}"
+        aimed_kill.aim(folder / "aims", "none", 0, "self")
+        with cluster() if given.dask else no_cluster() as scheduler:
+            report = soak(folder, given, scheduler)
     print(json.dumps(report, indent=2))
 
 
-def soak(folder: Path, kills: int, assets: int, seed: int) -> dict[str, object]:
+@contextmanager
+def cluster() -> Iterator[str]:
+    """Run two workers that stand at the seam, and are started again when they are killed."""
+    from distributed import LocalCluster
+
+    os.environ["SLATPREP_FAULTS"] = "aimed_kill:reached"
+    with LocalCluster(
+        n_workers=2, threads_per_worker=1, protocol="tcp://", dashboard_address=None,
+        silence_logs=50,
+    ) as started:  # fmt: skip
+        yield started.scheduler_address
+
+
+@contextmanager
+def no_cluster() -> Iterator[str]:
+    yield ""
+
+
+def soak(folder: Path, given: argparse.Namespace, scheduler: str) -> dict[str, object]:
     """Return what became of the builds; raises AssertionError at the first harm."""
-    chance = random.Random(seed)
+    chance = random.Random(given.seed)
     sources, expected, whole = [], [], 60.0
     for state in range(STATES):
         dataset = Dataset(folder / f"state-{state}")
-        for number in range(state, state + assets):
+        for number in range(state, state + given.assets):
             dataset.add(f"asset-{number:03}", seed=number + (state if number % 5 == 0 else 0))
         sources.append(dataset.root)
-        command = build_command(dataset.root, folder / f"reference-{state}.zarr")
         begin = time.perf_counter()
-        subprocess.run(command, env=environment(), check=True)
+        subprocess.run(build_command(dataset.root, folder / f"reference-{state}.zarr"), check=True)
         whole = min(whole, time.perf_counter() - begin)
         expected.append(tree(folder / f"reference-{state}.zarr"))
     allowed = [fingerprint(hashes) for hashes in expected]
@@ -74,42 +129,62 @@ def soak(folder: Path, kills: int, assets: int, seed: int) -> dict[str, object]:
     told: Counter[str] = Counter()
     begin = time.perf_counter()
     turn = done = 0
-    while done < kills:
+    while done < given.kills and time.perf_counter() - begin < 60 * given.minutes:
         # A state is tried three times, so that builds go on from what was finished.
         state = turn // 3 % STATES
         before = fingerprint(tree(out))
-        outcome = killed_build(build_command(sources[state], out), chance, whole)
+        if given.phase:
+            command = build_command(sources[state], out, "aimed", scheduler)
+            outcome, code = aimed_build(command, chance, given, folder / "aims")
+        else:
+            command = build_command(sources[state], out, scheduler=scheduler)
+            outcome, code = killed_build(command, chance, whole)
         after = fingerprint(tree(out))
-        assert after in (before, allowed[state]), f"kill {turn}: a store that nobody built"
+        wanted = (allowed[state],) if code == 0 else (before, allowed[state])
+        assert after in wanted, f"kill {turn} ({outcome}): a store that nobody built"
         read_whole(out)
         told[outcome] += 1
         done += outcome != ENDED
         turn += 1
         told["store replaced" if after != before else "store as before"] += 1
         if sys.stderr.isatty():
-            print(f"\r{done} of {kills}", end="", file=sys.stderr)
-    subprocess.run(build_command(sources[-1], out), env=environment(), check=True)
+            print(f"\r{done} of {given.kills}", end="", file=sys.stderr)
+    subprocess.run(build_command(sources[-1], out, scheduler=scheduler), check=True)
     assert tree(out) == expected[-1], "the last build is not what one from nothing is"
     left = {path.name for path in folder.iterdir() if "store" in path.name}
     assert left == {"store.zarr", "store.manifests"}, left
-    told["kills"] = done
     return {
-        **told,
+        **dict(sorted(told.items())),
+        "kills": done,
         "undisturbed build [s]": round(whole, 1),
         "seconds": round(time.perf_counter() - begin, 1),
         "harm": 0,
     }
 
 
-def killed_build(command: list[str], chance: random.Random, whole: float) -> str:
-    """Start a build and kill something of it at a random time; return what."""
-    build = subprocess.Popen(
-        command, env=environment(), start_new_session=True, stderr=subprocess.DEVNULL
-    )
+def aimed_build(
+    command: list[str], chance: random.Random, given: argparse.Namespace, aims: Path
+) -> tuple[str, int]:
+    """Run a build that is killed at a step; return what was killed where, and the exit code."""
+    phase = chance.choice(given.phase)
+    step, whom = chance.choice(PHASES[phase]), chance.choice(("self", "parent", "all"))
+    calls = chance.randrange(given.assets) if step.startswith(("asset", "shard")) else 0
+    aimed_kill.aim(aims, step, calls, whom)
+    variables = {**os.environ, "SLATPREP_FAULTS": "aimed_kill:reached"}
+    build = start(command, variables)
+    try:
+        code = build.wait(timeout=300)
+    except subprocess.TimeoutExpired as error:
+        raise AssertionError(f"a build hangs after a kill at {step!r}, {whom}") from error
+    return (f"{phase}, {step}: {whom} killed" if aimed_kill.struck(aims) else ENDED), code
+
+
+def killed_build(command: list[str], chance: random.Random, whole: float) -> tuple[str, int]:
+    """Start a build and kill something of it at a random time; return what, and the exit code."""
+    build = start(command, dict(os.environ))
     whom = chance.choice(("all", "parent", "worker"))
     try:
-        build.wait(timeout=chance.uniform(0.1, 1.1) * whole)
-        return ENDED
+        return ENDED, build.wait(timeout=chance.uniform(0.1, 1.1) * whole)
     except subprocess.TimeoutExpired:
         pass
     if whom == "worker":
@@ -117,21 +192,22 @@ def killed_build(command: list[str], chance: random.Random, whole: float) -> str
         if workers:
             os.kill(chance.choice(workers), signal.SIGKILL)
             try:
-                build.wait(timeout=120)
-                return (
-                    "a worker killed, and ended well"
-                    if build.returncode == 0
-                    else "a worker killed, and told so"
-                )
+                code = build.wait(timeout=120)
             except subprocess.TimeoutExpired as error:
                 raise AssertionError("a build hangs after its worker was killed") from error
+            return f"a worker killed, and {'ended well' if code == 0 else 'told so'}", code
         whom = "all"
     if whom == "parent":
         build.kill()
     else:
         os.killpg(build.pid, signal.SIGKILL)
-    build.wait()
-    return f"{whom} killed"
+    return f"{whom} killed", build.wait()
+
+
+def start(command: list[str], variables: dict[str, str]) -> subprocess.Popen[bytes]:
+    return subprocess.Popen(
+        command, env=variables, start_new_session=True, stderr=subprocess.DEVNULL
+    )
 
 
 def children(pid: int) -> list[int]:
@@ -158,8 +234,8 @@ def read_whole(path: Path) -> None:
     assert group["voxel/coords"].shape[0] == rows
 
 
-def build_command(sources: Path, out: Path) -> list[str]:
-    return [sys.executable, "-c", BUILD, str(sources), str(out)]
+def build_command(sources: Path, out: Path, aimed: str = "", scheduler: str = "") -> list[str]:
+    return [sys.executable, "-c", BUILD, str(sources), str(out), aimed, scheduler]
 
 
 def fingerprint(hashes: dict[str, str]) -> str:
