@@ -52,10 +52,11 @@ def make_demo(output: Output, directory: Path, levels: tuple[int, ...], **recipe
     slatprep make-demo other --assets 4 --seed 2 --grid-form prediction --slat-form hdf5
     """
     from slatprep import demo
+    from slatprep.storage.atomic import writing
 
     if levels:
         recipe["levels"] = tuple(sorted(set(levels)))
-    with output.progress("demo") as progress:
+    with writing(str(directory), directory.parent), output.progress("demo") as progress:
         summary = demo.make_demo(directory, progress=progress, **recipe)
 
     def show() -> None:

@@ -51,7 +51,7 @@ def describe(output: Output, store: Place, out: Path | None, location: str, **st
     slatprep describe demo.zarr --out demo.croissant.json --name demo
     """
     from slatprep.export import croissant
-    from slatprep.storage.atomic import staged
+    from slatprep.storage.atomic import staged, writing
     from slatprep.store import open_store
 
     if not location:
@@ -62,6 +62,6 @@ def describe(output: Output, store: Place, out: Path | None, location: str, **st
     if out is None:
         click.echo(text, nl=False)
         return
-    with staged(out) as path:
+    with writing(str(out), out.parent), staged(out) as path:
         path.write_text(text, encoding="utf-8")
     output.note(f"description: {out}")

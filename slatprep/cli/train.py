@@ -101,6 +101,7 @@ def train(
     from slatprep.learn.train import TrainParameters
     from slatprep.learn.train import train as run
     from slatprep.records import USABLE, Verdict
+    from slatprep.storage.atomic import writing
     from slatprep.store import open_store
 
     torch.set_num_threads(threads)
@@ -113,7 +114,10 @@ def train(
     runs = {name: out / name for name in _SIZES} if all_sizes else {size: out}
     summaries = {}
     for name, directory in runs.items():
-        with output.progress(f"train {name}", "steps") as steps:
+        with (
+            writing(str(directory), directory.parent),
+            output.progress(f"train {name}", "steps") as steps,
+        ):
             summaries[name] = run(
                 store,
                 directory,

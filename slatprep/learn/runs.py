@@ -9,6 +9,7 @@ import os
 import zipfile
 from collections.abc import Sequence
 from contextlib import AbstractContextManager
+from io import BytesIO
 from pathlib import Path
 from pickle import UnpicklingError
 from typing import Any
@@ -114,8 +115,10 @@ class Run:
 
     def save(self, name: str, state: dict[str, Any]) -> None:
         """Write a checkpoint; the old one stays until the new one is whole."""
+        buffer = BytesIO()
+        torch.save(state, buffer)  # Into a file that is full, it fails as no file would.
         with staged(self.path / name) as path:
-            torch.save(state, path)
+            path.write_bytes(buffer.getbuffer())
 
     def load(self, name: str) -> dict[str, Any] | None:
         """Read a checkpoint, None if there is none.

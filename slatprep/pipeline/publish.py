@@ -7,6 +7,7 @@ could write them is noticed by the next one, which writes them then.
 
 from __future__ import annotations
 
+import os
 import platform
 import shutil
 from collections.abc import Iterable, Iterator
@@ -36,6 +37,11 @@ from slatprep.store.reader import is_store
 from slatprep.store.records import RecordWriter
 from slatprep.store.writer import open_for_writing
 
+_MARKS = {"build.json": b'"slatprep-build-record"', "assets.jsonl": b'"slatprep-asset-record"'}
+"""Files beside a store, and what each says at its beginning."""
+
+_HEAD_BYTES = 4096
+
 
 class Destination:
     """Where a build goes: a folder that is replaced, or a new version on an object store.
@@ -55,7 +61,8 @@ class Destination:
     Raises
     ------
     StoreError
-        If there is something other than a store.
+        If there is something other than a store, or the folder of records lies in
+        it or holds files of other origin.
     """
 
     def __init__(self, out: str | Place, manifests: str | Place | None = None) -> None:
@@ -67,6 +74,8 @@ class Destination:
             raise StoreError(f"{manifests}: expected a local folder for the records")
         path, self._remote = storage_of(self.out).local, storage_of(self.out).remote
         self.store: Place = self.out if path is None else _replaceable(path)
+        if self._manifests is not None:
+            _require_records(self._manifests, storage_of(self.store).local)
         self._before: PublishedState | None = None
         self._upload: Upload | None = None
 
@@ -110,6 +119,26 @@ def _replaceable(out: Path) -> Path:
             f"{out} exists and is not a slatprep store; expected a store to replace, or a new path"
         )
     return target
+
+
+def _require_records(folder: Path, store: Path | None) -> None:
+    """Raise unless nothing but records of builds would be overwritten in a folder."""
+    if store is not None and folder.resolve().is_relative_to(store):
+        raise StoreError(f"{folder}: lies in the store; expected a folder outside of it")
+    there = [name for name in _MARKS if os.path.lexists(folder / name)]
+    # One that is damaged is known by the other.
+    if there and not any(_is_marked(folder / name, _MARKS[name]) for name in there):
+        raise StoreError(
+            f"{folder}: holds a {there[0]} that is not slatprep's; expected the records of a "
+            "build, or another folder"
+        )
+
+
+def _is_marked(file: Path, mark: bytes) -> bool:
+    try:
+        return mark in storage_of(file).read(_HEAD_BYTES)
+    except OSError:
+        return False
 
 
 def write_all_records(store: Path, path: Path, records: Iterable[Record]) -> str:

@@ -3,16 +3,19 @@
 ``.NAME.work`` lies beside NAME, on its file system. It holds the lock, the
 spool of finished assets and what this build alone writes. A build that is
 killed leaves it; the next one to the same target removes all but the spool
-and goes on from there.
+and goes on from there. Where others may write beside NAME, something else may
+lie there under that name: only a folder that a build of this user made is
+taken, and only what builds make is removed from it.
 """
 
 from __future__ import annotations
 
 import os
 import shutil
+import stat
 import tempfile
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -22,6 +25,8 @@ from slatprep.records import Place
 from slatprep.storage.atomic import restore_directory
 from slatprep.storage.lock import take_lock
 from slatprep.storage.place import storage_of
+
+LOCK, _PREFIX = "lock", "build-"
 
 
 @dataclass(frozen=True)
@@ -60,33 +65,37 @@ def work_beside(
     Raises
     ------
     StoreError
-        If the folder cannot be written, or another build has the lock; the
-        message names that build.
+        If the folder cannot be written or is not a build's, or another build has
+        the lock; the message names that build.
     """
     directory = work_directory(target)
-    try:
-        lock = take_lock(directory / "lock", f"{target}: another build is writing it")
-    except OSError as error:
-        raise StoreError(
-            f"{directory.parent}: cannot write there ({error.strerror}); "
-            "expected a folder for the result and for temporary files"
-        ) from error
+    with _making(directory):
+        _claim(directory)
+        lock = take_lock(directory / LOCK, f"{target}: another build is writing it")
     finished = False
     spool = Spool(directory / "spool", arrays)
     try:
-        _restore(directory, target)
-        _remove(directory, but=("lock", "spool"))
-        spool.directory.mkdir(exist_ok=True)
-        if fresh:
-            spool.keep_only(set())
-        yield Work(spool, Path(tempfile.mkdtemp(prefix="build-", dir=directory)))
+        with _making(directory):
+            _restore(directory, target)
+            _remove_builds(directory)
+            if not os.path.lexists(spool.directory):
+                spool.directory.mkdir()
+            elif spool.directory.is_symlink() or not spool.directory.is_dir():
+                raise _refusal(spool.directory, "is no folder")
+            if fresh:
+                spool.keep_only(set())
+            scratch = Path(tempfile.mkdtemp(prefix=_PREFIX, dir=directory))
+        yield Work(spool, scratch)
         finished = True
     finally:
         _restore(directory, target)
+        _remove_builds(directory)
         if (finished and not keep) or not spool.holds_any():
-            shutil.rmtree(directory, ignore_errors=True)
-        else:
-            _remove(directory, but=("lock", "spool"))
+            shutil.rmtree(spool.directory, ignore_errors=True)
+            # Last, as a folder without a lock is not taken for a build's.
+            (directory / LOCK).unlink(missing_ok=True)
+            with suppress(OSError):  # Somebody's files, or the next build's lock.
+                directory.rmdir()
         os.close(lock)
 
 
@@ -101,11 +110,45 @@ def _restore(directory: Path, target: Place) -> None:
         restore_directory(directory, local)
 
 
-def _remove(directory: Path, but: tuple[str, ...]) -> None:
-    for path in directory.iterdir():
-        if path.name in but:
-            continue
-        if path.is_dir():
-            shutil.rmtree(path, ignore_errors=True)
-        else:
-            path.unlink(missing_ok=True)
+@contextmanager
+def _making(directory: Path) -> Iterator[None]:
+    try:
+        yield
+    except OSError as error:
+        raise StoreError(
+            f"{directory.parent}: cannot write there ({error.strerror}); "
+            "expected a folder for the result and for temporary files"
+        ) from error
+
+
+def _claim(directory: Path) -> None:
+    """Make the work folder, which nobody else may enter, or see that a build of this user did."""
+    directory.parent.mkdir(parents=True, exist_ok=True)
+    with suppress(FileExistsError):
+        directory.mkdir(mode=0o700)
+    # Not by our number: a network file system may give our files to another user.
+    with tempfile.TemporaryDirectory(dir=directory.parent) as ours:
+        owner = Path(ours).stat().st_uid
+    try:
+        state = directory.lstat()
+        if not stat.S_ISDIR(state.st_mode):
+            raise _refusal(directory, "is no folder")
+        if state.st_uid != owner:
+            raise _refusal(directory, f"belongs to user {state.st_uid}")
+        names = {path.name for path in directory.iterdir()}
+    except FileNotFoundError:
+        return  # A build has just ended there, and taking the lock makes it again.
+    if names and LOCK not in names:
+        raise _refusal(directory, f"holds {min(names)} and was not made by a build")
+
+
+def _refusal(path: Path, what: str) -> StoreError:
+    return StoreError(
+        f"{path}: {what}; expected a work folder of slatprep, or nothing. Move it away, or choose "
+        "another path for the result"
+    )
+
+
+def _remove_builds(directory: Path) -> None:
+    for path in directory.glob(f"{_PREFIX}*"):
+        shutil.rmtree(path, ignore_errors=True)

@@ -7,8 +7,11 @@ a power failure finds the old one whole or the new one whole.
 from __future__ import annotations
 
 import ctypes
+import errno
 import os
+import secrets
 import shutil
+import stat
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -102,12 +105,20 @@ def _exchange(new: Path, target: Path) -> bool:
 def staged(path: Path) -> Iterator[Path]:
     """Yield a file beside `path` that takes its place, whole and on disk, when all went well.
 
-    Its name is the same each time, so what a killed process leaves is
-    overwritten by the next; two processes must not stage one path at a time.
+    Its name is the same each time, so what a killed process leaves is replaced
+    by the next; two processes must not stage one path at a time. Where a link
+    or somebody else's file has that name, it is left alone for another one.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_name(f".{path.name}.partial")
+    if os.path.lexists(temporary):
+        state = temporary.lstat()
+        if stat.S_ISREG(state.st_mode) and state.st_uid == os.geteuid():
+            temporary.unlink()
+        else:
+            temporary = path.with_name(f".{path.name}.{secrets.token_hex(8)}.partial")
     try:
+        os.close(os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o666))
         yield temporary
         flush(temporary)
         temporary.replace(path)
@@ -128,7 +139,9 @@ def writing(what: str, where: Path) -> Iterator[None]:
     try:
         yield
     except OSError as error:
+        full = error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+        advice = "Make room there" if full else "See that it may be written"
         raise StoreError(
             f"{what}: cannot be written to {where} ({error.strerror or error}); nothing was "
-            "replaced. Make room there and run again: what is finished is kept"
+            f"replaced. {advice} and run again: what is finished is kept"
         ) from error

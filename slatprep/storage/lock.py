@@ -5,10 +5,16 @@ from __future__ import annotations
 import json
 import os
 import platform
+import stat
 from datetime import UTC, datetime
 from pathlib import Path
 
 from slatprep.errors import StoreError
+
+# Neither follow a link nor wait at a pipe; Windows has neither flag.
+_FLAGS = os.O_RDWR | os.O_CREAT
+for _name in ("O_CLOEXEC", "O_NOFOLLOW", "O_NONBLOCK"):
+    _FLAGS |= getattr(os, _name, 0)
 
 
 def take_lock(path: Path, taken: str) -> int:
@@ -24,7 +30,10 @@ def take_lock(path: Path, taken: str) -> int:
     Raises
     ------
     StoreError
-        If another process holds it; the message names that process.
+        If another process holds it; the message names that process. If the file
+        is something else than a lock.
+    OSError
+        If it cannot be written, or is a link.
     """
     try:
         import fcntl
@@ -36,13 +45,13 @@ def take_lock(path: Path, taken: str) -> int:
     while True:
         path.parent.mkdir(parents=True, exist_ok=True)
         try:
-            descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o666)
+            descriptor = os.open(path, _FLAGS, 0o666)
         except FileNotFoundError:
             continue  # The holder before us has just removed its folder.
         try:
             fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
-            who = _named(os.pread(descriptor, 4096, 0))
+            who = _holder(descriptor) or "which has only just begun"
             os.close(descriptor)
             raise StoreError(
                 f"{taken} ({who}); wait until it has ended, or choose another path"
@@ -50,6 +59,12 @@ def take_lock(path: Path, taken: str) -> int:
         if _is_at(descriptor, path):
             break
         os.close(descriptor)  # What we locked has been removed; lock what is there now.
+    state = os.fstat(descriptor)
+    if not stat.S_ISREG(state.st_mode) or (state.st_size and not _holder(descriptor)):
+        os.close(descriptor)
+        raise StoreError(
+            f"{path}: holds something else than a lock; move it away, or choose another path"
+        )
     os.ftruncate(descriptor, 0)
     told = {
         "pid": os.getpid(),
@@ -67,9 +82,10 @@ def _is_at(descriptor: int, path: Path) -> bool:
         return False
 
 
-def _named(holder: bytes) -> str:
+def _holder(descriptor: int) -> str:
+    """Return who says to hold a lock; empty where nothing does."""
     try:
-        told = json.loads(holder)
+        told = json.loads(os.pread(descriptor, 4096, 0))
         return f"process {told['pid']} on {told['host']}, since {told['since']}"
-    except (ValueError, KeyError, TypeError):
-        return "which has only just begun"
+    except (ValueError, KeyError, TypeError, OSError):
+        return ""

@@ -171,6 +171,7 @@ def test_a_kill_between_two_renames_is_mended(
     build_store(dataset.parameters("pixie"), out)
     work = tmp_path / ".s.zarr.work"
     (work / "build-x").mkdir(parents=True)
+    (work / "lock").touch()
     out.rename(replace._aside(work / "build-x"))
     with work_beside(out):
         assert tree(out) == expected

@@ -19,7 +19,7 @@ from slatprep.inspect.report.statistics import Tally, no_tally, tally
 from slatprep.inspect.report.thumbnails import PER_SHEET, sheet, thumbnail
 from slatprep.inspect.report.voxels import COARSE, FULL, encode_asset
 from slatprep.records import Place, Verdict
-from slatprep.storage.atomic import staged
+from slatprep.storage.atomic import staged, writing
 from slatprep.store import open_store
 from slatprep.store.reader import Store
 from slatprep.workers import Progress
@@ -124,7 +124,7 @@ def write_report(
     side = FULL if full <= VOXEL_BYTES else COARSE
     content = page_content(store, outcomes, tallies, chosen, side)
     sheets = [drawn[start : start + PER_SHEET] for start in range(0, len(drawn), PER_SHEET)]
-    with staged(Path(out)) as temporary:
+    with writing(str(out), Path(out).parent), staged(Path(out)) as temporary:
         with temporary.open("w", encoding="utf-8", newline="\n") as file:
             write_page(
                 file,

@@ -1,0 +1,184 @@
+"""In a folder where others may write: no link is followed, no file of theirs touched."""
+
+from __future__ import annotations
+
+import errno
+import os
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from support.synthetic import Dataset
+
+from slatprep.errors import StoreError
+from slatprep.pipeline.dataset import build_store
+from slatprep.pipeline.work import work_beside
+from slatprep.storage.atomic import staged, writing
+from slatprep.storage.lock import take_lock
+
+MINE = "what somebody else wrote"
+
+
+@pytest.fixture
+def theirs(tmp_path: Path) -> Path:
+    """A file of somebody else, in a folder of theirs."""
+    (tmp_path / "theirs").mkdir()
+    file = tmp_path / "theirs" / "notes.txt"
+    file.write_text(MINE)
+    return file
+
+
+def refused(target: Path, fresh: bool = False) -> str:
+    with pytest.raises(StoreError) as error, work_beside(target, fresh=fresh):
+        pass
+    return str(error.value)
+
+
+def test_a_work_folder_that_is_a_link_is_refused(tmp_path: Path, theirs: Path) -> None:
+    (tmp_path / ".s.zarr.work").symlink_to(theirs.parent)
+    assert ".s.zarr.work: is no folder" in refused(tmp_path / "s.zarr")
+    assert theirs.read_text() == MINE
+
+
+def test_a_folder_that_no_build_made_is_refused(tmp_path: Path) -> None:
+    folder = tmp_path / ".s.zarr.work"
+    folder.mkdir()
+    (folder / "notes.txt").write_text(MINE)
+    assert "holds notes.txt" in refused(tmp_path / "s.zarr")
+    assert (folder / "notes.txt").read_text() == MINE
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="gives a folder away")
+def test_a_work_folder_of_another_user_is_refused(tmp_path: Path) -> None:
+    folder = tmp_path / ".s.zarr.work"
+    folder.mkdir()
+    os.chown(folder, 12345, 12345)
+    assert "belongs to user 12345" in refused(tmp_path / "s.zarr")
+
+
+def test_what_is_not_a_builds_own_stays_in_its_folder(tmp_path: Path) -> None:
+    folder = tmp_path / ".s.zarr.work"
+    (folder / "build-1").mkdir(parents=True)
+    (folder / "lock").touch()
+    (folder / "notes.txt").write_text(MINE)
+    with work_beside(tmp_path / "s.zarr"):
+        assert not (folder / "build-1").exists()
+    assert [path.name for path in folder.iterdir()] == ["notes.txt"]
+
+
+def test_nobody_else_may_enter_the_work_folder(tmp_path: Path) -> None:
+    with work_beside(tmp_path / "s.zarr") as work:
+        assert work.scratch.parent.stat().st_mode & 0o077 == 0
+
+
+def as_link(place: Path, theirs: Path) -> None:
+    place.symlink_to(theirs.parent)
+
+
+def as_file(place: Path, theirs: Path) -> None:
+    place.write_text(MINE)
+
+
+@pytest.mark.parametrize("put", [as_link, as_file])
+def test_a_spool_that_is_none_is_refused(
+    tmp_path: Path, theirs: Path, put: Callable[[Path, Path], None]
+) -> None:
+    folder = tmp_path / ".s.zarr.work"
+    folder.mkdir()
+    (folder / "lock").touch()
+    put(folder / "spool", theirs)
+    assert "spool: is no folder" in refused(tmp_path / "s.zarr", fresh=True)
+    assert theirs.read_text() == MINE
+
+
+def test_a_lock_that_is_a_link_or_holds_something_else_is_left_alone(
+    tmp_path: Path, theirs: Path
+) -> None:
+    (tmp_path / "lock").symlink_to(theirs)
+    with pytest.raises(OSError, match="symbolic links"):
+        take_lock(tmp_path / "lock", "taken")
+    with pytest.raises(StoreError, match="holds something else than a lock"):
+        take_lock(theirs, "taken")
+    assert theirs.read_text() == MINE
+
+
+def test_a_lock_that_a_killed_process_left_is_taken(tmp_path: Path) -> None:
+    for _ in range(2):
+        os.close(take_lock(tmp_path / "lock", "taken"))
+
+
+def test_a_link_in_place_of_a_partial_file_is_left_alone(tmp_path: Path, theirs: Path) -> None:
+    link = tmp_path / ".r.html.partial"
+    link.symlink_to(theirs)
+    with staged(tmp_path / "r.html") as file:
+        file.write_text("report")
+    assert link.is_symlink()
+    assert not (tmp_path / "r.html").is_symlink()
+    assert (tmp_path / "r.html").read_text() == "report"
+    assert theirs.read_text() == MINE
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="gives a file away")
+def test_another_users_partial_file_is_left_alone(tmp_path: Path) -> None:
+    other = tmp_path / ".r.html.partial"
+    other.write_text(MINE)
+    os.chown(other, 12345, 12345)
+    with staged(tmp_path / "r.html") as file:
+        file.write_text("report")
+    assert other.read_text() == MINE
+
+
+def test_a_staged_file_has_the_permissions_of_any_other(tmp_path: Path) -> None:
+    (tmp_path / "any").touch()
+    with staged(tmp_path / "r.html") as file:
+        file.write_text("report")
+    assert (tmp_path / "r.html").stat().st_mode == (tmp_path / "any").stat().st_mode
+
+
+def test_what_a_killed_process_left_of_a_file_is_replaced(tmp_path: Path) -> None:
+    (tmp_path / ".r.html.partial").write_text("a longer report, half of")
+    with staged(tmp_path / "r.html") as file:
+        file.write_text("report")
+    assert (tmp_path / "r.html").read_text() == "report"
+    assert [path.name for path in tmp_path.iterdir()] == ["r.html"]
+
+
+@pytest.mark.parametrize(
+    ("code", "advice"), [(errno.ENOSPC, "Make room there"), (errno.EACCES, "may be written")]
+)
+def test_what_to_do_about_a_disk_depends_on_what_it_says(code: int, advice: str) -> None:
+    with pytest.raises(StoreError, match=advice), writing("s.zarr", Path("/data")):
+        raise OSError(code, os.strerror(code))
+
+
+def test_a_full_disk_before_anything_is_written_is_told(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Inodes may run out between the lock and the next folder."""
+
+    def none_left(*_: object, **__: object) -> str:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr("tempfile.mkdtemp", none_left)
+    assert "cannot write there (No space left" in refused(tmp_path / "s.zarr")
+
+
+@pytest.mark.parametrize("file", ["build.json", "assets.jsonl"])
+def test_a_folder_for_records_that_holds_others_is_refused(
+    undisturbed: tuple[Dataset, Path], tmp_path: Path, file: str
+) -> None:
+    (tmp_path / "records").mkdir()
+    (tmp_path / "records" / file).write_text('{"mine": 1}\n')
+    with pytest.raises(StoreError, match=f"records: holds a {file} that is not slatprep's"):
+        build_store(
+            undisturbed[0].parameters(), tmp_path / "s.zarr", manifests=tmp_path / "records"
+        )
+    assert (tmp_path / "records" / file).read_text() == '{"mine": 1}\n'
+
+
+def test_a_folder_for_records_within_the_store_is_refused(
+    undisturbed: tuple[Dataset, Path], tmp_path: Path
+) -> None:
+    out = tmp_path / "s.zarr"
+    with pytest.raises(StoreError, match="lies in the store"):
+        build_store(undisturbed[0].parameters(), out, manifests=out / "records")
