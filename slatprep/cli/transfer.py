@@ -61,8 +61,8 @@ def transfer(
     --out: Where to write the particles with their materials.
     --points: Take an asset's materials from its SLAT voxels, a surface, or from its PixieVerse
         field, a solid.
-    --axes: Frame of the particles: turned as TRELLIS saves Gaussians, or the SLAT's. [default:
-        trellis for a PLY of Gaussians, else slat]
+    --axes: Frame of the particles: turned as TRELLIS saves Gaussians, or meshes, or the SLAT's.
+        [default: trellis for a PLY of TRELLIS's Gaussians, else slat]
     --frame: Write positions as the particles' file has them, or in the SLAT frame.
     --max-distance: A particle without a voxel this near is far.
     --far: Give far particles class 7 and properties 0, leave them out, or give them the nearest
@@ -79,8 +79,11 @@ def transfer(
     field = _field(**source)
     read = work.read_particles(particles, axes)
     result = work.transfer(read.in_slat(), field, max_distance=max_distance, far=far)
+    doubt = work.doubt_axes(read, field, result, max_distance)
     work.write_transferred(out, read, result, max_distance=max_distance, in_slat=frame == "slat")
-    if result.far:
+    if doubt:
+        output.problem(f"{doubt}: {far}")
+    elif result.far:
         output.note(
             f"{result.far:,} of {len(read.positions):,} particles have no voxel within "
             f"{max_distance:g} voxels: {far}"

@@ -12,10 +12,18 @@ from numpy.typing import NDArray
 
 from slatprep.errors import InputError, SlatprepError
 
-Axes = Literal["trellis", "slat"]
+Axes = Literal["trellis", "glb", "slat"]
 
-SAVED_AXES = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
-"""What TRELLIS multiplies positions with as it saves them (``Gaussian.save_ply``)."""
+SAVED_AXES: dict[Axes, NDArray[np.float64]] = {
+    "trellis": np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]]),
+    "glb": np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]]),
+    "slat": np.eye(3),
+}
+"""What positions of the SLAT frame are multiplied with in a file of each kind.
+
+TRELLIS saves Gaussians as (x, -z, y) (``Gaussian.save_ply``), and meshes as
+(x, z, -y) (``to_glb``).
+"""
 
 _GAUSSIAN = ("f_dc_0", "opacity", "scale_0", "rot_0")
 _KEYS = ("positions", "points", "xyz")
@@ -29,17 +37,21 @@ class Particles:
     ----------
     positions : ndarray of float64, shape (N, 3)
         As in the file.
-    axes : {"trellis", "slat"}
-        The frame of the file: turned as TRELLIS saves Gaussians, or the SLAT's.
+    axes : {"trellis", "glb", "slat"}
+        The frame of the file: turned as TRELLIS saves Gaussians, or meshes, or the SLAT's.
+    foreign : bool
+        Whether they are Gaussians with fields that TRELLIS does not write
+        (``f_rest_*``), whose axes and scale are those of another tool.
     """
 
     positions: NDArray[np.float64]
     axes: Axes
+    foreign: bool = False
 
     def in_slat(self) -> NDArray[np.float64]:
         """Return the positions (N, 3) in the SLAT frame."""
         # The transpose is the inverse; a row vector is multiplied from the right.
-        return self.positions @ SAVED_AXES if self.axes == "trellis" else self.positions
+        return self.positions @ SAVED_AXES[self.axes]
 
 
 def read_particles(path: Path, axes: Axes | None = None) -> Particles:
@@ -50,10 +62,10 @@ def read_particles(path: Path, axes: Axes | None = None) -> Particles:
     path : Path
         A PLY with ``x y z``; an npy of shape (N, 3); or an npz that holds such
         an array as ``positions``, ``points`` or ``xyz``.
-    axes : {"trellis", "slat"}, optional
+    axes : {"trellis", "glb", "slat"}, optional
         The frame of the file. By default a PLY with the fields of Gaussians
-        (``f_dc_0``, ``opacity``, ``scale_0``, ``rot_0``) is as TRELLIS saves
-        it, and everything else in the SLAT frame.
+        (``f_dc_0``, ``opacity``, ``scale_0``, ``rot_0``) and without
+        ``f_rest_0`` is as TRELLIS saves it, and everything else in the SLAT frame.
 
     Returns
     -------
@@ -69,9 +81,9 @@ def read_particles(path: Path, axes: Axes | None = None) -> Particles:
     """
     path = Path(path)
     if path.suffix.lower() == ".ply":
-        positions, gaussian = _read_ply(path)
+        positions, names = _read_ply(path)
     else:
-        positions, gaussian = _read_numpy(path), False
+        positions, names = _read_numpy(path), frozenset()
     if len(positions) == 0:
         raise InputError(path, "holds no particles", "at least one")
     finite = np.isfinite(positions).all(axis=1)
@@ -80,10 +92,12 @@ def read_particles(path: Path, axes: Axes | None = None) -> Particles:
         raise InputError(
             path, f"particle {row} lies at {positions[row].tolist()}", "finite x, y, z"
         )
-    return Particles(positions, axes or ("trellis" if gaussian else "slat"))
+    foreign = "f_rest_0" in names
+    by_trellis = names.issuperset(_GAUSSIAN) and not foreign
+    return Particles(positions, axes or ("trellis" if by_trellis else "slat"), foreign)
 
 
-def _read_ply(path: Path) -> tuple[NDArray[np.float64], bool]:
+def _read_ply(path: Path) -> tuple[NDArray[np.float64], frozenset[str]]:
     try:
         import plyfile
     except ImportError as error:
@@ -100,8 +114,10 @@ def _read_ply(path: Path) -> tuple[NDArray[np.float64], bool]:
     names = vertex.dtype.names or ()
     if not {"x", "y", "z"} <= set(names):
         raise InputError(path, f"has vertices of {', '.join(names)}", "fields x, y and z")
+    if any(vertex.dtype[axis].kind not in "fiu" for axis in "xyz"):
+        raise InputError(path, "has x, y, z that are lists", "a number each")
     positions = np.column_stack([np.asarray(vertex[axis], dtype=np.float64) for axis in "xyz"])
-    return positions, set(_GAUSSIAN) <= set(names)
+    return positions, frozenset(names)
 
 
 def _read_numpy(path: Path) -> NDArray[np.float64]:

@@ -24,6 +24,7 @@ __all__ = [
     "Particles",
     "Transferred",
     "VoxelField",
+    "doubt_axes",
     "predicted_field",
     "read_particles",
     "stored_field",
@@ -32,6 +33,16 @@ __all__ = [
 ]
 
 Far = Literal["background", "drop", "nearest"]
+
+MANY_FAR, MOST_FAR = 0.2, 0.5
+"""Shares of far particles above which other axes are tried, and above which nothing is written."""
+
+
+_FRAMES: dict[Axes, str] = {
+    "slat": "frame SLAT, unit cube -0.5..0.5, z up",
+    "trellis": "frame TRELLIS as it saves Gaussians, unit cube -0.5..0.5, y down",
+    "glb": "frame TRELLIS as it saves meshes, unit cube -0.5..0.5, y up",
+}
 
 
 @dataclass(frozen=True)
@@ -105,6 +116,63 @@ def transfer(
     )
 
 
+def doubt_axes(
+    particles: Particles, field: VoxelField, result: Transferred, max_distance: float
+) -> str:
+    """Say why many particles are far, if they are: by another tool's axes, or by another object.
+
+    Parameters
+    ----------
+    particles : Particles
+        The particles.
+    field : VoxelField
+        The materials.
+    result : Transferred
+        What `transfer` gave them.
+    max_distance : float
+        Voxels.
+
+    Returns
+    -------
+    str
+        One line; empty where at most `MANY_FAR` of the particles are far.
+
+    Raises
+    ------
+    ConfigError
+        If more than `MOST_FAR` of them are, or other axes leave a tenth as many,
+        with the same line.
+    """
+    count = len(particles.positions)
+    if result.far <= MANY_FAR * count:
+        return ""
+    shares: dict[Axes, float] = {}
+    for axes in get_args(Axes):
+        some = Particles(particles.positions[:: max(1, count // 20_000)], axes)
+        tried = transfer(some.in_slat(), field, max_distance=max_distance)
+        shares[axes] = tried.far / len(some.positions)
+    why = (
+        f"{result.far:,} of {count:,} particles have no voxel within {max_distance:g} voxels, "
+        f"as the file is read with --axes {particles.axes}"
+    )
+    fitting = min(shares, key=lambda axes: shares[axes])
+    if shares[fitting] < 0.5 * shares[particles.axes]:
+        why += f"; with --axes {fitting} {shares[fitting]:.0%} would be far"
+    else:
+        low, high = particles.positions.min(), particles.positions.max()
+        why += (
+            f", and no other --axes brings them nearer; they lie between {low:.3g} and "
+            f"{high:.3g}, expected positions of this object in the unit cube, -0.5 to 0.5"
+        )
+    if particles.foreign:
+        why += (
+            "; the file has f_rest_*, which TRELLIS does not write: another tool's axes and scale"
+        )
+    if result.far > MOST_FAR * count or shares[fitting] < 0.1 * shares[particles.axes]:
+        raise ConfigError(f"{why}. If all is right, --max-distance may be larger")
+    return why
+
+
 def write_transferred(
     path: Path, particles: Particles, result: Transferred, *, max_distance: float, in_slat: bool
 ) -> None:
@@ -133,10 +201,7 @@ def write_transferred(
     from slatprep.export import target
     from slatprep.export.ply import write_points
 
-    if in_slat or particles.axes == "slat":
-        frame = "frame SLAT, unit cube -0.5..0.5, z up"
-    else:
-        frame = "frame TRELLIS as it saves Gaussians, unit cube -0.5..0.5, y up"
+    frame = _FRAMES["slat" if in_slat else particles.axes]
     positions = particles.in_slat() if in_slat else particles.positions
     with target.file(path, _is_material_ply) as new:
         write_points(

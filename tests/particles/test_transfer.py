@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import plyfile
@@ -90,6 +91,56 @@ def test_gaussians_get_the_material_of_their_voxel(
         np.testing.assert_allclose(vertex["E"][here], modulus, rtol=1e-4)
         np.testing.assert_allclose(vertex["density"][here], density, rtol=1e-4)
         np.testing.assert_allclose(vertex["nu"][here], ratio, rtol=1e-4)
+
+
+@pytest.mark.parametrize(("axes", "turn"), [
+    ("trellis", lambda x, y, z: (x, -z, y)),
+    ("glb", lambda x, y, z: (x, z, -y)),
+    ("slat", lambda x, y, z: (x, y, z)),
+])  # fmt: skip
+def test_wrong_axes_are_an_error_that_names_the_right_ones(
+    axes: str, turn: Any, store: Path, true_parts: tuple[np.ndarray, np.ndarray], tmp_path: Path
+) -> None:
+    positions = particles_near(true_parts[0], 3000, 0.45)
+    np.save(tmp_path / "p.npy", np.column_stack(turn(*positions.T)))
+    words = (tmp_path / "p.npy", "--store", store, "--asset", "cup", "--out", tmp_path / "m.ply")
+    assert run("transfer", *words, "--axes", axes)["far"] == 0
+    (tmp_path / "m.ply").unlink()
+    for other in {"trellis", "glb", "slat"} - {axes}:
+        said = run_wrong(*words, "--axes", other)
+        assert f"with --axes {axes} 0% would be far" in said
+        assert not (tmp_path / "m.ply").exists()
+
+
+def test_particles_of_another_object_are_an_error_that_says_where_they_lie(
+    store: Path, tmp_path: Path
+) -> None:
+    np.save(tmp_path / "p.npy", np.random.default_rng(0).uniform(2, 3, (500, 3)))
+    said = run_wrong(tmp_path / "p.npy", "--store", store, "--asset", "cup",
+                     "--out", tmp_path / "m.ply")  # fmt: skip
+    assert "500 of 500 particles have no voxel within 2 voxels" in said
+    assert "no other --axes brings them nearer; they lie between 2" in said
+
+
+def test_a_third_of_the_particles_far_is_told(
+    store: Path, true_parts: tuple[np.ndarray, np.ndarray], tmp_path: Path
+) -> None:
+    positions = particles_near(true_parts[0], 900, 0.45)
+    positions[::3] += 3.0
+    np.save(tmp_path / "p.npy", positions)
+    command = ["transfer", tmp_path / "p.npy", "--store", store, "--asset", "cup", "-q"]
+    result = CliRunner().invoke(slatprep, [*map(str, command), "--out", str(tmp_path / "m.ply")])
+    assert result.exit_code == 0
+    assert "300 of 900 particles have no voxel" in result.stderr
+    assert "read with --axes slat" in result.stderr
+
+
+def test_gaussians_of_another_tool_are_not_taken_for_trellis(tmp_path: Path) -> None:
+    rows = np.zeros(4, dtype=[(name, "f4") for name in [*GAUSSIAN, "f_rest_0"]])
+    plyfile.PlyData([plyfile.PlyElement.describe(rows, "vertex")]).write(tmp_path / "g.ply")
+    read = read_particles(tmp_path / "g.ply")
+    assert read.foreign
+    assert read.axes == "slat"
 
 
 def test_open3d_reads_the_same_points(
