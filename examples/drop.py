@@ -21,14 +21,18 @@ import numpy as np
 import plyfile
 from drop_picture import Part, draw
 
+from slatprep.errors import SlatprepError
 from slatprep.geometry.frames import voxel_centres
 from slatprep.geometry.voxels import boundary, filled, occupancy_of
 from slatprep.parameters import BuildParameters, PixieverseSource, SlatSource
 from slatprep.particles import transfer
-from slatprep.particles.simulate import drop, rigid_deviation, strain
+from slatprep.particles.simulate import ELASTIC, drop, rigid_deviation, strain
 from slatprep.pipeline.dataset import build_store
 from slatprep.records import BACKGROUND, MATERIAL_CLASSES, RESOLUTION
 from slatprep.store import Store, open_store
+
+RATE = 60
+"""Frames a second."""
 
 # Class, then density [kg/m^3], Young's modulus [Pa] and Poisson's ratio, as PixieVerse orders them.
 JELLY = (0, 1050.0, 3.0e4, 0.42)
@@ -36,28 +40,44 @@ STEEL = (1, 7200.0, 5.0e10, 0.29)
 
 
 def main() -> None:
-    """Make, transfer, drop, measure and draw."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--out", type=Path, default=Path("drop.png"))
-    parser.add_argument("--store", type=Path, help="else a steel ball in jelly is made")
-    parser.add_argument("--asset", help="of the store")
-    parser.add_argument("--size", type=float, default=1.0, help="edge of the unit cube [m]")
-    parser.add_argument("--particles", type=int, default=32, help="along each axis of the cube")
-    parser.add_argument("--seconds", type=float, default=0.5)
-    parser.add_argument("--substeps", type=int, default=2, help="time steps a 60th of a second")
+    """Parse the options, and say in one line what cannot be done."""
+    parser = argparse.ArgumentParser(
+        description=__doc__.splitlines()[0], formatter_class=argparse.ArgumentDefaultsHelpFormatter
+    )
+    add = parser.add_argument
+    add("--out", type=Path, default=Path("drop.png"), help="picture to write")
+    add("--store", type=Path, help="store of the object; without, a steel ball in jelly is made")
+    add("--asset", help="id of the object in the store")
+    add("--size", type=float, default=1.0, help="edge of the unit cube [m]")
+    add("--particles", type=int, default=32, help="particles along each axis of the cube")
+    add("--seconds", type=float, default=0.5, help="length of the motion, at least a 60th")
+    add("--substeps", type=int, default=2, help="time steps a 60th of a second")
     options = parser.parse_args()
+    if options.seconds < 1 / RATE:
+        parser.error(f"--seconds is {options.seconds}; expected at least {1 / RATE:.3f}, one frame")
+    if (options.store is None) != (options.asset is None):
+        parser.error("--store and --asset go together")
+    try:
+        run(options)
+    except SlatprepError as error:
+        parser.exit(1, f"{parser.prog}: error: {error}\n")
+
+
+def run(options: argparse.Namespace) -> None:
+    """Make, transfer, drop, measure and draw."""
     with tempfile.TemporaryDirectory() as folder:
         path, name = options.store, options.asset
         if path is None:
             path, name = make_store(Path(folder)), "drop"
         store = open_store(path)
+        require_elastic(store, name)
         positions, material, properties = particles(store, name, options.particles, Path(folder))
         asset = store.asset(name)
     spacing = options.size / options.particles
     begin = time.perf_counter()
     frames = drop(
         options.size * positions, material, properties, spacing, height=0.25 * options.size,
-        seconds=options.seconds, substeps=options.substeps,
+        seconds=options.seconds, rate=RATE, substeps=options.substeps,
     )  # fmt: skip
     print(
         f"{len(positions)} particles, simulated {options.seconds} s in "
@@ -76,12 +96,27 @@ def main() -> None:
         apart = max(rigid_deviation(frames[0][here], frame[here]) for frame in frames)
         print(
             f"{kind}: {here.sum()} particles, E = {modulus}; mean strain {mean[worst]:.4f} at "
-            f"{worst / 60:.2f} s, at most {mean.max():.4f}; at most {1000 * apart:.2f} mm (rms) "
+            f"{worst / RATE:.2f} s, at most {mean.max():.4f}; at most {1000 * apart:.2f} mm (rms) "
             "from a rigid motion"
         )
-    fall = int(60 * np.sqrt(2 * 0.25 * options.size / 9.81))  # the last frame in the air
-    chosen = (0, fall, worst, len(frames) - 1)
+    chosen = chosen_frames(len(frames), 0.25 * options.size, worst)
     draw(options.out, positions, frames / options.size, strains, material, asset, parts, chosen)
+
+
+def require_elastic(store: Store, name: str) -> None:
+    """Refuse, before anything is computed, an object of what `drop` does not simulate."""
+    other = sorted(set(store.asset(name).field.material.tolist()) - set(ELASTIC))
+    if other:
+        words = [[MATERIAL_CLASSES[number] for number in numbers] for numbers in (other, ELASTIC)]
+        raise SlatprepError(
+            f"{name} has {', '.join(words[0])}; expected an object of {', '.join(words[1])} alone"
+        )
+
+
+def chosen_frames(count: int, height: float, worst: int) -> tuple[int, ...]:
+    """Return the frames to draw: first, last in the air, most strained, last; each once."""
+    fall = int(RATE * np.sqrt(2 * height / 9.81))
+    return tuple(sorted({0, min(fall, count - 1), worst, count - 1}))
 
 
 def in_pascal(value: float) -> str:

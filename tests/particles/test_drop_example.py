@@ -64,3 +64,36 @@ def test_picture_shows_the_jelly_strained_and_the_steel_not(
     # Strain is drawn reddish; light and shadow on what is at rest are grey.
     reddish = [((side[..., 0] - side[..., 1]) > 40).sum() for side in (left, right)]
     assert reddish[0] == 0 and reddish[1] > 1000
+
+
+def test_a_short_run_is_drawn_within_its_frames() -> None:
+    assert drop.chosen_frames(31, 0.25, 19) == (0, 13, 19, 30)
+    assert drop.chosen_frames(7, 0.25, 6) == (0, 6)  # 0.1 s: over before the ground is reached
+    assert drop.chosen_frames(2, 0.25, 0) == (0, 1)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["--seconds", "0.001"], "--seconds is 0.001; expected at least 0.017"),
+        (["--asset", "x"], "--store and --asset go together"),
+        (["--store", "{store}", "--asset", "drop"], "drop has sand; expected an object of jelly"),
+        (["--store", "nowhere.zarr", "--asset", "x"], "nowhere.zarr"),
+    ],
+)
+def test_what_cannot_be_dropped_is_said_in_a_line(
+    arguments: list[str],
+    said: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    if "{store}" in arguments:
+        monkeypatch.setattr(drop, "JELLY", (2, *drop.JELLY[1:]))  # sand
+        arguments = [str(drop.make_store(tmp_path)) if a == "{store}" else a for a in arguments]
+    monkeypatch.setattr(sys, "argv", ["drop.py", *arguments, "--out", str(tmp_path / "drop.png")])
+    with pytest.raises(SystemExit) as caught:
+        drop.main()
+    assert caught.value.code in (1, 2)
+    assert said in capsys.readouterr().err
+    assert not (tmp_path / "drop.png").exists()
