@@ -63,7 +63,7 @@ def check_alignment(
     Options
     -------
     --asset: An asset; may be repeated.
-    --worst: N assets of the lowest fitness, either way.
+    --worst: N assets, failed ones first, then doubtful ones, each by their confidence.
     --ambiguous: Assets whose classes depend on a choice among ties.
     --picture: A .png for one asset, else a folder. [default: NAME.pictures beside the store]
     --show: Open it in Open3D's viewer, where there is a screen.

@@ -256,7 +256,8 @@ def choose_assets(
     asset_ids : iterable of str
         Assets by id, or a beginning that no other has, in this order.
     worst : int
-        How many of the lowest fitness, of both directions the lower.
+        How many of the worst: by verdict, those that failed first, then by
+        confidence, then by fitness, of both directions the lower.
     ambiguous : bool
         Whether to take all above the threshold of ambiguity, most of all first.
 
@@ -271,9 +272,14 @@ def choose_assets(
     """
     rows = [store.match(asset_id) for asset_id in asset_ids]
     if worst:
+        places = {Verdict.FAILED: 0, Verdict.DOUBTFUL: 1, Verdict.GOOD: 2}
+        rank = [places.get(verdict, -1) for verdict in store.column("verdict")]
         fitness = np.minimum(store.column("fitness"), store.column("fitness_backward"))
         # An asset without a number is the worst of all.
-        rows += np.argsort(np.nan_to_num(fitness, nan=-1.0), kind="stable")[:worst].tolist()
+        confidence, fitness = (
+            np.nan_to_num(figure, nan=-1.0) for figure in (store.column("confidence"), fitness)
+        )
+        rows += np.lexsort((fitness, confidence, rank))[:worst].tolist()
     if ambiguous:
         share = store.column("ambiguity")
         order = np.argsort(-share, kind="stable")

@@ -7,17 +7,19 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from slatprep.align.deformation import PlaceMap
 from slatprep.geometry.frames import (
     VOXEL_SIZE,
     apply_transform,
-    invert_transform,
+    places_of,
     split_transform,
     voxel_centres,
 )
 from slatprep.geometry.voxels import boundary, occupancy_of, outer_boundary, voxels_of
 from slatprep.inspect.pictures.palette import DISTANCE_COLOURS
 from slatprep.inspect.pictures.voxels import View, view_rotation
-from slatprep.records import BACKGROUND, MATERIAL_COLOURS
+from slatprep.provenance.stored import StoredRecords
+from slatprep.records import BACKGROUND, MATERIAL_COLOURS, RESOLUTION
 from slatprep.store.reader import StoredAsset
 
 FARTHEST = 3.0
@@ -25,6 +27,10 @@ FARTHEST = 3.0
 
 VIEWPOINTS = ((300.0, 22.0), (60.0, 22.0), (205.0, 50.0))
 """Azimuth and elevation [degree] of the three directions a picture looks from."""
+
+
+Placed = tuple[NDArray[np.uint8], NDArray[np.uint8], NDArray[np.float64]]
+"""Voxels (K, 3), the class of each (K,), and the transform (4, 4) that puts them in a picture."""
 
 
 @dataclass(frozen=True)
@@ -47,8 +53,11 @@ class Scene:
         The SLAT's outer voxels, on which errors are measured.
     error, error_before : ndarray of float64, shape (M,)
         Distance [voxel] of each to the nearest outer voxel of the PixieVerse
-        field, under the transform, and with the frames laid on each other as
-        they are.
+        field: where it was looked up, and before; that is under the transform
+        alone where a deformation follows it, else with the frames laid on each
+        other as they are.
+    deformed : Deformed or None
+        What the deformation does, where there is one.
     """
 
     pixieverse: NDArray[np.uint8]
@@ -59,14 +68,53 @@ class Scene:
     surface: NDArray[np.uint8]
     error: NDArray[np.float64]
     error_before: NDArray[np.float64]
+    deformed: Deformed | None = None
+
+    @property
+    def placed(self) -> Placed:
+        """The PixieVerse field on the SLAT, through all of the map between the frames."""
+        if self.deformed is not None:
+            return self.deformed.voxels, self.deformed.material, np.eye(4)
+        return self.pixieverse, self.pixieverse_material, self.transform
+
+
+@dataclass(frozen=True)
+class Deformed:
+    """What a deformation does to an asset.
+
+    Attributes
+    ----------
+    voxels, material : ndarray of uint8, shapes (D, 3) and (D,)
+        The PixieVerse field as the SLAT's lattice sees it: its cells whose
+        centres are looked up in an occupied voxel, but for those inside.
+    displacement : ndarray of float64, shape (N,)
+        How far it moves where each SLAT voxel is looked up, in voxels.
+    """
+
+    voxels: NDArray[np.uint8]
+    material: NDArray[np.uint8]
+    displacement: NDArray[np.float64]
 
 
 def scene_of(asset: StoredAsset) -> Scene:
-    """Return the scene of an asset as the store holds it."""
+    """Return the scene of an asset as the store holds it.
+
+    Raises
+    ------
+    StoreError
+        If the asset is deformed, and its record, which holds how, cannot be read.
+    """
     occupancy = asset.grid_material != BACKGROUND
     shell = voxels_of(boundary(occupancy))
     outer = outer_boundary(occupancy)
     surface = outer_boundary(occupancy_of(asset.coords))
+    way = StoredRecords(asset.store).place_map(asset)
+    under = surface_distance(surface, outer, asset.transform)
+    if way.deformation is None:
+        deformed, error, before = None, under, surface_distance(surface, outer, np.eye(4))
+    else:
+        deformed = _deformed(asset, way)
+        error, before = surface_distance(surface, outer, asset.transform, way), under
     return Scene(
         pixieverse=shell,
         pixieverse_material=asset.grid_material[tuple(shell.T)],
@@ -74,13 +122,29 @@ def scene_of(asset: StoredAsset) -> Scene:
         slat_material=asset.material,
         transform=asset.transform,
         surface=surface,
-        error=surface_distance(surface, outer, asset.transform),
-        error_before=surface_distance(surface, outer, np.eye(4)),
+        error=error,
+        error_before=before,
+        deformed=deformed,
     )
 
 
+def _deformed(asset: StoredAsset, way: PlaceMap) -> Deformed:
+    cells = np.indices((RESOLUTION,) * 3, dtype=np.uint8).reshape(3, -1).T
+    found = np.rint((way.places(cells) + 0.5) * RESOLUTION - 0.5).astype(np.intp)
+    inside = ((found >= 0) & (found < RESOLUTION)).all(axis=1)
+    material = np.full(len(cells), BACKGROUND, dtype=np.uint8)
+    material[inside] = asset.grid_material[tuple(found[inside].T)]
+    grid = material.reshape((RESOLUTION,) * 3)
+    shell = voxels_of(boundary(grid != BACKGROUND))
+    moved = asset.place - places_of(asset.coords, asset.transform)
+    return Deformed(shell, grid[tuple(shell.T)], np.linalg.norm(moved, axis=1) / VOXEL_SIZE)
+
+
 def surface_distance(
-    slat: NDArray[np.uint8], pixieverse: NDArray[np.uint8], transform: ArrayLike
+    slat: NDArray[np.uint8],
+    pixieverse: NDArray[np.uint8],
+    transform: ArrayLike,
+    way: PlaceMap | None = None,
 ) -> NDArray[np.float64]:
     """Return how far each SLAT voxel is from the nearest PixieVerse voxel.
 
@@ -90,6 +154,8 @@ def surface_distance(
         Surface voxels, each in its own frame.
     transform : array_like, shape (4, 4)
         PixieVerse frame to SLAT frame.
+    way : PlaceMap, optional
+        The map of which the transform is a part, if that is not all of it.
 
     Returns
     -------
@@ -99,7 +165,7 @@ def surface_distance(
     from slatprep.geometry.nearest import Lattice
 
     _, _, scale = split_transform(transform)
-    points = apply_transform(invert_transform(transform), voxel_centres(slat))
+    points = places_of(slat, transform) if way is None else way.places(slat)
     distance, _ = Lattice(pixieverse).nearest(points)
     scaled: NDArray[np.float64] = distance * scale
     return scaled
@@ -108,8 +174,12 @@ def surface_distance(
 def views(scene: Scene, size: int) -> tuple[View, ...]:
     """Return the three views, at one scale that holds the sets before and after."""
     here = voxel_centres(scene.pixieverse)
-    after = apply_transform(scene.transform, here)
-    points = np.concatenate([here, after, voxel_centres(scene.slat)])
+    voxels, _, transform = scene.placed
+    after = (
+        apply_transform(scene.transform, here),
+        apply_transform(transform, voxel_centres(voxels)),
+    )
+    points = np.concatenate([here, *after, voxel_centres(scene.slat)])
     placed = []
     for azimuth, elevation in VIEWPOINTS:
         rotation = view_rotation(azimuth, elevation)
@@ -129,10 +199,12 @@ def class_colours(material: NDArray[np.uint8]) -> NDArray[np.float64]:
     return table[material]
 
 
-def distance_colours(distance: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the colour (N, 3) in 0..1 of each distance (N,) in voxels, up to `FARTHEST`."""
+def distance_colours(
+    distance: NDArray[np.float64], farthest: float = FARTHEST
+) -> NDArray[np.float64]:
+    """Return the colour (N, 3) in 0..1 of each distance (N,) in voxels, up to `farthest`."""
     stops = np.array([rgb(colour) for colour in DISTANCE_COLOURS])
-    along = np.linspace(0, FARTHEST, len(stops))
+    along = np.linspace(0, farthest, len(stops))
     return np.stack([np.interp(distance, along, stops[:, c]) for c in range(3)], axis=-1)
 
 

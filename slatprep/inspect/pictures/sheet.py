@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 
 from slatprep.inspect.check import AlignmentCheck
 from slatprep.inspect.pictures import palette
-from slatprep.inspect.pictures.alignment import DPI, STYLE, error_picture, outlined, png_of
+from slatprep.inspect.pictures.alignment import error_picture, outlined
+from slatprep.inspect.pictures.canvas import STYLE, new_figure, png_of, write
 from slatprep.inspect.pictures.scene import FARTHEST, Scene, views
 
 MOST = 60
@@ -37,41 +37,37 @@ def draw_sheet(
         A PNG; the same for the same arguments.
     """
     import matplotlib.style
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
 
     columns = min(_ACROSS, max(len(scenes), 2))
     rows = -(-len(scenes) // columns)
     width = 2 * _MARGIN + columns * (_CELL_WIDTH + _GAP) - _GAP
     height = _HEAD + rows * _CELL_HEIGHT + _MARGIN
 
-    def text(x: float, y: float, words: str, **style: Any) -> None:
-        figure.text(x / width, 1 - y / height, words, **style)
-
     with matplotlib.style.context(["default", STYLE]):
-        figure = Figure(figsize=(width / DPI, height / DPI), dpi=DPI)
-        FigureCanvasAgg(figure)
-        text(_MARGIN, 46, f"{len(scenes)} alignments", weight="bold", size=12)
-        text(
-            _MARGIN, 68, "left: PixieVerse voxels by class, SLAT outlined; right: error per voxel, "
-            f"pale 0 to dark {FARTHEST:g} voxels", size=7, color=palette.MUTED,
+        figure = new_figure(width, height)
+        write(figure, _MARGIN, 46, f"{len(scenes)} alignments", weight="bold", size=12)
+        write(
+            figure, _MARGIN, 68, "left: PixieVerse voxels by class, SLAT outlined; "
+            f"right: error per voxel, pale 0 to dark {FARTHEST:g} voxels",
+            size=7, color=palette.MUTED,
         )  # fmt: skip
         for number, (scene, check, title) in enumerate(zip(scenes, checks, titles, strict=True)):
             row, column = divmod(number, columns)
             x, y = _MARGIN + column * (_CELL_WIDTH + _GAP), _HEAD + row * _CELL_HEIGHT
             view = views(scene, _THUMBNAIL)[0]
-            images = *outlined(scene, view, scene.transform), error_picture(scene, view)
+            images = *outlined(scene, view, scene.placed), error_picture(scene, view)
             for k, image in enumerate(images):
                 pixels = np.rint(np.clip(image, 0, 1) * 255).astype(np.uint8)
                 left, bottom = x + k * _THUMBNAIL, height - y - _THUMBNAIL
                 figure.figimage(pixels, xo=left, yo=bottom, origin="upper")
             colour = palette.VERDICT_COLOURS[check.verdict]
             line = y + _THUMBNAIL + 16
-            text(x, line, title, size=7.5, weight="bold")
-            text(x + _CELL_WIDTH - _GAP, line, str(check.verdict), size=7.5, weight="bold",
+            write(figure, x, line, title, size=7.5, weight="bold")
+            write(figure, x + _CELL_WIDTH - _GAP, line, str(check.verdict), size=7.5, weight="bold",
                  color=colour, ha="right")  # fmt: skip
-            text(x, line + 17, check.asset_id[:40], size=6.5, color=palette.MUTED)
+            write(figure, x, line + 17, check.asset_id[:40], size=6.5, color=palette.MUTED)
             worse = min(check.figure("fitness").value, check.figure("fitness_backward").value)
-            words = f"fitness {worse:.3f}   ambiguity {check.figure('ambiguity').value:.3f}"
-            text(x, line + 32, words, size=6.5, color=palette.MUTED)
+            sure = check.value("confidence")
+            words = f"confidence {sure:.3f}   fitness {worse:.3f}"
+            write(figure, x, line + 32, words, size=6.5, color=palette.MUTED)
         return png_of(figure)

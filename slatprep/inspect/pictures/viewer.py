@@ -73,17 +73,18 @@ def meshes(scene: Scene) -> tuple[Mesh, ...]:
     """Return the four parts side by side along x, in the SLAT frame."""
     identity = np.eye(4)
     classes = class_colours(scene.pixieverse_material)
+    placed = scene.placed
     parts = (
         (scene.pixieverse, classes, identity),
-        (scene.pixieverse, classes, scene.transform),
+        (placed[0], class_colours(placed[1]), placed[2]),
         (scene.slat, class_colours(scene.slat_material), identity),
         (scene.surface, distance_colours(scene.error), identity),
     )
-    placed = []
+    done = []
     for number, (voxels, colours, transform) in enumerate(parts):
         vertices, triangles, painted = cube_mesh(voxels, colours, transform)
-        placed.append((vertices + APART * number * np.eye(3)[0], triangles, painted))
-    return tuple(placed)
+        done.append((vertices + APART * number * np.eye(3)[0], triangles, painted))
+    return tuple(done)
 
 
 def cube_mesh(

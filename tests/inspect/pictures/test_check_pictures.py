@@ -14,13 +14,15 @@ import pytest
 import zarr
 from click.testing import CliRunner, Result
 from matplotlib.image import imread
+from scipy.spatial import cKDTree
+from support.deformed import MOVES
 from support.synthetic import QUARTER_TURN
 
 from slatprep.cli.commands import slatprep
 from slatprep.errors import StoreError
 from slatprep.geometry.frames import apply_transform, invert_transform, voxel_centres
 from slatprep.inspect.check import check_alignment, choose_assets
-from slatprep.inspect.pictures.alignment import HEIGHT, WIDTH, panels
+from slatprep.inspect.pictures.alignment import HEIGHT, WIDER, WIDTH, displacement_scale, panels
 from slatprep.inspect.pictures.scene import FARTHEST, distance_colours, scene_of, views
 from slatprep.inspect.pictures.viewer import cube_mesh, has_screen, meshes
 from slatprep.inspect.pictures.write import write_pictures
@@ -77,6 +79,45 @@ def test_a_wrong_transform_is_drawn_worse(copy: Path) -> None:
         assert ink_bad.sum() > 1.5 * ink_right.sum()
 
 
+def test_a_deformation_is_shown_before_and_after_and_as_displacement(
+    deformed_build: BuildSummary, tmp_path: Path
+) -> None:
+    store = open_store(deformed_build.store)
+    for asset in store:
+        scene = scene_of(asset)
+        assert scene.deformed is not None
+        # The field as the SLAT's cells look it up: its outside lies on the SLAT's.
+        lattice = cKDTree(asset.coords.astype(float))
+        distance, _ = lattice.query(scene.deformed.voxels.astype(float))
+        assert np.mean(distance <= 1.0) > 0.95
+        material = asset.grid_material[tuple(scene.pixieverse.T)]
+        assert set(np.unique(scene.deformed.material)) == set(np.unique(material))
+        # Measured from the similarity: what the truth says, less what that takes of it.
+        true_places = MOVES[asset.asset_id](voxel_centres(asset.coords))
+        similar = apply_transform(invert_transform(asset.transform), voxel_centres(asset.coords))
+        moved = np.linalg.norm(true_places - similar, axis=1) * 64
+        assert np.median(np.abs(scene.deformed.displacement - moved)) < 0.7
+        assert np.median(scene.error) < 0.6 * np.median(scene.error_before)
+        for view in views(scene, 90):
+            before, similarity, deformed, displacement, result, error = panels(scene, view)
+            assert np.abs(similarity - before).sum() > 9
+            assert np.abs(deformed - similarity).sum() > 9
+            assert np.abs(displacement - result).sum() > 9 and error.min() < 0.9
+        file = tmp_path / f"{asset.asset_id}.png"
+        result = run("--asset", asset.asset_id, "--store", store.path, "--picture", file)
+        assert "picture:" in result.stdout, result.output
+        image = imread(file)
+        assert image.shape[:2] == (HEIGHT, WIDTH + WIDER)
+        for top in (142, 456, 770):
+            for left in (48, 362, 676, 990, 1304, 1618, 1978):
+                assert image[top : top + 300, left : left + 300, :3].std() > 0.05, (top, left)
+    # The scale under the column goes from the colour of none to that of the largest.
+    bar = image[1092, 990:1290, :3]
+    end = displacement_scale(scene.deformed)
+    np.testing.assert_allclose(bar[[0, -1]], distance_colours(np.array([0, end]), end), atol=0.01)
+    assert end - 1 < scene.deformed.displacement.max() <= end
+
+
 def test_the_error_is_the_distance_to_the_nearest_surface_voxel(copy: Path) -> None:
     misplace(copy, 0, 0.03)
     scene = scene_of(open_store(copy).asset("ant"))
@@ -117,6 +158,14 @@ def test_worst_and_ambiguous_choose_by_the_stores_figures(copy: Path) -> None:
     assert choose_assets(store, worst=3) == ["cup", "ant", "bear.front"]
     assert choose_assets(store, worst=99) == ["cup", "ant", "bear.front", "dog", "bear.side"]
     assert choose_assets(store, ambiguous=True) == ["bear.side", "bear.front"]
+    group["asset/confidence"][:] = [0.99, 0.97, 0.2, 0.98, np.nan]
+    group["asset/verdict"][:] = np.array(["good", "doubtful", "failed", "good", "good"], object)
+    store = open_store(copy)
+    by_verdict = ["bear.side", "bear.front", "dog", "cup", "ant"]
+    assert choose_assets(store, worst=5) == by_verdict
+    group["asset/confidence"][:] = 0.9
+    group["asset/verdict"][:] = np.array(["good"] * 5, object)
+    store = open_store(copy)
     chosen = choose_assets(store, ["dog", "ant"], worst=2, ambiguous=True)
     assert chosen == ["dog", "ant", "cup", "bear.side", "bear.front"]
     with pytest.raises(StoreError, match="no asset"):

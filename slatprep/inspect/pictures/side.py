@@ -1,0 +1,152 @@
+"""What stands beside the panels of a picture: figures, the spread of errors, the starts."""
+
+from __future__ import annotations
+
+import textwrap
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from slatprep.geometry.frames import split_transform
+from slatprep.inspect.check import AlignmentCheck
+from slatprep.inspect.pictures import palette
+from slatprep.inspect.pictures.canvas import size_of, write
+from slatprep.inspect.pictures.scene import FARTHEST, Scene, distance_colours
+from slatprep.records import RESOLUTION, Candidate
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+SIDE_WIDTH, SIDE_MARGIN = 402, 48
+"""Pixels of the column, and between it and the picture's edge."""
+
+SHOWN = (
+    "confidence",
+    "expected_accuracy",
+    "fitness",
+    "inlier_rmse",
+    "fitness_backward",
+    "inlier_rmse_backward",
+    "overlap",
+    "valid_share",
+    "ambiguity",
+    "margin",
+)
+"""The figures of a check that a picture shows, named as the store names them."""
+
+
+_LINE = 21
+
+
+def side_of(figure: Figure) -> float:
+    """Return where the column begins, in pixels from the left."""
+    return size_of(figure)[0] - SIDE_MARGIN - SIDE_WIDTH
+
+
+def draw_figures(figure: Figure, check: AlignmentCheck, scene: Scene, y: float) -> None:
+    """Write the figures, what is good, and how far the map between the frames moves things."""
+    left = side_of(figure)
+    columns = (left, left + 275, left + SIDE_WIDTH)
+    for x, name, ha in zip(columns, ("figure", "value", "good"), ("left", "right", "right"),
+                           strict=True):  # fmt: skip
+        write(figure, x, y, name, size=6.8, color=palette.MUTED, ha=ha)
+    _rule(figure, y + 7)
+    rows = [one for name in SHOWN for one in check.figures if one.name == name]
+    for number, one in enumerate(rows):
+        line = y + 30 + _LINE * number
+        worse = one.passes is False
+        colour = palette.VERDICT_COLOURS["failed"] if worse else palette.INK
+        write(figure, columns[0], line, one.name, size=7.5)
+        # Adding zero takes the sign from a rounded -0.
+        value = f"{round(one.value, 3) + 0.0:.3f}"
+        write(figure, columns[1], line, value, size=7.5, ha="right", color=colour)
+        limit = one.threshold_text.replace(">=", "\u2265").replace("<=", "\u2264")
+        write(figure, columns[2] - 26, line, limit, size=7.5, ha="right", color=palette.MUTED)
+        if one.passes is not None:
+            mark = "\u2717" if worse else "\u2713"
+            good = palette.VERDICT_COLOURS["failed" if worse else "good"]
+            write(figure, columns[2], line, mark, size=7.5, ha="right", color=good)
+    rotation, shift, scale = split_transform(check.transform)
+    angle = np.degrees(np.arccos(np.clip((np.trace(rotation) - 1) / 2, -1, 1)))
+    moved = np.linalg.norm(shift) * RESOLUTION
+    words = f"turned {angle:.1f}°, shifted {moved:.2f} voxel, scaled {scale:.3f}"
+    line = y + 36 + _LINE * len(rows)
+    write(figure, left, line, words, size=7, color=palette.MUTED)
+    if scene.deformed is not None:
+        apart = scene.deformed.displacement
+        words = f"deformed by {apart.mean():.2f} voxel in the mean, {apart.max():.2f} at most"
+        write(figure, left, line + 17, words, size=7, color=palette.MUTED)
+
+
+def draw_histogram(figure: Figure, scene: Scene, radius: float, y: float) -> None:
+    """Draw how many voxels have which error, and as a line how many had it before."""
+    write(figure, side_of(figure), y, "error per SLAT surface voxel", weight="bold", size=8.5)
+    share = float((scene.error <= radius).mean())
+    words = f"median {np.median(scene.error):.2f} voxel; {share:.1%} within {radius:g}"
+    write(figure, side_of(figure), y + 20, words, size=7, color=palette.MUTED)
+    axes = _axes(figure, y + 36, 190)
+    edges = np.linspace(0, FARTHEST, 31)
+    middles = (edges[:-1] + edges[1:]) / 2
+    shares = [
+        np.histogram(np.minimum(error, FARTHEST - 1e-9), edges)[0] / len(error)
+        for error in (scene.error, scene.error_before)
+    ]
+    axes.bar(middles, shares[0], width=edges[1] * 0.92, color=distance_colours(middles).tolist(),
+             edgecolor=palette.MUTED, linewidth=0.3)  # fmt: skip
+    axes.stairs(shares[1], edges, color=palette.MUTED, linewidth=0.8)
+    top = max(shares[0].max(), 0.02)
+    if shares[1].max() > 1.15 * top:
+        axes.set_ylim(0, 1.15 * top)
+    axes.axvline(radius, color=palette.INK, linewidth=0.8, linestyle=(0, (4, 3)))
+    axes.set_xlim(0, FARTHEST)
+    axes.set_xticks(range(int(FARTHEST) + 1), ["0", "1 voxel", "2", f"\u2265 {FARTHEST:g}"])
+    before = "before alignment" if scene.deformed is None else "without the deformation"
+    axes.text(0.95, 0.93, f"line: {before}", transform=axes.transAxes, ha="right",
+              fontsize=6.5, color=palette.MUTED)  # fmt: skip
+    axes.yaxis.set_major_formatter(lambda value, _: f"{value:.0%}")
+    axes.locator_params(axis="y", nbins=3)
+
+
+def draw_candidates(figure: Figure, candidates: Sequence[Candidate] | str, y: float) -> None:
+    """Draw the score of each start of the search; in its place, why that is not known."""
+    write(figure, side_of(figure), y, "starts of the search", weight="bold", size=8.5)
+    if isinstance(candidates, str):
+        for number, line in enumerate(textwrap.wrap(candidates, 56)):
+            write(figure, side_of(figure), y + 20 + 17 * number, line, size=7, color=palette.MUTED)
+        return
+    own = sorted((c for c in candidates if c.same_as is None), key=lambda c: (-c.fitness, c.index))
+    words = f"{len(own)} different of {len(candidates)}, by coarse fitness; some end alike"
+    write(figure, side_of(figure), y + 20, words, size=7, color=palette.MUTED)
+    axes = _axes(figure, y + 36, 190)
+    colours = [palette.ACCENT] + [palette.RULE] * (len(own) - 1)
+    axes.bar(range(len(own)), [c.fitness for c in own], width=0.78, color=colours)
+    axes.set_xlim(-0.8, max(len(own), 2) - 0.2)
+    axes.set_ylim(0, 1)
+    axes.set_yticks([0, 0.5, 1])
+    best = own[0]
+    if best.euler_degrees is not None:
+        name = "start at " + ", ".join(f"{angle:g}°" for angle in best.euler_degrees)
+        axes.set_xticks([0], [name], ha="left")
+    else:
+        axes.set_xticks([])
+
+
+def _axes(figure: Figure, y: float, height: float) -> Axes:
+    width, whole = size_of(figure)
+    left = side_of(figure) + 40
+    box = (left / width, 1 - (y + height) / whole, (SIDE_WIDTH - 40) / width, height / whole)
+    axes = figure.add_axes(box)
+    axes.tick_params(length=2.5, width=0.6)
+    for spine in axes.spines.values():
+        spine.set_linewidth(0.6)
+    return axes
+
+
+def _rule(figure: Figure, y: float) -> None:
+    from matplotlib.lines import Line2D
+
+    width, height = size_of(figure)
+    ends = [side_of(figure) / width, (side_of(figure) + SIDE_WIDTH) / width]
+    figure.add_artist(Line2D(ends, [1 - y / height] * 2, color=palette.RULE, linewidth=0.8))
