@@ -27,6 +27,10 @@ from .normalize import (
 )
 from .parameters import BuildParameters as BuildParameters
 from .pipeline.dataset import build_store as build_store
+from .pipeline.join import (
+    concat_stores as concat_stores,
+    subset_store as subset_store,
+)
 from .readers import (
     discover as discover,
     read_field as read_field,

@@ -88,7 +88,7 @@ def build_store(output: Output, out: Path, dry_run: bool, **options: Any) -> Non
         summary = build.build_store(
             parameters, out, progress=progress, **_by_work(output, parameters), **options
         )
-    _report(output, summary)
+    report(output, summary)
 
 
 @command()
@@ -118,7 +118,7 @@ def align(output: Output, out: Path, **options: Any) -> None:
         summary = build.align_pairs(
             parameters, out, progress=progress, **_by_work(output, parameters), **options
         )
-    _report(output, summary)
+    report(output, summary)
 
 
 def _by_work(output: Output, parameters: BuildParameters) -> dict[str, Any]:
@@ -164,7 +164,7 @@ def _show_plan(output: Output, plan: BuildPlan) -> None:
     output.result(document, show)
 
 
-def _report(output: Output, summary: BuildSummary) -> None:
+def report(output: Output, summary: BuildSummary) -> None:
     """Print what became of the assets, name those that did not go in, and set the exit code."""
     _show_damaged(output, summary.damaged)
     for asset_id, reason in summary.problems:

@@ -18,6 +18,8 @@ COMMANDS = {
     "verify": "slatprep.cli.verify:verify",
     "info": "slatprep.cli.info:info",
     "list": "slatprep.cli.list:list_assets",
+    "subset": "slatprep.cli.join:subset",
+    "concat": "slatprep.cli.join:concat",
     "report": "slatprep.cli.report:report",
     "score": "slatprep.cli.score:score",
     "export": "slatprep.cli.export:export",

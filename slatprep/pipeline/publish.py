@@ -25,6 +25,7 @@ from slatprep.provenance.record import (
     BuildRecord,
     PropertyCounts,
     Record,
+    Versions,
     to_json,
     write_records,
 )
@@ -157,8 +158,24 @@ def write_all_records(store: Path, path: Path, records: Iterable[Record]) -> str
     return build_id
 
 
-def publish_manifests(records: Path, summary: BuildSummary, parameters: BuildParameters) -> None:
+def publish_manifests(
+    records: Path,
+    summary: BuildSummary,
+    parameters: BuildParameters,
+    versions: Versions | None = None,
+) -> None:
     """Copy the records of a finished build to where people look for them.
+
+    Parameters
+    ----------
+    records : Path
+        Those of the assets.
+    summary : BuildSummary
+        What the build did.
+    parameters : BuildParameters
+        What it was asked for.
+    versions : dict of str to str, optional
+        Of the libraries that made the numbers, where they are not those of today.
 
     Raises
     ------
@@ -173,7 +190,7 @@ def publish_manifests(records: Path, summary: BuildSummary, parameters: BuildPar
         ):
             shutil.copyfile(records, records_file)
             reached("manifests written", str(folder))
-            document = to_json(build_record(summary, parameters), indent=True)
+            document = to_json(build_record(summary, parameters, versions), indent=True)
             build_file.write_bytes(document + b"\n")
         reached("manifests published", str(folder))
     except OSError as error:
@@ -183,7 +200,9 @@ def publish_manifests(records: Path, summary: BuildSummary, parameters: BuildPar
         ) from error
 
 
-def build_record(summary: BuildSummary, parameters: BuildParameters) -> BuildRecord:
+def build_record(
+    summary: BuildSummary, parameters: BuildParameters, versions: Versions | None = None
+) -> BuildRecord:
     """Return the record of a build that made a store."""
     if summary.store is None or summary.normalization is None:
         raise ValueError("a build without a store has no record")
@@ -196,7 +215,7 @@ def build_record(summary: BuildSummary, parameters: BuildParameters) -> BuildRec
         store=summary.store.name,
         records=summary.records.name,
         parameters=parameters,
-        versions=build_versions(parameters),
+        versions=versions or build_versions(parameters),
         normalization=summary.normalization,
         statuses=summary.statuses,
         verdicts=summary.verdicts,

@@ -13,6 +13,7 @@ import torch
 import zarr
 from hypothesis import given
 from hypothesis import strategies as st
+from torch.utils.data import DataLoader
 
 from slatprep import ConfigError, open_store
 from slatprep.geometry.frames import voxel_centres
@@ -187,3 +188,9 @@ def test_what_is_filtered_moves_no_object_to_another_split(learn_store: Path) ->
             for split in SPLITS:
                 some = select_assets(store, split, shares=shares, max_ambiguity=float(limit))
                 assert set(some) <= everything[split]
+
+
+def test_a_plain_loader_takes_collate(learn_store: Path) -> None:
+    dataset = SlatDataset(learn_store)
+    batches = list(DataLoader(dataset, batch_size=4, collate_fn=collate))
+    assert [asset for batch in batches for asset in batch.asset_ids] == dataset.asset_ids

@@ -1,0 +1,328 @@
+"""Stores made of stores: some assets of one, or those of several, without aligning again.
+
+Rows and records are taken over as they are. Ranges stay too, so a subset keeps
+the ranges of the dataset that it was chosen from; only stores that each have
+ranges of their own dataset are brought to the ranges of all of them.
+"""
+
+from __future__ import annotations
+
+import time
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass, replace
+from itertools import accumulate
+from typing import Any
+
+import numpy as np
+import orjson
+from numpy.typing import NDArray
+
+from slatprep.errors import ConfigError, StoreError
+from slatprep.normalize import denormalize_properties, normalize_properties
+from slatprep.parameters import BuildParameters, StoreParameters
+from slatprep.pipeline.pack import write_assets
+from slatprep.pipeline.publish import Destination, publish_manifests, write_all_records
+from slatprep.pipeline.spool import spooled
+from slatprep.pipeline.summary import BuildSummary, summarise_build
+from slatprep.pipeline.work import work_beside, work_directory
+from slatprep.provenance.places import manifests_beside
+from slatprep.provenance.record import AssetRecord, adapter_of, read_build_record
+from slatprep.provenance.stored import StoredRecords
+from slatprep.records import Normalization, Place, PropertyRange
+from slatprep.storage.atomic import writing
+from slatprep.storage.place import place_of
+from slatprep.store import Store, open_store
+from slatprep.store.layout import ARRAYS, FORMAT_VERSION, overlaps
+from slatprep.store.shard_writer import ShardWriter
+from slatprep.store.writer import Shard, create_store, finish_store, shards
+from slatprep.workers import Progress
+
+_NO_EXTENT = np.empty((0, 2))
+
+
+@dataclass(frozen=True, eq=False)
+class _Source:
+    """A store that assets are taken from."""
+
+    store: Store
+    records: StoredRecords
+    build: dict[str, Any]
+    """Its attribute ``build``."""
+    places: dict[str, Any]
+    """Where its sources lay, as ``build.json`` says; unknown without it."""
+
+
+_Row = tuple[_Source, int]
+"""An asset: where it is taken from, and its index there."""
+
+
+def subset_store(
+    store: str | Place,
+    out: str | Place,
+    assets: Iterable[str],
+    *,
+    manifests: str | Place | None = None,
+    progress: Progress | None = None,
+) -> BuildSummary:
+    """Make a store of some assets of another.
+
+    Its bytes are those of a build of the same assets with the same given ranges.
+
+    Parameters
+    ----------
+    store : str or Place
+        The store to choose from; it stays as it is.
+    out : str or Place
+        The new store, a path or URL; one that is there is replaced in one step.
+    assets : iterable of str
+        Ids, or beginnings of ids that no other has.
+    manifests : str or Path, optional
+        Folder of its records; by default beside it.
+    progress : callable, optional
+        Called with the rows of arrays written and those there are.
+
+    Raises
+    ------
+    ConfigError
+        If no asset is named, or `out` is the store itself.
+    StoreError
+        If the store lacks an asset, cannot be read, or is of an older format;
+        or the disk does not take the new one.
+    """
+    source = _source(store)
+    rows = [(source, row) for row in sorted({source.store.match(name) for name in assets})]
+    if not rows:
+        raise ConfigError(f"no asset of {source.store.path} is chosen; expected one at least")
+    return _write(rows, source.store.normalization, source.build, out, manifests, progress)
+
+
+def concat_stores(
+    stores: Iterable[str | Place],
+    out: str | Place,
+    *,
+    manifests: str | Place | None = None,
+    progress: Progress | None = None,
+) -> BuildSummary:
+    """Make one store of the assets of several.
+
+    Stores with the same ranges are joined byte by byte. Where each has those
+    of its own dataset, properties are brought to the ranges that span all of
+    them, by way of SI units in float32: right to 1e-6 of a range.
+
+    Parameters
+    ----------
+    stores : iterable of str or Place
+        Two or more; they stay as they are.
+    out, manifests, progress
+        As for `subset_store`.
+
+    Raises
+    ------
+    ConfigError
+        If there are fewer than two, or they do not go together: an id is in two
+        of them, parameters of alignment or look-up differ, or ranges differ
+        that do not come from the datasets.
+    StoreError
+        If one cannot be read or is of an older format, or the disk does not
+        take the new one.
+    """
+    sources = [_source(store) for store in stores]
+    if len(sources) < 2:
+        raise ConfigError(f"{len(sources)} stores to join; expected two or more")
+    rows = [(source, row) for source in sources for row in range(len(source.store))]
+    times = Counter(source.store.ids[row] for source, row in rows)
+    twice = sorted(asset_id for asset_id, count in times.items() if count > 1)
+    if twice:
+        raise ConfigError(
+            f"{len(twice)} ids are in more than one store, such as {', '.join(twice[:3])}; "
+            "expected each once: leave them out of one with `slatprep subset`"
+        )
+    build = _common_build(sources)
+    normalization = _common_ranges(sources)
+    rows.sort(key=lambda row: row[0].store.ids[row[1]])
+    return _write(rows, normalization, build, out, manifests, progress)
+
+
+def _source(place: str | Place) -> _Source:
+    store = open_store(place)
+    if store.format_version != FORMAT_VERSION:
+        raise StoreError(
+            f"{store.path} has format {store.format_version}, and {FORMAT_VERSION} is written; "
+            "build it again"
+        )
+    folder, places = manifests_beside(store.path), {}
+    if folder is not None:
+        file = folder / "build.json"
+        parameters = read_build_record(file.read_bytes(), str(file)).parameters
+        named = {name: getattr(parameters, name) for name in ("pixieverse", "slat", "pairing")}
+        places = orjson.loads(orjson.dumps(named, default=str))
+    return _Source(store, StoredRecords(store), store.attributes["build"], places)
+
+
+def _common_build(sources: Sequence[_Source]) -> dict[str, Any]:
+    """Return the attribute ``build`` of the joined store; versions that differ are all named."""
+    first = sources[0]
+    for other in sources[1:]:
+        for group, ours in first.build["parameters"].items():
+            theirs = other.build["parameters"].get(group)
+            if group not in ("store", "normalize") and theirs != ours:
+                raise ConfigError(
+                    f"{other.store.path} was built with [{group}] {theirs}, {first.store.path} "
+                    f"with {ours}; expected the same: build one of them again"
+                )
+    versions: dict[str, list[str]] = {}
+    for source in sources:
+        for name, version in source.build["versions"].items():
+            versions.setdefault(name, []).append(version)
+    return {
+        **first.build,
+        "name": " + ".join(dict.fromkeys(s.build["name"] for s in sources if s.build["name"])),
+        "versions": {name: ", ".join(dict.fromkeys(found)) for name, found in versions.items()},
+    }
+
+
+def _common_ranges(sources: Sequence[_Source]) -> Normalization:
+    """Return the ranges that all have, or those that span all datasets'."""
+    ranges = [source.store.normalization for source in sources]
+    if all(one == ranges[0] for one in ranges):
+        return ranges[0]
+    for source, one in zip(sources, ranges, strict=True):
+        if one.source != "dataset":
+            raise ConfigError(
+                f"{source.store.path} has ranges from {one.source!r}, not those of the others; "
+                "expected the same in all, or in each those of its dataset: build with --ranges"
+            )
+    first, second, third = (
+        PropertyRange(same[0].name, same[0].log10, min(r.lo for r in same), max(r.hi for r in same))
+        for same in zip(*(one.ranges for one in ranges), strict=True)
+    )
+    return Normalization((first, second, third), "dataset")
+
+
+def _write(
+    rows: Sequence[_Row],
+    normalization: Normalization,
+    build: dict[str, Any],
+    out: str | Place,
+    manifests: str | Place | None,
+    progress: Progress | None,
+) -> BuildSummary:
+    begin = time.perf_counter()
+    place = Destination(out, manifests)
+    sources = list(dict.fromkeys(source for source, _ in rows))
+    for source in sources:
+        if place_of(source.store.path) == place.store:
+            raise ConfigError(f"{place.out} is a store to take assets from; choose another path")
+    parameters = _parameters(sources, build)
+    assets = [spooled(record, _NO_EXTENT) for record in _records(rows, normalization)]
+    with work_beside(place.store) as work:
+        place.look()
+        store, records = work.scratch / "store.zarr", work.scratch / "assets.jsonl"
+        with writing(str(place.out), work_directory(place.store).parent):
+            offsets = [0, *accumulate(asset.n_voxels for asset in assets)]
+            create_store(store, len(rows), offsets[-1], parameters.store)
+            write_assets(store, assets, offsets, normalization)
+            _copy_rows(store, rows, offsets, normalization, parameters.store, progress)
+            build_id = write_all_records(store, records, _records(rows, normalization))
+            finish_store(store, normalization, build_id, build)
+            place.replace(store)
+        summary = summarise_build(
+            assets,
+            store=place.out,
+            records=place.records(),
+            build_id=build_id,
+            seconds=time.perf_counter() - begin,
+            normalization=normalization,
+            clipped=[r.counts.clipped for r in _records(rows, normalization) if r.counts.clipped],
+        )
+        publish_manifests(records, summary, parameters, build["versions"])
+        place.publish()
+    return summary
+
+
+def _records(rows: Iterable[_Row], normalization: Normalization) -> Iterator[AssetRecord]:
+    """Yield the records of rows, with the ranges they have in the new store."""
+    for source, row in rows:
+        record = source.records.read(row)
+        if record.normalization != normalization:
+            clipped = record.counts.clipped
+            if clipped is None or np.any([*_counts(clipped.voxel), *_counts(clipped.grid)]):
+                raise StoreError(
+                    f"{source.store.path}: values of {record.asset_id} were clipped to its ranges, "
+                    "so it cannot be brought to others; build it again"
+                )
+            record = replace(record, normalization=normalization)
+        yield record
+
+
+def _counts(counts: Any) -> list[int]:
+    return [counts.youngs_modulus, counts.density, counts.poissons_ratio]
+
+
+def _copy_rows(
+    path: Any,
+    rows: Sequence[_Row],
+    offsets: Sequence[int],
+    normalization: Normalization,
+    parameters: StoreParameters,
+    progress: Progress | None,
+) -> None:
+    """Write the shards of all arrays that have rows of voxels or grids."""
+    everything = list(shards([""] * len(rows), offsets, parameters))
+    for done, shard in enumerate(everything):
+        if progress:
+            progress(done, len(everything))
+        names = [layout.name for layout in ARRAYS if layout.name.startswith(f"{shard.group}/")]
+        with ExitStack() as stack:
+            writers = {
+                name: stack.enter_context(ShardWriter(path, name, shard.rows[0])) for name in names
+            }
+            for asset, own in _owners(shard):
+                source, row = rows[shard.first + asset]
+                start = int(source.store.offsets[row]) + own.start if own else row
+                stop = int(source.store.offsets[row]) + own.stop if own else row + 1
+                change = _renormaliser(source.store.normalization, normalization)
+                for name, writer in writers.items():
+                    values = source.store.read_rows(name, start, stop)
+                    writer.append(change(values, name))
+
+
+def _owners(shard: Shard) -> Iterator[tuple[int, slice | None]]:
+    """Yield the assets in a shard, and which of their voxels; of grids there is one each."""
+    if shard.group == "voxel":
+        yield from overlaps(shard.offsets, *shard.rows)
+    else:
+        yield from ((asset, None) for asset in range(len(shard.keys)))
+
+
+def _renormaliser(
+    old: Normalization, new: Normalization
+) -> Callable[[NDArray[Any], str], NDArray[Any]]:
+    """Return what brings the rows of an array, by its name, from one set of ranges to another."""
+
+    def change(values: NDArray[Any], name: str) -> NDArray[Any]:
+        if old == new or not name.endswith("/properties"):
+            return values
+        last = np.moveaxis(values, 1, -1)  # (N, 3), or of a grid (1, x, y, z, 3)
+        changed = normalize_properties(denormalize_properties(last, old), new)
+        return np.ascontiguousarray(np.moveaxis(changed, -1, 1))
+
+    return change
+
+
+def _parameters(sources: Sequence[_Source], build: dict[str, Any]) -> BuildParameters:
+    """Return what the build's record says: the parameters, and where all sources lay."""
+    places: dict[str, Any] = {"pixieverse": {"root": "unknown"}, "slat": {"root": "unknown"}}
+    if all(source.places == sources[0].places for source in sources):
+        places |= sources[0].places
+    else:
+        for side in ("pixieverse", "slat"):
+            roots = (source.places.get(side, {}).get("root", "unknown") for source in sources)
+            places[side] = {"root": " | ".join(dict.fromkeys(roots))}
+    document = {"name": build["name"], **places, **build["parameters"]}
+    parameters: BuildParameters = adapter_of(BuildParameters).validate_json(
+        orjson.dumps(document), strict=True
+    )
+    return parameters
