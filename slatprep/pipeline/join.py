@@ -81,7 +81,12 @@ def subset_store(
     manifests : str or Path, optional
         Folder of its records; by default beside it.
     progress : callable, optional
-        Called with the rows of arrays written and those there are.
+        Called with the shards written and those there are.
+
+    Returns
+    -------
+    BuildSummary
+        What the new store holds.
 
     Raises
     ------
@@ -117,6 +122,11 @@ def concat_stores(
         Two or more; they stay as they are.
     out, manifests, progress
         As for `subset_store`.
+
+    Returns
+    -------
+    BuildSummary
+        What the new store holds.
 
     Raises
     ------
