@@ -54,13 +54,12 @@ UNIT_CUBE: Bounds = np.array([[-0.5] * 3, [0.5] * 3])
 def writer(store: Store, ids: Sequence[str], options: ExportOptions) -> Writer:
     """Return what writes one PLY an asset; see `slatprep.export.FORMATS`."""
     bounds, notes = read_bounds(store, ids) if options.frame == "pixieverse" else ({}, ())
-    parameters = store.attributes["build"]["parameters"]
     one = functools.partial(
         write,
         points=options.points,
         frame=options.frame,
         bounds=bounds,
-        max_distance=float(parameters["sample"]["max_distance"]),
+        max_distance=store.about.build.parameters.sample.max_distance,
     )
     return Writer(one, notes=notes)
 

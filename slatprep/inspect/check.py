@@ -5,16 +5,13 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from slatprep.align.quality import measure_quality
-from slatprep.errors import StoreError
 from slatprep.judge import THRESHOLDS, verdict_of
 from slatprep.normalize import normalize_properties
-from slatprep.parameters import SampleParameters
 from slatprep.records import StructuredLatents, Verdict
 from slatprep.sample import sample
 from slatprep.store.reader import Store, StoredAsset
@@ -164,7 +161,7 @@ def check_alignment(store: Store, asset_id: str) -> AlignmentCheck:
         If the store has no such asset, or does not say how it was made.
     """
     asset = store.asset(asset_id)
-    radius = float(_parameters(store)["align"]["radius"])
+    radius = store.about.build.parameters.align.radius
     valid_share, differs = recompute_annotation(asset)
     latents = StructuredLatents(asset.coords, asset.feats)
     quality = measure_quality(asset.field, latents, asset.transform, radius)
@@ -229,7 +226,7 @@ def recompute_annotation(asset: StoredAsset) -> tuple[float, dict[str, NDArray[n
     StoreError
         If the store does not say how it was made.
     """
-    parameters = SampleParameters(**_parameters(asset.store)["sample"])
+    parameters = asset.store.about.build.parameters.sample
     annotation = sample(asset.field, asset.place, parameters)
     properties = normalize_properties(annotation.properties, asset.store.normalization)
     changes = np.abs(properties - asset.properties).max(axis=1)
@@ -285,13 +282,3 @@ def choose_assets(
         order = np.argsort(-share, kind="stable")
         rows += order[share[order] > THRESHOLDS.good_ambiguity].tolist()
     return [store.ids[row] for row in dict.fromkeys(rows)]
-
-
-def _parameters(store: Store) -> dict[str, Any]:
-    try:
-        parameters: dict[str, Any] = store.attributes["build"]["parameters"]
-    except (KeyError, TypeError):
-        raise StoreError(
-            f"{store.path} does not say with what parameters it was built; build it again"
-        ) from None
-    return parameters

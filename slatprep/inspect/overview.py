@@ -84,8 +84,8 @@ def overview_of(store: Store) -> StoreOverview:
     sizes = storage_of(store.path).files()
     return StoreOverview(
         path=store.path,
-        format_version=int(store.attributes["format_version"]),
-        build_id=str(store.attributes["manifest"]),
+        format_version=store.format_version,
+        build_id=store.about.manifest,
         files=len(sizes),
         size=sum(sizes.values()),
         engines=_counts(columns["engine"]),

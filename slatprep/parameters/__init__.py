@@ -15,8 +15,8 @@ from annotated_types import Ge, Gt, Le
 from slatprep.records import Engine, Place
 from slatprep.storage.place import place_of
 
-Positive = Annotated[float, Gt(0)]
-"""A number above 0; never infinite, as in every group."""
+Length = Annotated[float, Ge(1e-3), Le(1e3)]
+"""A length in voxels, of which either frame has 64: neither nothing nor beyond all bounds."""
 
 PositiveInt = Annotated[int, Gt(0)]
 """A whole number above 0."""
@@ -126,9 +126,9 @@ class AlignParameters(_Group):
     engine: Engine = Engine.FIELD
     model: Literal["auto", "rigid", "similarity", "affine", "deformable"] = "auto"
     scale_bounds: tuple[Annotated[float, Gt(0), Le(1)], Annotated[float, Ge(1)]] = (0.6, 1.6)
-    max_displacement: Positive = 16.0
-    radius: Positive = 1.0
-    icp_radius: Positive = 3.2
+    max_displacement: Length = 16.0
+    radius: Length = 1.0
+    icp_radius: Length = 3.2
     icp_iterations: PositiveInt = 60
 
 
@@ -174,8 +174,8 @@ class SampleParameters(_Group):
     """
 
     method: Literal["vote", "nearest"] = "vote"
-    max_distance: Positive = 3.0
-    vote_width: Positive = 0.5
+    max_distance: Length = 3.0
+    vote_width: Length = 0.5
     max_unphysical: Annotated[float, Ge(0), Le(1)] = 0.1
 
 

@@ -6,22 +6,19 @@ A store may come from a stranger. These checks cost no read beyond the root's
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
 from slatprep.errors import StoreError
 from slatprep.parameters import MAX_GRID_SHARD, MAX_VOXEL_CHUNK, MAX_VOXEL_SHARD
-from slatprep.records import MATERIAL_CLASSES, PROPERTY_COLUMNS, RESOLUTION, Place
+from slatprep.records import RESOLUTION, Place
 from slatprep.storage.documents import read_document
 from slatprep.store.digests import GROUP
 from slatprep.store.layout import (
     ARRAYS,
     ASSET_CHUNK,
     FIXED_SIZES,
-    FORMAT,
-    READABLE_VERSIONS,
     ArrayLayout,
 )
 from slatprep.store.records import RECORD_ARRAY
@@ -86,37 +83,6 @@ def read_metadata(path: Place) -> dict[str, Any]:
         return read_document(path, MAX_METADATA_BYTES)
     except (OSError, ValueError) as error:
         raise StoreError(f"{path}: cannot be read as metadata ({error})") from None
-
-
-def attribute_findings(attributes: Mapping[str, Any]) -> Iterator[Finding]:
-    """Yield what is wrong with the root's attributes."""
-    for name, expected in (
-        ("format", FORMAT),
-        ("resolution", RESOLUTION),
-        ("material_classes", list(MATERIAL_CLASSES)),
-        ("property_columns", list(PROPERTY_COLUMNS)),
-    ):
-        value = attributes.get(name)
-        if value != expected or type(value) is not type(expected):
-            yield _root(f"attribute {name} is {value!r}", repr(expected))
-    version = attributes.get("format_version")
-    if type(version) is not int or version not in READABLE_VERSIONS:
-        one_of = " or ".join(map(str, READABLE_VERSIONS))
-        yield _root(f"attribute format_version is {version!r}", one_of)
-    manifest = attributes.get("manifest")
-    if not (isinstance(manifest, str) and len(manifest) == 64 and _is_hex(manifest)):
-        yield _root(f"attribute manifest is {manifest!r}", "a SHA-256 in hex")
-    build = attributes.get("build")
-    if not (isinstance(build, dict) and isinstance(build.get("parameters"), dict)):
-        yield _root("attribute build names no parameters", "the parameters of the build")
-    ranges = attributes.get("normalization")
-    for name in PROPERTY_COLUMNS:
-        entry = ranges.get(name) if isinstance(ranges, dict) else None
-        if not _is_range(entry):
-            yield _root(
-                f"attribute normalization has {entry!r} for {name}",
-                "log10 (true or false), finite lo < hi, and source",
-            )
 
 
 def array_findings(name: str, metadata: object, sizes: Mapping[str, int]) -> Iterator[Finding]:
@@ -223,25 +189,6 @@ def _chunk_findings(
         if not fits or min(sizes) < 1 or sizes[0] > limit:
             expected = f"1 to {limit} rows of at most {rows}"
             yield Finding(where, "", f"{kind} shape is {sizes!r}", expected)
-
-
-def _root(what: str, expected: str) -> Finding:
-    return Finding("zarr.json", "", what, expected)
-
-
-def _is_hex(text: str) -> bool:
-    return all(letter in "0123456789abcdef" for letter in text)
-
-
-def _is_range(entry: object) -> bool:
-    if not isinstance(entry, dict) or not isinstance(entry.get("log10"), bool):
-        return False
-    lo, hi = entry.get("lo"), entry.get("hi")
-    if not (isinstance(lo, int | float) and isinstance(hi, int | float)):
-        return False
-    return (
-        math.isfinite(lo) and math.isfinite(hi) and lo < hi and isinstance(entry.get("source"), str)
-    )
 
 
 _LAYOUTS = {

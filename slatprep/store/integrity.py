@@ -9,10 +9,10 @@ from slatprep.errors import StoreError
 from slatprep.records import Place
 from slatprep.storage.files import LINK, file_digest
 from slatprep.storage.place import storage_of
+from slatprep.store.attributes import attribute_findings
 from slatprep.store.contract import (
     Finding,
     array_findings,
-    attribute_findings,
     dimension_sizes,
     read_metadata,
 )

@@ -15,10 +15,11 @@ from slatprep.errors import StoreError
 from slatprep.geometry.frames import places_of
 from slatprep.geometry.voxels import voxels_of
 from slatprep.normalize import denormalize_properties
-from slatprep.records import BACKGROUND, MaterialField, Normalization, Place, PropertyRange
+from slatprep.records import BACKGROUND, MaterialField, Normalization, Place
 from slatprep.storage.place import place_of, storage_of
 from slatprep.storage.versions import store_name
 from slatprep.store.assets import ASSET_COLUMNS, AssetTable
+from slatprep.store.attributes import RootAttributes, read_attributes
 from slatprep.store.contract import MAX_VOXELS, read_metadata
 from slatprep.store.layout import ARRAYS, FORMAT, READABLE_VERSIONS
 
@@ -123,6 +124,10 @@ class StoredAsset:
         )
 
 
+class AttributesError(StoreError):
+    """A store whose attributes do not say what readers rely on."""
+
+
 class Store(AssetTable):
     """A store opened for reading; `open_store` makes one.
 
@@ -157,6 +162,20 @@ class Store(AssetTable):
         """The last part of its path, or of its URL without the version."""
         return store_name(self.path)
 
+    @cached_property
+    def about(self) -> RootAttributes:
+        """What its attributes say, typed.
+
+        Raises
+        ------
+        AttributesError
+            If they do not say what readers rely on; `open_store` has asked already.
+        """
+        found = read_attributes(self.attributes)
+        if isinstance(found, tuple):
+            raise AttributesError(f"{self.path}/{found[0]}; run `slatprep verify`")
+        return found
+
     @property
     def group(self) -> zarr.Group:
         """The root as zarr-python has it, for everything this class does not offer.
@@ -171,14 +190,7 @@ class Store(AssetTable):
     @property
     def normalization(self) -> Normalization:
         """The ranges that properties were normalised with."""
-        entries = self.attributes["normalization"]
-        ranges = [
-            PropertyRange(name, bool(e["log10"]), float(e["lo"]), float(e["hi"]))
-            for name in self.attributes["property_columns"]
-            for e in [entries[name]]
-        ]
-        source = entries[ranges[0].name]["source"]
-        return Normalization((ranges[0], ranges[1], ranges[2]), source)
+        return self.about.ranges
 
     def read(
         self, index: int, columns: Sequence[str] = TRAINING_COLUMNS
@@ -274,7 +286,8 @@ def open_store(path: str | Place, *, copy: bool = False) -> Store:
     Raises
     ------
     StoreError
-        If there is nothing, something else, or a store of a newer format.
+        If there is nothing, something else, a store of a newer format, or one
+        whose attributes do not say what they must.
     """
     path = storage_of(place_of(path)).current_version()
     if copy:
@@ -295,7 +308,9 @@ def open_store(path: str | Place, *, copy: bool = False) -> Store:
             f"{path} has format version {version!r}; this slatprep reads {readable}. "
             "Use the slatprep that wrote it, or a newer one"
         )
-    return Store(path, document)
+    store = Store(path, document)
+    store.about  # noqa: B018 - refused here, and not halfway through a command
+    return store
 
 
 def is_store(path: Place) -> bool:

@@ -107,7 +107,7 @@ def write_report(
     """
     outcomes: list[Outcome] | None = None
     if manifests is not None:
-        outcomes = list(read_outcomes(manifests, str(store.attributes["manifest"])))
+        outcomes = list(read_outcomes(manifests, store.about.manifest))
         _refuse_other_records(store, outcomes, manifests)
     chosen = _chosen(store)
     drawn: list[Drawn] = []
@@ -161,7 +161,7 @@ def _chosen(store: Store) -> list[int]:
 def _draw(path: Path, indices: Sequence[int]) -> tuple[list[Drawn], dict[str, Tally]]:
     """Draw some assets of a store, and count by category, in a worker."""
     store = open_store(path)
-    max_distance = float(store.attributes["build"]["parameters"]["sample"]["max_distance"])
+    max_distance = store.about.build.parameters.sample.max_distance
     drawn: list[Drawn] = []
     tallies: dict[str, Tally] = {}
     for index in indices:

@@ -62,13 +62,13 @@ def page_content(
         JSON-ready. Table columns are lists of one entry an asset, those of
         the store first; not-a-number and what is unknown are None.
     """
-    build = store.attributes["build"]
+    build = store.about.build
     return {
         "title": store.name,
-        "name": str(build.get("name", "")),
-        "build_id": str(store.attributes["manifest"]),
+        "name": build.name,
+        "build_id": store.about.manifest,
         "records": outcomes is not None,
-        "versions": build["versions"],
+        "versions": build.versions,
         "voxels": int(store.offsets[-1]),
         "engine": sorted(set(map(str, store.column("engine")))),
         "thresholds": {
@@ -84,8 +84,8 @@ def page_content(
             "none": UNANNOTATED_COLOUR,
             "property": _PROPERTY_COLOURS,
             "distance": DISTANCE_COLOURS,
-            "max_distance": build["parameters"]["sample"]["max_distance"],
-            "radius": build["parameters"]["align"]["radius"],
+            "max_distance": build.parameters.sample.max_distance,
+            "radius": build.parameters.align.radius,
         },
         "detail": {
             "side": side,

@@ -18,9 +18,9 @@ from slatprep.inspect.verify.manifests import manifest_findings, source_roots
 from slatprep.provenance.places import manifests_beside
 from slatprep.records import Place, SourceRoots
 from slatprep.storage.place import place_of, storage_of
-from slatprep.store.contract import Finding
+from slatprep.store.contract import Finding, read_metadata
 from slatprep.store.integrity import file_findings, metadata_findings
-from slatprep.store.reader import Store, open_store
+from slatprep.store.reader import AttributesError, Store, open_store
 from slatprep.workers import Progress
 from slatprep.workers.local import Jobs, require_shared, run_unordered
 
@@ -103,6 +103,12 @@ def verify_store(
     path = storage_of(place_of(path)).current_version()
     try:
         store = open_store(path.absolute())  # workers may stand in another folder
+    except AttributesError:
+        # Values mean nothing without them; of what is there the files tell.
+        document = read_metadata(path / "zarr.json")
+        digests, found = file_findings(Store(path, document), jobs)
+        findings = {*metadata_findings(path), *found}
+        return Verification(path, 0, digests, 0, None, tuple(sorted(findings)))
     except StoreError as error:
         if not _is_file(path / "zarr.json"):
             raise

@@ -1,0 +1,162 @@
+"""What the attributes of a store's root say, as typed values; nothing is computed with others."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, fields
+from functools import cache
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar
+
+import orjson
+
+from slatprep.parameters import Length, SampleParameters
+from slatprep.records import (
+    MATERIAL_CLASSES,
+    PROPERTY_COLUMNS,
+    RESOLUTION,
+    Digest,
+    InJson,
+    Normalization,
+    PropertyRange,
+)
+from slatprep.store.contract import Finding
+from slatprep.store.layout import FORMAT, READABLE_VERSIONS
+
+if TYPE_CHECKING:
+    from pydantic import TypeAdapter
+
+
+def _one_of(*values: object) -> InJson:
+    return InJson({"type": "literal", "expected": list(values)})
+
+
+def _exactly(values: tuple[str, ...]) -> InJson:
+    each = [{"type": "literal", "expected": [value]} for value in values]
+    return InJson({"type": "tuple", "items_schema": each})
+
+
+@dataclass(frozen=True)
+class StoredRange:
+    """The range of one property; see `slatprep.records.PropertyRange`."""
+
+    log10: bool
+    lo: float
+    hi: float
+    source: str
+
+    def __post_init__(self) -> None:
+        if not self.lo < self.hi:
+            raise ValueError("lo must be less than hi")
+
+
+@dataclass(frozen=True)
+class StoredRanges:
+    """The ranges of all properties."""
+
+    youngs_modulus: StoredRange
+    density: StoredRange
+    poissons_ratio: StoredRange
+
+
+@dataclass(frozen=True)
+class StoredAlign:
+    """What readers ask of the parameters of alignment: the correspondence radius [voxel]."""
+
+    radius: Length
+
+
+@dataclass(frozen=True)
+class StoredParameters:
+    """What readers ask of the parameters of a build."""
+
+    align: StoredAlign
+    sample: SampleParameters
+
+
+@dataclass(frozen=True)
+class StoredBuild:
+    """What made a store: parameters, versions, and the name of the dataset."""
+
+    parameters: StoredParameters
+    versions: dict[str, str]
+    name: str = ""
+
+
+@dataclass(frozen=True)
+class RootAttributes:
+    """What readers rely on; attributes that they do not know are left alone.
+
+    `slatprep.store.layout.root_attributes` writes them.
+    """
+
+    __pydantic_config__: ClassVar[dict[str, object]] = {"extra": "ignore", "allow_inf_nan": False}
+
+    format: Annotated[str, _one_of(FORMAT)]
+    format_version: Annotated[int, _one_of(*READABLE_VERSIONS)]
+    resolution: Annotated[int, _one_of(RESOLUTION)]
+    material_classes: Annotated[tuple[str, ...], _exactly(MATERIAL_CLASSES)]
+    property_columns: Annotated[tuple[str, ...], _exactly(PROPERTY_COLUMNS)]
+    normalization: StoredRanges
+    manifest: Digest
+    build: StoredBuild
+
+    @property
+    def ranges(self) -> Normalization:
+        """The ranges as other stages have them."""
+        entries = [(name, getattr(self.normalization, name)) for name in PROPERTY_COLUMNS]
+        a, b, c = (PropertyRange(name, e.log10, e.lo, e.hi) for name, e in entries)
+        return Normalization((a, b, c), self.normalization.youngs_modulus.source)
+
+
+def read_attributes(attributes: Mapping[str, Any]) -> RootAttributes | tuple[Finding, ...]:
+    """Return the attributes of a root as typed values, or all that is wrong with them."""
+    from pydantic import ValidationError
+
+    try:
+        read: RootAttributes = _adapter().validate_json(
+            orjson.dumps(_without_news(attributes)), strict=True
+        )
+        return read
+    except ValidationError as error:
+        return tuple(
+            Finding(
+                "zarr.json",
+                "",
+                f"attribute {'/'.join(map(str, fault['loc']))} is {_shown(fault)}",
+                fault["msg"].removeprefix("Input should be ").removeprefix("Value error, "),
+            )
+            for fault in error.errors(include_url=False)[:_FAULTS]
+        )
+
+
+def attribute_findings(attributes: Mapping[str, Any]) -> Iterator[Finding]:
+    """Yield what is wrong with the root's attributes."""
+    found = read_attributes(attributes)
+    yield from found if isinstance(found, tuple) else ()
+
+
+_FAULTS = 64
+
+
+def _shown(fault: Mapping[str, Any]) -> str:
+    return "missing" if fault["type"] == "missing" else repr(fault["input"])[:100]
+
+
+def _without_news(attributes: Mapping[str, Any]) -> dict[str, Any]:
+    """Leave out parameters of looking up that only newer versions know."""
+    document: dict[str, Any] = orjson.loads(orjson.dumps(attributes))
+    at: Any = document
+    for key in ("build", "parameters", "sample"):
+        at = at.get(key) if isinstance(at, dict) else None
+    if isinstance(at, dict):
+        for name in at.keys() - {field.name for field in fields(SampleParameters)}:
+            del at[name]
+    return document
+
+
+@cache
+def _adapter() -> TypeAdapter[Any]:
+    # Late: pydantic takes a third of a second that commands without a store do not have.
+    from pydantic import TypeAdapter
+
+    return TypeAdapter(RootAttributes)

@@ -1,0 +1,159 @@
+"""Whatever a stranger's store, records or truth hold, no command ends in a traceback."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+from click.testing import CliRunner, Result
+
+from slatprep.cli.commands import slatprep
+from slatprep.pipeline.dataset import BuildSummary
+
+
+@pytest.fixture(scope="module")
+def original(mixed_build: BuildSummary, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    assert mixed_build.store is not None
+    folder = tmp_path_factory.mktemp("strangers")
+    shutil.copytree(mixed_build.store, folder / "s.zarr")
+    shutil.copytree(mixed_build.store.with_suffix(".manifests"), folder / "s.manifests")
+    return folder
+
+
+@pytest.fixture
+def store(original: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(original, tmp_path / "copy")) / "s.zarr"
+
+
+def run(*arguments: object) -> Result:
+    """Run a command; an error is a line and an exit code."""
+    done = CliRunner().invoke(slatprep, list(map(str, arguments)))
+    assert done.exception is None or isinstance(done.exception, SystemExit), arguments
+    return done
+
+
+def every_command(store: Path) -> dict[str, Result]:
+    out = store.parent / "out"
+    lines = {
+        "info": ("info", store),
+        "verify": ("verify", store),
+        "report": ("report", store, "--out", f"{out}.html"),
+        "describe": ("describe", store, "--out", f"{out}.json"),
+        "check": ("check-alignment", "--asset", "cup", "--store", store, "--picture", "none"),
+        **{
+            name: ("export", store, "--format", name, "--out", f"{out}-{name}")
+            for name in ("ply", "npz", "hdf5")
+        },
+    }
+    return {name: run(*line) for name, line in lines.items()}
+
+
+def edit(file: Path, change: Callable[[dict[str, Any]], object]) -> None:
+    document = json.loads(file.read_text())
+    change(document)
+    file.write_text(json.dumps(document))
+
+
+def _set(*path: str, value: object) -> Callable[[dict[str, Any]], object]:
+    def change(document: dict[str, Any]) -> None:
+        for key in path[:-1]:
+            document = document[key]
+        document[path[-1]] = value
+
+    return change
+
+
+SAMPLE = ("build", "parameters", "sample")
+ATTRIBUTES: dict[str, Callable[[dict[str, Any]], object]] = {
+    "no build": lambda a: a.pop("build"),
+    "build a list": _set("build", value=[1]),
+    "no parameters": _set("build", "parameters", value={}),
+    "no radius": _set("build", "parameters", "align", value={}),
+    "versions a number": _set("build", "versions", value=5),
+    "name a list": _set("build", "name", value=[1]),
+    "no ranges": lambda a: a.pop("normalization"),
+    "text for a bound": _set("normalization", "density", "lo", value="x"),
+    "endless bound": _set("normalization", "density", "hi", value=1e999),
+    "bounds exchanged": _set("normalization", "density", "lo", value=99),
+    "no columns": lambda a: a.pop("property_columns"),
+    "few columns": _set("property_columns", value=["density"]),
+    "columns a number": _set("property_columns", value=5),
+    "classes a number": _set("material_classes", value=[1] * 8),
+    "a lone surrogate": _set("build", "name", value="\ud800"),
+    "width 0": _set(*SAMPLE, "vote_width", value=0),
+    "width tiny": _set(*SAMPLE, "vote_width", value=1e-300),
+    "width huge": _set(*SAMPLE, "vote_width", value=1e300),
+    "width text": _set(*SAMPLE, "vote_width", value="x"),
+    "distance huge": _set(*SAMPLE, "max_distance", value=1e300),
+    "method other": _set(*SAMPLE, "method", value="other"),
+    "manifest a number": _set("manifest", value=5),
+    "resolution 1": _set("resolution", value=1),
+    "version true": _set("format_version", value=True),
+}
+
+
+@pytest.mark.parametrize("case", ATTRIBUTES)
+def test_attributes(store: Path, case: str) -> None:
+    edit(store / "zarr.json", lambda document: ATTRIBUTES[case](document["attributes"]))
+    for name, done in every_command(store).items():
+        assert done.exit_code == 1, name
+        assert "slatprep: error" in done.stderr or name == "verify"
+    told = run("verify", store, "-q").stdout
+    assert "zarr.json: " in told and "0 findings" not in told
+
+
+def test_attributes_that_are_not_known_hinder_nobody(store: Path) -> None:
+    def change(document: dict[str, Any]) -> None:
+        attributes = document["attributes"]
+        attributes["mine"] = {"x": [1, None, "y"]}
+        attributes["build"]["parameters"]["sample"]["of_tomorrow"] = 5
+        attributes["build"]["parameters"]["align"]["engine"] = "of tomorrow"
+
+    edit(store / "zarr.json", change)
+    for name, done in every_command(store).items():
+        assert done.exit_code == (name == "verify"), done.output
+
+
+RECORDS: dict[str, tuple[str, bytes | Callable[[dict[str, Any]], object]]] = {
+    "a list": ("build.json", b"[1]"),
+    "nested": ("build.json", b"[" * 100_000),
+    "nested object": ("build.json", b'{"a":' * 100_000),
+    "text": ("build.json", b"\xff\xfe"),
+    "counts a list": ("build.json", _set("counts", value=[1])),
+    "huge": ("build.json", b" " * (2**24 + 1)),
+    "endless": ("build.json", _set("duration_s", value=1e999)),
+    "lines of lists": ("assets.jsonl", b"[1]\n5\nnull\n"),
+    "nested line": ("assets.jsonl", b"[" * 100_000),
+    "long line": ("assets.jsonl", b"x" * 2**23),
+    "no text": ("assets.jsonl", b"\xff\xfe\n"),
+    "many faults": ("assets.jsonl", b'{"status":"ok",' + b'"x":0,' * 100 + b'"y":0}\n'),
+}
+
+
+@pytest.mark.parametrize("case", RECORDS)
+def test_records_beside_a_store(store: Path, case: str) -> None:
+    name, content = RECORDS[case]
+    file = store.with_suffix(".manifests") / name
+    if callable(content):
+        edit(file, content)
+    else:
+        file.write_bytes(content)
+    for command in ("report", "verify"):
+        out = ("--out", store.with_suffix(".html")) if command == "report" else ()
+        done = run(command, store, *out)
+        assert done.exit_code == 1
+        assert name in done.output
+
+
+@pytest.mark.parametrize("name", ["build.json", "assets.jsonl"])
+def test_a_device_in_place_of_a_record(store: Path, name: str) -> None:
+    file = store.with_suffix(".manifests") / name
+    file.unlink()
+    file.symlink_to("/dev/zero")
+    for command in ("report", "verify"):
+        out = ("--out", store.with_suffix(".html")) if command == "report" else ()
+        assert "no regular file" in run(command, store, *out).output
