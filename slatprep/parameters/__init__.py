@@ -15,7 +15,7 @@ from annotated_types import Ge, Gt, Le
 from slatprep.records import Engine, Place
 from slatprep.storage.place import place_of
 
-Length = Annotated[float, Ge(1e-3), Le(1e3)]
+Length = Annotated[float, Gt(1e-4), Le(1e3)]
 """A length in voxels, of which either frame has 64: neither nothing nor beyond all bounds."""
 
 PositiveInt = Annotated[int, Gt(0)]
@@ -198,8 +198,7 @@ class StoreParameters(_Group):
     def __post_init__(self) -> None:
         if self.voxel_chunk * self.voxel_chunks_per_shard > MAX_VOXEL_SHARD:
             raise ValueError(
-                f"voxel_chunk times voxel_chunks_per_shard is above {MAX_VOXEL_SHARD} rows; "
-                "make either smaller"
+                f"voxel_chunk times voxel_chunks_per_shard of at most {MAX_VOXEL_SHARD} rows"
             )
 
 

@@ -127,6 +127,8 @@ def _read(path: Path) -> dict[str, Any]:
     except tomllib.TOMLDecodeError as error:
         # tomllib's own message ends with the line and column.
         raise ConfigError(f"{path}: not valid TOML: {error}") from error
+    except RecursionError:
+        raise ConfigError(f"{path}: not valid TOML: nested too deeply") from None
     except (OSError, UnicodeDecodeError) as error:
         raise ConfigError(f"{path}: cannot be read as a dataset definition: {error}") from error
     folder = path.resolve().parent
@@ -155,7 +157,7 @@ def _explain(error: ErrorDetails, origin: _Origin) -> str:
         how = f"give {option} or " if option else ""
         group, _, key = name.rpartition(".")
         return f"{where}: {name}: not given; {how}set `{key}` in the table [{group}]"
-    expected = error["msg"].removeprefix("Input should be ")
+    expected = error["msg"].removeprefix("Input should be ").removeprefix("Value error, ")
     return f"{where}: {name}: got {error['input']!r}; expected {expected}"
 
 

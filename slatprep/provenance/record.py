@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Final, Literal
 
 import numpy as np
 import orjson
-from annotated_types import Ge, MinLen
+from annotated_types import Ge, MaxLen, MinLen
 
 from slatprep.errors import StoreError
 from slatprep.parameters import AlignParameters, BuildParameters, SampleParameters
@@ -55,7 +55,12 @@ def _named(versions: dict[str, str]) -> dict[str, str]:
     return versions
 
 
-_TEXTS = {"type": "dict", "keys_schema": {"type": "str"}, "values_schema": {"type": "str"}}
+_TEXTS = {
+    "type": "dict",
+    "keys_schema": {"type": "str"},
+    "values_schema": {"type": "str"},
+    "max_length": 64,
+}
 
 Versions = Annotated[dict[str, str], InJson(_TEXTS, _named)]
 """Versions of slatprep, Python and the libraries that made the numbers, by name."""
@@ -140,7 +145,7 @@ class AssetRecord:
     """PixieVerse category; empty where unknown."""
     status: Literal[Status.OK]
     """The asset is in the store."""
-    sources: Annotated[tuple[SourceFile, ...], MinLen(2)]
+    sources: Annotated[tuple[SourceFile, ...], MinLen(2), MaxLen(16)]
     """The files that were read."""
     bounds: dict[str, object] | None
     """World bounds as clip_features.npz states them."""
@@ -162,7 +167,7 @@ class AssetRecord:
     """The ranges of the properties; null where no store was built."""
     counts: VoxelCounts
     """Voxels of the asset."""
-    warnings: tuple[str, ...]
+    warnings: Annotated[tuple[str, ...], MaxLen(256)]
     """What a person should know about the sources."""
     duration_s: Seconds = 0.0
     """Seconds spent on the asset; 0 inside a store, where equal builds are equal bytes."""
@@ -273,6 +278,9 @@ class BuildRecord:
     """Assets in the store by verdict."""
     counts: BuildCounts
     """Voxels of the store."""
+
+
+_FAULTS = 64
 
 
 class RecordError(StoreError):
@@ -386,15 +394,17 @@ def _read(kind: Any, text: bytes | str, where: str) -> Any:
 
 def _faults(error: ValidationError) -> tuple[str, ...]:
     faults = []
-    found_at = [fault["loc"] for fault in error.errors(include_input=False)]
-    for fault in error.errors(include_url=False):
+    # A stranger's record may have any number.
+    found = error.errors(include_url=False)[:_FAULTS]
+    found_at = [fault["loc"] for fault in found]
+    for fault in found:
         at = fault["loc"]
         if any(other[: len(at)] == at and other != at for other in found_at):
             continue  # A list that is too short without the faulty item is no fault of its own.
         # Of a record that may be one of two kinds the first step names the kind.
         steps = [str(step) for step in at if step not in tuple(Status)]
-        found = "" if fault["type"] == "missing" else f", found {str(fault['input'])[:60]!r}"
-        faults.append(f"{'/'.join(steps) or 'it'}: {fault['msg']}{found}")
+        shown = "" if fault["type"] == "missing" else f", found {str(fault['input'])[:60]!r}"
+        faults.append(f"{'/'.join(steps) or 'it'}: {fault['msg']}{shown}")
     return tuple(faults)
 
 

@@ -33,7 +33,7 @@ def read_ranges(path: Place) -> Normalization:
     try:
         text = read_bounded(path, _MAX_BYTES).decode()
         table = json.loads(text) if path.suffix == ".json" else tomllib.loads(text)
-    except (OSError, UnicodeDecodeError, ValueError) as error:
+    except (OSError, ValueError, RecursionError) as error:
         raise ConfigError(f"{path}: cannot read ranges ({error})") from error
     ranges = []
     for name, log10 in zip(PROPERTY_COLUMNS, LOG10, strict=True):

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import Annotated
 
 import numpy as np
-from annotated_types import Ge
+from annotated_types import Ge, MaxLen
 
 from slatprep.records.json_types import (
     AffineMap,
@@ -19,6 +19,9 @@ from slatprep.records.json_types import (
     Transform,
 )
 from slatprep.records.words import Engine, Model, Search, Verdict
+
+MAX_CANDIDATES = 4096
+"""Candidates and placements of one alignment; engines try a few hundred starts."""
 
 
 @dataclass(frozen=True)
@@ -94,7 +97,7 @@ class Judgement:
 
     ambiguity: Ambiguity
     verdict: Verdict
-    reasons: tuple[str, ...] = ()
+    reasons: Annotated[tuple[str, ...], MaxLen(256)] = ()
     confidence: Number = float("nan")
     expected_accuracy: Number = float("nan")
     contradicted: bool = False
@@ -279,9 +282,9 @@ class Alignment:
     model: Model
     search: Search
     quality: Quality
-    candidates: tuple[Candidate, ...] = ()
+    candidates: Annotated[tuple[Candidate, ...], MaxLen(MAX_CANDIDATES)] = ()
     margin: Number = float("nan")
-    placements: tuple[Placement, ...] = ()
+    placements: Annotated[tuple[Placement, ...], MaxLen(MAX_CANDIDATES)] = ()
     score: Number = float("nan")
     settled_by: Consensus | Ruling | None = None
     deformation: Deformation | None = None

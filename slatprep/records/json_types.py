@@ -26,7 +26,7 @@ class InJson:
 
 
 def _array(*shape: int | None) -> InJson:
-    schema: dict[str, Any] = {"type": "float"}
+    schema: dict[str, Any] = dict(_FINITE)
     for size in reversed(shape):
         length = {"min_length": size or 0, "max_length": _MAX_SIDE if size is None else size}
         schema = {"type": "list", "items_schema": schema} | length
@@ -42,7 +42,20 @@ def _array(*shape: int | None) -> InJson:
     return InJson(schema, array)
 
 
+def _invertible() -> InJson:
+    read = _array(4, 4)
+
+    def map_of(values: list[Any]) -> NDArray[np.float64]:
+        matrix: NDArray[np.float64] = read.then(values)
+        if (matrix[3] != (0, 0, 0, 1)).any() or not 1e-9 < np.linalg.det(matrix[:3, :3]) < 1e9:
+            raise ValueError("no map of the frames: it has no inverse, or mirrors")
+        return matrix
+
+    return InJson(read.schema, map_of)
+
+
 _MAX_SIDE = 32
+_FINITE = {"type": "float", "allow_inf_nan": False}
 
 
 def _one_of(*words: str) -> InJson:
@@ -61,7 +74,7 @@ Count = Annotated[int, Ge(0)]
 """How many."""
 
 
-Number = Annotated[float, InJson({"type": "nullable", "schema": {"type": "float"}}, _null_is_nan)]
+Number = Annotated[float, InJson({"type": "nullable", "schema": _FINITE}, _null_is_nan)]
 """A number that may be NaN, which is null in JSON."""
 
 
@@ -69,7 +82,7 @@ Digest = Annotated[str, InJson({"type": "str", "pattern": "^[0-9a-f]{64}$"})]
 """SHA-256 in hex."""
 
 
-Transform = Annotated[NDArray[np.float64], _array(4, 4)]
+Transform = Annotated[NDArray[np.float64], _invertible()]
 """Homogeneous, (4, 4): PixieVerse frame to SLAT frame."""
 
 

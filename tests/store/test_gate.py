@@ -7,6 +7,7 @@ import os
 import pickle
 import shutil
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -15,11 +16,18 @@ import numpy as np
 import pytest
 import zarr
 from click.testing import CliRunner
+from support.synthetic import Dataset
 
 from slatprep.cli.commands import slatprep
 from slatprep.errors import StoreError
 from slatprep.inspect.verify import verify_store
-from slatprep.pipeline.dataset import BuildSummary
+from slatprep.parameters import (
+    MAX_GRID_SHARD,
+    MAX_VOXEL_CHUNK,
+    MAX_VOXEL_SHARD,
+    StoreParameters,
+)
+from slatprep.pipeline.dataset import BuildSummary, build_store
 from slatprep.store import open_store
 from slatprep.store.gate import gate_findings
 
@@ -89,6 +97,19 @@ def test_a_pickle_in_format_two_is_never_read(
         assert isinstance(done.exception, SystemExit), line
     with pytest.raises(StoreError, match="zarr_format is 2; expected 3"):
         open_store(store).group  # noqa: B018
+
+
+def test_the_largest_chunks_and_shards_that_may_be_asked_for_are_read(
+    make_dataset: Callable[..., Dataset], tmp_path: Path
+) -> None:
+    largest = StoreParameters(
+        voxel_chunk=MAX_VOXEL_CHUNK,
+        voxel_chunks_per_shard=MAX_VOXEL_SHARD // MAX_VOXEL_CHUNK,
+        grid_assets_per_shard=MAX_GRID_SHARD,
+    )
+    parameters = replace(make_dataset("a").parameters(), store=largest)
+    build_store(parameters, tmp_path / "large.zarr")
+    assert verify_store(tmp_path / "large.zarr").ok
 
 
 def test_what_is_built_goes_through_the_gate(store: Path) -> None:

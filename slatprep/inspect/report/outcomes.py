@@ -7,7 +7,8 @@ from collections.abc import Iterator
 from dataclasses import astuple, dataclass
 
 from slatprep.errors import StoreError
-from slatprep.provenance.record import FailedRecord, Record, read_build_record, read_record
+from slatprep.provenance.files import build_in, lines_in
+from slatprep.provenance.record import FailedRecord, Record, read_record
 from slatprep.records import Place, Status
 
 
@@ -56,20 +57,14 @@ def read_outcomes(manifests: Place, build_id: str) -> Iterator[Outcome]:
     StoreError
         If the records cannot be read or belong to another build.
     """
-    path = manifests / "build.json"
-    try:
-        found = read_build_record(path.read_bytes(), str(path)).id
-        if found != build_id:
-            raise StoreError(
-                f"{manifests} holds the records of build {found[:12]!r}, the store was written by "
-                f"{build_id[:12]!r}; name the folder of its own records with --manifests"
-            )
-        path = manifests / "assets.jsonl"
-        with path.open("rb") as lines:
-            for number, line in enumerate(lines, start=1):
-                yield _outcome(read_record(line, f"{path}, line {number}"))
-    except OSError as error:
-        raise StoreError(f"{path}: cannot be read ({error})") from error
+    found = build_in(manifests).id
+    if found != build_id:
+        raise StoreError(
+            f"{manifests} holds the records of build {found[:12]!r}, the store was written by "
+            f"{build_id[:12]!r}; name the folder of its own records with --manifests"
+        )
+    for where, line in lines_in(manifests):
+        yield _outcome(read_record(line, where))
 
 
 def kind_of(reason: str) -> str:

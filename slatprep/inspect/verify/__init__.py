@@ -135,7 +135,10 @@ def verify_store(
         if progress:
             progress(min(done * ASSETS_IN_TASK, total), total)
     if folder is not None:
-        findings |= set(manifest_findings(store, folder))
+        try:
+            findings |= set(manifest_findings(store, folder))
+        except StoreError as error:
+            findings.add(Finding(str(folder), "", str(error), "records of a readable store"))
     return Verification(path, total, digests, hashed, folder, tuple(sorted(findings)))
 
 

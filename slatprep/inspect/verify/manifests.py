@@ -10,6 +10,7 @@ import orjson
 
 from slatprep.errors import StoreError
 from slatprep.inspect.verify.assets import fault_findings
+from slatprep.provenance.files import ASSETS, BUILD, build_in, build_text, lines_in
 from slatprep.provenance.record import (
     AssetRecord,
     Record,
@@ -21,11 +22,10 @@ from slatprep.provenance.record import (
 )
 from slatprep.provenance.stored import StoredRecords
 from slatprep.records import Place, SourceRoots, Status
-from slatprep.store.contract import MAX_METADATA_BYTES, Finding
+from slatprep.storage.documents import parse_document
+from slatprep.store.contract import Finding
 from slatprep.store.layout import FORMAT_VERSION
 from slatprep.store.reader import Store
-
-BUILD, ASSETS = "build.json", "assets.jsonl"
 
 
 def source_roots(manifests: Place | None) -> SourceRoots:
@@ -40,7 +40,7 @@ def source_roots(manifests: Place | None) -> SourceRoots:
     if manifests is None:
         raise StoreError(f"no records beside the store say where its sources lie; {advice}")
     try:
-        build = read_build_record((manifests / BUILD).read_bytes(), str(manifests / BUILD))
+        build = build_in(manifests)
         slat = build.parameters.slat.root
         slat = slat.parent if slat.is_file() else slat
     except (OSError, StoreError) as error:
@@ -53,14 +53,14 @@ def manifest_findings(store: Store, folder: Place) -> Iterator[Finding]:
     build_file, assets_file = str(folder / BUILD), str(folder / ASSETS)
     manifest, build = store.attributes.get("manifest"), None
     try:
-        text = (folder / BUILD).read_bytes()
+        text = build_text(folder)
         build = read_build_record(text, build_file)
         build_id: object = build.id
     except RecordError as error:
         yield from fault_findings(build_file, "", error)
         build_id = _stated_id(text)
-    except OSError as error:
-        yield Finding(build_file, "", f"cannot be read ({error})", "the record of the build")
+    except StoreError as error:
+        yield Finding(build_file, "", str(error), "the record of the build")
         build_id = manifest
     if build_id != manifest:
         yield Finding(build_file, "", f"id is {build_id!r}", f"{manifest!r}, the store's")
@@ -68,14 +68,14 @@ def manifest_findings(store: Store, folder: Place) -> Iterator[Finding]:
     seen: Counter[str] = Counter({str(status): 0 for status in Status})
     faults: list[Finding] = []
     try:
-        checked = _checked(store, folder / ASSETS, seen, faults)
+        checked = _checked(store, folder, seen, faults)
         if store.format_version == FORMAT_VERSION:
             found = records_id(checked)
         else:
             deque(checked, maxlen=0)
-            found = _id_of_lines(folder / ASSETS)
-    except OSError as error:
-        yield Finding(assets_file, "", f"cannot be read ({error})", "a JSON record a line")
+            found = _id_of_lines(folder)
+    except StoreError as error:
+        yield Finding(assets_file, "", str(error), "a JSON record a line")
         return
     yield from faults
     if found != manifest:
@@ -95,43 +95,40 @@ def _stated_id(text: bytes) -> object:
     return document.get("id") if isinstance(document, dict) else None
 
 
-def _id_of_lines(path: Place) -> str:
+def _id_of_lines(folder: Place) -> str:
     """Return what `records_id` was for records that lacked fields which they have today."""
     digest = hashlib.sha256()
-    with path.open("rb") as file:
-        while line := file.readline(MAX_METADATA_BYTES):
-            try:
-                record = orjson.loads(line)
-            except ValueError:
-                continue  # A fault of its own.
-            left_out = {"duration_s": 0.0, "reason": "", "traceback": ""}
-            record |= {name: empty for name, empty in left_out.items() if name in record}
-            digest.update(orjson.dumps(record))
+    for _, line in lines_in(folder):
+        try:
+            record = parse_document(line)
+        except ValueError:
+            continue  # A fault of its own.
+        left_out = {"duration_s": 0.0, "reason": "", "traceback": ""}
+        record |= {name: empty for name, empty in left_out.items() if name in record}
+        digest.update(orjson.dumps(record))
     return digest.hexdigest()
 
 
 def _checked(
-    store: Store, path: Place, seen: Counter[str], faults: list[Finding]
+    store: Store, folder: Place, seen: Counter[str], faults: list[Finding]
 ) -> Iterator[Record]:
     """Yield the records of a file one by one, and note what is wrong with each."""
     rows = {asset_id: row for row, asset_id in enumerate(store.ids)}
     stored = StoredRecords(store)
-    with path.open("rb") as file:
-        number = 0
-        while line := file.readline(MAX_METADATA_BYTES):
-            number += 1
-            try:
-                record = read_record(line, f"{path}, line {number}")
-            except RecordError as error:
-                faults += fault_findings(f"{path}", f"line {number}", error)
-                continue
-            seen[str(record.status)] += 1
-            if isinstance(record, AssetRecord):
-                row = rows.get(record.asset_id)
-                if row is None or not _same(record, stored, row):
-                    what = "differs from asset/record"
-                    faults.append(Finding(str(path), record.asset_id, what, "the same record"))
-            yield record
+    file = str(folder / ASSETS)
+    for where, line in lines_in(folder):
+        try:
+            record = read_record(line, where)
+        except RecordError as error:
+            faults += fault_findings(file, where.removeprefix(f"{file}, "), error)
+            continue
+        seen[str(record.status)] += 1
+        if isinstance(record, AssetRecord):
+            row = rows.get(record.asset_id)
+            if row is None or not _same(record, stored, row):
+                what = "differs from asset/record"
+                faults.append(Finding(file, record.asset_id, what, "the same record"))
+        yield record
 
 
 def _same(record: AssetRecord, stored: StoredRecords, row: int) -> bool:
