@@ -86,6 +86,7 @@ class SlatSource(_Group):
         "{id}/{view}.npz",
         "{id}/{view}.h5",
         "{id}/{view}.hdf5",
+        "latents/*/{id}.npz",
     )
     group: str = "{id}"
 

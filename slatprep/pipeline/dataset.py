@@ -123,7 +123,7 @@ def build_store(
         if not damaged and is_current(plan, assets, context, given):
             return repeat_summary(assets, context, place, time.perf_counter() - begin)
         assets += _finish(unchanged, plan, context, jobs, progress)
-        usable, failed = _usable_and_failed(assets, parameters)
+        usable, failed = _usable_and_failed(assets, parameters, pairs)
         usable = apply_consensus(usable, work.spool, parameters, jobs)
         usable = apply_witness(usable, work.spool, parameters, jobs)
         with writing(str(place.out), work_directory(place.store).parent):
@@ -288,14 +288,16 @@ class _Packed:
 
 
 def _usable_and_failed(
-    assets: Iterable[SpooledAsset | FailedAsset], parameters: BuildParameters
+    assets: Iterable[SpooledAsset | FailedAsset],
+    parameters: BuildParameters,
+    pairs: Sequence[AssetPair],
 ) -> tuple[list[SpooledAsset], list[FailedAsset]]:
     """Return the assets that go into the store and those that do not, each by id."""
     by_id = sorted(assets, key=lambda asset: asset.asset_id)
     usable = [asset for asset in by_id if isinstance(asset, SpooledAsset)]
     failed = [asset for asset in by_id if isinstance(asset, FailedAsset)]
     if not usable:
-        raise StoreError(nothing_usable(failed, parameters))
+        raise StoreError(nothing_usable(failed, parameters, pairs))
     return usable, failed
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import islice
 
@@ -12,7 +12,8 @@ import numpy as np
 from slatprep.parameters import BuildParameters
 from slatprep.pipeline.spool import FailedAsset, SpooledAsset
 from slatprep.provenance.record import Clipped
-from slatprep.records import PROPERTY_COLUMNS, Normalization, Place, Status
+from slatprep.readers.pairing import explain_unmatched
+from slatprep.records import PROPERTY_COLUMNS, AssetPair, Normalization, Place, Status
 
 PROBLEMS_LISTED = 100
 """How many problems a summary lists; the records hold all."""
@@ -116,8 +117,12 @@ def _clipped_by_property(clipped: Iterable[Clipped]) -> dict[str, int]:
     return {name: sum(getattr(count, name) for count in counts) for name in PROPERTY_COLUMNS}
 
 
-def nothing_usable(failed: Sequence[FailedAsset], parameters: BuildParameters) -> str:
+def nothing_usable(
+    failed: Sequence[FailedAsset], parameters: BuildParameters, pairs: Collection[AssetPair] = ()
+) -> str:
     """Say why there is no store."""
+    if unmatched := explain_unmatched(pairs, parameters):
+        return f"{unmatched}. There is no store"
     problems = [f"\n  {asset.asset_id}: {asset.reason}" for asset in failed]
     if not problems:
         return (

@@ -140,7 +140,8 @@ def require_complete(pair: AssetPair) -> tuple[Place, Place]:
             root, pair.problem or f"nothing for id {pair.asset_id!r}", "a grid and a SLAT per id"
         )
     if pair.problem:
-        raise InputError(pair.slat, pair.problem, "one grid and one SLAT per id")
+        # Not by a file's name: which side is at fault, the problem says.
+        raise InputError(f"asset {pair.asset_id!r}", pair.problem, "one grid and one SLAT per id")
     return pair.grid, pair.slat
 
 

@@ -5,7 +5,7 @@ Only names are held: an entry per object and per SLAT, never an array.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from itertools import groupby
 from urllib.parse import quote
@@ -102,6 +102,33 @@ def discover(parameters: BuildParameters) -> list[AssetPair]:
     rows = sorted(_rows(grids, slats, claims), key=lambda row: (row.asset_id, row.object_id))
     roots = SourceRoots(pixieverse.root, slat.root.parent if one_file else slat.root)
     return list(_pairs(rows, _Found(parameters, roots, listing, one_file, grids, categories)))
+
+
+def explain_unmatched(pairs: Collection[AssetPair], parameters: BuildParameters) -> str:
+    """Say in one line that the names of the two sides have nothing in common; empty if they have.
+
+    Parameters
+    ----------
+    pairs : collection of AssetPair
+        What `discover` found.
+    parameters : BuildParameters
+        By which it looked.
+    """
+    grids = [pair.object_id for pair in pairs if pair.slat is None and pair.grid is not None]
+    slats = [pair.object_id for pair in pairs if pair.grid is None and pair.slat is not None]
+    if not grids or not slats or any(pair.grid and pair.slat for pair in pairs):
+        return ""
+    table, root = parameters.pairing.map, parameters.slat.root
+    if table is not None:
+        hint = f"the table {table} joins none of them"
+    else:
+        own = root / "metadata.csv"
+        example = own if own.is_file() else "FILE.csv"
+        hint = f"name a table that joins them: --map {example} (docs/configuration.md, [pairing])"
+    return (
+        f"no id occurs on both sides: {len(grids):,} grids such as {grids[0][:40]!r}, "
+        f"{len(slats):,} SLATs such as {slats[0][:40]!r}; {hint}"
+    )
 
 
 def _find_grids(source: PixieverseSource, listing: Listing) -> dict[str, list[_Grid]]:
@@ -291,7 +318,10 @@ def _unrecordable(path: str) -> str:
 def _several_grids(object_id: str, grids: list[_Grid]) -> str:
     files = ", ".join(grid.path for grid in grids)
     if len({grid.sample for grid in grids}) > 1:
-        return f"id {object_id!r} has {len(grids)} samples ({files}); choose one with `sample`"
+        return (
+            f"id {object_id!r} has {len(grids)} samples ({files}); choose one with `sample` in the "
+            "table [pixieverse] of the dataset definition"
+        )
     return f"{len(grids)} grids for one id {object_id!r} ({files}); expected one"
 
 

@@ -11,7 +11,7 @@ from support.trees import records_of, tree
 
 from slatprep.errors import ConfigError, InputError, MissingPartnerError, StoreError
 from slatprep.inspect.verify import verify_store
-from slatprep.parameters import SampleParameters
+from slatprep.parameters import PairingParameters, SampleParameters
 from slatprep.pipeline.dataset import BuildSummary, align_pairs, build_store
 from slatprep.provenance.places import manifests_of
 from slatprep.store import open_store
@@ -207,6 +207,32 @@ def test_islands_without_annotation_stay_occupied(
     counts = records_of(summary.records)["a"]["counts"]
     assert counts["unannotated"] == 3
     assert counts["occupied"] == counts["annotated"] + 3 == (grid[..., 3] != 7).sum()
+
+
+def test_names_without_anything_in_common_are_told_in_one_line(
+    make_dataset: MakeDataset, tmp_path: Path
+) -> None:
+    dataset = make_dataset("uid1", "uid2")
+    for number, path in enumerate(sorted((dataset.root / "slat").iterdir())):
+        path.rename(path.with_name(f"chair_{number}.npz"))
+    with pytest.raises(StoreError) as caught:
+        build_store(dataset.parameters(), tmp_path / "s.zarr")
+    assert str(caught.value) == (
+        "no id occurs on both sides: 2 grids such as 'uid1', 2 SLATs such as 'chair_0'; name "
+        "a table that joins them: --map FILE.csv (docs/configuration.md, [pairing]). "
+        "There is no store"
+    )
+    table = dataset.root / "slat/metadata.csv"
+    table.write_text("object_id,slat_id\nother,thing\n")
+    with pytest.raises(StoreError, match=rf"--map {table} "):
+        build_store(dataset.parameters(), tmp_path / "s.zarr")
+    parameters = replace(dataset.parameters(), pairing=PairingParameters(map=table))
+    with pytest.raises(StoreError) as caught:
+        build_store(parameters, tmp_path / "s.zarr")
+    assert "\n" not in str(caught.value)
+    assert f"{table} joins none of them" in str(caught.value)
+    table.write_text("object_id,slat_id\nuid1,chair_0\n")
+    assert build_store(parameters, tmp_path / "s.zarr").statuses["ok"] == 1
 
 
 def test_no_asset_is_lost_to_one_unphysical_voxel(

@@ -77,6 +77,19 @@ def test_default_layout(find, tmp_path):
     assert second.slat == tmp_path / "slat/b.h5"
 
 
+def test_the_root_of_trellis_s_toolkit(find, tmp_path):
+    root = tmp_path / "slat"
+    root.mkdir()
+    (root / "metadata.csv").write_text(
+        f"sha256,file_identifier\n{SHA},https://example.org/3d-models/a-chair-{UID}\n"
+    )
+    (pair,) = find([grid(UID)], [f"latents/dino/{SHA}.npz"], map=root / "metadata.csv")
+    assert not pair.problem
+    assert pair.slat == root / "latents/dino" / f"{SHA}.npz"
+    (pair,) = find(slats=[f"latents/other/{SHA}.npz"], map=root / "metadata.csv")
+    assert f"latents/dino/{SHA}.npz, latents/other/{SHA}.npz" in pair.problem
+
+
 def test_predictions_and_their_masks(find, tmp_path):
     (pair,) = find(["a/sample_2_pred.npy", "a/sample_2_mask.npy"], ["a.npz"])
     assert pair.problem == ""
@@ -95,7 +108,9 @@ def test_several_samples_need_a_choice(find):
     (pair,) = find(files, ["a.npz"])
     assert "2 samples" in pair.problem
     assert all(file in pair.problem for file in files)
-    assert "choose one" in pair.problem
+    assert "choose one with `sample` in the table [pixieverse]" in pair.problem
+    with pytest.raises(InputError, match="asset 'a': id 'a' has 2 samples"):
+        read_field(pair)
 
     (pair,) = find(pixieverse={"sample": "1"})
     assert pair.problem == ""
