@@ -1,7 +1,7 @@
 # `make` alone lists what there is; every target sets up what it needs.
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help align test lint docs schema wheel mutants lock clean
+.PHONY: help align test lint docs schema wheel sdist mutants lock clean
 
 PYTHON ?= python3
 VENV   ?= .venv
@@ -30,6 +30,7 @@ help:
 	@echo "  make docs             the documentation as a site, in $(SITE)"
 	@echo "  make schema           the JSON Schemas of the records, from their classes"
 	@echo "  make wheel            a wheel, in dist, tried from another folder"
+	@echo "  make sdist            a source archive, in dist, that can run its tests"
 	@echo "  make mutants          change one operator or number at a time: do the tests notice?"
 	@echo "  make lock             resolve the versions in requirements/ anew"
 	@echo "  make clean            remove the environment, the demo data and caches; never your stores"
@@ -96,6 +97,9 @@ schema: $(VENV)/.installed-dev
 
 wheel: $(VENV)/.installed-dev
 	$(WHEEL)
+
+sdist: $(VENV)/.installed-dev
+	sh tools/try-sdist.sh $(BIN)/python dist
 
 # Half an hour of one core; MUTANTS='--budget 300 judge sample' is a part of it.
 MUTANTS ?= --budget 1500 --seed 0

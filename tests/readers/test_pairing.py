@@ -354,6 +354,13 @@ def test_patterns_of_deeper_layouts(find):
     assert pair.slat.parts[-3:] == ("latents", "model", "a.npz")
 
 
+def test_the_folder_of_trellis_s_own_toolkit_is_found_as_it_is(find):
+    (pair,) = find(
+        [grid("a")], ["latents/dinov2_enc/a.npz", "ss_latents/enc/a.npz", "metadata.csv"]
+    )
+    assert pair.slat is not None and pair.slat.parent.name == "dinov2_enc"
+
+
 @pytest.mark.parametrize("pattern", ["/{id}.npz", "../{id}.npz", "a//{id}.npz", "{name}.npz"])
 def test_bad_patterns(find, pattern):
     with pytest.raises(ConfigError, match="pattern"):
