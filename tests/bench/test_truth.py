@@ -16,10 +16,22 @@ from slatprep.cli.commands import slatprep as slatprep_command
 from slatprep.errors import InputError
 from slatprep.geometry.frames import make_transform
 from slatprep.parameters import BuildParameters, PixieverseSource, SlatSource
+from slatprep.store.layout import ARRAYS
 
 # A rod of two materials along x in the PixieVerse frame.
 ROD = np.array([[x, 32, 32] for x in range(20, 40)])
 ROD_MATERIAL = np.where(ROD[:, 0] < 30, 1, 5).astype(np.uint8)
+
+
+def add_array(root: zarr.Group, name: str, array: np.ndarray) -> None:
+    (dimensions,) = (layout.dimensions for layout in ARRAYS if layout.name == name)
+    root.create_array(
+        name,
+        data=array,
+        chunks=(1 if name.startswith("grid/") else len(array), *array.shape[1:]),
+        dimension_names=dimensions,
+        config={"write_empty_chunks": True},
+    )
 
 
 def write_store(path: Path, assets: dict[str, dict[str, np.ndarray]]) -> None:
@@ -47,9 +59,11 @@ def write_store(path: Path, assets: dict[str, dict[str, np.ndarray]]) -> None:
         arrays[f"asset/{name}"] = np.zeros(len(ids))
     arrays["asset/property_ambiguity"] = np.zeros((len(ids), 3))
     for name, array in arrays.items():
-        root.create_array(name, data=array, config={"write_empty_chunks": True})
+        add_array(root, name, array)
     for name in ("id", "object_id", "view", "category", "engine", "model", "search", "verdict"):
-        strings = root.create_array(f"asset/{name}", shape=(len(ids),), dtype=str)
+        strings = root.create_array(
+            f"asset/{name}", shape=(len(ids),), dtype=str, dimension_names=("asset",)
+        )
         strings[:] = np.array(ids if name == "id" else [""] * len(ids), dtype=object)
 
 
@@ -212,10 +226,11 @@ def test_places_of_the_store_are_what_counts_where_it_has_them(tmp_path: Path) -
     aside = np.array([0.0, 1 / 64, 0.0])
     stored = np.concatenate([LONG_PLACES + aside, rod_places]).astype(np.float32)
     root = zarr.open_group(tmp_path / "s.zarr")
-    root.create_array("voxel/place", data=stored)
+    add_array(root, "voxel/place", stored)
     for name in ("asset/confidence", "asset/expected_accuracy"):
-        root.create_array(name, data=np.ones(2))
-    root.create_array("voxel/confidence", data=np.ones(len(stored), np.float32))
+        add_array(root, name, np.ones(2))
+    add_array(root, "asset/unphysical", np.zeros(2, np.int64))
+    add_array(root, "voxel/confidence", np.ones(len(stored), np.float32))
     root.attrs["format_version"] = 2
     first, second = score_against_truth(tmp_path / "s.zarr", tmp_path / "truth").assets
     assert first.displacement == pytest.approx(1.0, abs=1e-5)
