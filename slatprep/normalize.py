@@ -81,11 +81,14 @@ def ranges_from_extents(extents: ArrayLike) -> Normalization:
     lo, hi = table[:, :, 0].min(axis=0), table[:, :, 1].max(axis=0)
     single = hi <= lo
     lo, hi = lo - single * _HALF_WIDTH_OF_A_POINT, hi + single * _HALF_WIDTH_OF_A_POINT
-    first, second, third = (
-        PropertyRange(name, log10, float(low), float(high))
-        for name, log10, low, high in zip(PROPERTY_COLUMNS, LOG10, lo, hi, strict=True)
-    )
-    return Normalization((first, second, third), source="dataset")
+    return normalization_of(np.stack([lo, hi], axis=1), "dataset")
+
+
+def normalization_of(ranges: NDArray[np.float64], source: str) -> Normalization:
+    """Return ranges, given as rows lo, hi (3, 2) of the mapped properties, as a `Normalization`."""
+    spans = zip(PROPERTY_COLUMNS, LOG10, ranges.tolist(), strict=True)
+    first, second, third = (PropertyRange(name, log10, *span) for name, log10, span in spans)
+    return Normalization((first, second, third), source)
 
 
 def normalize_properties(
@@ -159,6 +162,15 @@ def denormalize_properties(
         mapped = (given[..., column].astype(np.float64) + 1.0) * 0.5 * (span.hi - span.lo) + span.lo
         properties[..., column] = 10.0**mapped if span.log10 else mapped
     return properties
+
+
+def change_ranges(values: ArrayLike, old: Normalization, new: Normalization) -> NDArray[np.float64]:
+    """Bring values (N, 3) normalised by some ranges to others; nothing is clipped."""
+    changed = np.array(values, dtype=np.float64)
+    for column, (one, other) in enumerate(zip(old.ranges, new.ranges, strict=True)):
+        mapped = (changed[..., column] + 1.0) * 0.5 * (one.hi - one.lo) + one.lo
+        changed[..., column] = 2.0 * (mapped - other.lo) / (other.hi - other.lo) - 1.0
+    return changed
 
 
 def normalize_change(change: ArrayLike, normalization: Normalization) -> NDArray[np.float64]:

@@ -27,6 +27,7 @@ COMMANDS = {
     "transfer": "slatprep.cli.transfer:transfer",
     "describe": "slatprep.cli.describe:describe",
     "train": "slatprep.cli.train:train",
+    "predict": "slatprep.cli.predict:predict",
     "evaluate": "slatprep.cli.evaluate:evaluate",
     "bench": "slatprep.cli.bench:bench",
 }

@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 @option("--shares", metavar="TRAIN,VAL,TEST")
 @option("--spread", ChoiceOf("slatprep.learn.metrics:Spread"), "se")
 @option("--csv", NEW_FILE, name="csv_file")
-@option("--beside", metavar="pixie|FILE.csv")
+@option("--beside", metavar="pixie|slat-phys|FILE.csv")
 def evaluate(
     output: Output,
     predictions: Path,
@@ -46,7 +46,8 @@ def evaluate(
 
     PREDICTIONS is a directory of npz files, one an asset, or a Zarr or HDF5
     store with one group an asset; each has properties (N,3) in normalised
-    space, and may have material (N,) or logits (N,8), and coords (N,3). Errors are means over
+    space, and may have material (N,) or logits (N,8), coords (N,3), and
+    ranges (3,2), where they are not the store's. Errors are means over
     valid voxels, then over objects. Exit code 1 says that an asset of the
     split has no prediction.
 
@@ -58,8 +59,8 @@ def evaluate(
         0.8,0.1,0.1]
     --spread: Standard error or standard deviation over objects.
     --csv: Also write the table to this file.
-    --beside: Also print Pixie's published table, which has NeRF2Physics too, or one of your
-        own: a name, then columns named as here.
+    --beside: Also print the published table of Pixie, which has NeRF2Physics too, those of
+        SLAT-Phys, or one of your own: a name, then columns named as here.
 
     Example
     -------
@@ -69,11 +70,11 @@ def evaluate(
     """
     from slatprep.learn.metrics import evaluate_store
     from slatprep.learn.predictions import RUN_FILE, selection_of_run
-    from slatprep.learn.published import PIXIE_TABLE, read_scores
+    from slatprep.learn.published import TABLES, read_scores
 
     others: tuple[PublishedScore, ...] = ()
     if beside is not None:
-        others = PIXIE_TABLE if beside == "pixie" else read_scores(Path(beside))
+        others = TABLES[beside][1] if beside in TABLES else read_scores(Path(beside))
     chosen = {"shares": shares_of(shares)} if shares else selection_of_run(predictions)
     if chosen and not shares:
         output.note(f"split:   as {predictions.absolute().parent / RUN_FILE} says")
@@ -94,6 +95,11 @@ def evaluate(
         if beside is not None:
             _show_beside(output, result, others, beside)
 
+    if result.converted:
+        output.note(
+            f"note:    {result.converted} predictions were normalised by other ranges, and were "
+            "brought to the store's"
+        )
     document = dataclasses.asdict(result)
     for asset_id in result.missing:
         output.problem(f"{predictions}: no prediction of {asset_id}")
@@ -109,8 +115,10 @@ def _show_beside(
         ("these predictions", *result.overall.means.values())
     ]
     rows += [(score.method, *(score.means.get(name) for name in names)) for score in others]
-    if beside == "pixie":
-        title = "Beside Pixie's Table 1 (arXiv 2508.17437)"
+    from slatprep.learn.published import TABLES
+
+    if beside in TABLES:
+        title = f"Beside {TABLES[beside][0]}"
         output.note(
             "note: those were measured on PixieVerse's test objects; they compare only with "
             "predictions of the same objects, normalised by Pixie's ranges (--ranges pixie)"

@@ -57,12 +57,16 @@ class Evaluation:
         Over those of each category.
     missing : list of str
         Assets of the split without a prediction; they are not in the scores.
+    converted : int
+        Assets whose prediction was normalised by other ranges than the store's,
+        and was brought to those.
     """
 
     spread: Spread
     overall: Measure
     categories: dict[str, Measure]
     missing: list[str]
+    converted: int = 0
 
 
 def score_asset(
@@ -182,6 +186,7 @@ def evaluate_store(
     scored: list[int] = []
     scores: list[NDArray[np.float64]] = []
     missing: list[str] = []
+    converted = 0
     chosen = select_assets(
         store, split, shares=shares, verdicts=verdicts, max_ambiguity=max_ambiguity
     )
@@ -193,7 +198,10 @@ def evaluate_store(
                 missing.append(asset_id)
                 continue
             rows = store.read(index, ("coords", "properties", "material", "valid"))
-            prediction = check_prediction(f"{predictions}/{asset_id}", arrays, rows.pop("coords"))
+            prediction = check_prediction(
+                f"{predictions}/{asset_id}", arrays, rows.pop("coords"), store.normalization
+            )
+            converted += prediction.converted
             scored.append(index)
             scores.append(score_asset(prediction, **rows))
     if not scored:
@@ -208,4 +216,4 @@ def evaluate_store(
         [str(categories[k]) for k in scored],
         spread,
     )
-    return Evaluation(spread, overall, groups, missing)
+    return Evaluation(spread, overall, groups, missing, converted)

@@ -20,9 +20,17 @@ from slatprep.errors import InputError, StoreError
 from slatprep.geometry.voxels import flat_index
 from slatprep.learn.splits import Shares
 from slatprep.learn.zarr_arrays import read_array
+from slatprep.normalize import change_ranges, normalization_of
 from slatprep.readers.files import ArraySpec, load_source, npz_arrays, refusing
 from slatprep.readers.hdf5 import group_arrays
-from slatprep.records import MATERIAL_CLASSES, RESOLUTION, Share, Verdict
+from slatprep.records import (
+    MATERIAL_CLASSES,
+    PROPERTY_COLUMNS,
+    RESOLUTION,
+    Normalization,
+    Share,
+    Verdict,
+)
 from slatprep.storage.documents import read_document
 from slatprep.storage.names import file_name
 from slatprep.storage.place import storage_of
@@ -45,6 +53,7 @@ _SPECS = {
     "material": ArraySpec(((None,),), _NUMBERS),
     "logits": ArraySpec(((None, CLASSES),), _NUMBERS),
     "coords": ArraySpec(((None, 3),), _NUMBERS),
+    "ranges": ArraySpec(((len(PROPERTY_COLUMNS), 2),), _NUMBERS),
 }
 """What a prediction may have; whatever else lies beside it is not read."""
 
@@ -59,10 +68,13 @@ class VoxelPrediction:
         Young's modulus, density, Poisson's ratio in normalised space.
     material : ndarray of int64, shape (N,), optional
         Class 0..7.
+    converted : bool
+        Whether it was normalised by other ranges, and brought to the store's.
     """
 
     properties: NDArray[np.float64]
     material: NDArray[np.int64] | None
+    converted: bool = False
 
 
 @dataclass(frozen=True)
@@ -148,7 +160,10 @@ def open_predictions(path: Path) -> Iterator[ReadAsset]:
 
 
 def check_prediction(
-    source: str, arrays: Mapping[str, NDArray[Any]], coords: NDArray[np.uint8]
+    source: str,
+    arrays: Mapping[str, NDArray[Any]],
+    coords: NDArray[np.uint8],
+    normalization: Normalization,
 ) -> VoxelPrediction:
     """Check a prediction and put its voxels in the order of the store.
 
@@ -158,10 +173,12 @@ def check_prediction(
         Where it comes from, for messages.
     arrays : mapping of str to ndarray
         ``properties`` (N, 3); optionally ``material`` (N,) or ``logits``
-        (N, 8), and ``coords`` (N, 3), without which the order is taken to be
-        the store's.
+        (N, 8), ``coords`` (N, 3), without which the order is taken to be
+        the store's, and ``ranges`` (3, 2), without which they are.
     coords : ndarray of uint8, shape (N, 3)
         Voxels of the store.
+    normalization : Normalization
+        The store's ranges.
 
     Raises
     ------
@@ -174,6 +191,12 @@ def check_prediction(
     properties = _shaped(source, "properties", arrays, (count, 3)).astype(np.float64)
     if not np.isfinite(properties).all():
         raise InputError(source, "properties are not all finite", "numbers in normalised space")
+    converted = False
+    if "ranges" in arrays:
+        ranges = normalization_of(_checked_ranges(source, arrays), "prediction")
+        converted = ranges.ranges != normalization.ranges
+        if converted:
+            properties = change_ranges(properties, ranges, normalization)
     material = None
     if "material" in arrays:
         material = _shaped(source, "material", arrays, (count,))
@@ -187,7 +210,14 @@ def check_prediction(
         order = _order(source, _shaped(source, "coords", arrays, (count, 3)), coords)
         properties = properties[order]
         material = None if material is None else material[order]
-    return VoxelPrediction(properties, material)
+    return VoxelPrediction(properties, material, converted)
+
+
+def _checked_ranges(source: str, arrays: Mapping[str, NDArray[Any]]) -> NDArray[np.float64]:
+    ranges = _shaped(source, "ranges", arrays, (len(PROPERTY_COLUMNS), 2)).astype(np.float64)
+    if not (np.isfinite(ranges).all() and (ranges[:, 0] < ranges[:, 1]).all()):
+        raise InputError(source, f"ranges are {ranges.tolist()}", "lo below hi, a row a property")
+    return ranges
 
 
 def _order(source: str, ours: NDArray[Any], theirs: NDArray[np.uint8]) -> NDArray[np.int64]:

@@ -43,6 +43,32 @@ class EpochRecord:
     val_accuracy: float
 
 
+def read_state(path: Path) -> dict[str, Any]:
+    """Read a checkpoint, which may be a stranger's: nothing of it is executed.
+
+    Raises
+    ------
+    InputError
+        If the file is none, or damaged.
+    """
+    with (
+        refusing(path, "cannot be read", "a checkpoint of `slatprep train`"),
+        storage_of(path).open() as file,
+    ):
+        with zipfile.ZipFile(file) as archive:
+            # torch.save stores; what is packed could unpack to any size.
+            if any(info.compress_type != zipfile.ZIP_STORED for info in archive.infolist()):
+                raise ValueError("it is compressed")
+        file.seek(0)
+        try:
+            state = torch.load(file, map_location="cpu", weights_only=True)
+        except UnpicklingError as error:
+            raise ValueError(error) from None
+        if not isinstance(state, dict):
+            raise ValueError(f"it holds {type(state).__name__}")
+    return state
+
+
 class Run:
     """The directory of one training run; as a context it holds the directory's lock.
 
@@ -128,22 +154,7 @@ class Run:
         InputError
             If the file is damaged.
         """
-        path = self.path / name
-        if not path.exists():
-            return None
-        with self.reading(name), storage_of(path).open() as file:
-            with zipfile.ZipFile(file) as archive:
-                # torch.save stores; what is packed could unpack to any size.
-                if any(info.compress_type != zipfile.ZIP_STORED for info in archive.infolist()):
-                    raise ValueError("it is compressed")
-            file.seek(0)
-            try:
-                state = torch.load(file, map_location="cpu", weights_only=True)
-            except UnpicklingError as error:
-                raise ValueError(error) from None
-            if not isinstance(state, dict):
-                raise ValueError(f"it holds {type(state).__name__}")
-        return state
+        return read_state(self.path / name) if (self.path / name).exists() else None
 
     def reading(self, name: str) -> AbstractContextManager[None]:
         """Turn what a damaged or foreign checkpoint raises into an `InputError` that names it."""

@@ -13,15 +13,21 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from slatprep.errors import ConfigError, InputError
+from slatprep.errors import ConfigError
 from slatprep.learn.augment import Augmentation
 from slatprep.learn.baselines import VoxelBaseline, fit_baselines
 from slatprep.learn.dataset import IGNORED, SlatDataset, SlatLoader, SparseBatch, require_confidence
-from slatprep.learn.decoder import SIZES, PhysicsDecoder, Prediction, make_decoder
+from slatprep.learn.decoder import SIZES, Prediction, make_decoder
+from slatprep.learn.predict import (
+    Checkpoint,
+    checkpoint_state,
+    load_checkpoint,
+    predict,
+    write_prediction,
+)
 from slatprep.learn.runs import BEST, LAST, EpochRecord, Run
 from slatprep.learn.splits import Shares, Split
-from slatprep.records import USABLE, Place
-from slatprep.storage.names import file_name
+from slatprep.records import USABLE, Place, StructuredLatents
 from slatprep.workers import Progress
 
 PRECISIONS = ("auto", "fp32", "bf16")
@@ -192,7 +198,8 @@ def train(
             session.history.append(record)
             run.save(LAST, session.state())
             if session.best_epoch == record.epoch:
-                run.save(BEST, {"size": parameters.size, "model": session.model.state_dict()})
+                ranges = train_set.store.normalization
+                run.save(BEST, checkpoint_state(session.model, parameters.size, ranges))
             run.log(session.history)
             if progress is not None:
                 progress(record)
@@ -200,13 +207,8 @@ def train(
         baselines = zip(names, fit_baselines(train_set), strict=True)
         references = {name: _reference(baseline, val_set) for name, baseline in baselines}
         run.draw(session.history, references)
-        best = run.load(BEST)
-        if best is None:
-            raise InputError(run.path / BEST, "is missing", "the best model; train anew")
-        with run.reading(BEST):
-            session.model.load_state_dict(best["model"])
         predictions = run.path / "predictions"
-        _write_predictions(session.model, test_set, predictions, device)
+        _write_predictions(load_checkpoint(run.path / BEST, device), test_set, predictions)
     return TrainSummary(session.history, session.best_epoch, references, predictions)
 
 
@@ -353,19 +355,10 @@ def _reference(baseline: VoxelBaseline, dataset: SlatDataset) -> float:
     return float(np.mean(errors))
 
 
-@torch.no_grad()
-def _write_predictions(
-    model: PhysicsDecoder, dataset: SlatDataset, folder: Path, device: str
-) -> None:
-    """Write what `slatprep evaluate` reads: an npz an asset, named by `file_name`."""
-    folder.mkdir(exist_ok=True)
-    model.eval()
-    for batch in SlatLoader(dataset):
-        moved = batch.to(device)
-        prediction: Prediction = model(moved.coords, moved.feats)
-        np.savez_compressed(
-            folder / f"{file_name(batch.asset_ids[0])}.npz",
-            coords=batch.coords[:, 1:].numpy().astype(np.uint8),
-            properties=prediction.properties.cpu().numpy(),
-            material=prediction.logits.argmax(1).cpu().numpy().astype(np.uint8),
-        )
+def _write_predictions(checkpoint: Checkpoint, dataset: SlatDataset, folder: Path) -> None:
+    """Write what `slatprep evaluate` reads of each asset, decoded one by one."""
+    for index, asset_id in zip(dataset.indices.tolist(), dataset.asset_ids, strict=True):
+        rows = dataset.store.read(index, ("coords", "feats"))
+        latents = StructuredLatents(rows["coords"], rows["feats"])
+        (field,) = predict(checkpoint, [latents])
+        write_prediction(folder, asset_id, field, checkpoint)

@@ -1,7 +1,14 @@
 """Reading the sources: pairs are found by name, then each side is read and checked."""
 
-from slatprep.readers.pairing import discover
+from slatprep.readers.pairing import SlatFile, discover, discover_slats
 from slatprep.readers.pixieverse import read_field
-from slatprep.readers.slat import read_latents
+from slatprep.readers.slat import read_latents, read_slat
 
-__all__ = ["discover", "read_field", "read_latents"]
+__all__ = [
+    "SlatFile",
+    "discover",
+    "discover_slats",
+    "read_field",
+    "read_latents",
+    "read_slat",
+]

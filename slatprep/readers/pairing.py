@@ -39,6 +39,20 @@ class _Slat:
 
 
 @dataclass(frozen=True, slots=True)
+class SlatFile:
+    """A SLAT that nothing is paired with: its id, its file, the folder that holds it, its group.
+
+    `problem` says why it cannot be used, and is empty where all is well.
+    """
+
+    asset_id: str
+    path: Place
+    root: Place
+    group: str = ""
+    problem: str = ""
+
+
+@dataclass(frozen=True, slots=True)
 class _Row:
     """What will be one row: an object and the SLATs that bear this label (one, if all is well)."""
 
@@ -129,6 +143,43 @@ def explain_unmatched(pairs: Collection[AssetPair], parameters: BuildParameters)
         f"no id occurs on both sides: {len(grids):,} grids such as {grids[0][:40]!r}, "
         f"{len(slats):,} SLATs such as {slats[0][:40]!r}; {hint}"
     )
+
+
+def discover_slats(source: SlatSource) -> list[SlatFile]:
+    """Find SLATs that need no partner.
+
+    Parameters
+    ----------
+    source : SlatSource
+        A folder of them, or a file: an npz, or an HDF5 file with one SLAT or a group each.
+
+    Returns
+    -------
+    list of SlatFile
+        Sorted by id, ``<id>`` or ``<id>.<view>``, each once; a single file is named
+        after itself.
+
+    Raises
+    ------
+    ConfigError
+        If there is none.
+    """
+    root, one_file = source.root, source.root.is_file()
+    if not one_file and not root.exists():
+        raise ConfigError(f"{root}: does not exist; expected a SLAT, or a folder of them")
+    groups = one_file and root.suffix != ".npz"
+    slats = list(_each_slat(source, True)) if groups else []
+    if one_file and not slats:
+        slats = [_Slat(root.name.rpartition(".")[0], "", root.name)]
+    elif not one_file:
+        slats = [slat for found in _find_slats(source, False).values() for slat in found]
+    folder, named = root.parent if one_file else root, dict[str, SlatFile]()
+    for slat in _ordered(slats):
+        asset_id = _safe(f"{slat.slat_id}.{slat.view}" if slat.view else slat.slat_id)
+        twice = f"two SLATs have the id {asset_id!r}" if asset_id in named else ""
+        problem = slat.problem or twice
+        named[asset_id] = SlatFile(asset_id, folder / slat.path, folder, slat.group, problem)
+    return [named[asset_id] for asset_id in sorted(named)]
 
 
 def _find_grids(source: PixieverseSource, listing: Listing) -> dict[str, list[_Grid]]:

@@ -42,12 +42,32 @@ def read_latents(pair: AssetPair) -> StructuredLatents:
         If the file cannot be used; the message names file, value and row.
     """
     _, path = require_complete(pair)
-    if pair.slat_group or path.suffix.lower() in SUFFIXES:
-        arrays, source = load_datasets(path, pair.roots.slat, pair.slat_group, SPECS)
+    return read_slat(path, pair.roots.slat, pair.slat_group)
+
+
+def read_slat(path: Place, root: Place, group: str = "") -> StructuredLatents:
+    """Read one SLAT by its file, as `read_latents` reads that of a pair.
+
+    Parameters
+    ----------
+    path : Place
+        The file.
+    root : Place
+        The folder that it must lie in, and that its name is recorded below.
+    group : str
+        Its group, where an HDF5 file holds several.
+
+    Raises
+    ------
+    InputError
+        If the file cannot be used; the message names file, value and row.
+    """
+    if group or path.suffix.lower() in SUFFIXES:
+        arrays, source = load_datasets(path, root, group, SPECS)
     else:
-        data, source = load_source(path, pair.roots.slat, "slat")
+        data, source = load_source(path, root, "slat")
         arrays = npz_arrays(data, path, SPECS)
-    where = f"{path} [{pair.slat_group}]" if pair.slat_group else path
+    where = f"{path} [{group}]" if group else path
     coords, feats = arrays["coords"], arrays["feats"]
     if len(coords) != len(feats):
         raise InputError(

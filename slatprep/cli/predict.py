@@ -1,0 +1,145 @@
+"""`slatprep predict`: material fields from latents, by a trained decoder."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from slatprep.cli.options import NEW_FOLDER, POSITIVE, PlaceType, command, option
+from slatprep.cli.output import Output
+from slatprep.errors import InputError
+
+if TYPE_CHECKING:
+    from slatprep.records import Place, StructuredLatents
+
+
+@command()
+@click.argument("source", type=PlaceType(path_type=Path, exists=True))
+@option("--checkpoint", click.Path(path_type=Path, exists=True), required=True)
+@option("--out", NEW_FOLDER, required=True)
+@option("--asset", metavar="ID", name="assets", multiple=True)
+@option("--device", click.Choice(["cpu", "cuda"]), "cpu")
+@option("--batch-voxels", POSITIVE, 65_536)
+def predict(
+    output: Output,
+    source: Place,
+    checkpoint: Path,
+    out: Path,
+    assets: tuple[str, ...],
+    device: str,
+    batch_voxels: int,
+) -> None:
+    """Predict material fields of SOURCE with a trained decoder.
+
+    SOURCE is a SLAT (npz or HDF5), a folder of them, or a store. Each asset
+    gives <id>.npz with coords, properties in [-1,1] and properties_si in Pa,
+    kg/m^3 and 1, material, probabilities of the eight classes, ranges, the
+    checkpoint's SHA-256 and the seconds of its decoding: what `slatprep
+    evaluate` measures, and `slatprep transfer --prediction` puts on particles.
+    Needs PyTorch: pip install 'slatprep[train]'.
+
+    Options
+    -------
+    --checkpoint: best.pt of a run of `slatprep train`, or the folder of the run.
+    --out: Folder of the predictions; those of other assets stay.
+    --asset: Predict this asset alone; may be repeated.
+    --device: Where to compute.
+    --batch-voxels: Assets are decoded together until they have so many voxels.
+
+    Example
+    -------
+    slatprep predict latents --checkpoint runs/small --out predictions
+    slatprep predict demo.zarr --checkpoint runs/small/best.pt --out predictions --device cuda
+    """
+    from slatprep.learn import require_torch
+
+    require_torch()
+    from slatprep.learn import predict as work
+
+    decoder = work.load_checkpoint(checkpoint, device)
+    read = _Reader(output, source, assets)
+    predicted, voxels, decoding, writing = 0, 0, 0.0, 0.0
+    with output.progress("predict") as progress:
+        progress(0, len(read.ids))
+        for field in work.predict(decoder, read, batch_voxels=batch_voxels):
+            begin = time.perf_counter()
+            work.write_prediction(out, read.done[predicted], field, decoder)
+            writing += time.perf_counter() - begin
+            predicted += 1
+            voxels += len(field.coords)
+            decoding += field.seconds
+            progress(predicted + len(read.problems), len(read.ids))
+    counts = {"predicted": predicted, "voxels": voxels}
+    seconds = {"read": read.seconds, "decode": decoding, "write": writing}
+    document = {
+        "path": out,
+        "checkpoint": decoder.sha256,
+        "size": decoder.size,
+        **counts,
+        "seconds": seconds,
+        "problems": read.problems,
+    }
+
+    def show() -> None:
+        output.record(f"Predictions in {out}", counts)
+        each = 1e3 / max(predicted, 1)
+        output.table(
+            "Time",
+            ("stage", "seconds", "ms an asset"),
+            [(stage, spent, spent * each) for stage, spent in seconds.items()],
+        )
+
+    output.result(document, show, complete=not read.problems)
+
+
+class _Reader:
+    """The latents of a source, one asset after the other; what cannot be read is told and left."""
+
+    def __init__(self, output: Output, source: Place, assets: tuple[str, ...]) -> None:
+        from slatprep.parameters import SlatSource
+        from slatprep.readers import discover_slats
+        from slatprep.store import open_store
+        from slatprep.store.reader import is_store
+
+        self.output = output
+        self.store = open_store(source) if is_store(source) else None
+        files = [] if self.store else discover_slats(SlatSource(root=source))
+        self.files = {file.asset_id: file for file in files}
+        there = self.store.ids if self.store else list(self.files)
+        self.rows = {asset_id: row for row, asset_id in enumerate(there)}
+        unknown = [asset_id for asset_id in assets if asset_id not in self.rows]
+        if unknown:
+            raise InputError(source, f"has no asset {unknown[0]!r}", f"one of its {len(there)}")
+        self.ids = [asset_id for asset_id in there if not assets or asset_id in assets]
+        self.done: list[str] = []
+        self.problems: list[str] = []
+        self.seconds = 0.0
+
+    def __iter__(self) -> Iterator[StructuredLatents]:
+        for asset_id in self.ids:
+            begin = time.perf_counter()
+            try:
+                latents = self._latents(asset_id)
+            except InputError as error:
+                self.problems.append(str(error))
+                self.output.problem(f"slatprep: {error}")
+                continue
+            self.seconds += time.perf_counter() - begin
+            self.done.append(asset_id)
+            yield latents
+
+    def _latents(self, asset_id: str) -> StructuredLatents:
+        from slatprep.readers import read_slat
+        from slatprep.records import StructuredLatents
+
+        if self.store is None:
+            file = self.files[asset_id]
+            if file.problem:
+                raise InputError(file.path, file.problem, "one SLAT an id")
+            return read_slat(file.path, file.root, file.group)
+        rows = self.store.read(self.rows[asset_id], ("coords", "feats"))
+        return StructuredLatents(rows["coords"], rows["feats"])

@@ -1,0 +1,197 @@
+"""Predictions: what they say, by hand; from files and stores; measured by other ranges."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+import torch
+from click.testing import CliRunner
+from support.synthetic import Dataset
+
+from slatprep import InputError, build_store, open_store
+from slatprep.cli.commands import slatprep
+from slatprep.learn.decoder import make_decoder
+from slatprep.learn.metrics import evaluate_store
+from slatprep.learn.predict import checkpoint_state, load_checkpoint, predict
+from slatprep.learn.predictions import check_prediction
+from slatprep.normalize import PIXIE_RANGES, normalization_of, normalize_properties
+from slatprep.particles.fields import predicted_field
+from slatprep.records import FEATS_MEAN, FEATS_STD, StructuredLatents
+
+RANGES = np.array([[3.0, 9.0], [1.0, 4.0], [0.1, 0.5]])
+
+
+@pytest.fixture
+def checkpoint(tmp_path: Path) -> Path:
+    """A decoder with random heads, as a run's folder holds it."""
+    torch.manual_seed(3)
+    model = make_decoder("small")
+    for head in (model.regression, model.classification):
+        torch.nn.init.normal_(head.weight, std=0.3)
+    folder = tmp_path / "run"
+    folder.mkdir()
+    state = checkpoint_state(model, "small", normalization_of(RANGES, "dataset"))
+    torch.save(state, folder / "best.pt")
+    return folder
+
+
+def random_latents(seed: int, count: int = 300) -> StructuredLatents:
+    rng = np.random.default_rng(seed)
+    flat = rng.choice(64**3, count, replace=False)
+    coords = np.stack(np.unravel_index(flat, (64, 64, 64)), axis=1).astype(np.uint8)
+    feats = rng.normal(FEATS_MEAN, FEATS_STD, (count, 8)).astype(np.float32)
+    return StructuredLatents(coords, feats)
+
+
+def save(path: Path, latents: StructuredLatents) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    np.savez(path, coords=latents.coords, feats=latents.feats)
+
+
+def run(*arguments: object, code: int = 0) -> dict[str, object]:
+    result = CliRunner().invoke(slatprep, ["predict", *map(str, arguments), "--json"])
+    assert result.exit_code == code, result.output
+    return json.loads(result.stdout)  # type: ignore[no-any-return]
+
+
+def test_a_prediction_is_the_decoder_s_and_its_units_follow_by_hand(checkpoint: Path) -> None:
+    latents = random_latents(0)
+    (field,) = predict(load_checkpoint(checkpoint), [latents])
+    model = make_decoder("small")
+    model.load_state_dict(torch.load(checkpoint / "best.pt", weights_only=True)["model"])
+    feats = (latents.feats - np.array(FEATS_MEAN)) / np.array(FEATS_STD)
+    rows = np.concatenate([np.zeros((300, 1)), latents.coords], axis=1).astype(np.int32)
+    with torch.no_grad():
+        said = model(torch.from_numpy(rows), torch.from_numpy(feats.astype(np.float32)))
+    np.testing.assert_allclose(field.properties, said.properties.numpy(), atol=1e-5)
+    scores = np.exp(said.logits.numpy().astype(np.float64))
+    np.testing.assert_allclose(
+        field.probabilities, scores / scores.sum(axis=1, keepdims=True), atol=1e-5
+    )
+    assert np.array_equal(field.material, field.probabilities[:, :7].argmax(axis=1))
+    mapped = RANGES[:, 0] + (field.properties + 1) / 2 * (RANGES[:, 1] - RANGES[:, 0])
+    expected = np.concatenate([10 ** mapped[:, :2], mapped[:, 2:]], axis=1)
+    np.testing.assert_allclose(field.properties_si, expected, rtol=1e-5)
+
+
+def test_what_is_in_a_batch_changes_no_more_than_the_last_bits(checkpoint: Path) -> None:
+    assets = [random_latents(seed, 100 + 50 * seed) for seed in range(4)]
+    decoder = load_checkpoint(checkpoint)
+    alone = list(predict(decoder, assets, batch_voxels=1))
+    together = list(predict(decoder, assets, batch_voxels=10_000))
+    pairs = list(predict(decoder, assets, batch_voxels=300))
+    for latents, *fields in zip(assets, alone, together, pairs, strict=True):
+        for field in fields:
+            assert np.array_equal(field.coords, latents.coords)
+            np.testing.assert_allclose(field.properties, fields[0].properties, atol=1e-5)
+            assert field.seconds > 0
+
+
+def test_a_folder_of_slats_and_a_file_that_cannot_be_read(checkpoint: Path, tmp_path: Path) -> None:
+    slats, out = tmp_path / "slat", tmp_path / "out"
+    save(slats / "a.npz", random_latents(1))
+    save(slats / "b" / "front.npz", random_latents(2))
+    (slats / "c.npz").write_bytes(b"no zip")
+    told = run(slats, "--checkpoint", checkpoint, "--out", out, code=1)
+    assert told["predicted"] == 2
+    assert told["voxels"] == 600
+    assert told["checkpoint"] == hashlib.sha256((checkpoint / "best.pt").read_bytes()).hexdigest()
+    (problem,) = told["problems"]  # type: ignore[misc]
+    assert "c.npz" in problem
+    assert sorted(path.name for path in out.iterdir()) == ["a.npz", "b.front.npz"]
+    with np.load(out / "a.npz") as held:
+        assert np.array_equal(held["coords"], random_latents(1).coords)
+        np.testing.assert_array_equal(held["ranges"], RANGES)
+        assert str(held["checkpoint"]) == told["checkpoint"]
+        assert held["probabilities"].shape == (300, 8)
+        assert held["seconds"] > 0
+        first = held["properties"]
+    run(slats, "--checkpoint", checkpoint, "--out", out, "--asset", "a")
+    assert np.array_equal(np.load(out / "a.npz")["properties"], first)
+    carried = predicted_field(out / "a.npz", None)
+    assert np.array_equal(carried.voxels, random_latents(1).coords)
+
+
+def test_one_file_of_either_kind(checkpoint: Path, tmp_path: Path) -> None:
+    latents = random_latents(4)
+    save(tmp_path / "one.npz", latents)
+    with h5py.File(tmp_path / "two.h5", "w") as file:
+        file["coords"], file["feats"] = latents.coords, latents.feats
+    with h5py.File(tmp_path / "many.h5", "w") as file:
+        for name in ("x", "y"):
+            file[f"{name}/coords"], file[f"{name}/feats"] = latents.coords, latents.feats
+    for name, ids in (("one.npz", ["one"]), ("two.h5", ["two"]), ("many.h5", ["x", "y"])):
+        out = tmp_path / f"out-{name}"
+        told = run(tmp_path / name, "--checkpoint", checkpoint, "--out", out)
+        assert told["predicted"] == len(ids)
+        assert sorted(path.stem for path in out.iterdir()) == ids
+        np.testing.assert_allclose(
+            np.load(out / f"{ids[0]}.npz")["properties"],
+            np.load(tmp_path / "out-one.npz" / "one.npz")["properties"],
+            atol=1e-6,
+        )
+
+
+def test_a_store_of_other_ranges_measures_the_same(checkpoint: Path, tmp_path: Path) -> None:
+    """The error of one prediction does not depend on who normalised it."""
+    data = Dataset(tmp_path / "data")
+    for k in range(2):
+        data.add(f"a{k}", seed=k)
+    reports = []
+    for ranges in ("dataset", "pixie"):
+        store = tmp_path / f"{ranges}.zarr"
+        build_store(data.parameters(ranges), store)
+        run(store, "--checkpoint", checkpoint, "--out", tmp_path / "p")
+        reports.append(evaluate_store(tmp_path / "p", store, None))
+        assert reports[-1].converted == 2
+        # By hand: what the decoder says in SI units, normalised as the truth is, not clipped.
+        errors = []
+        opened = open_store(store)
+        for row, asset_id in enumerate(opened.ids):
+            rows = opened.read(row, ("properties", "valid"))
+            with np.load(tmp_path / "p" / f"{asset_id}.npz") as held:
+                mapped = np.log10(held["properties_si"].astype(np.float64))
+                mapped[:, 2] = held["properties_si"][:, 2]
+            low, high = np.array([[s.lo, s.hi] for s in opened.normalization.ranges]).T
+            said = 2 * (mapped - low) / (high - low) - 1
+            errors.append(np.square(said - rows["properties"])[rows["valid"]].mean())
+        assert reports[-1].overall.means["mean"] == pytest.approx(np.mean(errors), rel=1e-4)
+
+
+def test_ranges_of_a_prediction_are_checked_and_equal_ones_change_nothing() -> None:
+    coords = np.array([[1, 2, 3]], np.uint8)
+    values = normalize_properties([[1e7, 1000.0, 0.3]])
+    own = np.array([[span.lo, span.hi] for span in PIXIE_RANGES.ranges])
+    same = check_prediction("p", {"properties": values, "ranges": own}, coords, PIXIE_RANGES)
+    assert not same.converted
+    assert np.array_equal(same.properties, values)
+    other = check_prediction("p", {"properties": values, "ranges": RANGES}, coords, PIXIE_RANGES)
+    assert other.converted
+    for wrong in (own[:, ::-1], np.full((3, 2), np.nan), own[:2]):
+        with pytest.raises(InputError, match="ranges"):
+            check_prediction("p", {"properties": values, "ranges": wrong}, coords, PIXIE_RANGES)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda state: state.pop("ranges"),
+        lambda state: state.update(ranges=[[1.0, 0.0]] * 3),
+        lambda state: state.update(size="huge"),
+        lambda state: state["model"].popitem(),
+    ],
+    ids=["no ranges", "ranges turned about", "size", "weights"],
+)
+def test_a_checkpoint_that_says_too_little_is_refused(checkpoint: Path, change: object) -> None:
+    state = torch.load(checkpoint / "best.pt", weights_only=True)
+    change(state)  # type: ignore[operator]
+    torch.save(state, checkpoint / "best.pt")
+    with pytest.raises(InputError, match=r"best\.pt: holds no decoder with its ranges"):
+        load_checkpoint(checkpoint)
+    with pytest.raises(InputError, match="does not exist"):
+        load_checkpoint(checkpoint / "other.pt")
