@@ -18,6 +18,7 @@ from slatprep.inspect.report.page import write_page
 from slatprep.inspect.report.statistics import Tally, no_tally, tally
 from slatprep.inspect.report.thumbnails import PER_SHEET, sheet, thumbnail
 from slatprep.inspect.report.voxels import COARSE, FULL, encode_asset
+from slatprep.provenance.stored import StoredRecords
 from slatprep.records import Place, Verdict
 from slatprep.storage.atomic import staged, writing
 from slatprep.store import open_store
@@ -161,12 +162,14 @@ def _chosen(store: Store) -> list[int]:
 def _draw(path: Path, indices: Sequence[int]) -> tuple[list[Drawn], dict[str, Tally]]:
     """Draw some assets of a store, and count by category, in a worker."""
     store = open_store(path)
+    records = StoredRecords(store)
     max_distance = store.about.build.parameters.sample.max_distance
     drawn: list[Drawn] = []
     tallies: dict[str, Tally] = {}
     for index in indices:
         asset = store.asset(store.ids[index])
-        voxels = {side: encode_asset(asset, max_distance, side) for side in (FULL, COARSE)}
+        way = records.place_map(asset)
+        voxels = {side: encode_asset(asset, way, max_distance, side) for side in (FULL, COARSE)}
         drawn.append(Drawn(index, thumbnail(asset), voxels))
         _add(tallies, {str(asset.columns["category"]): tally(asset)})
     return drawn, tallies

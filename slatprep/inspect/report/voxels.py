@@ -8,6 +8,12 @@ itself. It holds, for n voxels a side and voxels in C order of the grid::
     N bytes each    class, E, density, Poisson's ratio, distance of the SLAT voxels
     K bytes         class of the boundary voxels
 
+and where the asset is deformed also::
+
+    4 bytes         a step in edges of the cube, float32, least significant byte first
+    3 K bytes       how many steps, signed, the centre of each boundary voxel moves along
+                    x, y and z of its own frame before the transform takes it to its place
+
 Properties are quantised to `LEVELS` over [-1, 1] and distances over 0 to the
 largest distance allowed; 255 means not valid, for a class as well.
 """
@@ -19,6 +25,8 @@ import zlib
 import numpy as np
 from numpy.typing import NDArray
 
+from slatprep.align.deformation import PlaceMap
+from slatprep.geometry.frames import apply_transform, invert_transform, voxel_centres
 from slatprep.geometry.voxels import boundary, filled
 from slatprep.records import BACKGROUND, RESOLUTION, UNANNOTATED
 from slatprep.store import StoredAsset
@@ -32,13 +40,15 @@ FULL, COARSE = RESOLUTION, RESOLUTION // 2
 """Voxels a side of the two levels of detail."""
 
 
-def encode_asset(asset: StoredAsset, max_distance: float, side: int) -> bytes:
+def encode_asset(asset: StoredAsset, way: PlaceMap, max_distance: float, side: int) -> bytes:
     """Return an asset's voxels for the 3D view.
 
     Parameters
     ----------
     asset : StoredAsset
         From a store.
+    way : PlaceMap
+        The map between its frames.
     max_distance : float
         Distance [voxel] at the end of its scale.
     side : int
@@ -63,6 +73,11 @@ def encode_asset(asset: StoredAsset, max_distance: float, side: int) -> bytes:
         *(_quantised(column).tobytes() for column in scalars.T),
         material[chosen].tobytes(),
     ]
+    if way.deformation is not None:
+        centres = voxel_centres(grid[chosen])
+        moved = apply_transform(invert_transform(way.transform), way.to_slat(centres)) - centres
+        step = np.float32(max(np.abs(moved).max(), 1e-6) / 127)
+        parts += [step.tobytes(), np.rint(moved / step).astype(np.int8).tobytes()]
     deflate = zlib.compressobj(6, zlib.DEFLATED, -zlib.MAX_WBITS)
     return deflate.compress(b"".join(parts)) + deflate.flush()
 

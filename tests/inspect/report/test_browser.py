@@ -5,16 +5,23 @@ from __future__ import annotations
 import io
 import time
 from collections.abc import Callable
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import pytest
 from PIL import Image
 from support.pages import HOSTILE, Report
 
+from slatprep.inspect.report import write_report
+from slatprep.pipeline.dataset import BuildSummary
+from slatprep.store import open_store
+
 if TYPE_CHECKING:
     from selenium.webdriver import Chrome
 
 pytest.importorskip("selenium")
+
+LIBRARY = '<script type="text/plain" id="library">'
 
 PATIENCE = 60  # A loaded machine draws 3D slowly without a graphics card.
 
@@ -135,12 +142,71 @@ def test_it_opens_an_asset_that_turns(opened: Chrome) -> None:
     assert_quiet(opened)
 
 
+def test_an_address_opens_an_asset_before_the_page_has_been_read(
+    browser: Chrome, hostile: Report, tmp_path: Path
+) -> None:
+    # So much stands between the scripts and the library that the asset is asked for first.
+    text = hostile.path.read_text("utf-8")
+    assert text.count(LIBRARY) == 1
+    filler = "<!--" + "x" * 4_000_000 + "-->"
+    slow = tmp_path / "slow.html"
+    slow.write_text(text.replace(LIBRARY, f"{filler}{LIBRARY}"), "utf-8")
+    browser.get("about:blank")
+    browser.get(f"{slow.as_uri()}#asset=ant")
+    canvas = browser.find_element("id", "canvas")
+
+    def colours() -> int:
+        image = Image.open(io.BytesIO(canvas.screenshot_as_png)).convert("P")
+        return len(image.getcolors() or ())
+
+    wait(lambda: colours() > 8)
+    assert browser.find_element("id", "message").text == ""
+    assert_quiet(browser)
+
+
 def test_an_asset_without_a_picture_says_why_it_is_not_there(opened: Chrome) -> None:
     click(opened, "#state-chips [data-state='not built']")
     click(opened, "tbody tr:not(.space)")
     assert "no 3D view" in opened.find_element("id", "message").text
     assert HOSTILE in opened.find_element("id", "asset-reasons").text
     assert_quiet(opened)
+
+
+def test_a_deformed_asset_is_found_by_its_model_and_shown_through_its_map(
+    browser: Chrome, deformed_build: BuildSummary, tmp_path: Path
+) -> None:
+    path = tmp_path / "page.html"
+    records = deformed_build.records.parent
+    write_report(open_store(deformed_build.store), path, manifests=records)
+    open_page(browser, Report(Path(deformed_build.store), records, path))
+    assert set(rows(browser)) == {"bent", "long"}
+    click(browser, "[data-sort=model]")
+    assert rows(browser) == ["long", "bent"]
+    click(browser, "[data-sort=confidence]")
+    least = browser.execute_script(
+        "return ASSETS.confidence.indexOf(Math.min(...ASSETS.confidence))"
+    )
+    assert rows(browser)[0] == browser.execute_script("return ASSETS.id[arguments[0]]", least)
+    browser.execute_script(
+        "const s = document.getElementById('model'); s.value = '=deformable';"
+        "s.dispatchEvent(new Event('change'))"
+    )
+    assert rows(browser) == ["bent"]
+    click(browser, "tbody tr:not(.space)")
+    canvas = browser.find_element("id", "canvas")
+
+    def pixels() -> bytes:
+        return bytes(canvas.screenshot_as_png)
+
+    wait(lambda: len(Image.open(io.BytesIO(pixels())).convert("P").getcolors() or ()) > 8)
+    click(browser, "[data-switch=field]")
+    click(browser, "[data-switch=slat]")
+    after = pixels()
+    click(browser, "[data-switch=before]")
+    wait(lambda: pixels() != after)
+    click(browser, "[data-switch=before]")
+    wait(lambda: pixels() == after)
+    assert_quiet(browser)
 
 
 @pytest.mark.parametrize(("theme", "other"), [("dark", "light"), ("light", "dark")])

@@ -15,12 +15,15 @@ import pytest
 import zarr
 from click.testing import CliRunner
 from PIL import Image
+from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
+from support.deformed import MOVES
 from support.pages import HOSTILE, Page, Report
 from support.synthetic import QUARTER_TURN
 
 from slatprep.cli.commands import slatprep as command
 from slatprep.errors import StoreError
+from slatprep.geometry.frames import apply_transform, voxel_centres
 from slatprep.inspect import report
 from slatprep.inspect.report import write_report
 from slatprep.inspect.report.outcomes import kind_of
@@ -42,8 +45,12 @@ def unpack(page: Page, index: int) -> dict[str, np.ndarray]:
     )
     columns = data[side**3 // 4 :][: 5 * len(slat)].reshape(5, len(slat))
     rest = data[side**3 // 4 + 5 * len(slat) :]
-    assert len(rest) == len(field)
-    return {"slat": slat, "field": field, "columns": columns, "field_material": rest}
+    material, rest = rest[: len(field)], rest[len(field) :]
+    moved = np.zeros(field.shape)
+    if len(rest):
+        moved = rest[4:].view(np.int8).reshape(field.shape) * float(rest[:4].view("<f4")[0])
+    return {"slat": slat, "field": field, "columns": columns, "field_material": material,
+            "moved": moved}  # fmt: skip
 
 
 # -- what it lists ------------------------------------------------------------
@@ -117,6 +124,30 @@ def test_voxels_of_the_view_are_the_store_s(page: Page, hostile: Report, index: 
     moved = moved @ asset.transform[:3, :3].T + asset.transform[:3, 3]
     moved = np.rint((moved + 0.5) * 64 - 0.5).astype(int)
     assert {tuple(v) for v in moved.tolist()} == {tuple(v) for v in seen["slat"].tolist()}
+
+
+@pytest.mark.parametrize("index", [0, 1])
+def test_a_deformed_boundary_lies_on_the_slat(
+    deformed_build: BuildSummary, tmp_path: Path, index: int
+) -> None:
+    store = open_store(deformed_build.store)
+    write_report(store, tmp_path / "page.html", manifests=deformed_build.records.parent)
+    page = Page(tmp_path / "page.html")
+    assert page.content["assets"]["model"] == ["deformable", "affine"]
+    asset = store.asset(store.ids[index])
+    voxels = unpack(page, index)
+    centres = voxel_centres(voxels["field"])
+    # Where the truth looks the places up, the SLAT's voxels are: the other way round.
+    looked_up = cKDTree(MOVES[asset.asset_id](voxel_centres(asset.coords)))
+    distance, nearest = looked_up.query(centres)
+    there = distance < 0.8 / 64
+    assert there.mean() > 0.9
+    placed = apply_transform(asset.transform, centres + voxels["moved"])
+    apart = np.linalg.norm(placed - voxel_centres(asset.coords)[nearest], axis=1)[there] * 64
+    assert np.median(apart) < 0.9
+    plain = apply_transform(asset.transform, centres)
+    before = np.linalg.norm(plain - voxel_centres(asset.coords)[nearest], axis=1)[there] * 64
+    assert np.median(apart) < 0.6 * np.median(before)
 
 
 def test_thumbnails_show_three_silhouettes(page: Page, hostile: Report) -> None:

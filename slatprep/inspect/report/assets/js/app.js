@@ -1,16 +1,17 @@
 /* Filters, theme, and one asset: what ties the parts together. */
 
 const Filter = (() => {
-  const initial = () => ({ text: "", category: null, states: null, kind: null, turn: null, bin: null });
+  const initial = () => ({ text: "", category: null, model: null, states: null, kind: null, turn: null, bin: null });
   let chosen = initial();
   let listeners = [];
   const haystack = ASSETS.id.map((id, k) => `${id}\n${ASSETS.category[k]}\n${ASSETS.reasons[k].join("\n")}`.toLowerCase());
 
   function matches(index) {
-    const { text, category, states, kind, turn, bin } = chosen;
+    const { text, category, model, states, kind, turn, bin } = chosen;
     return (
       (!text || haystack[index].includes(text)) &&
       (category === null || ASSETS.category[index] === category) &&
+      (model === null || ASSETS.model[index] === model) &&
       (states === null || states.includes(ASSETS.state[index])) &&
       (kind === null || ASSETS.kinds[index].includes(kind)) &&
       (turn === null || ASSETS.turn[index] === turn) &&
@@ -27,6 +28,7 @@ const Filter = (() => {
       chip.setAttribute("aria-pressed", String(chosen.states?.includes(chip.dataset.state) ?? false));
     }
     byId("category").value = chosen.category === null ? "*" : `=${chosen.category}`;
+    byId("model").value = chosen.model === null ? "*" : `=${chosen.model}`;
     if (byId("search").value.toLowerCase().trim() !== chosen.text) byId("search").value = chosen.text;
     const applied = [];
     if (chosen.kind !== null) applied.push(["kind", `reason: ${chosen.kind.replace(/\bN\b/g, "…")}`]);
@@ -62,9 +64,11 @@ const Filter = (() => {
   function create() {
     byId("search").addEventListener("input", (event) => set({ text: event.target.value.toLowerCase().trim() }));
     byId("filters").addEventListener("submit", (event) => event.preventDefault());
-    const categories = [...new Set(ASSETS.category)].sort();
-    byId("category").append(el("option", { value: "*" }, "all"), ...categories.map((name) => el("option", { value: `=${name}` }, name || "(unknown)")));
-    byId("category").addEventListener("change", (event) => set({ category: event.target.value === "*" ? null : event.target.value.slice(1) }));
+    for (const key of ["category", "model"]) {
+      const names = [...new Set(ASSETS[key].filter((name) => name !== null))].sort();
+      byId(key).append(el("option", { value: "*" }, "all"), ...names.map((name) => el("option", { value: `=${name}` }, name || "(unknown)")));
+      byId(key).addEventListener("change", (event) => set({ [key]: event.target.value === "*" ? null : event.target.value.slice(1) }));
+    }
     byId("state-chips").append(
       ...STATES.filter((state) => ASSETS.state.includes(state.name)).map((state) =>
         el("button", { type: "button", class: "chip", "data-state": state.name, "aria-pressed": "false", title: state.means, onclick: () => toggleState(state.name) }, stateTag(state.name)),

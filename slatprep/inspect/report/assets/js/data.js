@@ -76,7 +76,15 @@ const Data = (() => {
     const field = coordinates(take(side ** 3 / 8));
     const n = slat.length / 3;
     const [material, youngs_modulus, density, poissons_ratio, distance] = Array.from({ length: 5 }, () => take(n));
-    return { slat, field, material, youngs_modulus, density, poissons_ratio, distance, fieldMaterial: take(field.length / 3) };
+    const fieldMaterial = take(field.length / 3);
+    return { slat, field, material, youngs_modulus, density, poissons_ratio, distance, fieldMaterial, moved: at < bytes.length ? steps(take(bytes.length - at)) : null };
+  }
+
+  /** How far each boundary voxel moves in its own frame, in edges of the cube; see voxels.py. */
+  function steps(bytes) {
+    const view = new DataView(bytes.buffer, bytes.byteOffset, bytes.length);
+    const step = view.getFloat32(0, true);
+    return Float32Array.from({ length: bytes.length - 4 }, (_, k) => step * view.getInt8(4 + k));
   }
 
   /** Unpack an occupancy into voxels x, y, z, in C order. */

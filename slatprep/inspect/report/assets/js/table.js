@@ -10,7 +10,8 @@ const Table = (() => {
     { key: "id", title: "Asset", width: 156, value: (i) => ASSETS.id[i] },
     { key: "category", title: "Category", width: 132, value: (i) => ASSETS.category[i] || null, text: (i) => ASSETS.category[i] || Format.NONE, wide: true },
     { key: "state", title: "State", width: 172, value: (i) => STATES.findIndex((state) => state.name === ASSETS.state[i]) },
-    { key: "confidence", title: "Confidence", width: 96, ...number("confidence", 3) },
+    { key: "model", title: "Model", width: 112, value: (i) => ASSETS.model[i], text: (i) => ASSETS.model[i] ?? Format.NONE, wide: true },
+    { key: "confidence", title: "Confidence", width: 118, ...number("confidence", 3) },
     { key: "expected_accuracy", title: "Labels", width: 84, ...share("expected_accuracy"), wide: true },
     { key: "fitness", title: "Fitness", width: 88, ...number("fitness", 3) },
     { key: "fitness_backward", title: "Back", width: 74, ...number("fitness_backward", 3), wide: true },
@@ -22,6 +23,7 @@ const Table = (() => {
     { key: "voxels", title: "Voxels", width: 84, value: (i) => ASSETS.voxels[i], text: (i) => Format.count(ASSETS.voxels[i]), right: true, wide: true },
   ];
   const TITLES = {
+    model: "Rigid, similarity, affine or deformable: what maps the PixieVerse frame to the SLAT",
     confidence: "Calibrated probability that the placement is right",
     expected_accuracy: "Share of right classes to be expected among the valid voxels",
     fitness: "Share of PixieVerse boundary voxels with a SLAT voxel within the radius",

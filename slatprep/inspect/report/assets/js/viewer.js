@@ -78,6 +78,7 @@ const Viewer = (() => {
     message.textContent = ASSETS.picture[index] === null ? "This asset has no 3D view on this page." : "";
     byId("scale").replaceChildren();
     if (ASSETS.picture[index] === null) return draw();
+    await Data.arrived; // the library, too: an address may open an asset while the page is read
     try {
       if (!three) start();
     } catch (error) {
@@ -119,6 +120,17 @@ const Viewer = (() => {
     return mesh;
   }
 
+  /** Put each boundary voxel where the deformation has it before the transform, or where it was. */
+  function deform(field, { field: coordinates, moved }, before) {
+    if (!moved) return;
+    const place = new THREE.Matrix4();
+    for (let k = 0; k < field.count; k++) {
+      const [x, y, z] = [0, 1, 2].map((axis) => (coordinates[3 * k + axis] + 0.5) / side - 0.5 + (before ? 0 : moved[3 * k + axis]));
+      field.setMatrixAt(k, place.makeTranslation(x, y, z));
+    }
+    field.instanceMatrix.needsUpdate = true;
+  }
+
   function clear() {
     if (!shown) return;
     for (const mesh of [shown.slat, shown.field]) {
@@ -145,6 +157,7 @@ const Viewer = (() => {
     slat.material.opacity = both ? 0.45 : 1;
     slat.material.depthWrite = !both;
     slat.material.needsUpdate = true;
+    deform(field, voxels, state.before);
     const from = new THREE.Matrix4();
     field.matrix.copy(state.before ? from : field.userData.transform);
     field.matrixWorldNeedsUpdate = true;
