@@ -156,7 +156,7 @@ def is_found(bench: Bench, file: Path) -> bool:
             store = open_store(bench.store)
         except StoreError:
             return True
-        return any(metadata_findings(bench.store)) or bool(file_findings(store, 1)[1])
+        return any(metadata_findings(bench.store)) or bool(file_findings(store, 1, name)[1])
     return bool(file_findings(bench.opened, 1, name)[1])
 
 

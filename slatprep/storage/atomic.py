@@ -140,7 +140,7 @@ def writing(what: str, where: Path) -> Iterator[None]:
         yield
     except OSError as error:
         full = error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
-        advice = "Make room there" if full else "See that it may be written"
+        advice = "Make room there" if full else "See that both may be written"
         raise StoreError(
             f"{what}: cannot be written to {where} ({error.strerror or error}); nothing was "
             f"replaced. {advice} and run again: what is finished is kept"

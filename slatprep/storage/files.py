@@ -107,12 +107,14 @@ def local_files(path: Path) -> dict[str, int]:
     found = {}
     for folder, folders, files in os.walk(path):
         folders.sort()
-        links = [name for name in folders if Path(folder, name).is_symlink()]
-        for name in sorted([*files, *links]):
-            file = Path(folder, name)
-            state = file.lstat()
+        below = Path(folder).relative_to(path).as_posix()
+        prefix = "" if below == "." else f"{below}/"
+        states = {name: os.lstat(f"{folder}/{name}") for name in [*folders, *files]}
+        for name, state in sorted(states.items()):
+            if stat.S_ISDIR(state.st_mode):
+                continue
             size = state.st_size if stat.S_ISREG(state.st_mode) else OTHER
-            found[file.relative_to(path).as_posix()] = LINK if stat.S_ISLNK(state.st_mode) else size
+            found[prefix + name] = LINK if stat.S_ISLNK(state.st_mode) else size
     return found
 
 
