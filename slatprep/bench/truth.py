@@ -8,7 +8,6 @@ frame. There ``transform`` is the similarity that comes nearest to the places.
 
 from __future__ import annotations
 
-import zipfile
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -24,6 +23,7 @@ from slatprep.geometry.frames import (
     invert_transform,
     voxel_centres,
 )
+from slatprep.readers.files import ArraySpec, load_source, npz_arrays
 from slatprep.records import BACKGROUND, Place
 from slatprep.store import StoredAsset, open_store
 
@@ -34,7 +34,14 @@ least that a similarity can have."""
 ANSWERABLE_DISTANCE = 2.0
 """A SLAT voxel has a true answer where an annotation lies so near its true place [voxel]."""
 
-_TRUTH_KEYS = ("transform", "material", "name", "level", "symmetric")
+_TRUTH = {
+    "transform": ArraySpec(((4, 4),), "f"),
+    "material": ArraySpec(((None,),), "iu"),
+    "name": ArraySpec(((),), "U"),
+    "level": ArraySpec(((),), "iu"),
+    "symmetric": ArraySpec(((),), "b"),
+}
+_PLACES = {"places": ArraySpec(((None, 3),), "f")}
 
 
 @dataclass(frozen=True)
@@ -291,21 +298,25 @@ def read_truth(path: Path) -> Truth:
     Raises
     ------
     InputError
-        If the file cannot be read or lacks something.
+        If the file cannot be read, lacks something, or its numbers are no truth.
     """
-    expected = f"an npz with {', '.join(_TRUTH_KEYS)}"
     try:
-        with np.load(path, allow_pickle=False) as file:
-            return Truth(
-                path=path,
-                transform=file["transform"].astype(np.float64),
-                material=file["material"],
-                name=str(file["name"]),
-                level=int(file["level"]),
-                symmetric=bool(file["symmetric"]),
-                places=file["places"].astype(np.float64) if "places" in file else None,
-            )
-    except KeyError as error:
-        raise InputError(path, str(error.args[0]), expected) from error
-    except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
-        raise InputError(path, f"cannot be read ({error})", expected) from error
+        data, _ = load_source(path, path.parent, "truth")
+        arrays = npz_arrays(data, path, _TRUTH)
+        places = npz_arrays(data, path, _PLACES, partial=True).get("places")
+    except InputError as error:
+        raise InputError(path, f"cannot be read ({error.fault})", error.expected) from None
+    transform = arrays["transform"].astype(np.float64)
+    if not np.isfinite(transform).all() or not np.linalg.det(transform) > 0:
+        raise InputError(path, "transform is not finite or has no inverse", "a similarity")
+    if places is not None and not np.isfinite(places).all():
+        raise InputError(path, "places are not all finite", "points of the unit cube")
+    return Truth(
+        path=path,
+        transform=transform,
+        material=arrays["material"],
+        name=str(arrays["name"]),
+        level=int(arrays["level"]),
+        symmetric=bool(arrays["symmetric"]),
+        places=None if places is None else places.astype(np.float64),
+    )

@@ -7,8 +7,6 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import click
-
 from slatprep.cli.info import show_quality
 from slatprep.cli.options import (
     NEW_FILE,
@@ -20,7 +18,7 @@ from slatprep.cli.options import (
     source_options,
     workers_options,
 )
-from slatprep.cli.output import Output
+from slatprep.cli.output import Output, say
 
 if TYPE_CHECKING:
     from slatprep.parameters import BuildParameters
@@ -148,8 +146,8 @@ def _show_plan(output: Output, plan: BuildPlan) -> None:
         if rows:
             output.table("What would be done", ("asset", "action", "why"), rows)
         counts = ", ".join(f"{count:,} to {action}" for action, count in plan.actions.items())
-        click.echo(f"assets:  {len(plan.assets):,} ({counts})")
-        click.echo(f"store:   {plan.store} (a dry run: nothing is written)")
+        say(f"assets:  {len(plan.assets):,} ({counts})")
+        say(f"store:   {plan.store} (a dry run: nothing is written)")
 
     assets = [
         {"asset_id": asset.asset_id, "action": str(asset.action), "reason": asset.reason}
@@ -188,10 +186,10 @@ def report(output: Output, summary: BuildSummary) -> None:
 
             show_quality(output, overview_of(open_store(summary.store)))
         others = ", ".join(f"{count:,} {status}" for status, count in summary.statuses.items())
-        click.echo(f"assets:  {total:,} ({others}) in {summary.seconds:,.1f} s")
+        say(f"assets:  {total:,} ({others}) in {summary.seconds:,.1f} s")
         if summary.store is not None:
-            click.echo(f"store:   {summary.store}")
-        click.echo(f"records: {summary.records}")
+            say(f"store:   {summary.store}")
+        say(f"records: {summary.records}")
 
     output.result(
         {**dataclasses.asdict(summary), "complete": summary.complete}, show, summary.complete

@@ -18,7 +18,7 @@ from slatprep.cli.options import (
     option,
     store_option,
 )
-from slatprep.cli.output import EXIT_INCOMPLETE, Output
+from slatprep.cli.output import EXIT_INCOMPLETE, Output, say
 from slatprep.errors import ConfigError, StoreError
 
 if TYPE_CHECKING:
@@ -105,9 +105,9 @@ def check_alignment(
     def print_all() -> None:
         _print(output, checks)
         if sheet is not None:
-            click.echo(f"pictures: {target} ({len(pictures)}), all in one: {sheet}")
+            say(f"pictures: {target} ({len(pictures)}), all in one: {sheet}")
         elif pictures:
-            click.echo(f"picture: {pictures[0]}")
+            say(f"picture: {pictures[0]}")
         output.note(f"store: {path}")
 
     output.result(_documents(checks, pictures), print_all)
@@ -130,7 +130,7 @@ def _target(store: Place, picture: str | None, assets: int) -> Path | None:
 
 def _print(output: Output, checks: list[AlignmentCheck]) -> None:
     if not checks:
-        click.echo("no asset is ambiguous")
+        say("no asset is ambiguous")
     if len(checks) > 1:
         output.table(
             "Alignments (rmse in voxels)",
@@ -164,9 +164,9 @@ def _print(output: Output, checks: list[AlignmentCheck]) -> None:
                 ],
             )
         for words in one.reasons if len(checks) > 1 else one.words:
-            click.echo(f"{one.asset_id}: {words}")
+            say(f"{one.asset_id}: {words}")
         if not one.consistent:
-            click.echo(
+            say(
                 f"{one.asset_id}: the store says {one.stored_verdict}, and its figures do not all "
                 "agree: it was changed, or another version of slatprep built it"
             )

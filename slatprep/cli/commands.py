@@ -7,7 +7,7 @@ from typing import Any
 
 import click
 
-from slatprep.cli.output import EXIT_INCOMPLETE, EXIT_INTERRUPTED, EXIT_USAGE
+from slatprep.cli.output import EXIT_INCOMPLETE, EXIT_INTERRUPTED, EXIT_USAGE, say
 from slatprep.errors import ConfigError, SlatprepError
 
 COMMANDS = {
@@ -60,10 +60,10 @@ class LazyGroup(click.Group):
         try:
             return super().invoke(ctx)
         except SlatprepError as error:
-            click.echo(f"slatprep: error: {error}", err=True)
+            say(f"slatprep: error: {error}", err=True)
             ctx.exit(EXIT_USAGE if isinstance(error, ConfigError) else EXIT_INCOMPLETE)
         except KeyboardInterrupt:
-            click.echo("\nslatprep: stopped; nothing was replaced", err=True)
+            say("\nslatprep: stopped; nothing was replaced", err=True)
             ctx.exit(EXIT_INTERRUPTED)
 
 

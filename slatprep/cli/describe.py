@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import click
 
 from slatprep.cli.options import EXISTING_FOLDER, NEW_FILE, command, option
-from slatprep.cli.output import Output
+from slatprep.cli.output import Output, say
 from slatprep.storage.place import storage_of
 
 if TYPE_CHECKING:
@@ -60,7 +60,7 @@ def describe(output: Output, store: Place, out: Path | None, location: str, **st
     document = croissant.describe(open_store(store), location=location.rstrip("/"), **stated)
     text = croissant.to_json(document)
     if out is None:
-        click.echo(text, nl=False)
+        say(text, nl=False)
         return
     with writing(str(out), out.parent), staged(out) as path:
         path.write_text(text, encoding="utf-8")

@@ -88,7 +88,7 @@ def evaluate(
         import csv
 
         with csv_file.open("w", encoding="utf-8", newline="") as file:
-            csv.writer(file).writerows([header, *rows])
+            csv.writer(file).writerows([header, *(map(_cell, row) for row in rows)])
 
     def show() -> None:
         output.table("Mean squared error in normalised space; accuracy of the class", header, rows)
@@ -105,6 +105,12 @@ def evaluate(
         output.problem(f"{predictions}: no prediction of {asset_id}")
     document |= {"beside": others} if beside is not None else {}
     output.result(document, show, complete=not result.missing)
+
+
+def _cell(value: object) -> object:
+    """Return a value as a spreadsheet takes it: no text of a stranger's becomes a formula."""
+    formula = isinstance(value, str) and value.lstrip()[:1] in ("=", "+", "-", "@")
+    return f"'{value}" if formula else value
 
 
 def _show_beside(

@@ -5,10 +5,8 @@ from __future__ import annotations
 from operator import attrgetter
 from typing import TYPE_CHECKING
 
-import click
-
 from slatprep.cli.options import command, store_argument
-from slatprep.cli.output import Cell, Output
+from slatprep.cli.output import Cell, Output, say
 
 if TYPE_CHECKING:
     from slatprep.inspect.overview import StoreOverview
@@ -76,10 +74,10 @@ def show_quality(output: Output, overview: StoreOverview) -> None:
     doubted = [name for name, count in total.verdicts.items() if count and name != "good"]
     if doubted:
         options = " ".join(f"--verdict {name}" for name in doubted)
-        click.echo(f"why:     slatprep list {overview.path} {options}")
+        say(f"why:     slatprep list {overview.path} {options}")
     if total.ambiguous:
-        click.echo(
+        say(
             f"tied:    {total.ambiguous:,} of {total.assets:,} have other placements that fit "
             "about as well, with other labels"
         )
-        click.echo(f"look:    slatprep check-alignment --ambiguous --store {overview.path}")
+        say(f"look:    slatprep check-alignment --ambiguous --store {overview.path}")

@@ -4,10 +4,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-import click
-
 from slatprep.cli.options import ChoiceOf, command, option, store_argument
-from slatprep.cli.output import Output
+from slatprep.cli.output import Output, say
 
 if TYPE_CHECKING:
     from slatprep.records import Place
@@ -54,7 +52,7 @@ def list_assets(
     def show() -> None:
         if ids:
             for asset in listed:
-                click.echo(asset.asset_id)
+                say(asset.asset_id)
             return
         length = output.id_length(opened.ids)
         output.table(

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import functools
 import itertools
+import json
 import math
 import sys
 import time
@@ -63,7 +64,7 @@ class Output:
         Where the result is not `complete`, end with the exit code that says so.
         """
         if self.as_json:
-            click.echo(as_json(document))
+            say(as_json(document))
         else:
             show()
         if not complete:
@@ -72,11 +73,11 @@ class Output:
     def note(self, message: str) -> None:
         """Print a line on standard error, unless quiet."""
         if self.verbosity >= 0:
-            click.echo(message, err=True)
+            say(message, err=True)
 
     def problem(self, message: str) -> None:
         """Print one line on standard error about something that did not go in."""
-        click.echo(message, err=True)
+        say(message, err=True)
 
     def table(self, title: str, columns: Sequence[str], rows: Iterable[Sequence[Cell]]) -> None:
         """Print a table; columns of numbers are aligned to the right."""
@@ -117,6 +118,31 @@ class Output:
         else:
             with _progress_bar(label) as update:
                 yield update
+
+
+def say(text: object = "", *, err: bool = False, nl: bool = True) -> None:
+    """Print text as `printable` has it: every command prints by this alone."""
+    click.echo(printable(str(text)), err=err, nl=nl)
+
+
+def printable(text: str) -> str:
+    r"""Return text with whatever a terminal would obey written as JSON escapes.
+
+    Names and categories may be a stranger's. Lines and tabs stay.
+
+    Examples
+    --------
+    >>> print(printable("cup" + chr(27) + "[2J"))
+    cup\u001b[2J
+    """
+    if text.isprintable():
+        return text
+    return "".join(c if c.isprintable() or c in "\n\t" else _escaped(c) for c in text)
+
+
+def _escaped(character: str) -> str:
+    code = ord(character)
+    return f"\\u{code:04x}" if code < 0x10000 else json.dumps(character)[1:-1]
 
 
 OUTPUT_OPTIONS = (
@@ -176,7 +202,8 @@ def _text(cell: Cell) -> str:
         return "yes" if cell else "no"
     if isinstance(cell, int):
         return f"{cell:,}"
-    return f"{cell:.3f}" if isinstance(cell, float) else str(cell)
+    # A cell is one line.
+    return f"{cell:.3f}" if isinstance(cell, float) else printable(str(cell)).replace("\n", "\\n")
 
 
 def _rich_table(
@@ -213,14 +240,14 @@ def _plain_table(
 ) -> None:
     lines = [list(columns), *cells]
     widths = [max(len(line[k]) for line in lines) for k in range(len(columns))]
-    click.echo(title)
+    say(title)
     for line in lines:
         padded = (
             text.rjust(width) if right else text.ljust(width)
             for text, width, right in zip(line, widths, numeric, strict=True)
         )
-        click.echo("  ".join(padded).rstrip())
-    click.echo()
+        say("  ".join(padded).rstrip())
+    say()
 
 
 def _progress_lines(label: str, unit: str) -> Progress:
@@ -233,7 +260,7 @@ def _progress_lines(label: str, unit: str) -> Progress:
             start = now
         elif done >= _TELLING and now - last >= _SECONDS_BETWEEN_LINES:
             left = _clock((now - start) / done * (total - done))
-            click.echo(f"{label}: {done:,} of {total:,} {unit}, {left} left", err=True)
+            say(f"{label}: {done:,} of {total:,} {unit}, {left} left", err=True)
             last = now
 
     return update

@@ -5,8 +5,6 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import click
-
 from slatprep.cli.options import (
     FOLDER,
     NEW_FILE,
@@ -16,7 +14,7 @@ from slatprep.cli.options import (
     option,
     store_argument,
 )
-from slatprep.cli.output import Output
+from slatprep.cli.output import Output, say
 
 if TYPE_CHECKING:
     from slatprep.records import Place
@@ -68,7 +66,7 @@ def report(
         )
 
     def show() -> None:
-        click.echo(f"page:   {summary.path} ({summary.size / 1e6:,.1f} MB)")
-        click.echo(f"assets: {summary.assets:,}, {summary.in_detail:,} of them with a 3D view")
+        say(f"page:   {summary.path} ({summary.size / 1e6:,.1f} MB)")
+        say(f"assets: {summary.assets:,}, {summary.in_detail:,} of them with a 3D view")
 
     output.result(summary, show)

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from slatprep.cli.options import EXISTING_FOLDER, command, option, store_argument, workers_options
-from slatprep.cli.output import Output
+from slatprep.cli.output import Output, say
 
 if TYPE_CHECKING:
     from slatprep.records import Place
@@ -60,13 +60,13 @@ def verify(
 
     def show() -> None:
         for finding in result.findings:
-            click.echo(finding)
+            say(finding)
         records = result.manifests or "none beside the store"
         output.note(
             f"{result.assets:,} assets, {result.files:,} files, {result.sources:,} sources; "
             f"records: {records}"
         )
         found = f"{len(result.findings):,} findings" if result.findings else "nothing is wrong"
-        click.echo(f"{store}: {found}")
+        say(f"{store}: {found}")
 
     output.result({**dataclasses.asdict(result), "ok": result.ok}, show, complete=result.ok)

@@ -135,10 +135,8 @@ def _distribution(store: Store, location: str) -> list[dict[str, Any]]:
 
 def _file_set(name: str, array: Any, location: str) -> dict[str, Any]:
     attributes: Mapping[str, Any] = array.attrs
-    dimensions = ", ".join(
-        f"{dimension} {size}"
-        for dimension, size in zip(array.metadata.dimension_names, array.shape, strict=True)
-    )
+    names = array.metadata.dimension_names or ("dimension",) * len(array.shape)
+    dimensions = ", ".join(f"{n} {size}" for n, size in zip(names, array.shape, strict=True))
     kind = "str" if array.dtype.kind in "OTU" else str(array.dtype)
     units = f" [{attributes['units']}]" if "units" in attributes else ""
     return {

@@ -80,7 +80,9 @@ def overview_of(store: Store) -> StoreOverview:
              "unphysical")  # fmt: skip
     columns = {name: store.column(name) for name in names}
     columns["voxels"] = np.diff(store.offsets)
-    categories = np.array([str(category) for category in columns["category"]])
+    rows: dict[str, list[int]] = {}
+    for row, category in enumerate(columns["category"]):
+        rows.setdefault(str(category), []).append(row)
     sizes = storage_of(store.path).files()
     return StoreOverview(
         path=store.path,
@@ -91,21 +93,20 @@ def overview_of(store: Store) -> StoreOverview:
         engines=_counts(columns["engine"]),
         models=_counts(columns["model"]),
         normalization=store.normalization,
-        total=_group("all", columns, np.ones(len(categories), dtype=bool)),
+        total=_group("all", columns, list(range(len(store)))),
         categories=tuple(
-            _group(name or "(unknown)", columns, categories == name)
-            for name in sorted(set(categories))
+            _group(name or "(unknown)", columns, own) for name, own in sorted(rows.items())
         ),
     )
 
 
-def _group(name: str, columns: dict[str, NDArray[Any]], chosen: NDArray[np.bool_]) -> GroupOverview:
+def _group(name: str, columns: dict[str, NDArray[Any]], chosen: list[int]) -> GroupOverview:
     own = {column: values[chosen] for column, values in columns.items()}
     voxels = int(own["voxels"].sum())
     verdicts = _counts(own["verdict"])
     return GroupOverview(
         name=name,
-        assets=int(chosen.sum()),
+        assets=len(chosen),
         voxels=voxels,
         verdicts={str(verdict): verdicts.get(str(verdict), 0) for verdict in Verdict},
         **{median: float(np.median(own[median])) for median in _MEDIANS},

@@ -328,6 +328,8 @@ def _header(
             shape, fortran, dtype = np.lib.format.read_array_header_2_0(start)
         else:  # 3.0 is for field names, which no plain array has
             raise ValueError(f"format version {version}")
+    if any(type(size) is not int for size in shape):  # True is a number, too
+        raise InputError(where, f"has shape {shape}", "whole numbers for a shape")
     spec.check(where, shape, dtype)
     wanted = math.prod(shape) * dtype.itemsize
     held = size - start.tell()

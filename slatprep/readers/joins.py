@@ -6,10 +6,11 @@ import csv
 import io
 import json
 import re
+from collections import Counter
 from collections.abc import Collection
 
 from slatprep.errors import ConfigError, in_unicode
-from slatprep.records import Place
+from slatprep.records import MAX_NAME_BYTES, Place
 from slatprep.storage.place import storage_of
 
 MAX_JSON_BYTES = 256 * 2**20
@@ -48,6 +49,9 @@ def read_map(
         with io.TextIOWrapper(storage_of(path).open(), "utf-8-sig", newline="") as file:
             reader = csv.DictReader(file)
             columns = set(reader.fieldnames or ())
+            for name in ("object_id", "slat_id", "view", "sha256", "file_identifier"):
+                if (reader.fieldnames or ()).count(name) > 1:
+                    raise ConfigError(f"{path}: has two columns {name}; expected one")
             if {"object_id", "slat_id"} <= columns:
                 form = ("object_id", "slat_id")
             elif {"sha256", "file_identifier"} <= columns:
@@ -84,7 +88,7 @@ def read_categories(path: Place) -> dict[str, str]:
         data = storage_of(path).read(MAX_JSON_BYTES)
         if len(data) > MAX_JSON_BYTES:
             raise ConfigError(f"{path}: is larger than {MAX_JSON_BYTES >> 20} MiB")
-        entries = json.loads(data)
+        entries = json.loads(data, object_pairs_hook=_unique)
     except (OSError, ValueError, RecursionError) as error:
         raise ConfigError(f"{path}: cannot be read as JSON ({error})") from None
     if not isinstance(entries, dict):
@@ -94,8 +98,21 @@ def read_categories(path: Place) -> dict[str, str]:
         category = entry.get("obj_class") if isinstance(entry, dict) else None
         if not isinstance(category, str):
             raise ConfigError(f"{path}: {object_id!r} has no obj_class; expected a category")
+        if len(category) > MAX_NAME_BYTES // 4:
+            raise ConfigError(
+                f"{path}: the obj_class of {object_id[:80]!r} has {len(category)} letters; "
+                f"expected at most {MAX_NAME_BYTES // 4}"
+            )
         categories[object_id] = in_unicode(category)
     return categories
+
+
+def _unique(pairs: list[tuple[str, object]]) -> dict[str, object]:
+    entries = dict(pairs)
+    if len(entries) < len(pairs):
+        name, _ = Counter(name for name, _ in pairs).most_common(1)[0]
+        raise ValueError(f"the key {name[:80]!r} occurs twice")
+    return entries
 
 
 def _object_of(file_identifier: str) -> str:

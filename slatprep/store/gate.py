@@ -68,7 +68,7 @@ def gate_findings(name: str, metadata: object) -> Iterator[Finding]:
     data_type = metadata.get("data_type")
     if data_type not in DATA_TYPES:
         yield Finding(where, "", f"data_type is {data_type!r}", f"one of {', '.join(DATA_TYPES)}")
-    axes = metadata.get("dimension_names")
+    axes = metadata.get("dimension_names") or []
     if not isinstance(axes, list) or not all(isinstance(axis, str) for axis in axes):
         yield Finding(where, "", f"dimension_names is {axes!r}", "a name for each dimension")
     for codec in _codecs(metadata.get("codecs")):

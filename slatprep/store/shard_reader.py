@@ -233,14 +233,13 @@ class RowReader:
     def _open(self, number: int) -> _Shard:
         try:
             file = self.folder.open(self.key(number))
-            size = file.size()
+            shard = _Shard(file, self._index(number, file, file.size()))
         except FileNotFoundError:
             if self.optional:
                 return _Shard(None, np.array([[MISSING, MISSING]], np.uint64))
             raise self._damaged(number, "is missing (was the store replaced?)") from None
         except OSError as error:
             raise self._damaged(number, f"cannot be read ({error.strerror})") from None
-        shard = _Shard(file, self._index(number, file, size))
         # Two threads may both have opened it; whichever is kept is as good.
         self._shards[number] = shard
         for oldest in list(self._shards)[:-OPEN_SHARDS]:

@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
+import csv
 import json
 import shutil
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
+import zarr
 from click.testing import CliRunner, Result
 
 from slatprep.cli.commands import slatprep
 from slatprep.pipeline.dataset import BuildSummary
+from slatprep.store import open_store
 
 
 @pytest.fixture(scope="module")
@@ -157,3 +161,68 @@ def test_a_device_in_place_of_a_record(store: Path, name: str) -> None:
     for command in ("report", "verify"):
         out = ("--out", store.with_suffix(".html")) if command == "report" else ()
         assert "no regular file" in run(command, store, *out).output
+
+
+def rewrite(store: Path, array: str, row: int, value: object) -> None:
+    zarr.open_group(store, mode="r+", use_consolidated=False)[array][row] = value
+
+
+def test_escape_sequences_do_not_reach_the_terminal(store: Path) -> None:
+    for row, text in enumerate(("\x1b]0;title\x07", "\x1b[2J", "\x9b31m\u202e", "a\r\nb")):
+        rewrite(store, "asset/category", row, text)
+    rewrite(store, "asset/verdict", 0, "\x1b[2J")
+    for line in (["info"], ["list"], ["verify"], ["report"], ["info", "--json"]):
+        done = run(line[0], store, *line[1:])
+        assert not set("\x1b\x07\x9b\r\u202e") & set(done.output), line
+    categories = json.loads(run("info", store, "--json").stdout)["categories"]
+    assert {"\x1b[2J", "\x9b31m\u202e"} <= {group["name"] for group in categories}
+
+
+@pytest.mark.parametrize("name", ["verdict", "model", "engine"])
+def test_a_report_of_unknown_words_is_refused(store: Path, name: str) -> None:
+    rewrite(store, f"asset/{name}", 0, "other")
+    done = run("report", store, "--out", store.with_suffix(".html"))
+    assert done.exit_code == 1 and "'other' is none of" in done.stderr
+
+
+TRUTH: dict[str, dict[str, Any]] = {
+    "singular": {"transform": np.zeros((4, 4))},
+    "no numbers": {"transform": np.full((4, 4), np.nan)},
+    "misshaped": {"transform": np.eye(3)},
+    "text": {"material": np.full(7, "x")},
+    "objects": {"name": np.array([{}], object)},
+    "list of levels": {"level": np.arange(3)},
+    "places nowhere": {"places": np.full((7, 3), np.nan)},
+}
+
+
+@pytest.mark.parametrize("case", TRUTH)
+def test_truth_that_is_none(store: Path, tmp_path: Path, case: str) -> None:
+    sound = {"transform": np.eye(4), "material": np.zeros(7, np.uint8), "name": "a", "level": 0}
+    (tmp_path / "truth").mkdir()
+    np.savez(tmp_path / "truth/cup.npz", **({**sound, "symmetric": False} | TRUTH[case]))
+    done = run("score", store, tmp_path / "truth")
+    assert done.exit_code == 1 and "cup.npz" in done.stderr
+
+
+def test_a_category_with_the_space_of_all_costs_no_memory(store: Path) -> None:
+    """One text of megabytes among few rows is refused by the reader."""
+    rewrite(store, "asset/category", 0, "x" * 2**20)
+    done = run("info", store)
+    assert done.exit_code == 1 and "expected at most" in done.stderr
+
+
+def test_a_table_of_scores_has_no_formulas(store: Path, tmp_path: Path) -> None:
+    opened = open_store(store)
+    (tmp_path / "p").mkdir()
+    for row, asset_id in enumerate(opened.ids):
+        count = len(opened.read(row, ("coords",))["coords"])
+        np.savez(tmp_path / f"p/{asset_id}.npz", properties=np.zeros((count, 3)))
+    for row, category in enumerate(("=cmd|x", "+1", "-1", "@a", " =b")):
+        rewrite(store, "asset/category", row, category)
+    table = tmp_path / "scores.csv"
+    run("evaluate", tmp_path / "p", "--store", store, "--split", "all", "--csv", table)
+    with table.open(encoding="utf-8", newline="") as file:
+        first = {row[0] for row in csv.reader(file)}
+    # The bear's two views are one object, of the first one's category.
+    assert first >= {"'=cmd|x", "'+1", "'@a", "' =b"}

@@ -258,3 +258,10 @@ def test_fortran_and_big_endian_arrays_read_alike(make_pair):
         assert array.dtype == np.float32
         assert array.dtype.isnative
         np.testing.assert_array_equal(array, grid)
+
+
+def test_a_shape_of_truth_values_is_refused() -> None:
+    """Python takes True for 1, and numpy makes an array of it that cannot be shaped again."""
+    data = npy_bytes(np.zeros((1, 3), np.float32)).replace(b"(1, 3), }   ", b"(True, 3), }", 1)
+    with pytest.raises(InputError, match=r"has shape \(True, 3\)"):
+        npy_array(data, "x.npy", ArraySpec(((None, 3),), "f"))

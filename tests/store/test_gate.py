@@ -136,7 +136,7 @@ EDITS: dict[str, tuple[dict[str, Any], str]] = {
     "complex": ({"data_type": "complex64"}, "data_type is 'complex64'"),
     "named type": ({"data_type": {"name": "struct"}}, "data_type is"),
     "format 2": ({"zarr_format": 2}, "zarr_format is 2"),
-    "no axes": ({"dimension_names": None}, "dimension_names is None"),
+    "no axes": ({"dimension_names": 5}, "dimension_names is 5"),
     "no array": ({"node_type": "other"}, "is no array or group"),
 }
 

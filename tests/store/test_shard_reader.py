@@ -1,5 +1,6 @@
 """Rows read straight from shards, against zarr-python, from threads and processes, and hostile."""
 
+import errno
 import json
 import multiprocessing
 import os
@@ -18,8 +19,11 @@ from hypothesis import strategies as st
 
 from slatprep.errors import StoreError
 from slatprep.pipeline.dataset import BuildSummary
+from slatprep.storage.files import LocalFile, LocalFolder
 from slatprep.store import Store, open_store
+from slatprep.store.contract import read_metadata
 from slatprep.store.layout import ARRAYS
+from slatprep.store.shard_reader import RowReader
 
 
 @pytest.fixture(scope="module")
@@ -205,3 +209,20 @@ def test_a_shard_that_is_a_pipe_or_a_folder_does_not_hang(copy: Path) -> None:
     os.mkfifo(shard)
     with pytest.raises(StoreError, match="no regular file"):
         open_store(copy).read(0)
+
+
+def test_an_index_that_cannot_be_read_names_its_file(copy: Path) -> None:
+    """As an object store that cuts a body short makes it: size answers, reading does not."""
+
+    class Cut(LocalFile):
+        def pread(self, length: int, offset: int) -> bytes:
+            raise OSError(errno.EIO, "the body was cut")
+
+    class Folder(LocalFolder):
+        def open(self, name: str) -> LocalFile:
+            return Cut(f"{self.path}/{name}")
+
+    metadata = read_metadata(copy / "voxel/feats/zarr.json")
+    reader = RowReader.of(Folder(copy), "voxel/feats", metadata)
+    with pytest.raises(StoreError, match=r"voxel/feats/c/0/0: cannot be read \(the body was cut\)"):
+        reader.read(0, 1)

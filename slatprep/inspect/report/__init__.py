@@ -18,6 +18,7 @@ from slatprep.inspect.report.page import write_page
 from slatprep.inspect.report.statistics import Tally, no_tally, tally
 from slatprep.inspect.report.thumbnails import PER_SHEET, sheet, thumbnail
 from slatprep.inspect.report.voxels import COARSE, FULL, encode_asset
+from slatprep.inspect.verify.index import WORDS
 from slatprep.provenance.stored import StoredRecords
 from slatprep.records import Place, Verdict
 from slatprep.storage.atomic import staged, writing
@@ -106,6 +107,7 @@ def write_report(
     StoreError
         If the store or its records cannot be read, or belong to different builds.
     """
+    _refuse_other_words(store)
     outcomes: list[Outcome] | None = None
     if manifests is not None:
         outcomes = list(read_outcomes(manifests, store.about.manifest))
@@ -145,6 +147,16 @@ def _refuse_other_records(store: Store, outcomes: Sequence[Outcome], manifests: 
             f"{manifests} has no record of {len(missing)} assets of {store.path}, such as "
             f"{min(missing)!r}; name the folder of its own records with --manifests"
         )
+
+
+def _refuse_other_words(store: Store) -> None:
+    for name, words in WORDS.items():
+        other = set(map(str, store.column(name))) - set(words)
+        if other:
+            raise StoreError(
+                f"{store.path}/asset/{name}: {min(other)!r} is none of {', '.join(words)}, and "
+                "cannot be drawn; run `slatprep verify`"
+            )
 
 
 def _chosen(store: Store) -> list[int]:

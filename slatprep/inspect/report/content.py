@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
@@ -133,11 +134,11 @@ def _properties(
 
 def _balance(store: Store, tallies: Mapping[str, Tally]) -> list[dict[str, Any]]:
     """Return the SLAT voxels of each class by category; the last count is of those not valid."""
-    categories = [str(category) for category in store.column("category")]
+    assets = Counter(str(category) for category in store.column("category"))
     return [
         {
             "category": category,
-            "assets": categories.count(category),
+            "assets": assets[category],
             "classes": tallies[category].classes.tolist(),
         }
         for category in sorted(tallies)
