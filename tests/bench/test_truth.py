@@ -41,7 +41,21 @@ def write_store(path: Path, assets: dict[str, dict[str, np.ndarray]]) -> None:
     counts = [len(row["coords"]) for row in rows]
     n = sum(counts)
     root = zarr.create_group(path, zarr_format=3)
-    root.attrs.update({"format": "slatprep-store", "format_version": 1})
+    properties = ["youngs_modulus", "density", "poissons_ratio"]
+    span = {"log10": False, "lo": 0.0, "hi": 1.0, "source": "dataset"}
+    root.attrs.update(
+        {
+            "format": "slatprep-store",
+            "format_version": 1,
+            "resolution": 64,
+            "material_classes": ["jelly", "metal", "sand", "visplas", "fluid", "snow",
+                                 "stationary", "background"],
+            "property_columns": properties,
+            "normalization": dict.fromkeys(properties, span),
+            "manifest": "0" * 64,
+            "build": {"parameters": {"align": {"radius": 1.0}, "sample": {}}, "versions": {}},
+        }
+    )  # fmt: skip
     arrays: dict[str, np.ndarray] = {
         "asset/offset": np.array([0, *np.cumsum(counts)], dtype=np.int64),
         "asset/transform": np.stack([row["transform"] for row in rows]),
@@ -230,6 +244,7 @@ def test_places_of_the_store_are_what_counts_where_it_has_them(tmp_path: Path) -
     for name in ("asset/confidence", "asset/expected_accuracy"):
         add_array(root, name, np.ones(2))
     add_array(root, "asset/unphysical", np.zeros(2, np.int64))
+    add_array(root, "asset/contradicted", np.zeros(2, bool))
     add_array(root, "voxel/confidence", np.ones(len(stored), np.float32))
     root.attrs["format_version"] = 2
     first, second = score_against_truth(tmp_path / "s.zarr", tmp_path / "truth").assets

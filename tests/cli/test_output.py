@@ -174,3 +174,11 @@ def test_bar_tells_no_time_left_before_it_can(
     shown = sys.stderr.getvalue()  # type: ignore[attr-defined]
     assert "left" not in shown
     assert ("starting" if done is None else f"{done}/8") in shown
+
+
+def test_commands_print_through_one_function() -> None:
+    """Which escapes what a terminal would obey."""
+    folder = Path(str(module.__file__)).parent
+    printing = [p.name for p in folder.glob("*.py") if "click.echo(" in p.read_text("utf-8")]
+    assert printing == ["output.py"]
+    assert Path(str(module.__file__)).read_text("utf-8").count("click.echo(") == 1
