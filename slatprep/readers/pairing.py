@@ -8,12 +8,12 @@ from __future__ import annotations
 from collections.abc import Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from itertools import groupby
-from urllib.parse import quote
 
-from slatprep.errors import ConfigError, InputError, in_unicode
+from slatprep.errors import ConfigError, in_unicode
 from slatprep.parameters import BuildParameters, PixieverseSource, SlatSource
 from slatprep.readers.joins import read_categories, read_map
-from slatprep.readers.patterns import NAME, fill, find_files, list_below
+from slatprep.readers.patterns import NAME, fill, find_files, list_below, tried_names
+from slatprep.readers.slat_files import NamedSlat, encoded, find_slats, ordered
 from slatprep.records import AssetPair, Place, SourceRoots
 from slatprep.storage.listing import Listing
 
@@ -28,38 +28,13 @@ class _Grid:
 
 
 @dataclass(frozen=True, slots=True)
-class _Slat:
-    """A SLAT by its own names; `path` is empty where a map names one that does not exist."""
-
-    slat_id: str
-    view: str
-    path: str
-    group: str = ""
-    problem: str = ""
-
-
-@dataclass(frozen=True, slots=True)
-class SlatFile:
-    """A SLAT that nothing is paired with: its id, its file, the folder that holds it, its group.
-
-    `problem` says why it cannot be used, and is empty where all is well.
-    """
-
-    asset_id: str
-    path: Place
-    root: Place
-    group: str = ""
-    problem: str = ""
-
-
-@dataclass(frozen=True, slots=True)
 class _Row:
     """What will be one row: an object and the SLATs that bear this label (one, if all is well)."""
 
     asset_id: str
     object_id: str
     view: str
-    slats: tuple[_Slat, ...]
+    slats: tuple[NamedSlat, ...]
 
 
 @dataclass(frozen=True, slots=True)
@@ -110,7 +85,7 @@ def discover(parameters: BuildParameters) -> list[AssetPair]:
         raise ConfigError(f"{error.filename}: cannot be looked at ({error.strerror})") from None
     listing = list_below(pixieverse.root)
     grids = _find_grids(pixieverse, listing)
-    slats = _find_slats(slat, one_file)
+    slats = find_slats(slat, one_file)
     claims = {} if pairing.map is None else read_map(pairing.map, grids, slats)
     categories = {} if pairing.categories is None else read_categories(pairing.categories)
     rows = sorted(_rows(grids, slats, claims), key=lambda row: (row.asset_id, row.object_id))
@@ -145,43 +120,6 @@ def explain_unmatched(pairs: Collection[AssetPair], parameters: BuildParameters)
     )
 
 
-def discover_slats(source: SlatSource) -> list[SlatFile]:
-    """Find SLATs that need no partner.
-
-    Parameters
-    ----------
-    source : SlatSource
-        A folder of them, or a file: an npz, or an HDF5 file with one SLAT or a group each.
-
-    Returns
-    -------
-    list of SlatFile
-        Sorted by id, ``<id>`` or ``<id>.<view>``, each once; a single file is named
-        after itself.
-
-    Raises
-    ------
-    ConfigError
-        If there is none.
-    """
-    root, one_file = source.root, source.root.is_file()
-    if not one_file and not root.exists():
-        raise ConfigError(f"{root}: does not exist; expected a SLAT, or a folder of them")
-    groups = one_file and root.suffix != ".npz"
-    slats = list(_each_slat(source, True)) if groups else []
-    if one_file and not slats:
-        slats = [_Slat(root.name.rpartition(".")[0], "", root.name)]
-    elif not one_file:
-        slats = [slat for found in _find_slats(source, False).values() for slat in found]
-    folder, named = root.parent if one_file else root, dict[str, SlatFile]()
-    for slat in _ordered(slats):
-        asset_id = _safe(f"{slat.slat_id}.{slat.view}" if slat.view else slat.slat_id)
-        twice = f"two SLATs have the id {asset_id!r}" if asset_id in named else ""
-        problem = slat.problem or twice
-        named[asset_id] = SlatFile(asset_id, folder / slat.path, folder, slat.group, problem)
-    return [named[asset_id] for asset_id in sorted(named)]
-
-
 def _find_grids(source: PixieverseSource, listing: Listing) -> dict[str, list[_Grid]]:
     """Return the grids of each object, all found by the first pattern that matches any."""
     chosen = _settled(sample=source.sample)
@@ -195,81 +133,36 @@ def _find_grids(source: PixieverseSource, listing: Listing) -> dict[str, list[_G
             found.setdefault(fields.get("id", path), []).append(grid)
         grids |= found
     if not grids:
-        raise ConfigError(f"{source.root}: no grid found; looked for {_tried(source.grid, chosen)}")
+        raise ConfigError(
+            f"{source.root}: no grid found; looked for {tried_names(source.grid, chosen)}"
+        )
     return grids
-
-
-def _find_slats(source: SlatSource, one_file: bool) -> dict[str, list[_Slat]]:
-    slats: dict[str, list[_Slat]] = {}
-    for slat in _each_slat(source, one_file):
-        slats.setdefault(slat.slat_id, []).append(slat)
-    if not slats:
-        tried = f"groups {source.group}" if one_file else _tried(source.pattern, {})
-        raise ConfigError(f"{source.root}: no SLAT found; looked for {tried}")
-    problems = [slat.problem for found in slats.values() for slat in found if slat.problem]
-    if one_file and problems:
-        raise ConfigError(problems[0])
-    return slats
-
-
-def _each_slat(source: SlatSource, one_file: bool) -> Iterator[_Slat]:
-    if one_file:
-        yield from _each_group(source, source.root.parent, source.root.name)
-        return
-    listing = list_below(source.root)
-    unlisted: set[str] = set()
-    for pattern in source.pattern:
-        for fields, path, problem in find_files(listing, pattern, {}):
-            if path in unlisted:
-                continue
-            if problem:
-                unlisted.add(path)
-            if problem or "id" in fields:
-                slat_id, view = fields.get("id", path), fields.get("view", "")
-                yield _Slat(slat_id, view, path, problem=problem)
-            else:
-                yield from _each_group(source, source.root, path, fields)
-
-
-def _each_group(
-    source: SlatSource, root: Place, path: str, known: Mapping[str, str] | None = None
-) -> Iterator[_Slat]:
-    """Return the SLATs that lie as groups in one HDF5 file."""
-    from slatprep.readers.hdf5 import find_groups
-
-    if "{id}" not in source.group:
-        raise ConfigError(f"group pattern {source.group!r} names no {{id}}")
-    try:
-        for fields, group in find_groups(root / path, root, source.group, known or {}):
-            yield _Slat(fields["id"], fields.get("view", ""), path, group)
-    except InputError as error:
-        yield _Slat(path, "", path, problem=str(error))
 
 
 def _rows(
     grids: Mapping[str, list[_Grid]],
-    slats: Mapping[str, list[_Slat]],
+    slats: Mapping[str, list[NamedSlat]],
     claims: Mapping[str, list[tuple[str, str]]],
 ) -> Iterator[_Row]:
     """Join objects and SLATs: by the map where it names them, by equal id otherwise."""
     claimed = {slat_id for named in claims.values() for slat_id, _ in named}
     for object_id in {*grids, *claims, *(slats.keys() - claimed)}:
-        labelled: dict[str, list[_Slat]] = {}
+        labelled: dict[str, list[NamedSlat]] = {}
         for label, slat in _slats_of(object_id, slats, claims, claimed):
             labelled.setdefault(label, []).append(slat)
         if len(labelled) <= 1:
             labelled = {"": [slat for group in labelled.values() for slat in group]}
         for label, group in labelled.items():
             asset_id = f"{object_id}.{label}" if label else object_id
-            yield _Row(_safe(asset_id), object_id, label, _ordered(group))
+            yield _Row(encoded(asset_id), object_id, label, ordered(group))
 
 
 def _slats_of(
     object_id: str,
-    slats: Mapping[str, list[_Slat]],
+    slats: Mapping[str, list[NamedSlat]],
     claims: Mapping[str, list[tuple[str, str]]],
     claimed: set[str],
-) -> Iterator[tuple[str, _Slat]]:
+) -> Iterator[tuple[str, NamedSlat]]:
     """Return the SLATs of an object, each with the label that tells it from the others."""
     if object_id not in claims:
         if object_id not in claimed:
@@ -281,18 +174,9 @@ def _slats_of(
         found = slats.get(slat_id, [])
         if view and any(slat.view for slat in found):
             found = [slat for slat in found if slat.view == view]
-        for slat in found or [_Slat(slat_id, view, "")]:
+        for slat in found or [NamedSlat(slat_id, view, "")]:
             parts = (slat_id if several else "", slat.view)
             yield view or ".".join(part for part in parts if part), slat
-
-
-def _ordered(slats: Iterable[_Slat]) -> tuple[_Slat, ...]:
-    return tuple(sorted(slats, key=lambda slat: (slat.path, slat.group, slat.slat_id)))
-
-
-def _safe(name: str) -> str:
-    """Return a name as it is where it is a valid id, percent-encoded where it is not."""
-    return quote(name.encode(errors="surrogateescape"), safe="").replace("~", "%7E")
 
 
 def _pairs(rows: list[_Row], there: _Found) -> Iterator[AssetPair]:
@@ -312,7 +196,7 @@ def _pair(row: _Row, there: _Found, shared: str) -> AssetPair:
     source, slat_source = there.parameters.pixieverse, there.parameters.slat
     grids = sorted(there.grids.get(row.object_id, ()), key=lambda found: found.path)
     problems = [shared, *_name_problems(row)]
-    sides: tuple[_Grid | _Slat, ...] = (*grids, *row.slats)
+    sides: tuple[_Grid | NamedSlat, ...] = (*grids, *row.slats)
     for side in sides:
         problems += [side.problem, _unrecordable(side.path)]
     grid = mask = bounds = None
@@ -325,7 +209,7 @@ def _pair(row: _Row, there: _Found, shared: str) -> AssetPair:
             mask = _find_one(there, source.mask, known, "mask", problems)
             bounds = _find_one(there, source.bounds, known, "bounds", problems)
     else:
-        tried = _tried(source.grid, _settled(id=row.object_id, sample=source.sample))
+        tried = tried_names(source.grid, _settled(id=row.object_id, sample=source.sample))
         problems.append(f"no grid for id {row.object_id!r}; looked for {tried} below {source.root}")
     found = [slat for slat in row.slats if slat.path]
     if not found:
@@ -338,8 +222,8 @@ def _pair(row: _Row, there: _Found, shared: str) -> AssetPair:
         )
     return AssetPair(
         asset_id=row.asset_id,
-        object_id=_safe(row.object_id),
-        view=_safe(row.view),
+        object_id=encoded(row.object_id),
+        view=encoded(row.view),
         category=there.categories.get(row.object_id, ""),
         roots=there.roots,
         grid=grid,
@@ -381,7 +265,7 @@ def _no_slat(row: _Row, source: SlatSource, one_file: bool) -> str:
     if one_file:
         tried = " or ".join(f"group {fill(source.group, {'id': name})}" for name in sorted(names))
         return f"no SLAT for id {row.object_id!r}; looked for {tried} in {source.root}"
-    tried = "; ".join(_tried(source.pattern, {"id": name}) for name in sorted(names))
+    tried = "; ".join(tried_names(source.pattern, {"id": name}) for name in sorted(names))
     return f"no SLAT for id {row.object_id!r}; looked for {tried} below {source.root}"
 
 
@@ -408,7 +292,3 @@ def _find_one(
 def _settled(**fields: str) -> dict[str, str]:
     """Return the fields of a pattern that have a value."""
     return {name: value for name, value in fields.items() if value}
-
-
-def _tried(patterns: Iterable[str], known: Mapping[str, str]) -> str:
-    return ", ".join(fill(pattern, known) for pattern in patterns)

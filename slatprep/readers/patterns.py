@@ -7,7 +7,7 @@ Component by component only the folders that can match are listed.
 from __future__ import annotations
 
 import re
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from functools import lru_cache
 from typing import NamedTuple
 
@@ -201,3 +201,8 @@ def _walk(
             yield from _walk(names, path + "/", rest, known | fields, skip)
         elif "*" in literal or names.is_file(path):
             yield Found(known | fields, path)
+
+
+def tried_names(patterns: Iterable[str], known: Mapping[str, str]) -> str:
+    """Return the names that patterns stand for, as `fill` has them, to print."""
+    return ", ".join(fill(pattern, known) for pattern in patterns)

@@ -1,0 +1,138 @@
+"""Finding SLATs by name: files of a folder, groups of HDF5 files, or both."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass
+from urllib.parse import quote
+
+from slatprep.errors import ConfigError, InputError
+from slatprep.parameters import SlatSource
+from slatprep.readers.patterns import find_files, list_below, tried_names
+from slatprep.records import Place
+
+
+@dataclass(frozen=True, slots=True)
+class NamedSlat:
+    """A SLAT by its own names; `path` is empty where a map names one that does not exist."""
+
+    slat_id: str
+    view: str
+    path: str
+    group: str = ""
+    problem: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class SlatFile:
+    """A SLAT that nothing is paired with: its id, its file, the folder that holds it, its group.
+
+    `problem` says why it cannot be used, and is empty where all is well.
+    """
+
+    asset_id: str
+    path: Place
+    root: Place
+    group: str = ""
+    problem: str = ""
+
+
+def discover_slats(source: SlatSource) -> list[SlatFile]:
+    """Find SLATs that need no partner.
+
+    Parameters
+    ----------
+    source : SlatSource
+        A folder of them, or a file: an npz, or an HDF5 file with one SLAT or a group each.
+
+    Returns
+    -------
+    list of SlatFile
+        Sorted by id, ``<id>`` or ``<id>.<view>``, each once; a single file is named
+        after itself.
+
+    Raises
+    ------
+    ConfigError
+        If there is none.
+    """
+    root, one_file = source.root, source.root.is_file()
+    if not one_file and not root.exists():
+        raise ConfigError(f"{root}: does not exist; expected a SLAT, or a folder of them")
+    groups = one_file and root.suffix != ".npz"
+    slats = list(_each_slat(source, True)) if groups else []
+    if one_file and not slats:
+        slats = [NamedSlat(root.name.rpartition(".")[0], "", root.name)]
+    elif not one_file:
+        slats = [slat for found in find_slats(source, False).values() for slat in found]
+    folder, named = root.parent if one_file else root, dict[str, SlatFile]()
+    for slat in ordered(slats):
+        asset_id = encoded(f"{slat.slat_id}.{slat.view}" if slat.view else slat.slat_id)
+        twice = f"two SLATs have the id {asset_id!r}" if asset_id in named else ""
+        problem = slat.problem or twice
+        named[asset_id] = SlatFile(asset_id, folder / slat.path, folder, slat.group, problem)
+    return [named[asset_id] for asset_id in sorted(named)]
+
+
+def find_slats(source: SlatSource, one_file: bool) -> dict[str, list[NamedSlat]]:
+    """Return the SLATs of a folder, or of an HDF5 file, by their ids.
+
+    Raises
+    ------
+    ConfigError
+        If there is none, or the one file cannot be read.
+    """
+    slats: dict[str, list[NamedSlat]] = {}
+    for slat in _each_slat(source, one_file):
+        slats.setdefault(slat.slat_id, []).append(slat)
+    if not slats:
+        tried = f"groups {source.group}" if one_file else tried_names(source.pattern, {})
+        raise ConfigError(f"{source.root}: no SLAT found; looked for {tried}")
+    problems = [slat.problem for found in slats.values() for slat in found if slat.problem]
+    if one_file and problems:
+        raise ConfigError(problems[0])
+    return slats
+
+
+def _each_slat(source: SlatSource, one_file: bool) -> Iterator[NamedSlat]:
+    if one_file:
+        yield from _each_group(source, source.root.parent, source.root.name)
+        return
+    listing = list_below(source.root)
+    unlisted: set[str] = set()
+    for pattern in source.pattern:
+        for fields, path, problem in find_files(listing, pattern, {}):
+            if path in unlisted:
+                continue
+            if problem:
+                unlisted.add(path)
+            if problem or "id" in fields:
+                slat_id, view = fields.get("id", path), fields.get("view", "")
+                yield NamedSlat(slat_id, view, path, problem=problem)
+            else:
+                yield from _each_group(source, source.root, path, fields)
+
+
+def _each_group(
+    source: SlatSource, root: Place, path: str, known: Mapping[str, str] | None = None
+) -> Iterator[NamedSlat]:
+    """Return the SLATs that lie as groups in one HDF5 file."""
+    from slatprep.readers.hdf5 import find_groups
+
+    if "{id}" not in source.group:
+        raise ConfigError(f"group pattern {source.group!r} names no {{id}}")
+    try:
+        for fields, group in find_groups(root / path, root, source.group, known or {}):
+            yield NamedSlat(fields["id"], fields.get("view", ""), path, group)
+    except InputError as error:
+        yield NamedSlat(path, "", path, problem=str(error))
+
+
+def ordered(slats: Iterable[NamedSlat]) -> tuple[NamedSlat, ...]:
+    """Return SLATs in an order that no file system decides."""
+    return tuple(sorted(slats, key=lambda slat: (slat.path, slat.group, slat.slat_id)))
+
+
+def encoded(name: str) -> str:
+    """Return a name as it is where it is a valid id, percent-encoded where it is not."""
+    return quote(name.encode(errors="surrogateescape"), safe="").replace("~", "%7E")
