@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 from slatprep.errors import ConfigError, InputError, SlatprepError
 from slatprep.readers.patterns import NAME
 from slatprep.readers.slat import LATENT_CHANNELS, check_coords
+from slatprep.records import StructuredLatents
 from slatprep.storage.atomic import staged
 
 if TYPE_CHECKING:
@@ -60,6 +61,13 @@ class Pipeline(Protocol):
         self, cond: dict[str, Any], coords: Any, sampler_params: dict[str, Any] = ...
     ) -> Any:
         """Draw latents on them; returns a sparse tensor with ``coords`` and ``feats``."""
+
+    @property
+    def device(self) -> Any:
+        """Where it runs."""
+
+    def decode_slat(self, slat: Any, formats: list[str]) -> dict[str, list[Any]]:
+        """Decode latents, to ``gaussian`` and others."""
 
 
 @dataclass(frozen=True)
@@ -217,6 +225,32 @@ def extract(
             yield _extract(session, extraction, preprocess)
         except InputError as error:
             yield error
+
+
+def decode_gaussians(session: Session, latents: StructuredLatents, path: Path) -> None:
+    """Save the Gaussians that TRELLIS decodes latents to, as TRELLIS saves them.
+
+    Parameters
+    ----------
+    session : Session
+        The loaded pipeline.
+    latents : StructuredLatents
+        Latents as the pipeline draws them, not standardised.
+    path : Path
+        A PLY; one that is there is replaced.
+    """
+    from trellis.modules.sparse import SparseTensor
+
+    torch, device = session.torch, session.pipeline.device
+    coords = np.insert(latents.coords.astype(np.int32), 0, 0, axis=1)
+    with session.torch.no_grad():
+        slat = SparseTensor(
+            feats=torch.from_numpy(latents.feats).to(device),
+            coords=torch.from_numpy(coords).to(device),
+        )
+        (gaussians,) = session.pipeline.decode_slat(slat, ["gaussian"])["gaussian"]
+    with staged(path) as file:
+        gaussians.save_ply(str(file))
 
 
 def _extract(session: Session, extraction: Extraction, preprocess: bool) -> Extracted:

@@ -4,17 +4,21 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
 
-from slatprep.cli.options import NEW_FOLDER, POSITIVE, PlaceType, command, option
+from slatprep.cli.options import NEW_FILE, NEW_FOLDER, POSITIVE, PlaceType, command, option
 from slatprep.cli.output import Output
-from slatprep.errors import InputError
+from slatprep.errors import ConfigError, InputError
 
 if TYPE_CHECKING:
+    from slatprep.extract import Session
     from slatprep.records import Place, StructuredLatents
+
+_IMAGES = (".png", ".jpg", ".jpeg", ".webp", ".bmp")
 
 
 @command()
@@ -22,6 +26,8 @@ if TYPE_CHECKING:
 @option("--checkpoint", click.Path(path_type=Path, exists=True), required=True)
 @option("--out", NEW_FOLDER, required=True)
 @option("--asset", metavar="ID", name="assets", multiple=True)
+@option("--gaussians", NEW_FILE, metavar="FILE.ply")
+@option("--seed", click.IntRange(min=0), 42)
 @option("--device", click.Choice(["cpu", "cuda"]), "cpu")
 @option("--batch-voxels", POSITIVE, 65_536)
 def predict(
@@ -30,12 +36,15 @@ def predict(
     checkpoint: Path,
     out: Path,
     assets: tuple[str, ...],
+    gaussians: Path | None,
+    seed: int,
     device: str,
     batch_voxels: int,
 ) -> None:
     """Predict material fields of SOURCE with a trained decoder.
 
-    SOURCE is a SLAT (npz or HDF5), a folder of them, or a store. Each asset
+    SOURCE is a SLAT (npz or HDF5), a folder of them, a store, or an image,
+    whose latents are drawn by TRELLIS, where that is installed. Each asset
     gives <id>.npz with coords, properties in [-1,1] and properties_si in Pa,
     kg/m^3 and 1, material, probabilities of the eight classes, ranges, the
     checkpoint's SHA-256 and the seconds of its decoding: what `slatprep
@@ -47,6 +56,8 @@ def predict(
     --checkpoint: best.pt of a run of `slatprep train`, or the folder of the run.
     --out: Folder of the predictions; those of other assets stay.
     --asset: Predict this asset alone; may be repeated.
+    --gaussians: Also decode an image's latents to Gaussians, and write those with their materials.
+    --seed: Seed of an image's latents.
     --device: Where to compute.
     --batch-voxels: Assets are decoded together until they have so many voxels.
 
@@ -54,14 +65,18 @@ def predict(
     -------
     slatprep predict latents --checkpoint runs/small --out predictions
     slatprep predict demo.zarr --checkpoint runs/small/best.pt --out predictions --device cuda
+    slatprep predict cup.png --checkpoint runs/large --out cup --gaussians cup.ply --device cuda
     """
     from slatprep.learn import require_torch
 
     require_torch()
     from slatprep.learn import predict as work
 
+    image = _image(output, source, out, seed, device)
+    if gaussians is not None and image is None:
+        raise ConfigError("--gaussians goes with an image; for a PLY there is, slatprep transfer")
     decoder = work.load_checkpoint(checkpoint, device)
-    read = _Reader(output, source, assets)
+    read = _Reader(output, image.latents if image else source, assets)
     predicted, voxels, decoding, writing = 0, 0, 0.0, 0.0
     with output.progress("predict") as progress:
         progress(0, len(read.ids))
@@ -75,6 +90,12 @@ def predict(
             progress(predicted + len(read.problems), len(read.ids))
     counts = {"predicted": predicted, "voxels": voxels}
     seconds = {"read": read.seconds, "decode": decoding, "write": writing}
+    if image:
+        seconds = {"draw latents": image.seconds} | seconds
+    if image and gaussians is not None and predicted:
+        begin = time.perf_counter()
+        _write_gaussians(image, out, gaussians)
+        seconds["gaussians"] = time.perf_counter() - begin
     document = {
         "path": out,
         "checkpoint": decoder.sha256,
@@ -94,6 +115,46 @@ def predict(
         )
 
     output.result(document, show, complete=not read.problems)
+
+
+@dataclass(frozen=True)
+class _Image:
+    """Latents drawn for an image: where they are, by what, and how long it took."""
+
+    latents: Path
+    session: Session
+    seconds: float
+
+
+def _image(output: Output, source: Place, out: Path, seed: int, device: str) -> _Image | None:
+    """Draw the latents of an image; None where the source is none."""
+    if source.suffix.lower() not in _IMAGES:
+        return None
+    from slatprep import extract as work
+
+    session = work.load_session(device=device)
+    begin = time.perf_counter()
+    extractions = work.list_extractions([Path(str(source))], out / "latents", [seed], False)
+    (result,) = work.extract(session, extractions)
+    if isinstance(result, InputError):
+        raise result
+    output.note(f"latents: {extractions[0].slat}")
+    return _Image(extractions[0].slat, session, time.perf_counter() - begin)
+
+
+def _write_gaussians(image: _Image, out: Path, path: Path) -> None:
+    """Decode an image's latents to Gaussians, and give each the material of its voxel."""
+    from slatprep.extract import decode_gaussians
+    from slatprep.particles import transfer as work
+    from slatprep.readers import read_slat
+    from slatprep.storage.names import file_name
+
+    plain = out / "gaussians.ply"
+    decode_gaussians(image.session, read_slat(image.latents, image.latents.parent), plain)
+    field = work.predicted_field(out / f"{file_name(image.latents.stem)}.npz", None)
+    particles = work.read_particles(plain)
+    result = work.transfer(particles.in_slat(), field)
+    work.write_transferred(path, particles, result, max_distance=2.0, in_slat=False)
 
 
 class _Reader:

@@ -4,17 +4,22 @@ from __future__ import annotations
 
 import hashlib
 import json
+import sys
 from pathlib import Path
+from types import ModuleType, SimpleNamespace
+from typing import Any
 
 import h5py
 import numpy as np
 import pytest
 import torch
 from click.testing import CliRunner
+from PIL.Image import Image
 from support.synthetic import Dataset
 
 from slatprep import InputError, build_store, open_store
 from slatprep.cli.commands import slatprep
+from slatprep.extract import Session
 from slatprep.learn.decoder import make_decoder
 from slatprep.learn.metrics import evaluate_store
 from slatprep.learn.predict import checkpoint_state, load_checkpoint, predict
@@ -195,3 +200,79 @@ def test_a_checkpoint_that_says_too_little_is_refused(checkpoint: Path, change: 
         load_checkpoint(checkpoint)
     with pytest.raises(InputError, match="does not exist"):
         load_checkpoint(checkpoint / "other.pt")
+
+
+class Pipeline:
+    """What is used of TRELLIS's image pipeline; its Gaussians lie at the voxels' centres."""
+
+    device = "cpu"
+
+    def __init__(self) -> None:
+        self.sparse_structure_sampler_params: dict[str, object] = {}
+        self.slat_sampler_params: dict[str, object] = {}
+        self.slat_normalization: dict[str, object] = {}
+
+    def preprocess_image(self, input: Image) -> Image:
+        return input
+
+    def get_cond(self, image: list[Image]) -> dict[str, object]:
+        return {}
+
+    def sample_sparse_structure(
+        self, cond: object, num_samples: int = 1, sampler_params: object = None
+    ) -> torch.Tensor:
+        return torch.from_numpy(np.insert(random_latents(9).coords.astype(np.int32), 0, 0, axis=1))
+
+    def sample_slat(
+        self, cond: object, coords: torch.Tensor, sampler_params: object = None
+    ) -> SimpleNamespace:
+        return SimpleNamespace(coords=coords, feats=torch.from_numpy(random_latents(9).feats))
+
+    def decode_slat(self, slat: Any, formats: list[str]) -> dict[str, list[Any]]:
+        assert formats == ["gaussian"]
+        x, y, z = ((slat.coords[:, 1:].numpy() + 0.5) / 64 - 0.5).T
+        self.feats = slat.feats.numpy()
+        names = ("x", "y", "z", "f_dc_0", "opacity", "scale_0", "rot_0")
+        rows = np.zeros(len(x), [(name, "f4") for name in names])
+        rows["x"], rows["y"], rows["z"] = x, -z, y  # as TRELLIS's save_ply turns them
+
+        def save_ply(path: str) -> None:
+            from plyfile import PlyData, PlyElement
+
+            PlyData([PlyElement.describe(rows, "vertex")]).write(path)
+
+        return {"gaussian": [SimpleNamespace(save_ply=save_ply)]}
+
+
+def test_an_image_becomes_gaussians_with_materials(
+    checkpoint: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The whole chain, with TRELLIS's interface in place of TRELLIS."""
+    import PIL.Image
+    from plyfile import PlyData
+
+    pipeline = Pipeline()
+    sparse = SimpleNamespace(SparseTensor=lambda feats, coords: SimpleNamespace(**locals()))
+    monkeypatch.setitem(sys.modules, "trellis", ModuleType("trellis"))
+    monkeypatch.setitem(sys.modules, "trellis.modules", ModuleType("trellis.modules"))
+    monkeypatch.setitem(sys.modules, "trellis.modules.sparse", sparse)
+    monkeypatch.setattr(
+        "slatprep.extract.load_session",
+        lambda device: Session(pipeline, torch, {"name": "m", "revision": "r"}),
+    )
+    PIL.Image.new("RGB", (8, 8)).save(tmp_path / "cup.png")
+    out, ply = tmp_path / "out", tmp_path / "cup.ply"
+    told = run(tmp_path / "cup.png", "--checkpoint", checkpoint, "--out", out, "--gaussians", ply)
+    assert list(told["seconds"]) == ["draw latents", "read", "decode", "write", "gaussians"]  # type: ignore[call-overload]
+    np.testing.assert_array_equal(pipeline.feats, random_latents(9).feats)
+    rows = PlyData.read(str(ply))["vertex"].data
+    with np.load(out / "cup.npz") as held:
+        assert np.array_equal(rows["material_id"], held["material"])
+        np.testing.assert_allclose(rows["E"], held["properties_si"][:, 0], rtol=1e-6)
+    refused = CliRunner().invoke(
+        slatprep,
+        ["predict", str(out / "latents"), "--checkpoint", str(checkpoint), "--out", str(out),
+         "--gaussians", str(ply)],
+    )  # fmt: skip
+    assert refused.exit_code == 2
+    assert "--gaussians goes with an image" in refused.output
