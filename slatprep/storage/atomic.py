@@ -113,7 +113,7 @@ def staged(path: Path) -> Iterator[Path]:
     temporary = path.with_name(f".{path.name}.partial")
     if os.path.lexists(temporary):
         state = temporary.lstat()
-        if stat.S_ISREG(state.st_mode) and state.st_uid == os.geteuid():
+        if stat.S_ISREG(state.st_mode) and state.st_uid == _user():
             temporary.unlink()
         else:
             temporary = path.with_name(f".{path.name}.{secrets.token_hex(8)}.partial")
@@ -125,6 +125,11 @@ def staged(path: Path) -> Iterator[Path]:
         flush(path.parent)
     finally:
         temporary.unlink(missing_ok=True)
+
+
+def _user() -> int:
+    """Return our number; on Windows 0, as files have there."""
+    return getattr(os, "geteuid", int)()
 
 
 @contextmanager
