@@ -13,17 +13,21 @@ import tempfile
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from importlib.util import find_spec
 from itertools import islice
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from slatprep.align import align
 from slatprep.align.deformation import map_of
 from slatprep.align.starts import euler_starts
 from slatprep.align.surface import surface_of
 from slatprep.bench.truth import LevelScore, TruthScore, compare_with_truth, read_truth, summarise
-from slatprep.errors import ConfigError
+from slatprep.demo.generated import nearest_similarity
+from slatprep.errors import ConfigError, SlatprepError
+from slatprep.geometry.frames import voxel_centres
 from slatprep.geometry.voxels import occupancy_of
 from slatprep.parameters import PRESETS, AlignParameters
 from slatprep.parameters.files import load_parameters
@@ -33,9 +37,19 @@ from slatprep.sample import sample
 from slatprep.workers import Progress
 from slatprep.workers.local import single_threaded
 
-ENGINES = ("field", "small_gicp", "open3d", "open3d-64")
-"""The default engine, GICP from the same 24 rotations, the paper's protocol
-without repeated rotations (``--preset paper``), and as published."""
+ENGINES = ("field", "cpd-affine", "cpd-deformable", "small_gicp", "open3d", "open3d-64")
+"""The default engine; from the same 24 rotations Coherent Point Drift, affine and
+deformable, and GICP; the paper's protocol without repeated rotations (``--preset
+paper``), and as published."""
+
+_NEEDS = {
+    "cpd-affine": ("pycpd", "bench"),
+    "cpd-deformable": ("pycpd", "bench"),
+    "small_gicp": ("small_gicp", "bench"),
+    "open3d": ("open3d", "paper"),
+    "open3d-64": ("open3d", "paper"),
+}
+"""The package that an engine needs, and the extra that installs it."""
 
 REFERENCE = "field"
 
@@ -89,10 +103,21 @@ class AlignBench:
     engines: tuple[EngineResult, ...]
 
 
+def installed_engines() -> tuple[str, ...]:
+    """Return those of `ENGINES` whose package is installed."""
+    return tuple(engine for engine in ENGINES if not missing_extra(engine))
+
+
+def missing_extra(engine: str) -> str:
+    """Return the extra of slatprep that an engine waits for; empty where it is installed."""
+    package, extra = _NEEDS.get(engine, ("", ""))
+    return extra if package and find_spec(package) is None else ""
+
+
 def bench_align(
     folder: Path,
     *,
-    engines: Sequence[str] = ENGINES,
+    engines: Sequence[str] = (),
     repeats: int = 3,
     limit: int | None = None,
     progress: Progress | None = None,
@@ -105,8 +130,8 @@ def bench_align(
         Holds ``pixieverse/``, ``slat/`` and ``truth/``, as `make_demo` writes
         them, or several such folders.
     engines : sequence of str
-        Some of `ENGINES`; the first one of them that is timed is the default
-        engine, in any order.
+        Some of `ENGINES`, all that are installed where none is named; the
+        default engine is always among them, and the first.
     repeats : int
         How often each asset is aligned by each engine.
     limit : int, optional
@@ -118,10 +143,19 @@ def bench_align(
     ------
     ConfigError
         If there is no asset with truth, or an engine is unknown.
+    SlatprepError
+        If an engine that is named is not installed.
     """
+    engines = engines or installed_engines()
     unknown = set(engines) - set(ENGINES)
     if unknown:
         raise ConfigError(f"no engine {sorted(unknown)}; expected some of {', '.join(ENGINES)}")
+    for engine in engines:
+        if extra := missing_extra(engine):
+            raise SlatprepError(
+                f"the engine {engine} needs {_NEEDS[engine][0]}, which is not installed: "
+                f"pip install 'slatprep[{extra}]'"
+            )
     chosen = [REFERENCE, *(e for e in ENGINES if e in engines and e != REFERENCE)]
     pairs = list(pairs_with_truth(folder, limit))
     if not pairs:
@@ -148,17 +182,16 @@ def bench_align(
                 fields.append(time.process_time() - begin)
                 for position, engine in enumerate(chosen):
                     begin = time.process_time()
-                    alignment = _align(engine, field, latents)
+                    transform, places = _align(engine, field, latents)
                     seconds[engine].append(time.process_time() - begin)
                     if repeat == 0:
                         preset = PRESETS["default" if engine == REFERENCE else "paper"]
-                        places = map_of(alignment).places(latents.coords)
                         annotation = sample(field, places, preset.sample)
                         score = compare_with_truth(
                             pair.asset_id,
                             truth,
                             coords=latents.coords,
-                            transform=alignment.transform,
+                            transform=transform,
                             places=places,
                             material=annotation.material,
                             valid=annotation.valid,
@@ -205,7 +238,20 @@ def pairs_with_truth(folder: Path, limit: int | None = None) -> Iterator[tuple[A
         yield from islice(found, limit)
 
 
-def _align(engine: str, field: MaterialField, latents: StructuredLatents) -> Alignment:
+def _align(
+    engine: str, field: MaterialField, latents: StructuredLatents
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return the similarity (4, 4) of an engine's map, and where it leads the voxels (N, 3)."""
+    if engine.startswith("cpd-"):
+        from slatprep.bench.cpd import cpd_places
+
+        places = cpd_places(field, latents, deformable=engine == "cpd-deformable")
+        return nearest_similarity(places, voxel_centres(latents.coords)), places
+    alignment = _aligned(engine, field, latents)
+    return alignment.transform, map_of(alignment).places(latents.coords)
+
+
+def _aligned(engine: str, field: MaterialField, latents: StructuredLatents) -> Alignment:
     if engine == "open3d-64":
         from slatprep.align import open3d_icp
 

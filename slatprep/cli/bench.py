@@ -38,12 +38,14 @@ def align(
     Times are processor seconds of one thread, an asset; every engine aligns
     each asset in turn. open3d-64 is the paper's protocol as published, open3d
     the same without repeated rotations (the preset 'paper'), small_gicp GICP
-    from the same rotations, field the default engine.
+    from the same rotations, cpd-affine and cpd-deformable Coherent Point Drift
+    from them, field the default engine. All but the last need extras of
+    slatprep: pip install 'slatprep[bench,paper]'.
 
     Options
     -------
     --data: Folder with pixieverse/, slat/ and truth/, or of such folders. [default: demo data]
-    --engine: Engine to measure; may be repeated. [default: all]
+    --engine: Engine to measure; may be repeated. [default: all that are installed]
     --assets: At most so many assets of each folder. [default: 25 of the demo, all of --data]
     --repeats: How often each is measured.
     --seed: Seed of the demo data.
@@ -53,7 +55,7 @@ def align(
     slatprep bench align --assets 14 --repeats 3
     slatprep bench align --data demo --engine field --engine open3d-64
     """
-    from slatprep.bench.align import ENGINES, bench_align
+    from slatprep.bench.align import ENGINES, bench_align, missing_extra
     from slatprep.demo import make_demo
 
     with tempfile.TemporaryDirectory() as temporary, output.progress("alignments") as progress:
@@ -61,9 +63,12 @@ def align(
             data = Path(temporary) / "demo"
             make_demo(data, assets or 25, seed)
         result = bench_align(
-            data, engines=engines or ENGINES, repeats=repeats, limit=assets, progress=progress
+            data, engines=engines, repeats=repeats, limit=assets, progress=progress
         )
     output.result(result, lambda: _show_align(output, result))
+    for engine in () if engines else ENGINES:
+        if extra := missing_extra(engine):
+            output.note(f"{engine}: not installed, left out (pip install 'slatprep[{extra}]')")
 
 
 def _show_align(output: Output, result: AlignBench) -> None:
