@@ -10,7 +10,13 @@ from slatprep.parameters import SampleParameters
 from slatprep.records import RESOLUTION, UNANNOTATED, Annotation, MaterialField
 
 
-def sample(field: MaterialField, places: ArrayLike, parameters: SampleParameters) -> Annotation:
+def sample(
+    field: MaterialField,
+    places: ArrayLike,
+    parameters: SampleParameters,
+    *,
+    labels_alone: bool = False,
+) -> Annotation:
     """Look material and properties up at SLAT voxels.
 
     Each SLAT voxel, carried into the PixieVerse frame, takes the values of
@@ -30,6 +36,9 @@ def sample(field: MaterialField, places: ArrayLike, parameters: SampleParameters
         so, and the labels follow from what it holds.
     parameters : SampleParameters
         The method, and from which distance on a SLAT voxel is not valid.
+    labels_alone : bool
+        Whether nobody asks how far off the voxels are that are not valid: their
+        ``distance`` is then infinite.
 
     Returns
     -------
@@ -42,7 +51,8 @@ def sample(field: MaterialField, places: ArrayLike, parameters: SampleParameters
     lattice = Lattice(field.voxels)
     place = np.asarray(places, dtype=np.float32)
     points = place.astype(np.float64)
-    distance, used = lattice.nearest(points)
+    limit = parameters.max_distance * (1.0 + 1e-12) if labels_alone else np.inf
+    distance, used = lattice.nearest(points, limit)
     valid = distance <= parameters.max_distance
     if parameters.method == "vote":
         voted = lattice.vote(points, field.material, parameters.vote_width)

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
 from slatprep.geometry.frames import make_transform, places_of, voxel_centres
+from slatprep.geometry.voxels import occupancy_of
 from slatprep.parameters import SampleParameters
 from slatprep.records import MaterialField
 from slatprep.sample import sample
@@ -74,3 +76,23 @@ def test_a_vote_changes_the_class_and_takes_that_class_s_nearest_values() -> Non
     assert voted.material.tolist() == [3]
     np.testing.assert_array_equal(voted.properties[0], properties[0])
     np.testing.assert_allclose(voted.distance, [0.7], rtol=1e-5)
+
+
+@pytest.mark.parametrize("method", ["nearest", "vote"])
+def test_labels_alone_are_the_same_labels(method: str) -> None:
+    rng = np.random.default_rng(3)
+    voxels = np.unique(rng.integers(20, 40, (500, 3)), axis=0).astype(np.uint8)
+    field = MaterialField(
+        occupancy=occupancy_of(voxels),
+        voxels=voxels,
+        material=rng.integers(0, 7, len(voxels)).astype(np.uint8),
+        properties=rng.random((len(voxels), 3), dtype=np.float32),
+    )
+    places = rng.uniform(-0.6, 0.6, (4000, 3))
+    parameters = SampleParameters(method=method, max_distance=2.3)
+    whole = sample(field, places, parameters)
+    alone = sample(field, places, parameters, labels_alone=True)
+    for name in ("properties", "material", "valid", "place"):
+        np.testing.assert_array_equal(getattr(alone, name), getattr(whole, name))
+    np.testing.assert_array_equal(alone.distance[alone.valid], whole.distance[alone.valid])
+    assert np.isinf(alone.distance[~alone.valid]).all()

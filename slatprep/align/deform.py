@@ -59,6 +59,9 @@ SOLVER_STEPS = 6
 """Steps of conjugate gradients for each step of Gauss and Newton."""
 
 OFFSET_PRIOR = 0.01
+PIXIEVERSE_WEIGHT = 0.5
+"""Weight of a PixieVerse sample in a fit: floaters and ground are surface that only they have."""
+
 _RIDGE, _DAMPING = 1e-4, 1e-6
 
 
@@ -159,6 +162,11 @@ class Pairing:
                 self._residuals[rows],
             )  # fmt: skip
 
+    def _linearise_weighted(self, warp: Warp, tau: float) -> None:
+        self.linearise(warp, tau)
+        self._vectors[self._pixie_rows :] *= PIXIEVERSE_WEIGHT**0.5
+        self._residuals[self._pixie_rows :] *= PIXIEVERSE_WEIGHT**0.5
+
     def residuals(self, warp: Warp) -> tuple[Array, Array]:
         """Return the residuals in voxels of the SLAT's and of the PixieVerse samples."""
         self.linearise(warp, 1e6)
@@ -174,7 +182,7 @@ class Pairing:
         """Improve the affine part by one step for each of `taus`, on the samples `seen`."""
         step = np.zeros(13)
         for tau in taus:
-            self.linearise(warp, tau)
+            self._linearise_weighted(warp, tau)
             affine_step(
                 self._places[seen], self._vectors[seen], self._residuals[seen],
                 self.centre, _RIDGE, warp.offset, OFFSET_PRIOR * len(seen), step,
@@ -193,7 +201,7 @@ class Pairing:
         c = warp.coefficients.copy()
         strength = STIFFNESS * len(seen) / (c.size / 3) / warp.spacing**4
         for tau in taus:
-            self.linearise(warp, tau)
+            self._linearise_weighted(warp, tau)
             offset = lattice_step(
                 self._bases[seen], self._weights[seen], self._vectors[seen],
                 self._residuals[seen], c, strength, _DAMPING * len(seen),

@@ -18,7 +18,7 @@ import numpy as np
 from numba import njit
 
 from slatprep.align.bspline import bend, gather, locate, scatter, strides_of
-from slatprep.align.solver import interpolate, solve_symmetric
+from slatprep.align.solver import interpolate, solve_linear
 
 _INVERSE_STEPS = 2
 
@@ -122,7 +122,10 @@ def affine_step(  # type: ignore[no-untyped-def]
     rhs[12] -= offset_prior * offset
     for i in range(n):
         normal[i, i] += ridge * normal[i, i] + 1e-9 * places.shape[0]
-    solve_symmetric(normal, rhs, step)
+    for i in range(n):
+        for j in range(i):
+            normal[i, j] = normal[j, i]
+    solve_linear(normal, rhs, step)
 
 
 @njit(cache=True)

@@ -21,7 +21,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from slatprep.align.deform import Similarity, deform_if_earned, places_of, try_out
+from slatprep.align.deform import CLEAN, Similarity, deform_if_earned, places_of, try_out
 from slatprep.align.quality import compare
 from slatprep.align.starts import candidates_of, distinct_starts, so3_starts
 from slatprep.align.surface import Surface, surface_of
@@ -143,8 +143,10 @@ def align(
             poses = pair.ranked(pair.distinct([*poses, *wide]))
 
     tied = [pose for pose in poses if pose.merit > poses[0].merit - TIE]
-    tied = pair.distinct(pair.refine(tied, FINE_SAMPLES, FINE_TAUS, 0.002))
-    best, model = pair.simplest(tied[0])
+    rough = poses[0].score < CLEAN
+    fine = pair.refine(tied, FINE_SAMPLES, FINE_TAUS, 0.002, size_by_slat=rough)
+    tied = pair.distinct(fine)
+    best, model = pair.simplest(tied[0], rough)
     others = pair.distinct([best, *tied[1:], *poses])[1:]
 
     deformed = deform_if_earned(pair.slat, pair.pixie, best.similarity, model, parameters)
@@ -181,8 +183,9 @@ def refined_at(
     pair = _Pair(surface_of(occupancy_of(latents.coords)), surface_of(field.occupancy), parameters)
     rotation, shift, scale = split_transform(alignment.transform)
     start = Pose(rotation, shift / VOXEL_SIZE, scale)
-    (fine,) = pair.refine([start], FINE_SAMPLES, FINE_TAUS, 0.002)
-    best, model = pair.simplest(fine)
+    rough = alignment.score < CLEAN
+    (fine,) = pair.refine([start], FINE_SAMPLES, FINE_TAUS, 0.002, size_by_slat=rough)
+    best, model = pair.simplest(fine, rough)
     deformed = deform_if_earned(pair.slat, pair.pixie, best.similarity, model, parameters)
     return replace(
         alignment,
@@ -235,8 +238,9 @@ class _Pair:
         taus: Sequence[float],
         tolerance: float,
         free_scale: bool | None = None,
+        size_by_slat: bool = False,
     ) -> list[Pose]:
-        """Refine each pose on an even subset of the samples."""
+        """Refine each pose on an even subset of the samples; see `slatprep.align.solver.solve`."""
         from slatprep.align.solver import solve
 
         slat, pixie = self._subsets(samples)
@@ -250,7 +254,7 @@ class _Pair:
             pixie.points, pixie.values, pixie.distance, pixie.origin,
             rotations, shifts, scales, offsets,
             np.array(taus), self.free_scale if free_scale is None else free_scale,
-            low, high, tolerance,
+            size_by_slat, low, high, tolerance,
         )  # fmt: skip
         return [
             Pose(rotation, shift, float(scale), float(offset), 0.5 * (here + back), within, rmse,
@@ -315,14 +319,16 @@ class _Pair:
         survivors = survivors[: min(max(SURVIVORS, len(likely)), MOST_SURVIVORS)]
         return self.distinct(self.refine(survivors, POLISH_SAMPLES, POLISH_TAUS, 0.01))
 
-    def simplest(self, pose: Pose) -> tuple[Pose, Model]:
+    def simplest(self, pose: Pose, rough: bool) -> tuple[Pose, Model]:
         """Return the pose with its scale set to one where that fits as well, and the model."""
         model = self.parameters.model
         if model in ("rigid", "similarity"):
             return pose, Model(model)
         if abs(pose.scale - 1.0) < RIGID_IF_SCALE_WITHIN:
             start = replace(pose, shift=self._rescaled_shift(pose), scale=1.0)
-            (rigid,) = self.refine([start], FINE_SAMPLES, FINE_TAUS, 0.002, free_scale=False)
+            (rigid,) = self.refine(
+                [start], FINE_SAMPLES, FINE_TAUS, 0.002, free_scale=False, size_by_slat=rough
+            )
             if rigid.score >= pose.score - RIGID_LOSS:
                 return rigid, Model.RIGID
         return pose, Model.SIMILARITY

@@ -144,9 +144,14 @@ def solve(  # type: ignore[no-untyped-def]
     slat_points, slat_values, slat_field, slat_origin,
     pixie_points, pixie_values, pixie_field, pixie_origin,
     rotations, shifts, scales, offsets,
-    taus, free_scale, scale_low, scale_high, tolerance,
+    taus, free_scale, size_by_slat, scale_low, scale_high, tolerance,
 ):  # fmt: skip
     """Refine poses of the PixieVerse surface on the SLAT surface, in place.
+
+    Where `size_by_slat`, the equations of scale and offset are summed over the
+    SLAT samples alone. Floaters, ground and bumps of a rough field are surface
+    that only PixieVerse has, and all of it lies outside: its samples would make
+    the object smaller.
 
     One Gauss-Newton step for each of `taus` (voxels), ended early once a step
     moves the object's rim by less than `tolerance` voxels. Returns, a row a
@@ -160,6 +165,7 @@ def solve(  # type: ignore[no-untyped-def]
     centre /= slat_points.shape[0]
     samples = slat_points.shape[0] + pixie_points.shape[0]
     normal, rhs = np.zeros((UNKNOWNS, UNKNOWNS)), np.zeros(UNKNOWNS)
+    by_slat, rhs_by_slat = np.zeros((UNKNOWNS, UNKNOWNS)), np.zeros(UNKNOWNS)
     step = np.zeros(UNKNOWNS)
     fits = np.zeros((len(scales), 4))
     for pose in range(len(scales)):
@@ -172,21 +178,30 @@ def solve(  # type: ignore[no-untyped-def]
                 slat_points, slat_values, pixie_field, pixie_origin,
                 rotation, shift, scale, offset, centre, tau, True, normal, rhs,
             )  # fmt: skip
+            by_slat[:], rhs_by_slat[:] = normal, rhs
             _accumulate(
                 pixie_points, pixie_values, slat_field, slat_origin,
                 rotation, shift, scale, offset, centre, tau, False, normal, rhs,
             )  # fmt: skip
+            for i in range(UNKNOWNS):
+                for j in range(i):
+                    normal[i, j] = normal[j, i]
+            if size_by_slat:
+                for i in range(6, UNKNOWNS):
+                    rhs[i] = 2.0 * rhs_by_slat[i]
+                    for j in range(UNKNOWNS):
+                        normal[i, j] = 2.0 * by_slat[min(i, j), max(i, j)]
             # On a ball, offset and scale cannot be told apart: a weak prior keeps
             # the offset near 0. A little damping keeps a plane's slide at rest.
             normal[7, 7] += _OFFSET_PRIOR * samples
             rhs[7] += _OFFSET_PRIOR * samples * offset
             if not free_scale:
-                normal[:7, 6] = 0.0
-                normal[6, 6:] = 0.0
+                normal[:, 6] = 0.0
+                normal[6, :] = 0.0
                 rhs[6] = 0.0
             for i in range(UNKNOWNS):
                 normal[i, i] += 1e-4 * normal[i, i] + 1e-6 * samples
-            solve_symmetric(normal, -rhs, step)
+            solve_linear(normal, -rhs, step)
             angle = math.sqrt(step[0] ** 2 + step[1] ** 2 + step[2] ** 2)
             if angle > _LONGEST_TURN:
                 step[:3] *= _LONGEST_TURN / angle
@@ -229,26 +244,26 @@ def _product(matrix, vector):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def solve_symmetric(matrix, rhs, step):  # type: ignore[no-untyped-def]
-    """Solve ``matrix @ step = rhs`` by Cholesky's method, from and in the upper half.
+def solve_linear(matrix, rhs, step):  # type: ignore[no-untyped-def]
+    """Solve ``matrix @ step = rhs`` by elimination with partial pivoting, in place.
 
     A dozen unknowns take less time here than calling LAPACK does, and the bits
     do not depend on which kernels a BLAS picks for the processor.
     """
     n = len(rhs)
     for i in range(n):
-        for j in range(i, n):
-            total = matrix[i, j]
-            for k in range(i):
-                total -= matrix[k, i] * matrix[k, j]
-            matrix[i, j] = math.sqrt(total) if i == j else total / matrix[i, i]
-    for i in range(n):
-        total = rhs[i]
-        for k in range(i):
-            total -= matrix[k, i] * step[k]
-        step[i] = total / matrix[i, i]
-    for i in range(n - 1, -1, -1):
-        total = step[i]
+        pivot = i + np.argmax(np.abs(matrix[i:, i]))
+        if pivot != i:
+            for j in range(i, n):
+                matrix[i, j], matrix[pivot, j] = matrix[pivot, j], matrix[i, j]
+            rhs[i], rhs[pivot] = rhs[pivot], rhs[i]
         for k in range(i + 1, n):
-            total -= matrix[i, k] * step[k]
+            factor = matrix[k, i] / matrix[i, i]
+            for j in range(i + 1, n):
+                matrix[k, j] -= factor * matrix[i, j]
+            rhs[k] -= factor * rhs[i]
+    for i in range(n - 1, -1, -1):
+        total = rhs[i]
+        for j in range(i + 1, n):
+            total -= matrix[i, j] * step[j]
         step[i] = total / matrix[i, i]

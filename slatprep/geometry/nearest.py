@@ -18,6 +18,7 @@ from slatprep.records import RESOLUTION
 
 _REACH = 6  # voxels searched by cells before a tree is built after all
 _SURE = _REACH + 0.5  # no voxel beyond the cells can be nearer than this
+_BLOCK = 4  # cells a side of what is passed over at once
 
 
 class Lattice:
@@ -62,7 +63,8 @@ class Lattice:
             near ones; -1 where the distance exceeds `limit`.
         """
         position = _in_voxels(points)
-        distance, nearest = _search(position, self._row, *_cells(), float(limit) ** 2)
+        near = self._blocks_near(min(limit, _SURE))
+        distance, nearest = _search(position, self._row, near, *_cells(), float(limit) ** 2)
         if limit > _SURE:
             # Few points lie so far off that their cells cannot tell; a tree knows of those.
             far = np.flatnonzero(~(distance <= _SURE))
@@ -70,6 +72,21 @@ class Lattice:
                 voxels = self._voxels.astype(np.intp)
                 distance[far], nearest[far] = _search_far(position[far], voxels, limit)
         return distance, nearest
+
+    def _blocks_near(self, reach: float) -> NDArray[np.bool_]:
+        """Return the blocks of cells that may have a voxel within a reach; far off none need look.
+
+        A set that fills the grid, looked up in one that does not, has mostly such points.
+        """
+        near = np.zeros((RESOLUTION // _BLOCK,) * 3, dtype=bool)
+        near[tuple((self._voxels // _BLOCK).T)] = True
+        for axis in range(3):
+            own = np.moveaxis(near, axis, 0)
+            before = own.copy()
+            for step in range(1, math.ceil((reach + 0.5) / _BLOCK) + 1):
+                own[step:] |= before[:-step]
+                own[:-step] |= before[step:]
+        return near
 
     def vote(
         self, points: NDArray[np.float64], labels: NDArray[np.uint8], width: float
@@ -110,12 +127,16 @@ def _search_far(
 ) -> tuple[NDArray[np.float64], NDArray[np.intp]]:
     from scipy.spatial import cKDTree
 
-    # Of equally near voxels the lower row wins, here as above.
     tree = cKDTree(voxels)
-    distance, nearest = tree.query(position, k=1)
-    for point, apart in enumerate(distance):
-        rivals = tree.query_ball_point(position[point], apart * (1.0 + 1e-12))
-        nearest[point] = min([*rivals, nearest[point]])
+    distances, rows = tree.query(
+        position, k=[1, 2]
+    )  # the second is infinitely far if there is none
+    distance, nearest = distances[:, 0], rows[:, 0]
+    # Of equally near voxels the lower row wins, here as above.
+    alike = distance * (1.0 + 1e-12)
+    tied = np.flatnonzero(distances[:, 1] <= alike)
+    for point, rivals in zip(tied, tree.query_ball_point(position[tied], alike[tied]), strict=True):
+        nearest[point] = min(rivals)
     beyond = distance > limit
     distance[beyond], nearest[beyond] = np.inf, -1
     return distance, nearest
@@ -134,7 +155,7 @@ def _cells() -> tuple[NDArray[np.int64], NDArray[np.float64]]:
 
 
 @njit(cache=True)
-def _search(position, row, offsets, floors, limit):  # type: ignore[no-untyped-def]
+def _search(position, row, near, offsets, floors, limit):  # type: ignore[no-untyped-def]
     count = position.shape[0]
     size = row.shape[0]
     distance = np.full(count, np.inf)
@@ -142,6 +163,9 @@ def _search(position, row, offsets, floors, limit):  # type: ignore[no-untyped-d
     for m in range(count):
         x, y, z = position[m, 0], position[m, 1], position[m, 2]
         a, b, c = int(np.rint(x)), int(np.rint(y)), int(np.rint(z))
+        inside = min(max(a, 0), size - 1), min(max(b, 0), size - 1), min(max(c, 0), size - 1)
+        if not near[inside[0] // _BLOCK, inside[1] // _BLOCK, inside[2] // _BLOCK]:
+            continue
         best, found = np.inf, -1
         for n in range(offsets.shape[0]):
             # Equality goes on: an equally near voxel may have the lower row.

@@ -44,10 +44,11 @@ def measure_ambiguity(
         if alignment.deformation is not None:
             # The others are known without a deformation: like is compared with like.
             places = places_of(latents.coords, alignment.transform)
-            annotation = sample(field, places, parameters)
+            annotation = sample(field, places, parameters, labels_alone=True)
         mapped = to_mapped(annotation.properties)
         for placement in alignment.placements:
-            other = sample(field, places_of(latents.coords, placement.transform), parameters)
+            places = places_of(latents.coords, placement.transform)
+            other = sample(field, places, parameters, labels_alone=True)
             differs |= other.material != annotation.material
             both = annotation.valid & other.valid
             if both.any():

@@ -40,7 +40,7 @@ def code_fingerprint() -> str:
     digest = hashlib.sha256()
     for path in numeric_modules().values():
         tree = _without_docstrings(ast.parse(path.read_bytes()))
-        digest.update(f"{ast.dump(tree)}\n".encode())
+        digest.update(f"{_dump(tree)}\n".encode())
     return digest.hexdigest()
 
 
@@ -80,6 +80,20 @@ def _imports(path: Path) -> Iterator[str]:
             yield from (f"{node.module}.{alias.name}" for alias in node.names)
         elif isinstance(node, ast.Import):
             yield from (alias.name for alias in node.names if alias.name.startswith("slatprep"))
+
+
+def _dump(node: object) -> str:
+    """Write a tree as `ast.dump` does, but alike under every Python.
+
+    Newer ones have more fields, empty where older code could not use them,
+    and leave out others that are empty; so all of those are left out here.
+    """
+    if isinstance(node, ast.AST):
+        fields = (f"{k}={_dump(v)}" for k, v in ast.iter_fields(node) if v is not None and v != [])
+        return f"{type(node).__name__}({', '.join(fields)})"
+    if isinstance(node, list):
+        return f"[{', '.join(map(_dump, node))}]"
+    return ascii(node)  # repr() shows what this Python's edition of Unicode calls printable
 
 
 def _without_docstrings(tree: ast.Module) -> ast.Module:

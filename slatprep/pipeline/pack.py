@@ -76,6 +76,7 @@ def write_shard(
             clipped[asset] = counts
             for array, rows in arrays.items():
                 writers[array].append(rows)
+        reached("shard filled", name)
     reached("shard written", name)
     return shard, clipped
 

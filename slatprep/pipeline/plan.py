@@ -17,6 +17,7 @@ from slatprep.pipeline.context import BuildContext
 from slatprep.provenance.record import AssetRecord, RecordError
 from slatprep.readers.identity import hash_sources
 from slatprep.records import AssetPair, Place, SourceFile
+from slatprep.storage.faults import reached
 from slatprep.workers.local import Jobs, run_unordered
 
 
@@ -141,6 +142,7 @@ def plan_assets(
 def plan_asset(pair: AssetPair, context: BuildContext) -> PlannedAsset:
     """Say what will be done with one asset, and why."""
     asset_id, recipe = pair.asset_id, context.recipe
+    reached("asset compared", asset_id)
     try:
         sources, digests = hash_sources(pair)
     except SlatprepError as error:

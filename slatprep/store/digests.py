@@ -11,12 +11,13 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from slatprep.errors import StoreError
 from slatprep.storage.files import file_digest, local_files
 
 GROUP = "file"
@@ -28,16 +29,29 @@ ATTRIBUTES = "zarr.json#attributes"
 def write_digests(path: Path) -> None:
     """Add the digests of all files to a store that is otherwise complete.
 
+    What no array accounts for is removed first.
+
     Parameters
     ----------
     path : Path
         The store; its root attributes are written, metadata not yet consolidated.
+
+    Raises
+    ------
+    StoreError
+        If a file of an array is not there.
     """
     import zarr
 
     root = zarr.open_group(path, mode="r+", zarr_format=3, use_consolidated=False)
-    files = {name: size for name, size in local_files(path).items() if _is_covered(name)}
-    names, sizes = list(files), list(files.values())
+    meant = dict(_files_of(root))
+    for name in local_files(path).keys() - meant.keys() - {"zarr.json"}:
+        (path / name).unlink()
+    names = sorted(name for name in meant if (path / name).exists())
+    for name in meant.keys() - set(names):
+        if meant[name]:
+            raise StoreError(f"{path / name}: was not written; nothing was replaced. Run again")
+    sizes = [(path / name).stat().st_size for name in names]
     digests = [file_digest(path / name) for name in names]
     attributes = dict(root.attrs)
     names.append(ATTRIBUTES)
@@ -71,8 +85,16 @@ def is_own(name: str) -> bool:
     return name.startswith(f"{GROUP}/")
 
 
-def _is_covered(name: str) -> bool:
-    return name != "zarr.json" and not is_own(name)
+def _files_of(root: Any) -> Iterator[tuple[str, bool]]:
+    """Yield the files of a store by its metadata, and whether each must be there."""
+    for path, node in root.members(max_depth=None):
+        yield f"{path}/zarr.json", True
+        if hasattr(node, "chunks"):  # an array, no group
+            rows = (node.shards or node.chunks)[0]
+            for number in range(-(-node.shape[0] // rows)):
+                key = node.metadata.encode_chunk_key((number,) + (0,) * (node.ndim - 1))
+                # Zarr leaves out files of fill values alone, as a column of empty strings is.
+                yield f"{path}/{key}", not path.startswith("asset/")
 
 
 def _canonical(attributes: Mapping[str, Any]) -> bytes:

@@ -48,8 +48,11 @@ class ShardWriter:
         self._rows = self._chunks = self._bytes = 0
         self._path = store / layout.key(start // layout.shard_rows)
         self._path.parent.mkdir(parents=True, exist_ok=True)
-        # A worker that a cluster has given up may still be writing the same shard.
-        self._partial = self._path.with_name(f".{self._path.name}.{uuid.uuid4().hex}.partial")
+        # Beside the store, where what a killed worker leaves is no part of it; with a name of
+        # its own, as a worker that a cluster has given up may still be writing the same shard.
+        partials = store.with_name(f"{store.name}.partial")
+        partials.mkdir(exist_ok=True)
+        self._partial = partials / uuid.uuid4().hex
         self._file = self._partial.open("wb")
 
     def append(self, rows: NDArray[Any]) -> None:

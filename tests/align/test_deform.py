@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import product
+
 import numpy as np
 import pytest
 from support.deformed import Move, bend, occupancy, stretch
@@ -98,6 +100,28 @@ def test_roughness_is_no_reason_to_deform() -> None:
     assert figures.offset < 0  # it is thicker
 
 
+def test_what_only_the_field_has_does_not_make_the_object_smaller() -> None:
+    """Rough thick fields with blobs afloat, of an object that the SLAT shows 8 % larger."""
+    from scipy.ndimage import distance_transform_edt, gaussian_filter
+
+    solid = occupancy(lambda points: points)
+    latents = latents_of(voxels_of(boundary(occupancy(lambda points: points / 1.08))))
+    signed = distance_transform_edt(~solid) - distance_transform_edt(solid)
+    voxels = np.argwhere(np.ones_like(solid)) - 31.5
+    scales, off = [], []
+    for seed in range(4):
+        rng = np.random.default_rng(seed)
+        noise = gaussian_filter(rng.normal(size=solid.shape), 1.5)
+        rough = signed < 1.0 + 0.6 * noise / noise.std()
+        for centre in rng.uniform(-30, 30, (30, 3)):
+            rough |= (((voxels - centre) ** 2).sum(axis=1) < 6).reshape(solid.shape)
+        alignment = align(field_of(rough), latents, AlignParameters(model="similarity"))
+        scales.append(np.cbrt(np.linalg.det(alignment.transform[:3, :3])))
+        off.append(mistakes(alignment, latents, lambda points: points / 1.08).mean())
+    assert np.mean(scales) == pytest.approx(1.08, abs=0.01)
+    assert np.mean(off) < 0.3
+
+
 def test_a_model_that_is_asked_for_is_fitted_and_the_bound_holds() -> None:
     field, latents = pair(bend)
     for model in ("rigid", "similarity"):
@@ -106,7 +130,12 @@ def test_a_model_that_is_asked_for_is_fitted_and_the_bound_holds() -> None:
         assert plain.deformation is None
     free = align(field, latents, AlignParameters(model="deformable"))
     assert free.deformation is not None
-    farthest = np.linalg.norm(free.deformation.coefficients, axis=-1).max() * 64
+    affine, bending = free.deformation.affine, free.deformation.coefficients
+    low, high = latents.coords.min(axis=0) / 64 - 0.5, (latents.coords.max(axis=0) + 1) / 64 - 0.5
+    corners = np.array(list(product(*np.stack([low, high], axis=1))))
+    by_affine = np.linalg.norm(corners @ affine[:, :3].T + affine[:, 3] - corners, axis=1)
+    by_bending = np.linalg.norm(bending, axis=-1)
+    farthest = max(by_affine.max(), by_bending.max()) * 64
     for limit in (farthest + 1.0, 0.5):
         parameters = AlignParameters(model="deformable", max_displacement=limit)
         bounded = align(field, latents, parameters)
@@ -115,6 +144,9 @@ def test_a_model_that_is_asked_for_is_fitted_and_the_bound_holds() -> None:
             assert limit == 0.5
         else:
             assert np.linalg.norm(bounded.deformation.coefficients, axis=-1).max() * 64 <= limit
+        if limit > farthest:
+            assert bounded.deformation is not None
+            np.testing.assert_array_equal(bounded.deformation.coefficients, bending)
 
 
 def test_repetition_and_the_order_of_voxels_do_not_change_a_bit() -> None:

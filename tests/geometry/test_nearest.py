@@ -33,6 +33,24 @@ def test_of_equally_near_voxels_the_first_is_taken() -> None:
         assert index.tolist() == [0]
 
 
+@pytest.mark.parametrize("limit", [0.5, 1.0, 3.0, 6.5, 9.0, np.inf])
+def test_every_cell_of_the_grid_finds_the_first_of_its_nearest_voxels(limit: float) -> None:
+    """Against all distances by brute force, in whole numbers: near, far, and often tied."""
+    voxels = np.array(
+        [[3, 3, 3], [3, 9, 3], [40, 40, 41], [40, 40, 40], [63, 0, 63], [3, 3, 15]], dtype=np.uint8
+    )
+    cells = np.argwhere(np.ones((64, 64, 64), dtype=bool))
+    squares = ((cells[:, None] - voxels.astype(int)) ** 2).sum(axis=2)
+    least = squares.min(axis=1)
+    first = squares.argmin(axis=1)
+    distance, index = Lattice(voxels).nearest(voxel_centres(cells), limit=limit)
+    within = least <= limit**2
+    assert within.any()
+    np.testing.assert_array_equal(index, np.where(within, first, -1))
+    np.testing.assert_allclose(distance[within], np.sqrt(least[within]), rtol=1e-12)
+    assert np.isinf(distance[~within]).all()
+
+
 def test_beyond_the_limit_nothing_is_found() -> None:
     voxels = np.array([[0, 0, 0]], dtype=np.uint8)
     points = voxel_centres([[2, 0, 0], [3, 0, 0], [63, 63, 63]])

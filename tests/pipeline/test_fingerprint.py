@@ -1,4 +1,5 @@
 import ast
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -29,6 +30,34 @@ def test_statements_count_and_words_do_not(tmp_path: Path, monkeypatch: pytest.M
 def test_it_is_the_same_in_another_process() -> None:
     code = "from slatprep.pipeline.fingerprint import code_fingerprint; print(code_fingerprint())"
     told = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert told.stdout.strip() == code_fingerprint()
+
+
+def test_a_tree_is_written_alike_under_every_python() -> None:
+    text = "class C[T]: x: int = None" if sys.version_info >= (3, 12) else "class C: x: int = None"
+    tree = ast.parse("def f(a, *, b=[]): return f'{a!r:>{b}}' 'x'")
+    assert fingerprint._dump(tree) == (
+        "Module(body=[FunctionDef(name='f', args=arguments(args=[arg(arg='a')], "
+        "kwonlyargs=[arg(arg='b')], kw_defaults=[List(ctx=Load())]), body=[Return("
+        "value=JoinedStr(values=[FormattedValue(value=Name(id='a', ctx=Load()), conversion=114, "
+        "format_spec=JoinedStr(values=[Constant(value='>'), FormattedValue(value=Name(id='b', "
+        "ctx=Load()), conversion=-1)])), Constant(value='x')]))])])"
+    )
+    assert ("type_params" in fingerprint._dump(ast.parse(text))) == ("[" in text)
+
+
+def answers(python: str) -> bool:
+    return subprocess.run([python, "-c", ""], capture_output=True, check=False).returncode == 0
+
+
+@pytest.mark.parametrize("minor", [11, 12, 13, 14])
+def test_it_is_the_same_under_another_python(minor: int) -> None:
+    python = shutil.which(f"python3.{minor}")
+    if minor == sys.version_info[1] or python is None or not answers(python):
+        pytest.skip("this Python, or none")
+    # The module alone, as another Python need not have the libraries.
+    code = f"import runpy; print(runpy.run_path({fingerprint.__file__!r})['code_fingerprint']())"
+    told = subprocess.run([python, "-c", code], capture_output=True, text=True, check=True)
     assert told.stdout.strip() == code_fingerprint()
 
 

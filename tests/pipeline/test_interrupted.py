@@ -18,6 +18,7 @@ from support.synthetic import Dataset, make_asset
 from support.trees import tree
 
 from slatprep.errors import StoreError
+from slatprep.inspect.verify import verify_store
 from slatprep.pipeline.dataset import build_store
 from slatprep.pipeline.work import work_beside
 from slatprep.storage import atomic as replace
@@ -192,6 +193,23 @@ if (step, name) == ("asset begun", "b") and not os.path.exists({died!r}):
     assert done.returncode == 0, done.stderr
     assert Path(died).exists()
     assert tree(tmp_path / "s.zarr") == expected
+
+
+def test_a_worker_that_dies_with_a_shard_open_leaves_nothing_of_it(
+    reference: tuple[Dataset, dict[str, str]], script: Path, tmp_path: Path
+) -> None:
+    dataset, expected = reference
+    out, died = tmp_path / "s.zarr", str(tmp_path / "died")
+    fault = f"""
+if step == "shard filled" and not os.path.exists({died!r}):
+    open({died!r}, "w").close()
+    kill_self()
+"""
+    done = run(script, dataset, out, fault, jobs=2)
+    assert done.returncode == 0, done.stderr
+    assert Path(died).exists()
+    assert tree(out) == expected
+    assert verify_store(out).ok
 
 
 DIES_OF_B = """

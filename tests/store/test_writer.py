@@ -2,8 +2,16 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
+import numpy as np
+import pytest
+import zarr
+
+from slatprep.errors import StoreError
 from slatprep.parameters import StoreParameters
-from slatprep.store.writer import Shard, shards
+from slatprep.store.digests import write_digests
+from slatprep.store.writer import Shard, create_store, shards
 
 
 def test_a_shard_has_the_keys_of_just_those_assets_with_rows_in_it() -> None:
@@ -15,3 +23,32 @@ def test_a_shard_has_the_keys_of_just_those_assets_with_rows_in_it() -> None:
         Shard("grid", (0, 2), 0, ["a", "b"]),
         Shard("grid", (2, 3), 2, ["c"]),
     ]
+
+
+@pytest.fixture
+def written(tmp_path: Path) -> Path:
+    """A store of one asset and 40 voxels, all of whose rows are written."""
+    store = tmp_path / "s"
+    create_store(store, 1, 40, StoreParameters(voxel_chunk=4, voxel_chunks_per_shard=2))
+    root = zarr.open_group(store, mode="r+", use_consolidated=False)
+    with zarr.config.set({"array.write_empty_chunks": True}):
+        for _, array in root.members(max_depth=None):
+            if isinstance(array, zarr.Array):
+                array[...] = np.full(array.shape, array.fill_value, array.dtype)
+    return store
+
+
+def test_what_nobody_meant_to_write_is_not_in_a_store(written: Path) -> None:
+    stray = written / "voxel" / "feats" / "c" / "0" / ".0.c196bb58.partial"
+    stray.write_bytes(b"what a killed worker left")
+    write_digests(written)
+    assert not stray.exists()
+    names = zarr.open_group(written, mode="r", use_consolidated=False)["file/name"][:]
+    assert "voxel/feats/c/4/0" in names
+    assert not any("partial" in name for name in names)
+
+
+def test_a_shard_that_was_not_written_ends_the_build(written: Path) -> None:
+    (written / "voxel" / "feats" / "c" / "1" / "0").unlink()
+    with pytest.raises(StoreError, match="voxel/feats/c/1/0: was not written"):
+        write_digests(written)

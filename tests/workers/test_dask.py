@@ -39,6 +39,12 @@ faults = Path(__file__).parent
 
 
 def reached(step, name):
+    if step == "shard filled":
+        try:
+            (faults / "kill-once").unlink()
+        except FileNotFoundError:
+            return
+        os.kill(os.getpid(), signal.SIGKILL)
     if step != "asset begun":
         return
     if (faults / f"deadly-{name}").exists():
@@ -200,6 +206,20 @@ def test_a_build_whose_worker_is_killed_gives_the_same_bytes(
     assert build.returncode == 0, errors
     assert errors == f"{address}: 3 workers\n"
     assert tree(tmp_path / "s.zarr") == tree(expected)
+
+
+def test_a_worker_that_is_killed_with_a_shard_open_leaves_nothing_of_it(
+    shared: tuple[Processes, str], address: str, local: tuple[Dataset, Path], tmp_path: Path
+) -> None:
+    dataset, expected = local
+    once = shared[0].folder / "kill-once"
+    once.touch()
+    with Cluster(address) as cluster:
+        summary = build_store(dataset.parameters("pixie"), tmp_path / "s.zarr", jobs=cluster)
+    assert not once.exists()
+    assert summary.complete
+    assert tree(tmp_path / "s.zarr") == tree(expected)
+    assert verify_store(tmp_path / "s.zarr").ok
 
 
 def test_an_asset_that_kills_every_worker_is_named_and_the_others_go_in(
