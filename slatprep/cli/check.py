@@ -26,15 +26,15 @@ if TYPE_CHECKING:
     from slatprep.records import Place
     from slatprep.store import Store
 
-_COLUMNS = (
-    "confidence",
-    "expected_accuracy",
-    "fitness",
-    "fitness_backward",
-    "inlier_rmse",
-    "valid_share",
-    "ambiguity",
-)
+_COLUMNS = {
+    "confidence": "confidence",
+    "labels": "expected_accuracy",
+    "fitness": "fitness",
+    "back": "fitness_backward",
+    "valid": "valid_share",
+    "tied": "ambiguity",
+}
+"""Figures by their short titles, of which a line has room for six."""
 
 
 @command("check-alignment")
@@ -132,14 +132,15 @@ def _print(output: Output, checks: list[AlignmentCheck]) -> None:
     if not checks:
         say("no asset is ambiguous")
     if len(checks) > 1:
+        length = output.id_length(one.asset_id for one in checks)
         output.table(
-            "Alignments (rmse in voxels)",
-            ("asset", "verdict", *_COLUMNS, "consistent"),
+            "Alignments",
+            ("asset", "verdict", *_COLUMNS, "as stored"),
             [
                 (
-                    one.asset_id,
+                    one.asset_id[:length],
                     one.verdict,
-                    *(one.value(n) for n in _COLUMNS),
+                    *(one.value(name) for name in _COLUMNS.values()),
                     one.consistent,
                 )
                 for one in checks

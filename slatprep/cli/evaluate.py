@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -91,7 +92,12 @@ def evaluate(
             csv.writer(file).writerows([header, *(map(_cell, row) for row in rows)])
 
     def show() -> None:
-        output.table("Mean squared error in normalised space; accuracy of the class", header, rows)
+        what = "standard error" if spread == "se" else "standard deviation"
+        output.table(
+            f"Mean squared error in normalised space, class accuracy (± {what} over n objects)",
+            ("category", "n", *result.overall.means),
+            _in_short(result),
+        )
         if beside is not None:
             _show_beside(output, result, others, beside)
 
@@ -132,6 +138,18 @@ def _show_beside(
     else:
         title = f"Beside {beside}"
     output.table(title, ("method", *names), rows)
+
+
+def _in_short(result: Evaluation) -> list[tuple[str | int, ...]]:
+    """Return the rows for people: each mean with its spread, where there is one."""
+    rows: list[tuple[str | int, ...]] = []
+    for name, m in {**result.categories, "all": result.overall}.items():
+        cells = (
+            f"{mean:.3f}" if math.isnan(m.spreads[key]) else f"{mean:.3f}±{m.spreads[key]:.3f}"
+            for key, mean in m.means.items()
+        )
+        rows.append((name or "(none)", m.objects, *cells))
+    return rows
 
 
 def _rows(result: Evaluation) -> list[tuple[str | int | float, ...]]:

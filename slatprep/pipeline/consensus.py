@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 from slatprep.align.consensus import find_consensus, settle
 from slatprep.parameters import BuildParameters
@@ -13,7 +13,11 @@ from slatprep.workers.local import Jobs, run_unordered
 
 
 def apply_consensus(
-    assets: Sequence[SpooledAsset], spool: Spool, parameters: BuildParameters, jobs: Jobs
+    assets: Sequence[SpooledAsset],
+    spool: Spool,
+    parameters: BuildParameters,
+    jobs: Jobs,
+    note: Callable[[str], None] | None = None,
 ) -> list[SpooledAsset]:
     """Give ambiguous assets the placement nearest to the dataset's common rotation, if asked to.
 
@@ -27,6 +31,8 @@ def apply_consensus(
         Whether to do it, and how to align and to look up.
     jobs : int or Workers
         Worker processes, or a cluster's.
+    note : callable, optional
+        Gets a line that says what came of it.
 
     Returns
     -------
@@ -40,10 +46,18 @@ def apply_consensus(
         for asset in assets
         if not asset.n_placements and asset.columns["verdict"] != Verdict.FAILED
     )
+    tied = [asset for asset in assets if asset.n_placements]
+    tell = note or (lambda line: None)
     if consensus is None:
+        tell(f"consensus: too few assets share a rotation; all {len(tied):,} ties stay")
         return list(assets)
-    tied = ((asset, spool, consensus, parameters) for asset in assets if asset.n_placements)
-    changed = {asset.asset_id: asset for asset in run_unordered(settle_asset, tied, jobs)}
+    tasks = ((asset, spool, consensus, parameters) for asset in tied)
+    changed = {asset.asset_id: asset for asset in run_unordered(settle_asset, tasks, jobs)}
+    moved = sum(changed[asset.asset_id] is not asset for asset in tied)
+    tell(
+        f"consensus: {consensus.agreeing:,} of {consensus.winners:,} assets without a tie share a "
+        f"rotation; {moved:,} of {len(tied):,} ties were given another placement by it"
+    )
     return [changed.get(asset.asset_id, asset) for asset in assets]
 
 

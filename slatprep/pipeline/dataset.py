@@ -124,7 +124,7 @@ def build_store(
             return repeat_summary(assets, context, place, time.perf_counter() - begin)
         assets += _finish(unchanged, plan, context, jobs, progress)
         usable, failed = _usable_and_failed(assets, parameters, pairs)
-        usable = apply_consensus(usable, work.spool, parameters, jobs)
+        usable = apply_consensus(usable, work.spool, parameters, jobs, note)
         usable = apply_witness(usable, work.spool, parameters, jobs)
         with writing(str(place.out), work_directory(place.store).parent):
             packed = _pack(usable, failed, given, work, parameters, jobs)

@@ -18,6 +18,8 @@ MOST = 60
 _ACROSS = 4
 _THUMBNAIL = 200
 _MARGIN, _HEAD, _GAP = 40, 84, 20
+_TITLE = 26
+"""Characters of a title that leave room for the verdict."""
 _CELL_WIDTH, _CELL_HEIGHT = 2 * _THUMBNAIL + _GAP, _THUMBNAIL + 66
 
 
@@ -62,12 +64,16 @@ def draw_sheet(
                 figure.figimage(pixels, xo=left, yo=bottom, origin="upper")
             colour = palette.VERDICT_COLOURS[check.verdict]
             line = y + _THUMBNAIL + 16
-            write(figure, x, line, title, size=7.5, weight="bold")
+            write(figure, x, line, _cut(title), size=7.5, weight="bold")
             write(figure, x + _CELL_WIDTH - _GAP, line, str(check.verdict), size=7.5, weight="bold",
                  color=colour, ha="right")  # fmt: skip
             write(figure, x, line + 17, check.asset_id[:40], size=6.5, color=palette.MUTED)
             worse = min(check.figure("fitness").value, check.figure("fitness_backward").value)
             sure = check.value("confidence")
-            words = f"confidence {sure:.3f}   fitness {worse:.3f}"
+            words = f"confidence {sure:.3f}   fitness {worse:.3f} (the lower of both ways)"
             write(figure, x, line + 32, words, size=6.5, color=palette.MUTED)
         return png_of(figure)
+
+
+def _cut(title: str) -> str:
+    return title if len(title) <= _TITLE else f"{title[: _TITLE - 1]}…"

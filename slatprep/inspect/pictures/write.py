@@ -76,8 +76,8 @@ def write_pictures(
 
 
 def title_of(asset: StoredAsset) -> str:
-    """Return what a picture calls an asset: its category, else its id."""
-    return str(asset.columns["category"]).replace("_", " ") or asset.asset_id
+    """Return what a picture calls an asset, whose id stands below: its category."""
+    return str(asset.columns["category"]).replace("_", " ") or "category unknown"
 
 
 def subtitle_of(asset: StoredAsset) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
@@ -70,6 +71,11 @@ def page_content(
         "build_id": store.about.manifest,
         "records": outcomes is not None,
         "versions": build.versions,
+        "parameters": [
+            (f"{group}.{name}", json.dumps(value))
+            for group, entries in sorted(store.attributes["build"]["parameters"].items())
+            for name, value in sorted(entries.items())
+        ],
         "voxels": int(store.offsets[-1]),
         "engine": sorted(set(map(str, store.column("engine")))),
         "thresholds": {

@@ -24,6 +24,7 @@ const Filter = (() => {
     for (let index = 0; index < TOTAL; index++) if (matches(index)) found.push(index);
     Table.show(found);
     byId("count").textContent = found.length === TOTAL ? `${Format.plural(TOTAL, "asset")}` : `${Format.count(found.length)} of ${Format.plural(TOTAL, "asset")}`;
+    if (!found.length) byId("count").textContent += ": none matches; clear the search or remove a filter";
     for (const chip of document.querySelectorAll("#state-chips .chip")) {
       chip.setAttribute("aria-pressed", String(chosen.states?.includes(chip.dataset.state) ?? false));
     }

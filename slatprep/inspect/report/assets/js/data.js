@@ -6,7 +6,7 @@ const TOTAL = ASSETS.id.length;
 
 const STATES = [
   { name: "good", sign: "✓", means: "the surfaces lie on each other" },
-  { name: "doubtful", sign: "?", means: "wants looking at" },
+  { name: "doubtful", sign: "?", means: "should be looked at" },
   { name: "failed", sign: "!", means: "the surfaces do not lie on each other" },
   { name: "not built", sign: "✕", means: "could not be used, not in the store" },
   { name: "skipped", sign: "–", means: "a partner is missing, not in the store" },

@@ -215,6 +215,7 @@ const Sections = (() => {
     byId("detail-hint").textContent = notes.join(" ");
     byId("detail-hint").hidden = !notes.length;
     byId("colophon").textContent = `Made by slatprep ${CONTENT.versions.slatprep} from build ${CONTENT.build_id.slice(0, 12)}.`;
+    byId("parameters").replaceChildren(...CONTENT.parameters.map(([name, value]) => el("li", {}, el("code", {}, `${name} = ${value}`))));
   }
 
   return { states, quality, rotations, properties, balance, colophon };

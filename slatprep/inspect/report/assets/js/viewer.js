@@ -7,6 +7,8 @@ const Viewer = (() => {
     ...CONTENT.properties.map((property) => ({ key: property.name, title: PROPERTY_NAMES[property.name].symbol, property })),
     { key: "distance", title: "Distance" },
   ];
+  const AXIS = 0.22;
+  const AXIS_COLOURS = ["#d1453b", "#3a9a4b", "#3f7fd6"];
   const canvas = byId("canvas");
   const reduced = matchMedia("(prefers-reduced-motion: reduce)");
   let three = null; // renderer, scene, camera, controls, key light
@@ -53,11 +55,29 @@ const Viewer = (() => {
 
   let pointer = null;
 
-  /** The unit cube that both frames share, drawn thin. */
+  /** The unit cube that both frames share, drawn thin, and the axes from its lowest corner. */
   function addFrame() {
-    const { BoxGeometry, EdgesGeometry, LineSegments, LineBasicMaterial } = THREE;
+    const { BoxGeometry, EdgesGeometry, InstancedMesh, LineSegments, LineBasicMaterial, Matrix4, MeshLambertMaterial, Vector3 } = THREE;
     const material = new LineBasicMaterial({ color: 0x8a94a1, transparent: true, opacity: 0.5 });
     three.scene.add(new LineSegments(new EdgesGeometry(new BoxGeometry(1, 1, 1)), material));
+    three.axes = ["x", "y", "z"].map((name, axis) => {
+      const along = (size, across) => [0, 1, 2].map((k) => (k === axis ? size : across));
+      const bar = new InstancedMesh(new BoxGeometry(...along(AXIS, 0.008)), new MeshLambertMaterial({ color: AXIS_COLOURS[axis] }), 1);
+      bar.setMatrixAt(0, new Matrix4().makeTranslation(...along(AXIS / 2 - 0.5, -0.5)));
+      three.scene.add(bar);
+      const label = el("span", { class: "axis-name", "aria-hidden": "true", style: { "--tone": AXIS_COLOURS[axis] } }, name);
+      canvas.after(label);
+      return { label, end: new Vector3(...along(AXIS - 0.47, -0.5)) };
+    });
+  }
+
+  /** Put the names of the axes where their ends are seen. */
+  function placeNames() {
+    for (const { label, end } of three.axes) {
+      const seen = end.clone().project(three.camera);
+      label.style.left = `${(seen.x + 1) * 0.5 * canvas.clientWidth}px`;
+      label.style.top = `${(1 - seen.y) * 0.5 * canvas.clientHeight}px`;
+    }
   }
 
   function resize() {
@@ -241,7 +261,11 @@ const Viewer = (() => {
     stale = false;
   }
 
-  const draw = () => three && three.renderer.render(three.scene, three.camera);
+  function draw() {
+    if (!three) return;
+    three.renderer.render(three.scene, three.camera);
+    placeNames();
+  }
 
   function onKey(event) {
     const turn = { ArrowLeft: [-0.12, 0], ArrowRight: [0.12, 0], ArrowUp: [0, -0.12], ArrowDown: [0, 0.12] }[event.key];
