@@ -194,3 +194,19 @@ def test_a_plain_loader_takes_collate(learn_store: Path) -> None:
     dataset = SlatDataset(learn_store)
     batches = list(DataLoader(dataset, batch_size=4, collate_fn=collate))
     assert [asset for batch in batches for asset in batch.asset_ids] == dataset.asset_ids
+
+
+def test_voxels_that_are_not_sure_enough_are_left_out(learn_store: Path) -> None:
+    store = open_store(learn_store)
+    spread = np.concatenate([asset.confidence[asset.valid] for asset in store])
+    least = float(np.median(spread))
+    assert (spread >= least).any() and (spread < least).any()
+    everything, sure = SlatDataset(store), SlatDataset(store, min_confidence=least)
+    for number, asset_id in enumerate(sure.asset_ids):
+        asset, item, whole = store.asset(asset_id), sure[number], everything[number]
+        kept = asset.valid & (asset.confidence >= least)
+        np.testing.assert_array_equal(item.valid.numpy(), kept)
+        np.testing.assert_array_equal(whole.valid.numpy(), asset.valid)
+        np.testing.assert_array_equal(item.confidence.numpy(), asset.confidence)
+        np.testing.assert_array_equal(item.material.numpy() != IGNORED, kept)
+        assert not item.properties.numpy()[~kept].any()

@@ -184,6 +184,24 @@ def test_commands_train_and_evaluate(learn_store: Path, tmp_path: Path) -> None:
     assert wrong.exit_code == 2
 
 
+def test_the_command_weighs_voxels_by_their_confidence(learn_store: Path, tmp_path: Path) -> None:
+    losses = []
+    for number, weigh in enumerate(([], ["--weigh-by-confidence"], ["--weigh-by-confidence"])):
+        run = tmp_path / str(number)
+        result = CliRunner().invoke(
+            slatprep,
+            ["train", str(learn_store), "--out", str(run), "--size", "small", "--epochs", "1",
+             "--threads", "1", "--shares", "0.4,0.3,0.3", "--json", *weigh],
+        )  # fmt: skip
+        assert result.exit_code == 0, result.output
+        (epoch,) = json.loads(result.stdout)["small"]["history"]
+        losses.append(epoch["train_loss"])
+        told = json.loads((run / "run.json").read_text())
+        assert told["weigh_by_confidence"] is bool(weigh)
+    # No class is certain, so each voxel weighs less than one, and the loss with it.
+    assert losses[1] == losses[2] < losses[0]
+
+
 def test_a_run_is_trained_by_one_process_at_a_time(learn_store: Path, tmp_path: Path) -> None:
     held = take_lock(tmp_path / "run" / ".lock", "by the test")
     with pytest.raises(StoreError, match=rf"another training .* \(process {os.getpid()} on"):

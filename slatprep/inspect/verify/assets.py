@@ -15,18 +15,31 @@ from slatprep.align.deformation import map_of
 from slatprep.errors import InputError, StoreError
 from slatprep.geometry.voxels import flat_index
 from slatprep.inspect.check import TOLERANCES, recompute_annotation
+from slatprep.judge import voxel_confidence
 from slatprep.normalize import normalize_change
 from slatprep.pipeline.previous import PLACE_TOLERANCE
 from slatprep.provenance.columns import columns_of
 from slatprep.provenance.record import AssetRecord, RecordError
 from slatprep.provenance.stored import StoredRecords
-from slatprep.records import BACKGROUND, RESOLUTION, UNANNOTATED, Model, Place, SourceRoots
+from slatprep.records import (
+    BACKGROUND,
+    RESOLUTION,
+    UNANNOTATED,
+    Annotation,
+    Model,
+    Place,
+    SourceRoots,
+    StructuredLatents,
+)
 from slatprep.storage.files import file_digest
 from slatprep.storage.place import storage_of
 from slatprep.store.contract import Finding
 from slatprep.store.reader import Store, StoredAsset, open_store
 from slatprep.store.records import RECORD_ARRAY
 from slatprep.store.shard_reader import DamagedFileError
+
+CONFIDENCE_TOLERANCE = 1e-5
+"""By so much a voxel's probability may differ: another machine may round its sums otherwise."""
 
 
 def asset_findings(
@@ -77,6 +90,8 @@ def asset_findings(
             findings.append(Finding(RECORD_ARRAY, asset_id, f"no record ({error})", "one a row"))
             continue
         findings += record_findings(asset, record, store)
+        if not own:  # Values that are no probabilities, classes or places give none.
+            findings += confidence_findings(asset, record)
         if roots is not None:
             findings += source_findings(record, roots, run)
             sources += len(record.sources)
@@ -175,6 +190,23 @@ def record_findings(asset: StoredAsset, record: AssetRecord, store: Store) -> It
     if wrong:
         what = f"{wrong} of {len(places)} voxels differ"
         yield Finding("voxel/place", asset.asset_id, what, "where the map in the record leads")
+
+
+def confidence_findings(asset: StoredAsset, record: AssetRecord) -> Iterator[Finding]:
+    """Yield where ``voxel/confidence`` is not what the field, the map and the record give."""
+    if asset.store.format_version == 1:
+        return
+    annotation = Annotation(
+        asset.properties, asset.material, asset.valid, asset.distance, asset.place
+    )
+    latents = StructuredLatents(asset.coords, asset.feats)
+    confidence = record.judgement.confidence
+    likely = voxel_confidence(asset.field, latents, record.alignment, annotation, confidence)
+    wrong = np.count_nonzero(~(np.abs(likely - asset.confidence) <= CONFIDENCE_TOLERANCE))
+    if wrong:
+        what = f"{wrong} of {len(likely)} voxels differ"
+        expected = "what the grid, the places and the record give"
+        yield Finding("voxel/confidence", asset.asset_id, what, expected)
 
 
 def source_findings(record: AssetRecord, roots: SourceRoots, run: str) -> Iterator[Finding]:

@@ -183,6 +183,16 @@ def test_a_voxel_that_is_not_valid_but_labelled_is_found(store: Path) -> None:
     assert {"voxel/material", "voxel/properties"} <= files
 
 
+def test_another_confidence_of_a_voxel_is_found(store: Path) -> None:
+    asset = open_store(store).asset("ant")
+    assert asset.valid[7] and abs(asset.confidence[7] - 0.5) > 0.1
+    rewrite(store, "voxel/confidence", 7, 0.5)
+    findings = of_file(found(store), "voxel/confidence")
+    assert [(f.asset, f.what) for f in findings] == [
+        ("ant", f"1 of {len(asset.coords)} voxels differ")
+    ]
+
+
 def test_a_row_that_its_record_does_not_tell_of_is_found(store: Path) -> None:
     rewrite(store, "asset/fitness", 0, 0.123)
     findings = [f for f in found(store) if f.file == "asset/record"]
