@@ -97,7 +97,11 @@ def test_a_deformation_is_shown_before_and_after_and_as_displacement(
         similar = apply_transform(invert_transform(asset.transform), voxel_centres(asset.coords))
         moved = np.linalg.norm(true_places - similar, axis=1) * 64
         assert np.median(np.abs(scene.deformed.displacement - moved)) < 0.7
-        assert np.median(scene.error) < 0.6 * np.median(scene.error_before)
+        # Where the voxels truly lie they are as near to the surface as two lattices can be.
+        surface = cKDTree(voxel_centres(scene.pixieverse))
+        least, _ = surface.query(MOVES[asset.asset_id](voxel_centres(scene.surface)))
+        assert np.median(scene.error) < 64 * np.median(least) + 0.1
+        assert np.quantile(scene.error, 0.9) < 0.4 * np.quantile(scene.error_before, 0.9)
         for view in views(scene, 90):
             before, similarity, deformed, displacement, result, error = panels(scene, view)
             assert np.abs(similarity - before).sum() > 9
