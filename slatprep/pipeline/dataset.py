@@ -28,7 +28,8 @@ from slatprep.pipeline.update import is_current, repeat_summary
 from slatprep.pipeline.witness import apply_witness
 from slatprep.pipeline.work import Work, work_beside, work_directory
 from slatprep.provenance.make import complete_record, origin
-from slatprep.provenance.record import AssetRecord, Clipped, Record, write_records
+from slatprep.provenance.record import AssetRecord, Clipped, Record
+from slatprep.provenance.record_json import write_records
 from slatprep.readers import discover
 from slatprep.records import AssetPair, Normalization, Place
 from slatprep.storage.atomic import staged, writing

@@ -28,7 +28,8 @@ from slatprep.pipeline.spool import spooled
 from slatprep.pipeline.summary import BuildSummary, summarise_build
 from slatprep.pipeline.work import work_beside, work_directory
 from slatprep.provenance.places import manifests_beside
-from slatprep.provenance.record import AssetRecord, adapter_of, read_build_record
+from slatprep.provenance.record import AssetRecord
+from slatprep.provenance.record_json import adapter_of, read_build_record
 from slatprep.provenance.stored import StoredRecords
 from slatprep.records import Normalization, Place, PropertyRange
 from slatprep.storage.atomic import writing

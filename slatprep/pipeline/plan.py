@@ -14,7 +14,8 @@ from enum import StrEnum
 
 from slatprep.errors import SlatprepError, StoreError
 from slatprep.pipeline.context import BuildContext
-from slatprep.provenance.record import AssetRecord, RecordError
+from slatprep.provenance.record import AssetRecord
+from slatprep.provenance.record_json import RecordError
 from slatprep.readers.identity import hash_sources
 from slatprep.records import AssetPair, Place, SourceFile
 from slatprep.storage.faults import reached

@@ -26,9 +26,8 @@ from slatprep.provenance.record import (
     PropertyCounts,
     Record,
     Versions,
-    to_json,
-    write_records,
 )
+from slatprep.provenance.record_json import to_json, write_records
 from slatprep.records import Place
 from slatprep.storage.atomic import replace_directory
 from slatprep.storage.faults import reached

@@ -16,7 +16,8 @@ from slatprep.align.settle import refit
 from slatprep.judge import judge_with_voxels
 from slatprep.parameters import BuildParameters
 from slatprep.pipeline.spool import Spool, SpooledAsset
-from slatprep.provenance.record import AssetRecord, FailedRecord, FirstPass, to_json
+from slatprep.provenance.record import AssetRecord, FailedRecord, FirstPass
+from slatprep.provenance.record_json import to_json
 from slatprep.records import Alignment, Annotation, Judgement, MaterialField, StructuredLatents
 from slatprep.sample import sample
 

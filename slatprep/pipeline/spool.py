@@ -23,7 +23,8 @@ from numpy.typing import NDArray
 from slatprep.errors import StoreError
 from slatprep.normalize import property_extent
 from slatprep.provenance.columns import Column, columns_of
-from slatprep.provenance.record import AssetRecord, FailedRecord, Record, read_record, to_json
+from slatprep.provenance.record import AssetRecord, FailedRecord, Record
+from slatprep.provenance.record_json import read_record, to_json
 from slatprep.records import (
     RESOLUTION,
     Annotation,

@@ -16,10 +16,8 @@ from slatprep.pipeline.publish import Destination, build_record, publish_manifes
 from slatprep.pipeline.spool import FailedAsset, SpooledAsset, spooled
 from slatprep.pipeline.summary import BuildSummary, summarise_build
 from slatprep.provenance.make import origin
-from slatprep.provenance.record import (
-    BuildRecord,
-    Clipped,
-    Record,
+from slatprep.provenance.record import BuildRecord, Clipped, Record
+from slatprep.provenance.record_json import (
     read_build_record,
     read_record,
     records_id,

@@ -5,7 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 from slatprep.errors import StoreError
-from slatprep.provenance.record import BuildRecord, read_build_record
+from slatprep.provenance.record import BuildRecord
+from slatprep.provenance.record_json import read_build_record
 from slatprep.records import Place
 from slatprep.storage.documents import read_bounded
 from slatprep.storage.place import storage_of

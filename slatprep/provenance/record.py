@@ -1,26 +1,20 @@
 """The records of an asset and of a build: what was made from what, by what, and how well.
 
-They are written by `to_json` and read by `read_record` and its siblings, and
-nowhere else. A record that is read is checked: unknown keys, types, ranges and
+They are written and read by `slatprep.provenance.record_json`, and nowhere
+else. A record that is read is checked: unknown keys, types, ranges and
 digests. ``slatprep/provenance/schema`` holds the JSON Schemas, which
 `slatprep.provenance.schemas` makes from these classes.
 """
 
 from __future__ import annotations
 
-import hashlib
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from datetime import datetime
-from functools import lru_cache
-from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Final, Literal
+from typing import TYPE_CHECKING, Annotated, ClassVar, Final, Literal
 
-import numpy as np
-import orjson
 from annotated_types import Ge, MaxLen, MinLen
 
-from slatprep.errors import StoreError
 from slatprep.parameters import AlignParameters, BuildParameters, SampleParameters
 from slatprep.records import (
     PROPERTY_COLUMNS,
@@ -34,10 +28,9 @@ from slatprep.records import (
     Status,
     Verdict,
 )
-from slatprep.storage.place import is_place
 
 if TYPE_CHECKING:
-    from pydantic import TypeAdapter, ValidationError
+    pass
 
 RECORD_VERSION: Final = 2
 
@@ -280,137 +273,6 @@ class BuildRecord:
     """Voxels of the store."""
 
 
-_FAULTS = 64
-
-
-class RecordError(StoreError):
-    """A record that cannot be read.
-
-    Parameters
-    ----------
-    where : str
-        The file, and the line or row in it.
-    faults : tuple of str
-        What is wrong, each with its place in the record and the value there.
-    """
-
-    def __init__(self, where: str, faults: tuple[str, ...]) -> None:
-        super().__init__(
-            f"{where}: not a record that this version of slatprep reads ({'; '.join(faults[:3])}); "
-            "build again to have it written anew"
-        )
-        self.faults = faults
-
-
-def to_json(record: Record | BuildRecord, *, indent: bool = False) -> bytes:
-    """Return a record as JSON in UTF-8: in one line, or indented; NaN becomes null."""
-    option = orjson.OPT_SERIALIZE_NUMPY | (orjson.OPT_INDENT_2 if indent else 0)
-    return orjson.dumps(record, default=_plain, option=option)
-
-
-def read_record(text: bytes | str, where: str) -> Record:
-    """Read a line of ``assets.jsonl``.
-
-    Parameters
-    ----------
-    text : bytes or str
-        JSON.
-    where : str
-        What errors call it.
-
-    Raises
-    ------
-    RecordError
-        If it is no record of this version, or breaks its schema.
-    """
-    record: Record = _read(Record, text, where)
-    return record
-
-
-def read_asset_record(text: bytes | str, where: str) -> AssetRecord:
-    """Read the record of a row; see `read_record`."""
-    record: AssetRecord = _read(AssetRecord, text, where)
-    return record
-
-
-def read_build_record(text: bytes | str, where: str) -> BuildRecord:
-    """Read ``build.json``; see `read_record`."""
-    record: BuildRecord = _read(BuildRecord, text, where)
-    return record
-
-
-def records_id(records: Iterable[Record]) -> str:
-    """Return the id of a build: SHA-256, in hex, of its records in the order of asset ids.
-
-    How long things took and in what words they failed are left out: they
-    differ between runs, machines and folders without the content differing.
-    """
-    digest = hashlib.sha256()
-    for record in records:
-        if isinstance(record, AssetRecord):
-            content: Record = record.without_duration()
-        else:
-            content = replace(record, duration_s=0.0, reason="", traceback="")
-        digest.update(to_json(content))
-    return digest.hexdigest()
-
-
-def write_records(path: Path, records: Iterable[Record]) -> str:
-    """Write records, in the order of their asset ids, as JSON Lines; return `records_id`."""
-
-    def passing() -> Iterator[Record]:
-        for record in records:
-            file.write(to_json(record) + b"\n")
-            yield record
-
-    with path.open("wb") as file:
-        return records_id(passing())
-
-
 def property_counts(counts: Iterable[int]) -> PropertyCounts:
     """Return counts in the order of ``PROPERTY_COLUMNS`` by name."""
     return PropertyCounts(**dict(zip(PROPERTY_COLUMNS, map(int, counts), strict=True)))
-
-
-@lru_cache(maxsize=4)
-def adapter_of(kind: Any) -> TypeAdapter[Any]:
-    """Return what reads a kind of record, and knows its JSON Schema."""
-    # Late: pydantic takes a third of a second that a command without records does not have.
-    from pydantic import Field, TypeAdapter
-
-    if kind is Record:
-        return TypeAdapter(Annotated[Record, Field(discriminator="status")])
-    return TypeAdapter(kind)
-
-
-def _read(kind: Any, text: bytes | str, where: str) -> Any:
-    from pydantic import ValidationError
-
-    try:
-        return adapter_of(kind).validate_json(text, strict=True)
-    except ValidationError as error:
-        raise RecordError(where, _faults(error)) from None
-
-
-def _faults(error: ValidationError) -> tuple[str, ...]:
-    faults = []
-    # A stranger's record may have any number.
-    found = error.errors(include_url=False)[:_FAULTS]
-    found_at = [fault["loc"] for fault in found]
-    for fault in found:
-        at = fault["loc"]
-        if any(other[: len(at)] == at and other != at for other in found_at):
-            continue  # A list that is too short without the faulty item is no fault of its own.
-        # Of a record that may be one of two kinds the first step names the kind.
-        steps = [str(step) for step in at if step not in tuple(Status)]
-        shown = "" if fault["type"] == "missing" else f", found {str(fault['input'])[:60]!r}"
-        faults.append(f"{'/'.join(steps) or 'it'}: {fault['msg']}{shown}")
-    return tuple(faults)
-
-
-def _plain(value: object) -> Any:
-    if isinstance(value, np.ndarray):  # not contiguous
-        return value.tolist()
-    if is_place(value):
-        return str(value)
-    raise TypeError(f"a record cannot hold {type(value).__name__} {value!r}")

@@ -11,7 +11,8 @@ import json
 from pathlib import Path
 from typing import Any
 
-from slatprep.provenance.record import BuildRecord, Record, adapter_of
+from slatprep.provenance.record import BuildRecord, Record
+from slatprep.provenance.record_json import adapter_of
 
 FOLDER = Path(__file__).with_name("schema")
 

@@ -5,7 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 from slatprep.align.deformation import PlaceMap
-from slatprep.provenance.record import AssetRecord, read_asset_record
+from slatprep.provenance.record import AssetRecord
+from slatprep.provenance.record_json import read_asset_record
 from slatprep.records import Model
 from slatprep.store.reader import Store, StoredAsset
 from slatprep.store.records import RECORD_ARRAY, RECORDS_IN_CHUNK

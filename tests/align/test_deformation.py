@@ -24,7 +24,7 @@ from slatprep.align.deformation import (
 )
 from slatprep.geometry.frames import make_transform, places_of
 from slatprep.parameters import SampleParameters
-from slatprep.provenance.record import adapter_of
+from slatprep.provenance.record_json import adapter_of
 from slatprep.records import Deformation
 from slatprep.sample import sample
 

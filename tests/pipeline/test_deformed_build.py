@@ -20,7 +20,7 @@ from slatprep.inspect.check import check_alignment
 from slatprep.inspect.verify import verify_store
 from slatprep.particles.transfer import stored_field, transfer
 from slatprep.pipeline.dataset import BuildSummary
-from slatprep.provenance.record import read_asset_record, to_json
+from slatprep.provenance.record_json import read_asset_record, to_json
 from slatprep.provenance.schemas import FOLDER
 from slatprep.provenance.stored import StoredRecords
 from slatprep.store import open_store

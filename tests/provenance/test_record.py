@@ -9,9 +9,8 @@ import pytest
 from support.synthetic import Dataset
 
 from slatprep.pipeline.dataset import BuildSummary
-from slatprep.provenance.record import (
-    AssetRecord,
-    FailedRecord,
+from slatprep.provenance.record import AssetRecord, FailedRecord
+from slatprep.provenance.record_json import (
     RecordError,
     read_asset_record,
     read_build_record,

@@ -8,7 +8,8 @@ from dataclasses import astuple, dataclass
 
 from slatprep.errors import StoreError
 from slatprep.provenance.files import build_in, lines_in
-from slatprep.provenance.record import FailedRecord, Record, read_record
+from slatprep.provenance.record import FailedRecord, Record
+from slatprep.provenance.record_json import read_record
 from slatprep.records import Place, Status
 
 

@@ -19,7 +19,8 @@ from slatprep.judge import voxel_confidence
 from slatprep.normalize import normalize_change
 from slatprep.pipeline.previous import PLACE_TOLERANCE
 from slatprep.provenance.columns import columns_of
-from slatprep.provenance.record import AssetRecord, RecordError
+from slatprep.provenance.record import AssetRecord
+from slatprep.provenance.record_json import RecordError
 from slatprep.provenance.stored import StoredRecords
 from slatprep.records import (
     BACKGROUND,

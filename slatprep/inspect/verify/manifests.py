@@ -11,9 +11,8 @@ import orjson
 from slatprep.errors import StoreError
 from slatprep.inspect.verify.assets import fault_findings
 from slatprep.provenance.files import ASSETS, BUILD, build_in, build_text, lines_in
-from slatprep.provenance.record import (
-    AssetRecord,
-    Record,
+from slatprep.provenance.record import AssetRecord, Record
+from slatprep.provenance.record_json import (
     RecordError,
     read_build_record,
     read_record,
