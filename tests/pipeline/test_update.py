@@ -64,6 +64,7 @@ def test_nothing_changed_writes_nothing(built: tuple[Dataset, Path], aligned: li
         "voxels": summary.n_voxels,
         "valid": summary.n_valid,
         "clipped": summary.clipped,
+        "unphysical": summary.n_unphysical,
     }
 
 
