@@ -221,11 +221,10 @@ def verdict_of(
             f"(good: {limits.good_valid_share:.0%})"
         )
     if ambiguity > limits.good_ambiguity:
-        count = f"{ties} other" if ties else "other"
+        others = "another placement fits" if ties == 1 else f"{ties or ''} other placements fit"
         reasons.append(
-            f"{count} placements fit about as well and would change the "
-            f"class of {ambiguity:.1%} of the voxels "
-            f"(good: {limits.good_ambiguity:.0%})"
+            f"{others.lstrip()} about as well and would change the class of {ambiguity:.1%} of the "
+            f"voxels (good: {limits.good_ambiguity:.0%})"
         )
     if contradicted:
         reasons.append(_CONTRADICTED)
