@@ -27,13 +27,14 @@ from slatprep.pipeline.publish import Destination, publish_manifests, write_all_
 from slatprep.pipeline.spool import spooled
 from slatprep.pipeline.summary import BuildSummary, summarise_build
 from slatprep.pipeline.work import work_beside, work_directory
+from slatprep.provenance.files import build_in
 from slatprep.provenance.places import manifests_beside
 from slatprep.provenance.record import AssetRecord
-from slatprep.provenance.record_json import adapter_of, read_build_record
+from slatprep.provenance.record_json import adapter_of
 from slatprep.provenance.stored import StoredRecords
 from slatprep.records import Normalization, Place, PropertyRange
 from slatprep.storage.atomic import writing
-from slatprep.storage.place import place_of
+from slatprep.storage.place import storage_of
 from slatprep.store import Store, open_store
 from slatprep.store.layout import ARRAYS, FORMAT_VERSION, overlaps
 from slatprep.store.shard_writer import ShardWriter
@@ -163,22 +164,33 @@ def _source(place: str | Place) -> _Source:
             f"{store.path} has format {store.format_version}, and {FORMAT_VERSION} is written; "
             "build it again"
         )
-    folder, places = manifests_beside(store.path), {}
-    if folder is not None:
-        file = folder / "build.json"
-        parameters = read_build_record(file.read_bytes(), str(file)).parameters
-        named = {name: getattr(parameters, name) for name in ("pixieverse", "slat", "pairing")}
-        places = orjson.loads(orjson.dumps(named, default=str))
-    return _Source(store, StoredRecords(store), store.attributes["build"], places)
+    return _Source(store, StoredRecords(store), store.attributes["build"], _places_of(store))
+
+
+def _places_of(store: Store) -> dict[str, Any]:
+    """Return where a store's sources lay; nothing where no record beside it is of its build."""
+    folder = manifests_beside(store.path)
+    if folder is None:
+        return {}
+    try:
+        record = build_in(folder)
+    except StoreError:
+        return {}  # The store does not need it, and `slatprep verify` names it.
+    if record.id != store.attributes["manifest"]:
+        return {}
+    named = {name: getattr(record.parameters, name) for name in ("pixieverse", "slat", "pairing")}
+    places: dict[str, Any] = orjson.loads(orjson.dumps(named, default=str))
+    return places
 
 
 def _common_build(sources: Sequence[_Source]) -> dict[str, Any]:
     """Return the attribute ``build`` of the joined store; versions that differ are all named."""
     first = sources[0]
     for other in sources[1:]:
-        for group, ours in first.build["parameters"].items():
-            theirs = other.build["parameters"].get(group)
-            if group not in ("store", "normalize") and theirs != ours:
+        both = first.build["parameters"], other.build["parameters"]
+        for group in sorted({*both[0], *both[1]} - {"store", "normalize"}):
+            ours, theirs = (parameters.get(group) for parameters in both)
+            if theirs != ours:
                 raise ConfigError(
                     f"{other.store.path} was built with [{group}] {theirs}, {first.store.path} "
                     f"with {ours}; expected the same: build one of them again"
@@ -224,7 +236,7 @@ def _write(
     place = Destination(out, manifests)
     sources = list(dict.fromkeys(source for source, _ in rows))
     for source in sources:
-        if place_of(source.store.path) == place.store:
+        if _same_place(source.store.path, place.store):
             raise ConfigError(f"{place.out} is a store to take assets from; choose another path")
     parameters = _parameters(sources, build)
     assets = [spooled(record, _NO_EXTENT) for record in _records(rows, normalization)]
@@ -251,6 +263,14 @@ def _write(
         publish_manifests(records, summary, parameters, build["versions"])
         place.publish()
     return summary
+
+
+def _same_place(one: Place, other: Place) -> bool:
+    """Whether two places are one, whatever leads there."""
+    here, there = storage_of(one).local, storage_of(other).local
+    if here is None or there is None:
+        return one == other
+    return here.resolve() == there.resolve()
 
 
 def _records(rows: Iterable[_Row], normalization: Normalization) -> Iterator[AssetRecord]:
@@ -333,7 +353,13 @@ def _parameters(sources: Sequence[_Source], build: dict[str, Any]) -> BuildParam
             roots = (source.places.get(side, {}).get("root", "unknown") for source in sources)
             places[side] = {"root": " | ".join(dict.fromkeys(roots))}
     document = {"name": build["name"], **places, **build["parameters"]}
-    parameters: BuildParameters = adapter_of(BuildParameters).validate_json(
-        orjson.dumps(document), strict=True
-    )
+    try:
+        parameters: BuildParameters = adapter_of(BuildParameters).validate_json(
+            orjson.dumps(document), strict=True
+        )
+    except ValueError as error:
+        path = sources[0].store.path
+        raise StoreError(
+            f"{path}: its attribute build does not say how it was built ({error}); build it again"
+        ) from None
     return parameters

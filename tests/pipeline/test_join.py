@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import shutil
 from collections.abc import Callable
 from dataclasses import replace
@@ -141,3 +142,55 @@ def test_commands_choose_and_join(mixed_build: BuildSummary, tmp_path: Path) -> 
     assert good.exit_code == 0, good.output
     assert len(open_store(tmp_path / "all.zarr")) == 5
     assert CliRunner().invoke(slatprep, ["subset", str(store), "--out", "x.zarr"]).exit_code == 2
+
+
+def test_a_source_is_never_replaced_whatever_path_leads_there(
+    parts: tuple[Dataset, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    _, folder = parts
+    shutil.copytree(folder / "ac.zarr", tmp_path / "own.zarr")
+    before = tree(tmp_path / "own.zarr")
+    (tmp_path / "link.zarr").symlink_to("own.zarr")
+    monkeypatch.chdir(tmp_path)
+    for source, out in (
+        ("own.zarr", "own.zarr"),
+        ("own.zarr", tmp_path / "own.zarr"),
+        ("link.zarr", "own.zarr"),
+        ("own.zarr", "link.zarr"),
+        ("./own.zarr", "../" + tmp_path.name + "/own.zarr"),
+    ):
+        with pytest.raises(ConfigError, match="is a store to take assets from"):
+            subset_store(source, out, ["a"])
+        with pytest.raises(ConfigError, match="is a store to take assets from"):
+            concat_stores([source, folder / "bd.zarr"], out)
+    assert tree(tmp_path / "own.zarr") == before
+
+
+def test_records_beside_a_store_are_taken_only_if_they_are_of_its_build(
+    parts: tuple[Dataset, Path], tmp_path: Path
+) -> None:
+    _, folder = parts
+    for name, change in (
+        ("none", lambda file: file.unlink()),
+        ("broken", lambda file: file.write_text("[" * 100_000)),
+        ("stale", lambda file: shutil.copy(folder / "bd.manifests" / "build.json", file)),
+    ):
+        shutil.copytree(folder / "ac.zarr", tmp_path / f"{name}.zarr")
+        shutil.copytree(folder / "ac.manifests", tmp_path / f"{name}.manifests")
+        change(tmp_path / f"{name}.manifests" / "build.json")
+        summary = subset_store(tmp_path / f"{name}.zarr", tmp_path / f"{name}-a.zarr", ["a"])
+        told = json.loads((summary.records.parent / "build.json").read_text())  # type: ignore[union-attr]
+        assert told["parameters"]["pixieverse"]["root"] == "unknown"
+
+
+def test_a_store_whose_attributes_do_not_say_how_it_was_built_is_refused(
+    parts: tuple[Dataset, Path], tmp_path: Path
+) -> None:
+    _, folder = parts
+    shutil.copytree(folder / "ac.zarr", tmp_path / "odd.zarr")
+    file = tmp_path / "odd.zarr" / "zarr.json"
+    document = json.loads(file.read_text())
+    document["attributes"]["build"]["parameters"]["align"]["unheard_of"] = 1
+    file.write_text(json.dumps(document))
+    with pytest.raises(StoreError, match="does not say how it was built"):
+        subset_store(tmp_path / "odd.zarr", tmp_path / "out.zarr", ["a"])
