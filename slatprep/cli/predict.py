@@ -12,7 +12,7 @@ import click
 
 from slatprep.cli.options import NEW_FILE, NEW_FOLDER, POSITIVE, PlaceType, command, option
 from slatprep.cli.output import Output
-from slatprep.errors import ConfigError, InputError
+from slatprep.errors import ConfigError, InputError, StoreError
 
 if TYPE_CHECKING:
     from slatprep.extract import Session
@@ -185,7 +185,7 @@ class _Reader:
             begin = time.perf_counter()
             try:
                 latents = self._latents(asset_id)
-            except InputError as error:
+            except (InputError, StoreError) as error:
                 self.problems.append(str(error))
                 self.output.problem(f"slatprep: {error}")
                 continue
@@ -194,8 +194,7 @@ class _Reader:
             yield latents
 
     def _latents(self, asset_id: str) -> StructuredLatents:
-        from slatprep.readers import read_slat
-        from slatprep.records import StructuredLatents
+        from slatprep.readers.slat import checked_latents, read_slat
 
         if self.store is None:
             file = self.files[asset_id]
@@ -203,4 +202,4 @@ class _Reader:
                 raise InputError(file.path, file.problem, "one SLAT an id")
             return read_slat(file.path, file.root, file.group)
         rows = self.store.read(self.rows[asset_id], ("coords", "feats"))
-        return StructuredLatents(rows["coords"], rows["feats"])
+        return checked_latents(rows["coords"], rows["feats"], f"{self.store.path} [{asset_id}]")

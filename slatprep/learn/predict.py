@@ -106,11 +106,15 @@ def load_checkpoint(path: Path, device: str = "cpu") -> Checkpoint:
     wanted = "best.pt of a run of `slatprep train`; one without ranges is trained anew"
     with refusing(path, "holds no decoder with its ranges", wanted):
         size = str(state["size"])
-        ranges = np.asarray(state["ranges"], dtype=np.float64).reshape(3, 2)
+        if not isinstance(state["ranges"], list):
+            raise TypeError(f"ranges are {type(state['ranges']).__name__}")
+        ranges = np.array(state["ranges"], dtype=np.float64).reshape(3, 2)
         if not (np.isfinite(ranges).all() and (ranges[:, 0] < ranges[:, 1]).all()):
             raise ValueError(f"ranges are {ranges.tolist()}")
         model = make_decoder(size)
         model.load_state_dict(state["model"])
+        if not all(bool(torch.isfinite(weight).all()) for weight in model.parameters()):
+            raise ValueError("weights are not all finite")
         source = str(state["ranges_source"])
     sha256 = hashlib.sha256(path.read_bytes()).hexdigest()
     return Checkpoint(

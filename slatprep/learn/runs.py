@@ -6,6 +6,7 @@ import csv
 import dataclasses
 import json
 import os
+import pickletools
 import zipfile
 from collections.abc import Sequence
 from contextlib import AbstractContextManager
@@ -26,6 +27,9 @@ from slatprep.storage.place import storage_of
 
 LAST, BEST = "last.pt", "best.pt"
 _LOCK = ".lock"
+
+_GLOBALS = ("torch", "collections OrderedDict")
+"""What a checkpoint's pickle may name, as its beginning."""
 
 INK, MUTED = "#1F2328", "#6B7280"
 """Colours of the curve: text and data, and what they are compared with."""
@@ -59,6 +63,9 @@ def read_state(path: Path) -> dict[str, Any]:
             # torch.save stores; what is packed could unpack to any size.
             if any(info.compress_type != zipfile.ZIP_STORED for info in archive.infolist()):
                 raise ValueError("it is compressed")
+            for info in archive.infolist():
+                if info.filename.endswith("/data.pkl"):
+                    _check_globals(archive.read(info))
         file.seek(0)
         try:
             state = torch.load(file, map_location="cpu", weights_only=True)
@@ -67,6 +74,19 @@ def read_state(path: Path) -> dict[str, Any]:
         if not isinstance(state, dict):
             raise ValueError(f"it holds {type(state).__name__}")
     return state
+
+
+def _check_globals(pickled: bytes) -> None:
+    """Raise where a checkpoint names more than tensors: torch itself would make a bytearray."""
+    words: list[str] = []
+    for operation, argument, _ in pickletools.genops(pickled):
+        name = str(argument)
+        if operation.name == "STACK_GLOBAL":
+            name = " ".join(words[-2:])
+        elif isinstance(argument, str):
+            words.append(argument)
+        if operation.name in ("GLOBAL", "STACK_GLOBAL") and not name.startswith(_GLOBALS):
+            raise ValueError(f"it names {name[:80]!r}")
 
 
 class Run:

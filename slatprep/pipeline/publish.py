@@ -114,6 +114,9 @@ def _replaceable(out: Path) -> Path:
             f"{out}: cannot be looked at ({error.strerror}); expected a path that may be read and "
             "written"
         ) from error
+    around = next((str(path) for path in target.parents if is_store(path)), "")
+    if around:
+        raise StoreError(f"{out} lies inside the store {around}; choose a path outside of it")
     if taken:
         raise StoreError(
             f"{out} exists and is not a slatprep store; expected a store to replace, or a new path"

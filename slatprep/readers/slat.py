@@ -11,7 +11,7 @@ from slatprep.errors import InputError
 from slatprep.geometry.voxels import flat_index
 from slatprep.readers.files import ArraySpec, load_source, npz_arrays, require_complete
 from slatprep.readers.hdf5 import SUFFIXES, load_datasets
-from slatprep.records import RESOLUTION, AssetPair, Place, StructuredLatents
+from slatprep.records import RESOLUTION, AssetPair, Place, SourceFile, StructuredLatents
 
 LATENT_CHANNELS = 8
 
@@ -68,7 +68,22 @@ def read_slat(path: Place, root: Place, group: str = "") -> StructuredLatents:
         data, source = load_source(path, root, "slat")
         arrays = npz_arrays(data, path, SPECS)
     where = f"{path} [{group}]" if group else path
-    coords, feats = arrays["coords"], arrays["feats"]
+    return checked_latents(arrays["coords"], arrays["feats"], where, (source,))
+
+
+def checked_latents(
+    coords: NDArray[Any],
+    feats: NDArray[Any],
+    where: str | Place,
+    sources: tuple[SourceFile, ...] = (),
+) -> StructuredLatents:
+    """Return coordinates (N, 3) or (N, 4) and latents (N, 8) as a SLAT, wherever they come from.
+
+    Raises
+    ------
+    InputError
+        If they are none; the message names the place, value and row.
+    """
     if len(coords) != len(feats):
         raise InputError(
             where, f"{len(coords)} rows of coords but {len(feats)} of feats", "one latent per voxel"
@@ -79,7 +94,7 @@ def read_slat(path: Place, root: Place, group: str = "") -> StructuredLatents:
     return StructuredLatents(
         coords=check_coords(coords, where),
         feats=_check_feats(feats, where, warnings),
-        sources=(source,),
+        sources=sources,
         warnings=tuple(warnings),
     )
 

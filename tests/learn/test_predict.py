@@ -13,6 +13,7 @@ import h5py
 import numpy as np
 import pytest
 import torch
+import zarr
 from click.testing import CliRunner
 from PIL.Image import Image
 from support.synthetic import Dataset
@@ -188,9 +189,11 @@ def test_ranges_of_a_prediction_are_checked_and_equal_ones_change_nothing() -> N
         lambda state: state.pop("ranges"),
         lambda state: state.update(ranges=[[1.0, 0.0]] * 3),
         lambda state: state.update(size="huge"),
+        lambda state: state.update(ranges=torch.zeros(1).expand(10**9)),
         lambda state: state["model"].popitem(),
+        lambda state: state["model"]["regression.weight"].fill_(float("nan")),
     ],
-    ids=["no ranges", "ranges turned about", "size", "weights"],
+    ids=["no ranges", "ranges turned about", "size", "ranges without end", "weights", "no numbers"],
 )
 def test_a_checkpoint_that_says_too_little_is_refused(checkpoint: Path, change: object) -> None:
     state = torch.load(checkpoint / "best.pt", weights_only=True)
@@ -276,3 +279,29 @@ def test_an_image_becomes_gaussians_with_materials(
     )  # fmt: skip
     assert refused.exit_code == 2
     assert "--gaussians goes with an image" in refused.output
+
+
+def test_a_checkpoint_that_would_set_memory_aside_is_not_unpickled(checkpoint: Path) -> None:
+    torch.save({"size": "small", "extra": bytearray(10)}, checkpoint / "best.pt")
+    with pytest.raises(InputError, match=r"it names '.* bytearray'"):
+        load_checkpoint(checkpoint)
+
+
+def test_latents_of_a_store_are_held_to_what_a_file_s_are(checkpoint: Path, tmp_path: Path) -> None:
+    data = Dataset(tmp_path / "data")
+    for k in range(2):
+        data.add(f"a{k}", seed=k)
+    store = tmp_path / "s.zarr"
+    build_store(data.parameters(), store)
+    feats = zarr.open_group(store, mode="r+")["voxel/feats"]
+    feats[5] = np.nan
+    told = run(store, "--checkpoint", checkpoint, "--out", tmp_path / "p", code=1)
+    assert told["predicted"] == 1
+    (problem,) = told["problems"]  # type: ignore[misc]
+    assert "[a0]" in problem
+    assert "finite" in problem
+    (tmp_path / "s.zarr/voxel/feats/c/0/0").write_bytes(b"")
+    told = run(store, "--checkpoint", checkpoint, "--out", tmp_path / "p", code=1)
+    assert told["predicted"] == 1  # the other asset's rows are in other shards
+    (problem,) = told["problems"]  # type: ignore[misc]
+    assert "has no sound index" in problem

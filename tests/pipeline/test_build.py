@@ -311,3 +311,15 @@ def test_other_parameters_make_another_build_id(make_dataset: MakeDataset, tmp_p
     assert align_pairs(parameters, tmp_path / "2.jsonl").build_id == first
     nearer = replace(parameters, sample=replace(parameters.sample, max_distance=2.0))
     assert align_pairs(nearer, tmp_path / "3.jsonl").build_id != first
+
+
+def test_no_store_is_built_inside_another(make_dataset: MakeDataset, tmp_path: Path) -> None:
+    """The next build of the outer one would remove it as a stray."""
+    data = make_dataset("a")
+    outer = tmp_path / "outer.zarr"
+    build_store(data.parameters(), outer)
+    before = tree(outer)
+    for inner in (outer / "inner.zarr", outer / "asset" / "deep" / "inner.zarr"):
+        with pytest.raises(StoreError, match=r"lies inside the store .*outer\.zarr"):
+            build_store(data.parameters(), inner)
+    assert tree(outer) == before
