@@ -17,7 +17,7 @@ from typing import Any
 
 import torch
 
-from slatprep.errors import ConfigError, InputError
+from slatprep.errors import ConfigError
 from slatprep.learn.predictions import RUN_BYTES, RUN_FILE
 from slatprep.readers.files import refusing
 from slatprep.storage.atomic import staged
@@ -26,7 +26,7 @@ from slatprep.storage.lock import take_lock
 from slatprep.storage.place import storage_of
 
 LAST, BEST = "last.pt", "best.pt"
-_LOCK = ".lock"
+_LOCK, _PARTIAL = ".lock", f".{RUN_FILE}.partial"
 
 _GLOBALS = ("torch", "collections OrderedDict")
 """What a checkpoint's pickle may name, as its beginning."""
@@ -118,17 +118,19 @@ class Run:
 
     def __enter__(self) -> Run:
         file = self.path / RUN_FILE
-        there = file.exists()
-        if not there and self.path.exists() and any(p.name != _LOCK for p in self.path.iterdir()):
-            raise ConfigError(f"{self.path} is not empty and holds no run; choose another --out")
         self._lock = take_lock(self.path / _LOCK, f"{self.path}: another training is writing it")
-        if there:
-            try:
+        try:
+            # Not before: another training may have begun, or ended, until the lock was ours.
+            if file.exists():
                 with refusing(file, "cannot be read", "what `slatprep train` wrote"):
                     self.parameters = read_document(file, RUN_BYTES)
-            except InputError:
-                self.__exit__()
-                raise
+            elif any(path.name not in (_LOCK, _PARTIAL) for path in self.path.iterdir()):
+                raise ConfigError(
+                    f"{self.path} is not empty and holds no run; choose another --out"
+                )
+        except BaseException:
+            self.__exit__()
+            raise
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -147,7 +149,8 @@ class Run:
         wanted, found = json.loads(text), self.parameters
         file = self.path / RUN_FILE
         if not found:
-            file.write_text(text, encoding="utf-8")
+            with staged(file) as path:
+                path.write_text(text, encoding="utf-8")
         elif found != wanted:
             others = [
                 f"{name} {found.get(name)!r} instead of {wanted.get(name)!r}"

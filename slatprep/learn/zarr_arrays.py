@@ -21,7 +21,7 @@ from slatprep.storage.documents import read_document
 from slatprep.storage.files import LocalFolder
 from slatprep.store.codecs import ChunkDecoder
 from slatprep.store.contract import MAX_METADATA_BYTES
-from slatprep.store.shard_reader import RowReader
+from slatprep.store.shard_reader import BAD_METADATA, RowReader, whole_sizes
 
 _DTYPES = (
     *(f"{kind}{bits}" for kind in ("int", "uint") for bits in (8, 16, 32, 64)),
@@ -56,23 +56,27 @@ def read_array(path: Path, spec: ArraySpec) -> NDArray[Any]:
         if metadata["data_type"] not in _DTYPES:
             raise ValueError(f"data_type is {metadata['data_type']!r}")
         dtype = np.dtype(metadata["data_type"])
-        shape = tuple(map(int, metadata["shape"]))
+        if metadata.get("storage_transformers"):
+            raise ValueError(f"storage_transformers are {metadata['storage_transformers']!r}")
+        shape = whole_sizes(metadata["shape"])
         spec.check(path, shape, dtype)
         if metadata["codecs"][0]["name"] == "sharding_indexed":
             return RowReader.of(LocalFolder(path.parent), path.name, metadata).read(0, shape[0])
         return _read_chunks(path, metadata, shape, dtype.newbyteorder("<"))
-    except (OSError, KeyError, TypeError, ValueError, AttributeError, IndexError) as error:
+    except (*BAD_METADATA, OSError) as error:
         raise StoreError(f"{path}: {error!r}") from None
 
 
 def _read_chunks(
     path: Path, metadata: dict[str, Any], shape: tuple[int, ...], dtype: np.dtype[Any]
 ) -> NDArray[Any]:
-    steps = tuple(map(int, metadata["chunk_grid"]["configuration"]["chunk_shape"]))
+    steps = whole_sizes(metadata["chunk_grid"]["configuration"]["chunk_shape"])
     decoder = ChunkDecoder.of(dtype, steps, metadata["codecs"], 0)
     corners = [range(0, n, step) for n, step in zip(shape, steps, strict=True)]
     chunks = math.prod(map(len, corners))
-    if chunks > _MAX_CHUNKS or not 0 < decoder.nbytes <= _MAX_CHUNK_BYTES:
+    # A writer may cut short arrays by the rows of long ones, but not rows wider than they are.
+    wide = any(step > n for step, n in zip(steps[1:], shape[1:], strict=True))
+    if wide or chunks > _MAX_CHUNKS or not 0 < decoder.nbytes <= _MAX_CHUNK_BYTES:
         raise ValueError(f"{chunks} chunks of {steps}")
     keys = metadata["chunk_key_encoding"]
     separator = keys.get("configuration", {}).get("separator", "/")

@@ -6,15 +6,20 @@ import json
 import os
 import platform
 import stat
+from contextlib import ExitStack
 from datetime import UTC, datetime
 from pathlib import Path
 
 from slatprep.errors import StoreError
+from slatprep.storage.documents import parse_document
 
 # Neither follow a link nor wait at a pipe; Windows has neither flag.
 _FLAGS = os.O_RDWR | os.O_CREAT
 for _name in ("O_CLOEXEC", "O_NOFOLLOW", "O_NONBLOCK"):
     _FLAGS |= getattr(os, _name, 0)
+
+_TRIES = 100
+"""How often a lock is looked for again that its holder has just removed."""
 
 
 def take_lock(path: Path, taken: str) -> int:
@@ -31,7 +36,7 @@ def take_lock(path: Path, taken: str) -> int:
     ------
     StoreError
         If another process holds it; the message names that process. If the file
-        is something else than a lock.
+        is something else than a lock, or its folder does not stay.
     OSError
         If it cannot be written, or is a link.
     """
@@ -42,26 +47,36 @@ def take_lock(path: Path, taken: str) -> int:
             f"{path}: cannot be locked, as Windows has no flock; expected Linux or macOS "
             "(on Windows, the Linux subsystem WSL)"
         ) from None
-    while True:
+    for _ in range(_TRIES):
         path.parent.mkdir(parents=True, exist_ok=True)
         try:
             descriptor = os.open(path, _FLAGS, 0o666)
         except FileNotFoundError:
             continue  # The holder before us has just removed its folder.
-        try:
-            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            who = _holder(descriptor) or "which has only just begun"
-            os.close(descriptor)
-            raise StoreError(
-                f"{taken} ({who}); wait until it has ended, or choose another path"
-            ) from None
-        if _is_at(descriptor, path):
-            break
-        os.close(descriptor)  # What we locked has been removed; lock what is there now.
+        with ExitStack() as unless_held:
+            unless_held.callback(os.close, descriptor)
+            try:
+                fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                who = _holder(descriptor) or "which has only just begun"
+                raise StoreError(
+                    f"{taken} ({who}); wait until it has ended, or choose another path"
+                ) from None
+            if not _is_at(descriptor, path):
+                continue  # What we locked has been removed; lock what is there now.
+            _sign(descriptor, path)
+            unless_held.pop_all()
+            return descriptor
+    raise StoreError(
+        f"{path}: cannot be locked, as it or its folder was removed {_TRIES} times meanwhile; "
+        "expected a folder that stays (is the current one deleted?). Choose another path"
+    )
+
+
+def _sign(descriptor: int, path: Path) -> None:
+    """Write into a lock who holds it."""
     state = os.fstat(descriptor)
     if not stat.S_ISREG(state.st_mode) or (state.st_size and not _holder(descriptor)):
-        os.close(descriptor)
         raise StoreError(
             f"{path}: holds something else than a lock; move it away, or choose another path"
         )
@@ -72,7 +87,6 @@ def take_lock(path: Path, taken: str) -> int:
         "since": datetime.now(UTC).isoformat(timespec="seconds"),
     }
     os.pwrite(descriptor, json.dumps(told).encode(), 0)
-    return descriptor
 
 
 def _is_at(descriptor: int, path: Path) -> bool:
@@ -85,7 +99,7 @@ def _is_at(descriptor: int, path: Path) -> bool:
 def _holder(descriptor: int) -> str:
     """Return who says to hold a lock; empty where nothing does."""
     try:
-        told = json.loads(os.pread(descriptor, 4096, 0))
+        told = parse_document(os.pread(descriptor, 4096, 0))
         return f"process {told['pid']} on {told['host']}, since {told['since']}"
-    except (ValueError, KeyError, TypeError, OSError):
+    except (ValueError, KeyError, OSError):
         return ""

@@ -19,7 +19,7 @@ from slatprep.store.contract import (
 from slatprep.store.digests import GROUP
 from slatprep.store.gate import NAMES, gate_findings
 from slatprep.store.layout import ASSET_CHUNK
-from slatprep.store.shard_reader import RowReader
+from slatprep.store.shard_reader import BAD_METADATA, RowReader
 
 if TYPE_CHECKING:
     import zarr
@@ -53,7 +53,7 @@ class Arrays:
         try:
             # Consolidated, so that zarr-python reads no metadata but those just looked at.
             return zarr.open_group(str(self.path), mode="r", zarr_format=3, use_consolidated=True)
-        except (KeyError, TypeError, ValueError, AttributeError, OSError) as error:
+        except (*BAD_METADATA, OSError) as error:
             raise StoreError(f"{self.path}: bad metadata ({error!r})") from None
 
     def reader(self, name: str) -> RowReader:

@@ -63,8 +63,20 @@ def gate_findings(name: str, metadata: object) -> Iterator[Finding]:
     found = metadata.get("zarr_format")
     if type(found) is not int or found != 3:
         yield Finding(where, "", f"zarr_format is {found!r}", "3")
+    attributes = metadata.get("attributes", {})
+    if not isinstance(attributes, Mapping):
+        yield Finding(where, "", f"attributes is {attributes!r}", "a JSON object")
     if metadata["node_type"] == "group":
+        # zarr-python would take arrays from here that nobody has looked at.
+        nested = metadata.get("consolidated_metadata")
+        if nested is not None and not (
+            isinstance(nested, Mapping) and nested.get("metadata") == {}
+        ):
+            yield Finding(where, "", "has consolidated metadata of its own", "the root's alone")
         return
+    transformers = metadata.get("storage_transformers")
+    if transformers not in (None, []):
+        yield Finding(where, "", f"storage_transformers is {transformers!r}", "none")
     data_type = metadata.get("data_type")
     if data_type not in DATA_TYPES:
         yield Finding(where, "", f"data_type is {data_type!r}", f"one of {', '.join(DATA_TYPES)}")

@@ -38,8 +38,26 @@ MAX_CHUNK_BYTES = 256 * 2**20
 """What one chunk may unpack to; a grid's takes 3 MiB."""
 
 
+BAD_METADATA = (
+    ArithmeticError,  # A fill value beyond its data type.
+    AttributeError,
+    IndexError,
+    KeyError,
+    TypeError,
+    ValueError,
+)
+"""What Python, numpy and zarr-python raise for metadata that make no sense."""
+
+
 MAX_TEXT = {RECORD_ARRAY: MAX_RECORD_BYTES}
 """What the texts of a chunk may have on average, where that is more than a name may have."""
+
+
+def whole_sizes(sizes: object) -> tuple[int, ...]:
+    """Return the sizes that metadata list; ValueError where one is no integer, or negative."""
+    if not isinstance(sizes, list) or not all(type(n) is int and n >= 0 for n in sizes):
+        raise ValueError(f"sizes are {sizes!r}, not integers of at least 0")
+    return tuple(sizes)
 
 
 class DamagedFileError(StoreError):
@@ -125,20 +143,20 @@ class RowReader:
         """
         try:
             return cls._of(folder, name, metadata)
-        except (KeyError, TypeError, ValueError, AttributeError, IndexError) as error:
+        except BAD_METADATA as error:
             raise StoreError(f"{folder.path}/{name}: bad metadata ({error!r})") from None
 
     @classmethod
     def _of(cls, folder: Folder, name: str, metadata: Mapping[str, Any]) -> RowReader:
         text = metadata["data_type"] == "string"
         dtype = np.dtype(object) if text else np.dtype(metadata["data_type"]).newbyteorder("<")
-        shape = tuple(map(int, metadata["shape"]))
-        outer = tuple(map(int, metadata["chunk_grid"]["configuration"]["chunk_shape"]))
+        shape = whole_sizes(metadata["shape"])
+        outer = whole_sizes(metadata["chunk_grid"]["configuration"]["chunk_shape"])
         codecs, inner = metadata["codecs"], outer
         sharded = codecs[0]["name"] == "sharding_indexed"
         if sharded:
             sharding = codecs[0]["configuration"]
-            inner, codecs = tuple(map(int, sharding["chunk_shape"])), sharding["codecs"]
+            inner, codecs = whole_sizes(sharding["chunk_shape"]), sharding["codecs"]
             index_codecs = [codec["name"] for codec in sharding["index_codecs"]]
             at_end = sharding.get("index_location", "end") == "end"
             if index_codecs != _INDEX_CODECS or not at_end or len(metadata["codecs"]) > 1:

@@ -18,12 +18,14 @@ import zarr
 from click.testing import CliRunner
 
 from slatprep.cli.commands import slatprep
-from slatprep.errors import InputError
+from slatprep.errors import InputError, StoreError
 from slatprep.learn.metrics import evaluate_store
 from slatprep.learn.predictions import selection_of_run
 from slatprep.learn.runs import LAST
 from slatprep.learn.splits import Shares
 from slatprep.learn.train import TrainParameters, train
+from slatprep.learn.zarr_arrays import read_array
+from slatprep.readers.files import ArraySpec
 from slatprep.store import open_store
 
 SHARES = Shares(0.4, 0.3, 0.3)
@@ -169,6 +171,30 @@ def test_zarr_predictions_of_other_codecs_or_sizes_are_refused(
     file.write_text(json.dumps(json.loads(file.read_text()) | change))
     with pytest.raises(InputError, match=message):
         evaluate_store(tmp_path / "p.zarr", learn_store, None)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"fill_value": 300}, "OverflowError"),
+        ({"shape": [8.9, 3]}, "sizes are"),
+        ({"chunk_grid": {"configuration": {"chunk_shape": [4.0, 3]}}}, "sizes are"),
+        ({"chunk_grid": {"configuration": {"chunk_shape": [8, 64]}}}, "chunks of|chunks that"),
+        ({"storage_transformers": [{"name": "x"}]}, "storage_transformers are"),
+    ],
+)
+@pytest.mark.parametrize("shards", [None, (8, 3)])
+def test_metadata_of_arrays_are_taken_at_their_word(
+    tmp_path: Path, change: dict[str, Any], message: str, shards: tuple[int, ...] | None
+) -> None:
+    root, spec = zarr.open_group(tmp_path / "p.zarr", mode="w"), ArraySpec(((None, 3),), "u")
+    array = root.create_array("a", shape=(8, 3), dtype="uint8", chunks=(4, 3), shards=shards)
+    array[:] = 1
+    file = tmp_path / "p.zarr/a/zarr.json"
+    assert read_array(file.parent, spec).tolist() == [[1, 1, 1]] * 8
+    file.write_text(json.dumps(json.loads(file.read_text()) | change))
+    with pytest.raises(StoreError, match=message):
+        read_array(file.parent, spec)
 
 
 def test_a_pipe_is_not_waited_for(learn_store: Path, tmp_path: Path) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import dataclasses
+import errno
 import json
 import math
 import os
@@ -21,7 +22,7 @@ from slatprep.learn import train as module
 from slatprep.learn.baselines import fit_baselines
 from slatprep.learn.dataset import IGNORED, SlatDataset, SlatLoader, SparseBatch, collate
 from slatprep.learn.decoder import Prediction, make_decoder
-from slatprep.learn.runs import BEST, LAST
+from slatprep.learn.runs import BEST, LAST, Run
 from slatprep.learn.splits import Shares, split_of
 from slatprep.learn.train import TrainParameters, loss_of, precision_of, train
 from slatprep.storage.lock import take_lock
@@ -209,6 +210,38 @@ def test_a_run_is_trained_by_one_process_at_a_time(learn_store: Path, tmp_path: 
     os.close(held)
     train(learn_store, tmp_path / "run", dataclasses.replace(SHORT, epochs=1))
     assert not (tmp_path / "run" / ".lock").exists()
+
+
+def test_a_run_that_another_training_wrote_before_the_lock_was_ours_is_read(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def late(path: Path, taken: str) -> int:
+        path.parent.mkdir()
+        (path.parent / "run.json").write_text('{"seed": 7}')
+        return take_lock(path, taken)
+
+    monkeypatch.setattr("slatprep.learn.runs.take_lock", late)
+    with Run(tmp_path / "run") as run:
+        assert run.parameters == {"seed": 7}
+    assert not (tmp_path / "run/.lock").exists()
+
+
+def test_a_run_on_a_full_disk_leaves_no_half_of_its_parameters(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(*_: object) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    with monkeypatch.context() as patched, Run(tmp_path / "run") as run:
+        patched.setattr("slatprep.storage.atomic.flush", full)
+        with pytest.raises(OSError, match="No space left"):
+            run.begin({"seed": 7})
+        assert not (tmp_path / "run/run.json").exists()
+    (tmp_path / "run/.run.json.partial").write_text("{")  # As a killed training leaves it.
+    with Run(tmp_path / "run") as run:
+        run.begin({"seed": 7})
+    with Run(tmp_path / "run") as run:
+        assert run.parameters == {"seed": 7}
 
 
 def test_steps_are_counted_from_where_a_run_goes_on(learn_store: Path, tmp_path: Path) -> None:

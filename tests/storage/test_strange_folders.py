@@ -107,6 +107,32 @@ def test_a_lock_that_a_killed_process_left_is_taken(tmp_path: Path) -> None:
         os.close(take_lock(tmp_path / "lock", "taken"))
 
 
+def test_a_lock_in_a_folder_that_is_gone_is_not_looked_for_without_end(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "gone").mkdir()
+    monkeypatch.chdir(tmp_path / "gone")
+    (tmp_path / "gone").rmdir()
+    with pytest.raises(StoreError, match=r"lock: cannot be locked.* expected a folder that stays"):
+        take_lock(Path("lock"), "taken")
+
+
+def test_a_lock_that_cannot_be_taken_leaves_nothing_open(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(*_: object) -> int:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(os, "pwrite", full)
+    (tmp_path / "deep").write_text("[" * 4096)
+    before = len(list(Path("/dev/fd").iterdir()))
+    with pytest.raises(StoreError, match="holds something else than a lock"):
+        take_lock(tmp_path / "deep", "taken")
+    with pytest.raises(OSError, match="No space left"):
+        take_lock(tmp_path / "lock", "taken")
+    assert len(list(Path("/dev/fd").iterdir())) == before
+
+
 def test_a_link_in_place_of_a_partial_file_is_left_alone(tmp_path: Path, theirs: Path) -> None:
     link = tmp_path / ".r.html.partial"
     link.symlink_to(theirs)

@@ -138,6 +138,8 @@ EDITS: dict[str, tuple[dict[str, Any], str]] = {
     "format 2": ({"zarr_format": 2}, "zarr_format is 2"),
     "no axes": ({"dimension_names": 5}, "dimension_names is 5"),
     "no array": ({"node_type": "other"}, "is no array or group"),
+    "no table of attributes": ({"attributes": 5}, "attributes is 5"),
+    "transformers": ({"storage_transformers": [{"name": "x"}]}, "storage_transformers is"),
 }
 
 
@@ -150,6 +152,30 @@ def test_what_is_not_on_the_lists_is_refused_and_found(store: Path, case: str) -
         open_store(store).group  # noqa: B018
     findings = verify_store(store).findings
     assert any(f.file == f"{name}/zarr.json" and what in f.what for f in findings)
+
+
+def test_a_group_has_no_consolidated_metadata_of_its_own() -> None:
+    group: dict[str, Any] = {"zarr_format": 3, "node_type": "group", "attributes": {}}
+    frame = {"kind": "inline", "must_understand": False}
+    for allowed in (None, {**frame, "metadata": {}}):
+        assert not list(gate_findings("voxel", {**group, META: allowed}))
+    for nested in (5, frame, {**frame, "metadata": {"feats": {"zarr_format": 2}}}):
+        (finding,) = gate_findings("voxel", {**group, META: nested})
+        assert finding.what == "has consolidated metadata of its own"
+
+
+def test_a_fill_value_beyond_its_data_type_is_told(store: Path, tmp_path: Path) -> None:
+    edit_root(store, lambda d: d[META]["metadata"]["voxel/material"].update(fill_value=300))
+    for line in (
+        ["check-alignment", "--asset", "cup", "--store", str(store)],
+        ["export", str(store), "--format", "ply", "--frame", "pixieverse",
+         "--out", str(tmp_path / "e")],
+        ["describe", str(store), "--out", str(tmp_path / "d.json")],
+        ["verify", str(store)],
+    ):  # fmt: skip
+        done = CliRunner().invoke(slatprep, line)
+        assert done.exit_code == 1, (line, done.output)
+        assert isinstance(done.exception, SystemExit), (line, done.exception)
 
 
 def test_an_array_of_another_name_is_refused(store: Path) -> None:
