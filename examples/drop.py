@@ -18,8 +18,6 @@ import time
 from pathlib import Path
 
 import numpy as np
-import plyfile
-from drop_picture import Part, draw
 
 from slatprep.errors import SlatprepError
 from slatprep.geometry.frames import voxel_centres
@@ -30,6 +28,14 @@ from slatprep.particles.simulate import ELASTIC, drop, rigid_deviation, strain
 from slatprep.pipeline.dataset import build_store
 from slatprep.records import BACKGROUND, MATERIAL_CLASSES, RESOLUTION
 from slatprep.store import Store, open_store
+
+try:
+    import plyfile
+    from drop_picture import Part, draw
+except ModuleNotFoundError as error:
+    raise SystemExit(
+        f"drop.py: {error}; it simulates and draws with pip install 'slatprep[simulate,paper]'"
+    ) from None
 
 RATE = 60
 """Frames a second."""
