@@ -7,8 +7,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from support.raw_sources import COORDS, FEATS, raw_grid
+from support.raw_sources import COORDS, FEATS, raw_grid, touch
 
+from slatprep.parameters import BuildParameters, PairingParameters, PixieverseSource, SlatSource
+from slatprep.readers import discover
 from slatprep.records import AssetPair, SourceRoots
 
 
@@ -45,3 +47,21 @@ def make_pair(tmp_path: Path) -> Callable[..., AssetPair]:
         )
 
     return make
+
+
+@pytest.fixture
+def find(tmp_path):
+    """Make empty files on both sides, and return what discover says of them."""
+
+    def run(grids=(), slats=(), *, pixieverse=None, slat=None, **pairing):
+        for side, names in (("pixie", grids), ("slat", slats)):
+            (tmp_path / side).mkdir(exist_ok=True)
+            touch(tmp_path / side, *names)
+        parameters = BuildParameters(
+            pixieverse=PixieverseSource(**{"root": tmp_path / "pixie", **(pixieverse or {})}),
+            slat=SlatSource(**{"root": tmp_path / "slat", **(slat or {})}),
+            pairing=PairingParameters(**pairing),
+        )
+        return list(discover(parameters))
+
+    return run

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 
 COORDS = np.array([[0, 0, 0], [63, 1, 2], [5, 63, 63]], dtype=np.uint8)
@@ -19,3 +21,13 @@ def raw_grid() -> np.ndarray:
     grid[1, 2, 4] = 7850.0, 2.0e11, 0.30, 1
     grid[60, 0, 63] = 500.0, 1.0e5, 0.45, 6
     return grid
+
+
+def touch(root: Path, *names: str) -> None:
+    for name in names:
+        (root / name).parent.mkdir(parents=True, exist_ok=True)
+        (root / name).touch()
+
+
+def grid(name: str) -> str:
+    return f"{name}/sample_0/material_grid.npy"

@@ -120,3 +120,19 @@ class Requests:
 def requests(monkeypatch: pytest.MonkeyPatch) -> Requests:
     """Count requests from here on."""
     return Requests(monkeypatch)
+
+
+@pytest.fixture
+def url(bucket: str) -> str:
+    return f"s3://{bucket}/stores/demo.zarr"
+
+
+@pytest.fixture
+def change_client(monkeypatch: pytest.MonkeyPatch, new_clients: Any) -> Callable[[str, Any], None]:
+    """Return what has the client of this process do something else."""
+
+    def change(name: str, method: Any) -> None:
+        monkeypatch.setattr(S3FileSystem, name, method)
+        new_clients()
+
+    return change

@@ -2,12 +2,8 @@
 
 from __future__ import annotations
 
-import json
 import multiprocessing
-import os
-import signal
 import threading
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -16,8 +12,8 @@ import fsspec
 import numpy as np
 import pytest
 import zarr
-from s3fs.core import S3FileSystem
-from support.faults import inject, kill_self
+from support.faults import inject
+from support.remote import Made, current, put, versions
 from support.synthetic import Dataset
 from support.trees import contents, tree
 
@@ -27,43 +23,8 @@ from slatprep.parameters import StoreParameters
 from slatprep.pipeline.dataset import build_store, plan_build
 from slatprep.storage.place import place_of, storage_of
 from slatprep.storage.upload import published_state, upload_store
-from slatprep.storage.versions import Pointer, read_pointer
+from slatprep.storage.versions import Pointer
 from slatprep.store import Store, open_store
-
-Made = tuple[Dataset, Path]
-
-
-@pytest.fixture
-def url(bucket: str) -> str:
-    return f"s3://{bucket}/stores/demo.zarr"
-
-
-def put(store: Path, url: str) -> Path:
-    """Publish a finished store; return where its version lies."""
-    made = upload_store(store, published_state(place_of(url)))
-    made.publish()
-    return made.version
-
-
-def current(s3: Any, url: str) -> dict[str, str]:
-    """Return what is in sight: the hashes of the version that the pointer names."""
-    pointer = json.loads(s3.cat_file(f"{url}/current.json"))
-    return contents(s3, f"{url}/versions/{pointer['version']}")
-
-
-@pytest.fixture
-def change_client(monkeypatch: pytest.MonkeyPatch, new_clients: Any) -> Callable[[str, Any], None]:
-    """Return what has the client of this process do something else."""
-
-    def change(name: str, method: Any) -> None:
-        monkeypatch.setattr(S3FileSystem, name, method)
-        new_clients()
-
-    return change
-
-
-def versions(s3: Any, url: str) -> set[str]:
-    return {name.split("/")[1] for name in contents(s3, url) if name.startswith("versions/")}
 
 
 def test_a_store_is_built_from_s3_to_s3_and_equals_the_local_one(
@@ -183,168 +144,6 @@ def test_who_opens_it_while_it_is_replaced_finds_one_or_the_other_whole(
     reader.join()
     assert faults == []
     assert set(seen) == set(stores)
-
-
-Fault = Callable[[str, str], object]
-
-
-def kill_midway() -> Fault:
-    """Let this process be killed at its twentieth object."""
-    put_file, left = S3FileSystem._put_file, [20]
-
-    async def dies(*args: Any, **options: Any) -> Any:
-        left[0] -= 1
-        if left[0] < 0:
-            kill_self()
-        return await put_file(*args, **options)
-
-    S3FileSystem._put_file = dies
-    return lambda step, name: None
-
-
-def kill_before() -> Fault:
-    return lambda step, name: step == "manifests published" and kill_self()
-
-
-def kill_after() -> Fault:
-    return lambda step, name: step == "pointer replaced" and kill_self()
-
-
-def build_and_be_killed(fault: Callable[[], Fault], dataset: Dataset, url: str) -> None:
-    """Build in a process of its own that kills itself with signal 9 where `fault` has it."""
-
-    def run() -> None:
-        inject(pytest.MonkeyPatch(), fault())
-        build_store(dataset.parameters("pixie"), url)
-
-    child = multiprocessing.get_context("fork").Process(target=run)
-    child.start()
-    child.join(120)
-    assert child.exitcode == -signal.SIGKILL
-
-
-@pytest.mark.parametrize(
-    ("fault", "shown"),
-    [
-        (kill_midway, False),
-        (kill_before, False),
-        (kill_after, True),
-    ],
-    ids=["while it uploads", "before the pointer", "after the pointer"],
-)
-def test_a_build_that_is_killed_leaves_a_whole_store_and_the_next_one_completes(
-    s3: Any, url: str, undisturbed: Made, another: Made, fault: Any, shown: bool, requests: Any
-) -> None:
-    (_, old), (dataset, new) = undisturbed, another
-    put(old, url)
-    build_and_be_killed(fault, dataset, url)
-    assert current(s3, url) == tree(new if shown else old)
-    there = len(contents(s3, f"{url}/versions"))
-    requests.made.clear()
-    summary = build_store(dataset.parameters("pixie"), url)
-    assert summary.complete
-    assert current(s3, url) == tree(new)
-    # Nothing was uploaded twice, and nothing is left but the version before.
-    uploaded = [key for key in requests.of("put_object") if "/versions/" in key]
-    assert len(uploaded) == len(tree(old)) + len(tree(new)) - there
-    pointer = read_pointer(place_of(url))
-    assert versions(s3, url) == {pointer.version, pointer.previous}  # type: ignore[union-attr]
-
-
-def test_what_a_killed_build_uploaded_goes_when_the_sources_changed_since(
-    s3: Any, url: str, undisturbed: Made, another: Made
-) -> None:
-    (_, expected), (dataset, _) = undisturbed, another
-    build_and_be_killed(kill_midway, dataset, url)
-    assert 0 < len(contents(s3, url)) < 30
-    assert not s3.exists(f"{url}/current.json")
-    with pytest.raises(StoreError, match="does not exist"):
-        open_store(url)
-    put(expected, url)
-    assert current(s3, url) == tree(expected)
-    assert len(versions(s3, url)) == 1
-
-
-def test_a_build_is_refused_that_another_has_overtaken(
-    s3: Any,
-    url: str,
-    undisturbed: Made,
-    another: Made,
-    monkeypatch: pytest.MonkeyPatch,
-    tmp_path: Path,
-) -> None:
-    """The other runs on another machine: no lock of this one's disk keeps it out."""
-    elsewhere = str(tmp_path / "elsewhere")
-
-    def overtaken(step: str, name: str) -> None:
-        if step == "store created" and os.environ["SLATPREP_CACHE"] != elsewhere:
-            with pytest.MonkeyPatch.context() as there:
-                there.setenv("SLATPREP_CACHE", elsewhere)
-                build_store(another[0].parameters("pixie"), url)
-
-    inject(monkeypatch, overtaken)
-    with pytest.raises(StoreError, match=f"^{url}: another build replaced it while this one ran"):
-        build_store(undisturbed[0].parameters("pixie"), url)
-    assert current(s3, url) == tree(another[1])
-
-
-def test_the_second_build_on_one_machine_is_refused_at_once(
-    url: str, undisturbed: Made, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    parameters = undisturbed[0].parameters("pixie")
-
-    def twice(step: str, name: str) -> None:
-        if step == "store created":
-            with pytest.raises(StoreError, match=f"^{url}: another build is writing it"):
-                build_store(parameters, url)
-
-    inject(monkeypatch, twice)
-    assert build_store(parameters, url).complete
-
-
-@pytest.mark.parametrize("first", [True, False], ids=["none before", "one before"])
-def test_the_server_itself_refuses_a_pointer_that_moved_at_the_last_moment(
-    s3: Any,
-    url: str,
-    undisturbed: Made,
-    another: Made,
-    change_client: Any,
-    first: bool,
-    tmp_path: Path,
-) -> None:
-    if not first:
-        (tmp_path / "old.zarr").mkdir()
-        (tmp_path / "old.zarr" / "zarr.json").write_text("{}")
-        put(tmp_path / "old.zarr", url)
-    late = upload_store(undisturbed[1], published_state(place_of(url)))
-    early = upload_store(another[1], published_state(place_of(url)))
-    pipe = S3FileSystem._pipe_file
-
-    async def overtaken(filesystem: Any, path: str, data: bytes, **options: Any) -> Any:
-        await pipe(filesystem, path, early.pointer.encode())
-        return await pipe(filesystem, path, data, **options)
-
-    change_client("_pipe_file", overtaken)
-    with pytest.raises(StoreError, match="another build replaced it"):
-        late.publish()
-    assert current(s3, url) == tree(another[1])
-
-
-def test_an_answer_that_is_lost_does_not_make_a_failure_of_a_success(
-    s3: Any, url: str, undisturbed: Made, another: Made, change_client: Any
-) -> None:
-    put(another[1], url)
-    made = upload_store(undisturbed[1], published_state(place_of(url)))
-    pipe, lost = S3FileSystem._pipe_file, []
-
-    async def deaf(*args: Any, **options: Any) -> Any:
-        lost.append(await pipe(*args, **options))
-        raise OSError("connection lost")
-
-    change_client("_pipe_file", deaf)
-    made.publish()
-    assert len(lost) == 1
-    assert current(s3, url) == tree(undisturbed[1])
 
 
 def test_older_versions_that_must_not_be_removed_are_told(

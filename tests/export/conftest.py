@@ -1,0 +1,15 @@
+"""The store that exports are made of."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from slatprep.pipeline.dataset import BuildSummary
+
+
+@pytest.fixture
+def store(mixed_build: BuildSummary) -> Path:
+    assert mixed_build.store is not None
+    return mixed_build.store

@@ -1,0 +1,108 @@
+"""Dask's scheduler and workers as processes of their own, which fail where they are told to."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+FAULTS = """
+import os, signal, time
+from pathlib import Path
+
+faults = Path(__file__).parent
+
+
+def reached(step, name):
+    if step == "shard filled":
+        try:
+            (faults / "kill-once").unlink()
+        except FileNotFoundError:
+            return
+        os.kill(os.getpid(), signal.SIGKILL)
+    if step != "asset begun":
+        return
+    if (faults / f"deadly-{name}").exists():
+        os.kill(os.getpid(), signal.SIGKILL)
+    try:
+        (faults / f"hold-{name}").unlink()
+    except FileNotFoundError:
+        return
+    (faults / "held.partial").write_text(str(os.getpid()))
+    (faults / "held.partial").rename(faults / "held")
+    time.sleep(600)  # until it is killed
+"""
+
+
+class Processes:
+    """Dask's own commands, in a folder that tells them how to fail."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        (folder / "faults.py").write_text(FAULTS)
+        self._started: list[subprocess.Popen[bytes]] = []
+
+    def scheduler(self) -> str:
+        """Start a scheduler at a free port and return its address."""
+        file = self.folder / "scheduler.json"
+        self._start(
+            "scheduler", "--host", "127.0.0.1", "--port", "0", "--no-dashboard",
+            "--dashboard-address", "127.0.0.1:0", "--scheduler-file", str(file),
+        )  # fmt: skip
+        wait_until(lambda: file.exists() and file.read_text().endswith("}"))
+        return str(json.loads(file.read_text())["address"])
+
+    def worker(self, address: str, *options: str, path: str = "") -> subprocess.Popen[bytes]:
+        """Start a worker of one thread, unless options say otherwise."""
+        return self._start(
+            "worker", address, "--nthreads", "1", "--no-dashboard",
+            "--local-directory", str(self.folder), *options, path=path,
+        )  # fmt: skip
+
+    def stop(self) -> None:
+        """End all of them."""
+        for process in self._started:
+            end(process)
+
+    def _start(self, *arguments: str, path: str = "") -> subprocess.Popen[bytes]:
+        paths = (
+            path,
+            str(self.folder),
+            str(Path(__file__).parents[1] / "workers"),
+            os.environ.get("PYTHONPATH", ""),
+        )
+        environment = {
+            **os.environ,
+            "SLATPREP_FAULTS": "faults:reached",
+            "OMP_NUM_THREADS": "1",
+            "PYTHONPATH": os.pathsep.join(filter(None, paths)),
+            # Two dead workers are enough to give a task up; by default it takes four.
+            "DASK_DISTRIBUTED__SCHEDULER__ALLOWED_FAILURES": "1",
+        }
+        with (self.folder / f"{arguments[0]}-{len(self._started)}.log").open("wb") as log:
+            process = subprocess.Popen(
+                [sys.executable, "-m", "distributed.cli.dask_" + arguments[0], *arguments[1:]],
+                env=environment, cwd=self.folder, stdout=log, stderr=log, start_new_session=True,
+            )  # fmt: skip
+        self._started.append(process)
+        return process
+
+
+def end(process: subprocess.Popen[bytes]) -> None:
+    """Kill a command and the workers that its nanny started."""
+    try:
+        os.killpg(process.pid, signal.SIGKILL)
+    except ProcessLookupError:
+        return
+    process.wait()
+
+
+def wait_until(condition: object, seconds: float = 180.0) -> None:
+    deadline = time.monotonic() + seconds
+    while not condition():  # type: ignore[operator]
+        assert time.monotonic() < deadline, "waited too long"
+        time.sleep(0.05)

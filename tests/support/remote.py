@@ -1,0 +1,31 @@
+"""Stores put on S3, and what is in sight there."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+from slatprep.storage.place import place_of
+from slatprep.storage.upload import published_state, upload_store
+from support.synthetic import Dataset
+from support.trees import contents
+
+Made = tuple[Dataset, Path]
+
+
+def put(store: Path, url: str) -> Path:
+    """Publish a finished store; return where its version lies."""
+    made = upload_store(store, published_state(place_of(url)))
+    made.publish()
+    return made.version
+
+
+def current(s3: Any, url: str) -> dict[str, str]:
+    """Return what is in sight: the hashes of the version that the pointer names."""
+    pointer = json.loads(s3.cat_file(f"{url}/current.json"))
+    return contents(s3, f"{url}/versions/{pointer['version']}")
+
+
+def versions(s3: Any, url: str) -> set[str]:
+    return {name.split("/")[1] for name in contents(s3, url) if name.startswith("versions/")}
