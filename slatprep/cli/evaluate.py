@@ -14,8 +14,10 @@ from slatprep.cli.options import (
     NEW_FILE,
     ChoiceOf,
     command,
+    note_split,
     option,
-    shares_of,
+    split_options,
+    split_rule,
 )
 from slatprep.cli.output import Output
 
@@ -29,7 +31,7 @@ if TYPE_CHECKING:
 @click.argument("predictions", type=click.Path(path_type=Path, exists=True))
 @option("--store", EXISTING_FOLDER, required=True, metavar="STORE.zarr")
 @option("--split", ChoiceOf("slatprep.learn.splits:SPLITS", "all"), "test")
-@option("--shares", metavar="TRAIN,VAL,TEST")
+@split_options
 @option("--spread", ChoiceOf("slatprep.learn.metrics:Spread"), "se")
 @option("--csv", NEW_FILE, name="csv_file")
 @option("--beside", metavar="pixie|slat-phys|FILE.csv")
@@ -38,6 +40,7 @@ def evaluate(
     predictions: Path,
     store: Place,
     split: Any,
+    split_by: str | None,
     shares: str | None,
     spread: Any,
     csv_file: Path | None,
@@ -50,14 +53,13 @@ def evaluate(
     space, and may have material (N,) or logits (N,8), coords (N,3), and
     ranges (3,2), where they are not the store's. Errors are means over
     valid voxels, then over objects. Exit code 1 says that an asset of the
-    split has no prediction.
+    split has no prediction. Predictions beside the run.json of a training
+    are of the objects that it says, unless --split-by or --shares are given.
 
     Options
     -------
     --store: Has the truth.
     --split: Objects to measure on.
-    --shares: Shares of the objects. [default: as the run says that the predictions are of, else
-        0.8,0.1,0.1]
     --spread: Standard error or standard deviation over objects.
     --csv: Also write the table to this file.
     --beside: Also print the published table of Pixie, which has NeRF2Physics too, those of
@@ -67,20 +69,34 @@ def evaluate(
     -------
     slatprep evaluate runs/small/predictions --store demo.zarr
     slatprep evaluate predictions.h5 --store demo.zarr --split all --spread sd --csv scores.csv
+    slatprep evaluate predictions --store pixieverse.zarr --split-by test_set.json
     slatprep evaluate runs/large/predictions --store pixieverse.zarr --beside pixie
     """
     from slatprep.learn.metrics import evaluate_store
     from slatprep.learn.predictions import RUN_FILE, selection_of_run
     from slatprep.learn.published import TABLES, read_scores
+    from slatprep.learn.splits import HASH, assign_store
+    from slatprep.store import open_store
 
     others: tuple[PublishedScore, ...] = ()
     if beside is not None:
         others = TABLES[beside][1] if beside in TABLES else read_scores(Path(beside))
-    chosen = {"shares": shares_of(shares)} if shares else selection_of_run(predictions)
-    if chosen and not shares:
-        output.note(f"split:   as {predictions.absolute().parent / RUN_FILE} says")
+    rule, how = split_rule(split_by, shares), f"by {split_by or HASH}"
+    selection = None if split_by or shares else selection_of_run(predictions)
+    if selection is not None:
+        rule |= {name: selection.pop(name) for name in ("by", "shares") if name in selection}
+        how = f"as {predictions.absolute().parent / RUN_FILE} says"
+    elif not split_by and not shares:
+        how += ", as no run lies beside the predictions (others: --split-by, --split all)"
+    assignment = assign_store(open_store(store), **rule)
+    note_split(output, assignment, f"{split}, {how}")
     result = evaluate_store(
-        predictions, store, None if split == "all" else split, spread=spread, **(chosen or {})
+        predictions,
+        store,
+        None if split == "all" else split,
+        spread=spread,
+        splits=assignment.splits,
+        **(selection or {}),
     )
     rows = _rows(result)
     names = (name for mean in result.overall.means for name in (mean, f"{mean} {spread}"))

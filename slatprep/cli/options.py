@@ -18,7 +18,7 @@ from slatprep.cli.output import OUTPUT_OPTIONS, Output, with_output
 from slatprep.storage.place import place_of, storage_of
 
 if TYPE_CHECKING:
-    from slatprep.learn.splits import Shares
+    from slatprep.learn.splits import Assignment, Shares
     from slatprep.parameters import BuildParameters
     from slatprep.records import Place
     from slatprep.store import Store
@@ -298,16 +298,44 @@ def parameters_of(options: dict[str, Any]) -> BuildParameters:
     return load_parameters(options.pop("config"), given, options.pop("preset"))
 
 
-shares_option = option(
-    "--shares",
-    default="0.8,0.1,0.1",
-    text="Shares of the objects; a hash of the id decides where one goes.",
-    metavar="TRAIN,VAL,TEST",
-)
+def split_options(command: _Function) -> _Function:
+    """Add ``--split-by`` and ``--shares``, of which `split_rule` makes what decides a split."""
+    by = option(
+        "--split-by",
+        text="What parts the objects: a hash of their ids; Pixie's rule; one category to test on; "
+        "or a file of ids, a list to test on or a JSON object of the lists train, val and test.  "
+        "[default: hash]",
+        metavar="hash|pixie|category:NAME|FILE",
+    )
+    shares = option(
+        "--shares",
+        text="Shares of the objects by the hash, which also parts what no rule tests on into "
+        "train and val.  [default: 0.8,0.1,0.1]",
+        metavar="TRAIN,VAL,TEST",
+    )
+    return by(shares(command))
 
 
-def shares_of(text: str) -> Shares:
-    """Return the shares that ``--shares`` gives; they must be three numbers."""
+def split_rule(split_by: str | None, shares: str | None) -> dict[str, Any]:
+    """Return ``by`` and ``shares`` for `slatprep.learn.splits.assign_store`."""
+    from slatprep.learn.splits import HASH, Shares
+
+    return {"by": split_by or HASH, "shares": Shares() if shares is None else _shares(shares)}
+
+
+def note_split(output: Output, assignment: Assignment, how: str) -> None:
+    """Say how objects are parted, and what of a file's ids and of the store's objects is not."""
+    counts = ", ".join(f"{len(ids):,} {split}" for split, ids in assignment.lists().items())
+    output.note(f"split:   {how}: {counts}")
+    for ids, what in (
+        (assignment.unknown, "are of no object of the store that has a valid voxel"),
+        (assignment.unlisted, "of the store are in none of its lists, and left out"),
+    ):
+        if ids:
+            output.note(f"note:    {len(ids):,} ids {what}: {', '.join(ids[:3])[:200]} ...")
+
+
+def _shares(text: str) -> Shares:
     from slatprep.learn.splits import Shares
 
     try:

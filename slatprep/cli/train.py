@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 import os
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -16,14 +17,16 @@ from slatprep.cli.options import (
     ChoiceOf,
     command,
     note_left_out,
+    note_split,
     option,
-    shares_of,
-    shares_option,
+    split_options,
+    split_rule,
     verdicts_option,
 )
 from slatprep.cli.output import Output
 
 if TYPE_CHECKING:
+    from slatprep.learn.runs import EpochRecord
     from slatprep.learn.train import TrainSummary
     from slatprep.records import Place
 
@@ -36,15 +39,17 @@ _SIZES = ("small", "medium", "large")
 @option("--size", click.Choice(_SIZES), "large")
 @option("--all-sizes", is_flag=True)
 @option("--epochs", POSITIVE, 100)
+@option("--steps", POSITIVE)
 @option("--batch-size", POSITIVE, 1)
 @option("--accumulate", POSITIVE, 1)
 @option("--learning-rate", click.FloatRange(min=0, min_open=True), 0.0001)
 @option("--precision", click.Choice(["auto", "fp32", "bf16"]), "auto")
+@option("--keep", click.Choice(["best", "last"]), "best")
 @option("--patience", POSITIVE, 10)
 @option("--augment", ChoiceOf("slatprep.learn.augment:Augmentation"), "none", name="augmentation")
 @verdicts_option
 @option("--max-ambiguity", float)
-@shares_option
+@split_options
 @option("--weigh-by-confidence", is_flag=True)
 @option("--seed", int, 0)
 @option("--device", click.Choice(["cpu", "cuda"]), "cpu")
@@ -56,7 +61,8 @@ def train(
     out: Path,
     size: str,
     all_sizes: bool,
-    shares: str,
+    split_by: str | None,
+    shares: str | None,
     verdicts: tuple[str, ...] | None,
     device: str,
     workers: int,
@@ -75,10 +81,12 @@ def train(
     --size: 0.20, 1.19 or 6.32 million weights.
     --all-sizes: Train all three, each in its own directory.
     --epochs: Passes over the training objects.
+    --steps: Steps of the optimiser to do instead, whatever part of a pass the last ones are.
     --batch-size: Assets in a batch.
     --accumulate: Batches in a step of the optimiser.
     --learning-rate: Of AdamW, before the cosine.
     --precision: bf16: mixed precision; auto: that where the processor computes in it, else fp32.
+    --keep: Weights of the epoch that validates best, or of the last, whatever validation says.
     --patience: Stop after so many epochs without progress.
     --augment: Quarter turns and flips: of 8 or 48 kinds.
     --max-ambiguity: Leave out assets that are more ambiguous.
@@ -92,24 +100,35 @@ def train(
     -------
     slatprep train demo.zarr --out runs/small --size small --epochs 8 --learning-rate 0.003
     slatprep train demo.zarr --out runs/sizes --all-sizes
+    slatprep train demo.zarr --out runs/large --steps 2000 --keep last --split-by test_set.json
     """
     from slatprep.learn import require_torch
 
     require_torch()
     import torch
 
+    from slatprep.learn.splits import assign_store
     from slatprep.learn.train import TrainParameters
     from slatprep.learn.train import train as run
     from slatprep.records import USABLE, Verdict
     from slatprep.storage.atomic import writing
     from slatprep.store import open_store
 
+    given = click.get_current_context().get_parameter_source("epochs")
+    if parameters["steps"] and given is not click.core.ParameterSource.DEFAULT:
+        raise click.UsageError("--epochs and --steps both say when to end; give one of them")
     torch.set_num_threads(threads)
+    opened, rule = open_store(store), split_rule(split_by, shares)
+    note_split(output, assign_store(opened, **rule), f"by {rule['by']}")
     if verdicts is None:
         verdicts = USABLE
-        note_left_out(output, open_store(store))
+        note_left_out(output, opened)
     chosen = TrainParameters(
-        size=size, shares=shares_of(shares), verdicts=verdicts or tuple(Verdict), **parameters
+        size=size,
+        split_by=rule["by"],
+        shares=rule["shares"],
+        verdicts=verdicts or tuple(Verdict),
+        **parameters,
     )
     runs = {name: out / name for name in _SIZES} if all_sizes else {size: out}
     summaries = {}
@@ -125,15 +144,22 @@ def train(
                 device=device,
                 workers=workers,
                 steps=steps,
-                progress=lambda r, name=name: output.note(  # type: ignore[misc]
-                    f"{name}, epoch {r.epoch}: train loss {r.train_loss:.4f}, validation loss "
-                    f"{r.val_loss:.4f}, MSE {r.val_mse:.4f}, accuracy {r.val_accuracy:.3f}"
-                ),
+                progress=lambda r, name=name: output.note(f"{name}, {_line(r)}"),  # type: ignore[misc]
             )
     output.result(summaries, lambda: _show_training(output, summaries))
     output.note(f"runs:    {', '.join(str(directory) for directory in runs.values())}")
     first = next(iter(summaries.values()))
     output.note(f"next:    slatprep evaluate {first.predictions} --store {store}")
+
+
+def _line(record: EpochRecord) -> str:
+    line = f"epoch {record.epoch}: train loss {record.train_loss:.4f}"
+    if math.isnan(record.val_loss):
+        return line
+    return (
+        f"{line}, validation loss {record.val_loss:.4f}, MSE {record.val_mse:.4f}, "
+        f"accuracy {record.val_accuracy:.3f}"
+    )
 
 
 def _show_training(output: Output, summaries: dict[str, TrainSummary]) -> None:

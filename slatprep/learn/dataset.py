@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -119,6 +119,9 @@ class SlatDataset(Dataset[Item]):
         Which objects, as `slatprep.learn.splits.split_objects` decides; all if not given.
     shares : Shares
         Shares of the splits.
+    splits : mapping of str to {"train", "val", "test"}, optional
+        Split by object id, such as those of `slatprep.learn.splits.assign_store`,
+        instead of the hash.
     verdicts : collection of str, optional
         Verdicts that are good enough; all if not given.
     max_ambiguity : float, optional
@@ -144,6 +147,7 @@ class SlatDataset(Dataset[Item]):
         split: Split | None = None,
         *,
         shares: Shares = Shares(),  # noqa: B008 (immutable)
+        splits: Mapping[str, Split] | None = None,
         verdicts: Collection[str] | None = None,
         max_ambiguity: float | None = None,
         min_confidence: float | None = None,
@@ -152,7 +156,12 @@ class SlatDataset(Dataset[Item]):
     ) -> None:
         self.store = store if isinstance(store, Store) else open_store(store, copy=True)
         self.indices = select_assets(
-            self.store, split, shares=shares, verdicts=verdicts, max_ambiguity=max_ambiguity
+            self.store,
+            split,
+            shares=shares,
+            splits=splits,
+            verdicts=verdicts,
+            max_ambiguity=max_ambiguity,
         )
         if len(self.indices) == 0:
             raise ConfigError(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -156,6 +156,7 @@ def evaluate_store(
     spread: Spread = "se",
     verdicts: Collection[str] | None = None,
     max_ambiguity: float | None = None,
+    splits: Mapping[str, Split] | None = None,
 ) -> Evaluation:
     """Measure predictions against a store.
 
@@ -171,7 +172,7 @@ def evaluate_store(
         Shares of the splits, as in training.
     spread : {"se", "sd"}
         Standard error or standard deviation over objects.
-    verdicts, max_ambiguity
+    verdicts, max_ambiguity, splits
         As for `slatprep.learn.splits.select_assets`.
 
     Raises
@@ -188,7 +189,12 @@ def evaluate_store(
     missing: list[str] = []
     converted = 0
     chosen = select_assets(
-        store, split, shares=shares, verdicts=verdicts, max_ambiguity=max_ambiguity
+        store,
+        split,
+        shares=shares,
+        verdicts=verdicts,
+        max_ambiguity=max_ambiguity,
+        splits=splits,
     )
     with open_predictions(predictions) as read:
         for index in chosen.tolist():

@@ -41,6 +41,9 @@ CLASSES = len(MATERIAL_CLASSES)
 RUN_FILE = "run.json"
 """What `slatprep train` writes beside the predictions: the parameters of the run."""
 
+SPLITS_FILE = "splits.json"
+"""What it writes there of the objects: which are in each split."""
+
 RUN_BYTES = 2**20
 """No such file is larger."""
 
@@ -97,7 +100,8 @@ def selection_of_run(predictions: Path) -> dict[str, Any] | None:
     Returns
     -------
     dict or None
-        ``shares``, ``verdicts`` and ``max_ambiguity``; None where no run lies there.
+        ``shares``, ``verdicts`` and ``max_ambiguity``, and as ``by`` the file of the objects
+        in each split, where there is one; None where no run lies there.
 
     Raises
     ------
@@ -112,13 +116,15 @@ def selection_of_run(predictions: Path) -> dict[str, Any] | None:
     try:
         run = read_document(file, RUN_BYTES)
         named = {name: run[name] for name in ("shares", "verdicts", "max_ambiguity")}
-        return vars(TypeAdapter(_Selection).validate_python(named))
+        selection = vars(TypeAdapter(_Selection).validate_python(named))
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise InputError(
             file,
             f"does not say which assets the run chose ({error!r})",
-            "what `slatprep train` wrote; or give --shares",
+            "what `slatprep train` wrote; or give --split-by or --shares",
         ) from error
+    lists = file.with_name(SPLITS_FILE)
+    return selection | ({"by": str(lists)} if lists.exists() else {})
 
 
 ReadAsset = Callable[[str], Mapping[str, NDArray[Any]] | None]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import dataclasses
+import hashlib
 import json
 import os
 import pickletools
@@ -18,7 +19,8 @@ from typing import Any
 import torch
 
 from slatprep.errors import ConfigError
-from slatprep.learn.predictions import RUN_BYTES, RUN_FILE
+from slatprep.learn.predictions import RUN_BYTES, RUN_FILE, SPLITS_FILE
+from slatprep.learn.splits import Assignment
 from slatprep.readers.files import refusing
 from slatprep.storage.atomic import staged
 from slatprep.storage.documents import read_document
@@ -37,7 +39,10 @@ INK, MUTED = "#1F2328", "#6B7280"
 
 @dataclasses.dataclass(frozen=True)
 class EpochRecord:
-    """One line of ``log.csv``: means over the epoch, in the loss's own units."""
+    """One line of ``log.csv``: means over the epoch, in the loss's own units.
+
+    Those of the validation are NaN where there is no object to validate on.
+    """
 
     epoch: int
     learning_rate: float
@@ -137,14 +142,19 @@ class Run:
         (self.path / _LOCK).unlink(missing_ok=True)
         os.close(self._lock)
 
-    def begin(self, parameters: dict[str, Any]) -> None:
+    def begin(self, parameters: dict[str, Any], assignment: Assignment | None = None) -> None:
         """Note everything that decides the result, or go on with the run that has the same.
+
+        The objects of each split go into ``splits.json``, their digest into ``run.json``.
 
         Raises
         ------
         ConfigError
             If the run there has other parameters; the message names them.
         """
+        if assignment is not None:
+            lists = json.dumps(assignment.lists(), indent=1) + "\n"
+            parameters = parameters | {"splits": hashlib.sha256(lists.encode()).hexdigest()}
         text = json.dumps(parameters, indent=1, sort_keys=True) + "\n"
         wanted, found = json.loads(text), self.parameters
         file = self.path / RUN_FILE
@@ -161,6 +171,9 @@ class Run:
                 f"{file}: the run there has other parameters ({', '.join(others)}); "
                 "repeat them to go on with it, or choose another --out"
             )
+        if assignment is not None:
+            with staged(self.path / SPLITS_FILE) as path:
+                path.write_text(lists, encoding="utf-8")
 
     def save(self, name: str, state: dict[str, Any]) -> None:
         """Write a checkpoint; the old one stays until the new one is whole."""

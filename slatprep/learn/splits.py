@@ -1,109 +1,75 @@
-"""Which objects are trained on, validated on and tested on."""
+"""Which assets of a store a split has."""
 
 from __future__ import annotations
 
-import hashlib
-from collections import Counter
-from collections.abc import Collection, Iterable
-from dataclasses import dataclass
-from typing import Literal
+from collections.abc import Collection, Mapping
 
 import numpy as np
 from numpy.typing import NDArray
 
 from slatprep.errors import ConfigError
+from slatprep.readers.splits import (
+    HASH,
+    SPLITS,
+    Assignment,
+    Shares,
+    Split,
+    assign_splits,
+    split_objects,
+    split_of,
+)
 from slatprep.records import Verdict
 from slatprep.store import Store
 
-Split = Literal["train", "val", "test"]
-SPLITS: tuple[Split, ...] = ("train", "val", "test")
+__all__ = [
+    "HASH",
+    "SPLITS",
+    "Assignment",
+    "Shares",
+    "Split",
+    "assign_store",
+    "select_assets",
+    "split_objects",
+    "split_of",
+]
 
 
-@dataclass(frozen=True)
-class Shares:
-    """Shares of the objects, in expectation; they add up to 1.
+def assign_store(
+    store: Store,
+    by: str = HASH,
+    shares: Shares = Shares(),  # noqa: B008 (immutable)
+) -> Assignment:
+    """Return the split of every object of a store that has a valid voxel.
+
+    Parameters
+    ----------
+    store : Store
+        An open store.
+    by, shares
+        As for `slatprep.readers.splits.assign_splits`.
 
     Raises
     ------
-    ConfigError
-        If they do not, or one is negative.
+    ConfigError, InputError
+        As `slatprep.readers.splits.assign_splits` raises them.
+    StoreError
+        If the store cannot be read.
     """
-
-    train: float = 0.8
-    val: float = 0.1
-    test: float = 0.1
-
-    def __post_init__(self) -> None:
-        values = (self.train, self.val, self.test)
-        if min(values) < 0 or abs(sum(values) - 1) > 1e-9:
-            raise ConfigError(
-                f"shares of train, val and test are {values}; "
-                "expected three numbers from 0 to 1 that add up to 1, such as 0.8, 0.1, 0.1"
-            )
-
-
-def position_of(object_id: str) -> float:
-    """Return where an object lies in [0, 1): the first 8 bytes of its id's SHA-256, over 2^64."""
-    digest = hashlib.sha256(object_id.encode("utf-8")).digest()
-    # 53 bits are what a float64 holds exactly, so the result never rounds up to 1.
-    return (int.from_bytes(digest[:8], "big") >> 11) / 2**53
-
-
-def split_of(object_id: str, shares: Shares = Shares()) -> Split:
-    """Return the split of an object.
-
-    The id alone decides: all views of an object are in one split, and an
-    object stays in its split when the dataset grows.
-
-    Parameters
-    ----------
-    object_id : str
-        PixieVerse id, ``asset/object_id`` of the store.
-    shares : Shares
-        Shares of the splits.
-    """
-    position = position_of(object_id)
-    if position < shares.train:
-        return "train"
-    return "val" if position < shares.train + shares.val else "test"
-
-
-def split_objects(object_ids: Iterable[str], shares: Shares = Shares()) -> dict[str, Split]:
-    """Return the split of every object of a dataset, none of those asked for empty.
-
-    It is the split of `split_of`, but for datasets so small that one would get
-    no object: it then takes the object whose place in [0, 1) is nearest to its
-    own, from a split that has others. That needs as many objects as splits.
-
-    Parameters
-    ----------
-    object_ids : iterable of str
-        All objects of the dataset, whatever is filtered later: the choice
-        must be the same for whoever trains and for whoever tests.
-    shares : Shares
-        Shares of the splits; one with share 0 stays empty.
-    """
-    splits = {object_id: split_of(object_id, shares) for object_id in sorted(set(object_ids))}
-    ends = {"train": 0.0, "val": shares.train, "test": shares.train + shares.val}
-    for split in SPLITS:
-        share, low = getattr(shares, split), ends[split]
-        if share == 0 or split in splits.values():
-            continue
-        counts = Counter(splits.values())
-        spare = [object_id for object_id, other in splits.items() if counts[other] > 1]
-        if spare:
-            middle = low + share / 2
-            splits[min(spare, key=lambda object_id: abs(position_of(object_id) - middle))] = split
-    return splits
+    columns = (store.ids, store.column("object_id"), store.column("category"))
+    rows = np.flatnonzero(store.column("valid_share") > 0).tolist()
+    named = [tuple(str(column[row]) for column in columns) for row in rows]
+    objects = {object_id: category for _, object_id, category in named}
+    return assign_splits(by, objects, shares, {asset: name for asset, name, _ in named})
 
 
 def select_assets(
     store: Store,
     split: Split | None = None,
     *,
-    shares: Shares = Shares(),
+    shares: Shares = Shares(),  # noqa: B008 (immutable)
     verdicts: Collection[str] | None = None,
     max_ambiguity: float | None = None,
+    splits: Mapping[str, Split] | None = None,
 ) -> NDArray[np.int64]:
     """Return the indices of assets that a split has, in the order of the store.
 
@@ -120,6 +86,8 @@ def select_assets(
     max_ambiguity : float, optional
         Largest ``asset/ambiguity`` that is good enough. An asset without that
         number is then left out.
+    splits : mapping of str to {"train", "val", "test"}, optional
+        Split by object id, such as those of `assign_store`, instead of the hash.
 
     Returns
     -------
@@ -146,7 +114,7 @@ def select_assets(
         chosen &= store.column("ambiguity") <= max_ambiguity
     if split is not None:
         objects = [str(object_id) for object_id in store.column("object_id")]
-        usable = zip(objects, store.column("valid_share") > 0, strict=True)
-        splits = split_objects((name for name, is_usable in usable if is_usable), shares)
+        if splits is None:
+            splits = assign_store(store, shares=shares).splits
         chosen &= np.array([splits.get(object_id) == split for object_id in objects])
     return np.flatnonzero(chosen)

@@ -5,8 +5,9 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field, replace
+from itertools import islice
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -26,11 +27,13 @@ from slatprep.learn.predict import (
     write_prediction,
 )
 from slatprep.learn.runs import BEST, LAST, EpochRecord, Run
-from slatprep.learn.splits import Shares, Split
+from slatprep.learn.splits import HASH, Assignment, Shares, Split, assign_store
 from slatprep.records import USABLE, Place, StructuredLatents
+from slatprep.store import Store, open_store
 from slatprep.workers import Progress
 
 PRECISIONS = ("auto", "fp32", "bf16")
+KEEPS = ("best", "last")
 
 PROPERTY_WEIGHT = 1.0
 CLASS_WEIGHT = 0.5
@@ -47,12 +50,17 @@ class TrainParameters:
         Size of the decoder: small, medium or large.
     epochs : int
         Passes over the training objects; the cosine ends with the last.
+    steps : int, optional
+        Steps of the optimiser to do instead of `epochs`; the last pass may be a part of one.
     batch_size, accumulate : int
         Assets in a batch, and batches in a step of the optimiser.
     learning_rate : float
         Of AdamW, before the cosine lowers it to 0.
     precision : str
         ``fp32``, ``bf16`` for mixed precision, or ``auto``: see `precision_of`.
+    keep : {"best", "last"}
+        Which epoch's weights are kept: those of the least validation loss, or those of the
+        last, which no object to validate on and no patience has a say in.
     patience : int
         Epochs without a better validation loss after which training stops.
     augmentation : str
@@ -61,6 +69,8 @@ class TrainParameters:
         Verdicts of alignments that are good enough.
     max_ambiguity : float, optional
         Largest ambiguity that is good enough.
+    split_by : str
+        What parts the objects, see `slatprep.readers.splits.assign_splits`.
     shares : Shares
         Shares of train, val and test.
     weigh_by_confidence : bool
@@ -71,20 +81,23 @@ class TrainParameters:
 
     size: str = "large"
     epochs: int = 100
+    steps: int | None = None
     batch_size: int = 1
     accumulate: int = 1
     learning_rate: float = 1e-4
     precision: str = "auto"
+    keep: Literal["best", "last"] = "best"
     patience: int = 10
     augmentation: Augmentation = "none"
     verdicts: tuple[str, ...] = USABLE
     max_ambiguity: float | None = None
+    split_by: str = HASH
     shares: Shares = field(default_factory=Shares)
     weigh_by_confidence: bool = False
     seed: int = 0
 
     def __post_init__(self) -> None:
-        for name, allowed in (("size", tuple(SIZES)), ("precision", PRECISIONS)):
+        for name, allowed in (("size", tuple(SIZES)), ("precision", PRECISIONS), ("keep", KEEPS)):
             if getattr(self, name) not in allowed:
                 raise ConfigError(
                     f"{name} is {getattr(self, name)!r}; expected one of {', '.join(allowed)}"
@@ -102,7 +115,8 @@ class TrainSummary:
     best_epoch : int
         The one whose weights are kept.
     references : dict of str to float
-        Validation MSE of the training mean and of a per-voxel linear model.
+        Validation MSE of the training mean and of a per-voxel linear model; empty where
+        there is nothing to validate on.
     predictions : Path
         Predictions of the test objects, for `slatprep evaluate`.
     """
@@ -177,16 +191,27 @@ def train(
     StoreError
         If the store cannot be read, or another process trains into `out`.
     """
-    train_set = _dataset(store, "train", parameters)
+    opened = open_store(store, copy=True)
+    assignment = assign_store(opened, parameters.split_by, parameters.shares)
+    train_set, test_set = (
+        _dataset(opened, name, parameters, assignment) for name in ("train", "test")
+    )
     if parameters.weigh_by_confidence:
         require_confidence(train_set.store)
-    val_set, test_set = _dataset(store, "val", parameters), _dataset(store, "test", parameters)
+    val_set = None
+    if "val" in assignment.splits.values():
+        val_set = _dataset(opened, "val", parameters, assignment)
+    elif parameters.keep == "best":
+        raise ConfigError(
+            "there is no object to validate on, by which the best weights would be chosen; "
+            "expected --keep last, or objects to validate on (--shares, or a list val)"
+        )
     with Run(out) as run:
         if parameters.precision == "auto":
             # A run goes on as it began, whatever processor it goes on with.
             known = run.parameters.get("precision") or precision_of(device)
             parameters = replace(parameters, precision=known)
-        run.begin(asdict(parameters) | {"store": str(train_set.store.attributes["manifest"])})
+        run.begin(asdict(parameters) | {"store": str(opened.attributes["manifest"])}, assignment)
         session = _Session(parameters, train_set, device, workers)
         state = run.load(LAST)
         if state is not None:
@@ -198,15 +223,17 @@ def train(
             session.history.append(record)
             run.save(LAST, session.state())
             if session.best_epoch == record.epoch:
-                ranges = train_set.store.normalization
+                ranges = opened.normalization
                 run.save(BEST, checkpoint_state(session.model, parameters.size, ranges))
             run.log(session.history)
             if progress is not None:
                 progress(record)
-        names = "mean of the training voxels", "linear in each voxel"
-        baselines = zip(names, fit_baselines(train_set), strict=True)
-        references = {name: _reference(baseline, val_set) for name, baseline in baselines}
-        run.draw(session.history, references)
+        references = {}
+        if val_set is not None:
+            names = "mean of the training voxels", "linear in each voxel"
+            baselines = zip(names, fit_baselines(train_set), strict=True)
+            references = {name: _reference(baseline, val_set) for name, baseline in baselines}
+            run.draw(session.history, references)
         predictions = run.path / "predictions"
         _write_predictions(load_checkpoint(run.path / BEST, device), test_set, predictions)
     return TrainSummary(session.history, session.best_epoch, references, predictions)
@@ -242,6 +269,8 @@ class _Session:
             dataset, parameters.batch_size, shuffle=True, workers=workers, pin_memory=pinned
         )
         self.steps = math.ceil(len(self.loader) / parameters.accumulate)
+        self.all_steps = parameters.steps or parameters.epochs * self.steps
+        self.epochs = math.ceil(self.all_steps / self.steps)
         self.history: list[EpochRecord] = []
         self.first_epoch = 0
 
@@ -251,11 +280,13 @@ class _Session:
 
     @property
     def best_epoch(self) -> int:
+        if self.parameters.keep == "last":
+            return self.epoch - 1
         return int(np.argmin([record.val_loss for record in self.history]))
 
     @property
     def finished(self) -> bool:
-        if self.epoch >= self.parameters.epochs:
+        if self.epoch >= self.epochs:
             return True
         return bool(self.history) and self.epoch - 1 - self.best_epoch >= self.parameters.patience
 
@@ -265,10 +296,12 @@ class _Session:
         self.loader.set_epoch(self.epoch)
         accumulate, losses, rate = self.parameters.accumulate, [], 0.0
         before = (self.epoch - self.first_epoch) * len(self.loader)
-        total = (self.parameters.epochs - self.first_epoch) * len(self.loader)
+        batches = min(len(self.loader), (self.all_steps - self.epoch * self.steps) * accumulate)
+        last = min(len(self.loader), (self.all_steps - (self.epochs - 1) * self.steps) * accumulate)
+        total = (self.epochs - 1 - self.first_epoch) * len(self.loader) + last
         if steps and before == 0:
             steps(0, total)
-        for number, batch in enumerate(self.loader):
+        for number, batch in enumerate(islice(self.loader, batches)):
             moved = batch.to(self.device)
             loss = loss_of(self._predict(moved), moved, self.parameters.weigh_by_confidence)
             # The last step of an epoch may have fewer batches.
@@ -286,8 +319,10 @@ class _Session:
         return float(np.mean(losses)), rate
 
     @torch.no_grad()
-    def validate(self, dataset: SlatDataset) -> tuple[float, float, float]:
-        """Return loss, MSE and class accuracy, each a mean over assets."""
+    def validate(self, dataset: SlatDataset | None) -> tuple[float, float, float]:
+        """Return loss, MSE and class accuracy, each a mean over assets; NaN without a dataset."""
+        if dataset is None:
+            return math.nan, math.nan, math.nan
         self.model.eval()
         scores = []
         for batch in SlatLoader(dataset):
@@ -324,8 +359,8 @@ class _Session:
         self.first_epoch = self.epoch
 
     def _rate(self, step: int) -> float:
-        total = self.parameters.epochs * self.steps
-        return self.parameters.learning_rate * 0.5 * (1 + math.cos(math.pi * step / total))
+        cosine = math.cos(math.pi * step / self.all_steps)
+        return self.parameters.learning_rate * 0.5 * (1 + cosine)
 
     def _predict(self, batch: SparseBatch) -> Prediction:
         mixed = self.parameters.precision == "bf16"
@@ -334,11 +369,13 @@ class _Session:
         return prediction
 
 
-def _dataset(store: Place, split: Split, parameters: TrainParameters) -> SlatDataset:
+def _dataset(
+    store: Store, split: Split, parameters: TrainParameters, assignment: Assignment
+) -> SlatDataset:
     return SlatDataset(
         store,
         split,
-        shares=parameters.shares,
+        splits=assignment.splits,
         verdicts=parameters.verdicts,
         max_ambiguity=parameters.max_ambiguity,
         augmentation=parameters.augmentation if split == "train" else "none",

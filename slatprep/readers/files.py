@@ -11,6 +11,7 @@ from __future__ import annotations
 import hashlib
 import io
 import math
+import sys
 import tokenize
 import zipfile
 import zlib
@@ -39,6 +40,7 @@ _KIND_NAMES = {
     "i": "integer",
     "u": "unsigned integer",
     "f": "floating-point",
+    "S": "byte text",
     "U": "text",
 }
 
@@ -206,6 +208,12 @@ def npy_array(data: bytes, where: str | Place, spec: ArraySpec) -> NDArray[Any]:
     values = np.frombuffer(data, dtype, math.prod(shape), offset)
     array = values.reshape(shape, order="F" if fortran else "C")
     return array.astype(dtype.newbyteorder("="), copy=False)
+
+
+def is_text(value: NDArray[Any]) -> bool:
+    """Whether an array of text holds characters alone, neither surrogates nor what is above."""
+    codes = np.ascontiguousarray(value).view(np.uint32)
+    return not ((codes > sys.maxunicode) | (codes >> 11 == 0xD800 >> 11)).any()
 
 
 def npz_arrays(

@@ -7,7 +7,6 @@ slatprep orders them as `PROPERTY_COLUMNS` does, Young's modulus first.
 
 from __future__ import annotations
 
-import sys
 from typing import Any
 
 import numpy as np
@@ -18,6 +17,7 @@ from slatprep.normalize import PIXIE_RANGES, denormalize_properties
 from slatprep.parameters import SampleParameters
 from slatprep.readers.files import (
     ArraySpec,
+    is_text,
     load_source,
     npy_array,
     npz_small_arrays,
@@ -275,17 +275,11 @@ def _read_bounds(
         plain = value.astype(np.float64) if value.dtype.kind == "f" else value
         if plain.dtype.kind == "f" and not np.isfinite(plain).all():
             warnings.append(f"bounds: {path} [{name}] is not finite; left out")
-        elif plain.dtype.kind == "U" and not _is_text(plain):
+        elif plain.dtype.kind == "U" and not is_text(plain):
             warnings.append(f"bounds: {path} [{name}] is no text; left out")
         else:
             bounds[name] = plain.tolist()
     return bounds
-
-
-def _is_text(value: NDArray[Any]) -> bool:
-    """Whether an array of text holds characters alone, neither surrogates nor what is above."""
-    codes = np.ascontiguousarray(value).view(np.uint32)
-    return not ((codes > sys.maxunicode) | (codes >> 11 == 0xD800 >> 11)).any()
 
 
 def _first(bad: NDArray[np.bool_]) -> tuple[int, ...]:

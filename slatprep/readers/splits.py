@@ -1,0 +1,284 @@
+"""Which objects are trained on, validated on and tested on: by a hash, a rule, or lists of ids."""
+
+from __future__ import annotations
+
+import hashlib
+from collections import Counter
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+import orjson
+
+from slatprep.errors import ConfigError, InputError
+from slatprep.readers.files import ArraySpec, is_text, npy_array
+from slatprep.records import Place
+from slatprep.storage.documents import read_bounded
+from slatprep.storage.place import place_of
+
+Split = Literal["train", "val", "test"]
+SPLITS: tuple[Split, ...] = ("train", "val", "test")
+
+
+@dataclass(frozen=True)
+class Shares:
+    """Shares of the objects, in expectation; they add up to 1.
+
+    Raises
+    ------
+    ConfigError
+        If they do not, or one is negative.
+    """
+
+    train: float = 0.8
+    val: float = 0.1
+    test: float = 0.1
+
+    def __post_init__(self) -> None:
+        values = (self.train, self.val, self.test)
+        if not (min(values) >= 0 and abs(sum(values) - 1) <= 1e-9):  # NaN is neither
+            raise ConfigError(
+                f"shares of train, val and test are {values}; "
+                "expected three numbers from 0 to 1 that add up to 1, such as 0.8, 0.1, 0.1"
+            )
+
+
+def position_of(object_id: str) -> float:
+    """Return where an object lies in [0, 1): the first 8 bytes of its id's SHA-256, over 2^64."""
+    digest = hashlib.sha256(object_id.encode("utf-8")).digest()
+    # 53 bits are what a float64 holds exactly, so the result never rounds up to 1.
+    return (int.from_bytes(digest[:8], "big") >> 11) / 2**53
+
+
+def split_of(object_id: str, shares: Shares = Shares()) -> Split:
+    """Return the split of an object.
+
+    The id alone decides: all views of an object are in one split, and an
+    object stays in its split when the dataset grows.
+
+    Parameters
+    ----------
+    object_id : str
+        PixieVerse id, ``asset/object_id`` of the store.
+    shares : Shares
+        Shares of the splits.
+    """
+    position = position_of(object_id)
+    if position < shares.train:
+        return "train"
+    return "val" if position < shares.train + shares.val else "test"
+
+
+def split_objects(object_ids: Iterable[str], shares: Shares = Shares()) -> dict[str, Split]:
+    """Return the split of every object of a dataset, none of those asked for empty.
+
+    It is the split of `split_of`, but for datasets so small that one would get
+    no object: it then takes the object whose place in [0, 1) is nearest to its
+    own, from a split that has others. That needs as many objects as splits.
+
+    Parameters
+    ----------
+    object_ids : iterable of str
+        All objects of the dataset, whatever is filtered later: the choice
+        must be the same for whoever trains and for whoever tests.
+    shares : Shares
+        Shares of the splits; one with share 0 stays empty.
+    """
+    splits = {object_id: split_of(object_id, shares) for object_id in sorted(set(object_ids))}
+    ends = {"train": 0.0, "val": shares.train, "test": shares.train + shares.val}
+    for split in SPLITS:
+        share, low = getattr(shares, split), ends[split]
+        if share == 0 or split in splits.values():
+            continue
+        counts = Counter(splits.values())
+        spare = [object_id for object_id, other in splits.items() if counts[other] > 1]
+        if spare:
+            middle = low + share / 2
+            splits[min(spare, key=lambda object_id: abs(position_of(object_id) - middle))] = split
+    return splits
+
+
+HASH, PIXIE, CATEGORY = "hash", "pixie", "category:"
+"""What `assign_splits` takes besides the path of a file."""
+
+_MAX_BYTES = 64 * 2**20
+_IDS = ArraySpec(((None,),), "US")
+_FORMS = (
+    "ids, one a line; a JSON list of them; a JSON object of the lists train, val and test; or an "
+    "npy array of text"
+)
+
+
+@dataclass(frozen=True)
+class Assignment:
+    """Which split each object of a dataset is in.
+
+    Attributes
+    ----------
+    splits : dict of str to {"train", "val", "test"}
+        By object id.
+    unknown : tuple of str
+        Ids of a file that the dataset does not have.
+    unlisted : tuple of str
+        Objects that are in none of a file's lists, and so in no split.
+    """
+
+    splits: dict[str, Split]
+    unknown: tuple[str, ...] = ()
+    unlisted: tuple[str, ...] = ()
+
+    def lists(self) -> dict[Split, list[str]]:
+        """Return the objects of each split, sorted: what `read_lists` reads."""
+        by_split: dict[Split, list[str]] = {split: [] for split in SPLITS}
+        for object_id, split in sorted(self.splits.items()):
+            by_split[split].append(object_id)
+        return by_split
+
+
+def assign_splits(
+    by: str,
+    objects: Mapping[str, str],
+    shares: Shares = Shares(),
+    assets: Mapping[str, str] | None = None,
+) -> Assignment:
+    """Return the split of every object of a dataset by a rule.
+
+    Parameters
+    ----------
+    by : str
+        ``hash``: see `split_objects`. ``pixie``: see `pixie_test_objects`.
+        ``category:NAME``: all objects of a category are tested on. Anything else
+        is the path of a file, see `read_lists`.
+    objects : mapping of str to str
+        Category by object id.
+    shares : Shares
+        For ``hash``. Where the rule, or a file with a single list, says only what is tested
+        on, the other objects are parted by hash in the proportion of train and val.
+    assets : mapping of str to str, optional
+        Object id by asset id: a file may name an object by its assets.
+
+    Raises
+    ------
+    ConfigError
+        If there is no such category, or a file puts one object into two splits.
+    InputError
+        If the file cannot be used, or has no object of the dataset.
+    """
+    if by == HASH:
+        return Assignment(split_objects(objects, shares))
+    if by == PIXIE:
+        return Assignment(_around(pixie_test_objects(objects), objects, shares))
+    if by.startswith(CATEGORY):
+        name = by.removeprefix(CATEGORY)
+        chosen = [object_id for object_id, category in objects.items() if category == name]
+        if not chosen:
+            known = ", ".join(sorted(set(objects.values()) - {""})) or "none"
+            raise ConfigError(f"no object has the category {name!r}; expected one of: {known}")
+        return Assignment(_around(chosen, objects, shares))
+    return _by_file(place_of(by), objects, shares, assets or {})
+
+
+def pixie_test_objects(object_ids: Iterable[str]) -> list[str]:
+    """Return the objects that Pixie's rule sets aside for its test: a tenth, drawn with seed 42.
+
+    Pixie splits a dataset of n objects by ``torch.utils.data.random_split`` into ``int(0.9 * n)``
+    and the rest, with a generator of seed 42, and tests on the rest (vlongle/pixie,
+    ``training_discrete.py``). It takes them in the order in which its file system lists
+    them, here they are sorted: the objects that Pixie itself tested on are those of its
+    ``test_set.json``.
+    """
+    ordered = sorted(set(object_ids))
+    # torch.randperm swaps each place with one drawn from those not yet filled: a 32-bit
+    # word of MT19937, seeded as numpy's legacy generator is, modulo their number.
+    words = np.random.RandomState(42)
+    for place in range(len(ordered) - 1):
+        other = place + int(words.randint(0, 2**32, dtype=np.uint32)) % (len(ordered) - place)
+        ordered[place], ordered[other] = ordered[other], ordered[place]
+    return ordered[int(0.9 * len(ordered)) :]
+
+
+def read_lists(path: Place) -> dict[Split, tuple[str, ...]]:
+    """Read which ids each split has.
+
+    Parameters
+    ----------
+    path : Place
+        Ids of objects or assets: a JSON object with some of the lists ``train``, ``val`` and
+        ``test``; or a single list, of those to test on, as JSON, as a one-dimensional npy
+        array of text, or one id a line.
+
+    Raises
+    ------
+    InputError
+        If it cannot be read, or is none of these.
+    """
+    try:
+        data = read_bounded(path, _MAX_BYTES)
+        if path.suffix == ".npy":
+            names = npy_array(data, path, _IDS).astype(str)
+            if not is_text(names):
+                raise ValueError("it holds no text")
+            listed: Any = names.tolist()
+        elif path.suffix == ".json":
+            listed = orjson.loads(data)
+        else:
+            listed = [
+                line.strip() for line in data.decode("utf-8-sig").splitlines() if line.strip()
+            ]
+    except (OSError, ValueError) as error:
+        raise InputError(path, f"cannot be read ({error})", _FORMS) from None
+    lists = listed if isinstance(listed, dict) else {"test": listed}
+    for name, ids in lists.items():
+        if name not in SPLITS:
+            raise InputError(path, f"has a list {name[:80]!r}", f"some of {', '.join(SPLITS)}")
+        if not isinstance(ids, list):
+            raise InputError(path, f"holds {type(ids).__name__} for {name}", _FORMS)
+        wrong = [one for one in ids if not isinstance(one, str)]
+        if wrong:
+            raise InputError(path, f"{name} has {str(wrong[0])[:80]!r}, which is no text", _FORMS)
+    if not any(lists.values()):
+        raise InputError(path, "has no id", _FORMS)
+    return {split: tuple(lists[split]) for split in SPLITS if split in lists}
+
+
+def _by_file(
+    path: Place, objects: Mapping[str, str], shares: Shares, assets: Mapping[str, str]
+) -> Assignment:
+    lists = read_lists(path)
+    splits: dict[str, Split] = {}
+    unknown: dict[str, None] = {}
+    for split, ids in lists.items():
+        for one in ids:
+            object_id = one if one in objects else assets.get(one)
+            if object_id is None:
+                unknown[one] = None
+            elif splits.setdefault(object_id, split) != split:
+                raise ConfigError(
+                    f"{path}: {one!r} is in the lists {splits[object_id]} and {split}; expected "
+                    "every object, with all its views, in one"
+                )
+    if not splits:
+        raise InputError(
+            path,
+            f"has none of the dataset's {len(objects):,} objects",
+            f"ids such as {next(iter(sorted(objects)), 'none: there is no object')}",
+        )
+    if lists.keys() == {"test"}:
+        splits = _around(splits, objects, shares)
+    unlisted = tuple(object_id for object_id in sorted(objects) if object_id not in splits)
+    return Assignment(splits, tuple(unknown), unlisted)
+
+
+def _around(test: Iterable[str], objects: Iterable[str], shares: Shares) -> dict[str, Split]:
+    """Return splits of which that to test on is given, and a hash parts the others."""
+    splits: dict[str, Split] = dict.fromkeys(test, "test")
+    others = shares.train + shares.val
+    if others == 0:
+        raise ConfigError(
+            "shares leave nothing to train and validate on; expected a share of train, such as "
+            "0.9,0.1,0"
+        )
+    train = shares.train / others
+    rest = (object_id for object_id in objects if object_id not in splits)
+    return splits | split_objects(rest, Shares(train, 1 - train, 0.0))

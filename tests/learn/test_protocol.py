@@ -1,0 +1,153 @@
+"""Training and measuring by the protocols of others: their splits, steps and weights."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from click.testing import CliRunner, Result
+
+from slatprep import ConfigError, open_store
+from slatprep.cli.commands import slatprep
+from slatprep.learn.dataset import SlatDataset, SlatLoader
+from slatprep.learn.runs import BEST, LAST
+from slatprep.learn.splits import Shares, assign_store, select_assets
+from slatprep.learn.train import TrainParameters, train
+from slatprep.readers.splits import pixie_test_objects
+
+BY_FILE = {"train": ["a", "b", "c"], "val": ["d"], "test": ["e", "h.front"]}
+FAST = ("--size", "small", "--learning-rate", "0.002", "--threads", "1")
+
+
+def run(*arguments: object) -> Result:
+    return CliRunner().invoke(slatprep, [str(argument) for argument in arguments])
+
+
+@pytest.fixture
+def lists(tmp_path: Path) -> Path:
+    path = tmp_path / "lists.json"
+    path.write_text(json.dumps(BY_FILE | {"train": ["a", "b", "c", "nobody"]}))
+    return path
+
+
+def test_a_store_is_parted_by_each_rule(learn_store: Path, lists: Path) -> None:
+    store = open_store(learn_store)
+    found = assign_store(store, str(lists))
+    assert found.lists() == {"train": ["a", "b", "c"], "val": ["d"], "test": ["e", "h"]}
+    assert (found.unknown, found.unlisted) == (("nobody",), ("f", "g"))
+    tested = select_assets(store, "test", splits=found.splits)
+    assert [store.ids[k] for k in tested] == ["e", "h.front", "h.side"]
+    by_pixie = assign_store(store, "pixie", Shares(1.0, 0.0, 0.0)).lists()
+    assert by_pixie["test"] == pixie_test_objects("abcdefgh") and by_pixie["val"] == []
+    assert SlatDataset(store, "val", splits=found.splits).asset_ids == ["d"]
+
+
+def test_a_run_keeps_its_lists_and_evaluate_takes_them(
+    learn_store: Path, lists: Path, tmp_path: Path
+) -> None:
+    out = tmp_path / "run"
+    command = ("train", learn_store, "--out", out, *FAST, "--epochs", "1", "--split-by", lists)
+    trained = run(*command)
+    assert trained.exit_code == 0, trained.output
+    assert "3 train, 1 val, 2 test" in trained.stderr
+    assert "1 ids are of no object" in trained.stderr and "nobody" in trained.stderr
+    assert "2 ids of the store are in none" in trained.stderr
+    kept = json.loads((out / "splits.json").read_text())
+    assert kept == {"train": ["a", "b", "c"], "val": ["d"], "test": ["e", "h"]}
+    assert json.loads((out / "run.json").read_text())["split_by"] == str(lists)
+    assert {path.stem for path in (out / "predictions").iterdir()} == {"e", "h.front", "h.side"}
+
+    measured = run("evaluate", out / "predictions", "--store", learn_store, "--json")
+    assert measured.exit_code == 0, measured.output
+    assert json.loads(measured.stdout)["overall"]["objects"] == 2
+    assert f"as {out / 'run.json'} says: 3 train, 1 val, 2 test" in measured.stderr
+    same = run("evaluate", out / "predictions", "--store", learn_store, "--json",
+               "--split-by", out / "splits.json")  # fmt: skip
+    assert same.stdout == measured.stdout
+
+    # A file that says something else by the time that the run goes on is another run.
+    lists.write_text(json.dumps(BY_FILE | {"val": ["d", "g"]}))
+    other = run(*command)
+    assert other.exit_code == 2 and "splits" in other.stderr
+
+
+def test_evaluate_outside_a_run_says_which_split_it_takes(
+    learn_store: Path, tmp_path: Path
+) -> None:
+    store = open_store(learn_store)
+    for index, asset_id in enumerate(store.ids):
+        coords = store.read(index, ("coords",))["coords"]
+        np.savez(tmp_path / f"{asset_id}.npz", properties=np.zeros(coords.shape))
+    command = ("evaluate", tmp_path, "--store", learn_store)
+    bare = run(*command)
+    assert bare.exit_code == 0, bare.output
+    assert "test, by hash, as no run lies beside the predictions" in bare.stderr
+    assert "--split all" in bare.stderr and "--split-by" in bare.stderr
+    chosen = run(*command, "--split-by", "pixie", "--json")
+    assert chosen.exit_code == 0, chosen.output
+    assert "by pixie: " in chosen.stderr and "no run" not in chosen.stderr
+    assert json.loads(chosen.stdout)["overall"]["objects"] == 1
+
+
+@pytest.mark.parametrize("steps", [1, 3, 4])
+def test_steps_end_where_they_are_told_to(learn_store: Path, tmp_path: Path, steps: int) -> None:
+    chosen = TrainParameters(
+        size="small", steps=steps, epochs=1, batch_size=1, accumulate=2, learning_rate=2e-3,
+        shares=Shares(0.4, 0.3, 0.3), keep="last",
+    )  # fmt: skip
+    batches = len(SlatLoader(SlatDataset(learn_store, "train", shares=chosen.shares), 1))
+    per_epoch = math.ceil(batches / 2)
+    seen: list[tuple[int, int]] = []
+    history = train(
+        learn_store, tmp_path / "run", chosen, steps=lambda *done: seen.append(done)
+    ).history
+    assert len(history) == math.ceil(steps / per_epoch)
+    # The cosine ends with the last step, and the log has the rate of each pass's last one.
+    ends = [min(steps, (k + 1) * per_epoch) - 1 for k in range(len(history))]
+    cosine = [2e-3 * (1 + math.cos(math.pi * end / steps)) / 2 for end in ends]
+    assert [record.learning_rate for record in history] == pytest.approx(cosine)
+    full, rest = divmod(steps, per_epoch)
+    done = full * batches + min(2 * rest, batches)
+    assert seen == [(k, done) for k in range(done + 1)]
+
+
+def test_a_run_of_steps_goes_on_to_the_bit(learn_store: Path, tmp_path: Path) -> None:
+    chosen = TrainParameters(
+        size="small", steps=5, batch_size=2, learning_rate=2e-3, shares=Shares(0.4, 0.3, 0.3)
+    )
+    train(learn_store, tmp_path / "whole", chosen)
+    train(learn_store, tmp_path / "parts", chosen, stop_after=1)
+    train(learn_store, tmp_path / "parts", chosen)
+    whole, parts = (
+        torch.load(tmp_path / name / LAST, weights_only=True)["model"]
+        for name in ("whole", "parts")
+    )
+    assert all(torch.equal(whole[key], parts[key]) for key in whole)
+
+
+def test_the_last_weights_need_no_validation(learn_store: Path, tmp_path: Path) -> None:
+    shares = Shares(0.9, 0.0, 0.1)
+    two = TrainParameters(size="small", epochs=2, learning_rate=2e-3, shares=shares, keep="last")
+    summary = train(learn_store, tmp_path / "run", two)
+    assert summary.best_epoch == 1 and summary.references == {}
+    assert all(math.isnan(record.val_loss) for record in summary.history)
+    last, kept = (
+        torch.load(tmp_path / "run" / name, weights_only=True)["model"] for name in (LAST, BEST)
+    )
+    assert all(torch.equal(last[key], kept[key]) for key in last)
+    assert not (tmp_path / "run" / "curve.png").exists()
+    with pytest.raises(ConfigError, match="--keep last"):
+        train(learn_store, tmp_path / "other", TrainParameters(size="small", shares=shares))
+    shown = run("train", learn_store, "--out", tmp_path / "shown", *FAST, "--steps", "2",
+                "--keep", "last", "--split-by", "pixie", "--shares", "1,0,0")  # fmt: skip
+    assert shown.exit_code == 0, shown.output
+    assert "loss nan" not in shown.output
+
+
+def test_epochs_and_steps_are_not_given_together(learn_store: Path, tmp_path: Path) -> None:
+    both = run("train", learn_store, "--out", tmp_path / "run", "--epochs", "2", "--steps", "3")
+    assert both.exit_code == 2 and "give one of them" in both.stderr

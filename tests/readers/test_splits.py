@@ -1,0 +1,164 @@
+"""Splits by rules and by files of ids."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from slatprep import ConfigError, InputError
+from slatprep.readers.splits import (
+    Assignment,
+    Shares,
+    assign_splits,
+    pixie_test_objects,
+    read_lists,
+    split_objects,
+)
+
+OBJECTS = {f"{k:032x}": ("tree", "rocks", "")[k % 3] for k in range(60)}
+SOME = sorted(OBJECTS)[:6]
+
+
+@pytest.mark.parametrize("count", [1, 2, 9, 10, 11, 157, 1577])
+def test_pixie_s_rule_is_torch_s_random_split(count: int) -> None:
+    torch = pytest.importorskip("torch")
+    ids = [f"{k:032x}" for k in range(count)]
+    permutation = torch.randperm(count, generator=torch.Generator().manual_seed(42)).tolist()
+    expected = [ids[k] for k in permutation[int(0.9 * count) :]]
+    assert pixie_test_objects(reversed(ids)) == expected
+
+
+def test_pixie_s_rule_without_torch() -> None:
+    # The last 3 of torch.randperm(30, generator=torch.Generator().manual_seed(42)), torch 2.13.
+    letters = [f"{k:02d}" for k in range(30)]
+    assert pixie_test_objects(letters) == ["05", "24", "03"]
+    assert len(pixie_test_objects(OBJECTS)) == 6
+
+
+@pytest.mark.parametrize("shares", [Shares(), Shares(0.5, 0.25, 0.25), Shares(1.0, 0.0, 0.0)])
+def test_what_no_rule_tests_on_is_parted_by_the_hash(shares: Shares) -> None:
+    for by, test in (
+        ("pixie", set(pixie_test_objects(OBJECTS))),
+        ("category:tree", {name for name, category in OBJECTS.items() if category == "tree"}),
+    ):
+        splits = assign_splits(by, OBJECTS, shares).splits
+        assert splits.keys() == OBJECTS.keys()
+        assert {name for name, split in splits.items() if split == "test"} == test
+        train = shares.train / (shares.train + shares.val)
+        rest = split_objects(OBJECTS.keys() - test, Shares(train, 1 - train, 0.0))
+        assert {name: split for name, split in splits.items() if split != "test"} == rest
+
+
+def test_a_category_that_is_not_there_is_named() -> None:
+    with pytest.raises(ConfigError, match="'cars'; expected one of: rocks, tree"):
+        assign_splits("category:cars", OBJECTS)
+
+
+def test_shares_without_training_are_refused() -> None:
+    with pytest.raises(ConfigError, match="nothing to train"):
+        assign_splits("pixie", OBJECTS, Shares(0.0, 0.0, 1.0))
+    with pytest.raises(ConfigError, match="add up to 1"):
+        Shares(math.nan, 0.5, 0.5)
+
+
+def written(path: Path, ids: Any) -> str:
+    if path.suffix == ".npy":
+        np.save(path, ids)
+    elif path.suffix == ".json":
+        path.write_text(json.dumps(ids))
+    else:
+        path.write_bytes(ids)
+    return str(path)
+
+
+@pytest.mark.parametrize(
+    ("name", "ids"),
+    [
+        ("test.json", SOME),
+        ("test.npy", np.array(SOME)),
+        ("bytes.npy", np.array(SOME, "S32")),
+        ("test.txt", "\n".join(SOME).encode()),
+        ("windows.txt", b"\xef\xbb\xbf" + "\r\n\r\n  ".join(SOME).encode() + b"\r\n"),
+    ],
+)
+def test_a_single_list_is_what_is_tested_on(tmp_path: Path, name: str, ids: Any) -> None:
+    found = assign_splits(written(tmp_path / name, ids), OBJECTS)
+    assert found.lists()["test"] == SOME
+    assert found.splits.keys() == OBJECTS.keys()
+    assert (found.unknown, found.unlisted) == ((), ())
+
+
+def test_lists_are_taken_as_they_are(tmp_path: Path) -> None:
+    lists = {"train": [SOME[0], "nobody", "nobody"], "test": [SOME[1], SOME[1], "view"]}
+    path = written(tmp_path / "splits.json", lists)
+    found = assign_splits(path, OBJECTS, assets={"view": SOME[2]})
+    assert found.lists() == {"train": [SOME[0]], "val": [], "test": SOME[1:3]}
+    assert found.unknown == ("nobody",)
+    assert found.unlisted == tuple(sorted(OBJECTS)[3:])
+    # What a run keeps is such a file, and says the same.
+    kept = written(tmp_path / "kept.json", found.lists())
+    assert assign_splits(kept, OBJECTS) == Assignment(found.splits, (), found.unlisted)
+
+
+def test_an_object_in_two_lists_is_an_error(tmp_path: Path) -> None:
+    path = written(tmp_path / "two.json", {"train": SOME, "test": ["view"]})
+    with pytest.raises(ConfigError, match="'view' is in the lists train and test"):
+        assign_splits(path, OBJECTS, assets={"view": SOME[4]})
+
+
+@pytest.mark.parametrize(
+    ("name", "ids", "message"),
+    [
+        ("a.json", {"train": SOME, "valid": []}, "has a list 'valid'"),
+        ("a.json", {"train": SOME[0]}, "holds str for train"),
+        ("a.json", [SOME[0], 3], "'3', which is no text"),
+        ("a.json", "x", "holds str for test"),
+        ("a.json", {"train": [], "test": []}, "has no id"),
+        ("a.json", ["nobody"], "has none of the dataset's 60 objects"),
+        ("a.npy", np.array(SOME, object), "Python objects"),
+        ("a.npy", np.arange(4), "dtype"),
+        ("a.npy", np.array([SOME]), "shape"),
+        ("a.npy", np.array([], "U32"), "has no id"),
+        ("a.npy", np.frombuffer(b"\xff\xff\xff\x7f", "U1"), "cannot be read"),
+        ("a.npy", np.array([b"\xff"]), "cannot be read"),
+        ("a.txt", b"\xff\xfe", "cannot be read"),
+        ("a.txt", b" \n \n", "has no id"),
+        ("missing.txt", None, "cannot be read"),
+        ("a.json", None, "cannot be read"),
+    ],
+)
+def test_files_that_are_no_lists_are_named(
+    tmp_path: Path, name: str, ids: Any, message: str
+) -> None:
+    path = tmp_path / name
+    if ids is not None:
+        written(path, ids)
+    elif name == "a.json":
+        path.write_text("[" * 100_000)
+    with pytest.raises(InputError, match=message) as caught:
+        assign_splits(str(path), OBJECTS)
+    assert str(path) in str(caught.value)
+
+
+def test_no_pickle_is_read(tmp_path: Path) -> None:
+    class Bomb:
+        def __reduce__(self) -> tuple[Any, ...]:
+            return (Path.touch, (tmp_path / "harmed",))
+
+    np.save(tmp_path / "a.npy", np.array([Bomb()], object), allow_pickle=True)
+    with pytest.raises(InputError, match="pickle"):
+        read_lists(tmp_path / "a.npy")
+    assert not (tmp_path / "harmed").exists()
+
+
+def test_a_file_without_an_end_is_not_read_to_it(tmp_path: Path) -> None:
+    path = tmp_path / "large.txt"
+    with path.open("wb") as file:
+        file.truncate(2**40)
+    with pytest.raises(InputError, match="larger than"):
+        read_lists(path)
