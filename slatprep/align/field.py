@@ -21,7 +21,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from slatprep.align.deform import CLEAN, Similarity, deform_if_earned, places_of, try_out
+from slatprep.align.deform import (
+    CLEAN,
+    Deformed,
+    Similarity,
+    deform_if_earned,
+    places_of,
+    try_out,
+)
 from slatprep.align.quality import compare
 from slatprep.align.starts import candidates_of, distinct_starts, so3_starts
 from slatprep.align.surface import Surface, surface_of
@@ -143,13 +150,9 @@ def align(
             poses = pair.ranked(pair.distinct([*poses, *wide]))
 
     tied = [pose for pose in poses if pose.merit > poses[0].merit - TIE]
-    rough = poses[0].score < CLEAN
-    fine = pair.refine(tied, FINE_SAMPLES, FINE_TAUS, 0.002, size_by_slat=rough)
-    tied = pair.distinct(fine)
-    best, model = pair.simplest(tied[0], rough)
-    others = pair.distinct([best, *tied[1:], *poses])[1:]
-
-    deformed = deform_if_earned(pair.slat, pair.pixie, best.similarity, model, parameters)
+    tied, deformed = pair.finish(tied, rough=poses[0].score < CLEAN)
+    best = tied[0]
+    others = pair.distinct([*tied, *poses])[1:]
 
     fitted = {s.index: (fit.fitness, fit.rmse) for s, fit in zip(starts, fits, strict=True)}
     transform = best.transform
@@ -160,7 +163,7 @@ def align(
         search=search,
         quality=compare(pair.pixie.boundary, pair.slat.boundary, transform, parameters.radius),
         candidates=candidates_of(fitted),
-        # The next one's score may come from fewer samples and exceed by a hair.
+        # The next one's score may come from fewer samples, and then be the higher one.
         margin=max(best.merit - others[0].merit, 0.0) if others else 1.0,
         placements=tuple(
             Placement(pose.transform, pose.score, float(pair.apart([pose], best)[0]))
@@ -183,10 +186,7 @@ def refined_at(
     pair = _Pair(surface_of(occupancy_of(latents.coords)), surface_of(field.occupancy), parameters)
     rotation, shift, scale = split_transform(alignment.transform)
     start = Pose(rotation, shift / VOXEL_SIZE, scale)
-    rough = alignment.score < CLEAN
-    (fine,) = pair.refine([start], FINE_SAMPLES, FINE_TAUS, 0.002, size_by_slat=rough)
-    best, model = pair.simplest(fine, rough)
-    deformed = deform_if_earned(pair.slat, pair.pixie, best.similarity, model, parameters)
+    (best,), deformed = pair.finish([start], rough=alignment.score < CLEAN)
     return replace(
         alignment,
         transform=best.transform,
@@ -319,7 +319,15 @@ class _Pair:
         survivors = survivors[: min(max(SURVIVORS, len(likely)), MOST_SURVIVORS)]
         return self.distinct(self.refine(survivors, POLISH_SAMPLES, POLISH_TAUS, 0.01))
 
-    def simplest(self, pose: Pose, rough: bool) -> tuple[Pose, Model]:
+    def finish(self, poses: Sequence[Pose], rough: bool) -> tuple[list[Pose], Deformed]:
+        """Refine poses on all samples, best first, and deform the best one if that is earned."""
+        fine = self.refine(poses, FINE_SAMPLES, FINE_TAUS, 0.002, size_by_slat=rough)
+        first, *others = self.distinct(fine)
+        best, model = self._simplest(first, rough)
+        deformed = deform_if_earned(self.slat, self.pixie, best.similarity, model, self.parameters)
+        return [best, *others], deformed
+
+    def _simplest(self, pose: Pose, rough: bool) -> tuple[Pose, Model]:
         """Return the pose with its scale set to one where that fits as well, and the model."""
         model = self.parameters.model
         if model in ("rigid", "similarity"):

@@ -128,9 +128,8 @@ def _search_far(
     from scipy.spatial import cKDTree
 
     tree = cKDTree(voxels)
-    distances, rows = tree.query(
-        position, k=[1, 2]
-    )  # the second is infinitely far if there is none
+    # A set of one voxel has its second nearest at infinity.
+    distances, rows = tree.query(position, k=[1, 2])
     distance, nearest = distances[:, 0], rows[:, 0]
     # Of equally near voxels the lower row wins, here as above.
     alike = distance * (1.0 + 1e-12)
