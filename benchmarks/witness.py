@@ -4,7 +4,7 @@
 
 DIR is a dataset with truth, as `slatprep make-demo --latents material` writes
 it. Two stores are built of it in a temporary folder, without and with the pass
-in which latents are heard.
+that compares labels with latents.
 
 An asset counts as tied if a placement that fits as well as the chosen one gives
 other classes to more than 5 % of the voxels that have one under all of them. It

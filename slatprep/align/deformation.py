@@ -186,7 +186,7 @@ def make_deformation(
     if not made.coefficients.size:
         return made
     length = np.linalg.norm(made.coefficients, axis=-1, keepdims=True)
-    # A hair less, so that rounding does not lead beyond.
+    # Slightly less, so that rounding does not lead beyond the bound.
     shorter = np.minimum(1.0, (1.0 - 1e-6) * limit / np.maximum(length, 1e-12))
     made = replace(made, coefficients=_rounded(made.coefficients * shorter))
     for _ in range(_SHRINKS):

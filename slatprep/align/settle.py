@@ -11,16 +11,16 @@ from slatprep.records import (
     Alignment,
     Consensus,
     Engine,
+    LatentChoice,
     MaterialField,
     Model,
     Placement,
-    Ruling,
     StructuredLatents,
 )
 
 
 def take(
-    alignment: Alignment, chosen: int, latents: StructuredLatents, by: Consensus | Ruling
+    alignment: Alignment, chosen: int, latents: StructuredLatents, by: Consensus | LatentChoice
 ) -> Alignment:
     """Exchange an alignment's placement for a tied one.
 
@@ -32,7 +32,7 @@ def take(
         Number of the placement in ``placements``, from 0.
     latents : StructuredLatents
         The SLAT, over whose voxels displacements are measured.
-    by : Consensus or Ruling
+    by : Consensus or LatentChoice
         What chose it.
 
     Returns

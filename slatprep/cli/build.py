@@ -169,7 +169,7 @@ def report(output: Output, summary: BuildSummary) -> None:
         output.problem(f"{asset_id}: {reason}")
     total, good = sum(summary.statuses.values()), summary.statuses["ok"]
     for asset_id in summary.contradicted:
-        output.note(f"{asset_id}: its latents speak against its labels; look at it first")
+        output.note(f"{asset_id}: its latents contradict its labels; look at it first")
     unlisted = total - good - len(summary.problems)
     if unlisted:
         output.problem(f"and {unlisted:,} more: see {summary.records}")

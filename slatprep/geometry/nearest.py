@@ -91,7 +91,7 @@ class Lattice:
     def vote(
         self, points: NDArray[np.float64], labels: NDArray[np.uint8], width: float
     ) -> NDArray[np.intp]:
-        """Find the voxel that speaks for each point after a vote of those around it.
+        """Find for each point the voxel that a vote of those around it chooses.
 
         The voxels in the 27 cells around the point vote for their label with the
         weight exp(-d^2 / 2 width^2), d their distance from the point.
@@ -111,10 +111,10 @@ class Lattice:
             Row of the nearest voxel that has the winning label (the lower label
             wins a draw), or -1 where none of the 27 cells is in the set.
         """
-        spokesman: NDArray[np.intp] = _vote(
+        chosen: NDArray[np.intp] = _vote(
             _in_voxels(points), self._row, labels, int(labels.max()) + 1, 0.5 / width**2
         )
-        return spokesman
+        return chosen
 
 
 def _in_voxels(points: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -134,8 +134,8 @@ def _search_far(
     # Of equally near voxels the lower row wins, here as above.
     alike = distance * (1.0 + 1e-12)
     tied = np.flatnonzero(distances[:, 1] <= alike)
-    for point, rivals in zip(tied, tree.query_ball_point(position[tied], alike[tied]), strict=True):
-        nearest[point] = min(rivals)
+    for point, ties in zip(tied, tree.query_ball_point(position[tied], alike[tied]), strict=True):
+        nearest[point] = min(ties)
     beyond = distance > limit
     distance[beyond], nearest[beyond] = np.inf, -1
     return distance, nearest
@@ -187,7 +187,7 @@ def _search(position, row, near, offsets, floors, limit):  # type: ignore[no-unt
 @njit(cache=True)
 def _vote(position, row, labels, n_labels, steepness):  # type: ignore[no-untyped-def]
     count, size = position.shape[0], row.shape[0]
-    spokesman = np.full(count, -1, dtype=np.intp)
+    chosen = np.full(count, -1, dtype=np.intp)
     nearest, nearest_square = np.zeros(n_labels, dtype=np.intp), np.zeros(n_labels)
     voter_label, voter_square = np.zeros(27, dtype=np.intp), np.zeros(27)
     votes = np.zeros(n_labels)
@@ -210,10 +210,10 @@ def _vote(position, row, labels, n_labels, steepness):  # type: ignore[no-untype
                     if square < best or (square == best and voxel < nearest[label]):
                         nearest_square[label], nearest[label] = square, voxel
         if parties == 1:  # Away from borders all voters agree.
-            spokesman[m] = nearest[voter_label[0]]
+            chosen[m] = nearest[voter_label[0]]
         elif parties > 1:
             votes[:] = 0.0
             for voter in range(voters):
                 votes[voter_label[voter]] += math.exp(-voter_square[voter] * steepness)
-            spokesman[m] = nearest[np.argmax(votes)]
-    return spokesman
+            chosen[m] = nearest[np.argmax(votes)]
+    return chosen

@@ -119,7 +119,7 @@ def surroundings_of(
 
 
 def _open(alignment: Alignment) -> tuple[Placement, ...]:
-    """Return the placements that tie and that nothing but chance has chosen among."""
+    """Return the placements that tie where neither consensus nor latents chose among them."""
     return alignment.placements if alignment.settled_by is None else ()
 
 

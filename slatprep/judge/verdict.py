@@ -60,7 +60,7 @@ _WORDS = {
     "roughness": "the surfaces lie on each other roughly only",
 }
 
-_CONTRADICTED = "its latents speak against its labels: classes drawn by lot would be likelier"
+_CONTRADICTED = "its latents contradict its labels: labels drawn at random would be likelier"
 
 
 def judge(
@@ -184,10 +184,10 @@ def verdict_of(
     expected_accuracy : float
         Expected share of right labels among the valid ones; NaN where it is not known.
     cause : str
-        What most speaks against the placement: ``placement``, ``shape`` or
+        What most lowers the confidence in the placement: ``placement``, ``shape`` or
         ``roughness``; empty where that is not known.
     contradicted : bool
-        Whether the asset's latents speak against its labels.
+        Whether the latents of the asset contradict its labels.
 
     Returns
     -------

@@ -3,7 +3,7 @@
 Where geometry cannot tell placements apart, latents may, if they know of
 classes at all. Of every class a Gaussian of the latents is estimated from
 assets whose labels are sure, with one covariance for all classes (linear
-discriminant analysis); an asset is never heard by a model that has seen its
+discriminant analysis); an asset is never judged by a model that has seen its
 object. What the sum of log likelihoods over a block of space is worth,
 neighbouring voxels being much alike, is calibrated on the sure assets: their
 labels against those that they would have half a turn away (Platt,
@@ -32,33 +32,33 @@ from slatprep.records import (
     RESOLUTION,
     UNANNOTATED,
     Alignment,
+    LatentChoice,
     MaterialField,
-    Ruling,
     StructuredLatents,
 )
 from slatprep.sample import sample
 
 FOLDS = 5
-"""Parts of a dataset, by object, each heard by a model of the others."""
+"""Parts of a dataset, by object, each judged by a model of the others."""
 
 DECISIVE = 0.95
 """From this probability on a placement is taken to be the right one."""
 
 CHANCE = 1e-3
-"""Latents are heard if so many sure assets agreeing would be rarer than this by chance."""
+"""Latents are used if so many sure assets agreeing would be rarer than this by chance."""
 
-MOST_TRUST = 1e4
+MOST_FACTOR = 1e4
 """Log odds that a block of usual strength can be worth; Platt's target keeps far below."""
 
 RARE = 0.005
 """Labels are contradicted that are less likely than those of all but this share of sure assets,
-and less likely than if their classes were drawn by lot."""
+and less likely than if their classes were drawn at random."""
 
 OTHER_LABELS = 0.01
 """Tied placements that change the class of more than this share of the voxels differ in labels."""
 
 BLOCK = 8
-"""Edge, in voxels, of the blocks that count as one voice each."""
+"""Edge, in voxels, of the blocks that count as one observation each."""
 
 REACH = 6.0
 """Voxels that half a turn may carry a place off the nearest annotated voxel."""
@@ -102,7 +102,7 @@ class LatentModel:
         return likely
 
     def gain(self, feats: NDArray[np.float32], material: NDArray[np.uint8]) -> float:
-        """Return the mean log likelihood of labels (N,) less that of classes drawn by lot.
+        """Return the mean log likelihood of labels (N,) less that of classes drawn at random.
 
         Voxels without a label do not count; 0 where none has one.
         """
@@ -110,12 +110,12 @@ class LatentModel:
         if not known.any():
             return 0.0
         likely, present = self.log_likelihood(feats[known]), self.shares > 0
-        lot = logsumexp(likely[:, present], axis=1, b=self.shares[present])
-        return float((likely[np.arange(len(lot)), material[known]] - lot).mean())
+        chance = logsumexp(likely[:, present], axis=1, b=self.shares[present])
+        return float((likely[np.arange(len(chance)), material[known]] - chance).mean())
 
 
 @dataclass(frozen=True, eq=False)
-class Hearing:
+class LatentEvidence:
     """What an asset's latents say, before it is known how much that is worth.
 
     Attributes
@@ -143,23 +143,23 @@ class Hearing:
 
 
 @dataclass(frozen=True)
-class Trial:
-    """How far latents can be trusted: what sure assets' latents said of right and wrong labels.
+class Reliability:
+    """How far latents can be relied on: how those of sure assets fit right and wrong labels.
 
     Attributes
     ----------
     witnesses, agreeing : int
-        Sure assets that could be asked, and those that preferred their own labels
-        to all others.
-    trust : float
-        By which a log likelihood is multiplied; 0 where latents are not heard.
+        Sure assets that could be compared, and those whose latents fit their own labels
+        best.
+    factor : float
+        By which a log likelihood is multiplied; 0 where latents are not used.
     least_gain : float
-        Gain below which latents contradict labels; minus infinity where they are not heard.
+        Gain below which latents contradict labels; minus infinity where they are not used.
     """
 
     witnesses: int
     agreeing: int
-    trust: float
+    factor: float
     least_gain: float
 
 
@@ -223,15 +223,15 @@ def _model_of(seen: Moments) -> LatentModel:
     return LatentModel(means, precision, seen.weight / assets)
 
 
-def hear(
+def weigh(
     field: MaterialField,
     latents: StructuredLatents,
     alignment: Alignment,
     material: NDArray[np.uint8],
     model: LatentModel,
     parameters: SampleParameters,
-) -> Hearing:
-    """Ask an asset's latents about its labels, and about those it could have instead.
+) -> LatentEvidence:
+    """Compare an asset's latents with its labels, and with those it could have instead.
 
     Parameters
     ----------
@@ -257,7 +257,7 @@ def hear(
     differing = np.array(
         [[np.count_nonzero(one[rows] != two[rows]) for two in labels] for one in labels]
     )
-    return Hearing(
+    return LatentEvidence(
         support,
         differing,
         len(rows),
@@ -293,72 +293,72 @@ def _against(
             yield sums[np.unique(blocks[rows[differ]])]
 
 
-def try_witnesses(hearings: Sequence[Hearing]) -> Trial:
+def reliability_of(evidence: Sequence[LatentEvidence]) -> Reliability:
     """Find out from assets whose labels are sure what their latents are worth.
 
     Parameters
     ----------
-    hearings : sequence of Hearing
+    evidence : sequence of LatentEvidence
         Of the sure assets.
 
     Returns
     -------
-    Trial
-        `trust` is 0 where their latents do not prefer their own labels more
+    Reliability
+        `factor` is 0 where their latents do not prefer their own labels more
         often than chance would have it.
     """
-    asked = [hearing.against for hearing in hearings if hearing.against]
-    agreeing = sum(min(float(blocks.sum()) for blocks in against) > 0 for against in asked)
-    trust = 0.0
-    if asked and binomtest(agreeing, len(asked), 0.5, alternative="greater").pvalue < CHANCE:
-        trust = _trust([np.concatenate(against) for against in asked])
-    gains = np.array([hearing.gain for hearing in hearings])
-    least = min(0.0, float(np.quantile(gains, RARE))) if trust else -np.inf
-    return Trial(len(asked), agreeing, trust, least)
+    compared = [one.against for one in evidence if one.against]
+    agreeing = sum(min(float(blocks.sum()) for blocks in against) > 0 for against in compared)
+    factor = 0.0
+    if compared and binomtest(agreeing, len(compared), 0.5, alternative="greater").pvalue < CHANCE:
+        factor = _factor([np.concatenate(against) for against in compared])
+    gains = np.array([one.gain for one in evidence])
+    least = min(0.0, float(np.quantile(gains, RARE))) if factor else -np.inf
+    return Reliability(len(compared), agreeing, factor, least)
 
 
-def _trust(asked: Sequence[Array]) -> float:
-    """Return the factor that makes blocks' log likelihoods (B,) log odds, each asset one voice."""
-    blocks = np.concatenate(asked)
-    weight = np.concatenate([np.full(len(some), 1.0 / len(some)) for some in asked])
+def _factor(compared: Sequence[Array]) -> float:
+    """Return the factor that makes log likelihoods of blocks (B,) log odds, by asset alike."""
+    blocks = np.concatenate(compared)
+    weight = np.concatenate([np.full(len(some), 1.0 / len(some)) for some in compared])
     unit = float(np.sqrt(np.average(blocks**2, weights=weight)))
     # Platt's target: all agreeing is no proof that the next one will.
-    target = (len(asked) + 1.0) / (len(asked) + 2.0)
+    target = (len(compared) + 1.0) / (len(compared) + 2.0)
 
-    def slope(trust: float) -> float:
-        return float(np.sum(weight * blocks / unit * (target - expit(trust * blocks / unit))))
+    def slope(factor: float) -> float:
+        return float(np.sum(weight * blocks / unit * (target - expit(factor * blocks / unit))))
 
-    # Where nothing is asked for the slope falls from the start.
-    return brentq(slope, 0.0, MOST_TRUST) / unit if slope(0.0) > 0.0 > slope(MOST_TRUST) else 0.0
+    # Where nothing is compared for the slope falls from the start.
+    return brentq(slope, 0.0, MOST_FACTOR) / unit if slope(0.0) > 0.0 > slope(MOST_FACTOR) else 0.0
 
 
-def ruling_of(hearing: Hearing, trial: Trial) -> tuple[int, Ruling] | None:
+def choice_of(found: LatentEvidence, reliability: Reliability) -> tuple[int, LatentChoice] | None:
     """Choose among an asset's tied placements, if its latents are decisive.
 
     Returns
     -------
-    tuple of int and Ruling, or None
+    tuple of int and LatentChoice, or None
         The number of the placement, 0 the one that the asset has, which stands
         where its labels are those of the likeliest one; None where nothing
         tied changes labels, or the latents do not say enough.
     """
-    different = hearing.differing > OTHER_LABELS * max(hearing.voxels, 1)
-    best = int(np.argmax(hearing.support))
-    if trial.trust == 0.0 or not different[best].any():
+    different = found.differing > OTHER_LABELS * max(found.voxels, 1)
+    best = int(np.argmax(found.support))
+    if reliability.factor == 0.0 or not different[best].any():
         return None
-    probability = float(softmax(trial.trust * hearing.support)[~different[best]].sum())
+    probability = float(softmax(reliability.factor * found.support)[~different[best]].sum())
     # No asset is surer than that its latents are of the kind that can be relied on.
-    probability = min(probability, (trial.agreeing + 1.0) / (trial.witnesses + 2.0))
+    probability = min(probability, (reliability.agreeing + 1.0) / (reliability.witnesses + 2.0))
     if probability < DECISIVE:
         return None
     chosen = 0 if not different[best, 0] else best
     rivals = np.flatnonzero(different[best])
-    rival = rivals[np.argmax(hearing.support[rivals])]
-    evidence = float(hearing.support[best] - hearing.support[rival])
-    return chosen, Ruling(
+    rival = rivals[np.argmax(found.support[rivals])]
+    evidence = float(found.support[best] - found.support[rival])
+    return chosen, LatentChoice(
         probability,
         evidence,
-        int(hearing.differing[best, rival]),
-        trial.witnesses,
-        trial.agreeing,
+        int(found.differing[best, rival]),
+        reliability.witnesses,
+        reliability.agreeing,
     )

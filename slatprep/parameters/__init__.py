@@ -147,7 +147,7 @@ class ConsensusParameters(_Group):
 
 @dataclass(frozen=True)
 class WitnessParameters(_Group):
-    """Whether latents are heard as witnesses of labels.
+    """Whether labels are compared with latents.
 
     With `settle`, a pass after that of the consensus lets the latents of assets
     that are sure tell what latents are like in each class: assets whose geometry

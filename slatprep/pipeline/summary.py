@@ -43,7 +43,7 @@ class BuildSummary:
     problems : tuple of (str, str)
         Asset id and reason of the first `PROBLEMS_LISTED` that are not ``ok``.
     contradicted : tuple of str
-        Ids of the first `PROBLEMS_LISTED` whose latents speak against their labels.
+        Ids of the first `PROBLEMS_LISTED` whose latents contradict their labels.
     store : Place or None
         The store; None where only alignments were written.
     normalization : Normalization or None

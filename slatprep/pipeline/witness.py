@@ -1,4 +1,4 @@
-"""The pass in which latents are heard: they settle ties, and contradict labels."""
+"""The pass that compares labels with latents: it settles ties, and names contradicted labels."""
 
 from __future__ import annotations
 
@@ -8,28 +8,28 @@ from dataclasses import replace
 from slatprep.align.settle import take
 from slatprep.judge import contradicted
 from slatprep.judge.witness import (
-    Hearing,
+    LatentEvidence,
     LatentModel,
     Moments,
-    Trial,
+    Reliability,
+    choice_of,
     fit_models,
     fold_of,
-    hear,
     moments_of,
-    ruling_of,
-    try_witnesses,
+    reliability_of,
+    weigh,
 )
 from slatprep.parameters import BuildParameters
 from slatprep.pipeline.settle import Reopened
 from slatprep.pipeline.spool import Spool, SpooledAsset
-from slatprep.records import Ruling, Verdict
+from slatprep.records import LatentChoice, Verdict
 from slatprep.workers.local import Jobs, run_unordered
 
 
 def apply_witness(
     assets: Sequence[SpooledAsset], spool: Spool, parameters: BuildParameters, jobs: Jobs
 ) -> list[SpooledAsset]:
-    """Let latents settle ties and contradict labels, if asked to.
+    """Settle ties by the latents and mark labels that they contradict, if asked to.
 
     Parameters
     ----------
@@ -58,15 +58,17 @@ def apply_witness(
         return list(assets)
     model_of = {asset.asset_id: models[fold_of(_object_of(asset))] for asset in assets}
     tasks = ((asset, spool, model_of[asset.asset_id], parameters) for asset in assets)
-    heard = dict(run_unordered(hear_asset, tasks, jobs))
-    trial = try_witnesses([heard[asset.asset_id] for asset in sure])
-    rulings = {asset.asset_id: ruling_of(heard[asset.asset_id], trial) for asset in assets}
+    evidence = dict(run_unordered(weigh_asset, tasks, jobs))
+    reliability = reliability_of([evidence[asset.asset_id] for asset in sure])
+    choices = {asset.asset_id: choice_of(evidence[asset.asset_id], reliability) for asset in assets}
     tasks_of_changed = (
-        (asset, spool, rulings[asset.asset_id], trial, model_of[asset.asset_id], parameters)
+        (asset, spool, choices[asset.asset_id], reliability, model_of[asset.asset_id], parameters)
         for asset in assets
-        if rulings[asset.asset_id] or heard[asset.asset_id].gain < trial.least_gain
+        if choices[asset.asset_id] or evidence[asset.asset_id].gain < reliability.least_gain
     )
-    changed = {asset.asset_id: asset for asset in run_unordered(rule, tasks_of_changed, jobs)}
+    changed = {
+        asset.asset_id: asset for asset in run_unordered(apply_latents, tasks_of_changed, jobs)
+    }
     return [changed.get(asset.asset_id, asset) for asset in assets]
 
 
@@ -76,12 +78,12 @@ def read_moments(asset: SpooledAsset, spool: Spool) -> tuple[str, Moments]:
     return asset.asset_id, moments_of(arrays["feats"], arrays["material"])
 
 
-def hear_asset(
+def weigh_asset(
     asset: SpooledAsset, spool: Spool, model: LatentModel, parameters: BuildParameters
-) -> tuple[str, Hearing]:
-    """Return an asset's id and what its latents say."""
+) -> tuple[str, LatentEvidence]:
+    """Return an asset's id and what its latents say of its labels."""
     first = Reopened(asset, spool)
-    return asset.asset_id, hear(
+    return asset.asset_id, weigh(
         first.field,
         first.latents,
         first.record.alignment,
@@ -91,20 +93,20 @@ def hear_asset(
     )
 
 
-def rule(
+def apply_latents(
     asset: SpooledAsset,
     spool: Spool,
-    ruling: tuple[int, Ruling] | None,
-    trial: Trial,
+    choice: tuple[int, LatentChoice] | None,
+    reliability: Reliability,
     model: LatentModel,
     parameters: BuildParameters,
 ) -> SpooledAsset:
-    """Do with one asset what its latents said; see `slatprep.judge.witness.ruling_of`."""
+    """Place one asset anew as its latents ask, or mark its labels as contradicted."""
     first = Reopened(asset, spool)
     alignment, annotation = first.record.alignment, first.annotation
     judgement = first.record.judgement
-    if ruling is not None:
-        number, by = ruling
+    if choice is not None:
+        number, by = choice
         # Placement 0 is the one that the asset has: it stands, and is settled now.
         chosen = (
             take(alignment, number - 1, first.latents, by)
@@ -112,7 +114,7 @@ def rule(
             else replace(alignment, settled_by=by)
         )
         alignment, annotation, judgement = first.placed(chosen, parameters)
-    if model.gain(first.latents.feats, annotation.material) < trial.least_gain:
+    if model.gain(first.latents.feats, annotation.material) < reliability.least_gain:
         judgement = contradicted(judgement)
     return first.put(alignment, annotation, judgement)
 

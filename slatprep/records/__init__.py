@@ -17,9 +17,9 @@ from slatprep.records.alignment import (
     Deformation,
     FitFigures,
     Judgement,
+    LatentChoice,
     Placement,
     Quality,
-    Ruling,
 )
 from slatprep.records.json_types import (
     AffineMap,
@@ -91,6 +91,7 @@ __all__ = [
     "FitFigures",
     "InJson",
     "Judgement",
+    "LatentChoice",
     "Lattice",
     "MaterialField",
     "Model",
@@ -102,7 +103,6 @@ __all__ = [
     "PropertyRange",
     "Quality",
     "Rotation",
-    "Ruling",
     "Search",
     "Share",
     "SourceFile",

@@ -92,7 +92,7 @@ class Judgement:
     ``confidence`` is the calibrated probability that the placement is right,
     ``expected_accuracy`` the share of right labels to be expected among the
     valid ones; NaN in records of builds that did not tell. ``contradicted`` says
-    that the asset's latents speak against its labels, where latents were heard.
+    that the latents of the asset contradict its labels, where the two were compared.
     """
 
     ambiguity: Ambiguity
@@ -113,7 +113,7 @@ class Consensus:
 
 
 @dataclass(frozen=True)
-class Ruling:
+class LatentChoice:
     """What its latents say of an asset's tied placements.
 
     Attributes
@@ -267,7 +267,7 @@ class Alignment:
     score : float
         What the engine ranks placements by, 1 for a perfect fit; NaN where it
         ranks by fitness alone.
-    settled_by : Consensus, Ruling or None
+    settled_by : Consensus, LatentChoice or None
         The dataset's common rotation, where it moved the asset to another of its
         tied placements; what the latents say, where they chose among those.
     deformation : Deformation or None
@@ -286,6 +286,6 @@ class Alignment:
     margin: Number = float("nan")
     placements: Annotated[tuple[Placement, ...], MaxLen(MAX_CANDIDATES)] = ()
     score: Number = float("nan")
-    settled_by: Consensus | Ruling | None = None
+    settled_by: Consensus | LatentChoice | None = None
     deformation: Deformation | None = None
     figures: FitFigures | None = None

@@ -150,7 +150,7 @@ ARRAYS = (
         "bool",
         ("asset",),
         False,
-        "the latents speak against the labels, where latents were heard",
+        "the latents contradict the labels, where latents were compared with them",
         since=2,
     ),
     ArrayLayout(

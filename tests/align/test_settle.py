@@ -18,14 +18,14 @@ from slatprep.geometry.frames import VOXEL_SIZE, make_transform, voxel_centres
 from slatprep.parameters import AlignParameters
 from slatprep.records import (
     Alignment,
+    LatentChoice,
     MaterialField,
     Model,
     Placement,
-    Ruling,
     StructuredLatents,
 )
 
-BY = Ruling(0.99, 12.0, 300, 40, 40)
+BY = LatentChoice(0.99, 12.0, 300, 40, 40)
 ELSEWHERE = make_transform(Rotation.from_euler("x", 180, degrees=True).as_matrix())
 
 
@@ -63,7 +63,7 @@ def test_a_placement_that_is_taken_is_deformed_as_aligning_would_deform_it(
     places = map_of(settled).places(latents.coords)
     off = np.linalg.norm(places - MOVES[name](voxel_centres(latents.coords)), axis=1) / VOXEL_SIZE
     assert np.median(off) < 0.7
-    # The rest of the search left the best placement a hair from where it is fitted again.
+    # The search leaves the best placement slightly off where a new fit ends.
     apart = np.linalg.norm(places - map_of(found).places(latents.coords), axis=1) / VOXEL_SIZE
     assert apart.max() < 0.2
     assert settled.figures is not None

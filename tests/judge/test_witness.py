@@ -14,15 +14,15 @@ from slatprep.geometry.voxels import boundary, voxels_of
 from slatprep.judge.witness import (
     DECISIVE,
     FOLDS,
-    Hearing,
+    LatentEvidence,
     LatentModel,
-    Trial,
+    Reliability,
+    choice_of,
     fit_models,
     fold_of,
-    hear,
     moments_of,
-    ruling_of,
-    try_witnesses,
+    reliability_of,
+    weigh,
 )
 from slatprep.parameters import SampleParameters
 from slatprep.records import (
@@ -90,72 +90,72 @@ class Asset:
         feats = latents(rng, self.material).astype(np.float32)
         self.latents = StructuredLatents(latents_of(coords).coords, feats)
 
-    def heard(self, models: list[LatentModel], *tied: np.ndarray) -> Hearing:
+    def evidence(self, models: list[LatentModel], *tied: np.ndarray) -> LatentEvidence:
         first = aligned(*(tied or (np.eye(4),)))
         model = models[fold_of(self.object_id)]
-        return hear(self.field, self.latents, first, self.material, model, SampleParameters())
+        return weigh(self.field, self.latents, first, self.material, model, SampleParameters())
 
 
-def trial_of(latents: Latents, count: int = 40) -> tuple[list[LatentModel], Trial]:
+def models_of(latents: Latents, count: int = 40) -> tuple[list[LatentModel], Reliability]:
     assets = [Asset(number, latents) for number in range(count)]
     models = fit_models((a.object_id, moments_of(a.latents.feats, a.material)) for a in assets)
     assert models is not None
-    return models, try_witnesses([asset.heard(models) for asset in assets])
+    return models, reliability_of([asset.evidence(models) for asset in assets])
 
 
 UPSIDE_DOWN = make_transform(Rotation.from_euler("x", 180, degrees=True).as_matrix())
 
 
 def test_latents_that_know_classes_choose_the_right_one_of_two_placements() -> None:
-    models, trial = trial_of(telling)
-    assert trial.agreeing == trial.witnesses == 40
+    models, reliability = models_of(telling)
+    assert reliability.agreeing == reliability.witnesses == 40
     for number in range(100, 120):
         box = Asset(number, telling, boxy=True)
-        right_first = ruling_of(box.heard(models, np.eye(4), UPSIDE_DOWN), trial)
-        wrong_first = ruling_of(box.heard(models, UPSIDE_DOWN, np.eye(4)), trial)
+        right_first = choice_of(box.evidence(models, np.eye(4), UPSIDE_DOWN), reliability)
+        wrong_first = choice_of(box.evidence(models, UPSIDE_DOWN, np.eye(4)), reliability)
         assert right_first is not None and wrong_first is not None
         assert (right_first[0], wrong_first[0]) == (0, 1)
-        ruling = wrong_first[1]
-        assert ruling.probability >= DECISIVE
-        assert ruling.evidence > 0
+        choice = wrong_first[1]
+        assert choice.probability >= DECISIVE
+        assert choice.evidence > 0
         box_of = {tuple(c): m for c, m in zip(box.latents.coords, box.material, strict=True)}
         turned = [box_of[(x, 63 - y, 63 - z)] for x, y, z in box.latents.coords.astype(int)]
-        assert ruling.voxels == np.count_nonzero(np.array(turned) != box.material)
+        assert choice.voxels == np.count_nonzero(np.array(turned) != box.material)
 
 
 @pytest.mark.parametrize("latents", [noise, shuffled, of_object])
 def test_latents_that_know_nothing_of_places_settle_and_contradict_nothing(
     latents: Latents,
 ) -> None:
-    models, trial = trial_of(latents)
-    assert trial.trust == 0.0
+    models, reliability = models_of(latents)
+    assert reliability.factor == 0.0
     for number in range(100, 110):
-        hearing = Asset(number, latents, boxy=True).heard(models, np.eye(4), UPSIDE_DOWN)
-        assert ruling_of(hearing, trial) is None
-        assert not hearing.gain < trial.least_gain
+        evidence = Asset(number, latents, boxy=True).evidence(models, np.eye(4), UPSIDE_DOWN)
+        assert choice_of(evidence, reliability) is None
+        assert not evidence.gain < reliability.least_gain
 
 
 def test_few_witnesses_are_not_enough() -> None:
-    models, trial = trial_of(telling, count=12)
-    assert trial.agreeing == trial.witnesses == 12
+    models, reliability = models_of(telling, count=12)
+    assert reliability.agreeing == reliability.witnesses == 12
     box = Asset(100, telling, boxy=True)
-    assert ruling_of(box.heard(models, UPSIDE_DOWN, np.eye(4)), trial) is None
+    assert choice_of(box.evidence(models, UPSIDE_DOWN, np.eye(4)), reliability) is None
 
 
 def test_placements_that_change_no_labels_are_left_alone() -> None:
-    models, trial = trial_of(telling)
+    models, reliability = models_of(telling)
     box = Asset(100, telling, boxy=True)
     about_z = make_transform(Rotation.from_euler("z", 90, degrees=True).as_matrix())
-    assert ruling_of(box.heard(models, np.eye(4), about_z), trial) is None
+    assert choice_of(box.evidence(models, np.eye(4), about_z), reliability) is None
 
 
 def test_labels_of_another_object_are_contradicted_and_true_ones_are_not() -> None:
-    models, trial = trial_of(telling)
+    models, reliability = models_of(telling)
     for number in range(100, 130):
         asset = Asset(number, telling)
-        assert not asset.heard(models).gain < trial.least_gain
+        assert not asset.evidence(models).gain < reliability.least_gain
         asset.material = (asset.material + 1) % 7
-        assert asset.heard(models).gain < trial.least_gain
+        assert asset.evidence(models).gain < reliability.least_gain
 
 
 def test_an_object_is_never_heard_by_a_model_that_has_seen_it() -> None:

@@ -1,4 +1,4 @@
-"""A build's pass in which latents are heard, on demo data whose latents carry material, or not."""
+"""A build's pass that compares labels with latents, which carry material or nothing."""
 
 from __future__ import annotations
 
@@ -90,7 +90,7 @@ def test_assets_without_a_tie_keep_every_byte_but_those_that_are_contradicted(
     assert [key for key, record in heard.items() if record["judgement"]["contradicted"]] == [wrong]
     assert alone[wrong]["judgement"]["verdict"] == "good"
     assert heard[wrong]["judgement"]["verdict"] != "good"
-    assert "latents speak against" in heard[wrong]["judgement"]["reasons"][0]
+    assert "latents contradict" in heard[wrong]["judgement"]["reasons"][0]
     assert heard[wrong]["alignment"] == alone[wrong]["alignment"]
     groups = [zarr.open_group(store, mode="r") for store in stores]
     for row, asset_id in enumerate(alone):
