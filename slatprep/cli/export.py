@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from slatprep.records import Place
 
 # Which options belong to which format; an option without effect is a mistake.
-_ONLY_FOR = {"points": "ply", "frame": "ply", "shard_size": "webdataset"}
+_ONLY_FOR = {"points": "ply", "frame": "ply", "shard_size": "webdataset", "latent_model": "npz"}
 
 
 @command()
@@ -37,6 +37,7 @@ _ONLY_FOR = {"points": "ply", "frame": "ply", "shard_size": "webdataset"}
 @option("--points", ChoiceOf("slatprep.export.formats:Points"))
 @option("--frame", ChoiceOf("slatprep.export.formats:Frame"))
 @option("--shard-size", POSITIVE)
+@option("--latent-model", metavar="NAME")
 @jobs_option
 def export(output: Output, store: Place, kind: Any, out: Path, **others: Any) -> None:
     """Write assets of STORE in a format of other tools.
@@ -46,14 +47,16 @@ def export(output: Output, store: Place, kind: Any, out: Path, **others: Any) ->
 
     Options
     -------
-    --format: Point clouds with Pixie's fields, one HDF5 file, tar shards, or TRELLIS's npz with
-        the targets added.
+    --format: Point clouds with Pixie's fields, one HDF5 file, tar shards, or what TRELLIS's
+        data set loads (npz and metadata.csv) with the targets added.
     --out: The file (hdf5) or folder (all others); an existing export is replaced when the new
         one is complete.
     --asset: The asset; may be repeated. [default: all]
     --points: ply: SLAT voxels, or the voxels of the PixieVerse field. [default: slat]
     --frame: ply: the SLAT's unit cube, or PixieVerse's world. [default: slat]
     --shard-size: webdataset: assets a shard. [default: 256]
+    --latent-model: npz: the encoder's name, which TRELLIS's configuration gives as latent_model.
+        [default: the one of TRELLIS's own configurations]
 
     Example
     -------
@@ -61,7 +64,7 @@ def export(output: Output, store: Place, kind: Any, out: Path, **others: Any) ->
     slatprep export demo.zarr --format ply --out world --points grid --frame pixieverse
     slatprep export demo.zarr --format hdf5 --out demo.h5 --asset 5f61cc --asset 803c1a
     slatprep export demo.zarr --format webdataset --out shards --shard-size 128 --jobs 2
-    slatprep export demo.zarr --format npz --out latents
+    slatprep export demo.zarr --format npz --out trellis
     """
     options = {name: value for name in _ONLY_FOR if (value := others.pop(name)) is not None}
     for name in options:

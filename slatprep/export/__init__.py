@@ -138,7 +138,10 @@ def export_store(
                 entries += part
                 tell(len(entries), len(ids))
             entries.sort(key=lambda entry: str(entry["asset_id"]))
-            target.write_index(directory, {**about, "notes": writer.notes}, entries)
+            about |= {"notes": writer.notes}
+            if writer.finish is not None:
+                about |= {"files": writer.finish(directory, entries)}
+            target.write_index(directory, about, entries)
     files = [out] if out.is_file() else [path for path in out.rglob("*") if path.is_file()]
     return ExportSummary(
         format=format,

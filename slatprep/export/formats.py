@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 from slatprep.export.assets import Exported
 
 Points = Literal["slat", "grid"]
 Frame = Literal["slat", "pixieverse"]
+
+TRELLIS_ENCODER = "dinov2_vitl14_reg_slat_enc_swin8_B_64l8_fp16"
+"""The encoder whose latents TRELLIS's published configurations name as ``latent_model``."""
 
 
 @dataclass(frozen=True)
@@ -26,11 +29,14 @@ class ExportOptions:
         PLY: the unit cube of the SLAT, or the world of PixieVerse's bounds.
     shard_size : int
         WebDataset: assets in one shard.
+    latent_model : str
+        npz: the encoder's name, by which TRELLIS's data set finds the latents.
     """
 
     points: Points = "slat"
     frame: Frame = "slat"
     shard_size: int = 256
+    latent_model: str = TRELLIS_ENCODER
 
 
 @dataclass(frozen=True)
@@ -48,6 +54,9 @@ class Writer:
         count.
     notes : tuple of str
         What a person should know of the result.
+    finish : callable, optional
+        Takes the directory and the index's entry of each asset, sorted by id;
+        writes what is of all of them and returns the names of those files.
     is_export : callable, optional
         Given where the export is one file, which one process writes: whether
         a file is such an export and may be replaced.
@@ -56,4 +65,5 @@ class Writer:
     write: Callable[..., Iterable[Exported]]
     batch: int = 16
     notes: tuple[str, ...] = ()
+    finish: Callable[[Path, Sequence[dict[str, Any]]], Sequence[str]] | None = None
     is_export: Callable[[Path], bool] | None = None

@@ -1,30 +1,59 @@
-"""One npz an asset, as TRELLIS's dataset toolkit writes latents, with the targets added."""
+"""The layout that TRELLIS's structured-latent data set loads, with the targets in each npz.
+
+Below the root lie ``latents/<model>/<sha256>.npz`` and ``metadata.csv``, by
+whose columns TRELLIS chooses and finds the files (its ``DATASET.md`` and
+``trellis/datasets``).
+"""
 
 from __future__ import annotations
 
+import csv
 from collections.abc import Iterable, Iterator, Sequence
-from pathlib import Path
+from functools import partial
+from pathlib import Path, PurePosixPath
+from typing import Any
 
 import numpy as np
 
+from slatprep.errors import ConfigError
 from slatprep.export.assets import TARGETS, Exported
 from slatprep.export.formats import ExportOptions, Writer
 from slatprep.storage.names import file_name
 from slatprep.store import Store, StoredAsset
 
+METADATA = "metadata.csv"
+
+_NO_WORDS = frozenset({"na", "null", "none", "true", "false"})
+"""What pandas, with which TRELLIS reads `METADATA`, takes for something else than a name."""
+
 
 def writer(store: Store, ids: Sequence[str], options: ExportOptions) -> Writer:
-    """Return what writes one npz an asset; see `slatprep.export.FORMATS`."""
-    return Writer(write)
+    """Return what writes TRELLIS's layout; see `slatprep.export.FORMATS`.
+
+    Raises
+    ------
+    ConfigError
+        If the model's name cannot name a folder.
+    """
+    model = options.latent_model
+    if not model or model != file_name(model):
+        raise ConfigError(
+            f"latent_model is {model!r}; expected an encoder's name, of letters, digits, . _ and -"
+        )
+    return Writer(partial(write, model), finish=partial(write_metadata, model))
 
 
-def write(directory: Path, number: int, assets: Iterable[StoredAsset]) -> Iterator[Exported]:
+def write(
+    model: str, directory: Path, number: int, assets: Iterable[StoredAsset]
+) -> Iterator[Exported]:
     """Write one npz an asset: TRELLIS's ``coords`` and ``feats``, and the `TARGETS`.
 
     Parameters
     ----------
+    model : str
+        The encoder's name, which is the folder's.
     directory : Path
-        Where to.
+        The root.
     number : int
         Of the batch; unused, as each asset has its own file.
     assets : iterable of StoredAsset
@@ -35,8 +64,41 @@ def write(directory: Path, number: int, assets: Iterable[StoredAsset]) -> Iterat
     Exported
         What was written of each.
     """
+    folder = PurePosixPath("latents", model)
+    (directory / folder).mkdir(parents=True, exist_ok=True)
     for asset in assets:
-        name = f"{file_name(asset.asset_id)}.npz"
+        name = str(folder / f"{_stem(asset.asset_id)}.npz")
         arrays = {key: getattr(asset, key) for key in ("coords", "feats", *TARGETS)}
         np.savez_compressed(directory / name, **arrays)
         yield Exported(asset, name, len(asset.coords))
+
+
+def write_metadata(model: str, directory: Path, entries: Sequence[dict[str, Any]]) -> list[str]:
+    """Write the table by which TRELLIS's data set finds the latents; return its name.
+
+    ``aesthetic_score`` is not known here and would leave every asset out if it
+    were empty; ``inf`` passes any threshold and is no score that was measured.
+    """
+    with (directory / METADATA).open("w", encoding="utf-8", newline="") as file:
+        table = csv.writer(file, lineterminator="\n")
+        table.writerow(("sha256", "aesthetic_score", "num_voxels", f"latent_{model}"))
+        for entry in entries:
+            stem = PurePosixPath(entry["file"]).name.removesuffix(".npz")
+            table.writerow((stem, "inf", entry["points"], True))
+    return [METADATA]
+
+
+def _stem(asset_id: str) -> str:
+    """Name an asset's file so that pandas reads the name back as it is."""
+    name = file_name(asset_id)
+    try:
+        if name == str(int(name)) and len(name) < 19:  # a number of 64 bits comes back as it is
+            return name
+    except ValueError:
+        pass
+    try:
+        float(name)
+    except ValueError:
+        if name.casefold() not in _NO_WORDS:
+            return name
+    return f"%{ord(name[0]):02X}{name[1:]}"

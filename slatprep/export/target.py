@@ -91,10 +91,11 @@ def _files_of_export(out: Path) -> frozenset[str] | None:
         return frozenset()
     try:
         index = json.loads((out / INDEX).read_text(encoding="utf-8"))
-        files = [PurePosixPath(entry["file"]) for entry in index["assets"]]
-    except (OSError, ValueError, KeyError, TypeError, RecursionError):
-        return None
-    if index.get("format") != FORMAT:
+        if index["format"] != FORMAT:
+            return None
+        names = [*index.get("files", ()), *(entry["file"] for entry in index["assets"])]
+        files = [PurePosixPath(name) for name in names]
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError):
         return None
     folders = (str(parent) for file in files for parent in file.parents[:-1])
     return frozenset({INDEX, *map(str, files), *folders})

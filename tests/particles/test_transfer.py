@@ -199,7 +199,7 @@ def test_grid_reaches_inside_the_object(store: Path, mixed: Dataset, tmp_path: P
 def test_prediction_is_transferred_as_the_store_is(store: Path, tmp_path: Path) -> None:
     """What `export --format npz` writes has the form of a prediction."""
     export_store(store, tmp_path / "npz", "npz", assets=["cup"])
-    prediction = tmp_path / "npz" / "cup.npz"
+    (prediction,) = (tmp_path / "npz").glob("latents/*/cup.npz")
     with np.load(prediction) as held:
         np.savez(tmp_path / "points.npz", positions=particles_near(held["coords"], 100, 0.5))
     for name, words in (

@@ -14,4 +14,5 @@ def index_of(directory: Path) -> list[dict[str, Any]]:
 def bytes_of(path: Path) -> dict[str, bytes]:
     if path.is_file():
         return {"": path.read_bytes()}
-    return {file.name: file.read_bytes() for file in path.iterdir()}
+    files = (file for file in path.rglob("*") if file.is_file())
+    return {file.relative_to(path).as_posix(): file.read_bytes() for file in files}
