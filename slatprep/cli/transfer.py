@@ -61,8 +61,8 @@ def transfer(
     --out: Where to write the particles with their materials.
     --points: Take an asset's materials from its SLAT voxels, a surface, or from its PixieVerse
         field, a solid.
-    --axes: Frame of the particles: turned as TRELLIS saves Gaussians, or meshes, or the SLAT's.
-        [default: trellis for a PLY of TRELLIS's Gaussians, else slat]
+    --axes: Frame of the particles: turned as TRELLIS saves Gaussians, or meshes, or the SLAT's, as
+        they are. [default: what a PLY of slatprep says; trellis for TRELLIS's Gaussians; slat]
     --frame: Write positions as the particles' file has them, or in the SLAT frame.
     --max-distance: A particle without a voxel this near is far.
     --far: Give far particles class 7 and properties 0, leave them out, or give them the nearest
@@ -79,6 +79,11 @@ def transfer(
     field = _field(**source)
     read = work.read_particles(particles, axes)
     result = work.transfer(read.in_slat(), field, max_distance=max_distance, far=far)
+    if read.foreign and axes is None:
+        output.note(
+            f"{particles}: the Gaussians are another tool's than TRELLIS ({read.foreign}): read as "
+            "they are, in the SLAT frame; --axes says otherwise"
+        )
     doubt = work.doubt_axes(read, field, result, max_distance)
     work.write_transferred(out, read, result, max_distance=max_distance, in_slat=frame == "slat")
     if doubt:

@@ -25,7 +25,16 @@ TRELLIS saves Gaussians as (x, -z, y) (``Gaussian.save_ply``), and meshes as
 (x, z, -y) (``to_glb``).
 """
 
+FRAMES: dict[Axes, str] = {
+    "slat": "frame SLAT, unit cube -0.5..0.5, z up",
+    "trellis": "frame TRELLIS as it saves Gaussians, unit cube -0.5..0.5, y down",
+    "glb": "frame TRELLIS as it saves meshes, unit cube -0.5..0.5, y up",
+}
+"""What a PLY written here says of its frame, in a comment."""
+
 _GAUSSIAN = ("f_dc_0", "opacity", "scale_0", "rot_0")
+_REACH = 0.6
+"""Farther out TRELLIS decodes no Gaussian: its voxels end at 0.5, its offsets within two voxels."""
 _KEYS = ("positions", "points", "xyz")
 
 
@@ -39,14 +48,14 @@ class Particles:
         As in the file.
     axes : {"trellis", "glb", "slat"}
         The frame of the file: turned as TRELLIS saves Gaussians, or meshes, or the SLAT's.
-    foreign : bool
-        Whether they are Gaussians with fields that TRELLIS does not write
-        (``f_rest_*``), whose axes and scale are those of another tool.
+    foreign : str
+        By what Gaussians are another tool's than TRELLIS, whose axes and scale
+        are not known; empty where nothing says so.
     """
 
     positions: NDArray[np.float64]
     axes: Axes
-    foreign: bool = False
+    foreign: str = ""
 
     def in_slat(self) -> NDArray[np.float64]:
         """Return the positions (N, 3) in the SLAT frame."""
@@ -63,9 +72,11 @@ def read_particles(path: Path, axes: Axes | None = None) -> Particles:
         A PLY with ``x y z``; an npy of shape (N, 3); or an npz that holds such
         an array as ``positions``, ``points`` or ``xyz``.
     axes : {"trellis", "glb", "slat"}, optional
-        The frame of the file. By default a PLY with the fields of Gaussians
-        (``f_dc_0``, ``opacity``, ``scale_0``, ``rot_0``) and without
-        ``f_rest_0`` is as TRELLIS saves it, and everything else in the SLAT frame.
+        The frame of the file. By default it is what a PLY of slatprep says it
+        is; a PLY with the fields of Gaussians (``f_dc_0``, ``opacity``,
+        ``scale_0``, ``rot_0``) is as TRELLIS saves it, unless it has ``f_rest_*``,
+        has no normals or leaves the unit cube, as no Gaussians of TRELLIS do;
+        and everything else is in the SLAT frame.
 
     Returns
     -------
@@ -81,9 +92,9 @@ def read_particles(path: Path, axes: Axes | None = None) -> Particles:
     """
     path = Path(path)
     if path.suffix.lower() == ".ply":
-        positions, names = _read_ply(path)
+        positions, names, comments = _read_ply(path)
     else:
-        positions, names = _read_numpy(path), frozenset()
+        positions, names, comments = _read_numpy(path), frozenset(), ()
     if len(positions) == 0:
         raise InputError(path, "holds no particles", "at least one")
     finite = np.isfinite(positions).all(axis=1)
@@ -92,12 +103,32 @@ def read_particles(path: Path, axes: Axes | None = None) -> Particles:
         raise InputError(
             path, f"particle {row} lies at {positions[row].tolist()}", "finite x, y, z"
         )
-    foreign = "f_rest_0" in names
-    by_trellis = names.issuperset(_GAUSSIAN) and not foreign
-    return Particles(positions, axes or ("trellis" if by_trellis else "slat"), foreign)
+    if axes is None and any(comment.startswith("frame PixieVerse") for comment in comments):
+        raise InputError(
+            path,
+            "is an export of points in the PixieVerse frame",
+            "the SLAT frame: slatprep export --frame slat; or say with --axes how they lie",
+        )
+    stated = next((key for key, words in FRAMES.items() if words in comments), None)
+    gaussian = names.issuperset(_GAUSSIAN)
+    foreign = _by_another_tool(positions, names) if gaussian else ""
+    guessed: Axes = "trellis" if gaussian and not foreign else "slat"
+    return Particles(positions, axes or stated or guessed, foreign)
 
 
-def _read_ply(path: Path) -> tuple[NDArray[np.float64], frozenset[str]]:
+def _by_another_tool(positions: NDArray[np.float64], names: frozenset[str]) -> str:
+    """Say by what Gaussians are not TRELLIS's; empty where they may be."""
+    signs = []
+    if "f_rest_0" in names:
+        signs.append("it has f_rest_*")
+    if not names.issuperset(("nx", "ny", "nz")):
+        signs.append("it has no normals")
+    if (reach := float(np.abs(positions).max())) > _REACH:
+        signs.append(f"it reaches {reach:.3g} from the centre, out of the unit cube")
+    return " and ".join(signs)
+
+
+def _read_ply(path: Path) -> tuple[NDArray[np.float64], frozenset[str], tuple[str, ...]]:
     try:
         import plyfile
     except ImportError as error:
@@ -106,7 +137,8 @@ def _read_ply(path: Path) -> tuple[NDArray[np.float64], frozenset[str]]:
             "`pip install 'slatprep[simulate]'`"
         ) from error
     try:
-        vertex = plyfile.PlyData.read(path)["vertex"].data
+        read = plyfile.PlyData.read(path)
+        vertex = read["vertex"].data
     except (OSError, KeyError, ValueError, UnicodeDecodeError, plyfile.PlyParseError) as error:
         raise InputError(
             path, f"is no readable PLY with vertices ({error})", "a PLY of Gaussians or points"
@@ -117,7 +149,7 @@ def _read_ply(path: Path) -> tuple[NDArray[np.float64], frozenset[str]]:
     if any(vertex.dtype[axis].kind not in "fiu" for axis in "xyz"):
         raise InputError(path, "has x, y, z that are lists", "a number each")
     positions = np.column_stack([np.asarray(vertex[axis], dtype=np.float64) for axis in "xyz"])
-    return positions, frozenset(names)
+    return positions, frozenset(names), tuple(read.comments)
 
 
 def _read_numpy(path: Path) -> NDArray[np.float64]:

@@ -15,8 +15,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from slatprep.errors import ConfigError
 from slatprep.particles.fields import VoxelField, predicted_field, stored_field
-from slatprep.particles.read import Axes, Particles, read_particles
-from slatprep.records import BACKGROUND
+from slatprep.particles.read import FRAMES, Axes, Particles, read_particles
+from slatprep.records import BACKGROUND, RESOLUTION
 
 __all__ = [
     "Axes",
@@ -36,13 +36,6 @@ Far = Literal["background", "drop", "nearest"]
 
 MANY_FAR, MOST_FAR = 0.2, 0.5
 """Shares of far particles above which other axes are tried, and above which nothing is written."""
-
-
-_FRAMES: dict[Axes, str] = {
-    "slat": "frame SLAT, unit cube -0.5..0.5, z up",
-    "trellis": "frame TRELLIS as it saves Gaussians, unit cube -0.5..0.5, y down",
-    "glb": "frame TRELLIS as it saves meshes, unit cube -0.5..0.5, y up",
-}
 
 
 @dataclass(frozen=True)
@@ -119,7 +112,7 @@ def transfer(
 def doubt_axes(
     particles: Particles, field: VoxelField, result: Transferred, max_distance: float
 ) -> str:
-    """Say why many particles are far, if they are: by another tool's axes, or by another object.
+    """Say why many particles are far, if they are: other axes, another scale, a surface, an object.
 
     Parameters
     ----------
@@ -151,13 +144,23 @@ def doubt_axes(
         some = Particles(particles.positions[:: max(1, count // 20_000)], axes)
         tried = transfer(some.in_slat(), field, max_distance=max_distance)
         shares[axes] = tried.far / len(some.positions)
+    points = particles.in_slat()
+    distance = transfer(points, field, max_distance=max_distance).distance
+    far = distance > max_distance
     why = (
-        f"{result.far:,} of {count:,} particles have no voxel within {max_distance:g} voxels, "
+        f"{result.far:,} of {count:,} particles have no voxel within {max_distance:g} voxels "
+        f"({result.far / count:.0%}, half of them none within {np.median(distance[far]):.3g}), "
         f"as the file is read with --axes {particles.axes}"
     )
     fitting = min(shares, key=lambda axes: shares[axes])
+    inside = _enclosed(field, points[far])
     if shares[fitting] < 0.5 * shares[particles.axes]:
         why += f"; with --axes {fitting} {shares[fitting]:.0%} would be far"
+    elif inside > 0.5:
+        why += (
+            f"; {inside:.0%} of them lie inside the object, whose voxels here are its surface: "
+            "--points grid has materials inside"
+        )
     else:
         low, high = particles.positions.min(), particles.positions.max()
         why += (
@@ -165,12 +168,20 @@ def doubt_axes(
             f"{high:.3g}, expected positions of this object in the unit cube, -0.5 to 0.5"
         )
     if particles.foreign:
-        why += (
-            "; the file has f_rest_*, which TRELLIS does not write: another tool's axes and scale"
-        )
+        why += f"; the Gaussians are another tool's than TRELLIS, in its scale: {particles.foreign}"
     if result.far > MOST_FAR * count or shares[fitting] < 0.1 * shares[particles.axes]:
         raise ConfigError(f"{why}. If all is right, --max-distance may be larger")
     return why
+
+
+def _enclosed(field: VoxelField, points: NDArray[np.float64]) -> float:
+    """Return the share of points in the SLAT frame that the field's voxels enclose."""
+    from slatprep.geometry.voxels import filled, occupancy_of
+
+    voxels = np.floor((field.locate(points) + 0.5) * RESOLUTION).astype(int)
+    there = ((voxels >= 0) & (voxels < RESOLUTION)).all(axis=1)
+    solid = filled(occupancy_of(field.voxels))
+    return float(solid[tuple(voxels[there].T)].sum() / max(len(points), 1))
 
 
 def write_transferred(
@@ -201,7 +212,7 @@ def write_transferred(
     from slatprep.export import target
     from slatprep.export.ply import write_points
 
-    frame = _FRAMES["slat" if in_slat else particles.axes]
+    frame = FRAMES["slat" if in_slat else particles.axes]
     positions = particles.in_slat() if in_slat else particles.positions
     with target.file(path, _is_material_ply) as new:
         write_points(

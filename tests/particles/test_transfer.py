@@ -14,7 +14,7 @@ from support.synthetic import JELLY, METAL, Dataset
 
 from slatprep.cli.commands import slatprep
 from slatprep.errors import ConfigError, InputError
-from slatprep.export import export_store
+from slatprep.export import ExportOptions, export_store
 from slatprep.particles.transfer import VoxelField, predicted_field, read_particles, transfer
 from slatprep.pipeline.dataset import BuildSummary
 
@@ -135,12 +135,77 @@ def test_a_third_of_the_particles_far_is_told(
     assert "read with --axes slat" in result.stderr
 
 
-def test_gaussians_of_another_tool_are_not_taken_for_trellis(tmp_path: Path) -> None:
-    rows = np.zeros(4, dtype=[(name, "f4") for name in [*GAUSSIAN, "f_rest_0"]])
+@pytest.mark.parametrize(
+    ("names", "reach", "sign"),
+    [
+        ([*GAUSSIAN, "f_rest_0"], 0.4, "it has f_rest_*"),
+        ([name for name in GAUSSIAN if name[0] != "n"], 0.4, "it has no normals"),
+        (GAUSSIAN, 3.0, "it reaches 3 from the centre, out of the unit cube"),
+    ],
+)
+def test_gaussians_of_another_tool_are_not_taken_for_trellis(
+    names: list[str],
+    reach: float,
+    sign: str,
+    store: Path,
+    true_parts: tuple[np.ndarray, np.ndarray],
+    tmp_path: Path,
+) -> None:
+    rows = np.zeros(400, dtype=[(name, "f4") for name in names])
+    positions = particles_near(true_parts[0], len(rows), 0.45)
+    positions *= reach / abs(positions).max()
+    rows["x"], rows["y"], rows["z"] = positions.T
     plyfile.PlyData([plyfile.PlyElement.describe(rows, "vertex")]).write(tmp_path / "g.ply")
     read = read_particles(tmp_path / "g.ply")
-    assert read.foreign
+    assert read.foreign == sign
     assert read.axes == "slat"
+    assert read_particles(tmp_path / "g.ply", "glb").axes == "glb"
+
+    words = ["transfer", tmp_path / "g.ply", "--store", store, "--asset", "cup", "--far", "drop",
+             "--max-distance", "64"]  # fmt: skip
+    told = CliRunner().invoke(slatprep, [*map(str, words), "--out", str(tmp_path / "m.ply")])
+    if reach < 1:
+        assert told.exit_code == 0
+        assert f"another tool's than TRELLIS ({sign}): read as they are" in told.stderr
+    else:
+        assert told.exit_code != 0 and sign in told.stderr and "half of them" in told.stderr
+
+
+def test_what_slatprep_wrote_says_its_frame(
+    store: Path, true_parts: tuple[np.ndarray, np.ndarray], tmp_path: Path
+) -> None:
+    write_gaussians(tmp_path / "g.ply", particles_near(true_parts[0], 200, 0.4))
+    words = ("--store", store, "--asset", "cup", "--out")
+    run("transfer", tmp_path / "g.ply", *words, tmp_path / "once.ply")
+    again = run("transfer", tmp_path / "once.ply", *words, tmp_path / "twice.ply")
+    assert again["axes"] == "trellis"
+    assert (tmp_path / "once.ply").read_bytes() == (tmp_path / "twice.ply").read_bytes()
+
+    for points, frame in (("slat", "slat"), ("grid", "slat"), ("grid", "pixieverse")):
+        options = ExportOptions(points=points, frame=frame)
+        export_store(store, tmp_path / frame, "ply", assets=["cup"], options=options)
+        if frame == "slat":
+            done = run("transfer", tmp_path / frame / "cup.ply", *words, tmp_path / "m.ply",
+                       "--points", points)  # fmt: skip
+            assert done["far"] == 0
+    said = run_wrong(tmp_path / "pixieverse" / "cup.ply", *words, tmp_path / "m.ply")
+    assert "in the PixieVerse frame; expected the SLAT frame: slatprep export --frame slat" in said
+    run_wrong(tmp_path / "pixieverse" / "cup.ply", *words, tmp_path / "m.ply", "--axes", "slat")
+
+
+def test_a_solid_on_a_surface_is_told_of_points_grid(tmp_path: Path) -> None:
+    cube = np.argwhere(np.ones((20, 20, 20))) + 20
+    shell = cube[((cube == 20) | (cube == 39)).any(axis=1)]
+    np.savez(
+        tmp_path / "p.npz", coords=shell, material=np.zeros(len(shell), int),
+        properties_si=np.tile([1e5, 1e3, 0.3], (len(shell), 1)),
+    )  # fmt: skip
+    np.save(tmp_path / "solid.npy", (cube + 0.5) / 64 - 0.5)
+    said = run_wrong(tmp_path / "solid.npy", "--prediction", tmp_path / "p.npz",
+                     "--out", tmp_path / "m.ply", "--max-distance", "1")  # fmt: skip
+    # 16^3 of 20^3 are more than a voxel from the shell.
+    assert "4,096 of 8,000 particles" in said and "(51%, half of them none within 3)" in said
+    assert "100% of them lie inside the object" in said and "--points grid" in said
 
 
 def test_open3d_reads_the_same_points(
