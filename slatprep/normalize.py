@@ -57,18 +57,20 @@ def property_extent(field: MaterialField) -> NDArray[np.float64]:
     return to_mapped([[c.min() for c in columns], [c.max() for c in columns]]).T
 
 
-def ranges_from_extents(extents: ArrayLike) -> Normalization:
+def ranges_from_extents(extents: ArrayLike, source: str = "dataset") -> Normalization:
     """Return the ranges that span a whole dataset.
 
     Parameters
     ----------
     extents : array_like of float64, shape (A, 3, 2)
         What `property_extent` gave for each asset.
+    source : str
+        What the ranges say of where they come from.
 
     Returns
     -------
     Normalization
-        Dataset minimum and maximum of each property, as SLAT-Phys uses them.
+        Dataset minimum and maximum of each property.
 
     Raises
     ------
@@ -78,10 +80,16 @@ def ranges_from_extents(extents: ArrayLike) -> Normalization:
     table = np.asarray(extents, dtype=np.float64).reshape(-1, 3, 2)
     if len(table) == 0 or not np.isfinite(table).all():
         raise ValueError(f"ranges need finite extents of at least one asset, got {table.tolist()}")
-    lo, hi = table[:, :, 0].min(axis=0), table[:, :, 1].max(axis=0)
+    return ranges_from_bounds(table[:, :, 0].min(axis=0), table[:, :, 1].max(axis=0), source)
+
+
+def ranges_from_bounds(
+    lo: NDArray[np.float64], hi: NDArray[np.float64], source: str
+) -> Normalization:
+    """Return the ranges between bounds (3,) of the mapped properties; a point gets a width."""
     single = hi <= lo
     lo, hi = lo - single * _HALF_WIDTH_OF_A_POINT, hi + single * _HALF_WIDTH_OF_A_POINT
-    return normalization_of(np.stack([lo, hi], axis=1), "dataset")
+    return normalization_of(np.stack([lo, hi], axis=1), source)
 
 
 def normalization_of(ranges: NDArray[np.float64], source: str) -> Normalization:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from pathlib import Path
 
 import numpy as np
@@ -138,10 +139,60 @@ def test_ranges_are_read_from_toml_and_json(tmp_path: Path) -> None:
         assert found.source == name
 
 
+PIXIE_S_FILE = {
+    "density_min": 1.7031893730163574, "density_max": 3.871432304382324,
+    "E_min": 3.0183002948760986, "E_max": 10.881680488586426,
+    "nu_min": 0.21027633547782898, "nu_max": 0.4492689371109009,
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("form", ["json", "lines", "minima and maxima"])
+def test_pixie_s_own_file_gives_pixie_s_ranges(tmp_path: Path, form: str) -> None:
+    percentiles = {
+        name.replace("_min", "_p1").replace("_max", "_p99"): value
+        for name, value in PIXIE_S_FILE.items()
+    }
+    numbers = PIXIE_S_FILE | ({} if form == "minima and maxima" else percentiles)
+    path = tmp_path / "normalization_ranges.yaml"
+    lines = "".join(f"{name}: {value}  # log10\n" for name, value in numbers.items())
+    path.write_text(f"---\n{lines}\n" if form == "lines" else json.dumps(numbers))
+    found = read_ranges(path)
+    assert found.ranges == PIXIE_RANGES.ranges
+    assert found.source == "normalization_ranges.yaml"
+
+
 @pytest.mark.parametrize(
     "text",
     [
         "",
+        "{",
+        "[" * 100_000,
+        '{"a":' * 100_000,
+        "density_p1: !!python/object/apply:os.system [ls]",
+        "- 1",
+        "density_p1: [1, 2]",
+        json.dumps(PIXIE_S_FILE | {"nu_min": "0.2"}),
+        json.dumps(PIXIE_S_FILE | {"nu_min": math.nan}),
+        json.dumps(PIXIE_S_FILE | {"nu_max": math.inf}),
+        json.dumps(PIXIE_S_FILE | {"E_max": 10**400}),
+        json.dumps(PIXIE_S_FILE | {"E_min": True}),
+        json.dumps(PIXIE_S_FILE | {"nu_min": 0.5}),
+        json.dumps({k: v for k, v in PIXIE_S_FILE.items() if k != "E_min"}),
+        "{}",
+    ],
+)
+def test_bad_files_of_pixie_s_form_are_named(tmp_path: Path, text: str) -> None:
+    (tmp_path / "ranges.yaml").write_text(text)
+    with pytest.raises(ConfigError, match=r"ranges\.yaml"):
+        read_ranges(tmp_path / "ranges.yaml")
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "",
+        "[youngs_modulus]\nlo = true\nhi = 4\n",
+        "[youngs_modulus]\nlo = -1e308\nhi = 1e308\n",
         "not toml at all",
         "[youngs_modulus]\nlo = 3\nhi = 3\n",
         "[youngs_modulus]\nlo = 3\nhi = inf\n",

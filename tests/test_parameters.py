@@ -92,6 +92,24 @@ def test_preset_replaces_the_align_table(folder: Path) -> None:
     assert parameters.sample == PRESETS["paper"].sample
 
 
+def test_preset_paper_takes_pixie_s_ranges_and_the_default_those_of_the_file(folder: Path) -> None:
+    path = write(folder, MINIMAL + '[normalize]\nranges = "p2-p98"\n')
+    ranges = [load_parameters(path, preset=p).normalize.ranges for p in (None, "default", "paper")]
+    assert ranges == ["p2-p98", "p2-p98", "pixie"]
+    given = load_parameters(path, {"normalize": {"ranges": "dataset"}}, "paper")
+    assert given.normalize.ranges == "dataset"
+
+
+def test_lists_of_ids_lie_beside_the_definition(folder: Path) -> None:
+    (folder / "lists.json").write_text("{}")
+    named = '[normalize]\nobjects = "train"\nshares = [1, 0, 0]\nsplit_by = '
+    found = load_parameters(write(folder, MINIMAL + named + '"lists.json"\n')).normalize
+    assert found.split_by == str(folder / "lists.json") and found.shares == (1.0, 0.0, 0.0)
+    for rule in ("pixie", "category:tree", "hash"):
+        path = write(folder, MINIMAL + named + f'"{rule}"\n')
+        assert load_parameters(path).normalize.split_by == rule
+
+
 def test_patterns_are_lists(folder: Path) -> None:
     path = write(folder, MINIMAL + 'pattern = ["a/{id}.npz", "b/{id}.npz"]\n')
     assert load_parameters(path).slat.pattern == ("a/{id}.npz", "b/{id}.npz")
@@ -101,6 +119,22 @@ def test_patterns_are_lists(folder: Path) -> None:
     ("addition", "words"),
     [
         ('[align]\nengin = "field"\n', ("align.engin", "did you mean 'engine'", "radius")),
+        ('[normalize]\nranges = "p99-p1"\n', ("normalize", "p99-p1", "the lower first")),
+        ('[normalize]\nranges = "p1-p101"\n', ("normalize", "p1-p101", "p0 to p100")),
+        ('[normalize]\nranges = "p1-pnan"\n', ("normalize.ranges", "does not exist", "p1-p99")),
+        ('[normalize]\nsplit_by = "pixie"\n', ("normalize", "objects = 'train'")),
+        (
+            '[normalize]\nranges = "pixie"\nobjects = "train"\n',
+            ("normalize", "percentiles of it where objects"),
+        ),
+        (
+            '[normalize]\nobjects = "train"\nshares = [0.5, 0.5, 0.5]\n',
+            ("normalize", "add up to 1"),
+        ),
+        (
+            '[normalize]\nobjects = "train"\nsplit_by = "nothing.json"\n',
+            ("normalize.split_by", "nothing.json", "does not exist"),
+        ),
         ('[align]\nengine = "magic"\n', ("align.engine", "'magic'", "'open3d'")),
         ("[align]\nradius = true\n", ("align.radius", "True", "number")),
         ('[align]\nradius = "3"\n', ("align.radius", "'3'", "number")),

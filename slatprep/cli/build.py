@@ -69,6 +69,7 @@ def build_store(output: Output, out: Path, dry_run: bool, **options: Any) -> Non
     -------
     slatprep build-store --pixieverse demo/pixieverse --slat demo/slat --out demo.zarr --jobs 2
     slatprep build-store --config manifests/demo.toml --preset paper --out data/demo.zarr
+    slatprep build-store --config demo/dataset.toml --ranges p1-p99 --ranges-of train --out d.zarr
     slatprep build-store --config manifests/demo.toml --out data/demo.zarr --dry-run
     slatprep build-store --config manifests/demo.toml --out data/demo.zarr --scheduler tcp://node7:8786
     """

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 import inspect
 import pkgutil
@@ -144,8 +145,9 @@ EXISTING_FOLDER = PlaceType(path_type=Path, exists=True, file_okay=False)
 
 _PIXIEVERSE = "Root of the PixieVerse grids or predictions, a folder or a URL."
 _MAP = "CSV that joins the ids of the two sides, or TRELLIS's metadata.csv."
-_RANGES = "Where the normalisation ranges come from.  [default: dataset]"
-_PRESET = "Named alignment parameters; 'paper' is the protocol of SLAT-Phys."
+_RANGES = "Where the normalisation ranges come from; p1-p99: percentiles.  [default: dataset]"
+_RANGES_OF = "Objects whose ranges are taken, where they are the dataset's.  [default: all]"
+_PRESET = "Named parameters; 'paper' is the protocol of SLAT-Phys, in Pixie's ranges."
 
 
 def source_options(command: _Function) -> _Function:
@@ -156,7 +158,9 @@ def source_options(command: _Function) -> _Function:
         option("--pixieverse", PLACE, text=_PIXIEVERSE),
         option("--slat", PLACE, text="Root of the TRELLIS latents, or one HDF5 file, or a URL."),
         option("--map", PLACE, text=_MAP),
-        option("--ranges", text=_RANGES, metavar="dataset|pixie|FILE"),
+        option("--ranges", text=_RANGES, metavar="dataset|pLO-pHI|pixie|FILE"),
+        option("--ranges-of", click.Choice(["all", "train"]), text=_RANGES_OF),
+        split_options,
         option("--preset", preset, text=_PRESET),
     )
     return functools.reduce(lambda decorated, add: add(decorated), reversed(options), command)
@@ -289,9 +293,14 @@ def parameters_of(options: dict[str, Any]) -> BuildParameters:
 
     given: dict[str, dict[str, object]] = {}
     for name, flag in OPTIONS.items():
-        if (value := options.pop(flag.removeprefix("--"))) is not None:
-            group, key = name.split(".")
-            given[group] = {key: value if isinstance(value, str) else str(value.absolute())}
+        if (value := options.pop(flag.removeprefix("--").replace("-", "_"))) is None:
+            continue
+        group, key = name.split(".")
+        if key == "shares":
+            value = dataclasses.astuple(_shares(value))
+        elif not isinstance(value, str):
+            value = str(value.absolute())
+        given.setdefault(group, {})[key] = value
     for name in ("consensus", "witness"):
         if options.pop(name, False):
             given[name] = {"settle": True}

@@ -7,12 +7,13 @@ provenance records them with each result.
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass, field
 from typing import Annotated, Any, ClassVar, Literal
 
 from annotated_types import Ge, Gt, Le
 
-from slatprep.records import Engine, Place
+from slatprep.records import Engine, Place, Share
 from slatprep.storage.place import place_of
 
 Length = Annotated[float, Gt(1e-4), Le(1e3)]
@@ -27,6 +28,10 @@ what a store may have to be read, and so what it may be told to be built with.""
 
 MAX_SHARD_CHUNKS = 2**20
 """Chunks of one shard, whose index a reader holds in memory."""
+
+
+NAMED_SPLITS, CATEGORY = ("hash", "pixie"), "category:"
+"""What `NormalizeParameters.split_by` may be, or begin with, besides the path of a file."""
 
 
 class _Group:
@@ -182,9 +187,41 @@ class SampleParameters(_Group):
 
 @dataclass(frozen=True)
 class NormalizeParameters(_Group):
-    """Where the ranges come from: ``dataset``, ``pixie``, or the path of a TOML or JSON file."""
+    """Where the ranges come from.
+
+    `ranges` is ``dataset`` (its minimum and maximum), percentiles of it such as
+    ``p1-p99``, ``pixie``, or the path of a TOML, JSON or YAML file. Those of the
+    dataset are taken of all `objects`, or of those to train on (``train``), as
+    `split_by` and `shares` part them, see `slatprep.readers.splits.assign_splits`.
+    """
 
     ranges: str = "dataset"
+    objects: Literal["all", "train"] = "all"
+    split_by: str = "hash"
+    shares: tuple[Share, Share, Share] = (0.8, 0.1, 0.1)
+
+    def __post_init__(self) -> None:
+        percentiles = percentiles_of(self.ranges)
+        if percentiles and not percentiles[0] < percentiles[1] <= 100:
+            raise ValueError("percentiles such as p1-p99, from p0 to p100, the lower first")
+        if abs(sum(self.shares) - 1) > 1e-9:
+            raise ValueError("shares of train, val and test that add up to 1")
+        own = NormalizeParameters.split_by, NormalizeParameters.shares
+        if self.objects == "all" and (self.split_by, self.shares) != own:
+            raise ValueError("objects = 'train' (--ranges-of train) where split_by or shares are")
+        if self.objects == "train" and self.ranges != "dataset" and not percentiles:
+            raise ValueError("ranges of the dataset or percentiles of it where objects = 'train'")
+
+
+def percentiles_of(ranges: str) -> tuple[float, float] | None:
+    """Return the percentiles that ranges such as ``p1-p99`` go from and to; None for others."""
+    match = re.fullmatch(r"p(\d+(?:\.\d+)?)-p(\d+(?:\.\d+)?)", ranges, re.ASCII)
+    return (float(match[1]), float(match[2])) if match else None
+
+
+def is_split_file(by: str) -> bool:
+    """Whether what parts the objects is a file of ids, and not a rule with a name."""
+    return by not in NAMED_SPLITS and not by.startswith(CATEGORY)
 
 
 @dataclass(frozen=True)
@@ -221,10 +258,14 @@ class BuildParameters(_Group):
 
 @dataclass(frozen=True)
 class Preset:
-    """Named parameters of the stages that decide which annotation a SLAT voxel gets."""
+    """Named parameters of the stages that decide which annotation a SLAT voxel gets.
+
+    Without ranges of its own a preset leaves those of the file.
+    """
 
     align: AlignParameters = AlignParameters()
     sample: SampleParameters = SampleParameters()
+    normalize: NormalizeParameters | None = None
 
 
 PRESETS: dict[str, Preset] = {
@@ -232,6 +273,8 @@ PRESETS: dict[str, Preset] = {
     "paper": Preset(
         align=AlignParameters(engine=Engine.OPEN3D, model="rigid"),
         sample=SampleParameters(method="nearest"),
+        normalize=NormalizeParameters(ranges="pixie"),
     ),
 }
-"""``paper`` is the protocol of SLAT-Phys, the reference for comparisons."""
+"""``paper`` is the protocol of SLAT-Phys, the reference for comparisons: its targets are
+normalised by Pixie's published ranges."""

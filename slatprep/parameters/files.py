@@ -16,7 +16,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple, get_args, get_type_hints
 
 from slatprep.errors import ConfigError, in_unicode
-from slatprep.parameters import PRESETS, BuildParameters
+from slatprep.parameters import (
+    CATEGORY,
+    NAMED_SPLITS,
+    PRESETS,
+    BuildParameters,
+    is_split_file,
+    percentiles_of,
+)
 from slatprep.storage.place import place_of
 
 if TYPE_CHECKING:
@@ -25,7 +32,7 @@ if TYPE_CHECKING:
 Overrides = Mapping[str, "Mapping[str, object] | str"]
 """Values that win over the file, nested as the file is: ``{"slat": {"root": ...}}``."""
 
-NAMED_RANGES = ("dataset", "pixie")
+NAMED_RANGES = ("dataset", "pixie", "percentiles such as p1-p99")
 """What `normalize.ranges` may be besides the path of a file."""
 
 _UNKNOWN_KEY = "unexpected_keyword_argument"
@@ -35,10 +42,16 @@ OPTIONS = {
     "slat.root": "--slat",
     "pairing.map": "--map",
     "normalize.ranges": "--ranges",
+    "normalize.objects": "--ranges-of",
+    "normalize.split_by": "--split-by",
+    "normalize.shares": "--shares",
 }
 """The options that give a value of the file, by its key."""
 
-_PATHS = ("pixieverse.root", "slat.root", "pairing.map", "pairing.categories", "normalize.ranges")
+_PATHS = (
+    "pixieverse.root", "slat.root", "pairing.map", "pairing.categories", "normalize.ranges",
+    "normalize.split_by",
+)  # fmt: skip
 
 
 def load_parameters(
@@ -76,7 +89,8 @@ def load_parameters(
     if preset is not None:
         if preset not in PRESETS:
             raise ConfigError(f"preset: there is no {preset!r}; allowed: {', '.join(PRESETS)}")
-        data |= asdict(PRESETS[preset])
+        groups = asdict(PRESETS[preset])
+        data |= {group: values for group, values in groups.items() if values is not None}
     origin = _Origin(config, overrides or {})
     for group, values in origin.overrides.items():
         table = data.get(group, {})
@@ -135,9 +149,16 @@ def _read(path: Path) -> dict[str, Any]:
     for group, key in (name.split(".") for name in _PATHS):
         table = data.get(group)
         value = table.get(key) if isinstance(table, dict) else None
-        if isinstance(value, str) and value and (key != "ranges" or value not in NAMED_RANGES):
+        if isinstance(value, str) and value and _is_path(key, value):
             data[group][key] = str(place_of(value, folder))
     return data
+
+
+def _is_path(key: str, value: object) -> bool:
+    """Whether the value of one of `_PATHS` is a path, and not a word."""
+    if key == "ranges":
+        return value not in NAMED_RANGES and percentiles_of(str(value)) is None
+    return key != "split_by" or is_split_file(str(value))
 
 
 def _explain(error: ErrorDetails, origin: _Origin) -> str:
@@ -174,7 +195,7 @@ def _check_paths(parameters: BuildParameters, origin: _Origin) -> None:
     for name in _PATHS:
         group, _, key = name.partition(".")
         value = getattr(getattr(parameters, group), key)
-        if value is None or value in NAMED_RANGES:
+        if value is None or not _is_path(key, value):
             continue
         try:
             if place_of(value).exists():
@@ -182,5 +203,6 @@ def _check_paths(parameters: BuildParameters, origin: _Origin) -> None:
             fault = "does not exist; expected a path"
         except OSError as error:
             fault = f"cannot be looked at ({error.strerror}); expected a path"
-        named = f", or one of {', '.join(NAMED_RANGES)}" if name == "normalize.ranges" else ""
+        words = {"ranges": NAMED_RANGES, "split_by": (*NAMED_SPLITS, f"{CATEGORY}NAME")}.get(key)
+        named = f", or one of {', '.join(words)}" if words else ""
         raise ConfigError(f"{origin.of(name)}: {name}: {value} {fault}{named}")

@@ -17,10 +17,11 @@ from slatprep.pipeline.asset import fail_asset, finish_asset, process_asset
 from slatprep.pipeline.consensus import apply_consensus
 from slatprep.pipeline.context import BuildContext
 from slatprep.pipeline.kernels import compile_kernels
-from slatprep.pipeline.pack import dataset_ranges, given_ranges, pack_store
+from slatprep.pipeline.pack import pack_store
 from slatprep.pipeline.plan import Action, BuildPlan, PlannedAsset, plan_assets
 from slatprep.pipeline.previous import previous_build
 from slatprep.pipeline.publish import Destination, publish_manifests, write_all_records
+from slatprep.pipeline.ranges import dataset_ranges, given_ranges, source_of
 from slatprep.pipeline.recipe import recipe_of
 from slatprep.pipeline.spool import FailedAsset, Spool, SpooledAsset
 from slatprep.pipeline.summary import BuildSummary, nothing_usable, summarise_build
@@ -111,6 +112,7 @@ def build_store(
     begin = time.perf_counter()
     place = Destination(out, manifests)
     given = given_ranges(parameters.normalize)
+    source = given.source if given else source_of(parameters.normalize)
     with work_beside(place.store, fresh=fresh, keep=keep_work) as work:
         place.look()
         pairs = _discover(parameters, jobs, work.scratch)
@@ -121,7 +123,7 @@ def build_store(
         new, unchanged = _split(pairs, plan)
         _compile(plan, jobs, note)
         assets = _finish(new, plan, context, jobs, progress)
-        if not damaged and is_current(plan, assets, context, given):
+        if not damaged and is_current(plan, assets, context, given or source):
             return repeat_summary(assets, context, place, time.perf_counter() - begin)
         assets += _finish(unchanged, plan, context, jobs, progress)
         usable, failed = _usable_and_failed(assets, parameters, pairs)
@@ -311,7 +313,7 @@ def _pack(
     jobs: Jobs,
 ) -> _Packed:
     """Normalise and pack the rows of a store, then its records and its root attributes."""
-    normalization = given or dataset_ranges(usable)
+    normalization = given or dataset_ranges(usable, work.spool, parameters.normalize, jobs)
     store, records = work.scratch / "store.zarr", work.scratch / "assets.jsonl"
     clipped = pack_store(store, work.spool, usable, normalization, parameters.store, jobs)
     completed = _completed_records(work.spool, usable, failed, normalization, clipped)

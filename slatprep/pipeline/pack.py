@@ -12,19 +12,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slatprep.geometry.voxels import flat_index
-from slatprep.normalize import (
-    PIXIE_RANGES,
-    normalize_and_count,
-    normalize_change,
-    ranges_from_extents,
-)
-from slatprep.parameters import NormalizeParameters, StoreParameters
+from slatprep.normalize import normalize_and_count, normalize_change
+from slatprep.parameters import StoreParameters
 from slatprep.pipeline.spool import Spool, SpooledAsset
 from slatprep.provenance.record import Clipped, property_counts
-from slatprep.readers.ranges import read_ranges
 from slatprep.records import BACKGROUND, UNANNOTATED, Normalization
 from slatprep.storage.faults import reached
-from slatprep.storage.place import place_of
 from slatprep.store.layout import (
     ARRAYS,
     overlaps,
@@ -118,20 +111,6 @@ def write_assets(
         if where == "asset":
             dtype = object if layout.dtype == "str" else layout.dtype
             group[name][:] = np.array(columns[name], dtype=dtype)
-
-
-def given_ranges(parameters: NormalizeParameters) -> Normalization | None:
-    """Return ranges that do not depend on the dataset, or None; read first, to fail early."""
-    if parameters.ranges == "dataset":
-        return None
-    if parameters.ranges == "pixie":
-        return PIXIE_RANGES
-    return read_ranges(place_of(parameters.ranges))
-
-
-def dataset_ranges(usable: Sequence[SpooledAsset]) -> Normalization:
-    """Return the ranges that the usable assets span."""
-    return ranges_from_extents([asset.extent for asset in usable])
 
 
 def pack_store(

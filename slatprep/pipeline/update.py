@@ -35,7 +35,7 @@ def is_current(
     plan: Mapping[str, PlannedAsset],
     others: Sequence[SpooledAsset | FailedAsset],
     context: BuildContext,
-    given: Normalization | None,
+    ranges: Normalization | str,
 ) -> bool:
     """Whether the store that is there is the one that this build would write.
 
@@ -47,8 +47,8 @@ def is_current(
         The assets that are not unchanged.
     context : BuildContext
         The build.
-    given : Normalization or None
-        Ranges that do not depend on the dataset.
+    ranges : Normalization or str
+        Ranges that do not depend on the dataset, or where those of the dataset come from.
     """
     previous = context.previous
     if previous is None or any(isinstance(asset, SpooledAsset) for asset in others):
@@ -60,7 +60,7 @@ def is_current(
         and not any(asset.names for asset in plan.values())
         and actions.count(Action.REUSE) == len(store)
         and store.attributes.get("build") == origin(context.parameters)
-        and (given is None or store.normalization == given)
+        and ranges in (store.normalization, store.normalization.source)
         and records_id(_all_records(others, previous, context)) == previous.build_id
     )
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import math
 import tomllib
 from typing import TypeGuard
 
@@ -14,9 +13,15 @@ from slatprep.storage.documents import read_bounded
 
 _MAX_BYTES = 2**20
 
+# Beyond all units: ranges are in log10, and what is divided by their width must not overflow.
+_MAX_BOUND = 1e6
+
+# What Pixie's file calls each of PROPERTY_COLUMNS.
+_PIXIE_WORDS = ("E", "density", "nu")
+
 
 def read_ranges(path: Place) -> Normalization:
-    """Read ranges from a TOML or JSON file.
+    """Read ranges from a TOML or JSON file, or from Pixie's ``normalization_ranges.yaml``.
 
     The file has one table a property with ``lo`` and ``hi`` in mapped units
     (log10 of Pa and of kg/m^3, plain Poisson's ratio)::
@@ -25,6 +30,10 @@ def read_ranges(path: Place) -> Normalization:
         lo = 3.0
         hi = 11.0
 
+    Pixie's has ``density_p1``, ``density_p99``, ``E_p1``, ``nu_p1`` and so on, in the same
+    units, as JSON or a line each; its loader reads these, and ``density_min`` and
+    ``density_max``, which say the same, are read where they are not there.
+
     Raises
     ------
     ConfigError
@@ -32,7 +41,10 @@ def read_ranges(path: Place) -> Normalization:
     """
     try:
         text = read_bounded(path, _MAX_BYTES).decode()
-        table = json.loads(text) if path.suffix == ".json" else tomllib.loads(text)
+        if path.suffix in (".yaml", ".yml"):
+            table = _of_pixie(text)
+        else:
+            table = json.loads(text) if path.suffix == ".json" else tomllib.loads(text)
     except (OSError, ValueError, RecursionError) as error:
         raise ConfigError(f"{path}: cannot read ranges ({error})") from error
     ranges = []
@@ -48,5 +60,27 @@ def read_ranges(path: Place) -> Normalization:
     return Normalization((ranges[0], ranges[1], ranges[2]), source=path.name)
 
 
+def _of_pixie(text: str) -> dict[str, dict[str, object]]:
+    """Return the tables of a file of Pixie's, whose JSON is YAML as well; ValueError if it is none.
+
+    YAML itself, which could name objects to be made, is not needed for twelve numbers.
+    """
+    if text.lstrip().startswith("{"):
+        numbers = json.loads(text)
+    else:
+        lines = (line.partition("#")[0].strip() for line in text.splitlines())
+        pairs = (line.partition(":") for line in lines if line not in ("", "---"))
+        numbers = {name.strip(): float(value) for name, _, value in pairs}
+    return {
+        name: {
+            end: numbers.get(f"{word}_{percentile}", numbers.get(f"{word}_{limit}"))
+            for end, percentile, limit in (("lo", "p1", "min"), ("hi", "p99", "max"))
+        }
+        for name, word in zip(PROPERTY_COLUMNS, _PIXIE_WORDS, strict=True)
+    }
+
+
 def _is_number(value: object) -> TypeGuard[float]:
-    return isinstance(value, int | float) and math.isfinite(value)
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        return False
+    return abs(value) <= _MAX_BOUND  # NaN is not

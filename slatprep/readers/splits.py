@@ -12,6 +12,7 @@ import numpy as np
 import orjson
 
 from slatprep.errors import ConfigError, InputError
+from slatprep.parameters import CATEGORY, NAMED_SPLITS
 from slatprep.readers.files import ArraySpec, is_text, npy_array
 from slatprep.records import Place
 from slatprep.storage.documents import read_bounded
@@ -99,8 +100,7 @@ def split_objects(object_ids: Iterable[str], shares: Shares = Shares()) -> dict[
     return splits
 
 
-HASH, PIXIE, CATEGORY = "hash", "pixie", "category:"
-"""What `assign_splits` takes besides the path of a file."""
+HASH, PIXIE = NAMED_SPLITS
 
 _MAX_BYTES = 64 * 2**20
 _IDS = ArraySpec(((None,),), "US")
@@ -214,7 +214,7 @@ def read_lists(path: Place) -> dict[Split, tuple[str, ...]]:
         If it cannot be read, or is none of these.
     """
     try:
-        data = read_bounded(path, _MAX_BYTES)
+        data = read_id_file(path)
         if path.suffix == ".npy":
             names = npy_array(data, path, _IDS).astype(str)
             if not is_text(names):
@@ -226,7 +226,7 @@ def read_lists(path: Place) -> dict[Split, tuple[str, ...]]:
             listed = [
                 line.strip() for line in data.decode("utf-8-sig").splitlines() if line.strip()
             ]
-    except (OSError, ValueError) as error:
+    except ValueError as error:
         raise InputError(path, f"cannot be read ({error})", _FORMS) from None
     lists = listed if isinstance(listed, dict) else {"test": listed}
     for name, ids in lists.items():
@@ -240,6 +240,14 @@ def read_lists(path: Place) -> dict[Split, tuple[str, ...]]:
     if not any(lists.values()):
         raise InputError(path, "has no id", _FORMS)
     return {split: tuple(lists[split]) for split in SPLITS if split in lists}
+
+
+def read_id_file(path: Place) -> bytes:
+    """Read a file of ids whole; InputError if it cannot be."""
+    try:
+        return read_bounded(path, _MAX_BYTES)
+    except (OSError, ValueError) as error:
+        raise InputError(path, f"cannot be read ({error})", _FORMS) from None
 
 
 def _by_file(

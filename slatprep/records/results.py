@@ -52,7 +52,8 @@ class PropertyRange:
 class Normalization:
     """The three property ranges, in the order of ``PROPERTY_COLUMNS``, and where they come from.
 
-    ``source`` is ``dataset``, ``pixie`` or the name of a file.
+    ``source`` is ``dataset``, ``p1-p99`` or other percentiles of it, either of which may
+    be ``of train by`` what parts the objects; ``pixie``; or the name of a file.
     """
 
     ranges: tuple[PropertyRange, PropertyRange, PropertyRange]

@@ -1,0 +1,176 @@
+"""The ranges that properties are normalised by: given ones, or those of the dataset's fields."""
+
+from __future__ import annotations
+
+import hashlib
+from collections import Counter
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from slatprep.errors import ConfigError
+from slatprep.normalize import (
+    PIXIE_RANGES,
+    ranges_from_bounds,
+    ranges_from_extents,
+    to_mapped,
+)
+from slatprep.parameters import NormalizeParameters, is_split_file, percentiles_of
+from slatprep.pipeline.spool import Spool, SpooledAsset
+from slatprep.readers.ranges import read_ranges
+from slatprep.readers.splits import Shares, assign_splits, read_id_file, read_lists
+from slatprep.records import PROPERTY_COLUMNS, Normalization
+from slatprep.storage.place import place_of
+from slatprep.workers.local import Jobs, run_unordered
+
+_HALF = 16
+"""Bits that the first pass over the fields counts by."""
+
+
+def given_ranges(parameters: NormalizeParameters) -> Normalization | None:
+    """Return ranges that do not depend on the dataset, or None; read first, to fail early."""
+    if parameters.ranges == "dataset" or percentiles_of(parameters.ranges):
+        return None
+    if parameters.ranges == "pixie":
+        return PIXIE_RANGES
+    return read_ranges(place_of(parameters.ranges))
+
+
+def source_of(parameters: NormalizeParameters) -> str:
+    """Return where ranges of the dataset come from, in a word that changes when they would.
+
+    Raises
+    ------
+    InputError
+        If a file of ids cannot be used.
+    """
+    if parameters.objects == "all":
+        return parameters.ranges
+    by = parameters.split_by
+    if is_split_file(by):
+        read_lists(place_of(by))  # Not after all assets are aligned.
+        digest = hashlib.sha256(read_id_file(place_of(by))).hexdigest()
+        by = f"{place_of(by).name}, sha256 {digest[:12]}"
+    return f"{parameters.ranges} of train by {by}"
+
+
+def dataset_ranges(
+    usable: Sequence[SpooledAsset], spool: Spool, parameters: NormalizeParameters, jobs: Jobs
+) -> Normalization:
+    """Return the ranges of the usable assets' fields: their extent, or percentiles.
+
+    Percentiles are over the annotated voxels of all fields together, each alike and each
+    field once, and interpolated in mapped units, as numpy and Pixie (``inspect_ranges.py``,
+    which draws 2,000,000 of them) do.
+
+    Parameters
+    ----------
+    usable : sequence of SpooledAsset
+        One asset at least.
+    spool : Spool
+        Where their fields lie.
+    parameters : NormalizeParameters
+        Ranges that are of the dataset.
+    jobs : int or Workers
+        As for a build.
+
+    Raises
+    ------
+    ConfigError
+        If there is no training object, or a split cannot be made.
+    InputError
+        If a file of ids cannot be used.
+    """
+    chosen, source = _chosen(usable, parameters), source_of(parameters)
+    percentiles = percentiles_of(parameters.ranges)
+    if percentiles is None:
+        return ranges_from_extents([asset.extent for asset in chosen], source)
+    keys = [asset.key for asset in chosen]
+    coarse = _counted(spool, keys, jobs)
+    place = (sum(coarse[0].values()) - 1) * np.array(percentiles) / 100
+    ranks = np.concatenate([np.floor(place), np.ceil(place)]).astype(int).tolist()
+    halves = [[_at(counts, rank) for rank in ranks] for counts in coarse]
+    fine = _counted(spool, keys, jobs, [{half for half, _ in own} for own in halves])
+    bits = [
+        [
+            _at({value: n for value, n in counts.items() if value >> _HALF == half}, rank)[0]
+            for half, rank in own
+        ]
+        for counts, own in zip(fine, halves, strict=True)
+    ]
+    below, above = np.split(to_mapped(np.array(bits, dtype=np.uint32).view(np.float32).T), 2)
+    lo, hi = below + (place % 1)[:, None] * (above - below)
+    return ranges_from_bounds(lo, hi, source)
+
+
+def _chosen(
+    usable: Sequence[SpooledAsset], parameters: NormalizeParameters
+) -> Sequence[SpooledAsset]:
+    """Return an asset of each object that counts."""
+    by_object = {str(asset.columns["object_id"]): asset for asset in reversed(usable)}
+    if parameters.objects == "train":
+        valid = [asset for asset in usable if asset.n_valid]
+        splits = assign_splits(
+            parameters.split_by,
+            {str(asset.columns["object_id"]): str(asset.columns["category"]) for asset in valid},
+            Shares(*parameters.shares),
+            {asset.asset_id: str(asset.columns["object_id"]) for asset in valid},
+        ).splits
+        by_object = {name: a for name, a in by_object.items() if splits.get(name) == "train"}
+        if not by_object:
+            raise ConfigError(
+                "normalize.objects: no object is trained on, of which ranges could be taken; "
+                "expected a share or a list of train"
+            )
+    return list(by_object.values())
+
+
+def _counted(
+    spool: Spool, keys: Sequence[str], jobs: Jobs, halves: Sequence[set[int]] | None = None
+) -> list[Counter[int]]:
+    totals: list[Counter[int]] = [Counter() for _ in PROPERTY_COLUMNS]
+    for counts in run_unordered(count_bits, ((spool, key, halves) for key in keys), jobs):
+        for total, (bits, numbers) in zip(totals, counts, strict=True):
+            total.update(dict(zip(bits.tolist(), numbers.tolist(), strict=True)))
+    return totals
+
+
+def count_bits(
+    spool: Spool, key: str, halves: Sequence[set[int]] | None = None
+) -> list[tuple[NDArray[np.uint32], NDArray[np.int64]]]:
+    """Count a field's values by their bits, which order floats that are not negative.
+
+    Parameters
+    ----------
+    spool : Spool
+        Where the field lies.
+    key : str
+        Names it.
+    halves : sequence of set of int, optional
+        For each property the upper 16 bits whose values are counted, by all 32; by default
+        all values are, by their upper 16 bits. So two passes find any value by its rank,
+        whatever their number, in a memory that does not grow with it.
+
+    Returns
+    -------
+    list of tuple of ndarray
+        Of each property the bits, sorted, and how often they occur.
+    """
+    # Minus zero is no less than zero.
+    bits = np.abs(spool.field(key).properties).view(np.uint32)
+    if halves is None:
+        return [np.unique(column >> _HALF, return_counts=True) for column in bits.T]
+    return [
+        np.unique(column[np.isin(column >> _HALF, list(own))], return_counts=True)
+        for column, own in zip(bits.T, halves, strict=True)
+    ]
+
+
+def _at(counts: Mapping[int, int], rank: int) -> tuple[int, int]:
+    """Return the value of a rank, and its rank among equal ones."""
+    for value in sorted(counts):
+        if rank < counts[value]:
+            return value, rank
+        rank -= counts[value]
+    raise IndexError(rank)

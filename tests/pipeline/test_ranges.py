@@ -1,0 +1,162 @@
+"""Ranges by percentiles and of the objects to train on, against numpy over the raw grids."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from support.synthetic import Dataset
+from support.trees import tree
+
+from slatprep import ConfigError, InputError
+from slatprep.parameters import BuildParameters, NormalizeParameters
+from slatprep.pipeline.dataset import build_store
+from slatprep.provenance.record_json import read_build_record
+from slatprep.store import open_store
+
+MakeDataset = Callable[..., Dataset]
+
+
+def noisy(dataset: Dataset, *names: str) -> Dataset:
+    """Give every voxel properties of its own, over decades, with ties and zeros among them."""
+    rng = np.random.default_rng(7)
+    for number, name in enumerate(names):
+        grid = dataset.assets[name].grid
+        inside = grid[..., 3] != 7
+        count = int(inside.sum())
+        grid[inside, 0] = 10 ** rng.uniform(1, 3 + number, count)
+        grid[inside, 1] = 10 ** rng.normal(6, 2, count)
+        grid[inside, 2] = np.round(rng.uniform(0, 0.5, count), 3)
+        grid[(*np.argwhere(inside)[0], 2)] = -0.0
+        dataset.write_grid(name, grid)
+    return dataset
+
+
+def expected(dataset: Dataset, names: str, lo: float, hi: float) -> np.ndarray:
+    """Take percentiles as numpy does, over all voxels that are not background."""
+    grids = [dataset.assets[name].grid for name in names]
+    voxels = np.concatenate([grid[grid[..., 3] != 7] for grid in grids]).astype(np.float64)
+    mapped = np.stack([np.log10(voxels[:, 1]), np.log10(voxels[:, 0]), voxels[:, 2]])
+    return np.asarray(np.percentile(mapped, [lo, hi], axis=1).T)
+
+
+def ranges_of(out: Path) -> np.ndarray:
+    return np.array([[one.lo, one.hi] for one in open_store(out).normalization.ranges])
+
+
+def of(dataset: Dataset, **normalize: object) -> BuildParameters:
+    return replace(dataset.parameters(), normalize=NormalizeParameters(**normalize))  # type: ignore[arg-type, no-any-return]
+
+
+@pytest.mark.parametrize(
+    ("ranges", "lo", "hi"),
+    [("p1-p99", 1, 99), ("p0.5-p97.25", 0.5, 97.25), ("p0-p100", 0, 100), ("p50-p51", 50, 51)],
+)
+def test_percentiles_are_numpy_s(
+    make_dataset: MakeDataset, tmp_path: Path, ranges: str, lo: float, hi: float
+) -> None:
+    dataset, out = noisy(make_dataset("a", "b", "c"), "a", "b", "c"), tmp_path / "s.zarr"
+    build_store(of(dataset, ranges=ranges), out)
+    np.testing.assert_allclose(ranges_of(out), expected(dataset, "abc", lo, hi), rtol=1e-12)
+    assert open_store(out).normalization.source == ranges
+
+
+def test_percentiles_do_not_depend_on_jobs_or_on_what_was_there(
+    make_dataset: MakeDataset, tmp_path: Path
+) -> None:
+    dataset = noisy(make_dataset("a", "b", "c"), "a", "b", "c")
+    out, two, later = (tmp_path / f"{name}.zarr" for name in ("out", "two", "later"))
+    build_store(of(dataset, ranges="p1-p99"), out)
+    build_store(of(dataset, ranges="p1-p99"), two, jobs=2)
+    build_store(of(dataset, ranges="dataset"), later)
+    build_store(of(dataset, ranges="p1-p99"), later)
+    assert tree(out) == tree(two) == tree(later)
+
+
+def test_an_object_of_several_views_counts_once(make_dataset: MakeDataset, tmp_path: Path) -> None:
+    dataset, out = noisy(make_dataset("a", "b"), "a", "b"), tmp_path / "s.zarr"
+    shape = dataset.assets["b"]
+    for view in ("front", "side"):
+        dataset.write_slat(f"b/{view}.npz", shape.coords, shape.feats)
+    (dataset.root / "slat" / "b.npz").unlink()
+    build_store(of(dataset, ranges="p1-p99"), out)
+    assert open_store(out).ids == ["a", "b.front", "b.side"]
+    np.testing.assert_allclose(ranges_of(out), expected(dataset, "ab", 1, 99), rtol=1e-12)
+
+
+@pytest.mark.parametrize(("ranges", "bounds"), [("p1-p99", (1, 99)), ("dataset", (0, 100))])
+def test_ranges_of_the_objects_to_train_on(
+    make_dataset: MakeDataset, tmp_path: Path, ranges: str, bounds: tuple[float, float]
+) -> None:
+    dataset, out = noisy(make_dataset("a", "b", "c"), "a", "b", "c"), tmp_path / "s.zarr"
+    lists = tmp_path / "lists.json"
+    lists.write_text(json.dumps({"train": ["a", "b"], "test": ["c"]}))
+    chosen = of(dataset, ranges=ranges, objects="train", split_by=str(lists))
+    summary = build_store(chosen, out)
+    np.testing.assert_allclose(ranges_of(out), expected(dataset, "ab", *bounds), rtol=1e-12)
+    source = open_store(out).normalization.source
+    assert source.startswith(f"{ranges} of train by lists.json, sha256 ")
+    record = summary.records.parent / "build.json"
+    told = read_build_record(record.read_bytes(), str(record))
+    assert told.parameters.normalize == chosen.normalize
+    assert told.normalization.source == source
+
+    # Nothing changed: nothing is written; another list in the file: other ranges.
+    before = out.stat().st_ino
+    build_store(chosen, out)
+    assert out.stat().st_ino == before
+    lists.write_text(json.dumps({"train": ["a", "c"], "test": ["b"]}))
+    build_store(chosen, out)
+    np.testing.assert_allclose(ranges_of(out), expected(dataset, "ac", *bounds), rtol=1e-12)
+
+
+def test_by_hash_the_training_s_own_objects_count(
+    make_dataset: MakeDataset, tmp_path: Path
+) -> None:
+    from slatprep.learn.splits import Shares, assign_store
+
+    names = "abcdef"
+    dataset, out = noisy(make_dataset(*names), *names), tmp_path / "s.zarr"
+    shares = (0.5, 0.25, 0.25)
+    build_store(of(dataset, ranges="p1-p99", objects="train", shares=shares), out)
+    trained = assign_store(open_store(out), "hash", Shares(*shares)).lists()["train"]
+    assert 0 < len(trained) < len(names)
+    np.testing.assert_allclose(
+        ranges_of(out), expected(dataset, "".join(trained), 1, 99), rtol=1e-12
+    )
+    assert open_store(out).normalization.source == "p1-p99 of train by hash"
+
+
+def test_a_single_value_gets_a_width(make_dataset: MakeDataset, tmp_path: Path) -> None:
+    dataset, out = make_dataset("a"), tmp_path / "s.zarr"
+    grid = dataset.assets["a"].grid
+    grid[grid[..., 3] != 7, :3] = (1000, 1e6, 0.25)
+    dataset.write_grid("a", grid)
+    build_store(of(dataset, ranges="p1-p99"), out)
+    np.testing.assert_allclose(ranges_of(out), [[5.5, 6.5], [2.5, 3.5], [-0.25, 0.75]])
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [('{"train": ["a"]', "cannot be read"), ('{"train": ["nobody"]}', "none of the dataset's")],
+)
+def test_lists_that_cannot_be_used_are_named(
+    make_dataset: MakeDataset, tmp_path: Path, text: str, message: str
+) -> None:
+    dataset, out = make_dataset("a"), tmp_path / "s.zarr"
+    (tmp_path / "lists.json").write_text(text)
+    chosen = of(dataset, ranges="p1-p99", objects="train", split_by=str(tmp_path / "lists.json"))
+    with pytest.raises(InputError, match=message):
+        build_store(chosen, out)
+    assert not out.exists()
+
+
+def test_nobody_to_train_on_is_an_error(make_dataset: MakeDataset, tmp_path: Path) -> None:
+    (tmp_path / "lists.json").write_text('{"test": ["a"], "val": ["b"]}')
+    chosen = of(make_dataset("a", "b"), objects="train", split_by=str(tmp_path / "lists.json"))
+    with pytest.raises(ConfigError, match="no object is trained on"):
+        build_store(chosen, tmp_path / "s.zarr")
