@@ -59,3 +59,7 @@ class ConfigError(SlatprepError):
 
 class StoreError(SlatprepError):
     """A store that cannot be read, written or trusted."""
+
+
+class UnknownAssetError(StoreError, ConfigError):
+    """A name that no asset of a store has, or several: the caller's mistake, not the store's."""

@@ -192,6 +192,6 @@ def report(output: Output, summary: BuildSummary) -> None:
             say(f"store:   {summary.store}")
         say(f"records: {summary.records}")
 
-    output.result(
+    output.made(
         {**dataclasses.asdict(summary), "complete": summary.complete}, show, summary.complete
     )

@@ -19,7 +19,6 @@ from slatprep.cli.options import (
     store_option,
 )
 from slatprep.cli.output import EXIT_INCOMPLETE, Output, say
-from slatprep.errors import ConfigError, StoreError
 
 if TYPE_CHECKING:
     from slatprep.inspect.check import AlignmentCheck
@@ -64,8 +63,9 @@ def check_alignment(
     -------
     --asset: An asset; may be repeated.
     --worst: N assets, failed ones first, then doubtful ones, each by their confidence.
-    --ambiguous: Assets whose classes depend on a choice among ties.
-    --picture: A .png for one asset, else a folder. [default: NAME.pictures beside the store]
+    --ambiguous: Assets whose ties would change the class of more than 5 % of the voxels.
+    --picture: A .png, .svg or .pdf for one asset, else a folder. [default: NAME.pictures beside
+        the store]
     --show: Open it in Open3D's viewer, where there is a screen.
 
     Exit codes
@@ -87,11 +87,7 @@ def check_alignment(
     from slatprep.store import open_store
 
     opened = open_store(path)
-    try:
-        chosen = check.choose_assets(opened, asset_ids, worst or 0, ambiguous)
-    except StoreError as error:
-        # An unknown name is wrong use, not a failed check.
-        raise ConfigError(str(error)) from None
+    chosen = check.choose_assets(opened, asset_ids, worst or 0, ambiguous)
     target = _target(path, picture, len(chosen))
     checks = [check.check_alignment(opened, asset_id) for asset_id in chosen]
     pictures: list[Path] = []
@@ -123,7 +119,7 @@ def _target(store: Place, picture: str | None, assets: int) -> Path | None:
     if picture is None:
         return beside(store, ".pictures")
     target = Path(picture)
-    if assets > 1 and target.suffix.lower() == ".png":
+    if assets > 1 and target.suffix.lower() in (".png", ".svg", ".pdf"):
         raise click.UsageError(f"--picture {target} is one file; {assets} assets need a folder")
     return target
 

@@ -66,4 +66,4 @@ def make_demo(output: Output, directory: Path, levels: tuple[int, ...], **recipe
             f"next: slatprep build-store --config {summary.config} --out {summary.directory}.zarr"
         )
 
-    output.result(summary, show)
+    output.made(summary, show)

@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 @split_options
 @option("--spread", ChoiceOf("slatprep.learn.metrics:Spread"), "se")
 @option("--csv", NEW_FILE, name="csv_file")
-@option("--beside", metavar="pixie|slat-phys|FILE.csv")
+@option("--beside", metavar="pixie|slat-phys|FILE.csv", multiple=True)
 def evaluate(
     output: Output,
     predictions: Path,
@@ -44,7 +44,7 @@ def evaluate(
     shares: str | None,
     spread: Any,
     csv_file: Path | None,
-    beside: str | None,
+    beside: tuple[str, ...],
 ) -> None:
     """Measure PREDICTIONS by Pixie's protocol.
 
@@ -63,7 +63,7 @@ def evaluate(
     --spread: Standard error or standard deviation over objects.
     --csv: Also write the table to this file.
     --beside: Also print the published table of Pixie, which has NeRF2Physics too, those of
-        SLAT-Phys, or one of your own: a name, then columns named as here.
+        SLAT-Phys, or one of your own: a name, then columns named as here; may be repeated.
 
     Example
     -------
@@ -78,9 +78,9 @@ def evaluate(
     from slatprep.learn.splits import HASH, assign_store
     from slatprep.store import open_store
 
-    others: tuple[PublishedScore, ...] = ()
-    if beside is not None:
-        others = TABLES[beside][1] if beside in TABLES else read_scores(Path(beside))
+    others = {
+        name: TABLES[name][1] if name in TABLES else read_scores(Path(name)) for name in beside
+    }
     rule, how = split_rule(split_by, shares), f"by {split_by or HASH}"
     selection = None if split_by or shares else selection_of_run(predictions)
     if selection is not None:
@@ -114,8 +114,8 @@ def evaluate(
             ("category", "n", *result.overall.means),
             _in_short(result),
         )
-        if beside is not None:
-            _show_beside(output, result, others, beside)
+        for name, scores in others.items():
+            _show_beside(output, result, scores, name)
 
     if result.converted:
         output.note(
@@ -125,7 +125,8 @@ def evaluate(
     document = dataclasses.asdict(result)
     for asset_id in result.missing:
         output.problem(f"{predictions}: no prediction of {asset_id}")
-    document |= {"beside": others} if beside is not None else {}
+    if beside:
+        document["beside"] = [score for scores in others.values() for score in scores]
     output.result(document, show, complete=not result.missing)
 
 

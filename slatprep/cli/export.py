@@ -90,4 +90,4 @@ def export(output: Output, store: Place, kind: Any, out: Path, **others: Any) ->
     }
     for note in summary.notes:
         output.note(note)
-    output.result(summary, lambda: output.record(f"Exported to {summary.path}", cells))
+    output.made(summary, lambda: output.record(f"Exported to {summary.path}", cells))

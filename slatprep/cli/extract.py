@@ -75,6 +75,4 @@ def extract_slat(
     }
 
     document = {"path": out, "model": session.model, **counts, "problems": problems}
-    output.result(
-        document, lambda: output.record(f"Latents in {out}", counts), complete=not problems
-    )
+    output.made(document, lambda: output.record(f"Latents in {out}", counts), complete=not problems)

@@ -61,6 +61,9 @@ def show_quality(output: Output, overview: StoreOverview) -> None:
     ``labels`` is the share of right classes to be expected. Below the table a
     line says how many assets to look at, and how.
     """
+    from slatprep.inspect.check import AT_MOST
+    from slatprep.inspect.overview import UNKNOWN
+
     medians = attrgetter("confidence", "expected_accuracy", "fitness", "valid_share")
     total = overview.total
     output.table(
@@ -71,13 +74,19 @@ def show_quality(output: Output, overview: StoreOverview) -> None:
             for group in (*overview.categories, total)
         ],
     )
+    unknown = sum(group.assets for group in overview.categories if group.name == UNKNOWN)
+    if unknown:
+        say(
+            f'unknown: the category of {unknown:,}; categories = "obj_ids_metadata.json" under '
+            "[pairing] of a --config FILE tells it"
+        )
     doubted = [name for name, count in total.verdicts.items() if count and name != "good"]
     if doubted:
         options = " ".join(f"--verdict {name}" for name in doubted)
         say(f"why:     slatprep list {overview.path} {options}")
     if total.ambiguous:
         say(
-            f"tied:    {total.ambiguous:,} of {total.assets:,} have other placements that fit "
-            "about as well, with other labels"
+            f"tied:    {total.ambiguous:,} of {total.assets:,}: other placements fit about as "
+            f"well, and change more than {AT_MOST['ambiguity']:.0%} of the classes"
         )
         say(f"look:    slatprep check-alignment --ambiguous --store {overview.path}")

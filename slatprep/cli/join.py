@@ -16,6 +16,7 @@ from slatprep.cli.options import (
     command,
     complete_asset,
     option,
+    require_categories,
 )
 from slatprep.cli.output import Output
 
@@ -66,6 +67,7 @@ def subset(
     chosen = list(assets)
     if verdicts or categories:
         opened = open_store(store)
+        require_categories(opened, categories)
         chosen += [asset.asset_id for asset in list_assets(opened, verdicts, categories)]
     with output.progress("subset", "shards") as progress:
         summary = subset_store(store, out, chosen, manifests=manifests, progress=progress)

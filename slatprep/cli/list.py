@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from slatprep.cli.options import ChoiceOf, command, option, store_argument
+from slatprep.cli.options import ChoiceOf, command, option, require_categories, store_argument
 from slatprep.cli.output import Output, say
 
 if TYPE_CHECKING:
@@ -47,6 +47,7 @@ def list_assets(
     from slatprep.store import open_store
 
     opened = open_store(store)
+    require_categories(opened, categories)
     listed = list(listed_of(opened, verdicts, categories, max_confidence))
 
     def show() -> None:

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import dataclasses
+import difflib
 import functools
 import inspect
 import pkgutil
 import re
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from textwrap import indent
 from typing import TYPE_CHECKING, Any, TypeVar, get_args
@@ -222,6 +223,18 @@ verdicts_option = option(
     callback=lambda _context, _parameter, given: () if "all" in given else given or None,
 )
 """The verdicts; none where all are taken, None where the option was not given."""
+
+
+def require_categories(store: Store, categories: Sequence[str]) -> None:
+    """Refuse a category that no asset of a store has, and name the one that may be meant."""
+    known = sorted(set(map(str, store.column("category"))))
+    for category in categories:
+        if category not in known:
+            close = difflib.get_close_matches(category, known, n=1) or list(filter(None, known))
+            expected = f"expected {', '.join(close)}" if close else "no category is known"
+            raise click.BadParameter(
+                f"no asset has {category!r}; {expected}", param_hint="--category"
+            )
 
 
 def note_left_out(output: Output, store: Store) -> None:

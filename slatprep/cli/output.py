@@ -51,7 +51,7 @@ class Output:
     as_json : bool
         One JSON document on standard output instead of tables.
     verbosity : int
-        -1 prints errors and results alone, 1 prints more than the usual.
+        -1 prints errors and what was asked for alone, 1 prints more than the usual.
     """
 
     def __init__(self, as_json: bool = False, verbosity: int = 0) -> None:
@@ -69,6 +69,10 @@ class Output:
             show()
         if not complete:
             click.get_current_context().exit(EXIT_INCOMPLETE)
+
+    def made(self, document: object, show: Callable[[], None], complete: bool = True) -> None:
+        """Print what was made, as `result` does what was asked; where quiet, in JSON alone."""
+        self.result(document, show if self.verbosity >= 0 else lambda: None, complete)
 
     def note(self, message: str) -> None:
         """Print a line on standard error, unless quiet."""
@@ -147,7 +151,9 @@ def _escaped(character: str) -> str:
 
 OUTPUT_OPTIONS = (
     click.Option(["--json", "as_json"], is_flag=True, help="Print JSON instead of tables."),
-    click.Option(["-q", "--quiet"], is_flag=True, help="Print errors and results alone."),
+    click.Option(
+        ["-q", "--quiet"], is_flag=True, help="Print errors, and what is asked for, alone."
+    ),
     click.Option(["-v", "--verbose"], is_flag=True, help="Print more than the usual."),
 )
 """What every command takes, and `with_output` reads."""

@@ -114,7 +114,7 @@ def predict(
             [(stage, spent, spent * each) for stage, spent in seconds.items()],
         )
 
-    output.result(document, show, complete=not read.problems)
+    output.made(document, show, complete=not read.problems)
 
 
 @dataclass(frozen=True)
@@ -174,7 +174,7 @@ class _Reader:
         self.rows = {asset_id: row for row, asset_id in enumerate(there)}
         unknown = [asset_id for asset_id in assets if asset_id not in self.rows]
         if unknown:
-            raise InputError(source, f"has no asset {unknown[0]!r}", f"one of its {len(there)}")
+            raise ConfigError(f"{source} has no asset {unknown[0]!r}; it has {len(there)} assets")
         self.ids = [asset_id for asset_id in there if not assets or asset_id in assets]
         self.done: list[str] = []
         self.problems: list[str] = []

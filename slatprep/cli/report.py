@@ -69,4 +69,4 @@ def report(
         say(f"page:   {summary.path} ({summary.size / 1e6:,.1f} MB)")
         say(f"assets: {summary.assets:,}, {summary.in_detail:,} of them with a 3D view")
 
-    output.result(summary, show)
+    output.made(summary, show)

@@ -99,7 +99,7 @@ def transfer(
         "written": len(result.rows),
         "far": result.far,
     }
-    output.result({"path": out, **counts}, lambda: output.record(f"Transferred to {out}", counts))
+    output.made({"path": out, **counts}, lambda: output.record(f"Transferred to {out}", counts))
 
 
 def _field(

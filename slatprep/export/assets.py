@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from slatprep.errors import ConfigError, StoreError
+from slatprep.errors import ConfigError
 from slatprep.records import Verdict
 from slatprep.store import Store, StoredAsset
 
@@ -57,11 +57,7 @@ def choose_ids(store: Store, assets: Sequence[str], verdicts: Sequence[str]) -> 
     unknown = sorted(set(verdicts) - set(Verdict))
     if unknown:
         raise ConfigError(f"verdict is {unknown[0]!r}; expected one of {', '.join(Verdict)}")
-    try:
-        rows = sorted({store.match(asset_id) for asset_id in assets}) or range(len(store))
-    except StoreError as error:
-        # An unknown name is the caller's mistake; nothing is wrong with the store.
-        raise ConfigError(str(error)) from None
+    rows = sorted({store.match(asset_id) for asset_id in assets}) or range(len(store))
     verdict = store.column("verdict")
     chosen = [store.ids[row] for row in rows if not verdicts or verdict[row] in verdicts]
     if not chosen:

@@ -10,9 +10,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from slatprep.judge import THRESHOLDS
 from slatprep.records import Normalization, Place, Verdict
 from slatprep.storage.place import storage_of
 from slatprep.store import Store
+
+UNKNOWN = "(unknown)"
+"""Name of the group of assets whose category no table says."""
 
 _MEDIANS = ("confidence", "expected_accuracy", "fitness", "inlier_rmse", "fitness_backward",
             "overlap")  # fmt: skip
@@ -24,8 +28,8 @@ class GroupOverview:
 
     ``verdicts`` counts the assets by verdict. Confidence, expected
     accuracy, fitness, rmse [voxel] and overlap are medians over the assets;
-    ``valid_share`` is over all their voxels; ``ambiguous`` counts assets with
-    tied placements that differ in class at some voxel; ``unphysical`` counts
+    ``valid_share`` is over all their voxels; ``ambiguous`` counts assets whose
+    tied placements differ in more classes than a good one's may; ``unphysical`` counts
     the PixieVerse voxels that were left out, as no material has their properties.
     """
 
@@ -95,7 +99,7 @@ def overview_of(store: Store) -> StoreOverview:
         normalization=store.normalization,
         total=_group("all", columns, list(range(len(store)))),
         categories=tuple(
-            _group(name or "(unknown)", columns, own) for name, own in sorted(rows.items())
+            _group(name or UNKNOWN, columns, own) for name, own in sorted(rows.items())
         ),
     )
 
@@ -111,7 +115,7 @@ def _group(name: str, columns: dict[str, NDArray[Any]], chosen: list[int]) -> Gr
         verdicts={str(verdict): verdicts.get(str(verdict), 0) for verdict in Verdict},
         **{median: float(np.median(own[median])) for median in _MEDIANS},
         valid_share=float(own["valid_share"] @ own["voxels"] / voxels),
-        ambiguous=int((own["ambiguity"] > 0).sum()),
+        ambiguous=int((own["ambiguity"] > THRESHOLDS.good_ambiguity).sum()),
         unphysical=int(own["unphysical"].sum()),
     )
 

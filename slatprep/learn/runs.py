@@ -12,6 +12,7 @@ import zipfile
 from collections.abc import Sequence
 from contextlib import AbstractContextManager
 from io import BytesIO
+from itertools import pairwise
 from pathlib import Path
 from pickle import UnpicklingError
 from typing import Any
@@ -227,14 +228,33 @@ class Run:
         figure = Figure(figsize=(6.6, 3.6), layout="constrained")
         axes = figure.add_subplot()
         errors = [record.val_mse for record in history]
-        axes.plot([record.epoch + 1 for record in history], errors, "o-", color=INK, ms=4)
+        axes.plot([record.epoch for record in history], errors, "o-", color=INK, ms=4)
         for style, error in zip(("--", ":"), references.values(), strict=True):
             axes.axhline(error, color=MUTED, linestyle=style)
-        for name, error in {"decoder": errors[-1], **references}.items():
-            axes.annotate(name, (1.0, error), (6, 0), va="center", textcoords="offset points",
-                          xycoords=("axes fraction", "data"), fontsize=9, color=INK)  # fmt: skip
-        axes.set(xlabel="passes over the training objects", ylabel="validation MSE (normalised)")
-        axes.set_ylim(0, 1.08 * max(*errors, *references.values()))
+        top = 1.08 * max(*errors, *references.values())
+        named = {"decoder": errors[-1], **references}
+        for name, height in zip(
+            named, apart([error / top for error in named.values()]), strict=True
+        ):
+            axes.annotate(name, (1.0, height), (6, 0), va="center", textcoords="offset points",
+                          xycoords="axes fraction", fontsize=9, color=INK)  # fmt: skip
+        axes.set(xlabel="epoch (the first is 0)", ylabel="validation MSE (normalised)")
+        axes.set_ylim(0, top)
         axes.xaxis.set_major_locator(MaxNLocator(integer=True))
         axes.spines[["top", "right"]].set_visible(False)
         figure.savefig(self.path / "curve.png", dpi=120)
+
+
+def apart(heights: Sequence[float], gap: float = 0.065) -> list[float]:
+    """Return where labels stand that are wanted at heights: in their order, none on another.
+
+    Examples
+    --------
+    >>> apart([0.5, 0.5, 0.1], gap=0.25)
+    [0.5, 0.75, 0.1]
+    """
+    placed = list(heights)
+    order = sorted(range(len(placed)), key=lambda k: placed[k])
+    for lower, upper in pairwise(order):
+        placed[upper] = max(placed[upper], placed[lower] + gap)
+    return placed

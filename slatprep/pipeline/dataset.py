@@ -128,7 +128,7 @@ def build_store(
         assets += _finish(unchanged, plan, context, jobs, progress)
         usable, failed = _usable_and_failed(assets, parameters, pairs)
         usable = apply_consensus(usable, work.spool, parameters, jobs, note)
-        usable = apply_witness(usable, work.spool, parameters, jobs)
+        usable = apply_witness(usable, work.spool, parameters, jobs, note)
         with writing(str(place.out), work_directory(place.store).parent):
             packed = _pack(usable, failed, given, work, parameters, jobs)
             place.replace(packed.store)

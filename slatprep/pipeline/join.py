@@ -41,6 +41,10 @@ from slatprep.store.shard_writer import ShardWriter
 from slatprep.store.writer import Shard, create_store, finish_store, shards
 from slatprep.workers import Progress
 
+NO_ROOT, APART = "unknown", " | "
+"""What a build's record says of sources that no record told of, and what stands between the
+roots of sources that lie apart."""
+
 _NO_EXTENT = np.empty((0, 2))
 
 
@@ -345,13 +349,13 @@ def _renormaliser(
 
 def _parameters(sources: Sequence[_Source], build: dict[str, Any]) -> BuildParameters:
     """Return what the build's record says: the parameters, and where all sources lay."""
-    places: dict[str, Any] = {"pixieverse": {"root": "unknown"}, "slat": {"root": "unknown"}}
+    places: dict[str, Any] = {"pixieverse": {"root": NO_ROOT}, "slat": {"root": NO_ROOT}}
     if all(source.places == sources[0].places for source in sources):
         places |= sources[0].places
     else:
         for side in ("pixieverse", "slat"):
-            roots = (source.places.get(side, {}).get("root", "unknown") for source in sources)
-            places[side] = {"root": " | ".join(dict.fromkeys(roots))}
+            roots = (source.places.get(side, {}).get("root", NO_ROOT) for source in sources)
+            places[side] = {"root": APART.join(dict.fromkeys(roots))}
     document = {"name": build["name"], **places, **build["parameters"]}
     try:
         parameters: BuildParameters = adapter_of(BuildParameters).validate_json(

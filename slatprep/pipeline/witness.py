@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 
 from slatprep.align.settle import take
@@ -27,7 +27,11 @@ from slatprep.workers.local import Jobs, run_unordered
 
 
 def apply_witness(
-    assets: Sequence[SpooledAsset], spool: Spool, parameters: BuildParameters, jobs: Jobs
+    assets: Sequence[SpooledAsset],
+    spool: Spool,
+    parameters: BuildParameters,
+    jobs: Jobs,
+    note: Callable[[str], None] | None = None,
 ) -> list[SpooledAsset]:
     """Settle ties by the latents and mark labels that they contradict, if asked to.
 
@@ -42,6 +46,8 @@ def apply_witness(
         Whether to do it, and how to align and to look up.
     jobs : int or Workers
         Worker processes, or a cluster's.
+    note : callable, optional
+        Gets a line that says what came of it.
 
     Returns
     -------
@@ -54,7 +60,9 @@ def apply_witness(
     sure = [asset for asset in assets if asset.columns["verdict"] == Verdict.GOOD]
     moments = dict(run_unordered(read_moments, ((asset, spool) for asset in sure), jobs))
     models = fit_models((_object_of(asset), moments[asset.asset_id]) for asset in sure)
+    tell = note or (lambda line: None)
     if models is None:
+        tell(f"witness: {len(sure):,} good assets have too few classes; latents are not used")
         return list(assets)
     model_of = {asset.asset_id: models[fold_of(_object_of(asset))] for asset in assets}
     tasks = ((asset, spool, model_of[asset.asset_id], parameters) for asset in assets)
@@ -69,6 +77,8 @@ def apply_witness(
     changed = {
         asset.asset_id: asset for asset in run_unordered(apply_latents, tasks_of_changed, jobs)
     }
+    contradictions = sum(bool(asset.columns["contradicted"]) for asset in changed.values())
+    tell(_told(reliability, choices.values(), contradictions))
     return [changed.get(asset.asset_id, asset) for asset in assets]
 
 
@@ -117,6 +127,22 @@ def apply_latents(
     if model.gain(first.latents.feats, annotation.material) < reliability.least_gain:
         judgement = contradicted(judgement)
     return first.put(alignment, annotation, judgement)
+
+
+def _told(
+    reliability: Reliability, choices: Iterable[tuple[int, LatentChoice] | None], contradicted: int
+) -> str:
+    """Say how reliable latents are, and what they decided."""
+    agreeing, good = reliability.agreeing, reliability.witnesses
+    fit = f"the latents of {agreeing:,} of {good:,} good assets fit their own labels best"
+    if not reliability.factor:
+        return f"witness: {fit}; too few, so latents are not used"
+    decided = [choice[0] for choice in choices if choice]
+    moved = sum(number > 0 for number in decided)
+    return (
+        f"witness: {fit}; of {len(decided):,} ties that latents decide {moved:,} were given "
+        f"another placement; they contradict the labels of {contradicted:,} assets"
+    )
 
 
 def _object_of(asset: SpooledAsset) -> str:

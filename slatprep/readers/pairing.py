@@ -85,6 +85,11 @@ def discover(parameters: BuildParameters) -> list[AssetPair]:
         raise ConfigError(f"{error.filename}: cannot be looked at ({error.strerror})") from None
     listing = list_below(pixieverse.root)
     grids = _find_grids(pixieverse, listing)
+    if not grids:
+        tried = tried_names(pixieverse.grid, _settled(sample=pixieverse.sample))
+        swapped = not one_file and _find_grids(pixieverse, list_below(slat.root))
+        hint = f"; the roots are swapped: grids lie below {slat.root}" if swapped else ""
+        raise ConfigError(f"{pixieverse.root}: no grid found; looked for {tried}{hint}")
     slats = find_slats(slat, one_file)
     claims = {} if pairing.map is None else read_map(pairing.map, grids, slats)
     categories = {} if pairing.categories is None else read_categories(pairing.categories)
@@ -132,10 +137,6 @@ def _find_grids(source: PixieverseSource, listing: Listing) -> dict[str, list[_G
             grid = _Grid(fields.get("sample", ""), path, problem)
             found.setdefault(fields.get("id", path), []).append(grid)
         grids |= found
-    if not grids:
-        raise ConfigError(
-            f"{source.root}: no grid found; looked for {tried_names(source.grid, chosen)}"
-        )
     return grids
 
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from slatprep.errors import StoreError
+from slatprep.errors import StoreError, UnknownAssetError
 from slatprep.records import Place
 from slatprep.store.arrays import Arrays
 from slatprep.store.layout import ARRAYS
@@ -91,17 +91,19 @@ class AssetTable:
 
         Raises
         ------
-        StoreError
+        UnknownAssetError
             If the store has no such asset; the message names those it might be.
         """
         index = self._index.get(asset_id)
         if index is None:
             views = [known for known in self.ids if known.startswith(f"{asset_id}.")]
-            close = views or difflib.get_close_matches(asset_id, self.ids)
+            alike = asset_id.casefold()
+            begun = [known for known in self.ids if alike and known.casefold().startswith(alike)]
+            close = views or begun or difflib.get_close_matches(asset_id, self.ids)
             hint = (
                 f"did you mean {' or '.join(close[:5])}?" if close else f"it has {len(self)} assets"
             )
-            raise StoreError(f"{self.path} has no asset {asset_id!r}; {hint}")
+            raise UnknownAssetError(f"{self.path} has no asset {asset_id!r}; {hint}")
         return index
 
     def match(self, name: str) -> int:
@@ -109,7 +111,7 @@ class AssetTable:
 
         Raises
         ------
-        StoreError
+        UnknownAssetError
             If there is none, or several begin so; the message names them.
         """
         alike = [known for known in self.ids if known.startswith(name)] if name else []
@@ -119,7 +121,7 @@ class AssetTable:
             return self.find(alike[0])
         if all(known.startswith(f"{name}.") for known in alike):
             return self.find(name)  # Views of one object: the message offers them.
-        raise StoreError(
+        raise UnknownAssetError(
             f"{self.path}: {len(alike)} ids begin with {name!r}, such as {', '.join(alike[:3])}; "
             "give more of it"
         )

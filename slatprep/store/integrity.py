@@ -72,7 +72,7 @@ def file_findings(store: Store, jobs: Jobs, below: str = "") -> tuple[int, set[F
     Returns
     -------
     files : int
-        How many digests were compared.
+        How many files the store has, those of the digests themselves included.
     findings : set of Finding
         Missing, additional and changed files.
     """
@@ -102,7 +102,7 @@ def file_findings(store: Store, jobs: Jobs, below: str = "") -> tuple[int, set[F
             if digest in places:
                 what = f"holds what belongs in {places[digest]}"
             findings.add(Finding(name, "", what, f"SHA-256 {expected[name][1]}"))
-    return len(common), findings
+    return len(files), findings
 
 
 def _compare(path: Place, name: str, found: int, size: int, digest: str) -> tuple[str, str, str]:

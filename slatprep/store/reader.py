@@ -327,7 +327,10 @@ def _require_there(path: Place) -> None:
     except OSError as error:
         raise StoreError(f"{path}: cannot be reached ({error.strerror})") from None
     if not there:
-        raise StoreError(f"{needed} does not exist; build a store with `slatprep build-store`")
+        raise StoreError(
+            f"{path} is not a slatprep store: {needed} does not exist; build a store with "
+            "`slatprep build-store`"
+        )
 
 
 def _root_document(path: Place) -> dict[str, Any]:

@@ -191,6 +191,8 @@ def test_table_is_printed_beside(
     document = json.loads(CliRunner().invoke(slatprep, [*arguments, *beside]).stdout)
     assert document["beside"][-1]["method"] == "all"
     assert document["beside"][-1]["means"] == pytest.approx(ours["means"])
+    both = CliRunner().invoke(slatprep, [*arguments, "--beside", "pixie", "--beside", str(own)])
+    assert "2508.17437" in both.stdout and f"Beside {own}" in both.stdout
 
 
 @pytest.mark.parametrize(

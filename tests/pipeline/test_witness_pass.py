@@ -41,8 +41,11 @@ def telling(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, BuildParame
 def stores(telling: tuple[Path, BuildParameters]) -> tuple[Path, Path]:
     root, parameters = telling
     alone, heard = root / "alone.zarr", root / "heard.zarr"
-    build_store(parameters, alone, keep_work=True)
-    build_store(replace(parameters, witness=HEARD), heard)
+    told: list[str] = []
+    build_store(parameters, alone, keep_work=True, note=told.append)
+    assert not any("witness" in line for line in told)
+    build_store(replace(parameters, witness=HEARD), heard, note=told.append)
+    (root / "told").write_text(told[-1])
     return alone, heard
 
 
@@ -80,6 +83,11 @@ def test_ties_that_change_labels_are_settled_right_and_recorded(
         assert heard[asset_id]["first_pass"]["alignment"] == alone[asset_id]["alignment"]
         assert heard[asset_id]["judgement"]["confidence"] >= 0.9
     assert any(before[asset_id] < 0.9 for asset_id in settled)
+    moved = sum(heard[k]["alignment"]["transform"] != alone[k]["alignment"]["transform"]
+                for k in settled)  # fmt: skip
+    told = (root / "told").read_text()
+    assert f"of {len(settled)} ties that latents decide {moved} were given another" in told
+    assert told.endswith("contradict the labels of 1 assets")
 
 
 def test_assets_without_a_tie_keep_every_byte_but_those_that_are_contradicted(
@@ -152,8 +160,9 @@ def test_latents_that_carry_nothing_change_nothing(tmp_path: Path) -> None:
     parameters = load_parameters(tmp_path / "dataset.toml", {})
     alone, heard = tmp_path / "alone.zarr", tmp_path / "heard.zarr"
     build_store(parameters, alone)
-    summary = build_store(replace(parameters, witness=HEARD), heard)
-    assert summary.contradicted == ()
+    told: list[str] = []
+    summary = build_store(replace(parameters, witness=HEARD), heard, note=told.append)
+    assert summary.contradicted == () and told[-1].endswith("latents are not used")
     assert all(record["first_pass"] is None for record in records_beside(heard).values())
     before, after = (zarr.open_group(store, mode="r") for store in (alone, heard))
     for name, array in before["voxel"].arrays():

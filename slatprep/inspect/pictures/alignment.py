@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import textwrap
-from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -11,7 +10,7 @@ from numpy.typing import NDArray
 
 from slatprep.inspect.check import AlignmentCheck
 from slatprep.inspect.pictures import palette
-from slatprep.inspect.pictures.canvas import STYLE, new_figure, png_of, size_of, write
+from slatprep.inspect.pictures.canvas import new_figure, size_of, write
 from slatprep.inspect.pictures.scene import (
     Deformed,
     Placed,
@@ -28,7 +27,7 @@ from slatprep.inspect.pictures.side import (
     side_of,
 )
 from slatprep.inspect.pictures.voxels import Drawing, View, draw_voxels
-from slatprep.records import MATERIAL_CLASSES, MATERIAL_COLOURS, UNANNOTATED, Candidate
+from slatprep.records import MATERIAL_CLASSES, MATERIAL_COLOURS, UNANNOTATED, Alignment
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -39,6 +38,8 @@ WIDTH, HEIGHT = 1800, 1140
 PANEL = 300
 _LEFT, _TOP, _GAP = 48, 142, 14
 WIDER = 2 * (PANEL + _GAP)
+_MOST_LINES = 10
+"""Lines of reasons for which the column at the right has room."""
 
 COLUMNS = (
     ("before", "PixieVerse classes, SLAT outlined"),
@@ -63,9 +64,10 @@ def draw_alignment(
     check: AlignmentCheck,
     title: str,
     subtitle: str,
-    candidates: Sequence[Candidate] | str,
-) -> bytes:
-    """Draw an alignment as a PNG.
+    alignment: Alignment,
+    finer: int = 1,
+) -> Figure:
+    """Draw an alignment.
 
     Parameters
     ----------
@@ -75,28 +77,28 @@ def draw_alignment(
         Its verdict and figures.
     title, subtitle : str
         What the asset is.
-    candidates : sequence of Candidate, or str
-        The starts and their scores; in their place, why they are not known.
+    alignment : Alignment
+        Its starts and their scores.
+    finer : int
+        By how much the panels are finer than the pixels of the figure.
 
     Returns
     -------
-    bytes
-        A PNG of `WIDTH` (with a deformation `WIDER`) x `HEIGHT` pixels; the same for
-        the same arguments.
+    Figure
+        Of `WIDTH` (with a deformation `WIDER`) x `HEIGHT` pixels; the same for the same
+        arguments. It is drawn in `STYLE`, and has to be saved in it.
     """
-    import matplotlib.style
-
-    # A user's matplotlibrc must not change the picture.
-    with matplotlib.style.context(["default", STYLE]):
-        figure = new_figure(WIDTH + (WIDER if scene.deformed else 0), HEIGHT)
-        _head(figure, check, title, subtitle)
-        _panels(figure, scene)
-        _legend(figure, scene)
-        tops = [_TOP + row * (PANEL + _GAP) for row in range(3)]
-        draw_figures(figure, check, scene, tops[0])
-        draw_histogram(figure, scene, check.radius, tops[1] + 12)
-        draw_candidates(figure, candidates, tops[2] + 12)
-        return png_of(figure)
+    figure = new_figure(WIDTH + (WIDER if scene.deformed else 0), HEIGHT)
+    reasons = _head(figure, check, title, subtitle)
+    _panels(figure, scene, finer)
+    _legend(figure, scene)
+    tops = [_TOP + row * (PANEL + _GAP) for row in range(3)]
+    # Long reasons push down what stands below them, as far as there is room.
+    figures = draw_figures(figure, check, scene, max(tops[0], reasons + 26))
+    histogram = max(tops[1] + 12, figures + 44)
+    draw_histogram(figure, scene, check.radius, histogram)
+    draw_candidates(figure, alignment, max(tops[2] + 12, histogram + 290))
+    return figure
 
 
 def outlined(scene: Scene, view: View, *sets: Placed) -> list[NDArray[np.float64]]:
@@ -155,18 +157,25 @@ def _outline(drawing: Drawing) -> NDArray[np.float64]:
     return line
 
 
-def _panels(figure: Figure, scene: Scene) -> None:
+def _panels(figure: Figure, scene: Scene, finer: int) -> None:
     columns = COLUMNS if scene.deformed is None else DEFORMED_COLUMNS
     for column, (name, meaning) in enumerate(columns):
         x = _LEFT + column * (PANEL + _GAP)
         write(figure, x, _TOP - 30, name, weight="bold", size=9)
         write(figure, x, _TOP - 10, meaning, color=palette.MUTED, size=6.8)
-    for row, view in enumerate(views(scene, PANEL)):
+    for row, view in enumerate(views(scene, finer * PANEL)):
         y = _TOP + row * (PANEL + _GAP)
         for column, image in enumerate(panels(scene, view)):
             x = _LEFT + column * (PANEL + _GAP)
             pixels = np.rint(np.clip(image, 0, 1) * 255).astype(np.uint8)
-            figure.figimage(pixels, xo=x, yo=HEIGHT - y - PANEL, origin="upper")
+            if finer == 1:
+                figure.figimage(pixels, xo=x, yo=HEIGHT - y - PANEL, origin="upper")
+            else:
+                width = size_of(figure)[0]
+                box = x / width, 1 - (y + PANEL) / HEIGHT, PANEL / width, PANEL / HEIGHT
+                axes = figure.add_axes(box)
+                axes.imshow(pixels, interpolation="none")
+                axes.set_axis_off()
         _axes_triad(figure, view, _LEFT + 6, y + PANEL - 34)
 
 
@@ -184,7 +193,8 @@ def _axes_triad(figure: Figure, view: View, x: float, y: float) -> None:
         )  # fmt: skip
 
 
-def _head(figure: Figure, check: AlignmentCheck, title: str, subtitle: str) -> None:
+def _head(figure: Figure, check: AlignmentCheck, title: str, subtitle: str) -> int:
+    """Write what the asset is and how good; return where the last reason stands."""
     write(figure, _LEFT, 50, title, weight="bold", size=13)
     write(figure, _LEFT, 76, subtitle, size=7.5, color=palette.MUTED)
     colour = palette.VERDICT_COLOURS[check.verdict]
@@ -200,11 +210,12 @@ def _head(figure: Figure, check: AlignmentCheck, title: str, subtitle: str) -> N
     reasons = list(check.words)
     if not check.consistent:
         reasons.append("the store's figures do not all agree with its voxels")
-    lines = [line for reason in reasons for line in textwrap.wrap(reason, 52)]
-    if len(lines) > 3:
-        lines = [*lines[:2], f"{lines[2]} ..."]
+    lines = [line for reason in reasons for line in textwrap.wrap(reason, 51)]
+    if len(lines) > _MOST_LINES:
+        lines = [*lines[: _MOST_LINES - 1], "and more: `slatprep check-alignment` prints all"]
     for number, line in enumerate(lines):
         write(figure, side_of(figure), 74 + 17 * number, line, size=7, color=palette.MUTED)
+    return 74 + 17 * (len(lines) - 1)
 
 
 def _legend(figure: Figure, scene: Scene) -> None:

@@ -27,14 +27,24 @@ STYLE: dict[str, Any] = {
     "xtick.labelsize": 7.0,
     "ytick.labelsize": 7.0,
     "figure.facecolor": palette.PAPER,
+    "svg.hashsalt": "slatprep",  # else names within a file are drawn at random
+    "pdf.fonttype": 42,
 }
 """How matplotlib draws here."""
 
 
-def png_of(figure: Figure) -> bytes:
-    """Return a figure as a PNG that holds nothing but the picture."""
+FORMATS: dict[str, dict[str, None]] = {
+    "png": {"Software": None},
+    "svg": {"Date": None},
+    "pdf": {"CreationDate": None, "Creator": None, "Producer": None},
+}
+"""The formats of a picture, with what is left out so that the same picture has the same bytes."""
+
+
+def in_format(figure: Figure, kind: str = "png") -> bytes:
+    """Return a figure as a file of one of `FORMATS` that holds nothing but the picture."""
     buffer = BytesIO()
-    figure.savefig(buffer, format="png", dpi=figure.dpi, metadata={"Software": None})
+    figure.savefig(buffer, format=kind, dpi=figure.dpi, metadata=FORMATS[kind])
     return buffer.getvalue()
 
 

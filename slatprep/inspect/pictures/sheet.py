@@ -9,7 +9,7 @@ import numpy as np
 from slatprep.inspect.check import AlignmentCheck
 from slatprep.inspect.pictures import palette
 from slatprep.inspect.pictures.alignment import error_picture, outlined
-from slatprep.inspect.pictures.canvas import STYLE, new_figure, png_of, write
+from slatprep.inspect.pictures.canvas import STYLE, in_format, new_figure, write
 from slatprep.inspect.pictures.scene import FARTHEST, Scene, views
 
 MOST = 60
@@ -72,7 +72,7 @@ def draw_sheet(
             sure = check.value("confidence")
             words = f"confidence {sure:.3f}   fitness {worse:.3f} (the lower of both ways)"
             write(figure, x, line + 32, words, size=6.5, color=palette.MUTED)
-        return png_of(figure)
+        return in_format(figure)
 
 
 def _cut(title: str) -> str:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import textwrap
-from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -13,7 +11,7 @@ from slatprep.inspect.check import AlignmentCheck
 from slatprep.inspect.pictures import palette
 from slatprep.inspect.pictures.canvas import size_of, write
 from slatprep.inspect.pictures.scene import FARTHEST, Scene, distance_colours
-from slatprep.records import RESOLUTION, Candidate
+from slatprep.records import RESOLUTION, Alignment, Search
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -45,8 +43,11 @@ def side_of(figure: Figure) -> float:
     return size_of(figure)[0] - SIDE_MARGIN - SIDE_WIDTH
 
 
-def draw_figures(figure: Figure, check: AlignmentCheck, scene: Scene, y: float) -> None:
-    """Write the figures, what is good, and how far the map between the frames moves things."""
+def draw_figures(figure: Figure, check: AlignmentCheck, scene: Scene, y: float) -> float:
+    """Write the figures, what is good, and how far the map between the frames moves things.
+
+    Returns where the last line stands.
+    """
     left = side_of(figure)
     columns = (left, left + 275, left + SIDE_WIDTH)
     for x, name, ha in zip(columns, ("figure", "value", "good"), ("left", "right", "right"),
@@ -77,14 +78,19 @@ def draw_figures(figure: Figure, check: AlignmentCheck, scene: Scene, y: float) 
     if scene.deformed is not None:
         apart = scene.deformed.displacement
         words = f"deformed by {apart.mean():.2f} voxel in the mean, {apart.max():.2f} at most"
-        write(figure, left, line + 17, words, size=7, color=palette.MUTED)
+        line += 17
+        write(figure, left, line, words, size=7, color=palette.MUTED)
+    return line
 
 
 def draw_histogram(figure: Figure, scene: Scene, radius: float, y: float) -> None:
     """Draw how many voxels have which error, and as a line how many had it before."""
     write(figure, side_of(figure), y, "error per SLAT surface voxel", weight="bold", size=8.5)
     share = float((scene.error <= radius).mean())
-    words = f"median {np.median(scene.error):.2f} voxel; {share:.1%} within {radius:g}"
+    before = "before" if scene.deformed is None else "undeformed"
+    words = (
+        f"median {np.median(scene.error):.2f} voxel, {share:.1%} within {radius:g}; line: {before}"
+    )
     write(figure, side_of(figure), y + 20, words, size=7, color=palette.MUTED)
     axes = _axes(figure, y + 36, 190)
     edges = np.linspace(0, FARTHEST, 31)
@@ -96,37 +102,37 @@ def draw_histogram(figure: Figure, scene: Scene, radius: float, y: float) -> Non
     axes.bar(middles, shares[0], width=edges[1] * 0.92, color=distance_colours(middles).tolist(),
              edgecolor=palette.MUTED, linewidth=0.3)  # fmt: skip
     axes.stairs(shares[1], edges, color=palette.MUTED, linewidth=0.8)
-    top = max(shares[0].max(), 0.02)
-    if shares[1].max() > 1.15 * top:
-        axes.set_ylim(0, 1.15 * top)
+    axes.set_ylim(0, 1.15 * max(share.max() for share in shares))
     axes.axvline(radius, color=palette.INK, linewidth=0.8, linestyle=(0, (4, 3)))
     axes.set_xlim(0, FARTHEST)
     axes.set_xticks(range(int(FARTHEST) + 1), ["0", "1 voxel", "2", f"\u2265 {FARTHEST:g}"])
-    before = "before alignment" if scene.deformed is None else "without the deformation"
-    axes.text(0.95, 0.93, f"line: {before}", transform=axes.transAxes, ha="right",
-              fontsize=6.5, color=palette.MUTED)  # fmt: skip
     axes.yaxis.set_major_formatter(lambda value, _: f"{value:.0%}")
     axes.locator_params(axis="y", nbins=3)
 
 
-def draw_candidates(figure: Figure, candidates: Sequence[Candidate] | str, y: float) -> None:
-    """Draw the score of each start of the search; in its place, why that is not known."""
+def draw_candidates(figure: Figure, alignment: Alignment, y: float) -> None:
+    """Draw the score of each start of the search by quarter turns."""
+    candidates = alignment.candidates
     write(figure, side_of(figure), y, "starts of the search", weight="bold", size=8.5)
-    if isinstance(candidates, str):
-        for number, line in enumerate(textwrap.wrap(candidates, 56)):
-            write(figure, side_of(figure), y + 20 + 17 * number, line, size=7, color=palette.MUTED)
+    if not candidates:
+        words = "none are recorded"
+        write(figure, side_of(figure), y + 20, words, size=7, color=palette.MUTED)
         return
     own = sorted((c for c in candidates if c.same_as is None), key=lambda c: (-c.fitness, c.index))
     words = f"{len(own)} different of {len(candidates)}, by coarse fitness; some end alike"
     write(figure, side_of(figure), y + 20, words, size=7, color=palette.MUTED)
     axes = _axes(figure, y + 36, 190)
-    colours = [palette.ACCENT] + [palette.RULE] * (len(own) - 1)
+    wide = alignment.search is Search.SO3
+    colours = [palette.RULE if wide else palette.ACCENT] + [palette.RULE] * (len(own) - 1)
     axes.bar(range(len(own)), [c.fitness for c in own], width=0.78, color=colours)
     axes.set_xlim(-0.8, max(len(own), 2) - 0.2)
     axes.set_ylim(0, 1)
     axes.set_yticks([0, 0.5, 1])
     best = own[0]
-    if best.euler_degrees is not None:
+    if wide:
+        name = "these fit poorly: all orientations were searched"
+        axes.set_xticks([-0.4], [name], ha="left")
+    elif best.euler_degrees is not None:
         name = "start at " + ", ".join(f"{angle:g}°" for angle in best.euler_degrees)
         axes.set_xticks([0], [name], ha="left")
     else:

@@ -8,6 +8,7 @@ from pathlib import Path
 from slatprep.errors import StoreError
 from slatprep.inspect.check import AlignmentCheck
 from slatprep.inspect.pictures.alignment import draw_alignment
+from slatprep.inspect.pictures.canvas import FORMATS, STYLE, in_format
 from slatprep.inspect.pictures.scene import Scene, scene_of
 from slatprep.inspect.pictures.sheet import MOST, draw_sheet
 from slatprep.provenance.stored import StoredRecords
@@ -26,7 +27,7 @@ def write_pictures(
     *,
     progress: Progress | None = None,
 ) -> tuple[list[Path], Path | None]:
-    """Draw alignments and write them as PNG files.
+    """Draw alignments and write them as files.
 
     Parameters
     ----------
@@ -35,8 +36,8 @@ def write_pictures(
     checks : sequence of AlignmentCheck
         The assets to draw, in the order of the contact sheet.
     target : Path
-        A file that ends in ``.png`` for one asset, a folder otherwise: it gets
-        a file an asset, named by its id, and a contact sheet of several.
+        A file that ends in the name of one of `FORMATS` for one asset, a folder otherwise: it gets
+        a PNG an asset, named by its id, and a contact sheet of several.
     progress : callable, optional
         Called with the assets done and the assets in all.
 
@@ -52,7 +53,10 @@ def write_pictures(
     StoreError
         If a file cannot be written, or a record cannot be read.
     """
-    alone = len(checks) == 1 and target.suffix.lower() == ".png"
+    import matplotlib.style
+
+    kind = target.suffix.lower()[1:]
+    alone = len(checks) == 1 and kind in FORMATS
     records = StoredRecords(store)
     pictures: list[Path] = []
     scenes: list[Scene] = []
@@ -60,8 +64,12 @@ def write_pictures(
     for number, check in enumerate(checks):
         asset = store.asset(check.asset_id)
         scene, title = scene_of(asset), title_of(asset)
-        candidates = records.of(check.asset_id).alignment.candidates
-        drawn = draw_alignment(scene, check, title, subtitle_of(asset), candidates)
+        alignment = records.of(check.asset_id).alignment
+        # A user's matplotlibrc must not change the picture.
+        with matplotlib.style.context(["default", STYLE]):
+            finer = 2 if alone and kind != "png" else 1
+            figure = draw_alignment(scene, check, title, subtitle_of(asset), alignment, finer)
+            drawn = in_format(figure, kind if alone else "png")
         pictures.append(target if alone else target / f"{file_name(check.asset_id)}.png")
         _write(pictures[-1], drawn)
         if len(checks) > 1 and number < MOST:

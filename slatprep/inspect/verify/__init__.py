@@ -40,7 +40,7 @@ class Verification:
     assets : int
         Assets whose values were checked.
     files : int
-        Files whose digest was compared.
+        Files of the store, all of which were compared with the digests.
     sources : int
         Source files whose digest was compared.
     manifests : Place or None
@@ -106,9 +106,9 @@ def verify_store(
     except AttributesError:
         # Values mean nothing without them; of what is there the files tell.
         document = read_metadata(path / "zarr.json")
-        digests, found = file_findings(Store(path, document), jobs)
+        files, found = file_findings(Store(path, document), jobs)
         findings = {*metadata_findings(path), *found}
-        return Verification(path, 0, digests, 0, None, tuple(sorted(findings)))
+        return Verification(path, 0, files, 0, None, tuple(sorted(findings)))
     except StoreError as error:
         if not _is_file(path / "zarr.json"):
             raise
@@ -120,7 +120,7 @@ def verify_store(
     needed = [roots.pixieverse, roots.slat] if sources and roots else []
     require_shared(jobs, [store.path / "zarr.json", *needed])
     findings = set(metadata_findings(path))
-    digests, found = file_findings(store, jobs)
+    files, found = file_findings(store, jobs)
     findings |= found
     try:
         findings |= set(index_findings(store))
@@ -139,7 +139,7 @@ def verify_store(
             findings |= set(manifest_findings(store, folder))
         except StoreError as error:
             findings.add(Finding(str(folder), "", str(error), "records of a readable store"))
-    return Verification(path, total, digests, hashed, folder, tuple(sorted(findings)))
+    return Verification(path, total, files, hashed, folder, tuple(sorted(findings)))
 
 
 def _is_file(path: Place) -> bool:

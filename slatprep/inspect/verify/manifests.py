@@ -10,6 +10,7 @@ import orjson
 
 from slatprep.errors import StoreError
 from slatprep.inspect.verify.assets import fault_findings
+from slatprep.pipeline.join import APART, NO_ROOT
 from slatprep.provenance.files import ASSETS, BUILD, build_in, build_text, lines_in
 from slatprep.provenance.record import AssetRecord, Record
 from slatprep.provenance.record_json import (
@@ -42,9 +43,21 @@ def source_roots(manifests: Place | None) -> SourceRoots:
         build = build_in(manifests)
         slat = build.parameters.slat.root
         slat = slat.parent if slat.is_file() else slat
+        roots = build.parameters.pixieverse.root, slat
+        gone = [root for root in roots if not root.exists()]
     except (OSError, StoreError) as error:
         raise StoreError(f"{manifests / BUILD}: names no sources ({error}); {advice}") from None
-    return SourceRoots(build.parameters.pixieverse.root, slat)
+    if not gone:
+        return SourceRoots(*roots)
+    text = str(build.parameters.pixieverse.root)
+    if APART in text:
+        raise StoreError(
+            f"{manifests / BUILD}: the store was joined of others, whose sources lie apart "
+            f"({text}); verify those, or {advice} of one folder with all sources"
+        )
+    if text == NO_ROOT:
+        raise StoreError(f"{manifests / BUILD}: says not where its sources lie; {advice}")
+    raise StoreError(f"{manifests / BUILD}: its sources are not at {gone[0]} any more; {advice}")
 
 
 def manifest_findings(store: Store, folder: Place) -> Iterator[Finding]:

@@ -7,13 +7,17 @@ import os
 import shutil
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
+import matplotlib.style
 import numpy as np
 import pytest
 import zarr
 from click.testing import CliRunner, Result
 from matplotlib.image import imread
+from matplotlib.text import Text
+from matplotlib.transforms import Bbox
 from scipy.spatial import cKDTree
 from support.deformed import MOVES
 from support.synthetic import QUARTER_TURN
@@ -22,11 +26,21 @@ from slatprep.cli.commands import slatprep
 from slatprep.errors import StoreError
 from slatprep.geometry.frames import apply_transform, invert_transform, voxel_centres
 from slatprep.inspect.check import check_alignment, choose_assets
-from slatprep.inspect.pictures.alignment import HEIGHT, WIDER, WIDTH, displacement_scale, panels
+from slatprep.inspect.pictures.alignment import (
+    HEIGHT,
+    WIDER,
+    WIDTH,
+    displacement_scale,
+    draw_alignment,
+    panels,
+)
+from slatprep.inspect.pictures.canvas import STYLE
 from slatprep.inspect.pictures.scene import FARTHEST, distance_colours, scene_of, views
 from slatprep.inspect.pictures.viewer import cube_mesh, has_screen, meshes
 from slatprep.inspect.pictures.write import write_pictures
 from slatprep.pipeline.dataset import BuildSummary
+from slatprep.provenance.stored import StoredRecords
+from slatprep.records import Search
 from slatprep.store import open_store
 
 
@@ -64,6 +78,47 @@ def test_the_picture_is_whole_and_the_same_each_time(copy: Path, tmp_path: Path)
     for top in (142, 456, 770):
         for left in (48, 362, 676, 990, 1350):
             assert image[top : top + 300, left : left + 300, :3].std() > 0.05, (top, left)
+
+
+def test_no_words_are_cut_or_written_over_others(copy: Path) -> None:
+    group = zarr.open_group(copy, mode="r+")
+    for name, value in (("confidence", 0.4), ("expected_accuracy", 0.5), ("ambiguity", 0.9)):
+        group[f"asset/{name}"][0] = value
+    misplace(copy, 0, 0.06)
+    store = open_store(copy)
+    check = check_alignment(store, "ant")
+    alignment = StoredRecords(store).of("ant").alignment
+    scene = scene_of(store.asset("ant"))
+    for search in Search:
+        with matplotlib.style.context(["default", STYLE]):
+            figure = draw_alignment(scene, check, "t", "s", replace(alignment, search=search))
+            renderer = figure.canvas.get_renderer()
+            texts = [t for t in figure.findobj(Text) if t.get_text() and t.get_visible()]
+            boxes = [text.get_window_extent(renderer) for text in texts]
+        whole = " ".join(text.get_text() for text in texts)
+        assert len(check.reasons) >= 4 and all(reason in whole for reason in check.reasons)
+        for k, box in enumerate(boxes):
+            assert box.x0 >= 0 and box.y0 >= 0 and box.x1 <= WIDTH and box.y1 <= HEIGHT, texts[k]
+            # Lines of a paragraph touch; what else shares a pixel cannot be read.
+            for other in range(k):
+                both = Bbox.intersection(box, boxes[other])
+                assert both is None or both.height <= 4, (texts[k], texts[other])
+        (histogram,) = [axes for axes in figure.axes if axes.patches and axes.lines]
+        before = np.histogram(np.minimum(scene.error_before, FARTHEST - 1e-9), 30, (0, FARTHEST))[0]
+        assert histogram.get_ylim()[1] > before.max() / len(scene.error_before)
+
+
+@pytest.mark.parametrize("kind", ["svg", "pdf"])
+def test_a_picture_for_a_paper_is_of_lines_and_letters(
+    kind: str, copy: Path, tmp_path: Path
+) -> None:
+    files = [tmp_path / f"{name}.{kind}" for name in ("one", "two")]
+    for file in files:
+        assert run("--asset", "ant", "--store", copy, "--picture", file).exit_code == 0
+    assert files[0].read_bytes() == files[1].read_bytes()
+    assert files[0].read_bytes()[:5] in (b"<?xml", b"%PDF-")
+    several = run("--worst", "2", "--store", copy, "--picture", files[0])
+    assert several.exit_code == 2 and "need a folder" in several.stderr
 
 
 def test_a_wrong_transform_is_drawn_worse(copy: Path) -> None:

@@ -1,0 +1,144 @@
+"""What commands say to somebody who meets them for the first time, and with which exit code."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import zarr
+from click.testing import CliRunner, Result
+from support.synthetic import Dataset
+
+from slatprep import open_store
+from slatprep.cli.commands import slatprep
+from slatprep.pipeline.dataset import BuildSummary, build_store
+
+
+def run(*words: object) -> Result:
+    result = CliRunner().invoke(slatprep, [str(word) for word in words])
+    assert "Traceback" not in result.output
+    return result
+
+
+@pytest.fixture
+def store(mixed_build: BuildSummary) -> Path:
+    assert mixed_build.store is not None
+    return Path(str(mixed_build.store))
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ("check-alignment", "--store", "STORE", "--asset", "NOBODY", "--picture", "none"),
+        ("export", "STORE", "--asset", "NOBODY", "--format", "npz", "--out", "OUT"),
+        ("subset", "STORE", "--asset", "NOBODY", "--out", "OUT"),
+        ("transfer", "POINTS", "--store", "STORE", "--asset", "NOBODY", "--out", "OUT"),
+    ],
+)
+def test_a_name_that_no_asset_has_is_wrong_use_in_every_command(
+    words: tuple[str, ...], store: Path, tmp_path: Path
+) -> None:
+    np.save(tmp_path / "p.npy", np.zeros((3, 3), np.float32))
+    places = {"STORE": store, "OUT": tmp_path / "out", "POINTS": tmp_path / "p.npy"}
+    for name, said in (("nobody", "has no asset 'nobody'"), ("be", "2 ids begin with 'be'")):
+        result = run(*(places.get(word, name if word == "NOBODY" else word) for word in words))
+        assert result.exit_code == 2 and said in result.stderr
+
+
+def test_capitals_of_an_id_are_forgiven_in_words(store: Path) -> None:
+    result = run("check-alignment", "--store", store, "--asset", "BEAR.S", "--picture", "none")
+    assert result.exit_code == 2 and "did you mean bear.side?" in result.stderr
+
+
+@pytest.mark.parametrize("command", ["list", "subset"])
+def test_a_category_that_no_asset_has_is_told_with_the_one_meant(
+    command: str, mixed: Dataset, tmp_path: Path
+) -> None:
+    (tmp_path / "kinds.json").write_text(json.dumps({"cup": {"obj_class": "vessels"}}))
+    config = tmp_path / "dataset.toml"
+    config.write_text(
+        f'[pixieverse]\nroot = "{mixed.root}/pixieverse"\n[slat]\nroot = "{mixed.root}/slat"\n'
+        f'[pairing]\ncategories = "kinds.json"\n'
+    )
+    built = run("build-store", "--config", config, "--out", tmp_path / "s.zarr")
+    assert built.exit_code == 1 and "unknown: the category of 4" in built.stdout
+    out = ("--out", tmp_path / "x.zarr") if command == "subset" else ()
+    result = run(command, tmp_path / "s.zarr", "--category", "vessel", *out)
+    assert result.exit_code == 2 and "expected vessels" in result.stderr
+    assert run(command, tmp_path / "s.zarr", "--category", "vessels", *out).exit_code == 0
+
+
+def test_no_category_is_known_where_no_table_is_named(store: Path) -> None:
+    assert "[pairing]" in run("info", store).stdout
+    result = run("list", store, "--category", "cup")
+    assert result.exit_code == 2 and "no category is known" in result.stderr
+
+
+def test_ambiguous_means_the_same_wherever_it_is_counted(store: Path, tmp_path: Path) -> None:
+    copied = tmp_path / "copy.zarr"
+    assert run("subset", store, "--verdict", "good", "--out", copied, "-q").exit_code == 0
+    zarr.open_group(copied, mode="r+")["asset/ambiguity"][:] = [0.0, 0.2, 0.9, 0.05, 0.01]
+    assert "2 of 5: other placements" in run("info", copied).stdout
+    drawn = run("check-alignment", "--store", copied, "--ambiguous", "--picture", "none", "--json")
+    assert [one["asset_id"] for one in json.loads(drawn.stdout)] == ["bear.side", "bear.front"]
+
+
+def test_info_and_verify_count_the_same_files(store: Path) -> None:
+    told = (run(command, store, "--json") for command in ("info", "verify"))
+    one, other = (json.loads(result.stdout)["files"] for result in told)
+    assert one == other == sum(file.is_file() for file in store.rglob("*"))
+
+
+@pytest.mark.parametrize("command", ["build-store", "align"])
+def test_swapped_roots_are_recognised(command: str, mixed: Dataset, tmp_path: Path) -> None:
+    words = (command, "--pixieverse", mixed.root / "slat", "--slat", mixed.root / "pixieverse")
+    result = run(*words, "--out", tmp_path / "out.zarr")
+    assert result.exit_code == 2
+    assert f"the roots are swapped: grids lie below {mixed.root}/pixieverse" in result.stderr
+
+
+def test_a_folder_that_is_no_store_is_called_so_by_every_command(tmp_path: Path) -> None:
+    for command in ("info", "list", "verify", "report", "describe"):
+        result = run(command, tmp_path)
+        assert result.exit_code == 1 and f"{tmp_path} is not a slatprep store" in result.stderr
+
+
+def test_quiet_commands_that_make_something_print_nothing(store: Path, tmp_path: Path) -> None:
+    made = run("subset", store, "--asset", "cup", "--out", tmp_path / "cup.zarr", "-q")
+    assert made.output == "" and len(open_store(tmp_path / "cup.zarr")) == 1
+    assert run("report", tmp_path / "cup.zarr", "-q").output == ""
+    assert "cup" in run("list", tmp_path / "cup.zarr", "-q").stdout
+    assert json.loads(run("export", store, "--format", "npz", "--out", tmp_path / "n", "-q",
+                          "--json").stdout)["assets"] == 5  # fmt: skip
+
+
+def test_sources_of_a_joined_store_are_said_to_lie_apart(
+    store: Path, mixed: Dataset, tmp_path: Path
+) -> None:
+    other = Dataset(tmp_path / "other")
+    other.add("elk", seed=8)
+    pixieverse = other.root / "pixieverse"
+    build_store(other.parameters(), tmp_path / "elk.zarr")
+    both = tmp_path / "both.zarr"
+    assert run("concat", store, tmp_path / "elk.zarr", "--out", both).exit_code == 0
+    result = run("verify", both, "--sources")
+    assert result.exit_code == 1 and len(result.stderr.splitlines()) == 1
+    assert "sources lie apart" in result.stderr and str(pixieverse) in result.stderr
+    pixieverse.rename(tmp_path / "moved")
+    moved = run("verify", tmp_path / "elk.zarr", "--sources").stderr
+    assert f"its sources are not at {pixieverse} any more; name the roots" in moved
+
+
+def test_our_own_cloud_in_the_frame_of_pixieverse_is_recognised(
+    store: Path, tmp_path: Path
+) -> None:
+    pytest.importorskip("plyfile")
+    for frame in ("pixieverse", "slat"):
+        words = ("--format", "ply", "--frame", frame, "--points", "grid", "--asset", "cup")
+        assert run("export", store, *words, "--out", tmp_path / frame).exit_code == 0
+    words = ("--store", store, "--asset", "cup", "--out", tmp_path / "m.ply")
+    result = run("transfer", tmp_path / "pixieverse" / "cup.ply", *words)
+    assert result.exit_code == 1 and "slatprep export --frame slat" in result.stderr
+    assert run("transfer", tmp_path / "slat" / "cup.ply", *words).exit_code == 0
