@@ -15,6 +15,7 @@ from slatprep.cli.options import (
     chosen_store,
     command,
     complete_asset,
+    jobs_option,
     option,
     store_option,
 )
@@ -43,6 +44,7 @@ _COLUMNS = {
 @store_option
 @option("--picture", metavar="PATH|none")
 @option("--show", is_flag=True)
+@jobs_option
 def check_alignment(
     output: Output,
     asset_ids: tuple[str, ...],
@@ -51,6 +53,7 @@ def check_alignment(
     store: Place | None,
     picture: str | None,
     show: bool,
+    jobs: int,
 ) -> None:
     """Say and show whether the alignment of an asset is good.
 
@@ -85,18 +88,21 @@ def check_alignment(
     path = chosen_store(store)
     from slatprep.inspect import check
     from slatprep.store import open_store
+    from slatprep.workers.local import run_unordered
 
     opened = open_store(path)
     chosen = check.choose_assets(opened, asset_ids, worst or 0, ambiguous)
     target = _target(path, picture, len(chosen))
-    checks = [check.check_alignment(opened, asset_id) for asset_id in chosen]
+    run = run_unordered(check.check_stored, ((opened.path, one) for one in chosen), jobs)
+    found = {one.asset_id: one for one in run}
+    checks = [found[asset_id] for asset_id in chosen]
     pictures: list[Path] = []
     sheet = None
     if target is not None and checks:
         from slatprep.inspect.pictures.write import write_pictures
 
         with output.progress("pictures") as progress:
-            pictures, sheet = write_pictures(opened, checks, target, progress=progress)
+            pictures, sheet = write_pictures(opened, checks, target, jobs=jobs, progress=progress)
 
     def print_all() -> None:
         _print(output, checks)

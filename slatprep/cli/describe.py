@@ -16,6 +16,10 @@ if TYPE_CHECKING:
     from slatprep.records import Place
 
 
+_ASKED_FOR = ("license", "cite_as", "date_published")
+"""What a description may do without, but readers of Croissant warn of."""
+
+
 @command(context_settings={"show_default": False})
 @click.argument("store", type=EXISTING_FOLDER)
 @option("--out", NEW_FILE, metavar="FILE.json")
@@ -57,6 +61,9 @@ def describe(output: Output, store: Place, out: Path | None, location: str, **st
     if not location:
         local, beside = storage_of(store).local, out.parent if out else Path()
         location = Path(os.path.relpath(local, beside)).as_posix() if local else str(store)
+    missing = [f"--{name.replace('_', '-')}" for name in _ASKED_FOR if not stated[name]]
+    if missing:
+        output.note(f"catalogues also ask for {', '.join(missing)}")
     document = croissant.describe(open_store(store), location=location.rstrip("/"), **stated)
     text = croissant.to_json(document)
     if out is None:

@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 from slatprep.align.quality import measure_quality
 from slatprep.judge import THRESHOLDS, verdict_of
 from slatprep.normalize import normalize_properties
-from slatprep.records import StructuredLatents, Verdict
+from slatprep.records import Place, StructuredLatents, Verdict
 from slatprep.sample import sample
-from slatprep.store.reader import Store, StoredAsset
+from slatprep.store.reader import Store, StoredAsset, open_store
 
 QUALITY_TOLERANCE = 1e-3
 """Recomputed quality differs less than this; one voxel at the radius may round either way."""
@@ -206,6 +206,11 @@ def check_alignment(store: Store, asset_id: str) -> AlignmentCheck:
     return AlignmentCheck(
         asset_id, verdict, reasons, str(columns["verdict"]), tuple(figures), asset.transform, radius
     )
+
+
+def check_stored(path: Place, asset_id: str) -> AlignmentCheck:
+    """Check an alignment as `check_alignment` does, in a worker, which opens the store itself."""
+    return check_alignment(open_store(path), asset_id)
 
 
 def recompute_annotation(asset: StoredAsset) -> tuple[float, dict[str, NDArray[np.float64]]]:

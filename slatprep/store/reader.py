@@ -6,6 +6,7 @@ from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from html import escape
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -156,6 +157,27 @@ class Store(AssetTable):
         except StoreError as error:
             what = f"cannot be read ({error})"
         return f"<Store {self.path}: {what}>"
+
+    def _repr_html_(self) -> str:
+        """Return the store as a notebook shows it: a table of what it holds."""
+        try:
+            verdicts = Counter(str(verdict) for verdict in self._column("verdict"))
+            rows = {
+                "path": self.path,
+                "assets": f"{len(self):,}",
+                **{f"assets {verdict}": f"{n:,}" for verdict, n in verdicts.most_common()},
+                "categories": f"{len(set(map(str, self._column('category'))) - {''}):,}",
+                "voxels": f"{self.offsets[-1]:,}",
+                "ranges": self.normalization.source,
+                "build": self.about.manifest[:12],
+            }
+        except StoreError as error:
+            rows = {"path": self.path, "cannot be read": error}
+        cells = "".join(
+            f"<tr><th>{escape(name)}</th><td>{escape(str(value))}</td></tr>"
+            for name, value in rows.items()
+        )
+        return f"<table><caption>slatprep store</caption>{cells}</table>"
 
     @property
     def name(self) -> str:

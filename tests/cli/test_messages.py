@@ -47,6 +47,17 @@ def test_a_name_that_no_asset_has_is_wrong_use_in_every_command(
         assert result.exit_code == 2 and said in result.stderr
 
 
+def test_a_misspelt_command_is_told_with_the_one_meant() -> None:
+    result = run("chek-alignment", "--worst", "3")
+    assert result.exit_code == 2 and "did you mean check-alignment?" in result.stderr
+    assert run("xyzzy").exit_code == 2
+
+
+def test_what_catalogues_ask_for_is_named_where_it_is_not_stated(store: Path) -> None:
+    told = run("describe", store, "--license", "https://spdx.org/licenses/MIT")
+    assert "also ask for --cite-as, --date-published" in told.stderr
+
+
 def test_capitals_of_an_id_are_forgiven_in_words(store: Path) -> None:
     result = run("check-alignment", "--store", store, "--asset", "BEAR.S", "--picture", "none")
     assert result.exit_code == 2 and "did you mean bear.side?" in result.stderr

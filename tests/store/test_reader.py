@@ -76,6 +76,9 @@ def test_store_and_assets_say_what_they_are_in_a_line(
         chunk.write_bytes(b"torn")
     damaged = open_store(tmp_path / "s.zarr")
     assert "cannot be read" in repr(damaged)
+    shown = store._repr_html_()
+    assert "<th>assets good</th><td>5</td>" in shown and str(store.path) in shown
+    assert "cannot be read" in damaged._repr_html_()
 
 
 def test_the_table_of_assets_is_that_of_the_arrays(mixed_build: BuildSummary) -> None:

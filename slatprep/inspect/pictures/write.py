@@ -12,9 +12,11 @@ from slatprep.inspect.pictures.canvas import FORMATS, STYLE, in_format
 from slatprep.inspect.pictures.scene import Scene, scene_of
 from slatprep.inspect.pictures.sheet import MOST, draw_sheet
 from slatprep.provenance.stored import StoredRecords
+from slatprep.records import Place
 from slatprep.storage.names import file_name
-from slatprep.store.reader import Store, StoredAsset
+from slatprep.store.reader import Store, StoredAsset, open_store
 from slatprep.workers import Progress
+from slatprep.workers.local import run_unordered
 
 SHEET = "sheet.png"
 """Name of the contact sheet in a folder of pictures."""
@@ -25,6 +27,7 @@ def write_pictures(
     checks: Sequence[AlignmentCheck],
     target: Path,
     *,
+    jobs: int = 1,
     progress: Progress | None = None,
 ) -> tuple[list[Path], Path | None]:
     """Draw alignments and write them as files.
@@ -38,6 +41,8 @@ def write_pictures(
     target : Path
         A file that ends in the name of one of `FORMATS` for one asset, a folder otherwise: it gets
         a PNG an asset, named by its id, and a contact sheet of several.
+    jobs : int
+        Worker processes; what is drawn does not depend on them.
     progress : callable, optional
         Called with the assets done and the assets in all.
 
@@ -53,34 +58,41 @@ def write_pictures(
     StoreError
         If a file cannot be written, or a record cannot be read.
     """
-    import matplotlib.style
-
     kind = target.suffix.lower()[1:]
     alone = len(checks) == 1 and kind in FORMATS
-    records = StoredRecords(store)
-    pictures: list[Path] = []
-    scenes: list[Scene] = []
-    titles: list[str] = []
-    for number, check in enumerate(checks):
-        asset = store.asset(check.asset_id)
-        scene, title = scene_of(asset), title_of(asset)
-        alignment = records.of(check.asset_id).alignment
-        # A user's matplotlibrc must not change the picture.
-        with matplotlib.style.context(["default", STYLE]):
-            finer = 2 if alone and kind != "png" else 1
-            figure = draw_alignment(scene, check, title, subtitle_of(asset), alignment, finer)
-            drawn = in_format(figure, kind if alone else "png")
-        pictures.append(target if alone else target / f"{file_name(check.asset_id)}.png")
-        _write(pictures[-1], drawn)
-        if len(checks) > 1 and number < MOST:
-            scenes.append(scene)
-            titles.append(title)
+    shown = {check.asset_id: check for check in checks[:MOST]}
+    drawn: dict[str, tuple[Scene, str]] = {}
+    files = {
+        check.asset_id: target if alone else target / f"{file_name(check.asset_id)}.png"
+        for check in checks
+    }
+    tasks = ((store.path, check, kind if alone else "png") for check in checks)
+    for done, (asset_id, picture, scene, title) in enumerate(run_unordered(_drawn, tasks, jobs), 1):
+        _write(files[asset_id], picture)
+        if asset_id in shown:
+            drawn[asset_id] = scene, title
         if progress is not None:
-            progress(number + 1, len(checks))
-    if not scenes:
-        return pictures, None
-    _write(target / SHEET, draw_sheet(scenes, checks[: len(scenes)], titles))
-    return pictures, target / SHEET
+            progress(done, len(checks))
+    if len(checks) < 2:
+        return list(files.values()), None
+    scenes, titles = zip(*(drawn[asset_id] for asset_id in shown), strict=True)
+    _write(target / SHEET, draw_sheet(scenes, list(shown.values()), titles))
+    return list(files.values()), target / SHEET
+
+
+def _drawn(path: Place, check: AlignmentCheck, kind: str) -> tuple[str, bytes, Scene, str]:
+    """Return an asset's id, its picture, and what a contact sheet shows of it."""
+    import matplotlib.style
+
+    store = open_store(path)
+    asset = store.asset(check.asset_id)
+    scene, title = scene_of(asset), title_of(asset)
+    alignment = StoredRecords(store).of(check.asset_id).alignment
+    # A user's matplotlibrc must not change the picture.
+    with matplotlib.style.context(["default", STYLE]):
+        finer = 1 if kind == "png" else 2
+        figure = draw_alignment(scene, check, title, subtitle_of(asset), alignment, finer)
+        return check.asset_id, in_format(figure, kind), scene, title
 
 
 def title_of(asset: StoredAsset) -> str:

@@ -19,6 +19,7 @@ from slatprep.inspect.report.statistics import Tally, no_tally, tally
 from slatprep.inspect.report.thumbnails import PER_SHEET, sheet, thumbnail
 from slatprep.inspect.report.voxels import COARSE, FULL, encode_asset
 from slatprep.inspect.verify.index import WORDS
+from slatprep.provenance.files import build_in
 from slatprep.provenance.stored import StoredRecords
 from slatprep.records import Place, Verdict
 from slatprep.storage.atomic import staged, writing
@@ -109,7 +110,9 @@ def write_report(
     """
     _refuse_other_words(store)
     outcomes: list[Outcome] | None = None
+    created = None
     if manifests is not None:
+        created = f"{build_in(manifests).created:%Y-%m-%d}"
         outcomes = list(read_outcomes(manifests, store.about.manifest))
         _refuse_other_records(store, outcomes, manifests)
     chosen = _chosen(store)
@@ -125,7 +128,7 @@ def write_report(
     drawn.sort(key=attrgetter("index"))
     full = sum(len(one.voxels[FULL]) for one in drawn)
     side = FULL if full <= VOXEL_BYTES else COARSE
-    content = page_content(store, outcomes, tallies, chosen, side)
+    content = page_content(store, outcomes, tallies, chosen, side, created)
     sheets = [drawn[start : start + PER_SHEET] for start in range(0, len(drawn), PER_SHEET)]
     with writing(str(out), Path(out).parent), staged(Path(out)) as temporary:
         with temporary.open("w", encoding="utf-8", newline="\n") as file:

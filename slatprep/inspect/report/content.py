@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from slatprep.inspect.pictures.palette import DISTANCE_COLOURS
-from slatprep.inspect.report.outcomes import Outcome, kind_of
+from slatprep.inspect.report.outcomes import Outcome, kinds_of
 from slatprep.inspect.report.statistics import Tally, nearest_quarter_turn, no_tally, quarter_turns
 from slatprep.inspect.report.thumbnails import COLUMNS, PER_SHEET, VIEWS
 from slatprep.inspect.report.voxels import LEVELS
@@ -42,6 +42,7 @@ def page_content(
     tallies: Mapping[str, Tally],
     chosen: Sequence[int],
     side: int,
+    created: str | None,
 ) -> dict[str, Any]:
     """Return the content of a page.
 
@@ -57,6 +58,8 @@ def page_content(
         Assets with a thumbnail and a 3D view, ascending.
     side : int
         Voxels a side of the 3D views.
+    created : str or None
+        When the store was built, if a record says so.
 
     Returns
     -------
@@ -69,6 +72,7 @@ def page_content(
         "title": store.name,
         "name": build.name,
         "build_id": store.about.manifest,
+        "created": created,
         "records": outcomes is not None,
         "versions": build.versions,
         "parameters": [
@@ -174,6 +178,10 @@ def _table(
             [round(float(value), 6) for value in matrix[:3].ravel()] for matrix in transforms
         ),
         "tied": (outcome and outcome.tied for outcome in stored),
+        "ties": (
+            [[round(number, 6) for number in tie] for tie in outcome.ties] if outcome else []
+            for outcome in stored
+        ),
         "displacement": (outcome and _number(outcome.displacement) for outcome in stored),
         "reasons": (list(outcome.reasons) if outcome else [] for outcome in stored),
         "picture": map(pictures.get, range(len(store))),
@@ -187,7 +195,8 @@ def _table(
     }
     blank = [None] * len(absent)
     columns = {name: [*own, *of_absent.get(name, blank)] for name, own in of_stored.items()}
-    columns["kinds"] = [[kind_of(reason) for reason in own] for own in columns["reasons"]]
+    kinds = kinds_of(reason for own in columns["reasons"] for reason in own)
+    columns["kinds"] = [[kinds[reason] for reason in own] for own in columns["reasons"]]
     return columns
 
 

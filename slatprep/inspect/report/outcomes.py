@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import astuple, dataclass
 
 from slatprep.errors import StoreError
@@ -11,6 +11,11 @@ from slatprep.provenance.files import build_in, lines_in
 from slatprep.provenance.record import FailedRecord, Record
 from slatprep.provenance.record_json import read_record
 from slatprep.records import Place, Status
+
+MOST_TIES = 8
+"""Tied placements of an asset that a page can show."""
+
+_NUMBER = re.compile(r"\d[\d,]*(?:\.\d+)?(?:e[-+]?\d+)?")
 
 
 @dataclass(frozen=True)
@@ -32,6 +37,8 @@ class Outcome:
         None where there is none.
     clipped : tuple of int
         Values of ``voxel/properties`` outside the range, by property.
+    ties : tuple of tuple of float
+        Transforms of the first `MOST_TIES` tied placements, three rows of four each.
     """
 
     asset_id: str
@@ -41,6 +48,7 @@ class Outcome:
     tied: int
     displacement: float | None
     clipped: tuple[int, ...]
+    ties: tuple[tuple[float, ...], ...] = ()
 
 
 def read_outcomes(manifests: Place, build_id: str) -> Iterator[Outcome]:
@@ -78,9 +86,33 @@ def kind_of(reason: str) -> str:
     >>> kind_of("a/b.npz: holds 3 voxels twice; expected distinct coordinates")
     'holds N voxels twice'
     """
-    kind = reason.partition("; expected")[0]
-    kind = re.sub(r"^\S*[/\\.]\S*: ", "", kind)
-    return re.sub(r"\d[\d,]*(\.\d+)?(e[-+]?\d+)?", "N", kind)
+    return _NUMBER.sub("N", _fault_of(reason))
+
+
+def kinds_of(reasons: Iterable[str]) -> dict[str, str]:
+    """Return the kind of each reason, with the numbers that all of one kind have in common.
+
+    Examples
+    --------
+    >>> kinds_of(["only 76% right (good: 80%)", "only 55% right (good: 80%)"])
+    {'only 76% right (good: 80%)': 'only N% right (good: 80%)', 'only 55% right (good: 80%)': 'only N% right (good: 80%)'}
+    """  # noqa: E501
+    all_reasons = list(reasons)
+    common: dict[str, list[str]] = {}
+    for reason in all_reasons:
+        kind, numbers = kind_of(reason), _NUMBER.findall(_fault_of(reason))
+        known = common.setdefault(kind, numbers)
+        common[kind] = [a if a == b else "N" for a, b in zip(known, numbers, strict=True)]
+    kinds = {}
+    for reason in all_reasons:
+        texts = _NUMBER.split(_fault_of(reason))
+        between = [*common[kind_of(reason)], ""]
+        kinds[reason] = "".join(a + b for a, b in zip(texts, between, strict=True))
+    return kinds
+
+
+def _fault_of(reason: str) -> str:
+    return re.sub(r"^\S*[/\\.]\S*: ", "", reason.partition("; expected")[0])
 
 
 def _outcome(record: Record) -> Outcome:
@@ -94,4 +126,7 @@ def _outcome(record: Record) -> Outcome:
         tied=len(placements),
         displacement=max((placement.displacement for placement in placements), default=None),
         clipped=astuple(clipped.voxel) if clipped else (),
+        ties=tuple(
+            tuple(placement.transform[:3].ravel().tolist()) for placement in placements[:MOST_TIES]
+        ),
     )

@@ -21,6 +21,7 @@ from matplotlib.transforms import Bbox
 from scipy.spatial import cKDTree
 from support.deformed import MOVES
 from support.synthetic import QUARTER_TURN
+from support.trees import tree
 
 from slatprep.cli.commands import slatprep
 from slatprep.errors import StoreError
@@ -238,6 +239,10 @@ def test_several_assets_get_a_file_each_and_a_contact_sheet(copy: Path, tmp_path
     told = json.loads(result.stdout)
     assert len(told) == 2 and told[0]["asset_id"] == "cup"
     assert {Path(one["picture"]) for one in told} | {folder / "sheet.png"} == set(folder.iterdir())
+    again = tmp_path / "again"
+    words = ("--worst", "1", "--asset", "cup", "--store", copy, "--picture", again)
+    assert run(*words, "--jobs", "2").exit_code == 0
+    assert tree(again) == tree(folder)
     for asset in told:
         passes = {figure["name"]: figure["passes"] for figure in asset["figures"]}
         assert passes["confidence"] is True and passes["overlap"] is None

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import io
+import json
+import shutil
 import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import numpy as np
 import pytest
 from PIL import Image
 from support.pages import HOSTILE, Report
@@ -206,6 +209,45 @@ def test_a_deformed_asset_is_found_by_its_model_and_shown_through_its_map(
     wait(lambda: pixels() != after)
     click(browser, "[data-switch=before]")
     wait(lambda: pixels() == after)
+    assert_quiet(browser)
+
+
+def test_tied_placements_are_stepped_through(
+    browser: Chrome, mixed_build: BuildSummary, tmp_path: Path
+) -> None:
+    records = tmp_path / "records"
+    shutil.copytree(mixed_build.records.parent, records)
+    lines = [json.loads(line) for line in mixed_build.records.read_text().splitlines()]
+    turned = np.eye(4)
+    turned[:2, :2] = [[-1, 0], [0, -1]]
+    for line in lines:
+        if line["asset_id"] == "cup":
+            line["alignment"]["placements"] = [
+                {"transform": turned.tolist(), "score": 1.0, "displacement": 40.0}
+            ]
+    (records / "assets.jsonl").write_text("".join(f"{json.dumps(line)}\n" for line in lines))
+    path = tmp_path / "page.html"
+    write_report(open_store(mixed_build.store), path, manifests=records)
+    browser.get("about:blank")
+    browser.get(f"{path.as_uri()}#asset=cup")
+    canvas = browser.find_element("id", "canvas")
+
+    def pixels() -> bytes:
+        return bytes(canvas.screenshot_as_png)
+
+    wait(lambda: len(Image.open(io.BytesIO(pixels())).convert("P").getcolors() or ()) > 8)
+    assert browser.find_element("id", "ties").text.split("\n")[1:] == ["as taken", "tie 1"]
+    click(browser, "#ties button:nth-of-type(1)")
+    click(browser, "[data-switch=slat]")
+    click(browser, "[data-switch=slat]")
+    taken = pixels()
+    click(browser, "#ties button:nth-of-type(2)")
+    wait(lambda: pixels() != taken)
+    click(browser, "#ties button:nth-of-type(1)")
+    wait(lambda: pixels() == taken)
+    click(browser, "#next")
+    wait(lambda: browser.find_element("id", "asset-title").text.startswith("dog"))
+    assert not browser.find_element("id", "ties").is_displayed()
     assert_quiet(browser)
 
 

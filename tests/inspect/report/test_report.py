@@ -26,7 +26,7 @@ from slatprep.errors import StoreError
 from slatprep.geometry.frames import apply_transform, voxel_centres
 from slatprep.inspect import report
 from slatprep.inspect.report import write_report
-from slatprep.inspect.report.outcomes import kind_of
+from slatprep.inspect.report.outcomes import kind_of, kinds_of
 from slatprep.inspect.report.statistics import nearest_quarter_turn, quarter_turns
 from slatprep.pipeline.dataset import BuildSummary
 from slatprep.store import open_store
@@ -272,6 +272,16 @@ def test_other_records_are_refused(
 )
 def test_reasons_are_grouped_without_files_and_numbers(reason: str, kind: str | None) -> None:
     assert kind_of(reason) == (reason if kind is None else kind)
+
+
+def test_numbers_that_all_reasons_of_a_kind_share_are_kept() -> None:
+    reasons = [
+        "only 76.1% lie within 1 voxel (good: 80%)",
+        "only 9% lie within 1 voxel (good: 80%)",
+    ]
+    kinds = kinds_of([*reasons, "a/b.npz: holds 3 rows; expected 2"])
+    assert [kinds[reason] for reason in reasons] == ["only N% lie within 1 voxel (good: 80%)"] * 2
+    assert kinds["a/b.npz: holds 3 rows; expected 2"] == "holds 3 rows"
 
 
 # -- the command --------------------------------------------------------------

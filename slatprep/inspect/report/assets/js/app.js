@@ -118,9 +118,35 @@ const Detail = (() => {
     byId("previous").disabled = Table.neighbour(index, -1) === null;
     byId("next").disabled = Table.neighbour(index, 1) === null;
     byId("readout").replaceChildren();
+    byId("copy").textContent = "Copy id";
+    placements(value("ties") ?? []);
     if (!dialog.open) dialog.showModal();
     history.replaceState(null, "", `#asset=${encodeURIComponent(value("id"))}`);
     Viewer.show(index);
+  }
+
+  /** Offer the placements that fit as well as the one taken, as the records have them. */
+  function placements(ties) {
+    const all = byId("ties");
+    all.hidden = !ties.length;
+    const names = ["as taken", ...ties.map((_, k) => `tie ${k + 1}`)];
+    const choose = (chosen) => {
+      Viewer.place(chosen);
+      [...all.querySelectorAll("button")].forEach((button, k) => button.setAttribute("aria-pressed", String(k === chosen)));
+    };
+    all.replaceChildren(
+      all.querySelector("legend"),
+      ...names.map((name, k) => el("button", { type: "button", class: "chip", "aria-pressed": String(k === 0), onclick: () => choose(k) }, name)),
+    );
+  }
+
+  async function copy() {
+    try {
+      await navigator.clipboard.writeText(ASSETS.id[index]);
+      byId("copy").textContent = "Copied";
+    } catch {
+      byId("copy").textContent = "Not allowed here";
+    }
   }
 
   function figures(value) {
@@ -166,6 +192,8 @@ const Detail = (() => {
 
   function create() {
     byId("close").addEventListener("click", () => dialog.close());
+    byId("copy").hidden = !navigator.clipboard;
+    byId("copy").addEventListener("click", copy);
     byId("previous").addEventListener("click", () => step(-1));
     byId("next").addEventListener("click", () => step(1));
     dialog.addEventListener("keydown", (event) => {

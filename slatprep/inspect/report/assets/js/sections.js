@@ -131,7 +131,7 @@ const Sections = (() => {
     const source = CONTENT.properties[0].source;
     const range = { dataset: "the smallest and largest value of this dataset", pixie: "Pixie's published ranges" }[source] ?? `the file ${source}`;
     byId("properties-hint").textContent =
-      `Left: the annotated voxels of the PixieVerse fields in physical units, before normalisation. Right: the valid SLAT voxels as the store holds them, after. ` +
+      `Before: the annotated voxels of the PixieVerse fields in physical units, not normalised. After: the valid SLAT voxels as the store holds them. ` +
       `Solid lines mark the range that becomes −1 to 1 (${range}); dashed lines, Pixie's published range.`;
     byId("property-charts").replaceChildren(...CONTENT.properties.flatMap((property) => [before(property), after(property)]));
   }
@@ -214,7 +214,7 @@ const Sections = (() => {
     if (assets < inStore) notes.push(`${Format.count(assets)} of ${Format.count(inStore)} assets have a thumbnail and a 3D view, and make up the distributions: those with a doubtful or failed alignment first, the rest evenly chosen.`);
     byId("detail-hint").textContent = notes.join(" ");
     byId("detail-hint").hidden = !notes.length;
-    byId("colophon").textContent = `Made by slatprep ${CONTENT.versions.slatprep} from build ${CONTENT.build_id.slice(0, 12)}.`;
+    byId("colophon").textContent = `Made by slatprep ${CONTENT.versions.slatprep} from build ${CONTENT.build_id.slice(0, 12)}${CONTENT.created ? ` of ${CONTENT.created}` : ""}.`;
     byId("parameters").replaceChildren(...CONTENT.parameters.map(([name, value]) => el("li", {}, el("code", {}, `${name} = ${value}`))));
   }
 

@@ -15,7 +15,7 @@ const Viewer = (() => {
   let shown = null; // voxels and meshes of the asset on the stage
   let frame = 0;
   let stale = true; // whether the stage shows something else than it should
-  const state = { mode: "material", slat: true, field: false, before: false, turning: !reduced.matches };
+  const state = { mode: "material", slat: true, field: false, before: false, tie: 0, turning: !reduced.matches };
 
   function library() {
     if (typeof THREE === "undefined") {
@@ -109,7 +109,7 @@ const Viewer = (() => {
     clear(); // another asset may have come while this one was unpacked
     const slat = instances(voxels.slat, 0.94);
     const field = instances(voxels.field, 0.94);
-    field.userData.transform = matrixOf(ASSETS.transform[index]);
+    state.tie = 0;
     shown = { index, voxels, slat, field, last: lastSteps(voxels) };
     three.scene.add(slat, field);
     update();
@@ -177,9 +177,10 @@ const Viewer = (() => {
     slat.material.opacity = both ? 0.45 : 1;
     slat.material.depthWrite = !both;
     slat.material.needsUpdate = true;
-    deform(field, voxels, state.before);
-    const from = new THREE.Matrix4();
-    field.matrix.copy(state.before ? from : field.userData.transform);
+    // What was fitted to the shapes belongs to the placement that was taken.
+    deform(field, voxels, state.before || state.tie > 0);
+    const transform = state.tie ? ASSETS.ties[shown.index][state.tie - 1] : ASSETS.transform[shown.index];
+    field.matrix.copy(state.before ? new THREE.Matrix4() : matrixOf(transform));
     field.matrixWorldNeedsUpdate = true;
     byId("scale").replaceChildren(scaleOf(state.mode));
     stale = true;
@@ -307,6 +308,16 @@ const Viewer = (() => {
     update();
   }
 
+  /** Show the PixieVerse side in another of its tied placements; 0 is the one taken. */
+  function place(tie) {
+    state.tie = tie;
+    const turn = (key, wanted) => { if (state[key] !== wanted) document.querySelector(`[data-switch=${key}]`).click(); };
+    turn("before", false);
+    turn("field", true);
+    turn("slat", false); // beside it the boundary has no classes, in which ties differ
+    update();
+  }
+
   function flip(key, button) {
     state[key] = !state[key];
     button.setAttribute("aria-pressed", String(state[key]));
@@ -315,5 +326,5 @@ const Viewer = (() => {
     update();
   }
 
-  return { create, show, update, stop: clear };
+  return { create, show, update, place, stop: clear };
 })();
