@@ -7,3 +7,7 @@ trap 'rm -rf "$work"' EXIT
 slatprep make-demo "$work/demo" --assets 1 --seed 0 --level 3 --quiet
 slatprep build-store --config "$work/demo/dataset.toml" --out "$work/demo.zarr" --quiet
 slatprep check-alignment --store "$work/demo.zarr" --worst 1 --picture "$here/alignment.png"
+# Makes statistics.png of 24 demo assets.
+slatprep make-demo "$work/many" --assets 24 --seed 0 --quiet
+slatprep build-store --config "$work/many/dataset.toml" --out "$work/demo24.zarr" --quiet
+slatprep stats "$work/demo24.zarr" --picture "$here/statistics.png" --quiet

@@ -19,6 +19,7 @@ COMMANDS = {
     "verify": "slatprep.cli.verify:verify",
     "info": "slatprep.cli.info:info",
     "list": "slatprep.cli.list:list_assets",
+    "stats": "slatprep.cli.stats:stats",
     "subset": "slatprep.cli.join:subset",
     "concat": "slatprep.cli.join:concat",
     "report": "slatprep.cli.report:report",

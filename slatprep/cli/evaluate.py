@@ -19,7 +19,7 @@ from slatprep.cli.options import (
     split_options,
     split_rule,
 )
-from slatprep.cli.output import Output
+from slatprep.cli.output import Output, write_csv
 
 if TYPE_CHECKING:
     from slatprep.learn.metrics import Evaluation, Measure
@@ -102,10 +102,7 @@ def evaluate(
     names = (name for mean in result.overall.means for name in (mean, f"{mean} {spread}"))
     header = ("category", "objects", *names)
     if csv_file is not None:
-        import csv
-
-        with csv_file.open("w", encoding="utf-8", newline="") as file:
-            csv.writer(file).writerows([header, *(map(_cell, row) for row in rows)])
+        write_csv(csv_file, header, rows)
 
     def show() -> None:
         what = "standard error" if spread == "se" else "standard deviation"
@@ -128,12 +125,6 @@ def evaluate(
     if beside:
         document["beside"] = [score for scores in others.values() for score in scores]
     output.result(document, show, complete=not result.missing)
-
-
-def _cell(value: object) -> object:
-    """Return a value as a spreadsheet takes it: no text of a stranger's becomes a formula."""
-    formula = isinstance(value, str) and value.lstrip()[:1] in ("=", "+", "-", "@")
-    return f"'{value}" if formula else value
 
 
 def _show_beside(

@@ -34,7 +34,7 @@ _Command = TypeVar("_Command", bound=Callable[..., object])
 
 _STYLES = {"good": "green", "doubtful": "yellow", "failed": "red"}
 
-_MAY_SHRINK = ("category", "model", "why")
+_MAY_SHRINK = ("category", "group", "model", "why")
 """Columns whose texts are cut, or broken between words, where a terminal is narrow."""
 _LEAST_WIDTH, _GAP = 12, 2
 _LEAST_ID = 8
@@ -124,6 +124,31 @@ class Output:
                 yield update
 
 
+def write_csv(file: Path, header: Sequence[str], rows: Iterable[Sequence[object]]) -> None:
+    """Write a table as a spreadsheet takes it: no text of a stranger's becomes a formula.
+
+    Raises
+    ------
+    StoreError
+        If the file cannot be written.
+    """
+    import csv
+
+    from slatprep.storage.atomic import staged, writing
+
+    with (
+        writing(str(file), file.parent),
+        staged(file) as path,
+        path.open("w", encoding="utf-8", newline="") as opened,
+    ):
+        csv.writer(opened).writerows([header, *(map(_for_spreadsheet, row) for row in rows)])
+
+
+def _for_spreadsheet(value: object) -> object:
+    formula = isinstance(value, str) and value.lstrip()[:1] in ("=", "+", "-", "@")
+    return f"'{value}" if formula else value
+
+
 def say(text: object = "", *, err: bool = False, nl: bool = True) -> None:
     """Print text as `printable` has it: every command prints by this alone."""
     click.echo(printable(str(text)), err=err, nl=nl)
@@ -208,8 +233,11 @@ def _text(cell: Cell) -> str:
         return "yes" if cell else "no"
     if isinstance(cell, int):
         return f"{cell:,}"
+    if isinstance(cell, float):
+        size = abs(cell)
+        return f"{cell:.3f}" if size < 1e4 else f"{cell:,.0f}" if size < 1e7 else f"{cell:.3g}"
     # A cell is one line.
-    return f"{cell:.3f}" if isinstance(cell, float) else printable(str(cell)).replace("\n", "\\n")
+    return printable(str(cell)).replace("\n", "\\n")
 
 
 def _rich_table(

@@ -23,6 +23,18 @@ class ListedAsset:
     reasons: tuple[str, ...]
 
 
+def rows_chosen(
+    store: Store, verdicts: Collection[str] = (), categories: Collection[str] = ()
+) -> list[int]:
+    """Return the rows of the assets with one of these verdicts and categories; empty takes all."""
+    named = zip(store.column("verdict"), store.column("category"), strict=True)
+    return [
+        row
+        for row, (verdict, category) in enumerate(named)
+        if (not verdicts or verdict in verdicts) and (not categories or category in categories)
+    ]
+
+
 def list_assets(
     store: Store,
     verdicts: Collection[str] = (),
@@ -45,20 +57,15 @@ def list_assets(
     StoreError
         If the store, or the record of an asset that is not good, cannot be read.
     """
-    table, records = store.table(), StoredRecords(store)
-    for row, asset_id in enumerate(store.ids):
-        verdict, category = str(table["verdict"][row]), str(table["category"][row])
-        confidence = float(table["confidence"][row])
-        if (
-            (verdicts and verdict not in verdicts)
-            or (categories and category not in categories)
-            or (max_confidence is not None and not confidence <= max_confidence)
-        ):
+    table, records, ids = store.table(), StoredRecords(store), store.ids
+    for row in rows_chosen(store, verdicts, categories):
+        verdict, confidence = str(table["verdict"][row]), float(table["confidence"][row])
+        if max_confidence is not None and not confidence <= max_confidence:
             continue
         good = verdict == Verdict.GOOD  # A record takes a millisecond to read, and most are good.
         yield ListedAsset(
-            asset_id,
-            category,
+            ids[row],
+            str(table["category"][row]),
             verdict,
             confidence,
             float(table["fitness"][row]),

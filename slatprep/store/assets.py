@@ -114,8 +114,10 @@ class AssetTable:
         UnknownAssetError
             If there is none, or several begin so; the message names them.
         """
+        if name in self._index:
+            return self._index[name]  # Going through all assets must not go through all ids each.
         alike = [known for known in self.ids if known.startswith(name)] if name else []
-        if name in self._index or not alike:
+        if not alike:
             return self.find(name)
         if len(alike) == 1:
             return self.find(alike[0])

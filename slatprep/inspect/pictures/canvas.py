@@ -66,4 +66,5 @@ def size_of(figure: Figure) -> tuple[float, float]:
 def write(figure: Figure, x: float, y: float, words: str, **style: Any) -> None:
     """Write at a pixel of the figure, counted from its upper left corner."""
     width, height = size_of(figure)
-    figure.text(x / width, 1 - y / height, words, **style)
+    # A stranger's name with a $ in it is no formula.
+    figure.text(x / width, 1 - y / height, words, parse_math=False, **style)

@@ -1,0 +1,158 @@
+"""`slatprep stats`: what the voxels of a store are."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from slatprep.cli.options import (
+    NEW_FILE,
+    ChoiceOf,
+    command,
+    jobs_option,
+    option,
+    require_categories,
+    store_argument,
+)
+from slatprep.cli.output import Cell, Output, write_csv
+
+if TYPE_CHECKING:
+    from slatprep.inspect.statistics import Distribution, GroupStatistics, StoreStatistics
+    from slatprep.records import Place
+
+_CATEGORIES = 20
+"""Categories in a table; the files have all."""
+
+
+@command()
+@store_argument
+@option("--verdict", ChoiceOf("slatprep.records:Verdict"), name="verdicts", multiple=True)
+@option("--category", name="categories", multiple=True)
+@option("--weight", ChoiceOf("slatprep.inspect.statistics:Weight"), "voxel")
+@option("--csv", NEW_FILE, name="csv_file")
+@option("--picture", NEW_FILE, metavar="FILE.png|svg|pdf")
+@jobs_option
+def stats(
+    output: Output,
+    store: Place,
+    verdicts: tuple[str, ...],
+    categories: tuple[str, ...],
+    weight: Any,
+    csv_file: Path | None,
+    picture: Path | None,
+    jobs: int,
+) -> None:
+    """Say what the voxels of STORE are: classes and properties, by category and in all.
+
+    Both before the lookup (the annotated voxels of the PixieVerse fields) and after it
+    (the valid SLAT voxels). Without STORE, the one that `make align` built last under
+    data/ is taken.
+
+    Options
+    -------
+    --verdict: Only assets with this verdict; may be repeated. [default: all]
+    --category: Only assets of this category; may be repeated. [default: all]
+    --weight: What weighs one: every voxel, or all voxels of an asset together.
+    --csv: Also write a table to this file: a line for each group, side, property and scale.
+    --picture: Also draw them in this file.
+
+    Example
+    -------
+    slatprep stats demo.zarr
+    slatprep stats demo.zarr --verdict good --weight asset --picture demo.png --csv demo.csv
+    """
+    from slatprep.inspect.pictures.canvas import FORMATS
+
+    kind = "png" if picture is None else picture.suffix[1:].lower()
+    if kind not in FORMATS:
+        raise click.BadParameter(
+            f"{picture} ends in none of .{', .'.join(FORMATS)}", param_hint="--picture"
+        )
+    from slatprep.inspect.statistics import COLUMNS, store_statistics, table_of
+    from slatprep.store import open_store
+
+    opened = open_store(store)
+    require_categories(opened, categories)
+    with output.progress("stats") as progress:
+        found = store_statistics(
+            opened,
+            verdicts=verdicts,
+            categories=categories,
+            weight=weight,
+            jobs=jobs,
+            progress=progress,
+        )
+    if csv_file is not None:
+        write_csv(csv_file, COLUMNS, table_of(found))
+    if picture is not None:
+        from slatprep.inspect.pictures.statistics import draw_statistics
+        from slatprep.storage.atomic import staged, writing
+
+        with writing(str(picture), picture.parent), staged(picture) as path:
+            path.write_bytes(draw_statistics(opened, found, kind))
+        output.note(f"picture: {picture}")
+    output.result(found, lambda: _show(output, found))
+
+
+def _show(output: Output, found: StoreStatistics) -> None:
+    kept = sorted(found.categories, key=lambda group: -group.slat.assets)[:_CATEGORIES]
+    groups = [group for group in found.groups if group.by != "category" or group in kept]
+    chosen = f"{found.assets_chosen:,} of {found.assets:,} assets"
+    output.record(f"{chosen}, weighted by {found.weight}", {**found.total.verdicts})
+    output.table(
+        "Voxels before and after the lookup, and the share that is not annotated",
+        ("group", "assets", "before", "share", "none", "after", "share", "none"),
+        [_voxels(group) for group in groups if group.slat.assets or group.field.assets],
+    )
+    output.table(
+        "Properties of all annotated voxels",
+        ("property", "lookup", "mean", "std", "5%", "50%", "95%"),
+        [
+            (f"{name}{_unit(own.unit)}", side, *_spread(own.si))
+            for name in found.total.slat.properties
+            for side, own in (
+                ("before", found.total.field.properties[name]),
+                ("after", found.total.slat.properties[name]),
+            )
+        ],
+    )
+    for name, whole in found.total.slat.properties.items():
+        rows: list[tuple[Cell, ...]] = []
+        for group in groups:
+            before, after = (
+                side.properties[name].log10 or side.properties[name].si
+                for side in (group.field, group.slat)
+            )
+            if group.slat.voxels:
+                rows.append((_name(group), *_spread(after), before.quantiles["50%"]))
+        output.table(
+            f"{'log10 of ' if whole.log10 else ''}{name}{_unit(whole.unit)}, after the lookup",
+            ("group", "mean", "std", "5%", "50%", "95%", "50% before"),
+            rows,
+        )
+    if len(kept) < len(found.categories):
+        output.note(
+            f"note:    {len(kept)} of {len(found.categories):,} categories, those with most "
+            "assets; --json and --csv have all"
+        )
+
+
+def _voxels(group: GroupStatistics) -> tuple[Cell, ...]:
+    before, after = group.field, group.slat
+    cells = ((side.voxels, side.share, side.unannotated) for side in (before, after))
+    return (_name(group), after.assets, *(cell for own in cells for cell in own))
+
+
+def _name(group: GroupStatistics) -> str:
+    """Return what a group is called: a category may have the name of a class."""
+    return f"class {group.name}" if group.by == "class" else group.name
+
+
+def _spread(own: Distribution) -> tuple[Cell, ...]:
+    return (own.mean, own.std, *(own.quantiles[name] for name in ("5%", "50%", "95%")))
+
+
+def _unit(unit: str) -> str:
+    return "" if unit == "1" else f" [{unit}]"

@@ -1,0 +1,171 @@
+"""What the voxels of a store are, as one picture: properties by class, together, and classes."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from slatprep.inspect.pictures import palette
+from slatprep.inspect.pictures.canvas import STYLE, in_format, new_figure, size_of, write
+from slatprep.inspect.statistics import Histogram, JointHistogram, StoreStatistics
+from slatprep.records import CLASS_COLOURS
+from slatprep.store.reader import Store
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+MOST_CATEGORIES = 16
+"""Categories with a bar; of a store with more those with most assets."""
+
+_WIDTH, _HEAD, _FOOT = 1500, 170, 60
+_LEFT, _GAP, _PLOT = 210, 100, 535
+"""From the left edge to the plots, between the two columns of them, and their width, in pixels."""
+_HISTOGRAM, _JOINT, _BAR, _BETWEEN = 190, 480, 26, 90
+"""Heights in pixels, and what lies between two rows of plots."""
+_SIDES = (("field", "PixieVerse fields, before the lookup"), ("slat", "SLAT voxels, after it"))
+
+
+def draw_statistics(store: Store, statistics: StoreStatistics, kind: str = "png") -> bytes:
+    """Draw the statistics of a store.
+
+    Parameters
+    ----------
+    store : Store
+        The store.
+    statistics : StoreStatistics
+        From `slatprep.inspect.statistics.store_statistics`.
+    kind : str
+        ``png``, ``svg`` or ``pdf``.
+
+    Returns
+    -------
+    bytes
+        The picture; the same for the same arguments.
+    """
+    import matplotlib.style
+
+    kept = sorted(statistics.categories, key=lambda one: -one.slat.assets)[:MOST_CATEGORIES]
+    shown = [group for group in statistics.categories if group in kept]
+    joint = (_JOINT + _BETWEEN) * (statistics.joint is not None)
+    rows = len(statistics.histograms) * (_HISTOGRAM + _BETWEEN)
+    height = _HEAD + rows + joint + _BAR * max(len(shown), 1) + _BETWEEN + _FOOT
+    with matplotlib.style.context(["default", STYLE]):
+        figure = new_figure(_WIDTH, height)
+        _head(figure, store, statistics)
+        for column, (side, _) in enumerate(_SIDES):
+            top = _HEAD
+            for histogram in statistics.histograms:
+                _histogram(_axes(figure, column, top, _HISTOGRAM), histogram, side)
+                top += _HISTOGRAM + _BETWEEN
+            if statistics.joint is not None:
+                _joint(
+                    figure, _axes(figure, column, top, _JOINT), statistics, statistics.joint, side
+                )
+                top += joint
+            bars = [getattr(group, side).classes for group in shown]
+            names = [f"{_cut(group.name)} ({group.slat.assets:,})" for group in shown]
+            names = names if column == 0 else [""] * len(names)
+            _bars(_axes(figure, column, top, _BAR * max(len(bars), 1)), names, bars)
+        return in_format(figure, kind)
+
+
+def _head(figure: Figure, store: Store, statistics: StoreStatistics) -> None:
+    write(figure, 40, 48, f"Statistics of {store.name}", weight="bold", size=12)
+    counts = ", ".join(f"{count:,} {name}" for name, count in statistics.total.verdicts.items())
+    what = "voxel weighs" if statistics.weight == "voxel" else "asset's voxels together weigh"
+    words = (
+        f"{statistics.assets_chosen:,} of {statistics.assets:,} assets ({counts}); "
+        f"every {what} one; not annotated: {_percent(statistics.total.field.unannotated)} before, "
+        f"{_percent(statistics.total.slat.unannotated)} after"
+    )
+    write(figure, 40, 74, words, size=7, color=palette.MUTED)
+    x = 40.0
+    width, height = size_of(figure)
+    from matplotlib.patches import Rectangle
+
+    for group in statistics.classes:
+        place = (x / width, 1 - 104 / height)
+        figure.add_artist(
+            Rectangle(place, 12 / width, 12 / height, color=CLASS_COLOURS[group.name])
+        )
+        write(figure, x + 18, 103, group.name, size=7)
+        x += 50 + 10 * len(group.name)
+    for column, (_, title) in enumerate(_SIDES):
+        left = _LEFT + column * (_PLOT + _GAP)
+        write(figure, left, _HEAD - 14, title, size=8, weight="bold")
+
+
+def _axes(figure: Figure, column: int, top: float, tall: float) -> Axes:
+    width, height = size_of(figure)
+    left = _LEFT + column * (_PLOT + _GAP)
+    return figure.add_axes((left / width, 1 - (top + tall) / height, _PLOT / width, tall / height))
+
+
+def _histogram(axes: Axes, histogram: Histogram, side: str) -> None:
+    shares = _shares(getattr(histogram, side))
+    upto = np.vstack([np.zeros(shares.shape[1]), np.cumsum(shares, axis=0)])
+    colours = [*CLASS_COLOURS.values()]
+    for index in np.flatnonzero(shares.any(axis=1)):
+        axes.stairs(
+            upto[index + 1], histogram.edges, baseline=upto[index], fill=True, color=colours[index]
+        )
+    axes.set_xlim(histogram.edges[0], histogram.edges[-1])
+    most = max(_shares(own).sum(axis=0).max() for own in (histogram.field, histogram.slat))
+    axes.set_ylim(0, 1.05 * most or 1.0)
+    axes.set_xlabel(_label(histogram))
+    axes.set_ylabel("share")
+
+
+def _joint(
+    figure: Figure, axes: Axes, statistics: StoreStatistics, joint: JointHistogram, side: str
+) -> None:
+    from matplotlib.colors import LinearSegmentedColormap, LogNorm
+
+    shares = np.ma.masked_equal(_shares(getattr(joint, side)), 0.0)
+    first, second = (one for one in statistics.histograms if one.name in joint.names)
+    colours = LinearSegmentedColormap.from_list("shares", palette.DISTANCE_COLOURS[1:])
+    # Below five powers of ten all is as pale as the least that is told apart.
+    mesh = axes.pcolormesh(
+        *joint.edges, shares.T, cmap=colours, norm=LogNorm(1e-5, 1.0), rasterized=True
+    )
+    if side == _SIDES[-1][0]:
+        bar = figure.colorbar(mesh, cax=axes.inset_axes((1.02, 0, 0.02, 1)))
+        bar.outline.set_visible(False)
+        bar.set_label("share of voxels")
+    axes.set_xlim(first.edges[0], first.edges[-1])
+    axes.set_ylim(second.edges[0], second.edges[-1])
+    axes.set_xlabel(_label(first))
+    axes.set_ylabel(_label(second))
+
+
+def _bars(axes: Axes, names: list[str], bars: list[dict[str, float]]) -> None:
+    places = np.arange(len(bars))
+    left = np.zeros(len(bars))
+    for name in bars[0] if bars else ():
+        shares = np.nan_to_num([bar[name] for bar in bars])
+        axes.barh(places, shares, 0.8, left, color=CLASS_COLOURS[name])
+        left = left + shares
+    axes.set_xlim(0, 1)
+    axes.set_ylim(max(len(bars), 1) - 0.5, -0.5)
+    axes.set_yticks(places, names, parse_math=False)  # A $ in a name is no formula.
+    axes.set_xlabel("share of annotated voxels, by category (assets)")
+
+
+def _shares(weights: NDArray[np.float64]) -> NDArray[np.float64]:
+    return weights / (weights.sum() or 1.0)
+
+
+def _label(histogram: Histogram) -> str:
+    unit = "" if histogram.unit == "1" else f" [{histogram.unit}]"
+    return f"{'log10 of ' * histogram.log10}{histogram.name.replace('_', ' ')}{unit}"
+
+
+def _percent(share: float) -> str:
+    return "-" if np.isnan(share) else f"{share:.2%}"
+
+
+def _cut(name: str) -> str:
+    return name if len(name) <= 14 else f"{name[:13]}…"

@@ -1,0 +1,199 @@
+"""Counts, moments and histograms of an asset's voxels before and after the lookup; tallies add up.
+
+Moments are merged by the pairwise update of Chan, Golub and LeVeque
+("Updating Formulae and a Pairwise Algorithm for Computing Sample Variances",
+1979), so that nothing cancels, however many assets are added.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from slatprep.normalize import denormalize_properties
+from slatprep.records import BACKGROUND, Normalization
+
+JOINT_BINS = 64
+"""Bins of either axis of the joint histogram, over [-1, 1]."""
+
+Voxels = tuple[NDArray[np.uint8], NDArray[np.float32]]
+"""Classes and normalised properties of voxels."""
+
+_CLASSES = BACKGROUND  # The classes of a material are those below it.
+
+
+@dataclass(frozen=True, eq=False)
+class SideTally:
+    """Sums over the voxels of one side of an asset, or of many.
+
+    Attributes
+    ----------
+    assets, voxels : ndarray of int64, shape (8,)
+        Assets that have voxels of each class, and those voxels; the last entry is
+        of voxels without an annotation.
+    weights : ndarray of float64, shape (8,)
+        What those voxels weigh together.
+    histogram : ndarray of float64, shape (P, 7, bins)
+        Weight by property, class and bin of the normalised value, over [-1, 1].
+    sums : ndarray of float64, shape (P, 7, bins)
+        Weighted sum of the normalised values there: where a bin has one value, it can be told.
+    joint : ndarray of float64, shape (JOINT_BINS, JOINT_BINS)
+        Weight by bins of the first two properties; zero where there is only one.
+    mean, squares : ndarray of float64, shape (2, P, 7)
+        Weighted mean, and weighted sum of squared differences from it, of the
+        normalised values and of those in SI units.
+    ends : ndarray of float64, shape (2, P, 7)
+        Smallest and largest normalised value; inf and -inf where there is none.
+    """
+
+    assets: NDArray[np.int64]
+    voxels: NDArray[np.int64]
+    weights: NDArray[np.float64]
+    histogram: NDArray[np.float64]
+    sums: NDArray[np.float64]
+    joint: NDArray[np.float64]
+    mean: NDArray[np.float64]
+    squares: NDArray[np.float64]
+    ends: NDArray[np.float64]
+
+    def __add__(self, other: SideTally) -> SideTally:
+        weights = np.stack([self.weights, other.weights])
+        mean, squares = pooled(
+            weights[:, None, None, :-1],
+            np.stack([self.mean, other.mean]),
+            np.stack([self.squares, other.squares]),
+            axis=0,
+        )
+        least, most = (
+            np.minimum(self.ends[0], other.ends[0]),
+            np.maximum(self.ends[1], other.ends[1]),
+        )
+        return SideTally(
+            self.assets + other.assets,
+            self.voxels + other.voxels,
+            weights.sum(axis=0),
+            self.histogram + other.histogram,
+            self.sums + other.sums,
+            self.joint + other.joint,
+            mean,
+            squares,
+            np.stack([least, most]),
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Tally:
+    """The PixieVerse field, before the lookup, and the SLAT's voxels, after it."""
+
+    field: SideTally
+    slat: SideTally
+
+    def __add__(self, other: Tally) -> Tally:
+        return Tally(self.field + other.field, self.slat + other.slat)
+
+
+def pooled(
+    weights: NDArray[np.float64],
+    mean: NDArray[np.float64],
+    squares: NDArray[np.float64],
+    axis: int,
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Merge means and sums of squared differences along an axis; 0 where nothing weighs."""
+    total = weights.sum(axis=axis, keepdims=True)
+    centre = (weights * mean).sum(axis=axis, keepdims=True) / np.where(total > 0, total, 1.0)
+    merged = (squares + weights * (mean - centre) ** 2).sum(axis=axis)
+    return centre.squeeze(axis), merged
+
+
+def no_tally(properties: int, bins: int) -> Tally:
+    """Return the tally of nothing, of so many properties, in so many bins."""
+    nothing = SideTally(
+        assets=np.zeros(_CLASSES + 1, np.int64),
+        voxels=np.zeros(_CLASSES + 1, np.int64),
+        weights=np.zeros(_CLASSES + 1),
+        histogram=np.zeros((properties, _CLASSES, bins)),
+        sums=np.zeros((properties, _CLASSES, bins)),
+        joint=np.zeros((JOINT_BINS, JOINT_BINS)),
+        mean=np.zeros((2, properties, _CLASSES)),
+        squares=np.zeros((2, properties, _CLASSES)),
+        ends=np.stack([np.full((properties, _CLASSES), end) for end in (np.inf, -np.inf)]),
+    )
+    return Tally(nothing, nothing)
+
+
+def tally(
+    field: Voxels, slat: Voxels, ranges: Normalization, bins: int, *, by_asset: bool = False
+) -> Tally:
+    """Tally the voxels of one asset.
+
+    Parameters
+    ----------
+    field, slat : tuple of ndarray
+        Classes, and normalised properties of as many voxels, as ``grid/*`` (properties first:
+        (R, R, R) and (P, R, R, R)) and ``voxel/*`` ((N,) and (N, P)) hold them.
+    ranges : Normalization
+        The ranges of the properties.
+    bins : int
+        Bins of the histograms, over [-1, 1].
+    by_asset : bool
+        Let all voxels of a side weigh one together, instead of one each.
+    """
+    grid, values = field
+    annotated = grid < BACKGROUND
+    before = grid[grid != BACKGROUND], values[:, annotated]
+    after = slat[0], slat[1][slat[0] < BACKGROUND].T
+    return Tally(
+        _side(*before, ranges, bins, by_asset),
+        _side(*after, ranges, bins, by_asset),
+    )
+
+
+def _side(
+    material: NDArray[np.uint8],
+    properties: NDArray[np.float32],
+    ranges: Normalization,
+    bins: int,
+    by_asset: bool,
+) -> SideTally:
+    """Tally voxels (N,), and normalised properties (P, K) of those with a class."""
+    weight = np.float64(1.0 / max(len(material), 1) if by_asset else 1.0)
+    classes = np.minimum(material, BACKGROUND)
+    counts = np.bincount(classes, minlength=_CLASSES + 1).astype(np.int64)
+    own = classes[classes < BACKGROUND].astype(np.int64)
+    values = np.stack([properties, denormalize_properties(properties.T, ranges).T])
+    values = values.astype(np.float64)
+    size, shape = _CLASSES * bins, (len(properties), _CLASSES, bins)
+    places = own * bins + _bins(properties, bins)
+    histogram = [np.bincount(row, minlength=size) for row in places]
+    sums = [np.bincount(*pair, minlength=size) for pair in zip(places, values[0], strict=True)]
+    joint: NDArray[np.float64] = np.zeros(JOINT_BINS**2)
+    if len(properties) > 1:
+        first, second = _bins(properties[:2], JOINT_BINS)
+        joint += np.bincount(first * JOINT_BINS + second, minlength=JOINT_BINS**2) * weight
+    mean = np.zeros((2, len(properties), _CLASSES))
+    squares = np.zeros_like(mean)
+    ends = np.stack([np.full(mean.shape[1:], end) for end in (np.inf, -np.inf)])
+    for index in np.flatnonzero(counts[:-1]):
+        chosen = values[:, :, own == index]
+        mean[..., index] = chosen.mean(axis=-1)
+        squares[..., index] = ((chosen - mean[..., index, None]) ** 2).sum(axis=-1) * weight
+        ends[:, :, index] = chosen[0].min(axis=-1), chosen[0].max(axis=-1)
+    return SideTally(
+        assets=(counts > 0).astype(np.int64),
+        voxels=counts,
+        weights=counts * weight,
+        histogram=np.stack(histogram).reshape(shape) * weight,
+        sums=np.stack(sums).reshape(shape) * weight,
+        joint=joint.reshape(JOINT_BINS, JOINT_BINS),
+        mean=mean,
+        squares=squares,
+        ends=ends,
+    )
+
+
+def _bins(values: NDArray[np.float32], bins: int) -> NDArray[np.int64]:
+    """Return in which of so many bins over [-1, 1] each value lies."""
+    places: NDArray[np.int64] = ((values + 1.0) * (bins / 2)).astype(np.int64)
+    return np.clip(places, 0, bins - 1)

@@ -1,0 +1,241 @@
+"""What `slatprep stats` counts, against numpy over the arrays themselves."""
+
+from __future__ import annotations
+
+import csv
+import json
+import math
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import zarr
+from click.testing import CliRunner, Result
+
+from slatprep import open_store
+from slatprep.cli.commands import slatprep
+from slatprep.cli.output import as_json
+from slatprep.inspect.pictures.statistics import draw_statistics
+from slatprep.inspect.statistics import (
+    QUANTILES,
+    PropertyStatistics,
+    SideStatistics,
+    StoreStatistics,
+    store_statistics,
+)
+from slatprep.pipeline.dataset import BuildSummary
+
+CATEGORIES = ["b", "", "a", "=b", "b"]
+VERDICTS = ["good", "good", "failed", "doubtful", "good"]
+
+
+@pytest.fixture(scope="module")
+def store(mixed_build: BuildSummary, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Copy `mixed` with labels drawn at random, so that no two voxels need agree."""
+    path = tmp_path_factory.mktemp("statistics") / "s.zarr"
+    shutil.copytree(str(mixed_build.store), path)
+    group, rng = zarr.open_group(path, mode="r+"), np.random.default_rng(7)
+    group["asset/category"][:] = np.array(CATEGORIES, dtype=object)
+    group["asset/verdict"][:] = np.array(VERDICTS, dtype=object)
+    for side, axis in (("voxel", -1), ("grid", 1)):
+        material = group[f"{side}/material"][:]
+        drawn = rng.choice([0, 1, 4, 255], material.shape, p=[0.5, 0.2, 0.2, 0.1])
+        material[material != 7] = drawn[material != 7]
+        values = rng.uniform(-1, 1, group[f"{side}/properties"].shape).astype(np.float32)
+        values = np.where(np.expand_dims(material < 7, axis), values, np.float32(np.nan))
+        group[f"{side}/material"][:] = material
+        group[f"{side}/properties"][:] = values
+    return path
+
+
+def arrays(path: Path, side: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return the asset, class and normalised properties of every occupied voxel of a side."""
+    group = zarr.open_group(path, mode="r")
+    if side == "slat":
+        counts = np.diff(group["asset/offset"][:])
+        owner = np.repeat(np.arange(len(counts)), counts)
+        return owner, group["voxel/material"][:], group["voxel/properties"][:]
+    material = group["grid/material"][:]
+    owner = np.nonzero(material != 7)[0]
+    values = np.moveaxis(group["grid/properties"][:], 1, -1)[material != 7]
+    return owner, material[material != 7], values
+
+
+def expect(found: PropertyStatistics, mapped: np.ndarray, weights: np.ndarray, error: float):
+    """Hold a property's figures against numpy's, of mapped values that are in no doubt."""
+    linear = 10.0**mapped if found.log10 else mapped
+    for own, values in ((found.log10, mapped), (found.si, linear)):
+        if own is None:
+            continue
+        mean = np.average(values, weights=weights)
+        assert own.mean == pytest.approx(mean, rel=1e-6)
+        std = math.sqrt(np.average((values - mean) ** 2, weights=weights))
+        assert own.std == pytest.approx(std, rel=1e-6)
+        assert (own.least, own.most) == pytest.approx((values.min(), values.max()), rel=1e-6)
+    scale = found.log10 or found.si
+    names = dict(zip(QUANTILES, scale.quantiles.values(), strict=True))
+    assert list(scale.quantiles) == ["1%", "5%", "25%", "50%", "75%", "95%", "99%"]
+    exact = np.quantile(mapped, QUANTILES, method="inverted_cdf", weights=weights)
+    np.testing.assert_allclose(list(names.values()), exact, rtol=0, atol=1.001 * error)
+    if found.log10:
+        raised = 10.0 ** np.array([*found.log10.quantiles.values()])
+        np.testing.assert_allclose([*found.si.quantiles.values()], raised)
+
+
+def hold(path: Path, found: StoreStatistics, weight: str) -> None:
+    """Hold every group of some statistics against the arrays."""
+    ranges = open_store(path).normalization.ranges
+    categories = np.array(CATEGORIES)
+    for side in ("field", "slat"):
+        owner, material, values = arrays(path, side)
+        weights = np.ones(len(owner))
+        if weight == "asset":
+            weights = 1.0 / np.bincount(owner)[owner]
+        for group in found.groups:
+            chosen = np.ones(len(owner), bool)
+            if group.by == "class":
+                chosen = material == ["jelly", "metal", "sand", "visplas", "fluid"].index(
+                    group.name
+                )
+            elif group.by == "category":
+                name = "" if group.name == "(unknown)" else group.name
+                chosen = categories[owner] == name
+            own: SideStatistics = getattr(group, side)
+            annotated = chosen & (material < 7)
+            assert own.voxels == chosen.sum()
+            assert own.assets == len(np.unique(owner[chosen]))
+            assert own.share == pytest.approx(weights[chosen].sum() / weights.sum())
+            share = 1 - weights[annotated].sum() / weights[chosen].sum()
+            assert own.unannotated == pytest.approx(share, abs=1e-12)
+            for index, name in ((0, "jelly"), (1, "metal"), (4, "fluid")):
+                of_class = weights[annotated & (material == index)].sum()
+                if group.by != "class" or name == group.name:
+                    share = of_class / weights[annotated].sum()
+                    assert own.classes[name] == pytest.approx(share)
+            for k, span in enumerate(ranges):
+                mapped = (values[annotated, k].astype(float) + 1) / 2 * (
+                    span.hi - span.lo
+                ) + span.lo
+                error = found.quantile_error[span.name]
+                assert error == pytest.approx((span.hi - span.lo) / 4096)
+                expect(own.properties[span.name], mapped, weights[annotated], error)
+
+
+def only_present(found: StoreStatistics) -> StoreStatistics:
+    """Leave classes out that no voxel has, as they have no figures."""
+    empty = [group for group in found.classes if not group.slat.voxels]
+    assert {group.name for group in empty} == {"sand", "visplas", "snow", "stationary"}
+    for group in empty:
+        assert math.isnan(group.slat.properties["density"].si.mean)
+    return replace(found, classes=tuple(one for one in found.classes if one.slat.voxels))
+
+
+@pytest.mark.parametrize("weight", ["voxel", "asset"])
+def test_every_group_is_as_numpy_has_it(store: Path, weight) -> None:
+    found = store_statistics(open_store(store), weight=weight)
+    hold(store, only_present(found), weight)
+    assert found.total.verdicts == {"good": 3, "doubtful": 1, "failed": 1}
+    assert [(one.name, one.verdicts["good"]) for one in found.categories] == [
+        ("(unknown)", 1), ("=b", 0), ("a", 0), ("b", 2),
+    ]  # fmt: skip
+
+
+def test_histograms_add_up_and_the_joint_has_every_pair(store: Path) -> None:
+    found = store_statistics(open_store(store))
+    for side in ("field", "slat"):
+        _, material, values = arrays(store, side)
+        for k, histogram in enumerate(found.histograms):
+            for kind in range(7):
+                expected, _ = np.histogram(values[material == kind, k], 64, (-1, 1))
+                np.testing.assert_array_equal(getattr(histogram, side)[kind], expected)
+        pairs = values[material < 7, :2]
+        expected, *_ = np.histogram2d(*pairs.T, bins=64, range=((-1, 1), (-1, 1)))
+        np.testing.assert_array_equal(getattr(found.joint, side), expected)
+    span = open_store(store).normalization.ranges[0]
+    assert found.joint is not None and found.joint.names == ("youngs_modulus", "density")
+    assert (found.joint.edges[0][0], found.joint.edges[0][-1]) == (span.lo, span.hi)
+
+
+def test_values_that_recur_have_exact_quantiles(mixed_build: BuildSummary) -> None:
+    """Two materials, by hand: most voxels are jelly, of 1e5 Pa, the others metal, of 2e11."""
+    found = store_statistics(open_store(mixed_build.store)).total.slat
+    assert 0.05 < found.classes["metal"] < 0.45
+    modulus = found.properties["youngs_modulus"].si
+    assert modulus.quantiles["50%"] == pytest.approx(1.0e5, rel=1e-5)
+    assert modulus.quantiles["99%"] == pytest.approx(2.0e11, rel=1e-5)
+    assert modulus.mean == pytest.approx(
+        1.0e5 * found.classes["jelly"] + 2.0e11 * found.classes["metal"], rel=1e-5
+    )
+
+
+def test_filters_choose_assets_and_jobs_change_nothing(store: Path) -> None:
+    opened = open_store(store)
+    found = store_statistics(opened, verdicts=("good",), categories=("b",))
+    assert (found.assets, found.assets_chosen) == (5, 2)
+    (only,) = found.categories
+    assert only.slat == found.total.slat and only.name == "b"
+    one, two = (as_json(store_statistics(opened, jobs=jobs)) for jobs in (1, 2))
+    assert one == two
+
+
+def run(*arguments: object) -> Result:
+    result = CliRunner().invoke(slatprep, ["stats", *map(str, arguments)])
+    assert result.exit_code == 0, result.output
+    return result
+
+
+def test_the_command_prints_and_writes_the_same(store: Path, tmp_path: Path) -> None:
+    table = tmp_path / "t.csv"
+    document = json.loads(run(store, "--json", "--csv", table).stdout)
+    assert document["total"]["slat"]["voxels"] == len(arrays(store, "slat")[0])
+    assert np.shape(document["joint"]["slat"]) == (64, 64)
+    with table.open(encoding="utf-8", newline="") as file:
+        rows = list(csv.DictReader(file))
+    (row,) = (
+        row for row in rows
+        if (row["by"], row["side"], row["property"], row["scale"])
+        == ("all", "slat", "density", "log10")
+    )  # fmt: skip
+    told = document["total"]["slat"]["properties"]["density"]["log10"]
+    assert float(row["50%"]) == told["quantiles"]["50%"] and float(row["mean"]) == told["mean"]
+    assert {row["name"] for row in rows if row["by"] == "category"} == {
+        "a", "b", "'=b", "(unknown)",
+    }  # fmt: skip
+    lines = run(store).stdout.splitlines()
+    assert lines[0] == "5 of 5 assets, weighted by voxel"
+    assert max(map(len, lines)) <= 80
+
+
+@pytest.mark.parametrize("kind", ["png", "svg", "pdf"])
+def test_a_picture_is_the_same_each_time_and_takes_any_name(
+    store: Path, tmp_path: Path, kind: str
+) -> None:
+    opened = open_store(store)
+    found = store_statistics(opened)
+    assert draw_statistics(opened, found, kind) == draw_statistics(opened, found, kind)
+    copy = Path(shutil.copytree(store, tmp_path / "s.zarr"))
+    group = zarr.open_group(copy, mode="r+")
+    group["asset/category"][:] = np.array(["$\\frac", "$$", "b", "x" * 60, "b"], dtype=object)
+    file = tmp_path / f"p.{kind}"
+    run(copy, "--picture", file)
+    start = {"png": b"\x89PNG", "svg": b"<?xml", "pdf": b"%PDF"}[kind]
+    assert file.read_bytes().startswith(start)
+
+
+def test_nothing_chosen_is_nothing_counted(store: Path, tmp_path: Path) -> None:
+    result = run(store, "--verdict", "failed", "--category", "b", "--picture", tmp_path / "p.png")
+    assert result.stdout.startswith("0 of 5 assets")
+    document = json.loads(run(store, "--verdict", "failed", "--category", "b", "--json").stdout)
+    assert document["total"]["slat"]["properties"]["density"]["si"]["mean"] is None
+    assert document["categories"] == []
+
+
+def test_wrong_use_is_refused(store: Path) -> None:
+    for option, value, told in (
+        ("--picture", "p.gif", "none of .png, .svg, .pdf"),
+        ("--category", "boat", "boat"),
+    ):
+        result = CliRunner().invoke(slatprep, ["stats", str(store), option, value])
+        assert result.exit_code == 2 and told in result.output
