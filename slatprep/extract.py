@@ -9,8 +9,9 @@ from __future__ import annotations
 import hashlib
 import io
 import json
-from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
+import time
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 from importlib import metadata
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
@@ -32,6 +33,9 @@ MODEL = "microsoft/TRELLIS-image-large"
 """The model of TRELLIS that turns images into structured latents."""
 
 FORMAT = "slatprep-extraction"
+
+STAGES = ("image", "sparse structure", "SLAT")
+"""What drawing latents is timed by: cutting out and DINO; occupied voxels; their latents."""
 
 _LATENTS = (
     "as TRELLIS's pipeline returns them: multiplied with the model's std and moved by its mean, "
@@ -95,10 +99,14 @@ class Extraction:
 
 @dataclass(frozen=True)
 class Extracted:
-    """What came of an extraction: its number of voxels, and whether it had been done before."""
+    """What came of an extraction: its number of voxels, and whether it had been done before.
+
+    `seconds` has what each stage took, by its name; it is empty where nothing was drawn.
+    """
 
     voxels: int
     kept: bool
+    seconds: Mapping[str, float] = field(default_factory=dict)
 
 
 def load_session(model: str = MODEL, revision: str | None = None, device: str = "cuda") -> Session:
@@ -274,7 +282,7 @@ def _extract(session: Session, extraction: Extraction, preprocess: bool) -> Extr
     record: dict[str, Any] = orjson.loads(text)
     if extraction.slat.exists():
         return _kept(extraction, record)
-    coords, feats = _run(session, image, extraction.seed, preprocess)
+    coords, feats, seconds = _run(session, image, extraction.seed, preprocess)
     check_coords(coords, extraction.image)
     if len(coords) == 0 or feats.shape != (len(coords), LATENT_CHANNELS):
         raise InputError(
@@ -291,25 +299,36 @@ def _extract(session: Session, extraction: Extraction, preprocess: bool) -> Extr
     record["slat"] = {"voxels": len(coords), "sha256": _sha256(extraction.slat)}
     with staged(extraction.record) as path:
         path.write_text(json.dumps(record, indent=1) + "\n", encoding="utf-8")
-    return Extracted(len(coords), kept=False)
+    return Extracted(len(coords), kept=False, seconds=seconds)
 
 
 def _run(
     session: Session, image: Image, seed: int, preprocess: bool
-) -> tuple[NDArray[np.int32], NDArray[np.float32]]:
+) -> tuple[NDArray[np.int32], NDArray[np.float32], dict[str, float]]:
     pipeline = session.pipeline
+    ends = [time.perf_counter()]
+
+    def end_stage() -> None:
+        if str(pipeline.device).startswith("cuda"):
+            session.torch.cuda.synchronize()  # what was asked for is computed later
+        ends.append(time.perf_counter())
+
     # The same calls in the same order as the pipeline's own `run`, which draws
     # the same numbers for a seed, but decodes latents instead of returning them.
     with session.torch.no_grad():
         if preprocess:
             image = pipeline.preprocess_image(image)
         cond = pipeline.get_cond([image])
+        end_stage()
         session.torch.manual_seed(seed)
         voxels = pipeline.sample_sparse_structure(cond, 1)
+        end_stage()
         slat = pipeline.sample_slat(cond, voxels)
+        end_stage()
     return (
         np.ascontiguousarray(slat.coords.detach().cpu().numpy(), dtype=np.int32),
         np.ascontiguousarray(slat.feats.detach().cpu().float().numpy(), dtype=np.float32),
+        dict(zip(STAGES, np.diff(ends).tolist(), strict=True)),
     )
 
 

@@ -67,6 +67,8 @@ class Torch(ModuleType):
 class Pipeline:
     """TRELLIS's interface; the object in the image is an L of `voxels` voxels."""
 
+    device = "cpu"
+
     def __init__(self, torch: Torch, voxels: int | None = None) -> None:
         self.torch, self.voxels, self.seen = torch, voxels, []
         self.sparse_structure_sampler_params = {"steps": 12, "cfg_strength": 7.5}

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -72,10 +72,11 @@ def predict(
     require_torch()
     from slatprep.learn import predict as work
 
-    image = _image(output, source, out, seed, device)
-    if gaussians is not None and image is None:
+    is_image = source.suffix.lower() in _IMAGES
+    if gaussians is not None and not is_image:
         raise ConfigError("--gaussians goes with an image; for a PLY there is, slatprep transfer")
     decoder = work.load_checkpoint(checkpoint, device)
+    image = _draw(output, source, out, seed, device) if is_image else None
     read = _Reader(output, image.latents if image else source, assets)
     predicted, voxels, decoding, writing = 0, 0, 0.0, 0.0
     with output.progress("predict") as progress:
@@ -91,10 +92,10 @@ def predict(
     counts = {"predicted": predicted, "voxels": voxels}
     seconds = {"read": read.seconds, "decode": decoding, "write": writing}
     if image:
-        seconds = {"draw latents": image.seconds} | seconds
+        seconds = {**image.seconds, **seconds}
     if image and gaussians is not None and predicted:
         begin = time.perf_counter()
-        _write_gaussians(image, out, gaussians)
+        _write_gaussians(output, image, out, gaussians)
         seconds["gaussians"] = time.perf_counter() - begin
     document = {
         "path": out,
@@ -111,7 +112,10 @@ def predict(
         output.table(
             "Time",
             ("stage", "seconds", "ms an asset"),
-            [(stage, spent, spent * each) for stage, spent in seconds.items()],
+            [
+                (stage, spent, spent * each)
+                for stage, spent in {**seconds, "in all": sum(seconds.values())}.items()
+            ],
         )
 
     output.made(document, show, complete=not read.problems)
@@ -119,30 +123,27 @@ def predict(
 
 @dataclass(frozen=True)
 class _Image:
-    """Latents drawn for an image: where they are, by what, and how long it took."""
+    """Latents drawn for an image: where they are, by what, and how long each stage took."""
 
     latents: Path
     session: Session
-    seconds: float
+    seconds: Mapping[str, float]
 
 
-def _image(output: Output, source: Place, out: Path, seed: int, device: str) -> _Image | None:
-    """Draw the latents of an image; None where the source is none."""
-    if source.suffix.lower() not in _IMAGES:
-        return None
+def _draw(output: Output, source: Place, out: Path, seed: int, device: str) -> _Image:
+    """Draw the latents of an image."""
     from slatprep import extract as work
 
     session = work.load_session(device=device)
-    begin = time.perf_counter()
     extractions = work.list_extractions([Path(str(source))], out / "latents", [seed], False)
     (result,) = work.extract(session, extractions)
     if isinstance(result, InputError):
         raise result
-    output.note(f"latents: {extractions[0].slat}")
-    return _Image(extractions[0].slat, session, time.perf_counter() - begin)
+    output.note(f"latents: {extractions[0].slat}{', drawn before' if result.kept else ''}")
+    return _Image(extractions[0].slat, session, result.seconds)
 
 
-def _write_gaussians(image: _Image, out: Path, path: Path) -> None:
+def _write_gaussians(output: Output, image: _Image, out: Path, path: Path) -> None:
     """Decode an image's latents to Gaussians, and give each the material of its voxel."""
     from slatprep.extract import decode_gaussians
     from slatprep.particles import transfer as work
@@ -152,8 +153,10 @@ def _write_gaussians(image: _Image, out: Path, path: Path) -> None:
     plain = out / "gaussians.ply"
     decode_gaussians(image.session, read_slat(image.latents, image.latents.parent), plain)
     field = work.predicted_field(out / f"{file_name(image.latents.stem)}.npz", None)
-    particles = work.read_particles(plain)
+    particles = work.read_particles(plain, "trellis")
     result = work.transfer(particles.in_slat(), field)
+    if result.far:
+        output.note(f"{result.far:,} of {len(result.rows):,} Gaussians have no voxel: background")
     work.write_transferred(path, particles, result, max_distance=2.0, in_slat=False)
 
 
