@@ -1,7 +1,7 @@
 # `make` alone lists what there is; every target sets up what it needs.
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help align test lint docs schema wheel sdist mutants lock clean
+.PHONY: help align test lint docs schema wheel sdist simulate mutants lock clean
 
 PYTHON ?= python3
 VENV   ?= .venv
@@ -31,6 +31,7 @@ help:
 	@echo "  make schema           the JSON Schemas of the records, from their classes"
 	@echo "  make wheel            a wheel, in dist, tried from another folder"
 	@echo "  make sdist            a source archive, in dist, that can run its tests"
+	@echo "  make simulate         the tests of the simulation, with its engine (0.5 GB, some minutes)"
 	@echo "  make mutants          change one operator or number at a time: do the tests notice?"
 	@echo "  make lock             resolve the versions in requirements/ anew"
 	@echo "  make clean            remove the environment, the demo data and caches; never your stores"
@@ -100,6 +101,11 @@ wheel: $(VENV)/.installed-dev
 
 sdist: $(VENV)/.installed-dev
 	sh tools/try-sdist.sh $(BIN)/python dist
+
+# Not a part of `make test`: the engine compiles its kernels for a minute or two on a new machine.
+simulate: $(VENV)/.installed-dev
+	$(BIN)/python -m pip install --quiet --editable '.[simulate]'
+	$(BIN)/python -m pytest tests/particles
 
 # Half an hour of one core; MUTANTS='--budget 300 judge sample' is a part of it.
 MUTANTS ?= --budget 1500 --seed 0

@@ -24,7 +24,7 @@ from slatprep.geometry.frames import voxel_centres
 from slatprep.geometry.voxels import boundary, filled, occupancy_of
 from slatprep.parameters import BuildParameters, PixieverseSource, SlatSource
 from slatprep.particles import transfer
-from slatprep.particles.simulate import ELASTIC, drop, rigid_deviation, strain
+from slatprep.particles.simulate import ELASTIC, rigid_deviation, simulate, strain
 from slatprep.pipeline.dataset import build_store
 from slatprep.records import BACKGROUND, MATERIAL_CLASSES, RESOLUTION
 from slatprep.store import Store, open_store
@@ -81,7 +81,7 @@ def run(options: argparse.Namespace) -> None:
         asset = store.asset(name)
     spacing = options.size / options.particles
     begin = time.perf_counter()
-    frames = drop(
+    frames = simulate(
         options.size * positions, material, properties, spacing, height=0.25 * options.size,
         seconds=options.seconds, rate=RATE, substeps=options.substeps,
     )  # fmt: skip
@@ -110,7 +110,7 @@ def run(options: argparse.Namespace) -> None:
 
 
 def require_elastic(store: Store, name: str) -> None:
-    """Refuse, before anything is computed, an object of what `drop` does not simulate."""
+    """Refuse, before anything is computed, an object of what flows: its strain says nothing."""
     other = sorted(set(store.asset(name).field.material.tolist()) - set(ELASTIC))
     if other:
         words = [[MATERIAL_CLASSES[number] for number in numbers] for numbers in (other, ELASTIC)]
@@ -163,10 +163,7 @@ def particles(
     store: Store, name: str, count: int, folder: Path
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Fill a SLAT with a lattice of particles and give them the store's materials."""
-    inside = filled(occupancy_of(store.asset(name).coords))
-    lattice = (np.argwhere(np.ones((count,) * 3)) + 0.5) / count - 0.5
-    voxels = np.floor((lattice + 0.5) * RESOLUTION).astype(int)
-    np.save(folder / "solid.npy", lattice[inside[tuple(voxels.T)]])
+    np.save(folder / "solid.npy", fill(store.asset(name).coords, count))
 
     # What `slatprep transfer solid.npy --store STORE --asset NAME --points grid --far drop` does.
     solid = transfer.read_particles(folder / "solid.npy")
@@ -178,6 +175,14 @@ def particles(
     columns = [np.column_stack([vertex[n] for n in names]) for names in
                (("x", "y", "z"), ("E", "density", "nu"))]  # fmt: skip
     return columns[0], np.asarray(vertex["material_id"]), columns[1]
+
+
+def fill(coords: np.ndarray, count: int) -> np.ndarray:
+    """Return a lattice of particles (N, 3) inside SLAT voxels, `count` along the unit cube."""
+    inside = filled(occupancy_of(coords))
+    lattice = (np.argwhere(np.ones((count,) * 3)) + 0.5) / count - 0.5
+    voxels = np.floor((lattice + 0.5) * RESOLUTION).astype(int)
+    return lattice[inside[tuple(voxels.T)]]
 
 
 if __name__ == "__main__":

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -131,23 +131,33 @@ def surface(asset: StoredAsset, number: int) -> o3d.geometry.TriangleMesh:
     return mesh.filter_smooth_taubin(60)
 
 
-def _camera() -> np.ndarray:
+def _camera(angle: float) -> np.ndarray:
     """Return the rays (height, width, 6) of a camera that looks down on the ground."""
     eye, target = np.array([1.5, -2.1, 1.0]), np.array([0.0, 0.0, 0.37])
     ahead = (target - eye) / np.linalg.norm(target - eye)
     right = np.cross(ahead, [0.0, 0.0, 1.0])
     right /= np.linalg.norm(right)
     up = np.cross(right, ahead)
-    step = 2 * np.tan(np.radians(25.0) / 2) / SIZE[0]
+    step = 2 * np.tan(np.radians(angle) / 2) / SIZE[0]
     rows = (SIZE[0] / 2 - 0.5 - np.arange(SIZE[0])) * step
     columns = (np.arange(SIZE[1]) + 0.5 - SIZE[1] / 2) * step
     ways = ahead + rows[:, None, None] * up + columns[None, :, None] * right
     return np.concatenate([np.broadcast_to(eye, ways.shape), ways], axis=-1)
 
 
+@dataclass(frozen=True)
+class Shape:
+    """What rays may hit: triangles, with normals and values (T, 3, ...) at their corners."""
+
+    mesh: o3d.geometry.TriangleMesh
+    normals: np.ndarray
+    values: np.ndarray
+    paint: Callable[[np.ndarray], np.ndarray]
+    gloss: float
+
+
 def _render(parts, meshes, lift, frames, strains, material, frame):
-    scene = o3d.t.geometry.RaycastingScene()
-    normals, values, first = [], [], [0]
+    shapes = []
     for part, mesh in zip(parts, meshes, strict=True):
         here = material == part.number
         known = np.flatnonzero(here)[np.isfinite(strains[frame, here])]
@@ -160,14 +170,26 @@ def _render(parts, meshes, lift, frames, strains, material, frame):
         moved.vertices = o3d.utility.Vector3dVector(rest + (weight[..., None] * shift).sum(axis=1))
         moved.compute_vertex_normals()
         triangles = np.asarray(moved.triangles)
-        normals.append(np.asarray(moved.vertex_normals)[triangles])
-        values.append((weight * strains[frame, known][near]).sum(axis=1)[triangles])
-        first.append(first[-1] + len(triangles))
-        scene.add_triangles(o3d.t.geometry.TriangleMesh.from_legacy(moved))
+        strained = (weight * strains[frame, known][near]).sum(axis=1)[triangles]
+        shapes.append(Shape(
+            moved, np.asarray(moved.vertex_normals)[triangles], strained[..., None],
+            lambda value: SCALE(value[:, 0] / MOST)[:, :3], 0.5 if part.shiny else 0.18,
+        ))  # fmt: skip
+    return trace(shapes)
+
+
+def trace(shapes: Sequence[Shape], angle: float = 25.0) -> np.ndarray:
+    """Return what is seen of shapes on a white, sunlit ground: (height / 2, width / 2, 3).
+
+    `angle` is the camera's, in degrees.
+    """
+    scene = o3d.t.geometry.RaycastingScene()
+    for shape in shapes:
+        scene.add_triangles(o3d.t.geometry.TriangleMesh.from_legacy(shape.mesh))
     ground = o3d.geometry.TriangleMesh.create_box(8.0, 8.0, 0.01).translate((-4, -4, -0.01))
     scene.add_triangles(o3d.t.geometry.TriangleMesh.from_legacy(ground))
 
-    rays = o3d.core.Tensor(_camera(), dtype=o3d.core.Dtype.Float32)
+    rays = o3d.core.Tensor(_camera(angle), dtype=o3d.core.Dtype.Float32)
     hit = scene.cast_rays(rays)
     geometry, triangle = hit["geometry_ids"].numpy(), hit["primitive_ids"].numpy()
     uv, far = hit["primitive_uvs"].numpy(), hit["t_hit"].numpy()
@@ -178,12 +200,12 @@ def _render(parts, meshes, lift, frames, strains, material, frame):
     colour = np.ones((*far.shape, 3))
     share = np.stack([1 - uv.sum(axis=-1), uv[..., 0], uv[..., 1]], axis=-1)
     gloss = np.zeros(far.shape)
-    for k, part in enumerate(parts):
+    for k, shape in enumerate(shapes):
         on = geometry == k
-        gloss[on] = 0.5 if part.shiny else 0.18
-        normal[on] = np.einsum("nk,nkc->nc", share[on], normals[k][triangle[on]])
-        value = (share[on] * values[k][triangle[on]]).sum(axis=-1)
-        colour[on] = SCALE(value / MOST)[:, :3]
+        gloss[on] = shape.gloss
+        normal[on] = np.einsum("nk,nkc->nc", share[on], shape.normals[triangle[on]])
+        value = np.einsum("nk,nkc->nc", share[on], shape.values[triangle[on]])
+        colour[on] = shape.paint(value)
     normal /= np.linalg.norm(normal, axis=-1, keepdims=True) + 1e-12
 
     sun = np.array([0.35, -0.5, 0.8]) / np.linalg.norm([0.35, -0.5, 0.8])
@@ -200,7 +222,7 @@ def _render(parts, meshes, lift, frames, strains, material, frame):
     shine *= gloss
     image = np.clip(colour * light[..., None] + shine[..., None], 0, 1)
     # The ground is white but for the shadow on it.
-    on_ground = geometry == len(parts)
+    on_ground = geometry == len(shapes)
     image[on_ground] = np.where(shadow[on_ground], 0.83, 1.0)[:, None]
     image[~seen] = 1.0
     return image.reshape(SIZE[0] // 2, 2, SIZE[1] // 2, 2, 3).mean(axis=(1, 3))

@@ -1,4 +1,4 @@
-"""Drop particles on the ground with an existing engine, and measure what each part suffers.
+"""Let particles fall, or stand in the wind, with an existing engine, and measure what each suffers.
 
 The engine is Newton's implicit material point method (Linux Foundation,
 https://github.com/newton-physics/newton), which runs on a CPU. Being
@@ -8,7 +8,7 @@ implicit, it takes jelly and steel in one object with the same time step.
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -17,38 +17,93 @@ from slatprep.errors import SlatprepError
 from slatprep.records import MATERIAL_CLASSES
 
 ELASTIC = (0, 1, 6)
-"""Classes that are simulated, all as elastic solids: jelly, metal, stationary."""
+"""Classes that are simulated as elastic solids: jelly, metal, stationary."""
 
 _NEVER = 1.0e15
 """Pascal; a yield stress that nothing reaches."""
 
 
-def drop(
+class Yielding(NamedTuple):
+    """Where a material stops being elastic, which neither PixieVerse nor a store says.
+
+    Attributes
+    ----------
+    friction : float
+        Shear stress at yield over pressure; 0.68 is an angle of repose of 34 degrees.
+    pressure : float
+        At which it is crushed [Pa].
+    tension : float
+        Share of `pressure` that it bears in tension.
+    stress : float
+        Shear stress at yield without pressure [Pa].
+    hardening : float
+        How much compaction strengthens and loosening weakens it.
+    dilatancy : float
+        Change of volume that goes with shear, 0 to 1.
+    viscosity : float
+        Where it flows [Pa s].
+    """
+
+    friction: float = 0.0
+    pressure: float = _NEVER
+    tension: float = 1.0
+    stress: float = 0.0
+    hardening: float = 0.0
+    dilatancy: float = 0.0
+    viscosity: float = 0.0
+
+
+YIELDING = {
+    **dict.fromkeys(ELASTIC, Yielding(stress=_NEVER)),
+    2: Yielding(friction=0.68, tension=0.0),
+    3: Yielding(stress=300.0, viscosity=100.0),
+    4: Yielding(viscosity=1e-3),
+    5: Yielding(friction=0.5, pressure=3e3, tension=0.2, hardening=10.0, dilatancy=1.0),
+}
+"""What is assumed of each class: dry sand, mud for visplas, water, fresh snow."""
+
+AIR, DRAG = 1.2, 1.0
+"""Density of air [kg/m^3], and the drag coefficient of what stands in it."""
+
+
+def simulate(
     positions: ArrayLike,
     material: ArrayLike,
     properties: ArrayLike,
     spacing: float,
     *,
     height: float = 0.25,
+    gravity: float = 9.81,
+    wind: ArrayLike = (0.0, 0.0, 0.0),
+    fixed: ArrayLike | None = None,
     seconds: float = 0.5,
     rate: int = 60,
     substeps: int = 2,
     progress: Callable[[int, int], None] | None = None,
 ) -> NDArray[np.float64]:
-    """Let an elastic object fall on the ground from rest.
+    """Let an object fall on the ground from rest, in still air or in the wind.
 
     Parameters
     ----------
     positions : array_like, shape (N, 3)
         Particles on a cubic lattice that fills the object [m], z up.
     material : array_like of int, shape (N,)
-        Class of each, one of `ELASTIC`.
+        Class of each, one of `YIELDING`.
     properties : array_like, shape (N, 3)
         Young's modulus [Pa], density [kg/m^3] and Poisson's ratio of each.
     spacing : float
         Of the lattice [m]; the engine's grid is twice as wide.
     height : float
         Free fall of the lowest particle [m].
+    gravity : float
+        Downwards [m/s^2]. The shape at rest is without load: what stands as
+        it was seen bears its weight already, and sags a second time with it.
+    wind : array_like, shape (3,)
+        Velocity of the air [m/s]. Where a face of a particle's cell is free and
+        meets the wind, it presses with ``AIR * DRAG / 2`` times the square of
+        the velocity relative to the particle; nothing gives shelter.
+    fixed : array_like of bool, shape (N,), optional
+        Particles that never move, as the roots of a plant.
     seconds : float
         Length of the motion.
     rate : int
@@ -73,22 +128,23 @@ def drop(
     newton, warp = _engine()
     rest[:, 2] += height + spacing / 2 - rest[:, 2].min()
     modulus, density, ratio = stuff.T
-    builder = newton.ModelBuilder()
+    held = np.zeros(len(rest), dtype=bool) if fixed is None else np.asarray(fixed, dtype=bool)
+    mass = density * spacing**3
+    builder = newton.ModelBuilder(gravity=(0.0, 0.0, -gravity))
     newton.solvers.SolverImplicitMPM.register_custom_attributes(builder)
     builder.add_particles(
         pos=[warp.vec3(*point) for point in rest],
         vel=[warp.vec3(0.0)] * len(rest),
-        mass=(density * spacing**3).tolist(),
+        mass=np.where(held, 0.0, mass).tolist(),  # which the engine takes for infinite
         radius=[spacing / 2] * len(rest),
     )
     builder.add_ground_plane()
     model = builder.finalize(device="cpu")
     model.mpm.young_modulus.assign(modulus.astype(np.float32))
     model.mpm.poisson_ratio.assign(ratio.astype(np.float32))
-    # Elastic, and so without an end to what it bears, in compression, tension and shear.
-    for limit in (model.mpm.yield_pressure, model.mpm.yield_stress):
-        limit.fill_(_NEVER)
-    model.mpm.tensile_yield_ratio.fill_(1.0)
+    limits = np.array([YIELDING[number] for number in np.asarray(material).tolist()], np.float32)
+    for values, column in zip(_limits(model.mpm), limits.T, strict=True):
+        values.assign(column)
     solver = newton.solvers.SolverImplicitMPM(
         model,
         config=newton.solvers.SolverImplicitMPM.Config(
@@ -100,9 +156,15 @@ def drop(
         ),
     )
     now, after = model.state(), model.state()
+    air = np.asarray(wind, dtype=np.float64)
+    area = windward(rest, air, spacing)
     frames, count = [rest], round(seconds * rate)
     for frame in range(count):
         for _ in range(substeps):
+            if area.any():
+                past = air - now.particle_qd.numpy()
+                speed = np.linalg.norm(past, axis=1)
+                now.particle_f.assign((AIR * DRAG / 2 * area * speed)[:, None] * past)
             solver.step(now, after, None, None, 1.0 / (rate * substeps))
             solver.project_outside(after, after, 1.0 / (rate * substeps))
             now, after = after, now
@@ -110,6 +172,51 @@ def drop(
         if progress:
             progress(frame + 1, count)
     return np.stack(frames)
+
+
+def _limits(mpm: Any) -> tuple[Any, ...]:
+    """Return the engine's arrays for the fields of `Yielding`."""
+    return (
+        mpm.friction,
+        mpm.yield_pressure,
+        mpm.tensile_yield_ratio,
+        mpm.yield_stress,
+        mpm.hardening,
+        mpm.dilatancy,
+        mpm.viscosity,
+    )
+
+
+def windward(positions: ArrayLike, wind: ArrayLike, spacing: float) -> NDArray[np.float64]:
+    """Return the area that each particle's free faces turn to the wind.
+
+    Parameters
+    ----------
+    positions : array_like, shape (N, 3)
+        Particles on a cubic lattice.
+    wind : array_like, shape (3,)
+        Where it blows to; its strength does not matter.
+    spacing : float
+        Of the lattice.
+
+    Returns
+    -------
+    ndarray of float64, shape (N,)
+        Across the wind, in the square of the unit of `spacing`; 0 where
+        other particles lie upwind of all of a particle's faces, or without wind.
+    """
+    rest, way = np.asarray(positions, dtype=np.float64), np.asarray(wind, dtype=np.float64)
+    area = np.zeros(len(rest))
+    if not way.any():
+        return area
+    cells = np.rint((rest - rest.min(axis=0)) / spacing).astype(np.int64) + 1
+    taken = np.zeros(cells.max(axis=0) + 2, dtype=bool)
+    taken[tuple(cells.T)] = True
+    for axis, part in enumerate(way / np.linalg.norm(way)):
+        upwind = cells.copy()
+        upwind[:, axis] -= int(np.sign(part))
+        area += abs(part) * ~taken[tuple(upwind.T)]
+    return area * spacing**2
 
 
 def strain(
@@ -182,12 +289,12 @@ def _check(
 ) -> None:
     if len(positions) == 0:
         raise SlatprepError("there are no particles to simulate")
-    others = sorted(set(material.tolist()) - set(ELASTIC))
+    others = sorted(set(material.tolist()) - set(YIELDING))
     if others:
         name = dict(enumerate(MATERIAL_CLASSES)).get(others[0], "unknown")
         raise SlatprepError(
             f"material {others[0]} ({name}) is not simulated; expected "
-            f"{', '.join(f'{index} ({MATERIAL_CLASSES[index]})' for index in ELASTIC)}"
+            f"{', '.join(f'{index} ({MATERIAL_CLASSES[index]})' for index in sorted(YIELDING))}"
         )
     modulus, density, ratio = properties.T
     wrong = ~((modulus > 0) & (density > 0) & (ratio > -1) & (ratio < 0.5))

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from slatprep.errors import SlatprepError
-from slatprep.particles.simulate import drop, rigid_deviation, strain
+from slatprep.particles.simulate import AIR, rigid_deviation, simulate, strain, windward
 
 SPACING = 0.1
 CUBE = np.argwhere(np.ones((4, 4, 4))) * SPACING
@@ -63,7 +63,6 @@ def test_lone_particles_have_no_strain() -> None:
 @pytest.mark.parametrize(
     ("material", "change", "said"),
     [
-        (4, None, r"material 4 \(fluid\) is not simulated"),
         (7, None, r"material 7 \(background\) is not simulated"),
         (0, (3, 1, 0.0), "particle 3 has E = 100000 Pa, density = 0"),
         (0, (5, 2, 0.5), "nu = 0.5; expected"),
@@ -77,24 +76,80 @@ def test_particles_that_cannot_be_simulated_are_named(
     if change:
         stuff[change[0], change[1]] = change[2]
     with pytest.raises(SlatprepError, match=said):
-        drop(CUBE, ONE_PART + material, stuff, SPACING)
+        simulate(CUBE, ONE_PART + material, stuff, SPACING)
 
 
 def test_without_newton_it_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "newton", None)
     with pytest.raises(SlatprepError, match=r"pip install 'slatprep\[simulate\]'"):
-        drop(CUBE, ONE_PART, STUFF, SPACING)
+        simulate(CUBE, ONE_PART, STUFF, SPACING)
 
 
-# Newton with warp-lang is 0.5 GB, and compiling its kernels for a CPU takes a minute of it.
-@pytest.mark.skipif(
-    importlib.util.find_spec("newton") is None, reason="needs the extra `simulate`, 0.5 GB"
+@given(st.integers(0, 2**32 - 1))
+def test_the_wind_meets_the_shadow_of_what_is_convex(seed: int) -> None:
+    """Of a box in any wind, the free faces are together as large as its shadow."""
+    rng = np.random.default_rng(seed)
+    size, way = rng.integers(1, 5, 3), rng.normal(size=3)
+    box = (np.argwhere(np.ones(size)) + rng.normal(size=3)) * SPACING
+    across = np.abs(way) / np.linalg.norm(way)
+    shadow = across @ [size[1] * size[2], size[0] * size[2], size[0] * size[1]] * SPACING**2
+    np.testing.assert_allclose(windward(box, way, SPACING).sum(), shadow)
+    assert not windward(box, np.zeros(3), SPACING).any()
+
+
+# `make simulate` runs these with the real engine, as a job of continuous integration does. They
+# are not in `make test`: Newton with warp-lang is 0.5 GB, and its kernels compile for a minute or
+# two of CPU time before the first step, on every new machine.
+needs_newton = pytest.mark.skipif(
+    importlib.util.find_spec("newton") is None,
+    reason="needs the extra `simulate`: 0.5 GB, and minutes to compile; see make simulate",
 )
+
+
+@needs_newton
+def test_water_runs_sand_slumps_snow_packs_and_jelly_stands() -> None:
+    column = np.argwhere(np.ones((4, 4, 8))) * SPACING
+    kinds = {4: (2e5, 1e3, 0.45), 2: (1e7, 1.6e3, 0.3), 5: (2e5, 3e2, 0.25), 0: (2e5, 1e3, 0.4)}
+    positions = np.concatenate([column + np.array([3.0 * k, 0, 0]) for k in range(len(kinds))])
+    material = np.repeat(list(kinds), len(column))
+    stuff = np.repeat(list(kinds.values()), len(column), axis=0)
+    frames = simulate(positions, material, stuff, SPACING, height=0.1, seconds=0.8, substeps=1)
+    assert (frames[..., 2] > -SPACING / 2).all()  # none in the ground
+    water, sand, snow, jelly = (frames[-1][material == number] for number in kinds)
+    heights = [np.percentile(part[:, 2], 90) for part in (water, sand, snow, jelly)]
+    assert heights == sorted(heights)
+    assert heights[0] < 2.5 * SPACING and heights[3] > 6 * SPACING
+    assert np.ptp(water[:, 0]) > np.ptp(sand[:, 0]) > 1.5 * np.ptp(jelly[:, 0])
+
+
+@needs_newton
+def test_wind_pushes_by_the_drag_equation_and_what_is_held_stays() -> None:
+    """m dv/dt = 1/2 rho A (U - v)^2 has a closed form; jelly that is rooted bends downwind."""
+    wind, density, seconds = 10.0, 20.0, 0.25
+    pole = np.argwhere(np.ones((2, 2, 8))) * SPACING + [3.0, 0.0, 0.0]
+    positions = np.concatenate([CUBE, pole])
+    stuff = np.repeat([[1e5, density, 0.3], [3e4, 1e3, 0.3]], [len(CUBE), len(pole)], axis=0)
+    free = np.arange(len(positions)) < len(CUBE)
+    foot = ~free & (positions[:, 2] < 1.5 * SPACING)
+    frames = simulate(
+        positions, np.zeros(len(positions), dtype=int), stuff, SPACING, height=0.5,
+        wind=(wind, 0, 0), fixed=foot, seconds=seconds, substeps=1,
+    )  # fmt: skip
+    side = 4 * SPACING
+    rate = AIR / 2 * side**2 * wind / (density * side**3)  # 1/s
+    expected = wind * seconds - wind / rate * np.log(1 + rate * seconds)
+    moved = (frames[-1] - frames[0])[:, 0]
+    np.testing.assert_allclose(moved[free].mean(), expected, rtol=0.1)
+    assert abs(moved[foot]).max() < 1e-6  # the engine computes in single precision
+    assert moved[len(CUBE) :].max() > 0.1 * SPACING and moved[len(CUBE) :].min() > -1e-3
+
+
+@needs_newton
 def test_steel_on_jelly_falls_as_galileo_says_and_the_jelly_gives_way() -> None:
     tower = np.argwhere(np.ones((6, 6, 9))) * SPACING
     top = tower[:, 2] > 5.5 * SPACING
     stuff = np.where(top[:, None], [6e10, 7e3, 0.3], [6e4, 1e3, 0.4])
-    frames = drop(tower, top.astype(int), stuff, SPACING, height=0.2, seconds=0.35)
+    frames = simulate(tower, top.astype(int), stuff, SPACING, height=0.2, seconds=0.35)
     for frame in (6, 10):  # still falling: g t^2 / 2
         fallen = (frames[0] - frames[frame])[:, 2]
         np.testing.assert_allclose(fallen, 9.81 / 2 * (frame / 60) ** 2, rtol=0.15)
