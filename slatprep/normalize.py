@@ -181,6 +181,13 @@ def change_ranges(values: ArrayLike, old: Normalization, new: Normalization) -> 
     return changed
 
 
+def normalize_mapped(mapped: ArrayLike, normalization: Normalization) -> NDArray[np.float64]:
+    """Normalise mapped properties (N, 3); nothing is clipped."""
+    lo, hi = np.array([[one.lo, one.hi] for one in normalization.ranges]).T
+    normalized: NDArray[np.float64] = 2.0 * (np.asarray(mapped) - lo) / (hi - lo) - 1.0
+    return normalized
+
+
 def normalize_change(change: ArrayLike, normalization: Normalization) -> NDArray[np.float64]:
     """Scale differences of mapped properties to differences of normalised ones."""
     spans = np.array([one.hi - one.lo for one in normalization.ranges])

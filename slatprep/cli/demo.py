@@ -22,6 +22,7 @@ from slatprep.cli.output import Output
 @option("--grid-form", ChoiceOf("slatprep.demo.write:GridForm"), "raw")
 @option("--slat-form", ChoiceOf("slatprep.demo.write:SlatForm"), "npz")
 @option("--slat-names", ChoiceOf("slatprep.demo.write:SlatNames"), "id")
+@option("--results", is_flag=True)
 @jobs_option
 def make_demo(output: Output, directory: Path, levels: tuple[int, ...], **recipe: Any) -> None:
     """Make procedural assets with known truth in DIRECTORY.
@@ -43,6 +44,8 @@ def make_demo(output: Output, directory: Path, levels: tuple[int, ...], **recipe
     --grid-form: Raw grids, or predictions of 11 or 4 channels.
     --slat-form: Files of (N,3) or (N,4) coordinates, HDF5, or one HDF5 for all.
     --slat-names: Name SLATs by object, or by sha256 with a metadata.csv.
+    --results: Also write results/: grids as a method that errs might predict them, 12 MB each,
+        for `slatprep evaluate --grids`.
 
     Example
     -------

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import click
 
@@ -22,28 +23,33 @@ from slatprep.cli.options import (
 from slatprep.cli.output import Output, write_csv
 
 if TYPE_CHECKING:
+    from slatprep.learn.compare import Comparison
     from slatprep.learn.metrics import Evaluation, Measure
     from slatprep.learn.published import PublishedScore
     from slatprep.records import Place
 
 
 @command()
-@click.argument("predictions", type=click.Path(path_type=Path, exists=True))
+@click.argument("predictions", required=False, type=click.Path(path_type=Path, exists=True))
 @option("--store", EXISTING_FOLDER, required=True, metavar="STORE.zarr")
+@option("--grids", multiple=True, metavar="[NAME=]DIR")
 @option("--split", ChoiceOf("slatprep.learn.splits:SPLITS", "all"), "test")
 @split_options
-@option("--spread", ChoiceOf("slatprep.learn.metrics:Spread"), "se")
+@option("--spread", ChoiceOf("slatprep.learn.metrics:SPREADS"), "se")
 @option("--csv", NEW_FILE, name="csv_file")
+@option("--picture", NEW_FILE)
 @option("--beside", metavar="pixie|slat-phys|FILE.csv", multiple=True)
 def evaluate(
     output: Output,
-    predictions: Path,
+    predictions: Path | None,
     store: Place,
+    grids: tuple[str, ...],
     split: Any,
     split_by: str | None,
     shares: str | None,
     spread: Any,
     csv_file: Path | None,
+    picture: Path | None,
     beside: tuple[str, ...],
 ) -> None:
     """Measure PREDICTIONS by Pixie's protocol.
@@ -59,9 +65,13 @@ def evaluate(
     Options
     -------
     --store: Has the truth.
+    --grids: Grids that Pixie, or another method, predicted: DIR/ID/sample_0_pred.npy, of 11 or 4
+        channels; may be repeated. They are measured on their own voxels and looked up at the
+        SLAT's, on the same objects as PREDICTIONS, which may be left out.
     --split: Objects to measure on.
-    --spread: Standard error or standard deviation over objects.
+    --spread: Standard error or standard deviation over objects, or what Pixie prints.
     --csv: Also write the table to this file.
+    --picture: --grids: also draw the table, as a PNG.
     --beside: Also print the published table of Pixie, which has NeRF2Physics too, those of
         SLAT-Phys, or one of your own: a name, then columns named as here; may be repeated.
 
@@ -71,72 +81,133 @@ def evaluate(
     slatprep evaluate predictions.h5 --store demo.zarr --split all --spread sd --csv scores.csv
     slatprep evaluate predictions --store pixieverse.zarr --split-by test_set.json
     slatprep evaluate runs/large/predictions --store pixieverse.zarr --beside pixie
+    slatprep evaluate runs/large/predictions --store demo.zarr --grids Pixie=results --picture m.png
     """
-    from slatprep.learn.metrics import evaluate_store
+    from slatprep.learn.metrics import SPREADS, evaluate_store
     from slatprep.learn.predictions import RUN_FILE, selection_of_run
     from slatprep.learn.published import TABLES, read_scores
     from slatprep.learn.splits import HASH, assign_store
     from slatprep.store import open_store
 
+    if predictions is None and not grids:
+        raise click.UsageError("nothing to measure; give PREDICTIONS, --grids, or both")
+    if picture is not None and not grids:
+        raise click.UsageError("--picture draws methods side by side; give --grids as well")
+    folders = _folders(grids)
     others = {
         name: TABLES[name][1] if name in TABLES else read_scores(Path(name)) for name in beside
     }
     rule, how = split_rule(split_by, shares), f"by {split_by or HASH}"
-    selection = None if split_by or shares else selection_of_run(predictions)
-    if selection is not None:
+    selection = None
+    if predictions is not None and not split_by and not shares:
+        selection = selection_of_run(predictions)
+    if predictions is not None and selection is not None:
         rule |= {name: selection.pop(name) for name in ("by", "shares") if name in selection}
         how = f"as {predictions.absolute().parent / RUN_FILE} says"
     elif not split_by and not shares:
         how += ", as no run lies beside the predictions (others: --split-by, --split all)"
     assignment = assign_store(open_store(store), **rule)
     note_split(output, assignment, f"{split}, {how}")
-    result = evaluate_store(
-        predictions,
-        store,
-        None if split == "all" else split,
-        spread=spread,
-        splits=assignment.splits,
-        **(selection or {}),
-    )
-    rows = _rows(result)
-    names = (name for mean in result.overall.means for name in (mean, f"{mean} {spread}"))
-    header = ("category", "objects", *names)
+    chosen: dict[str, Any] = {"splits": assignment.splits, "spread": spread, **(selection or {})}
+    part = None if split == "all" else split
+    result: Evaluation | Comparison
+    if grids:
+        from slatprep.learn.compare import compare_methods
+
+        result = compare_methods(predictions, folders, store, part, **chosen)
+        measures = ours = result.methods
+        what, problems = "method", result.problems
+        _note_methods(output, result)
+    else:
+        result = evaluate_store(cast("Path", predictions), store, part, **chosen)
+        measures = {name or "(none)": m for name, m in result.categories.items()}
+        measures |= {"all": result.overall}
+        ours, what = {"these predictions": result.overall}, "category"
+        problems = [f"{predictions}: no prediction of {name}" for name in result.missing]
+        if result.converted:
+            output.note(
+                f"note:    {result.converted} predictions were normalised by other ranges, and "
+                "were brought to the store's"
+            )
     if csv_file is not None:
-        write_csv(csv_file, header, rows)
+        _write_csv(csv_file, what, measures, spread)
+    if picture is not None:
+        from slatprep.learn.compare import draw_comparison
+
+        draw_comparison(measures, SPREADS[spread], picture)
+        output.note(f"picture: {picture}")
 
     def show() -> None:
-        what = "standard error" if spread == "se" else "standard deviation"
         output.table(
-            f"Mean squared error in normalised space, class accuracy (± {what} over n objects)",
-            ("category", "n", *result.overall.means),
-            _in_short(result),
+            "Mean squared error in normalised space, class accuracy "
+            f"(± {SPREADS[spread]} over n objects)",
+            (what, "n", *next(iter(measures.values())).means),
+            _in_short(measures),
         )
         for name, scores in others.items():
-            _show_beside(output, result, scores, name)
+            _show_beside(output, ours, scores, name)
 
-    if result.converted:
-        output.note(
-            f"note:    {result.converted} predictions were normalised by other ranges, and were "
-            "brought to the store's"
-        )
+    for problem in problems:
+        output.problem(problem)
     document = dataclasses.asdict(result)
-    for asset_id in result.missing:
-        output.problem(f"{predictions}: no prediction of {asset_id}")
     if beside:
         document["beside"] = [score for scores in others.values() for score in scores]
-    output.result(document, show, complete=not result.missing)
+    output.result(document, show, complete=not problems)
+
+
+def _folders(grids: tuple[str, ...]) -> dict[str, Path]:
+    """Return the folders of ``--grids`` by the method's name, by default the folder's own."""
+    folders: dict[str, Path] = {}
+    for text in grids:
+        name, _, rest = text.rpartition("=")
+        folder = Path(text) if Path(text).is_dir() else Path(rest)
+        if not rest or not folder.is_dir():
+            raise click.BadParameter(f"{text!r} is no folder", param_hint="--grids")
+        name = folder.resolve().name if folder == Path(text) else name
+        if name in folders:
+            raise click.BadParameter(
+                f"two folders are called {name!r}; name them apart: NAME=DIR", param_hint="--grids"
+            )
+        folders[name] = folder
+    return folders
+
+
+def _note_methods(output: Output, result: Comparison) -> None:
+    if result.problems:
+        output.note(
+            f"note:    {len(result.problems)} assets have not a prediction of every method, and "
+            "are left out of all"
+        )
+    if result.partly_annotated:
+        output.note(
+            f"note:    {result.partly_annotated} objects have occupied voxels without an "
+            "annotation, which are not scored; Pixie's loader drops such objects"
+        )
+
+
+def _write_csv(file: Path, what: str, measures: Mapping[str, Measure], spread: str) -> None:
+    metrics = next(iter(measures.values())).means
+    names = (name for mean in metrics for name in (mean, f"{mean} {spread}"))
+    rows = [
+        (name, m.objects, *(s[key] for key in metrics for s in (m.means, m.spreads)))
+        for name, m in measures.items()
+    ]
+    write_csv(file, (what, "objects", *names), rows)
 
 
 def _show_beside(
-    output: Output, result: Evaluation, others: tuple[PublishedScore, ...], beside: str
+    output: Output,
+    ours: Mapping[str, Measure],
+    others: tuple[PublishedScore, ...],
+    beside: str,
 ) -> None:
-    names = tuple(result.overall.means)
-    rows: list[tuple[str | float | None, ...]] = [
-        ("these predictions", *result.overall.means.values())
-    ]
-    rows += [(score.method, *(score.means.get(name) for name in names)) for score in others]
     from slatprep.learn.published import TABLES
 
+    names = tuple(next(iter(ours.values())).means)
+    rows: list[tuple[str | float | None, ...]] = [
+        (name, *measure.means.values()) for name, measure in ours.items()
+    ]
+    rows += [(score.method, *(score.means.get(name) for name in names)) for score in others]
     if beside in TABLES:
         title = f"Beside {TABLES[beside][0]}"
         output.note(
@@ -146,23 +217,22 @@ def _show_beside(
     else:
         title = f"Beside {beside}"
     output.table(title, ("method", *names), rows)
+    spreads = [
+        (score.method, *(score.spreads.get(name) for name in names), score.spread)
+        for score in others
+        if score.spreads
+    ]
+    if spreads:
+        output.table("Their spreads, as printed", ("method", *names, "what they are"), spreads)
 
 
-def _in_short(result: Evaluation) -> list[tuple[str | int, ...]]:
+def _in_short(measures: Mapping[str, Measure]) -> list[tuple[str | int, ...]]:
     """Return the rows for people: each mean with its spread, where there is one."""
     rows: list[tuple[str | int, ...]] = []
-    for name, m in {**result.categories, "all": result.overall}.items():
+    for name, m in measures.items():
         cells = (
             f"{mean:.3f}" if math.isnan(m.spreads[key]) else f"{mean:.3f}±{m.spreads[key]:.3f}"
             for key, mean in m.means.items()
         )
-        rows.append((name or "(none)", m.objects, *cells))
+        rows.append((name, m.objects, *cells))
     return rows
-
-
-def _rows(result: Evaluation) -> list[tuple[str | int | float, ...]]:
-    measures: dict[str, Measure] = {**result.categories, "all": result.overall}
-    return [
-        (name or "(none)", m.objects, *(s[key] for key in m.means for s in (m.means, m.spreads)))
-        for name, m in measures.items()
-    ]

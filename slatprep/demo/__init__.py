@@ -26,6 +26,7 @@ from slatprep.demo.write import (
     slat_name,
     write_categories,
     write_pixieverse,
+    write_results,
     write_slat,
     write_trellis_metadata,
     write_truth,
@@ -61,6 +62,7 @@ class _Recipe:
     grid_form: GridForm
     slat_form: SlatForm
     slat_names: SlatNames
+    results: bool
 
 
 def make_demo(
@@ -75,6 +77,7 @@ def make_demo(
     grid_form: GridForm = "raw",
     slat_form: SlatForm = "npz",
     slat_names: SlatNames = "id",
+    results: bool = False,
     jobs: int = 1,
     progress: Callable[[int, int], None] | None = None,
 ) -> DemoSummary:
@@ -111,6 +114,8 @@ def make_demo(
         a group an asset.
     slat_names : {"id", "sha256"}
         Name the SLATs by object id, or by sha256 with TRELLIS's ``metadata.csv``.
+    results : bool
+        Also write ``results/``: what a method that errs might predict, 12 MB an asset.
     jobs : int
         Processes.
     progress : callable, optional
@@ -128,7 +133,7 @@ def make_demo(
     """
     recipe = _Recipe(
         assets, seed, tuple(levels), views, latents, habitual_share,
-        grid_form, slat_form, slat_names,
+        grid_form, slat_form, slat_names, results,
     )  # fmt: skip
     _check(recipe)
     root = Path(directory)
@@ -205,6 +210,8 @@ def _make_one(root: Path, recipe: _Recipe, index: int) -> tuple[int, dict[str, A
         habitual_share=recipe.habitual_share,
     )
     write_pixieverse(root / "pixieverse", asset, recipe.grid_form)
+    if recipe.results:
+        write_results(root / "results", asset)
     write_slat(root / "slat", asset, recipe.slat_form, recipe.slat_names)
     write_truth(root / "truth", asset)
     return index, {

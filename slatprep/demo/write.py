@@ -74,6 +74,24 @@ def _prediction(grid: NDArray[np.float32], form: GridForm) -> NDArray[np.float32
     return np.ascontiguousarray(np.moveaxis(channels, -1, 0), dtype=np.float32)
 
 
+def write_results(root: Path, asset: DemoAsset) -> None:
+    """Write what a method that errs might predict of an asset, as Pixie lays its results out.
+
+    The field is off by up to a voxel along each axis, so that voxels at the rim are
+    predicted to be background, and its properties by a share of their range: as a whole,
+    and voxel by voxel.
+    """
+    rng = np.random.default_rng(int.from_bytes(asset.object_id.encode(), "big"))
+    shifted = np.roll(asset.grid, rng.integers(-1, 2, size=3), axis=(0, 1, 2))
+    prediction = _prediction(shifted, "prediction")
+    prediction[:3] += rng.normal(0.0, 0.1, size=(3, 1, 1, 1))
+    prediction[:3] += rng.normal(0.0, 0.1, size=prediction[:3].shape)
+    folder = root / asset.object_id
+    folder.mkdir(parents=True, exist_ok=True)
+    np.save(folder / "sample_0_pred.npy", prediction)
+    np.save(folder / "sample_0_mask.npy", asset.occupancy.astype(np.float32))
+
+
 def write_slat(root: Path, asset: DemoAsset, form: SlatForm, names: SlatNames) -> None:
     """Write the SLATs of an asset below `root`: a file each, or a group each of ``latents.h5``."""
     name = slat_name(asset, names)

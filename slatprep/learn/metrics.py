@@ -22,7 +22,19 @@ METRICS = ("log10 E", "log10 density", "nu", "mean", "accuracy")
 The names are the columns of tables and CSV files.
 """
 
-Spread = Literal["se", "sd"]
+Spread = Literal["se", "sd", "pixie", "pixie-std"]
+
+SPREADS: dict[Spread, str] = {
+    "se": "standard error",
+    "sd": "standard deviation",
+    "pixie": "standard error, of accuracy 1.645 standard errors, as Pixie prints",
+    "pixie-std": "standard deviation by n, of accuracy 1.645 of them, as Pixie's std prints",
+}
+"""What `Measure.spreads` may be, over objects: the first two of a sample (n - 1), the others
+as vlongle/pixie's ``metrics.py`` prints them."""
+
+_PIXIE_90 = 1.645
+"""Standard errors of Pixie's interval of 90 % for accuracy."""
 
 
 @dataclass(frozen=True)
@@ -34,8 +46,8 @@ class Measure:
     objects : int
         How many.
     means, spreads : dict of str to float
-        For each of `METRICS` the mean over objects, and its standard error or
-        the standard deviation (of a sample); NaN where there is none.
+        For each of `METRICS` the mean over objects, and its spread, see
+        `SPREADS`; NaN where there is none.
     """
 
     objects: int
@@ -49,8 +61,8 @@ class Evaluation:
 
     Attributes
     ----------
-    spread : {"se", "sd"}
-        What `Measure.spreads` are.
+    spread : str
+        What `Measure.spreads` are, see `SPREADS`.
     overall : Measure
         Over all objects.
     categories : dict of str to Measure
@@ -107,13 +119,17 @@ def measure(scores: NDArray[np.float64], spread: Spread) -> Measure:
     ----------
     scores : ndarray of float64, shape (objects, 5)
         `METRICS` of each; one object at least.
-    spread : {"se", "sd"}
-        Standard error of the mean, or standard deviation.
+    spread : str
+        See `SPREADS`.
     """
     count = len(scores)
     deviation = np.full(len(METRICS), np.nan)
     if count > 1:
-        deviation = scores.std(axis=0, ddof=1) / (np.sqrt(count) if spread == "se" else 1.0)
+        deviation = scores.std(axis=0, ddof=0 if spread == "pixie-std" else 1)
+        if spread in ("se", "pixie"):
+            deviation /= np.sqrt(count)
+        if spread in ("pixie", "pixie-std"):
+            deviation[METRICS.index("accuracy")] *= _PIXIE_90
     means, spreads = (
         dict(zip(METRICS, figures.tolist(), strict=True))
         for figures in (scores.mean(axis=0), deviation)
@@ -135,7 +151,7 @@ def average_objects(
         `METRICS` of each asset.
     objects, categories : sequence of str
         Object and category of each. Several views of an object count as one.
-    spread : {"se", "sd"}
+    spread : str
         As in `measure`.
     """
     _, first, number = np.unique(objects, return_index=True, return_inverse=True)
@@ -170,8 +186,8 @@ def evaluate_store(
         Objects to measure on; all if None.
     shares : Shares
         Shares of the splits, as in training.
-    spread : {"se", "sd"}
-        Standard error or standard deviation over objects.
+    spread : str
+        See `SPREADS`.
     verdicts, max_ambiguity, splits
         As for `slatprep.learn.splits.select_assets`.
 

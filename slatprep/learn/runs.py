@@ -22,6 +22,7 @@ import torch
 from slatprep.errors import ConfigError
 from slatprep.learn.predictions import RUN_BYTES, RUN_FILE, SPLITS_FILE
 from slatprep.learn.splits import Assignment
+from slatprep.learn.style import INK, MUTED
 from slatprep.readers.files import refusing
 from slatprep.storage.atomic import staged
 from slatprep.storage.documents import read_document
@@ -33,9 +34,6 @@ _LOCK, _PARTIAL = ".lock", f".{RUN_FILE}.partial"
 
 _GLOBALS = ("torch", "collections OrderedDict")
 """What a checkpoint's pickle may name, as its beginning."""
-
-INK, MUTED = "#1F2328", "#6B7280"
-"""Colours of the curve: text and data, and what they are compared with."""
 
 
 @dataclasses.dataclass(frozen=True)

@@ -5,11 +5,11 @@ Only names are held: an entry per object and per SLAT, never an array.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import groupby
 
-from slatprep.errors import ConfigError, in_unicode
+from slatprep.errors import ConfigError, InputError, in_unicode
 from slatprep.parameters import BuildParameters, PixieverseSource, SlatSource
 from slatprep.readers.joins import read_categories, read_map
 from slatprep.readers.patterns import NAME, fill, find_files, list_below, tried_names
@@ -19,7 +19,7 @@ from slatprep.storage.listing import Listing
 
 
 @dataclass(frozen=True, slots=True)
-class _Grid:
+class NamedGrid:
     """A grid file of an object, or the folder of one that cannot be listed."""
 
     sample: str
@@ -45,7 +45,7 @@ class _Found:
     roots: SourceRoots
     listing: Listing
     one_file: bool
-    grids: Mapping[str, list[_Grid]]
+    grids: Mapping[str, list[NamedGrid]]
     categories: Mapping[str, str]
 
 
@@ -84,10 +84,10 @@ def discover(parameters: BuildParameters) -> list[AssetPair]:
     except OSError as error:
         raise ConfigError(f"{error.filename}: cannot be looked at ({error.strerror})") from None
     listing = list_below(pixieverse.root)
-    grids = _find_grids(pixieverse, listing)
+    grids = find_grids(pixieverse, listing)
     if not grids:
         tried = tried_names(pixieverse.grid, _settled(sample=pixieverse.sample))
-        swapped = not one_file and _find_grids(pixieverse, list_below(slat.root))
+        swapped = not one_file and find_grids(pixieverse, list_below(slat.root))
         hint = f"; the roots are swapped: grids lie below {slat.root}" if swapped else ""
         raise ConfigError(f"{pixieverse.root}: no grid found; looked for {tried}{hint}")
     slats = find_slats(slat, one_file)
@@ -125,23 +125,32 @@ def explain_unmatched(pairs: Collection[AssetPair], parameters: BuildParameters)
     )
 
 
-def _find_grids(source: PixieverseSource, listing: Listing) -> dict[str, list[_Grid]]:
-    """Return the grids of each object, all found by the first pattern that matches any."""
+def find_grids(
+    source: PixieverseSource, listing: Listing | None = None
+) -> dict[str, list[NamedGrid]]:
+    """Return the grids of each object, all found by the first pattern that matches any.
+
+    Raises
+    ------
+    ConfigError
+        If the folder cannot be listed, or a pattern makes no sense.
+    """
     chosen = _settled(sample=source.sample)
-    grids: dict[str, list[_Grid]] = {}
+    listing = list_below(source.root) if listing is None else listing
+    grids: dict[str, list[NamedGrid]] = {}
     for pattern in source.grid:
         if "{id}" not in pattern:
             raise ConfigError(f"grid pattern {pattern!r} names no {{id}}")
-        found: dict[str, list[_Grid]] = {}
+        found: dict[str, list[NamedGrid]] = {}
         for fields, path, problem in find_files(listing, pattern, chosen, skip=grids):
-            grid = _Grid(fields.get("sample", ""), path, problem)
+            grid = NamedGrid(fields.get("sample", ""), path, problem)
             found.setdefault(fields.get("id", path), []).append(grid)
         grids |= found
     return grids
 
 
 def _rows(
-    grids: Mapping[str, list[_Grid]],
+    grids: Mapping[str, list[NamedGrid]],
     slats: Mapping[str, list[NamedSlat]],
     claims: Mapping[str, list[tuple[str, str]]],
 ) -> Iterator[_Row]:
@@ -197,7 +206,7 @@ def _pair(row: _Row, there: _Found, shared: str) -> AssetPair:
     source, slat_source = there.parameters.pixieverse, there.parameters.slat
     grids = sorted(there.grids.get(row.object_id, ()), key=lambda found: found.path)
     problems = [shared, *_name_problems(row)]
-    sides: tuple[_Grid | NamedSlat, ...] = (*grids, *row.slats)
+    sides: tuple[NamedGrid | NamedSlat, ...] = (*grids, *row.slats)
     for side in sides:
         problems += [side.problem, _unrecordable(side.path)]
     grid = mask = bounds = None
@@ -251,7 +260,21 @@ def _unrecordable(path: str) -> str:
     return f"{path}: its name is no UTF-8, so that no record can hold it; rename it"
 
 
-def _several_grids(object_id: str, grids: list[_Grid]) -> str:
+def one_grid(
+    root: Place, found: Sequence[NamedGrid], object_id: str, tried: Iterable[str]
+) -> Place:
+    """Return the one grid of an object that `find_grids` found; InputError if it is not one."""
+    if not found:
+        looked = tried_names(tried, {"id": object_id})
+        raise InputError(root, f"no grid for id {object_id!r}", f"one of {looked}")
+    if len(found) > 1:
+        raise InputError(root, _several_grids(object_id, list(found)), "one grid of every object")
+    if found[0].problem:
+        raise InputError(root, found[0].problem, "a grid")
+    return root / found[0].path
+
+
+def _several_grids(object_id: str, grids: list[NamedGrid]) -> str:
     files = ", ".join(grid.path for grid in grids)
     if len({grid.sample for grid in grids}) > 1:
         return (

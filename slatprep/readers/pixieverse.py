@@ -13,7 +13,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slatprep.errors import InputError
-from slatprep.normalize import PIXIE_RANGES, denormalize_properties
+from slatprep.normalize import (
+    PIXIE_RANGES,
+    change_ranges,
+    denormalize_properties,
+    normalize_mapped,
+    to_mapped,
+)
 from slatprep.parameters import SampleParameters
 from slatprep.readers.files import (
     ArraySpec,
@@ -30,6 +36,7 @@ from slatprep.records import (
     RESOLUTION,
     AssetPair,
     MaterialField,
+    Normalization,
     Place,
     SourceFile,
 )
@@ -45,6 +52,9 @@ BOUND = ArraySpec(shapes=(), kinds="biufU")
 
 UNLABELLED = -1
 """Class id of an occupied voxel that Pixie's labelling set aside."""
+
+_NO_LOG_OF_ZERO = 1e-6
+"""What Pixie adds to density and Young's modulus before it takes log10."""
 
 # Source channel of each of PROPERTY_COLUMNS; the files begin with density.
 _CHANNEL_ORDER = (1, 0, 2)
@@ -143,6 +153,64 @@ def read_field(
         sources=tuple(sources),
         warnings=tuple(warnings),
     )
+
+
+def read_prediction(
+    path: Place, root: Place, where: NDArray[np.bool_], normalization: Normalization
+) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
+    """Read what a predicted grid says of some voxels.
+
+    Parameters
+    ----------
+    path : Place
+        A prediction, (11, 64, 64, 64) or (4, 64, 64, 64), normalised by Pixie's ranges; or
+        (64, 64, 64, 4) in SI units: the forms of `read_field`. Its mask, if any, is not read.
+    root : Place
+        Folder that it must not leave.
+    where : ndarray of bool, shape (64, 64, 64)
+        K voxels.
+    normalization : Normalization
+        The ranges that the result is normalised by. What was normalised already is brought
+        to them and not clipped; SI values are normalised as Pixie does it: 1e-6 is added
+        before log10, and they are clipped.
+
+    Returns
+    -------
+    properties : ndarray of float64, shape (K, 3)
+        In the order of ``PROPERTY_COLUMNS``.
+    material : ndarray of uint8, shape (K,)
+        Class 0 to 7; background also where no class is the likeliest, or it is -1.
+
+    Raises
+    ------
+    InputError
+        If it has another form, or a value at one of the voxels is none that can be measured.
+    """
+    data, _ = load_source(path, root, "grid")
+    grid = npy_array(data, path, GRID)
+    raw = grid.shape == _RAW_SHAPE
+    channels = np.moveaxis(grid, -1, 0) if raw else grid
+    if grid.shape == _SCORES_SHAPE:
+        classes = _classes_of_scores(channels[3:], where, path, [])
+    else:
+        classes = _classes_of_ids(channels[3], path)
+    material = np.where(classes == UNLABELLED, BACKGROUND, classes)[where].astype(np.uint8)
+    values = np.stack([channels[k][where] for k in _CHANNEL_ORDER], axis=1).astype(np.float64)
+    bad = ~np.isfinite(values)
+    if raw:
+        bad[:, :2] |= values[:, :2] < 0
+    if bad.any():
+        row, column = _first(bad)
+        raise InputError(
+            path,
+            f"{PROPERTY_COLUMNS[column]} {values[row, column]:g} at voxel "
+            f"{tuple(map(int, np.argwhere(where)[row]))}",
+            "finite numbers" + (", none of E and density below 0" if raw else ""),
+        )
+    if not raw:
+        return change_ranges(values, PIXIE_RANGES, normalization), material
+    values[:, :2] += _NO_LOG_OF_ZERO
+    return np.clip(normalize_mapped(to_mapped(values), normalization), -1, 1), material
 
 
 def _read_mask(values: NDArray[Any], path: Place, warnings: list[str]) -> NDArray[np.bool_]:

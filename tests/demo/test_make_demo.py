@@ -212,3 +212,16 @@ def test_a_directory_with_other_content_is_left_alone(tmp_path):
     make_demo(tmp_path / "demo", 1, 0)
     with pytest.raises(ConfigError, match="empty directory"):
         make_demo(tmp_path / "demo", 1, 1)
+
+
+def test_results_are_predictions_that_err(tmp_path):
+    make_demo(tmp_path / "demo", 1, 7, levels=(2,), results=True)
+    make_demo(tmp_path / "again", 1, 7, levels=(2,), results=True)
+    assert digests(tmp_path / "demo" / "results") == digests(tmp_path / "again" / "results")
+    made = make_asset(7, 0, levels=(2,))
+    prediction = np.load(tmp_path / "demo" / "results" / made.object_id / "sample_0_pred.npy")
+    assert prediction.shape == (11, 64, 64, 64) and prediction.dtype == np.float32
+    assert (prediction[3:].sum(axis=0) == 1).all()
+    known = (made.grid[..., 3] >= 0) & (made.grid[..., 3] < 7)
+    right = (prediction[3:].argmax(axis=0) == made.grid[..., 3])[known].mean()
+    assert 0.5 < right < 0.999

@@ -1,0 +1,266 @@
+"""Methods side by side on the same objects: at SLAT voxels, and on PixieVerse grids."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from contextlib import nullcontext
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from slatprep.errors import InputError
+from slatprep.geometry.voxels import voxels_of
+from slatprep.learn.metrics import METRICS, Measure, Spread, average_objects, score_asset
+from slatprep.learn.predictions import (
+    ReadAsset,
+    VoxelPrediction,
+    check_prediction,
+    open_predictions,
+)
+from slatprep.learn.splits import Split, select_assets
+from slatprep.learn.style import INK, MUTED
+from slatprep.parameters import PixieverseSource
+from slatprep.readers.pairing import NamedGrid, find_grids, one_grid
+from slatprep.readers.pixieverse import read_prediction
+from slatprep.records import BACKGROUND, UNANNOTATED, MaterialField, Place
+from slatprep.sample import sample
+from slatprep.storage.atomic import staged, writing
+from slatprep.store import Store, open_store
+
+OURS = "these predictions"
+"""What the method is called whose predictions are of SLAT voxels."""
+
+_GRIDS = (*PixieverseSource.grid, "{id}.npy")
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """Scores of several methods over the same objects.
+
+    Attributes
+    ----------
+    spread : str
+        What `Measure.spreads` are.
+    methods : dict of str to Measure
+        By the method's name, over all objects.
+    categories : dict of str to dict of str to Measure
+        By category, then by method.
+    partly_annotated : int
+        Objects with occupied voxels that are not annotated, which are in no score.
+        Pixie's loader leaves such objects out.
+    problems : list of str
+        Why assets of the split were left out, of all methods alike.
+    """
+
+    spread: Spread
+    methods: dict[str, Measure]
+    categories: dict[str, dict[str, Measure]]
+    partly_annotated: int
+    problems: list[str]
+
+
+def compare_methods(
+    predictions: Path | None,
+    grids: Mapping[str, Path],
+    store_path: Place,
+    split: Split | None = "test",
+    *,
+    splits: Mapping[str, Split],
+    spread: Spread = "se",
+    verdicts: Collection[str] | None = None,
+    max_ambiguity: float | None = None,
+) -> Comparison:
+    """Measure predictions of SLAT voxels and predicted grids against a store.
+
+    A grid is measured twice. On its own voxels, by Pixie's protocol: squared errors in
+    normalised space and class accuracy, means over the object's annotated voxels, then over
+    objects; a voxel that is predicted to be background has the wrong class, its properties
+    count as they are, and nothing is clipped that the network left unclipped
+    (vlongle/pixie, ``inference_combined.py``). And at the SLAT's voxels: the grid's values
+    are looked up there as the store's own labels were, at the places that it holds, so that
+    the grid those labels are of scores perfectly.
+
+    Parameters
+    ----------
+    predictions : Path, optional
+        As `slatprep.learn.predictions.open_predictions` reads them.
+    grids : mapping of str to Path
+        Folders by the name of the method, see `slatprep.readers.pixieverse.read_prediction`;
+        ``<object id>/sample_<k>_pred.npy``, ``<object id>/sample_<k>/material_grid.npy`` or
+        ``<object id>.npy``.
+    store_path : Place
+        The store.
+    split, splits, verdicts, max_ambiguity
+        As for `slatprep.learn.splits.select_assets`.
+    spread : str
+        As for `slatprep.learn.metrics.measure`.
+
+    Raises
+    ------
+    InputError
+        If no asset has a prediction of every method that can be used.
+    ConfigError
+        If a folder cannot be listed.
+    StoreError
+        If the store cannot be read.
+    """
+    store = open_store(store_path)
+    object_ids, categories = store.column("object_id"), store.column("category")
+    found = {name: find_grids(PixieverseSource(root, _GRIDS)) for name, root in grids.items()}
+    names = [OURS] if predictions else []
+    names += [f"{name}, {where}" for name in grids for where in ("SLAT voxels", "own grid")]
+    scored: list[int] = []
+    scores: list[list[NDArray[np.float64]]] = []
+    partly: set[str] = set()
+    problems: list[str] = []
+    chosen = select_assets(
+        store, split, splits=splits, verdicts=verdicts, max_ambiguity=max_ambiguity
+    )
+    with open_predictions(predictions) if predictions else nullcontext() as read:
+        for index in chosen.tolist():
+            object_id = str(object_ids[index])
+            truth = _Truth(store, index)
+            try:
+                rows = [truth.score(_ours(predictions, read, truth))] if read else []
+                for name, root in grids.items():
+                    rows += truth.score_grid(root, found[name].get(object_id, []), object_id)
+            except InputError as error:
+                problems.append(str(error))
+                continue
+            scored.append(index)
+            scores.append(rows)
+            if (truth.grid == UNANNOTATED).any():
+                partly.add(object_id)
+    if not scored:
+        raise InputError(
+            predictions or next(iter(grids.values())),
+            f"no asset of split {split or 'all'} has a prediction of every method "
+            f"({problems[0] if problems else 'the split is empty'})",
+            "predictions of the same objects",
+        )
+    measured = [
+        average_objects(
+            [rows[k] for rows in scores],
+            [str(object_ids[index]) for index in scored],
+            [str(categories[index]) for index in scored],
+            spread,
+        )
+        for k in range(len(names))
+    ]
+    return Comparison(
+        spread,
+        {name: overall for name, (overall, _) in zip(names, measured, strict=True)},
+        {
+            category: {
+                name: groups[category] for name, (_, groups) in zip(names, measured, strict=True)
+            }
+            for category in measured[0][1]
+        },
+        len(partly),
+        problems,
+    )
+
+
+class _Truth:
+    """What a store says of one asset: at its SLAT voxels, and on its grid."""
+
+    def __init__(self, store: Store, index: int) -> None:
+        self.store, self.index, self.asset_id = store, index, store.ids[index]
+        columns = ("coords", "properties", "material", "valid", "place")
+        self.voxels = store.read(index, columns)
+        self.grid = np.asarray(store.read_rows("grid/material", index, index + 1)[0])
+
+    def score(self, prediction: VoxelPrediction) -> NDArray[np.float64]:
+        """Return the metrics of a prediction of the SLAT's voxels."""
+        truth = (self.voxels[name] for name in ("properties", "material", "valid"))
+        return score_asset(prediction, *truth)
+
+    def score_grid(
+        self, root: Path, found: Sequence[NamedGrid], object_id: str
+    ) -> Iterator[NDArray[np.float64]]:
+        """Yield the metrics of a predicted grid at the SLAT's voxels, and on the grid itself."""
+        path = one_grid(root, found, object_id, _GRIDS)
+        annotated = self.grid < BACKGROUND
+        ranges = self.store.normalization
+        properties, material = read_prediction(path, root, annotated, ranges)
+        # The values are carried to where they are looked up, whatever their unit.
+        field = MaterialField(
+            occupancy=annotated,
+            voxels=voxels_of(annotated),
+            material=material,
+            properties=properties.astype(np.float32),
+        )
+        looked_up = sample(field, self.voxels["place"], self.store.about.build.parameters.sample)
+        valid = self.voxels["valid"]
+        yield self.score(
+            VoxelPrediction(
+                np.where(valid[:, None], looked_up.properties, 0.0).astype(np.float64),
+                looked_up.material.astype(np.int64),
+            )
+        )
+        stored = self.store.read_rows("grid/properties", self.index, self.index + 1)[0]
+        yield score_asset(
+            VoxelPrediction(properties, material.astype(np.int64)),
+            np.asarray(stored)[:, annotated].T,
+            self.grid[annotated],
+            np.ones(len(properties), dtype=bool),
+        )
+
+
+def _ours(predictions: Path | None, read: ReadAsset, truth: _Truth) -> VoxelPrediction:
+    arrays = read(truth.asset_id)
+    if arrays is None:
+        raise InputError(predictions, f"no prediction of {truth.asset_id}", "one of every asset")
+    source = f"{predictions}/{truth.asset_id}"
+    return check_prediction(source, arrays, truth.voxels["coords"], truth.store.normalization)
+
+
+def draw_comparison(methods: Mapping[str, Measure], what: str, path: Path) -> None:
+    """Draw a panel a metric, with each method's mean and spread.
+
+    Parameters
+    ----------
+    methods : mapping of str to Measure
+        One method at least.
+    what : str
+        What the spreads are, in words.
+    path : Path
+        A PNG.
+
+    Raises
+    ------
+    StoreError
+        If it cannot be written.
+    """
+    from matplotlib.figure import Figure
+
+    names = list(methods)
+    figure = Figure(figsize=(11.0, 1.3 + 0.38 * len(names)), layout="constrained")
+    panels = figure.subplots(1, len(METRICS), sharey=True)
+    for axes, metric in zip(panels, METRICS, strict=True):
+        means = [methods[name].means[metric] for name in names]
+        spreads = np.nan_to_num([methods[name].spreads[metric] for name in names])
+        places = range(len(names))
+        axes.barh(places, means, height=0.6, color="#AFC3DC")
+        axes.errorbar(means, places, xerr=spreads, fmt="none", ecolor=INK, capsize=3, lw=1)
+        for place, mean, spread in zip(places, means, spreads, strict=True):
+            if np.isfinite(mean):
+                axes.annotate(f"{mean:.3f}", (mean + spread, place), (5, 0), va="center",
+                              textcoords="offset points", fontsize=8, color=INK)  # fmt: skip
+        top = np.nanmax([*np.add(means, spreads), 1e-3])
+        axes.set_xlim(0, 1.45 * top)
+        axes.set_title(metric, fontsize=9, color=INK)
+        axes.tick_params(labelsize=8, colors=MUTED, length=0)
+        axes.locator_params(axis="x", nbins=4)
+        axes.spines[["top", "right", "left"]].set_visible(False)
+    panels[0].set_yticks(range(len(names)), names, color=INK)
+    panels[0].invert_yaxis()
+    count = methods[names[0]].objects
+    figure.supxlabel(
+        f"mean squared error in normalised space, and class accuracy; {count} objects, ± {what}",
+        fontsize=8, color=MUTED,
+    )  # fmt: skip
+    with writing(str(path), path.parent), staged(path) as partial:
+        figure.savefig(partial, dpi=120, format="png")

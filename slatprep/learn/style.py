@@ -1,0 +1,3 @@
+"""Colours of the figures: text and data, and what they are compared with."""
+
+INK, MUTED = "#1F2328", "#6B7280"
