@@ -32,6 +32,8 @@ from slatprep.store import Store, open_store
 OURS = "these predictions"
 """What the method is called whose predictions are of SLAT voxels."""
 
+_BARS = "#AFC3DC"
+
 _GRIDS = (*PixieverseSource.grid, "{id}.npy")
 
 
@@ -236,26 +238,30 @@ def draw_comparison(methods: Mapping[str, Measure], what: str, path: Path) -> No
     """
     from matplotlib.figure import Figure
 
-    names = list(methods)
+    names, places = list(methods), range(len(methods))
+    means = np.array([[m.means[metric] for metric in METRICS] for m in methods.values()])
+    spreads = np.array([[m.spreads[metric] for metric in METRICS] for m in methods.values()])
+    spreads = np.nan_to_num(spreads)
+    # Errors are of one unit and get one scale; no accuracy is above 1.
+    most = max(float(np.nanmax((means + spreads)[:, :-1])), 1e-3)
     figure = Figure(figsize=(11.0, 1.3 + 0.38 * len(names)), layout="constrained")
     panels = figure.subplots(1, len(METRICS), sharey=True)
-    for axes, metric in zip(panels, METRICS, strict=True):
-        means = [methods[name].means[metric] for name in names]
-        spreads = np.nan_to_num([methods[name].spreads[metric] for name in names])
-        places = range(len(names))
-        axes.barh(places, means, height=0.6, color="#AFC3DC")
-        axes.errorbar(means, places, xerr=spreads, fmt="none", ecolor=INK, capsize=3, lw=1)
-        for place, mean, spread in zip(places, means, spreads, strict=True):
+    for k, (axes, metric) in enumerate(zip(panels, METRICS, strict=True)):
+        axes.barh(places, means[:, k], height=0.6, color=_BARS)
+        axes.errorbar(
+            means[:, k], places, xerr=spreads[:, k], fmt="none", ecolor=INK, capsize=3, lw=1
+        )
+        for place in places:
+            mean = means[place, k]
             if np.isfinite(mean):
-                axes.annotate(f"{mean:.3f}", (mean + spread, place), (5, 0), va="center",
+                axes.annotate(f"{mean:.3f}", (mean + spreads[place, k], place), (5, 0), va="center",
                               textcoords="offset points", fontsize=8, color=INK)  # fmt: skip
-        top = np.nanmax([*np.add(means, spreads), 1e-3])
-        axes.set_xlim(0, 1.45 * top)
+        axes.set_xlim(0, 1.35 * (1.0 if metric == "accuracy" else most))
         axes.set_title(metric, fontsize=9, color=INK)
         axes.tick_params(labelsize=8, colors=MUTED, length=0)
         axes.locator_params(axis="x", nbins=4)
         axes.spines[["top", "right", "left"]].set_visible(False)
-    panels[0].set_yticks(range(len(names)), names, color=INK)
+    panels[0].set_yticks(places, names, color=INK)
     panels[0].invert_yaxis()
     count = methods[names[0]].objects
     figure.supxlabel(
