@@ -22,8 +22,8 @@ from numpy.typing import NDArray
 
 from slatprep.errors import ConfigError, InputError, SlatprepError
 from slatprep.readers.patterns import NAME
-from slatprep.readers.slat import LATENT_CHANNELS, check_coords
-from slatprep.records import StructuredLatents
+from slatprep.readers.slat import check_coords
+from slatprep.records import TRELLIS, StructuredLatents
 from slatprep.storage.atomic import staged
 
 if TYPE_CHECKING:
@@ -284,11 +284,11 @@ def _extract(session: Session, extraction: Extraction, preprocess: bool) -> Extr
         return _kept(extraction, record)
     coords, feats, seconds = _run(session, image, extraction.seed, preprocess)
     check_coords(coords, extraction.image)
-    if len(coords) == 0 or feats.shape != (len(coords), LATENT_CHANNELS):
+    if len(coords) == 0 or feats.shape != (len(coords), TRELLIS.channels):
         raise InputError(
             extraction.image,
             f"gave coords {coords.shape} and feats {feats.shape}",
-            f"N > 0 voxels with {LATENT_CHANNELS} channels; look at what is in the image",
+            f"N > 0 voxels with {TRELLIS.channels} channels; look at what is in the image",
         )
     if not np.isfinite(feats).all():
         raise InputError(

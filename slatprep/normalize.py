@@ -1,19 +1,18 @@
 """Physical properties to [-1, 1] and back.
 
-Young's modulus and density are mapped to log10 of their SI value, Poisson's
-ratio is taken as it is; the mapped value v of a range lo..hi becomes
+A property is mapped to log10 of its SI value (Young's modulus, density) or
+taken as it is (Poisson's ratio), as its table says; the mapped value v of a range lo..hi becomes
 ``2 (v - lo) / (hi - lo) - 1`` (SLAT-Phys; Pixie uses the same form).
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from slatprep.records import PROPERTY_COLUMNS, MaterialField, Normalization, PropertyRange
-
-LOG10 = (True, True, False)
-"""Which of ``PROPERTY_COLUMNS`` are normalised on a log10 scale."""
+from slatprep.records import PROPERTIES, MaterialField, Normalization, Property, PropertyRange
 
 PIXIE_RANGES = Normalization(
     ranges=(
@@ -30,10 +29,11 @@ PIXIE_RANGES = Normalization(
 _HALF_WIDTH_OF_A_POINT = 0.5
 
 
-def to_mapped(properties: ArrayLike) -> NDArray[np.float64]:
-    """Map SI properties (N, 3) to log10 E, log10 density and Poisson's ratio."""
+def to_mapped(properties: ArrayLike, table: Sequence[Property] = PROPERTIES) -> NDArray[np.float64]:
+    """Map SI properties (N, P) to log10 of those that are normalised so; the others stay."""
     mapped = np.array(properties, dtype=np.float64)
-    mapped[..., :2] = np.log10(mapped[..., :2])
+    columns = [column for column, one in enumerate(table) if one.log10]
+    mapped[..., columns] = np.log10(mapped[..., columns])
     return mapped
 
 
@@ -47,25 +47,30 @@ def property_extent(field: MaterialField) -> NDArray[np.float64]:
 
     Returns
     -------
-    ndarray of float64, shape (3, 2)
-        Per property of ``PROPERTY_COLUMNS`` the minimum and maximum, log10 for
-        Young's modulus and density.
+    ndarray of float64, shape (P, 2)
+        Per property of its table the minimum and maximum, of log10 where that
+        is how it is normalised.
     """
-    # log10 is monotonic, so it is taken of six numbers and not of the whole field.
+    # log10 is monotonic, so it is taken of a few numbers and not of the whole field.
     # By column: numpy takes ten times as long along the first axis of a narrow array.
-    columns = [field.properties[:, k] for k in range(len(PROPERTY_COLUMNS))]
-    return to_mapped([[c.min() for c in columns], [c.max() for c in columns]]).T
+    columns = list(field.properties.T)
+    ends = [[c.min() for c in columns], [c.max() for c in columns]]
+    return to_mapped(ends, field.table).T
 
 
-def ranges_from_extents(extents: ArrayLike, source: str = "dataset") -> Normalization:
+def ranges_from_extents(
+    extents: ArrayLike, source: str = "dataset", table: Sequence[Property] = PROPERTIES
+) -> Normalization:
     """Return the ranges that span a whole dataset.
 
     Parameters
     ----------
-    extents : array_like of float64, shape (A, 3, 2)
+    extents : array_like of float64, shape (A, P, 2)
         What `property_extent` gave for each asset.
     source : str
         What the ranges say of where they come from.
+    table : sequence of Property
+        The properties.
 
     Returns
     -------
@@ -77,44 +82,49 @@ def ranges_from_extents(extents: ArrayLike, source: str = "dataset") -> Normaliz
     ValueError
         If there is no asset, or an extent is not finite.
     """
-    table = np.asarray(extents, dtype=np.float64).reshape(-1, 3, 2)
-    if len(table) == 0 or not np.isfinite(table).all():
-        raise ValueError(f"ranges need finite extents of at least one asset, got {table.tolist()}")
-    return ranges_from_bounds(table[:, :, 0].min(axis=0), table[:, :, 1].max(axis=0), source)
+    ends = np.asarray(extents, dtype=np.float64).reshape(-1, len(table), 2)
+    if len(ends) == 0 or not np.isfinite(ends).all():
+        raise ValueError(f"ranges need finite extents of at least one asset, got {ends.tolist()}")
+    return ranges_from_bounds(ends[:, :, 0].min(axis=0), ends[:, :, 1].max(axis=0), source, table)
 
 
 def ranges_from_bounds(
-    lo: NDArray[np.float64], hi: NDArray[np.float64], source: str
+    lo: NDArray[np.float64],
+    hi: NDArray[np.float64],
+    source: str,
+    table: Sequence[Property] = PROPERTIES,
 ) -> Normalization:
-    """Return the ranges between bounds (3,) of the mapped properties; a point gets a width."""
+    """Return the ranges between bounds (P,) of the mapped properties; a point gets a width."""
     single = hi <= lo
     lo, hi = lo - single * _HALF_WIDTH_OF_A_POINT, hi + single * _HALF_WIDTH_OF_A_POINT
-    return normalization_of(np.stack([lo, hi], axis=1), source)
+    return normalization_of(np.stack([lo, hi], axis=1), source, table)
 
 
-def normalization_of(ranges: NDArray[np.float64], source: str) -> Normalization:
-    """Return ranges, given as rows lo, hi (3, 2) of the mapped properties, as a `Normalization`."""
-    spans = zip(PROPERTY_COLUMNS, LOG10, ranges.tolist(), strict=True)
-    first, second, third = (PropertyRange(name, log10, *span) for name, log10, span in spans)
-    return Normalization((first, second, third), source)
+def normalization_of(
+    ranges: NDArray[np.float64], source: str, table: Sequence[Property] = PROPERTIES
+) -> Normalization:
+    """Return ranges, given as rows lo, hi (P, 2) of the mapped properties, as a `Normalization`."""
+    spans = zip(table, ranges.tolist(), strict=True)
+    return Normalization(tuple(PropertyRange(p.name, p.log10, *span) for p, span in spans), source)
 
 
 def normalize_properties(
     properties: ArrayLike, normalization: Normalization = PIXIE_RANGES
 ) -> NDArray[np.float32]:
-    """Bring Young's modulus, density and Poisson's ratio to [-1, 1].
+    """Bring properties to [-1, 1].
 
     Parameters
     ----------
-    properties : array_like, shape (N, 3)
-        Young's modulus [Pa], density [kg/m^3], Poisson's ratio; NaN passes through.
+    properties : array_like, shape (N, P)
+        In SI units, a column for each range (Young's modulus [Pa], density
+        [kg/m^3] and Poisson's ratio by default); NaN passes through.
     normalization : Normalization
         The ranges; Pixie's published ones by default, a store's own are
         ``store.normalization``.
 
     Returns
     -------
-    ndarray of float32, shape (N, 3)
+    ndarray of float32, shape (N, P)
         Clipped to [-1, 1].
 
     Examples
@@ -131,10 +141,10 @@ def normalize_properties(
 def normalize_and_count(
     properties: ArrayLike, normalization: Normalization
 ) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
-    """Normalise as `normalize_properties`, and count per property (3,) what was clipped."""
+    """Normalise as `normalize_properties`, and count per property (P,) what was clipped."""
     given = np.asarray(properties)
     values = np.empty(given.shape, dtype=np.float32)
-    clipped = np.zeros(len(PROPERTY_COLUMNS), dtype=np.int64)
+    clipped = np.zeros(len(normalization.ranges), dtype=np.int64)
     for column, span in enumerate(normalization.ranges):
         mapped = given[..., column].astype(np.float64)
         if span.log10:
@@ -153,16 +163,15 @@ def denormalize_properties(
 
     Parameters
     ----------
-    values : array_like, shape (N, 3)
-        Normalised Young's modulus, density and Poisson's ratio.
+    values : array_like, shape (N, P)
+        Normalised properties, a column for each range.
     normalization : Normalization
         The ranges they were normalised with.
 
     Returns
     -------
-    ndarray of float32, shape (N, 3)
-        Young's modulus [Pa], density [kg/m^3], Poisson's ratio. What had been
-        clipped comes back as the end of its range.
+    ndarray of float32, shape (N, P)
+        In SI units. What had been clipped comes back as the end of its range.
     """
     given = np.asarray(values)
     properties = np.empty(given.shape, dtype=np.float32)
@@ -173,7 +182,7 @@ def denormalize_properties(
 
 
 def change_ranges(values: ArrayLike, old: Normalization, new: Normalization) -> NDArray[np.float64]:
-    """Bring values (N, 3) normalised by some ranges to others; nothing is clipped."""
+    """Bring values (N, P) normalised by some ranges to others; nothing is clipped."""
     changed = np.array(values, dtype=np.float64)
     for column, (one, other) in enumerate(zip(old.ranges, new.ranges, strict=True)):
         mapped = (changed[..., column] + 1.0) * 0.5 * (one.hi - one.lo) + one.lo

@@ -13,6 +13,7 @@ _PACKAGES = {
     "field": ("numpy", "scipy", "numba"),
     "open3d": ("numpy", "open3d-cpu", "open3d"),
     "small_gicp": ("numpy", "small_gicp"),
+    "known": ("numpy", "scipy", "numba"),
 }
 """The packages that make each engine's numbers."""
 
@@ -54,6 +55,10 @@ def align(
             from slatprep.align.gicp import align as align_gicp
 
             return align_gicp(field, latents, parameters)
+        case Engine.KNOWN:
+            from slatprep.align.known import align as align_known
+
+            return align_known(field, latents, parameters)
 
 
 def require_engine(parameters: AlignParameters) -> None:

@@ -174,6 +174,8 @@ def report(output: Output, summary: BuildSummary) -> None:
     unlisted = total - good - len(summary.problems)
     if unlisted:
         output.problem(f"and {unlisted:,} more: see {summary.records}")
+    for warning in summary.warnings:
+        output.problem(warning)
     if summary.n_unphysical:
         output.problem(
             f"{summary.n_unphysical:,} PixieVerse voxels with properties that no material has are "

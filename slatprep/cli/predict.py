@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -16,7 +16,7 @@ from slatprep.errors import ConfigError, InputError, StoreError
 
 if TYPE_CHECKING:
     from slatprep.extract import Session
-    from slatprep.records import Place, StructuredLatents
+    from slatprep.records import LatentSpace, Place, StructuredLatents
 
 _IMAGES = (".png", ".jpg", ".jpeg", ".webp", ".bmp")
 
@@ -30,6 +30,7 @@ _IMAGES = (".png", ".jpg", ".jpeg", ".webp", ".bmp")
 @option("--seed", click.IntRange(min=0), 42)
 @option("--device", click.Choice(["cpu", "cuda"]), "cpu")
 @option("--batch-voxels", POSITIVE, 65_536)
+@option("--standardised", click.Choice(["auto", "yes", "no"]), "auto")
 def predict(
     output: Output,
     source: Place,
@@ -40,6 +41,7 @@ def predict(
     seed: int,
     device: str,
     batch_voxels: int,
+    standardised: str,
 ) -> None:
     """Predict material fields of SOURCE with a trained decoder.
 
@@ -60,6 +62,7 @@ def predict(
     --seed: Seed of an image's latents.
     --device: Where to compute.
     --batch-voxels: Assets are decoded together until they have so many voxels.
+    --standardised: Whether the latents of files have been standardised already; auto looks.
 
     Example
     -------
@@ -77,7 +80,10 @@ def predict(
         raise ConfigError("--gaussians goes with an image; for a PLY there is, slatprep transfer")
     decoder = work.load_checkpoint(checkpoint, device)
     image = _draw(output, source, out, seed, device) if is_image else None
-    read = _Reader(output, image.latents if image else source, assets)
+    space = decoder.contents.latents
+    if image is not None:
+        standardised = "no"  # TRELLIS draws them as its decoders want them.
+    read = _Reader(output, image.latents if image else source, assets, space, standardised)
     predicted, voxels, decoding, writing = 0, 0, 0.0, 0.0
     with output.progress("predict") as progress:
         progress(0, len(read.ids))
@@ -163,13 +169,20 @@ def _write_gaussians(output: Output, image: _Image, out: Path, path: Path) -> No
 class _Reader:
     """The latents of a source, one asset after the other; what cannot be read is told and left."""
 
-    def __init__(self, output: Output, source: Place, assets: tuple[str, ...]) -> None:
+    def __init__(
+        self,
+        output: Output,
+        source: Place,
+        assets: tuple[str, ...],
+        space: LatentSpace,
+        standardised: str,
+    ) -> None:
         from slatprep.parameters import SlatSource
         from slatprep.readers import discover_slats
         from slatprep.store import open_store
         from slatprep.store.reader import is_store
 
-        self.output = output
+        self.output, self.space, self.standardised = output, space, standardised
         self.store = open_store(source) if is_store(source) else None
         files = [] if self.store else discover_slats(SlatSource(root=source))
         self.files = {file.asset_id: file for file in files}
@@ -196,6 +209,20 @@ class _Reader:
             self.done.append(asset_id)
             yield latents
 
+    def _of_file(self, latents: StructuredLatents) -> StructuredLatents:
+        """Return the latents of a file, saying whether they have been standardised."""
+        from slatprep.readers.encoders import in_words, look_standardised
+
+        if self.standardised != "auto":
+            return replace(latents, standardised=self.standardised == "yes")
+        if not look_standardised(latents.moments, self.space):
+            return latents
+        self.output.note(
+            f"{latents.sources[0].path}: its latents look standardised already "
+            f"({in_words(latents.moments)}) and are taken so; --standardised says otherwise"
+        )
+        return replace(latents, standardised=True)
+
     def _latents(self, asset_id: str) -> StructuredLatents:
         from slatprep.readers.slat import checked_latents, read_slat
 
@@ -203,6 +230,8 @@ class _Reader:
             file = self.files[asset_id]
             if file.problem:
                 raise InputError(file.path, file.problem, "one SLAT an id")
-            return read_slat(file.path, file.root, file.group)
+            return self._of_file(read_slat(file.path, file.root, file.group, self.space))
         rows = self.store.read(self.rows[asset_id], ("coords", "feats"))
-        return checked_latents(rows["coords"], rows["feats"], f"{self.store.path} [{asset_id}]")
+        space, where = self.store.contents.latents, f"{self.store.path} [{asset_id}]"
+        latents = checked_latents(rows["coords"], rows["feats"], where, space=space)
+        return replace(latents, standardised=space.standardised)

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -182,7 +182,8 @@ def _about(store: Store, format: str) -> dict[str, Any]:
         "resolution": attributes["resolution"],
         "material_classes": attributes["material_classes"],
         "property_columns": attributes["property_columns"],
-        "property_units": ["Pa", "kg/m^3", "1"],
+        "property_units": [one.unit for one in store.contents.properties],
+        "latents": asdict(store.contents.latents),
         "normalization": attributes["normalization"],
     }
 

@@ -191,7 +191,7 @@ def _classes(store: Store) -> dict[str, Any]:
 
 
 def _properties(store: Store) -> dict[str, Any]:
-    ranges = zip(store.normalization.ranges, ("Pa", "kg/m^3", "1"), strict=True)
+    ranges = zip(store.normalization.ranges, store.contents.properties, strict=True)
     return _record_set(
         "properties",
         "The columns of voxel/properties and the channels of grid/properties: a normalised value "
@@ -203,7 +203,7 @@ def _properties(store: Store) -> dict[str, Any]:
             "lo": ("sc:Float", "value that becomes -1"),
             "hi": ("sc:Float", "value that becomes 1"),
         },
-        ((one.name, unit, one.log10, one.lo, one.hi) for one, unit in ranges),
+        ((one.name, of.unit, one.log10, one.lo, one.hi) for one, of in ranges),
     )
 
 

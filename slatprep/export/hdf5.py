@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Any
 from slatprep.export.assets import Exported, describe_columns
 from slatprep.export.formats import ExportOptions, Writer
 from slatprep.export.target import FORMAT
-from slatprep.records import PROPERTY_COLUMNS
 from slatprep.storage.names import file_name
 from slatprep.store import Store, StoredAsset
 
@@ -23,12 +22,9 @@ _DATASETS: dict[str, dict[str, Any]] = {
     "feats": {"description": "SLAT latents"},
     "properties": {
         "description": "normalised properties in [-1, 1], NaN where not valid",
-        "columns": PROPERTY_COLUMNS,
     },
     "properties_si": {
         "description": "properties, NaN where not valid",
-        "columns": PROPERTY_COLUMNS,
-        "units": ("Pa", "kg/m^3", "1"),
     },
     "material": {"description": "class 0..6, 255 where not valid"},
     "valid": {"description": "an annotation was found near enough"},
@@ -82,6 +78,11 @@ def _write_group(file: h5py.File, asset: StoredAsset) -> None:
         packing = {} if name == "transform" else {"compression": "gzip", "shuffle": True}
         dataset = group.create_dataset(name, data=getattr(asset, name), **packing)
         dataset.attrs.update(attributes)
+        if name.startswith("properties"):
+            table = asset.store.contents.properties
+            dataset.attrs["columns"] = [one.name for one in table]
+            if name == "properties_si":
+                dataset.attrs["units"] = [one.unit for one in table]
 
 
 class _LateFaults(io.FileIO):

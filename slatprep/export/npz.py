@@ -68,7 +68,9 @@ def write(
     (directory / folder).mkdir(parents=True, exist_ok=True)
     for asset in assets:
         name = str(folder / f"{_stem(asset.asset_id)}.npz")
-        arrays = {key: getattr(asset, key) for key in ("coords", "feats", *TARGETS)}
+        arrays = {key: getattr(asset, key) for key in ("coords", *TARGETS)}
+        # TRELLIS's data set standardises what it reads.
+        arrays["feats"] = asset.store.contents.latents.as_encoded(asset.feats)
         np.savez_compressed(directory / name, **arrays)
         yield Exported(asset, name, len(asset.coords))
 

@@ -15,7 +15,6 @@ from slatprep.inspect.listing import rows_chosen
 from slatprep.inspect.tallies import JOINT_BINS, SideTally, Tally, no_tally, pooled, tally
 from slatprep.records import (
     BACKGROUND,
-    PROPERTY_COLUMNS,
     Normalization,
     Place,
     PropertyRange,
@@ -40,8 +39,6 @@ Weight = Literal["voxel", "asset"]
 _TASK_ASSETS = 32
 
 _Task = tuple[Place, list[int], bool]
-
-_UNITS = dict(zip(PROPERTY_COLUMNS, ("Pa", "kg/m^3", "1"), strict=True))
 
 
 @dataclass(frozen=True)
@@ -227,8 +224,8 @@ def store_statistics(
     ranges = store.normalization.ranges
     make = _Summariser(
         store.normalization,
-        tuple(_UNITS[one.name] for one in ranges),
-        store.about.material_classes[:BACKGROUND],
+        tuple(one.unit for one in store.contents.properties),
+        store.contents.classes[:BACKGROUND] or ("annotated",),
     )
     total = nothing = no_tally(len(ranges), BINS)
     done, groups = 0, []

@@ -5,10 +5,13 @@ from __future__ import annotations
 import numpy as np
 
 from slatprep.geometry.frames import places_of
-from slatprep.normalize import to_mapped
+from slatprep.normalize import property_extent, to_mapped
 from slatprep.parameters import SampleParameters
 from slatprep.records import Alignment, Ambiguity, Annotation, MaterialField, StructuredLatents
 from slatprep.sample import sample
+
+NOTABLE = 0.1
+"""Share of a property's extent in the field from which on it counts as another one."""
 
 
 def measure_ambiguity(
@@ -34,27 +37,31 @@ def measure_ambiguity(
     Returns
     -------
     Ambiguity
-        The share of SLAT voxels whose class differs in any of the placements,
-        and the largest mean absolute change of log10 Young's modulus, log10
-        density and Poisson's ratio over the voxels valid in both.
+        The share of SLAT voxels whose class differs in any of the placements
+        (where there are no classes, a property by more than `NOTABLE`),
+        and the largest mean absolute change of each property, of log10 where it
+        is normalised so, over the voxels valid in both.
     """
     differs = np.zeros(len(latents.coords), dtype=bool)
-    change = np.zeros(3)
+    change = np.zeros(len(field.table))
     if alignment.placements:
         if alignment.deformation is not None:
             # The others are known without a deformation: like is compared with like.
             places = places_of(latents.coords, alignment.transform)
             annotation = sample(field, places, parameters, labels_alone=True)
-        mapped = to_mapped(annotation.properties)
+        mapped = to_mapped(annotation.properties, field.table)
         for placement in alignment.placements:
             places = places_of(latents.coords, placement.transform)
             other = sample(field, places, parameters, labels_alone=True)
             differs |= other.material != annotation.material
             both = annotation.valid & other.valid
             if both.any():
-                delta = np.abs(mapped - to_mapped(other.properties))[both]
+                delta = np.abs(mapped - to_mapped(other.properties, field.table))[both]
                 change = np.maximum(change, delta.mean(axis=0))
+                if not field.classified:
+                    span = np.ptp(property_extent(field), axis=1)
+                    differs[both] |= (delta > NOTABLE * span).any(axis=1)
     return Ambiguity(
         material_share=float(differs.mean()),
-        property_change=(float(change[0]), float(change[1]), float(change[2])),
+        property_change=tuple(change.tolist()),
     )

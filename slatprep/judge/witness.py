@@ -28,7 +28,6 @@ from slatprep.judge.evidence import HARMLESS
 from slatprep.parameters import SampleParameters
 from slatprep.records import (
     BACKGROUND,
-    FEATS_STD,
     RESOLUTION,
     UNANNOTATED,
     Alignment,
@@ -217,7 +216,8 @@ def _model_of(seen: Moments) -> LatentModel:
     present = seen.weight > 0
     by_class = seen.total[present]
     between = (by_class / seen.weight[present, None]).T @ by_class
-    ridge = _RIDGE * np.diag(np.square(FEATS_STD))
+    variance = np.diag(seen.products) / assets - mean**2
+    ridge = _RIDGE * np.diag(np.where(variance > 0, variance, 1.0))
     precision: Array = np.linalg.inv((seen.products - between) / assets + ridge)
     means = (seen.total + _SHRINK * mean) / (seen.weight[:, None] + _SHRINK)
     return LatentModel(means, precision, seen.weight / assets)

@@ -9,7 +9,6 @@ from numpy.typing import NDArray
 
 from slatprep.geometry.frames import voxel_centres
 from slatprep.learn.dataset import Item, SlatDataset
-from slatprep.learn.predictions import CLASSES
 
 
 @dataclass(frozen=True)
@@ -18,17 +17,21 @@ class VoxelBaseline:
 
     Attributes
     ----------
-    weights : ndarray of float64, shape (12, 11)
-        From the 8 latents, the position and 1 to the three properties and the
-        class indicators.
+    weights : ndarray of float64, shape (channels + 4, P + classes)
+        From the latents, the position and 1 to the properties and the class
+        indicators.
+    properties : int
+        P.
     """
 
     weights: NDArray[np.float64]
+    properties: int
 
     def predict(self, item: Item) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-        """Return properties (N, 3), within [-1, 1], and classes (N,)."""
+        """Return properties (N, P), within [-1, 1], and classes (N,)."""
         outputs = _inputs(item) @ self.weights
-        return np.clip(outputs[:, :3], -1, 1), outputs[:, 3:].argmax(axis=1)
+        split = self.properties
+        return np.clip(outputs[:, :split], -1, 1), outputs[:, split:].argmax(axis=1)
 
 
 def fit_baselines(dataset: SlatDataset) -> tuple[VoxelBaseline, VoxelBaseline]:
@@ -39,17 +42,20 @@ def fit_baselines(dataset: SlatDataset) -> tuple[VoxelBaseline, VoxelBaseline]:
     mean, linear : VoxelBaseline
         The mean and the most frequent class everywhere; least squares.
     """
-    squares, products = np.zeros((12, 12)), np.zeros((12, 3 + CLASSES))
+    contents = dataset.store.contents
+    size, count = contents.latents.channels + 4, len(contents.properties)
+    squares = np.zeros((size, size))
+    products = np.zeros((size, count + contents.n_classes))
     for item in (dataset[k] for k in range(len(dataset))):
         valid = item.valid.numpy()
-        inputs, targets = _inputs(item)[valid], _targets(item)[valid]
+        inputs, targets = _inputs(item)[valid], _targets(item, contents.n_classes)[valid]
         squares += inputs.T @ inputs
         products += inputs.T @ targets
     # The last input is 1, so its products are the sum of the targets and the count.
     mean = np.zeros_like(products)
     mean[-1] = products[-1] / squares[-1, -1]
     linear = np.linalg.lstsq(squares, products, rcond=None)[0]
-    return VoxelBaseline(mean), VoxelBaseline(np.asarray(linear, np.float64))
+    return VoxelBaseline(mean, count), VoxelBaseline(np.asarray(linear, np.float64), count)
 
 
 def _inputs(item: Item) -> NDArray[np.float64]:
@@ -57,6 +63,6 @@ def _inputs(item: Item) -> NDArray[np.float64]:
     return np.hstack([item.feats.numpy(), position, np.ones((len(position), 1))])
 
 
-def _targets(item: Item) -> NDArray[np.float64]:
-    indicators = item.material.numpy()[:, None] == np.arange(CLASSES)
+def _targets(item: Item, classes: int) -> NDArray[np.float64]:
+    indicators = item.material.numpy()[:, None] == np.arange(classes)
     return np.hstack([item.properties.numpy(), indicators])

@@ -22,7 +22,8 @@ from slatprep.learn.predictions import (
 from slatprep.learn.splits import Split, select_assets
 from slatprep.learn.style import INK, MUTED
 from slatprep.parameters import PixieverseSource
-from slatprep.readers.pairing import NamedGrid, find_grids, one_grid
+from slatprep.readers.adapters import FoundField
+from slatprep.readers.pairing import find_grids, one_grid
 from slatprep.readers.pixieverse import read_prediction
 from slatprep.records import BACKGROUND, UNANNOTATED, MaterialField, Place
 from slatprep.sample import sample
@@ -180,7 +181,7 @@ class _Truth:
         return score_asset(prediction, *truth)
 
     def score_grid(
-        self, root: Path, found: Sequence[NamedGrid], object_id: str
+        self, root: Path, found: Sequence[FoundField], object_id: str
     ) -> Iterator[NDArray[np.float64]]:
         """Yield the metrics of a predicted grid at the SLAT's voxels, and on the grid itself."""
         path = one_grid(root, found, object_id, _GRIDS)

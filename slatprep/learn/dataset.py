@@ -42,10 +42,11 @@ class Item:
         Id of the row.
     coords : Tensor of int32, shape (N, 3)
         SLAT voxels.
-    feats : Tensor of float32, shape (N, 8)
-        Latents, standardised with TRELLIS's mean and standard deviation.
-    properties : Tensor of float32, shape (N, 3)
-        Young's modulus, density, Poisson's ratio in [-1, 1]; 0 where not valid.
+    feats : Tensor of float32, shape (N, channels)
+        Latents, standardised with the encoder's mean and standard deviation
+        unless the store's have been standardised already.
+    properties : Tensor of float32, shape (N, P)
+        The store's properties in [-1, 1]; 0 where not valid.
     material : Tensor of int64, shape (N,)
         Class 0..6; -100 where not valid.
     valid : Tensor of bool, shape (N,)
@@ -175,8 +176,7 @@ class SlatDataset(Dataset[Item]):
             require_confidence(self.store)
         self.seed, self.min_confidence = seed, min_confidence
         self._symmetries = lattice_symmetries(augmentation)
-        self._mean = np.array(FEATS_MEAN, np.float32)
-        self._std = np.array(FEATS_STD, np.float32)
+        self._latents = self.store.contents.latents
 
     def __len__(self) -> int:
         return len(self.indices)
@@ -197,7 +197,7 @@ class SlatDataset(Dataset[Item]):
         return Item(
             asset_id,
             torch.from_numpy(move(rows["coords"].astype(np.int32), self._symmetry(asset_id, draw))),
-            torch.from_numpy((rows["feats"] - self._mean) / self._std),
+            torch.from_numpy(self._latents.standardise(rows["feats"])),
             torch.from_numpy(np.where(valid[:, None], rows["properties"], np.float32(0))),
             torch.from_numpy(material),
             torch.from_numpy(valid),

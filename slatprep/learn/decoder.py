@@ -17,9 +17,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from slatprep.learn.predictions import CLASSES
-from slatprep.readers.slat import LATENT_CHANNELS
-from slatprep.records import PROPERTY_COLUMNS, RESOLUTION
+from slatprep.records import PIXIEVERSE, RESOLUTION, Contents
 
 WINDOW = 8
 
@@ -49,10 +47,10 @@ class Prediction(NamedTuple):
 
     Attributes
     ----------
-    properties : Tensor of float32, shape (N, 3)
-        Young's modulus, density, Poisson's ratio in [-1, 1].
-    logits : Tensor of float32, shape (N, 8)
-        Scores of the classes.
+    properties : Tensor of float32, shape (N, P)
+        Properties in [-1, 1].
+    logits : Tensor of float32, shape (N, C)
+        Scores of the classes, or of the one that stands for all where there are none.
     """
 
     properties: Tensor
@@ -195,18 +193,23 @@ class PhysicsDecoder(nn.Module):
         One of `SIZES`, or another.
     window : int
         Edge of an attention window, voxels.
+    contents : Contents
+        Its input has the channels of these latents, its heads these properties
+        and classes.
     """
 
-    def __init__(self, size: DecoderSize, window: int = WINDOW) -> None:
+    def __init__(
+        self, size: DecoderSize, window: int = WINDOW, contents: Contents = PIXIEVERSE
+    ) -> None:
         super().__init__()
         self.size, self.window = size, window
-        self.embed = nn.Linear(LATENT_CHANNELS, size.channels)
+        self.embed = nn.Linear(contents.latents.channels, size.channels)
         self.blocks = nn.ModuleList(
             SwinBlock(size.channels, size.heads) for _ in range(size.blocks)
         )
         self.norm = nn.LayerNorm(size.channels, eps=1e-6, elementwise_affine=False)
-        self.regression = nn.Linear(size.channels, len(PROPERTY_COLUMNS))
-        self.classification = nn.Linear(size.channels, CLASSES)
+        self.regression = nn.Linear(size.channels, len(contents.properties))
+        self.classification = nn.Linear(size.channels, contents.n_classes)
         for module in self.modules():
             if isinstance(module, nn.Linear):
                 nn.init.xavier_uniform_(module.weight)
@@ -222,7 +225,7 @@ class PhysicsDecoder(nn.Module):
         ----------
         coords : Tensor of int, shape (N, 4)
             Batch column and voxel; rows in any order.
-        feats : Tensor of float32, shape (N, 8)
+        feats : Tensor of float32, shape (N, channels)
             Standardised latents.
         """
         shifts = (0, self.window // 2)
@@ -237,6 +240,6 @@ class PhysicsDecoder(nn.Module):
             return Prediction(torch.tanh(self.regression(hidden)), self.classification(hidden))
 
 
-def make_decoder(size: str) -> PhysicsDecoder:
-    """Return a decoder by the name of its size: small, medium or large."""
-    return PhysicsDecoder(SIZES[size])
+def make_decoder(size: str, contents: Contents = PIXIEVERSE) -> PhysicsDecoder:
+    """Return a decoder of what a store holds, by its size: small, medium or large."""
+    return PhysicsDecoder(SIZES[size], contents=contents)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
@@ -13,14 +13,26 @@ from numpy.typing import NDArray
 from slatprep.errors import InputError
 from slatprep.learn.predictions import VoxelPrediction, check_prediction, open_predictions
 from slatprep.learn.splits import Shares, Split, select_assets
-from slatprep.records import Place
+from slatprep.records import Normalization, Place
 from slatprep.store import open_store
 
 METRICS = ("log10 E", "log10 density", "nu", "mean", "accuracy")
-"""Mean squared errors in normalised space, the mean of the three, and class accuracy.
+"""Mean squared errors in normalised space, their mean, and class accuracy.
 
 The names are the columns of tables and CSV files.
 """
+
+_SHORT = {"youngs_modulus": "E", "poissons_ratio": "nu"}
+
+
+def metrics_of(normalization: Normalization) -> tuple[str, ...]:
+    """Return the metrics of a store's properties; `METRICS` where it has PixieVerse's three."""
+    names = (
+        f"{'log10 ' if span.log10 else ''}{_SHORT.get(span.name, span.name)}"
+        for span in normalization.ranges
+    )
+    return (*names, "mean", "accuracy")
+
 
 Spread = Literal["se", "sd", "pixie", "pixie-std"]
 
@@ -112,7 +124,7 @@ def score_asset(
     return np.array([*errors, errors.mean(), accuracy])
 
 
-def measure(scores: NDArray[np.float64], spread: Spread) -> Measure:
+def measure(scores: NDArray[np.float64], spread: Spread, names: Sequence[str] = METRICS) -> Measure:
     """Take mean and spread over objects.
 
     Parameters
@@ -123,15 +135,15 @@ def measure(scores: NDArray[np.float64], spread: Spread) -> Measure:
         See `SPREADS`.
     """
     count = len(scores)
-    deviation = np.full(len(METRICS), np.nan)
+    deviation = np.full(len(names), np.nan)
     if count > 1:
         deviation = scores.std(axis=0, ddof=0 if spread == "pixie-std" else 1)
         if spread in ("se", "pixie"):
             deviation /= np.sqrt(count)
         if spread in ("pixie", "pixie-std"):
-            deviation[METRICS.index("accuracy")] *= _PIXIE_90
+            deviation[list(names).index("accuracy")] *= _PIXIE_90
     means, spreads = (
-        dict(zip(METRICS, figures.tolist(), strict=True))
+        dict(zip(names, figures.tolist(), strict=True))
         for figures in (scores.mean(axis=0), deviation)
     )
     return Measure(count, means, spreads)
@@ -142,6 +154,7 @@ def average_objects(
     objects: Sequence[str],
     categories: Sequence[str],
     spread: Spread,
+    names: Sequence[str] = METRICS,
 ) -> tuple[Measure, dict[str, Measure]]:
     """Average assets per object, then objects, over all and per category.
 
@@ -159,9 +172,10 @@ def average_objects(
     per_object = np.array([rows[number == k].mean(axis=0) for k in range(len(first))])
     category = np.array(categories)[first]
     groups = {
-        str(name): measure(per_object[category == name], spread) for name in np.unique(category)
+        str(name): measure(per_object[category == name], spread, names)
+        for name in np.unique(category)
     }
-    return measure(per_object, spread), groups
+    return measure(per_object, spread, names), groups
 
 
 def evaluate_store(
@@ -225,6 +239,8 @@ def evaluate_store(
             )
             converted += prediction.converted
             scored.append(index)
+            if not store.contents.classes:
+                prediction = replace(prediction, material=None)
             scores.append(score_asset(prediction, **rows))
     if not scored:
         raise InputError(
@@ -237,5 +253,6 @@ def evaluate_store(
         [str(object_ids[k]) for k in scored],
         [str(categories[k]) for k in scored],
         spread,
+        metrics_of(store.normalization),
     )
     return Evaluation(spread, overall, groups, missing, converted)

@@ -9,21 +9,21 @@ from __future__ import annotations
 import hashlib
 import time
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import orjson
 import torch
 from numpy.typing import NDArray
 
 from slatprep.errors import InputError
-from slatprep.learn.dataset import FEATS_MEAN, FEATS_STD
 from slatprep.learn.decoder import PhysicsDecoder, make_decoder
 from slatprep.learn.runs import read_state
 from slatprep.normalize import denormalize_properties, normalization_of
 from slatprep.readers.files import refusing
-from slatprep.records import BACKGROUND, Normalization, StructuredLatents
+from slatprep.records import PIXIEVERSE, Contents, Normalization, StructuredLatents
 from slatprep.storage.atomic import staged
 from slatprep.storage.names import file_name
 
@@ -33,11 +33,12 @@ BATCH_VOXELS = 65_536
 
 @dataclass(frozen=True)
 class Checkpoint:
-    """A trained decoder, the ranges of what it predicts, and the digest of its file."""
+    """A trained decoder, what it predicts from what, the ranges, and the digest of its file."""
 
     model: PhysicsDecoder
     size: str
     normalization: Normalization
+    contents: Contents
     sha256: str
     device: str
 
@@ -50,14 +51,14 @@ class PredictedField:
     ----------
     coords : ndarray of uint8, shape (N, 3)
         SLAT voxels, in the order of the latents.
-    properties : ndarray of float32, shape (N, 3)
-        Young's modulus, density, Poisson's ratio in [-1, 1].
-    properties_si : ndarray of float32, shape (N, 3)
-        The same in Pa, kg/m^3 and 1.
+    properties : ndarray of float32, shape (N, P)
+        The checkpoint's properties in [-1, 1].
+    properties_si : ndarray of float32, shape (N, P)
+        The same in SI units.
     material : ndarray of uint8, shape (N,)
         The likeliest class, 0 to 6: a voxel of a SLAT is not background.
-    probabilities : ndarray of float32, shape (N, 8)
-        Of all classes, background last; they add up to 1.
+    probabilities : ndarray of float32, shape (N, C)
+        Of all classes, background last; they add up to 1. Without classes, one column of 1.
     seconds : float
         What decoding took, of a batch by voxels.
     """
@@ -71,15 +72,27 @@ class PredictedField:
 
 
 def checkpoint_state(
-    model: PhysicsDecoder, size: str, normalization: Normalization
+    model: PhysicsDecoder,
+    size: str,
+    normalization: Normalization,
+    contents: Contents = PIXIEVERSE,
 ) -> dict[str, Any]:
     """Return what a checkpoint holds of a decoder that is to be used."""
     ranges = [[span.lo, span.hi] for span in normalization.ranges]
+    # As JSON: a checkpoint may name nothing but tensors and plain values.
+    held = orjson.dumps(
+        {
+            "properties": [[p.name, p.unit, p.log10] for p in contents.properties],
+            "classes": contents.classes,
+            "latents": contents.latents,
+        }
+    ).decode()
     return {
         "size": size,
         "model": model.state_dict(),
         "ranges": ranges,
         "ranges_source": normalization.source,
+        "contents": held,
     }
 
 
@@ -108,18 +121,34 @@ def load_checkpoint(path: Path, device: str = "cpu") -> Checkpoint:
         size = str(state["size"])
         if not isinstance(state["ranges"], list):
             raise TypeError(f"ranges are {type(state['ranges']).__name__}")
-        ranges = np.array(state["ranges"], dtype=np.float64).reshape(3, 2)
+        contents = _contents_in(state)
+        shape = len(contents.properties), 2
+        ranges = np.array(state["ranges"], dtype=np.float64).reshape(shape)
         if not (np.isfinite(ranges).all() and (ranges[:, 0] < ranges[:, 1]).all()):
             raise ValueError(f"ranges are {ranges.tolist()}")
-        model = make_decoder(size)
+        model = make_decoder(size, contents)
         model.load_state_dict(state["model"])
         if not all(bool(torch.isfinite(weight).all()) for weight in model.parameters()):
             raise ValueError("weights are not all finite")
         source = str(state["ranges_source"])
     sha256 = hashlib.sha256(path.read_bytes()).hexdigest()
-    return Checkpoint(
-        model.to(device).eval(), size, normalization_of(ranges, source), sha256, device
-    )
+    normalization = normalization_of(ranges, source, contents.properties)
+    return Checkpoint(model.to(device).eval(), size, normalization, contents, sha256, device)
+
+
+def _contents_in(state: dict[str, Any]) -> Contents:
+    """Return what a checkpoint was trained on; of before they told, PixieVerse with TRELLIS."""
+    from pydantic import TypeAdapter
+
+    if "contents" not in state:
+        return PIXIEVERSE
+    document = orjson.loads(str(state["contents"]))
+    document["properties"] = [
+        dict(zip(("name", "unit", "log10"), row, strict=True)) for row in document["properties"]
+    ]
+    # Bounds of values are no part of it: JSON has no infinity.
+    contents: Contents = TypeAdapter(Contents).validate_json(orjson.dumps(document), strict=True)
+    return contents
 
 
 def predict(
@@ -135,7 +164,8 @@ def predict(
     checkpoint : Checkpoint
         The decoder.
     assets : iterable of StructuredLatents
-        Latents as TRELLIS gives them; they are standardised here.
+        Latents as the checkpoint's `LatentSpace` has them, unless they say of
+        themselves that they are standardised; they are standardised here.
     batch_voxels : int
         Assets are decoded together until they have so many voxels. What else
         is in a batch may change the last bits of a prediction.
@@ -161,8 +191,10 @@ def _decode(checkpoint: Checkpoint, assets: list[StructuredLatents]) -> Iterator
     counts = [len(latents.coords) for latents in assets]
     voxels = np.concatenate([latents.coords for latents in assets]).astype(np.int32)
     asset = np.repeat(np.arange(len(assets), dtype=np.int32), counts)
-    feats = np.concatenate([latents.feats for latents in assets])
-    feats = (feats - np.array(FEATS_MEAN, np.float32)) / np.array(FEATS_STD, np.float32)
+    space = replace(checkpoint.contents.latents, standardised=False)
+    feats = np.concatenate(
+        [one.feats if one.standardised else space.standardise(one.feats) for one in assets]
+    )
     device = checkpoint.device
     coords = torch.from_numpy(np.concatenate([asset[:, None], voxels], axis=1)).to(device)
     said = checkpoint.model(coords, torch.from_numpy(feats).to(device))
@@ -176,7 +208,7 @@ def _decode(checkpoint: Checkpoint, assets: list[StructuredLatents]) -> Iterator
             coords=latents.coords,
             properties=own,
             properties_si=denormalize_properties(own, checkpoint.normalization),
-            material=likely[:, :BACKGROUND].argmax(axis=1).astype(np.uint8),
+            material=likely[:, : max(likely.shape[1] - 1, 1)].argmax(axis=1).astype(np.uint8),
             probabilities=likely,
             seconds=seconds * len(own),
         )
@@ -187,8 +219,9 @@ def write_prediction(
 ) -> Path:
     """Write ``<asset id>.npz`` and return its path.
 
-    It has the arrays of a `PredictedField`, ``ranges`` (3, 2) of the mapped
-    properties, ``checkpoint`` (the SHA-256 of its file) and ``seconds``.
+    It has the arrays of a `PredictedField`, ``ranges`` (P, 2) of the mapped
+    properties, ``columns`` (P,), their names, ``checkpoint`` (the SHA-256 of its
+    file) and ``seconds``.
     """
     path = folder / f"{file_name(asset_id)}.npz"
     with staged(path) as file, file.open("wb") as stream:
@@ -200,6 +233,7 @@ def write_prediction(
             material=field.material,
             probabilities=field.probabilities,
             ranges=np.array([[span.lo, span.hi] for span in checkpoint.normalization.ranges]),
+            columns=np.array([span.name for span in checkpoint.normalization.ranges]),
             checkpoint=np.array(checkpoint.sha256),
             seconds=np.array(field.seconds),
         )

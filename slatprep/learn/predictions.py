@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -20,12 +20,12 @@ from slatprep.errors import InputError, StoreError
 from slatprep.geometry.voxels import flat_index
 from slatprep.learn.splits import Shares
 from slatprep.learn.zarr_arrays import read_array
-from slatprep.normalize import change_ranges, normalization_of
+from slatprep.normalize import change_ranges
 from slatprep.readers.files import ArraySpec, load_source, npz_arrays, refusing
 from slatprep.readers.hdf5 import group_arrays
 from slatprep.records import (
     MATERIAL_CLASSES,
-    PROPERTY_COLUMNS,
+    MAX_PROPERTIES,
     RESOLUTION,
     Normalization,
     Share,
@@ -52,11 +52,11 @@ _FORMS = "a directory of <asset id>.npz, a Zarr group or an HDF5 file with a gro
 _NUMBERS = "iuf"
 
 _SPECS = {
-    "properties": ArraySpec(((None, 3),), _NUMBERS),
+    "properties": ArraySpec(tuple((None, n + 1) for n in range(MAX_PROPERTIES)), _NUMBERS),
     "material": ArraySpec(((None,),), _NUMBERS),
     "logits": ArraySpec(((None, CLASSES),), _NUMBERS),
     "coords": ArraySpec(((None, 3),), _NUMBERS),
-    "ranges": ArraySpec(((len(PROPERTY_COLUMNS), 2),), _NUMBERS),
+    "ranges": ArraySpec(tuple((n + 1, 2) for n in range(MAX_PROPERTIES)), _NUMBERS),
 }
 """What a prediction may have; whatever else lies beside it is not read."""
 
@@ -67,8 +67,8 @@ class VoxelPrediction:
 
     Attributes
     ----------
-    properties : ndarray of float64, shape (N, 3)
-        Young's modulus, density, Poisson's ratio in normalised space.
+    properties : ndarray of float64, shape (N, P)
+        The store's properties in normalised space.
     material : ndarray of int64, shape (N,), optional
         Class 0..7.
     converted : bool
@@ -178,9 +178,9 @@ def check_prediction(
     source : str
         Where it comes from, for messages.
     arrays : mapping of str to ndarray
-        ``properties`` (N, 3); optionally ``material`` (N,) or ``logits``
+        ``properties`` (N, P); optionally ``material`` (N,) or ``logits``
         (N, 8), ``coords`` (N, 3), without which the order is taken to be
-        the store's, and ``ranges`` (3, 2), without which they are.
+        the store's, and ``ranges`` (P, 2), without which they are.
     coords : ndarray of uint8, shape (N, 3)
         Voxels of the store.
     normalization : Normalization
@@ -194,12 +194,20 @@ def check_prediction(
     count = len(coords)
     if "properties" not in arrays:
         raise InputError(source, f"has {', '.join(sorted(arrays)) or 'nothing'}", "properties")
-    properties = _shaped(source, "properties", arrays, (count, 3)).astype(np.float64)
+    columns = len(normalization.ranges)
+    properties = _shaped(source, "properties", arrays, (count, columns)).astype(np.float64)
     if not np.isfinite(properties).all():
         raise InputError(source, "properties are not all finite", "numbers in normalised space")
     converted = False
     if "ranges" in arrays:
-        ranges = normalization_of(_checked_ranges(source, arrays), "prediction")
+        spans = _checked_ranges(source, arrays, columns).tolist()
+        ranges = Normalization(
+            tuple(
+                replace(r, lo=lo, hi=hi)
+                for r, (lo, hi) in zip(normalization.ranges, spans, strict=True)
+            ),
+            "prediction",
+        )
         converted = ranges.ranges != normalization.ranges
         if converted:
             properties = change_ranges(properties, ranges, normalization)
@@ -219,8 +227,10 @@ def check_prediction(
     return VoxelPrediction(properties, material, converted)
 
 
-def _checked_ranges(source: str, arrays: Mapping[str, NDArray[Any]]) -> NDArray[np.float64]:
-    ranges = _shaped(source, "ranges", arrays, (len(PROPERTY_COLUMNS), 2)).astype(np.float64)
+def _checked_ranges(
+    source: str, arrays: Mapping[str, NDArray[Any]], columns: int
+) -> NDArray[np.float64]:
+    ranges = _shaped(source, "ranges", arrays, (columns, 2)).astype(np.float64)
     if not (np.isfinite(ranges).all() and (ranges[:, 0] < ranges[:, 1]).all()):
         raise InputError(source, f"ranges are {ranges.tolist()}", "lo below hi, a row a property")
     return ranges

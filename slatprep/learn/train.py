@@ -223,8 +223,8 @@ def train(
             session.history.append(record)
             run.save(LAST, session.state())
             if session.best_epoch == record.epoch:
-                ranges = opened.normalization
-                run.save(BEST, checkpoint_state(session.model, parameters.size, ranges))
+                ranges, holds = opened.normalization, opened.contents
+                run.save(BEST, checkpoint_state(session.model, parameters.size, ranges, holds))
             run.log(session.history)
             if progress is not None:
                 progress(record)
@@ -262,7 +262,7 @@ class _Session:
         torch.manual_seed(parameters.seed)
         torch.use_deterministic_algorithms(device == "cpu")
         self.parameters, self.device = parameters, device
-        self.model = make_decoder(parameters.size).to(device)
+        self.model = make_decoder(parameters.size, dataset.store.contents).to(device)
         self.optimizer = torch.optim.AdamW(self.model.parameters(), lr=parameters.learning_rate)
         pinned = device != "cpu"
         self.loader = SlatLoader(
@@ -396,6 +396,7 @@ def _write_predictions(checkpoint: Checkpoint, dataset: SlatDataset, folder: Pat
     """Write what `slatprep evaluate` reads of each asset, decoded one by one."""
     for index, asset_id in zip(dataset.indices.tolist(), dataset.asset_ids, strict=True):
         rows = dataset.store.read(index, ("coords", "feats"))
-        latents = StructuredLatents(rows["coords"], rows["feats"])
+        done = dataset.store.contents.latents.standardised
+        latents = StructuredLatents(rows["coords"], rows["feats"], standardised=done)
         (field,) = predict(checkpoint, [latents])
         write_prediction(folder, asset_id, field, checkpoint)

@@ -58,7 +58,10 @@ class PixieverseSource(_Group):
     Patterns are relative to `root` and name ``{id}`` (one path component) and
     optionally ``{sample}``; the first grid pattern that matches anything for
     an object is used. `sample` chooses among several samples of an object;
-    left empty, an object with more than one sample is a fault.
+    left empty, an object with more than one sample is a fault. `adapter` is
+    what reads it, one of `slatprep.readers.adapters.SOURCES` or another
+    package's. `transform` is, for the engine ``known``, the file with the
+    transform to the SLAT frame: one for all, or a pattern that names ``{id}``.
     """
 
     root: PlaceText
@@ -69,6 +72,8 @@ class PixieverseSource(_Group):
     mask: tuple[str, ...] = ("{id}/clip_features_mask.npy", "{id}/sample_{sample}_mask.npy")
     bounds: tuple[str, ...] = ("{id}/clip_features.npz",)
     sample: str = ""
+    adapter: str = "pixieverse"
+    transform: str = ""
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "root", place_of(self.root))
@@ -81,6 +86,10 @@ class SlatSource(_Group):
     Patterns are relative to `root` and name ``{id}`` and optionally
     ``{view}``. Where `root` is an HDF5 file, or a pattern names no ``{id}``,
     the file holds one group an asset, named by `group`.
+
+    `encoder` is what made the latents: a name of `slatprep.readers.adapters.LATENTS`, or
+    the path of a JSON file that describes another. `standardised` says whether
+    they have been standardised already; ``auto`` decides by what they look like.
     """
 
     root: PlaceText
@@ -94,6 +103,8 @@ class SlatSource(_Group):
         "latents/*/{id}.npz",
     )
     group: str = "{id}"
+    encoder: str = "trellis"
+    standardised: Literal["auto", "yes", "no"] = "auto"
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "root", place_of(self.root))
@@ -254,6 +265,10 @@ class BuildParameters(_Group):
     sample: SampleParameters = field(default_factory=SampleParameters)
     normalize: NormalizeParameters = field(default_factory=NormalizeParameters)
     store: StoreParameters = field(default_factory=StoreParameters)
+
+    def __post_init__(self) -> None:
+        if self.pixieverse.transform and self.align.engine is not Engine.KNOWN:
+            raise ValueError('align.engine = "known", as pixieverse.transform is given')
 
 
 @dataclass(frozen=True)

@@ -40,6 +40,7 @@ _UNKNOWN_KEY = "unexpected_keyword_argument"
 OPTIONS = {
     "pixieverse.root": "--pixieverse",
     "slat.root": "--slat",
+    "slat.encoder": "--encoder",
     "pairing.map": "--map",
     "normalize.ranges": "--ranges",
     "normalize.objects": "--ranges-of",
@@ -49,8 +50,8 @@ OPTIONS = {
 """The options that give a value of the file, by its key."""
 
 _PATHS = (
-    "pixieverse.root", "slat.root", "pairing.map", "pairing.categories", "normalize.ranges",
-    "normalize.split_by",
+    "pixieverse.root", "slat.root", "slat.encoder", "pairing.map", "pairing.categories",
+    "normalize.ranges", "normalize.split_by",
 )  # fmt: skip
 
 
@@ -158,6 +159,8 @@ def _is_path(key: str, value: object) -> bool:
     """Whether the value of one of `_PATHS` is a path, and not a word."""
     if key == "ranges":
         return value not in NAMED_RANGES and percentiles_of(str(value)) is None
+    if key == "encoder":
+        return str(value).endswith(".json")
     return key != "split_by" or is_split_file(str(value))
 
 

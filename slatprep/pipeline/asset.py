@@ -24,7 +24,7 @@ from slatprep.pipeline.spool import FailedAsset, Spool, SpooledAsset
 from slatprep.provenance.make import record_of, record_of_failed
 from slatprep.provenance.record import AssetRecord
 from slatprep.readers import read_field, read_latents
-from slatprep.readers.identity import source_digests
+from slatprep.readers.identity import reading_of, source_digests
 from slatprep.records import AssetPair, Failed, Finished, Status
 from slatprep.sample import sample
 from slatprep.storage.faults import reached
@@ -157,7 +157,8 @@ def _repeated(
 def _key(asset: Finished, recipe: Recipe) -> str:
     sources = asset.field.sources + asset.latents.sources
     shared = asset.latents if asset.pair.slat_group else None
-    return recipe.key(asset.pair.asset_id, source_digests(sources, shared))
+    digests = source_digests(sources, shared) | reading_of(asset.pair.roots)
+    return recipe.key(asset.pair.asset_id, digests)
 
 
 def _resumed(planned: PlannedAsset, spool: Spool) -> SpooledAsset | None:

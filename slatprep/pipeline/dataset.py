@@ -17,7 +17,7 @@ from slatprep.pipeline.asset import fail_asset, finish_asset, process_asset
 from slatprep.pipeline.consensus import apply_consensus
 from slatprep.pipeline.context import BuildContext
 from slatprep.pipeline.kernels import compile_kernels
-from slatprep.pipeline.pack import pack_store
+from slatprep.pipeline.pack import latent_warnings, pack_store, settled_contents
 from slatprep.pipeline.plan import Action, BuildPlan, PlannedAsset, plan_assets
 from slatprep.pipeline.previous import previous_build
 from slatprep.pipeline.publish import Destination, publish_manifests, write_all_records
@@ -31,8 +31,8 @@ from slatprep.pipeline.work import Work, work_beside, work_directory
 from slatprep.provenance.make import complete_record, origin
 from slatprep.provenance.record import AssetRecord, Clipped, Record
 from slatprep.provenance.record_json import write_records
-from slatprep.readers import discover
-from slatprep.records import AssetPair, Normalization, Place
+from slatprep.readers import contents_of, discover
+from slatprep.records import AssetPair, Contents, Normalization, Place
 from slatprep.storage.atomic import staged, writing
 from slatprep.store.writer import finish_store
 from slatprep.workers.local import Jobs, at_most, require_shared, run_unordered
@@ -111,7 +111,8 @@ def build_store(
     """
     begin = time.perf_counter()
     place = Destination(out, manifests)
-    given = given_ranges(parameters.normalize)
+    declared = contents_of(parameters)
+    given = given_ranges(parameters.normalize, declared.properties)
     source = given.source if given else source_of(parameters.normalize)
     with work_beside(place.store, fresh=fresh, keep=keep_work) as work:
         place.look()
@@ -123,14 +124,15 @@ def build_store(
         new, unchanged = _split(pairs, plan)
         _compile(plan, jobs, note)
         assets = _finish(new, plan, context, jobs, progress)
-        if not damaged and is_current(plan, assets, context, given or source):
+        if not damaged and is_current(plan, assets, context, given or source, declared):
             return repeat_summary(assets, context, place, time.perf_counter() - begin)
         assets += _finish(unchanged, plan, context, jobs, progress)
         usable, failed = _usable_and_failed(assets, parameters, pairs)
         usable = apply_consensus(usable, work.spool, parameters, jobs, note)
         usable = apply_witness(usable, work.spool, parameters, jobs, note)
         with writing(str(place.out), work_directory(place.store).parent):
-            packed = _pack(usable, failed, given, work, parameters, jobs)
+            contents = settled_contents(usable, declared, parameters.slat.standardised)
+            packed = _pack(usable, failed, given, work, parameters, jobs, contents)
             place.replace(packed.store)
         summary = summarise_build(
             [*usable, *failed],
@@ -141,6 +143,7 @@ def build_store(
             normalization=packed.normalization,
             clipped=packed.clipped,
             damaged=damaged,
+            warnings=latent_warnings(usable, contents.latents, parameters.slat.standardised),
         )
         publish_manifests(packed.records, summary, parameters)
         place.publish()
@@ -311,14 +314,17 @@ def _pack(
     work: Work,
     parameters: BuildParameters,
     jobs: Jobs,
+    contents: Contents,
 ) -> _Packed:
     """Normalise and pack the rows of a store, then its records and its root attributes."""
-    normalization = given or dataset_ranges(usable, work.spool, parameters.normalize, jobs)
+    normalization = given or dataset_ranges(
+        usable, work.spool, parameters.normalize, jobs, contents.properties
+    )
     store, records = work.scratch / "store.zarr", work.scratch / "assets.jsonl"
-    clipped = pack_store(store, work.spool, usable, normalization, parameters.store, jobs)
+    clipped = pack_store(store, work.spool, usable, normalization, parameters.store, jobs, contents)
     completed = _completed_records(work.spool, usable, failed, normalization, clipped)
     build_id = write_all_records(store, records, completed)
-    finish_store(store, normalization, build_id, origin(parameters))
+    finish_store(store, normalization, build_id, origin(parameters), contents)
     return _Packed(store, records, build_id, normalization, clipped)
 
 

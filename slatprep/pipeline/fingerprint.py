@@ -16,6 +16,9 @@ from pathlib import Path
 
 STAGES = (
     "slatprep.readers.pixieverse",
+    "slatprep.readers.voxels",
+    "slatprep.readers.vomp",
+    "slatprep.readers.transforms",
     "slatprep.readers.slat",
     "slatprep.align",
     "slatprep.sample",

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from slatprep.errors import ConfigError, StoreError
 from slatprep.normalize import denormalize_properties, normalize_properties
 from slatprep.parameters import BuildParameters, StoreParameters
-from slatprep.pipeline.pack import write_assets
+from slatprep.pipeline.pack import settled_contents, write_assets
 from slatprep.pipeline.publish import Destination, publish_manifests, write_all_records
 from slatprep.pipeline.spool import spooled
 from slatprep.pipeline.summary import BuildSummary, summarise_build
@@ -32,7 +32,7 @@ from slatprep.provenance.places import manifests_beside
 from slatprep.provenance.record import AssetRecord
 from slatprep.provenance.record_json import adapter_of
 from slatprep.provenance.stored import StoredRecords
-from slatprep.records import Normalization, Place, PropertyRange
+from slatprep.records import Contents, Normalization, Place, PropertyRange
 from slatprep.storage.atomic import writing
 from slatprep.storage.place import storage_of
 from slatprep.store import Store, open_store
@@ -106,7 +106,9 @@ def subset_store(
     rows = [(source, row) for row in sorted({source.store.match(name) for name in assets})]
     if not rows:
         raise ConfigError(f"no asset of {source.store.path} is chosen; expected one at least")
-    return _write(rows, source.store.normalization, source.build, out, manifests, progress)
+    contents = source.store.contents
+    ranges = source.store.normalization
+    return _write(rows, ranges, source.build, out, manifests, progress, contents)
 
 
 def concat_stores(
@@ -155,10 +157,10 @@ def concat_stores(
             f"{len(twice)} ids are in more than one store, such as {', '.join(twice[:3])}; "
             "expected each once: leave them out of one with `slatprep subset`"
         )
-    build = _common_build(sources)
+    build, contents = _common_build(sources), _common_contents(sources)
     normalization = _common_ranges(sources)
     rows.sort(key=lambda row: row[0].store.ids[row[1]])
-    return _write(rows, normalization, build, out, manifests, progress)
+    return _write(rows, normalization, build, out, manifests, progress, contents)
 
 
 def _source(place: str | Place) -> _Source:
@@ -221,11 +223,35 @@ def _common_ranges(sources: Sequence[_Source]) -> Normalization:
                 f"{source.store.path} has ranges from {one.source!r}, not those of the others; "
                 "expected the same in all, or in each those of its dataset: build with --ranges"
             )
-    first, second, third = (
+    spans = (
         PropertyRange(same[0].name, same[0].log10, min(r.lo for r in same), max(r.hi for r in same))
         for same in zip(*(one.ranges for one in ranges), strict=True)
     )
-    return Normalization((first, second, third), "dataset")
+    return Normalization(tuple(spans), "dataset")
+
+
+def _common_contents(sources: Sequence[_Source]) -> Contents:
+    """Return what all stores hold; moments of latents that a build measured are pooled."""
+    first = sources[0].store.contents
+    for source in sources[1:]:
+        other = source.store.contents
+        for name in ("properties", "classes"):
+            if getattr(other, name) != getattr(first, name):
+                raise ConfigError(
+                    f"{source.store.path} has other {name} than {sources[0].store.path}; "
+                    "expected the same tables in both"
+                )
+        if replace(other.latents, mean=(), std=()) != replace(first.latents, mean=(), std=()):
+            raise ConfigError(
+                f"{source.store.path} has latents of {other.latents.encoder!r} (standardised: "
+                f"{other.latents.standardised}), {sources[0].store.path} of "
+                f"{first.latents.encoder!r} ({first.latents.standardised}); expected the same"
+            )
+    if all(source.store.contents == first for source in sources):
+        return first
+    unknown = replace(first, latents=replace(first.latents, mean=(), std=()))
+    rows = (spooled(record, _NO_EXTENT) for source in sources for record in source.records)
+    return settled_contents(rows, unknown, "as said")
 
 
 def _write(
@@ -235,6 +261,7 @@ def _write(
     out: str | Place,
     manifests: str | Place | None,
     progress: Progress | None,
+    contents: Contents,
 ) -> BuildSummary:
     begin = time.perf_counter()
     place = Destination(out, manifests)
@@ -249,11 +276,11 @@ def _write(
         store, records = work.scratch / "store.zarr", work.scratch / "assets.jsonl"
         with writing(str(place.out), work_directory(place.store).parent):
             offsets = [0, *accumulate(asset.n_voxels for asset in assets)]
-            create_store(store, len(rows), offsets[-1], parameters.store)
+            create_store(store, len(rows), offsets[-1], parameters.store, contents)
             write_assets(store, assets, offsets, normalization)
             _copy_rows(store, rows, offsets, normalization, parameters.store, progress)
             build_id = write_all_records(store, records, _records(rows, normalization))
-            finish_store(store, normalization, build_id, build)
+            finish_store(store, normalization, build_id, build, contents)
             place.replace(store)
         summary = summarise_build(
             assets,
@@ -293,7 +320,7 @@ def _records(rows: Iterable[_Row], normalization: Normalization) -> Iterator[Ass
 
 
 def _counts(counts: Any) -> list[int]:
-    return [counts.youngs_modulus, counts.density, counts.poissons_ratio]
+    return list(counts.values())
 
 
 def _copy_rows(

@@ -23,7 +23,6 @@ from slatprep.provenance.record import (
     AssetRecord,
     BuildCounts,
     BuildRecord,
-    PropertyCounts,
     Record,
     Versions,
 )
@@ -224,7 +223,7 @@ def build_record(
         counts=BuildCounts(
             summary.n_voxels,
             summary.n_valid,
-            PropertyCounts(**summary.clipped),
+            dict(summary.clipped),
             summary.n_unphysical,
         ),
     )

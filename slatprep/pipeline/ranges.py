@@ -10,31 +10,30 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slatprep.errors import ConfigError
-from slatprep.normalize import (
-    PIXIE_RANGES,
-    ranges_from_bounds,
-    ranges_from_extents,
-    to_mapped,
-)
+from slatprep.normalize import ranges_from_bounds, ranges_from_extents, to_mapped
 from slatprep.parameters import NormalizeParameters, is_split_file, percentiles_of
 from slatprep.pipeline.spool import Spool, SpooledAsset
-from slatprep.readers.ranges import read_ranges
+from slatprep.readers.ranges import pixie_ranges, read_ranges
 from slatprep.readers.splits import Shares, assign_splits, read_id_file, read_lists
-from slatprep.records import PROPERTY_COLUMNS, Normalization
+from slatprep.records import PROPERTIES, Normalization, Property
 from slatprep.storage.place import place_of
 from slatprep.workers.local import Jobs, run_unordered
+
+_SIGN = np.uint32(1 << 31)
 
 _HALF = 16
 """Bits that the first pass over the fields counts by."""
 
 
-def given_ranges(parameters: NormalizeParameters) -> Normalization | None:
+def given_ranges(
+    parameters: NormalizeParameters, table: Sequence[Property] = PROPERTIES
+) -> Normalization | None:
     """Return ranges that do not depend on the dataset, or None; read first, to fail early."""
     if parameters.ranges == "dataset" or percentiles_of(parameters.ranges):
         return None
     if parameters.ranges == "pixie":
-        return PIXIE_RANGES
-    return read_ranges(place_of(parameters.ranges))
+        return pixie_ranges(table)
+    return read_ranges(place_of(parameters.ranges), table)
 
 
 def source_of(parameters: NormalizeParameters) -> str:
@@ -56,7 +55,11 @@ def source_of(parameters: NormalizeParameters) -> str:
 
 
 def dataset_ranges(
-    usable: Sequence[SpooledAsset], spool: Spool, parameters: NormalizeParameters, jobs: Jobs
+    usable: Sequence[SpooledAsset],
+    spool: Spool,
+    parameters: NormalizeParameters,
+    jobs: Jobs,
+    table: Sequence[Property] = PROPERTIES,
 ) -> Normalization:
     """Return the ranges of the usable assets' fields: their extent, or percentiles.
 
@@ -74,6 +77,8 @@ def dataset_ranges(
         Ranges that are of the dataset.
     jobs : int or Workers
         As for a build.
+    table : sequence of Property
+        The properties.
 
     Raises
     ------
@@ -85,13 +90,13 @@ def dataset_ranges(
     chosen, source = _chosen(usable, parameters), source_of(parameters)
     percentiles = percentiles_of(parameters.ranges)
     if percentiles is None:
-        return ranges_from_extents([asset.extent for asset in chosen], source)
+        return ranges_from_extents([asset.extent for asset in chosen], source, table)
     keys = [asset.key for asset in chosen]
-    coarse = _counted(spool, keys, jobs)
+    coarse = _counted(spool, keys, jobs, len(table))
     place = (sum(coarse[0].values()) - 1) * np.array(percentiles) / 100
     ranks = np.concatenate([np.floor(place), np.ceil(place)]).astype(int).tolist()
     halves = [[_at(counts, rank) for rank in ranks] for counts in coarse]
-    fine = _counted(spool, keys, jobs, [{half for half, _ in own} for own in halves])
+    fine = _counted(spool, keys, jobs, len(table), [{h for h, _ in own} for own in halves])
     bits = [
         [
             _at({value: n for value, n in counts.items() if value >> _HALF == half}, rank)[0]
@@ -99,9 +104,9 @@ def dataset_ranges(
         ]
         for counts, own in zip(fine, halves, strict=True)
     ]
-    below, above = np.split(to_mapped(np.array(bits, dtype=np.uint32).view(np.float32).T), 2)
+    below, above = np.split(to_mapped(_of_ranks(np.array(bits, dtype=np.uint32)).T, table), 2)
     lo, hi = below + (place % 1)[:, None] * (above - below)
-    return ranges_from_bounds(lo, hi, source)
+    return ranges_from_bounds(lo, hi, source, table)
 
 
 def _chosen(
@@ -127,9 +132,13 @@ def _chosen(
 
 
 def _counted(
-    spool: Spool, keys: Sequence[str], jobs: Jobs, halves: Sequence[set[int]] | None = None
+    spool: Spool,
+    keys: Sequence[str],
+    jobs: Jobs,
+    columns: int,
+    halves: Sequence[set[int]] | None = None,
 ) -> list[Counter[int]]:
-    totals: list[Counter[int]] = [Counter() for _ in PROPERTY_COLUMNS]
+    totals: list[Counter[int]] = [Counter() for _ in range(columns)]
     for counts in run_unordered(count_bits, ((spool, key, halves) for key in keys), jobs):
         for total, (bits, numbers) in zip(totals, counts, strict=True):
             total.update(dict(zip(bits.tolist(), numbers.tolist(), strict=True)))
@@ -139,7 +148,7 @@ def _counted(
 def count_bits(
     spool: Spool, key: str, halves: Sequence[set[int]] | None = None
 ) -> list[tuple[NDArray[np.uint32], NDArray[np.int64]]]:
-    """Count a field's values by their bits, which order floats that are not negative.
+    """Count a field's values by their bits, brought to an order that is that of the values.
 
     Parameters
     ----------
@@ -157,14 +166,26 @@ def count_bits(
     list of tuple of ndarray
         Of each property the bits, sorted, and how often they occur.
     """
-    # Minus zero is no less than zero.
-    bits = np.abs(spool.field(key).properties).view(np.uint32)
+    bits = _in_order(spool.field(key).properties)
     if halves is None:
         return [np.unique(column >> _HALF, return_counts=True) for column in bits.T]
     return [
         np.unique(column[np.isin(column >> _HALF, list(own))], return_counts=True)
         for column, own in zip(bits.T, halves, strict=True)
     ]
+
+
+def _in_order(values: NDArray[np.float32]) -> NDArray[np.uint32]:
+    """Return the bits of floats so changed that they have the floats' order."""
+    # Minus zero is no less than zero.
+    bits = np.ascontiguousarray(values + np.float32(0)).view(np.uint32)
+    ordered: NDArray[np.uint32] = np.where(bits >> 31, ~bits, bits | _SIGN)
+    return ordered
+
+
+def _of_ranks(ordered: NDArray[np.uint32]) -> NDArray[np.float32]:
+    """Return the floats of bits that `_in_order` made."""
+    return np.where(ordered >> 31, ordered ^ _SIGN, ~ordered).view(np.float32)
 
 
 def _at(counts: Mapping[int, int], rank: int) -> tuple[int, int]:

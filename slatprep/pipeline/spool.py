@@ -28,7 +28,9 @@ from slatprep.provenance.record_json import read_record, to_json
 from slatprep.records import (
     RESOLUTION,
     Annotation,
+    LatentMoments,
     MaterialField,
+    Property,
     Status,
     StructuredLatents,
 )
@@ -56,10 +58,12 @@ class SpooledAsset:
         SLAT voxels, and those that found an annotation.
     n_placements : int
         Distinct placements that fit about as well as the one chosen.
-    extent : ndarray of float64, shape (3, 2)
+    extent : ndarray of float64, shape (P, 2)
         What `slatprep.normalize.property_extent` gives.
     columns : dict
         See `slatprep.provenance.columns.columns_of`.
+    latents : LatentMoments or None
+        Of its latents; None where its record does not tell.
     damaged : str
         Why, in words, what an older store holds of it was not taken over.
     """
@@ -71,6 +75,7 @@ class SpooledAsset:
     n_placements: int
     extent: NDArray[np.float64]
     columns: dict[str, Column]
+    latents: LatentMoments | None = None
     damaged: str = ""
 
 
@@ -123,6 +128,9 @@ class Spool:
                 "grid_voxels": field.voxels,
                 "grid_material": field.material,
                 "grid_properties": field.properties,
+                "grid_table": np.array([(one.name, one.unit) for one in field.table]),
+                "grid_log10": np.array([one.log10 for one in field.table]),
+                "grid_classified": np.array(field.classified),
             }
         self._write(record.key, record, arrays)
         return spooled(record, extent)
@@ -183,6 +191,13 @@ class Spool:
                 voxels=arrays["grid_voxels"],
                 material=arrays["grid_material"],
                 properties=arrays["grid_properties"],
+                table=tuple(
+                    Property(str(name), str(unit), bool(log10))
+                    for (name, unit), log10 in zip(
+                        arrays["grid_table"], arrays["grid_log10"], strict=True
+                    )
+                ),
+                classified=bool(arrays["grid_classified"]),
             )
 
     def _path(self, key: str) -> Path:
@@ -212,6 +227,7 @@ def spooled(record: AssetRecord, extent: NDArray[np.float64]) -> SpooledAsset:
         n_voxels=record.counts.slat_voxels,
         n_valid=record.counts.valid,
         n_placements=len(record.alignment.placements),
+        latents=record.latents,
         extent=extent,
         columns=columns_of(record),
     )

@@ -13,7 +13,7 @@ from slatprep.parameters import BuildParameters
 from slatprep.pipeline.spool import FailedAsset, SpooledAsset
 from slatprep.provenance.record import Clipped
 from slatprep.readers.pairing import explain_unmatched
-from slatprep.records import PROPERTY_COLUMNS, AssetPair, Normalization, Place, Status
+from slatprep.records import AssetPair, Normalization, Place, Status
 
 PROBLEMS_LISTED = 100
 """How many problems a summary lists; the records hold all."""
@@ -50,6 +50,8 @@ class BuildSummary:
         Ranges of the properties.
     clipped : dict
         By property, values of ``voxel/properties`` that lay outside its range.
+    warnings : tuple of str
+        What a person should know about the dataset as a whole.
     damaged : tuple of str
         What of the store that was there was not as it was written, and was made anew.
     """
@@ -68,6 +70,7 @@ class BuildSummary:
     normalization: Normalization | None = None
     clipped: Mapping[str, int] = field(default_factory=dict)
     damaged: tuple[str, ...] = ()
+    warnings: tuple[str, ...] = ()
 
     @property
     def complete(self) -> bool:
@@ -85,6 +88,7 @@ def summarise_build(
     normalization: Normalization | None = None,
     clipped: Iterable[Clipped] = (),
     damaged: Sequence[str] = (),
+    warnings: Iterable[str] = (),
 ) -> BuildSummary:
     """Count what became of the assets."""
     usable = [asset for asset in assets if isinstance(asset, SpooledAsset)]
@@ -107,14 +111,17 @@ def summarise_build(
         store=store,
         normalization=normalization,
         clipped=_clipped_by_property(clipped),
+        warnings=tuple(warnings),
         damaged=(*damaged, *(f"{a.asset_id}: {a.damaged}" for a in usable if a.damaged)),
     )
 
 
 def _clipped_by_property(clipped: Iterable[Clipped]) -> dict[str, int]:
     """Return the clipped values of ``voxel/properties`` of all assets, by property."""
-    counts = [asset.voxel for asset in clipped]
-    return {name: sum(getattr(count, name) for count in counts) for name in PROPERTY_COLUMNS}
+    counts: Counter[str] = Counter()
+    for asset in clipped:
+        counts.update(asset.voxel)  # Zeros are kept, and the order of the columns.
+    return dict(counts)
 
 
 def nothing_usable(

@@ -10,6 +10,7 @@ import numpy as np
 
 from slatprep.errors import StoreError
 from slatprep.pipeline.context import BuildContext
+from slatprep.pipeline.pack import settled_contents
 from slatprep.pipeline.plan import Action, PlannedAsset
 from slatprep.pipeline.previous import PreviousBuild
 from slatprep.pipeline.publish import Destination, build_record, publish_manifests
@@ -24,7 +25,7 @@ from slatprep.provenance.record_json import (
     to_json,
     write_records,
 )
-from slatprep.records import Normalization, Place
+from slatprep.records import Contents, Normalization, Place
 from slatprep.storage.atomic import writing
 from slatprep.storage.documents import read_bounded
 from slatprep.storage.place import storage_of
@@ -36,6 +37,7 @@ def is_current(
     others: Sequence[SpooledAsset | FailedAsset],
     context: BuildContext,
     ranges: Normalization | str,
+    declared: Contents,
 ) -> bool:
     """Whether the store that is there is the one that this build would write.
 
@@ -49,6 +51,8 @@ def is_current(
         The build.
     ranges : Normalization or str
         Ranges that do not depend on the dataset, or where those of the dataset come from.
+    declared : Contents
+        What the sources hold.
     """
     previous = context.previous
     if previous is None or any(isinstance(asset, SpooledAsset) for asset in others):
@@ -61,6 +65,12 @@ def is_current(
         and actions.count(Action.REUSE) == len(store)
         and store.attributes.get("build") == origin(context.parameters)
         and ranges in (store.normalization, store.normalization.source)
+        and store.contents
+        == settled_contents(
+            (spooled(record, np.empty((0, 2))) for record in previous.records),
+            declared,
+            context.parameters.slat.standardised,
+        )
         and records_id(_all_records(others, previous, context)) == previous.build_id
     )
 

@@ -60,6 +60,7 @@ def record_of(
         alignment=asset.alignment,
         judgement=asset.judgement,
         counts=counts_of(asset),
+        latents=latents.moments,
         warnings=field.warnings + latents.warnings,
         duration_s=round(seconds, 4),
     )

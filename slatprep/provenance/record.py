@@ -17,13 +17,15 @@ from annotated_types import Ge, MaxLen, MinLen
 
 from slatprep.parameters import AlignParameters, BuildParameters, SampleParameters
 from slatprep.records import (
-    PROPERTY_COLUMNS,
+    MAX_PROPERTIES,
     Alignment,
     Count,
     Digest,
     InJson,
     Judgement,
+    LatentMoments,
     Normalization,
+    PropertyName,
     SourceFile,
     Status,
     Verdict,
@@ -69,13 +71,8 @@ class StageParameters:
     sample: SampleParameters
 
 
-@dataclass(frozen=True)
-class PropertyCounts:
-    """How many values, by property."""
-
-    youngs_modulus: Count
-    density: Count
-    poissons_ratio: Count
+PropertyCounts = Annotated[dict[PropertyName, Count], MaxLen(MAX_PROPERTIES)]
+"""How many values, by property."""
 
 
 @dataclass(frozen=True)
@@ -160,6 +157,8 @@ class AssetRecord:
     """The ranges of the properties; null where no store was built."""
     counts: VoxelCounts
     """Voxels of the asset."""
+    latents: LatentMoments | None = None
+    """Mean and standard deviation of each channel of its latents, as they lie in the file."""
     warnings: Annotated[tuple[str, ...], MaxLen(256)]
     """What a person should know about the sources."""
     duration_s: Seconds = 0.0
@@ -273,6 +272,7 @@ class BuildRecord:
     """Voxels of the store."""
 
 
-def property_counts(counts: Iterable[int]) -> PropertyCounts:
-    """Return counts in the order of ``PROPERTY_COLUMNS`` by name."""
-    return PropertyCounts(**dict(zip(PROPERTY_COLUMNS, map(int, counts), strict=True)))
+def property_counts(counts: Iterable[int], normalization: Normalization) -> PropertyCounts:
+    """Return counts in the order of the ranges by name."""
+    names = (one.name for one in normalization.ranges)
+    return dict(zip(names, map(int, counts), strict=True))

@@ -124,9 +124,29 @@ def _read(kind: Any, text: bytes | str, where: str) -> Any:
     from pydantic import ValidationError
 
     try:
-        return adapter_of(kind).validate_json(text, strict=True)
+        read = adapter_of(kind).validate_json(text, strict=True)
     except ValidationError as error:
         raise RecordError(where, _faults(error)) from None
+    if isinstance(read, AssetRecord) and (faults := tuple(_table_faults(read))):
+        raise RecordError(where, faults)
+    return read
+
+
+def _table_faults(record: AssetRecord) -> Iterator[str]:
+    """Yield where a record does not have the properties that its ranges name."""
+    if record.normalization is None:
+        return
+    names = [one.name for one in record.normalization.ranges]
+    for at, of in (
+        ("judgement", record.judgement),
+        ("first_pass/judgement", record.first_pass and record.first_pass.judgement),
+    ):
+        if of and len(of.ambiguity.property_change) != len(names):
+            yield f"{at}/ambiguity/property_change: should have a number for each of {names}"
+    if clipped := record.counts.clipped:
+        for group in ("voxel", "grid"):
+            if list(getattr(clipped, group)) != names:
+                yield f"counts/clipped/{group}: should have the properties {names}"
 
 
 def _faults(error: ValidationError) -> tuple[str, ...]:

@@ -1,15 +1,79 @@
 """Reading the sources: pairs are found by name, then each side is read and checked."""
 
-from slatprep.readers.pairing import discover
-from slatprep.readers.pixieverse import read_field
-from slatprep.readers.slat import read_latents, read_slat
+from __future__ import annotations
+
+from dataclasses import replace
+
+from slatprep.parameters import SampleParameters
+from slatprep.readers.adapters import latent_adapter, source_adapter
+from slatprep.readers.files import require_complete
+from slatprep.readers.pairing import contents_of, discover
+from slatprep.readers.slat import read_slat
 from slatprep.readers.slat_files import SlatFile, discover_slats
+from slatprep.readers.transforms import read_transform
+from slatprep.records import AssetPair, MaterialField, StructuredLatents
 
 __all__ = [
     "SlatFile",
+    "contents_of",
     "discover",
     "discover_slats",
     "read_field",
     "read_latents",
     "read_slat",
 ]
+
+
+def read_field(
+    pair: AssetPair, max_unphysical: float = SampleParameters.max_unphysical
+) -> MaterialField:
+    """Read the annotated side of a pair by the adapter of its source.
+
+    Parameters
+    ----------
+    pair : AssetPair
+        A pair without a problem.
+    max_unphysical : float
+        See `slatprep.parameters.SampleParameters`.
+
+    Returns
+    -------
+    MaterialField
+        Occupancy, and material and SI properties of the annotated voxels; of
+        PixieVerse as `slatprep.readers.pixieverse.read_grid` says.
+
+    Raises
+    ------
+    InputError
+        If a file cannot be used; the message names file, value and voxel.
+    """
+    field = source_adapter(pair.roots.adapter).read(pair, max_unphysical)
+    if pair.transform is None:
+        return field
+    frame, source = read_transform(pair.transform, pair.roots.pixieverse)
+    return replace(field, frame=frame, sources=(*field.sources, source))
+
+
+def read_latents(pair: AssetPair) -> StructuredLatents:
+    """Read the SLAT side of a pair by the adapter of its encoder.
+
+    Parameters
+    ----------
+    pair : AssetPair
+        A pair without a problem; of its SLAT see `slatprep.readers.slat.read_slat`.
+
+    Returns
+    -------
+    StructuredLatents
+        Coordinates and latents in the order of the file.
+
+    Raises
+    ------
+    InputError
+        If the file cannot be used; the message names file, value and row.
+    """
+    _, path = require_complete(pair)
+    space = pair.roots.contents.latents
+    adapter = latent_adapter(space.encoder)
+    read = read_slat if adapter is None else adapter.read
+    return read(path, pair.roots.slat, pair.slat_group, space)

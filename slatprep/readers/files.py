@@ -42,6 +42,7 @@ _KIND_NAMES = {
     "f": "floating-point",
     "S": "byte text",
     "U": "text",
+    "V": "structured",
 }
 
 _COMPLETE = "a complete file; copy or make it again"
@@ -88,11 +89,14 @@ class ArraySpec:
         Allowed numpy dtype kinds.
     max_items : int
         Bound on the number of items where `shapes` is empty.
+    note : str
+        What an error says of the shapes beside them.
     """
 
     shapes: tuple[tuple[int | None, ...], ...]
     kinds: str
     max_items: int = 64
+    note: str = ""
 
     def check(self, where: str | Place, shape: tuple[int, ...], dtype: np.dtype[Any]) -> None:
         """Raise InputError, naming `where`, unless shape and dtype are allowed."""
@@ -107,7 +111,9 @@ class ArraySpec:
             raise InputError(where, f"has dtype {dtype.str}", f"a {kinds} array")
         if self.shapes and not any(_fits(shape, allowed) for allowed in self.shapes):
             allowed_text = " or ".join(_shape_text(allowed) for allowed in self.shapes)
-            raise InputError(where, f"has shape {_shape_text(shape)}", f"shape {allowed_text}")
+            raise InputError(
+                where, f"has shape {_shape_text(shape)}", f"shape {allowed_text}{self.note}"
+            )
         if not self.shapes and (len(shape) > 8 or not 0 < math.prod(shape) <= self.max_items):
             raise InputError(
                 where, f"has shape {_shape_text(shape)}", f"1 to {self.max_items} values"
@@ -157,7 +163,7 @@ def load_source(path: Place, root: Place, role: str) -> tuple[bytes, SourceFile]
     root : Place
         Folder that it must not leave.
     role : str
-        Role of the file in the pair: ``grid``, ``mask``, ``bounds`` or ``slat``.
+        Role of the file in the pair, as `SourceFile` has it.
 
     Raises
     ------

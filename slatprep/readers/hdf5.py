@@ -39,7 +39,7 @@ _MAX_CHUNK_BYTES = 2**26
 
 
 def load_datasets(
-    path: Place, root: Place, group: str, specs: Mapping[str, ArraySpec]
+    path: Place, root: Place, group: str, specs: Mapping[str, ArraySpec], role: str = "slat"
 ) -> tuple[dict[str, NDArray[Any]], SourceFile]:
     """Read the named datasets of a group, and hash the file.
 
@@ -51,6 +51,8 @@ def load_datasets(
         Group with the datasets; empty for a file that holds one asset.
     specs : mapping of str to ArraySpec
         The datasets wanted and what they may look like.
+    role : str
+        Role of the file in the pair.
 
     Raises
     ------
@@ -66,7 +68,7 @@ def load_datasets(
             source = _hash_shared(path, root)
             file = h5py.File(storage_of(path).on_disk(), "r", locking=False)
         else:
-            data, source = load_source(path, root, "slat")
+            data, source = load_source(path, root, role)
             file = h5py.File(h5py.h5f.open_file_image(data))
         with file:
             arrays = group_arrays(file, path, group, specs)

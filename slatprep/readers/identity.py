@@ -7,9 +7,10 @@ from collections.abc import Iterable
 from contextlib import suppress
 
 from slatprep.errors import InputError
+from slatprep.readers.adapters import made_by
 from slatprep.readers.files import load_source, require_complete
-from slatprep.readers.slat import read_latents
-from slatprep.records import AssetPair, SourceFile, StructuredLatents
+from slatprep.readers.slat import read_slat
+from slatprep.records import TRELLIS, AssetPair, SourceFile, SourceRoots, StructuredLatents
 
 
 def hash_sources(pair: AssetPair) -> tuple[tuple[SourceFile, ...], dict[str, str]]:
@@ -32,15 +33,29 @@ def hash_sources(pair: AssetPair) -> tuple[tuple[SourceFile, ...], dict[str, str
     InputError
         If a file cannot be read.
     """
-    grid, slat = require_complete(pair)
+    (grid, slat), space = require_complete(pair), pair.roots.contents.latents
     files = [(grid, "grid")] + ([(pair.mask, "mask")] if pair.mask else [])
     sources = [load_source(path, pair.roots.pixieverse, role)[1] for path, role in files]
     if pair.bounds:
         with suppress(InputError):  # The supervision does without, and so does the reader.
             sources.append(load_source(pair.bounds, pair.roots.pixieverse, "bounds")[1])
-    latents = read_latents(pair) if pair.slat_group else None
+    for path, role in ((pair.beside, "description"), (pair.transform, "transform")):
+        if path:
+            sources.append(load_source(path, pair.roots.pixieverse, role)[1])
+    latents = read_slat(slat, pair.roots.slat, pair.slat_group, space) if pair.slat_group else None
     sources += latents.sources if latents else [load_source(slat, pair.roots.slat, "slat")[1]]
-    return tuple(sources), source_digests(sources, latents)
+    return tuple(sources), source_digests(sources, latents) | reading_of(pair.roots)
+
+
+def reading_of(roots: SourceRoots) -> dict[str, str]:
+    """Return what decides, besides their bytes, what files are read as; nothing by default."""
+    space, reading = roots.contents.latents, {}
+    if roots.adapter != SourceRoots.adapter:
+        reading["adapter"] = f"{roots.adapter} {made_by('slatprep.sources', roots.adapter)}"
+    if (space.channels, space.resolution) != (TRELLIS.channels, TRELLIS.resolution):
+        own = made_by("slatprep.latents", space.encoder)
+        reading["encoder"] = f"{space.encoder} {space.channels} {space.resolution} {own}"
+    return reading
 
 
 def source_digests(

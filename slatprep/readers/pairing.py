@@ -11,20 +11,13 @@ from itertools import groupby
 
 from slatprep.errors import ConfigError, InputError, in_unicode
 from slatprep.parameters import BuildParameters, PixieverseSource, SlatSource
+from slatprep.readers.adapters import FoundField, patterns_of, source_adapter
+from slatprep.readers.encoders import latent_space
 from slatprep.readers.joins import read_categories, read_map
 from slatprep.readers.patterns import NAME, fill, find_files, list_below, tried_names
 from slatprep.readers.slat_files import NamedSlat, encoded, find_slats, ordered
-from slatprep.records import AssetPair, Place, SourceRoots
+from slatprep.records import AssetPair, Contents, Place, SourceRoots
 from slatprep.storage.listing import Listing
-
-
-@dataclass(frozen=True, slots=True)
-class NamedGrid:
-    """A grid file of an object, or the folder of one that cannot be listed."""
-
-    sample: str
-    path: str
-    problem: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,7 +38,7 @@ class _Found:
     roots: SourceRoots
     listing: Listing
     one_file: bool
-    grids: Mapping[str, list[NamedGrid]]
+    grids: Mapping[str, list[FoundField]]
     categories: Mapping[str, str]
 
 
@@ -86,16 +79,33 @@ def discover(parameters: BuildParameters) -> list[AssetPair]:
     listing = list_below(pixieverse.root)
     grids = find_grids(pixieverse, listing)
     if not grids:
-        tried = tried_names(pixieverse.grid, _settled(sample=pixieverse.sample))
-        swapped = not one_file and find_grids(pixieverse, list_below(slat.root))
+        adapter = source_adapter(pixieverse.adapter)
+        patterns = patterns_of(adapter, pixieverse)
+        tried = tried_names(patterns, _settled(sample=pixieverse.sample))
+        # Plain voxels have the names that SLATs have.
+        ours = pixieverse.adapter == PixieverseSource.adapter and not one_file
+        swapped = ours and find_grids(pixieverse, list_below(slat.root))
         hint = f"; the roots are swapped: grids lie below {slat.root}" if swapped else ""
         raise ConfigError(f"{pixieverse.root}: no grid found; looked for {tried}{hint}")
     slats = find_slats(slat, one_file)
     claims = {} if pairing.map is None else read_map(pairing.map, grids, slats)
     categories = {} if pairing.categories is None else read_categories(pairing.categories)
     rows = sorted(_rows(grids, slats, claims), key=lambda row: (row.asset_id, row.object_id))
-    roots = SourceRoots(pixieverse.root, slat.root.parent if one_file else slat.root)
+    folder = slat.root.parent if one_file else slat.root
+    roots = SourceRoots(pixieverse.root, folder, contents_of(parameters), pixieverse.adapter)
     return list(_pairs(rows, _Found(parameters, roots, listing, one_file, grids, categories)))
+
+
+def contents_of(parameters: BuildParameters) -> Contents:
+    """Return what the sources of a dataset hold, as far as it is known before they are read.
+
+    Raises
+    ------
+    ConfigError
+        If they cannot tell.
+    """
+    held = source_adapter(parameters.pixieverse.adapter).describe(parameters.pixieverse)
+    return Contents(held.properties, held.classes, latent_space(parameters.slat))
 
 
 def explain_unmatched(pairs: Collection[AssetPair], parameters: BuildParameters) -> str:
@@ -127,30 +137,23 @@ def explain_unmatched(pairs: Collection[AssetPair], parameters: BuildParameters)
 
 def find_grids(
     source: PixieverseSource, listing: Listing | None = None
-) -> dict[str, list[NamedGrid]]:
-    """Return the grids of each object, all found by the first pattern that matches any.
+) -> dict[str, list[FoundField]]:
+    """Return the grids of each object, as the source's adapter finds them.
 
     Raises
     ------
     ConfigError
         If the folder cannot be listed, or a pattern makes no sense.
     """
-    chosen = _settled(sample=source.sample)
-    listing = list_below(source.root) if listing is None else listing
-    grids: dict[str, list[NamedGrid]] = {}
-    for pattern in source.grid:
-        if "{id}" not in pattern:
-            raise ConfigError(f"grid pattern {pattern!r} names no {{id}}")
-        found: dict[str, list[NamedGrid]] = {}
-        for fields, path, problem in find_files(listing, pattern, chosen, skip=grids):
-            grid = NamedGrid(fields.get("sample", ""), path, problem)
-            found.setdefault(fields.get("id", path), []).append(grid)
-        grids |= found
+    grids: dict[str, list[FoundField]] = {}
+    found = source_adapter(source.adapter).find(source, listing or list_below(source.root))
+    for grid in found:
+        grids.setdefault(grid.object_id, []).append(grid)
     return grids
 
 
 def _rows(
-    grids: Mapping[str, list[NamedGrid]],
+    grids: Mapping[str, list[FoundField]],
     slats: Mapping[str, list[NamedSlat]],
     claims: Mapping[str, list[tuple[str, str]]],
 ) -> Iterator[_Row]:
@@ -206,18 +209,27 @@ def _pair(row: _Row, there: _Found, shared: str) -> AssetPair:
     source, slat_source = there.parameters.pixieverse, there.parameters.slat
     grids = sorted(there.grids.get(row.object_id, ()), key=lambda found: found.path)
     problems = [shared, *_name_problems(row)]
-    sides: tuple[NamedGrid | NamedSlat, ...] = (*grids, *row.slats)
+    sides: tuple[FoundField | NamedSlat, ...] = (*grids, *row.slats)
     for side in sides:
         problems += [side.problem, _unrecordable(side.path)]
-    grid = mask = bounds = None
+    grid = mask = bounds = transform = beside = None
     if grids:
         grid = source.root / grids[0].path
         if len(grids) > 1:
             problems.append(_several_grids(row.object_id, grids))
         if NAME.fullmatch(row.object_id):
             known = _settled(id=row.object_id, sample=grids[0].sample or source.sample)
-            mask = _find_one(there, source.mask, known, "mask", problems)
-            bounds = _find_one(there, source.bounds, known, "bounds", problems)
+            if source.adapter == "pixieverse":
+                mask = _find_one(there, source.mask, known, "mask", problems)
+                bounds = _find_one(there, source.bounds, known, "bounds", problems)
+            if grids[0].beside:
+                beside = source.root / grids[0].beside
+            if source.transform:
+                # A name without an id stands for one file, of all assets.
+                transform = _find_one(there, (source.transform,), known, "transform", problems)
+                if transform is None:
+                    tried = fill(source.transform, known)
+                    problems.append(f"no transform for id {row.object_id!r}; looked for {tried}")
     else:
         tried = tried_names(source.grid, _settled(id=row.object_id, sample=source.sample))
         problems.append(f"no grid for id {row.object_id!r}; looked for {tried} below {source.root}")
@@ -242,6 +254,8 @@ def _pair(row: _Row, there: _Found, shared: str) -> AssetPair:
         slat=there.roots.slat / found[0].path if found else None,
         slat_group=found[0].group if found else "",
         problem="; ".join(dict.fromkeys(filter(None, problems))),
+        transform=transform,
+        beside=beside,
     )
 
 
@@ -261,7 +275,7 @@ def _unrecordable(path: str) -> str:
 
 
 def one_grid(
-    root: Place, found: Sequence[NamedGrid], object_id: str, tried: Iterable[str]
+    root: Place, found: Sequence[FoundField], object_id: str, tried: Iterable[str]
 ) -> Place:
     """Return the one grid of an object that `find_grids` found; InputError if it is not one."""
     if not found:
@@ -274,7 +288,7 @@ def one_grid(
     return root / found[0].path
 
 
-def _several_grids(object_id: str, grids: list[NamedGrid]) -> str:
+def _several_grids(object_id: str, grids: list[FoundField]) -> str:
     files = ", ".join(grid.path for grid in grids)
     if len({grid.sample for grid in grids}) > 1:
         return (

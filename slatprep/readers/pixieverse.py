@@ -7,6 +7,7 @@ slatprep orders them as `PROPERTY_COLUMNS` does, Young's modulus first.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -20,7 +21,8 @@ from slatprep.normalize import (
     normalize_mapped,
     to_mapped,
 )
-from slatprep.parameters import SampleParameters
+from slatprep.parameters import PixieverseSource, SampleParameters
+from slatprep.readers.adapters import FoundField, Holding, find_by_pattern
 from slatprep.readers.files import (
     ArraySpec,
     is_text,
@@ -40,6 +42,7 @@ from slatprep.records import (
     Place,
     SourceFile,
 )
+from slatprep.storage.listing import Listing
 
 _CUBE = (RESOLUTION,) * 3
 _RAW_SHAPE = (*_CUBE, 4)
@@ -66,7 +69,26 @@ _PHYSICAL = (
 )
 
 
-def read_field(
+class PixieVerse:
+    """PixieVerse's grids and Pixie's predictions; patterns and samples as `discover` has them."""
+
+    patterns = PixieverseSource.grid
+
+    def describe(self, source: PixieverseSource) -> Holding:
+        """Say that there are three properties and PhysGaussian's classes."""
+        return Holding()
+
+    def find(self, source: PixieverseSource, listing: Listing) -> Iterator[FoundField]:
+        """Find the grids by the names of their files."""
+        chosen = {"sample": source.sample} if source.sample else {}
+        return find_by_pattern(source.grid, listing, chosen)
+
+    def read(self, pair: AssetPair, max_unphysical: float) -> MaterialField:
+        """Read a grid or a prediction; see `read_grid`."""
+        return read_grid(pair, max_unphysical)
+
+
+def read_grid(
     pair: AssetPair, max_unphysical: float = SampleParameters.max_unphysical
 ) -> MaterialField:
     """Read the PixieVerse side of a pair, whichever form it has.

@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import json
 import tomllib
+from collections.abc import Sequence
 from typing import TypeGuard
 
+import numpy as np
+
 from slatprep.errors import ConfigError
-from slatprep.normalize import LOG10
-from slatprep.records import PROPERTY_COLUMNS, Normalization, Place, PropertyRange
+from slatprep.normalize import PIXIE_RANGES, normalization_of
+from slatprep.records import PROPERTIES, PROPERTY_COLUMNS, Normalization, Place, Property
 from slatprep.storage.documents import read_bounded
 
 _MAX_BYTES = 2**20
@@ -20,7 +23,7 @@ _MAX_BOUND = 1e6
 _PIXIE_WORDS = ("E", "density", "nu")
 
 
-def read_ranges(path: Place) -> Normalization:
+def read_ranges(path: Place, properties: Sequence[Property] = PROPERTIES) -> Normalization:
     """Read ranges from a TOML or JSON file, or from Pixie's ``normalization_ranges.yaml``.
 
     The file has one table a property with ``lo`` and ``hi`` in mapped units
@@ -48,7 +51,7 @@ def read_ranges(path: Place) -> Normalization:
     except (OSError, ValueError, RecursionError) as error:
         raise ConfigError(f"{path}: cannot read ranges ({error})") from error
     ranges = []
-    for name, log10 in zip(PROPERTY_COLUMNS, LOG10, strict=True):
+    for name, log10 in ((one.name, one.log10) for one in properties):
         entry = table.get(name) if isinstance(table, dict) else None
         lo, hi = (entry.get(k) if isinstance(entry, dict) else None for k in ("lo", "hi"))
         if not _is_number(lo) or not _is_number(hi) or lo >= hi:
@@ -56,8 +59,26 @@ def read_ranges(path: Place) -> Normalization:
                 f"{path}: {name} has lo = {lo!r} and hi = {hi!r}; expected a table [{name}] with "
                 f"finite lo < hi{' in log10 of the SI value' if log10 else ''}"
             )
-        ranges.append(PropertyRange(name, log10, float(lo), float(hi)))
-    return Normalization((ranges[0], ranges[1], ranges[2]), source=path.name)
+        ranges.append((float(lo), float(hi)))
+    return normalization_of(np.array(ranges), path.name, properties)
+
+
+def pixie_ranges(table: Sequence[Property]) -> Normalization:
+    """Return Pixie's published ranges of the properties of a table.
+
+    Raises
+    ------
+    ConfigError
+        If it has one that Pixie publishes no range of.
+    """
+    published = {one.name: one for one in PIXIE_RANGES.ranges}
+    unknown = [one.name for one in table if one.name not in published]
+    if unknown:
+        raise ConfigError(
+            f"normalize.ranges: Pixie publishes no range of {unknown[0]}; expected 'dataset', or a "
+            "file with a range of each property"
+        )
+    return Normalization(tuple(published[one.name] for one in table), PIXIE_RANGES.source)
 
 
 def _of_pixie(text: str) -> dict[str, dict[str, object]]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -9,44 +10,57 @@ from numpy.typing import NDArray
 
 from slatprep.errors import InputError
 from slatprep.geometry.voxels import flat_index
-from slatprep.readers.files import ArraySpec, load_source, npz_arrays, require_complete
+from slatprep.readers.encoders import ENOUGH, in_words, look_standardised
+from slatprep.readers.files import ArraySpec, load_source, npz_arrays
 from slatprep.readers.hdf5 import SUFFIXES, load_datasets
-from slatprep.records import RESOLUTION, AssetPair, Place, SourceFile, StructuredLatents
-
-LATENT_CHANNELS = 8
-
-SPECS = {
-    "coords": ArraySpec(shapes=((None, 3), (None, 4)), kinds="iu"),
-    "feats": ArraySpec(shapes=((None, LATENT_CHANNELS),), kinds="f"),
-}
-
-
-def read_latents(pair: AssetPair) -> StructuredLatents:
-    """Read the SLAT side of a pair, from npz or HDF5.
-
-    Parameters
-    ----------
-    pair : AssetPair
-        A pair without a problem. Its SLAT holds ``coords``, (N, 3) integers or
-        (N, 4) with a leading batch column of zeros, and ``feats``, (N, 8)
-        float: in an npz, at the top of an HDF5 file, or in a group of one.
-
-    Returns
-    -------
-    StructuredLatents
-        Coordinates and latents in the order of the file.
-
-    Raises
-    ------
-    InputError
-        If the file cannot be used; the message names file, value and row.
-    """
-    _, path = require_complete(pair)
-    return read_slat(path, pair.roots.slat, pair.slat_group)
+from slatprep.records import (
+    RESOLUTION,
+    TRELLIS,
+    LatentSpace,
+    Place,
+    SourceFile,
+    StructuredLatents,
+)
 
 
-def read_slat(path: Place, root: Place, group: str = "") -> StructuredLatents:
-    """Read one SLAT by its file, as `read_latents` reads that of a pair.
+@dataclass(frozen=True)
+class _Slat:
+    """Reads latents that lie as TRELLIS's tools save them."""
+
+    space: LatentSpace
+
+    def read(self, path: Place, root: Place, group: str, space: LatentSpace) -> StructuredLatents:
+        """Read one SLAT; see `read_slat`."""
+        return read_slat(path, root, group, space)
+
+
+def trellis() -> _Slat:
+    """Return what reads TRELLIS's latents."""
+    return _Slat(TRELLIS)
+
+
+def sam3d() -> _Slat:
+    """Return what reads those of SAM 3D Objects, which are TRELLIS's."""
+    return _Slat(replace(TRELLIS, encoder="sam3d"))
+
+
+def trellis2() -> _Slat:
+    """Return what reads TRELLIS.2's shape latents of resolution 1024; no moments are published."""
+    return _Slat(LatentSpace("trellis2", 32, RESOLUTION))
+
+
+_COORDS = ArraySpec(shapes=((None, 3), (None, 4)), kinds="iu")
+
+
+def read_slat(
+    path: Place, root: Place, group: str = "", space: LatentSpace = TRELLIS
+) -> StructuredLatents:
+    """Read one SLAT from npz or HDF5.
+
+    It holds ``coords``, (N, 3) integers or (N, 4) with a leading batch column of
+    zeros, and ``feats``, float with as many channels as the encoder gives: in an
+    npz, at the top of an HDF5 file, or in a group of one. Other arrays beside
+    them are not read.
 
     Parameters
     ----------
@@ -56,19 +70,23 @@ def read_slat(path: Place, root: Place, group: str = "") -> StructuredLatents:
         The folder that it must lie in, and that its name is recorded below.
     group : str
         Its group, where an HDF5 file holds several.
+    space : LatentSpace
+        What the encoder gives.
 
     Raises
     ------
     InputError
         If the file cannot be used; the message names file, value and row.
     """
+    feats = ArraySpec(((None, space.channels),), "f", note=f" (slat.encoder: {space.encoder})")
+    specs = {"coords": _COORDS, "feats": feats}
     if group or path.suffix.lower() in SUFFIXES:
-        arrays, source = load_datasets(path, root, group, SPECS)
+        arrays, source = load_datasets(path, root, group, specs)
     else:
         data, source = load_source(path, root, "slat")
-        arrays = npz_arrays(data, path, SPECS)
+        arrays = npz_arrays(data, path, specs)
     where = f"{path} [{group}]" if group else path
-    return checked_latents(arrays["coords"], arrays["feats"], where, (source,))
+    return checked_latents(arrays["coords"], arrays["feats"], where, (source,), space)
 
 
 def checked_latents(
@@ -76,8 +94,9 @@ def checked_latents(
     feats: NDArray[Any],
     where: str | Place,
     sources: tuple[SourceFile, ...] = (),
+    space: LatentSpace = TRELLIS,
 ) -> StructuredLatents:
-    """Return coordinates (N, 3) or (N, 4) and latents (N, 8) as a SLAT, wherever they come from.
+    """Return coordinates (N, 3) or (N, 4) and latents as a SLAT, wherever they come from.
 
     Raises
     ------
@@ -91,12 +110,16 @@ def checked_latents(
     if len(coords) == 0:
         raise InputError(where, "the SLAT is empty", "at least one voxel")
     warnings: list[str] = []
-    return StructuredLatents(
-        coords=check_coords(coords, where),
-        feats=_check_feats(feats, where, warnings),
-        sources=sources,
-        warnings=tuple(warnings),
+    latents = StructuredLatents(
+        check_coords(coords, where), _check_feats(feats, where, warnings), sources
     )
+    enough = len(coords) >= ENOUGH and not space.standardised
+    if enough and look_standardised(latents.moments, space):
+        warnings.append(
+            f"feats look standardised already ({in_words(latents.moments)}); "
+            "slat.standardised says whether they are"
+        )
+    return replace(latents, warnings=tuple(warnings))
 
 
 def check_coords(coords: NDArray[Any], where: str | Place) -> NDArray[np.uint8]:

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import Annotated
 
 import numpy as np
-from annotated_types import Ge, MaxLen
+from annotated_types import Ge, MaxLen, MinLen
 
 from slatprep.records.json_types import (
     AffineMap,
@@ -18,6 +18,7 @@ from slatprep.records.json_types import (
     Share,
     Transform,
 )
+from slatprep.records.tables import MAX_PROPERTIES
 from slatprep.records.words import Engine, Model, Search, Verdict
 
 MAX_CANDIDATES = 4096
@@ -77,12 +78,12 @@ class Ambiguity:
 
     ``material_share`` is the share of SLAT voxels whose class differs in any
     of them from the best placement's; ``property_change`` is the largest mean
-    absolute change of log10 Young's modulus, log10 density and Poisson's
-    ratio. All are 0 where nothing is tied.
+    absolute change of each property, of log10 of those that are normalised so.
+    All are 0 where nothing is tied.
     """
 
     material_share: Share
-    property_change: tuple[Number, Number, Number]
+    property_change: Annotated[tuple[Number, ...], MinLen(1), MaxLen(MAX_PROPERTIES)]
 
 
 @dataclass(frozen=True)

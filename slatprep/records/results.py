@@ -6,20 +6,21 @@ from dataclasses import dataclass
 from typing import Annotated, Literal
 
 import numpy as np
+from annotated_types import MaxLen, MinLen
 from numpy.typing import NDArray
 
 from slatprep.records.alignment import Alignment, Judgement
-from slatprep.records.json_types import _one_of
 from slatprep.records.sources import AssetPair, MaterialField, StructuredLatents
-from slatprep.records.words import PROPERTY_COLUMNS, Status
+from slatprep.records.tables import MAX_PROPERTIES, PropertyName
+from slatprep.records.words import Status
 
 
 @dataclass(frozen=True, eq=False)
 class Annotation:
     """Material and properties looked up at every SLAT voxel, in SI units.
 
-    ``properties`` is (N, 3) float32 (Young's modulus [Pa], density [kg/m^3],
-    Poisson's ratio), NaN where not valid; ``material`` (N,) uint8, 255 where
+    ``properties`` is (N, P) float32 in SI units, columns as in the field, NaN
+    where not valid; ``material`` (N,) uint8, 255 where
     not valid; ``valid`` (N,) bool; ``distance`` (N,) float32, in voxels of the
     PixieVerse frame, to the annotation used; ``place`` (N, 3) float32, where the
     voxel was looked up, in the PixieVerse frame; ``confidence`` (N,) float32, how
@@ -42,7 +43,7 @@ class PropertyRange:
     ``log10`` is true, the SI value itself otherwise.
     """
 
-    name: Annotated[str, _one_of(*PROPERTY_COLUMNS)]
+    name: PropertyName
     log10: bool
     lo: float
     hi: float
@@ -50,13 +51,13 @@ class PropertyRange:
 
 @dataclass(frozen=True)
 class Normalization:
-    """The three property ranges, in the order of ``PROPERTY_COLUMNS``, and where they come from.
+    """The range of every property, in the order of the columns, and where they come from.
 
     ``source`` is ``dataset``, ``p1-p99`` or other percentiles of it, either of which may
     be ``of train by`` what parts the objects; ``pixie``; or the name of a file.
     """
 
-    ranges: tuple[PropertyRange, PropertyRange, PropertyRange]
+    ranges: Annotated[tuple[PropertyRange, ...], MinLen(1), MaxLen(MAX_PROPERTIES)]
     source: str
 
 

@@ -76,16 +76,13 @@ MATERIAL_COLOURS = {
 """The same by material id, as the store holds it."""
 
 
-PROPERTY_COLUMNS = ("youngs_modulus", "density", "poissons_ratio")
-"""Order of the property columns everywhere in slatprep; SI units are Pa, kg/m^3, none."""
-
-
 class Engine(StrEnum):
     """What finds the transform."""
 
     FIELD = "field"
     OPEN3D = "open3d"
     SMALL_GICP = "small_gicp"
+    KNOWN = "known"
 
 
 class Model(StrEnum):
@@ -98,10 +95,11 @@ class Model(StrEnum):
 
 
 class Search(StrEnum):
-    """The start orientations that were needed: 64 quarter turns, or all orientations."""
+    """The start orientations that were needed: 64 quarter turns, all orientations, or none."""
 
     EULER64 = "euler64"
     SO3 = "so3"
+    NONE = "none"
 
 
 class Verdict(StrEnum):

@@ -10,6 +10,7 @@ from slatprep.errors import StoreError
 from slatprep.records import Place
 from slatprep.storage.place import storage_of
 from slatprep.store.contract import (
+    DEFINING,
     MIN_ASSET_BYTES,
     Finding,
     dimension_sizes,
@@ -71,7 +72,7 @@ class Arrays:
 
     def _checked(self, name: str) -> RowReader:
         of_files = (f"{GROUP}/name",) if name.startswith(f"{GROUP}/") else ()
-        for needed in ("asset/id", "voxel/coords", *of_files, name):
+        for needed in (*DEFINING, *of_files, name):
             if needed not in self._metadata:
                 self._metadata[needed] = self._read(needed)
         try:

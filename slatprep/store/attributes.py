@@ -8,15 +8,22 @@ from functools import cache
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
 import orjson
+from annotated_types import MaxLen, MinLen
 
 from slatprep.parameters import Length, SampleParameters
 from slatprep.records import (
     MATERIAL_CLASSES,
-    PROPERTY_COLUMNS,
+    MAX_PROPERTIES,
+    PROPERTIES,
     RESOLUTION,
+    TRELLIS,
+    Contents,
     Digest,
     InJson,
+    LatentSpace,
     Normalization,
+    Property,
+    PropertyName,
     PropertyRange,
 )
 from slatprep.store.contract import Finding
@@ -30,9 +37,12 @@ def _one_of(*values: object) -> InJson:
     return InJson({"type": "literal", "expected": list(values)})
 
 
-def _exactly(values: tuple[str, ...]) -> InJson:
+def _exactly(values: tuple[str, ...]) -> Any:
     each = [{"type": "literal", "expected": [value]} for value in values]
-    return InJson({"type": "tuple", "items_schema": each})
+    return {"type": "tuple", "items_schema": each}
+
+
+_CLASSES = InJson({"type": "union", "choices": [_exactly(MATERIAL_CLASSES), _exactly(())]})
 
 
 @dataclass(frozen=True)
@@ -47,15 +57,6 @@ class StoredRange:
     def __post_init__(self) -> None:
         if not self.lo < self.hi:
             raise ValueError("lo must be less than hi")
-
-
-@dataclass(frozen=True)
-class StoredRanges:
-    """The ranges of all properties."""
-
-    youngs_modulus: StoredRange
-    density: StoredRange
-    poissons_ratio: StoredRange
 
 
 @dataclass(frozen=True)
@@ -94,18 +95,36 @@ class RootAttributes:
     format: Annotated[str, _one_of(FORMAT)]
     format_version: Annotated[int, _one_of(*READABLE_VERSIONS)]
     resolution: Annotated[int, _one_of(RESOLUTION)]
-    material_classes: Annotated[tuple[str, ...], _exactly(MATERIAL_CLASSES)]
-    property_columns: Annotated[tuple[str, ...], _exactly(PROPERTY_COLUMNS)]
-    normalization: StoredRanges
+    material_classes: Annotated[tuple[str, ...], _CLASSES]
+    property_columns: Annotated[tuple[PropertyName, ...], MinLen(1), MaxLen(MAX_PROPERTIES)]
+    normalization: dict[str, StoredRange]
     manifest: Digest
     build: StoredBuild
+    property_units: tuple[str, ...] = tuple(one.unit for one in PROPERTIES)
+    latents: LatentSpace = TRELLIS
+
+    def __post_init__(self) -> None:
+        columns = set(self.property_columns)
+        if not columns == self.normalization.keys() or len(columns) < len(self.property_columns):
+            raise ValueError("property_columns and normalization must name the same properties")
+        if len(self.property_units) != len(self.property_columns):
+            raise ValueError("property_units must have a unit for each of property_columns")
 
     @property
     def ranges(self) -> Normalization:
         """The ranges as other stages have them."""
-        entries = [(name, getattr(self.normalization, name)) for name in PROPERTY_COLUMNS]
-        a, b, c = (PropertyRange(name, e.log10, e.lo, e.hi) for name, e in entries)
-        return Normalization((a, b, c), self.normalization.youngs_modulus.source)
+        entries = [(name, self.normalization[name]) for name in self.property_columns]
+        ranges = tuple(PropertyRange(name, e.log10, e.lo, e.hi) for name, e in entries)
+        return Normalization(ranges, entries[0][1].source)
+
+    @property
+    def contents(self) -> Contents:
+        """What the store holds, as other stages have it."""
+        properties = (
+            Property(name, unit, self.normalization[name].log10)
+            for name, unit in zip(self.property_columns, self.property_units, strict=True)
+        )
+        return Contents(tuple(properties), self.material_classes, self.latents)
 
 
 def read_attributes(attributes: Mapping[str, Any]) -> RootAttributes | tuple[Finding, ...]:

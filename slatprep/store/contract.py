@@ -12,7 +12,7 @@ from typing import Any
 
 from slatprep.errors import StoreError
 from slatprep.parameters import MAX_GRID_SHARD, MAX_VOXEL_CHUNK, MAX_VOXEL_SHARD
-from slatprep.records import RESOLUTION, Place
+from slatprep.records import MAX_CHANNELS, MAX_PROPERTIES, RESOLUTION, Place
 from slatprep.storage.documents import read_document
 from slatprep.store.digests import GROUP
 from slatprep.store.layout import (
@@ -30,6 +30,9 @@ MAX_VOXELS = RESOLUTION**3
 """Rows of one asset: each coordinate occurs once."""
 
 MAX_ASSETS, MAX_FILES = 2**24, 2**20
+
+DEFINING = ("asset/id", "voxel/coords", "voxel/feats", "voxel/properties")
+"""Arrays whose shapes say how many assets, voxels, channels and properties there are."""
 
 MIN_ASSET_BYTES = 256
 """No asset takes less of a store's files: its record alone, packed, has more. By this the number
@@ -134,23 +137,26 @@ def dimension_sizes(metadata: Mapping[str, Any]) -> dict[str, int]:
     Raises
     ------
     StoreError
-        If ``asset/id`` or ``voxel/coords`` say no number of rows.
+        If an array that defines one says no size.
     """
     sizes = dict(FIXED_SIZES)
     for name, dimension, limit in (
         ("asset/id", "asset", MAX_ASSETS),
         ("voxel/coords", "voxel", 2**40),
         (f"{GROUP}/name", "file", MAX_FILES),
+        ("voxel/feats", "latent", MAX_CHANNELS),
+        ("voxel/properties", "property", MAX_PROPERTIES),
     ):
         if dimension == "file" and name not in metadata:
             continue
+        at, what = (1, "columns") if dimension in ("latent", "property") else (0, "rows")
         try:
-            rows = metadata[name]["shape"][0]
+            size = metadata[name]["shape"][at]
         except (KeyError, TypeError, IndexError):
             raise StoreError(f"{name}/zarr.json: is missing or has no shape") from None
-        if type(rows) is not int or not 0 <= rows <= limit:
-            raise StoreError(f"{name}/zarr.json: {rows!r} rows; expected 0 to {limit}")
-        sizes[dimension] = rows
+        if type(size) is not int or not at <= size <= limit:
+            raise StoreError(f"{name}/zarr.json: {size!r} {what}; expected {at} to {limit}")
+        sizes[dimension] = size
     sizes["asset_edge"] = sizes["asset"] + 1
     return sizes
 

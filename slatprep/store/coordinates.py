@@ -7,13 +7,14 @@ An array that is named as its dimension becomes an index in xarray: after
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from slatprep.geometry.frames import voxel_centres
-from slatprep.records import PROPERTY_COLUMNS, RESOLUTION
+from slatprep.records import RESOLUTION
 
 _AXES = ("x", "y", "z")
 
@@ -21,7 +22,7 @@ ASSET_COORDINATES = "id object_id view category"
 """Arrays of ``asset`` that name its rows; the attribute is CF's."""
 
 
-def write_coordinates(path: Path) -> None:
+def write_coordinates(path: Path, properties: Sequence[str]) -> None:
     """Write the coordinates of every group into a store that is being made.
 
     Parameters
@@ -29,13 +30,15 @@ def write_coordinates(path: Path) -> None:
     path : Path
         The store, with its groups in place; to be called before its metadata
         are consolidated.
+    properties : sequence of str
+        Names of the properties.
     """
     import zarr
     from zarr.codecs import Crc32cCodec, ZstdCodec
 
     root: Any = zarr.open_group(path, mode="r+", zarr_format=3, use_consolidated=False)
     centres = voxel_centres(np.repeat(np.arange(RESOLUTION)[:, None], 3, axis=1))[:, 0]
-    texts = {"property": PROPERTY_COLUMNS, "axis": _AXES}
+    texts = {"property": properties, "axis": _AXES}
     for group, dimensions in (
         ("asset", ("property",)),
         ("voxel", ("axis", "property")),

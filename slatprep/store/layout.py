@@ -9,16 +9,16 @@ from __future__ import annotations
 
 from bisect import bisect_right
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Any
 
 from slatprep.parameters import StoreParameters
 from slatprep.records import (
     BACKGROUND,
-    MATERIAL_CLASSES,
-    PROPERTY_COLUMNS,
+    PIXIEVERSE,
     RESOLUTION,
     UNANNOTATED,
+    Contents,
     Normalization,
 )
 
@@ -243,14 +243,7 @@ def arrays_of(version: int) -> tuple[ArrayLayout, ...]:
     return tuple(layout for layout in ARRAYS if layout.since <= version)
 
 
-FIXED_SIZES = {
-    "row": 4,
-    "column": 4,
-    "axis": 3,
-    "property": len(PROPERTY_COLUMNS),
-    "latent": 8,
-    **dict.fromkeys(_XYZ, RESOLUTION),
-}
+FIXED_SIZES = {"row": 4, "column": 4, "axis": 3, **dict.fromkeys(_XYZ, RESOLUTION)}
 """Dimensions that are the same in every store."""
 
 
@@ -302,7 +295,11 @@ def overlaps(offsets: Sequence[int], start: int, stop: int) -> Iterator[tuple[in
 
 
 def create_arrays(
-    root: zarr.Group, n_assets: int, n_voxels: int, parameters: StoreParameters
+    root: zarr.Group,
+    n_assets: int,
+    n_voxels: int,
+    parameters: StoreParameters,
+    contents: Contents = PIXIEVERSE,
 ) -> None:
     """Create every array of the store, empty.
 
@@ -314,8 +311,17 @@ def create_arrays(
         A and N.
     parameters : StoreParameters
         Sizes of chunks and shards, and the compression level.
+    contents : Contents
+        How many properties and channels there are.
     """
-    sizes = {"asset": n_assets, "asset_edge": n_assets + 1, "voxel": n_voxels, **FIXED_SIZES}
+    sizes = {
+        "asset": n_assets,
+        "asset_edge": n_assets + 1,
+        "voxel": n_voxels,
+        "property": len(contents.properties),
+        "latent": contents.latents.channels,
+        **FIXED_SIZES,
+    }
     chunk_and_shard = {
         "asset": (ASSET_CHUNK, None),
         "voxel": (parameters.voxel_chunk, rows_per_shard(parameters)),
@@ -356,7 +362,7 @@ def _codecs(layout: ArrayLayout, level: int) -> dict[str, Any]:
 
 
 def root_attributes(
-    normalization: Normalization, manifest: str, build: Mapping[str, object]
+    normalization: Normalization, manifest: str, build: Mapping[str, object], contents: Contents
 ) -> dict[str, Any]:
     """Return the attributes of the store's root.
 
@@ -367,8 +373,10 @@ def root_attributes(
         "format": FORMAT,
         "format_version": FORMAT_VERSION,
         "resolution": RESOLUTION,
-        "material_classes": list(MATERIAL_CLASSES),
-        "property_columns": list(PROPERTY_COLUMNS),
+        "material_classes": list(contents.classes),
+        "property_columns": [one.name for one in contents.properties],
+        "property_units": [one.unit for one in contents.properties],
+        "latents": asdict(contents.latents),
         "normalization": normalization_attribute(normalization),
         "manifest": manifest,
         "build": dict(build),

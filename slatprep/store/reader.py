@@ -16,7 +16,7 @@ from slatprep.errors import StoreError
 from slatprep.geometry.frames import places_of
 from slatprep.geometry.voxels import voxels_of
 from slatprep.normalize import denormalize_properties
-from slatprep.records import BACKGROUND, MaterialField, Normalization, Place
+from slatprep.records import BACKGROUND, Contents, MaterialField, Normalization, Place
 from slatprep.storage.place import place_of, storage_of
 from slatprep.storage.versions import store_name
 from slatprep.store.assets import ASSET_COLUMNS, AssetTable
@@ -55,10 +55,10 @@ class StoredAsset:
         Id of the row.
     coords : ndarray of uint8, shape (N, 3)
         SLAT voxels.
-    feats : ndarray of float32, shape (N, 8)
-        Their latents.
-    properties : ndarray of float32, shape (N, 3)
-        Young's modulus, density, Poisson's ratio in [-1, 1]; NaN where not valid.
+    feats : ndarray of float32, shape (N, channels)
+        Their latents; ``store.contents.latents`` says what they are.
+    properties : ndarray of float32, shape (N, P)
+        The store's properties in [-1, 1]; NaN where not valid.
     material : ndarray of uint8, shape (N,)
         Class 0..6; 255 where not valid.
     valid : ndarray of bool, shape (N,)
@@ -99,12 +99,12 @@ class StoredAsset:
 
     @cached_property
     def properties_si(self) -> NDArray[np.float32]:
-        """Young's modulus [Pa], density [kg/m^3], Poisson's ratio, (N, 3); NaN where not valid."""
+        """Properties in SI units, (N, P), by ``store.contents``; NaN where not valid."""
         return denormalize_properties(self.properties, self.store.normalization)
 
     @cached_property
     def grid_properties(self) -> NDArray[np.float32]:
-        """The PixieVerse field in [-1, 1], (3, 64, 64, 64); NaN where not annotated."""
+        """The PixieVerse field in [-1, 1], (P, 64, 64, 64); NaN where not annotated."""
         return np.asarray(self.store.read_rows("grid/properties", self.index, self.index + 1)[0])
 
     @cached_property
@@ -122,6 +122,8 @@ class StoredAsset:
             voxels=voxels_of(annotated),
             material=self.grid_material[annotated],
             properties=denormalize_properties(values, self.store.normalization),
+            table=self.store.contents.properties,
+            classified=bool(self.store.contents.classes),
         )
 
 
@@ -208,6 +210,11 @@ class Store(AssetTable):
             If its metadata name anything that `slatprep.store.gate` does not allow.
         """
         return self._arrays.group
+
+    @property
+    def contents(self) -> Contents:
+        """The tables of its properties and classes, and what its latents are."""
+        return self.about.contents
 
     @property
     def normalization(self) -> Normalization:

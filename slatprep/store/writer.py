@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from slatprep.parameters import StoreParameters
-from slatprep.records import Normalization
+from slatprep.records import PIXIEVERSE, Contents, Normalization
 from slatprep.store.coordinates import write_coordinates
 from slatprep.store.digests import write_digests
 from slatprep.store.layout import (
@@ -53,12 +53,18 @@ class Shard:
     offsets: Sequence[int] = ()
 
 
-def create_store(path: Path, n_assets: int, n_voxels: int, parameters: StoreParameters) -> None:
+def create_store(
+    path: Path,
+    n_assets: int,
+    n_voxels: int,
+    parameters: StoreParameters,
+    contents: Contents = PIXIEVERSE,
+) -> None:
     """Create an empty store with every array in place."""
     import zarr
 
     root = zarr.create_group(path, zarr_format=3)
-    create_arrays(root, n_assets, n_voxels, parameters)
+    create_arrays(root, n_assets, n_voxels, parameters, contents)
     create_record_array(root, n_assets, parameters.compression_level)
 
 
@@ -75,7 +81,11 @@ def shards(
 
 
 def finish_store(
-    path: Path, normalization: Normalization, build_id: str, build: Mapping[str, object]
+    path: Path,
+    normalization: Normalization,
+    build_id: str,
+    build: Mapping[str, object],
+    contents: Contents = PIXIEVERSE,
 ) -> None:
     """Write the root's attributes and all files' digests; gather all metadata in one file.
 
@@ -89,11 +99,14 @@ def finish_store(
         Id of the build.
     build : mapping
         Parameters and versions that made the content.
+    contents : Contents
+        What it holds.
     """
     import zarr
 
-    open_for_writing(path).attrs.update(root_attributes(normalization, build_id, build))
-    write_coordinates(path)
+    attributes = root_attributes(normalization, build_id, build, contents)
+    open_for_writing(path).attrs.update(attributes)
+    write_coordinates(path, attributes["property_columns"])
     write_digests(path)
     with warnings.catch_warnings():
         # Zarr says that consolidated metadata are not in format 3's text yet.

@@ -64,8 +64,8 @@ def test_it_is_the_same_under_another_python(minor: int) -> None:
 def test_it_covers_every_module_that_an_asset_runs_through() -> None:
     """Trace what is loaded for one asset, in a process that has loaded nothing else."""
     code = (
-        "import sys; from slatprep.readers.pixieverse import read_field; "
-        "from slatprep.readers.slat import read_latents; from slatprep.sample import sample; "
+        "import sys; from slatprep.readers.pixieverse import read_grid; "
+        "from slatprep.readers.slat import read_slat; from slatprep.sample import sample; "
         "from slatprep.judge import judge; from slatprep.align import quality, field; "
         "print(*(m for m in sys.modules if m.startswith('slatprep')))"
     )

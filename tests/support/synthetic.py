@@ -15,6 +15,7 @@ from slatprep.parameters import (
     SlatSource,
     StoreParameters,
 )
+from slatprep.records import FEATS_MEAN, FEATS_STD
 
 SMALL_SHARDS = StoreParameters(
     voxel_chunk=128, voxel_chunks_per_shard=4, grid_assets_per_shard=2, compression_level=1
@@ -62,7 +63,8 @@ def make_asset(seed: int = 0) -> Asset:
     surface = np.argwhere(occupied & ~buried)
     turned = np.stack([63 - surface[:, 1], surface[:, 0], surface[:, 2]], axis=1)
     turned = turned[rng.permutation(len(turned))]
-    feats = rng.normal(size=(len(turned), 8)).astype(np.float32)
+    # As TRELLIS's latents are: those of mean 0 and spread 1 would pass for standardised ones.
+    feats = rng.normal(FEATS_MEAN, FEATS_STD, size=(len(turned), 8)).astype(np.float32)
     return Asset(grid, turned.astype(np.uint8), feats)
 
 

@@ -192,7 +192,7 @@ def _draw(path: Path, indices: Sequence[int]) -> tuple[list[Drawn], dict[str, Ta
 
 def _add(tallies: dict[str, Tally], more: Mapping[str, Tally]) -> None:
     for category, counts in more.items():
-        tallies[category] = tallies.get(category, no_tally()) + counts
+        tallies[category] = tallies.get(category) or no_tally(counts.field.shape[0]) + counts
 
 
 def _base64(content: bytes) -> str:

@@ -21,7 +21,6 @@ from slatprep.records import (
     CLASS_COLOURS,
     MATERIAL_CLASSES,
     UNANNOTATED_COLOUR,
-    Normalization,
     Status,
 )
 from slatprep.store.reader import Store
@@ -89,7 +88,8 @@ def page_content(
             "ambiguity": THRESHOLDS.good_ambiguity,
         },
         "classes": [
-            {"name": name, "colour": CLASS_COLOURS[name]} for name in MATERIAL_CLASSES[:BACKGROUND]
+            {"name": name if store.contents.classes else "annotated", "colour": CLASS_COLOURS[name]}
+            for name in MATERIAL_CLASSES[:BACKGROUND]
         ],
         "scales": {
             "none": UNANNOTATED_COLOUR,
@@ -107,19 +107,20 @@ def page_content(
             "views": VIEWS,
         },
         "turns": quarter_turns(),
-        "properties": _properties(store.normalization, outcomes, tallies),
+        "properties": _properties(store, outcomes, tallies),
         "balance": _balance(store, tallies),
         "assets": _table(store, outcomes, chosen),
     }
 
 
 def _properties(
-    normalization: Normalization,
+    store: Store,
     outcomes: Sequence[Outcome] | None,
     tallies: Mapping[str, Tally],
 ) -> list[dict[str, Any]]:
     """Return the spread of each property, by class, and the ranges it is held against."""
-    total = sum(tallies.values(), start=no_tally())
+    normalization, published = store.normalization, {one.name: one for one in PIXIE_RANGES.ranges}
+    total = sum(tallies.values(), start=no_tally(len(normalization.ranges)))
     clipped = np.zeros(len(normalization.ranges), dtype=np.int64)
     for outcome in outcomes or ():
         if outcome.clipped:
@@ -131,13 +132,19 @@ def _properties(
             "lo": span.lo,
             "hi": span.hi,
             "source": normalization.source,
-            "pixie": [published.lo, published.hi],
+            "unit": one.unit,
+            "pixie": [pixie.lo, pixie.hi] if (pixie := published.get(span.name)) else None,
             "field": field.tolist(),
             "slat": slat.tolist(),
             "clipped": int(count) if outcomes is not None else None,
         }
-        for span, published, field, slat, count in zip(
-            normalization.ranges, PIXIE_RANGES.ranges, total.field, total.slat, clipped, strict=True
+        for span, one, field, slat, count in zip(
+            normalization.ranges,
+            store.contents.properties,
+            total.field,
+            total.slat,
+            clipped,
+            strict=True,
         )
     ]
 

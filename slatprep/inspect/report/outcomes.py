@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Iterator
-from dataclasses import astuple, dataclass
+from dataclasses import dataclass
 
 from slatprep.errors import StoreError
 from slatprep.provenance.files import build_in, lines_in
@@ -125,7 +125,7 @@ def _outcome(record: Record) -> Outcome:
         reasons=record.judgement.reasons,
         tied=len(placements),
         displacement=max((placement.displacement for placement in placements), default=None),
-        clipped=astuple(clipped.voxel) if clipped else (),
+        clipped=tuple(clipped.voxel.values()) if clipped else (),
         ties=tuple(
             tuple(placement.transform[:3].ravel().tolist()) for placement in placements[:MOST_TIES]
         ),

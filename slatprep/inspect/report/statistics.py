@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from slatprep.align.starts import distinct_starts
 from slatprep.geometry.frames import split_transform
-from slatprep.records import BACKGROUND, PROPERTY_COLUMNS, UNANNOTATED
+from slatprep.records import BACKGROUND, UNANNOTATED
 from slatprep.store import StoredAsset
 
 BINS = 64
@@ -23,9 +23,9 @@ class Tally:
 
     Attributes
     ----------
-    field : ndarray of int64, shape (3, 7, BINS)
+    field : ndarray of int64, shape (P, 7, BINS)
         Annotated voxels of the PixieVerse field by property, class and bin.
-    slat : ndarray of int64, shape (3, 7, BINS)
+    slat : ndarray of int64, shape (P, 7, BINS)
         Valid SLAT voxels by property, class and bin.
     classes : ndarray of int64, shape (8,)
         SLAT voxels of each class; the last counts those that are not valid.
@@ -39,10 +39,10 @@ class Tally:
         return Tally(self.field + other.field, self.slat + other.slat, self.classes + other.classes)
 
 
-def no_tally() -> Tally:
-    """Return the tally of nothing."""
+def no_tally(properties: int) -> Tally:
+    """Return the tally of nothing, of so many properties."""
     # The classes of a material are those below BACKGROUND.
-    shape = (len(PROPERTY_COLUMNS), BACKGROUND, BINS)
+    shape = (properties, BACKGROUND, BINS)
     return Tally(
         np.zeros(shape, np.int64), np.zeros(shape, np.int64), np.zeros(BACKGROUND + 1, np.int64)
     )

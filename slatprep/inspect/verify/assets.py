@@ -249,7 +249,9 @@ def _claims(
     columns = columns_of(record)
     del columns["property_ambiguity"]
     change = record.judgement.ambiguity.property_change
-    said = normalize_change([change], store.normalization)[0]
+    said: object = change  # A record may have other properties than its store.
+    if len(change) == len(store.normalization.ranges):
+        said = normalize_change([change], store.normalization)[0]
     yield "property_ambiguity", said, asset.columns["property_ambiguity"]
     for name, column in columns.items():
         yield name, column, asset.transform if name == "transform" else asset.columns[name]

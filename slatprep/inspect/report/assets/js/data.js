@@ -17,6 +17,10 @@ const PROPERTY_NAMES = {
   density: { name: "Density", symbol: "ρ", unit: "kg/m³" },
   poissons_ratio: { name: "Poisson's ratio", symbol: "ν", unit: "" },
 };
+for (const { name, unit } of CONTENT.properties) {
+  const words = name.replaceAll("_", " ");
+  PROPERTY_NAMES[name] ??= { name: words, symbol: words, unit: unit === "1" ? "" : unit };
+}
 
 const Data = (() => {
   const { per_sheet: perSheet, columns, views, side, levels } = CONTENT.detail;
@@ -75,9 +79,11 @@ const Data = (() => {
     const slat = coordinates(take(side ** 3 / 8));
     const field = coordinates(take(side ** 3 / 8));
     const n = slat.length / 3;
-    const [material, youngs_modulus, density, poissons_ratio, distance] = Array.from({ length: 5 }, () => take(n));
+    const material = take(n);
+    const properties = Object.fromEntries(CONTENT.properties.map(({ name }) => [name, take(n)]));
+    const distance = take(n);
     const fieldMaterial = take(field.length / 3);
-    return { slat, field, material, youngs_modulus, density, poissons_ratio, distance, fieldMaterial, moved: at < bytes.length ? steps(take(bytes.length - at)) : null };
+    return { slat, field, material, ...properties, distance, fieldMaterial, moved: at < bytes.length ? steps(take(bytes.length - at)) : null };
   }
 
   /** How far each boundary voxel moves in its own frame, in edges of the cube; see voxels.py. */

@@ -149,7 +149,8 @@ const Sections = (() => {
   function before(property) {
     const { name, unit } = PROPERTY_NAMES[property.name];
     const { parts, all, say } = spread(property, property.field);
-    const [lo, hi] = [Math.min(property.lo, property.pixie[0]), Math.max(property.hi, property.pixie[1])];
+    const pixie = property.pixie ?? [];
+    const [lo, hi] = [Math.min(property.lo, ...pixie), Math.max(property.hi, ...pixie)];
     const margin = 0.04 * (hi - lo);
     const domain = [lo - margin, hi + margin];
     const edge = (k) => property.lo + ((property.hi - property.lo) * k) / parts.length;
@@ -157,7 +158,11 @@ const Sections = (() => {
     const text = (x) => (property.log10 ? Format.scientific(x) : x.toFixed(2));
     const ticks = [];
     if (property.log10) for (let p = Math.ceil(domain[0]); p <= domain[1]; p += domain[1] - domain[0] > 6 ? 2 : 1) ticks.push({ at: p, text: Format.power(p) });
-    else for (let t = Math.ceil(domain[0] * 10) / 10; t <= domain[1]; t += 0.1) ticks.push({ at: t, text: t.toFixed(1) });
+    else {
+      const step = 10 ** Math.floor(Math.log10(domain[1] - domain[0]));
+      const digits = Math.max(0, -Math.log10(step));
+      for (let k = Math.ceil(domain[0] / step); k * step <= domain[1]; k++) ticks.push({ at: k * step, text: (k * step).toFixed(digits) });
+    }
     return Charts.histogram({
       title: `${name}${unit && ` [${unit}]`}, before`,
       sub: `${Format.count(all)} voxels, ${text(property.lo)} to ${text(property.hi)}${unit && ` ${unit}`}`,
@@ -165,8 +170,7 @@ const Sections = (() => {
       marks: [
         { at: property.lo, text: text(property.lo), own: true },
         { at: property.hi, text: text(property.hi), own: true },
-        { at: property.pixie[0], text: "" },
-        { at: property.pixie[1], text: "" },
+        ...pixie.map((at) => ({ at, text: "" })),
       ],
       describe: (k) => `${text(edges[k])} to ${text(edges[k + 1])} ${unit}: ${say(k)}`,
     });

@@ -1,0 +1,30 @@
+"""A frame that is known: nothing is searched, and what is said of it is measured as ever.
+
+The transform is the source's, the identity where it states none. Quality and,
+from them, confidence and verdict follow as for any engine, so a frame that is
+wrong shows.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from slatprep.align.quality import measure_quality
+from slatprep.geometry.frames import split_transform
+from slatprep.parameters import AlignParameters
+from slatprep.records import Alignment, Engine, MaterialField, Model, Search, StructuredLatents
+
+
+def align(
+    field: MaterialField, latents: StructuredLatents, parameters: AlignParameters
+) -> Alignment:
+    """Take the frame that the field states; see `slatprep.align.align`."""
+    transform = np.eye(4) if field.frame is None else field.frame
+    _, _, scale = split_transform(transform)
+    return Alignment(
+        transform=transform,
+        engine=Engine.KNOWN,
+        model=Model.RIGID if abs(scale - 1.0) < 1e-6 else Model.SIMILARITY,
+        search=Search.NONE,
+        quality=measure_quality(field, latents, transform, parameters.radius),
+    )

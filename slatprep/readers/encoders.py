@@ -1,0 +1,131 @@
+"""Which encoder made latents: what is known of it, and whether latents look standardised."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from slatprep.errors import ConfigError
+from slatprep.parameters import SlatSource
+from slatprep.readers.adapters import adapter_names, latent_adapter
+from slatprep.records import LatentMoments, LatentSpace, Place
+from slatprep.storage.documents import read_document
+from slatprep.storage.place import place_of
+
+ENOUGH = 64
+"""Voxels below which the moments of latents say nothing of whether they are standardised."""
+
+_MAX_BYTES = 2**20
+
+
+def latent_space(source: SlatSource) -> LatentSpace:
+    """Return what the latents of a source are, as far as it is known before they are read.
+
+    Parameters
+    ----------
+    source : SlatSource
+        ``encoder`` is the name of a latent adapter, or the path of a JSON file with ``encoder``
+        (a name), ``channels``, ``resolution`` and optionally ``mean`` and ``std``.
+
+    Raises
+    ------
+    ConfigError
+        If there is no such encoder, or the file does not say what it must.
+    """
+    adapter = latent_adapter(source.encoder)
+    known = adapter.space if adapter else _read_space(place_of(source.encoder))
+    return replace(known, standardised=source.standardised == "yes")
+
+
+def _read_space(path: Place) -> LatentSpace:
+    from pydantic import TypeAdapter
+
+    if path.suffix != ".json":
+        known = ", ".join(adapter_names("slatprep.latents"))
+        raise ConfigError(
+            f"slat.encoder: there is no {str(path)!r}; expected {known}, or a JSON "
+            "file that describes another"
+        )
+    try:
+        document = json.dumps(read_document(path, _MAX_BYTES))
+        space: LatentSpace = TypeAdapter(LatentSpace).validate_json(document)
+    except (OSError, ValueError) as error:
+        reason = " ".join(str(error).split())[:300]
+        raise ConfigError(
+            f"{path}: describes no encoder ({reason}); expected encoder, channels, resolution, and "
+            "mean and std of each channel if they are known"
+        ) from None
+    return space
+
+
+def settle_latents(
+    declared: LatentSpace,
+    standardised: str,
+    moments: Sequence[tuple[int, LatentMoments | None]],
+) -> LatentSpace:
+    """Return what the latents of a whole dataset are, now that all have been read.
+
+    Parameters
+    ----------
+    declared : LatentSpace
+        What `latent_space` says.
+    standardised : {"auto", "yes", "no"}
+        Whether they have been standardised already; ``auto`` decides by what they look like.
+    moments : sequence of (int, LatentMoments)
+        Voxels and moments of each asset, in an order that does not depend on the number of jobs.
+    """
+    known = [(count, one) for count, one in moments if one is not None and count]
+    if not known:
+        return declared
+    pooled = _pool(known)
+    if standardised == "auto" and sum(count for count, _ in known) >= ENOUGH:
+        declared = replace(declared, standardised=look_standardised(pooled, declared))
+    if not declared.mean and not declared.standardised:
+        # A channel that never changes is left as wide as it is.
+        std = tuple(s if s > 0 else 1.0 for s in pooled.std)
+        declared = replace(declared, mean=pooled.mean, std=std)
+    return declared
+
+
+def look_standardised(moments: LatentMoments, space: LatentSpace) -> bool:
+    """Whether latents look as if they had been standardised already.
+
+    Their spread is near 1, half to one and a half in the median channel, and a
+    standard normal makes them likelier than normals with the encoder's own mean
+    and standard deviation; where those are not known, their mean is near 0.
+
+    Parameters
+    ----------
+    moments : LatentMoments
+        Of an asset or a dataset.
+    space : LatentSpace
+        What their encoder gives.
+    """
+    mean, std = np.array(moments.mean), np.array(moments.std)
+    if not 0.5 <= np.median(std) <= 1.5:
+        return False
+    if not space.mean:
+        return bool(np.abs(mean).max() <= 0.5)
+    own_mean, own_std = np.array(space.mean), np.array(space.std)
+    as_encoded = -0.5 * ((mean - own_mean) ** 2 + std**2) / own_std**2 - np.log(own_std)
+    standard = -0.5 * (mean**2 + std**2)
+    return bool((standard - as_encoded).sum() > 0)
+
+
+def in_words(moments: LatentMoments) -> str:
+    """Return the spread and the mean of channels in a few words."""
+    mean, std = np.abs(moments.mean).max(), moments.std
+    return f"means within {mean:.2g} of 0, standard deviations {min(std):.2g} to {max(std):.2g}"
+
+
+def _pool(known: Sequence[tuple[int, LatentMoments]]) -> LatentMoments:
+    counts = np.array([count for count, _ in known], dtype=np.float64)
+    share: NDArray[np.float64] = (counts / counts.sum())[:, None]
+    means, stds = (np.array([getattr(one, n) for _, one in known]) for n in ("mean", "std"))
+    mean = (share * means).sum(axis=0)
+    variance = (share * (stds**2 + (means - mean) ** 2)).sum(axis=0)
+    return LatentMoments(tuple(mean.tolist()), tuple(np.sqrt(variance).tolist()))

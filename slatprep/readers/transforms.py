@@ -1,0 +1,51 @@
+"""Transforms that are known: a matrix in a file, of one asset or of all."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+from numpy.typing import NDArray
+
+from slatprep.errors import InputError
+from slatprep.geometry.frames import split_transform
+from slatprep.readers.files import ArraySpec, load_source, npy_array, refusing
+from slatprep.records import Place, SourceFile
+
+_MATRIX = ArraySpec(shapes=((4, 4),), kinds="fiu")
+_EXPECTED = "a 4x4 matrix, source frame to SLAT frame, as numpy.save writes it or as JSON"
+
+
+def read_transform(path: Place, root: Place) -> tuple[NDArray[np.float64], SourceFile]:
+    """Read a similarity from a JSON list of rows or an npy file.
+
+    Parameters
+    ----------
+    path, root : Place
+        The file, and the folder that it must lie in.
+
+    Returns
+    -------
+    transform : ndarray of float64, shape (4, 4)
+        Takes points of the source's unit cube to points of the SLAT's.
+    source : SourceFile
+        The file, with the role ``transform``.
+
+    Raises
+    ------
+    InputError
+        If it holds no similarity.
+    """
+    data, source = load_source(path, root, "transform")
+    if path.suffix.lower() == ".json":
+        with refusing(path, "holds no matrix", _EXPECTED):
+            matrix = np.array(json.loads(data), dtype=np.float64)
+    else:
+        matrix = npy_array(data, path, _MATRIX).astype(np.float64)
+    try:
+        split_transform(matrix)
+        if (matrix[3] != (0, 0, 0, 1)).any():
+            raise ValueError(f"the last row must be 0, 0, 0, 1, got {matrix[3].tolist()}")
+    except ValueError as error:
+        raise InputError(path, str(error), _EXPECTED) from None
+    return matrix, source

@@ -1,0 +1,170 @@
+"""Annotated voxels of any grid, or points, to a field on the 64^3 grid of the frame."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from slatprep.errors import InputError
+from slatprep.geometry.voxels import voxels_of
+from slatprep.normalize import to_mapped
+from slatprep.records import (
+    BACKGROUND,
+    PROPERTIES,
+    RESOLUTION,
+    MaterialField,
+    Place,
+    Property,
+    SourceFile,
+)
+
+MAX_RESOLUTION = 512
+
+
+def field_of_voxels(
+    where: str | Place,
+    voxels: NDArray[Any],
+    properties: NDArray[Any],
+    *,
+    resolution: int = RESOLUTION,
+    material: NDArray[Any] | None = None,
+    table: Sequence[Property] = PROPERTIES,
+    max_unphysical: float = 0.0,
+    sources: Sequence[SourceFile] = (),
+    warnings: Sequence[str] = (),
+    frame: NDArray[np.float64] | None = None,
+) -> MaterialField:
+    """Make a field of annotated voxels.
+
+    A coarser grid than 64^3 is taken cell by cell; of a finer one, and of
+    points, each cell takes the class of most of its voxels (of equally many the
+    lowest) and the mean of their properties, of log10 where they are
+    normalised so.
+
+    Parameters
+    ----------
+    where : str or Place
+        What errors call the source.
+    voxels : ndarray, shape (K, 3)
+        Integers in 0..resolution - 1; or floats, points of the unit cube [-0.5, 0.5]^3.
+    properties : ndarray, shape (K, P)
+        SI values, a column for each of `table`.
+    resolution : int
+        Voxels along each axis of the source's grid.
+    material : ndarray of int, shape (K,), optional
+        Class 0..6 of each; all are of class 0 where the source has no classes.
+    table : sequence of Property
+        What the columns are.
+    max_unphysical : float
+        See `slatprep.parameters.SampleParameters`.
+    sources, warnings, frame
+        As `MaterialField` has them.
+
+    Raises
+    ------
+    InputError
+        If there is no voxel, one is out of range, or too many are unphysical.
+    """
+    voxels, notes = np.asarray(voxels), list(warnings)
+    count = len(voxels)
+    if voxels.ndim != 2 or voxels.shape[1] != 3 or count == 0:
+        raise InputError(where, f"has voxels of shape {voxels.shape}", "(K, 3), one at least")
+    if not 2 <= resolution <= MAX_RESOLUTION:
+        raise InputError(where, f"has a grid of {resolution}^3", f"2 to {MAX_RESOLUTION} a side")
+    if voxels.dtype.kind == "f":
+        resolution = max(resolution, RESOLUTION)
+        scaled = np.floor((voxels.astype(np.float64) + 0.5) * resolution)
+        index = np.where(voxels == 0.5, resolution - 1, scaled)
+    else:
+        index = voxels.astype(np.float64)
+    inside = ((index >= 0) & (index < resolution)).all(axis=1)
+    if not inside.all():
+        row = int(np.argmin(inside))
+        expected = "points of [-0.5, 0.5]^3" if voxels.dtype.kind == "f" else f"0..{resolution - 1}"
+        raise InputError(where, f"voxel {voxels[row].tolist()} in row {row} is outside", expected)
+    classes = np.zeros(count, np.int64) if material is None else np.asarray(material, np.int64)
+    if classes.shape != (count,) or ((classes < 0) | (classes >= BACKGROUND)).any():
+        raise InputError(where, "has classes that are none", f"{count} of 0..{BACKGROUND - 1}")
+    with np.errstate(over="ignore"):  # what float32 cannot hold becomes infinite, and a fault
+        values = np.asarray(properties).astype(np.float32)
+    if values.shape != (count, len(table)):
+        raise InputError(where, f"has properties {values.shape}", f"({count}, {len(table)})")
+    keep, unphysical = _physical(where, values, table, max_unphysical, notes)
+
+    cells, side = index.astype(np.int64), min(resolution, RESOLUTION)
+    if resolution > RESOLUTION:
+        cells = (2 * cells + 1) * RESOLUTION // (2 * resolution)
+    flat = (cells[:, 0] * side + cells[:, 1]) * side + cells[:, 2]
+    own, labels, means = _merged(flat[keep], classes[keep], values[keep], table)
+    if len(own) < np.count_nonzero(keep):
+        notes.append(f"{np.count_nonzero(keep)} voxels were merged into {len(own)} of {side}^3")
+    there = np.full(side**3, -1, dtype=np.int64)
+    there[flat] = len(own)  # occupied at least
+    there[own] = np.arange(len(own))
+    # A cell of the 64^3 grid takes what the source has at its centre.
+    steps = (2 * np.arange(RESOLUTION) + 1) * side // (2 * RESOLUTION)
+    rows = there.reshape((side,) * 3)[np.ix_(steps, steps, steps)]
+    annotated = (rows >= 0) & (rows < len(own))
+    return MaterialField(
+        occupancy=rows >= 0,
+        voxels=voxels_of(annotated),
+        material=labels[rows[annotated]].astype(np.uint8),
+        properties=means[rows[annotated]],
+        unphysical=unphysical,
+        sources=tuple(sources),
+        warnings=tuple(notes),
+        table=tuple(table),
+        frame=frame,
+        classified=material is not None,
+    )
+
+
+def _physical(
+    where: str | Place,
+    values: NDArray[np.float32],
+    table: Sequence[Property],
+    max_unphysical: float,
+    notes: list[str],
+) -> tuple[NDArray[np.bool_], int]:
+    """Return which rows a material can have, and how many it cannot; refuse too many."""
+    fine = np.stack([one.physical(values[:, k]) for k, one in enumerate(table)], axis=1)
+    keep = np.asarray(fine.all(axis=1))
+    bad = int(np.count_nonzero(~keep))
+    if bad:
+        row, column = (int(i) for i in np.argwhere(~fine)[0])
+        what = f"{table[column].name} {values[row, column]:g} in row {row}"
+        if bad == len(keep) or bad > max_unphysical * len(keep):
+            raise InputError(
+                where,
+                f"{bad} of {len(keep)} annotated voxels are unphysical, the first by {what}",
+                f"{table[column].allowed}, in all but {max_unphysical:.4g} of them "
+                "(sample.max_unphysical)",
+            )
+        notes.append(f"{bad} voxels are unphysical, the first by {what}; not annotated")
+    return keep, bad
+
+
+def _merged(
+    flat: NDArray[np.int64],
+    classes: NDArray[np.int64],
+    values: NDArray[np.float32],
+    table: Sequence[Property],
+) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float32]]:
+    """Return the cells that voxels lie in, sorted, with one class and one row of values each."""
+    cells, first, cell = np.unique(flat, return_index=True, return_inverse=True)
+    if len(cells) == len(flat):
+        return cells, classes[first], values[first]
+    votes = np.zeros((len(cells), BACKGROUND), dtype=np.int64)
+    np.add.at(votes, (cell, classes), 1)
+    winners = votes.argmax(axis=1)
+    counted = classes == winners[cell]
+    means = np.zeros((len(cells), len(table)))
+    np.add.at(means, cell[counted], to_mapped(values[counted], table))
+    means /= votes[np.arange(len(cells)), winners][:, None]
+    for column, one in enumerate(table):
+        if one.log10:
+            means[:, column] = 10.0 ** means[:, column]
+    return cells, winners, means.astype(np.float32)

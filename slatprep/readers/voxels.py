@@ -1,0 +1,144 @@
+"""Plain voxels: an npz or HDF5 file an object, and a file that says what its columns are.
+
+``source.json`` in the root describes them all::
+
+    {"properties": [{"name": "yield_stress", "unit": "Pa", "scale": "log10"}, ...],
+     "classes": false, "resolution": 64, "aligned": true}
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Annotated, Any, ClassVar, Literal
+
+import numpy as np
+from annotated_types import Ge, Le, MaxLen, MinLen
+
+from slatprep.errors import ConfigError, InputError
+from slatprep.parameters import PixieverseSource
+from slatprep.readers.adapters import FoundField, Holding, find_by_pattern, patterns_of
+from slatprep.readers.files import ArraySpec, load_source, npz_arrays, require_complete
+from slatprep.readers.hdf5 import SUFFIXES, load_datasets
+from slatprep.readers.voxel_sets import MAX_RESOLUTION, field_of_voxels
+from slatprep.records import (
+    MATERIAL_CLASSES,
+    MAX_PROPERTIES,
+    AssetPair,
+    MaterialField,
+    Place,
+    Property,
+    PropertyName,
+)
+from slatprep.storage.documents import read_bounded
+from slatprep.storage.listing import Listing
+
+DESCRIPTION = "source.json"
+_MAX_BYTES = 2**16
+
+_COLUMN = ArraySpec(shapes=((None,),), kinds="fiu")
+_VOXELS = ArraySpec(shapes=((None, 3),), kinds="fiu")
+
+
+@dataclass(frozen=True)
+class _Column:
+    """A property as ``source.json`` has it."""
+
+    name: PropertyName
+    unit: str
+    scale: Literal["log10", "linear"]
+    least: float = -np.inf
+    most: float = np.inf
+
+
+@dataclass(frozen=True)
+class _Description:
+    """What ``source.json`` says; see the documentation of the format."""
+
+    __pydantic_config__: ClassVar[dict[str, object]] = {"extra": "forbid"}
+
+    properties: Annotated[tuple[_Column, ...], MinLen(1), MaxLen(MAX_PROPERTIES)]
+    classes: bool = True
+    resolution: Annotated[int, Ge(2), Le(MAX_RESOLUTION)] = 64
+    aligned: bool = False
+
+    @property
+    def table(self) -> tuple[Property, ...]:
+        """The properties as records have them."""
+        return tuple(
+            Property(one.name, one.unit, one.scale == "log10", one.least, one.most)
+            for one in self.properties
+        )
+
+
+class PlainVoxels:
+    """``<id>.npz``, ``.h5`` or ``.hdf5``: ``voxels`` (K, 3), a column a property, ``material``."""
+
+    patterns = ("{id}.npz", "{id}.h5", "{id}.hdf5")
+
+    def describe(self, source: PixieverseSource) -> Holding:
+        """Read ``source.json``."""
+        said = _description(source.root)
+        return Holding(said.table, MATERIAL_CLASSES if said.classes else ())
+
+    def find(self, source: PixieverseSource, listing: Listing) -> Iterator[FoundField]:
+        """Find the fields by the names of their files."""
+        return find_by_pattern(patterns_of(self, source), listing, {}, DESCRIPTION)
+
+    def read(self, pair: AssetPair, max_unphysical: float) -> MaterialField:
+        """Read a field; see `slatprep.readers.adapters.SourceAdapter`."""
+        path, _ = require_complete(pair)
+        root = pair.roots.pixieverse
+        said = _description(root)
+        specs = {"voxels": _VOXELS, **{one.name: _COLUMN for one in said.properties}}
+        specs |= {"material": _COLUMN} if said.classes else {}
+        if path.suffix.lower() in SUFFIXES:
+            arrays, file = load_datasets(path, root, "", specs, role="grid")
+        else:
+            data, file = load_source(path, root, "grid")
+            arrays = npz_arrays(data, path, specs)
+        _, about = load_source(root / DESCRIPTION, root, "description")
+        columns: list[Any] = [arrays[one.name] for one in said.properties]
+        lengths = {len(column) for column in arrays.values()}
+        if len(lengths) > 1:
+            raise InputError(path, f"has columns of {sorted(lengths)} rows", "a row a voxel")
+        return field_of_voxels(
+            path,
+            arrays["voxels"],
+            np.stack(columns, axis=1),
+            resolution=said.resolution,
+            material=arrays.get("material"),
+            table=said.table,
+            max_unphysical=max_unphysical,
+            sources=(file, about),
+            frame=np.eye(4) if said.aligned else None,
+        )
+
+
+@lru_cache(maxsize=4)
+def _parsed(text: bytes, where: str) -> _Description:
+    from pydantic import TypeAdapter
+
+    try:
+        read: _Description = TypeAdapter(_Description).validate_json(text, strict=True)
+        if len({one.name for one in read.properties}) < len(read.properties):
+            raise ValueError("a property has two columns")
+    except ValueError as error:
+        reason = " ".join(str(error).split())[:300]
+        raise ConfigError(
+            f"{where}: does not describe plain voxels ({reason}); expected properties with name, "
+            "unit and scale, and classes, resolution and aligned where they are not true, 64, false"
+        ) from None
+    return read
+
+
+def _description(root: Place) -> _Description:
+    path = root / DESCRIPTION
+    try:
+        text = read_bounded(path, _MAX_BYTES)
+    except (OSError, ValueError) as error:
+        raise ConfigError(
+            f"{path}: cannot be read ({error}); expected a file that says what the columns are"
+        ) from None
+    return _parsed(text, str(path))

@@ -1,0 +1,153 @@
+"""What a dataset holds: its properties, its classes, and the latents beside them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Annotated
+
+import numpy as np
+from annotated_types import Ge, Le, MaxLen
+from numpy.typing import NDArray
+
+from slatprep.records.json_types import InJson
+from slatprep.records.words import (
+    FEATS_MEAN,
+    FEATS_STD,
+    MATERIAL_CLASSES,
+    RESOLUTION,
+)
+
+MAX_PROPERTIES, MAX_CHANNELS = 32, 256
+"""Columns of properties, and channels of latents, that one store may have."""
+
+PropertyName = Annotated[str, InJson({"type": "str", "pattern": r"^[a-z][a-z0-9_]{0,63}$"})]
+"""Name of a property: lower-case letters, digits and ``_``, a letter first."""
+
+
+@dataclass(frozen=True)
+class Property:
+    """One property of a material.
+
+    Attributes
+    ----------
+    name : str
+        Its name, as a column of every table.
+    unit : str
+        SI unit of its values; ``1`` where it has none.
+    log10 : bool
+        Whether it is normalised as log10 of its value, which then must be above
+        0, or as the value itself.
+    least, most : float
+        Values that a material can have, ends included; what reads a source asks
+        for them, and a store does not keep them.
+    """
+
+    name: PropertyName
+    unit: str
+    log10: bool
+    least: float = field(default=-np.inf, compare=False)
+    most: float = field(default=np.inf, compare=False)
+
+    def physical(self, values: NDArray[np.float32]) -> NDArray[np.bool_]:
+        """Return which values (K,) a material can have."""
+        fine: NDArray[np.bool_] = np.isfinite(values)
+        if self.log10:
+            fine &= values > 0
+        return fine & (values >= self.least) & (values <= self.most)
+
+    @property
+    def allowed(self) -> str:
+        """What its values may be, in words."""
+        name = self.name.replace("_", " ")
+        bounds = f" in [{self.least:g}, {self.most:g}]" if np.isfinite(self.most) else ""
+        above = " above 0" if self.log10 else ""
+        return f"a finite {name}{above}{bounds}" + ("" if self.unit == "1" else f" {self.unit}")
+
+
+PROPERTIES = (
+    Property("youngs_modulus", "Pa", True),
+    Property("density", "kg/m^3", True),
+    Property("poissons_ratio", "1", False, 0.0, 0.5),
+)
+"""The three that PixieVerse annotates."""
+
+PROPERTY_COLUMNS = tuple(one.name for one in PROPERTIES)
+"""Their names, in the order that all tables of PixieVerse have."""
+
+
+@dataclass(frozen=True)
+class LatentMoments:
+    """Mean and standard deviation of each channel of some latents, as they lie there."""
+
+    mean: Annotated[tuple[float, ...], MaxLen(MAX_CHANNELS)]
+    std: Annotated[tuple[float, ...], MaxLen(MAX_CHANNELS)]
+
+
+@dataclass(frozen=True)
+class LatentSpace:
+    """Where latents come from, and the numbers that standardise them.
+
+    Attributes
+    ----------
+    encoder : str
+        What made them: ``trellis``, or a name of the user's.
+    channels : int
+        Numbers a voxel.
+    resolution : int
+        Voxels along each axis of its grid.
+    mean, std : tuple of float
+        Of each channel before they are standardised; empty where nobody
+        published them, and a build measures its dataset's.
+    standardised : bool
+        Whether the latents as they lie there have been standardised already.
+    """
+
+    encoder: str
+    channels: Annotated[int, Ge(1), Le(MAX_CHANNELS)]
+    resolution: Annotated[int, Ge(2), Le(256)]
+    mean: tuple[float, ...] = ()
+    std: tuple[float, ...] = ()
+    standardised: bool = False
+
+    def __post_init__(self) -> None:
+        counts = {len(self.mean), len(self.std)}
+        if counts not in ({0}, {self.channels}) or not all(s > 0 for s in self.std):
+            raise ValueError(f"a mean and a std above 0 for each of {self.channels} channels")
+
+    def standardise(self, feats: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Return latents (N, channels) with mean 0 and standard deviation 1; never done twice."""
+        if self.standardised:
+            return feats
+        mean, std = np.array(self.mean, np.float32), np.array(self.std, np.float32)
+        changed: NDArray[np.float32] = (feats - mean) / std
+        return changed
+
+    def as_encoded(self, feats: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Return latents (N, channels) as the encoder gives them, where its moments are known."""
+        if not self.standardised or not self.mean:
+            return feats
+        mean, std = np.array(self.mean, np.float32), np.array(self.std, np.float32)
+        restored: NDArray[np.float32] = feats * std + mean
+        return restored
+
+
+TRELLIS = LatentSpace("trellis", 8, RESOLUTION, FEATS_MEAN, FEATS_STD)
+"""TRELLIS's structured latents; SAM 3D Objects has the same."""
+
+
+@dataclass(frozen=True)
+class Contents:
+    """What a dataset holds; without classes, every annotated voxel is of class 0."""
+
+    properties: tuple[Property, ...] = PROPERTIES
+    classes: tuple[str, ...] = MATERIAL_CLASSES
+    latents: LatentSpace = TRELLIS
+
+    @property
+    def n_classes(self) -> int:
+        """How many classes a decoder scores: one stands for all where there are none."""
+        return max(len(self.classes), 1)
+
+
+PIXIEVERSE = Contents()
+"""PixieVerse with TRELLIS, the default everywhere."""

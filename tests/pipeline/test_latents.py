@@ -1,0 +1,132 @@
+"""Latents of any width and encoder, standardised already or not, all the way to a prediction."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from support.synthetic import Dataset
+
+from slatprep import build_store, concat_stores, export_store, open_store
+from slatprep.learn.dataset import SlatDataset
+from slatprep.learn.predict import load_checkpoint, predict
+from slatprep.learn.train import TrainParameters, train
+from slatprep.parameters import BuildParameters
+from slatprep.records import FEATS_MEAN, FEATS_STD, StructuredLatents
+
+MEAN, STD = np.array(FEATS_MEAN, np.float32), np.array(FEATS_STD, np.float32)
+
+
+@pytest.fixture
+def dataset(tmp_path: Path) -> Dataset:
+    made = Dataset(tmp_path / "sources")
+    for seed, name in enumerate("abcdef"):
+        made.add(name, seed)
+    return made
+
+
+def rewrite(dataset: Dataset, change) -> None:
+    for name, asset in dataset.assets.items():
+        asset.feats = change(asset.feats)
+        dataset.write_slat(f"{name}.npz", asset.coords, asset.feats)
+
+
+def of(dataset: Dataset, **slat: object) -> BuildParameters:
+    parameters = dataset.parameters()
+    return replace(parameters, slat=replace(parameters.slat, **slat))
+
+
+def test_a_store_says_which_encoder_made_its_latents(dataset: Dataset, tmp_path: Path) -> None:
+    summary = build_store(dataset.parameters(), tmp_path / "s.zarr")
+    assert summary.warnings == ()
+    held = open_store(tmp_path / "s.zarr").attributes["latents"]
+    assert held == {
+        "encoder": "trellis",
+        "channels": 8,
+        "resolution": 64,
+        "mean": list(FEATS_MEAN),
+        "std": list(FEATS_STD),
+        "standardised": False,
+    }
+
+
+def test_standardised_latents_are_named_and_never_standardised_twice(
+    dataset: Dataset, tmp_path: Path
+) -> None:
+    raw = {name: asset.feats.copy() for name, asset in dataset.assets.items()}
+    rewrite(dataset, lambda feats: (feats - MEAN) / STD)
+    out = tmp_path / "s.zarr"
+    summary = build_store(of(dataset), out)
+    assert len(summary.warnings) == 1
+    assert "look standardised already" in summary.warnings[0]
+    assert 'slat.standardised = "yes"' in summary.warnings[0]
+    store = open_store(out)
+    assert store.contents.latents.standardised
+    np.testing.assert_array_equal(store.asset("a").feats, dataset.assets["a"].feats)
+
+    data = SlatDataset(store)
+    item = data[data.asset_ids.index("a")]
+    np.testing.assert_array_equal(item.feats.numpy(), dataset.assets["a"].feats)
+
+    export_store(out, tmp_path / "npz", "npz", assets=["a"])
+    with np.load(next((tmp_path / "npz").glob("**/a.npz"))) as file:
+        np.testing.assert_allclose(file["feats"], raw["a"], atol=1e-5)
+
+    # Said outright, nobody warns; said wrongly, it is done as said.
+    assert build_store(of(dataset, standardised="yes"), out).warnings == ()
+    assert open_store(out).contents.latents.standardised
+    assert build_store(of(dataset, standardised="no"), out).warnings == ()
+    assert not open_store(out).contents.latents.standardised
+
+
+def test_one_asset_unlike_the_others_is_named(dataset: Dataset, tmp_path: Path) -> None:
+    asset = dataset.assets["c"]
+    dataset.write_slat("c.npz", asset.coords, (asset.feats - MEAN) / STD)
+    summary = build_store(of(dataset), tmp_path / "s.zarr")
+    assert len(summary.warnings) == 1
+    assert "1 of 6 assets look standardised already, unlike the others (c)" in summary.warnings[0]
+    lines = Path(str(summary.records)).read_text().splitlines()
+    warned = [record["asset_id"] for record in map(json.loads, lines) if record["warnings"]]
+    assert warned == ["c"]
+
+
+def test_other_widths_are_stored_trained_on_and_predicted_from(
+    dataset: Dataset, tmp_path: Path
+) -> None:
+    rewrite(dataset, lambda feats: np.tile(3 * feats + 1, 4)[:, :20])
+    description = tmp_path / "mine.json"
+    description.write_text(json.dumps({"encoder": "mine", "channels": 20, "resolution": 64}))
+    out = tmp_path / "s.zarr"
+    parameters = of(dataset, encoder=str(description))
+    build_store(parameters, out)
+    store = open_store(out)
+    every = np.concatenate([asset.feats for asset in dataset.assets.values()])
+    assert store.shape("voxel/feats")[1] == 20
+    np.testing.assert_allclose(store.contents.latents.mean, every.mean(axis=0), rtol=1e-5)
+    np.testing.assert_allclose(store.contents.latents.std, every.std(axis=0), rtol=1e-5)
+
+    run = tmp_path / "run"
+    train(out, run, TrainParameters(size="small", epochs=1, precision="fp32"))
+    checkpoint = load_checkpoint(run)
+    assert checkpoint.contents == store.contents
+    asset = store.asset("a")
+    standard = store.contents.latents.standardise(asset.feats)
+    said = [
+        next(predict(checkpoint, [StructuredLatents(asset.coords, feats, standardised=done)]))
+        for feats, done in ((asset.feats, False), (standard, True))
+    ]
+    np.testing.assert_array_equal(said[0].properties, said[1].properties)
+
+    # Nothing is done again, and what is joined has the moments of all.
+    assert build_store(parameters, out).build_id == str(store.attributes["manifest"])
+    other = Dataset(tmp_path / "others")
+    other.add("x", 3)
+    rewrite(other, lambda feats: np.tile(feats, 4)[:, :20])
+    build_store(of(other, encoder=str(description)), tmp_path / "o.zarr")
+    concat_stores([out, tmp_path / "o.zarr"], tmp_path / "both.zarr")
+    both = np.concatenate([every, other.assets["x"].feats])
+    joined = open_store(tmp_path / "both.zarr").contents.latents
+    np.testing.assert_allclose(joined.mean, both.mean(axis=0), rtol=1e-5)

@@ -1,0 +1,263 @@
+"""Sources that are not PixieVerse: other properties, no classes, other grids, known frames."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+from scipy.spatial import cKDTree
+from support.synthetic import QUARTER_TURN, SMALL_SHARDS, make_asset
+
+from slatprep import build_store, export_store, open_store
+from slatprep.cli.commands import slatprep as command
+from slatprep.errors import ConfigError
+from slatprep.inspect.verify import verify_store
+from slatprep.learn.metrics import evaluate_store
+from slatprep.learn.train import TrainParameters, train
+from slatprep.parameters import (
+    AlignParameters,
+    BuildParameters,
+    NormalizeParameters,
+    PixieverseSource,
+    SampleParameters,
+    SlatSource,
+)
+from slatprep.records import Engine
+
+TABLE = [
+    {"name": "density", "unit": "kg/m^3", "scale": "log10"},
+    {"name": "yield_stress", "unit": "Pa", "scale": "log10"},
+    {"name": "friction_angle", "unit": "degree", "scale": "linear", "least": -10, "most": 90},
+]
+NAMES = [str(one["name"]) for one in TABLE]
+KNOWN = AlignParameters(engine=Engine.KNOWN)
+
+
+def voxels_of(seed: int) -> tuple[np.ndarray, dict[str, np.ndarray], np.ndarray]:
+    """Return the voxels of the synthetic L, its columns and its classes."""
+    grid = make_asset(seed).grid
+    voxels = np.argwhere(grid[..., 3] != 7)
+    rows = grid[tuple(voxels.T)]
+    material = rows[:, 3].astype(np.uint8)
+    columns = {
+        "density": rows[:, 0],
+        "yield_stress": 10.0 ** (4 + material + voxels[:, 0] / 64),
+        "friction_angle": -5.0 + 40.0 * material + voxels[:, 2] / 10,
+    }
+    return voxels, columns, material
+
+
+def write(
+    root: Path, names: str, *, classes: bool = True, form: str = "npz", **said: object
+) -> None:
+    """Write plain voxels, and SLATs that lie a quarter turn away."""
+    (root / "slat").mkdir(parents=True)
+    source = root / "voxels"
+    source.mkdir()
+    about = {"properties": TABLE, "classes": classes, **said}
+    (source / "source.json").write_text(json.dumps(about))
+    for seed, name in enumerate(names):
+        voxels, columns, material = voxels_of(seed)
+        arrays = {"voxels": voxels, **columns, "material": material, "segment": np.zeros(3)}
+        if form == "npz":
+            np.savez(source / f"{name}.npz", **arrays)
+        else:
+            with h5py.File(source / f"{name}.h5", "w") as file:
+                for key, array in arrays.items():
+                    file[key] = array
+        asset = make_asset(seed)
+        np.savez(root / "slat" / f"{name}.npz", coords=asset.coords, feats=asset.feats)
+
+
+def parameters_of(root: Path, adapter: str = "voxels", **groups: object) -> BuildParameters:
+    return BuildParameters(
+        PixieverseSource(root / "voxels", adapter=adapter),
+        SlatSource(root / "slat"),
+        sample=SampleParameters(method="nearest"),
+        store=SMALL_SHARDS,
+        **groups,  # type: ignore[arg-type]
+    )
+
+
+@pytest.mark.parametrize(("form", "classes"), [("npz", True), ("hdf5", False)])
+def test_properties_of_any_table_are_those_of_the_nearest_voxels(
+    tmp_path: Path, form: str, classes: bool
+) -> None:
+    write(tmp_path, "abc", form=form, classes=classes)
+    out = tmp_path / "s.zarr"
+    summary = build_store(parameters_of(tmp_path), out)
+    assert summary.verdicts == {"good": 3}
+    store = open_store(out)
+    assert store.attributes["property_columns"] == NAMES
+    assert store.attributes["property_units"] == ["kg/m^3", "Pa", "degree"]
+    assert [store.attributes["normalization"][n]["log10"] for n in NAMES] == [True, True, False]
+    assert bool(store.contents.classes) is classes
+    for seed, asset in enumerate(store):
+        voxels, columns, material = voxels_of(seed)
+        places = np.asarray(asset.place, np.float64) * 64 + 31.5
+        _, used = cKDTree(voxels).query(places)
+        assert asset.valid.all()
+        np.testing.assert_array_equal(asset.material, material[used] if classes else 0 * used)
+        for column, name in enumerate(NAMES):
+            np.testing.assert_allclose(
+                asset.properties_si[:, column], columns[name][used], rtol=1e-5, atol=1e-4
+            )
+    verification = verify_store(out)
+    assert not verification.findings
+    # Nothing is done twice, and another description is another source.
+    assert build_store(parameters_of(tmp_path), out).build_id == summary.build_id
+    about = json.loads((tmp_path / "voxels" / "source.json").read_text())
+    about["properties"][2]["most"] = 1.0
+    (tmp_path / "voxels" / "source.json").write_text(json.dumps(about))
+    strict = replace(parameters_of(tmp_path), sample=SampleParameters("nearest", max_unphysical=1))
+    assert build_store(strict, out).n_unphysical > 0
+
+
+def test_an_extra_property_goes_all_the_way_to_scores(tmp_path: Path) -> None:
+    from click.testing import CliRunner
+
+    write(tmp_path, "abcdefgh")
+    out, run = tmp_path / "s.zarr", tmp_path / "run"
+    build_store(parameters_of(tmp_path), out)
+    train(out, run, TrainParameters(size="small", epochs=1, precision="fp32"))
+    scores = evaluate_store(run / "predictions", out, split=None)
+    names = ("log10 density", "log10 yield_stress", "friction_angle", "mean", "accuracy")
+    assert tuple(scores.overall.means) == names
+    with np.load(next((run / "predictions").glob("*.npz"))) as file:
+        assert file["properties_si"].shape[1] == 3
+        assert file["columns"].tolist() == NAMES
+    for form in ("npz", "hdf5", "webdataset", "ply"):
+        assert export_store(out, tmp_path / form, form).assets == 8
+    for name in ("report", "info", "describe", "stats"):
+        result = CliRunner().invoke(command, [name, str(out)])
+        assert result.exit_code == 0, result.output
+
+
+@pytest.mark.parametrize("side", [32, 128])
+def test_other_grids_lie_where_they_should(tmp_path: Path, side: int) -> None:
+    write(tmp_path, "a", resolution=side)
+    voxels, columns, material = voxels_of(0)
+    if side == 32:
+        voxels, rows = np.unique(voxels // 2, axis=0, return_index=True)
+    else:
+        corners = np.stack(np.meshgrid(*[[0, 1]] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
+        rows = np.repeat(np.arange(len(voxels)), 8)
+        voxels = (2 * voxels[:, None] + corners).reshape(-1, 3)
+    arrays = {name: column[rows] for name, column in columns.items()}
+    np.savez(tmp_path / "voxels" / "a.npz", voxels=voxels, material=material[rows], **arrays)
+    parameters = replace(
+        parameters_of(tmp_path, align=KNOWN),
+        pixieverse=PixieverseSource(tmp_path / "voxels", adapter="voxels", transform="frame.npy"),
+    )
+    np.save(tmp_path / "voxels" / "frame.npy", QUARTER_TURN)
+    build_store(parameters, tmp_path / "s.zarr")
+    (asset,) = open_store(tmp_path / "s.zarr")
+    centres = (voxels + 0.5) / side - 0.5
+    apart, used = cKDTree(centres).query(np.asarray(asset.place, np.float64))
+    assert apart.max() < 2 / side
+    right = np.isclose(asset.properties_si[:, 1], arrays["yield_stress"][used], rtol=0.1)
+    assert right.mean() > 0.95
+
+
+def test_vomp_s_voxels_are_read_and_share_the_frame_of_their_latents(tmp_path: Path) -> None:
+    (tmp_path / "slat").mkdir()
+    folder = tmp_path / "voxels" / "voxels"
+    folder.mkdir(parents=True)
+    names = ("x", "y", "z", "youngs_modulus", "poissons_ratio", "density")
+    for seed, name in enumerate("ab"):
+        grid = make_asset(seed).grid
+        voxels = np.argwhere(grid[..., 3] != 7)
+        density, modulus, ratio, _ = grid[tuple(voxels.T)].T
+        dtype = [*((key, "<f4") for key in names), ("segment_id", "<U32")]
+        rows = np.zeros(len(voxels), dtype=dtype)
+        corners = voxels / 64 - 0.5
+        for key, column in zip(names, (*corners.T, modulus, ratio, density), strict=True):
+            rows[key] = column
+        np.savez(folder / f"{name}_with_materials.npz", voxel_data=rows, other=np.zeros(2))
+        edge = ~np.all(
+            [np.roll(grid[..., 3] != 7, s, a) for s in (-1, 1) for a in range(3)], axis=0
+        )
+        slat = voxels[edge[tuple(voxels.T)]]
+        feats = make_asset(seed).feats[: len(slat)]
+        np.savez(tmp_path / "slat" / f"{name}.npz", coords=slat.astype(np.uint8), feats=feats)
+    summary = build_store(parameters_of(tmp_path, "vomp", align=KNOWN), tmp_path / "s.zarr")
+    assert summary.verdicts == {"good": 2}
+    store = open_store(tmp_path / "s.zarr")
+    assert store.attributes["material_classes"] == []
+    asset = store.asset("a")
+    np.testing.assert_array_equal(asset.transform, np.eye(4))
+    assert asset.columns["engine"] == "known"
+    truth = make_asset(0).grid[tuple(asset.coords.T)]
+    np.testing.assert_allclose(asset.properties_si, truth[:, [1, 0, 2]], rtol=1e-5)
+
+
+@pytest.mark.parametrize("suffix", ["json", "npy"])
+def test_a_frame_that_is_known_is_checked(tmp_path: Path, suffix: str) -> None:
+    write(tmp_path, "ab")
+    frames = {"a": QUARTER_TURN, "b": QUARTER_TURN.T}  # of b, turned the wrong way
+    for name, frame in frames.items():
+        path = tmp_path / "voxels" / f"{name}.frame.{suffix}"
+        if suffix == "npy":
+            np.save(path, frame)
+        else:
+            path.write_text(json.dumps(frame.tolist()))
+    source = PixieverseSource(
+        tmp_path / "voxels", adapter="voxels", transform=f"{{id}}.frame.{suffix}"
+    )
+    parameters = replace(parameters_of(tmp_path, align=KNOWN), pixieverse=source)
+    out = tmp_path / "s.zarr"
+    build_store(parameters, out)
+    store = open_store(out)
+    right, wrong = store.asset("a"), store.asset("b")
+    assert right.columns["verdict"] == "good"
+    assert wrong.columns["verdict"] == "failed"
+    assert wrong.columns["confidence"] < 0.5 < 0.9 < right.columns["confidence"]
+    np.testing.assert_array_equal(right.transform, QUARTER_TURN)
+    # The file is a source as others are: another frame is other work.
+    np.save(tmp_path / "voxels" / "b.frame.npy", QUARTER_TURN)
+    (tmp_path / "voxels" / "b.frame.json").write_text(json.dumps(QUARTER_TURN.tolist()))
+    assert build_store(parameters, out).verdicts == {"good": 2}
+
+
+@pytest.mark.parametrize(
+    ("frame", "said"),
+    [
+        (np.eye(3), "4x4"),
+        (np.diag([1.0, 1, -1, 1]), "mirror"),
+        (np.diag([1.0, 2, 1, 1]), "shear"),
+        (np.full((4, 4), np.nan), "finite"),
+    ],
+)
+def test_a_frame_that_is_no_similarity_fails_its_asset_alone(
+    tmp_path: Path, frame: np.ndarray, said: str
+) -> None:
+    write(tmp_path, "ab")
+    for name, one in (("a", QUARTER_TURN), ("b", frame)):
+        (tmp_path / "voxels" / f"{name}.json").write_text(json.dumps(one.tolist()))
+    source = PixieverseSource(tmp_path / "voxels", adapter="voxels", transform="{id}.json")
+    parameters = replace(parameters_of(tmp_path, align=KNOWN), pixieverse=source)
+    summary = build_store(parameters, tmp_path / "s.zarr")
+    assert summary.statuses["failed"] == 1
+    assert said in summary.problems[0][1]
+
+
+def test_what_is_not_there_or_does_not_fit_is_said(tmp_path: Path) -> None:
+    write(tmp_path, "a")
+    with pytest.raises(ConfigError, match="no adapter 'gvm'; expected pixieverse, voxels, vomp"):
+        build_store(parameters_of(tmp_path, "gvm"), tmp_path / "s.zarr")
+    with pytest.raises(ConfigError, match="Pixie publishes no range of yield_stress"):
+        build_store(
+            parameters_of(tmp_path, normalize=NormalizeParameters("pixie")), tmp_path / "s.zarr"
+        )
+    about = tmp_path / "voxels" / "source.json"
+    for text in ("", "{}", '{"properties": []}', '{"properties": [{"name": "A b"}]}'):
+        about.write_text(text)
+        with pytest.raises(ConfigError, match=r"source\.json: does not describe plain voxels"):
+            build_store(parameters_of(tmp_path), tmp_path / "s.zarr")
+    about.unlink()
+    with pytest.raises(ConfigError, match=r"source\.json: cannot be read"):
+        build_store(parameters_of(tmp_path), tmp_path / "s.zarr")

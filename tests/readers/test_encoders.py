@@ -1,0 +1,98 @@
+"""Which encoder made latents, and whether they look standardised."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from slatprep.errors import ConfigError, InputError
+from slatprep.parameters import SlatSource
+from slatprep.readers import read_latents
+from slatprep.readers.encoders import latent_space, look_standardised, settle_latents
+from slatprep.records import FEATS_MEAN, FEATS_STD, TRELLIS, LatentMoments, LatentSpace
+
+
+def moments_of(feats: np.ndarray) -> LatentMoments:
+    return LatentMoments(tuple(feats.mean(axis=0).tolist()), tuple(feats.std(axis=0).tolist()))
+
+
+@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize("narrow", [1.0, 0.6])
+def test_raw_and_standardised_latents_are_told_apart(seed: int, narrow: float) -> None:
+    rng = np.random.default_rng(seed)
+    # One asset's channels spread less than a dataset's, and about a mean of its own.
+    z = rng.normal(size=(500, 8)) * narrow + rng.normal(scale=0.4, size=8)
+    raw = z * np.array(FEATS_STD) + np.array(FEATS_MEAN)
+    assert look_standardised(moments_of(z), TRELLIS)
+    assert not look_standardised(moments_of(raw), TRELLIS)
+
+
+def test_unpublished_moments_are_those_of_all_voxels_of_the_dataset() -> None:
+    rng = np.random.default_rng(1)
+    parts = [rng.normal(size=(n, 4)) * 3 + shift for n, shift in ((100, 5.0), (700, -2.0))]
+    space = settle_latents(
+        LatentSpace("mine", 4, 64), "auto", [(len(part), moments_of(part)) for part in parts]
+    )
+    every = np.concatenate(parts)
+    assert not space.standardised
+    np.testing.assert_allclose(space.mean, every.mean(axis=0), rtol=1e-12)
+    np.testing.assert_allclose(space.std, every.std(axis=0), rtol=1e-12)
+    standardised = space.standardise(every.astype(np.float32))
+    np.testing.assert_allclose(standardised.mean(axis=0), 0, atol=1e-6)
+    np.testing.assert_allclose(standardised.std(axis=0), 1, atol=1e-6)
+
+
+def test_what_is_standardised_is_not_standardised_again_and_can_be_undone() -> None:
+    feats = np.random.default_rng(2).normal(size=(50, 8)).astype(np.float32)
+    done = replace(TRELLIS, standardised=True)
+    np.testing.assert_array_equal(done.standardise(feats), feats)
+    np.testing.assert_allclose(TRELLIS.standardise(done.as_encoded(feats)), feats, atol=1e-6)
+    np.testing.assert_array_equal(TRELLIS.as_encoded(feats), feats)
+
+
+def test_the_reader_wants_the_encoder_s_channels(make_pair) -> None:
+    pair = make_pair(
+        coords=np.array([[1, 2, 3], [4, 5, 6]], np.uint8), feats=np.ones((2, 32), np.float32)
+    )
+    with pytest.raises(InputError, match=r"\(2, 32\).*8\).*slat\.encoder: trellis"):
+        read_latents(pair)
+    wide = LatentSpace("trellis2", 32, 64)
+    contents = replace(pair.roots.contents, latents=wide)
+    pair = replace(pair, roots=replace(pair.roots, contents=contents))
+    assert read_latents(pair).feats.shape == (2, 32)
+
+
+def test_an_encoder_of_one_s_own(tmp_path: Path) -> None:
+    path = tmp_path / "mine.json"
+    path.write_text(
+        json.dumps(
+            {"encoder": "mine", "channels": 2, "resolution": 64, "mean": [1, 2], "std": [3, 4]}
+        )
+    )
+    source = SlatSource(tmp_path, encoder=str(path), standardised="yes")
+    assert latent_space(source) == LatentSpace("mine", 2, 64, (1.0, 2.0), (3.0, 4.0), True)
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("{}", "channels"),
+        ('{"encoder": "a", "channels": 2, "resolution": 64, "mean": [1]}', "each of 2 channels"),
+        ('{"encoder": "a", "channels": 1, "resolution": 64, "mean": [1], "std": [0]}', "above 0"),
+        ("nonsense", "cannot|Expecting|describes"),
+    ],
+)
+def test_a_file_that_describes_no_encoder(tmp_path: Path, text: str, said: str) -> None:
+    path = tmp_path / "mine.json"
+    path.write_text(text)
+    with pytest.raises(ConfigError, match=said):
+        latent_space(SlatSource(tmp_path, encoder=str(path)))
+
+
+def test_an_unknown_encoder_is_named_with_those_there_are(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=r"'trelis'.*trellis, .*JSON file"):
+        latent_space(SlatSource(tmp_path, encoder="trelis"))
