@@ -28,6 +28,7 @@ COMMANDS = {
     "extract-slat": "slatprep.cli.extract:extract_slat",
     "transfer": "slatprep.cli.transfer:transfer",
     "describe": "slatprep.cli.describe:describe",
+    "publish": "slatprep.cli.publish:publish",
     "train": "slatprep.cli.train:train",
     "predict": "slatprep.cli.predict:predict",
     "evaluate": "slatprep.cli.evaluate:evaluate",

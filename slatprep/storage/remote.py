@@ -258,7 +258,7 @@ def connected(place: RemotePlace) -> Iterator[tuple[Any, str]]:
     except (ImportError, ValueError) as error:
         raise ConfigError(
             f"{place}: cannot be reached ({error}); pip install 'slatprep[remote]' brings s3://, "
-            "and gcsfs gs://"
+            "'slatprep[hub]' hf://, and gcsfs gs://"
         ) from None
     try:
         yield system, str(name)

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from slatprep.errors import StoreError
-from slatprep.inspect.check import AlignmentCheck
+from slatprep.inspect.check import AlignmentCheck, check_alignment
 from slatprep.inspect.pictures.alignment import draw_alignment
 from slatprep.inspect.pictures.canvas import FORMATS, STYLE, in_format
 from slatprep.inspect.pictures.scene import Scene, scene_of
@@ -78,6 +78,13 @@ def write_pictures(
     scenes, titles = zip(*(drawn[asset_id] for asset_id in shown), strict=True)
     _write(target / SHEET, draw_sheet(scenes, list(shown.values()), titles))
     return list(files.values()), target / SHEET
+
+
+def sheet_of(store: Store, asset_ids: Sequence[str]) -> bytes:
+    """Draw a contact sheet of up to `MOST` assets of a store."""
+    shown = [store.asset(asset_id) for asset_id in asset_ids[:MOST]]
+    checks = [check_alignment(store, asset.asset_id) for asset in shown]
+    return draw_sheet([scene_of(one) for one in shown], checks, [title_of(one) for one in shown])
 
 
 def _drawn(path: Place, check: AlignmentCheck, kind: str) -> tuple[str, bytes, Scene, str]:

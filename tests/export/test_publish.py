@@ -1,0 +1,154 @@
+"""What `slatprep publish` writes is read by a hub's own libraries, and from a hub."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from click.testing import CliRunner, Result
+from support.trees import tree
+
+from slatprep.cli.commands import slatprep
+from slatprep.export.card import Stated, card_of
+from slatprep.pipeline.dataset import BuildSummary
+from slatprep.store import open_store
+
+HUB = Path(__file__).parents[1] / "support" / "hub.py"
+
+
+def run(*words: object) -> Result:
+    return CliRunner().invoke(slatprep, ["publish", *map(str, words)])
+
+
+@pytest.fixture(scope="module")
+def root(mixed_build: BuildSummary, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Publish a store and shards of it, as two datasets of one owner."""
+    folder = tmp_path_factory.mktemp("hub") / "me"
+    for name, data in (("store", "store"), ("shards", "webdataset")):
+        words = (mixed_build.store, "--out", folder / name, "--data", data)
+        result = run(*words, "--license", "CC-BY-4.0", "--name", "A | B: <i>'c'", "--pictures", 2)
+        assert result.exit_code == 0, result.output
+        assert "--cite-as, --url, --date-published" in result.stderr
+    return folder.parent
+
+
+def test_every_file_has_its_checksum_and_the_store_is_the_same(
+    root: Path, mixed_build: BuildSummary
+) -> None:
+    for name in ("store", "shards"):
+        folder = root / "me" / name
+        lines = (folder / "SHA256SUMS").read_text().splitlines()
+        sums = dict(line.split("  ")[::-1] for line in lines)
+        files = {one.relative_to(folder).as_posix() for one in folder.rglob("*") if one.is_file()}
+        assert files - sums.keys() == {"SHA256SUMS", "index.json"}
+        for file, digest in sums.items():
+            assert hashlib.sha256((folder / file).read_bytes()).hexdigest() == digest
+    assert tree(root / "me" / "store" / "mixed.zarr") == tree(Path(str(mixed_build.store)))
+
+
+def test_it_replaces_what_it_wrote_and_nothing_else(
+    root: Path, mixed_build: BuildSummary, tmp_path: Path
+) -> None:
+    words = (mixed_build.store, "--out", tmp_path / "out", "--pictures", 0, "-q")
+    for _ in range(2):
+        result = run(*words)
+        assert (result.exit_code, result.output) == (0, "")
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine" / "notes.txt").write_text("mine")
+    assert run(mixed_build.store, "--out", tmp_path / "mine", "--pictures", 0).exit_code == 2
+    assert [one.name for one in (tmp_path / "mine").iterdir()] == ["notes.txt"]
+    inside = run(mixed_build.store, "--out", mixed_build.store / "hub", "--pictures", 0)
+    assert inside.exit_code == 2 and "inside the store" in inside.stderr
+    verdict = run(mixed_build.store, "--out", tmp_path / "v", "--verdict", "good")
+    assert verdict.exit_code == 2 and "slatprep subset" in verdict.stderr
+
+
+def test_the_card_is_read_by_the_hubs_library(root: Path) -> None:
+    hub = pytest.importorskip("huggingface_hub")
+    card = hub.DatasetCard.load(root / "me" / "shards" / "README.md")
+    assert card.data.license == "cc-by-4.0" and card.data.pretty_name == "A | B: <i>'c'"
+    assert card.data.to_dict()["configs"][0]["data_files"] == "data/*.tar"
+    assert "A \\| B: &lt;i&gt;'c'" in card.text and "(assets.png)" in card.text
+    assert "| (unknown) | 5 |" in card.text
+    document = json.loads((root / "me" / "store" / "croissant.json").read_text())
+    assert document["license"] == "https://spdx.org/licenses/CC-BY-4.0"
+    assert document["distribution"][0]["contentUrl"] == "mixed.zarr/zarr.json"
+
+
+def test_a_card_says_what_is_not_known(mixed_build: BuildSummary) -> None:
+    store = open_store(mixed_build.store)
+    assert "Not stated: ask" in card_of(store, Stated(), "s.zarr", [])
+    linked = card_of(store, Stated(license="https://a.org/l", cite_as="```me"), "s.zarr", [])
+    assert 'license: "other"' in linked and 'license_link: "https://a.org/l"' in linked
+    assert "```\n'''me\n```" in linked
+
+
+@pytest.fixture(scope="module")
+def hub(root: Path) -> Iterator[str]:
+    """Serve the datasets as the hub does; return the address."""
+    pytest.importorskip("huggingface_hub")
+    with subprocess.Popen(
+        [sys.executable, str(HUB), str(root)],
+        stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
+    ) as process:  # fmt: skip
+        assert process.stdout is not None
+        yield process.stdout.readline().strip()
+        process.kill()
+
+
+def from_hub(hub: str, code: str, tmp_path: Path) -> Any:
+    """Run code in a new process, whose hub this one is, and return what it printed last."""
+    none = dict.fromkeys(("HTTP_PROXY", "HTTPS_PROXY", "http_proxy", "https_proxy"), "")
+    home = {"HF_ENDPOINT": hub, "HF_HOME": str(tmp_path), "HF_HUB_DISABLE_XET": "1"}
+    done = subprocess.run(
+        [sys.executable, "-c", code],
+        capture_output=True, text=True, env=os.environ | none | home, check=False,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    return json.loads(done.stdout.splitlines()[-1])
+
+
+def test_a_store_is_read_from_the_hub(hub: str, mixed_build: BuildSummary, tmp_path: Path) -> None:
+    code = (
+        "import hashlib, json, slatprep\n"
+        "from slatprep.inspect.verify import verify_store\n"
+        "url = 'hf://datasets/me/store/mixed.zarr'\n"
+        "store = slatprep.open_store(url)\n"
+        "sums = [hashlib.sha256(a.properties.tobytes() + a.grid_material.tobytes()).hexdigest()"
+        " for a in store]\n"
+        "faults = []\n"
+        "for name in ('store/none.zarr', 'nobody/x.zarr'):\n"
+        "    try: slatprep.open_store(f'hf://datasets/me/{name}')\n"
+        "    except slatprep.StoreError as error: faults.append(str(error))\n"
+        "print(json.dumps([store.ids, sums, verify_store(url).ok, faults]))\n"
+    )
+    ids, sums, sound, faults = from_hub(hub, code, tmp_path)
+    store = open_store(mixed_build.store)
+    assert ids == store.ids and sound
+    for asset, digest in zip(store, sums, strict=True):
+        content = asset.properties.tobytes() + asset.grid_material.tobytes()
+        assert hashlib.sha256(content).hexdigest() == digest
+    assert len(faults) == 2 and all("is not a slatprep store" in fault for fault in faults)
+
+
+def test_shards_are_a_dataset_of_the_hubs_library(
+    root: Path, mixed_build: BuildSummary, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Where the library `datasets` is installed, which brings 220 MB and is in no extra."""
+    datasets = pytest.importorskip("datasets")
+    loaded = datasets.load_dataset(
+        str(root / "me" / "shards"), split="train", cache_dir=str(tmp_path)
+    ).with_format("numpy")
+    store = open_store(mixed_build.store)
+    assert [row["json"]["asset_id"] for row in loaded] == store.ids
+    for row, asset in zip(loaded, store, strict=True):
+        np.testing.assert_array_equal(row["npz"]["coords"], asset.coords)
+        np.testing.assert_array_equal(row["npz"]["properties"], asset.properties)
