@@ -3,7 +3,8 @@
 The nouns and verbs that a notebook needs, loaded when they are first used;
 ``__init__.pyi`` lists them (Scientific Python's SPEC 1):
 
-- a store: `open_store`, `Store`, `StoredAsset`, `build_store`, `export_store`, `store_statistics`;
+- a store: `open_store`, `Store`, `StoredAsset`, `build_store`, `export_store`;
+- what is in it: `store_statistics`, `compare_stores`;
 - its sources: `load_parameters`, `discover`, `read_field`, `read_latents`;
 - two voxel sets: `align_voxels`, `annotate_voxels`, `apply_transform`, and
   `map_of`, which makes of an alignment the map of points, a `PlaceMap`;

@@ -20,6 +20,7 @@ from .geometry.frames import (
     apply_transform as apply_transform,
     voxel_centres as voxel_centres,
 )
+from .inspect.compare import compare_stores as compare_stores
 from .inspect.statistics import store_statistics as store_statistics
 from .normalize import (
     PIXIE_RANGES as PIXIE_RANGES,

@@ -20,6 +20,7 @@ COMMANDS = {
     "info": "slatprep.cli.info:info",
     "list": "slatprep.cli.list:list_assets",
     "stats": "slatprep.cli.stats:stats",
+    "diff": "slatprep.cli.diff:diff",
     "subset": "slatprep.cli.join:subset",
     "concat": "slatprep.cli.join:concat",
     "report": "slatprep.cli.report:report",

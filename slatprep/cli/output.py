@@ -34,7 +34,7 @@ _Command = TypeVar("_Command", bound=Callable[..., object])
 
 _STYLES = {"good": "green", "doubtful": "yellow", "failed": "red"}
 
-_MAY_SHRINK = ("category", "group", "model", "why")
+_MAY_SHRINK = ("category", "group", "model", "why", "A", "B")
 """Columns whose texts are cut, or broken between words, where a terminal is narrow."""
 _LEAST_WIDTH, _GAP = 12, 2
 _LEAST_ID = 8

@@ -17,12 +17,11 @@ from slatprep.records import (
     BACKGROUND,
     Normalization,
     Place,
-    PropertyRange,
     Verdict,
 )
 from slatprep.store import Store, open_store
 from slatprep.workers import Progress
-from slatprep.workers.local import run_unordered
+from slatprep.workers.local import run_in_order
 
 BINS = 4096
 """Bins that quantiles are read from, over a property's range."""
@@ -37,8 +36,6 @@ Weight = Literal["voxel", "asset"]
 """What weighs one: every voxel, or all voxels of an asset's side together."""
 
 _TASK_ASSETS = 32
-
-_Task = tuple[Place, list[int], bool]
 
 
 @dataclass(frozen=True)
@@ -220,7 +217,7 @@ def store_statistics(
         for some in of_category
         for start in range(0, len(some), _TASK_ASSETS)
     ]
-    tallies = _in_order(tasks, jobs)
+    tallies = run_in_order(_tally_some, tasks, jobs)
     ranges = store.normalization.ranges
     make = _Summariser(
         store.normalization,
@@ -277,19 +274,7 @@ def table_of(statistics: StoreStatistics) -> Iterator[tuple[str | int | float, .
                                values.least, *ends)  # fmt: skip
 
 
-def _in_order(tasks: Sequence[_Task], jobs: int) -> Iterator[Tally]:
-    """Yield the tally of each task in the order of the tasks, so that sums are always the same."""
-    numbered = ((number, *task) for number, task in enumerate(tasks))
-    early: dict[int, Tally] = {}
-    following = 0
-    for number, counts in run_unordered(_tally_some, numbered, jobs):
-        early[number] = counts
-        while following in early:
-            yield early.pop(following)
-            following += 1
-
-
-def _tally_some(number: int, path: Place, rows: Sequence[int], by_asset: bool) -> tuple[int, Tally]:
+def _tally_some(path: Place, rows: Sequence[int], by_asset: bool) -> Tally:
     """Tally some assets of a store, in a worker."""
     store = open_store(path)
     ranges = store.normalization
@@ -307,7 +292,7 @@ def _tally_some(number: int, path: Place, rows: Sequence[int], by_asset: bool) -
             BINS,
             by_asset=by_asset,
         )
-    return number, total
+    return total
 
 
 @dataclass(frozen=True, eq=False)
@@ -397,10 +382,9 @@ class _Summariser:
 
     def joint(self, counts: Tally) -> JointHistogram | None:
         """Return the joint histogram of the first two properties."""
-        spans: Sequence[PropertyRange] = self.ranges.ranges
-        if len(spans) < 2:
+        if len(self.ranges.ranges) < 2:
             return None
-        first, second = spans[:2]
+        first, second = self.ranges.ranges[:2]
         edges = [np.linspace(span.lo, span.hi, JOINT_BINS + 1) for span in (first, second)]
         return JointHistogram(
             (first.name, second.name), (edges[0], edges[1]), counts.field.joint, counts.slat.joint

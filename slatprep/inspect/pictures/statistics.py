@@ -25,6 +25,8 @@ _LEFT, _GAP, _PLOT = 210, 100, 535
 """From the left edge to the plots, between the two columns of them, and their width, in pixels."""
 _HISTOGRAM, _JOINT, _BAR, _BETWEEN = 190, 480, 26, 90
 """Heights in pixels, and what lies between two rows of plots."""
+_COLOURS = (*CLASS_COLOURS.values(),)
+"""Of classes by their index: a store without classes has one of its own."""
 _SIDES = (("field", "PixieVerse fields, before the lookup"), ("slat", "SLAT voxels, after it"))
 
 
@@ -86,11 +88,9 @@ def _head(figure: Figure, store: Store, statistics: StoreStatistics) -> None:
     width, height = size_of(figure)
     from matplotlib.patches import Rectangle
 
-    for group in statistics.classes:
+    for group, colour in zip(statistics.classes, _COLOURS, strict=False):
         place = (x / width, 1 - 104 / height)
-        figure.add_artist(
-            Rectangle(place, 12 / width, 12 / height, color=CLASS_COLOURS[group.name])
-        )
+        figure.add_artist(Rectangle(place, 12 / width, 12 / height, color=colour))
         write(figure, x + 18, 103, group.name, size=7)
         x += 50 + 10 * len(group.name)
     for column, (_, title) in enumerate(_SIDES):
@@ -107,10 +107,9 @@ def _axes(figure: Figure, column: int, top: float, tall: float) -> Axes:
 def _histogram(axes: Axes, histogram: Histogram, side: str) -> None:
     shares = _shares(getattr(histogram, side))
     upto = np.vstack([np.zeros(shares.shape[1]), np.cumsum(shares, axis=0)])
-    colours = [*CLASS_COLOURS.values()]
     for index in np.flatnonzero(shares.any(axis=1)):
         axes.stairs(
-            upto[index + 1], histogram.edges, baseline=upto[index], fill=True, color=colours[index]
+            upto[index + 1], histogram.edges, baseline=upto[index], fill=True, color=_COLOURS[index]
         )
     axes.set_xlim(histogram.edges[0], histogram.edges[-1])
     most = max(_shares(own).sum(axis=0).max() for own in (histogram.field, histogram.slat))
@@ -144,9 +143,9 @@ def _joint(
 def _bars(axes: Axes, names: list[str], bars: list[dict[str, float]]) -> None:
     places = np.arange(len(bars))
     left = np.zeros(len(bars))
-    for name in bars[0] if bars else ():
+    for name, colour in zip(bars[0] if bars else (), _COLOURS, strict=False):
         shares = np.nan_to_num([bar[name] for bar in bars])
-        axes.barh(places, shares, 0.8, left, color=CLASS_COLOURS[name])
+        axes.barh(places, shares, 0.8, left, color=colour)
         left = left + shares
     axes.set_xlim(0, 1)
     axes.set_ylim(max(len(bars), 1) - 0.5, -0.5)

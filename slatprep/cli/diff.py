@@ -1,0 +1,135 @@
+"""`slatprep diff`: what differs between two stores."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import click
+
+from slatprep.cli.options import EXISTING_FOLDER, POSITIVE, command, jobs_option, option
+from slatprep.cli.output import Cell, Output, say
+from slatprep.errors import ConfigError, StoreError
+
+if TYPE_CHECKING:
+    from slatprep.inspect.compare import AssetChange, PropertyChange, StoreDifference
+    from slatprep.records import Place
+
+_SHOWN = 20
+
+
+@command()
+@click.argument("a", type=EXISTING_FOLDER)
+@click.argument("b", type=EXISTING_FOLDER)
+@option("--worst", POSITIVE, metavar="N")
+@jobs_option
+def diff(output: Output, a: Place, b: Place, worst: int | None, jobs: int) -> None:
+    """Say what changed from store A to store B, in sum and asset by asset.
+
+    Assets that one store alone has; sources, verdicts, placements, labels, properties
+    in SI units and latents of those that both have; and what differs of ranges,
+    parameters and versions.
+
+    Options
+    -------
+    --worst: Name so many of the assets that changed, those first whose labels changed most.
+        [default: 20; with --json all]
+
+    Exit codes
+    ----------
+    0  the same
+    1  different
+    2  a store cannot be read, or wrong use
+
+    Example
+    -------
+    slatprep diff old.zarr new.zarr
+    slatprep diff old.zarr new.zarr --json --worst 100
+    """
+    from slatprep.inspect.compare import compare_stores
+    from slatprep.store import open_store
+
+    if worst is None and not output.as_json:
+        worst = _SHOWN
+    try:
+        with output.progress("diff") as progress:
+            found = compare_stores(
+                open_store(a), open_store(b), worst=worst, jobs=jobs, progress=progress
+            )
+    except StoreError as error:
+        raise ConfigError(str(error)) from error  # 1 means different here, as it does of diff.
+    output.result(found, lambda: _show(output, found), complete=found.same)
+
+
+def _show(output: Output, found: StoreDifference) -> None:
+    if found.same:
+        say(f"{found.a} and {found.b} hold the same")
+        return
+    output.record(
+        f"A: {found.a}\nB: {found.b}",
+        {
+            "assets in both": found.assets,
+            "changed": found.changed,
+            "only in A": len(found.only_a),
+            "only in B": len(found.only_b),
+        },
+    )
+    for store, ids in (("A", found.only_a), ("B", found.only_b)):
+        for asset_id in ids[:_SHOWN]:
+            say(f"only in {store}: {asset_id}")
+        if len(ids) > _SHOWN:
+            say(f"only in {store}: {len(ids) - _SHOWN:,} more (--json has all)")
+    if found.settings:
+        output.table(
+            "Settings",
+            ("setting", "A", "B"),
+            [(one.name, _value(one.a), _value(one.b)) for one in found.settings],
+        )
+    if found.what:
+        output.table(
+            "Assets that changed, by what",
+            ("what", "assets", "how"),
+            [(what, count, _how(found, what)) for what, count in found.what.items()],
+        )
+    changed = {name: own for name, own in found.properties.items() if own.changed}
+    if changed:
+        output.table(
+            "Properties of voxels that are valid in both: absolute change",
+            ("property", "voxels", "changed", "mean", "most", "mean of log10"),
+            [(name, *_cells(own)) for name, own in changed.items()],
+        )
+    if found.worst:
+        length = output.id_length([one.asset_id for one in found.worst])
+        output.table(
+            f"{len(found.worst):,} of {found.changed:,} assets that changed",
+            ("id", "verdict", "moved", "labels", "why"),
+            [_line(one, length) for one in found.worst],
+        )
+
+
+def _how(found: StoreDifference, what: str) -> str:
+    """Say how much it is, where that can be said of all assets together."""
+    if what == "verdict":
+        return ", ".join(f"{count:,} {words}" for words, count in found.verdicts.items())
+    if what == "placement":
+        return f"by {found.moved:.3g} voxels (median), at most {found.moved_most:.3g}"
+    if what == "labels":
+        return f"{found.labels:,} of {found.voxels:,} voxels ({found.labels / found.voxels:.2%})"
+    return ""
+
+
+def _cells(own: PropertyChange) -> tuple[Cell, ...]:
+    return (own.voxels, own.changed, own.mean, own.most, own.log10)
+
+
+def _line(one: AssetChange, length: int | None) -> tuple[Cell, ...]:
+    verdict = one.verdicts[1] if "verdict" not in one.what else " > ".join(one.verdicts)
+    details = {"sources": one.sources, "columns": one.columns}
+    why = (
+        f"{what} ({', '.join(details[what])})" if details.get(what) else what for what in one.what
+    )
+    labels = one.labels / one.voxels if one.voxels else None
+    return (one.asset_id[:length], verdict, one.moved, labels, ", ".join(why))
+
+
+def _value(value: object) -> str:
+    return "-" if value is None else str(value)

@@ -1,0 +1,418 @@
+"""What differs between two stores: their settings, and asset by asset what became of it."""
+
+from __future__ import annotations
+
+import heapq
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from slatprep.errors import StoreError
+from slatprep.geometry.frames import displacement
+from slatprep.normalize import denormalize_properties
+from slatprep.provenance.stored import StoredRecords
+from slatprep.records import RESOLUTION, Place
+from slatprep.store import Store, open_store
+from slatprep.store.assets import ASSET_COLUMNS
+from slatprep.store.layout import ARRAYS
+from slatprep.workers import Progress
+from slatprep.workers.local import run_in_order
+
+_VOXEL_ARRAYS = tuple(
+    layout.name.removeprefix("voxel/") for layout in ARRAYS if layout.name.startswith("voxel/")
+)
+
+_ROUNDING = 1e-6
+"""Share of a range: what two normalisations of one value to float32 cannot differ by."""
+
+_TASK_ASSETS = 32
+
+_Rows = tuple[int, int]
+"""The row of an asset in either store."""
+
+
+@dataclass(frozen=True)
+class Setting:
+    """An attribute of the stores' roots that differs; None where one has no such attribute."""
+
+    name: str
+    a: object
+    b: object
+
+
+@dataclass(frozen=True)
+class PropertyChange:
+    """How a property changed over voxels that are valid in both stores.
+
+    Attributes
+    ----------
+    voxels, changed : int
+        Those voxels, and how many of them have another value.
+    mean, most : float
+        Mean and largest absolute change, in the SI unit.
+    log10 : float or None
+        Mean absolute change of log10, where both stores normalise it so.
+    """
+
+    voxels: int
+    changed: int
+    mean: float
+    most: float
+    log10: float | None
+
+
+@dataclass(frozen=True)
+class AssetChange:
+    """What became of an asset that is in both stores.
+
+    Attributes
+    ----------
+    asset_id : str
+        Its id.
+    what : tuple of str
+        Words for all that differs: ``sources``, ``verdict``, ``placement``, ``voxels``,
+        ``labels``, ``properties``, ``latents``, ``columns``; none where nothing does.
+    verdicts : tuple of str
+        In either store.
+    sources : tuple of str
+        Roles of the source files whose content differs.
+    columns : tuple of str
+        Other arrays, ``asset/*`` and ``voxel/*``, that differ, by their last names.
+    moved : float
+        Mean distance, in voxels of the PixieVerse frame, between where the two
+        look a SLAT voxel up; where they have other SLAT voxels, by the transforms alone.
+    voxels, unmatched : int
+        SLAT voxels of both, and those that only one has.
+    labels : int
+        Voxels of both whose class differs, or that are valid in one only.
+    properties : dict of str to PropertyChange
+        By name, of those that both stores have.
+    """
+
+    asset_id: str
+    what: tuple[str, ...]
+    verdicts: tuple[str, str]
+    sources: tuple[str, ...]
+    columns: tuple[str, ...]
+    moved: float
+    voxels: int
+    unmatched: int
+    labels: int
+    properties: dict[str, PropertyChange]
+
+
+@dataclass(frozen=True)
+class StoreDifference:
+    """What differs between two stores.
+
+    Attributes
+    ----------
+    a, b : Place
+        The stores.
+    same : bool
+        Whether nothing does.
+    settings : tuple of Setting
+        Attributes that differ: format, ranges, parameters, versions, the digest of the records.
+    only_a, only_b : tuple of str
+        Ids of assets that one store alone has.
+    assets, changed : int
+        Assets that both have, and how many of these changed.
+    what : dict of str to int
+        Of those that changed how many in what respect; see `AssetChange`.
+    verdicts : dict of str to int
+        Changes of the verdict, such as ``good > failed``.
+    moved, moved_most : float
+        Median and largest of `AssetChange.moved` over the assets that moved; NaN where none did.
+    voxels, labels : int
+        SLAT voxels of both, and how many of them have another class.
+    properties : dict of str to PropertyChange
+        Over the voxels of all assets.
+    worst : tuple of AssetChange
+        Assets that changed, first those with most labels changed, then those that moved most.
+    """
+
+    a: Place
+    b: Place
+    same: bool
+    settings: tuple[Setting, ...]
+    only_a: tuple[str, ...]
+    only_b: tuple[str, ...]
+    assets: int
+    changed: int
+    what: dict[str, int]
+    verdicts: dict[str, int]
+    moved: float
+    moved_most: float
+    voxels: int
+    labels: int
+    properties: dict[str, PropertyChange]
+    worst: tuple[AssetChange, ...]
+
+
+def compare_stores(
+    a: Store,
+    b: Store,
+    *,
+    worst: int | None = None,
+    jobs: int = 1,
+    progress: Progress | None = None,
+) -> StoreDifference:
+    """Return what differs between two stores.
+
+    Each asset is read once from either, but for ``grid/*``, which is judged by
+    the digests of its sources.
+
+    Parameters
+    ----------
+    a, b : Store
+        From `slatprep.open_store`.
+    worst : int, optional
+        How many of the assets that changed to return; all by default, of some 1 kB each.
+    jobs : int
+        Worker processes. The result does not depend on it.
+    progress : callable, optional
+        Called with the assets done and the assets in all.
+
+    Returns
+    -------
+    StoreDifference
+        What differs, in sum and by asset.
+
+    Raises
+    ------
+    StoreError
+        If a store cannot be read.
+    """
+    rows_b = {asset_id: row for row, asset_id in enumerate(b.ids)}
+    rows = [(row, rows_b[name]) for row, name in enumerate(a.ids) if name in rows_b]
+    settings = tuple(_settings(a.attributes, b.attributes))
+    only_a = tuple(name for name in a.ids if name not in rows_b)
+    only_b = tuple(sorted(rows_b.keys() - set(a.ids)))
+    total = _Sum()
+    changes = total.of(_changes(a, b, rows, jobs, progress))
+    if worst is None:
+        kept = sorted(changes, key=_how_much, reverse=True)
+    else:
+        kept = heapq.nlargest(worst, changes, key=_how_much)
+    moved = np.array(total.moved)
+    return StoreDifference(
+        a=a.path,
+        b=b.path,
+        same=not (settings or only_a or only_b or total.changed),
+        settings=settings,
+        only_a=only_a,
+        only_b=only_b,
+        assets=len(rows),
+        changed=total.changed,
+        what=dict(sorted(total.what.items())),
+        verdicts=dict(sorted(total.verdicts.items())),
+        moved=float(np.median(moved)) if len(moved) else float("nan"),
+        moved_most=float(moved.max()) if len(moved) else float("nan"),
+        voxels=total.voxels,
+        labels=total.labels,
+        properties=total.properties,
+        worst=tuple(kept),
+    )
+
+
+class _Sum:
+    """Adds up changes as they pass."""
+
+    def __init__(self) -> None:
+        self.changed = self.voxels = self.labels = 0
+        self.what, self.verdicts = Counter[str](), Counter[str]()
+        self.moved: list[float] = []
+        self.properties: dict[str, PropertyChange] = {}
+
+    def of(self, changes: Iterator[AssetChange]) -> Iterator[AssetChange]:
+        """Count all, and yield those of assets that changed."""
+        for change in changes:
+            self.voxels += change.voxels
+            self.labels += change.labels
+            for name, own in change.properties.items():
+                before = self.properties.get(name)
+                self.properties[name] = own if before is None else _sum_of(before, own)
+            if not change.what:
+                continue
+            self.changed += 1
+            self.what.update(change.what)
+            if change.verdicts[0] != change.verdicts[1]:
+                self.verdicts[" > ".join(change.verdicts)] += 1
+            if change.moved:
+                self.moved.append(change.moved)
+            yield change
+
+
+def _sum_of(one: PropertyChange, other: PropertyChange) -> PropertyChange:
+    voxels = one.voxels + other.voxels
+    if not voxels:
+        return one
+    shares = one.voxels / voxels, other.voxels / voxels
+    return PropertyChange(
+        voxels=voxels,
+        changed=one.changed + other.changed,
+        mean=shares[0] * one.mean + shares[1] * other.mean,
+        most=max(one.most, other.most),
+        log10=None
+        if one.log10 is None or other.log10 is None
+        else shares[0] * one.log10 + shares[1] * other.log10,
+    )
+
+
+def _how_much(change: AssetChange) -> tuple[float, ...]:
+    share = (change.labels + change.unmatched) / max(change.voxels + change.unmatched, 1)
+    return (share, change.moved, sum(own.changed for own in change.properties.values()))
+
+
+def _settings(a: Mapping[str, Any], b: Mapping[str, Any], above: str = "") -> Iterator[Setting]:
+    """Yield the entries of two JSON objects that differ, each by the names that lead to it."""
+    for key in sorted(a.keys() | b.keys()):
+        one, other, name = a.get(key), b.get(key), f"{above}{key}"
+        if isinstance(one, dict) and isinstance(other, dict):
+            yield from _settings(one, other, f"{name}.")
+        elif one != other:
+            yield Setting(name, one, other)
+
+
+def _changes(
+    a: Store, b: Store, rows: Sequence[_Rows], jobs: int, progress: Progress | None
+) -> Iterator[AssetChange]:
+    """Yield what became of each asset that both have."""
+    both = [list(own) for own in zip(*rows, strict=True)] or [[], []]
+    # A column at a time: of a large store all of them take much memory.
+    names = (*(name for name in ASSET_COLUMNS if name != "verdict"), "transform")
+    columns = np.stack([_unequal(a.column(name)[both[0]], b.column(name)[both[1]])
+                        for name in names])  # fmt: skip
+    verdicts = [store.column("verdict")[own] for store, own in zip((a, b), both, strict=True)]
+    starts = range(0, len(rows), _TASK_ASSETS)
+    tasks = ((a.path, b.path, rows[start : start + _TASK_ASSETS]) for start in starts)
+    done = 0
+    for some in run_in_order(_compare_some, tasks, jobs):
+        for change in some:
+            own = tuple(name for name, other in zip(names, columns[:, done], strict=True) if other)
+            words = str(verdicts[0][done]), str(verdicts[1][done])
+            done += 1
+            yield _described(replace(change, verdicts=words, columns=own + change.columns))
+        if progress:
+            progress(done, len(rows))
+
+
+def _unequal(a: NDArray[Any], b: NDArray[Any]) -> NDArray[np.bool_]:
+    """Return which rows of two arrays differ; not-a-number is equal to itself."""
+    if a.shape[1:] != b.shape[1:]:
+        return np.ones(len(a), bool)
+    other = (a != b) & ((a == a) | (b == b))
+    return np.asarray(other.any(axis=tuple(range(1, other.ndim))), bool)
+
+
+_TOLD_APART = {"material": "labels", "valid": "labels", "properties": "properties",
+               "feats": "latents", "place": "placement", "coords": "voxels"}  # fmt: skip
+"""What it is called that an array differs; of all others, and of ``asset/*``, ``columns``."""
+
+
+def _described(change: AssetChange) -> AssetChange:
+    """Return a change with what differs in words, and in `columns` what has no word of its own."""
+    words = {_TOLD_APART.get(name, "columns") for name in change.columns}
+    words |= {"sources"} if change.sources else set()
+    words |= {"verdict"} if change.verdicts[0] != change.verdicts[1] else set()
+    words |= {"placement"} if change.moved else set()
+    columns = tuple(name for name in change.columns if name not in _TOLD_APART)
+    return replace(change, what=tuple(sorted(words)), columns=columns)
+
+
+def _compare_some(path_a: Place, path_b: Place, rows: Sequence[_Rows]) -> list[AssetChange]:
+    """Compare some assets, in a worker; the columns of ``asset/*`` are left to the caller."""
+    stores = open_store(path_a), open_store(path_b)
+    records = [StoredRecords(store) for store in stores]
+    changes = []
+    for pair in rows:
+        here, there = (own.read(row) for own, row in zip(records, pair, strict=True))
+        digests = [{(one.role, one.sha256) for one in own.sources} for own in (here, there)]
+        change = _compare(*stores, here.asset_id, pair)
+        roles = tuple(sorted({role for role, _ in digests[0] ^ digests[1]}))
+        changes.append(replace(change, sources=roles))
+    return changes
+
+
+def _compare(a: Store, b: Store, asset_id: str, rows: _Rows) -> AssetChange:
+    """Compare the voxels of an asset."""
+    one, other = a.read(rows[0], _VOXEL_ARRAYS), b.read(rows[1], _VOXEL_ARRAYS)
+    coords = one.pop("coords"), other.pop("coords")
+    unmatched, moved = 0, 0.0
+    order = np.array_equal(*coords)
+    if not order:
+        codes = [own.astype(np.int64) @ (1 << 40, 1 << 20, 1) for own in coords]
+        found, mine, theirs = np.intersect1d(codes[0], codes[1], return_indices=True)
+        one = {name: values[mine] for name, values in one.items()}
+        other = {name: values[theirs] for name, values in other.items()}
+        unmatched = len(codes[0]) + len(codes[1]) - 2 * len(found)
+    if unmatched:
+        transforms = [
+            store.read_rows("asset/transform", row, row + 1)[0]
+            for store, row in zip((b, a), reversed(rows), strict=True)
+        ]
+        try:
+            moved = displacement(transforms[0], transforms[1], coords[0])
+        except ValueError as error:
+            raise StoreError(f"{a.path} or {b.path}: asset {asset_id}: {error}; run `slatprep "
+                             "verify`") from None  # fmt: skip
+    elif not np.array_equal(one["place"], other["place"]):
+        apart = other["place"].astype(np.float64) - one["place"]
+        moved = float(np.linalg.norm(apart, axis=1).mean() * RESOLUTION)
+    labels = (one["material"] != other["material"]) | (one["valid"] != other["valid"])
+    properties = _properties(a, b, one.pop("properties"), other.pop("properties"))
+    columns = [name for name in one if _unequal(one[name], other[name]).any()]
+    columns += ["properties"] * any(own.changed for own in properties.values())
+    return AssetChange(
+        asset_id=asset_id,
+        what=(),
+        verdicts=("", ""),
+        sources=(),
+        columns=(*columns, *["coords"] * (not order)),
+        moved=moved,
+        voxels=len(labels),
+        unmatched=unmatched,
+        labels=int(labels.sum()),
+        properties=properties,
+    )
+
+
+def _properties(
+    a: Store, b: Store, one: NDArray[np.float32], other: NDArray[np.float32]
+) -> dict[str, PropertyChange]:
+    """Compare normalised properties of the same voxels, in SI units."""
+    spans = {span.name: (k, span) for k, span in enumerate(b.normalization.ranges)}
+    si = [
+        denormalize_properties(values, store.normalization).astype(np.float64)
+        for values, store in ((one, a), (other, b))
+    ]
+    changes = {}
+    for k, span in enumerate(a.normalization.ranges):
+        if span.name not in spans:
+            continue
+        column, other_span = spans[span.name]
+        both = np.isfinite(one[:, k]) & np.isfinite(other[:, column])
+        here, there = si[0][both, k], si[1][both, column]
+        apart, powers = np.abs(there - here), None
+        if span.log10 and other_span.log10:
+            powers = np.abs(np.log10(there) - np.log10(here))
+        if span == other_span:
+            changed = one[both, k] != other[both, column]
+        else:
+            changed = (apart if powers is None else powers) > _ROUNDING * (span.hi - span.lo)
+        changes[span.name] = PropertyChange(
+            voxels=len(here),
+            changed=int(changed.sum()),
+            mean=_mean(apart),
+            most=float(apart.max(initial=0.0)),
+            log10=None if powers is None else _mean(powers),
+        )
+    return changes
+
+
+def _mean(values: NDArray[np.float64]) -> float:
+    return float(values.mean()) if len(values) else 0.0

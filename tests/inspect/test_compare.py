@@ -1,0 +1,203 @@
+"""What `slatprep diff` says, of changes made by hand."""
+
+from __future__ import annotations
+
+import json
+import math
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import zarr
+from click.testing import CliRunner, Result
+from support.synthetic import Dataset, make_asset
+
+from slatprep import compare_stores, open_store, subset_store
+from slatprep.cli.commands import slatprep
+from slatprep.cli.output import as_json
+from slatprep.geometry.frames import displacement
+from slatprep.inspect.compare import StoreDifference
+from slatprep.normalize import denormalize_properties
+from slatprep.pipeline.dataset import BuildSummary, build_store
+
+IDS = ["ant", "bear.front", "bear.side", "cup", "dog"]
+
+
+@pytest.fixture
+def copy(mixed_build: BuildSummary, tmp_path: Path) -> Path:
+    """Copy `mixed`, to be changed."""
+    return Path(shutil.copytree(str(mixed_build.store), tmp_path / "b.zarr"))
+
+
+def change(path: Path, name: str, edit: Callable[[Any], None]) -> None:
+    """Change an array of a store in place."""
+    array = zarr.open_group(path, mode="r+")[name]
+    values = array[:]
+    edit(values)
+    array[:] = values
+
+
+def rows(path: Path, asset: int) -> slice:
+    return slice(*zarr.open_group(path, mode="r")["asset/offset"][asset : asset + 2].tolist())
+
+
+def compare(build: BuildSummary, copy: Path, **options: Any) -> StoreDifference:
+    return compare_stores(open_store(str(build.store)), open_store(copy), **options)
+
+
+def run(*arguments: object) -> Result:
+    return CliRunner().invoke(slatprep, ["diff", *map(str, arguments)])
+
+
+def test_a_copy_is_the_same(mixed_build: BuildSummary, copy: Path) -> None:
+    found = compare(mixed_build, copy)
+    assert found.same and (found.assets, found.changed, found.worst) == (5, 0, ())
+    assert found.voxels == open_store(copy).offsets[-1] and math.isnan(found.moved)
+    result = run(mixed_build.store, copy)
+    assert result.exit_code == 0 and "hold the same" in result.stdout
+
+
+def test_every_change_is_counted_where_it_was_made(mixed_build: BuildSummary, copy: Path) -> None:
+    before = open_store(str(mixed_build.store))
+    ant, cup, dog = (rows(copy, asset) for asset in (0, 3, 4))
+
+    def relabel(material: np.ndarray) -> None:
+        material[ant][:7] = (material[ant][:7] + 1) % 7
+
+    def soften(values: np.ndarray) -> None:
+        values[cup][:4, 0] -= np.float32(0.25)
+
+    change(copy, "voxel/material", relabel)
+    change(copy, "voxel/properties", soften)
+    change(copy, "voxel/place", lambda places: places[dog].__iadd__(np.float32([0, 3 / 64, 0])))
+    change(copy, "voxel/feats", lambda feats: feats[rows(copy, 1)].__imul__(2))
+    change(copy, "asset/verdict", lambda verdicts: verdicts.__setitem__(4, "failed"))
+    change(copy, "asset/fitness", lambda fitness: fitness.__setitem__(2, 0.5))
+    found = compare(mixed_build, copy)
+    assert not found.same and not found.settings and not found.only_a + found.only_b
+    assert found.what == {
+        "labels": 1, "properties": 1, "placement": 1, "latents": 1, "verdict": 1, "columns": 1,
+    }  # fmt: skip
+    assert found.verdicts == {"good > failed": 1} and found.labels == 7
+    assert found.moved == found.moved_most == pytest.approx(3, rel=1e-5)
+    of = {one.asset_id: one for one in found.worst}
+    assert list(of) == ["ant", "dog", "cup", "bear.front", "bear.side"]
+    assert of["ant"].what == ("labels",) and of["ant"].labels == 7
+    assert of["dog"].what == ("placement", "verdict") and of["dog"].verdicts == ("good", "failed")
+    assert of["bear.front"].what == ("latents",)
+    assert (of["bear.side"].what, of["bear.side"].columns) == (("columns",), ("fitness",))
+
+    # Of Young's modulus, as the ranges have it: a quarter of [-1, 1] is an eighth of the range.
+    span = before.normalization.ranges[0]
+    own = of["cup"].properties["youngs_modulus"]
+    valid = int(np.isfinite(before.read(3)["properties"][:, 0]).sum())
+    assert (own.voxels, own.changed) == (valid, 4)
+    assert own.log10 == pytest.approx(4 / valid * (span.hi - span.lo) / 8, rel=1e-5)
+    here = before.asset("cup").properties[:4]
+    moduli = [
+        denormalize_properties(values, before.normalization)[:, 0].astype(float)
+        for values in (here, here - np.float32([0.25, 0, 0]))
+    ]
+    apart = np.abs(moduli[1] - moduli[0])
+    assert own.most == pytest.approx(apart.max(), rel=1e-5)
+    assert own.mean == pytest.approx(apart.sum() / valid, rel=1e-5)
+    whole = found.properties["youngs_modulus"]
+    assert whole.changed == 4 and whole.most == own.most
+    assert whole.mean == pytest.approx(apart.sum() / whole.voxels, rel=1e-5)
+    assert found.properties["density"].changed == 0
+
+
+def test_voxels_are_matched_wherever_they_lie(mixed_build: BuildSummary, copy: Path) -> None:
+    """The same voxels in another order, and one voxel that is another."""
+    before = open_store(str(mixed_build.store))
+    ant, dog = rows(copy, 0), rows(copy, 4)
+    for name in ("coords", "feats", "properties", "material", "valid", "distance", "place",
+                 "confidence"):  # fmt: skip
+        change(copy, f"voxel/{name}", lambda values: values.__setitem__(ant, values[ant][::-1]))
+    change(copy, "voxel/coords", lambda coords: coords[dog].__setitem__(5, [0, 0, 0]))
+    turned = np.eye(4)
+    turned[:3, 3] = 2 / 64, 0, 0
+    turned = turned @ before.asset("dog").transform
+    change(copy, "asset/transform", lambda transforms: transforms.__setitem__(4, turned))
+    found = compare(mixed_build, copy)
+    of = {one.asset_id: one for one in found.worst}
+    assert of.keys() == {"ant", "dog"}
+    assert of["ant"].what == ("voxels",) and of["ant"].unmatched == 0
+    dog_before = before.asset("dog")
+    assert of["dog"].unmatched == 2 and of["dog"].voxels == len(dog_before.coords) - 1
+    assert of["dog"].moved == displacement(turned, dog_before.transform, dog_before.coords)
+    assert of["dog"].moved == pytest.approx(2)
+    assert set(of["dog"].what) == {"voxels", "placement", "columns"}
+
+
+def test_other_sources_ranges_and_assets(tmp_path: Path) -> None:
+    dataset = Dataset(tmp_path / "sources")
+    for seed, object_id in enumerate(("kept", "softer", "gone")):
+        dataset.add(object_id, seed)
+    build_store(dataset.parameters("pixie"), tmp_path / "a.zarr")
+    shutil.rmtree(dataset.root / "pixieverse" / "gone")
+    dataset.add("new", 3)
+    grid = make_asset(1).grid
+    grid[..., 1] *= 10  # Young's modulus
+    dataset.write_grid("softer", grid)
+    build_store(dataset.parameters("dataset"), tmp_path / "b.zarr")
+    a, b = open_store(tmp_path / "a.zarr"), open_store(tmp_path / "b.zarr")
+    found = compare_stores(a, b)
+    assert (found.only_a, found.only_b, found.assets) == (("gone",), ("new",), 2)
+    settings = {one.name: (one.a, one.b) for one in found.settings}
+    span = b.normalization.ranges[1]
+    assert settings["normalization.density.lo"][1] == span.lo
+    assert settings["normalization.density.source"] == ("pixie", "dataset")
+    of = {one.asset_id: one for one in found.worst}
+    softer = of["softer"]
+    assert softer.sources == ("grid",) and {"sources", "properties"} <= set(softer.what)
+    # What is clipped by Pixie's range of E cannot be told; the others are ten times as much.
+    jelly = a.asset("softer").material == 0
+    assert softer.properties["youngs_modulus"].changed >= jelly.sum() > 0
+    # The same values by other ranges differ by rounding alone, but where a range clipped them.
+    kept = of["kept"].properties
+    assert kept["density"].changed == (a.asset("kept").material == 1).sum()  # 8,000 kg/m^3
+    assert kept["poissons_ratio"].changed == 0
+    assert "sources" not in of["kept"].what
+
+    subset_store(a.path, tmp_path / "gone.zarr", ["gone"])
+    nothing = compare_stores(open_store(tmp_path / "gone.zarr"), b)
+    assert (nothing.assets, nothing.only_a) == (0, ("gone",))
+    assert nothing.only_b == ("kept", "new", "softer") and not nothing.same
+    result = run(tmp_path / "gone.zarr", b.path)
+    assert result.exit_code == 1 and "only in A: gone" in result.stdout
+
+
+def test_the_command_tells_it_and_how_it_ended(mixed_build: BuildSummary, copy: Path) -> None:
+    change(copy, "asset/verdict", lambda verdicts: verdicts.__setitem__(4, "failed"))
+    change(copy, "asset/fitness", lambda fitness: fitness.__setitem__(slice(0, 4), 0.5))
+    result = run(mixed_build.store, copy)
+    assert result.exit_code == 1
+    assert "1 good > failed" in result.stdout and "good > failed" in result.stdout
+    document = run(mixed_build.store, copy, "--json")
+    assert document.exit_code == 1
+    found = json.loads(document.stdout)
+    assert found["what"] == {"columns": 4, "verdict": 1} and len(found["worst"]) == 5
+    assert found["moved"] is None
+    worst = json.loads(run(mixed_build.store, copy, "--json", "--worst", 2).stdout)["worst"]
+    assert worst == found["worst"][:2]
+
+
+def test_jobs_change_nothing(mixed_build: BuildSummary, copy: Path) -> None:
+    change(copy, "voxel/place", lambda places: places.__iadd__(np.float32(0.001)))
+    one, two = (as_json(compare(mixed_build, copy, jobs=jobs, worst=3)) for jobs in (1, 2))
+    assert one == two
+
+
+def test_trouble_is_neither_the_same_nor_different(mixed_build: BuildSummary, copy: Path) -> None:
+    damaged = next((copy / "voxel/place").rglob("c/*"))
+    while damaged.is_dir():
+        damaged = next(damaged.iterdir())
+    damaged.write_bytes(damaged.read_bytes()[:50])
+    result = run(mixed_build.store, copy)
+    assert result.exit_code == 2 and "voxel/place" in result.stderr
+    assert run(mixed_build.store, copy.parent / "nothing").exit_code == 2
+    assert run(mixed_build.store, copy.parent).exit_code == 2
