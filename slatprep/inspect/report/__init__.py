@@ -12,12 +12,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slatprep.errors import StoreError
-from slatprep.inspect.report.content import page_content
+from slatprep.inspect.report.content import BINS, page_content
 from slatprep.inspect.report.outcomes import Outcome, read_outcomes
 from slatprep.inspect.report.page import write_page
-from slatprep.inspect.report.statistics import Tally, no_tally, tally
 from slatprep.inspect.report.thumbnails import PER_SHEET, sheet, thumbnail
 from slatprep.inspect.report.voxels import COARSE, FULL, encode_asset
+from slatprep.inspect.tallies import Tally, tally
 from slatprep.inspect.verify.index import WORDS
 from slatprep.provenance.files import build_in
 from slatprep.provenance.stored import StoredRecords
@@ -186,13 +186,18 @@ def _draw(path: Path, indices: Sequence[int]) -> tuple[list[Drawn], dict[str, Ta
         way = records.place_map(asset)
         voxels = {side: encode_asset(asset, way, max_distance, side) for side in (FULL, COARSE)}
         drawn.append(Drawn(index, thumbnail(asset), voxels))
-        _add(tallies, {str(asset.columns["category"]): tally(asset)})
+        field, slat = (
+            (asset.grid_material, asset.grid_properties),
+            (asset.material, asset.properties),
+        )
+        counts = tally(field, slat, store.normalization, BINS)
+        _add(tallies, {str(asset.columns["category"]): counts})
     return drawn, tallies
 
 
 def _add(tallies: dict[str, Tally], more: Mapping[str, Tally]) -> None:
     for category, counts in more.items():
-        tallies[category] = tallies.get(category) or no_tally(counts.field.shape[0]) + counts
+        tallies[category] = tallies[category] + counts if category in tallies else counts
 
 
 def _base64(content: bytes) -> str:

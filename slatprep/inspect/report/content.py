@@ -10,10 +10,11 @@ from typing import Any
 import numpy as np
 
 from slatprep.inspect.pictures.palette import DISTANCE_COLOURS
+from slatprep.inspect.report.orientations import nearest_quarter_turn, quarter_turns
 from slatprep.inspect.report.outcomes import Outcome, kinds_of
-from slatprep.inspect.report.statistics import Tally, nearest_quarter_turn, no_tally, quarter_turns
 from slatprep.inspect.report.thumbnails import COLUMNS, PER_SHEET, VIEWS
 from slatprep.inspect.report.voxels import LEVELS
+from slatprep.inspect.tallies import Tally, no_tally
 from slatprep.judge import THRESHOLDS
 from slatprep.normalize import PIXIE_RANGES
 from slatprep.records import (
@@ -33,6 +34,9 @@ _PROPERTY_COLOURS = ("#440154", "#472D7B", "#3B528B", "#2C728E", "#21918C", "#28
 _FIGURES = ("confidence", "expected_accuracy", "fitness", "fitness_backward", "inlier_rmse",
             "overlap", "valid_share", "ambiguity", "margin")  # fmt: skip
 _DIGITS = 5
+
+BINS = 64
+"""Bins of the histograms of normalised properties, over [-1, 1]."""
 
 
 def page_content(
@@ -120,7 +124,7 @@ def _properties(
 ) -> list[dict[str, Any]]:
     """Return the spread of each property, by class, and the ranges it is held against."""
     normalization, published = store.normalization, {one.name: one for one in PIXIE_RANGES.ranges}
-    total = sum(tallies.values(), start=no_tally(len(normalization.ranges)))
+    total = sum(tallies.values(), start=no_tally(len(normalization.ranges), BINS))
     clipped = np.zeros(len(normalization.ranges), dtype=np.int64)
     for outcome in outcomes or ():
         if outcome.clipped:
@@ -141,8 +145,8 @@ def _properties(
         for span, one, field, slat, count in zip(
             normalization.ranges,
             store.contents.properties,
-            total.field,
-            total.slat,
+            total.field.histogram.astype(np.int64),
+            total.slat.histogram.astype(np.int64),
             clipped,
             strict=True,
         )
@@ -156,7 +160,7 @@ def _balance(store: Store, tallies: Mapping[str, Tally]) -> list[dict[str, Any]]
         {
             "category": category,
             "assets": assets[category],
-            "classes": tallies[category].classes.tolist(),
+            "classes": tallies[category].slat.voxels.tolist(),
         }
         for category in sorted(tallies)
     ]

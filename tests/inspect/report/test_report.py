@@ -26,8 +26,8 @@ from slatprep.errors import StoreError
 from slatprep.geometry.frames import apply_transform, voxel_centres
 from slatprep.inspect import report
 from slatprep.inspect.report import write_report
+from slatprep.inspect.report.orientations import nearest_quarter_turn, quarter_turns
 from slatprep.inspect.report.outcomes import kind_of, kinds_of
-from slatprep.inspect.report.statistics import nearest_quarter_turn, quarter_turns
 from slatprep.pipeline.dataset import BuildSummary
 from slatprep.store import open_store
 
