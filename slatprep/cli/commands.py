@@ -23,6 +23,7 @@ COMMANDS = {
     "diff": "slatprep.cli.diff:diff",
     "subset": "slatprep.cli.join:subset",
     "concat": "slatprep.cli.join:concat",
+    "upgrade": "slatprep.cli.join:upgrade",
     "report": "slatprep.cli.report:report",
     "score": "slatprep.cli.score:score",
     "export": "slatprep.cli.export:export",

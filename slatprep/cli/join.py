@@ -18,7 +18,7 @@ from slatprep.cli.options import (
     option,
     require_categories,
 )
-from slatprep.cli.output import Output
+from slatprep.cli.output import Output, say
 
 if TYPE_CHECKING:
     from slatprep.records import Place
@@ -99,3 +99,33 @@ def concat(output: Output, stores: tuple[Place, ...], out: Place, manifests: Pat
     with output.progress("concat", "shards") as progress:
         summary = concat_stores(stores, out, manifests=manifests, progress=progress)
     report(output, summary)
+
+
+@command()
+@click.argument("store", type=EXISTING_FOLDER)
+@option("--out", PLACE, metavar="STORE.zarr")
+@option("--manifests", NEW_FOLDER)
+def upgrade(output: Output, store: Place, out: Place | None, manifests: Path | None) -> None:
+    """Bring a STORE of an older format to today's, without aligning again.
+
+    Its sources are not needed: places, confidences and verdicts follow from
+    what it holds, and all other rows are taken over as they are.
+
+    Options
+    -------
+    --out: The new store, a path or URL. [default: STORE itself, replaced in one step]
+    --manifests: Folder for the records. [default: beside the new store]
+
+    Example
+    -------
+    slatprep upgrade old.zarr
+    slatprep upgrade old.zarr --out new.zarr
+    """
+    from slatprep.pipeline.upgrade import upgrade_store
+
+    with output.progress("upgrade", "shards") as progress:
+        summary = upgrade_store(store, out, manifests=manifests, progress=progress)
+    if summary is None:
+        output.result({"store": store}, lambda: say(f"{store} has today's format already"))
+    else:
+        report(output, summary)

@@ -49,7 +49,7 @@ _NO_EXTENT = np.empty((0, 2))
 
 
 @dataclass(frozen=True, eq=False)
-class _Source:
+class Source:
     """A store that assets are taken from."""
 
     store: Store
@@ -60,7 +60,7 @@ class _Source:
     """Where its sources lay, as ``build.json`` says; unknown without it."""
 
 
-_Row = tuple[_Source, int]
+_Row = tuple[Source, int]
 """An asset: where it is taken from, and its index there."""
 
 
@@ -108,7 +108,7 @@ def subset_store(
         raise ConfigError(f"no asset of {source.store.path} is chosen; expected one at least")
     contents = source.store.contents
     ranges = source.store.normalization
-    return _write(rows, ranges, source.build, out, manifests, progress, contents)
+    return write_rows(rows, ranges, source.build, out, manifests, progress, contents)
 
 
 def concat_stores(
@@ -160,20 +160,20 @@ def concat_stores(
     build, contents = _common_build(sources), _common_contents(sources)
     normalization = _common_ranges(sources)
     rows.sort(key=lambda row: row[0].store.ids[row[1]])
-    return _write(rows, normalization, build, out, manifests, progress, contents)
+    return write_rows(rows, normalization, build, out, manifests, progress, contents)
 
 
-def _source(place: str | Place) -> _Source:
+def _source(place: str | Place) -> Source:
     store = open_store(place)
     if store.format_version != FORMAT_VERSION:
         raise StoreError(
             f"{store.path} has format {store.format_version}, and {FORMAT_VERSION} is written; "
             "build it again"
         )
-    return _Source(store, StoredRecords(store), store.attributes["build"], _places_of(store))
+    return Source(store, StoredRecords(store), store.attributes["build"], places_of_sources(store))
 
 
-def _places_of(store: Store) -> dict[str, Any]:
+def places_of_sources(store: Store) -> dict[str, Any]:
     """Return where a store's sources lay; nothing where no record beside it is of its build."""
     folder = manifests_beside(store.path)
     if folder is None:
@@ -189,7 +189,7 @@ def _places_of(store: Store) -> dict[str, Any]:
     return places
 
 
-def _common_build(sources: Sequence[_Source]) -> dict[str, Any]:
+def _common_build(sources: Sequence[Source]) -> dict[str, Any]:
     """Return the attribute ``build`` of the joined store; versions that differ are all named."""
     first = sources[0]
     for other in sources[1:]:
@@ -212,7 +212,7 @@ def _common_build(sources: Sequence[_Source]) -> dict[str, Any]:
     }
 
 
-def _common_ranges(sources: Sequence[_Source]) -> Normalization:
+def _common_ranges(sources: Sequence[Source]) -> Normalization:
     """Return the ranges that all have, or those that span all datasets'."""
     ranges = [source.store.normalization for source in sources]
     if all(one == ranges[0] for one in ranges):
@@ -230,7 +230,7 @@ def _common_ranges(sources: Sequence[_Source]) -> Normalization:
     return Normalization(tuple(spans), "dataset")
 
 
-def _common_contents(sources: Sequence[_Source]) -> Contents:
+def _common_contents(sources: Sequence[Source]) -> Contents:
     """Return what all stores hold; moments of latents that a build measured are pooled."""
     first = sources[0].store.contents
     for source in sources[1:]:
@@ -254,7 +254,7 @@ def _common_contents(sources: Sequence[_Source]) -> Contents:
     return settled_contents(rows, unknown, "as said")
 
 
-def _write(
+def write_rows(
     rows: Sequence[_Row],
     normalization: Normalization,
     build: dict[str, Any],
@@ -262,12 +262,14 @@ def _write(
     manifests: str | Place | None,
     progress: Progress | None,
     contents: Contents,
+    in_place: bool = False,
 ) -> BuildSummary:
+    """Write a store of rows of others, in their order; `in_place` it may replace one of them."""
     begin = time.perf_counter()
     place = Destination(out, manifests)
     sources = list(dict.fromkeys(source for source, _ in rows))
     for source in sources:
-        if _same_place(source.store.path, place.store):
+        if not in_place and _same_place(source.store.path, place.store):
             raise ConfigError(f"{place.out} is a store to take assets from; choose another path")
     parameters = _parameters(sources, build)
     assets = [spooled(record, _NO_EXTENT) for record in _records(rows, normalization)]
@@ -347,7 +349,7 @@ def _copy_rows(
                 stop = int(source.store.offsets[row]) + own.stop if own else row + 1
                 change = _renormaliser(source.store.normalization, normalization)
                 for name, writer in writers.items():
-                    values = source.store.read_rows(name, start, stop)
+                    values = source.records.rows(name, start, stop)
                     writer.append(change(values, name))
 
 
@@ -374,7 +376,7 @@ def _renormaliser(
     return change
 
 
-def _parameters(sources: Sequence[_Source], build: dict[str, Any]) -> BuildParameters:
+def _parameters(sources: Sequence[Source], build: dict[str, Any]) -> BuildParameters:
     """Return what the build's record says: the parameters, and where all sources lay."""
     places: dict[str, Any] = {"pixieverse": {"root": NO_ROOT}, "slat": {"root": NO_ROOT}}
     if all(source.places == sources[0].places for source in sources):

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from typing import Any
+
+from numpy.typing import NDArray
 
 from slatprep.align.deformation import PlaceMap
 from slatprep.provenance.record import AssetRecord
@@ -49,6 +52,10 @@ class StoredRecords:
         if asset.columns["model"] in (Model.RIGID, Model.SIMILARITY):
             return PlaceMap(asset.transform)
         return PlaceMap(asset.transform, self.read(asset.index).alignment.deformation)
+
+    def rows(self, name: str, start: int, stop: int) -> NDArray[Any]:
+        """Return rows of an array of the store."""
+        return self.store.read_rows(name, start, stop)
 
     def read(self, row: int) -> AssetRecord:
         """Return the record of a row.

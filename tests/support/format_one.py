@@ -26,6 +26,7 @@ def write_format_one(store: Path, out: Path) -> None:
     del build["parameters"]["align"]["max_displacement"]
     del build["parameters"]["sample"]["max_unphysical"]
     root.attrs.update({"format_version": 1, "build": build})
+    del root.attrs["latents"], root.attrs["property_units"]
     names = [
         n for n in root["file/name"][:] if not n.startswith(tuple(f"{newer}/" for newer in _NEWER))
     ]
@@ -56,5 +57,5 @@ def _older(text: str) -> str:
         del record["judgement"][name]
     del record["parameters"]["align"]["max_displacement"]
     del record["parameters"]["sample"]["max_unphysical"]
-    del record["counts"]["unphysical"]
+    del record["counts"]["unphysical"], record["latents"]
     return json.dumps(record, separators=(",", ":"), ensure_ascii=False)
