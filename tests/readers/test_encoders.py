@@ -96,3 +96,10 @@ def test_a_file_that_describes_no_encoder(tmp_path: Path, text: str, said: str) 
 def test_an_unknown_encoder_is_named_with_those_there_are(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match=r"'trelis'.*trellis, .*JSON file"):
         latent_space(SlatSource(tmp_path, encoder="trelis"))
+
+
+def test_a_grid_that_cannot_be_placed_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "coarse.json"
+    path.write_text(json.dumps({"encoder": "coarse", "channels": 32, "resolution": 32}))
+    with pytest.raises(ConfigError, match=r"coarse lie on a grid of 32\^3; only those of 64\^3"):
+        latent_space(SlatSource(tmp_path, encoder=str(path)))
