@@ -2,10 +2,12 @@
 
     python benchmarks/confidence.py table.npz [--assets 14] [--levels 0 1 2 3 4 5 6 7]
                                     [--seeds 101 102] [--jobs 2]
+    python benchmarks/confidence.py table.npz --generations [--assets 33] [--seeds 911 912]
     python benchmarks/confidence.py table.npz --dataset DIR ...
 
-Demo assets of each level, or the assets of datasets with a truth, are aligned by the
-default engine. Each row of the table is one alignment:
+Demo assets of each level, pairs of generated shapes of one object (`generations.py`), or
+the assets of datasets with a truth, are aligned by the default engine. Each row of the
+table is one alignment:
 
 own      an asset's field on its own SLAT, as the engine places it;
 heading  the same, with all placements hidden from the engine that lie within 3 voxels of
@@ -30,12 +32,14 @@ from typing import Any
 from unittest.mock import patch
 
 import numpy as np
+from generations import make_pair
 from numpy.typing import NDArray
 
 from slatprep.align import field as engine
 from slatprep.align.deformation import map_of
 from slatprep.bench.truth import SUCCESS_DISPLACEMENT, Truth, compare_with_truth, read_truth
 from slatprep.demo import make_demo
+from slatprep.demo.generated import nearest_similarity
 from slatprep.geometry.frames import VOXEL_SIZE, split_transform, voxel_centres
 from slatprep.judge import measure_ambiguity
 from slatprep.judge.evidence import HARMLESS, evidence_of, surroundings_of
@@ -56,6 +60,9 @@ HIDDEN = 3.0
 VOXELS = 500
 """Voxels of a row that the table has."""
 
+GENERATIONS, BENDS = 8, (1.5, 3.5)
+"""The number that stands for pairs of generated shapes, and how far each is bent [voxel, rms]."""
+
 Asset = tuple[str, MaterialField, StructuredLatents, Truth]
 Row = dict[str, Any]
 
@@ -64,6 +71,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("table", type=Path, help="where the table goes, an npz")
     parser.add_argument("--dataset", type=Path, nargs="+", help="instead of demo data")
+    parser.add_argument("--generations", action="store_true", help="instead of levels")
     parser.add_argument("--assets", type=int, default=14, help="of each level and seed")
     parser.add_argument("--levels", type=int, nargs="+", default=list(range(8)))
     parser.add_argument("--seeds", type=int, nargs="+", default=[101, 102])
@@ -76,16 +84,39 @@ def main() -> None:
             rows += [{"seed": 0, "held_out": True} | row for row in made]
             write(options.table, rows)
         return
-    for level in options.levels:
+    for level in [GENERATIONS] if options.generations else options.levels:
         for number, seed in enumerate(options.seeds):
-            with tempfile.TemporaryDirectory() as folder:
-                make_demo(
-                    folder, options.assets, seed * 10 + level, levels=(level,), jobs=options.jobs
-                )
-                assets = _read(Path(folder))
+            if level == GENERATIONS:
+                assets = _generations(seed, options.assets, options.jobs)
+            else:
+                assets = _made(seed * 10 + level, options.assets, level, options.jobs)
             about = {"seed": seed, "held_out": 2 * number >= len(options.seeds)}
             rows += [about | row for row in _rows_of_all(assets, options.jobs)]
             write(options.table, rows)  # What is there is kept if a later level stops.
+
+
+def _made(seed: int, count: int, level: int, jobs: int) -> list[Asset]:
+    with tempfile.TemporaryDirectory() as folder:
+        make_demo(folder, count, seed, levels=(level,), jobs=jobs)
+        return _read(Path(folder))
+
+
+def _generations(seed: int, count: int, jobs: int) -> list[Asset]:
+    """Make pairs of generated shapes, every second one torn, bent more and less."""
+    bends = np.random.default_rng(seed).uniform(*BENDS, count)
+    tasks = [(seed, index, float(bend), index % 2 == 1) for index, bend in enumerate(bends)]
+    with ProcessPoolExecutor(jobs) as pool:
+        pairs = list(pool.map(make_pair, *zip(*tasks, strict=True)))
+    assets = []
+    for number, pair in enumerate(pairs):
+        if pair is not None:
+            best = nearest_similarity(pair.places, voxel_centres(pair.latents.coords))
+            truth = Truth(
+                Path(), best, pair.material, pair.name, GENERATIONS, symmetric=False,
+                places=pair.places,
+            )  # fmt: skip
+            assets.append((f"{seed}-{number}", pair.field, pair.latents, truth))
+    return assets
 
 
 def _read(root: Path) -> list[Asset]:
