@@ -86,7 +86,7 @@ def evaluate(
     from slatprep.learn.metrics import SPREADS, evaluate_store
     from slatprep.learn.predictions import RUN_FILE, selection_of_run
     from slatprep.learn.published import TABLES, read_scores
-    from slatprep.learn.splits import HASH, assign_store
+    from slatprep.learn.splits import assign_store
     from slatprep.store import open_store
 
     if predictions is None and not grids:
@@ -97,14 +97,15 @@ def evaluate(
     others = {
         name: TABLES[name][1] if name in TABLES else read_scores(Path(name)) for name in beside
     }
-    rule, how = split_rule(split_by, shares), f"by {split_by or HASH}"
+    rule = split_rule(split_by, shares)
+    how, is_given = f"by {rule['by']}", split_by is not None or shares is not None
     selection = None
-    if predictions is not None and not split_by and not shares:
+    if predictions is not None and not is_given:
         selection = selection_of_run(predictions)
     if predictions is not None and selection is not None:
         rule |= {name: selection.pop(name) for name in ("by", "shares") if name in selection}
         how = f"as {predictions.absolute().parent / RUN_FILE} says"
-    elif not split_by and not shares:
+    elif not is_given:
         how += ", as no run lies beside the predictions (others: --split-by, --split all)"
     assignment = assign_store(open_store(store), **rule)
     note_split(output, assignment, f"{split}, {how}")

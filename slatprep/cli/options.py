@@ -344,7 +344,10 @@ def split_rule(split_by: str | None, shares: str | None) -> dict[str, Any]:
     """Return ``by`` and ``shares`` for `slatprep.learn.splits.assign_store`."""
     from slatprep.learn.splits import HASH, Shares
 
-    return {"by": split_by or HASH, "shares": Shares() if shares is None else _shares(shares)}
+    return {
+        "by": HASH if split_by is None else split_by,
+        "shares": Shares() if shares is None else _shares(shares),
+    }
 
 
 def note_split(output: Output, assignment: Assignment, how: str) -> None:

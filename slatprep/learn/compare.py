@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from slatprep.errors import InputError
+from slatprep.errors import ConfigError, InputError
 from slatprep.geometry.voxels import voxels_of
 from slatprep.learn.metrics import METRICS, Measure, Spread, average_objects, score_asset
 from slatprep.learn.predictions import (
@@ -25,7 +25,14 @@ from slatprep.parameters import PixieverseSource
 from slatprep.readers.adapters import FoundField
 from slatprep.readers.pairing import find_grids, one_grid
 from slatprep.readers.pixieverse import read_prediction
-from slatprep.records import BACKGROUND, UNANNOTATED, MaterialField, Place
+from slatprep.records import (
+    BACKGROUND,
+    MATERIAL_CLASSES,
+    PROPERTY_COLUMNS,
+    UNANNOTATED,
+    MaterialField,
+    Place,
+)
 from slatprep.sample import sample
 from slatprep.storage.atomic import staged, writing
 from slatprep.store import Store, open_store
@@ -105,11 +112,17 @@ def compare_methods(
     InputError
         If no asset has a prediction of every method that can be used.
     ConfigError
-        If a folder cannot be listed.
+        If a folder cannot be listed, or the store holds other properties or classes.
     StoreError
         If the store cannot be read.
     """
     store = open_store(store_path)
+    held = tuple(one.name for one in store.contents.properties), store.contents.classes
+    if held != (PROPERTY_COLUMNS, MATERIAL_CLASSES):
+        raise ConfigError(
+            f"{store.path} holds {', '.join(held[0])} and {len(held[1])} classes, which grids of "
+            "Pixie's form do not; expected a store of PixieVerse's properties and classes"
+        )
     object_ids, categories = store.column("object_id"), store.column("category")
     found = {name: find_grids(PixieverseSource(root, _GRIDS)) for name, root in grids.items()}
     names = [OURS] if predictions else []
@@ -242,9 +255,11 @@ def draw_comparison(methods: Mapping[str, Measure], what: str, path: Path) -> No
     names, places = list(methods), range(len(methods))
     means = np.array([[m.means[metric] for metric in METRICS] for m in methods.values()])
     spreads = np.array([[m.spreads[metric] for metric in METRICS] for m in methods.values()])
-    spreads = np.nan_to_num(spreads)
-    # Errors are of one unit and get one scale; no accuracy is above 1.
-    most = max(float(np.nanmax((means + spreads)[:, :-1])), 1e-3)
+    spreads[~np.isfinite(spreads)] = 0.0
+    # Errors are of one unit and get one scale, which one beyond all bounds does not stretch;
+    # no accuracy is above 1.
+    ends = (means + spreads)[:, :-1]
+    most = max([1e-3, *ends[np.isfinite(ends)].tolist()])
     figure = Figure(figsize=(11.0, 1.3 + 0.38 * len(names)), layout="constrained")
     panels = figure.subplots(1, len(METRICS), sharey=True)
     for k, (axes, metric) in enumerate(zip(panels, METRICS, strict=True)):

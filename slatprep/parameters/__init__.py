@@ -219,7 +219,9 @@ class NormalizeParameters(_Group):
             raise ValueError("shares of train, val and test that add up to 1")
         own = NormalizeParameters.split_by, NormalizeParameters.shares
         if self.objects == "all" and (self.split_by, self.shares) != own:
-            raise ValueError("objects = 'train' (--ranges-of train) where split_by or shares are")
+            raise ValueError(
+                "objects = 'train' (--ranges-of train) where split_by or shares say whom"
+            )
         if self.objects == "train" and self.ranges != "dataset" and not percentiles:
             raise ValueError("ranges of the dataset or percentiles of it where objects = 'train'")
 

@@ -21,7 +21,7 @@ from slatprep.pipeline.pack import latent_warnings, pack_store, settled_contents
 from slatprep.pipeline.plan import Action, BuildPlan, PlannedAsset, plan_assets
 from slatprep.pipeline.previous import previous_build
 from slatprep.pipeline.publish import Destination, publish_manifests, write_all_records
-from slatprep.pipeline.ranges import dataset_ranges, given_ranges, source_of
+from slatprep.pipeline.ranges import check_objects, dataset_ranges, given_ranges, source_of
 from slatprep.pipeline.recipe import recipe_of
 from slatprep.pipeline.spool import FailedAsset, Spool, SpooledAsset
 from slatprep.pipeline.summary import BuildSummary, nothing_usable, summarise_build
@@ -117,6 +117,7 @@ def build_store(
     with work_beside(place.store, fresh=fresh, keep=keep_work) as work:
         place.look()
         pairs = _discover(parameters, jobs, work.scratch)
+        check_objects(pairs, parameters.normalize)
         jobs = at_most(len(pairs) // assets_per_job, jobs)
         previous, damaged = (None, ()) if fresh else previous_build(place.store, jobs)
         context = BuildContext(parameters, recipe_of(parameters), work.spool, previous, strict)

@@ -15,7 +15,7 @@ from slatprep.parameters import NormalizeParameters, is_split_file, percentiles_
 from slatprep.pipeline.spool import Spool, SpooledAsset
 from slatprep.readers.ranges import pixie_ranges, read_ranges
 from slatprep.readers.splits import Shares, assign_splits, read_id_file, read_lists
-from slatprep.records import PROPERTIES, Normalization, Property
+from slatprep.records import PROPERTIES, AssetPair, Normalization, Property
 from slatprep.storage.place import place_of
 from slatprep.workers.local import Jobs, run_unordered
 
@@ -52,6 +52,13 @@ def source_of(parameters: NormalizeParameters) -> str:
         digest = hashlib.sha256(read_id_file(place_of(by))).hexdigest()
         by = f"{place_of(by).name}, sha256 {digest[:12]}"
     return f"{parameters.ranges} of train by {by}"
+
+
+def check_objects(pairs: Sequence[AssetPair], parameters: NormalizeParameters) -> None:
+    """Raise what `dataset_ranges` would of a split that cannot be made, before hours of work."""
+    if parameters.objects == "train":
+        objects = {pair.object_id: pair.category for pair in pairs}
+        _trained(objects, parameters, {pair.asset_id: pair.object_id for pair in pairs})
 
 
 def dataset_ranges(
@@ -116,19 +123,27 @@ def _chosen(
     by_object = {str(asset.columns["object_id"]): asset for asset in reversed(usable)}
     if parameters.objects == "train":
         valid = [asset for asset in usable if asset.n_valid]
-        splits = assign_splits(
-            parameters.split_by,
+        trained = _trained(
             {str(asset.columns["object_id"]): str(asset.columns["category"]) for asset in valid},
-            Shares(*parameters.shares),
+            parameters,
             {asset.asset_id: str(asset.columns["object_id"]) for asset in valid},
-        ).splits
-        by_object = {name: a for name, a in by_object.items() if splits.get(name) == "train"}
-        if not by_object:
-            raise ConfigError(
-                "normalize.objects: no object is trained on, of which ranges could be taken; "
-                "expected a share or a list of train"
-            )
+        )
+        by_object = {name: asset for name, asset in by_object.items() if name in trained}
     return list(by_object.values())
+
+
+def _trained(
+    objects: Mapping[str, str], parameters: NormalizeParameters, assets: Mapping[str, str]
+) -> set[str]:
+    shares = Shares(*parameters.shares)
+    splits = assign_splits(parameters.split_by, objects, shares, assets).splits
+    trained = {object_id for object_id, split in splits.items() if split == "train"}
+    if not trained:
+        raise ConfigError(
+            "normalize.objects: no object is trained on, of which ranges could be taken; "
+            "expected a share or a list of train"
+        )
+    return trained
 
 
 def _counted(

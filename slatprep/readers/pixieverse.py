@@ -217,7 +217,7 @@ def read_prediction(
     else:
         classes = _classes_of_ids(channels[3], path)
     material = np.where(classes == UNLABELLED, BACKGROUND, classes)[where].astype(np.uint8)
-    values = np.stack([channels[k][where] for k in _CHANNEL_ORDER], axis=1).astype(np.float64)
+    values = _gather(channels, where).astype(np.float64)
     bad = ~np.isfinite(values)
     if raw:
         bad[:, :2] |= values[:, :2] < 0

@@ -105,8 +105,8 @@ HASH, PIXIE = NAMED_SPLITS
 _MAX_BYTES = 64 * 2**20
 _IDS = ArraySpec(((None,),), "US")
 _FORMS = (
-    "ids, one a line; a JSON list of them; a JSON object of the lists train, val and test; or an "
-    "npy array of text"
+    "a file of ids: one a line, a JSON list of them, a JSON object of the lists train, val and "
+    "test, or an npy array of text"
 )
 
 
@@ -246,8 +246,12 @@ def read_id_file(path: Place) -> bytes:
     """Read a file of ids whole; InputError if it cannot be."""
     try:
         return read_bounded(path, _MAX_BYTES)
+    except FileNotFoundError:
+        rules = f"{HASH}, {PIXIE}, {CATEGORY}NAME, or {_FORMS}"
+        raise InputError(path, "does not exist", rules) from None
     except (OSError, ValueError) as error:
-        raise InputError(path, f"cannot be read ({error})", _FORMS) from None
+        reason = getattr(error, "strerror", None) or error
+        raise InputError(path, f"cannot be read ({reason})", _FORMS) from None
 
 
 def _by_file(

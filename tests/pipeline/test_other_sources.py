@@ -16,6 +16,7 @@ from slatprep import build_store, export_store, open_store
 from slatprep.cli.commands import slatprep as command
 from slatprep.errors import ConfigError
 from slatprep.inspect.verify import verify_store
+from slatprep.learn.compare import compare_methods
 from slatprep.learn.metrics import evaluate_store
 from slatprep.learn.train import TrainParameters, train
 from slatprep.parameters import (
@@ -261,3 +262,10 @@ def test_what_is_not_there_or_does_not_fit_is_said(tmp_path: Path) -> None:
     about.unlink()
     with pytest.raises(ConfigError, match=r"source\.json: cannot be read"):
         build_store(parameters_of(tmp_path), tmp_path / "s.zarr")
+
+
+def test_pixie_s_grids_are_not_measured_against_other_properties(tmp_path: Path) -> None:
+    write(tmp_path, "a")
+    build_store(parameters_of(tmp_path), tmp_path / "s.zarr")
+    with pytest.raises(ConfigError, match="holds density, yield_stress, friction_angle"):
+        compare_methods(None, {"m": tmp_path / "slat"}, tmp_path / "s.zarr", None, splits={})

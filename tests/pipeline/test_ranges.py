@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from support.faults import inject
 from support.synthetic import Dataset
 from support.trees import tree
 
@@ -145,8 +146,13 @@ def test_a_single_value_gets_a_width(make_dataset: MakeDataset, tmp_path: Path) 
     [('{"train": ["a"]', "cannot be read"), ('{"train": ["nobody"]}', "none of the dataset's")],
 )
 def test_lists_that_cannot_be_used_are_named(
-    make_dataset: MakeDataset, tmp_path: Path, text: str, message: str
+    make_dataset: MakeDataset,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    text: str,
+    message: str,
 ) -> None:
+    inject(monkeypatch, lambda step, name: pytest.fail(f"{step} {name}"))
     dataset, out = make_dataset("a"), tmp_path / "s.zarr"
     (tmp_path / "lists.json").write_text(text)
     chosen = of(dataset, ranges="p1-p99", objects="train", split_by=str(tmp_path / "lists.json"))

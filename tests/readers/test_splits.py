@@ -128,7 +128,7 @@ def test_an_object_in_two_lists_is_an_error(tmp_path: Path) -> None:
         ("a.npy", np.array([b"\xff"]), "cannot be read"),
         ("a.txt", b"\xff\xfe", "cannot be read"),
         ("a.txt", b" \n \n", "has no id"),
-        ("missing.txt", None, "cannot be read"),
+        ("missing.txt", None, "does not exist; expected hash, pixie, category:NAME, or a file"),
         ("a.json", None, "cannot be read"),
     ],
 )
