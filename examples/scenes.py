@@ -8,8 +8,8 @@ Each SLAT is filled with particles, which take the material of the nearest voxel
 by `slatprep.particles.transfer`: of the PixieVerse field of a stored asset, or of
 a prediction of `slatprep predict`. What each class does beyond its elastic limit
 is `slatprep.particles.simulate.YIELDING`. Without wind the objects fall; in the
-wind, along x, they stand, held at the foot and where they are stationary, in the
-shape in which they bear their weight already, so without gravity.
+wind, along x, they stand, held at the foot and where they are stationary or soil,
+in the shape in which they bear their weight already, so without gravity.
 """
 
 from __future__ import annotations
@@ -44,7 +44,8 @@ except ModuleNotFoundError as error:
 
 RATE = 30
 """Frames a second."""
-STATIONARY = MATERIAL_CLASSES.index("stationary")
+HELD = [MATERIAL_CLASSES.index(name) for name in ("stationary", "sand")]
+"""Pots and soil, which hold what grows in them."""
 
 
 class Scene(NamedTuple):
@@ -116,7 +117,7 @@ def run(name: str, source: tuple[np.ndarray, VoxelField], options: argparse.Name
         options.size * positions, given.material, given.properties, spacing,
         height=0.0 if windy else 0.25 * options.size, gravity=0.0 if windy else 9.81,
         wind=(options.wind, 0.0, 0.0),
-        fixed=(foot | (given.material == STATIONARY)) if windy else None,
+        fixed=(foot | np.isin(given.material, HELD)) if windy else None,
         seconds=options.seconds, rate=RATE, substeps=options.substeps,
     )  # fmt: skip
     counts = {MATERIAL_CLASSES[k]: int(n) for k, n in enumerate(np.bincount(given.material)) if n}
@@ -142,7 +143,7 @@ def picture(scene: Scene, frame: int, count: int) -> np.ndarray:
     colours = np.array([to_rgb(MATERIAL_COLOURS[number]) for number in scene.material])
     normals = np.tile(corners[faces], (len(centres), 1, 1))
     values = np.repeat(colours, len(faces), axis=0)[:, None].repeat(3, axis=1)
-    return trace([Shape(mesh, normals, values, lambda value: value, 0.0)], angle=33.0)
+    return trace([Shape(mesh, normals, values, lambda value: value, 0.0)], angle=38.0)
 
 
 def write(path: Path, scenes: list[Scene], count: int, particles: int) -> None:
