@@ -39,6 +39,8 @@ DAMAGES_LISTED = 10
 @option("--consensus", is_flag=True)
 @option("--witness", is_flag=True)
 @option("--fresh", is_flag=True)
+@option("--rehash", is_flag=True)
+@option("--compact", is_flag=True)
 @option("--keep-work", is_flag=True)
 @option("--dry-run", is_flag=True)
 @workers_options
@@ -51,7 +53,8 @@ def build_store(output: Output, out: Path, dry_run: bool, **options: Any) -> Non
     the records, and the exit code is 1.
 
     Assets whose sources, parameters and code did not change are not aligned
-    again, and a build that was interrupted goes on where it stopped.
+    again, their rows are taken over, and a build that was interrupted goes on
+    where it stopped.
 
     Options
     -------
@@ -61,8 +64,10 @@ def build_store(output: Output, out: Path, dry_run: bool, **options: Any) -> Non
     --consensus: Settle ties by the rotation that most assets share.
     --witness: Settle ties by what the latents say, and name assets whose labels they contradict.
     --fresh: Reuse nothing of an earlier build.
-    --keep-work: Keep all assets' arrays beside the store, about 1 MB each; the next build is
-        faster.
+    --rehash: Hash all sources, also those whose size, times and inode are as they were.
+    --compact: Order rows by id, as a first build does; an update adds new assets behind.
+    --keep-work: Keep all assets' arrays beside the store, about 1 MB each, so that sources
+        are not read again where all must be packed anew.
     --dry-run: Say what would be done, and why; write nothing.
 
     Example
@@ -78,9 +83,8 @@ def build_store(output: Output, out: Path, dry_run: bool, **options: Any) -> Non
 
     if dry_run:
         with output.progress("compare") as progress:
-            plan = build.plan_build(
-                parameters, out, jobs=options["jobs"], fresh=options["fresh"], progress=progress
-            )
+            chosen = {name: options[name] for name in ("jobs", "fresh", "rehash")}
+            plan = build.plan_build(parameters, out, progress=progress, **chosen)
         _show_plan(output, plan)
         return
     with output.progress("build") as progress:

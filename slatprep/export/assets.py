@@ -59,7 +59,8 @@ def choose_ids(store: Store, assets: Sequence[str], verdicts: Sequence[str]) -> 
         raise ConfigError(f"verdict is {unknown[0]!r}; expected one of {', '.join(Verdict)}")
     rows = sorted({store.match(asset_id) for asset_id in assets}) or range(len(store))
     verdict = store.column("verdict")
-    chosen = [store.ids[row] for row in rows if not verdicts or verdict[row] in verdicts]
+    ids = (store.ids[row] for row in rows if not verdicts or verdict[row] in verdicts)
+    chosen = sorted(ids)
     if not chosen:
         there = Counter(str(verdict[row]) for row in rows)
         counts = ", ".join(f"{count} {name}" for name, count in sorted(there.items()))

@@ -58,7 +58,7 @@ def list_assets(
         If the store, or the record of an asset that is not good, cannot be read.
     """
     table, records, ids = store.table(), StoredRecords(store), store.ids
-    for row in rows_chosen(store, verdicts, categories):
+    for row in sorted(rows_chosen(store, verdicts, categories), key=ids.__getitem__):
         verdict, confidence = str(table["verdict"][row]), float(table["confidence"][row])
         if max_confidence is not None and not confidence <= max_confidence:
             continue

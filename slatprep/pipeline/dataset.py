@@ -7,34 +7,51 @@ dataset, for what is new or changed, and replaces the store in one step.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
+from types import MappingProxyType
+
+import numpy as np
 
 from slatprep.errors import StoreError
 from slatprep.parameters import BuildParameters
+from slatprep.pipeline.assemble import assemble
 from slatprep.pipeline.asset import fail_asset, finish_asset, process_asset
+from slatprep.pipeline.carry import Carried, KeptAsset, Row, in_order, kept_assets
 from slatprep.pipeline.consensus import apply_consensus
 from slatprep.pipeline.context import BuildContext
 from slatprep.pipeline.kernels import compile_kernels
-from slatprep.pipeline.pack import latent_warnings, pack_store, settled_contents
+from slatprep.pipeline.pack import latent_warnings, settled_contents
 from slatprep.pipeline.plan import Action, BuildPlan, PlannedAsset, plan_assets
-from slatprep.pipeline.previous import previous_build
-from slatprep.pipeline.publish import Destination, publish_manifests, write_all_records
-from slatprep.pipeline.ranges import check_objects, dataset_ranges, given_ranges, source_of
+from slatprep.pipeline.previous import previous_build, store_there
+from slatprep.pipeline.publish import Destination, publish_manifests
+from slatprep.pipeline.ranges import check_objects, given_ranges, source_of
 from slatprep.pipeline.recipe import recipe_of
+from slatprep.pipeline.seen import Found
 from slatprep.pipeline.spool import FailedAsset, Spool, SpooledAsset
-from slatprep.pipeline.summary import BuildSummary, nothing_usable, summarise_build
-from slatprep.pipeline.update import is_current, repeat_summary
+from slatprep.pipeline.summary import (
+    BuildSummary,
+    counts_in,
+    counts_of,
+    nothing_usable,
+    summarise_build,
+)
+from slatprep.pipeline.update import (
+    Looked,
+    Wanted,
+    found_before,
+    is_current,
+    is_untouched,
+    repeat_summary,
+)
 from slatprep.pipeline.witness import apply_witness
-from slatprep.pipeline.work import Work, work_beside, work_directory
-from slatprep.provenance.make import complete_record, origin
-from slatprep.provenance.record import AssetRecord, Clipped, Record
+from slatprep.pipeline.work import work_beside, work_directory
 from slatprep.provenance.record_json import write_records
 from slatprep.readers import contents_of, discover
-from slatprep.records import AssetPair, Contents, Normalization, Place
+from slatprep.records import AssetPair, Place
 from slatprep.storage.atomic import staged, writing
-from slatprep.store.writer import finish_store
+from slatprep.store import open_store
 from slatprep.workers.local import Jobs, at_most, require_shared, run_unordered
 
 __all__ = [
@@ -63,6 +80,8 @@ def build_store(
     strict: bool = False,
     fresh: bool = False,
     keep_work: bool = False,
+    rehash: bool = False,
+    compact: bool = False,
     assets_per_job: int = 1,
     progress: Progress | None = None,
     note: Note | None = None,
@@ -87,8 +106,12 @@ def build_store(
     fresh : bool
         Do everything, whatever was done before.
     keep_work : bool
-        Keep each asset's arrays beside the store, about a megabyte an asset,
-        so that the next build does not even read unchanged assets twice.
+        Keep each asset's arrays beside the store, about a megabyte an asset, so that
+        the next build can pack all of them anew without reading their sources.
+    rehash : bool
+        Hash all sources, also those whose size, times and inode are as they were.
+    compact : bool
+        Order rows by id, as in a first build, where updates have added some behind.
     assets_per_job : int
         Start no more processes than there are so many assets for.
     progress : callable, optional
@@ -113,41 +136,76 @@ def build_store(
     place = Destination(out, manifests)
     declared = contents_of(parameters)
     given = given_ranges(parameters.normalize, declared.properties)
-    source = given.source if given else source_of(parameters.normalize)
+    wanted = Wanted(given or source_of(parameters.normalize), compact, declared)
     with work_beside(place.store, fresh=fresh, keep=keep_work) as work:
         place.look()
         pairs = _discover(parameters, jobs, work.scratch)
         check_objects(pairs, parameters.normalize)
         jobs = at_most(len(pairs) // assets_per_job, jobs)
+        there = None if fresh else store_there(place.store)
+        context = BuildContext(parameters, recipe_of(parameters), work.spool, there, strict)
+        looked = Looked.at(pairs, context, place, rehash)
+        if is_untouched(looked, pairs, context, place.records(), wanted):
+            clipped = looked.seen.rows["clipped"].sum(axis=0)
+            seconds = time.perf_counter() - begin
+            return repeat_summary([], context, place, seconds, clipped, untouched=True)
         previous, damaged = (None, ()) if fresh else previous_build(place.store, jobs)
-        context = BuildContext(parameters, recipe_of(parameters), work.spool, previous, strict)
-        plan = _plan(pairs, context, jobs, progress)
+        context = replace(context, previous=previous)
+        known = {} if damaged else looked.known
+        few = at_most((len(pairs) - len(known)) // assets_per_job, jobs)
+        plan = _plan(pairs, context, few, progress, known)
         new, unchanged = _split(pairs, plan)
-        _compile(plan, jobs, note)
-        assets = _finish(new, plan, context, jobs, progress)
-        if not damaged and is_current(plan, assets, context, given or source, declared):
-            return repeat_summary(assets, context, place, time.perf_counter() - begin)
-        assets += _finish(unchanged, plan, context, jobs, progress)
-        usable, failed = _usable_and_failed(assets, parameters, pairs)
-        usable = apply_consensus(usable, work.spool, parameters, jobs, note)
-        usable = apply_witness(usable, work.spool, parameters, jobs, note)
+        _compile(plan, few, note)
+        assets = _finish(new, plan, context, few, progress)
+        keys = {pair.asset_id: plan[pair.asset_id].key for pair in unchanged}
+        unmade = not any(isinstance(asset, SpooledAsset) for asset in assets)
+        intact = previous is not None and not damaged and unmade
+        found = found_before(keys, previous, looked.seen) if previous and intact else {}
+        if intact and is_current(plan, assets, context, wanted, found):
+            clipped = np.sum([one.clipped for one in found.values()], axis=0)
+            seconds = time.perf_counter() - begin
+            summary = repeat_summary(assets, context, place, seconds, clipped, untouched=False)
+            looked.note(summary, place, found)
+            return summary
+        kept = None
+        if not damaged and not keep_work:
+            made = [asset for asset in assets if isinstance(asset, SpooledAsset)]
+            kept = kept_assets(unchanged, plan, made, context, looked.seen, given, declared)
+        if kept is None:
+            assets += _finish(unchanged, plan, context, jobs, progress)
+        else:
+            jobs = few
+        usable, failed = _usable_and_failed(assets, kept or [], parameters, pairs)
+        keys = {asset.asset_id: asset.key for asset in usable}
+        if kept is None:
+            made = [asset for asset in usable if isinstance(asset, SpooledAsset)]
+            made = apply_consensus(made, work.spool, parameters, jobs, note)
+            usable = list(apply_witness(made, work.spool, parameters, jobs, note))
+        contents = settled_contents(usable, declared, parameters.slat.standardised)
+        usable = in_order(usable, previous, compact)
+        carried = Carried(previous, usable) if kept and previous else None
         with writing(str(place.out), work_directory(place.store).parent):
-            contents = settled_contents(usable, declared, parameters.slat.standardised)
-            packed = _pack(usable, failed, given, work, parameters, jobs, contents)
+            packed = assemble(usable, failed, given, work, parameters, jobs, contents, carried)
+            counts = counts_in(open_store(packed.store))
             place.replace(packed.store)
+        told = (asset for asset in usable if isinstance(asset, SpooledAsset) and asset.damaged)
         summary = summarise_build(
-            [*usable, *failed],
+            counts,
+            failed,
             store=place.out,
             records=place.records(),
             build_id=packed.build_id,
             seconds=time.perf_counter() - begin,
             normalization=packed.normalization,
-            clipped=packed.clipped,
-            damaged=damaged,
+            clipped=packed.clipped.sum(axis=0),
             warnings=latent_warnings(usable, contents.latents, parameters.slat.standardised),
+            damaged=(*damaged, *(f"{asset.asset_id}: {asset.damaged}" for asset in told)),
         )
         publish_manifests(packed.records, summary, parameters)
         place.publish()
+        clips = zip(usable, packed.clipped, strict=True)
+        found = {a.asset_id: Found(keys[a.asset_id], a.extent, c, a.latents) for a, c in clips}
+        looked.note(summary, place, found)
         if keep_work:
             work.spool.keep_only({asset.key for asset in usable})
     return summary
@@ -159,13 +217,14 @@ def plan_build(
     *,
     jobs: Jobs = 1,
     fresh: bool = False,
+    rehash: bool = False,
     progress: Progress | None = None,
 ) -> BuildPlan:
     """Say what `build_store` would do with each asset, and why; nothing is written.
 
     Parameters
     ----------
-    parameters, out, jobs, fresh, progress
+    parameters, out, jobs, fresh, rehash, progress
         As for `build_store`.
 
     Returns
@@ -178,7 +237,9 @@ def plan_build(
     pairs = _discover(parameters, jobs)
     previous, damaged = (None, ()) if fresh else previous_build(place.store, jobs)
     context = BuildContext(parameters, recipe_of(parameters), spool, previous, strict=False)
-    return BuildPlan(place.out, tuple(plan_assets(pairs, context, jobs, progress)), damaged)
+    known = {} if damaged else Looked.at(pairs, context, place, rehash).known
+    plan = plan_assets(pairs, context, jobs, progress, known)
+    return BuildPlan(place.out, tuple(plan), damaged)
 
 
 def align_pairs(
@@ -226,7 +287,9 @@ def align_pairs(
         with writing(str(out), out.parent), staged(out) as file:
             build_id = write_records(file, (work.spool.record(asset.key) for asset in assets))
     seconds = time.perf_counter() - begin
-    return summarise_build(assets, records=out, build_id=build_id, seconds=seconds)
+    failed = [asset for asset in assets if isinstance(asset, FailedAsset)]
+    counts = counts_of(asset for asset in assets if isinstance(asset, SpooledAsset))
+    return summarise_build(counts, failed, records=out, build_id=build_id, seconds=seconds)
 
 
 def _discover(parameters: BuildParameters, jobs: Jobs, *shared: Path) -> list[AssetPair]:
@@ -238,12 +301,17 @@ def _discover(parameters: BuildParameters, jobs: Jobs, *shared: Path) -> list[As
 
 
 def _plan(
-    pairs: Sequence[AssetPair], context: BuildContext, jobs: Jobs, progress: Progress | None
+    pairs: Sequence[AssetPair],
+    context: BuildContext,
+    jobs: Jobs,
+    progress: Progress | None,
+    known: Mapping[str, str] = MappingProxyType({}),
 ) -> dict[str, PlannedAsset]:
     """Return what is to be done by asset id; nothing where nothing was done before."""
     if context.previous is None and not context.spool.holds_any():
         return {}
-    return {asset.asset_id: asset for asset in plan_assets(pairs, context, jobs, progress)}
+    plan = plan_assets(pairs, context, jobs, progress, known)
+    return {asset.asset_id: asset for asset in plan}
 
 
 def _compile(plan: Mapping[str, PlannedAsset], jobs: Jobs, note: Note | None) -> None:
@@ -283,64 +351,16 @@ def _finish(
     return assets
 
 
-@dataclass(frozen=True)
-class _Packed:
-    """A new store that is not in place yet, and what goes into the summary of it."""
-
-    store: Path
-    records: Path
-    build_id: str
-    normalization: Normalization
-    clipped: Sequence[Clipped]
-
-
 def _usable_and_failed(
     assets: Iterable[SpooledAsset | FailedAsset],
+    kept: Sequence[KeptAsset],
     parameters: BuildParameters,
     pairs: Sequence[AssetPair],
-) -> tuple[list[SpooledAsset], list[FailedAsset]]:
+) -> tuple[list[Row], list[FailedAsset]]:
     """Return the assets that go into the store and those that do not, each by id."""
-    by_id = sorted(assets, key=lambda asset: asset.asset_id)
-    usable = [asset for asset in by_id if isinstance(asset, SpooledAsset)]
+    by_id = sorted((*assets, *kept), key=lambda asset: asset.asset_id)
+    usable: list[Row] = [asset for asset in by_id if not isinstance(asset, FailedAsset)]
     failed = [asset for asset in by_id if isinstance(asset, FailedAsset)]
     if not usable:
         raise StoreError(nothing_usable(failed, parameters, pairs))
     return usable, failed
-
-
-def _pack(
-    usable: Sequence[SpooledAsset],
-    failed: Sequence[FailedAsset],
-    given: Normalization | None,
-    work: Work,
-    parameters: BuildParameters,
-    jobs: Jobs,
-    contents: Contents,
-) -> _Packed:
-    """Normalise and pack the rows of a store, then its records and its root attributes."""
-    normalization = given or dataset_ranges(
-        usable, work.spool, parameters.normalize, jobs, contents.properties
-    )
-    store, records = work.scratch / "store.zarr", work.scratch / "assets.jsonl"
-    clipped = pack_store(store, work.spool, usable, normalization, parameters.store, jobs, contents)
-    completed = _completed_records(work.spool, usable, failed, normalization, clipped)
-    build_id = write_all_records(store, records, completed)
-    finish_store(store, normalization, build_id, origin(parameters), contents)
-    return _Packed(store, records, build_id, normalization, clipped)
-
-
-def _completed_records(
-    spool: Spool,
-    usable: Sequence[SpooledAsset],
-    failed: Sequence[FailedAsset],
-    normalization: Normalization,
-    clipped: Sequence[Clipped],
-) -> Iterator[Record]:
-    """Yield the records of a build by asset id, with the ranges and what they clip."""
-    clips = dict(zip((asset.asset_id for asset in usable), clipped, strict=True))
-    everything: list[SpooledAsset | FailedAsset] = [*usable, *failed]
-    for asset in sorted(everything, key=lambda asset: asset.asset_id):
-        record = spool.record(asset.key)
-        if isinstance(record, AssetRecord):
-            record = complete_record(record, normalization, clips[asset.asset_id])
-        yield record

@@ -22,10 +22,16 @@ from numpy.typing import NDArray
 from slatprep.errors import ConfigError, StoreError
 from slatprep.normalize import denormalize_properties, normalize_properties
 from slatprep.parameters import BuildParameters, StoreParameters
-from slatprep.pipeline.pack import settled_contents, write_assets
+from slatprep.pipeline.pack import (
+    arrays_in,
+    owners,
+    settled_contents,
+    stored_rows,
+    write_assets,
+)
 from slatprep.pipeline.publish import Destination, publish_manifests, write_all_records
 from slatprep.pipeline.spool import spooled
-from slatprep.pipeline.summary import BuildSummary, summarise_build
+from slatprep.pipeline.summary import BuildSummary, counts_of, summarise_build
 from slatprep.pipeline.work import work_beside, work_directory
 from slatprep.provenance.files import build_in
 from slatprep.provenance.places import manifests_beside
@@ -36,9 +42,9 @@ from slatprep.records import Contents, Normalization, Place, PropertyRange
 from slatprep.storage.atomic import writing
 from slatprep.storage.place import storage_of
 from slatprep.store import Store, open_store
-from slatprep.store.layout import ARRAYS, FORMAT_VERSION, overlaps
+from slatprep.store.layout import FORMAT_VERSION
 from slatprep.store.shard_writer import ShardWriter
-from slatprep.store.writer import Shard, create_store, finish_store, shards
+from slatprep.store.writer import create_store, finish_store, shards
 from slatprep.workers import Progress
 
 NO_ROOT, APART = "unknown", " | "
@@ -103,7 +109,8 @@ def subset_store(
         or the disk does not take the new one.
     """
     source = _source(store)
-    rows = [(source, row) for row in sorted({source.store.match(name) for name in assets})]
+    chosen = {source.store.match(name) for name in assets}
+    rows = [(source, row) for row in sorted(chosen, key=source.store.ids.__getitem__)]
     if not rows:
         raise ConfigError(f"no asset of {source.store.path} is chosen; expected one at least")
     contents = source.store.contents
@@ -281,17 +288,19 @@ def write_rows(
             create_store(store, len(rows), offsets[-1], parameters.store, contents)
             write_assets(store, assets, offsets, normalization)
             _copy_rows(store, rows, offsets, normalization, parameters.store, progress)
-            build_id = write_all_records(store, records, _records(rows, normalization))
+            own = enumerate(_records(rows, normalization))
+            build_id = write_all_records(store, records, own)
             finish_store(store, normalization, build_id, build, contents)
             place.replace(store)
         summary = summarise_build(
-            assets,
+            counts_of(assets),
+            (),
             store=place.out,
             records=place.records(),
             build_id=build_id,
             seconds=time.perf_counter() - begin,
             normalization=normalization,
-            clipped=[r.counts.clipped for r in _records(rows, normalization) if r.counts.clipped],
+            clipped=_clipped(_records(rows, normalization)),
         )
         publish_manifests(records, summary, parameters, build["versions"])
         place.publish()
@@ -321,6 +330,12 @@ def _records(rows: Iterable[_Row], normalization: Normalization) -> Iterator[Ass
         yield record
 
 
+def _clipped(records: Iterable[AssetRecord]) -> NDArray[np.int64]:
+    """Return the clipped values of the voxels of all assets, by property."""
+    counts = (record.counts.clipped for record in records)
+    return np.asarray(np.sum([_counts(one.voxel) for one in counts if one], axis=0, dtype=np.int64))
+
+
 def _counts(counts: Any) -> list[int]:
     return list(counts.values())
 
@@ -338,27 +353,17 @@ def _copy_rows(
     for done, shard in enumerate(everything):
         if progress:
             progress(done, len(everything))
-        names = [layout.name for layout in ARRAYS if layout.name.startswith(f"{shard.group}/")]
         with ExitStack() as stack:
             writers = {
-                name: stack.enter_context(ShardWriter(path, name, shard.rows[0])) for name in names
+                name: stack.enter_context(ShardWriter(path, name, shard.rows[0]))
+                for name in arrays_in(shard.group)
             }
-            for asset, own in _owners(shard):
+            for asset, own in owners(shard, *shard.rows):
                 source, row = rows[shard.first + asset]
-                start = int(source.store.offsets[row]) + own.start if own else row
-                stop = int(source.store.offsets[row]) + own.stop if own else row + 1
                 change = _renormaliser(source.store.normalization, normalization)
-                for name, writer in writers.items():
-                    values = source.records.rows(name, start, stop)
-                    writer.append(change(values, name))
-
-
-def _owners(shard: Shard) -> Iterator[tuple[int, slice | None]]:
-    """Yield the assets in a shard, and which of their voxels; of grids there is one each."""
-    if shard.group == "voxel":
-        yield from overlaps(shard.offsets, *shard.rows)
-    else:
-        yield from ((asset, None) for asset in range(len(shard.keys)))
+                values_of = stored_rows(source.store, shard.group, row, own, source.records.rows)
+                for name, values in values_of.items():
+                    writers[name].append(change(values, name))
 
 
 def _renormaliser(

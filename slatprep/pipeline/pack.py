@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from itertools import accumulate
 from pathlib import Path
 from typing import Any
@@ -15,25 +15,28 @@ from numpy.typing import NDArray
 from slatprep.geometry.voxels import flat_index
 from slatprep.normalize import normalize_and_count, normalize_change
 from slatprep.parameters import StoreParameters
+from slatprep.pipeline.carry import Carried, KeptAsset, Row
+from slatprep.pipeline.previous import PreviousBuild
 from slatprep.pipeline.spool import Spool, SpooledAsset
-from slatprep.provenance.record import Clipped, property_counts
 from slatprep.readers.encoders import ENOUGH, in_words, look_standardised, settle_latents
 from slatprep.records import BACKGROUND, UNANNOTATED, Contents, LatentSpace, Normalization
 from slatprep.storage.faults import reached
-from slatprep.store.layout import (
-    ARRAYS,
-    overlaps,
-)
+from slatprep.store import Store
+from slatprep.store.layout import ARRAYS, ArrayLayout, overlaps
 from slatprep.store.shard_writer import ShardWriter
 from slatprep.store.writer import Shard, create_store, open_for_writing, shards
 from slatprep.workers.local import Jobs, run_unordered
 
-Rows = tuple[int, dict[str, NDArray[Any]], NDArray[np.int64]]
-"""An asset by its place in the shard, its rows of the group's arrays, and the values clipped."""
+Arrays = dict[str, NDArray[Any]]
+"""Rows of arrays, by their full names."""
 
 
 def write_shard(
-    path: Path, spool: Spool, shard: Shard, normalization: Normalization
+    path: Path,
+    spool: Spool,
+    shard: Shard,
+    normalization: Normalization,
+    previous: PreviousBuild | None = None,
 ) -> tuple[Shard, NDArray[np.int64]]:
     """Normalise and write one shard of every array of its group.
 
@@ -47,84 +50,146 @@ def write_shard(
         What to write; no other task may have it.
     normalization : Normalization
         Ranges of the properties.
+    previous : PreviousBuild, optional
+        Where assets lie that are not in the spool.
 
     Returns
     -------
     shard : Shard
         The same.
     clipped : ndarray of int64, shape (len(shard.keys), P)
-        How many of the values written lay outside the range, by property.
+        How many of the values of the spool's assets lay outside the range, by property.
     """
     name = f"{shard.group} {shard.rows[0]}"
     reached("shard begun", name)
     clipped = np.zeros((len(shard.keys), len(normalization.ranges)), dtype=np.int64)
+    held = None if previous is None else previous.store
+    arrays_of = _grid_rows if shard.group == "grid" else _voxel_rows
     with ExitStack() as stack:
         writers = {
-            layout.name.partition("/")[2]: stack.enter_context(
-                ShardWriter(path, layout.name, shard.rows[0])
-            )
-            for layout in ARRAYS
-            if layout.name.startswith(f"{shard.group}/")
+            name: stack.enter_context(ShardWriter(path, name, shard.rows[0]))
+            for name in arrays_in(shard.group)
         }
-        read = _grid_rows if shard.group == "grid" else _voxel_rows
-        for asset, arrays, counts in read(spool, shard, normalization):
-            clipped[asset] = counts
-            for array, rows in arrays.items():
-                writers[array].append(rows)
+        for same, *rows in shard.pieces:
+            if same and held is not None:
+                for array, writer in writers.items():
+                    reader = held.reader(array)
+                    first, last = (-(-row // reader.chunk_rows) for row in rows)
+                    for data, lengths in reader.packed(first, last):
+                        writer.append_packed(data, lengths)
+                continue
+            for asset, own in owners(shard, *rows):
+                key = shard.keys[asset]
+                if isinstance(key, int) and held is not None:
+                    arrays = stored_rows(held, shard.group, key, own)
+                else:
+                    arrays, counts = arrays_of(spool, str(key), own, normalization)
+                    clipped[asset] += counts
+                for array, values in arrays.items():
+                    writers[array].append(values)
         reached("shard filled", name)
     reached("shard written", name)
     return shard, clipped
 
 
-def _voxel_rows(spool: Spool, shard: Shard, normalization: Normalization) -> Iterator[Rows]:
-    for asset, own in overlaps(shard.offsets, *shard.rows):
-        arrays = {name: array[own] for name, array in spool.voxels(shard.keys[asset]).items()}
-        arrays["properties"], clipped = normalize_and_count(arrays["properties"], normalization)
-        yield asset, arrays, clipped
+def arrays_in(group: str) -> list[str]:
+    """Return the full names of a group's arrays."""
+    return [layout.name for layout in ARRAYS if layout.name.startswith(f"{group}/")]
 
 
-def _grid_rows(spool: Spool, shard: Shard, normalization: Normalization) -> Iterator[Rows]:
-    for asset, key in enumerate(shard.keys):
-        field = spool.field(key)
-        cells = flat_index(field.voxels)
-        material = np.where(field.occupancy, np.uint8(UNANNOTATED), np.uint8(BACKGROUND))
-        material.reshape(-1)[cells] = field.material
-        normalized, clipped = normalize_and_count(field.properties, normalization)
-        properties = np.full((len(clipped), material.size), np.nan, dtype=np.float32)
-        for plane, column in zip(properties, normalized.T, strict=True):
-            plane[cells] = column
-        properties = properties.reshape(1, len(clipped), *material.shape)
-        yield asset, {"material": material[None], "properties": properties}, clipped
+def owners(shard: Shard, start: int, stop: int) -> Iterator[tuple[int, slice]]:
+    """Yield the assets that own rows of a shard, and which of their own those are."""
+    if shard.group == "voxel":
+        yield from overlaps(shard.offsets, start, stop)
+    else:
+        first = shard.rows[0]
+        yield from ((asset, slice(0, 1)) for asset in range(start - first, stop - first))
+
+
+def stored_rows(
+    store: Store,
+    group: str,
+    row: int,
+    own: slice,
+    read: Callable[[str, int, int], NDArray[Any]] | None = None,
+) -> Arrays:
+    """Read an asset's rows of every array of a group, `own` of them, by the array's name."""
+    read = read or store.read_rows
+    begin = int(store.offsets[row]) if group == "voxel" else row
+    rows = begin + own.start, begin + own.stop
+    return {name: read(name, *rows) for name in arrays_in(group)}
+
+
+def _voxel_rows(
+    spool: Spool, key: str, own: slice, normalization: Normalization
+) -> tuple[Arrays, NDArray[np.int64]]:
+    arrays = {name: array[own] for name, array in spool.voxels(key).items()}
+    arrays["properties"], clipped = normalize_and_count(arrays["properties"], normalization)
+    return {f"voxel/{name}": array for name, array in arrays.items()}, clipped
+
+
+def _grid_rows(
+    spool: Spool, key: str, own: slice, normalization: Normalization
+) -> tuple[Arrays, NDArray[np.int64]]:
+    del own  # a grid is one row
+    field = spool.field(key)
+    cells = flat_index(field.voxels)
+    material = np.where(field.occupancy, np.uint8(UNANNOTATED), np.uint8(BACKGROUND))
+    material.reshape(-1)[cells] = field.material
+    normalized, clipped = normalize_and_count(field.properties, normalization)
+    properties = np.full((len(clipped), material.size), np.nan, dtype=np.float32)
+    for plane, column in zip(properties, normalized.T, strict=True):
+        plane[cells] = column
+    properties = properties.reshape(1, len(clipped), *material.shape)
+    return {"grid/material": material[None], "grid/properties": properties}, clipped
 
 
 def write_assets(
-    path: Path, assets: Sequence[SpooledAsset], offsets: Sequence[int], normalization: Normalization
+    path: Path,
+    assets: Sequence[Row],
+    offsets: Sequence[int],
+    normalization: Normalization,
+    store: Store | None = None,
 ) -> None:
-    """Write every ``asset/*`` array."""
-    columns: dict[str, Any] = {
-        name: [asset.columns[name] for asset in assets] for name in assets[0].columns
-    }
-    columns["id"] = [asset.asset_id for asset in assets]
-    columns["offset"] = offsets
-    columns["property_ambiguity"] = normalize_change(columns["property_ambiguity"], normalization)
+    """Write every ``asset/*`` array; `store` is the one that has the kept assets."""
+    made = [(row, asset) for row, asset in enumerate(assets) if isinstance(asset, SpooledAsset)]
+    kept = [(row, asset) for row, asset in enumerate(assets) if isinstance(asset, KeptAsset)]
+    ids = [asset.asset_id for asset in assets]
     group = open_for_writing(path)["asset"]
     for layout in ARRAYS:
         where, _, name = layout.name.partition("/")
-        if where == "asset":
-            dtype = object if layout.dtype == "str" else layout.dtype
-            group[name][:] = np.array(columns[name], dtype=dtype)
+        if where != "asset":
+            continue
+        if name in ("id", "offset"):
+            values: Any = ids if name == "id" else offsets
+        else:
+            own: Any = [asset.columns[name] for _, asset in made]
+            if name == "property_ambiguity" and made:
+                own = normalize_change(own, normalization)
+            values = np.empty((len(assets), *group[name].shape[1:]), _dtype(layout))
+            if made:
+                values[[row for row, _ in made]] = own
+            if kept and store is not None:
+                held = store.column(name)
+                values[[row for row, _ in kept]] = held[[asset.row for _, asset in kept]]
+                for row, asset in kept:
+                    if asset.names is not None and hasattr(asset.names, name):
+                        values[row] = getattr(asset.names, name)
+        group[name][:] = np.array(values, _dtype(layout))
 
 
-def settled_contents(
-    assets: Iterable[SpooledAsset], declared: Contents, standardised: str
-) -> Contents:
+def _dtype(layout: ArrayLayout) -> Any:
+    return object if layout.dtype == "str" else layout.dtype
+
+
+def settled_contents(assets: Iterable[Row], declared: Contents, standardised: str) -> Contents:
     """Return what a store holds, its latents as `settle_latents` finds them to be."""
     moments = [(asset.n_voxels, asset.latents) for asset in assets]
     return replace(declared, latents=settle_latents(declared.latents, standardised, moments))
 
 
 def latent_warnings(
-    assets: Sequence[SpooledAsset], latents: LatentSpace, standardised: str
+    assets: Sequence[Row], latents: LatentSpace, standardised: str
 ) -> Iterator[str]:
     """Yield what a person should know about whether the latents of a store are standardised."""
     known = [(a.asset_id, a.latents) for a in assets if a.latents and a.n_voxels >= ENOUGH]
@@ -143,25 +208,46 @@ def latent_warnings(
         )
 
 
+@dataclass(frozen=True)
+class Packed:
+    """What became of packing: values clipped, (A, P) by group, and what was taken over.
+
+    `digests` are those of files that were taken over, `records` the shards of records among them.
+    """
+
+    clipped: Mapping[str, NDArray[np.int64]]
+    digests: Mapping[str, str]
+    records: frozenset[int]
+
+
 def pack_store(
     path: Path,
     spool: Spool,
-    assets: Sequence[SpooledAsset],
+    assets: Sequence[Row],
     normalization: Normalization,
     parameters: StoreParameters,
     jobs: Jobs,
     contents: Contents,
-) -> list[Clipped]:
-    """Write the store's arrays, a task a shard; return the values clipped, by asset."""
-    keys = [asset.key for asset in assets]
+    carried: Carried | None = None,
+) -> Packed:
+    """Write the store's arrays, a task a shard; take over what `carried` has."""
+    keys = [asset.row if isinstance(asset, KeptAsset) else asset.key for asset in assets]
     offsets = [0, *accumulate(asset.n_voxels for asset in assets)]
     create_store(path, len(keys), offsets[-1], parameters, contents)
     reached("store created", path.name)
-    write_assets(path, assets, offsets, normalization)
+    previous = carried.previous if carried else None
+    write_assets(path, assets, offsets, normalization, previous.store if previous else None)
     shape = len(keys), len(contents.properties)
     clipped = {group: np.zeros(shape, dtype=np.int64) for group in ("voxel", "grid")}
-    tasks = ((path, spool, shard, normalization) for shard in shards(keys, offsets, parameters))
+    same = carried.rows if carried else None
+    tasks = (
+        (path, spool, shard, normalization, previous)
+        for shard in shards(keys, offsets, parameters, same)
+    )
     for shard, counts in run_unordered(write_shard, tasks, jobs):
         clipped[shard.group][shard.first : shard.first + len(shard.keys)] += counts
-    both = zip(clipped["voxel"], clipped["grid"], strict=True)
-    return [Clipped(*(property_counts(one, normalization) for one in pair)) for pair in both]
+    for row, asset in enumerate(assets):
+        if isinstance(asset, KeptAsset):
+            clipped["voxel"][row] = asset.clipped
+    taken = carried.take_shards(path, parameters) if carried else ({}, frozenset())
+    return Packed(clipped, *taken)

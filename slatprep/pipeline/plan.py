@@ -1,16 +1,16 @@
 """What a build will do with each asset, and why, before it does it.
 
-Sources are compared by content. Their sizes and times are not trusted: a
-copied or restored file keeps them, and hashing takes a small part of what
-aligning takes.
+Sources are compared by content, but for those that `slatprep.pipeline.seen` has
+seen as they are.
 """
 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from enum import StrEnum
+from types import MappingProxyType
 
 from slatprep.errors import SlatprepError, StoreError
 from slatprep.pipeline.context import BuildContext
@@ -109,6 +109,7 @@ def plan_assets(
     context: BuildContext,
     jobs: Jobs,
     progress: Callable[[int, int], None] | None = None,
+    known: Mapping[str, str] = MappingProxyType({}),
 ) -> list[PlannedAsset]:
     """Say what will be done with each asset, and why.
 
@@ -122,14 +123,24 @@ def plan_assets(
         Worker processes, or a cluster's.
     progress : callable, optional
         Called with the assets done and the assets in all.
+    known : mapping of str to str
+        Keys of assets whose sources need not be hashed again, by id.
 
     Returns
     -------
     list of PlannedAsset
         Sorted by asset id; those to be removed as well.
     """
-    tasks = ((pair, context) for pair in pairs)
     plan = []
+    other = []
+    resumable = context.spool.holds_any()
+    for pair in pairs:
+        key = known.get(pair.asset_id)
+        if key is None or (resumable and context.spool.find(key)):
+            other.append(pair)
+        else:
+            plan.append(PlannedAsset(pair.asset_id, Action.REUSE, "unchanged", key))
+    tasks = ((pair, context) for pair in other)
     for planned in run_unordered(plan_asset, tasks, jobs):
         plan.append(planned)
         if progress:

@@ -63,6 +63,13 @@ class PreviousBuild:
         return f"the store has format {found}, and {FORMAT_VERSION} is written"
 
     @cached_property
+    def digests(self) -> dict[str, str]:
+        """SHA-256 of its files by name, as it holds them."""
+        files = self.store.shape("file/name")[0]
+        names, digests = (self.store.read_rows(f"file/{n}", 0, files) for n in ("name", "sha256"))
+        return dict(zip(map(str, names), map(str, digests), strict=True))
+
+    @cached_property
     def records(self) -> StoredRecords:
         """Its records."""
         return StoredRecords(self.store)
@@ -88,6 +95,10 @@ class PreviousBuild:
             raise StoreError(f"{file} is damaged")
         return self.records.read(row).of_first_pass()
 
+    def text(self, row: int) -> bytes:
+        """Return the record of a row as the store holds it, JSON in UTF-8."""
+        return self.records.text(row).encode()
+
     def holds(self, asset: Finished) -> bool:
         """Whether the store's labels and places of an asset are those it has been given now.
 
@@ -112,6 +123,15 @@ class PreviousBuild:
 @lru_cache(maxsize=1)
 def _in_this_process(path: Place, build_id: str, damaged: frozenset[str]) -> PreviousBuild:
     return PreviousBuild(path, build_id, damaged)
+
+
+def store_there(target: Place) -> PreviousBuild | None:
+    """Return the store at a path, none of its files compared; None where none can be opened."""
+    try:
+        store = open_store(target)
+    except StoreError:
+        return None
+    return PreviousBuild(store.path, str(store.attributes.get("manifest")))
 
 
 def previous_build(target: Place, jobs: Jobs) -> tuple[PreviousBuild | None, tuple[str, ...]]:

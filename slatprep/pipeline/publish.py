@@ -20,13 +20,12 @@ from slatprep.pipeline.summary import BuildSummary
 from slatprep.provenance.make import build_versions
 from slatprep.provenance.places import manifests_of
 from slatprep.provenance.record import (
-    AssetRecord,
     BuildCounts,
     BuildRecord,
     Record,
     Versions,
 )
-from slatprep.provenance.record_json import to_json, write_records
+from slatprep.provenance.record_json import content_of, to_json, write_records
 from slatprep.records import Place
 from slatprep.storage.atomic import replace_directory
 from slatprep.storage.faults import reached
@@ -143,18 +142,35 @@ def _is_marked(file: Path, mark: bytes) -> bool:
         return False
 
 
-def write_all_records(store: Path, path: Path, records: Iterable[Record]) -> str:
-    """Write all records to a file, and those of rows into the new store; return the build's id."""
-    writer = RecordWriter(open_for_writing(store))
+def write_all_records(
+    store: Path,
+    path: Path,
+    records: Iterable[tuple[int, Record | bytes]],
+    taken: frozenset[int] = frozenset(),
+) -> str:
+    """Write all records to a file, and those of rows into the new store; return the build's id.
 
-    def passing() -> Iterator[Record]:
-        for record in records:
-            if isinstance(record, AssetRecord):
-                writer.add(to_json(record.without_duration()))
+    Parameters
+    ----------
+    store : Path
+        The new store.
+    path : Path
+        The file.
+    records : iterable of (int, Record or bytes)
+        Rows and records, by asset id; rows of assets that do not go in are negative. A
+        record that the store that is there has may be given as its text.
+    taken : frozenset of int
+        Shards of records that the new store has already.
+    """
+    writer = RecordWriter(open_for_writing(store), taken)
+
+    def passing() -> Iterator[Record | bytes]:
+        for row, record in records:
+            if row >= 0:
+                writer.add(row, content_of(record))
             yield record
 
     build_id = write_records(path, passing())
-    writer.flush()
     reached("records written", str(path))
     return build_id
 
@@ -165,7 +181,7 @@ def publish_manifests(
     parameters: BuildParameters,
     versions: Versions | None = None,
 ) -> None:
-    """Copy the records of a finished build to where people look for them.
+    """Move the records of a finished build to where people look for them.
 
     Parameters
     ----------
@@ -189,7 +205,10 @@ def publish_manifests(
             storage_of(summary.records).staged() as records_file,
             storage_of(folder / "build.json").staged() as build_file,
         ):
-            shutil.copyfile(records, records_file)
+            try:
+                records.replace(records_file)
+            except OSError:  # on another disk
+                shutil.copyfile(records, records_file)
             reached("manifests written", str(folder))
             document = to_json(build_record(summary, parameters, versions), indent=True)
             build_file.write_bytes(document + b"\n")

@@ -11,9 +11,9 @@ import numpy as np
 
 from slatprep.parameters import BuildParameters
 from slatprep.pipeline.spool import FailedAsset, SpooledAsset
-from slatprep.provenance.record import Clipped
 from slatprep.readers.pairing import explain_unmatched
 from slatprep.records import AssetPair, Normalization, Place, Status
+from slatprep.store import Store
 
 PROBLEMS_LISTED = 100
 """How many problems a summary lists; the records hold all."""
@@ -78,50 +78,79 @@ class BuildSummary:
         return all(count == 0 for status, count in self.statuses.items() if status != Status.OK)
 
 
+@dataclass(frozen=True)
+class Counts:
+    """What of a `BuildSummary` the assets with status ``ok`` tell."""
+
+    verdicts: dict[str, int]
+    n_voxels: int
+    n_valid: int
+    n_unphysical: int
+    contradicted: tuple[str, ...]
+
+
+def counts_of(assets: Iterable[SpooledAsset]) -> Counts:
+    """Count what became of finished assets."""
+    usable = list(assets)
+    return Counts(
+        verdicts=dict(sorted(Counter(str(asset.columns["verdict"]) for asset in usable).items())),
+        n_voxels=sum(asset.n_voxels for asset in usable),
+        n_valid=sum(asset.n_valid for asset in usable),
+        n_unphysical=int(np.sum([asset.columns["unphysical"] for asset in usable])),
+        contradicted=tuple(
+            islice((a.asset_id for a in usable if a.columns["contradicted"]), PROBLEMS_LISTED)
+        ),
+    )
+
+
+def counts_in(store: Store) -> Counts:
+    """Count what became of the assets of a store."""
+    sizes = np.diff(store.offsets)
+    rows = np.flatnonzero(store.column("contradicted"))
+    contradicted = sorted(store.ids[row] for row in rows)
+    return Counts(
+        verdicts=dict(sorted(Counter(map(str, store.column("verdict"))).items())),
+        n_voxels=int(sizes.sum()),
+        n_valid=int(np.rint(store.column("valid_share") * sizes).sum()),
+        n_unphysical=int(store.column("unphysical").sum()),
+        contradicted=tuple(contradicted[:PROBLEMS_LISTED]),
+    )
+
+
 def summarise_build(
-    assets: Sequence[SpooledAsset | FailedAsset],
+    counts: Counts,
+    failed: Sequence[FailedAsset],
     *,
     records: Place,
     build_id: str,
     seconds: float,
     store: Place | None = None,
     normalization: Normalization | None = None,
-    clipped: Iterable[Clipped] = (),
+    clipped: Iterable[int] = (),
     damaged: Sequence[str] = (),
     warnings: Iterable[str] = (),
 ) -> BuildSummary:
-    """Count what became of the assets."""
-    usable = [asset for asset in assets if isinstance(asset, SpooledAsset)]
-    failed = [asset for asset in assets if isinstance(asset, FailedAsset)]
-    statuses = Counter(str(asset.status) for asset in failed) + Counter(ok=len(usable))
-    verdicts = Counter(str(asset.columns["verdict"]) for asset in usable)
+    """Say what became of the assets; `clipped` are values of ``voxel/properties`` by property."""
+    statuses = Counter(str(asset.status) for asset in failed)
+    statuses[str(Status.OK)] = sum(counts.verdicts.values())
+    names = [one.name for one in normalization.ranges] if normalization else []
     return BuildSummary(
         records=records,
         build_id=build_id,
         seconds=seconds,
         statuses={str(status): statuses[str(status)] for status in Status},
-        verdicts=dict(sorted(verdicts.items())),
-        n_voxels=sum(asset.n_voxels for asset in usable),
-        n_valid=sum(asset.n_valid for asset in usable),
-        n_unphysical=int(np.sum([asset.columns["unphysical"] for asset in usable])),
+        verdicts=counts.verdicts,
+        n_voxels=counts.n_voxels,
+        n_valid=counts.n_valid,
+        n_unphysical=counts.n_unphysical,
         problems=tuple((asset.asset_id, asset.reason) for asset in failed[:PROBLEMS_LISTED]),
-        contradicted=tuple(
-            islice((a.asset_id for a in usable if a.columns["contradicted"]), PROBLEMS_LISTED)
-        ),
+        contradicted=counts.contradicted,
         store=store,
         normalization=normalization,
-        clipped=_clipped_by_property(clipped),
+        clipped=dict(zip(names, map(int, clipped), strict=False)),
         warnings=tuple(warnings),
-        damaged=(*damaged, *(f"{a.asset_id}: {a.damaged}" for a in usable if a.damaged)),
+        damaged=tuple(damaged),
     )
-
-
-def _clipped_by_property(clipped: Iterable[Clipped]) -> dict[str, int]:
-    """Return the clipped values of ``voxel/properties`` of all assets, by property."""
-    counts: Counter[str] = Counter()
-    for asset in clipped:
-        counts.update(asset.voxel)  # Zeros are kept, and the order of the columns.
-    return dict(counts)
 
 
 def nothing_usable(

@@ -81,28 +81,34 @@ def read_build_record(text: bytes | str, where: str) -> BuildRecord:
     return record
 
 
-def records_id(records: Iterable[Record]) -> str:
+def records_id(records: Iterable[Record | bytes]) -> str:
     """Return the id of a build: SHA-256, in hex, of its records in the order of asset ids.
 
     How long things took and in what words they failed are left out: they
     differ between runs, machines and folders without the content differing.
+    A record of a row may be given as the text that a store holds of it.
     """
     digest = hashlib.sha256()
     for record in records:
-        if isinstance(record, AssetRecord):
-            content: Record = record.without_duration()
-        else:
-            content = replace(record, duration_s=0.0, reason="", traceback="")
-        digest.update(to_json(content))
+        digest.update(content_of(record))
     return digest.hexdigest()
 
 
-def write_records(path: Path, records: Iterable[Record]) -> str:
+def content_of(record: Record | bytes) -> bytes:
+    """Return what of a record counts in `records_id`; of a row's it is what its store holds."""
+    if isinstance(record, bytes):
+        return record
+    if isinstance(record, AssetRecord):
+        return to_json(record.without_duration())
+    return to_json(replace(record, duration_s=0.0, reason="", traceback=""))
+
+
+def write_records(path: Path, records: Iterable[Record | bytes]) -> str:
     """Write records, in the order of their asset ids, as JSON Lines; return `records_id`."""
 
-    def passing() -> Iterator[Record]:
+    def passing() -> Iterator[Record | bytes]:
         for record in records:
-            file.write(to_json(record) + b"\n")
+            file.write((record if isinstance(record, bytes) else to_json(record)) + b"\n")
             yield record
 
     with path.open("wb") as file:

@@ -14,6 +14,9 @@ from slatprep.records import Model
 from slatprep.store.reader import Store, StoredAsset
 from slatprep.store.records import RECORD_ARRAY, RECORDS_IN_CHUNK
 
+_CHUNKS_KEPT = 8
+"""Chunks of texts in memory, 0.6 MB each."""
+
 
 class StoredRecords:
     """The records of a store, by row or in order.
@@ -26,7 +29,7 @@ class StoredRecords:
 
     def __init__(self, store: Store) -> None:
         self.store = store
-        self._chunk: tuple[int, list[str]] = (-1, [])
+        self._chunks: dict[int, list[str]] = {}
 
     def __iter__(self) -> Iterator[AssetRecord]:
         return (self.read(row) for row in range(len(self.store)))
@@ -65,13 +68,18 @@ class StoredRecords:
         StoreError
             If it cannot be read.
         """
+        where = f"{self.store.path}: {RECORD_ARRAY}, row {row}"
+        return read_asset_record(self.text(row), where)
+
+    def text(self, row: int) -> str:
+        """Return the record of a row as its JSON, unchecked; StoreError where it cannot be read."""
         chunk, position = divmod(row, RECORDS_IN_CHUNK)
-        # Assets are asked for nearly in order: the last chunk answers most of the time.
-        if self._chunk[0] != chunk:
+        # Assets are asked for nearly in order, of each segment.
+        if chunk not in self._chunks:
             start = chunk * RECORDS_IN_CHUNK
             stop = min(start + RECORDS_IN_CHUNK, len(self.store))
             texts = self.store.read_rows(RECORD_ARRAY, start, stop)
-            self._chunk = (chunk, [str(text) for text in texts])
-        return read_asset_record(
-            self._chunk[1][position], f"{self.store.path}: {RECORD_ARRAY}, row {row}"
-        )
+            if len(self._chunks) == _CHUNKS_KEPT:
+                del self._chunks[next(iter(self._chunks))]
+            self._chunks[chunk] = [str(text) for text in texts]
+        return self._chunks[chunk][position]

@@ -5,8 +5,10 @@ from __future__ import annotations
 import errno
 import hashlib
 import os
+import shutil
 import stat
-from io import BytesIO, FileIO
+from contextlib import suppress
+from io import BufferedWriter, BytesIO, FileIO
 from pathlib import Path
 from typing import TYPE_CHECKING, cast
 
@@ -92,6 +94,57 @@ def open_regular(path: Path) -> LocalFile:
         file.close()
         raise
     return file
+
+
+def private_file(path: Path) -> BufferedWriter:
+    """Open a file of our own for writing, in place, that nobody else may read; it is emptied.
+
+    Raises
+    ------
+    OSError
+        If it cannot be written, or is a link, has other names, or is somebody else's.
+    """
+    flags = os.O_WRONLY | os.O_CREAT | _NO_WAITING | getattr(os, "O_NOFOLLOW", 0)
+    file = LocalFile(os.open(path, flags, 0o600), "wb")
+    try:
+        file.size()
+        if not is_only_ours(os.fstat(file.fileno())):
+            raise OSError(errno.EPERM, "it is not ours alone")
+        file.truncate(0)
+    except OSError:
+        file.close()
+        raise
+    return BufferedWriter(file)
+
+
+def is_only_ours(state: os.stat_result) -> bool:
+    """Whether a regular file belongs to us and has one name, by its state."""
+    user = getattr(os, "geteuid", lambda: state.st_uid)()
+    return stat.S_ISREG(state.st_mode) and state.st_nlink == 1 and state.st_uid == user
+
+
+def take_file(source: Path, target: Path) -> None:
+    """Give a file a second name, or copy it where it is not ours alone or that cannot be done.
+
+    A copy shares its blocks with the original where the file system can do that.
+
+    Raises
+    ------
+    OSError
+        If it cannot be read, or the disk does not take it.
+    """
+    target.parent.mkdir(parents=True, exist_ok=True)
+    if is_only_ours(source.lstat()):
+        with suppress(OSError):
+            os.link(source, target)
+            return
+    with open_regular(source) as old, target.open("xb") as new:
+        left = old.size()
+        with suppress(OSError, AttributeError):  # no such call, or none between these places
+            while left and (done := os.copy_file_range(old.fileno(), new.fileno(), left)):
+                left -= done
+        new.seek(0, os.SEEK_END)
+        shutil.copyfileobj(old, new)
 
 
 LINK, OTHER = -1, -2

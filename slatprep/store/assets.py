@@ -13,6 +13,7 @@ from slatprep.errors import StoreError, UnknownAssetError
 from slatprep.records import Place
 from slatprep.store.arrays import Arrays
 from slatprep.store.layout import ARRAYS
+from slatprep.store.shard_reader import RowReader
 
 if TYPE_CHECKING:
     import pandas
@@ -64,7 +65,7 @@ class AssetTable:
 
     @cached_property
     def ids(self) -> list[str]:
-        """Asset ids, sorted."""
+        """Asset ids; they ascend, but where an update added rows behind others."""
         return [str(asset_id) for asset_id in self.column("id")]
 
     @cached_property
@@ -181,6 +182,10 @@ class AssetTable:
             If there is no such array or row, or a file is missing or damaged.
         """
         return self._arrays.reader(name).read(start, stop)
+
+    def reader(self, name: str) -> RowReader:
+        """Return what reads the rows of an array, by its full name; see `read_rows`."""
+        return self._arrays.reader(name)
 
     def shape(self, name: str) -> tuple[int, ...]:
         """Return the shape of an array, from its metadata alone."""

@@ -13,6 +13,7 @@ import hashlib
 import json
 from collections.abc import Iterator, Mapping
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -26,7 +27,7 @@ ATTRIBUTES = "zarr.json#attributes"
 """Name under which the digest of the root's attributes is kept."""
 
 
-def write_digests(path: Path) -> None:
+def write_digests(path: Path, known: Mapping[str, str] = MappingProxyType({})) -> None:
     """Add the digests of all files to a store that is otherwise complete.
 
     What no array accounts for is removed first.
@@ -35,6 +36,8 @@ def write_digests(path: Path) -> None:
     ----------
     path : Path
         The store; its root attributes are written, metadata not yet consolidated.
+    known : mapping of str to str
+        Digests, by name, of files that need not be read again.
 
     Raises
     ------
@@ -52,7 +55,7 @@ def write_digests(path: Path) -> None:
         if meant[name]:
             raise StoreError(f"{path / name}: was not written; nothing was replaced. Run again")
     sizes = [(path / name).stat().st_size for name in names]
-    digests = [file_digest(path / name) for name in names]
+    digests = [known.get(name) or file_digest(path / name) for name in names]
     attributes = dict(root.attrs)
     names.append(ATTRIBUTES)
     sizes.append(len(_canonical(attributes)))

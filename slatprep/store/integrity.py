@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 from slatprep.errors import StoreError
@@ -97,12 +98,23 @@ def file_findings(store: Store, jobs: Jobs, below: str = "") -> tuple[int, set[F
     places = {digest: name for name, (_, digest) in expected.items()}
     common = sorted(name for name in present & expected.keys() if name.startswith(below))
     tasks = ((store.path, name, files[name], *expected[name]) for name in common)
-    for name, what, digest in run_unordered(_compare, tasks, jobs):
+    for name, what, digest in _compared(tasks, jobs):
         if what:
             if digest in places:
                 what = f"holds what belongs in {places[digest]}"
             findings.add(Finding(name, "", what, f"SHA-256 {expected[name][1]}"))
     return len(files), findings
+
+
+def _compared(
+    tasks: Iterable[tuple[Place, str, int, int, str]], jobs: Jobs
+) -> Iterator[tuple[str, str, str]]:
+    if not isinstance(jobs, int):
+        yield from run_unordered(_compare, tasks, jobs)
+        return
+    # Hashing lets go of the interpreter, and a process would take longer to start.
+    with ThreadPoolExecutor(jobs) as pool:
+        yield from pool.map(lambda task: _compare(*task), tasks)
 
 
 def _compare(path: Place, name: str, found: int, size: int, digest: str) -> tuple[str, str, str]:

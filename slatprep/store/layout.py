@@ -10,6 +10,7 @@ from __future__ import annotations
 from bisect import bisect_right
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
+from itertools import pairwise
 from typing import TYPE_CHECKING, Any
 
 from slatprep.parameters import StoreParameters
@@ -62,7 +63,7 @@ class ArrayLayout:
 _XYZ = ("x", "y", "z")
 
 ARRAYS = (
-    ArrayLayout("asset/id", "str", ("asset",), "", "id of the row, sorted ascending"),
+    ArrayLayout("asset/id", "str", ("asset",), "", "id of the row, ascending within a segment"),
     ArrayLayout("asset/object_id", "str", ("asset",), "", "PixieVerse id of the object"),
     ArrayLayout("asset/view", "str", ("asset",), "", "image or seed the SLAT was made from"),
     ArrayLayout("asset/category", "str", ("asset",), "", "PixieVerse category, empty if unknown"),
@@ -361,13 +362,28 @@ def _codecs(layout: ArrayLayout, level: int) -> dict[str, Any]:
     return {"compressors": (compressors[layout.packing], Crc32cCodec())}
 
 
+def segments_of(ids: Sequence[str]) -> list[int]:
+    """Return the rows at which ids begin to ascend anew: 0, and those that updates added.
+
+    Examples
+    --------
+    >>> segments_of(["a", "d", "b", "c"])
+    [0, 2]
+    """
+    return [0, *(row for row, (one, other) in enumerate(pairwise(ids), 1) if one > other)]
+
+
 def root_attributes(
-    normalization: Normalization, manifest: str, build: Mapping[str, object], contents: Contents
+    normalization: Normalization,
+    manifest: str,
+    build: Mapping[str, object],
+    contents: Contents,
+    ids: Sequence[str],
 ) -> dict[str, Any]:
     """Return the attributes of the store's root.
 
     `build` holds the parameters and versions that made the content, so that
-    the store explains itself without its manifests.
+    the store explains itself without its manifests; `ids` are those of its rows.
     """
     return {
         "format": FORMAT,
@@ -380,6 +396,7 @@ def root_attributes(
         "normalization": normalization_attribute(normalization),
         "manifest": manifest,
         "build": dict(build),
+        "segments": segments_of(ids),
     }
 
 

@@ -40,28 +40,30 @@ def create_record_array(root: Any, n_assets: int, level: int) -> None:
 
 
 class RecordWriter:
-    """Writes the records of a new store in order, a shard at a time.
+    """Writes the records of a new store in any order, each shard when all of its rows are there.
 
     Parameters
     ----------
     root : zarr.Group
         The store, with the array created.
+    taken : frozenset of int
+        Shards that have been taken over.
     """
 
-    def __init__(self, root: Any) -> None:
+    def __init__(self, root: Any, taken: frozenset[int] = frozenset()) -> None:
         self._array = root[RECORD_ARRAY]
-        self._start = 0
-        self._texts: list[str] = []
+        self._taken = taken
+        self._waiting: dict[int, dict[int, str]] = {}
 
-    def add(self, record: bytes) -> None:
-        """Take the next row's record, JSON in UTF-8."""
-        self._texts.append(record.decode())
-        if len(self._texts) == RECORDS_IN_SHARD:
-            self.flush()
-
-    def flush(self) -> None:
-        """Write what has been taken."""
-        stop = self._start + len(self._texts)
-        if self._texts:
-            self._array[self._start : stop] = np.array(self._texts, dtype=object)
-        self._start, self._texts = stop, []
+    def add(self, row: int, record: bytes) -> None:
+        """Take a row's record, JSON in UTF-8."""
+        shard = row // RECORDS_IN_SHARD
+        if shard in self._taken:
+            return
+        texts = self._waiting.setdefault(shard, {})
+        texts[row] = record.decode()
+        start = shard * RECORDS_IN_SHARD
+        stop = min(start + RECORDS_IN_SHARD, self._array.shape[0])
+        if len(texts) == stop - start:
+            rows = self._waiting.pop(shard)
+            self._array[start:stop] = np.array([rows[row] for row in range(start, stop)], object)

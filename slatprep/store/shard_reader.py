@@ -10,9 +10,9 @@ zarr-python reads the same bytes with far more work around them.
 from __future__ import annotations
 
 import threading
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
-from itertools import groupby
+from itertools import accumulate, groupby, pairwise
 from typing import Any
 
 import numpy as np
@@ -30,6 +30,8 @@ MISSING = 2**64 - 1
 
 OPEN_SHARDS = 32
 """Shards of one array that stay open at a time."""
+
+_COPIED_BYTES = 4 * 2**20
 
 _INDEX_CODECS = ["bytes", "crc32c"]
 
@@ -209,6 +211,40 @@ class RowReader:
                 self._chunk(*divmod(chunk, per_shard), whole)
                 target[...] = whole[first - base : last - base]
         return out
+
+    def packed(self, first: int, last: int) -> Iterator[tuple[bytes, list[int]]]:
+        """Yield the bytes of chunks ``first`` to ``last - 1`` of one shard, as they are packed.
+
+        Yields
+        ------
+        data : bytes
+            Of several chunks, one after the other; the checksum of each holds.
+        lengths : list of int
+            Of each of them.
+
+        Raises
+        ------
+        StoreError
+            If a chunk is damaged, or they do not lie as slatprep writes them.
+        """
+        number, place = divmod(first, self.chunks_per_shard)
+        shard = self._shards.get(number) or self._open(number)
+        index = shard.index[place : place + last - first].astype(np.int64)
+        ends = index.sum(axis=1)
+        if shard.file is None or len(index) < last - first or (ends[:-1] != index[1:, 0]).any():
+            raise self._damaged(number, "its chunks do not follow one another")
+        # A few at a time: a shard may be larger than memory.
+        cuts = np.flatnonzero(np.diff(index[:, 0] // _COPIED_BYTES)) + 1
+        for own in np.split(index, cuts):
+            offset, lengths = int(own[0, 0]), own[:, 1].tolist()
+            try:
+                data = shard.file.pread(sum(lengths), offset)
+            except OSError as error:
+                raise self._damaged(number, f"cannot be read ({error.strerror})") from None
+            begins = [0, *accumulate(lengths)]
+            if not all(crc32c_holds(data[a:b]) for a, b in pairwise(begins)):
+                raise self._damaged(number, "a chunk is damaged")
+            yield data, lengths
 
     def _chunk(self, number: int, place: int, out: NDArray[Any]) -> None:
         shard = self._shards.get(number) or self._open(number)

@@ -7,7 +7,7 @@ once: chunks one after the other, then their index (see `slatprep.store.shard_re
 from __future__ import annotations
 
 import uuid
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from types import TracebackType
 from typing import Any
@@ -67,6 +67,15 @@ class ShardWriter:
             self._rows += len(taken)
             if self._rows == len(self._chunk):
                 self._flush(self._chunk)
+
+    def append_packed(self, data: bytes, lengths: Iterable[int]) -> None:
+        """Take the next chunks as `RowReader.packed` gives them; the last rows filled one."""
+        if self._rows:
+            raise ValueError(f"{self._rows} rows of a chunk are waiting; expected none")
+        self._file.write(data)
+        for length in lengths:
+            self._index[self._chunks] = self._bytes, length
+            self._chunks, self._bytes = self._chunks + 1, self._bytes + length
 
     def finish(self) -> None:
         """Write the last chunk, filled up, and the index; on exit the shard gets its name."""

@@ -25,6 +25,7 @@ from slatprep.store.layout import (
     rows_per_shard,
 )
 from slatprep.store.records import create_record_array
+from slatprep.store.unmoved import Piece, Unmoved
 
 
 @dataclass(frozen=True)
@@ -39,18 +40,22 @@ class Shard:
         First row and end in the store.
     first : int
         Index of the first asset that has rows in it.
-    keys : sequence of str
-        Keys, in the spool, of the assets that have rows in it.
+    keys : sequence of str or int
+        Of the assets that have rows in it: keys in the spool, or rows in the store
+        that is there.
     offsets : sequence of int
         ``voxel`` alone: first row of each of them in the store, and the last
         one's end.
+    pieces : sequence of Piece
+        Its rows, and which of them the store that is there has at the same place.
     """
 
     group: str
     rows: tuple[int, int]
     first: int
-    keys: Sequence[str]
+    keys: Sequence[str | int]
     offsets: Sequence[int] = ()
+    pieces: Sequence[Piece] = ()
 
 
 def create_store(
@@ -69,15 +74,33 @@ def create_store(
 
 
 def shards(
-    keys: Sequence[str], offsets: Sequence[int], parameters: StoreParameters
+    keys: Sequence[str | int],
+    offsets: Sequence[int],
+    parameters: StoreParameters,
+    same: Mapping[str, Unmoved] | None = None,
 ) -> Iterator[Shard]:
-    """Yield every shard of a store whose assets, by key, begin at rows `offsets`."""
-    for start, stop in row_ranges(offsets[-1], rows_per_shard(parameters)):
+    """Yield every shard of a store whose assets, by key, begin at rows `offsets`.
+
+    `same` has, by group, the rows that are the same in the store that is there;
+    shards that are the same as a whole are left out.
+    """
+    of_voxels, of_grids = (
+        same[group] if same else Unmoved((), 0, 0) for group in ("voxel", "grid")
+    )
+    per_shard = rows_per_shard(parameters)
+    for start, stop in row_ranges(offsets[-1], per_shard):
+        if of_voxels.holds(start, start + per_shard):
+            continue
         owners = [asset for asset, _ in overlaps(offsets, start, stop)]
         first, last = owners[0], owners[-1] + 1
-        yield Shard("voxel", (start, stop), first, keys[first:last], offsets[first : last + 1])
-    for start, stop in row_ranges(len(keys), parameters.grid_assets_per_shard):
-        yield Shard("grid", (start, stop), start, keys[start:stop])
+        pieces = tuple(of_voxels.pieces(start, stop, parameters.voxel_chunk))
+        own, at = keys[first:last], offsets[first : last + 1]
+        yield Shard("voxel", (start, stop), first, own, at, pieces)
+    per_shard = parameters.grid_assets_per_shard
+    for start, stop in row_ranges(len(keys), per_shard):
+        if not of_grids.holds(start, start + per_shard):
+            pieces = tuple(of_grids.pieces(start, stop, 1))
+            yield Shard("grid", (start, stop), start, keys[start:stop], pieces=pieces)
 
 
 def finish_store(
@@ -86,6 +109,8 @@ def finish_store(
     build_id: str,
     build: Mapping[str, object],
     contents: Contents = PIXIEVERSE,
+    *,
+    known: Mapping[str, str] | None = None,
 ) -> None:
     """Write the root's attributes and all files' digests; gather all metadata in one file.
 
@@ -101,13 +126,16 @@ def finish_store(
         Parameters and versions that made the content.
     contents : Contents
         What it holds.
+    known : mapping of str to str, optional
+        Digests of files that were taken over, which has been seen to be true.
     """
     import zarr
 
-    attributes = root_attributes(normalization, build_id, build, contents)
-    open_for_writing(path).attrs.update(attributes)
-    write_coordinates(path, attributes["property_columns"])
-    write_digests(path)
+    root = open_for_writing(path)
+    ids = root["asset/id"][:]
+    root.attrs.update(root_attributes(normalization, build_id, build, contents, ids))
+    write_coordinates(path, [one.name for one in contents.properties])
+    write_digests(path, known or {})
     with warnings.catch_warnings():
         # Zarr says that consolidated metadata are not in format 3's text yet.
         # They only save reads: a reader that ignores them finds every array.

@@ -287,7 +287,7 @@ def test_manifests_go_where_asked(make_dataset: MakeDataset, tmp_path: Path) -> 
     parameters = make_dataset("a").parameters()
     build_store(parameters, tmp_path / "s.zarr", manifests=tmp_path / "elsewhere" / "records")
     names = {path.name for path in (tmp_path / "elsewhere" / "records").iterdir()}
-    assert names == {"assets.jsonl", "build.json"}
+    assert names == {"assets.jsonl", "build.json", "sources.seen"}
     assert not manifests_of(tmp_path / "s.zarr").exists()
 
 

@@ -58,7 +58,11 @@ def ends_well(dataset: Dataset, out: Path, expected: dict[str, str]) -> None:
         "s.manifests",
     }
     manifests = out.with_name(f"{out.stem}.manifests")
-    assert {path.name for path in manifests.iterdir()} == {"assets.jsonl", "build.json"}
+    assert {path.name for path in manifests.iterdir()} == {
+        "assets.jsonl",
+        "build.json",
+        "sources.seen",
+    }
     assert json.loads((manifests / "build.json").read_text())["id"] == summary.build_id
     assert len((manifests / "assets.jsonl").read_text().splitlines()) == 3
 

@@ -39,10 +39,16 @@ _TOLERANCE = 1e-6
 def index_findings(store: Store) -> Iterator[Finding]:
     """Yield what is wrong with the ``asset/*`` arrays."""
     ids = store.ids
-    for before, after in pairwise(ids):
-        if before >= after:
-            what = "occurs twice" if before == after else f"comes after {before!r}"
-            yield Finding("asset/id", after, what, "ids sorted ascending, each once")
+    begins = store.attributes.get("segments", [0])
+    if not isinstance(begins, list) or begins[:1] != [0]:
+        yield Finding("zarr.json", "", f"attribute segments is {begins!r}", "rows, from 0 on")
+        begins = [0]
+    known = set(ids[:1])
+    for row, (before, after) in enumerate(pairwise(ids), 1):
+        if after in known or (before > after and row not in begins):
+            what = "occurs twice" if after in known else f"comes after {before!r}"
+            yield Finding("asset/id", after, what, "ids ascending in each segment, each once")
+        known.add(after)
     for name, allowed in (("id", ASSET_ID), ("object_id", NAME), ("view", NAME)):
         for asset_id, value in zip(ids, store.column(name), strict=True):
             # An object with one SLAT has no view.

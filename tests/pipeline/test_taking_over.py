@@ -1,0 +1,407 @@
+"""What did not change is taken over: files, chunks and rows, checked, and only then."""
+
+from __future__ import annotations
+
+import json
+import os
+import random
+import shutil
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from support.faults import inject
+from support.synthetic import Dataset, make_asset
+from support.trees import records_of, tree
+
+from slatprep.inspect.verify import verify_store
+from slatprep.parameters import BuildParameters
+from slatprep.pipeline import carry, seen
+from slatprep.pipeline.dataset import build_store, plan_build
+from slatprep.store import open_store
+from slatprep.store.unmoved import Unmoved
+
+MakeDataset = Callable[..., Dataset]
+
+
+@pytest.fixture(autouse=True)
+def files_are_old(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Trust the states of files however shortly ago they were written."""
+    monkeypatch.setattr(seen, "_FINE_NS", 0)
+    monkeypatch.setattr(seen, "_COARSE_NS", 0)
+
+
+@pytest.fixture(autouse=True)
+def few_are_new(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let two new assets of six be few."""
+    monkeypatch.setattr(carry, "MOST_BEHIND", 1.0)
+
+
+@pytest.fixture
+def steps(monkeypatch: pytest.MonkeyPatch) -> list[tuple[str, str]]:
+    found: list[tuple[str, str]] = []
+    inject(monkeypatch, lambda step, name: found.append((step, name)))
+    return found
+
+
+@pytest.fixture
+def built(make_dataset: MakeDataset, tmp_path: Path) -> tuple[Dataset, Path]:
+    """Four assets, and a store of them in some ten shards an array."""
+    dataset, out = make_dataset("a", "c", "e", "g"), tmp_path / "s.zarr"
+    build_store(dataset.parameters(), out)
+    return dataset, out
+
+
+def from_nothing(parameters: BuildParameters, tmp_path: Path) -> dict[str, str]:
+    summary = build_store(parameters, tmp_path / "reference" / "s.zarr")
+    hashes = tree(summary.store)
+    shutil.rmtree(tmp_path / "reference")
+    return hashes
+
+
+def inodes(out: Path) -> dict[str, int]:
+    return {p.relative_to(out).as_posix(): p.stat().st_ino for p in out.rglob("*") if p.is_file()}
+
+
+def same_files(before: dict[str, int], after: dict[str, int], below: str) -> int:
+    return sum(after.get(name) == ino for name, ino in before.items() if name.startswith(below))
+
+
+def names(steps: list[tuple[str, str]], step: str) -> list[str]:
+    return [name for found, name in steps if found == step]
+
+
+def test_new_assets_come_behind_and_the_rest_stays_where_it_is(
+    built: tuple[Dataset, Path], steps: list[tuple[str, str]], tmp_path: Path
+) -> None:
+    dataset, out = built
+    before, files = inodes(out), tree(out)
+    dataset.add("d", seed=1)
+    dataset.add("b", seed=2)
+    steps.clear()
+    summary = build_store(dataset.parameters(), out)
+    assert names(steps, "asset read") == ["b", "d"]
+    store = open_store(out)
+    assert store.ids == ["a", "c", "e", "g", "b", "d"]
+    assert store.attributes["segments"] == [0, 4]
+    assert verify_store(out, sources=True).ok
+    # Of the shards of each array the last alone had room.
+    shards = {name for name in before if name.startswith("voxel/feats/c/")}
+    assert len(shards) > 9
+    assert same_files(before, inodes(out), "voxel/feats/c/") == len(shards) - 1
+    assert same_files(before, inodes(out), "grid/material/c/") == 2
+    # ...and what is new in it is as a first build writes it.
+    built_anew = from_nothing(dataset.parameters(), tmp_path)
+    assert tree(out) != built_anew
+    assert list(records_of(out.with_name("s.manifests") / "assets.jsonl")) == list("abcdeg")
+    compacted = build_store(dataset.parameters(), out, compact=True)
+    assert compacted.build_id == summary.build_id
+    assert tree(out) == built_anew
+    assert names(steps, "asset aligned") == ["b", "d", *"abcdeg"]  # the last are `from_nothing`
+    assert files.keys() <= built_anew.keys()
+
+
+def test_what_is_new_and_sorts_last_gives_the_bytes_of_a_first_build(
+    built: tuple[Dataset, Path], tmp_path: Path
+) -> None:
+    dataset, out = built
+    dataset.add("h", seed=1)
+    build_store(dataset.parameters(), out, jobs=2)
+    assert tree(out) == from_nothing(dataset.parameters(), tmp_path)
+
+
+def test_where_much_is_new_all_rows_are_ordered_by_id(
+    built: tuple[Dataset, Path], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    dataset, out = built
+    monkeypatch.setattr(carry, "MOST_BEHIND", 0.2)
+    dataset.add("b", seed=2)
+    build_store(dataset.parameters(), out)
+    assert tree(out) == from_nothing(dataset.parameters(), tmp_path)
+
+
+def test_every_asset_has_the_rows_of_a_first_build(
+    built: tuple[Dataset, Path], tmp_path: Path
+) -> None:
+    dataset, out = built
+    dataset.add("b", seed=2)
+    build_store(dataset.parameters(), out)
+    build_store(dataset.parameters(), tmp_path / "reference.zarr")
+    one, other = open_store(out), open_store(tmp_path / "reference.zarr")
+    table, reference = one.to_pandas(), other.to_pandas()
+    assert table.loc[reference.index].equals(reference)
+    for asset in other:
+        mine = one.asset(asset.asset_id)
+        for name in ("coords", "feats", "properties", "material", "valid", "distance", "place",
+                     "confidence", "grid_properties", "grid_material"):  # fmt: skip
+            np.testing.assert_array_equal(getattr(mine, name), getattr(asset, name))
+    assert one.attributes["manifest"] == other.attributes["manifest"]
+
+
+def test_a_change_of_latents_alone_costs_its_own_chunks(
+    built: tuple[Dataset, Path], steps: list[tuple[str, str]], tmp_path: Path
+) -> None:
+    dataset, out = built
+    before = inodes(out)
+    made = make_asset(1)
+    dataset.write_slat("c.npz", made.coords, made.feats + 1)
+    steps.clear()
+    build_store(dataset.parameters(), out)
+    assert names(steps, "asset read") == ["c"]
+    after = inodes(out)
+    shards = {name for name in before if name.startswith("voxel/feats/c/")}
+    assert 3 < same_files(before, after, "voxel/feats/c/") < len(shards)
+    assert tree(out) == from_nothing(dataset.parameters(), tmp_path)
+
+
+def test_what_is_removed_moves_the_rows_behind_it(
+    built: tuple[Dataset, Path], steps: list[tuple[str, str]], tmp_path: Path
+) -> None:
+    dataset, out = built
+    before = inodes(out)
+    shutil.rmtree(dataset.root / "pixieverse" / "e")
+    (dataset.root / "slat" / "e.npz").unlink()
+    steps.clear()
+    build_store(dataset.parameters(), out)
+    assert names(steps, "asset read") == []
+    assert same_files(before, inodes(out), "voxel/feats/c/") > 3
+    assert tree(out) == from_nothing(dataset.parameters(), tmp_path)
+
+
+def test_another_name_costs_a_record(
+    built: tuple[Dataset, Path], steps: list[tuple[str, str]], tmp_path: Path
+) -> None:
+    dataset, out = built
+    before = inodes(out)
+    categories = tmp_path / "categories.json"
+    categories.write_text(json.dumps({"c": {"obj_class": "tree"}}))
+    parameters = dataset.parameters()
+    named = replace(parameters, pairing=replace(parameters.pairing, categories=categories))
+    steps.clear()
+    build_store(named, out)
+    assert names(steps, "asset read") == []
+    after = inodes(out)
+    for group in ("voxel/feats/c/", "grid/material/c/"):
+        assert same_files(before, after, group) == sum(name.startswith(group) for name in before)
+    assert tree(out) == from_nothing(named, tmp_path)
+
+
+def test_any_sequence_of_updates_comes_to_the_same_when_compacted(
+    make_dataset: MakeDataset, tmp_path: Path
+) -> None:
+    rng = random.Random(5)
+    dataset, out = make_dataset("m", "n"), tmp_path / "s.zarr"
+    there = ["m", "n"]
+    build_store(dataset.parameters(), out)
+    for _ in range(5):
+        for _ in range(rng.randrange(1, 4)):
+            what = rng.choice(["add", "add", "change", "remove"])
+            name = rng.choice(there)
+            if what == "add":
+                name = rng.choice([one for one in "abcdefghijklmnopqrstuvwxyz" if one not in there])
+                there.append(name)
+            if what == "remove" and len(there) > 1:
+                there.remove(name)
+                shutil.rmtree(dataset.root / "pixieverse" / name)
+                (dataset.root / "slat" / f"{name}.npz").unlink()
+            else:
+                dataset.add(name, seed=rng.randrange(8))
+        build_store(dataset.parameters(), out)
+        assert sorted(open_store(out).ids) == sorted(there)
+    assert verify_store(out, sources=True).ok
+    build_store(dataset.parameters(), out, compact=True)
+    assert tree(out) == from_nothing(dataset.parameters(), tmp_path)
+
+
+def test_ranges_that_change_take_no_rows_over_and_align_nothing(
+    built: tuple[Dataset, Path], steps: list[tuple[str, str]], tmp_path: Path
+) -> None:
+    dataset, out = built
+    made = make_asset(2)
+    made.grid[..., 1] *= 10
+    dataset.write_grid("h", made.grid)
+    dataset.write_slat("h.npz", made.coords, made.feats)
+    steps.clear()
+    build_store(dataset.parameters(), out)
+    assert names(steps, "asset aligned") == ["h"]
+    assert sorted(names(steps, "asset reused")) == ["a", "c", "e", "g"]
+    assert tree(out) == from_nothing(dataset.parameters(), tmp_path)
+
+
+@pytest.mark.parametrize(
+    "name", ["voxel/feats/c/0/0", "voxel/valid/c/9", "grid/material/c/1/0/0/0", "asset/fitness/c/0"]
+)
+def test_a_flipped_bit_is_not_taken_over(
+    built: tuple[Dataset, Path], tmp_path: Path, name: str
+) -> None:
+    dataset, out = built
+    data = bytearray((out / name).read_bytes())
+    data[len(data) // 3] ^= 4
+    (out / name).write_bytes(data)
+    dataset.add("h", seed=1)
+    (told,) = build_store(dataset.parameters(), out).damaged
+    assert told.startswith(f"{name}: its bytes changed")
+    assert tree(out) == from_nothing(dataset.parameters(), tmp_path)
+
+
+@pytest.mark.parametrize(
+    "step",
+    [
+        "store created",
+        "shard filled",
+        "records written",
+        "directory flushed",
+        "store replaced",
+        "manifests written",
+    ],
+)
+def test_an_update_that_fails_leaves_one_whole_store(
+    built: tuple[Dataset, Path], monkeypatch: pytest.MonkeyPatch, tmp_path: Path, step: str
+) -> None:
+    dataset, out = built
+    before = tree(out)
+    dataset.add("b", seed=1)
+    dataset.add("h", seed=2)
+
+    class StopError(Exception):
+        pass
+
+    def fail(found: str, name: str) -> None:
+        if found == step:
+            raise StopError
+
+    with monkeypatch.context() as context:
+        inject(context, fail)
+        with pytest.raises(StopError):
+            build_store(dataset.parameters(), out)
+    replaced = step in ("store replaced", "manifests written")
+    assert (tree(out) == before) is not replaced
+    of_records = str(out.with_name("s.manifests"))  # which may still be the old ones
+    assert not [f for f in verify_store(out).findings if not f.file.startswith(of_records)]
+    build_store(dataset.parameters(), out)
+    assert verify_store(out, sources=True).ok
+    build_store(dataset.parameters(), out, compact=True)
+    assert tree(out) == from_nothing(dataset.parameters(), tmp_path)
+
+
+def test_a_store_with_other_names_shares_no_file_with_the_next(
+    built: tuple[Dataset, Path], tmp_path: Path
+) -> None:
+    """Whoever writes into a snapshot made of hard links must not change the store."""
+    dataset, out = built
+    shutil.copytree(out, tmp_path / "snapshot", copy_function=os.link)
+    held = set(inodes(tmp_path / "snapshot").values())
+    dataset.add("h", seed=1)
+    build_store(dataset.parameters(), out)
+    assert not held & set(inodes(out).values())
+    assert tree(out) == from_nothing(dataset.parameters(), tmp_path)
+
+
+def test_sources_that_are_as_they_were_are_not_read(
+    built: tuple[Dataset, Path], steps: list[tuple[str, str]]
+) -> None:
+    dataset, out = built
+    build_store(dataset.parameters(), out)
+    assert steps == []
+    (dataset.root / "slat" / "c.npz").touch()
+    build_store(dataset.parameters(), out)
+    assert names(steps, "asset compared") == ["c"]
+    steps.clear()
+    build_store(dataset.parameters(), out)
+    assert steps == []
+    build_store(dataset.parameters(), out, rehash=True)
+    assert names(steps, "asset compared") == list("aceg")
+    steps.clear()
+    plan_build(dataset.parameters(), out)
+    assert steps == []
+    plan_build(dataset.parameters(), out, rehash=True)
+    assert names(steps, "asset compared") == list("aceg")
+
+
+@pytest.mark.parametrize("how", ["gone", "flipped", "cut", "empty", "link", "machine", "young"])
+def test_what_was_seen_is_not_trusted_without_reason(
+    built: tuple[Dataset, Path],
+    steps: list[tuple[str, str]],
+    monkeypatch: pytest.MonkeyPatch,
+    tmp_path: Path,
+    how: str,
+) -> None:
+    dataset, out = built
+    path = out.with_name("s.manifests") / "sources.seen"
+    data = path.read_bytes()
+    if how == "flipped":
+        path.write_bytes(data[:200] + bytes([data[200] ^ 1]) + data[201:])
+    elif how in ("cut", "empty"):
+        path.write_bytes(data[:-7] if how == "cut" else b"")
+    elif how == "machine":
+        monkeypatch.setattr("platform.node", lambda: "another")
+    elif how == "young":
+        monkeypatch.setattr(seen, "_FINE_NS", 10**15)
+        monkeypatch.setattr(seen, "_COARSE_NS", 10**15)
+        monkeypatch.setattr("time.sleep", lambda seconds: None)
+    else:
+        path.unlink()
+        if how == "link":
+            (tmp_path / "theirs").write_bytes(b"theirs")
+            path.symlink_to(tmp_path / "theirs")
+    steps.clear()
+    before = tree(out)
+    build_store(dataset.parameters(), out)
+    assert names(steps, "asset compared") == list("aceg")
+    assert names(steps, "asset read") == []
+    assert tree(out) == before
+    if how == "link":
+        assert (tmp_path / "theirs").read_bytes() == b"theirs"
+    dataset.add("h", seed=1)
+    build_store(dataset.parameters(), out)
+    assert tree(out) == from_nothing(dataset.parameters(), tmp_path)
+
+
+def test_what_was_seen_of_one_store_is_nothing_to_another(
+    built: tuple[Dataset, Path], tmp_path: Path, steps: list[tuple[str, str]]
+) -> None:
+    dataset, out = built
+    shutil.copytree(out, tmp_path / "kept")
+    dataset.write_slat("c.npz", make_asset(1).coords, make_asset(1).feats + 1)
+    build_store(dataset.parameters(), out)
+    shutil.rmtree(out)
+    (tmp_path / "kept").rename(out)
+    steps.clear()
+    build_store(dataset.parameters(), out)
+    assert names(steps, "asset compared") == list("aceg")
+    assert names(steps, "asset aligned") == ["c"]
+
+
+@pytest.mark.parametrize("file", ["s.zarr/voxel/feats/c/0/0", "s.manifests/assets.jsonl"])
+def test_a_file_that_changed_under_an_unchanged_dataset_is_found(
+    built: tuple[Dataset, Path], file: str
+) -> None:
+    dataset, out = built
+    path = out.parent / file
+    data = bytearray(path.read_bytes())
+    data[100] ^= 1
+    path.write_bytes(data)
+    assert not verify_store(out).ok
+    build_store(dataset.parameters(), out)
+    assert verify_store(out).ok
+
+
+def test_rows_of_chunks_that_are_the_same() -> None:
+    """Against the definition: every row of the chunk, at the same place in both arrays."""
+    rng = random.Random(0)
+    for _ in range(300):
+        old, new, chunk = rng.randrange(1, 12), rng.randrange(1, 12), rng.randrange(1, 5)
+        same = [rng.random() < 0.8 and row < old for row in range(new)]
+        runs = []
+        for row, is_same in enumerate(same):
+            if is_same and runs and runs[-1][1] == row:
+                runs[-1] = (runs[-1][0], row + 1)
+            elif is_same:
+                runs.append((row, row + 1))
+        rows = Unmoved(tuple(runs), old, new)
+        for start in range(0, new, chunk):
+            ends = [min(start + chunk, length) for length in (old, new)]
+            expected = ends[0] == ends[1] and all(same[start : ends[1]])
+            assert rows.holds(start, start + chunk) is expected, (runs, old, new, start, chunk)
