@@ -1,10 +1,13 @@
-"""Cost, memory and files of a build against the number of assets, with a straight line through.
+"""Cost, memory and files of builds and updates against the number of assets.
 
-    python benchmarks/scale.py 100 300 1000
+    python benchmarks/scale.py 100 1000 10000
+    python benchmarks/scale.py 20000 --given
 
-Sources are small made assets; their files are linked, so that a thousand fit
-anywhere. Time is CPU time of the build and its workers. A second build of the
-same shows what it costs to find that nothing changed.
+Sources are small made assets; their files are linked, so that any number fits
+anywhere. Time is CPU time of the build and its workers. The second build finds that nothing
+changed, the third gets new assets (``--new``), the fourth loses one. With ``--given`` alignments
+are not searched but taken from the first asset of each shape, so that what is left is what
+grows with the number of assets.
 """
 
 from __future__ import annotations
@@ -26,87 +29,127 @@ from support.synthetic import Dataset, make_asset
 
 VARIANTS = 8
 BUILD = """
-import json, resource, sys
+import hashlib, json, os, resource, sys, time
 from pathlib import Path
 from dataclasses import replace
 from support.synthetic import Dataset
-from slatprep import build_store
 from slatprep.parameters import StoreParameters
+from slatprep.pipeline import asset
+from slatprep.pipeline.dataset import build_store
+
+jobs = int(sys.argv[3])
+if jobs == 1:
+    found, search = {}, asset.align
+    def given(field, latents, parameters):
+        key = hashlib.sha256(field.occupancy.tobytes() + latents.coords.tobytes()).digest()
+        if key not in found:
+            found[key] = search(field, latents, parameters)
+        return found[key]
+    asset.align = given
+
+started = time.process_time()
 parameters = replace(Dataset(Path(sys.argv[1])).parameters(), store=StoreParameters())
-build_store(parameters, Path(sys.argv[2]), jobs=2)
-from joblib.externals.loky import get_reusable_executor
-get_reusable_executor().shutdown()
+summary = build_store(parameters, Path(sys.argv[2]), jobs=jobs, assets_per_job=20)
+if jobs > 1:
+    from joblib.externals.loky import get_reusable_executor
+    get_reusable_executor().shutdown()
+written = 0
+for line in Path("/proc/self/io").read_text().splitlines() if jobs == 1 else ():
+    name, _, value = line.partition(": ")
+    written = int(value) if name == "wchar" else written
 peak = lambda who: resource.getrusage(who).ru_maxrss / 1024
-print(json.dumps([peak(resource.RUSAGE_SELF), peak(resource.RUSAGE_CHILDREN)]))
+print(json.dumps({
+    "parent [MB]": round(peak(resource.RUSAGE_SELF)),
+    "worker [MB]": round(peak(resource.RUSAGE_CHILDREN)),
+    "start [s]": round(started, 1),
+    "written [MB]": round(written / 1e6),
+    "assets": summary.statuses["ok"],
+}))
 """
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("assets", type=int, nargs="+")
+    parser.add_argument("--new", type=int, default=50, help="assets that the update adds")
+    parser.add_argument("--given", action="store_true", help="do not search alignments; one job")
+    parser.add_argument("--folder", type=Path, help="where to work")
     arguments = parser.parse_args()
     rows = []
     for count in arguments.assets:
-        with tempfile.TemporaryDirectory(prefix="scale-") as folder:
-            rows.append(measure(Path(folder), count))
+        with tempfile.TemporaryDirectory(prefix="scale-", dir=arguments.folder) as folder:
+            rows.append(measure(Path(folder), count, arguments.new, 1 if arguments.given else 2))
             print(json.dumps(rows[-1]), flush=True)
+    if len(rows) < 2:
+        return
     counts = np.array([row["assets"] for row in rows], dtype=float)
-    for name in (
-        "CPU [s]",
-        "CPU, nothing changed [s]",
-        "parent [MB]",
-        "store [MB]",
-        "records [MB]",
-    ):
+    for name in ("CPU [s]", "CPU, nothing changed [s]", "parent [MB]", "store [MB]"):
         values = np.array([row[name] for row in rows])
         slope, start = np.polyfit(counts, values, 1)
         worst = np.abs(values - start - slope * counts).max() / values.max()
         print(f"{name}: {start:.2f} + {slope:.5f} an asset, off by at most {worst:.1%}")
 
 
-def measure(folder: Path, count: int) -> dict[str, float]:
+def measure(folder: Path, count: int, new: int, jobs: int) -> dict[str, float]:
     dataset = Dataset(folder / "sources")
     for number in range(count):
-        if number < VARIANTS:
-            dataset.add(f"a{number:06}", seed=number)
-            continue
-        like = f"a{number % VARIANTS:06}"
-        grid = dataset.root / "pixieverse" / f"a{number:06}" / "sample_0" / "material_grid.npy"
-        grid.parent.mkdir(parents=True)
-        os.link(dataset.root / "pixieverse" / like / "sample_0" / "material_grid.npy", grid)
-        made = make_asset(number % VARIANTS) if number < 2 * VARIANTS else None
-        if made is None:
-            os.link(
-                dataset.root / "slat" / f"{like}.npz", dataset.root / "slat" / f"a{number:06}.npz"
-            )
-        else:
-            dataset.write_slat(f"a{number:06}.npz", made.coords, made.feats + 1)
+        add(dataset, number, "m")
     out = folder / "s.zarr"
-    spent, (parent, worker) = build(dataset.root, out)
-    again, _ = build(dataset.root, out)
+    spent, first = build(dataset.root, out, jobs)
     files = [path.stat().st_size for path in out.rglob("*") if path.is_file()]
     begin = time.perf_counter()
     code = f"from slatprep.store import open_store; len(open_store({str(out)!r}))"
     subprocess.run([sys.executable, "-c", code], check=True, env=environment())
     row = {
         "assets": count,
-        "CPU [s]": round(spent, 1),
-        "CPU, nothing changed [s]": round(again, 1),
-        "parent [MB]": round(parent),
-        "worker [MB]": round(worker),
+        "CPU [s]": spent,
+        "parent [MB]": first["parent [MB]"],
+        "worker [MB]": first["worker [MB]"],
+        "start of a process, CPU [s]": first["start [s]"],
+        "written [MB]": first["written [MB]"],
         "files": len(files),
         "store [MB]": round(sum(files) / 1e6, 2),
         "records [MB]": round((folder / "s.manifests" / "assets.jsonl").stat().st_size / 1e6, 2),
         "open, with start of Python [s]": round(time.perf_counter() - begin, 2),
     }
+    row["CPU, nothing changed [s]"], again = build(dataset.root, out, jobs)
+    row["parent, nothing changed [MB]"] = again["parent [MB]"]
+    # Ids in between the others, in files of their own: a new link to a file changes its state.
+    for number in range(new):
+        add(dataset, number, "mm")
+    row[f"CPU, {new} new [s]"], added = build(dataset.root, out, jobs)
+    row[f"written, {new} new [MB]"] = added["written [MB]"]
+    gone = f"m{count // 2:06}"
+    shutil.rmtree(dataset.root / "pixieverse" / gone)
+    (dataset.root / "slat" / f"{gone}.npz").unlink()
+    row["CPU, one gone [s]"], less = build(dataset.root, out, jobs)
+    if less["assets"] != count + new - 1:
+        raise RuntimeError(f"{less} after {count} and {new} assets, less one")
     shutil.rmtree(out)
     return row
 
 
-def build(sources: Path, out: Path) -> tuple[float, list[float]]:
+def add(dataset: Dataset, number: int, prefix: str) -> None:
+    """Add an asset: one of a few shapes, by a link to the files of the first of that shape."""
+    name, like = f"{prefix}{number:06}", f"{prefix}{number % VARIANTS:06}"
+    if number < VARIANTS:
+        made = make_asset(number)
+        dataset.write_grid(name, made.grid)
+        dataset.write_slat(f"{name}.npz", made.coords, made.feats)
+        return
+    grid = Path("sample_0", "material_grid.npy")
+    (dataset.root / "pixieverse" / name / grid).parent.mkdir(parents=True)
+    for old, copy in (
+        (f"pixieverse/{like}" / grid, f"pixieverse/{name}" / grid),
+        (Path("slat", f"{like}.npz"), Path("slat", f"{name}.npz")),
+    ):
+        os.link(dataset.root / old, dataset.root / copy)
+
+
+def build(sources: Path, out: Path, jobs: int) -> tuple[float, dict[str, float]]:
     before = resource.getrusage(resource.RUSAGE_CHILDREN)
     told = subprocess.run(
-        [sys.executable, "-c", BUILD, str(sources), str(out)],
+        [sys.executable, "-c", BUILD, str(sources), str(out), str(jobs)],
         check=True,
         env=environment(),
         capture_output=True,
@@ -114,7 +157,7 @@ def build(sources: Path, out: Path) -> tuple[float, list[float]]:
     )
     after = resource.getrusage(resource.RUSAGE_CHILDREN)
     spent = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
-    return spent, json.loads(told.stdout.splitlines()[-1])
+    return round(spent, 1), json.loads(told.stdout.splitlines()[-1])
 
 
 if __name__ == "__main__":

@@ -12,7 +12,7 @@ Dask cluster compute, which outlives the builds. After every kill the store is
 opened with plain zarr and read whole, and must be, byte for byte, one of the
 stores that an undisturbed build wrote of an earlier or the present state; of
 the present one, if the build ended well. At the end a last build runs
-undisturbed and must equal one from nothing.
+undisturbed and must equal one from nothing. Builds are told to order rows by id.
 """
 
 from __future__ import annotations
@@ -67,7 +67,8 @@ if sys.argv[4]:
 else:
     workers = nullcontext(2)
 with workers as jobs:
-    build_store(Dataset(Path(sys.argv[1])).parameters(), Path(sys.argv[2]), jobs=jobs)
+    parameters = Dataset(Path(sys.argv[1])).parameters()
+    build_store(parameters, Path(sys.argv[2]), jobs=jobs, compact=True)
 """
 
 

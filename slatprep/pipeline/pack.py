@@ -70,7 +70,7 @@ def write_shard(
             name: stack.enter_context(ShardWriter(path, name, shard.rows[0]))
             for name in arrays_in(shard.group)
         }
-        for same, *rows in shard.pieces:
+        for same, *rows in shard.pieces or ((False, *shard.rows),):
             if same and held is not None:
                 for array, writer in writers.items():
                     reader = held.reader(array)

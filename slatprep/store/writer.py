@@ -47,7 +47,8 @@ class Shard:
         ``voxel`` alone: first row of each of them in the store, and the last
         one's end.
     pieces : sequence of Piece
-        Its rows, and which of them the store that is there has at the same place.
+        Its rows, and which of them the store that is there has at the same place; empty
+        where none may be.
     """
 
     group: str
@@ -93,13 +94,13 @@ def shards(
             continue
         owners = [asset for asset, _ in overlaps(offsets, start, stop)]
         first, last = owners[0], owners[-1] + 1
-        pieces = tuple(of_voxels.pieces(start, stop, parameters.voxel_chunk))
+        pieces = tuple(of_voxels.pieces(start, stop, parameters.voxel_chunk)) if same else ()
         own, at = keys[first:last], offsets[first : last + 1]
         yield Shard("voxel", (start, stop), first, own, at, pieces)
     per_shard = parameters.grid_assets_per_shard
     for start, stop in row_ranges(len(keys), per_shard):
         if not of_grids.holds(start, start + per_shard):
-            pieces = tuple(of_grids.pieces(start, stop, 1))
+            pieces = tuple(of_grids.pieces(start, stop, 1)) if same else ()
             yield Shard("grid", (start, stop), start, keys[start:stop], pieces=pieces)
 
 
