@@ -1,7 +1,7 @@
 # `make` alone lists what there is; every target sets up what it needs.
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help align test lint docs schema wheel sdist simulate mutants lock clean
+.PHONY: help align test bench lint docs schema wheel sdist simulate mutants lock clean
 
 PYTHON ?= python3
 VENV   ?= .venv
@@ -27,6 +27,7 @@ help:
 	@echo "  make align DATA=FILE  the same on your own data (see manifests/mine.example.toml)"
 	@echo "  make test             linters, type checker, documentation, wheel and tests"
 	@echo "  make lint             linters and type checker alone"
+	@echo "  make bench            every measurement that the documentation quotes, onto docs/benchmarks.md"
 	@echo "  make docs             the documentation as a site, in $(SITE)"
 	@echo "  make schema           the JSON Schemas of the records, from their classes"
 	@echo "  make wheel            a wheel, in dist, tried from another folder"
@@ -102,10 +103,17 @@ wheel: $(VENV)/.installed-dev
 sdist: $(VENV)/.installed-dev
 	sh tools/try-sdist.sh $(BIN)/python dist
 
+<<<<<<< HEAD
 # Not a part of `make test`: the engine compiles its kernels for a minute or two on a new machine.
 simulate: $(VENV)/.installed-dev
 	$(BIN)/python -m pip install --quiet --editable '.[simulate]'
 	$(BIN)/python -m pytest tests/particles
+=======
+# Hours; BENCH=--quick takes minutes, BENCH='--only scale' one of them, BENCH=--list names them.
+BENCH ?=
+bench: $(VENV)/.installed-dev
+	$(BIN)/python benchmarks/bench.py $(BENCH)
+>>>>>>> cc73307 (Run every measurement that the documentation quotes by make bench)
 
 # Half an hour of one core; MUTANTS='--budget 300 judge sample' is a part of it.
 MUTANTS ?= --budget 1500 --seed 0
