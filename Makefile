@@ -103,17 +103,15 @@ wheel: $(VENV)/.installed-dev
 sdist: $(VENV)/.installed-dev
 	sh tools/try-sdist.sh $(BIN)/python dist
 
-<<<<<<< HEAD
 # Not a part of `make test`: the engine compiles its kernels for a minute or two on a new machine.
 simulate: $(VENV)/.installed-dev
 	$(BIN)/python -m pip install --quiet --editable '.[simulate]'
 	$(BIN)/python -m pytest tests/particles
-=======
+
 # Hours; BENCH=--quick takes minutes, BENCH='--only scale' one of them, BENCH=--list names them.
 BENCH ?=
 bench: $(VENV)/.installed-dev
 	$(BIN)/python benchmarks/bench.py $(BENCH)
->>>>>>> cc73307 (Run every measurement that the documentation quotes by make bench)
 
 # Half an hour of one core; MUTANTS='--budget 300 judge sample' is a part of it.
 MUTANTS ?= --budget 1500 --seed 0
