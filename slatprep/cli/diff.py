@@ -15,6 +15,8 @@ if TYPE_CHECKING:
     from slatprep.records import Place
 
 _SHOWN = 20
+_COLUMNS = 3
+"""Columns that are named where no more differ; --json names all."""
 
 
 @command()
@@ -123,10 +125,10 @@ def _cells(own: PropertyChange) -> tuple[Cell, ...]:
 
 def _line(one: AssetChange, length: int | None) -> tuple[Cell, ...]:
     verdict = one.verdicts[1] if "verdict" not in one.what else " > ".join(one.verdicts)
-    details = {"sources": one.sources, "columns": one.columns}
-    why = (
-        f"{what} ({', '.join(details[what])})" if details.get(what) else what for what in one.what
-    )
+    more = {"sources": ", ".join(one.sources), "columns": ", ".join(one.columns)}
+    if len(one.columns) > _COLUMNS:
+        more["columns"] = f"{len(one.columns)}"
+    why = (f"{what} ({more[what]})" if more.get(what) else what for what in one.what)
     labels = one.labels / one.voxels if one.voxels else None
     return (one.asset_id[:length], verdict, one.moved, labels, ", ".join(why))
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import heapq
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -81,7 +81,7 @@ class AssetChange:
     sources : tuple of str
         Roles of the source files whose content differs.
     columns : tuple of str
-        Other arrays, ``asset/*`` and ``voxel/*``, that differ, by their last names.
+        Other arrays that differ, such as ``asset/fitness`` and ``voxel/confidence``.
     moved : float
         Mean distance, in voxels of the PixieVerse frame, between where the two
         look a SLAT voxel up; where they have other SLAT voxels, by the transforms alone.
@@ -189,7 +189,7 @@ def compare_stores(
     """
     rows_b = {asset_id: row for row, asset_id in enumerate(b.ids)}
     rows = [(row, rows_b[name]) for row, name in enumerate(a.ids) if name in rows_b]
-    settings = tuple(_settings(a.attributes, b.attributes))
+    settings = tuple(_settings(_attributes(a), _attributes(b)))
     only_a = tuple(name for name in a.ids if name not in rows_b)
     only_b = tuple(sorted(rows_b.keys() - set(a.ids)))
     total = _Sum()
@@ -268,6 +268,13 @@ def _how_much(change: AssetChange) -> tuple[float, ...]:
     return (share, change.moved, sum(own.changed for own in change.properties.values()))
 
 
+def _attributes(store: Store) -> dict[str, Any]:
+    """Return the attributes of a root; what an older store does not say is what it has."""
+    about = store.about
+    latents, units = asdict(about.latents), about.property_units
+    return {**store.attributes, "latents": latents, "property_units": units}
+
+
 def _settings(a: Mapping[str, Any], b: Mapping[str, Any], above: str = "") -> Iterator[Setting]:
     """Yield the entries of two JSON objects that differ, each by the names that lead to it."""
     for key in sorted(a.keys() | b.keys()):
@@ -293,7 +300,11 @@ def _changes(
     done = 0
     for some in run_in_order(_compare_some, tasks, jobs):
         for change in some:
-            own = tuple(name for name, other in zip(names, columns[:, done], strict=True) if other)
+            own = tuple(
+                f"asset/{name}"
+                for name, other in zip(names, columns[:, done], strict=True)
+                if other
+            )
             words = str(verdicts[0][done]), str(verdicts[1][done])
             done += 1
             yield _described(replace(change, verdicts=words, columns=own + change.columns))
@@ -309,8 +320,9 @@ def _unequal(a: NDArray[Any], b: NDArray[Any]) -> NDArray[np.bool_]:
     return np.asarray(other.any(axis=tuple(range(1, other.ndim))), bool)
 
 
-_TOLD_APART = {"material": "labels", "valid": "labels", "properties": "properties",
-               "feats": "latents", "place": "placement", "coords": "voxels"}  # fmt: skip
+_TOLD_APART = {"voxel/material": "labels", "voxel/valid": "labels", "voxel/feats": "latents",
+               "voxel/properties": "properties", "voxel/place": "placement",
+               "voxel/coords": "voxels"}  # fmt: skip
 """What it is called that an array differs; of all others, and of ``asset/*``, ``columns``."""
 
 
@@ -365,14 +377,15 @@ def _compare(a: Store, b: Store, asset_id: str, rows: _Rows) -> AssetChange:
         moved = float(np.linalg.norm(apart, axis=1).mean() * RESOLUTION)
     labels = (one["material"] != other["material"]) | (one["valid"] != other["valid"])
     properties = _properties(a, b, one.pop("properties"), other.pop("properties"))
-    columns = [name for name in one if _unequal(one[name], other[name]).any()]
-    columns += ["properties"] * any(own.changed for own in properties.values())
+    differ = [name for name in one if _unequal(one[name], other[name]).any()]
+    differ += ["properties"] * any(own.changed for own in properties.values())
+    differ += ["coords"] * (not order)
     return AssetChange(
         asset_id=asset_id,
         what=(),
         verdicts=("", ""),
         sources=(),
-        columns=(*columns, *["coords"] * (not order)),
+        columns=tuple(f"voxel/{name}" for name in differ),
         moved=moved,
         voxels=len(labels),
         unmatched=unmatched,

@@ -12,9 +12,10 @@ import pytest
 from scipy.spatial import cKDTree
 from support.synthetic import QUARTER_TURN, SMALL_SHARDS, make_asset
 
-from slatprep import build_store, export_store, open_store
+from slatprep import build_store, compare_stores, export_store, open_store, store_statistics
 from slatprep.cli.commands import slatprep as command
 from slatprep.errors import ConfigError
+from slatprep.inspect.pictures.statistics import draw_statistics
 from slatprep.inspect.verify import verify_store
 from slatprep.learn.compare import compare_methods
 from slatprep.learn.metrics import evaluate_store
@@ -109,6 +110,18 @@ def test_properties_of_any_table_are_those_of_the_nearest_voxels(
             )
     verification = verify_store(out)
     assert not verification.findings
+
+    found = store_statistics(store)
+    columns = [voxels_of(seed)[1] for seed in range(3)]
+    assert [one.name for one in found.classes][:1] == ["jelly" if classes else "annotated"]
+    for name, own in found.total.field.properties.items():
+        values = np.concatenate([each[name] for each in columns]).astype(float)
+        assert own.si.mean == pytest.approx(values.mean(), rel=1e-5)
+        assert (own.log10 is None) is (name == "friction_angle")
+        assert own.si.most == pytest.approx(values.max(), rel=1e-5)
+    assert found.joint is not None and found.joint.names == ("density", "yield_stress")
+    assert draw_statistics(store, found, "svg").startswith(b"<?xml")
+    assert compare_stores(store, open_store(out)).same
     # Nothing is done twice, and another description is another source.
     assert build_store(parameters_of(tmp_path), out).build_id == summary.build_id
     about = json.loads((tmp_path / "voxels" / "source.json").read_text())
