@@ -35,6 +35,7 @@ from pathlib import Path
 from typing import Any
 
 import checkout
+import numpy as np
 from click.testing import CliRunner
 from support.synthetic import Dataset, make_asset
 from support.trees import tree
@@ -77,6 +78,12 @@ class Bench:
         self.manifests = self.store.with_suffix(".manifests")
         self.build()
         self.sound = tree(self.store)
+        self.beside = self.store.with_name("beside")
+        (self.beside / "predictions").mkdir(parents=True)
+        np.save(self.beside / "p.npy", np.zeros((9, 3), np.float32))
+        for asset in open_store(self.store):
+            file = self.beside / "predictions" / f"{asset.asset_id}.npz"
+            np.savez(file, properties=np.nan_to_num(asset.properties))
         self.files = [self.store / name for name in sorted(local_files(self.store))]
         self.files += sorted(self.manifests.iterdir())
         self.opened = open_store(self.store)
@@ -218,7 +225,8 @@ def mutate(bench: Bench) -> None:
     kind, change = bench.chance.choice(MUTATIONS)
     command = bench.chance.choice(COMMANDS)
     out = Path(tempfile.mkdtemp(prefix="damage-out-"))
-    line = [part.format(store=bench.store, out=out, data=bench.dataset.root) for part in command]
+    places = {"store": bench.store, "out": out, "data": bench.dataset.root, "beside": bench.beside}
+    line = [part.format(**places) for part in command]
     what = f"{bench.name(file)} {kind}: slatprep {' '.join(line)}"
     with bench.changed(file) as content:
         change(bench, file, content)
@@ -300,6 +308,15 @@ COMMANDS = (
     ("export", "{store}", "--format", "npz", "--out", "{out}/e"),
     ("export", "{store}", "--format", "ply", "--frame", "pixieverse", "--out", "{out}/e"),
     ("check-alignment", "--store", "{store}", "--asset", "a"),
+    ("list", "{store}"),
+    ("subset", "{store}", "--verdict", "good", "--out", "{out}/s.zarr"),
+    ("publish", "{store}", "--out", "{out}/hub", "--pictures", "1"),
+    ("evaluate", "{beside}/predictions", "--store", "{store}", "--split", "all"),
+    ("transfer", "{beside}/p.npy", "--store", "{store}", "--asset", "a", "--out", "{out}/p.ply"),
+    (
+        "train", "{store}", "--out", "{out}/run", "--size", "small", "--epochs", "1",
+        "--shares", "0.4,0.3,0.3", "--threads", "1",
+    ),
     (
         "build-store", "--pixieverse", "{data}/pixieverse", "--slat", "{data}/slat",
         "--out", "{store}", "--dry-run",

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slatprep.geometry.frames import VOXEL_SIZE, places_of, split_transform
+from slatprep.judge.ambiguity import thinning
 from slatprep.records import (
     BACKGROUND,
     RESOLUTION,
@@ -110,11 +111,16 @@ def surroundings_of(
         before = places_of(latents.coords, alignment.transform).astype(np.float32)
         moved = np.linalg.norm(annotation.place - before, axis=1) / np.float32(VOXEL_SIZE)
     tied = np.zeros(count, dtype=np.float32)
-    for placement in _open(alignment):
+    ties = _open(alignment)
+    # Of a SLAT with far more voxels than usual some ties stand for all.
+    some = ties[:: thinning(count)]
+    for placement in some:
         places = places_of(latents.coords, placement.transform).astype(np.float32)
         other, there = shares_around(grid, places, annotation.material, (0,), BACKGROUND)
         tied += np.where(there[:, 0] > 0, other[:, 0], 0.0)
-    tied /= np.float32(len(_open(alignment)) + 1)
+    if len(some) < len(ties):
+        tied *= np.float32(len(ties) / len(some))
+    tied /= np.float32(len(ties) + 1)
     return Surroundings(others, solid, annotation.distance, moved, tied)
 
 

@@ -286,7 +286,7 @@ def _zarr(root: Path, asset_id: str) -> Mapping[str, NDArray[Any]] | None:
         return None
     try:
         return {
-            name: read_array(group / name, spec)
+            name: read_array(group / name, root, spec)
             for name, spec in _SPECS.items()
             if (group / name).is_dir()
         }

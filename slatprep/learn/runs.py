@@ -122,6 +122,9 @@ class Run:
 
     def __enter__(self) -> Run:
         file = self.path / RUN_FILE
+        # An empty file may be anybody's: it is left behind as it was found.
+        lock = self.path / _LOCK
+        self._foreign = lock.is_file() and not lock.stat().st_size
         self._lock = take_lock(self.path / _LOCK, f"{self.path}: another training is writing it")
         try:
             # Not before: another training may have begun, or ended, until the lock was ours.
@@ -138,7 +141,10 @@ class Run:
         return self
 
     def __exit__(self, *_: object) -> None:
-        (self.path / _LOCK).unlink(missing_ok=True)
+        if self._foreign:
+            os.ftruncate(self._lock, 0)
+        else:
+            (self.path / _LOCK).unlink(missing_ok=True)
         os.close(self._lock)
 
     def begin(self, parameters: dict[str, Any], assignment: Assignment | None = None) -> None:

@@ -15,10 +15,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from slatprep.errors import StoreError
+from slatprep.errors import InputError, StoreError
 from slatprep.readers.files import ArraySpec
 from slatprep.storage.documents import read_document
-from slatprep.storage.files import LocalFolder
+from slatprep.storage.files import LINK, LocalFolder, local_files
 from slatprep.store.codecs import ChunkDecoder
 from slatprep.store.contract import MAX_METADATA_BYTES
 from slatprep.store.shard_reader import BAD_METADATA, RowReader, whole_sizes
@@ -31,13 +31,15 @@ _MAX_CHUNK_BYTES = 2**26
 _MAX_CHUNKS = 4096
 
 
-def read_array(path: Path, spec: ArraySpec) -> NDArray[Any]:
+def read_array(path: Path, root: Path, spec: ArraySpec) -> NDArray[Any]:
     """Read an array of Zarr format 3 whole.
 
     Parameters
     ----------
     path : Path
         Folder with its ``zarr.json``.
+    root : Path
+        The hierarchy that it is of; no link may lead out of it.
     spec : ArraySpec
         What it may look like.
 
@@ -47,8 +49,9 @@ def read_array(path: Path, spec: ArraySpec) -> NDArray[Any]:
         If it is none, is packed in another way than with zstd, blosc or nothing,
         or a file of it is damaged.
     InputError
-        If its type or shape are not those of `spec`.
+        If its type or shape are not those of `spec`, or a link leads out of `root`.
     """
+    _refuse_links_out(path, root)
     try:
         metadata = read_document(path / "zarr.json", MAX_METADATA_BYTES)
         if metadata["zarr_format"] != 3 or metadata["node_type"] != "array":
@@ -65,6 +68,15 @@ def read_array(path: Path, spec: ArraySpec) -> NDArray[Any]:
         return _read_chunks(path, metadata, shape, dtype.newbyteorder("<"))
     except (*BAD_METADATA, OSError) as error:
         raise StoreError(f"{path}: {error!r}") from None
+
+
+def _refuse_links_out(path: Path, root: Path) -> None:
+    """Raise InputError where an array's folder, or anything in it, is a link out of the root."""
+    whole = root.resolve()
+    links = (path / name for name, size in local_files(path).items() if size == LINK)
+    for place in (path, *links):
+        if not place.resolve().is_relative_to(whole):
+            raise InputError(place, f"leads to {place.resolve()}, out of its root", "a file in it")
 
 
 def _read_chunks(

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 from support.shapes import GRID, chair, field_of, surface_latents
 
 from slatprep.align import align
 from slatprep.align.deformation import map_of
 from slatprep.judge import measure_ambiguity
+from slatprep.judge.ambiguity import MOST_VOXELS, thinning
+from slatprep.judge.evidence import surroundings_of
 from slatprep.parameters import AlignParameters, SampleParameters
-from slatprep.records import Alignment, Ambiguity
+from slatprep.records import Alignment, Ambiguity, StructuredLatents
 from slatprep.sample import sample
 
 BALL = ((GRID - 31.5) ** 2).sum(axis=-1) < 20**2
@@ -60,3 +63,27 @@ def test_a_chair_has_one_placement() -> None:
     assert alignment.placements == ()
     assert ambiguity.material_share == 0.0
     assert alignment.margin > 0.1
+
+
+def test_a_full_slat_is_judged_by_some_of_its_voxels_and_ties(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    ball = ((GRID - 31.5) ** 2).sum(axis=-1) < 27**2
+    field = field_of(ball, np.where(GRID[..., 2] < 32, 1, 3))
+    coords = np.argwhere(ball).astype(np.uint8)
+    latents = StructuredLatents(coords, np.zeros((len(coords), 8), np.float32))
+    alignment = align(field, latents, AlignParameters())
+    annotation = sample(field, map_of(alignment).places(coords), SampleParameters())
+    assert len(coords) > 2 * MOST_VOXELS and len(alignment.placements) == 23
+    assert [thinning(n) for n in (1, MOST_VOXELS, MOST_VOXELS + 1)] == [1, 1, 2]
+
+    def judged() -> tuple[Ambiguity, np.ndarray]:
+        ambiguity = measure_ambiguity(field, latents, alignment, annotation, SampleParameters())
+        return ambiguity, surroundings_of(field, latents, alignment, annotation).tied
+
+    some = judged()
+    monkeypatch.setattr("slatprep.judge.ambiguity.MOST_VOXELS", 10**9)
+    every = judged()
+    assert abs(some[0].material_share - every[0].material_share) < 0.01
+    np.testing.assert_allclose(some[0].property_change, every[0].property_change, rtol=0.02)
+    assert abs(some[1].mean() - every[1].mean()) < 0.05

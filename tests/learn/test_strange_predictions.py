@@ -191,10 +191,10 @@ def test_metadata_of_arrays_are_taken_at_their_word(
     array = root.create_array("a", shape=(8, 3), dtype="uint8", chunks=(4, 3), shards=shards)
     array[:] = 1
     file = tmp_path / "p.zarr/a/zarr.json"
-    assert read_array(file.parent, spec).tolist() == [[1, 1, 1]] * 8
+    assert read_array(file.parent, file.parents[1], spec).tolist() == [[1, 1, 1]] * 8
     file.write_text(json.dumps(json.loads(file.read_text()) | change))
     with pytest.raises(StoreError, match=message):
-        read_array(file.parent, spec)
+        read_array(file.parent, file.parents[1], spec)
 
 
 def test_a_pipe_is_not_waited_for(learn_store: Path, tmp_path: Path) -> None:
@@ -275,3 +275,26 @@ def test_compressed_foreign_and_best_checkpoints_are_named(
         (run / "run.json").write_text(json.dumps(parameters))
         with pytest.raises(InputError, match="does not say which assets"):
             selection_of_run(run / "predictions")
+
+
+@pytest.mark.parametrize("linked", ["group", "array", "metadata", "chunks"])
+def test_a_link_in_zarr_predictions_leads_nowhere_else(
+    learn_store: Path, tmp_path: Path, linked: str
+) -> None:
+    store = open_store(learn_store)
+    root = zarr.open_group(tmp_path / "p", mode="w")
+    for asset_id, (start, stop) in ((one, store.rows(k)) for k, one in enumerate(store.ids)):
+        root.create_group(asset_id).create_array("properties", data=np.full((stop - start, 3), 0.5))
+    own = tmp_path / "p" / store.ids[0]
+    places = {"array": "properties", "metadata": "properties/zarr.json", "chunks": "properties/c"}
+    place = own / places.get(linked, "")
+    for target in (tmp_path / "elsewhere", tmp_path / "p" / "inside"):
+        place.rename(target)
+        place.symlink_to(target)
+        if target.parent == tmp_path:
+            with pytest.raises(InputError, match="out of its root"):
+                evaluate_store(tmp_path / "p", learn_store, None)
+            place.unlink()
+            target.rename(place)
+        else:
+            assert evaluate_store(tmp_path / "p", learn_store, None).missing == []

@@ -212,6 +212,17 @@ def test_a_run_is_trained_by_one_process_at_a_time(learn_store: Path, tmp_path: 
     assert not (tmp_path / "run" / ".lock").exists()
 
 
+def test_an_empty_file_that_has_the_name_of_a_lock_stays_as_it_was(tmp_path: Path) -> None:
+    (tmp_path / ".lock").touch()
+    with Run(tmp_path):
+        assert (tmp_path / ".lock").stat().st_size
+        with pytest.raises(StoreError, match="another training"), Run(tmp_path):
+            pass
+    assert (tmp_path / ".lock").read_bytes() == b""
+    with Run(tmp_path):  # and is no hindrance
+        pass
+
+
 def test_a_run_that_another_training_wrote_before_the_lock_was_ours_is_read(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
