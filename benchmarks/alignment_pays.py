@@ -8,7 +8,7 @@ one by the default engine; the true labels make a third set, and what is left
 of the second without failed alignments, as training leaves it, a fourth. On
 each, gradient-boosted trees learn the properties and the class of a voxel from
 its latents and position, and all are measured on the same other objects by the
-paper's metrics over all SLAT voxels, never against labels that an alignment gave.
+paper's metrics against the truth, never against labels that an alignment gave.
 
 A draw takes the objects to learn from with replacement, the same for all sets,
 and seeds the trees. Intervals hold 95 % of the differences to the paper's
@@ -67,17 +67,20 @@ def main() -> None:
     add("--levels", type=int, nargs="+", default=[3, 5, 6, 7])
     add("--draws", type=int, default=12, help="trainings on each set of labels")
     add("--voxels", type=int, default=500, help="of each object, to learn from")
+    add("--test-voxels", type=int, default=1500, help="of each object, to measure on")
+    add("--jobs", type=int, default=1, help="processes that build, threads that learn")
     add("--work", type=Path, default=Path("alignment-pays"))
     add("--csv", type=Path, help="also write every score there")
     options = parser.parse_args()
+    threadpool_limits(options.jobs)
     rows: list[tuple[object, ...]] = []
     print("| level | labels of | objects | labels right |", " | ".join(METRICS), "|")
     print("| --- " * (4 + len(METRICS)) + "|", flush=True)
     for level in options.levels:
         folder = options.work / f"L{level}"
-        sets, normalization = training_sets(folder, level, options.assets)
+        sets, normalization = training_sets(folder, level, options.assets, options.jobs)
         config = demo(folder / "measure", level, options.test_assets, TEST_SEED)
-        test = true_objects(config.parent, normalization)
+        test = true_objects(config.parent, normalization, options.test_voxels)
         scores = {
             name: np.array([
                 learn_and_score(objects, test, sets["truth"], options.voxels, draw)
@@ -104,7 +107,7 @@ def demo(folder: Path, level: int, assets: int, seed: int) -> Path:
 
 
 def training_sets(
-    folder: Path, level: int, assets: int
+    folder: Path, level: int, assets: int, jobs: int
 ) -> tuple[dict[str, Objects], Normalization]:
     """Return the objects of one level by whose labels they carry, and how they are normalised."""
     config = demo(folder / "learn", level, assets, TRAIN_SEED)
@@ -113,7 +116,7 @@ def training_sets(
         out = folder / f"{name}.zarr"
         if not out.exists():
             overrides = {"normalize": {"ranges": "dataset"}}
-            build_store(load_parameters(config, overrides, preset), out)
+            build_store(load_parameters(config, overrides, preset), out, jobs=jobs)
         stores[name] = open_store(out)
     normalization = stores["slatprep"].normalization
     if any(store.normalization != normalization for store in stores.values()):
@@ -137,16 +140,20 @@ def training_sets(
     return sets, normalization
 
 
-def true_objects(folder: Path, normalization: Normalization) -> Objects:
-    """Return demo objects with the true labels in every voxel."""
+def true_objects(folder: Path, normalization: Normalization, voxels: int | None = None) -> Objects:
+    """Return demo objects with true labels, in every voxel or in some chosen at random."""
     objects = {}
     for path in sorted((folder / "truth").glob("*.npz")):
         with np.load(path) as truth, np.load(folder / "slat" / path.name) as slat:
+            rows = np.arange(len(slat["coords"]))
+            if voxels is not None:
+                rows = np.random.default_rng(0).permutation(rows)[:voxels]
+            properties = normalize_properties(truth["properties"][rows], normalization)
             objects[path.stem] = Voxels(
-                features_of(slat["coords"], slat["feats"]),
-                normalize_properties(truth["properties"], normalization).astype(np.float64),
-                truth["material"],
-                np.ones(len(slat["coords"]), dtype=bool),
+                features_of(slat["coords"][rows], slat["feats"][rows]),
+                properties.astype(np.float64),
+                truth["material"][rows],
+                np.ones(len(rows), dtype=bool),
             )
     return objects
 
@@ -175,15 +182,14 @@ def learn_and_score(
             parts.append((there.features[row], there.properties[row], there.material[row]))
     features, properties, material = (np.concatenate(part) for part in zip(*parts, strict=True))
     common = {"max_iter": 60, "early_stopping": False, "random_state": draw}
-    with threadpool_limits(1):
-        models = [
-            HistGradientBoostingRegressor(**common).fit(features, column) for column in properties.T
-        ]
-        classes = HistGradientBoostingClassifier(**common).fit(features, material)
-        # One call for all objects: a call costs more than its voxels.
-        seen = np.concatenate([one.features for one in test.values()])
-        predicted = np.column_stack([model.predict(seen) for model in models])
-        named = classes.predict(seen)
+    models = [
+        HistGradientBoostingRegressor(**common).fit(features, column) for column in properties.T
+    ]
+    classes = HistGradientBoostingClassifier(**common).fit(features, material)
+    # One call for all objects: a call costs more than its voxels.
+    seen = np.concatenate([one.features for one in test.values()])
+    predicted = np.column_stack([model.predict(seen) for model in models])
+    named = classes.predict(seen)
     ends = np.cumsum([len(one.material) for one in test.values()])[:-1]
     return np.array([
         score_asset(VoxelPrediction(values, number), one.properties, one.material, one.valid)
