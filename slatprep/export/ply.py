@@ -19,7 +19,7 @@ from slatprep.export.assets import Exported
 from slatprep.export.formats import ExportOptions, Frame, Points, Writer
 from slatprep.geometry.frames import voxel_centres
 from slatprep.provenance.stored import StoredRecords
-from slatprep.records import MATERIAL_COLOURS, RESOLUTION
+from slatprep.records import MATERIAL_COLOURS, PROPERTY_COLUMNS, RESOLUTION
 from slatprep.storage.names import file_name
 from slatprep.store import Store, StoredAsset
 
@@ -105,6 +105,9 @@ def write(
     class, as it is in what Pixie itself predicts.
     """
     for asset in assets:
+        table = asset.store.contents.properties
+        solid = asset.store.columns_of(PROPERTY_COLUMNS)
+        others = [column for column in range(len(table)) if column not in solid]
         if points == "grid":
             field = asset.field
             material, values = field.material, field.properties
@@ -121,7 +124,9 @@ def write(
         if frame == "pixieverse":
             positions = to_world(in_pixieverse, bounds[asset.asset_id])
         name = f"{file_name(asset.asset_id)}.ply"
-        write_points(directory / name, positions, material, values, conf, _COMMENTS[frame])
+        more = {(table[column].name, table[column].unit): values[:, column] for column in others}
+        solids = values[:, solid]
+        write_points(directory / name, positions, material, solids, conf, _COMMENTS[frame], more)
         yield Exported(asset, name, len(material))
 
 
@@ -132,6 +137,7 @@ def write_points(
     properties: NDArray[np.float32],
     conf: NDArray[np.floating],
     frame: str,
+    more: Mapping[tuple[str, str], NDArray[np.float32]] | None = None,
 ) -> None:
     """Write annotated points as Pixie does.
 
@@ -149,8 +155,12 @@ def write_points(
         Confidence in 0..1.
     frame : str
         What the file says of the frame, in one line.
+    more : mapping, optional
+        Further properties (N,), by name and unit; they stand after Pixie's.
     """
-    vertices = np.zeros(len(material), dtype=VERTEX)
+    more = more or {}
+    layout = np.dtype([*VERTEX.descr, *((name, "<f4") for name, _ in more)])
+    vertices = np.zeros(len(material), dtype=layout)
     for axis, name in enumerate("xyz"):
         vertices[name] = positions[:, axis]
     colours = _colours()
@@ -160,7 +170,10 @@ def write_points(
     vertices["E"], vertices["density"], vertices["nu"] = properties.T
     vertices["material_id"] = vertices["part_label"] = material
     vertices["conf"] = conf
-    _write(path, vertices, (frame, UNITS))
+    for (name, _), column in more.items():
+        vertices[name] = column
+    units = ", ".join((UNITS, *(f"{name} {unit}" for name, unit in more)))
+    _write(path, vertices, (frame, units))
 
 
 def read_bounds(store: Store, ids: Sequence[str]) -> tuple[dict[str, Bounds], tuple[str, ...]]:

@@ -15,7 +15,7 @@ from slatprep.normalize import denormalize_properties
 from slatprep.provenance.stored import StoredRecords
 from slatprep.readers.files import ArraySpec, load_source, npz_arrays, npz_small_arrays
 from slatprep.readers.slat import check_coords
-from slatprep.records import BACKGROUND, RESOLUTION, Normalization
+from slatprep.records import BACKGROUND, PROPERTY_COLUMNS, RESOLUTION, Normalization
 from slatprep.store import Store
 
 Points = Literal["slat", "grid"]
@@ -73,18 +73,19 @@ def stored_field(store: Store, asset_id: str, points: Points = "slat") -> VoxelF
     Raises
     ------
     StoreError
-        If the store cannot be read or has no such asset.
+        If the store cannot be read, has no such asset, or none of these properties.
     ConfigError
         If no voxel of the asset has a material.
     """
-    asset = store.asset(asset_id)
+    asset, columns = store.asset(asset_id), store.columns_of(PROPERTY_COLUMNS)
     if points == "grid":
         grid = asset.field
         place_map = StoredRecords(store).place_map(asset)
-        field = VoxelField(grid.voxels, grid.material, grid.properties, place_map)
+        field = VoxelField(grid.voxels, grid.material, grid.properties[:, columns], place_map)
     else:
         valid = asset.valid
-        field = VoxelField(asset.coords[valid], asset.material[valid], asset.properties_si[valid])
+        values = asset.properties_si[valid][:, columns]
+        field = VoxelField(asset.coords[valid], asset.material[valid], values)
     if len(field.voxels) == 0:
         raise ConfigError(
             f"{store.path}: no voxel of {asset_id} has a material; expected an asset whose "
@@ -123,6 +124,7 @@ def predicted_field(path: Path, normalization: Normalization | None) -> VoxelFie
     held = npz_small_arrays(data, path, _ANY)[0]
     coords = check_coords(arrays["coords"], path)
     material = arrays["material"]
+    _check_columns(path, data)
     if "properties_si" in held:
         values = npz_arrays(data, path, {"properties_si": _PROPERTIES})["properties_si"]
     else:
@@ -148,6 +150,15 @@ def predicted_field(path: Path, normalization: Normalization | None) -> VoxelFie
     return VoxelField(
         coords[valid], material[valid].astype(np.uint8), values[valid].astype(np.float32)
     )
+
+
+def _check_columns(path: Path, data: bytes) -> None:
+    """Refuse a prediction that names other properties than those that a solver takes."""
+    named = npz_small_arrays(data, path, ArraySpec(shapes=(), kinds="U"))[0].get("columns")
+    if named is not None and tuple(named.tolist()) != PROPERTY_COLUMNS:
+        raise InputError(
+            path, f"predicts {', '.join(map(str, named.ravel()))}", ", ".join(PROPERTY_COLUMNS)
+        )
 
 
 def _check_values(

@@ -148,10 +148,17 @@ def read_attributes(attributes: Mapping[str, Any]) -> RootAttributes | tuple[Fin
         )
 
 
-def attribute_findings(attributes: Mapping[str, Any]) -> Iterator[Finding]:
-    """Yield what is wrong with the root's attributes."""
-    found = read_attributes(attributes)
-    yield from found if isinstance(found, tuple) else ()
+def width_findings(said: RootAttributes, metadata: Mapping[str, Any]) -> Iterator[Finding]:
+    """Yield arrays, by their metadata, that have other columns than the attributes say."""
+    for name, attribute, columns in (
+        ("voxel/feats", "latents", said.latents.channels),
+        ("voxel/properties", "property_columns", len(said.property_columns)),
+    ):
+        array = metadata.get(name)
+        shape = array.get("shape") if isinstance(array, dict) else None
+        if isinstance(shape, list) and len(shape) == 2 and shape[1] != columns:
+            what = f"attribute {attribute} says {columns} columns of {name}"
+            yield Finding("zarr.json", "", what, f"{shape[1]!r}, as the array has")
 
 
 _FAULTS = 64

@@ -10,7 +10,7 @@ from slatprep.errors import StoreError
 from slatprep.records import Place
 from slatprep.storage.files import LINK, file_digest
 from slatprep.storage.place import storage_of
-from slatprep.store.attributes import attribute_findings
+from slatprep.store.attributes import read_attributes, width_findings
 from slatprep.store.contract import (
     Finding,
     array_findings,
@@ -27,7 +27,8 @@ from slatprep.workers.local import Jobs, run_unordered
 def metadata_findings(path: Place) -> Iterator[Finding]:
     """Yield where the metadata differ from the contract, or their two copies from each other."""
     root = read_metadata(path / "zarr.json")
-    yield from attribute_findings(root["attributes"])
+    said = read_attributes(root["attributes"])
+    yield from said if isinstance(said, tuple) else ()
     extra = {key: root.get(key) for key in ("zarr_format", "node_type")}
     if extra != {"zarr_format": 3, "node_type": "group"}:
         yield Finding("zarr.json", "", f"says {extra}", "a group of Zarr format 3")
@@ -37,6 +38,8 @@ def metadata_findings(path: Place) -> Iterator[Finding]:
     if not isinstance(copies, dict) or frame != _CONSOLIDATED:
         yield Finding("zarr.json", "", "has no consolidated metadata", "those of every array")
         copies = {}
+    if not isinstance(said, tuple):
+        yield from width_findings(said, copies)
     version = root["attributes"].get("format_version")
     layouts = arrays_of(version if version in READABLE_VERSIONS else READABLE_VERSIONS[-1])
     arrays: dict[str, Any] = {}

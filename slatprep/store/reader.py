@@ -20,7 +20,7 @@ from slatprep.records import BACKGROUND, Contents, MaterialField, Normalization,
 from slatprep.storage.place import place_of, storage_of
 from slatprep.storage.versions import store_name
 from slatprep.store.assets import ASSET_COLUMNS, AssetTable
-from slatprep.store.attributes import RootAttributes, read_attributes
+from slatprep.store.attributes import RootAttributes, read_attributes, width_findings
 from slatprep.store.contract import MAX_VOXELS, read_metadata
 from slatprep.store.layout import ARRAYS, FORMAT, READABLE_VERSIONS
 
@@ -216,6 +216,24 @@ class Store(AssetTable):
         """The tables of its properties and classes, and what its latents are."""
         return self.about.contents
 
+    def columns_of(self, names: Sequence[str]) -> list[int]:
+        """Return where properties stand among its columns.
+
+        Raises
+        ------
+        StoreError
+            If it does not have them all.
+        """
+        held = list(self.about.property_columns)
+        missing = [name for name in names if name not in held]
+        if missing:
+            lacking, there = " and no ".join(missing), ", ".join(held)
+            raise StoreError(
+                f"{self.path} has no {lacking}, only {there}; expected a store with "
+                f"{', '.join(names)}"
+            )
+        return [held.index(name) for name in names]
+
     @property
     def normalization(self) -> Normalization:
         """The ranges that properties were normalised with."""
@@ -338,7 +356,11 @@ def open_store(path: str | Place, *, copy: bool = False) -> Store:
             "Use the slatprep that wrote it, or a newer one"
         )
     store = Store(path, document)
-    store.about  # noqa: B018 - refused here, and not halfway through a command
+    # Refused here, and not halfway through a command.
+    gathered = document.get("consolidated_metadata")
+    metadata = gathered.get("metadata") if isinstance(gathered, dict) else None
+    for finding in width_findings(store.about, metadata if isinstance(metadata, dict) else {}):
+        raise AttributesError(f"{path}/{finding}; run `slatprep verify`")
     return store
 
 

@@ -11,11 +11,13 @@ import pytest
 from support.synthetic import Dataset
 
 from slatprep import build_store, concat_stores, export_store, open_store
+from slatprep.errors import StoreError
 from slatprep.learn.dataset import SlatDataset
 from slatprep.learn.predict import load_checkpoint, predict
 from slatprep.learn.train import TrainParameters, train
 from slatprep.parameters import BuildParameters
 from slatprep.records import FEATS_MEAN, FEATS_STD, StructuredLatents
+from slatprep.store.integrity import metadata_findings
 
 MEAN, STD = np.array(FEATS_MEAN, np.float32), np.array(FEATS_STD, np.float32)
 
@@ -130,3 +132,27 @@ def test_other_widths_are_stored_trained_on_and_predicted_from(
     both = np.concatenate([every, other.assets["x"].feats])
     joined = open_store(tmp_path / "both.zarr").contents.latents
     np.testing.assert_allclose(joined.mean, both.mean(axis=0), rtol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("attribute", "value", "said"),
+    [
+        ("latents", {"encoder": "x", "channels": 9, "resolution": 64}, "9 columns of voxel/feats"),
+        ("latents", {"encoder": "x", "channels": 8, "resolution": 64, "mean": [0.0]}, "8 channels"),
+        ("latents", {"encoder": "x", "channels": 0, "resolution": 64}, "latents/channels"),
+        ("property_columns", ["density"], "must name the same properties"),
+        ("property_columns", ["E [Pa]", "density", "poissons_ratio"], "property_columns/0"),
+        ("property_units", ["Pa"], "a unit for each"),
+    ],
+)
+def test_attributes_that_do_not_fit_the_arrays_are_refused(
+    dataset: Dataset, tmp_path: Path, attribute: str, value: object, said: str
+) -> None:
+    out = tmp_path / "s.zarr"
+    build_store(dataset.parameters(), out)
+    document = json.loads((out / "zarr.json").read_text())
+    document["attributes"][attribute] = value
+    (out / "zarr.json").write_text(json.dumps(document))
+    with pytest.raises(StoreError, match=said):
+        open_store(out)
+    assert any(said in str(finding) for finding in metadata_findings(out))
