@@ -11,12 +11,15 @@ from slatprep.cli.output import Cell, Output, say
 from slatprep.errors import ConfigError, StoreError
 
 if TYPE_CHECKING:
-    from slatprep.inspect.compare import AssetChange, PropertyChange, StoreDifference
+    from slatprep.inspect.difference import AssetChange, PropertyChange, StoreDifference
     from slatprep.records import Place
 
 _SHOWN = 20
 _COLUMNS = 3
 """Columns that are named where no more differ; --json names all."""
+
+_VALUE = 20
+"""Characters of a setting: a number fits, and of a digest its beginning."""
 
 
 @command()
@@ -134,4 +137,6 @@ def _line(one: AssetChange, length: int | None) -> tuple[Cell, ...]:
 
 
 def _value(value: object) -> str:
-    return "-" if value is None else str(value)
+    """Show a setting in what three columns leave of 80; ``--json`` has it whole."""
+    text = "-" if value is None else str(value)
+    return text if len(text) <= _VALUE else f"{text[: _VALUE - 3]}..."

@@ -19,7 +19,7 @@ from slatprep import compare_stores, open_store, subset_store
 from slatprep.cli.commands import slatprep
 from slatprep.cli.output import as_json
 from slatprep.geometry.frames import displacement
-from slatprep.inspect.compare import StoreDifference
+from slatprep.inspect.difference import StoreDifference
 from slatprep.normalize import denormalize_properties
 from slatprep.pipeline.dataset import BuildSummary, build_store
 
