@@ -5,6 +5,7 @@ from __future__ import annotations
 import ast
 import contextlib
 import io
+import json
 import os
 import re
 import shlex
@@ -50,6 +51,22 @@ def test_tutorial_runs_and_prints_what_it_shows(
                 assert result.exit_code == 0, f"{line}: {result.output}"
     assert compared >= 10
     assert (tmp_path / "shards" / "shard-000001.tar").exists()
+
+
+def test_the_notebook_is_the_tutorial() -> None:
+    written = (ROOT / "examples" / "tutorial.ipynb").read_text("utf-8")
+    made = subprocess.run(
+        [sys.executable, ROOT / "tools" / "notebook.py"], capture_output=True, text=True, check=True
+    )
+    assert made.stdout == written, "run: python tools/notebook.py > examples/tutorial.ipynb"
+    cells = json.loads(written)["cells"]
+    code = ["".join(cell["source"]) for cell in cells if cell["cell_type"] == "code"]
+    expected = [
+        (f"%%sh\n{text}" if language == "sh" else text).strip("\n")
+        for language, text in blocks("tutorial.md")
+        if language != "text"
+    ]
+    assert code == expected
 
 
 # -- messages ---------------------------------------------------------------
