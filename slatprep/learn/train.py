@@ -320,7 +320,7 @@ class _Session:
 
     @torch.no_grad()
     def validate(self, dataset: SlatDataset | None) -> tuple[float, float, float]:
-        """Return loss, MSE and class accuracy, each a mean over assets; NaN without a dataset."""
+        """Return loss, MSE and class accuracy, each a mean over assets; NaN where there is none."""
         if dataset is None:
             return math.nan, math.nan, math.nan
         self.model.eval()
@@ -333,7 +333,7 @@ class _Session:
             right = (prediction.logits.argmax(1) == moved.material)[valid].float().mean()
             scores.append([float(loss_of(prediction, moved)), float(error), float(right)])
         loss, error, accuracy = np.mean(scores, axis=0).tolist()
-        return loss, error, accuracy
+        return loss, error, accuracy if dataset.store.contents.classes else math.nan
 
     def state(self) -> dict[str, Any]:
         return {

@@ -163,6 +163,18 @@ def test_an_extra_property_goes_all_the_way_to_scores(tmp_path: Path) -> None:
         assert result.exit_code == 0, result.output
 
 
+def test_without_classes_no_accuracy_is_claimed(tmp_path: Path) -> None:
+    write(tmp_path, "abcdefgh", classes=False)
+    out, run = tmp_path / "s.zarr", tmp_path / "run"
+    build_store(parameters_of(tmp_path), out)
+    summary = train(out, run, TrainParameters(size="small", epochs=1, precision="fp32"))
+    assert np.isnan(summary.history[-1].val_accuracy)
+    assert np.isfinite(summary.history[-1].val_loss)
+    means = evaluate_store(run / "predictions", out, split=None).overall.means
+    assert np.isnan(means["accuracy"])
+    assert np.isfinite(means["mean"])
+
+
 def test_particles_and_points_take_their_properties_by_name(tmp_path: Path) -> None:
     from plyfile import PlyData
 
