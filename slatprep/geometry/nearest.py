@@ -14,6 +14,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from slatprep.geometry.voxels import boundary
 from slatprep.records import RESOLUTION
 
 _REACH = 6  # voxels searched by cells before a tree is built after all
@@ -69,8 +70,10 @@ class Lattice:
             # Few points lie so far off that their cells cannot tell; a tree knows of those.
             far = np.flatnonzero(~(distance <= _SURE))
             if len(far):
-                voxels = self._voxels.astype(np.intp)
-                distance[far], nearest[far] = _search_far(position[far], voxels, limit)
+                # Of an inner voxel some neighbour is nearer: the tree needs the boundary alone.
+                skin = np.sort(self._row[boundary(self._row >= 0)]).astype(np.intp)
+                distance[far], found = _search_far(position[far], self._voxels[skin], limit)
+                nearest[far] = np.where(found >= 0, skin[found], -1)
         return distance, nearest
 
     def _blocks_near(self, reach: float) -> NDArray[np.bool_]:
@@ -123,7 +126,7 @@ def _in_voxels(points: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _search_far(
-    position: NDArray[np.float64], voxels: NDArray[np.intp], limit: float
+    position: NDArray[np.float64], voxels: NDArray[np.uint8], limit: float
 ) -> tuple[NDArray[np.float64], NDArray[np.intp]]:
     from scipy.spatial import cKDTree
 
