@@ -23,6 +23,7 @@ from slatprep.errors import StoreError
 from slatprep.pipeline.spool import Spool
 from slatprep.records import Place
 from slatprep.storage.atomic import restore_directory
+from slatprep.storage.faults import reached
 from slatprep.storage.lock import take_lock
 from slatprep.storage.place import storage_of
 
@@ -69,13 +70,14 @@ def work_beside(
         the lock; the message names that build.
     """
     directory = work_directory(target)
-    with _making(directory):
-        _claim(directory)
-        lock = take_lock(directory / LOCK, f"{target}: another build is writing it")
-    finished = False
     spool = Spool(directory / "spool", arrays)
+    finished, lock = False, None
     try:
         with _making(directory):
+            _claim(directory)
+            reached("work folder made", directory.name)
+            lock = take_lock(directory / LOCK, f"{target}: another build is writing it")
+            reached("work folder locked", directory.name)
             _restore(directory, target)
             _remove_builds(directory)
             if not os.path.lexists(spool.directory):
@@ -87,16 +89,22 @@ def work_beside(
             scratch = Path(tempfile.mkdtemp(prefix=_PREFIX, dir=directory))
         yield Work(spool, scratch)
         finished = True
-    finally:
-        _restore(directory, target)
-        _remove_builds(directory)
-        if (finished and not keep) or not spool.holds_any():
-            shutil.rmtree(spool.directory, ignore_errors=True)
-            # Last, as a folder without a lock is not taken for a build's.
-            (directory / LOCK).unlink(missing_ok=True)
-            with suppress(OSError):  # Somebody's files, or the next build's lock.
+    except KeyboardInterrupt:
+        if lock is None:
+            with suppress(OSError):  # Not empty: of a build before, or one that has the lock.
                 directory.rmdir()
-        os.close(lock)
+        raise
+    finally:
+        if lock is not None:
+            _restore(directory, target)
+            _remove_builds(directory)
+            if (finished and not keep) or not spool.holds_any():
+                shutil.rmtree(spool.directory, ignore_errors=True)
+                # Last, as a folder without a lock is not taken for a build's.
+                (directory / LOCK).unlink(missing_ok=True)
+                with suppress(OSError):  # Somebody's files, or the next build's lock.
+                    directory.rmdir()
+            os.close(lock)
 
 
 def work_directory(target: Place) -> Path:

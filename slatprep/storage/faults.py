@@ -7,12 +7,12 @@ an error or end the process, is what happens at that step. Without the variable
 nothing is called. The variable is inherited by worker processes, so the module
 must be importable there too.
 
-Steps, in the order of a build: ``asset compared``, ``asset begun``, ``asset read``, ``asset
-aligned`` (or ``asset reused``), ``asset spooled``, ``store created``, ``shard
-begun``, ``shard filled`` (and not yet renamed), ``shard written``, ``records
-written``, ``directory flushed``, ``directory exchanged``, ``store replaced``,
-``manifests written`` (and not yet renamed), ``manifests published``, ``pointer
-replaced``.
+Steps, in the order of a build: ``work folder made``, ``work folder locked``, ``asset
+compared``, ``asset begun``, ``asset read``, ``asset aligned`` (or ``asset
+reused``), ``asset spooled``, ``store created``, ``shard begun``, ``shard
+filled`` (and not yet renamed), ``shard written``, ``records written``,
+``directory flushed``, ``directory exchanged``, ``store replaced``, ``manifests
+written`` (and not yet renamed), ``manifests published``, ``pointer replaced``.
 """
 
 from __future__ import annotations

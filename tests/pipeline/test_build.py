@@ -323,3 +323,19 @@ def test_no_store_is_built_inside_another(make_dataset: MakeDataset, tmp_path: P
         with pytest.raises(StoreError, match=r"lies inside the store .*outer\.zarr"):
             build_store(data.parameters(), inner)
     assert tree(outer) == before
+
+
+@pytest.mark.parametrize("step", ["work folder made", "work folder locked"])
+def test_a_build_that_is_stopped_as_it_begins_leaves_nothing(
+    make_dataset: MakeDataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, step: str
+) -> None:
+    def stop(reached: str, name: str) -> None:
+        if reached == step:
+            raise KeyboardInterrupt
+
+    dataset = make_dataset("a")
+    before = sorted(tmp_path.iterdir())
+    inject(monkeypatch, stop)
+    with pytest.raises(KeyboardInterrupt):
+        build_store(dataset.parameters(), tmp_path / "s.zarr")
+    assert sorted(tmp_path.iterdir()) == before
