@@ -5,7 +5,8 @@
 
 Flips: one bit of one file of a store, or of the records beside it. Each must be
 found by what `slatprep verify` does, or healed by the next build, or be without
-meaning: white space in JSON, and when, where and how long a build ran. Of some
+meaning: white space in JSON, and when, where and how long a build ran; one of
+`sources.seen` costs the next build some hashing. Of some
 that are found, the whole of `verify_store` and the next build are run: the
 store must then be, byte for byte, the one that it was, or refused in words.
 

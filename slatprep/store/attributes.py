@@ -37,14 +37,6 @@ def _one_of(*values: object) -> InJson:
     return InJson({"type": "literal", "expected": list(values)})
 
 
-def _exactly(values: tuple[str, ...]) -> Any:
-    each = [{"type": "literal", "expected": [value]} for value in values]
-    return {"type": "tuple", "items_schema": each}
-
-
-_CLASSES = InJson({"type": "union", "choices": [_exactly(MATERIAL_CLASSES), _exactly(())]})
-
-
 @dataclass(frozen=True)
 class StoredRange:
     """The range of one property; see `slatprep.records.PropertyRange`."""
@@ -95,7 +87,7 @@ class RootAttributes:
     format: Annotated[str, _one_of(FORMAT)]
     format_version: Annotated[int, _one_of(*READABLE_VERSIONS)]
     resolution: Annotated[int, _one_of(RESOLUTION)]
-    material_classes: Annotated[tuple[str, ...], _CLASSES]
+    material_classes: tuple[Annotated[str, _one_of(*MATERIAL_CLASSES)], ...]
     property_columns: Annotated[tuple[PropertyName, ...], MinLen(1), MaxLen(MAX_PROPERTIES)]
     normalization: dict[str, StoredRange]
     manifest: Digest
@@ -104,6 +96,8 @@ class RootAttributes:
     latents: LatentSpace = TRELLIS
 
     def __post_init__(self) -> None:
+        if self.material_classes not in (MATERIAL_CLASSES, ()):
+            raise ValueError(f"material_classes must be {', '.join(MATERIAL_CLASSES)}, or none")
         columns = set(self.property_columns)
         if not columns == self.normalization.keys() or len(columns) < len(self.property_columns):
             raise ValueError("property_columns and normalization must name the same properties")

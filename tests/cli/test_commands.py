@@ -274,6 +274,8 @@ def test_stopped_build_leaves_the_older_store_and_nothing_else(
         [sys.executable, "-m", "slatprep", "build-store", "--config",
          demo / "demo" / "dataset.toml", "--out", store, "--jobs", "2", "--fresh"],
         stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True,
+        # A shell that starts the tests in the background has them ignore SIGINT.
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
     )  # fmt: skip
     while len(list(tmp_path.iterdir())) == 1 and build.poll() is None:
         time.sleep(0.05)

@@ -8,7 +8,7 @@ import numpy as np
 
 from slatprep.parameters import BuildParameters, PixieverseSource, SlatSource
 from slatprep.pipeline.spool import FailedAsset, SpooledAsset
-from slatprep.pipeline.summary import nothing_usable, summarise_build
+from slatprep.pipeline.summary import counts_of, nothing_usable, summarise_build
 from slatprep.records import Status
 
 PARAMETERS = BuildParameters(PixieverseSource(Path("/grids")), SlatSource(Path("/slats")))
@@ -24,14 +24,10 @@ def finished(name: str, verdict: str) -> SpooledAsset:
 
 
 def test_assets_are_counted_and_the_first_hundred_problems_listed() -> None:
-    assets = [
-        finished("x", "good"),
-        *map(failed, range(120)),
-        failed(120, Status.SKIPPED),
-        finished("y", "doubtful"),
-        finished("z", "good"),
-    ]
-    summary = summarise_build(assets, records=Path("r"), build_id="id", seconds=1.0)
+    usable = [finished("x", "good"), finished("y", "doubtful"), finished("z", "good")]
+    without = [*map(failed, range(120)), failed(120, Status.SKIPPED)]
+    about = {"records": Path("r"), "build_id": "id", "seconds": 1.0}
+    summary = summarise_build(counts_of(usable), without, **about)
     assert summary.statuses == {"ok": 3, "failed": 120, "skipped": 1}
     assert summary.verdicts == {"doubtful": 1, "good": 2}
     assert (summary.n_voxels, summary.n_valid) == (30, 21)
@@ -40,7 +36,7 @@ def test_assets_are_counted_and_the_first_hundred_problems_listed() -> None:
     assert summary.problems[0] == ("a000", "reason 0")
     assert len(summary.problems) == 100
     assert not summary.complete
-    clean = summarise_build(assets[-1:], records=Path("r"), build_id="id", seconds=1.0)
+    clean = summarise_build(counts_of(usable[-1:]), [], **about)
     assert clean.complete
 
 
