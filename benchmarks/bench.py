@@ -120,9 +120,9 @@ MEASUREMENTS = (
         (84, 0, 900), (6, 0, 120), (DEMO,),
     ),
     Measurement(
-        "verdicts", "How often a verdict is wrong",
-        "quality", "python benchmarks/verdicts.py {folder}/demo",
-        (84, 0, 1800), (6, 0, 240), (DEMO,),
+        "generations", "Whether two generated shapes of one object are aligned and judged right",
+        "quality", "python benchmarks/generations.py --objects {size} --seeds 901 902",
+        (0, 44, 1800), (0, 5, 240),
     ),
     Measurement(
         "witness", "What latents settle",
