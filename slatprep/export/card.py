@@ -168,8 +168,9 @@ def _row(name: str, columns: dict[str, NDArray[Any]], chosen: NDArray[np.bool_])
 def _ranges(store: Store) -> Iterator[str]:
     yield "| property | unit | scale | -1 is | 1 is |"
     yield "| --- | --- | --- | ---: | ---: |"
-    for one, unit in zip(store.normalization.ranges, ("Pa", "kg/m³", "1"), strict=True):
+    for one, held in zip(store.normalization.ranges, store.contents.properties, strict=True):
         scale = "log10" if one.log10 else "linear"
+        unit = _plain(held.unit.replace("^3", "³"))
         yield f"| {one.name} | {unit} | {scale} | {one.lo:.6g} | {one.hi:.6g} |"
 
 

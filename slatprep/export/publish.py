@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import shutil
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -13,7 +12,7 @@ from slatprep.errors import ConfigError
 from slatprep.export import croissant, export_store, target
 from slatprep.export.card import Stated, card_of
 from slatprep.records import Place
-from slatprep.storage.files import local_files
+from slatprep.storage.files import file_digest, local_files
 from slatprep.storage.place import place_of, storage_of
 from slatprep.store import open_store
 
@@ -107,7 +106,7 @@ def publish_store(
         card = card_of(opened, stated, where, list(pictures or ()))
         (folder / CARD).write_text(card, encoding="utf-8")
         names = list(local_files(folder))
-        lines = (f"{_digest(folder / name)}  {name}\n" for name in names)
+        lines = (f"{file_digest(folder / name)}  {name}\n" for name in names)
         (folder / CHECKSUMS).write_text("".join(lines), encoding="utf-8")
         names.append(CHECKSUMS)
         size = sum((folder / name).stat().st_size for name in names)
@@ -127,8 +126,3 @@ def _copy(store: Path, to: Path) -> None:
             raise ConfigError(f"{store / name}: is no regular file; `slatprep verify` says more")
         (to / name).parent.mkdir(parents=True, exist_ok=True)
         shutil.copyfile(store / name, to / name)
-
-
-def _digest(file: Path) -> str:
-    with file.open("rb") as stream:
-        return hashlib.file_digest(stream, "sha256").hexdigest()

@@ -8,6 +8,7 @@ import os
 import subprocess
 import sys
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -152,3 +153,20 @@ def test_shards_are_a_dataset_of_the_hubs_library(
     for row, asset in zip(loaded, store, strict=True):
         np.testing.assert_array_equal(row["npz"]["coords"], asset.coords)
         np.testing.assert_array_equal(row["npz"]["properties"], asset.properties)
+
+
+def test_a_card_has_the_properties_that_the_store_holds(mixed_build: BuildSummary) -> None:
+    store = open_store(mixed_build.store)
+    card = card_of(store, Stated(), "s.zarr", [])
+    assert "| density | kg/m³ | log10 |" in card and "| youngs_modulus | Pa | log10 |" in card
+    held = store.about.contents.properties
+    ranges = store.about.normalization
+    two = replace(
+        store.about,
+        property_columns=tuple(one.name for one in held[1:]),
+        property_units=("g/cm^3", "1"),
+        normalization={one.name: ranges[one.name] for one in held[1:]},
+    )
+    store.__dict__["about"] = two
+    card = card_of(store, Stated(), "s.zarr", [])
+    assert "| density | g/cm³ | log10 |" in card and "youngs_modulus" not in card
