@@ -279,7 +279,11 @@ def write_rows(
         if not in_place and _same_place(source.store.path, place.store):
             raise ConfigError(f"{place.out} is a store to take assets from; choose another path")
     parameters = _parameters(sources, build)
-    assets = [spooled(record, _NO_EXTENT) for record in _records(rows, normalization)]
+    assets, clipped = [], []
+    for record in _records(rows, normalization):
+        assets.append(spooled(record, _NO_EXTENT))
+        if record.counts.clipped:
+            clipped.append(_counts(record.counts.clipped.voxel))
     with work_beside(place.store) as work:
         place.look()
         store, records = work.scratch / "store.zarr", work.scratch / "assets.jsonl"
@@ -300,7 +304,7 @@ def write_rows(
             build_id=build_id,
             seconds=time.perf_counter() - begin,
             normalization=normalization,
-            clipped=_clipped(_records(rows, normalization)),
+            clipped=np.sum(clipped, axis=0, dtype=np.int64),
         )
         publish_manifests(records, summary, parameters, build["versions"])
         place.publish()
@@ -328,12 +332,6 @@ def _records(rows: Iterable[_Row], normalization: Normalization) -> Iterator[Ass
                 )
             record = replace(record, normalization=normalization)
         yield record
-
-
-def _clipped(records: Iterable[AssetRecord]) -> NDArray[np.int64]:
-    """Return the clipped values of the voxels of all assets, by property."""
-    counts = (record.counts.clipped for record in records)
-    return np.asarray(np.sum([_counts(one.voxel) for one in counts if one], axis=0, dtype=np.int64))
 
 
 def _counts(counts: Any) -> list[int]:
