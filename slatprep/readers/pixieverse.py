@@ -31,6 +31,7 @@ from slatprep.readers.files import (
     npz_small_arrays,
     require_complete,
 )
+from slatprep.readers.voxel_sets import physical_rows
 from slatprep.records import (
     BACKGROUND,
     MATERIAL_CLASSES,
@@ -143,21 +144,16 @@ def read_grid(
 
     voxels = np.argwhere(annotated)
     properties = _gather(channels, annotated)
-    physical = _physical(properties, raw)
-    keep = np.asarray(physical.all(axis=1))
+
+    def told(row: int, column: int) -> tuple[str, str]:
+        at = tuple(map(int, voxels[row]))
+        name, expected = _PHYSICAL[column]
+        value = channels[_CHANNEL_ORDER[column]][at]
+        return f"{name} {value:g} at annotated voxel {at}", expected
+
+    keep = physical_rows(path, _physical(properties, raw), told, max_unphysical, warnings)
     unphysical = int(np.count_nonzero(~keep))
     if unphysical:
-        row, column = _first(~physical)
-        value = channels[_CHANNEL_ORDER[column]][tuple(voxels[row])]
-        name, expected = _PHYSICAL[column]
-        what = f"{name} {value:g} at annotated voxel {tuple(map(int, voxels[row]))}"
-        if unphysical == len(keep) or unphysical > max_unphysical * len(keep):
-            raise InputError(
-                path,
-                f"{unphysical} of {len(keep)} annotated voxels are unphysical, the first by {what}",
-                f"{expected}, in all but {max_unphysical:.4g} of them (sample.max_unphysical)",
-            )
-        warnings.append(f"{unphysical} voxels are unphysical, the first by {what}; not annotated")
         voxels, properties = voxels[keep], properties[keep]
     if not raw:
         properties = _to_si(properties, warnings)

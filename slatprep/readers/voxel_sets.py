@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -92,7 +92,13 @@ def field_of_voxels(
         values = np.asarray(properties).astype(np.float32)
     if values.shape != (count, len(table)):
         raise InputError(where, f"has properties {values.shape}", f"({count}, {len(table)})")
-    keep, unphysical = _physical(where, values, table, max_unphysical, notes)
+    fine = np.stack([one.physical(values[:, k]) for k, one in enumerate(table)], axis=1)
+
+    def told(row: int, column: int) -> tuple[str, str]:
+        one = table[column]
+        return f"{one.name} {values[row, column]:g} in row {row}", one.allowed
+
+    keep = physical_rows(where, fine, told, max_unphysical, notes)
 
     cells, side = index.astype(np.int64), min(resolution, RESOLUTION)
     if resolution > RESOLUTION:
@@ -113,7 +119,7 @@ def field_of_voxels(
         voxels=voxels_of(annotated),
         material=labels[rows[annotated]].astype(np.uint8),
         properties=means[rows[annotated]],
-        unphysical=unphysical,
+        unphysical=int(np.count_nonzero(~keep)),
         sources=tuple(sources),
         warnings=tuple(notes),
         table=tuple(table),
@@ -122,29 +128,31 @@ def field_of_voxels(
     )
 
 
-def _physical(
+def physical_rows(
     where: str | Place,
-    values: NDArray[np.float32],
-    table: Sequence[Property],
+    fine: NDArray[np.bool_],
+    told: Callable[[int, int], tuple[str, str]],
     max_unphysical: float,
     notes: list[str],
-) -> tuple[NDArray[np.bool_], int]:
-    """Return which rows a material can have, and how many it cannot; refuse too many."""
-    fine = np.stack([one.physical(values[:, k]) for k, one in enumerate(table)], axis=1)
+) -> NDArray[np.bool_]:
+    """Return which annotated voxels (K,) a material can have; refuse too many others, note few.
+
+    `fine` (K, P) says it of each property; `told` says of a row and a column what is there,
+    and what is expected instead.
+    """
     keep = np.asarray(fine.all(axis=1))
     bad = int(np.count_nonzero(~keep))
     if bad:
         row, column = (int(i) for i in np.argwhere(~fine)[0])
-        what = f"{table[column].name} {values[row, column]:g} in row {row}"
+        what, expected = told(row, column)
         if bad == len(keep) or bad > max_unphysical * len(keep):
             raise InputError(
                 where,
                 f"{bad} of {len(keep)} annotated voxels are unphysical, the first by {what}",
-                f"{table[column].allowed}, in all but {max_unphysical:.4g} of them "
-                "(sample.max_unphysical)",
+                f"{expected}, in all but {max_unphysical:.4g} of them (sample.max_unphysical)",
             )
         notes.append(f"{bad} voxels are unphysical, the first by {what}; not annotated")
-    return keep, bad
+    return keep
 
 
 def _merged(
