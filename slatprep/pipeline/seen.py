@@ -185,7 +185,7 @@ def _state_of(pair: AssetPair) -> bytes:
     names = (pair.asset_id, pair.object_id, pair.view, pair.category, pair.slat_group,
              str(pair.roots.pixieverse), str(pair.roots.slat), pair.problem)  # fmt: skip
     states: list[object] = [names]
-    for file in (pair.grid, pair.mask, pair.bounds, pair.slat):
+    for file in (pair.grid, pair.mask, pair.bounds, pair.slat, pair.beside, pair.transform):
         state = None if file is None else _file_state(file)
         if state == ():
             return _UNKNOWN

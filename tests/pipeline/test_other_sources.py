@@ -29,6 +29,7 @@ from slatprep.parameters import (
     SlatSource,
 )
 from slatprep.particles.fields import stored_field
+from slatprep.pipeline import seen
 from slatprep.records import Engine
 
 TABLE = [
@@ -276,6 +277,29 @@ def test_a_frame_that_is_known_is_checked(tmp_path: Path, suffix: str) -> None:
     np.save(tmp_path / "voxels" / "b.frame.npy", QUARTER_TURN)
     (tmp_path / "voxels" / "b.frame.json").write_text(json.dumps(QUARTER_TURN.tolist()))
     assert build_store(parameters, out).verdicts == {"good": 2}
+
+
+def test_every_file_that_decides_an_asset_is_looked_at_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # States of files are trusted however shortly ago they were written.
+    monkeypatch.setattr(seen, "_FINE_NS", 0)
+    write(tmp_path, "ab")
+    frame = tmp_path / "voxels" / "frame.json"
+    frame.write_text(json.dumps(QUARTER_TURN.tolist()))
+    source = PixieverseSource(tmp_path / "voxels", adapter="voxels", transform="frame.json")
+    parameters = replace(parameters_of(tmp_path, align=KNOWN), pixieverse=source)
+    out = tmp_path / "s.zarr"
+    assert build_store(parameters, out).verdicts == {"good": 2}
+    frame.write_text(json.dumps(QUARTER_TURN.T.tolist()))
+    assert build_store(parameters, out).verdicts == {"failed": 2}
+    frame.write_text(json.dumps(QUARTER_TURN.tolist()))
+    about = tmp_path / "voxels" / "source.json"
+    about.write_text(about.read_text().replace('"most": 90', '"most": 1'))
+    strict = replace(parameters, sample=SampleParameters("nearest", max_unphysical=1))
+    assert build_store(strict, out).n_unphysical > 0
+    about.write_text(about.read_text().replace('"most": 1', '"most": 90'))
+    assert build_store(strict, out).n_unphysical == 0
 
 
 @pytest.mark.parametrize(
