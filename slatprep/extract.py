@@ -1,4 +1,4 @@
-"""Run TRELLIS's image pipeline and save its structured latents as `build-store` reads them.
+"""Run TRELLIS's image pipeline: its structured latents, as `build-store` reads them; Gaussians.
 
 TRELLIS (https://github.com/microsoft/TRELLIS) is not a dependency: it needs a
 GPU, kernels of its own and weights. It is imported when a pipeline is loaded.
@@ -11,7 +11,7 @@ import io
 import json
 import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from importlib import metadata
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
@@ -134,7 +134,8 @@ def load_session(model: str = MODEL, revision: str | None = None, device: str = 
         from trellis.pipelines import TrellisImageTo3DPipeline
     except ImportError as error:
         raise SlatprepError(
-            f"extract-slat runs TRELLIS, and {error.name or 'a part of it'} is not installed; "
+            f"TRELLIS draws and decodes latents, and {error.name or 'a part of it'} is not "
+            "installed; "
             "install TRELLIS as https://github.com/microsoft/TRELLIS says, on a machine with an "
             "NVIDIA GPU of at least 16 GB, and slatprep into the same environment"
         ) from error
@@ -243,7 +244,8 @@ def decode_gaussians(session: Session, latents: StructuredLatents, path: Path) -
     session : Session
         The loaded pipeline.
     latents : StructuredLatents
-        Latents as the pipeline draws them, not standardised.
+        Latents of TRELLIS; what has been standardised is brought back first, since the decoder
+        takes latents as the pipeline draws them.
     path : Path
         A PLY; one that is there is replaced.
     """
@@ -251,9 +253,10 @@ def decode_gaussians(session: Session, latents: StructuredLatents, path: Path) -
 
     torch, device = session.torch, session.pipeline.device
     coords = np.insert(latents.coords.astype(np.int32), 0, 0, axis=1)
+    space = replace(TRELLIS, standardised=latents.standardised)
     with session.torch.no_grad():
         slat = SparseTensor(
-            feats=torch.from_numpy(latents.feats).to(device),
+            feats=torch.tensor(space.as_encoded(latents.feats), device=device),
             coords=torch.from_numpy(coords).to(device),
         )
         (gaussians,) = session.pipeline.decode_slat(slat, ["gaussian"])["gaussian"]

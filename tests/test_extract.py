@@ -221,11 +221,15 @@ def test_a_bad_image_does_not_stop_the_others(images: list[Path], tmp_path: Path
     assert isinstance(nothing, InputError) and not (tmp_path / "none" / "bear.npz").exists()
 
 
+@pytest.mark.parametrize("command", ["extract-slat", "decode-slat"])
 def test_without_trellis_the_command_says_what_to_install(
-    images: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    command: str, images: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setitem(sys.modules, "trellis.pipelines", None)
-    words = ["extract-slat", str(images[0]), "--out", str(tmp_path / "slat")]
+    asset = make_asset(0)
+    np.savez(tmp_path / "cup.npz", coords=asset.coords, feats=asset.feats)
+    source = images[0] if command == "extract-slat" else tmp_path / "cup.npz"
+    words = [command, str(source), "--out", str(tmp_path / "slat")]
     result = CliRunner().invoke(slatprep, words)
     assert result.exit_code == 1 and len(result.stderr.splitlines()) == 1
     assert "install TRELLIS as https://github.com/microsoft/TRELLIS says" in result.stderr

@@ -28,6 +28,7 @@ COMMANDS = {
     "score": "slatprep.cli.score:score",
     "export": "slatprep.cli.export:export",
     "extract-slat": "slatprep.cli.extract:extract_slat",
+    "decode-slat": "slatprep.cli.extract:decode_slat",
     "transfer": "slatprep.cli.transfer:transfer",
     "describe": "slatprep.cli.describe:describe",
     "publish": "slatprep.cli.publish:publish",

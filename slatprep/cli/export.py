@@ -15,7 +15,10 @@ from slatprep.cli.options import (
     complete_asset,
     jobs_option,
     note_left_out,
+    note_split,
     option,
+    split_options,
+    split_rule,
     verdicts_option,
 )
 from slatprep.cli.output import Cell, Output
@@ -34,12 +37,23 @@ _ONLY_FOR = {"points": "ply", "frame": "ply", "shard_size": "webdataset", "laten
 @option("--out", click.Path(path_type=Path), required=True, metavar="PATH")
 @option("--asset", name="assets", multiple=True, metavar="ID", shell_complete=complete_asset)
 @verdicts_option
+@option("--split", ChoiceOf("slatprep.learn.splits:SPLITS", "all"), "all")
+@split_options
 @option("--points", ChoiceOf("slatprep.export.formats:Points"))
 @option("--frame", ChoiceOf("slatprep.export.formats:Frame"))
 @option("--shard-size", POSITIVE)
 @option("--latent-model", metavar="NAME")
 @jobs_option
-def export(output: Output, store: Place, kind: Any, out: Path, **others: Any) -> None:
+def export(
+    output: Output,
+    store: Place,
+    kind: Any,
+    out: Path,
+    split: Any,
+    split_by: str | None,
+    shares: str | None,
+    **others: Any,
+) -> None:
     """Write assets of STORE in a format of other tools.
 
     Properties are in SI units in PLY, normalised in WebDataset and npz, and
@@ -52,6 +66,7 @@ def export(output: Output, store: Place, kind: Any, out: Path, **others: Any) ->
     --out: The file (hdf5) or folder (all others); an existing export is replaced when the new
         one is complete.
     --asset: The asset; may be repeated. [default: all]
+    --split: Only objects of this split, parted as `slatprep train` parts them.
     --points: ply: SLAT voxels, or the voxels of the PixieVerse field. [default: slat]
     --frame: ply: the SLAT's unit cube, or PixieVerse's world. [default: slat]
     --shard-size: webdataset: assets a shard. [default: 256]
@@ -65,6 +80,7 @@ def export(output: Output, store: Place, kind: Any, out: Path, **others: Any) ->
     slatprep export demo.zarr --format hdf5 --out demo.h5 --asset 5f61cc --asset 803c1a
     slatprep export demo.zarr --format webdataset --out shards --shard-size 128 --jobs 2
     slatprep export demo.zarr --format npz --out trellis
+    slatprep export demo.zarr --format webdataset --out train --split train --split-by pixie
     """
     options = {name: value for name in _ONLY_FOR if (value := others.pop(name)) is not None}
     for name in options:
@@ -76,6 +92,10 @@ def export(output: Output, store: Place, kind: Any, out: Path, **others: Any) ->
 
     if others["verdicts"] is None and not others["assets"]:
         note_left_out(output, open_store(store))
+    if split != "all":
+        others |= _of_split(output, store, split, split_rule(split_by, shares), **others)
+    elif split_by is not None or shares is not None:
+        raise ConfigError("--split-by and --shares part the objects, and --split chooses: give it")
     with output.progress("export") as progress:
         chosen = ExportOptions(**options)
         summary = export_store(store, out, kind, options=chosen, progress=progress, **others)
@@ -91,3 +111,31 @@ def export(output: Output, store: Place, kind: Any, out: Path, **others: Any) ->
     for note in summary.notes:
         output.note(note)
     output.made(summary, lambda: output.record(f"Exported to {summary.path}", cells))
+
+
+def _of_split(
+    output: Output,
+    place: Place,
+    split: Any,
+    rule: dict[str, Any],
+    assets: Any,
+    verdicts: Any,
+    **_: Any,
+) -> dict[str, Any]:
+    """Return the assets of a split and the verdicts that may go out."""
+    from slatprep.learn.splits import assign_store, select_assets
+    from slatprep.records import USABLE
+    from slatprep.store import open_store
+
+    if assets:
+        raise ConfigError("--asset and --split both choose; give one of them")
+    store = open_store(place)
+    assignment = assign_store(store, **rule)
+    note_split(output, assignment, f"{split}, by {rule['by']}")
+    rows = select_assets(store, split, splits=assignment.splits)
+    if not len(rows):
+        raise ConfigError(f"{store.path}: no asset is in the split {split}, by {rule['by']}")
+    return {
+        "assets": [store.ids[row] for row in rows],
+        "verdicts": USABLE if verdicts is None else verdicts,
+    }

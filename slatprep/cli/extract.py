@@ -1,14 +1,35 @@
-"""`slatprep extract-slat`: structured latents of images, by TRELLIS."""
+"""`slatprep extract-slat` and `decode-slat`: latents of images, and Gaussians of latents."""
 
 from __future__ import annotations
 
+import functools
+import time
+from collections.abc import Callable
 from pathlib import Path
+from typing import TYPE_CHECKING, TypeVar
 
 import click
 
-from slatprep.cli.options import FILE, NEW_FOLDER, command, option
+from slatprep.cli.latents import LatentsReader, standardised_option
+from slatprep.cli.options import FILE, NEW_FOLDER, PlaceType, command, option
 from slatprep.cli.output import Output
 from slatprep.errors import InputError
+
+if TYPE_CHECKING:
+    from slatprep.records import Place
+
+_Command = TypeVar("_Command", bound=Callable[..., object])
+
+
+def _model_options(command: _Command) -> _Command:
+    """Add what says which of TRELLIS's models runs, and where."""
+    options = (
+        option("--model", text="Repository of the model, or its folder.",
+               default="microsoft/TRELLIS-image-large"),
+        option("--revision", text="Revision of the model.  [default: newest]", metavar="COMMIT"),
+        option("--device", text="Where to run it.", default="cuda"),
+    )  # fmt: skip
+    return functools.reduce(lambda decorated, add: add(decorated), reversed(options), command)
 
 
 @command("extract-slat")
@@ -16,9 +37,7 @@ from slatprep.errors import InputError
 @option("--out", NEW_FOLDER, required=True)
 @option("--seed", click.IntRange(min=0), (42,), name="seeds", multiple=True)
 @option("--by-folder", is_flag=True)
-@option("--model", default="microsoft/TRELLIS-image-large")
-@option("--revision", metavar="COMMIT")
-@option("--device", default="cuda")
+@_model_options
 @option("--no-preprocess", is_flag=True)
 def extract_slat(
     output: Output,
@@ -43,9 +62,6 @@ def extract_slat(
     --out: The --slat of build-store.
     --seed: Seed of what is drawn; may be repeated, each seed is a view.
     --by-folder: Images are named <id>/<view>, not <id>.
-    --model: Repository of the model, or its folder.
-    --revision: Revision of the model. [default: newest]
-    --device: Where to run it.
     --no-preprocess: Images are cut out and cropped already.
 
     Example
@@ -76,3 +92,55 @@ def extract_slat(
 
     document = {"path": out, "model": session.model, **counts, "problems": problems}
     output.made(document, lambda: output.record(f"Latents in {out}", counts), complete=not problems)
+
+
+@command("decode-slat")
+@click.argument("source", type=PlaceType(path_type=Path, exists=True))
+@option("--out", NEW_FOLDER, required=True)
+@option("--asset", metavar="ID", name="assets", multiple=True)
+@standardised_option
+@_model_options
+def decode_slat(
+    output: Output,
+    source: Place,
+    out: Path,
+    assets: tuple[str, ...],
+    standardised: str,
+    model: str,
+    revision: str | None,
+    device: str,
+) -> None:
+    """Decode the structured latents of SOURCE to Gaussians with TRELLIS's decoder.
+
+    SOURCE is a SLAT (npz or HDF5), a folder of them, or a store. Each asset
+    gives <id>.ply, as TRELLIS saves Gaussians, to which `slatprep transfer`
+    gives materials. TRELLIS itself must be installed.
+
+    Options
+    -------
+    --out: Folder of the Gaussians; those of other assets stay.
+    --asset: Decode this asset alone; may be repeated.
+
+    Example
+    -------
+    slatprep decode-slat slat/cup.npz --out gaussians
+    slatprep decode-slat demo.zarr --asset 5f61cc --out gaussians
+    """
+    from slatprep import extract as work
+    from slatprep.records import TRELLIS
+    from slatprep.storage.names import file_name
+
+    read = LatentsReader(output, source, assets, TRELLIS, standardised)
+    session = work.load_session(model, revision, device)
+    begin = time.perf_counter()
+    with output.progress("decode-slat") as progress:
+        for latents in read:
+            path = out / f"{file_name(read.done[-1])}.ply"
+            work.decode_gaussians(session, latents, path)
+            progress(len(read.done) + len(read.problems), len(read.ids))
+    counts = {"decoded": len(read.done), "failed": len(read.problems)}
+    document = {"path": out, "model": session.model, **counts, "problems": read.problems,
+                "seconds": time.perf_counter() - begin}  # fmt: skip
+    output.made(
+        document, lambda: output.record(f"Gaussians in {out}", counts), complete=not read.problems
+    )

@@ -3,20 +3,21 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
 
+from slatprep.cli.latents import LatentsReader, standardised_option
 from slatprep.cli.options import NEW_FILE, NEW_FOLDER, POSITIVE, PlaceType, command, option
 from slatprep.cli.output import Output
-from slatprep.errors import ConfigError, InputError, StoreError
+from slatprep.errors import ConfigError, InputError
 
 if TYPE_CHECKING:
     from slatprep.extract import Session
-    from slatprep.records import LatentSpace, Place, StructuredLatents
+    from slatprep.records import Place
 
 _IMAGES = (".png", ".jpg", ".jpeg", ".webp", ".bmp")
 
@@ -30,7 +31,7 @@ _IMAGES = (".png", ".jpg", ".jpeg", ".webp", ".bmp")
 @option("--seed", click.IntRange(min=0), 42)
 @option("--device", click.Choice(["cpu", "cuda"]), "cpu")
 @option("--batch-voxels", POSITIVE, 65_536)
-@option("--standardised", click.Choice(["auto", "yes", "no"]), "auto")
+@standardised_option
 def predict(
     output: Output,
     source: Place,
@@ -62,7 +63,6 @@ def predict(
     --seed: Seed of an image's latents.
     --device: Where to compute.
     --batch-voxels: Assets are decoded together until they have so many voxels.
-    --standardised: Whether the latents of files have been standardised already; auto looks.
 
     Example
     -------
@@ -77,13 +77,16 @@ def predict(
 
     is_image = source.suffix.lower() in _IMAGES
     if gaussians is not None and not is_image:
-        raise ConfigError("--gaussians goes with an image; for a PLY there is, slatprep transfer")
+        raise ConfigError(
+            "--gaussians goes with an image; `slatprep decode-slat` makes Gaussians of latents, "
+            "and `slatprep transfer` gives them materials"
+        )
     decoder = work.load_checkpoint(checkpoint, device)
     image = _draw(output, source, out, seed, device) if is_image else None
     space = decoder.contents.latents
     if image is not None:
         standardised = "no"  # TRELLIS draws them as its decoders want them.
-    read = _Reader(output, image.latents if image else source, assets, space, standardised)
+    read = LatentsReader(output, image.latents if image else source, assets, space, standardised)
     predicted, voxels, decoding, writing = 0, 0, 0.0, 0.0
     with output.progress("predict") as progress:
         progress(0, len(read.ids))
@@ -164,74 +167,3 @@ def _write_gaussians(output: Output, image: _Image, out: Path, path: Path) -> No
     if result.far:
         output.note(f"{result.far:,} of {len(result.rows):,} Gaussians have no voxel: background")
     work.write_transferred(path, particles, result, max_distance=2.0, in_slat=False)
-
-
-class _Reader:
-    """The latents of a source, one asset after the other; what cannot be read is told and left."""
-
-    def __init__(
-        self,
-        output: Output,
-        source: Place,
-        assets: tuple[str, ...],
-        space: LatentSpace,
-        standardised: str,
-    ) -> None:
-        from slatprep.parameters import SlatSource
-        from slatprep.readers import discover_slats
-        from slatprep.store import open_store
-        from slatprep.store.reader import is_store
-
-        self.output, self.space, self.standardised = output, space, standardised
-        self.store = open_store(source) if is_store(source) else None
-        files = [] if self.store else discover_slats(SlatSource(root=source))
-        self.files = {file.asset_id: file for file in files}
-        there = self.store.ids if self.store else list(self.files)
-        self.rows = {asset_id: row for row, asset_id in enumerate(there)}
-        unknown = [asset_id for asset_id in assets if asset_id not in self.rows]
-        if unknown:
-            raise ConfigError(f"{source} has no asset {unknown[0]!r}; it has {len(there)} assets")
-        self.ids = [asset_id for asset_id in there if not assets or asset_id in assets]
-        self.done: list[str] = []
-        self.problems: list[str] = []
-        self.seconds = 0.0
-
-    def __iter__(self) -> Iterator[StructuredLatents]:
-        for asset_id in self.ids:
-            begin = time.perf_counter()
-            try:
-                latents = self._latents(asset_id)
-            except (InputError, StoreError) as error:
-                self.problems.append(str(error))
-                self.output.problem(f"slatprep: {error}")
-                continue
-            self.seconds += time.perf_counter() - begin
-            self.done.append(asset_id)
-            yield latents
-
-    def _of_file(self, latents: StructuredLatents) -> StructuredLatents:
-        """Return the latents of a file, saying whether they have been standardised."""
-        from slatprep.readers.encoders import in_words, look_standardised
-
-        if self.standardised != "auto":
-            return replace(latents, standardised=self.standardised == "yes")
-        if not look_standardised(latents.moments, self.space):
-            return latents
-        self.output.note(
-            f"{latents.sources[0].path}: its latents look standardised already "
-            f"({in_words(latents.moments)}) and are taken so; --standardised says otherwise"
-        )
-        return replace(latents, standardised=True)
-
-    def _latents(self, asset_id: str) -> StructuredLatents:
-        from slatprep.readers.slat import checked_latents, read_slat
-
-        if self.store is None:
-            file = self.files[asset_id]
-            if file.problem:
-                raise InputError(file.path, file.problem, "one SLAT an id")
-            return self._of_file(read_slat(file.path, file.root, file.group, self.space))
-        rows = self.store.read(self.rows[asset_id], ("coords", "feats"))
-        space, where = self.store.contents.latents, f"{self.store.path} [{asset_id}]"
-        latents = checked_latents(rows["coords"], rows["feats"], where, space=space)
-        return replace(latents, standardised=space.standardised)

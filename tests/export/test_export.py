@@ -13,16 +13,19 @@ from typing import Any
 
 import numpy as np
 import pytest
+from click.testing import CliRunner
 from hypothesis import given
 from hypothesis import strategies as st
 from support.exports import bytes_of, index_of
 from support.synthetic import JELLY, METAL, QUARTER_TURN, Dataset
 from support.trees import tree
 
+from slatprep.cli.commands import slatprep
 from slatprep.errors import ConfigError, SlatprepError
 from slatprep.export import FORMATS, ExportOptions, export_store
 from slatprep.parameters import PixieverseSource, SlatSource
 from slatprep.readers import discover, read_latents
+from slatprep.readers.splits import Shares, split_objects
 from slatprep.storage.names import file_name
 from slatprep.store import Store
 
@@ -222,6 +225,35 @@ def test_assets_are_chosen_by_id_and_verdict(store: Path, tmp_path: Path) -> Non
     ):
         with pytest.raises(ConfigError, match=said):
             export_store(store, tmp_path / "none", "npz", **arguments)
+
+
+def test_splits_go_out_apart_and_together_they_are_all(store: Path, tmp_path: Path) -> None:
+    def export(*options: str, code: int = 0) -> str:
+        words = ["export", str(store), "--format", "npz", *options]
+        result = CliRunner().invoke(slatprep, words)
+        assert result.exit_code == code, result.output
+        return result.output
+
+    expected = split_objects(["ant", "bear", "cup", "dog"], Shares(0.4, 0.3, 0.3))
+    ids = []
+    for split in ("train", "val", "test"):
+        out = tmp_path / split
+        told = export("--out", str(out), "--split", split, "--shares", "0.4,0.3,0.3")
+        assert f"split:   {split}, by hash: " in told
+        own = [entry["asset_id"] for entry in index_of(out)]
+        assert {expected[one.partition(".")[0]] for one in own} == {split}
+        ids += own
+    assert sorted(ids) == ["ant", "bear.front", "bear.side", "cup", "dog"]
+    listed = tmp_path / "test.txt"
+    listed.write_text("bear.front\n")  # an object by one of its views
+    export("--out", str(tmp_path / "f"), "--split", "test", "--split-by", str(listed))
+    assert [entry["asset_id"] for entry in index_of(tmp_path / "f")] == ["bear.front", "bear.side"]
+    none = ("--out", str(tmp_path / "none"))
+    empty = export(*none, "--split", "test", "--shares", "1,0,0", code=2)
+    assert "no asset is in the split test" in empty
+    assert "both choose" in export(*none, "--split", "test", "--asset", "cup", code=2)
+    assert "--split chooses" in export(*none, "--split-by", "pixie", code=2)
+    assert not (tmp_path / "none").exists()
 
 
 HOSTILE = ["..", "../../etc/passwd", "a b", "-rf", "~", "__key__", "x" * 300, "häß", "a/b", "."]

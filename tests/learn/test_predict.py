@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import sys
+from dataclasses import replace
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
 from typing import Any
@@ -247,13 +248,9 @@ class Pipeline:
         return {"gaussian": [SimpleNamespace(save_ply=save_ply)]}
 
 
-def test_an_image_becomes_gaussians_with_materials(
-    checkpoint: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """The whole chain, with TRELLIS's interface in place of TRELLIS."""
-    import PIL.Image
-    from plyfile import PlyData
-
+@pytest.fixture
+def trellis(monkeypatch: pytest.MonkeyPatch) -> Pipeline:
+    """TRELLIS's interface in place of TRELLIS."""
     pipeline = Pipeline()
     sparse = SimpleNamespace(SparseTensor=lambda feats, coords: SimpleNamespace(**locals()))
     monkeypatch.setitem(sys.modules, "trellis", ModuleType("trellis"))
@@ -261,28 +258,95 @@ def test_an_image_becomes_gaussians_with_materials(
     monkeypatch.setitem(sys.modules, "trellis.modules.sparse", sparse)
     monkeypatch.setattr(
         "slatprep.extract.load_session",
-        lambda device: Session(pipeline, torch, {"name": "m", "revision": "r"}),
+        lambda *_, **__: Session(pipeline, torch, {"name": "m", "revision": "r"}),
     )
+    return pipeline
+
+
+@pytest.fixture
+def image(tmp_path: Path) -> Path:
+    import PIL.Image
+
     PIL.Image.new("RGB", (8, 8)).save(tmp_path / "cup.png")
+    return tmp_path / "cup.png"
+
+
+def test_an_image_becomes_gaussians_with_materials(
+    checkpoint: Path, tmp_path: Path, trellis: Pipeline, image: Path
+) -> None:
+    from plyfile import PlyData
+
     out, ply = tmp_path / "out", tmp_path / "cup.ply"
-    told = run(tmp_path / "cup.png", "--checkpoint", checkpoint, "--out", out, "--gaussians", ply)
+    words = (image, "--checkpoint", checkpoint, "--out", out, "--gaussians", ply)
     stages = ["image", "sparse structure", "SLAT", "read", "decode", "write", "gaussians"]
-    assert list(told["seconds"]) == stages  # type: ignore[call-overload]
+    assert list(run(*words)["seconds"]) == stages  # type: ignore[call-overload]
     # A second time the latents are there; what the decoder does is done again.
-    told = run(tmp_path / "cup.png", "--checkpoint", checkpoint, "--out", out, "--gaussians", ply)
-    assert list(told["seconds"]) == stages[3:]  # type: ignore[call-overload]
-    np.testing.assert_array_equal(pipeline.feats, random_latents(9).feats)
+    assert list(run(*words)["seconds"]) == stages[3:]  # type: ignore[call-overload]
+    np.testing.assert_array_equal(trellis.feats, random_latents(9).feats)
     rows = PlyData.read(str(ply))["vertex"].data
     with np.load(out / "cup.npz") as held:
         assert np.array_equal(rows["material_id"], held["material"])
         np.testing.assert_allclose(rows["E"], held["properties_si"][:, 0], rtol=1e-6)
-    refused = CliRunner().invoke(
-        slatprep,
-        ["predict", str(out / "latents"), "--checkpoint", str(checkpoint), "--out", str(out),
-         "--gaussians", str(ply)],
-    )  # fmt: skip
-    assert refused.exit_code == 2
-    assert "--gaussians goes with an image" in refused.output
+
+
+def step(*words: object, code: int = 0) -> str:
+    result = CliRunner().invoke(slatprep, [*map(str, words)])
+    assert result.exit_code == code, result.output
+    return result.output
+
+
+def test_each_step_alone_comes_to_what_the_one_line_does(
+    checkpoint: Path, tmp_path: Path, trellis: Pipeline, image: Path
+) -> None:
+    at_once = tmp_path / "at-once.ply"
+    run(image, "--checkpoint", checkpoint, "--out", tmp_path / "out", "--gaussians", at_once)
+    slats, predictions, gaussians = (tmp_path / name for name in ("slat", "p", "gaussians"))
+    step("extract-slat", image, "--out", slats)
+    refused = step("predict", slats, "--checkpoint", checkpoint, "--out", predictions,
+                   "--gaussians", at_once, code=2)  # fmt: skip
+    assert "`slatprep decode-slat` makes Gaussians of latents" in refused
+    step("predict", slats, "--checkpoint", checkpoint, "--out", predictions)
+    step("decode-slat", slats / "cup.npz", "--out", gaussians)
+    stepped = tmp_path / "stepped.ply"
+    step("transfer", gaussians / "cup.ply", "--prediction", predictions / "cup.npz",
+         "--out", stepped)  # fmt: skip
+    assert stepped.read_bytes() == at_once.read_bytes()
+
+
+def test_gaussians_of_stored_latents_and_of_standardised_ones(
+    tmp_path: Path, trellis: Pipeline
+) -> None:
+    """The decoder gets latents as TRELLIS draws them, whatever was done to those that are saved."""
+    data = Dataset(tmp_path / "data")
+    for k in range(2):
+        data.add(f"a{k}", seed=k)
+    store, out = tmp_path / "s.zarr", tmp_path / "gaussians"
+    build_store(data.parameters(), store)
+    step("decode-slat", store, "--asset", "a1", "--out", out)
+    assert [path.name for path in out.iterdir()] == ["a1.ply"]
+    np.testing.assert_array_equal(trellis.feats, open_store(store).asset("a1").feats)
+    latents = random_latents(9)
+    feats = (latents.feats - np.array(FEATS_MEAN)) / np.array(FEATS_STD)
+    save(tmp_path / "slat" / "b.npz", StructuredLatents(latents.coords, feats.astype(np.float32)))
+    (tmp_path / "slat" / "c.npz").write_bytes(b"no zip")
+    told = step("decode-slat", tmp_path / "slat", "--out", out, code=1)
+    assert "look standardised already" in told
+    assert "c.npz" in told
+    np.testing.assert_allclose(trellis.feats, latents.feats, atol=1e-5)
+    assert sorted(path.name for path in out.iterdir()) == ["a1.ply", "b.ply"]
+
+
+def test_latents_of_another_encoder_are_no_input(checkpoint: Path, tmp_path: Path) -> None:
+    data = Dataset(tmp_path / "data")
+    data.add("a", seed=0)
+    parameters = data.parameters()
+    with np.load(tmp_path / "data" / "slat" / "a.npz") as held:
+        coords, feats = held["coords"], np.repeat(held["feats"], 4, axis=1)
+    np.savez(tmp_path / "data" / "slat" / "a.npz", coords=coords, feats=feats)
+    build_store(replace(parameters, slat=replace(parameters.slat, encoder="trellis2")),
+                tmp_path / "s.zarr")  # fmt: skip
+    words = ("predict", tmp_path / "s.zarr", "--checkpoint", checkpoint, "--out", tmp_path / "p")
+    assert "latents of trellis2 (32 channels); expected those of trellis" in step(*words, code=2)
 
 
 def test_a_checkpoint_that_would_set_memory_aside_is_not_unpickled(checkpoint: Path) -> None:

@@ -1,0 +1,122 @@
+"""The latents that a command takes: of a file, of a folder of files, or of a store."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import click
+
+from slatprep.cli.options import option
+from slatprep.cli.output import Output
+from slatprep.errors import ConfigError, InputError, StoreError
+
+if TYPE_CHECKING:
+    from slatprep.records import LatentSpace, Place, StructuredLatents
+
+standardised_option = option(
+    "--standardised",
+    click.Choice(["auto", "yes", "no"]),
+    "auto",
+    "Whether the latents of files have been standardised already; auto looks.",
+)
+
+
+class LatentsReader:
+    """The latents of a source, one asset after the other; what cannot be read is told and left.
+
+    Raises
+    ------
+    ConfigError
+        If there is no asset of a name, or a store's latents are those of another encoder.
+    """
+
+    def __init__(
+        self,
+        output: Output,
+        source: Place,
+        assets: tuple[str, ...],
+        space: LatentSpace,
+        standardised: str,
+    ) -> None:
+        from slatprep.parameters import SlatSource
+        from slatprep.readers import discover_slats
+        from slatprep.store import open_store
+        from slatprep.store.reader import is_store
+
+        self.output, self.space, self.standardised = output, space, standardised
+        self.store = open_store(source) if is_store(source) else None
+        files = [] if self.store else discover_slats(SlatSource(root=source))
+        self.files = {file.asset_id: file for file in files}
+        there = self.store.ids if self.store else list(self.files)
+        self.rows = {asset_id: row for row, asset_id in enumerate(there)}
+        if self.store:
+            chosen = {there[self.store.match(name)] for name in assets}
+            _require_encoder(source, self.store.contents.latents, space)
+        else:
+            chosen = {_match(source, name, there) for name in assets}
+        self.ids = [asset_id for asset_id in there if not assets or asset_id in chosen]
+        self.done: list[str] = []
+        self.problems: list[str] = []
+        self.seconds = 0.0
+
+    def __iter__(self) -> Iterator[StructuredLatents]:
+        for asset_id in self.ids:
+            begin = time.perf_counter()
+            try:
+                latents = self._latents(asset_id)
+            except (InputError, StoreError) as error:
+                self.problems.append(str(error))
+                self.output.problem(f"slatprep: {error}")
+                continue
+            self.seconds += time.perf_counter() - begin
+            self.done.append(asset_id)
+            yield latents
+
+    def _of_file(self, latents: StructuredLatents) -> StructuredLatents:
+        """Return the latents of a file, saying whether they have been standardised."""
+        from slatprep.readers.encoders import in_words, look_standardised
+
+        if self.standardised != "auto":
+            return replace(latents, standardised=self.standardised == "yes")
+        if not look_standardised(latents.moments, self.space):
+            return latents
+        self.output.note(
+            f"{latents.sources[0].path}: its latents look standardised already "
+            f"({in_words(latents.moments)}) and are taken so; --standardised says otherwise"
+        )
+        return replace(latents, standardised=True)
+
+    def _latents(self, asset_id: str) -> StructuredLatents:
+        from slatprep.readers.slat import checked_latents, read_slat
+
+        if self.store is None:
+            file = self.files[asset_id]
+            if file.problem:
+                raise InputError(file.path, file.problem, "one SLAT an id")
+            return self._of_file(read_slat(file.path, file.root, file.group, self.space))
+        rows = self.store.read(self.rows[asset_id], ("coords", "feats"))
+        space, where = self.store.contents.latents, f"{self.store.path} [{asset_id}]"
+        latents = checked_latents(rows["coords"], rows["feats"], where, space=space)
+        return replace(latents, standardised=space.standardised)
+
+
+def _match(source: Place, name: str, ids: list[str]) -> str:
+    """Return the id, or the one that begins so, as `Store.match` does for a store's."""
+    alike = [name] if name in ids else [known for known in ids if known.startswith(name)]
+    if len(alike) != 1:
+        there = ", ".join(alike[:5]) if alike else f"it has {len(ids):,}"
+        raise ConfigError(f"{source}: expected one SLAT with the id {name!r}; {there}")
+    return alike[0]
+
+
+def _require_encoder(source: Place, held: LatentSpace, space: LatentSpace) -> None:
+    """Refuse latents of another encoder; one of the same width and moments has another name."""
+    same = (held.channels, held.resolution) == (space.channels, space.resolution)
+    if not same or (held.encoder != space.encoder and held.mean != space.mean):
+        raise ConfigError(
+            f"{source} holds latents of {held.encoder} ({held.channels} channels); expected those "
+            f"of {space.encoder} ({space.channels} channels)"
+        )
