@@ -37,6 +37,14 @@ def to_mapped(properties: ArrayLike, table: Sequence[Property] = PROPERTIES) -> 
     return mapped
 
 
+def from_mapped(mapped: ArrayLike, table: Sequence[Property] = PROPERTIES) -> NDArray[np.float32]:
+    """Bring mapped properties (N, P) back to SI units, the inverse of `to_mapped`."""
+    properties = np.array(mapped, dtype=np.float64)
+    columns = [column for column, one in enumerate(table) if one.log10]
+    properties[..., columns] = 10.0 ** properties[..., columns]
+    return properties.astype(np.float32)
+
+
 def property_extent(field: MaterialField) -> NDArray[np.float64]:
     """Return the smallest and largest mapped property of a field.
 

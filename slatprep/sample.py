@@ -1,13 +1,31 @@
-"""Material and properties at SLAT voxels, from the annotated PixieVerse voxels near them."""
+"""Material and properties at SLAT voxels, from the annotated PixieVerse voxels near them.
+
+`sample` looks them up in one field, `merge` makes one of what several fields say.
+"""
 
 from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from slatprep.geometry.frames import voxel_centres
+from slatprep.normalize import from_mapped, to_mapped
 from slatprep.parameters import SampleParameters
-from slatprep.records import RESOLUTION, UNANNOTATED, Annotation, MaterialField
+from slatprep.records import (
+    BACKGROUND,
+    RESOLUTION,
+    UNANNOTATED,
+    Annotation,
+    MaterialField,
+    Property,
+)
+
+NEAR_POWER, NEAR_SHARE = float(np.log10(2.0)), 0.2
+"""How far a property may lie off the merged one to count as the same: in log10, a factor of two,
+or as a share of the merged value where it is not normalised by log10."""
 
 
 def sample(
@@ -64,3 +82,63 @@ def sample(
     properties[~valid] = np.nan
     material[~valid] = UNANNOTATED
     return Annotation(properties, material, valid, distance.astype(np.float32), place)
+
+
+def merge(annotations: Sequence[Annotation], table: Sequence[Property]) -> Annotation:
+    """Make one annotation of several of the same SLAT voxels.
+
+    At each voxel those that are valid there count. Its properties are their mean, of
+    log10 where the table says so, and its class the one that most of them give, of
+    several such the one with the lowest id.
+
+    Its confidence is the mean of theirs, each taken fully where it gives the same class
+    and each of its properties is near the merged one, by half where a property is not,
+    and not at all where it gives another class.
+
+    Parameters
+    ----------
+    annotations : sequence of Annotation
+        Each with its confidence; place and distance are taken from the first.
+    table : sequence of Property
+        What their P properties are.
+
+    Returns
+    -------
+    Annotation
+        In SI units, with spread and votes. The spread is that of the annotations
+        themselves: the square root of the mean squared deviation.
+    """
+    valid = np.stack([one.valid for one in annotations])
+    count = valid.sum(axis=0)
+    some, several = count > 0, count > 1
+    mapped = np.stack([to_mapped(one.properties, table) for one in annotations])
+    there = valid[..., None]
+    of = np.maximum(count, 1)
+    # From the largest: where all are the same, the mean is that and the spread nothing.
+    most = np.where(there, mapped, -np.inf).max(axis=0)
+    mean = most + np.where(there, mapped - most, 0.0).sum(axis=0) / of[:, None]
+    apart = np.where(there, mapped - mean, 0.0)
+    spread = np.sqrt((apart**2).sum(axis=0) / of[:, None])
+
+    classes = np.arange(BACKGROUND)[:, None]
+    given = np.stack([one.material for one in annotations])
+    votes = np.stack([(given == one).sum(axis=0) for one in classes])
+    material = votes.argmax(axis=0).astype(np.uint8)
+
+    powers = np.array([one.log10 for one in table])
+    limit = np.where(powers, NEAR_POWER, NEAR_SHARE * np.abs(mean))
+    near = (np.abs(apart) <= limit * (1.0 + 1e-6)).all(axis=-1)
+    sure = np.stack([one.confidence for one in annotations if one.confidence is not None])
+    counted = np.where(given == material, np.where(near, 1.0, 0.5), 0.0)
+    confidence = (sure * counted).sum(axis=0) / of
+
+    mean[~some], spread[~several], material[~some] = np.nan, np.nan, UNANNOTATED
+    return replace(
+        annotations[0],
+        properties=from_mapped(mean, table),
+        material=material,
+        valid=some,
+        confidence=confidence.astype(np.float32),
+        spread=spread.astype(np.float32),
+        votes=(votes.max(axis=0) / of).astype(np.float32),
+    )

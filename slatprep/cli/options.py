@@ -146,6 +146,10 @@ EXISTING_FOLDER = PlaceType(path_type=Path, exists=True, file_okay=False)
 
 _PIXIEVERSE = "Root of the PixieVerse grids or predictions, a folder or a URL."
 _MAP = "CSV that joins the ids of the two sides, or TRELLIS's metadata.csv."
+_SAMPLES = (
+    "What becomes of several annotations of one object: refused, the first taken, an asset "
+    "each, or one asset of all.  [default: one]"
+)
 _ENCODER = "What made the latents.  [default: trellis]"
 _RANGES = "Where the normalisation ranges come from; p1-p99: percentiles.  [default: dataset]"
 _RANGES_OF = "Objects whose ranges are taken, where they are the dataset's.  [default: all]"
@@ -159,6 +163,7 @@ def source_options(command: _Function) -> _Function:
         option("--config", FILE, text="Dataset definition (TOML); options win over it."),
         option("--pixieverse", PLACE, text=_PIXIEVERSE),
         option("--slat", PLACE, text="Root of the TRELLIS latents, or one HDF5 file, or a URL."),
+        option("--samples", ChoiceOf("slatprep.parameters:Samples"), text=_SAMPLES),
         option("--encoder", text=_ENCODER, metavar="NAME|FILE.json"),
         option("--map", PLACE, text=_MAP),
         option("--ranges", text=_RANGES, metavar="dataset|pLO-pHI|pixie|FILE"),

@@ -216,6 +216,9 @@ def check_stored(path: Place, asset_id: str) -> AlignmentCheck:
 def recompute_annotation(asset: StoredAsset) -> tuple[float, dict[str, NDArray[np.float64]]]:
     """Sample an asset's annotation again from the stored grid, and compare.
 
+    The grid is that of one annotation. Where labels are merged of several, those are
+    compared in which all agree or which it alone reaches.
+
     Returns
     -------
     valid_share : float
@@ -235,15 +238,20 @@ def recompute_annotation(asset: StoredAsset) -> tuple[float, dict[str, NDArray[n
     annotation = sample(asset.field, asset.place, parameters)
     properties = normalize_properties(annotation.properties, asset.store.normalization)
     changes = np.abs(properties - asset.properties).max(axis=1)
+    both = annotation.valid & asset.valid
+    valid, material = annotation.valid != asset.valid, annotation.material != asset.material
+    share = float(annotation.valid.mean())
+    if asset.merged:
+        valid, material = annotation.valid & ~asset.valid, material & both & (asset.votes == 1)
+        both &= ~(asset.spread > 0).any(axis=1)
+        share = float(asset.valid.mean())
     differences = {
-        "voxel/valid": annotation.valid != asset.valid,
-        "voxel/material": annotation.material != asset.material,
-        "voxel/properties": np.where(annotation.valid & asset.valid, changes, 0.0),
+        "voxel/valid": valid,
+        "voxel/material": material,
+        "voxel/properties": np.where(both, changes, 0.0),
         "voxel/distance": np.abs(annotation.distance - asset.distance),
     }
-    return float(annotation.valid.mean()), {
-        name: difference.astype(np.float64) for name, difference in differences.items()
-    }
+    return share, {name: difference.astype(np.float64) for name, difference in differences.items()}
 
 
 def choose_assets(

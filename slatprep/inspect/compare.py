@@ -19,12 +19,14 @@ from slatprep.provenance.stored import StoredRecords
 from slatprep.records import RESOLUTION, Place
 from slatprep.store import Store, open_store
 from slatprep.store.assets import ASSET_COLUMNS
-from slatprep.store.layout import ARRAYS
+from slatprep.store.layout import ARRAYS, MERGED
 from slatprep.workers import Progress
 from slatprep.workers.local import run_in_order
 
 _VOXEL_ARRAYS = tuple(
-    layout.name.removeprefix("voxel/") for layout in ARRAYS if layout.name.startswith("voxel/")
+    layout.name.removeprefix("voxel/")
+    for layout in (*ARRAYS, *MERGED)
+    if layout.name.startswith("voxel/")
 )
 
 _ROUNDING = 1e-6

@@ -9,6 +9,7 @@ from slatprep.judge.verdict import (
     contradicted,
     judge,
     judge_with_voxels,
+    merged,
     verdict_of,
     voxel_confidence,
 )
@@ -20,6 +21,7 @@ __all__ = [
     "judge",
     "judge_with_voxels",
     "measure_ambiguity",
+    "merged",
     "verdict_of",
     "voxel_confidence",
 ]

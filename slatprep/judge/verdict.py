@@ -129,6 +129,37 @@ def contradicted(judgement: Judgement) -> Judgement:
     return replace(judgement, verdict=verdict, reasons=reasons, contradicted=True)
 
 
+def merged(judgement: Judgement, annotation: Annotation) -> Judgement:
+    """Return what several annotations are worth together.
+
+    Parameters
+    ----------
+    judgement : Judgement
+        Of the first of them, by its own labels.
+    annotation : Annotation
+        What `slatprep.sample.merge` made of all.
+
+    Returns
+    -------
+    Judgement
+        With the share of right labels that can be expected of the merged ones; doubtful
+        where that is too low because they differ.
+    """
+    valid = annotation.valid
+    likely = np.zeros(1) if annotation.confidence is None else annotation.confidence[valid]
+    expected = float(likely.mean(dtype=np.float64)) if valid.any() else 0.0
+    together = replace(judgement, expected_accuracy=expected)
+    least = THRESHOLDS.good_accuracy
+    if not expected < least <= judgement.expected_accuracy:
+        return together
+    verdict = Verdict.DOUBTFUL if judgement.verdict is Verdict.GOOD else judgement.verdict
+    reason = (
+        f"its annotations differ: only {expected:.1%} of the labels can be expected to be right "
+        f"(good: {least:.0%})"
+    )
+    return replace(together, verdict=verdict, reasons=(*judgement.reasons, reason))
+
+
 def voxel_confidence(
     field: MaterialField,
     latents: StructuredLatents,

@@ -50,6 +50,9 @@ class _Text:
 
 PlaceText = Annotated[Place, _Text]
 
+Samples = Literal["one", "first", "all", "merge"]
+"""What becomes of several annotations of one object, see `PixieverseSource`."""
+
 
 @dataclass(frozen=True)
 class PixieverseSource(_Group):
@@ -57,8 +60,10 @@ class PixieverseSource(_Group):
 
     Patterns are relative to `root` and name ``{id}`` (one path component) and
     optionally ``{sample}``; the first grid pattern that matches anything for
-    an object is used. `sample` chooses among several samples of an object;
-    left empty, an object with more than one sample is a fault. `adapter` is
+    an object is used. `sample` names the one to take of an object's samples,
+    `samples` says what becomes of several otherwise: a fault (``one``), the
+    lowest is taken (``first``), each is an asset of its own (``all``), or they
+    become one asset with labels merged of all (``merge``). `adapter` is
     what reads it, one of `slatprep.readers.adapters.SOURCES` or another
     package's. `transform` is, for the engine ``known``, the file with the
     transform to the SLAT frame: one for all, or a pattern that names ``{id}``.
@@ -72,11 +77,14 @@ class PixieverseSource(_Group):
     mask: tuple[str, ...] = ("{id}/clip_features_mask.npy", "{id}/sample_{sample}_mask.npy")
     bounds: tuple[str, ...] = ("{id}/clip_features.npz",)
     sample: str = ""
+    samples: Samples = "one"
     adapter: str = "pixieverse"
     transform: str = ""
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "root", place_of(self.root))
+        if self.sample and self.samples != "one":
+            raise ValueError("samples = 'one' where `sample` names the one to take")
 
 
 @dataclass(frozen=True)
@@ -271,6 +279,11 @@ class BuildParameters(_Group):
     def __post_init__(self) -> None:
         if self.pixieverse.transform and self.align.engine is not Engine.KNOWN:
             raise ValueError('align.engine = "known", as pixieverse.transform is given')
+        if self.pixieverse.samples == "merge" and (self.consensus.settle or self.witness.settle):
+            raise ValueError(
+                "pixieverse.samples of one, first or all with --consensus or --witness: these "
+                "place an asset anew, and each of merged annotations has a placement of its own"
+            )
 
 
 @dataclass(frozen=True)

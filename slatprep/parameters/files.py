@@ -40,6 +40,7 @@ _UNKNOWN_KEY = "unexpected_keyword_argument"
 OPTIONS = {
     "pixieverse.root": "--pixieverse",
     "slat.root": "--slat",
+    "pixieverse.samples": "--samples",
     "slat.encoder": "--encoder",
     "pairing.map": "--map",
     "normalize.ranges": "--ranges",

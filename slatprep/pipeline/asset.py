@@ -11,22 +11,19 @@ import time
 import traceback
 from dataclasses import replace
 
-from slatprep.align import align
-from slatprep.align.deformation import map_of
 from slatprep.errors import MissingPartnerError, SlatprepError, StoreError
-from slatprep.judge import judge_with_voxels, voxel_confidence
 from slatprep.parameters import BuildParameters
 from slatprep.pipeline.context import BuildContext
 from slatprep.pipeline.plan import Action, PlannedAsset
 from slatprep.pipeline.previous import PreviousBuild
 from slatprep.pipeline.recipe import Recipe
+from slatprep.pipeline.several import place, process_several
 from slatprep.pipeline.spool import FailedAsset, Spool, SpooledAsset
 from slatprep.provenance.make import record_of, record_of_failed
 from slatprep.provenance.record import AssetRecord
 from slatprep.readers import read_field, read_latents
-from slatprep.readers.identity import reading_of, source_digests
+from slatprep.readers.identity import hash_sources, reading_of, source_digests
 from slatprep.records import AssetPair, Failed, Finished, Status
-from slatprep.sample import sample
 from slatprep.storage.faults import reached
 
 
@@ -55,21 +52,14 @@ def process_asset(
     InputError
         If a source cannot be used or a partner is missing.
     """
+    if pair.others:
+        return process_several(pair, parameters, known.merged if known else ())
     field = read_field(pair, parameters.sample.max_unphysical)
     latents = read_latents(pair)
     reached("asset read", pair.asset_id)
-    alignment = known.alignment if known else align(field, latents, parameters.align)
-    reached("asset reused" if known else "asset aligned", pair.asset_id)
-    annotation = sample(field, map_of(alignment).places(latents.coords), parameters.sample)
-    if known:
-        judgement = known.judgement
-        likely = voxel_confidence(field, latents, alignment, annotation, judgement.confidence)
-    else:
-        judgement, likely = judge_with_voxels(
-            field, latents, alignment, annotation, parameters.sample
-        )
-    annotation = replace(annotation, confidence=likely)
-    return Finished(pair, field, latents, alignment, annotation, judgement)
+    before = (known.alignment, known.judgement) if known else ()
+    placed = place(pair, field, latents, parameters, *before)
+    return Finished(pair, field, latents, placed.alignment, placed.annotation, placed.judgement)
 
 
 def finish_asset(
@@ -113,7 +103,7 @@ def finish_asset(
         return _failed(_failure(pair, error), context, time.perf_counter() - begin)
     seconds = time.perf_counter() - begin
     record = record_of(asset, context.parameters, context.recipe.code, key, seconds)
-    kept = context.spool.put(record, asset.field, asset.latents, asset.annotation)
+    kept = context.spool.put(record, asset.field, asset.latents, asset.annotation, asset.others)
     return replace(kept, damaged=damaged)
 
 
@@ -155,6 +145,8 @@ def _repeated(
 
 
 def _key(asset: Finished, recipe: Recipe) -> str:
+    if asset.pair.others:
+        return recipe.key(asset.pair.asset_id, hash_sources(asset.pair)[1])
     sources = asset.field.sources + asset.latents.sources
     shared = asset.latents if asset.pair.slat_group else None
     digests = source_digests(sources, shared) | reading_of(asset.pair.roots)

@@ -27,7 +27,7 @@ from slatprep.provenance.make import origin
 from slatprep.records import AssetPair, Contents, LatentMoments, Normalization
 from slatprep.storage.files import take_file
 from slatprep.storage.place import storage_of
-from slatprep.store.layout import ARRAYS, rows_per_shard
+from slatprep.store.layout import ARRAYS, MERGED, rows_per_shard
 from slatprep.store.records import RECORD_ARRAY, RECORDS_IN_SHARD
 from slatprep.store.unmoved import Unmoved, unmoved
 
@@ -54,6 +54,8 @@ class KeptAsset:
         Of its latents.
     names : Names or None
         Where its record has other ones.
+    several : bool
+        Whether its labels are merged of several annotations.
     """
 
     asset_id: str
@@ -64,6 +66,7 @@ class KeptAsset:
     clipped: NDArray[np.int64]
     latents: LatentMoments | None
     names: Names | None = None
+    several: bool = False
 
 
 MOST_BEHIND = 0.1
@@ -125,12 +128,11 @@ def kept_assets(
         if found is None:
             return None
         row = store.find(pair.asset_id)
-        kept.append(
-            KeptAsset(pair.asset_id, planned.key, row, sizes[row], *found[1:], planned.names)
-        )
+        told = (*found[1:], planned.names, bool(pair.others))
+        kept.append(KeptAsset(pair.asset_id, planned.key, row, sizes[row], *told))
     rows: list[Row] = [*kept, *made]
-    if not rows:
-        return None
+    if not rows or store.merges != any(asset.several for asset in rows):
+        return None  # An array more, or less, is written anew.
     extents = [asset.extent for asset in rows]
     ranges = given or ranges_from_extents(extents, normalize.ranges, declared.properties)
     return kept if ranges == store.normalization else None
@@ -223,7 +225,8 @@ class Carried:
             "grid": parameters.grid_assets_per_shard,
             "record": RECORDS_IN_SHARD,
         }
-        arrays = [(layout.name.partition("/")[0], layout.name) for layout in ARRAYS]
+        layouts = (*ARRAYS, *(MERGED if store.merges else ()))
+        arrays = [(layout.name.partition("/")[0], layout.name) for layout in layouts]
         digests = self.previous.digests
         taken: dict[str, str] = {}
         records = set()

@@ -44,7 +44,7 @@ from slatprep.storage.place import storage_of
 from slatprep.store import Store, open_store
 from slatprep.store.layout import FORMAT_VERSION
 from slatprep.store.shard_writer import ShardWriter
-from slatprep.store.writer import create_store, finish_store, shards
+from slatprep.store.writer import create_store, finish_store, merges, shards
 from slatprep.workers import Progress
 
 NO_ROOT, APART = "unknown", " | "
@@ -289,7 +289,8 @@ def write_rows(
         store, records = work.scratch / "store.zarr", work.scratch / "assets.jsonl"
         with writing(str(place.out), work_directory(place.store).parent):
             offsets = [0, *accumulate(asset.n_voxels for asset in assets)]
-            create_store(store, len(rows), offsets[-1], parameters.store, contents)
+            several = any(asset.several for asset in assets)
+            create_store(store, len(rows), offsets[-1], parameters.store, contents, several)
             write_assets(store, assets, offsets, normalization)
             _copy_rows(store, rows, offsets, normalization, parameters.store, progress)
             own = enumerate(_records(rows, normalization))
@@ -354,22 +355,29 @@ def _copy_rows(
         with ExitStack() as stack:
             writers = {
                 name: stack.enter_context(ShardWriter(path, name, shard.rows[0]))
-                for name in arrays_in(shard.group)
+                for name in arrays_in(shard.group, merges(path))
             }
             for asset, own in owners(shard, *shard.rows):
                 source, row = rows[shard.first + asset]
                 change = _renormaliser(source.store.normalization, normalization)
                 values_of = stored_rows(source.store, shard.group, row, own, source.records.rows)
-                for name, values in values_of.items():
-                    writers[name].append(change(values, name))
+                for name, writer in writers.items():
+                    if name in values_of:
+                        writer.append(change(values_of[name], name))
+                    else:
+                        writer.append_fill(own.stop - own.start)
 
 
 def _renormaliser(
     old: Normalization, new: Normalization
 ) -> Callable[[NDArray[Any], str], NDArray[Any]]:
     """Return what brings the rows of an array, by its name, from one set of ranges to another."""
+    before, after = ([span.hi - span.lo for span in ranges.ranges] for ranges in (old, new))
+    scale = np.divide(before, after)
 
     def change(values: NDArray[Any], name: str) -> NDArray[Any]:
+        if old != new and name == "voxel/spread":
+            return (values * scale).astype(np.float32)
         if old == new or not name.endswith("/properties"):
             return values
         last = np.moveaxis(values, 1, -1)  # (N, 3), or of a grid (1, x, y, z, 3)

@@ -22,9 +22,9 @@ from slatprep.readers.encoders import ENOUGH, in_words, look_standardised, settl
 from slatprep.records import BACKGROUND, UNANNOTATED, Contents, LatentSpace, Normalization
 from slatprep.storage.faults import reached
 from slatprep.store import Store
-from slatprep.store.layout import ARRAYS, ArrayLayout, overlaps
+from slatprep.store.layout import ARRAYS, MERGED, ArrayLayout, overlaps
 from slatprep.store.shard_writer import ShardWriter
-from slatprep.store.writer import Shard, create_store, open_for_writing, shards
+from slatprep.store.writer import Shard, create_store, merges, open_for_writing, shards
 from slatprep.workers.local import Jobs, run_unordered
 
 Arrays = dict[str, NDArray[Any]]
@@ -68,7 +68,7 @@ def write_shard(
     with ExitStack() as stack:
         writers = {
             name: stack.enter_context(ShardWriter(path, name, shard.rows[0]))
-            for name in arrays_in(shard.group)
+            for name in arrays_in(shard.group, merges(path))
         }
         for same, *rows in shard.pieces or ((False, *shard.rows),):
             if same and held is not None:
@@ -85,16 +85,20 @@ def write_shard(
                 else:
                     arrays, counts = arrays_of(spool, str(key), own, normalization)
                     clipped[asset] += counts
-                for array, values in arrays.items():
-                    writers[array].append(values)
+                for array, writer in writers.items():
+                    if array in arrays:
+                        writer.append(arrays[array])
+                    else:
+                        writer.append_fill(own.stop - own.start)
         reached("shard filled", name)
     reached("shard written", name)
     return shard, clipped
 
 
-def arrays_in(group: str) -> list[str]:
-    """Return the full names of a group's arrays."""
-    return [layout.name for layout in ARRAYS if layout.name.startswith(f"{group}/")]
+def arrays_in(group: str, several: bool) -> list[str]:
+    """Return the full names of a group's arrays; those of merged labels where there are any."""
+    layouts = (*ARRAYS, *(MERGED if several else ()))
+    return [layout.name for layout in layouts if layout.name.startswith(f"{group}/")]
 
 
 def owners(shard: Shard, start: int, stop: int) -> Iterator[tuple[int, slice]]:
@@ -117,7 +121,7 @@ def stored_rows(
     read = read or store.read_rows
     begin = int(store.offsets[row]) if group == "voxel" else row
     rows = begin + own.start, begin + own.stop
-    return {name: read(name, *rows) for name in arrays_in(group)}
+    return {name: read(name, *rows) for name in arrays_in(group, store.merges)}
 
 
 def _voxel_rows(
@@ -125,6 +129,8 @@ def _voxel_rows(
 ) -> tuple[Arrays, NDArray[np.int64]]:
     arrays = {name: array[own] for name, array in spool.voxels(key).items()}
     arrays["properties"], clipped = normalize_and_count(arrays["properties"], normalization)
+    if "spread" in arrays:
+        arrays["spread"] = normalize_change(arrays["spread"], normalization).astype(np.float32)
     return {f"voxel/{name}": array for name, array in arrays.items()}, clipped
 
 
@@ -233,7 +239,8 @@ def pack_store(
     """Write the store's arrays, a task a shard; take over what `carried` has."""
     keys = [asset.row if isinstance(asset, KeptAsset) else asset.key for asset in assets]
     offsets = [0, *accumulate(asset.n_voxels for asset in assets)]
-    create_store(path, len(keys), offsets[-1], parameters, contents)
+    several = any(asset.several for asset in assets)
+    create_store(path, len(keys), offsets[-1], parameters, contents, several)
     reached("store created", path.name)
     previous = carried.previous if carried else None
     write_assets(path, assets, offsets, normalization, previous.store if previous else None)

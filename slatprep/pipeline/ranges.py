@@ -72,7 +72,7 @@ def dataset_ranges(
 
     Percentiles are over the annotated voxels of all fields together, each alike and each
     field once, and interpolated in mapped units, as numpy and Pixie (``inspect_ranges.py``,
-    which draws 2,000,000 of them) do.
+    which draws 2,000,000 of them) do; of annotations that are merged, the first counts.
 
     Parameters
     ----------
@@ -98,7 +98,7 @@ def dataset_ranges(
     percentiles = percentiles_of(parameters.ranges)
     if percentiles is None:
         return ranges_from_extents([asset.extent for asset in chosen], source, table)
-    keys = [asset.key for asset in chosen]
+    keys = list({_field_of(asset): asset.key for asset in reversed(chosen)}.values())
     coarse = _counted(spool, keys, jobs, len(table))
     place = (sum(coarse[0].values()) - 1) * np.array(percentiles) / 100
     ranks = np.concatenate([np.floor(place), np.ceil(place)]).astype(int).tolist()
@@ -119,17 +119,22 @@ def dataset_ranges(
 def _chosen(
     usable: Sequence[SpooledAsset], parameters: NormalizeParameters
 ) -> Sequence[SpooledAsset]:
-    """Return an asset of each object that counts."""
-    by_object = {str(asset.columns["object_id"]): asset for asset in reversed(usable)}
-    if parameters.objects == "train":
-        valid = [asset for asset in usable if asset.n_valid]
-        trained = _trained(
-            {str(asset.columns["object_id"]): str(asset.columns["category"]) for asset in valid},
-            parameters,
-            {asset.asset_id: str(asset.columns["object_id"]) for asset in valid},
-        )
-        by_object = {name: asset for name, asset in by_object.items() if name in trained}
-    return list(by_object.values())
+    """Return the assets of the objects that count."""
+    if parameters.objects != "train":
+        return usable
+    valid = [asset for asset in usable if asset.n_valid]
+    trained = _trained(
+        {str(asset.columns["object_id"]): str(asset.columns["category"]) for asset in valid},
+        parameters,
+        {asset.asset_id: str(asset.columns["object_id"]) for asset in valid},
+    )
+    return [asset for asset in usable if str(asset.columns["object_id"]) in trained]
+
+
+def _field_of(asset: SpooledAsset) -> tuple[str, str]:
+    """Return what tells an asset's field from others: views of an object have it in common."""
+    object_id, view = str(asset.columns["object_id"]), str(asset.columns["view"])
+    return object_id, asset.asset_id.removeprefix(object_id).removeprefix(f".{view}")
 
 
 def _trained(

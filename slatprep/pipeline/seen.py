@@ -183,9 +183,13 @@ def look(pairs: Sequence[AssetPair]) -> dict[str, bytes]:
 
 def _state_of(pair: AssetPair) -> bytes:
     names = (pair.asset_id, pair.object_id, pair.view, pair.category, pair.slat_group,
-             str(pair.roots.pixieverse), str(pair.roots.slat), pair.problem)  # fmt: skip
+             str(pair.roots.pixieverse), str(pair.roots.slat),
+             *(one.problem for one in pair.annotations))  # fmt: skip
     states: list[object] = [names]
-    for file in (pair.grid, pair.mask, pair.bounds, pair.slat, pair.beside, pair.transform):
+    files = [pair.slat]
+    for one in pair.annotations:
+        files += [one.grid, one.mask, one.bounds, one.beside, one.transform]
+    for file in files:
         state = None if file is None else _file_state(file)
         if state == ():
             return _UNKNOWN

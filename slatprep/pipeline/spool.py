@@ -13,6 +13,7 @@ from __future__ import annotations
 import hashlib
 import uuid
 import zipfile
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -41,6 +42,9 @@ Arrays = dict[str, NDArray[Any]]
 
 _VOXEL_ARRAYS = ("coords", "feats", "properties", "material", "valid", "distance", "place",
                  "confidence")  # fmt: skip
+_MERGED = ("spread", "votes")
+"""Arrays of an asset whose labels are merged of several annotations."""
+
 _TORN = (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile, StoreError)
 
 
@@ -66,6 +70,8 @@ class SpooledAsset:
         Of its latents; None where its record does not tell.
     damaged : str
         Why, in words, what an older store holds of it was not taken over.
+    several : bool
+        Whether its labels are merged of several annotations.
     """
 
     asset_id: str
@@ -77,6 +83,7 @@ class SpooledAsset:
     columns: dict[str, Column]
     latents: LatentMoments | None = None
     damaged: str = ""
+    several: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -110,19 +117,25 @@ class Spool:
         field: MaterialField,
         latents: StructuredLatents,
         annotation: Annotation,
+        others: Sequence[MaterialField] = (),
     ) -> SpooledAsset:
         """Write an asset's record and arrays; return what the parent keeps.
+
+        Of `others`, the further fields whose annotations are merged, the extent alone is kept.
 
         Raises
         ------
         StoreError
             If the disk does not take it; names the asset.
         """
-        extent = property_extent(field)
+        extents = [property_extent(own) for own in (field, *others)]
+        extent = np.stack([np.min(extents, axis=0)[:, 0], np.max(extents, axis=0)[:, 1]], axis=1)
         arrays: Arrays = {"extent": extent}
         if self.arrays:
             arrays |= {name: getattr(latents, name) for name in ("coords", "feats")}
             arrays |= {name: getattr(annotation, name) for name in _VOXEL_ARRAYS[2:]}
+            if annotation.spread is not None and annotation.votes is not None:
+                arrays |= {"spread": annotation.spread, "votes": annotation.votes}
             arrays |= {
                 "grid_occupancy": np.packbits(field.occupancy),
                 "grid_voxels": field.voxels,
@@ -179,7 +192,8 @@ class Spool:
     def voxels(self, key: str) -> Arrays:
         """Read an asset's rows of the ``voxel/*`` arrays, properties in SI units."""
         with np.load(self._path(key), allow_pickle=False) as arrays:
-            return {name: arrays[name] for name in _VOXEL_ARRAYS}
+            there = (name for name in (*_VOXEL_ARRAYS, *_MERGED) if name in arrays)
+            return {name: arrays[name] for name in there}
 
     def field(self, key: str) -> MaterialField:
         """Read an asset's PixieVerse field, without its sources."""
@@ -230,4 +244,5 @@ def spooled(record: AssetRecord, extent: NDArray[np.float64]) -> SpooledAsset:
         latents=record.latents,
         extent=extent,
         columns=columns_of(record),
+        several=bool(record.merged),
     )

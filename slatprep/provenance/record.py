@@ -19,6 +19,7 @@ from slatprep.parameters import AlignParameters, BuildParameters, SampleParamete
 from slatprep.records import (
     MAX_PROPERTIES,
     Alignment,
+    Contribution,
     Count,
     Digest,
     InJson,
@@ -35,6 +36,9 @@ if TYPE_CHECKING:
     pass
 
 RECORD_VERSION: Final = 2
+
+MAX_SOURCES = 256
+"""Files of one asset: several for each of its annotations, of which there are seldom many."""
 
 _CHECKED: dict[str, object] = {
     "extra": "forbid",
@@ -135,7 +139,7 @@ class AssetRecord:
     """PixieVerse category; empty where unknown."""
     status: Literal[Status.OK]
     """The asset is in the store."""
-    sources: Annotated[tuple[SourceFile, ...], MinLen(2), MaxLen(16)]
+    sources: Annotated[tuple[SourceFile, ...], MinLen(2), MaxLen(MAX_SOURCES)]
     """The files that were read."""
     bounds: dict[str, object] | None
     """World bounds as clip_features.npz states them."""
@@ -157,6 +161,10 @@ class AssetRecord:
     """The ranges of the properties; null where no store was built."""
     counts: VoxelCounts
     """Voxels of the asset."""
+    merged: Annotated[tuple[Contribution, ...], MaxLen(MAX_SOURCES)] = ()
+    """Of several annotations of the object each; what else is here is of the first of those that
+    are merged, but for the judgement's expected accuracy and the valid voxels. Left out of the
+    text where there is one annotation."""
     latents: LatentMoments | None = None
     """Mean and standard deviation of each channel of its latents, as they lie in the file."""
     warnings: Annotated[tuple[str, ...], MaxLen(256)]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Iterable, Iterator
-from dataclasses import replace
+from dataclasses import fields, replace
 from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -47,7 +47,11 @@ class RecordError(StoreError):
 def to_json(record: Record | BuildRecord, *, indent: bool = False) -> bytes:
     """Return a record as JSON in UTF-8: in one line, or indented; NaN becomes null."""
     option = orjson.OPT_SERIALIZE_NUMPY | (orjson.OPT_INDENT_2 if indent else 0)
-    return orjson.dumps(record, default=_plain, option=option)
+    written: object = record
+    if isinstance(record, AssetRecord) and not record.merged:
+        names = (one.name for one in fields(record) if one.name != "merged")
+        written = {name: getattr(record, name) for name in names}
+    return orjson.dumps(written, default=_plain, option=option)
 
 
 def read_record(text: bytes | str, where: str) -> Record:

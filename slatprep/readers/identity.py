@@ -10,7 +10,14 @@ from slatprep.errors import InputError
 from slatprep.readers.adapters import made_by
 from slatprep.readers.files import load_source, require_complete
 from slatprep.readers.slat import read_slat
-from slatprep.records import TRELLIS, AssetPair, SourceFile, SourceRoots, StructuredLatents
+from slatprep.records import (
+    TRELLIS,
+    AssetPair,
+    Place,
+    SourceFile,
+    SourceRoots,
+    StructuredLatents,
+)
 
 
 def hash_sources(pair: AssetPair) -> tuple[tuple[SourceFile, ...], dict[str, str]]:
@@ -33,18 +40,60 @@ def hash_sources(pair: AssetPair) -> tuple[tuple[SourceFile, ...], dict[str, str
     InputError
         If a file cannot be read.
     """
-    (grid, slat), space = require_complete(pair), pair.roots.contents.latents
+    if pair.others:
+        return _hash_several(pair)
+    grid, slat = require_complete(pair)
+    sources = _hash_annotation(pair, grid)
+    latents, files = _hash_slat(pair, slat)
+    sources += files
+    return tuple(sources), source_digests(sources, latents) | reading_of(pair.roots)
+
+
+def _hash_several(pair: AssetPair) -> tuple[tuple[SourceFile, ...], dict[str, str]]:
+    """Hash what is there of an object's annotations, of which some may be unreadable."""
+    sources: list[SourceFile] = []
+    digests: dict[str, str] = {}
+    faults: list[InputError] = []
+    found: Place | None = None
+    for one in pair.annotations:
+        try:
+            grid, slat = require_complete(one)
+            own, found = _hash_annotation(one, grid), slat
+        except InputError as error:
+            faults.append(error)
+            digests[f"grid {one.sample}"] = "unreadable"
+            continue
+        for role, digest in (source_digests(own) | reading_of(one.roots)).items():
+            digests[f"{role} {one.sample}"] = digest
+        sources += [file for file in own if file not in sources]
+    if found is None:
+        raise faults[0]
+    latents, files = _hash_slat(pair, found)
+    return (*sources, *files), digests | source_digests(files, latents)
+
+
+def _hash_annotation(pair: AssetPair, grid: Place) -> list[SourceFile]:
+    root = pair.roots.pixieverse
     files = [(grid, "grid")] + ([(pair.mask, "mask")] if pair.mask else [])
-    sources = [load_source(path, pair.roots.pixieverse, role)[1] for path, role in files]
+    sources = [load_source(path, root, role)[1] for path, role in files]
     if pair.bounds:
         with suppress(InputError):  # The supervision does without, and so does the reader.
-            sources.append(load_source(pair.bounds, pair.roots.pixieverse, "bounds")[1])
+            sources.append(load_source(pair.bounds, root, "bounds")[1])
     for path, role in ((pair.beside, "description"), (pair.transform, "transform")):
         if path:
-            sources.append(load_source(path, pair.roots.pixieverse, role)[1])
-    latents = read_slat(slat, pair.roots.slat, pair.slat_group, space) if pair.slat_group else None
-    sources += latents.sources if latents else [load_source(slat, pair.roots.slat, "slat")[1]]
-    return tuple(sources), source_digests(sources, latents) | reading_of(pair.roots)
+            sources.append(load_source(path, root, role)[1])
+    return sources
+
+
+def _hash_slat(
+    pair: AssetPair, slat: Place
+) -> tuple[StructuredLatents | None, tuple[SourceFile, ...]]:
+    """Return the latents, where their file holds those of others as well, and their file."""
+    if not pair.slat_group:
+        return None, (load_source(slat, pair.roots.slat, "slat")[1],)
+    space = pair.roots.contents.latents
+    latents = read_slat(slat, pair.roots.slat, pair.slat_group, space)
+    return latents, latents.sources
 
 
 def reading_of(roots: SourceRoots) -> dict[str, str]:

@@ -5,8 +5,9 @@ Only names are held: an entry per object and per SLAT, never an array.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import groupby
 
 from slatprep.errors import ConfigError, InputError, in_unicode
@@ -28,6 +29,8 @@ class _Row:
     object_id: str
     view: str
     slats: tuple[NamedSlat, ...]
+    sample: str | None = None
+    """The one of the object's samples that it is of; None where it is of all."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -90,7 +93,10 @@ def discover(parameters: BuildParameters) -> list[AssetPair]:
     slats = find_slats(slat, one_file)
     claims = {} if pairing.map is None else read_map(pairing.map, grids, slats)
     categories = {} if pairing.categories is None else read_categories(pairing.categories)
-    rows = sorted(_rows(grids, slats, claims), key=lambda row: (row.asset_id, row.object_id))
+    rows = list(_rows(grids, slats, claims))
+    if pixieverse.samples == "all":
+        rows = [own for row in rows for own in _rows_by_sample(row, grids)]
+    rows.sort(key=lambda row: (row.asset_id, row.object_id))
     folder = slat.root.parent if one_file else slat.root
     roots = SourceRoots(pixieverse.root, folder, contents_of(parameters), pixieverse.adapter)
     return list(_pairs(rows, _Found(parameters, roots, listing, one_file, grids, categories)))
@@ -170,6 +176,17 @@ def _rows(
             yield _Row(encoded(asset_id), object_id, label, ordered(group))
 
 
+def _rows_by_sample(row: _Row, grids: Mapping[str, list[FoundField]]) -> Iterator[_Row]:
+    """Yield a row for each sample of an object that has several."""
+    samples = {grid.sample for grid in grids.get(row.object_id, ())}
+    if len(samples) < 2:
+        yield row
+        return
+    for sample in sorted(samples):
+        label = f"{row.asset_id}.{encoded(f'sample_{sample}')}"
+        yield replace(row, asset_id=label, sample=sample)
+
+
 def _slats_of(
     object_id: str,
     slats: Mapping[str, list[NamedSlat]],
@@ -206,8 +223,27 @@ def _pairs(rows: list[_Row], there: _Found) -> Iterator[AssetPair]:
 
 
 def _pair(row: _Row, there: _Found, shared: str) -> AssetPair:
+    samples = there.parameters.pixieverse.samples
+    grids = sorted(there.grids.get(row.object_id, ()), key=_order_of)
+    if row.sample is not None:
+        grids = [grid for grid in grids if grid.sample == row.sample]
+    if samples == "first":
+        grids = [grid for grid in grids if grid.sample == grids[0].sample]
+    if samples != "merge":
+        return _pair_of(row, there, shared, grids)
+    apart = [list(group) for _, group in groupby(grids, key=lambda found: found.sample)]
+    first, *others = [_pair_of(row, there, shared, group) for group in apart or [[]]]
+    return replace(first, others=tuple(others))
+
+
+def _order_of(found: FoundField) -> tuple[float, str, str]:
+    """Order samples by number where they have one: 10 comes behind 2."""
+    number = float(found.sample) if found.sample.isdecimal() else math.inf
+    return number, found.sample, found.path
+
+
+def _pair_of(row: _Row, there: _Found, shared: str, grids: Sequence[FoundField]) -> AssetPair:
     source, slat_source = there.parameters.pixieverse, there.parameters.slat
-    grids = sorted(there.grids.get(row.object_id, ()), key=lambda found: found.path)
     problems = [shared, *_name_problems(row)]
     sides: tuple[FoundField | NamedSlat, ...] = (*grids, *row.slats)
     for side in sides:
@@ -256,6 +292,7 @@ def _pair(row: _Row, there: _Found, shared: str) -> AssetPair:
         problem="; ".join(dict.fromkeys(filter(None, problems))),
         transform=transform,
         beside=beside,
+        sample=grids[0].sample if grids else "",
     )
 
 
@@ -288,12 +325,13 @@ def one_grid(
     return root / found[0].path
 
 
-def _several_grids(object_id: str, grids: list[FoundField]) -> str:
+def _several_grids(object_id: str, grids: Sequence[FoundField]) -> str:
     files = ", ".join(grid.path for grid in grids)
     if len({grid.sample for grid in grids}) > 1:
         return (
             f"id {object_id!r} has {len(grids)} samples ({files}); choose one with `sample` in the "
-            "table [pixieverse] of the dataset definition"
+            "table [pixieverse] of the dataset definition, or say with --samples what becomes of "
+            "them: first, all or merge"
         )
     return f"{len(grids)} grids for one id {object_id!r} ({files}); expected one"
 

@@ -33,7 +33,14 @@ from slatprep.records.json_types import (
     Share,
     Transform,
 )
-from slatprep.records.results import Annotation, Failed, Finished, Normalization, PropertyRange
+from slatprep.records.results import (
+    Annotation,
+    Contribution,
+    Failed,
+    Finished,
+    Normalization,
+    PropertyRange,
+)
 from slatprep.records.sources import (
     AssetPair,
     MaterialField,
@@ -100,6 +107,7 @@ __all__ = [
     "Candidate",
     "Consensus",
     "Contents",
+    "Contribution",
     "Count",
     "Deformation",
     "Digest",

@@ -10,7 +10,8 @@ from annotated_types import MaxLen, MinLen
 from numpy.typing import NDArray
 
 from slatprep.records.alignment import Alignment, Judgement
-from slatprep.records.sources import AssetPair, MaterialField, StructuredLatents
+from slatprep.records.json_types import Count
+from slatprep.records.sources import AssetPair, MaterialField, SourceFile, StructuredLatents
 from slatprep.records.tables import MAX_PROPERTIES, PropertyName
 from slatprep.records.words import Status
 
@@ -25,6 +26,10 @@ class Annotation:
     PixieVerse frame, to the annotation used; ``place`` (N, 3) float32, where the
     voxel was looked up, in the PixieVerse frame; ``confidence`` (N,) float32, how
     likely the class is right, 0 where not valid, None until that is judged.
+
+    Merged of several, it has ``spread`` (N, P) float32, the standard deviation of each
+    property, of log10 where it is normalised so, NaN where fewer than two are valid; and
+    ``votes`` (N,) float32, the share of the valid ones that give its class, 0 where none is.
     """
 
     properties: NDArray[np.float32]
@@ -33,6 +38,24 @@ class Annotation:
     distance: NDArray[np.float32]
     place: NDArray[np.float32]
     confidence: NDArray[np.float32] | None = None
+    spread: NDArray[np.float32] | None = None
+    votes: NDArray[np.float32] | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Contribution:
+    """One of several annotations of an object, and what became of it in the merge."""
+
+    sample: str
+    """Which it is."""
+    sources: tuple[Count, ...]
+    """Its files, by their positions among the record's sources."""
+    left_out: str = ""
+    """Why it is no part of the merge; empty where it is."""
+    alignment: Alignment | None = None
+    """The transform from its own frame; null where it could not be read."""
+    judgement: Judgement | None = None
+    """What that alignment is worth."""
 
 
 @dataclass(frozen=True)
@@ -63,7 +86,11 @@ class Normalization:
 
 @dataclass(frozen=True, eq=False)
 class Finished:
-    """An asset that went through all stages; properties in SI units."""
+    """An asset that went through all stages; properties in SI units.
+
+    Merged of several annotations, it has a contribution for each, the files of all, and
+    the fields that were merged after the first, whose field and alignment are its own.
+    """
 
     pair: AssetPair
     field: MaterialField
@@ -71,6 +98,9 @@ class Finished:
     alignment: Alignment
     annotation: Annotation
     judgement: Judgement
+    contributions: tuple[Contribution, ...] = ()
+    sources: tuple[SourceFile, ...] = ()
+    others: tuple[MaterialField, ...] = ()
 
 
 @dataclass(frozen=True)

@@ -114,6 +114,10 @@ class AssetPair:
         empty where all is well.
     beside : Place or None
         Another file that the adapter of the source reads for it.
+    sample : str
+        Which of an object's annotations this is; empty where nothing names it.
+    others : tuple of AssetPair
+        The object's further annotations, each with the same SLAT, where they are to be merged.
     """
 
     asset_id: str
@@ -129,6 +133,13 @@ class AssetPair:
     problem: str = ""
     transform: Place | None = None
     beside: Place | None = None
+    sample: str = ""
+    others: tuple[AssetPair, ...] = ()
+
+    @property
+    def annotations(self) -> tuple[AssetPair, ...]:
+        """Every annotation of the object that goes into the row, this one first."""
+        return (self, *self.others)
 
 
 @dataclass(frozen=True, eq=False)

@@ -57,6 +57,10 @@ class Arrays:
         except (*BAD_METADATA, OSError) as error:
             raise StoreError(f"{self.path}: bad metadata ({error!r})") from None
 
+    def holds(self, name: str) -> bool:
+        """Whether the root's metadata have an array, by its full name."""
+        return name in self._metadata
+
     def reader(self, name: str) -> RowReader:
         """Return the reader of an array, by its full name.
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from slatprep.errors import StoreError, UnknownAssetError
 from slatprep.records import Place
 from slatprep.store.arrays import Arrays
-from slatprep.store.layout import ARRAYS
+from slatprep.store.layout import ARRAYS, MERGED
 from slatprep.store.shard_reader import RowReader
 
 if TYPE_CHECKING:
@@ -62,6 +62,11 @@ class AssetTable:
     def format_version(self) -> int:
         """Version of the format that it was written in."""
         return int(self.attributes["format_version"])
+
+    @property
+    def merges(self) -> bool:
+        """Whether labels of any asset are merged of several annotations."""
+        return all(self._arrays.holds(layout.name) for layout in MERGED)
 
     @cached_property
     def ids(self) -> list[str]:

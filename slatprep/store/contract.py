@@ -19,6 +19,7 @@ from slatprep.store.layout import (
     ARRAYS,
     ASSET_CHUNK,
     FIXED_SIZES,
+    MERGED,
     ArrayLayout,
 )
 from slatprep.store.records import RECORD_ARRAY
@@ -201,6 +202,7 @@ _LAYOUTS = {
     layout.name: layout
     for layout in (
         *ARRAYS,
+        *MERGED,
         ArrayLayout(RECORD_ARRAY, "str", ("asset",), "", ""),
         *(
             ArrayLayout(f"{GROUP}/{name}", dtype, ("file",), "", "")

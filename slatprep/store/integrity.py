@@ -19,7 +19,7 @@ from slatprep.store.contract import (
 )
 from slatprep.store.digests import ATTRIBUTES, attributes_digest, is_own
 from slatprep.store.gate import GROUPS, gate_findings
-from slatprep.store.layout import READABLE_VERSIONS, arrays_of
+from slatprep.store.layout import MERGED, READABLE_VERSIONS, arrays_of
 from slatprep.store.reader import Store
 from slatprep.workers.local import Jobs, run_unordered
 
@@ -65,7 +65,11 @@ def metadata_findings(path: Place) -> Iterator[Finding]:
     except StoreError as error:
         yield Finding("zarr.json", "", str(error), "shapes of the arrays")
         return
-    for layout in layouts:
+    merged = [layout.name for layout in MERGED if layout.name in arrays]
+    if len(merged) == 1:
+        both = " and ".join(layout.name for layout in MERGED)
+        yield Finding("zarr.json", "", f"has {merged[0]} alone", f"{both}, or neither")
+    for layout in (*layouts, *MERGED):
         if layout.name in arrays:
             yield from array_findings(layout.name, arrays[layout.name], sizes)
 

@@ -1,7 +1,7 @@
 """What lies where in the store: arrays, chunks, shards, attributes.
 
-The one table of arrays is `ARRAYS`; writer and reader take names, types and
-shapes from it. Rows of ``voxel/*`` and ``grid/*`` are cut into shards by
+The tables of arrays are `ARRAYS` and `MERGED`; writer and reader take names, types and
+shapes from them. Rows of ``voxel/*`` and ``grid/*`` are cut into shards by
 `row_ranges`, and `overlaps` says which assets lie in one.
 """
 
@@ -236,11 +236,33 @@ ARRAYS = (
         "class 0..6, 7 background, 255 occupied but not annotated",
     ),
 )
-"""Every array of the store."""
+"""Every array of any store."""
+
+MERGED = (
+    ArrayLayout(
+        "voxel/spread",
+        "float32",
+        ("voxel", "property"),
+        NAN,
+        "standard deviation of normalised properties over the annotations, NaN where not several",
+        packing="exponents",
+        since=2,
+    ),
+    ArrayLayout(
+        "voxel/votes",
+        "float32",
+        ("voxel",),
+        NAN,
+        "share of the annotations that give the class, 0 where not valid, NaN where not several",
+        packing="repeats",
+        since=2,
+    ),
+)
+"""What a store has besides where labels of any asset are merged of several annotations."""
 
 
 def arrays_of(version: int) -> tuple[ArrayLayout, ...]:
-    """Return the arrays that a store of a format version has."""
+    """Return the arrays that every store of a format version has."""
     return tuple(layout for layout in ARRAYS if layout.since <= version)
 
 
@@ -301,6 +323,7 @@ def create_arrays(
     n_voxels: int,
     parameters: StoreParameters,
     contents: Contents = PIXIEVERSE,
+    several: bool = False,
 ) -> None:
     """Create every array of the store, empty.
 
@@ -314,6 +337,8 @@ def create_arrays(
         Sizes of chunks and shards, and the compression level.
     contents : Contents
         How many properties and channels there are.
+    several : bool
+        Whether labels are merged of several annotations.
     """
     sizes = {
         "asset": n_assets,
@@ -328,7 +353,7 @@ def create_arrays(
         "voxel": (parameters.voxel_chunk, rows_per_shard(parameters)),
         "grid": (1, parameters.grid_assets_per_shard),
     }
-    for layout in ARRAYS:
+    for layout in (*ARRAYS, *(MERGED if several else ())):
         shape = tuple(sizes[dimension] for dimension in layout.dimensions)
         chunk, shard = chunk_and_shard[layout.name.partition("/")[0]]
         if shard is None:

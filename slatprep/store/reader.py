@@ -22,7 +22,7 @@ from slatprep.storage.versions import store_name
 from slatprep.store.assets import ASSET_COLUMNS, AssetTable
 from slatprep.store.attributes import RootAttributes, read_attributes, width_findings
 from slatprep.store.contract import MAX_VOXELS, read_metadata
-from slatprep.store.layout import ARRAYS, FORMAT, READABLE_VERSIONS
+from slatprep.store.layout import ARRAYS, FORMAT, MERGED, READABLE_VERSIONS
 
 if TYPE_CHECKING:
     import zarr
@@ -32,7 +32,7 @@ TRAINING_COLUMNS = ("coords", "feats", "properties")
 
 _VOXEL_COLUMNS = [
     name
-    for layout in ARRAYS
+    for layout in (*ARRAYS, *MERGED)
     for group, _, name in (layout.name.partition("/"),)
     if group == "voxel"
 ]
@@ -71,6 +71,12 @@ class StoredAsset:
     place : ndarray of float32, shape (N, 3)
         Where each voxel was looked up, in the PixieVerse frame. A store of
         format 1 does not hold it: there the inverse of the transform leads to it.
+    spread : ndarray of float32, shape (N, P)
+        Standard deviation of each normalised property over the annotations that the labels
+        are merged of, NaN where fewer than two are valid.
+    votes : ndarray of float32, shape (N,)
+        Share of the valid annotations that give the class, 0 where none is valid; NaN where
+        the asset has one annotation.
     transform : ndarray of float64, shape (4, 4)
         PixieVerse frame to SLAT frame, a similarity; a deformation that follows
         it is in the record, see `slatprep.provenance.stored.StoredRecords.place_map`.
@@ -90,12 +96,19 @@ class StoredAsset:
     distance: NDArray[np.float32]
     place: NDArray[np.float32]
     confidence: NDArray[np.float32]
+    spread: NDArray[np.float32]
+    votes: NDArray[np.float32]
     transform: NDArray[np.float64]
     columns: dict[str, Any]
 
     def __repr__(self) -> str:
         what = f"{self.columns['category'] or 'category unknown'}, {self.columns['verdict']}"
         return f"<StoredAsset {self.asset_id}: {what}, {len(self.coords):,} voxels>"
+
+    @property
+    def merged(self) -> bool:
+        """Whether its labels are merged of several annotations."""
+        return not np.isnan(self.votes[:1]).all()
 
     @cached_property
     def properties_si(self) -> NDArray[np.float32]:
@@ -251,7 +264,7 @@ class Store(AssetTable):
         columns : sequence of str
             Last names of ``voxel/*`` arrays: ``coords``, ``feats``,
             ``properties``, ``material``, ``valid``, ``distance``, ``place``,
-            ``confidence``.
+            ``confidence``, ``spread``, ``votes``.
 
         Returns
         -------
@@ -310,6 +323,9 @@ class Store(AssetTable):
             return places_of(coords, self._column("transform")[index]).astype(np.float32)
         if name == "confidence" and self.format_version == 1:
             return np.full(stop - start, np.nan, dtype=np.float32)
+        if name in ("spread", "votes") and not self.merges:
+            columns = [len(self.about.property_columns)] if name == "spread" else []
+            return np.full([stop - start, *columns], np.nan, dtype=np.float32)
         return self.read_rows(f"voxel/{name}", start, stop)
 
 

@@ -68,6 +68,11 @@ class ShardWriter:
             if self._rows == len(self._chunk):
                 self._flush(self._chunk)
 
+    def append_fill(self, rows: int) -> None:
+        """Take so many rows of the array's fill value."""
+        shape = (rows, *self._chunk.shape[1:])
+        self.append(np.full(shape, self._fill_value, self._chunk.dtype))
+
     def append_packed(self, data: bytes, lengths: Iterable[int]) -> None:
         """Take the next chunks as `RowReader.packed` gives them; the last rows filled one."""
         if self._rows:

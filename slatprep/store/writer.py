@@ -18,6 +18,7 @@ from slatprep.records import PIXIEVERSE, Contents, Normalization
 from slatprep.store.coordinates import write_coordinates
 from slatprep.store.digests import write_digests
 from slatprep.store.layout import (
+    MERGED,
     create_arrays,
     overlaps,
     root_attributes,
@@ -65,13 +66,19 @@ def create_store(
     n_voxels: int,
     parameters: StoreParameters,
     contents: Contents = PIXIEVERSE,
+    several: bool = False,
 ) -> None:
-    """Create an empty store with every array in place."""
+    """Create an empty store with every array in place; see `create_arrays`."""
     import zarr
 
     root = zarr.create_group(path, zarr_format=3)
-    create_arrays(root, n_assets, n_voxels, parameters, contents)
+    create_arrays(root, n_assets, n_voxels, parameters, contents, several)
     create_record_array(root, n_assets, parameters.compression_level)
+
+
+def merges(path: Path) -> bool:
+    """Whether a store that `create_store` made has arrays of merged labels."""
+    return all((path / layout.name).is_dir() for layout in MERGED)
 
 
 def shards(

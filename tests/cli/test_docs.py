@@ -16,7 +16,7 @@ import pytest
 
 from slatprep.parameters import BuildParameters
 from slatprep.parameters.files import load_parameters
-from slatprep.store.layout import ARRAYS
+from slatprep.store.layout import ARRAYS, MERGED
 
 ROOT = Path(__file__).parents[2]
 PAGES = sorted([*ROOT.glob("*.md"), *ROOT.glob("docs/*.md"), *ROOT.glob("manifests/*.md")])
@@ -90,7 +90,7 @@ def test_formats_describes_every_array() -> None:
     text = (ROOT / "docs" / "formats.md").read_text("utf-8")
     rows = re.findall(r"^\| `((?:asset|voxel|grid)/\w+)` \| \(([^)]*)\) \| (\w+) \|", text, re.M)
     documented = {name: (len(re.findall(r"\w+", shape)), dtype) for name, shape, dtype in rows}
-    expected = {array.name: (len(array.dimensions), array.dtype) for array in ARRAYS}
+    expected = {array.name: (len(array.dimensions), array.dtype) for array in (*ARRAYS, *MERGED)}
     # (A+1,) counts as two words; it is one dimension.
     documented["asset/offset"] = (1, documented["asset/offset"][1])
     assert documented == expected

@@ -78,6 +78,37 @@ def test_several_samples_need_a_choice(find):
     assert pair.problem == ""
     assert pair.grid.parent.name == "sample_1"
 
+
+def test_several_samples_by_number(find):
+    numbers = (10, 0, 2)
+    touched = [f"a/sample_{k}_{what}.npy" for k in numbers for what in ("pred", "mask")]
+    (pair,) = find(touched, ["a.npz"], pixieverse={"samples": "first"})
+    assert (pair.problem, pair.sample, pair.others) == ("", "0", ())
+
+    (pair,) = find(pixieverse={"samples": "merge"})
+    assert [one.sample for one in pair.annotations] == ["0", "2", "10"]
+    for one in pair.annotations:
+        assert one.problem == ""
+        assert one.asset_id == "a"
+        assert one.grid.name == f"sample_{one.sample}_pred.npy"
+        assert one.mask.name == f"sample_{one.sample}_mask.npy"
+        assert one.slat == pair.slat
+
+
+def test_each_sample_with_each_view(find):
+    files = [f"a/sample_{k}/material_grid.npy" for k in (0, 1)]
+    pairs = find(files, ["a/left.npz", "a/right.npz"], pixieverse={"samples": "all"})
+    assert [pair.asset_id for pair in pairs] == [
+        f"a.{view}.sample_{k}" for view in ("left", "right") for k in (0, 1)
+    ]
+    assert {pair.view for pair in pairs} == {"left", "right"}
+    assert all(not pair.problem for pair in pairs)
+
+
+def test_one_sample_is_named_or_all_are_asked_for(find):
+    with pytest.raises(ValueError, match="samples = 'one' where `sample` names"):
+        find([grid("a")], ["a.npz"], pixieverse={"samples": "merge", "sample": "1"})
+
     (pair,) = find([grid("b")], ["b.npz"], pixieverse={"sample": "1"})[1:]
     assert "looked for b/sample_1/material_grid.npy" in pair.problem
 

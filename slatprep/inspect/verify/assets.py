@@ -131,6 +131,16 @@ def value_findings(asset: StoredAsset) -> Iterator[Finding]:
             "no probability, or one where there is no class",
             "0 to 1 where valid, 0 elsewhere",
         ),
+        "voxel/spread": (
+            _is_spread(asset),
+            "negative, or there where fewer than two annotations are",
+            "0 or more for all properties or NaN for all",
+        ),
+        "voxel/votes": (
+            not asset.merged or (((asset.votes > 0) == valid).all() and (asset.votes <= 1).all()),
+            "no share, or one where there is no class",
+            "above 0 to 1 where valid, 0 elsewhere",
+        ),
         "grid/material": (
             _IS_GRID_CLASS[asset.grid_material].all(),
             "an unknown class",
@@ -195,7 +205,7 @@ def record_findings(asset: StoredAsset, record: AssetRecord, store: Store) -> It
 
 def confidence_findings(asset: StoredAsset, record: AssetRecord) -> Iterator[Finding]:
     """Yield where ``voxel/confidence`` is not what the field, the map and the record give."""
-    if asset.store.format_version == 1:
+    if asset.store.format_version == 1 or asset.merged:
         return
     annotation = Annotation(
         asset.properties, asset.material, asset.valid, asset.distance, asset.place
@@ -233,6 +243,14 @@ def source_findings(record: AssetRecord, roots: SourceRoots, run: str) -> Iterat
 
 
 _IS_GRID_CLASS = np.isin(np.arange(256), (*range(BACKGROUND + 1), UNANNOTATED))
+
+
+def _is_spread(asset: StoredAsset) -> bool:
+    """Whether spreads are where several annotations are, of all properties, and not negative."""
+    missing = np.isnan(asset.spread)
+    may = asset.valid & asset.merged
+    rows_agree = (missing.all(axis=1) == missing.any(axis=1)).all()
+    return bool(rows_agree and missing[~may].all() and (missing | (asset.spread >= 0)).all())
 
 
 def _normalised(values: NDArray[np.float32], where: NDArray[np.bool_]) -> bool:

@@ -1,0 +1,166 @@
+"""The way of an asset that has several annotations: each by itself, then merged."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from slatprep.align import align
+from slatprep.align.deformation import map_of
+from slatprep.errors import InputError
+from slatprep.judge import judge_with_voxels, merged, voxel_confidence
+from slatprep.parameters import BuildParameters
+from slatprep.readers import read_field, read_latents
+from slatprep.readers.identity import hash_sources
+from slatprep.records import (
+    Alignment,
+    Annotation,
+    AssetPair,
+    Contribution,
+    Finished,
+    Judgement,
+    MaterialField,
+    SourceFile,
+    StructuredLatents,
+    Verdict,
+)
+from slatprep.sample import merge, sample
+from slatprep.storage.faults import reached
+
+
+@dataclass(frozen=True, eq=False)
+class Placed:
+    """One annotation of an object, looked up at the SLAT's voxels through its own alignment."""
+
+    pair: AssetPair
+    field: MaterialField
+    alignment: Alignment
+    judgement: Judgement
+    annotation: Annotation
+
+
+def place(
+    pair: AssetPair,
+    field: MaterialField,
+    latents: StructuredLatents,
+    parameters: BuildParameters,
+    alignment: Alignment | None = None,
+    judgement: Judgement | None = None,
+) -> Placed:
+    """Align a field, look it up and judge it; an alignment and a judgement that are known stand."""
+    reused = alignment is not None
+    if alignment is None:
+        alignment = align(field, latents, parameters.align)
+    reached("asset reused" if reused else "asset aligned", pair.asset_id)
+    annotation = sample(field, map_of(alignment).places(latents.coords), parameters.sample)
+    if judgement is None:
+        judgement, likely = judge_with_voxels(
+            field, latents, alignment, annotation, parameters.sample
+        )
+    else:
+        confidence = judgement.confidence
+        likely = voxel_confidence(field, latents, alignment, annotation, confidence)
+    return Placed(pair, field, alignment, judgement, replace(annotation, confidence=likely))
+
+
+def process_several(
+    pair: AssetPair, parameters: BuildParameters, known: tuple[Contribution, ...] = ()
+) -> Finished:
+    """Take an asset from several annotations of its object to one, merged.
+
+    Left out are those that cannot be used, and those whose alignment failed where that
+    of another did not. Of fields that occupy the same voxels one alignment serves all.
+
+    Parameters
+    ----------
+    pair : AssetPair
+        With others beside it.
+    parameters : BuildParameters
+        How to align and to look up.
+    known : tuple of Contribution
+        What an earlier build found of the same annotations.
+
+    Returns
+    -------
+    Finished
+        Its field, alignment, places and distances are those of the first that is merged.
+
+    Raises
+    ------
+    InputError
+        If the SLAT, or none of the annotations, can be used.
+    """
+    sources, _ = hash_sources(pair)
+    before = {one.sample: one for one in known}
+    latents: StructuredLatents | None = None
+    placed: list[Placed] = []
+    faults: dict[str, InputError] = {}
+    for one in pair.annotations:
+        try:
+            field = read_field(one, parameters.sample.max_unphysical)
+        except InputError as error:
+            faults[one.sample] = error
+            continue
+        latents = latents or read_latents(one)
+        found = before.get(one.sample)
+        alignment = found.alignment if found else _same_alignment(field, placed)
+        judgement = found.judgement if found else None
+        placed.append(place(one, field, latents, parameters, alignment, judgement))
+    if latents is None:
+        raise _refused(pair, faults)
+    good = [one for one in placed if one.judgement.verdict is not Verdict.FAILED] or placed
+    first = good[0]
+    annotation = merge([one.annotation for one in good], first.field.table)
+    told = {one.pair.sample: one for one in placed}
+    contributions = tuple(
+        _contribution(one, told.get(one.sample), faults.get(one.sample), good, sources)
+        for one in pair.annotations
+    )
+    warnings = [f"sample {one.pair.sample}: {text}" for one in good for text in one.field.warnings]
+    left_out = ((one.sample, one.left_out) for one in contributions if one.left_out)
+    warnings += [f"sample {sample} is left out: {why}" for sample, why in left_out]
+    return Finished(
+        pair,
+        replace(first.field, warnings=tuple(warnings)),
+        latents,
+        first.alignment,
+        annotation,
+        merged(first.judgement, annotation),
+        contributions,
+        sources,
+        tuple(one.field for one in good[1:]),
+    )
+
+
+def _same_alignment(field: MaterialField, placed: list[Placed]) -> Alignment | None:
+    """Return the alignment of a field with the same geometry, which is all that engines use."""
+    for one in placed:
+        frames = [own.frame is None or own.frame.tobytes() for own in (field, one.field)]
+        if frames[0] == frames[1] and np.array_equal(field.occupancy, one.field.occupancy):
+            return one.alignment
+    return None
+
+
+def _contribution(
+    pair: AssetPair,
+    placed: Placed | None,
+    fault: InputError | None,
+    good: list[Placed],
+    sources: tuple[SourceFile, ...],
+) -> Contribution:
+    if placed is None:
+        return Contribution(pair.sample, (), " ".join(str(fault).split()))
+    left_out = "" if placed in good else f"its alignment failed: {placed.judgement.reasons[0]}"
+    files = tuple(k for k, file in enumerate(sources) if file in placed.field.sources)
+    return Contribution(pair.sample, files, left_out, placed.alignment, placed.judgement)
+
+
+def _refused(pair: AssetPair, faults: dict[str, InputError]) -> InputError:
+    """Return why none of the annotations can be used; one reason where all have the same."""
+    first, *others = faults.values()
+    if all(str(other) == str(first) for other in others):
+        return first
+    reasons = "; ".join(f"sample {sample}: {error}" for sample, error in faults.items())
+    what = f"none of its {len(faults)} annotations can be used ({reasons})"
+    return InputError(f"asset {pair.asset_id!r}", what, "one that can be")

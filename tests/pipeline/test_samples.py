@@ -1,0 +1,210 @@
+"""Several annotations of one object: merged, one taken, or an asset each."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from support.faults import inject
+from support.synthetic import Dataset, make_asset
+from support.trees import records_of, tree
+
+from slatprep.errors import StoreError
+from slatprep.inspect.check import check_alignment
+from slatprep.inspect.verify import verify_store
+from slatprep.parameters import BuildParameters, ConsensusParameters, Samples
+from slatprep.pipeline.dataset import BuildSummary, build_store, plan_build
+from slatprep.store import open_store
+
+MakeDataset = Callable[..., Dataset]
+
+FACTORS = (1.0, 3.0, 0.7)
+"""What the samples of object ``a`` make of Young's modulus."""
+
+
+def asked(dataset: Dataset, samples: Samples) -> BuildParameters:
+    parameters = dataset.parameters()
+    return replace(parameters, pixieverse=replace(parameters.pixieverse, samples=samples))
+
+
+def write_sample(dataset: Dataset, object_id: str, sample: int, grid: np.ndarray) -> None:
+    path = dataset.root / "pixieverse" / object_id / f"sample_{sample}" / "material_grid.npy"
+    path.parent.mkdir(parents=True, exist_ok=True)
+    np.save(path, grid)
+
+
+def sample_grid(seed: int, factor: float, metal: int = 1) -> np.ndarray:
+    """Return the grid of an asset, with another modulus and another word for its metal."""
+    grid = make_asset(seed).grid.copy()
+    grid[grid[..., 3] == 1, 3] = metal
+    grid[grid[..., 3] != 7, 1] *= factor
+    return grid
+
+
+@pytest.fixture
+def several(make_dataset: MakeDataset) -> Dataset:
+    """Object ``a`` with three samples, of which the last calls the metal sand; ``b`` with one."""
+    dataset = make_dataset("a", "b")
+    for sample, factor in enumerate(FACTORS):
+        write_sample(dataset, "a", sample, sample_grid(0, factor, metal=2 if sample == 2 else 1))
+    return dataset
+
+
+@pytest.fixture
+def merged(several: Dataset, tmp_path: Path) -> BuildSummary:
+    return build_store(asked(several, "merge"), tmp_path / "merged.zarr")
+
+
+def test_labels_are_the_mean_and_the_vote_of_all(
+    several: Dataset, merged: BuildSummary, tmp_path: Path
+) -> None:
+    store = open_store(str(merged.store))
+    asset, other = store.asset("a"), store.asset("b")
+    one = build_store(asked(several, "first"), tmp_path / "first.zarr")
+    alone = open_store(str(one.store)).asset("a")
+    assert np.array_equal(alone.place, asset.place)
+    assert asset.valid.all()
+    powers = np.log10(FACTORS)
+    expected = np.log10(alone.properties_si[:, 0].astype(float)) + powers.mean()
+    np.testing.assert_allclose(np.log10(asset.properties_si[:, 0]), expected, atol=2e-6)
+    np.testing.assert_allclose(asset.properties_si[:, 1:], alone.properties_si[:, 1:], rtol=1e-5)
+    modulus = store.normalization.ranges[0]
+    width = 0.5 * (modulus.hi - modulus.lo)
+    np.testing.assert_allclose(asset.spread[:, 0] * width, np.std(powers), rtol=1e-5)
+    assert not asset.spread[:, 1:].any()
+    metal = alone.material == 1
+    assert np.array_equal(asset.material, alone.material)
+    np.testing.assert_allclose(asset.votes, np.where(metal, 2 / 3, 1.0), rtol=1e-6)
+    # The mean of the factors is 1.28: only 3 is off by a factor of more than two.
+    counted = np.where(metal, (1.0 + 0.5) / 3, (1.0 + 0.5 + 1.0) / 3)
+    np.testing.assert_allclose(asset.confidence, alone.confidence * counted, rtol=2e-2)
+    assert asset.merged
+    assert not other.merged
+    assert np.isnan(other.spread).all()
+    assert np.isnan(other.votes).all()
+
+
+def test_the_record_has_every_annotation(merged: BuildSummary) -> None:
+    records = records_of(merged.records)
+    entries = records["a"]["merged"]
+    sources = records["a"]["sources"]
+    assert [entry["sample"] for entry in entries] == ["0", "1", "2"]
+    for number, entry in enumerate(entries):
+        (position,) = entry["sources"]
+        assert sources[position]["path"] == f"a/sample_{number}/material_grid.npy"
+        assert len(sources[position]["sha256"]) == 64
+        assert entry["judgement"]["verdict"] == "good"
+        assert entry["alignment"]["transform"] == entries[0]["alignment"]["transform"]
+        assert not entry["left_out"]
+    assert "merged" not in records["b"]
+    assert records["a"]["judgement"]["verdict"] == "doubtful"
+    assert "its annotations differ" in records["a"]["judgement"]["reasons"][0]
+
+
+def test_a_store_of_merged_labels_is_sound(merged: BuildSummary) -> None:
+    assert verify_store(str(merged.store), sources=True).findings == ()
+    store = open_store(str(merged.store))
+    check = check_alignment(store, "a")
+    assert check.consistent
+
+
+def test_without_several_a_merge_is_the_build_it_was(
+    make_dataset: MakeDataset, tmp_path: Path
+) -> None:
+    dataset = make_dataset("a", "b")
+    plain = build_store(dataset.parameters(), tmp_path / "plain.zarr")
+    for samples in ("first", "all", "merge"):
+        other = build_store(asked(dataset, samples), tmp_path / f"{samples}.zarr")
+        assert tree(other.store) == tree(plain.store)
+    assert not (tmp_path / "plain.zarr/voxel/spread").exists()
+
+
+def test_any_number_of_jobs_writes_the_same_bytes(
+    several: Dataset, merged: BuildSummary, tmp_path: Path
+) -> None:
+    two = build_store(asked(several, "merge"), tmp_path / "two.zarr", jobs=2)
+    assert tree(two.store) == tree(merged.store)
+
+
+def test_each_sample_may_be_an_asset(several: Dataset, tmp_path: Path) -> None:
+    store = open_store(str(build_store(asked(several, "all"), tmp_path / "all.zarr").store))
+    assert store.ids == ["a.sample_0", "a.sample_1", "a.sample_2", "b"]
+    assert set(store.column("object_id")) == {"a", "b"}
+    moduli = [
+        store.asset(f"a.sample_{k}").properties_si[:, 0].astype(float) for k in range(len(FACTORS))
+    ]
+    for factor, modulus in zip(FACTORS, moduli, strict=True):
+        np.testing.assert_allclose(modulus, moduli[0] * factor, rtol=1e-4)
+    assert not store.merges
+
+
+def test_what_fails_is_left_out_and_named(several: Dataset, tmp_path: Path) -> None:
+    path = several.root / "pixieverse/a/sample_0/material_grid.npy"
+    path.write_bytes(path.read_bytes()[:1000])
+    summary = build_store(asked(several, "merge"), tmp_path / "s.zarr")
+    assert summary.statuses["ok"] == 2
+    record = records_of(summary.records)["a"]
+    first, *others = record["merged"]
+    assert "material_grid.npy" in first["left_out"]
+    assert first["alignment"] is None
+    assert [other["left_out"] for other in others] == ["", ""]
+    assert any("sample 0 is left out" in warning for warning in record["warnings"])
+    asset = open_store(str(summary.store)).asset("a")
+    np.testing.assert_allclose(np.unique(asset.votes), [0.5, 1.0])
+    assert verify_store(str(summary.store), sources=True).findings == ()
+    # The same again: what cannot be read is no reason to do it anew.
+    assert {str(a.action) for a in plan_build(asked(several, "merge"), summary.store).assets} == {
+        "reuse"
+    }
+
+
+def test_an_asset_fails_when_none_is_left(several: Dataset, tmp_path: Path) -> None:
+    for sample in range(len(FACTORS)):
+        write_sample(several, "a", sample, np.zeros((64, 64, 63, 4), np.float32))
+    summary = build_store(asked(several, "merge"), tmp_path / "s.zarr")
+    assert summary.statuses == {"ok": 1, "failed": 1, "skipped": 0}
+    (problem,) = summary.problems
+    assert "none of its 3 annotations can be used" in problem[1]
+    assert "sample 2:" in problem[1]
+
+
+def test_a_sample_more_redoes_that_object_alone(
+    several: Dataset, merged: BuildSummary, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    write_sample(several, "b", 1, sample_grid(1, 2.0))
+    done: list[str] = []
+    inject(monkeypatch, lambda step, name: done.append(name) if step == "asset aligned" else None)
+    again = build_store(asked(several, "merge"), str(merged.store))
+    assert set(done) == {"b"}
+    fresh = build_store(asked(several, "merge"), tmp_path / "fresh.zarr")
+    assert tree(again.store) == tree(fresh.store)
+    assert open_store(str(again.store)).asset("b").merged
+
+
+def test_a_store_gains_and_loses_its_spread(
+    several: Dataset, make_dataset: MakeDataset, tmp_path: Path
+) -> None:
+    out = tmp_path / "s.zarr"
+    build_store(asked(several, "first"), out)
+    for samples, merges in (("merge", True), ("first", False)):
+        build_store(asked(several, samples), out)
+        fresh = build_store(asked(several, samples), tmp_path / f"{samples}-fresh.zarr")
+        assert tree(out) == tree(fresh.store)
+        assert open_store(out).merges is merges
+
+
+def test_passes_that_place_anew_are_refused(several: Dataset) -> None:
+    with pytest.raises(ValueError, match="--consensus or --witness"):
+        replace(asked(several, "merge"), consensus=ConsensusParameters(settle=True))
+
+
+def test_by_default_several_are_a_fault(several: Dataset, tmp_path: Path) -> None:
+    summary = build_store(several.parameters(), tmp_path / "s.zarr")
+    assert dict(summary.problems)["a"].endswith("expected one grid and one SLAT per id")
+    assert "--samples" in dict(summary.problems)["a"]
+    (several.root / "slat/b.npz").unlink()
+    with pytest.raises(StoreError, match="3 samples"):
+        build_store(several.parameters(), tmp_path / "t.zarr")
