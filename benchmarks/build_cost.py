@@ -2,10 +2,14 @@
 
     slatprep make-demo demo --assets 200
     python benchmarks/build_cost.py demo/dataset.toml
+    python benchmarks/build_cost.py demo/dataset.toml --full
 
 Times are CPU seconds of the process and its children, so that other work on
 the machine hardly matters; two jobs against one is wall clock and needs two
 free cores. Every step is run once before it is timed, so nothing is compiled.
+
+With --full the same of assets whose SLAT has every voxel of the grid, or every
+other one, and whose PixieVerse grid is one of the dataset, a cube, two voxels or dust.
 """
 
 from __future__ import annotations
@@ -23,7 +27,7 @@ from typing import Any
 import numpy as np
 import zarr
 
-from slatprep.parameters import BuildParameters
+from slatprep.parameters import BuildParameters, PixieverseSource, SlatSource
 from slatprep.parameters.files import load_parameters
 from slatprep.pipeline import assemble, publish
 from slatprep.pipeline import asset as process
@@ -38,11 +42,17 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("dataset", type=Path)
     parser.add_argument("--no-jobs", action="store_true", help="leave out two jobs against one")
+    parser.add_argument("--full", action="store_true", help="add SLATs that fill the grid")
     arguments = parser.parse_args()
     parameters = load_parameters(arguments.dataset)
     folder = Path(tempfile.mkdtemp(prefix="build-cost-"))
     try:
-        report = measure(parameters, folder, jobs=not arguments.no_jobs)
+        report = measure(parameters, folder, jobs=not arguments.no_jobs and not arguments.full)
+        if arguments.full:
+            report = {"usual": report}
+            for name in write_full(discover(parameters)[0].grid, folder):
+                sources = PixieverseSource(folder / name), SlatSource(folder / name / "slat")
+                report[name] = measure(BuildParameters(*sources), folder / name, jobs=False)
     finally:
         shutil.rmtree(folder)
     print(json.dumps(report, indent=2))
@@ -94,6 +104,31 @@ def measure(parameters: BuildParameters, folder: Path, jobs: bool) -> dict[str, 
         children = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss
         report["peak memory of a worker [MB]"] = round(children / 1024)
     return report
+
+
+def write_full(usual: Any, folder: Path) -> list[str]:
+    """Write assets of one or half of all voxels each, as far from usual as sources may be."""
+    rng = np.random.default_rng(0)
+    cells = np.argwhere(np.ones((64, 64, 64), dtype=bool))
+    cube = cells[(np.abs(cells - 31.5) < 12).all(axis=1)]
+    slats = {"full": cells, "checkered": cells[cells.sum(axis=1) % 2 == 0]}
+    grids = {"cube": cube, "two voxels": cells[:2], "dust": cells[rng.random(len(cells)) < 0.01]}
+    for slat, voxels in slats.items():
+        for grid in ("usual", "full", *grids):
+            place = folder / f"{slat}, {grid}"
+            (place / "a" / "sample_0").mkdir(parents=True)
+            (place / "slat").mkdir()
+            values = np.zeros((64, 64, 64, 4), dtype=np.float32)
+            values[..., 3] = 7
+            for part, stuff in ((0, (1e3, 1e5, 0.3, 0)), (1, (8e3, 2e11, 0.28, 1))):
+                values[tuple(grids.get(grid, cells)[part::2].T)] = stuff
+            np.save(
+                place / "a" / "sample_0" / "material_grid.npy",
+                np.load(usual) if grid == "usual" else values,
+            )
+            feats = rng.normal(0.0, 2.0, (len(voxels), 8)).astype(np.float32)
+            np.savez(place / "slat" / "a.npz", coords=voxels.astype(np.uint8), feats=feats)
+    return [f"{slat}, {grid}" for slat in slats for grid in ("usual", "full", *grids)]
 
 
 def reading_alone(pairs: list[Any]) -> float:

@@ -76,7 +76,8 @@ class Surface:
         there are too few.
         """
         if len(self.points) <= count:
-            return self
+            # Laid out in memory as a choice is, or the kernels are compiled once more.
+            return replace(self, points=np.ascontiguousarray(self.points))
         # Multiples of the golden ratio fill an interval evenly without the
         # regular steps that would beat with the lattice.
         fraction = (np.arange(first, first + count) * 0.618033988749895) % 1.0

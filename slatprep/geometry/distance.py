@@ -17,9 +17,12 @@ from numpy.typing import NDArray
 LARGEST_SIDE = 72
 """Longest side of a box: three squares of it still fit the integers used."""
 
-# Stands for "nothing of the other kind in this line". It exceeds every squared
-# distance in a box that the solid touches on all sides, and may be added to one.
-_FAR = 127
+NOTHING = 127
+"""Stands for "nothing of the other kind in this line".
+
+Its square exceeds every squared distance in a box that the solid touches on all
+sides, or within a slab of such a box, and may be added to one.
+"""
 
 
 def signed_distance(solid: NDArray[np.bool_]) -> NDArray[np.float32]:
@@ -59,16 +62,16 @@ def _squares_along_last(solid, inside, outside):  # type: ignore[no-untyped-def]
     """Squared distance within each line to the nearest voxel of the other kind; 0 in that kind."""
     for i in range(solid.shape[0]):
         for j in range(solid.shape[1]):
-            to_empty, to_solid = _FAR, _FAR
+            to_empty, to_solid = NOTHING, NOTHING
             for k in range(solid.shape[2]):
-                to_empty = min(to_empty + 1, _FAR) if solid[i, j, k] else 0
-                to_solid = 0 if solid[i, j, k] else min(to_solid + 1, _FAR)
+                to_empty = min(to_empty + 1, NOTHING) if solid[i, j, k] else 0
+                to_solid = 0 if solid[i, j, k] else min(to_solid + 1, NOTHING)
                 inside[i, j, k] = to_empty * to_empty
                 outside[i, j, k] = to_solid * to_solid
-            to_empty, to_solid = _FAR, _FAR
+            to_empty, to_solid = NOTHING, NOTHING
             for k in range(solid.shape[2] - 1, -1, -1):
-                to_empty = min(to_empty + 1, _FAR) if solid[i, j, k] else 0
-                to_solid = 0 if solid[i, j, k] else min(to_solid + 1, _FAR)
+                to_empty = min(to_empty + 1, NOTHING) if solid[i, j, k] else 0
+                to_solid = 0 if solid[i, j, k] else min(to_solid + 1, NOTHING)
                 inside[i, j, k] = min(inside[i, j, k], to_empty * to_empty)
                 outside[i, j, k] = min(outside[i, j, k], to_solid * to_solid)
 
@@ -80,17 +83,17 @@ def _spread_over_others(squares):  # type: ignore[no-untyped-def]
     slab, least = np.empty((a, c), np.int16), np.empty((a, c), np.int16)
     for j in range(b):
         slab[:] = squares[:, j]
-        _spread(slab, least)
+        spread(slab, least)
         squares[:, j] = least
     slab, least = np.empty((b, c), np.int16), np.empty((b, c), np.int16)
     for i in range(a):
         slab[:] = squares[i]
-        _spread(slab, least)
+        spread(slab, least)
         squares[i] = least
 
 
 @njit(cache=True)
-def _spread(slab, least):  # type: ignore[no-untyped-def]
+def spread(slab, least):  # type: ignore[no-untyped-def]
     """Set ``least[i, k]`` to the minimum over i' of ``slab[i', k] + (i - i')^2``.
 
     Comparisons are spelled out and 16 bits wide, so that they become vector instructions.

@@ -2,7 +2,9 @@
 
 A kd-tree spends most of its time being built. Voxels lie on a lattice, so the
 cells around a point, taken in order of how near they can be, find the same
-voxel after a few look-ups.
+voxel after a few look-ups. Where there are none that near, whole columns are
+looked at, in slabs that can hold a nearer one alone: that is fast even for
+points that are all far off.
 """
 
 from __future__ import annotations
@@ -14,12 +16,13 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from slatprep.geometry.voxels import boundary
+from slatprep.geometry.distance import NOTHING, spread
 from slatprep.records import RESOLUTION
 
-_REACH = 6  # voxels searched by cells before a tree is built after all
+_REACH = 3  # voxels searched by cells before columns are
 _SURE = _REACH + 0.5  # no voxel beyond the cells can be nearer than this
 _BLOCK = 4  # cells a side of what is passed over at once
+_ROUNDING = 1e-6  # voxels by which a bound is loosened, so that no rounding passes over a voxel
 
 
 class Lattice:
@@ -67,13 +70,13 @@ class Lattice:
         near = self._blocks_near(min(limit, _SURE))
         distance, nearest = _search(position, self._row, near, *_cells(), float(limit) ** 2)
         if limit > _SURE:
-            # Few points lie so far off that their cells cannot tell; a tree knows of those.
+            # Of a usual asset few points lie so far off that their cells cannot tell.
             far = np.flatnonzero(~(distance <= _SURE))
             if len(far):
-                # Of an inner voxel some neighbour is nearer: the tree needs the boundary alone.
-                skin = np.sort(self._row[boundary(self._row >= 0)]).astype(np.intp)
-                distance[far], found = _search_far(position[far], self._voxels[skin], limit)
-                nearest[far] = np.where(found >= 0, skin[found], -1)
+                below, above, apart = _columns(self._row)
+                distance[far], nearest[far] = _search_columns(
+                    position[far], self._row, below, above, apart, float(limit) ** 2
+                )
         return distance, nearest
 
     def _blocks_near(self, reach: float) -> NDArray[np.bool_]:
@@ -125,25 +128,6 @@ def _in_voxels(points: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.ascontiguousarray((np.asarray(points, dtype=np.float64) + 0.5) * RESOLUTION - 0.5)
 
 
-def _search_far(
-    position: NDArray[np.float64], voxels: NDArray[np.uint8], limit: float
-) -> tuple[NDArray[np.float64], NDArray[np.intp]]:
-    from scipy.spatial import cKDTree
-
-    tree = cKDTree(voxels)
-    # A set of one voxel has its second nearest at infinity.
-    distances, rows = tree.query(position, k=[1, 2])
-    distance, nearest = distances[:, 0], rows[:, 0]
-    # Of equally near voxels the lower row wins, here as above.
-    alike = distance * (1.0 + 1e-12)
-    tied = np.flatnonzero(distances[:, 1] <= alike)
-    for point, ties in zip(tied, tree.query_ball_point(position[tied], alike[tied]), strict=True):
-        nearest[point] = min(ties)
-    beyond = distance > limit
-    distance[beyond], nearest[beyond] = np.inf, -1
-    return distance, nearest
-
-
 @lru_cache(maxsize=1)
 def _cells() -> tuple[NDArray[np.int64], NDArray[np.float64]]:
     """Cell offsets by the smallest squared distance that a voxel in them can have."""
@@ -183,6 +167,77 @@ def _search(position, row, near, offsets, floors, limit):  # type: ignore[no-unt
             if square < best or (square == best and candidate < found):
                 best, found = square, candidate
         if best <= limit:
+            distance[m], nearest[m] = np.sqrt(best), found
+    return distance, nearest
+
+
+@njit(cache=True)
+def _columns(row):  # type: ignore[no-untyped-def]
+    """For each cell the next voxels of its column (a line along the last axis), and of its slab.
+
+    Returns the place in the column of the last voxel that does not come after the cell, and of
+    the first that does not come before it, -1 for none; and the squared distance to the nearest
+    voxel with the same first index, at least the square of `NOTHING` for none.
+    """
+    below, above = np.full(row.shape, -1, np.int8), np.full(row.shape, -1, np.int8)
+    apart, slab = np.empty(row.shape, np.int16), np.empty(row.shape[1:], np.int16)
+    size = row.shape[0]
+    for i in range(size):
+        for j in range(size):
+            last, after = -1, -1
+            for k in range(size):
+                last = k if row[i, j, k] >= 0 else last
+                below[i, j, k] = last
+            for k in range(size - 1, -1, -1):
+                after = k if row[i, j, k] >= 0 else after
+                above[i, j, k] = after
+                least = after - k if after >= 0 else NOTHING
+                if below[i, j, k] >= 0:
+                    least = min(least, k - below[i, j, k])
+                slab[j, k] = least * least
+        spread(slab, apart[i])
+    return below, above, apart
+
+
+@njit(cache=True)
+def _search_columns(position, row, below, above, apart, limit):  # type: ignore[no-untyped-def]
+    """Search slab after slab, column after column, from a point's own to both sides."""
+    count, end = position.shape[0], row.shape[0] - 1
+    distance = np.full(count, np.inf)
+    nearest = np.full(count, -1, dtype=np.intp)
+    for m in range(count):
+        x, y, z = position[m, 0], position[m, 1], position[m, 2]
+        v, w = min(max(y, 0.0), end), min(max(z, 0.0), end)
+        a, b, c = int(np.rint(min(max(x, 0.0), end))), int(np.rint(v)), int(np.rint(w))
+        # How far off the grid the point lies, and the cell that knows what its slab holds.
+        outside = (y - v) ** 2 + (z - w) ** 2
+        aside = math.sqrt((v - b) ** 2 + (w - c) ** 2) + _ROUNDING
+        best, found = limit, -1
+        for slabs in range(2 * end + 1):
+            step = (slabs + 1) // 2
+            if step and (step - 0.5) ** 2 > best:
+                break
+            i = a + step if slabs % 2 else a - step
+            across = (x - i) ** 2
+            if i < 0 or i > end or across > best or apart[i, b, c] >= NOTHING**2:
+                continue
+            if across + outside + max(math.sqrt(apart[i, b, c]) - aside, 0.0) ** 2 > best:
+                continue
+            for columns in range(2 * end + 1):
+                step = (columns + 1) // 2
+                if step and across + (step - 0.5) ** 2 > best:
+                    break
+                j = b + step if columns % 2 else b - step
+                if j < 0 or j > end or across + (y - j) ** 2 > best:
+                    continue
+                for k in (below[i, j, c], above[i, j, c]):
+                    if k < 0:
+                        continue
+                    candidate = row[i, j, k]
+                    square = (x - i) ** 2 + (y - j) ** 2 + (z - k) ** 2
+                    if square < best or (square == best and not 0 <= found <= candidate):
+                        best, found = square, candidate
+        if found >= 0:
             distance[m], nearest[m] = np.sqrt(best), found
     return distance, nearest
 

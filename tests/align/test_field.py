@@ -7,6 +7,7 @@ import subprocess
 import sys
 from collections.abc import Callable
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -14,8 +15,9 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from support.shapes import GRID, Case, chair, field_of, latents_of, surface_latents, turned
 
-from slatprep.align import align, engine_versions
+from slatprep.align import align, engine_versions, solver
 from slatprep.align.deformation import map_of
+from slatprep.align.field import FINE_SAMPLES
 from slatprep.align.starts import distinct_starts
 from slatprep.geometry.frames import displacement, make_transform, split_transform
 from slatprep.judge import judge
@@ -128,6 +130,28 @@ def test_a_missing_part_and_a_stray_part_do_not_pull() -> None:
     damaged |= ((GRID - np.array([56, 8, 8])) ** 2).sum(axis=-1) < 16
     alignment = align(field_of(damaged), latents, DEFAULT)
     assert displacement(alignment.transform, np.eye(4), latents.coords) < 0.05
+
+
+def test_the_search_looks_at_no_more_of_a_grid_full_of_voxels(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Counted in samples of either side times poses times steps."""
+    work: list[int] = []
+    solve = solver.solve
+
+    def counted(*given: Any) -> Any:
+        slat, pixie, poses, taus = given[0], given[4], given[8], given[12]
+        assert max(len(slat), len(pixie)) <= FINE_SAMPLES
+        work[-1] += (len(slat) + len(pixie)) * len(poses) * len(taus)
+        return solve(*given)
+
+    monkeypatch.setattr(solver, "solve", counted)
+    checkered = GRID.sum(axis=-1) % 2 == 0
+    for occupancy in (chair(), checkered, np.ones_like(checkered)):
+        work.append(0)
+        align(field_of(chair()), latents_of(np.argwhere(occupancy)), DEFAULT)
+    usual, *full = work
+    assert max(full) < 8 * usual
 
 
 BALL = ((GRID - 31.5) ** 2).sum(axis=-1) < 22**2

@@ -7,16 +7,18 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
 
 from slatprep.geometry.frames import voxel_centres
-from slatprep.geometry.nearest import Lattice
+from slatprep.geometry.nearest import Lattice, _columns, _search_columns
 
 
 @settings(deadline=None, max_examples=40)
-@given(st.integers(1, 3000), st.integers(0, 2**32 - 1), st.floats(0.2, 1.5))
-def test_the_nearest_voxel_is_a_kd_tree_s(count: int, seed: int, spread: float) -> None:
+@given(st.integers(1, 3000), st.integers(0, 2**32 - 1), st.floats(0.2, 1.5), st.integers(1, 64))
+def test_the_nearest_voxel_is_a_kd_tree_s(count: int, seed: int, spread: float, side: int) -> None:
     rng = np.random.default_rng(seed)
-    voxels = np.unique(rng.integers(0, 64, (count, 3)), axis=0).astype(np.uint8)
+    corner = rng.integers(0, 65 - side, 3)
+    voxels = np.unique(corner + rng.integers(0, side, (count, 3)), axis=0).astype(np.uint8)
     points = rng.uniform(-spread, spread, (200, 3))
     points[:50] = np.round(points[:50] * 128) / 128  # on voxels, faces and edges
     distance, index = Lattice(voxels).nearest(points)
@@ -57,6 +59,39 @@ def test_beyond_the_limit_nothing_is_found() -> None:
     distance, index = Lattice(voxels).nearest(points, limit=2.0)
     assert distance.tolist() == [2.0, np.inf, np.inf]
     assert index.tolist() == [0, -1, -1]
+
+
+class _Counted:
+    """An array that counts how often it is looked at."""
+
+    def __init__(self, array: np.ndarray) -> None:
+        self.array, self.shape, self.looks = array, array.shape, 0
+
+    def __getitem__(self, index: object) -> object:
+        self.looks += 1
+        return self.array[index]
+
+
+@pytest.mark.parametrize("held", ["two voxels", "a cube", "a shell", "dust"])
+def test_a_point_that_is_far_off_costs_few_looks(held: str) -> None:
+    """A SLAT that fills the grid has mostly such points."""
+    cells = np.argwhere(np.ones((64, 64, 64), dtype=bool))
+    inner = (np.abs(cells - 31.5) < 12).all(axis=1)
+    rng = np.random.default_rng(0)
+    voxels = {
+        "two voxels": cells[:2],
+        "a cube": cells[inner],
+        "a shell": cells[inner & (np.abs(cells - 31.5) > 11).any(axis=1)],
+        "dust": cells[rng.random(len(cells)) < 0.001],
+    }[held]
+    row = np.full((64, 64, 64), -1, dtype=np.int32)
+    row[tuple(voxels.T)] = np.arange(len(voxels))
+    turn = Rotation.from_euler("xyz", [10.0, 20.0, 30.0], degrees=True).as_matrix()
+    points = (rng.choice(cells, 200) - 31.5) @ turn.T + 31.5
+    columns = [_Counted(array) for array in _columns(row)]
+    distance, _ = _search_columns.py_func(points, row, *columns, np.inf)
+    np.testing.assert_allclose(distance, cKDTree(voxels).query(points)[0], rtol=1e-12)
+    assert sum(array.looks for array in columns) < 400 * len(points)
 
 
 def test_an_empty_set_is_refused() -> None:

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from typing import Any
+
 import numpy as np
 import pytest
 from support.shapes import GRID, chair, field_of, surface_latents
@@ -9,10 +12,17 @@ from support.shapes import GRID, chair, field_of, surface_latents
 from slatprep.align import align
 from slatprep.align.deformation import map_of
 from slatprep.judge import measure_ambiguity
-from slatprep.judge.ambiguity import MOST_VOXELS, thinning
+from slatprep.judge.ambiguity import FEWER, MOST_VOXELS, thinning
 from slatprep.judge.evidence import surroundings_of
 from slatprep.parameters import AlignParameters, SampleParameters
-from slatprep.records import Alignment, Ambiguity, StructuredLatents
+from slatprep.records import (
+    Alignment,
+    Ambiguity,
+    Annotation,
+    MaterialField,
+    Placement,
+    StructuredLatents,
+)
 from slatprep.sample import sample
 
 BALL = ((GRID - 31.5) ** 2).sum(axis=-1) < 20**2
@@ -87,3 +97,27 @@ def test_a_full_slat_is_judged_by_some_of_its_voxels_and_ties(
     assert abs(some[0].material_share - every[0].material_share) < 0.01
     np.testing.assert_allclose(some[0].property_change, every[0].property_change, rtol=0.02)
     assert abs(some[1].mean() - every[1].mean()) < 0.05
+
+
+def test_the_voxels_of_a_full_grid_that_are_looked_at_lie_in_all_of_its_layers(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Classes repeat every eight layers, as would steps of eight in a grid that is in order."""
+    full = np.ones((64, 64, 64), dtype=bool)
+    field = field_of(full, np.where(GRID[..., 2] % 8 == 0, 1, 3))
+    coords = np.argwhere(full).astype(np.uint8)
+    latents = StructuredLatents(coords, np.zeros((len(coords), 8), np.float32))
+    upside_down = Placement(np.diag([-1.0, 1.0, -1.0, 1.0]), 1.0, 20.0)
+    alignment = replace(align(field, latents, AlignParameters()), placements=(upside_down,))
+    annotation = sample(field, map_of(alignment).places(coords), SampleParameters())
+    looked: list[int] = []
+
+    def counted(field: MaterialField, places: np.ndarray, *rest: Any, **options: Any) -> Annotation:
+        looked.append(len(places))
+        return sample(field, places, *rest, **options)
+
+    monkeypatch.setattr("slatprep.judge.ambiguity.sample", counted)
+    some = measure_ambiguity(field, latents, alignment, annotation, SampleParameters())
+    # Layers 0, 8, 16... change with layers 7, 15, 23...: two of eight.
+    assert some.material_share == pytest.approx(0.25, abs=0.01)
+    assert looked == [pytest.approx(MOST_VOXELS / FEWER, rel=0.05)]

@@ -19,8 +19,10 @@ from slatprep.workers.local import at_most
 SCRIPT = """
 import sys
 from pathlib import Path
+import numpy as np
 from numba.core import event
 from slatprep.demo import make_demo
+from slatprep.parameters import BuildParameters, PixieverseSource, SlatSource
 from slatprep.parameters.files import load_parameters
 from slatprep.pipeline.dataset import build_store
 from slatprep.pipeline.kernels import compile_kernels
@@ -43,6 +45,17 @@ with event.install_listener("numba:compile", Listener()):
     del compiled[:]
     make_demo(root / "demo", 8, 3, levels=(0, 1, 2, 3, 4, 5, 6, 7))
     build_store(load_parameters(root / "demo" / "dataset.toml"), root / "s.zarr")
+    grid = np.zeros((64, 64, 64, 4), np.float32)
+    grid[..., 3] = 7
+    grid[30:32, 30, 30] = 1000, 1e5, 0.3, 0
+    (root / "few" / "pixieverse" / "a" / "sample_0").mkdir(parents=True)
+    (root / "few" / "slat").mkdir()
+    np.save(root / "few" / "pixieverse" / "a" / "sample_0" / "material_grid.npy", grid)
+    voxels = np.argwhere(grid[..., 3] == 0).astype(np.uint8)
+    latents = np.random.default_rng(0).normal(0, 2, (2, 8)).astype(np.float32)
+    np.savez(root / "few" / "slat" / "a.npz", coords=voxels, feats=latents)
+    sources = PixieverseSource(root / "few" / "pixieverse"), SlatSource(root / "few" / "slat")
+    build_store(BuildParameters(*sources), root / "few.zarr")
     assert not compiled, compiled
 """
 
