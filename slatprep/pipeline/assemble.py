@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -10,16 +10,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slatprep.parameters import BuildParameters
-from slatprep.pipeline.carry import Carried, KeptAsset, Row
+from slatprep.pipeline.carry import KeptAsset, Row
 from slatprep.pipeline.pack import Packed, pack_store
 from slatprep.pipeline.publish import write_all_records
 from slatprep.pipeline.ranges import dataset_ranges
-from slatprep.pipeline.spool import FailedAsset, Spool, SpooledAsset
+from slatprep.pipeline.rows import Rows
+from slatprep.pipeline.spool import FailedAsset, Spool
+from slatprep.pipeline.summary import Counts, counts_in
 from slatprep.pipeline.work import Work
 from slatprep.provenance.make import complete_record, origin
 from slatprep.provenance.record import AssetRecord, Clipped, Record, property_counts
 from slatprep.provenance.record_json import read_asset_record, to_json
-from slatprep.records import Contents, Normalization
+from slatprep.records import Normalization
+from slatprep.store import open_store
 from slatprep.store.writer import finish_store
 from slatprep.workers.local import Jobs
 
@@ -35,27 +38,23 @@ class Assembled:
     records: Path
     build_id: str
     normalization: Normalization
+    counts: Counts
     clipped: NDArray[np.int64]
 
 
 def assemble(
-    usable: Sequence[Row],
-    failed: Sequence[FailedAsset],
+    rows: Rows,
     given: Normalization | None,
     work: Work,
     parameters: BuildParameters,
     jobs: Jobs,
-    contents: Contents,
-    carried: Carried | None = None,
 ) -> Assembled:
     """Normalise and pack the rows of a store, then write its records and its root attributes.
 
     Parameters
     ----------
-    usable : sequence of SpooledAsset or KeptAsset
-        The assets of the store, by row.
-    failed : sequence of FailedAsset
-        Those that have a record and no row.
+    rows : Rows
+        What goes in.
     given : Normalization or None
         Ranges that do not depend on the dataset.
     work : Work
@@ -64,42 +63,34 @@ def assemble(
         The build's.
     jobs : int or Workers
         Worker processes, or a cluster's.
-    contents : Contents
-        What the store holds.
-    carried : Carried, optional
-        What is taken from the store that is there.
     """
-    normalization = given
+    normalization, contents, carried = given, rows.contents, rows.carried
     if normalization is None and carried is not None:
         normalization = carried.previous.store.normalization
     if normalization is None:
-        made = [asset for asset in usable if isinstance(asset, SpooledAsset)]
         normalization = dataset_ranges(
-            made, work.spool, parameters.normalize, jobs, contents.properties
+            rows.made, work.spool, parameters.normalize, jobs, contents.properties
         )
     store, records = work.scratch / "store.zarr", work.scratch / "assets.jsonl"
     packed = pack_store(
-        store, work.spool, usable, normalization, parameters.store, jobs, contents, carried
+        store, work.spool, rows.usable, normalization, parameters.store, jobs, contents, carried
     )
-    completed = _completed_records(work.spool, usable, failed, normalization, packed, carried)
+    completed = _completed_records(work.spool, rows, normalization, packed)
     build_id = write_all_records(store, records, completed, packed.records)
     finish_store(store, normalization, build_id, origin(parameters), contents, known=packed.digests)
-    return Assembled(store, records, build_id, normalization, packed.clipped["voxel"])
+    counts, clipped = counts_in(open_store(store)), packed.clipped["voxel"]
+    return Assembled(store, records, build_id, normalization, counts, clipped)
 
 
 def _completed_records(
-    spool: Spool,
-    usable: Sequence[Row],
-    failed: Sequence[FailedAsset],
-    normalization: Normalization,
-    packed: Packed,
-    carried: Carried | None,
+    spool: Spool, rows: Rows, normalization: Normalization, packed: Packed
 ) -> Iterator[tuple[int, Record | bytes]]:
     """Yield rows and records of a build by asset id, with the ranges and what they clip."""
-    everything: list[tuple[int, Row | FailedAsset]] = [*enumerate(usable)]
-    everything += [(-1, asset) for asset in failed]
+    everything: list[tuple[int, Row | FailedAsset]] = [*enumerate(rows.usable)]
+    everything += [(-1, asset) for asset in rows.failed]
     for row, asset in sorted(everything, key=lambda one: one[1].asset_id):
         if isinstance(asset, KeptAsset):
+            carried = rows.carried
             if carried is None:
                 raise ValueError("there is no store to take records from")
             text = carried.previous.text(asset.row)

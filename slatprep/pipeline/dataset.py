@@ -7,52 +7,32 @@ dataset, for what is new or changed, and replaces the store in one step.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType
 
-import numpy as np
-
-from slatprep.errors import StoreError
 from slatprep.parameters import BuildParameters
-from slatprep.pipeline.assemble import assemble
-from slatprep.pipeline.asset import fail_asset, finish_asset, process_asset
-from slatprep.pipeline.carry import Carried, KeptAsset, Row, in_order, kept_assets
-from slatprep.pipeline.consensus import apply_consensus
+from slatprep.pipeline.assemble import Assembled, assemble
+from slatprep.pipeline.asset import process_asset
 from slatprep.pipeline.context import BuildContext
-from slatprep.pipeline.kernels import compile_kernels
-from slatprep.pipeline.pack import latent_warnings, settled_contents
+from slatprep.pipeline.finish import Crew, Note, Progress, finish
+from slatprep.pipeline.pack import latent_warnings
 from slatprep.pipeline.plan import Action, BuildPlan, PlannedAsset, plan_assets
-from slatprep.pipeline.previous import previous_build, store_there
+from slatprep.pipeline.previous import store_there
 from slatprep.pipeline.publish import Destination, publish_manifests
-from slatprep.pipeline.ranges import check_objects, given_ranges, source_of
+from slatprep.pipeline.ranges import check_objects
 from slatprep.pipeline.recipe import recipe_of
+from slatprep.pipeline.rows import Rows, settle_rows
 from slatprep.pipeline.seen import Found
 from slatprep.pipeline.spool import FailedAsset, Spool, SpooledAsset
-from slatprep.pipeline.summary import (
-    BuildSummary,
-    counts_in,
-    counts_of,
-    nothing_usable,
-    summarise_build,
-)
-from slatprep.pipeline.update import (
-    Looked,
-    Wanted,
-    found_before,
-    is_current,
-    is_untouched,
-    repeat_summary,
-)
-from slatprep.pipeline.witness import apply_witness
+from slatprep.pipeline.summary import BuildSummary, counts_of, summarise_build
+from slatprep.pipeline.update import Update, Wanted
 from slatprep.pipeline.work import work_beside, work_directory
 from slatprep.provenance.record_json import write_records
-from slatprep.readers import contents_of, discover
+from slatprep.readers import discover
 from slatprep.records import AssetPair, Place
 from slatprep.storage.atomic import staged, writing
-from slatprep.store import open_store
-from slatprep.workers.local import Jobs, at_most, require_shared, run_unordered
+from slatprep.workers.local import Jobs, require_shared
 
 __all__ = [
     "BuildPlan",
@@ -63,12 +43,6 @@ __all__ = [
     "plan_build",
     "process_asset",
 ]
-
-Progress = Callable[[int, int], None]
-"""Called with the assets done and the assets in all; at the beginning with none done."""
-
-Note = Callable[[str], None]
-"""Called with a line for the user."""
 
 
 def build_store(
@@ -133,81 +107,32 @@ def build_store(
         With `strict`, for the first asset that cannot be used.
     """
     begin = time.perf_counter()
-    place = Destination(out, manifests)
-    declared = contents_of(parameters)
-    given = given_ranges(parameters.normalize, declared.properties)
-    wanted = Wanted(given or source_of(parameters.normalize), compact, declared)
+    crew = Crew(jobs, assets_per_job, progress, note)
+    place, wanted = Destination(out, manifests), Wanted.of(parameters, compact)
     with work_beside(place.store, fresh=fresh, keep=keep_work) as work:
         place.look()
         pairs = _discover(parameters, jobs, work.scratch)
         check_objects(pairs, parameters.normalize)
-        jobs = at_most(len(pairs) // assets_per_job, jobs)
         there = None if fresh else store_there(place.store)
         context = BuildContext(parameters, recipe_of(parameters), work.spool, there, strict)
-        looked = Looked.at(pairs, context, place, rehash)
-        if is_untouched(looked, pairs, context, place.records(), wanted):
-            clipped = looked.seen.rows["clipped"].sum(axis=0)
-            seconds = time.perf_counter() - begin
-            return repeat_summary([], context, place, seconds, clipped, untouched=True)
-        previous, damaged = (None, ()) if fresh else previous_build(place.store, jobs)
-        context = replace(context, previous=previous)
-        known = {} if damaged else looked.known
-        few = at_most((len(pairs) - len(known)) // assets_per_job, jobs)
-        plan = _plan(pairs, context, few, progress, known)
-        new, unchanged = _split(pairs, plan)
-        _compile(plan, few, note)
-        assets = _finish(new, plan, context, few, progress)
-        keys = {pair.asset_id: plan[pair.asset_id].key for pair in unchanged}
-        unmade = not any(isinstance(asset, SpooledAsset) for asset in assets)
-        intact = previous is not None and not damaged and unmade
-        found = found_before(keys, previous, looked.seen) if previous and intact else {}
-        if intact and is_current(plan, assets, context, wanted, found):
-            clipped = np.sum([one.clipped for one in found.values()], axis=0)
-            seconds = time.perf_counter() - begin
-            summary = repeat_summary(assets, context, place, seconds, clipped, untouched=False)
-            looked.note(summary, place, found)
+        update = Update.begun(pairs, context, place, wanted, rehash, begin)
+        if summary := update.untouched():
             return summary
-        kept = None
-        if not damaged and not keep_work:
-            made = [asset for asset in assets if isinstance(asset, SpooledAsset)]
-            kept = kept_assets(unchanged, plan, made, context, looked.seen, given, declared)
-        if kept is None:
-            assets += _finish(unchanged, plan, context, jobs, progress)
-        else:
-            jobs = few
-        usable, failed = _usable_and_failed(assets, kept or [], parameters, pairs)
-        keys = {asset.asset_id: asset.key for asset in usable}
-        if kept is None:
-            made = [asset for asset in usable if isinstance(asset, SpooledAsset)]
-            made = apply_consensus(made, work.spool, parameters, jobs, note)
-            usable = list(apply_witness(made, work.spool, parameters, jobs, note))
-        contents = settled_contents(usable, declared, parameters.slat.standardised)
-        usable = in_order(usable, previous, compact)
-        carried = Carried(previous, usable) if kept and previous else None
+        if not fresh:
+            update = update.compared(crew.of(len(pairs)))
+        plan = _plan(pairs, update.context, crew, update.known)
+        new, unchanged = _split(pairs, plan)
+        finished = finish(new, plan, update.context, crew)
+        if summary := update.current(plan, finished):
+            return summary
+        rows = settle_rows(update, finished, unchanged, plan, crew, keep_work)
         with writing(str(place.out), work_directory(place.store).parent):
-            packed = assemble(usable, failed, given, work, parameters, jobs, contents, carried)
-            counts = counts_in(open_store(packed.store))
-            place.replace(packed.store)
-        told = (asset for asset in usable if isinstance(asset, SpooledAsset) and asset.damaged)
-        summary = summarise_build(
-            counts,
-            failed,
-            store=place.out,
-            records=place.records(),
-            build_id=packed.build_id,
-            seconds=time.perf_counter() - begin,
-            normalization=packed.normalization,
-            clipped=packed.clipped.sum(axis=0),
-            warnings=latent_warnings(usable, contents.latents, parameters.slat.standardised),
-            damaged=(*damaged, *(f"{asset.asset_id}: {asset.damaged}" for asset in told)),
-        )
-        publish_manifests(packed.records, summary, parameters)
-        place.publish()
-        clips = zip(usable, packed.clipped, strict=True)
-        found = {a.asset_id: Found(keys[a.asset_id], a.extent, c, a.latents) for a, c in clips}
-        looked.note(summary, place, found)
+            packing = crew.of(len(rows.made))
+            assembled = assemble(rows, wanted.given, work, parameters, packing)
+            place.replace(assembled.store)
+        summary = _publish(update, rows, assembled)
         if keep_work:
-            work.spool.keep_only({asset.key for asset in usable})
+            work.spool.keep_only({asset.key for asset in rows.usable})
     return summary
 
 
@@ -235,11 +160,14 @@ def plan_build(
     place = Destination(out)
     spool = Spool(work_directory(place.store) / ("nothing" if fresh else "spool"))
     pairs = _discover(parameters, jobs)
-    previous, damaged = (None, ()) if fresh else previous_build(place.store, jobs)
-    context = BuildContext(parameters, recipe_of(parameters), spool, previous, strict=False)
-    known = {} if damaged else Looked.at(pairs, context, place, rehash).known
-    plan = plan_assets(pairs, context, jobs, progress, known)
-    return BuildPlan(place.out, tuple(plan), damaged)
+    check_objects(pairs, parameters.normalize)
+    there = None if fresh else store_there(place.store)
+    context = BuildContext(parameters, recipe_of(parameters), spool, there, strict=False)
+    update = Update.begun(pairs, context, place, Wanted.of(parameters), rehash)
+    if not fresh:
+        update = update.compared(jobs)
+    plan = plan_assets(pairs, update.context, jobs, progress, update.known)
+    return BuildPlan(place.out, tuple(plan), update.damaged)
 
 
 def align_pairs(
@@ -275,15 +203,12 @@ def align_pairs(
         With `strict`, for the first asset that cannot be used.
     """
     begin = time.perf_counter()
-    out = Path(out)
+    out, crew = Path(out), Crew(jobs, assets_per_job, progress, note)
     with work_beside(out.absolute(), arrays=False) as work:
         context = BuildContext(parameters, recipe_of(parameters), work.spool, None, strict)
         pairs = _discover(parameters, jobs, work.scratch)
-        jobs = at_most(len(pairs) // assets_per_job, jobs)
-        plan = _plan(pairs, context, jobs, progress)
-        _compile(plan, jobs, note)
-        assets = _finish(pairs, plan, context, jobs, progress)
-        assets.sort(key=lambda asset: asset.asset_id)
+        plan = _plan(pairs, context, crew)
+        assets = sorted(finish(pairs, plan, context, crew), key=lambda asset: asset.asset_id)
         with writing(str(out), out.parent), staged(out) as file:
             build_id = write_records(file, (work.spool.record(asset.key) for asset in assets))
     seconds = time.perf_counter() - begin
@@ -303,22 +228,15 @@ def _discover(parameters: BuildParameters, jobs: Jobs, *shared: Path) -> list[As
 def _plan(
     pairs: Sequence[AssetPair],
     context: BuildContext,
-    jobs: Jobs,
-    progress: Progress | None,
+    crew: Crew,
     known: Mapping[str, str] = MappingProxyType({}),
 ) -> dict[str, PlannedAsset]:
     """Return what is to be done by asset id; nothing where nothing was done before."""
     if context.previous is None and not context.spool.holds_any():
         return {}
-    plan = plan_assets(pairs, context, jobs, progress, known)
+    jobs = crew.of(len(pairs) - len(known))
+    plan = plan_assets(pairs, context, jobs, crew.progress, known)
     return {asset.asset_id: asset for asset in plan}
-
-
-def _compile(plan: Mapping[str, PlannedAsset], jobs: Jobs, note: Note | None) -> None:
-    """Compile before workers of this machine start, unless nothing will be aligned."""
-    aligns = any(asset.action is Action.ALIGN for asset in plan.values())
-    if isinstance(jobs, int) and (aligns or not plan):
-        compile_kernels(note)
 
 
 def _split(
@@ -332,35 +250,26 @@ def _split(
     return split
 
 
-def _finish(
-    pairs: Sequence[AssetPair],
-    plan: Mapping[str, PlannedAsset],
-    context: BuildContext,
-    jobs: Jobs,
-    progress: Progress | None,
-) -> list[SpooledAsset | FailedAsset]:
-    """Bring assets into the spool; return what is kept of each, in no order."""
-    tasks = ((pair, plan.get(pair.asset_id), context) for pair in pairs)
-    assets: list[SpooledAsset | FailedAsset] = []
-    if progress and pairs:
-        progress(0, len(pairs))
-    for asset in run_unordered(finish_asset, tasks, jobs, fail_asset):
-        assets.append(asset)
-        if progress:
-            progress(len(assets), len(pairs))
-    return assets
-
-
-def _usable_and_failed(
-    assets: Iterable[SpooledAsset | FailedAsset],
-    kept: Sequence[KeptAsset],
-    parameters: BuildParameters,
-    pairs: Sequence[AssetPair],
-) -> tuple[list[Row], list[FailedAsset]]:
-    """Return the assets that go into the store and those that do not, each by id."""
-    by_id = sorted((*assets, *kept), key=lambda asset: asset.asset_id)
-    usable: list[Row] = [asset for asset in by_id if not isinstance(asset, FailedAsset)]
-    failed = [asset for asset in by_id if isinstance(asset, FailedAsset)]
-    if not usable:
-        raise StoreError(nothing_usable(failed, parameters, pairs))
-    return usable, failed
+def _publish(update: Update, rows: Rows, assembled: Assembled) -> BuildSummary:
+    """Publish the records of a store that is in place, and the store where that is a step more."""
+    place, context = update.place, update.context
+    standardised = context.parameters.slat.standardised
+    told = (f"{asset.asset_id}: {asset.damaged}" for asset in rows.made if asset.damaged)
+    summary = summarise_build(
+        assembled.counts,
+        rows.failed,
+        store=place.out,
+        records=place.records(),
+        build_id=assembled.build_id,
+        seconds=update.seconds,
+        normalization=assembled.normalization,
+        clipped=assembled.clipped.sum(axis=0),
+        warnings=latent_warnings(rows.usable, rows.contents.latents, standardised),
+        damaged=(*update.damaged, *told),
+    )
+    publish_manifests(assembled.records, summary, context.parameters)
+    place.publish()
+    clips = zip(rows.usable, assembled.clipped, strict=True)
+    found = {a.asset_id: Found(rows.keys[a.asset_id], a.extent, c, a.latents) for a, c in clips}
+    update.note(summary, found)
+    return summary

@@ -14,7 +14,7 @@ from slatprep.normalize import ranges_from_bounds, ranges_from_extents, to_mappe
 from slatprep.parameters import NormalizeParameters, is_split_file, percentiles_of
 from slatprep.pipeline.spool import Spool, SpooledAsset
 from slatprep.readers.ranges import pixie_ranges, read_ranges
-from slatprep.readers.splits import Shares, assign_splits, read_id_file, read_lists
+from slatprep.readers.splits import Shares, assign_splits, read_id_file
 from slatprep.records import PROPERTIES, AssetPair, Normalization, Property
 from slatprep.storage.place import place_of
 from slatprep.workers.local import Jobs, run_unordered
@@ -48,7 +48,6 @@ def source_of(parameters: NormalizeParameters) -> str:
         return parameters.ranges
     by = parameters.split_by
     if is_split_file(by):
-        read_lists(place_of(by))  # Not after all assets are aligned.
         digest = hashlib.sha256(read_id_file(place_of(by))).hexdigest()
         by = f"{place_of(by).name}, sha256 {digest[:12]}"
     return f"{parameters.ranges} of train by {by}"

@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+import time
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from slatprep.errors import StoreError
+from slatprep.parameters import BuildParameters
 from slatprep.pipeline.context import BuildContext
 from slatprep.pipeline.plan import Action, PlannedAsset
-from slatprep.pipeline.previous import PreviousBuild
+from slatprep.pipeline.previous import PreviousBuild, previous_build
 from slatprep.pipeline.publish import Destination, build_record, publish_manifests
+from slatprep.pipeline.ranges import given_ranges, source_of
 from slatprep.pipeline.seen import (
     Found,
     Seen,
@@ -25,25 +29,18 @@ from slatprep.pipeline.seen import (
 )
 from slatprep.pipeline.spool import FailedAsset, SpooledAsset
 from slatprep.pipeline.summary import BuildSummary, counts_in, summarise_build
-from slatprep.provenance.files import ASSETS, BUILD, build_in
+from slatprep.provenance.files import ASSETS, BUILD, build_in, lines_in
 from slatprep.provenance.make import origin
 from slatprep.provenance.record import BuildRecord, Record
-from slatprep.provenance.record_json import (
-    read_build_record,
-    read_record,
-    records_id,
-    to_json,
-    write_records,
-)
+from slatprep.provenance.record_json import read_record, records_id, to_json, write_records
 from slatprep.readers import contents_of
 from slatprep.readers.encoders import settle_latents
 from slatprep.records import AssetPair, Contents, Normalization, Place
 from slatprep.storage.atomic import writing
-from slatprep.storage.documents import read_bounded
 from slatprep.storage.place import storage_of
 from slatprep.store import Store
-from slatprep.store.contract import MAX_METADATA_BYTES
 from slatprep.store.layout import segments_of
+from slatprep.workers.local import Jobs
 
 
 @dataclass(frozen=True)
@@ -63,6 +60,18 @@ class Wanted:
     ranges: Normalization | str
     compact: bool
     declared: Contents
+
+    @classmethod
+    def of(cls, parameters: BuildParameters, compact: bool = False) -> Wanted:
+        """Return what parameters ask for; raise `SlatprepError` if their files cannot be used."""
+        declared = contents_of(parameters)
+        given = given_ranges(parameters.normalize, declared.properties)
+        return cls(given or source_of(parameters.normalize), compact, declared)
+
+    @property
+    def given(self) -> Normalization | None:
+        """Ranges that do not depend on the dataset."""
+        return self.ranges if isinstance(self.ranges, Normalization) else None
 
     def allows(self, store: Store, context: BuildContext) -> bool:
         """Whether a store of the right assets is the one that is asked for."""
@@ -94,165 +103,175 @@ class Looked:
     known: dict[str, str]
     recipe: str
 
-    @classmethod
-    def at(
-        cls, pairs: Sequence[AssetPair], context: BuildContext, place: Destination, rehash: bool
-    ) -> Looked:
-        """Look at the sources, and read what the last build saw."""
-        slat = context.parameters.slat
-        recipe = context.recipe.key("", {"": str((contents_of(context.parameters), slat))})
-        states = look(pairs)
-        seen = Seen()
-        if context.previous is not None:
-            bound = bound_to(context.previous.build_id, recipe)
-            seen = read_seen(storage_of(place.records().parent).local, bound)
-        return cls(states, seen, {} if rehash else known_keys(seen, states), recipe)
 
-    def note(self, summary: BuildSummary, place: Destination, found: Mapping[str, Found]) -> None:
-        """Write down what was seen and found of the assets of a store that is in place."""
-        folder, path = (storage_of(p).local for p in (summary.records.parent, place.store))
-        if folder is not None and path is not None:
-            bound = bound_to(summary.build_id, self.recipe)
-            state = store_state(path, record_files(folder), wait=True)
-            write_seen(folder, bound, state, self.states, found)
+@dataclass(frozen=True, eq=False)
+class Update:
+    """A build that may find its store as it should be.
 
-
-def is_untouched(
-    looked: Looked,
-    pairs: Sequence[AssetPair],
-    context: BuildContext,
-    records: Place,
-    wanted: Wanted,
-) -> bool:
-    """Whether sources, store and records are as the last build left them, by their states alone.
-
-    Parameters
+    Attributes
     ----------
-    looked : Looked
-        What this build and the last one saw.
     pairs : sequence of AssetPair
         The dataset.
     context : BuildContext
-        The build; its store's files have not been read.
-    records : Place
-        The file of asset records.
+        The build. The files of its store have been read once it is `compared`.
+    place : Destination
+        The store and its records.
     wanted : Wanted
         What is asked for.
+    looked : Looked
+        What this build and the last one saw.
+    begin : float
+        When it began, by `time.perf_counter`.
+    damaged : tuple of str
+        What of the store that is there is not as it was written.
     """
-    previous, folder = context.previous, storage_of(records.parent).local
-    path = None if previous is None else storage_of(previous.path).local
-    seen = looked.seen
-    if previous is None or path is None or folder is None or not seen.store:
-        return False
-    if not len(looked.known) == len(pairs) == len(seen.rows):
-        return False
-    if store_state(path, record_files(folder)) != seen.store:
-        return False
-    # Assets that could not go in, and are gone now, were part of the build's id.
-    all_in = sum(build_in(folder).statuses.values()) == len(pairs)
-    return all_in and wanted.allows(previous.store, context)
+
+    pairs: Sequence[AssetPair]
+    context: BuildContext
+    place: Destination
+    wanted: Wanted
+    looked: Looked
+    begin: float
+    damaged: tuple[str, ...] = ()
+
+    @classmethod
+    def begun(
+        cls,
+        pairs: Sequence[AssetPair],
+        context: BuildContext,
+        place: Destination,
+        wanted: Wanted,
+        rehash: bool,
+        begin: float = 0.0,
+    ) -> Update:
+        """Look at the sources, and read what the last build saw; with `rehash` trust none of it."""
+        recipe = context.recipe.key("", {"": str((wanted.declared, context.parameters.slat))})
+        states, seen = look(pairs), Seen()
+        if context.previous is not None:
+            bound = bound_to(context.previous.build_id, recipe)
+            seen = read_seen(storage_of(place.records().parent).local, bound)
+        known = {} if rehash else known_keys(seen, states)
+        return cls(pairs, context, place, wanted, Looked(states, seen, known, recipe), begin)
+
+    @property
+    def seconds(self) -> float:
+        """What the build has taken so far."""
+        return time.perf_counter() - self.begin
+
+    @property
+    def known(self) -> dict[str, str]:
+        """Keys of the assets whose sources need not be hashed again."""
+        return {} if self.damaged else self.looked.known
+
+    def compared(self, jobs: Jobs) -> Update:
+        """Return it with a store of which every file has been compared with its digest."""
+        previous, damaged = previous_build(self.place.store, jobs)
+        return replace(self, context=replace(self.context, previous=previous), damaged=damaged)
+
+    def untouched(self) -> BuildSummary | None:
+        """Sum up a store that is as the last build left it, with sources and records, by states.
+
+        None where there is something to do.
+        """
+        previous, folder = self.context.previous, storage_of(self.place.records().parent).local
+        path = None if previous is None else storage_of(previous.path).local
+        seen, known = self.looked.seen, self.looked.known
+        if previous is None or path is None or folder is None or not seen.store:
+            return None
+        if not len(known) == len(self.pairs) == len(seen.rows):
+            return None
+        if store_state(path, _record_files(folder)) != seen.store:
+            return None
+        # Assets that could not go in, and are gone now, were part of the build's id.
+        all_in = sum(build_in(folder).statuses.values()) == len(self.pairs)
+        if not all_in or not self.wanted.allows(previous.store, self.context):
+            return None
+        return self._repeated([], previous, seen.rows["clipped"].sum(axis=0), untouched=True)
+
+    def current(
+        self, plan: Mapping[str, PlannedAsset], others: Sequence[SpooledAsset | FailedAsset]
+    ) -> BuildSummary | None:
+        """Sum up a store that is the one that this build would write; None where it is not.
+
+        Parameters
+        ----------
+        plan : mapping of str to PlannedAsset
+            What is to be done by asset.
+        others : sequence of SpooledAsset or FailedAsset
+            The assets that are not unchanged.
+        """
+        previous = self.context.previous
+        if previous is None or self.damaged or any(isinstance(a, SpooledAsset) for a in others):
+            return None
+        same = {p.asset_id: p.key for p in plan.values() if p.action is Action.REUSE}
+        gone = any(planned.action is Action.REMOVE for planned in plan.values())
+        if gone or any(p.names for p in plan.values()) or len(same) != len(previous.store):
+            return None
+        if not self.wanted.allows(previous.store, self.context):
+            return None
+        found = _found_before(same, previous, self.looked.seen)
+        if self._contents(previous.store, found) != previous.store.contents:
+            return None
+        if records_id(_all_records(others, previous, self.context)) != previous.build_id:
+            return None
+        clipped = np.sum([one.clipped for one in found.values()], axis=0)
+        summary = self._repeated(others, previous, clipped, untouched=False)
+        self.note(summary, found)
+        return summary
+
+    def note(self, summary: BuildSummary, found: Mapping[str, Found]) -> None:
+        """Write down what was seen and found of the assets of a store that is in place."""
+        folder, path = (storage_of(p).local for p in (summary.records.parent, self.place.store))
+        if folder is not None and path is not None:
+            bound = bound_to(summary.build_id, self.looked.recipe)
+            state = store_state(path, _record_files(folder), wait=True)
+            write_seen(folder, bound, state, self.looked.states, found)
+
+    def _contents(self, store: Store, found: Mapping[str, Found]) -> Contents:
+        """Return what a store of the assets that are there holds."""
+        sizes = dict(zip(store.ids, np.diff(store.offsets).tolist(), strict=True))
+        moments = [(sizes[asset_id], found[asset_id].latents) for asset_id in sorted(found)]
+        declared, slat = self.wanted.declared, self.context.parameters.slat
+        latents = settle_latents(declared.latents, slat.standardised, moments)
+        return replace(declared, latents=latents)
+
+    def _repeated(
+        self,
+        others: Sequence[SpooledAsset | FailedAsset],
+        previous: PreviousBuild,
+        clipped: NDArray[np.int64],
+        untouched: bool,
+    ) -> BuildSummary:
+        """Sum up a store that is current; write its records anew if they are not beside it.
+
+        With `untouched` they are known to be as they were written.
+        """
+        failed = [asset for asset in others if isinstance(asset, FailedAsset)]
+        summary = summarise_build(
+            counts_in(previous.store),
+            sorted(failed, key=lambda asset: asset.asset_id),
+            store=self.place.out,
+            records=self.place.records(previous.path),
+            build_id=previous.build_id,
+            seconds=self.seconds,
+            normalization=previous.store.normalization,
+            clipped=clipped,
+        )
+        parameters = self.context.parameters
+        if not _are_published(summary.records, build_record(summary, parameters), untouched):
+            scratch = self.context.spool.directory / ASSETS
+            with writing(str(self.place.out), scratch.parent):
+                write_records(scratch, _all_records(others, previous, self.context))
+            publish_manifests(scratch, summary, parameters)
+        return summary
 
 
-def record_files(folder: Path) -> list[Path]:
+def _record_files(folder: Path) -> list[Path]:
     """Return the files beside a store."""
     return [folder / ASSETS, folder / BUILD]
 
 
-def is_current(
-    plan: Mapping[str, PlannedAsset],
-    others: Sequence[SpooledAsset | FailedAsset],
-    context: BuildContext,
-    wanted: Wanted,
-    found: Mapping[str, Found],
-) -> bool:
-    """Whether the store that is there is the one that this build would write.
-
-    Parameters
-    ----------
-    plan : mapping of str to PlannedAsset
-        What is to be done by asset.
-    others : sequence of SpooledAsset or FailedAsset
-        The assets that are not unchanged.
-    context : BuildContext
-        The build.
-    wanted : Wanted
-        What is asked for.
-    found : mapping of str to Found
-        What was found of the unchanged assets.
-    """
-    previous = context.previous
-    if previous is None or any(isinstance(asset, SpooledAsset) for asset in others):
-        return False
-    actions = [asset.action for asset in plan.values()]
-    return (
-        Action.REMOVE not in actions
-        and not any(asset.names for asset in plan.values())
-        and actions.count(Action.REUSE) == len(previous.store)
-        and wanted.allows(previous.store, context)
-        and _contents_of(previous.store, found, context, wanted) == previous.store.contents
-        and records_id(_all_records(others, previous, context)) == previous.build_id
-    )
-
-
-def _contents_of(
-    store: Store, found: Mapping[str, Found], context: BuildContext, wanted: Wanted
-) -> Contents:
-    """Return what a store of the assets that are there holds."""
-    sizes = dict(zip(store.ids, np.diff(store.offsets).tolist(), strict=True))
-    moments = [(sizes[asset_id], found[asset_id].latents) for asset_id in sorted(found)]
-    standardised = context.parameters.slat.standardised
-    latents = settle_latents(wanted.declared.latents, standardised, moments)
-    return replace(wanted.declared, latents=latents)
-
-
-def repeat_summary(
-    others: Sequence[SpooledAsset | FailedAsset],
-    context: BuildContext,
-    place: Destination,
-    seconds: float,
-    clipped: Iterable[int],
-    untouched: bool,
-) -> BuildSummary:
-    """Sum up a store that is current; write its records anew if they are not beside it.
-
-    Parameters
-    ----------
-    others : sequence of SpooledAsset or FailedAsset
-        The assets that are not in the store.
-    context : BuildContext
-        The build.
-    place : Destination
-        The store and its records.
-    seconds : float
-        What the build took.
-    clipped : iterable of int
-        Clipped values of voxels by property.
-    untouched : bool
-        Whether the records beside the store are known to be as they were written.
-    """
-    previous = context.previous
-    if previous is None:
-        raise ValueError("there is no previous store")
-    failed = [asset for asset in others if isinstance(asset, FailedAsset)]
-    summary = summarise_build(
-        counts_in(previous.store),
-        sorted(failed, key=lambda asset: asset.asset_id),
-        store=place.out,
-        records=place.records(previous.path),
-        build_id=previous.build_id,
-        seconds=seconds,
-        normalization=previous.store.normalization,
-        clipped=clipped,
-    )
-    if not _are_published(summary.records, build_record(summary, context.parameters), untouched):
-        scratch = context.spool.directory / "assets.jsonl"
-        with writing(str(place.out), scratch.parent):
-            write_records(scratch, _all_records(others, previous, context))
-        publish_manifests(scratch, summary, context.parameters)
-    return summary
-
-
-def found_before(keys: Mapping[str, str], previous: PreviousBuild, seen: Seen) -> dict[str, Found]:
+def _found_before(keys: Mapping[str, str], previous: PreviousBuild, seen: Seen) -> dict[str, Found]:
     """Return what was found of the assets of a store, by id; what only the sources tell is NaN."""
     found = {}
     for asset_id, key in keys.items():
@@ -278,16 +297,12 @@ def _all_records(
 
 def _are_published(records: Place, wanted: BuildRecord, untouched: bool) -> bool:
     """Whether the records beside the store are those of a build, but for when and where it ran."""
-    build_file = records.parent / "build.json"
     try:
-        text = read_bounded(build_file, MAX_METADATA_BYTES)
-        found = read_build_record(text, str(build_file))
+        found = build_in(records.parent)
         if untouched:
             return _same(found, wanted)
-        with storage_of(records).open() as file:
-            lines = iter(lambda: file.readline(MAX_METADATA_BYTES), b"")
-            build_id = records_id(read_record(line, str(records)) for line in lines)
-    except (OSError, ValueError, StoreError):
+        build_id = records_id(read_record(line, at) for at, line in lines_in(records.parent))
+    except StoreError:
         return False
     return build_id == wanted.id and _same(found, wanted)
 

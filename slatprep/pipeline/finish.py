@@ -1,0 +1,80 @@
+"""Bring assets into the spool: each by one worker, with the user told how far it is."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+
+from slatprep.pipeline.asset import fail_asset, finish_asset
+from slatprep.pipeline.context import BuildContext
+from slatprep.pipeline.kernels import compile_kernels
+from slatprep.pipeline.plan import Action, PlannedAsset
+from slatprep.pipeline.spool import FailedAsset, SpooledAsset
+from slatprep.records import AssetPair
+from slatprep.workers.local import Jobs, at_most, run_unordered
+
+Progress = Callable[[int, int], None]
+"""Called with the assets done and the assets in all; at the beginning with none done."""
+
+Note = Callable[[str], None]
+"""Called with a line for the user."""
+
+
+@dataclass(frozen=True)
+class Crew:
+    """Who works on a build, and who is told of it.
+
+    Attributes
+    ----------
+    jobs : int or Workers
+        Worker processes, or a cluster's.
+    assets_per_job : int
+        No more processes are started than there are so many assets for.
+    progress : callable or None
+        See `Progress`.
+    note : callable or None
+        See `Note`.
+    """
+
+    jobs: Jobs
+    assets_per_job: int = 1
+    progress: Progress | None = None
+    note: Note | None = None
+
+    def of(self, assets: int) -> Jobs:
+        """Return who works on so many assets."""
+        return at_most(assets // self.assets_per_job, self.jobs)
+
+
+def finish(
+    pairs: Sequence[AssetPair],
+    plan: Mapping[str, PlannedAsset],
+    context: BuildContext,
+    crew: Crew,
+) -> list[SpooledAsset | FailedAsset]:
+    """Bring assets into the spool; return what is kept of each, in no order.
+
+    Parameters
+    ----------
+    pairs : sequence of AssetPair
+        The assets.
+    plan : mapping of str to PlannedAsset
+        What is to be done by id; of those that it does not have, everything.
+    context : BuildContext
+        The build.
+    crew : Crew
+        Who does it.
+    """
+    jobs = crew.of(len(pairs))
+    actions = {planned.action if (planned := plan.get(p.asset_id)) else Action.ALIGN for p in pairs}
+    if isinstance(jobs, int) and Action.ALIGN in actions:
+        compile_kernels(crew.note)  # Before workers of this machine start, each to compile all.
+    tasks = ((pair, plan.get(pair.asset_id), context) for pair in pairs)
+    assets: list[SpooledAsset | FailedAsset] = []
+    if crew.progress and pairs:
+        crew.progress(0, len(pairs))
+    for asset in run_unordered(finish_asset, tasks, jobs, fail_asset):
+        assets.append(asset)
+        if crew.progress:
+            crew.progress(len(assets), len(pairs))
+    return assets
