@@ -26,6 +26,7 @@ from slatprep.geometry.frames import (
 from slatprep.readers.files import ArraySpec, load_source, npz_arrays
 from slatprep.records import BACKGROUND, Place
 from slatprep.store import StoredAsset, open_store
+from slatprep.workers import Progress
 
 SUCCESS_DISPLACEMENT = 1.5
 """An asset is placed right where its mean displacement [voxel] is less than this above the
@@ -131,7 +132,9 @@ class TruthReport:
     missing: tuple[str, ...]
 
 
-def score_against_truth(store: Place, truth_dir: Path) -> TruthReport:
+def score_against_truth(
+    store: Place, truth_dir: Path, progress: Progress | None = None
+) -> TruthReport:
     """Compare every asset of a store with its truth.
 
     Parameters
@@ -140,6 +143,8 @@ def score_against_truth(store: Place, truth_dir: Path) -> TruthReport:
         A store of `slatprep build-store`; only its published layout is read.
     truth_dir : Path
         Folder of truth files; assets of the store without one are left out.
+    progress : callable, optional
+        Called with the assets compared and the assets in all.
 
     Returns
     -------
@@ -156,12 +161,14 @@ def score_against_truth(store: Place, truth_dir: Path) -> TruthReport:
     if not truths:
         raise InputError(truth_dir, "no truth in it", "a folder with one <asset id>.npz an asset")
     opened = open_store(store)
-    scores = tuple(
-        _score_asset(opened.asset(asset_id), truths[asset_id])
-        for asset_id in opened.ids
-        if asset_id in truths
-    )
-    return TruthReport(scores, summarise(scores), tuple(sorted(set(truths) - set(opened.ids))))
+    known = [asset_id for asset_id in opened.ids if asset_id in truths]
+    scores = []
+    for asset_id in known:
+        scores.append(_score_asset(opened.asset(asset_id), truths[asset_id]))
+        if progress is not None:
+            progress(len(scores), len(known))
+    missing = tuple(sorted(truths.keys() - known))
+    return TruthReport(tuple(scores), summarise(scores), missing)
 
 
 def summarise(scores: Sequence[TruthScore]) -> tuple[LevelScore, ...]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -169,6 +168,8 @@ def _show_plan(output: Output, plan: BuildPlan) -> None:
 
 def report(output: Output, summary: BuildSummary) -> None:
     """Print what became of the assets, name those that did not go in, and set the exit code."""
+    from slatprep.records import Verdict
+
     _show_damaged(output, summary.damaged)
     for asset_id, reason in summary.problems:
         output.problem(f"{asset_id}: {reason}")
@@ -198,6 +199,5 @@ def report(output: Output, summary: BuildSummary) -> None:
             say(f"store:   {summary.store}")
         say(f"records: {summary.records}")
 
-    output.made(
-        {**dataclasses.asdict(summary), "complete": summary.complete}, show, summary.complete
-    )
+    verdicts = {str(verdict): summary.verdicts.get(str(verdict), 0) for verdict in Verdict}
+    output.made(vars(summary) | {"verdicts": verdicts}, show, summary.complete)

@@ -19,7 +19,7 @@ from slatprep.cli.options import (
     option,
     store_option,
 )
-from slatprep.cli.output import EXIT_INCOMPLETE, Output, say
+from slatprep.cli.output import Output, say
 
 if TYPE_CHECKING:
     from slatprep.inspect.check import AlignmentCheck
@@ -112,11 +112,10 @@ def check_alignment(
             say(f"picture: {pictures[0]}")
         output.note(f"store: {path}")
 
-    output.result(_documents(checks, pictures), print_all)
     if show:
         _show(output, opened, chosen, sheet or (pictures[0] if pictures else None))
-    if not all(one.ok for one in checks):
-        click.get_current_context().exit(EXIT_INCOMPLETE)
+    document = {"store": path, "assets": _documents(checks, pictures), "sheet": sheet}
+    output.result(document, print_all, complete=all(one.ok for one in checks))
 
 
 def _target(store: Place, picture: str | None, assets: int) -> Path | None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import math
 from collections.abc import Mapping
 from pathlib import Path
@@ -150,7 +149,7 @@ def evaluate(
 
     for problem in problems:
         output.problem(problem)
-    document = dataclasses.asdict(result)
+    document = vars(result) | {"store": store}
     if beside:
         document["beside"] = [score for scores in others.values() for score in scores]
     output.result(document, show, complete=not problems)

@@ -41,7 +41,7 @@ def info(output: Output, store: Place) -> None:
             "engine": ", ".join(overview.engines),
             "model": ", ".join(overview.models),
         }
-        output.record(f"Store {overview.path}", contents)
+        output.record(f"Store {overview.store}", contents)
         show_quality(output, overview)
         output.table(
             f"Normalisation to [-1, 1] (ranges: {overview.normalization.source})",
@@ -83,10 +83,10 @@ def show_quality(output: Output, overview: StoreOverview) -> None:
     doubted = [name for name, count in total.verdicts.items() if count and name != "good"]
     if doubted:
         options = " ".join(f"--verdict {name}" for name in doubted)
-        say(f"why:     slatprep list {overview.path} {options}")
+        say(f"why:     slatprep list {overview.store} {options}")
     if total.ambiguous:
         say(
             f"tied:    {total.ambiguous:,} of {total.assets:,}: other placements fit about as "
             f"well, and change more than {AT_MOST['ambiguity']:.0%} of the classes"
         )
-        say(f"look:    slatprep check-alignment --ambiguous --store {overview.path}")
+        say(f"look:    slatprep check-alignment --ambiguous --store {overview.store}")

@@ -72,7 +72,7 @@ def list_assets(
             ],
         )
 
-    output.result(listed, show)
+    output.result({"store": store, "assets": listed}, show)
 
 
 def _in_short(reasons: tuple[str, ...]) -> str:

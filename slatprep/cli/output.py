@@ -7,6 +7,7 @@ aligned columns; with ``--json`` standard output is one JSON document.
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 import itertools
 import json
@@ -15,12 +16,13 @@ import sys
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any, TypeVar
 
 import click
 
-from slatprep.errors import in_unicode
+from slatprep.errors import SlatprepError, in_unicode
 from slatprep.storage.place import is_place, place_of, storage_of
 from slatprep.workers import Progress
 
@@ -52,23 +54,41 @@ class Output:
         One JSON document on standard output instead of tables.
     verbosity : int
         -1 prints errors and what was asked for alone, 1 prints more than the usual.
+    command : str
+        What a JSON document says it is of.
     """
 
-    def __init__(self, as_json: bool = False, verbosity: int = 0) -> None:
+    def __init__(self, as_json: bool = False, verbosity: int = 0, command: str = "") -> None:
         self.as_json = as_json
         self.verbosity = verbosity
+        self.command = command
 
     def result(self, document: object, show: Callable[[], None], complete: bool = True) -> None:
         """Print a result: the document as JSON, or what `show` prints for people.
 
-        Where the result is not `complete`, end with the exit code that says so.
+        The document is a mapping or a dataclass; command, version and whether it is `complete`
+        (``ok``) are put before it. Where it is not, end with the exit code that says so.
         """
         if self.as_json:
-            say(as_json(document))
+            fields = vars(document) if dataclasses.is_dataclass(document) else document
+            self._say_document(complete, fields)
         else:
             show()
         if not complete:
             click.get_current_context().exit(EXIT_INCOMPLETE)
+
+    def _say_document(self, ok: bool, fields: Any) -> None:
+        say(as_json({"command": self.command, "version": version("slatprep"), "ok": ok, **fields}))
+
+    @contextmanager
+    def failing(self) -> Iterator[None]:
+        """Say what ends the command in JSON as well, where that was asked for."""
+        try:
+            yield
+        except (SlatprepError, click.UsageError) as error:
+            if self.as_json:
+                self._say_document(False, {"error": str(error)})
+            raise
 
     def made(self, document: object, show: Callable[[], None], complete: bool = True) -> None:
         """Print what was made, as `result` does what was asked; where quiet, in JSON alone."""
@@ -190,7 +210,11 @@ def with_output(command: _Command) -> _Command:
     @functools.wraps(command)
     def run(*, as_json: bool, quiet: bool, verbose: bool, **options: Any) -> object:
         given = {name: _local(value) for name, value in options.items()}
-        return command(Output(as_json, int(verbose) - int(quiet)), **given)
+        # Without the program: "info", "bench align".
+        name = click.get_current_context().command_path.partition(" ")[2]
+        output = Output(as_json, int(verbose) - int(quiet), name)
+        with output.failing():
+            return command(output, **given)
 
     return run  # type: ignore[return-value]
 

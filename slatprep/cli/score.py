@@ -35,7 +35,8 @@ def score(output: Output, store: Place, truth_dir: Path) -> None:
     """
     from slatprep.bench.truth import score_against_truth
 
-    report = score_against_truth(store, truth_dir)
+    with output.progress("score") as progress:
+        report = score_against_truth(store, truth_dir, progress)
 
     def show() -> None:
         if output.verbosity > 0:

@@ -146,7 +146,7 @@ def train(
                 steps=steps,
                 progress=lambda r, name=name: output.note(f"{name}, {_line(r)}"),  # type: ignore[misc]
             )
-    output.made(summaries, lambda: _show_training(output, summaries))
+    output.made({"runs": summaries}, lambda: _show_training(output, summaries))
     output.note(f"runs:    {', '.join(str(directory) for directory in runs.values())}")
     first = next(iter(summaries.values()))
     output.note(f"next:    slatprep evaluate {first.predictions} --store {store}")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from typing import TYPE_CHECKING, Any
 
 import click
@@ -69,4 +68,4 @@ def verify(
         found = f"{len(result.findings):,} findings" if result.findings else "nothing is wrong"
         say(f"{store}: {found}")
 
-    output.result({**dataclasses.asdict(result), "ok": result.ok}, show, complete=result.ok)
+    output.result(result, show, complete=result.ok)

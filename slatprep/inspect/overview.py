@@ -56,7 +56,7 @@ class StoreOverview:
     in alphabetical order; ``files`` and ``size`` [byte] are what it takes on disk.
     """
 
-    path: Place
+    store: Place
     format_version: int
     build_id: str
     files: int
@@ -89,7 +89,7 @@ def overview_of(store: Store) -> StoreOverview:
         rows.setdefault(str(category), []).append(row)
     sizes = storage_of(store.path).files()
     return StoreOverview(
-        path=store.path,
+        store=store.path,
         format_version=store.format_version,
         build_id=store.about.manifest,
         files=len(sizes),

@@ -128,7 +128,7 @@ class StoreStatistics:
 
     Attributes
     ----------
-    path : Place
+    store : Place
         The store.
     assets, assets_chosen : int
         Assets of the store, and those that the filters left.
@@ -149,7 +149,7 @@ class StoreStatistics:
         Of the first two properties; None where there is only one.
     """
 
-    path: Place
+    store: Place
     assets: int
     assets_chosen: int
     weight: Weight
@@ -242,7 +242,7 @@ def store_statistics(
     ]
     whole = all_of_it.field.share, all_of_it.slat.share
     return StoreStatistics(
-        path=store.path,
+        store=store.path,
         assets=len(store),
         assets_chosen=len(rows),
         weight=weight,

@@ -24,7 +24,7 @@ def listed(build: BuildSummary, *options: str) -> str:
 
 def test_every_asset_is_in_a_line_with_what_the_store_says(mixed_build: BuildSummary) -> None:
     store = open_store(mixed_build.store)
-    documents = json.loads(listed(mixed_build, "--json"))
+    documents = json.loads(listed(mixed_build, "--json"))["assets"]
     assert [one["asset_id"] for one in documents] == store.ids
     frame = store.to_pandas()
     for one in documents:
@@ -65,7 +65,7 @@ def test_a_beginning_names_an_asset_where_no_other_has_it(mixed_build: BuildSumm
         store.match("")
     arguments = ["check-alignment", "--store", str(mixed_build.store), "--picture", "none"]
     result = CliRunner().invoke(slatprep, [*arguments, "--asset", "bear.s", "--json"])
-    assert json.loads(result.stdout)[0]["asset_id"] == "bear.side"
+    assert json.loads(result.stdout)["assets"][0]["asset_id"] == "bear.side"
 
 
 def test_ids_on_a_terminal_are_as_long_as_tells_them_apart(

@@ -93,7 +93,8 @@ def test_ambiguous_means_the_same_wherever_it_is_counted(store: Path, tmp_path: 
     zarr.open_group(copied, mode="r+")["asset/ambiguity"][:] = [0.0, 0.2, 0.9, 0.05, 0.01]
     assert "2 of 5: other placements" in run("info", copied).stdout
     drawn = run("check-alignment", "--store", copied, "--ambiguous", "--picture", "none", "--json")
-    assert [one["asset_id"] for one in json.loads(drawn.stdout)] == ["bear.side", "bear.front"]
+    told = [one["asset_id"] for one in json.loads(drawn.stdout)["assets"]]
+    assert told == ["bear.side", "bear.front"]
 
 
 def test_info_and_verify_count_the_same_files(store: Path) -> None:
@@ -153,3 +154,26 @@ def test_our_own_cloud_in_the_frame_of_pixieverse_is_recognised(
     result = run("transfer", tmp_path / "pixieverse" / "cup.ply", *words)
     assert result.exit_code == 1 and "slatprep export --frame slat" in result.stderr
     assert run("transfer", tmp_path / "slat" / "cup.ply", *words).exit_code == 0
+
+
+@pytest.mark.parametrize("command", ["info", "list", "verify", "stats", "check-alignment"])
+def test_documents_begin_alike_and_say_which_store(command: str, store: Path) -> None:
+    words = ("--worst", "1", "--picture", "none", "--store") if command == "check-alignment" else ()
+    document = json.loads(run(command, *words, store, "--json").stdout)
+    assert list(document)[:3] == ["command", "version", "ok"]
+    assert (document["command"], document["ok"]) == (command, True)
+    assert document["store"] == str(store)
+
+
+def test_what_ends_a_command_is_json_too(store: Path, tmp_path: Path) -> None:
+    for words, code, said in (
+        (("info", tmp_path, "--json"), 1, "is not a slatprep store"),
+        (("check-alignment", "--asset", "cuo", "--store", store, "--json"), 2, "did you mean cup?"),
+        (("check-alignment", "--store", store, "--json"), 2, "say which assets"),
+        (("bench", "read", "s3://nowhere/s.zarr", "--json"), 2, "expected a store on the local"),
+    ):
+        result = run(*words)
+        assert result.exit_code == code
+        document = json.loads(result.stdout)
+        assert said in document["error"] and said in result.stderr and document["ok"] is False
+    assert document["command"] == "bench read"

@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import json
 import sys
+from importlib.metadata import version
 from pathlib import Path
 
 import numpy as np
@@ -75,11 +76,17 @@ def test_verdicts_are_coloured_unless_no_color_says_otherwise(
 
 
 def test_json_is_the_only_thing_on_standard_output(capsys: pytest.CaptureFixture[str]) -> None:
-    printer = Output(as_json=True)
+    printer = Output(as_json=True, command="look")
     printer.note("a note")
     printer.result({"value": float("nan"), "pair": (1, 2)}, lambda: pytest.fail("not for people"))
     captured = capsys.readouterr()
-    assert json.loads(captured.out) == {"value": None, "pair": [1, 2]}
+    assert json.loads(captured.out) == {
+        "command": "look",
+        "version": version("slatprep"),
+        "ok": True,
+        "value": None,
+        "pair": [1, 2],
+    }
     assert captured.err == "a note\n"
 
 

@@ -165,7 +165,7 @@ def test_commands_train_and_evaluate(learn_store: Path, tmp_path: Path) -> None:
          "2", "--learning-rate", "0.002", "--threads", "1", *shares, "--json"],
     )  # fmt: skip
     assert trained.exit_code == 0, trained.output
-    history = json.loads(trained.stdout)["small"]["history"]
+    history = json.loads(trained.stdout)["runs"]["small"]["history"]
     assert history[1]["train_loss"] < history[0]["train_loss"]
     predictions = tmp_path / "run" / "predictions"
     evaluate = ["evaluate", str(predictions), "--store", str(learn_store), "--json"]
@@ -195,7 +195,7 @@ def test_the_command_weighs_voxels_by_their_confidence(learn_store: Path, tmp_pa
              "--threads", "1", "--shares", "0.4,0.3,0.3", "--json", *weigh],
         )  # fmt: skip
         assert result.exit_code == 0, result.output
-        (epoch,) = json.loads(result.stdout)["small"]["history"]
+        (epoch,) = json.loads(result.stdout)["runs"]["small"]["history"]
         losses.append(epoch["train_loss"])
         told = json.loads((run / "run.json").read_text())
         assert told["weigh_by_confidence"] is bool(weigh)

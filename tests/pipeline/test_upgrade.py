@@ -49,7 +49,7 @@ def test_upgrade_replaces_a_store_in_place(
     built, old = tmp_path / "built.zarr", tmp_path / "old.zarr"
     build_store(make_dataset("a", "b").parameters(), built)
     write_format_one(built, old)
-    for verdicts in ({"good": 2}, None):
+    for verdicts in ({"good": 2, "doubtful": 0, "failed": 0}, None):
         result = CliRunner().invoke(slatprep, ["upgrade", str(old), "--json"])
         assert result.exit_code == 0, result.output
         assert json.loads(result.stdout).get("verdicts") == verdicts

@@ -236,7 +236,7 @@ def test_several_assets_get_a_file_each_and_a_contact_sheet(copy: Path, tmp_path
     folder = tmp_path / "pictures"
     result = run("--worst", "1", "--asset", "cup", "--store", copy, "--picture", folder, "--json")
     assert result.exit_code == 0, result.output
-    told = json.loads(result.stdout)
+    told = json.loads(result.stdout)["assets"]
     assert len(told) == 2 and told[0]["asset_id"] == "cup"
     assert {Path(one["picture"]) for one in told} | {folder / "sheet.png"} == set(folder.iterdir())
     again = tmp_path / "again"
