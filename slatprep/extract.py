@@ -1,7 +1,7 @@
-"""Run TRELLIS's image pipeline: its structured latents, as `build-store` reads them; Gaussians.
+"""Run TRELLIS's pipeline: images to structured latents, and latents to Gaussians.
 
-TRELLIS (https://github.com/microsoft/TRELLIS) is not a dependency: it needs a
-GPU, kernels of its own and weights. It is imported when a pipeline is loaded.
+TRELLIS (https://github.com/microsoft/TRELLIS) is not a dependency, since it needs a GPU, its own
+CUDA kernels and its weights. It is imported when a pipeline is loaded.
 """
 
 from __future__ import annotations
@@ -25,6 +25,7 @@ from slatprep.readers.patterns import NAME
 from slatprep.readers.slat import check_coords
 from slatprep.records import TRELLIS, StructuredLatents
 from slatprep.storage.atomic import staged
+from slatprep.storage.files import file_digest
 
 if TYPE_CHECKING:
     from PIL.Image import Image
@@ -35,7 +36,7 @@ MODEL = "microsoft/TRELLIS-image-large"
 FORMAT = "slatprep-extraction"
 
 STAGES = ("image", "sparse structure", "SLAT")
-"""What drawing latents is timed by: cutting out and DINO; occupied voxels; their latents."""
+"""Timed stages of an extraction: background removal and DINO; occupied voxels; their latents."""
 
 _LATENTS = (
     "as TRELLIS's pipeline returns them: multiplied with the model's std and moved by its mean, "
@@ -44,14 +45,14 @@ _LATENTS = (
 
 
 class Pipeline(Protocol):
-    """What is used of ``trellis.pipelines.TrellisImageTo3DPipeline``."""
+    """The used part of ``trellis.pipelines.TrellisImageTo3DPipeline``."""
 
     sparse_structure_sampler_params: dict[str, Any]
     slat_sampler_params: dict[str, Any]
     slat_normalization: dict[str, Any]
 
     def preprocess_image(self, input: Image) -> Image:
-        """Cut the object out, and crop."""
+        """Remove the background, and crop."""
 
     def get_cond(self, image: list[Image]) -> dict[str, Any]:
         """Encode images."""
@@ -59,16 +60,16 @@ class Pipeline(Protocol):
     def sample_sparse_structure(
         self, cond: dict[str, Any], num_samples: int = 1, sampler_params: dict[str, Any] = ...
     ) -> Any:
-        """Draw occupied voxels, (N, 4) with a leading batch column."""
+        """Sample occupied voxels, (N, 4) with the batch column first."""
 
     def sample_slat(
         self, cond: dict[str, Any], coords: Any, sampler_params: dict[str, Any] = ...
     ) -> Any:
-        """Draw latents on them; returns a sparse tensor with ``coords`` and ``feats``."""
+        """Sample their latents: a sparse tensor with ``coords`` and ``feats``."""
 
     @property
     def device(self) -> Any:
-        """Where it runs."""
+        """The torch device it runs on."""
 
     def decode_slat(self, slat: Any, formats: list[str]) -> dict[str, list[Any]]:
         """Decode latents, to ``gaussian`` and others."""
@@ -76,7 +77,7 @@ class Pipeline(Protocol):
 
 @dataclass(frozen=True)
 class Session:
-    """A loaded pipeline, the torch it runs on, and what the provenance says of both."""
+    """A loaded pipeline, its torch module, and the description of both for the records."""
 
     pipeline: Pipeline
     torch: Any
@@ -85,7 +86,7 @@ class Session:
 
 @dataclass(frozen=True)
 class Extraction:
-    """An image, a seed, and the npz that its latents go to; the record is a JSON beside it."""
+    """An image, a seed, and the npz for its latents; the record is a JSON beside it."""
 
     image: Path
     seed: int
@@ -99,9 +100,9 @@ class Extraction:
 
 @dataclass(frozen=True)
 class Extracted:
-    """What came of an extraction: its number of voxels, and whether it had been done before.
+    """The result of an extraction: its number of voxels, and whether an existing SLAT was kept.
 
-    `seconds` has what each stage took, by its name; it is empty where nothing was drawn.
+    `seconds` has the time of each stage; it is empty for a SLAT that was kept.
     """
 
     voxels: int
@@ -118,9 +119,14 @@ def load_session(model: str = MODEL, revision: str | None = None, device: str = 
         Name of the model's repository, or a folder that holds its files.
     revision : str, optional
         Commit, tag or branch of the repository; by default its main branch.
-        The commit that was taken is in the provenance.
+        The commit is recorded.
     device : str
         The torch device to run on.
+
+    Returns
+    -------
+    Session
+        The pipeline on its device.
 
     Raises
     ------
@@ -144,7 +150,7 @@ def load_session(model: str = MODEL, revision: str | None = None, device: str = 
             raise ConfigError(f"{model} is a folder, which has no revision; leave --revision out")
         folder, taken = Path(model), "local folder"
     else:
-        # Fetched by commit first, so that what is recorded is what is loaded.
+        # Fetched first, so that the commit that is loaded is known.
         from huggingface_hub import snapshot_download
 
         folder = Path(snapshot_download(model, revision=revision))
@@ -154,14 +160,14 @@ def load_session(model: str = MODEL, revision: str | None = None, device: str = 
     about = {"name": model, "revision": taken, "torch": str(torch.__version__)}
     description = folder / "pipeline.json"
     if description.is_file():
-        about["pipeline_sha256"] = _sha256(description)
+        about["pipeline_sha256"] = file_digest(description)
     return Session(pipeline, torch, about)
 
 
 def list_extractions(
     images: Sequence[Path], out: Path, seeds: Sequence[int], by_folder: bool
 ) -> list[Extraction]:
-    """Name what each image and seed will be saved as.
+    """Name the files for each image and seed.
 
     Parameters
     ----------
@@ -170,9 +176,9 @@ def list_extractions(
     out : Path
         Folder of the latents, the root that `build-store` takes.
     seeds : sequence of int
-        Seeds, each of which gives every image one SLAT.
+        Seeds; each image gets a SLAT for each seed.
     by_folder : bool
-        Whether an image is named ``<id>/<view>``; otherwise its name is the id.
+        Whether images are named ``<id>/<view>`` instead of ``<id>``.
 
     Returns
     -------
@@ -218,16 +224,16 @@ def extract(
     session : Session
         The loaded pipeline.
     extractions : iterable of Extraction
-        What `list_extractions` made.
+        From `list_extractions`.
     preprocess : bool
-        Whether the pipeline cuts the object out and crops, as it does by
-        default; images that are prepared already need it not.
+        Whether the pipeline removes the background and crops; not needed for images
+        prepared in this way.
 
     Yields
     ------
     Extracted or InputError
-        What came of each, or why it gave nothing; the others go on. A SLAT
-        whose record says the same image, seed and model is kept.
+        The result of each, or why it failed, which does not stop the others. An existing
+        SLAT whose record has the same image, seed and model is kept.
     """
     for extraction in extractions:
         try:
@@ -237,17 +243,17 @@ def extract(
 
 
 def decode_gaussians(session: Session, latents: StructuredLatents, path: Path) -> None:
-    """Save the Gaussians that TRELLIS decodes latents to, as TRELLIS saves them.
+    """Decode latents to Gaussians and save them as TRELLIS does.
 
     Parameters
     ----------
     session : Session
         The loaded pipeline.
     latents : StructuredLatents
-        Latents of TRELLIS; what has been standardised is brought back first, since the decoder
-        takes latents as the pipeline draws them.
+        Latents of TRELLIS. Standardised ones are converted back, since the decoder takes
+        latents as the pipeline samples them.
     path : Path
-        A PLY; one that is there is replaced.
+        A PLY; an existing file is replaced.
     """
     from trellis.modules.sparse import SparseTensor
 
@@ -280,7 +286,7 @@ def _extract(session: Session, extraction: Extraction, preprocess: bool) -> Extr
         "slat_normalization": dict(pipeline.slat_normalization),
         "feats": _LATENTS,
     }
-    # As it is read again, to be compared with: lists for tuples and arrays.
+    # As JSON and back, so that it equals a record that was read: lists for tuples and arrays.
     text = orjson.dumps(document, option=orjson.OPT_SERIALIZE_NUMPY)
     record: dict[str, Any] = orjson.loads(text)
     if extraction.slat.exists():
@@ -299,7 +305,7 @@ def _extract(session: Session, extraction: Extraction, preprocess: bool) -> Extr
         )
     with staged(extraction.slat) as path, path.open("wb") as stream:
         np.savez(stream, coords=coords, feats=feats)
-    record["slat"] = {"voxels": len(coords), "sha256": _sha256(extraction.slat)}
+    record["slat"] = {"voxels": len(coords), "sha256": file_digest(extraction.slat)}
     with staged(extraction.record) as path:
         path.write_text(json.dumps(record, indent=1) + "\n", encoding="utf-8")
     return Extracted(len(coords), kept=False, seconds=seconds)
@@ -313,11 +319,11 @@ def _run(
 
     def end_stage() -> None:
         if str(pipeline.device).startswith("cuda"):
-            session.torch.cuda.synchronize()  # what was asked for is computed later
+            session.torch.cuda.synchronize()  # Kernels run asynchronously.
         ends.append(time.perf_counter())
 
-    # The same calls in the same order as the pipeline's own `run`, which draws
-    # the same numbers for a seed, but decodes latents instead of returning them.
+    # The calls and their order are those of the pipeline's `run`, so that a seed gives the same
+    # numbers; `run` itself does not return the latents.
     with session.torch.no_grad():
         if preprocess:
             image = pipeline.preprocess_image(image)
@@ -339,19 +345,15 @@ def _kept(extraction: Extraction, record: dict[str, Any]) -> Extracted:
     try:
         before = json.loads(extraction.record.read_text("utf-8"))
         slat = before.pop("slat")
-        if before == record and _sha256(extraction.slat) == slat["sha256"]:
+        if before == record and file_digest(extraction.slat) == slat["sha256"]:
             return Extracted(int(slat["voxels"]), kept=True)
     except (OSError, ValueError, KeyError, TypeError, AttributeError):
-        pass  # a record that cannot be used says nothing of the file beside it
+        pass  # A record that cannot be read does not identify the file either.
     raise InputError(
         extraction.slat,
         "exists, and its record does not say that it came from this image, seed and model",
         "a new folder, or that you move the file away",
     )
-
-
-def _sha256(path: Path) -> str:
-    return hashlib.sha256(path.read_bytes()).hexdigest()
 
 
 def _read_image(path: Path) -> tuple[bytes, Image]:

@@ -19,7 +19,7 @@ from slatprep.cli.options import (
 from slatprep.cli.output import Cell, Output, write_csv
 
 if TYPE_CHECKING:
-    from slatprep.inspect.statistics import Distribution, GroupStatistics, StoreStatistics
+    from slatprep.inspect.distributions import Distribution, GroupStatistics, StoreStatistics
     from slatprep.records import Place
 
 _CATEGORIES = 20
@@ -30,7 +30,7 @@ _CATEGORIES = 20
 @store_argument
 @option("--verdict", ChoiceOf("slatprep.records:Verdict"), name="verdicts", multiple=True)
 @option("--category", name="categories", multiple=True)
-@option("--weight", ChoiceOf("slatprep.inspect.statistics:Weight"), "voxel")
+@option("--weight", ChoiceOf("slatprep.inspect.distributions:Weight"), "voxel")
 @option("--csv", NEW_FILE, name="csv_file")
 @option("--picture", NEW_FILE, metavar="FILE.png|svg|pdf")
 @jobs_option
@@ -70,7 +70,8 @@ def stats(
         raise click.BadParameter(
             f"{picture} ends in none of .{', .'.join(FORMATS)}", param_hint="--picture"
         )
-    from slatprep.inspect.statistics import COLUMNS, store_statistics, table_of
+    from slatprep.inspect.distributions import COLUMNS, table_of
+    from slatprep.inspect.statistics import store_statistics
     from slatprep.store import open_store
 
     opened = open_store(store)

@@ -1,8 +1,7 @@
-"""Take a store elsewhere: PLY, HDF5, WebDataset shards, or TRELLIS's npz.
+"""Export a store as PLY, HDF5, WebDataset shards, or TRELLIS's npz.
 
-Each format is one module. `export_store` chooses the assets, hands batches of
-them to the format's writer, and moves the result into its place when it is
-complete.
+Each format is one module. `export_store` chooses the assets, passes batches of them to the
+format's writer, and moves the result into place when it is complete.
 """
 
 from __future__ import annotations
@@ -31,22 +30,22 @@ FORMATS = {
     "webdataset": "slatprep.export.webdataset",
     "npz": "slatprep.export.npz",
 }
-"""Name of each format and its module; to add one, add its line here.
+"""Name of each format and its module; to add a format, add its line here.
 
-The module's ``writer`` takes the open store, the ids that go out and the
+The module's ``writer`` takes the open store, the ids of the exported assets and the
 `ExportOptions`, and returns a `Writer`.
 """
 
 Progress = Callable[[int, int], None]
-"""Called with the assets done and the assets in all."""
+"""Called with the number of assets done and the number of all assets."""
 
 _Entry = dict[str, Any]
-"""An asset in the index of an export: its id, its file, its number of points."""
+"""The entry of an asset in the index of an export: id, columns, file, number of points."""
 
 
 @dataclass(frozen=True)
 class ExportSummary:
-    """What an export wrote: where, how many assets, points, files and bytes, in what time."""
+    """The result of an export: path, number of assets, points, files and bytes, and time."""
 
     format: str
     path: Path
@@ -76,22 +75,20 @@ def export_store(
     store : str or Place
         The store.
     out : str or Path
-        The file (``hdf5``) or directory (all others) to write. An export that
-        is there is replaced when the new one is complete; anything else is
-        left alone.
+        The file (``hdf5``) or folder (all others) to write. An existing export is replaced
+        when the new one is complete; other files are left alone.
     format : {"ply", "hdf5", "webdataset", "npz"}
-        What to write; docs/export.md says what is in each.
+        The format, see docs/export.md.
     assets : sequence of str
         Ids of the assets; empty takes all.
     verdicts : sequence of str, optional
-        Take only assets with one of these verdicts; empty takes all. By
-        default those of `assets` whatever their verdict is, or all that are
-        good or doubtful.
+        Only assets with one of these verdicts; empty takes all. By default `assets` with any
+        verdict, or without them all good and doubtful assets.
     options : ExportOptions, optional
-        What only some formats ask for.
+        Options of some formats.
     jobs : int
-        Worker processes; the bytes written do not depend on it. HDF5 is
-        written by one.
+        Worker processes; the bytes written do not depend on it. HDF5 is written by one
+        process.
     progress : callable, optional
         See `Progress`.
 
@@ -103,8 +100,8 @@ def export_store(
     Raises
     ------
     ConfigError
-        If no asset is left, an id is unknown, or `out` is something else or
-        lies in the store.
+        If no asset is left, an id is unknown, or `out` lies in the store or holds something
+        that is not an export.
     StoreError
         If the store cannot be read.
     """
@@ -171,7 +168,7 @@ def _entry(written: Exported) -> _Entry:
 
 
 def _about(store: Store, format: str) -> dict[str, Any]:
-    """Return what every export says of the store it was made from, JSON-ready."""
+    """Return the description of the store in every export, JSON-ready."""
     attributes = store.attributes
     return {
         "format": target.FORMAT,

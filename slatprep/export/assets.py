@@ -1,4 +1,4 @@
-"""Choose assets of a store, and what all exports say of each."""
+"""Choose the assets of an export, and describe each."""
 
 from __future__ import annotations
 
@@ -23,14 +23,14 @@ COLUMNS = (
     "ambiguity",
     "valid_share",
 )
-"""The columns of ``asset/*`` that travel with an exported asset."""
+"""The columns of ``asset/*`` in every export."""
 
 TARGETS = ("properties", "material", "valid")
-"""What a decoder is trained on, beside coordinates and latents."""
+"""The arrays that a decoder is trained to predict."""
 
 
 class Exported(NamedTuple):
-    """What was written of an asset: the name of its file, and its number of points."""
+    """An asset that was written, the name of its file, and its number of points."""
 
     asset: StoredAsset
     file: str
@@ -38,16 +38,21 @@ class Exported(NamedTuple):
 
 
 def choose_ids(store: Store, assets: Sequence[str], verdicts: Sequence[str]) -> list[str]:
-    """Return the ids that were asked for, sorted.
+    """Return the ids of the chosen assets, sorted.
 
     Parameters
     ----------
     store : Store
         The store.
     assets : sequence of str
-        Ids; empty means all.
+        Ids; empty takes all.
     verdicts : sequence of str
-        Verdicts that may go out; empty means all.
+        Only assets with one of these verdicts; empty takes all.
+
+    Returns
+    -------
+    list of str
+        At least one id.
 
     Raises
     ------
@@ -72,6 +77,6 @@ def choose_ids(store: Store, assets: Sequence[str], verdicts: Sequence[str]) -> 
 
 
 def describe_columns(asset: StoredAsset) -> dict[str, Any]:
-    """Return an asset's id and its `COLUMNS`, as Python's own numbers and words."""
+    """Return an asset's id and its `COLUMNS`, as Python objects."""
     columns = {name: np.asarray(asset.columns[name]).tolist() for name in COLUMNS}
     return {"asset_id": asset.asset_id, **columns}

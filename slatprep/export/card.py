@@ -1,4 +1,4 @@
-"""The card of a published dataset: what a hub shows of it, and reads of it."""
+"""The card of a published dataset, which a hub displays and parses."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from slatprep.export.croissant import DESCRIPTION
 from slatprep.store import Store
 
 _SIZES = ((1_000, "n<1K"), (10_000, "1K<n<10K"), (100_000, "10K<n<100K"))
-"""Hugging Face's words for numbers of samples below these."""
+"""Hugging Face's size categories, each below a number of samples."""
 
 _TAGS = ("3d", "physics", "material-properties", "structured-latents", "zarr", "slatprep")
 
@@ -44,12 +44,12 @@ Each sample is an asset: `json` describes it, `npz` holds its arrays."""
 
 @dataclass(frozen=True)
 class Stated:
-    """What a store cannot know about itself; what is empty is not known.
+    """Metadata of a dataset that its store does not hold; empty if not known.
 
     Attributes
     ----------
     name, url, cite_as, version : str
-        Name, home page, how to cite it, version.
+        Name, home page, citation, version.
     license : str
         An SPDX identifier, such as ``CC-BY-4.0``, or the URL of a licence.
     date_published : str
@@ -65,25 +65,30 @@ class Stated:
 
     @property
     def license_url(self) -> str:
-        """Where the licence is to be read."""
+        """The URL of the licence."""
         if not self.license or "://" in self.license:
             return self.license
         return f"https://spdx.org/licenses/{self.license}"
 
 
 def card_of(store: Store, stated: Stated, data: str, pictures: Sequence[str]) -> str:
-    """Return the card, in Markdown with a head in YAML as Hugging Face has it.
+    """Return the card: Markdown with metadata in YAML, as Hugging Face expects it.
 
     Parameters
     ----------
     store : Store
         The store.
     stated : Stated
-        What is said of it.
+        Metadata that the store does not hold.
     data : str
-        Where the data lie beside the card: the name of the store, or the pattern of shards.
+        Path of the data, relative to the card: the name of the store, or a pattern of shards.
     pictures : sequence of str
         Names of pictures beside the card.
+
+    Returns
+    -------
+    str
+        The text of the file.
     """
     title = stated.name or store.name.removesuffix(".zarr")
     shards = data.endswith(".tar")
@@ -98,7 +103,7 @@ def card_of(store: Store, stated: Stated, data: str, pictures: Sequence[str]) ->
         head |= {"license": "other", "license_name": "stated", "license_link": stated.license}
     if shards:
         head["configs"] = [{"config_name": "default", "data_files": data}]
-    # Every JSON value is one of YAML.
+    # Every JSON value is a YAML value.
     lines = [f"{key}: {json.dumps(value, ensure_ascii=False)}" for key, value in head.items()]
     about = store.about
     how = _HOW_WEBDATASET if shards else _HOW_ZARR.format(data=data)
@@ -175,6 +180,6 @@ def _ranges(store: Store) -> Iterator[str]:
 
 
 def _plain(text: str) -> str:
-    """Return a stranger's text as Markdown that shows it and obeys nothing in it."""
+    """Return text as Markdown in which nothing is markup."""
     words = html.escape(" ".join(text.split()), quote=False)
     return "".join(f"\\{c}" if c in r"\`*_[]|#!" else c for c in words)

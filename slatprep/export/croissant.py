@@ -1,9 +1,9 @@
 """Describe a store in Croissant, MLCommons' vocabulary for datasets.
 
 The description is JSON-LD after the Croissant 1.0 specification
-(http://mlcommons.org/croissant/1.0). Croissant has no extraction from Zarr
-yet, so the arrays are described (files, shapes, types, meaning) and the table
-of assets and the classes are in the description itself, as records.
+(http://mlcommons.org/croissant/1.0). Croissant cannot extract records from Zarr, so the arrays
+are only described (files, shapes, types, meaning), while the table of assets, the classes and
+the ranges are in the description as records.
 """
 
 from __future__ import annotations
@@ -24,10 +24,10 @@ _TERMS = (
     "includes isLiveDataset jsonPath key md5 parentField path recordSet references regex "
     "repeated replace samplingRate separator source subField transform"
 )
-"""Croissant's terms that need no more than their name."""
+"""Croissant's terms without further attributes."""
 
-# The context that the specification prescribes. The package mlcroissant writes it
-# too, but is needed for nothing else here and brings pandas.
+# The context of the specification. The package mlcroissant writes it too, but would be needed
+# for nothing else and depends on pandas.
 _CONTEXT: dict[str, Any] = {
     "@language": "en",
     "@vocab": "https://schema.org/",
@@ -43,7 +43,7 @@ _CONTEXT: dict[str, Any] = {
 }
 
 ZARR = "https://zarr-specs.readthedocs.io/en/latest/v3/core/index.html"
-"""What Zarr's files are; no media type is registered for them."""
+"""The format of Zarr's files; no media type is registered for it."""
 
 DESCRIPTION = (
     "PixieVerse material fields aligned with TRELLIS structured latents: for every latent voxel "
@@ -71,16 +71,15 @@ def describe(
     store : Store
         The store.
     location : str
-        Path or URL of the store as the description's readers see it, the
-        store's own name by default.
+        Path or URL of the store for readers of the description; by default the store's name.
     name, description, license, url, cite_as, version, date_published : str
-        What the store cannot know about itself. What is empty is left out,
-        and Croissant's validator says that it is recommended.
+        Metadata that the store does not hold. Empty ones are left out, of which Croissant's
+        validator warns.
 
     Returns
     -------
     dict
-        JSON-LD, JSON-ready. The same store gives the same description.
+        JSON-LD, JSON-ready; the same for the same store.
 
     Raises
     ------
@@ -214,7 +213,7 @@ def _assets(store: Store) -> dict[str, Any]:
         column = store.column(name)
         kind = "sc:Float" if column.dtype.kind == "f" else "sc:Text"
         fields[name] = kind, str(group[name].attrs.get("description", ""))
-        # JSON has no NaN, the one value that is not equal to itself: null stands for it.
+        # JSON has no NaN, which is the only value that differs from itself.
         columns.append([value if value == value else None for value in column.tolist()])
     fields["first_row"] = "sc:Integer", "its first row of voxel/*"
     fields["end_row"] = "sc:Integer", "the row after its last"

@@ -1,4 +1,4 @@
-"""What a format of an export offers: a `Writer`, which its module's ``writer`` returns."""
+"""The interface of an export format: the `Writer` that its module's ``writer`` returns."""
 
 from __future__ import annotations
 
@@ -13,24 +13,23 @@ Points = Literal["slat", "grid"]
 Frame = Literal["slat", "pixieverse"]
 
 TRELLIS_ENCODER = "dinov2_vitl14_reg_slat_enc_swin8_B_64l8_fp16"
-"""The encoder whose latents TRELLIS's published configurations name as ``latent_model``."""
+"""The encoder that TRELLIS's published configurations name as ``latent_model``."""
 
 
 @dataclass(frozen=True)
 class ExportOptions:
-    """What only some formats ask for.
+    """Options of some formats.
 
     Attributes
     ----------
     points : {"slat", "grid"}
-        PLY: the SLAT's voxels with the annotations found for them, or the
-        annotated voxels of the PixieVerse field.
+        PLY: the valid voxels of the SLAT, or the annotated voxels of the PixieVerse field.
     frame : {"slat", "pixieverse"}
-        PLY: the unit cube of the SLAT, or the world of PixieVerse's bounds.
+        PLY: the unit cube of the SLAT, or PixieVerse's world coordinates.
     shard_size : int
         WebDataset: assets in one shard.
     latent_model : str
-        npz: the encoder's name, by which TRELLIS's data set finds the latents.
+        npz: the encoder's name, by which TRELLIS's dataset finds the latents.
     """
 
     points: Points = "slat"
@@ -46,20 +45,19 @@ class Writer:
     Attributes
     ----------
     write : callable
-        Takes the directory, the number of a batch and its assets; writes
-        them and yields an `Exported` of each. Of an export that is one file:
-        takes the file, what is to be said of the store, and all assets.
+        Takes the folder, the number of a batch and its assets; writes them and yields an
+        `Exported` for each. If the export is a single file: takes the file, the description
+        of the store, and all assets.
     batch : int
-        Assets a worker takes at a time, so that opening the store does not
-        count.
+        Assets per task of a worker; several, so that opening the store takes little of it.
     notes : tuple of str
-        What a person should know of the result.
+        Remarks on the result for the user.
     finish : callable, optional
-        Takes the directory and the index's entry of each asset, sorted by id;
-        writes what is of all of them and returns the names of those files.
+        Takes the folder and the index's entries, sorted by id; writes the files that cover all
+        assets and returns their names.
     is_export : callable, optional
-        Given where the export is one file, which one process writes: whether
-        a file is such an export and may be replaced.
+        Only if the export is a single file, which one process writes: whether an existing
+        file is such an export and may be replaced.
     """
 
     write: Callable[..., Iterable[Exported]]

@@ -1,4 +1,4 @@
-"""One HDF5 file, a group an asset."""
+"""One HDF5 file with a group for each asset."""
 
 from __future__ import annotations
 
@@ -37,26 +37,26 @@ _DATASETS: dict[str, dict[str, Any]] = {
 
 
 def writer(store: Store, ids: Sequence[str], options: ExportOptions) -> Writer:
-    """Return what writes all assets into one file; see `slatprep.export.FORMATS`."""
+    """Return the writer of one file with all assets; see `slatprep.export.FORMATS`."""
     return Writer(write, is_export=is_export)
 
 
 def write(path: Path, about: dict[str, Any], assets: Iterable[StoredAsset]) -> Iterator[Exported]:
-    """Write a file with a group an asset, whose columns are the group's attributes.
+    """Write a file with a group for each asset; its columns become the group's attributes.
 
     Parameters
     ----------
     path : Path
         The file.
     about : dict
-        Attributes of the root; what is nested becomes JSON.
+        Attributes of the root; nested values are written as JSON.
     assets : iterable of StoredAsset
         The assets.
 
     Yields
     ------
     Exported
-        What was written of each.
+        For each asset.
     """
     import h5py
 
@@ -86,10 +86,10 @@ def _write_group(file: h5py.File, asset: StoredAsset) -> None:
 
 
 class _LateFaults(io.FileIO):
-    """A file that seems to take everything, and says afterwards if it did not.
+    """A file that hides errors of writing until `raise_fault` raises them.
 
-    HDF5 cannot close a file that a full disk has refused: it tries again for as
-    long as the process lives, and ends it by a segmentation fault.
+    HDF5 cannot close a file after an error such as a full disk: it retries for as long as the
+    process runs, and then crashes it.
     """
 
     fault: OSError | None = None
@@ -111,7 +111,7 @@ class _LateFaults(io.FileIO):
             return size or 0
 
     def raise_fault(self) -> None:
-        """Raise the first fault, if there was one."""
+        """Raise the first error, if there was one."""
         if self.fault is not None:
             raise self.fault
 

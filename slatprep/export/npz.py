@@ -1,8 +1,7 @@
-"""The layout that TRELLIS's structured-latent data set loads, with the targets in each npz.
+"""The layout that TRELLIS's dataset of structured latents loads, with the targets added.
 
-Below the root lie ``latents/<model>/<sha256>.npz`` and ``metadata.csv``, by
-whose columns TRELLIS chooses and finds the files (its ``DATASET.md`` and
-``trellis/datasets``).
+The root has ``latents/<model>/<sha256>.npz`` and ``metadata.csv``, whose columns TRELLIS uses to
+choose and find the files (its ``DATASET.md`` and ``trellis/datasets``).
 """
 
 from __future__ import annotations
@@ -24,16 +23,16 @@ from slatprep.store import Store, StoredAsset
 METADATA = "metadata.csv"
 
 _NO_WORDS = frozenset({"na", "null", "none", "true", "false"})
-"""What pandas, with which TRELLIS reads `METADATA`, takes for something else than a name."""
+"""Words that pandas, with which TRELLIS reads `METADATA`, does not read as text."""
 
 
 def writer(store: Store, ids: Sequence[str], options: ExportOptions) -> Writer:
-    """Return what writes TRELLIS's layout; see `slatprep.export.FORMATS`.
+    """Return the writer of TRELLIS's layout; see `slatprep.export.FORMATS`.
 
     Raises
     ------
     ConfigError
-        If the model's name cannot name a folder.
+        If the model's name is not usable as the name of a folder.
     """
     model = options.latent_model
     if not model or model != file_name(model):
@@ -46,40 +45,54 @@ def writer(store: Store, ids: Sequence[str], options: ExportOptions) -> Writer:
 def write(
     model: str, directory: Path, number: int, assets: Iterable[StoredAsset]
 ) -> Iterator[Exported]:
-    """Write one npz an asset: TRELLIS's ``coords`` and ``feats``, and the `TARGETS`.
+    """Write an npz for each asset: TRELLIS's ``coords`` and ``feats``, and the `TARGETS`.
 
     Parameters
     ----------
     model : str
-        The encoder's name, which is the folder's.
+        The encoder's name, which names the folder.
     directory : Path
         The root.
     number : int
-        Of the batch; unused, as each asset has its own file.
+        Number of the batch; not used, since each asset has its own file.
     assets : iterable of StoredAsset
         The assets of the batch.
 
     Yields
     ------
     Exported
-        What was written of each.
+        For each asset.
     """
     folder = PurePosixPath("latents", model)
     (directory / folder).mkdir(parents=True, exist_ok=True)
     for asset in assets:
         name = str(folder / f"{_stem(asset.asset_id)}.npz")
         arrays = {key: getattr(asset, key) for key in ("coords", *TARGETS)}
-        # TRELLIS's data set standardises what it reads.
+        # TRELLIS's dataset standardises the latents that it reads.
         arrays["feats"] = asset.store.contents.latents.as_encoded(asset.feats)
         np.savez_compressed(directory / name, **arrays)
         yield Exported(asset, name, len(asset.coords))
 
 
 def write_metadata(model: str, directory: Path, entries: Sequence[dict[str, Any]]) -> list[str]:
-    """Write the table by which TRELLIS's data set finds the latents; return its name.
+    """Write the table by which TRELLIS's dataset finds the latents.
 
-    ``aesthetic_score`` is not known here and would leave every asset out if it
-    were empty; ``inf`` passes any threshold and is no score that was measured.
+    ``aesthetic_score`` is not known. Without a number TRELLIS would leave the asset out; ``inf``
+    passes every threshold and cannot be mistaken for a measured score.
+
+    Parameters
+    ----------
+    model : str
+        The encoder's name.
+    directory : Path
+        The root.
+    entries : sequence of dict
+        The index's entry of each asset.
+
+    Returns
+    -------
+    list of str
+        The name of the table.
     """
     with (directory / METADATA).open("w", encoding="utf-8", newline="") as file:
         table = csv.writer(file, lineterminator="\n")
@@ -91,10 +104,10 @@ def write_metadata(model: str, directory: Path, entries: Sequence[dict[str, Any]
 
 
 def _stem(asset_id: str) -> str:
-    """Name an asset's file so that pandas reads the name back as it is."""
+    """Return a name for an asset's file that pandas reads as the same text."""
     name = file_name(asset_id)
     try:
-        if name == str(int(name)) and len(name) < 19:  # a number of 64 bits comes back as it is
+        if name == str(int(name)) and len(name) < 19:  # It survives as int64.
             return name
     except ValueError:
         pass

@@ -1,7 +1,7 @@
-"""One PLY point cloud an asset, with the fields of Pixie's material fields.
+"""A PLY point cloud for each asset, with the fields of Pixie's material fields.
 
-Fields, their order and types are those of Pixie's ``map_pred_to_coords.py``,
-which its fork of PhysGaussian's solver loads (``load_point_cloud``).
+Fields, their order and types are those of Pixie's ``map_pred_to_coords.py``, which Pixie's fork
+of PhysGaussian loads (``load_point_cloud``).
 """
 
 from __future__ import annotations
@@ -31,12 +31,12 @@ VERTEX = np.dtype(
         ("material_id", "<i4"), ("conf", "<f4"),
     ]
 )  # fmt: skip
-"""A point as Pixie lays it out; density in kg/m^3, E in Pa."""
+"""The fields of a point in Pixie's order; density in kg/m^3, E in Pa."""
 
 _TYPE_NAMES = {"<f4": "float", "<i4": "int", "|u1": "uchar"}
 
 UNITS = "density kg/m^3, E Pa, nu 1"
-"""The comment by which every PLY written here states its units."""
+"""The units, a comment in every PLY written here."""
 
 _COMMENTS = {
     "slat": "frame SLAT, unit cube -0.5..0.5, z up",
@@ -45,14 +45,14 @@ _COMMENTS = {
 
 
 Bounds = NDArray[np.float64]
-"""Smallest and largest world coordinate of a field: (2, 3), columns x, y, z."""
+"""Smallest and largest world coordinates of a field, (2, 3)."""
 
 UNIT_CUBE: Bounds = np.array([[-0.5] * 3, [0.5] * 3])
-"""Pixie's own default bounds."""
+"""Pixie's default bounds."""
 
 
 def writer(store: Store, ids: Sequence[str], options: ExportOptions) -> Writer:
-    """Return what writes one PLY an asset; see `slatprep.export.FORMATS`."""
+    """Return the writer of a PLY for each asset; see `slatprep.export.FORMATS`."""
     bounds, notes = read_bounds(store, ids) if options.frame == "pixieverse" else ({}, ())
     one = functools.partial(
         write,
@@ -74,35 +74,32 @@ def write(
     bounds: Mapping[str, Bounds],
     max_distance: float,
 ) -> Iterator[Exported]:
-    """Write one PLY an asset, of its annotated points.
+    """Write a PLY of the annotated points of each asset.
 
     Parameters
     ----------
     directory : Path
-        Where to.
+        The folder of the export.
     number : int
-        Of the batch; unused, as each asset has its own file.
+        Number of the batch; not used, since each asset has its own file.
     assets : iterable of StoredAsset
         The assets of the batch.
-    points : {"slat", "grid"}
-        Which points.
-    frame : {"slat", "pixieverse"}
-        Where they lie.
+    points, frame : str
+        As in `ExportOptions`.
     bounds : mapping
         World bounds by asset id, for the PixieVerse frame.
     max_distance : float
-        Voxels to an annotation at which ``conf`` is 0.
+        Distance [voxel] to the annotation at which ``conf`` is 0.
 
     Yields
     ------
     Exported
-        What was written of each.
+        For each asset.
 
     Notes
     -----
-    ``conf`` falls from 1 to 0 with the distance to the annotation used; a
-    point of the grid is its own annotation and has 1. ``part_label`` is the
-    class, as it is in what Pixie itself predicts.
+    ``conf`` falls linearly from 1 to 0 with the distance to the annotation; for points of the
+    grid it is 1. ``part_label`` is the class, as in Pixie's own predictions.
     """
     for asset in assets:
         table = asset.store.contents.properties
@@ -146,7 +143,7 @@ def write_points(
     path : Path
         The file.
     positions : ndarray of float, shape (N, 3)
-        Where they lie.
+        Positions in the frame.
     material : ndarray of uint8, shape (N,)
         Class of each, 0..7.
     properties : ndarray of float32, shape (N, 3)
@@ -154,9 +151,9 @@ def write_points(
     conf : ndarray of float, shape (N,)
         Confidence in 0..1.
     frame : str
-        What the file says of the frame, in one line.
+        Description of the frame, in one line, for a comment.
     more : mapping, optional
-        Further properties (N,), by name and unit; they stand after Pixie's.
+        Further properties (N,) by name and unit, written after Pixie's.
     """
     more = more or {}
     layout = np.dtype([*VERTEX.descr, *((name, "<f4") for name, _ in more)])
@@ -189,14 +186,14 @@ def read_bounds(store: Store, ids: Sequence[str]) -> tuple[dict[str, Bounds], tu
     Returns
     -------
     bounds : dict
-        By asset id; `UNIT_CUBE` where the sources stated none.
+        By asset id; `UNIT_CUBE` if the sources stated none.
     notes : tuple of str
-        What a person should know.
+        Remarks for the user.
 
     Raises
     ------
     StoreError
-        If a record's bounds make no sense.
+        If a record's bounds are invalid.
     """
     records = StoredRecords(store)
     stated = {asset_id: records.of(asset_id).bounds for asset_id in ids}
@@ -225,20 +222,20 @@ def _bounds(stated: dict[str, Any], where: str) -> Bounds:
 
 
 def to_world(points: ArrayLike, bounds: ArrayLike) -> NDArray[np.float64]:
-    """Carry points of the PixieVerse frame to world coordinates.
+    """Convert points of the PixieVerse frame to world coordinates.
 
     Parameters
     ----------
     points : array_like, shape (N, 3)
         Points of the unit cube in which voxel i is centred at (i + 0.5)/64 - 0.5.
     bounds : array_like, shape (2, 3)
-        What ``clip_features.npz`` states: the least and the greatest corner.
+        ``min_bounds`` and ``max_bounds`` of ``clip_features.npz``.
 
     Returns
     -------
     ndarray of float64, shape (N, 3)
-        Voxel i lies at ``linspace(min_bounds, max_bounds, 64)[i]``, where
-        Pixie's ``map_pred_to_coords.py`` puts it.
+        Voxel i lies at ``linspace(min_bounds, max_bounds, 64)[i]``, as in Pixie's
+        ``map_pred_to_coords.py``.
 
     Examples
     --------
@@ -260,7 +257,7 @@ def _colours() -> NDArray[np.uint8]:
 
 
 def _write(path: Path, vertices: NDArray[np.void], comments: tuple[str, ...]) -> None:
-    # A header and the rows as they lie in memory: the format is no more than that.
+    # The format is a header followed by the rows as in memory, so no library is needed.
     fields = vertices.dtype
     lines = [
         "ply",

@@ -1,4 +1,4 @@
-"""A folder that a hub of datasets takes as it is: card, description, pictures, data, checksums."""
+"""Write a dataset for a hub: card, description, pictures, data and checksums in a folder."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ from slatprep.store import open_store
 Data = Literal["store", "webdataset"]
 
 CARD, DESCRIPTION, CHECKSUMS, SHARDS = "README.md", "croissant.json", "SHA256SUMS", "data"
-"""Names of what lies beside the data, and of the folder of shards."""
+"""Names of the files beside the data, and of the folder of shards."""
 
 
 @dataclass(frozen=True)
 class PublishSummary:
-    """What was written: where, of which assets, and what of it a person should complete."""
+    """The result: path, data, number of assets, files and bytes, and metadata not stated."""
 
     path: Path
     data: str
@@ -44,24 +44,24 @@ def publish_store(
     verdicts: Sequence[str] | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> PublishSummary:
-    """Write what a dataset needs on a hub.
+    """Write a store as a dataset for a hub.
 
     Parameters
     ----------
     store : str or Place
         A store of the local disk.
     out : Path
-        The folder; one that was published before is replaced when the new one is complete.
+        The folder; an earlier result is replaced when the new one is complete.
     data : {"store", "webdataset"}
-        The data: the store as it is, or shards of the WebDataset convention.
+        The data: a copy of the store, or WebDataset shards.
     stated : Stated, optional
-        Licence and what else the store does not know.
+        Licence and other metadata that the store does not hold.
     pictures : mapping of str to bytes, optional
-        Pictures of the card by their names.
+        Pictures for the card by file name.
     verdicts : sequence of str, optional
         As in `slatprep.export.export_store`, for shards.
     progress : callable, optional
-        Called with the assets done and the assets in all, for shards.
+        Called with the number of assets done and the number of all assets, for shards.
 
     Returns
     -------
@@ -71,7 +71,8 @@ def publish_store(
     Raises
     ------
     ConfigError
-        If the store is on no local disk, or `out` is something else or lies in the store.
+        If the store is not on a local disk, or `out` lies in it or holds something that
+        `publish_store` did not write.
     StoreError
         If the store cannot be read.
     """
@@ -82,11 +83,12 @@ def publish_store(
     if local.resolve() in (out.resolve(), *out.resolve().parents):
         raise ConfigError(f"{out} lies inside the store; expected a path outside {place}")
     opened = open_store(place)
+    assets = len(opened)
     with target.directory(out) as folder:
         if data == "store":
             where = opened.name
             _copy(local, folder / where)
-            # Of shards a hub writes a description itself.
+            # For shards, hubs generate a description themselves.
             document = croissant.describe(
                 opened,
                 location=where,
@@ -100,7 +102,9 @@ def publish_store(
             (folder / DESCRIPTION).write_text(croissant.to_json(document), encoding="utf-8")
         else:
             where = f"{SHARDS}/*.tar"
-            export_store(place, folder / SHARDS, "webdataset", verdicts=verdicts, progress=progress)
+            assets = export_store(
+                place, folder / SHARDS, "webdataset", verdicts=verdicts, progress=progress
+            ).assets
         for name, content in (pictures or {}).items():
             (folder / name).write_bytes(content)
         card = card_of(opened, stated, where, list(pictures or ()))
@@ -116,11 +120,11 @@ def publish_store(
         target.write_index(folder, about, [])
     asked = ("license", "cite_as", "url", "date_published")
     missing = tuple(f"--{name.replace('_', '-')}" for name in asked if not getattr(stated, name))
-    return PublishSummary(out, where, len(opened), len(names), size, missing)
+    return PublishSummary(out, where, assets, len(names), size, missing)
 
 
 def _copy(store: Path, to: Path) -> None:
-    """Copy the regular files of a store, so that no link comes along."""
+    """Copy the regular files of a store; links and others raise an error."""
     for name, size in local_files(store).items():
         if size < 0:
             raise ConfigError(f"{store / name}: is no regular file; `slatprep verify` says more")

@@ -1,4 +1,4 @@
-"""Where an export goes: complete, or not at all, and never over something else."""
+"""The target of an export: written completely or not at all, and never over other files."""
 
 from __future__ import annotations
 
@@ -19,25 +19,35 @@ from slatprep.storage.atomic import flush, flush_tree, replace_directory, staged
 FORMAT = "slatprep-export"
 FORMAT_VERSION = 1
 INDEX = "index.json"
-"""Name of the file that says what is in an exported directory."""
+"""Name of the file that lists the contents of an exported folder."""
 
 
 @contextmanager
 def directory(out: Path) -> Iterator[Path]:
-    """Yield a new directory that takes the place of `out` when all went well.
+    """Yield a new folder that replaces `out` on success.
 
-    Where `out` holds more than an export, the files of the export alone are
-    replaced, one by one; otherwise all of it at once.
+    If `out` holds other files beside an export, the files of the export are replaced one by
+    one; otherwise the folder is replaced at once.
+
+    Parameters
+    ----------
+    out : Path
+        The target.
+
+    Yields
+    ------
+    Path
+        An empty folder to write to.
 
     Raises
     ------
     ConfigError
-        If `out` is there and is neither empty nor an export, or if something of
-        another origin has the name of a file to be written.
+        If `out` exists and is neither empty nor an export, or if another file has the name of
+        a file to be written.
     SlatprepError
-        If nothing can be written there.
+        If it cannot be written.
     """
-    # What a link points at is replaced, not the link.
+    # A link stays; its target is replaced.
     out = out.resolve()
     own = _files_of_export(out) if out.exists() else frozenset()
     if own is None:
@@ -60,14 +70,26 @@ def directory(out: Path) -> Iterator[Path]:
 
 @contextmanager
 def file(out: Path, is_export: Callable[[Path], bool]) -> Iterator[Path]:
-    """Yield a new file that takes the place of `out` when all went well.
+    """Yield a new file that replaces `out` on success.
+
+    Parameters
+    ----------
+    out : Path
+        The target.
+    is_export : callable
+        Whether an existing file is an export and may be replaced.
+
+    Yields
+    ------
+    Path
+        A path to write to.
 
     Raises
     ------
     ConfigError
-        If `out` is there and is no export.
+        If `out` exists and is not an export.
     SlatprepError
-        If nothing can be written there.
+        If it cannot be written.
     """
     out = out.resolve()
     if out.exists() and not (out.is_file() and is_export(out)):
@@ -77,14 +99,14 @@ def file(out: Path, is_export: Callable[[Path], bool]) -> Iterator[Path]:
 
 
 def write_index(path: Path, about: dict[str, Any], entries: Sequence[dict[str, Any]]) -> None:
-    """Write what an exported directory holds, one asset a line."""
+    """Write the index of an exported folder, with a line for each asset."""
     head = orjson.dumps(about, option=orjson.OPT_INDENT_2).removesuffix(b"\n}")
     rows = b",\n    ".join(map(orjson.dumps, entries))
     (path / INDEX).write_bytes(head + b',\n  "assets": [\n    ' + rows + b"\n  ]\n}\n")
 
 
 def _files_of_export(out: Path) -> frozenset[str] | None:
-    """Return the names of an export's files and folders; None if it is none, nor empty."""
+    """Return the names of an export's files and folders; None if `out` is not an export."""
     if not out.is_dir():
         return None
     if not any(out.iterdir()):
@@ -102,14 +124,14 @@ def _files_of_export(out: Path) -> frozenset[str] | None:
 
 
 def _names_below(directory: Path) -> Iterator[str]:
-    """Yield the names of all files and folders below a directory; links are not followed."""
+    """Yield the names of all files and folders below a folder; links are not followed."""
     for parent, folders, files in os.walk(directory):
         for name in (*folders, *files):
             yield Path(parent, name).relative_to(directory).as_posix()
 
 
 def _replace_files(new: Path, out: Path, own: frozenset[str], others: set[str]) -> None:
-    """Put the files of a new export in the place of the old one's, and leave all others alone."""
+    """Replace the files of an old export by those of a new one; keep all other files."""
     names = sorted(_names_below(new), key=lambda name: (name == INDEX, name))
     if taken := sorted(others.intersection(names)):
         raise ConfigError(
@@ -117,11 +139,11 @@ def _replace_files(new: Path, out: Path, own: frozenset[str], others: set[str]) 
             "name; move it away, or export to a new path"
         )
     flush_tree(new)
-    # Only what is there under a name of the old index: an index may say anything.
+    # Only names found below `out`: the index may contain any path.
     for name in own.intersection(_names_below(out)).difference(names):
         if not (out / name).is_dir():
             (out / name).unlink()
-    for name in names:  # the index last
+    for name in names:  # The index comes last.
         if (new / name).is_dir():
             (out / name).mkdir(exist_ok=True)
         else:

@@ -1,4 +1,4 @@
-"""Shards of the WebDataset convention: a tar whose members of one key are one sample."""
+"""WebDataset shards: tar files in which the members with one key are a sample."""
 
 from __future__ import annotations
 
@@ -17,29 +17,29 @@ from slatprep.store import Store, StoredAsset
 
 
 def writer(store: Store, ids: Sequence[str], options: ExportOptions) -> Writer:
-    """Return what writes a shard of `options.shard_size` assets; see `slatprep.export.FORMATS`."""
+    """Return the writer of shards of `options.shard_size` assets; see `slatprep.export.FORMATS`."""
     return Writer(write, batch=options.shard_size)
 
 
 def write(directory: Path, number: int, assets: Iterable[StoredAsset]) -> Iterator[Exported]:
-    """Write a shard, of each asset ``<key>.json`` and ``<key>.npz``.
+    """Write a shard with ``<key>.json`` and ``<key>.npz`` for each asset.
 
-    The key is the asset's id without dots, since WebDataset takes what follows
-    the first dot for the member's kind.
+    The key is the asset's id with dots encoded, since for WebDataset a key ends at the first
+    dot.
 
     Parameters
     ----------
     directory : Path
-        Where to.
+        The folder of the export.
     number : int
-        Of the shard.
+        Number of the shard.
     assets : iterable of StoredAsset
         The assets of the shard.
 
     Yields
     ------
     Exported
-        What was written of each.
+        For each asset.
     """
     shard = f"shard-{number:06d}.tar"
     with tarfile.open(directory / shard, "w") as tar:
@@ -48,7 +48,7 @@ def write(directory: Path, number: int, assets: Iterable[StoredAsset]) -> Iterat
             about = {**describe_columns(asset), "transform": asset.transform.tolist()}
             _add(tar, f"{key}.json", orjson.dumps(about))
             names = ("coords", "feats", *TARGETS, "distance", "place")
-            # Not compressed: a training loop reads this again and again.
+            # Not compressed, since a training loop reads it repeatedly.
             packed = io.BytesIO()
             np.savez(packed, **{name: getattr(asset, name) for name in names})
             _add(tar, f"{key}.npz", packed.getvalue())
@@ -56,7 +56,7 @@ def write(directory: Path, number: int, assets: Iterable[StoredAsset]) -> Iterat
 
 
 def _add(tar: tarfile.TarFile, name: str, content: bytes) -> None:
-    # A TarInfo of its own has no owner and time 0, so the bytes repeat.
+    # A new TarInfo has no owner and time 0, so the bytes are reproducible.
     member = tarfile.TarInfo(name)
     member.size = len(content)
     tar.addfile(member, io.BytesIO(content))

@@ -1,4 +1,4 @@
-"""Is an asset's alignment good? The answer, recomputed from the store alone."""
+"""Whether an asset's alignment is good, recomputed from the store alone."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from slatprep.sample import sample
 from slatprep.store.reader import Store, StoredAsset, open_store
 
 QUALITY_TOLERANCE = 1e-3
-"""Recomputed quality differs less than this; one voxel at the radius may round either way."""
+"""Largest difference of a recomputed figure: a voxel at the radius may round either way."""
 
 TOLERANCES = {
     "voxel/valid": 0.0,
@@ -27,7 +27,8 @@ TOLERANCES = {
 }
 """Largest difference between an array and its recomputed values, by name.
 
-Properties are normalised: float32 went through SI and back. Distances are in voxels.
+Properties are normalised; converting float32 to SI and back costs digits. Distances are in
+voxels.
 """
 
 _QUALITY = ("fitness", "inlier_rmse", "fitness_backward", "inlier_rmse_backward", "overlap")
@@ -37,18 +38,18 @@ AT_LEAST = {
     "expected_accuracy": THRESHOLDS.good_accuracy,
     "valid_share": THRESHOLDS.good_valid_share,
 }
-"""Figures that a good alignment reaches, by name."""
+"""Least value of each figure in a good alignment."""
 
 AT_MOST = {"ambiguity": THRESHOLDS.good_ambiguity}
-"""Figures that a good alignment does not exceed, by name."""
+"""Largest value of each figure in a good alignment."""
 
 
 @dataclass(frozen=True)
 class Figure:
     """One number of a check.
 
-    ``value`` was computed now, ``stored`` is what the store says; ``limit`` is
-    the largest allowed difference of the two.
+    ``value`` was computed now, ``stored`` is in the store; ``limit`` is their largest allowed
+    difference.
     """
 
     name: str
@@ -58,27 +59,28 @@ class Figure:
 
     @property
     def passes(self) -> bool | None:
-        """Whether the value is a good alignment's; None where the verdict does not ask."""
+        """Whether the value is that of a good alignment; None if it has no threshold."""
         if self.name in AT_LEAST:
             return self.value >= AT_LEAST[self.name]
         return self.value <= AT_MOST[self.name] if self.name in AT_MOST else None
 
     @property
     def threshold_text(self) -> str:
-        """What is good, like ``>= 0.8``; empty where the verdict does not ask."""
+        """The threshold in words, like ``>= 0.8``; empty if there is none."""
         if self.name in AT_LEAST:
             return f">= {AT_LEAST[self.name]:g}"
         return f"<= {AT_MOST[self.name]:g}" if self.name in AT_MOST else ""
 
     @property
     def ok(self) -> bool:
-        """Whether the two agree."""
-        return bool(abs(self.value - self.stored) <= self.limit)
+        """Whether the two agree; not-a-number, such as the margin of a known frame, is itself."""
+        both_unknown = math.isnan(self.value) and math.isnan(self.stored)
+        return both_unknown or bool(abs(self.value - self.stored) <= self.limit)
 
 
 @dataclass(frozen=True)
 class AlignmentCheck:
-    """What a check found.
+    """The result of a check.
 
     Attributes
     ----------
@@ -91,8 +93,8 @@ class AlignmentCheck:
     stored_verdict : str
         The verdict that the store holds.
     figures : tuple of Figure
-        Every number, computed now and as stored. Ambiguity and margin are
-        taken from the store: it does not hold the placements they come from.
+        Every number, computed now and as stored. Ambiguity and margin are only taken from
+        the store, which does not hold the placements that they follow from.
     transform : ndarray of float64, shape (4, 4)
         PixieVerse frame to SLAT frame.
     radius : float
@@ -112,12 +114,12 @@ class AlignmentCheck:
         return next(figure for figure in self.figures if figure.name == name)
 
     def value(self, name: str) -> float:
-        """Return the value of a figure; NaN where the store does not tell."""
+        """Return the value of a figure; NaN if the store does not have it."""
         return next((figure.value for figure in self.figures if figure.name == name), math.nan)
 
     @property
     def words(self) -> tuple[str, ...]:
-        """The verdict in words: why it is not better, or what makes it good."""
+        """The reasons of the verdict: why it is not better, or what makes it good."""
         if self.reasons:
             return self.reasons
         forward, backward = self.figure("fitness").value, self.figure("fitness_backward").value
@@ -131,7 +133,7 @@ class AlignmentCheck:
 
     @property
     def consistent(self) -> bool:
-        """Whether the store holds what its own grid, voxels and transform give."""
+        """Whether the stored figures agree with the stored grid, voxels and transform."""
         return self.verdict == self.stored_verdict and all(figure.ok for figure in self.figures)
 
     @property
@@ -153,12 +155,12 @@ def check_alignment(store: Store, asset_id: str) -> AlignmentCheck:
     Returns
     -------
     AlignmentCheck
-        Quality and annotation as computed now beside those stored.
+        Quality and annotation, recomputed and as stored.
 
     Raises
     ------
     StoreError
-        If the store has no such asset, or does not say how it was made.
+        If the store has no such asset, or lacks its build parameters.
     """
     asset = store.asset(asset_id)
     radius = store.about.build.parameters.align.radius
@@ -175,7 +177,7 @@ def check_alignment(store: Store, asset_id: str) -> AlignmentCheck:
         quality,
         valid_share,
         ambiguity,
-        # Of another fit than the one that was judged the confidence says nothing.
+        # The confidence was computed for the stored fit and holds for no other.
         confidence=confidence if same_fit else math.nan,
         expected_accuracy=expected,
         contradicted=bool(columns["contradicted"]),
@@ -214,7 +216,12 @@ def check_stored(path: Place, asset_id: str) -> AlignmentCheck:
 
 
 def recompute_annotation(asset: StoredAsset) -> tuple[float, dict[str, NDArray[np.float64]]]:
-    """Sample an asset's annotation again from the stored grid, and compare.
+    """Sample an asset's annotation again from the stored grid and compare it with the store.
+
+    Parameters
+    ----------
+    asset : StoredAsset
+        The asset.
 
     The grid is that of one annotation. Where labels are merged of several, those are
     compared in which all agree or which it alone reaches.
@@ -224,15 +231,14 @@ def recompute_annotation(asset: StoredAsset) -> tuple[float, dict[str, NDArray[n
     valid_share : float
         Share of the SLAT voxels that get an annotation now.
     differences : dict of str to ndarray of float64, shape (N,)
-        How much each SLAT voxel differs, by array, named as in `TOLERANCES`:
-        1 where valid or material is another one, the largest difference of
-        the three normalised properties where both are valid (0 elsewhere),
-        and that of the distance [voxel]. NaN is a difference, too.
+        How much each SLAT voxel differs, by the arrays of `TOLERANCES`: 1 where valid or
+        material changed, the largest difference of the normalised properties where both are
+        valid (0 elsewhere), and that of the distance [voxel]. NaN counts as a difference.
 
     Raises
     ------
     StoreError
-        If the store does not say how it was made.
+        If the store lacks its build parameters.
     """
     parameters = asset.store.about.build.parameters.sample
     annotation = sample(asset.field, asset.place, parameters)
@@ -257,35 +263,36 @@ def recompute_annotation(asset: StoredAsset) -> tuple[float, dict[str, NDArray[n
 def choose_assets(
     store: Store, asset_ids: Iterable[str] = (), worst: int = 0, ambiguous: bool = False
 ) -> list[str]:
-    """Choose assets to look at, each once: those named, then the worst, then the ambiguous.
+    """Choose assets to check, each once: those named, then the worst, then the ambiguous.
 
     Parameters
     ----------
     store : Store
         The store; only its ``asset/*`` arrays are read.
     asset_ids : iterable of str
-        Assets by id, or a beginning that no other has, in this order.
+        Ids, or prefixes that only one id has, in this order.
     worst : int
-        How many of the worst: by verdict, those that failed first, then by
-        confidence, then by fitness, of both directions the lower.
+        Number of the worst assets: by verdict, failed ones first, then by confidence, then by
+        the lower of the two fitnesses.
     ambiguous : bool
-        Whether to take all above the threshold of ambiguity, most of all first.
+        Whether to take all assets above the threshold of ambiguity, the most ambiguous first.
 
     Returns
     -------
     list of str
+        Ids.
 
     Raises
     ------
     StoreError
-        If the store has no asset of a name.
+        If no asset has one of the ids.
     """
     rows = [store.match(asset_id) for asset_id in asset_ids]
     if worst:
         places = {Verdict.FAILED: 0, Verdict.DOUBTFUL: 1, Verdict.GOOD: 2}
         rank = [places.get(verdict, -1) for verdict in store.column("verdict")]
         fitness = np.minimum(store.column("fitness"), store.column("fitness_backward"))
-        # An asset without a number is the worst of all.
+        # Assets without a number come first.
         confidence, fitness = (
             np.nan_to_num(figure, nan=-1.0) for figure in (store.column("confidence"), fitness)
         )

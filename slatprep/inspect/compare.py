@@ -1,4 +1,4 @@
-"""What differs between two stores: their settings, and asset by asset what became of it."""
+"""The differences between two stores: their settings, and the changes of each asset."""
 
 from __future__ import annotations
 
@@ -30,12 +30,12 @@ _VOXEL_ARRAYS = tuple(
 )
 
 _ROUNDING = 1e-6
-"""Share of a range: what two normalisations of one value to float32 cannot differ by."""
+"""Share of a range; rounding to float32 in two normalisations differs by less."""
 
 _TASK_ASSETS = 32
 
 _Rows = tuple[int, int]
-"""The row of an asset in either store."""
+"""The rows of an asset in the two stores."""
 
 
 def compare_stores(
@@ -46,26 +46,26 @@ def compare_stores(
     jobs: int = 1,
     progress: Progress | None = None,
 ) -> StoreDifference:
-    """Return what differs between two stores.
+    """Return the differences between two stores.
 
-    Each asset is read once from either, but for ``grid/*``, which is judged by
-    the digests of its sources.
+    Each asset is read once from either store, without ``grid/*``: those are compared by the
+    digests of their sources.
 
     Parameters
     ----------
     a, b : Store
         From `slatprep.open_store`.
     worst : int, optional
-        How many of the assets that changed to return; all by default, of some 1 kB each.
+        Number of changed assets to return, about 1 kB each; all by default.
     jobs : int
         Worker processes. The result does not depend on it.
     progress : callable, optional
-        Called with the assets done and the assets in all.
+        Called with the number of assets done and the number of all assets.
 
     Returns
     -------
     StoreDifference
-        What differs, in sum and by asset.
+        The differences, in total and by asset.
 
     Raises
     ------
@@ -105,7 +105,7 @@ def compare_stores(
 
 
 class _Sum:
-    """Adds up changes as they pass."""
+    """The totals of all changes."""
 
     def __init__(self) -> None:
         self.changed = self.voxels = self.labels = 0
@@ -114,7 +114,7 @@ class _Sum:
         self.properties: dict[str, PropertyChange] = {}
 
     def of(self, changes: Iterator[AssetChange]) -> Iterator[AssetChange]:
-        """Count all, and yield those of assets that changed."""
+        """Add all changes to the totals, and yield those of assets that changed."""
         for change in changes:
             self.voxels += change.voxels
             self.labels += change.labels
@@ -154,14 +154,14 @@ def _how_much(change: AssetChange) -> tuple[float, ...]:
 
 
 def _attributes(store: Store) -> dict[str, Any]:
-    """Return the attributes of a root; what an older store does not say is what it has."""
+    """Return the attributes of a store's root, with what an older format leaves implicit."""
     about = store.about
     latents, units = asdict(about.latents), about.property_units
     return {**store.attributes, "latents": latents, "property_units": units}
 
 
 def _settings(a: Mapping[str, Any], b: Mapping[str, Any], above: str = "") -> Iterator[Setting]:
-    """Yield the entries of two JSON objects that differ, each by the names that lead to it."""
+    """Yield the entries of two JSON objects that differ, each by its path with dots."""
     for key in sorted(a.keys() | b.keys()):
         one, other, name = a.get(key), b.get(key), f"{above}{key}"
         if isinstance(one, dict) and isinstance(other, dict):
@@ -173,9 +173,9 @@ def _settings(a: Mapping[str, Any], b: Mapping[str, Any], above: str = "") -> It
 def _changes(
     a: Store, b: Store, rows: Sequence[_Rows], jobs: int, progress: Progress | None
 ) -> Iterator[AssetChange]:
-    """Yield what became of each asset that both have."""
+    """Yield the change of each asset that both stores have."""
     both = [list(own) for own in zip(*rows, strict=True)] or [[], []]
-    # A column at a time: of a large store all of them take much memory.
+    # Column by column: all columns of a large store take much memory.
     names = (*(name for name in ASSET_COLUMNS if name != "verdict"), "transform")
     columns = np.stack([_unequal(a.column(name)[both[0]], b.column(name)[both[1]])
                         for name in names])  # fmt: skip
@@ -205,19 +205,19 @@ def _unequal(a: NDArray[Any], b: NDArray[Any]) -> NDArray[np.bool_]:
     return np.asarray(other.any(axis=tuple(range(1, other.ndim))), bool)
 
 
-_TOLD_APART = {"voxel/material": "labels", "voxel/valid": "labels", "voxel/feats": "latents",
-               "voxel/properties": "properties", "voxel/place": "placement",
-               "voxel/coords": "voxels"}  # fmt: skip
-"""What it is called that an array differs; of all others, and of ``asset/*``, ``columns``."""
+_WORDS = {"voxel/material": "labels", "voxel/valid": "labels", "voxel/feats": "latents",
+          "voxel/properties": "properties", "voxel/place": "placement",
+          "voxel/coords": "voxels"}  # fmt: skip
+"""The word for a difference in an array; ``columns`` for all others and for ``asset/*``."""
 
 
 def _described(change: AssetChange) -> AssetChange:
-    """Return a change with what differs in words, and in `columns` what has no word of its own."""
-    words = {_TOLD_APART.get(name, "columns") for name in change.columns}
+    """Return a change with `what` filled in, and only arrays without a word in `columns`."""
+    words = {_WORDS.get(name, "columns") for name in change.columns}
     words |= {"sources"} if change.sources else set()
     words |= {"verdict"} if change.verdicts[0] != change.verdicts[1] else set()
     words |= {"placement"} if change.moved else set()
-    columns = tuple(name for name in change.columns if name not in _TOLD_APART)
+    columns = tuple(name for name in change.columns if name not in _WORDS)
     return replace(change, what=tuple(sorted(words)), columns=columns)
 
 

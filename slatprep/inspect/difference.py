@@ -1,4 +1,4 @@
-"""What `slatprep.inspect.compare` finds: of a property, of an asset, of two stores."""
+"""The differences that `slatprep.inspect.compare` finds, as records."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from slatprep.records import Place
 
 @dataclass(frozen=True)
 class Setting:
-    """An attribute of the stores' roots that differs; None where one has no such attribute."""
+    """An attribute of the stores' roots that differs; None where a store does not have it."""
 
     name: str
     a: object
@@ -23,11 +23,11 @@ class PropertyChange:
     Attributes
     ----------
     voxels, changed : int
-        Those voxels, and how many of them have another value.
+        Number of those voxels, and of those whose value differs.
     mean, most : float
         Mean and largest absolute change, in the SI unit.
     log10 : float or None
-        Mean absolute change of log10, where both stores normalise it so.
+        Mean absolute change of log10; None unless both stores normalise it so.
     """
 
     voxels: int
@@ -39,30 +39,30 @@ class PropertyChange:
 
 @dataclass(frozen=True)
 class AssetChange:
-    """What became of an asset that is in both stores.
+    """The change of an asset that is in both stores.
 
     Attributes
     ----------
     asset_id : str
         Its id.
     what : tuple of str
-        Words for all that differs: ``sources``, ``verdict``, ``placement``, ``voxels``,
-        ``labels``, ``properties``, ``latents``, ``columns``; none where nothing does.
+        What differs, in words: ``sources``, ``verdict``, ``placement``, ``voxels``,
+        ``labels``, ``properties``, ``latents``, ``columns``; empty if nothing does.
     verdicts : tuple of str
-        In either store.
+        In the two stores.
     sources : tuple of str
         Roles of the source files whose content differs.
     columns : tuple of str
         Other arrays that differ, such as ``asset/fitness`` and ``voxel/confidence``.
     moved : float
-        Mean distance, in voxels of the PixieVerse frame, between where the two
-        look a SLAT voxel up; where they have other SLAT voxels, by the transforms alone.
+        Mean distance, in voxels of the PixieVerse frame, between the two places where a
+        SLAT voxel is looked up; from the transforms alone if the SLATs have different voxels.
     voxels, unmatched : int
-        SLAT voxels of both, and those that only one has.
+        Number of SLAT voxels in both stores, and in only one.
     labels : int
-        Voxels of both whose class differs, or that are valid in one only.
+        Voxels in both stores whose class differs, or that are valid in only one.
     properties : dict of str to PropertyChange
-        By name, of those that both stores have.
+        By name, of the properties in both stores.
     """
 
     asset_id: str
@@ -79,32 +79,32 @@ class AssetChange:
 
 @dataclass(frozen=True)
 class StoreDifference:
-    """What differs between two stores.
+    """The differences between two stores.
 
     Attributes
     ----------
     a, b : Place
         The stores.
     same : bool
-        Whether nothing does.
+        Whether there are none.
     settings : tuple of Setting
         Attributes that differ: format, ranges, parameters, versions, the digest of the records.
     only_a, only_b : tuple of str
-        Ids of assets that one store alone has.
+        Ids of assets in only one of the stores.
     assets, changed : int
-        Assets that both have, and how many of these changed.
+        Number of assets in both, and of those that changed.
     what : dict of str to int
-        Of those that changed how many in what respect; see `AssetChange`.
+        Number of changed assets by what differs, see `AssetChange`.
     verdicts : dict of str to int
         Changes of the verdict, such as ``good > failed``.
     moved, moved_most : float
-        Median and largest of `AssetChange.moved` over the assets that moved; NaN where none did.
+        Median and maximum of `AssetChange.moved` over the assets that moved; NaN if none did.
     voxels, labels : int
-        SLAT voxels of both, and how many of them have another class.
+        Number of SLAT voxels in both stores, and of those whose class differs.
     properties : dict of str to PropertyChange
         Over the voxels of all assets.
     worst : tuple of AssetChange
-        Assets that changed, first those with most labels changed, then those that moved most.
+        Assets that changed: those with most changed labels first, then those that moved most.
     """
 
     a: Place

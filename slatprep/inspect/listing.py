@@ -1,4 +1,4 @@
-"""The assets of a store one by one, with why they are not good."""
+"""The assets of a store in a list, with the reasons of their verdicts."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from slatprep.store import Store
 
 @dataclass(frozen=True)
 class ListedAsset:
-    """An asset in one line; ``reasons`` say why its verdict is not ``good``."""
+    """One line of the list; ``reasons`` say why the verdict is not ``good``."""
 
     asset_id: str
     category: str
@@ -26,7 +26,7 @@ class ListedAsset:
 def rows_chosen(
     store: Store, verdicts: Collection[str] = (), categories: Collection[str] = ()
 ) -> list[int]:
-    """Return the rows of the assets with one of these verdicts and categories; empty takes all."""
+    """Return the rows of assets with these verdicts and categories; empty takes all."""
     named = zip(store.column("verdict"), store.column("category"), strict=True)
     return [
         row
@@ -41,7 +41,7 @@ def list_assets(
     categories: Collection[str] = (),
     max_confidence: float | None = None,
 ) -> Iterator[ListedAsset]:
-    """Yield the assets of a store, by id.
+    """Yield the assets of a store, sorted by id.
 
     Parameters
     ----------
@@ -50,7 +50,12 @@ def list_assets(
     verdicts, categories : collection of str
         Only assets with one of these; empty takes all.
     max_confidence : float, optional
-        Only assets whose confidence is this or less.
+        Only assets with at most this confidence.
+
+    Yields
+    ------
+    ListedAsset
+        Each asset that passes the filters.
 
     Raises
     ------

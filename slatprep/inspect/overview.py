@@ -1,4 +1,4 @@
-"""What a store holds and how good it is, small enough for one screen."""
+"""The contents and quality of a store, for one screen."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from slatprep.storage.place import storage_of
 from slatprep.store import Store
 
 UNKNOWN = "(unknown)"
-"""Name of the group of assets whose category no table says."""
+"""Name of the group of assets whose category is not known."""
 
 _MEDIANS = ("confidence", "expected_accuracy", "fitness", "inlier_rmse", "fitness_backward",
             "overlap")  # fmt: skip
@@ -24,13 +24,12 @@ _MEDIANS = ("confidence", "expected_accuracy", "fitness", "inlier_rmse", "fitnes
 
 @dataclass(frozen=True)
 class GroupOverview:
-    """Some assets of a store in one line.
+    """Figures over some assets of a store.
 
-    ``verdicts`` counts the assets by verdict. Confidence, expected
-    accuracy, fitness, rmse [voxel] and overlap are medians over the assets;
-    ``valid_share`` is over all their voxels; ``ambiguous`` counts assets whose
-    tied placements differ in more classes than a good one's may; ``unphysical`` counts
-    the PixieVerse voxels that were left out, as no material has their properties.
+    ``verdicts`` counts the assets by verdict. Confidence, expected accuracy, fitness, rmse
+    [voxel] and overlap are medians over the assets; ``valid_share`` is over all their voxels.
+    ``ambiguous`` counts assets above the threshold of ambiguity; ``unphysical`` counts
+    PixieVerse voxels left out because no material has their properties.
     """
 
     name: str
@@ -50,10 +49,10 @@ class GroupOverview:
 
 @dataclass(frozen=True)
 class StoreOverview:
-    """What a store holds.
+    """The contents of a store.
 
-    ``total`` is over all assets, ``categories`` has an entry for each category
-    in alphabetical order; ``files`` and ``size`` [byte] are what it takes on disk.
+    ``total`` is over all assets, ``categories`` has an entry for each category in alphabetical
+    order; ``files`` is the number of the store's files, ``size`` their sum in bytes.
     """
 
     store: Place
@@ -69,7 +68,7 @@ class StoreOverview:
 
 
 def overview_of(store: Store) -> StoreOverview:
-    """Return what a store holds; only its ``asset/*`` arrays are read.
+    """Return the contents of a store; only its ``asset/*`` arrays are read.
 
     Parameters
     ----------
@@ -79,6 +78,7 @@ def overview_of(store: Store) -> StoreOverview:
     Returns
     -------
     StoreOverview
+        Figures over all assets and by category.
     """
     names = ("category", "verdict", *_MEDIANS, "valid_share", "ambiguity", "engine", "model",
              "unphysical")  # fmt: skip

@@ -1,9 +1,9 @@
-"""What the voxels of a store are: classes and properties, before and after the lookup."""
+"""Statistics of a store's voxels: classes and properties, before and after the lookup."""
 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 from itertools import groupby
 from typing import Literal
@@ -11,159 +11,32 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from slatprep.inspect.distributions import (
+    QUANTILE_NAMES,
+    QUANTILES,
+    Distribution,
+    GroupStatistics,
+    Histogram,
+    JointHistogram,
+    PropertyStatistics,
+    SideStatistics,
+    StoreStatistics,
+    Weight,
+)
 from slatprep.inspect.listing import rows_chosen
 from slatprep.inspect.tallies import JOINT_BINS, SideTally, Tally, no_tally, pooled, tally
-from slatprep.records import (
-    BACKGROUND,
-    Normalization,
-    Place,
-    Verdict,
-)
+from slatprep.records import BACKGROUND, Normalization, Place, Verdict
 from slatprep.store import Store, open_store
 from slatprep.workers import Progress
 from slatprep.workers.local import run_in_order
 
 BINS = 4096
-"""Bins that quantiles are read from, over a property's range."""
+"""Bins over a property's range from which quantiles are computed."""
 
 DRAWN_BINS = 64
-"""Bins of the histograms that are handed out."""
-
-QUANTILES = (0.01, 0.05, 0.25, 0.5, 0.75, 0.95, 0.99)
-_QUANTILE_NAMES = tuple(f"{100 * quantile:g}%" for quantile in QUANTILES)
-
-Weight = Literal["voxel", "asset"]
-"""What weighs one: every voxel, or all voxels of an asset's side together."""
+"""Bins of the histograms in the result."""
 
 _TASK_ASSETS = 32
-
-
-@dataclass(frozen=True)
-class Distribution:
-    """Mean, standard deviation (of the population), ends, and quantiles by name (``50%``)."""
-
-    mean: float
-    std: float
-    least: float
-    most: float
-    quantiles: dict[str, float]
-
-
-@dataclass(frozen=True)
-class PropertyStatistics:
-    """One property: in its SI unit, and of log10 of that where it is normalised so."""
-
-    unit: str
-    si: Distribution
-    log10: Distribution | None
-
-
-@dataclass(frozen=True)
-class SideStatistics:
-    """Some voxels of the PixieVerse fields, or of the SLATs.
-
-    Attributes
-    ----------
-    assets, voxels : int
-        Assets that have such a voxel, and those voxels; of a field those that are occupied.
-    share : float
-        What they weigh, of all voxels of that side.
-    unannotated : float
-        Of that the share without an annotation: a field's voxels without a
-        class, a SLAT's voxels that are not valid.
-    classes : dict of str to float
-        Of the annotated ones the share of each class.
-    properties : dict of str to PropertyStatistics
-        Of the annotated ones.
-    """
-
-    assets: int
-    voxels: int
-    share: float
-    unannotated: float
-    classes: dict[str, float]
-    properties: dict[str, PropertyStatistics]
-
-
-@dataclass(frozen=True)
-class GroupStatistics:
-    """All voxels, those of a class, or those of the assets of a category.
-
-    ``field`` is before the lookup, ``slat`` after it; ``verdicts`` counts the
-    assets by verdict, and is empty for a class, which no asset belongs to.
-    """
-
-    by: Literal["all", "class", "category"]
-    name: str
-    verdicts: dict[str, int]
-    field: SideStatistics
-    slat: SideStatistics
-
-
-@dataclass(frozen=True, eq=False)
-class Histogram:
-    """Weights by class (7, bins) of one property; `edges` (bins + 1,) in log10 where that is so."""
-
-    name: str
-    unit: str
-    log10: bool
-    edges: NDArray[np.float64]
-    field: NDArray[np.float64]
-    slat: NDArray[np.float64]
-
-
-@dataclass(frozen=True, eq=False)
-class JointHistogram:
-    """Weights (bins, bins) of two properties together, with their edges as in `Histogram`."""
-
-    names: tuple[str, str]
-    edges: tuple[NDArray[np.float64], NDArray[np.float64]]
-    field: NDArray[np.float64]
-    slat: NDArray[np.float64]
-
-
-@dataclass(frozen=True, eq=False)
-class StoreStatistics:
-    """What the voxels of a store are.
-
-    Attributes
-    ----------
-    store : Place
-        The store.
-    assets, assets_chosen : int
-        Assets of the store, and those that the filters left.
-    weight : str
-        What weighs one, ``voxel`` or ``asset``.
-    quantile_error : dict of str to float
-        How far a quantile of each property may be off, in log10 where it is
-        normalised so, in its SI unit otherwise: the width of the bin that it is
-        read from, whose mean it is, so that values which recur come back as
-        they are. All else is exact but for rounding.
-    total : GroupStatistics
-        All chosen assets.
-    classes, categories : tuple of GroupStatistics
-        The same by class, in the store's order, and by category, in alphabetical order.
-    histograms : tuple of Histogram
-        Of each property, over its range.
-    joint : JointHistogram or None
-        Of the first two properties; None where there is only one.
-    """
-
-    store: Place
-    assets: int
-    assets_chosen: int
-    weight: Weight
-    quantile_error: dict[str, float]
-    total: GroupStatistics
-    classes: tuple[GroupStatistics, ...]
-    categories: tuple[GroupStatistics, ...]
-    histograms: tuple[Histogram, ...]
-    joint: JointHistogram | None
-
-    @property
-    def groups(self) -> tuple[GroupStatistics, ...]:
-        """All groups: the total, the classes, the categories."""
-        return (self.total, *self.classes, *self.categories)
 
 
 def store_statistics(
@@ -175,10 +48,10 @@ def store_statistics(
     jobs: int = 1,
     progress: Progress | None = None,
 ) -> StoreStatistics:
-    """Return what the voxels of a store are, by class, category and property.
+    """Return the statistics of a store's voxels by class, category and property.
 
-    Each chosen asset is read once, its grid included. Memory does not grow with
-    assets, and with categories only by what is returned of each.
+    Each chosen asset is read once, with its grid. Memory does not grow with the number of
+    assets, and with the number of categories only by the size of the result.
 
     Parameters
     ----------
@@ -187,19 +60,19 @@ def store_statistics(
     verdicts, categories : collection of str
         Only assets with one of these; empty takes all.
     weight : str
-        ``voxel``: every voxel weighs one. ``asset``: the occupied voxels of a
-        field, and the voxels of a SLAT, weigh one together.
+        ``voxel``: each voxel has weight 1. ``asset``: the occupied voxels of a
+        field have weight 1 together, and so have the voxels of a SLAT.
     jobs : int
         Worker processes. The result does not depend on it.
     progress : callable, optional
-        Called with the assets done and the assets in all.
+        Called with the number of assets done and the number of all assets.
 
     Returns
     -------
     StoreStatistics
-        Numbers of nothing are NaN. Quantiles are the smallest value that at
-        least such a share of the weight does not exceed ("inverted_cdf" of
-        numpy), to within `StoreStatistics.quantile_error`.
+        Figures over no voxels are NaN. A quantile q is the smallest value that is not
+        exceeded by at least the share q of the weight (numpy's ``inverted_cdf``), up to
+        `StoreStatistics.quantile_error`.
 
     Raises
     ------
@@ -209,7 +82,7 @@ def store_statistics(
     rows = rows_chosen(store, verdicts, categories)
     column = [str(category) for category in store.column("category")]
     verdict_of = [str(verdict) for verdict in store.column("verdict")]
-    # Category after category, so that one tally is held at a time, however many there are.
+    # Ordered by category, so that only one category's tally is in memory at a time.
     rows.sort(key=lambda row: (column[row], row))
     of_category = [list(own) for _, own in groupby(rows, column.__getitem__)]
     tasks = [
@@ -236,42 +109,23 @@ def store_statistics(
         total += here
         name = column[own[0]] or "(unknown)"
         groups.append(make.group("category", name, here, Counter(verdict_of[r] for r in own)))
-    all_of_it = make.group("all", "all", total, Counter(verdict_of[row] for row in rows))
+    everything = make.group("all", "all", total, Counter(verdict_of[row] for row in rows))
     classes = [
         make.group("class", name, total, None, index) for index, name in enumerate(make.classes)
     ]
-    whole = all_of_it.field.share, all_of_it.slat.share
+    whole = everything.field.share, everything.slat.share
     return StoreStatistics(
         store=store.path,
         assets=len(store),
         assets_chosen=len(rows),
         weight=weight,
         quantile_error={one.name: (one.hi - one.lo) / BINS for one in ranges},
-        total=_of_whole(all_of_it, *whole),
+        total=_of_whole(everything, *whole),
         classes=tuple(_of_whole(group, *whole) for group in classes),
         categories=tuple(_of_whole(group, *whole) for group in groups),
         histograms=tuple(make.histogram(total, index) for index in range(len(ranges))),
         joint=make.joint(total),
     )
-
-
-COLUMNS = ("by", "name", "side", "assets", "voxels", "share", "unannotated", "property", "scale",
-           "unit", "mean", "std", "least", *_QUANTILE_NAMES, "most")  # fmt: skip
-"""Columns of `table_of`."""
-
-
-def table_of(statistics: StoreStatistics) -> Iterator[tuple[str | int | float, ...]]:
-    """Yield a row of `COLUMNS` for each group, side, property and scale."""
-    for group in statistics.groups:
-        for side, own in (("field", group.field), ("slat", group.slat)):
-            which = (group.by, group.name, side, own.assets, own.voxels, own.share, own.unannotated)
-            for name, found in own.properties.items():
-                for scale, values in (("linear", found.si), ("log10", found.log10)):
-                    if values is not None:
-                        quantiles = values.quantiles.values()
-                        ends = (*quantiles, values.most)
-                        yield (*which, name, scale, found.unit, values.mean, values.std,
-                               values.least, *ends)  # fmt: skip
 
 
 def _tally_some(path: Place, rows: Sequence[int], by_asset: bool) -> Tally:
@@ -280,7 +134,7 @@ def _tally_some(path: Place, rows: Sequence[int], by_asset: bool) -> Tally:
     ranges = store.normalization
     total = no_tally(len(ranges.ranges), BINS)
     for row in rows:
-        # No column of asset/* is needed, and those of a large store take long to read.
+        # Not `store.asset`: it reads all columns of asset/*, which takes long in a large store.
         material, properties = (
             store.read_rows(f"grid/{name}", row, row + 1)[0] for name in ("material", "properties")
         )
@@ -297,7 +151,7 @@ def _tally_some(path: Place, rows: Sequence[int], by_asset: bool) -> Tally:
 
 @dataclass(frozen=True, eq=False)
 class _Summariser:
-    """Makes of tallies what is handed out; shares are weights until `_of_whole`."""
+    """Turns tallies into statistics; `share` holds a weight until `_of_whole` divides it."""
 
     ranges: Normalization
     units: tuple[str, ...]
@@ -311,7 +165,7 @@ class _Summariser:
         verdicts: Counter[str] | None = None,
         index: int | None = None,
     ) -> GroupStatistics:
-        """Summarise all classes of a tally, or the one with this index."""
+        """Summarise all classes of a tally, or one class by its index."""
         named = {str(v): verdicts[str(v)] for v in Verdict} if verdicts is not None else {}
         chosen = np.arange(BACKGROUND + 1) if index is None else np.array([index])
         sides = (
@@ -352,7 +206,7 @@ class _Summariser:
         )
         total = float(weights.sum())
         if not total:
-            nothing = Distribution(*(np.nan,) * 4, dict.fromkeys(_QUANTILE_NAMES, np.nan))
+            nothing = Distribution(*(np.nan,) * 4, dict.fromkeys(QUANTILE_NAMES, np.nan))
             return PropertyStatistics(self.units[number], nothing, nothing if span.log10 else None)
         std = np.sqrt(squares / total)
         least, most = counts.ends[0, number, chosen].min(), counts.ends[1, number, chosen].max()
@@ -371,7 +225,7 @@ class _Summariser:
         )
 
     def histogram(self, counts: Tally, number: int) -> Histogram:
-        """Return a property's histogram by class, in wider bins."""
+        """Return a property's histogram by class, in `DRAWN_BINS` bins."""
         span = self.ranges.ranges[number]
         sides = (
             side.histogram[number].reshape(BACKGROUND, DRAWN_BINS, -1).sum(axis=-1)
@@ -392,9 +246,9 @@ class _Summariser:
 
 
 def _distribution(mean: float, std: float, values: NDArray[np.float64]) -> Distribution:
-    """Return a distribution; after the mean `values` has the ends and the quantiles."""
+    """Return a distribution; `values` are the mean, the extremes and the quantiles."""
     least, most, *quantiles = values[1:].tolist()
-    return Distribution(mean, std, least, most, dict(zip(_QUANTILE_NAMES, quantiles, strict=True)))
+    return Distribution(mean, std, least, most, dict(zip(QUANTILE_NAMES, quantiles, strict=True)))
 
 
 def _ratio(part: float, whole: float) -> float:
@@ -402,7 +256,7 @@ def _ratio(part: float, whole: float) -> float:
 
 
 def _of_whole(group: GroupStatistics, field: float, slat: float) -> GroupStatistics:
-    """Return a group with shares of these weights in place of weights."""
+    """Return a group whose weights are divided by the total weight of each side."""
     return replace(
         group,
         field=replace(group.field, share=_ratio(group.field.share, field)),

@@ -1,8 +1,8 @@
-"""Counts, moments and histograms of an asset's voxels before and after the lookup; tallies add up.
+"""Counts, moments and histograms of an asset's voxels before and after the lookup.
 
-Moments are merged by the pairwise update of Chan, Golub and LeVeque
-("Updating Formulae and a Pairwise Algorithm for Computing Sample Variances",
-1979), so that nothing cancels, however many assets are added.
+Tallies of several assets are added with ``+``. Moments are merged by the pairwise update of
+Chan, Golub and LeVeque ("Updating Formulae and a Pairwise Algorithm for Computing Sample
+Variances", 1979), which loses no digits however many assets are added.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ JOINT_BINS = 64
 Voxels = tuple[NDArray[np.uint8], NDArray[np.float32]]
 """Classes and normalised properties of voxels."""
 
-_CLASSES = BACKGROUND  # The classes of a material are those below it.
+_CLASSES = BACKGROUND  # Material classes are the numbers below it.
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,21 +31,21 @@ class SideTally:
     Attributes
     ----------
     assets, voxels : ndarray of int64, shape (8,)
-        Assets that have voxels of each class, and those voxels; the last entry is
-        of voxels without an annotation.
+        By class, the number of voxels and of assets that have any; the last entry is for
+        voxels without an annotation.
     weights : ndarray of float64, shape (8,)
-        What those voxels weigh together.
+        Total weight of those voxels.
     histogram : ndarray of float64, shape (P, 7, bins)
         Weight by property, class and bin of the normalised value, over [-1, 1].
     sums : ndarray of float64, shape (P, 7, bins)
-        Weighted sum of the normalised values there: where a bin has one value, it can be told.
+        Weighted sum of the normalised values in each bin, whose mean is exact where all are equal.
     joint : ndarray of float64, shape (JOINT_BINS, JOINT_BINS)
-        Weight by bins of the first two properties; zero where there is only one.
+        Weight by bins of the first two properties; zero if there is only one.
     mean, squares : ndarray of float64, shape (2, P, 7)
         Weighted mean, and weighted sum of squared differences from it, of the
         normalised values and of those in SI units.
     ends : ndarray of float64, shape (2, P, 7)
-        Smallest and largest normalised value; inf and -inf where there is none.
+        Smallest and largest normalised value; inf and -inf where there are no voxels.
     """
 
     assets: NDArray[np.int64]
@@ -100,7 +100,7 @@ def pooled(
     squares: NDArray[np.float64],
     axis: int,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Merge means and sums of squared differences along an axis; 0 where nothing weighs."""
+    """Merge means and sums of squared differences along an axis; 0 where all weights are 0."""
     total = weights.sum(axis=axis, keepdims=True)
     centre = (weights * mean).sum(axis=axis, keepdims=True) / np.where(total > 0, total, 1.0)
     merged = (squares + weights * (mean - centre) ** 2).sum(axis=axis)
@@ -108,7 +108,7 @@ def pooled(
 
 
 def no_tally(properties: int, bins: int) -> Tally:
-    """Return the tally of nothing, of so many properties, in so many bins."""
+    """Return an empty tally for a number of properties and of bins."""
     nothing = SideTally(
         assets=np.zeros(_CLASSES + 1, np.int64),
         voxels=np.zeros(_CLASSES + 1, np.int64),
@@ -131,14 +131,19 @@ def tally(
     Parameters
     ----------
     field, slat : tuple of ndarray
-        Classes, and normalised properties of as many voxels, as ``grid/*`` (properties first:
-        (R, R, R) and (P, R, R, R)) and ``voxel/*`` ((N,) and (N, P)) hold them.
+        Classes and normalised properties of the same voxels, in the shapes of ``grid/*``
+        ((R, R, R) and (P, R, R, R)) and of ``voxel/*`` ((N,) and (N, P)).
     ranges : Normalization
         The ranges of the properties.
     bins : int
         Bins of the histograms, over [-1, 1].
     by_asset : bool
-        Let all voxels of a side weigh one together, instead of one each.
+        Whether all voxels of a side have weight 1 together, instead of 1 each.
+
+    Returns
+    -------
+    Tally
+        Of this asset alone.
     """
     grid, values = field
     annotated = grid < BACKGROUND
@@ -194,6 +199,6 @@ def _side(
 
 
 def _bins(values: NDArray[np.float32], bins: int) -> NDArray[np.int64]:
-    """Return in which of so many bins over [-1, 1] each value lies."""
+    """Return the bin of each value, of equal bins over [-1, 1]."""
     places: NDArray[np.int64] = ((values + 1.0) * (bins / 2)).astype(np.int64)
     return np.clip(places, 0, bins - 1)

@@ -1,4 +1,4 @@
-"""What the store is for: load it into PyTorch, train the paper's decoder, measure it.
+"""Load a store into PyTorch, train SLAT-Phys's decoder, predict, and measure predictions.
 
 ``pip install 'slatprep[train]'`` brings PyTorch, which the loader needs;
 `splits`, `predictions` and `metrics` need numpy alone.
@@ -28,12 +28,12 @@ def __getattr__(name: str) -> object:
 
 
 def require_torch() -> None:
-    """Say what to install where PyTorch is missing.
+    """Make sure that PyTorch is installed.
 
     Raises
     ------
     SlatprepError
-        If PyTorch cannot be imported.
+        If it cannot be imported; the message says what to install.
     """
     try:
         import torch  # noqa: F401

@@ -1,14 +1,12 @@
-"""Augmentation that keeps every target valid: the symmetries of the voxel lattice.
+"""Augmentation by the symmetries of the voxel lattice, which keep every target valid.
 
-A quarter turn or a flip sends voxels to voxels, so it needs no interpolation,
-and each voxel keeps its own latents and targets. Young's modulus, density,
-Poisson's ratio and the class are scalars of an isotropic material: no turn and
-no mirror changes them. Nothing else is done here, because a scaled, sheared or
-jittered object would no longer have the voxels that its latents were made for.
+A quarter turn or a flip maps voxels to voxels, so it needs no interpolation. Young's modulus,
+density, Poisson's ratio and the class are scalars of an isotropic material and do not change.
+Scaling, shear or jitter are not offered: the object would no longer have the voxels that its
+latents were made for.
 
-The latents themselves are carried along unchanged. Whether TRELLIS would have
-given the turned object the same ones is a property of TRELLIS and not known
-here, which is why augmentation is off unless asked for.
+Latents keep their values. Whether TRELLIS would give the turned object the same latents is not
+known, so augmentation is off by default.
 """
 
 from __future__ import annotations
@@ -30,13 +28,13 @@ def lattice_symmetries(kind: Augmentation) -> NDArray[np.int64]:
     Parameters
     ----------
     kind : {"none", "upright", "all"}
-        ``none`` is the identity; ``upright`` the 8 quarter turns about z and
-        flips that keep TRELLIS's z axis pointing up; ``all`` the 48 of the cube.
+        ``none``: the identity; ``upright``: the 8 quarter turns about z and flips that keep
+        the z axis up; ``all``: the 48 of the cube.
 
     Returns
     -------
     ndarray of int64, shape (S, 3, 3)
-        The identity is the first.
+        The first is the identity.
     """
     symmetries = cube_symmetries()
     if kind == "none":
@@ -57,9 +55,9 @@ def move(coords: NDArray[np.int32], symmetry: NDArray[np.int64]) -> NDArray[np.i
     Returns
     -------
     ndarray of int32, shape (N, 3)
-        Voxel centres ``(i + 0.5) / 64 - 0.5`` times the matrix, as indices again.
+        Indices of the voxel centres ``(i + 0.5) / 64 - 0.5`` multiplied by the matrix.
     """
-    # Twice the distance from the centre is an odd integer, so all is exact.
+    # Twice the distance from the centre is an odd integer, so the arithmetic is exact.
     doubled = 2 * coords.astype(np.int64) - (RESOLUTION - 1)
     moved = doubled @ symmetry.T
     return ((moved + (RESOLUTION - 1)) // 2).astype(np.int32)

@@ -1,4 +1,4 @@
-"""References for a decoder: the training mean, and a linear model of each voxel alone."""
+"""Reference models for a decoder: the training mean, and a linear model of single voxels."""
 
 from __future__ import annotations
 
@@ -18,10 +18,9 @@ class VoxelBaseline:
     Attributes
     ----------
     weights : ndarray of float64, shape (channels + 4, P + classes)
-        From the latents, the position and 1 to the properties and the class
-        indicators.
+        From latents, position and 1 to properties and class indicators.
     properties : int
-        P.
+        Number of properties P.
     """
 
     weights: NDArray[np.float64]
@@ -33,14 +32,28 @@ class VoxelBaseline:
         split = self.properties
         return np.clip(outputs[:, :split], -1, 1), outputs[:, split:].argmax(axis=1)
 
+    def error(self, dataset: SlatDataset) -> float:
+        """Return the mean squared error of the properties, a mean over assets."""
+        errors = []
+        for item in (dataset[k] for k in range(len(dataset))):
+            predicted, _ = self.predict(item)
+            valid = item.valid.numpy()
+            errors.append(np.square(predicted - item.properties.numpy())[valid].mean())
+        return float(np.mean(errors))
+
 
 def fit_baselines(dataset: SlatDataset) -> tuple[VoxelBaseline, VoxelBaseline]:
-    """Fit both references in one pass over all valid voxels, each weighted alike.
+    """Fit both reference models in one pass over all valid voxels, with equal weights.
+
+    Parameters
+    ----------
+    dataset : SlatDataset
+        What they are fitted to.
 
     Returns
     -------
     mean, linear : VoxelBaseline
-        The mean and the most frequent class everywhere; least squares.
+        The mean and the most frequent class of all voxels; a least-squares fit.
     """
     contents = dataset.store.contents
     size, count = contents.latents.channels + 4, len(contents.properties)

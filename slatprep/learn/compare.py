@@ -1,4 +1,4 @@
-"""Methods side by side on the same objects: at SLAT voxels, and on PixieVerse grids."""
+"""Compare methods on the same objects, at SLAT voxels and on PixieVerse grids."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ from slatprep.storage.atomic import staged, writing
 from slatprep.store import Store, open_store
 
 OURS = "these predictions"
-"""What the method is called whose predictions are of SLAT voxels."""
+"""Name of the method whose predictions are for SLAT voxels."""
 
 _BARS = "#AFC3DC"
 
@@ -52,16 +52,16 @@ class Comparison:
     Attributes
     ----------
     spread : str
-        What `Measure.spreads` are.
+        The kind of `Measure.spreads`, one of `slatprep.learn.metrics.SPREADS`.
     methods : dict of str to Measure
         By the method's name, over all objects.
     categories : dict of str to dict of str to Measure
         By category, then by method.
     partly_annotated : int
-        Objects with occupied voxels that are not annotated, which are in no score.
-        Pixie's loader leaves such objects out.
+        Objects with occupied voxels that are not annotated and so not scored. Pixie's loader
+        leaves such objects out.
     problems : list of str
-        Why assets of the split were left out, of all methods alike.
+        Why assets of the split were left out; they are left out of all methods.
     """
 
     spread: Spread
@@ -84,20 +84,20 @@ def compare_methods(
 ) -> Comparison:
     """Measure predictions of SLAT voxels and predicted grids against a store.
 
-    A grid is measured twice. On its own voxels, by Pixie's protocol: squared errors in
-    normalised space and class accuracy, means over the object's annotated voxels, then over
-    objects; a voxel that is predicted to be background has the wrong class, its properties
-    count as they are, and nothing is clipped that the network left unclipped
-    (vlongle/pixie, ``inference_combined.py``). And at the SLAT's voxels: the grid's values
-    are looked up there as the store's own labels were, at the places that it holds, so that
-    the grid those labels are of scores perfectly.
+    A grid is measured twice. On its own voxels, by Pixie's protocol (vlongle/pixie,
+    ``inference_combined.py``): squared errors in normalised space and class accuracy, means
+    over the object's annotated voxels, then over objects. A voxel that is predicted to be
+    background has the wrong class; its properties count, and no prediction is clipped. At the
+    SLAT's voxels, the grid's values are looked up as the store's labels were, at the stored
+    places. The grid that the labels were made from therefore has no error there.
 
     Parameters
     ----------
     predictions : Path, optional
         As `slatprep.learn.predictions.open_predictions` reads them.
     grids : mapping of str to Path
-        Folders by the name of the method, see `slatprep.readers.pixieverse.read_prediction`;
+        Folders by the name of the method; for the files see
+        `slatprep.readers.pixieverse.read_prediction`:
         ``<object id>/sample_<k>_pred.npy``, ``<object id>/sample_<k>/material_grid.npy`` or
         ``<object id>.npy``.
     store_path : Place
@@ -107,10 +107,15 @@ def compare_methods(
     spread : str
         As for `slatprep.learn.metrics.measure`.
 
+    Returns
+    -------
+    Comparison
+        The scores.
+
     Raises
     ------
     InputError
-        If no asset has a prediction of every method that can be used.
+        If no asset has a usable prediction of every method.
     ConfigError
         If a folder cannot be listed, or the store holds other properties or classes.
     StoreError
@@ -180,7 +185,7 @@ def compare_methods(
 
 
 class _Truth:
-    """What a store says of one asset: at its SLAT voxels, and on its grid."""
+    """The labels of an asset at its SLAT voxels and on its grid."""
 
     def __init__(self, store: Store, index: int) -> None:
         self.store, self.index, self.asset_id = store, index, store.ids[index]
@@ -201,7 +206,7 @@ class _Truth:
         annotated = self.grid < BACKGROUND
         ranges = self.store.normalization
         properties, material = read_prediction(path, root, annotated, ranges)
-        # The values are carried to where they are looked up, whatever their unit.
+        # The values are normalised ones: the lookup copies them whatever their unit.
         field = MaterialField(
             occupancy=annotated,
             voxels=voxels_of(annotated),
@@ -234,16 +239,16 @@ def _ours(predictions: Path | None, read: ReadAsset, truth: _Truth) -> VoxelPred
 
 
 def draw_comparison(methods: Mapping[str, Measure], what: str, path: Path) -> None:
-    """Draw a panel a metric, with each method's mean and spread.
+    """Draw a panel for each metric, with the mean and spread of each method.
 
     Parameters
     ----------
     methods : mapping of str to Measure
-        One method at least.
+        At least one method.
     what : str
-        What the spreads are, in words.
+        The kind of the spreads, in words.
     path : Path
-        A PNG.
+        The PNG to write.
 
     Raises
     ------
@@ -256,8 +261,7 @@ def draw_comparison(methods: Mapping[str, Measure], what: str, path: Path) -> No
     means = np.array([[m.means[metric] for metric in METRICS] for m in methods.values()])
     spreads = np.array([[m.spreads[metric] for metric in METRICS] for m in methods.values()])
     spreads[~np.isfinite(spreads)] = 0.0
-    # Errors are of one unit and get one scale, which one beyond all bounds does not stretch;
-    # no accuracy is above 1.
+    # All errors share one scale, for which infinite ones are left out; accuracy ends at 1.
     ends = (means + spreads)[:, :-1]
     most = max([1e-3, *ends[np.isfinite(ends)].tolist()])
     figure = Figure(figsize=(11.0, 1.3 + 0.38 * len(names)), layout="constrained")

@@ -20,13 +20,13 @@ from slatprep.records import UNANNOTATED, Place
 from slatprep.store import Store, open_store
 
 IGNORED = -100
-"""Class of a voxel without annotation: what `torch.nn.functional.cross_entropy` passes over."""
+"""Class of voxels without annotation, which `torch.nn.functional.cross_entropy` ignores."""
 
 _COLUMNS = ("coords", "feats", "properties", "material", "valid", "confidence")
 
 
 class Draw(NamedTuple):
-    """One asset of one epoch; the epoch decides its augmentation."""
+    """An asset of one epoch; the epoch decides its augmentation."""
 
     number: int
     epoch: int
@@ -39,21 +39,20 @@ class Item:
     Attributes
     ----------
     asset_id : str
-        Id of the row.
+        Id of the asset.
     coords : Tensor of int32, shape (N, 3)
         SLAT voxels.
     feats : Tensor of float32, shape (N, channels)
-        Latents, standardised with the encoder's mean and standard deviation
-        unless the store's have been standardised already.
+        Latents, standardised with the encoder's mean and standard deviation.
     properties : Tensor of float32, shape (N, P)
         The store's properties in [-1, 1]; 0 where not valid.
     material : Tensor of int64, shape (N,)
-        Class 0..6; -100 where not valid.
+        Class 0..6; `IGNORED` where not valid.
     valid : Tensor of bool, shape (N,)
-        Where the targets mean something.
+        Which voxels have targets.
     confidence : Tensor of float32, shape (N,)
-        How likely the class is right; 0 where not valid, 1 elsewhere in a store
-        of format 1, which does not tell.
+        Probability that the class is right; 0 where not valid. In a store of format 1, which
+        has none, 1 where valid.
     """
 
     asset_id: str
@@ -67,18 +66,18 @@ class Item:
 
 @dataclass
 class SparseBatch:
-    """Assets one after the other, as TRELLIS's ``SparseTensor`` has them.
+    """Concatenated assets in the form of TRELLIS's ``SparseTensor``.
 
-    ``SparseTensor(feats=batch.feats, coords=batch.coords)`` is one.
+    ``SparseTensor(feats=batch.feats, coords=batch.coords)`` makes a tensor of a batch.
 
     Attributes
     ----------
     asset_ids : list of str
-        One for each value of the batch column.
+        By the value of the batch column.
     coords : Tensor of int32, shape (N, 4)
         Batch column, then the voxel.
     feats, properties, material, valid, confidence : Tensor
-        As in `Item`, of N rows.
+        As in `Item`, with N rows.
     """
 
     asset_ids: list[str]
@@ -114,25 +113,25 @@ class SlatDataset(Dataset[Item]):
     Parameters
     ----------
     store : Store or path
-        An open store, or where one lies. Worker processes, forked or spawned,
-        each read it for themselves.
+        An open store, or its path or URL. Worker processes, forked or spawned, each open it
+        themselves.
     split : {"train", "val", "test"}, optional
-        Which objects, as `slatprep.learn.splits.split_objects` decides; all if not given.
+        Only the objects of this split, see `slatprep.learn.splits.split_objects`.
     shares : Shares
         Shares of the splits.
     splits : mapping of str to {"train", "val", "test"}, optional
-        Split by object id, such as those of `slatprep.learn.splits.assign_store`,
-        instead of the hash.
+        Split of each object by id, such as from `slatprep.learn.splits.assign_store`;
+        by default the split by hash.
     verdicts : collection of str, optional
-        Verdicts that are good enough; all if not given.
+        Only assets with one of these verdicts.
     max_ambiguity : float, optional
-        Largest ambiguity that is good enough.
+        Only assets with at most this ambiguity.
     min_confidence : float, optional
-        Voxels whose class is less likely right are not valid.
+        Voxels whose class is right with less probability are not valid.
     augmentation : {"none", "upright", "all"}
         Symmetries of the lattice to draw from, see `slatprep.learn.augment`.
     seed : int
-        Decides, with the epoch and the asset's id, which symmetry is drawn.
+        With the epoch and the asset's id, decides which symmetry is drawn.
 
     Raises
     ------
@@ -205,19 +204,24 @@ class SlatDataset(Dataset[Item]):
         )
 
     def _symmetry(self, asset_id: str, draw: Draw) -> np.ndarray:
-        # Not from a worker's own generator: the draw must not depend on the number of workers.
+        # Not from a worker's generator, since the draw must not depend on the number of workers.
         words = np.frombuffer(asset_id.encode("utf-8").ljust(4, b"\0"), np.uint8)
         rng = np.random.default_rng([self.seed, draw.epoch, *words.tolist()])
         return np.asarray(self._symmetries[rng.integers(len(self._symmetries))])
 
 
 def require_confidence(store: Store) -> None:
-    """Make sure that a store tells how likely its classes are right.
+    """Make sure that a store has the confidence of its voxels.
+
+    Parameters
+    ----------
+    store : Store
+        The store.
 
     Raises
     ------
     ConfigError
-        If it has format 1, which does not.
+        If it has format 1, which does not hold it.
     """
     if store.format_version == 1:
         raise ConfigError(
@@ -232,7 +236,12 @@ def collate(items: Sequence[Item]) -> SparseBatch:
     Parameters
     ----------
     items : sequence of Item
-        One at least.
+        At least one.
+
+    Returns
+    -------
+    SparseBatch
+        The assets in this order.
     """
     coords = [
         torch.nn.functional.pad(item.coords, (1, 0), value=number)
@@ -243,14 +252,14 @@ def collate(items: Sequence[Item]) -> SparseBatch:
 
 
 class EpochSampler(Sampler[Draw]):
-    """Every asset once, in an order that seed and epoch decide.
+    """Each asset once, in an order that follows from seed and epoch.
 
     Parameters
     ----------
     length : int
         Number of assets.
     shuffle : bool
-        In the order of the store if False.
+        Whether to shuffle the assets, or keep the order of the store.
     seed : int
         With the epoch, decides the order.
     """
@@ -270,22 +279,22 @@ class EpochSampler(Sampler[Draw]):
 
 
 class SlatLoader(DataLoader[Item]):
-    """Batches of a `SlatDataset`, the same ones whatever the number of workers.
+    """Batches of a `SlatDataset`, which do not depend on the number of workers.
 
     Parameters
     ----------
     dataset : SlatDataset
-        What to load.
+        The assets to load.
     batch_size : int
         Assets in a batch; the last may have fewer.
     shuffle : bool
-        A new order each epoch, which the dataset's seed decides.
+        Whether each epoch has another order, which follows from the dataset's seed.
     workers : int
-        Processes that read ahead; 0 reads in this one.
+        Processes that read ahead; 0 reads in this process.
     start_method : {"fork", "spawn", "forkserver"}, optional
-        How they start; the platform's way if not given.
+        How they are started; by default as the platform does.
     pin_memory : bool
-        For a GPU.
+        Whether to pin batches in memory, for faster copies to a GPU.
 
     Examples
     --------
@@ -318,5 +327,5 @@ class SlatLoader(DataLoader[Item]):
         )
 
     def set_epoch(self, epoch: int) -> None:
-        """Choose the epoch, which decides order and augmentation."""
+        """Set the epoch, which decides order and augmentation."""
         self.order.epoch = epoch

@@ -1,11 +1,10 @@
 """SLAT-Phys's decoder: a sparse Swin transformer over occupied voxels, in plain PyTorch.
 
-The form is that of TRELLIS's sparse Swin decoders, written anew: pre-norm
-blocks of multi-head attention within windows of 8^3 voxels, moved by half a
-window in every other block (Liu et al., "Swin Transformer", ICCV 2021), an
-MLP of four times the width, layer norms without parameters, and a sinusoidal
-embedding of the absolute position. With the widths, depths and heads that
-SLAT-Phys states, this has the numbers of parameters that it states.
+The architecture is that of TRELLIS's sparse Swin decoders: pre-norm blocks of multi-head
+attention within windows of 8^3 voxels, shifted by half a window in every other block (Liu et
+al., "Swin Transformer", ICCV 2021), an MLP of four times the width, layer norms without
+parameters, and a sinusoidal embedding of the absolute position. With the widths, depths and
+heads of SLAT-Phys it has the numbers of parameters that SLAT-Phys states.
 """
 
 from __future__ import annotations
@@ -22,7 +21,7 @@ from slatprep.records import PIXIEVERSE, RESOLUTION, Contents
 WINDOW = 8
 
 _BUCKETS = (8, 16, 32, 48, 64, 96, 128, 192, 256, 384, 512)
-"""Window populations that share one padded attention call; 8^3 is the most there can be."""
+"""Bounds on the voxels of windows that share one padded attention call; most is 8^3."""
 
 
 @dataclass(frozen=True)
@@ -39,18 +38,18 @@ SIZES = {
     "medium": DecoderSize(128, 6, 8),
     "large": DecoderSize(256, 8, 16),
 }
-"""The three of SLAT-Phys: 0.20, 1.19 and 6.32 million parameters."""
+"""The sizes of SLAT-Phys: 0.20, 1.19 and 6.32 million parameters."""
 
 
 class Prediction(NamedTuple):
-    """What the decoder says of N voxels.
+    """Predictions for N voxels.
 
     Attributes
     ----------
     properties : Tensor of float32, shape (N, P)
         Properties in [-1, 1].
     logits : Tensor of float32, shape (N, C)
-        Scores of the classes, or of the one that stands for all where there are none.
+        Scores of the classes; one column for a store without classes.
     """
 
     properties: Tensor
@@ -58,16 +57,16 @@ class Prediction(NamedTuple):
 
 
 class Windows(NamedTuple):
-    """Voxels grouped by window, windows of like population padded to one length.
+    """Voxels grouped by window; windows with similar numbers of voxels are padded to one length.
 
     Attributes
     ----------
     rows : Tensor of int64, shape (P,)
-        Rows of the voxels, window by window, padding included.
+        Rows of the voxels, window by window, with padding.
     masks : list of Tensor of bool, shape (W, L)
-        For each group of W windows of length L, which of its entries are real.
+        For each group of W windows of length L, which entries are not padding.
     back : Tensor of int64, shape (N,)
-        Where each voxel is in `rows`.
+        Position of each voxel in `rows`.
     """
 
     rows: Tensor
@@ -83,9 +82,14 @@ def partition(coords: Tensor, window: int, shift: int) -> Windows:
     coords : Tensor of int, shape (N, 4)
         Batch column and voxel, in any order.
     window : int
-        Edge of a window, voxels.
+        Edge of a window [voxel].
     shift : int
-        By how much the windows are moved, voxels.
+        Shift of the windows [voxel].
+
+    Returns
+    -------
+    Windows
+        The groups.
     """
     cell = torch.div(coords[:, 1:].long() + shift, window, rounding_mode="floor")
     across = (RESOLUTION + window) // window + 1
@@ -100,7 +104,7 @@ def partition(coords: Tensor, window: int, shift: int) -> Windows:
         if bool(chosen.any()):
             place = torch.arange(int(counts[chosen].max()), device=coords.device)
             real = place < counts[chosen, None]
-            # Padding repeats a window's first voxel; the mask keeps it from being seen.
+            # Padding repeats a window's first voxel; attention masks it.
             rows.append(order[starts[chosen, None] + place * real].flatten())
             masks.append(real)
     every = torch.cat(rows)
@@ -111,17 +115,22 @@ def partition(coords: Tensor, window: int, shift: int) -> Windows:
 
 
 def embed_position(coords: Tensor, channels: int) -> Tensor:
-    """Return sines and cosines of the voxel's indices, float32 (N, channels).
+    """Return the sinusoidal embedding of voxel indices.
 
-    The frequencies are 10000^(-k / K), k = 0..K-1, for each axis (Vaswani et
-    al., 2017); channels that do not divide by six are filled with 0.
+    The frequencies are 10000^(-k / K), k = 0..K-1, for each axis (Vaswani et al., "Attention is
+    all you need", 2017); channels beyond a multiple of six are 0.
 
     Parameters
     ----------
     coords : Tensor of int, shape (N, 3)
         Voxels.
     channels : int
-        Width.
+        Width of the embedding.
+
+    Returns
+    -------
+    Tensor of float32, shape (N, channels)
+        Sines and cosines.
     """
     count = channels // 6
     steps = torch.arange(count, dtype=torch.float32, device=coords.device) / count
@@ -156,15 +165,15 @@ class WindowAttention(nn.Module):
 def _attend(q: Tensor, k: Tensor, v: Tensor, mask: Tensor) -> Tensor:
     if q.device.type != "cpu":
         return functional.scaled_dot_product_attention(q, k, v, attn_mask=mask)
-    # On a CPU the backward pass of PyTorch's bf16 attention takes as long as all
-    # the rest of a step twice over; in fp32 it is a small part.
+    # On a CPU the backward pass of PyTorch's bf16 attention takes twice as long as the rest of
+    # a step together; in fp32 it takes a small part of it.
     with torch.autocast("cpu", enabled=False):
         q, k, v = q.float(), k.float(), v.float()
         return functional.scaled_dot_product_attention(q, k, v, attn_mask=mask)
 
 
 class SwinBlock(nn.Module):
-    """Attention and MLP, each after a layer norm and added to what came in."""
+    """Attention and MLP, each after a layer norm and with a residual connection."""
 
     def __init__(self, channels: int, heads: int) -> None:
         super().__init__()
@@ -185,17 +194,16 @@ class SwinBlock(nn.Module):
 
 
 class PhysicsDecoder(nn.Module):
-    """Physical properties and class of every voxel, from its SLAT.
+    """A decoder from latents to the physical properties and the class of every voxel.
 
     Parameters
     ----------
     size : DecoderSize
         One of `SIZES`, or another.
     window : int
-        Edge of an attention window, voxels.
+        Edge of an attention window [voxel].
     contents : Contents
-        Its input has the channels of these latents, its heads these properties
-        and classes.
+        The latents, properties and classes, which give the widths of input and heads.
     """
 
     def __init__(
@@ -214,7 +222,7 @@ class PhysicsDecoder(nn.Module):
             if isinstance(module, nn.Linear):
                 nn.init.xavier_uniform_(module.weight)
                 nn.init.zeros_(module.bias)
-        # From 0 the regression starts in the middle of tanh, not where it is flat.
+        # Zero weights start the regression in the middle of tanh, where its slope is largest.
         for head in (self.regression, self.classification):
             nn.init.zeros_(head.weight)
 
@@ -227,6 +235,11 @@ class PhysicsDecoder(nn.Module):
             Batch column and voxel; rows in any order.
         feats : Tensor of float32, shape (N, channels)
             Standardised latents.
+
+        Returns
+        -------
+        Prediction
+            In the order of the rows.
         """
         shifts = (0, self.window // 2)
         windows = [partition(coords, self.window, shift) for shift in shifts]
@@ -234,12 +247,12 @@ class PhysicsDecoder(nn.Module):
         for number, block in enumerate(self.blocks):
             hidden = block(hidden, windows[number % 2])
         hidden = self.norm(hidden)
-        # The heads give float32: bf16 has three digits, too few for a loss to fall.
+        # The heads compute in float32: the three digits of bf16 are too few for the loss.
         with torch.autocast(hidden.device.type, enabled=False):
             hidden = hidden.float()
             return Prediction(torch.tanh(self.regression(hidden)), self.classification(hidden))
 
 
 def make_decoder(size: str, contents: Contents = PIXIEVERSE) -> PhysicsDecoder:
-    """Return a decoder of what a store holds, by its size: small, medium or large."""
+    """Return a decoder of a named size, small, medium or large, for the contents of a store."""
     return PhysicsDecoder(SIZES[size], contents=contents)

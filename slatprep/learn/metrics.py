@@ -1,4 +1,4 @@
-"""Pixie's protocol as SLAT-Phys states it: per voxel, then per object, then over objects."""
+"""Pixie's protocol as SLAT-Phys states it: means over voxels, then over objects."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ _SHORT = {"youngs_modulus": "E", "poissons_ratio": "nu"}
 
 
 def metrics_of(normalization: Normalization) -> tuple[str, ...]:
-    """Return the metrics of a store's properties; `METRICS` where it has PixieVerse's three."""
+    """Return the metrics for a store's properties: `METRICS` for those of PixieVerse."""
     names = (
         f"{'log10 ' if span.log10 else ''}{_SHORT.get(span.name, span.name)}"
         for span in normalization.ranges
@@ -42,11 +42,11 @@ SPREADS: dict[Spread, str] = {
     "pixie": "standard error, of accuracy 1.645 standard errors, as Pixie prints",
     "pixie-std": "standard deviation by n, of accuracy 1.645 of them, as Pixie's std prints",
 }
-"""What `Measure.spreads` may be, over objects: the first two of a sample (n - 1), the others
-as vlongle/pixie's ``metrics.py`` prints them."""
+"""Kinds of `Measure.spreads` over objects: the first two with n - 1, the others as
+vlongle/pixie's ``metrics.py`` prints them."""
 
 _PIXIE_90 = 1.645
-"""Standard errors of Pixie's interval of 90 % for accuracy."""
+"""Standard errors in half of Pixie's 90 % interval for accuracy."""
 
 
 @dataclass(frozen=True)
@@ -56,10 +56,9 @@ class Measure:
     Attributes
     ----------
     objects : int
-        How many.
+        Number of objects.
     means, spreads : dict of str to float
-        For each of `METRICS` the mean over objects, and its spread, see
-        `SPREADS`; NaN where there is none.
+        Mean over objects and its spread, see `SPREADS`, by metric; NaN if not defined.
     """
 
     objects: int
@@ -74,16 +73,16 @@ class Evaluation:
     Attributes
     ----------
     spread : str
-        What `Measure.spreads` are, see `SPREADS`.
+        The kind of `Measure.spreads`, see `SPREADS`.
     overall : Measure
         Over all objects.
     categories : dict of str to Measure
-        Over those of each category.
+        Over the objects of each category.
     missing : list of str
         Assets of the split without a prediction; they are not in the scores.
     converted : int
-        Assets whose prediction was normalised by other ranges than the store's,
-        and was brought to those.
+        Assets whose prediction was normalised by other ranges and was converted to the
+        store's.
     """
 
     spread: Spread
@@ -99,23 +98,23 @@ def score_asset(
     material: NDArray[np.uint8],
     valid: NDArray[np.bool_],
 ) -> NDArray[np.float64]:
-    """Return the five `METRICS` of one asset, means over its valid voxels.
+    """Return the metrics of one asset: means over its valid voxels.
 
     Parameters
     ----------
     prediction : VoxelPrediction
-        N voxels.
-    properties : ndarray of float32, shape (N, 3)
-        The truth in [-1, 1].
+        For N voxels.
+    properties : ndarray of float32, shape (N, P)
+        The true properties in [-1, 1].
     material : ndarray of uint8, shape (N,)
         The true class.
     valid : ndarray of bool, shape (N,)
-        Where there is a truth; one voxel at least.
+        Which voxels have labels; at least one.
 
     Returns
     -------
-    ndarray of float64, shape (5,)
-        Accuracy is NaN where no class was predicted.
+    ndarray of float64, shape (P + 2,)
+        As in `metrics_of`; accuracy is NaN if no class was predicted.
     """
     errors = np.square(prediction.properties - properties)[valid].mean(axis=0)
     accuracy = np.nan
@@ -125,14 +124,21 @@ def score_asset(
 
 
 def measure(scores: NDArray[np.float64], spread: Spread, names: Sequence[str] = METRICS) -> Measure:
-    """Take mean and spread over objects.
+    """Return mean and spread over objects.
 
     Parameters
     ----------
-    scores : ndarray of float64, shape (objects, 5)
-        `METRICS` of each; one object at least.
+    scores : ndarray of float64, shape (objects, metrics)
+        The metrics of each object; at least one object.
     spread : str
         See `SPREADS`.
+    names : sequence of str
+        Names of the metrics.
+
+    Returns
+    -------
+    Measure
+        By metric.
     """
     count = len(scores)
     deviation = np.full(len(names), np.nan)
@@ -160,12 +166,19 @@ def average_objects(
 
     Parameters
     ----------
-    scores : sequence of ndarray of float64, shape (5,)
-        `METRICS` of each asset.
+    scores : sequence of ndarray of float64, shape (metrics,)
+        The metrics of each asset.
     objects, categories : sequence of str
-        Object and category of each. Several views of an object count as one.
-    spread : str
+        Object and category of each asset. The views of an object count as one object.
+    spread, names
         As in `measure`.
+
+    Returns
+    -------
+    overall : Measure
+        Over all objects.
+    categories : dict of str to Measure
+        Over the objects of each category.
     """
     _, first, number = np.unique(objects, return_index=True, return_inverse=True)
     rows = np.array(scores)
@@ -193,11 +206,11 @@ def evaluate_store(
     Parameters
     ----------
     predictions : Path
-        As `open_predictions` reads it.
+        As `open_predictions` reads them.
     store_path : Path
         The store.
     split : {"train", "val", "test"}, optional
-        Objects to measure on; all if None.
+        Only objects of this split; all if None.
     shares : Shares
         Shares of the splits, as in training.
     spread : str
@@ -205,10 +218,15 @@ def evaluate_store(
     verdicts, max_ambiguity, splits
         As for `slatprep.learn.splits.select_assets`.
 
+    Returns
+    -------
+    Evaluation
+        The scores.
+
     Raises
     ------
     InputError
-        If nothing was predicted of the split, or a prediction cannot be used.
+        If no asset of the split has a prediction, or a prediction cannot be used.
     StoreError
         If the store cannot be read.
     """

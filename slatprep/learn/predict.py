@@ -1,12 +1,11 @@
 """Predict material fields from latents with a trained decoder, and write them.
 
-A prediction is an npz that `slatprep evaluate`, `slatprep transfer` and numpy
-read: it carries its ranges, so that nobody has to know the store behind it.
+A prediction is an npz that `slatprep evaluate`, `slatprep transfer` and numpy read. It holds its
+ranges, so that it can be used without the store that the decoder was trained on.
 """
 
 from __future__ import annotations
 
-import hashlib
 import time
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
@@ -25,15 +24,16 @@ from slatprep.normalize import denormalize_properties, normalization_of
 from slatprep.readers.files import refusing
 from slatprep.records import PIXIEVERSE, Contents, Normalization, StructuredLatents
 from slatprep.storage.atomic import staged
+from slatprep.storage.files import file_digest
 from slatprep.storage.names import file_name
 
 BATCH_VOXELS = 65_536
-"""Voxels of a batch, about; a larger asset is one by itself."""
+"""Voxels at which a batch is full; an asset with more is a batch by itself."""
 
 
 @dataclass(frozen=True)
 class Checkpoint:
-    """A trained decoder, what it predicts from what, the ranges, and the digest of its file."""
+    """A trained decoder: model, ranges, latents and properties, and the digest of its file."""
 
     model: PhysicsDecoder
     size: str
@@ -45,7 +45,7 @@ class Checkpoint:
 
 @dataclass(frozen=True, eq=False)
 class PredictedField:
-    """What a decoder says of one asset.
+    """A decoder's prediction for one asset.
 
     Attributes
     ----------
@@ -56,11 +56,11 @@ class PredictedField:
     properties_si : ndarray of float32, shape (N, P)
         The same in SI units.
     material : ndarray of uint8, shape (N,)
-        The likeliest class, 0 to 6: a voxel of a SLAT is not background.
+        The most probable class, 0 to 6; a voxel of a SLAT is not background.
     probabilities : ndarray of float32, shape (N, C)
-        Of all classes, background last; they add up to 1. Without classes, one column of 1.
+        Of all classes, background last, with sum 1. Without classes, one column of 1.
     seconds : float
-        What decoding took, of a batch by voxels.
+        Time of decoding: the share of its batch by voxels.
     """
 
     coords: NDArray[np.uint8]
@@ -77,9 +77,26 @@ def checkpoint_state(
     normalization: Normalization,
     contents: Contents = PIXIEVERSE,
 ) -> dict[str, Any]:
-    """Return what a checkpoint holds of a decoder that is to be used."""
+    """Return the state of a decoder as saved in a checkpoint.
+
+    Parameters
+    ----------
+    model : PhysicsDecoder
+        The decoder.
+    size : str
+        The name of its size.
+    normalization : Normalization
+        The ranges of its properties.
+    contents : Contents
+        What it was trained on.
+
+    Returns
+    -------
+    dict
+        Tensors and plain values, which `load_checkpoint` reads.
+    """
     ranges = [[span.lo, span.hi] for span in normalization.ranges]
-    # As JSON: a checkpoint may name nothing but tensors and plain values.
+    # As JSON, since a checkpoint may hold only tensors and plain values.
     held = orjson.dumps(
         {
             "properties": [[p.name, p.unit, p.log10] for p in contents.properties],
@@ -104,12 +121,17 @@ def load_checkpoint(path: Path, device: str = "cpu") -> Checkpoint:
     path : Path
         ``best.pt`` of a run, or the folder of the run.
     device : str
-        Where it computes.
+        The device to compute on.
+
+    Returns
+    -------
+    Checkpoint
+        The decoder, on the device and in evaluation mode.
 
     Raises
     ------
     InputError
-        If it is no such checkpoint, or one of before checkpoints had ranges.
+        If it is not such a checkpoint, or from a version whose checkpoints had no ranges.
     """
     if path.is_dir():
         path = path / "best.pt"
@@ -131,13 +153,14 @@ def load_checkpoint(path: Path, device: str = "cpu") -> Checkpoint:
         if not all(bool(torch.isfinite(weight).all()) for weight in model.parameters()):
             raise ValueError("weights are not all finite")
         source = str(state["ranges_source"])
-    sha256 = hashlib.sha256(path.read_bytes()).hexdigest()
     normalization = normalization_of(ranges, source, contents.properties)
-    return Checkpoint(model.to(device).eval(), size, normalization, contents, sha256, device)
+    return Checkpoint(
+        model.to(device).eval(), size, normalization, contents, file_digest(path), device
+    )
 
 
 def _contents_in(state: dict[str, Any]) -> Contents:
-    """Return what a checkpoint was trained on; of before they told, PixieVerse with TRELLIS."""
+    """Return what a decoder was trained on; older checkpoints, without it, on PixieVerse."""
     from pydantic import TypeAdapter
 
     if "contents" not in state:
@@ -146,7 +169,7 @@ def _contents_in(state: dict[str, Any]) -> Contents:
     document["properties"] = [
         dict(zip(("name", "unit", "log10"), row, strict=True)) for row in document["properties"]
     ]
-    # Bounds of values are no part of it: JSON has no infinity.
+    # Without the bounds of values, since JSON has no infinity.
     contents: Contents = TypeAdapter(Contents).validate_json(orjson.dumps(document), strict=True)
     return contents
 
@@ -164,16 +187,16 @@ def predict(
     checkpoint : Checkpoint
         The decoder.
     assets : iterable of StructuredLatents
-        Latents as the checkpoint's `LatentSpace` has them, unless they say of
-        themselves that they are standardised; they are standardised here.
+        Latents of the checkpoint's encoder; those that are not standardised are standardised
+        here.
     batch_voxels : int
-        Assets are decoded together until they have so many voxels. What else
-        is in a batch may change the last bits of a prediction.
+        Assets are decoded together up to this number of voxels. The other assets of a batch
+        may change the last bits of a prediction.
 
     Yields
     ------
     PredictedField
-        One for each.
+        For each asset.
     """
     batch: list[StructuredLatents] = []
     for latents in assets:
@@ -217,11 +240,26 @@ def _decode(checkpoint: Checkpoint, assets: list[StructuredLatents]) -> Iterator
 def write_prediction(
     folder: Path, asset_id: str, field: PredictedField, checkpoint: Checkpoint
 ) -> Path:
-    """Write ``<asset id>.npz`` and return its path.
+    """Write a prediction as an npz.
 
-    It has the arrays of a `PredictedField`, ``ranges`` (P, 2) of the mapped
-    properties, ``columns`` (P,), their names, ``checkpoint`` (the SHA-256 of its
-    file) and ``seconds``.
+    It has the arrays of a `PredictedField`, ``ranges`` (P, 2) and names ``columns`` (P,) of the
+    properties, ``checkpoint`` (the SHA-256 of its file) and ``seconds``.
+
+    Parameters
+    ----------
+    folder : Path
+        The folder of the predictions.
+    asset_id : str
+        The asset, which names the file.
+    field : PredictedField
+        The prediction.
+    checkpoint : Checkpoint
+        The decoder that made it.
+
+    Returns
+    -------
+    Path
+        ``<asset id>.npz`` in the folder.
     """
     path = folder / f"{file_name(asset_id)}.npz"
     with staged(path) as file, file.open("wb") as stream:

@@ -1,7 +1,7 @@
-"""Read predictions: npz files, Zarr or HDF5, by asset.
+"""Read predictions by asset: npz files, Zarr or HDF5.
 
-They may be a stranger's: nothing is unpickled or followed out of them, and nothing
-is read whose type or shape is not that of a prediction.
+The files are not trusted: nothing is unpickled, no link is followed out of them, and arrays of
+another type or shape than a prediction's are not read.
 """
 
 from __future__ import annotations
@@ -36,16 +36,16 @@ from slatprep.storage.names import file_name
 from slatprep.storage.place import storage_of
 
 CLASSES = len(MATERIAL_CLASSES)
-"""Classes that a decoder scores; background is one of them, though no voxel has it."""
+"""Number of classes with a score, background included."""
 
 RUN_FILE = "run.json"
-"""What `slatprep train` writes beside the predictions: the parameters of the run."""
+"""The parameters of a training run, beside its predictions."""
 
 SPLITS_FILE = "splits.json"
-"""What it writes there of the objects: which are in each split."""
+"""The objects of each split, beside `RUN_FILE`."""
 
 RUN_BYTES = 2**20
-"""No such file is larger."""
+"""Most bytes of a `RUN_FILE`."""
 
 _FORMS = "a directory of <asset id>.npz, a Zarr group or an HDF5 file with a group an asset"
 
@@ -58,12 +58,12 @@ _SPECS = {
     "coords": ArraySpec(((None, 3),), _NUMBERS),
     "ranges": ArraySpec(tuple((n + 1, 2) for n in range(MAX_PROPERTIES)), _NUMBERS),
 }
-"""What a prediction may have; whatever else lies beside it is not read."""
+"""The arrays of a prediction; others are not read."""
 
 
 @dataclass(frozen=True)
 class VoxelPrediction:
-    """What was predicted of one asset, voxels in the order of the store.
+    """The prediction for one asset, with voxels in the order of the store.
 
     Attributes
     ----------
@@ -72,7 +72,7 @@ class VoxelPrediction:
     material : ndarray of int64, shape (N,), optional
         Class 0..7.
     converted : bool
-        Whether it was normalised by other ranges, and brought to the store's.
+        Whether it was normalised by other ranges and converted to the store's.
     """
 
     properties: NDArray[np.float64]
@@ -82,7 +82,7 @@ class VoxelPrediction:
 
 @dataclass(frozen=True)
 class _Selection:
-    """What `select_assets` takes of a ``run.json``."""
+    """The entries of ``run.json`` that `select_assets` takes."""
 
     shares: Shares
     verdicts: tuple[Verdict, ...]
@@ -90,7 +90,7 @@ class _Selection:
 
 
 def selection_of_run(predictions: Path) -> dict[str, Any] | None:
-    """Return which assets a training run chose, as `slatprep.learn.splits.select_assets` takes it.
+    """Return which assets a training run chose.
 
     Parameters
     ----------
@@ -100,13 +100,14 @@ def selection_of_run(predictions: Path) -> dict[str, Any] | None:
     Returns
     -------
     dict or None
-        ``shares``, ``verdicts`` and ``max_ambiguity``, and as ``by`` the file of the objects
-        in each split, where there is one; None where no run lies there.
+        Arguments of `slatprep.learn.splits.select_assets`: ``shares``, ``verdicts`` and
+        ``max_ambiguity``, and as ``by`` the file of splits if there is one. None if the
+        predictions are not beside a run.
 
     Raises
     ------
     InputError
-        If the run's file does not say them.
+        If the run's file lacks one of them.
     """
     from pydantic import TypeAdapter
 
@@ -128,7 +129,7 @@ def selection_of_run(predictions: Path) -> dict[str, Any] | None:
 
 
 ReadAsset = Callable[[str], Mapping[str, NDArray[Any]] | None]
-"""Arrays of an asset by name; None where there is no such asset."""
+"""Returns the arrays of an asset by name; None if it has no prediction."""
 
 
 @contextmanager
@@ -138,9 +139,13 @@ def open_predictions(path: Path) -> Iterator[ReadAsset]:
     Parameters
     ----------
     path : Path
-        A directory of ``<asset_id>.npz``, a Zarr group of format 3, or an HDF5
-        file; ids that are no plain names are written as
-        `slatprep.storage.names.file_name` has it.
+        A folder of ``<asset_id>.npz``, a Zarr group of format 3, or an HDF5 file. Ids are
+        encoded by `slatprep.storage.names.file_name`.
+
+    Yields
+    ------
+    ReadAsset
+        Reads the prediction for an asset.
 
     Raises
     ------
@@ -154,7 +159,7 @@ def open_predictions(path: Path) -> Iterator[ReadAsset]:
     import h5py
 
     try:
-        storage_of(path).open().close()  # HDF5 would wait for a pipe.
+        storage_of(path).open().close()  # Refuses a pipe, at which HDF5 would wait.
     except OSError as error:
         raise InputError(path, f"cannot be read ({error.strerror})", _FORMS) from None
     if not h5py.is_hdf5(path):
@@ -176,20 +181,26 @@ def check_prediction(
     Parameters
     ----------
     source : str
-        Where it comes from, for messages.
+        Name of the prediction in messages.
     arrays : mapping of str to ndarray
-        ``properties`` (N, P); optionally ``material`` (N,) or ``logits``
-        (N, 8), ``coords`` (N, 3), without which the order is taken to be
-        the store's, and ``ranges`` (P, 2), without which they are.
+        ``properties`` (N, P); optionally ``material`` (N,) or ``logits`` (N, 8), ``coords``
+        (N, 3) and ``ranges`` (P, 2). Without ``coords`` and ``ranges`` order and ranges are
+        taken to be the store's.
     coords : ndarray of uint8, shape (N, 3)
         Voxels of the store.
     normalization : Normalization
         The store's ranges.
 
+    Returns
+    -------
+    VoxelPrediction
+        In the store's order and ranges.
+
     Raises
     ------
     InputError
-        If an array is missing, has another type or shape, is not finite, or the voxels are others.
+        If an array is missing, has another type or shape or is not finite, or the voxels
+        differ from the store's.
     """
     count = len(coords)
     if "properties" not in arrays:
@@ -258,7 +269,7 @@ def _shaped(
 
 
 def _whole(source: str, what: str, values: NDArray[Any], stop: int) -> NDArray[np.int64]:
-    """Return whole numbers below a bound as integers, whatever their type."""
+    """Return numbers of any type as integers, if they are whole and in 0..stop-1."""
     wrong = values[~((values >= 0) & (values < stop) & (values == np.floor(values)))]
     if wrong.size:
         raise InputError(source, f"has {what} {wrong.flat[0]:g}", f"0 to {stop - 1}")

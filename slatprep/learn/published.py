@@ -1,4 +1,4 @@
-"""Published scores, and tables of one's own, to print beside an evaluation."""
+"""Published scores, and other tables of scores, to print beside an evaluation."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ class PublishedScore:
     Attributes
     ----------
     method : str
-        Who was measured.
+        Name of the method.
     means : dict of str to float
-        Some of `slatprep.learn.metrics.METRICS`.
+        By metric, some of `slatprep.learn.metrics.METRICS`.
     spreads : dict of str to float
-        What stands behind the ± of each, where there is one.
+        The number after ± of each metric, if published.
     spread : str
-        What that is.
+        The kind of spread, in words.
     """
 
     method: str
@@ -37,7 +37,7 @@ _BY_SLAT_PHYS = "not said; as large as a standard deviation over objects"
 
 
 def _score(method: str, *values: float, spread: str = "") -> PublishedScore:
-    """Make a row of the means in the order of `METRICS`, and the spreads where they are known."""
+    """Make a row from means in the order of `METRICS`, followed by their spreads, if known."""
     means, spreads = values[: len(METRICS)], values[len(METRICS) :]
     return PublishedScore(
         method,
@@ -79,10 +79,10 @@ PIXIE_TABLE = (
         spread=_BY_PIXIE,
     ),
 )
-"""Le et al., "Pixie: Fast and Generalizable Supervised Learning of 3D Physics from
-Pixels", arXiv 2508.17437, Table 1: NeRF2Physics as Pixie's authors measured it, and
-Pixie with three kinds of features. On PixieVerse's test objects, over the voxels of
-Pixie's grids, normalised by Pixie's ranges."""
+"""Le et al., "Pixie: Fast and Generalizable Supervised Learning of 3D Physics from Pixels",
+arXiv 2508.17437, Table 1: NeRF2Physics, measured by Pixie's authors, and Pixie with three kinds
+of features. On PixieVerse's test objects, over the voxels of Pixie's grids, normalised by
+Pixie's ranges."""
 
 SLAT_PHYS_TABLE = (
     *(score for score in PIXIE_TABLE if score.method in ("NeRF2Physics", "Pixie")),
@@ -104,15 +104,15 @@ SLAT_PHYS_TABLE = (
     _score("SLAT-Phys, medium", 0.0195, 0.0433, 0.0573, 0.0400, 0.9355),
     _score("SLAT-Phys, large", 0.0173, 0.0361, 0.0540, 0.0358, 0.9453),
 )
-"""The tables of SLAT-Phys: its comparison, which quotes Pixie's, and its ablation of the
-decoder's size (2,000 steps), whose means are those of the three errors printed. Over SLAT
-voxels, normalised by Pixie's ranges."""
+"""The tables of SLAT-Phys: its comparison, with rows from Pixie's table, and its ablation of the
+decoder's size (2,000 steps), with the means of the three printed errors. Over SLAT voxels,
+normalised by Pixie's ranges."""
 
 TABLES = {
     "pixie": ("Pixie's Table 1 (arXiv 2508.17437)", PIXIE_TABLE),
     "slat-phys": ("SLAT-Phys's comparison and ablation", SLAT_PHYS_TABLE),
 }
-"""Published tables by the word that `slatprep evaluate --beside` takes, with their titles."""
+"""Published tables with their titles, by their names in `slatprep evaluate --beside`."""
 
 
 def read_scores(path: Path) -> tuple[PublishedScore, ...]:
@@ -121,15 +121,19 @@ def read_scores(path: Path) -> tuple[PublishedScore, ...]:
     Parameters
     ----------
     path : Path
-        A CSV whose first column names the methods and that has some of the
-        columns "log10 E", "log10 density", "nu", "mean" and "accuracy". What
-        ``slatprep evaluate --csv`` writes is one.
+        A CSV with the methods' names in the first column and some of the columns "log10 E",
+        "log10 density", "nu", "mean" and "accuracy", such as from ``slatprep evaluate --csv``.
+
+    Returns
+    -------
+    tuple of PublishedScore
+        A row of the table each, without spreads.
 
     Raises
     ------
     InputError
-        If the file cannot be read, has none of these columns, or something in
-        one of them is no number.
+        If the file cannot be read, has none of these columns, or one of their entries is not
+        a number.
     """
     expected = f"a CSV with a name in the first column and some of {', '.join(METRICS)}"
     try:

@@ -1,4 +1,4 @@
-"""The directory of a training run: parameters, log, checkpoints, curve, predictions."""
+"""The folder of a training run: parameters, log, checkpoints, curve, predictions."""
 
 from __future__ import annotations
 
@@ -33,14 +33,14 @@ LAST, BEST = "last.pt", "best.pt"
 _LOCK, _PARTIAL = ".lock", f".{RUN_FILE}.partial"
 
 _GLOBALS = ("torch", "collections OrderedDict")
-"""What a checkpoint's pickle may name, as its beginning."""
+"""Prefixes of the names that a checkpoint's pickle may contain."""
 
 
 @dataclasses.dataclass(frozen=True)
 class EpochRecord:
-    """One line of ``log.csv``: means over the epoch, in the loss's own units.
+    """One line of ``log.csv``: means over an epoch.
 
-    Those of the validation are NaN where there is no object to validate on.
+    Validation figures are NaN if there are no objects to validate on.
     """
 
     epoch: int
@@ -52,19 +52,29 @@ class EpochRecord:
 
 
 def read_state(path: Path) -> dict[str, Any]:
-    """Read a checkpoint, which may be a stranger's: nothing of it is executed.
+    """Read a checkpoint, which is not trusted: nothing in it is executed.
+
+    Parameters
+    ----------
+    path : Path
+        The file.
+
+    Returns
+    -------
+    dict
+        The saved state, on the CPU.
 
     Raises
     ------
     InputError
-        If the file is none, or damaged.
+        If the file is not a checkpoint, or damaged.
     """
     with (
         refusing(path, "cannot be read", "a checkpoint of `slatprep train`"),
         storage_of(path).open() as file,
     ):
         with zipfile.ZipFile(file) as archive:
-            # torch.save stores; what is packed could unpack to any size.
+            # torch.save does not compress; a compressed file could unpack to any size.
             if any(info.compress_type != zipfile.ZIP_STORED for info in archive.infolist()):
                 raise ValueError("it is compressed")
             for info in archive.infolist():
@@ -81,7 +91,7 @@ def read_state(path: Path) -> dict[str, Any]:
 
 
 def _check_globals(pickled: bytes) -> None:
-    """Raise where a checkpoint names more than tensors: torch itself would make a bytearray."""
+    """Raise where a pickle names more than tensors: torch would also allow a bytearray."""
     words: list[str] = []
     for operation, argument, _ in pickletools.genops(pickled):
         name = str(argument)
@@ -94,22 +104,22 @@ def _check_globals(pickled: bytes) -> None:
 
 
 class Run:
-    """The directory of one training run; as a context it holds the directory's lock.
+    """The folder of a training run; as a context manager it holds the folder's lock.
 
     Parameters
     ----------
     path : Path
-        New, empty, or that of a run.
+        A new or empty folder, or the folder of a run.
 
     Attributes
     ----------
     parameters : dict
-        Those of the run that is there; empty where there is none.
+        Those of the run in the folder; empty for a new run.
 
     Raises
     ------
     ConfigError
-        If the directory holds something else.
+        If the folder holds something else.
     StoreError
         If another process trains into it.
     InputError
@@ -122,12 +132,12 @@ class Run:
 
     def __enter__(self) -> Run:
         file = self.path / RUN_FILE
-        # An empty file may be anybody's: it is left behind as it was found.
+        # An empty lock file may be the user's, so it is not deleted afterwards.
         lock = self.path / _LOCK
         self._foreign = lock.is_file() and not lock.stat().st_size
         self._lock = take_lock(self.path / _LOCK, f"{self.path}: another training is writing it")
         try:
-            # Not before: another training may have begun, or ended, until the lock was ours.
+            # Only under the lock: another training may have changed the folder before.
             if file.exists():
                 with refusing(file, "cannot be read", "what `slatprep train` wrote"):
                     self.parameters = read_document(file, RUN_BYTES)
@@ -148,14 +158,21 @@ class Run:
         os.close(self._lock)
 
     def begin(self, parameters: dict[str, Any], assignment: Assignment | None = None) -> None:
-        """Note everything that decides the result, or go on with the run that has the same.
+        """Write the parameters of a new run, or continue a run with the same parameters.
 
         The objects of each split go into ``splits.json``, their digest into ``run.json``.
+
+        Parameters
+        ----------
+        parameters : dict
+            Everything that the result depends on.
+        assignment : Assignment, optional
+            The objects of each split.
 
         Raises
         ------
         ConfigError
-            If the run there has other parameters; the message names them.
+            If the run in the folder has other parameters; the message names them.
         """
         if assignment is not None:
             lists = json.dumps(assignment.lists(), indent=1) + "\n"
@@ -181,14 +198,14 @@ class Run:
                 path.write_text(lists, encoding="utf-8")
 
     def save(self, name: str, state: dict[str, Any]) -> None:
-        """Write a checkpoint; the old one stays until the new one is whole."""
+        """Write a checkpoint; an existing one is replaced when the new one is complete."""
         buffer = BytesIO()
-        torch.save(state, buffer)  # Into a file that is full, it fails as no file would.
+        torch.save(state, buffer)  # On a full disk it would not raise an OSError.
         with staged(self.path / name) as path:
             path.write_bytes(buffer.getbuffer())
 
     def load(self, name: str) -> dict[str, Any] | None:
-        """Read a checkpoint, None if there is none.
+        """Read a checkpoint; None if there is none.
 
         Raises
         ------
@@ -198,11 +215,11 @@ class Run:
         return read_state(self.path / name) if (self.path / name).exists() else None
 
     def reading(self, name: str) -> AbstractContextManager[None]:
-        """Turn what a damaged or foreign checkpoint raises into an `InputError` that names it."""
+        """Turn errors from a damaged or foreign checkpoint into an `InputError` with its name."""
         return refusing(self.path / name, "cannot be read", "a checkpoint of this run")
 
     def log(self, history: Sequence[EpochRecord]) -> None:
-        """Write ``log.csv``, and TensorBoard's events where it is installed."""
+        """Write ``log.csv``, and events for TensorBoard if it is installed."""
         names = [field.name for field in dataclasses.fields(EpochRecord)]
         with (self.path / "log.csv").open("w", encoding="utf-8", newline="") as file:
             writer = csv.writer(file)
@@ -217,14 +234,14 @@ class Run:
                 board.add_scalar(name, getattr(history[-1], name), history[-1].epoch)
 
     def draw(self, history: Sequence[EpochRecord], references: dict[str, float]) -> None:
-        """Draw ``curve.png``: validation error by epoch, beside the references.
+        """Draw ``curve.png``: validation error by epoch, and the errors of the references.
 
         Parameters
         ----------
         history : sequence of EpochRecord
-            One epoch at least.
+            At least one epoch.
         references : dict of str to float
-            Name and mean squared error of each of the two references.
+            Mean squared error of each of the two references, by name.
         """
         from matplotlib.figure import Figure
         from matplotlib.ticker import MaxNLocator
@@ -250,7 +267,7 @@ class Run:
 
 
 def apart(heights: Sequence[float], gap: float = 0.065) -> list[float]:
-    """Return where labels stand that are wanted at heights: in their order, none on another.
+    """Return heights for labels near the given ones, in the same order and at least `gap` apart.
 
     Examples
     --------

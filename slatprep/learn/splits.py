@@ -1,4 +1,4 @@
-"""Which assets of a store a split has."""
+"""The assets of a store in a split."""
 
 from __future__ import annotations
 
@@ -48,6 +48,11 @@ def assign_store(
     by, shares
         As for `slatprep.readers.splits.assign_splits`.
 
+    Returns
+    -------
+    Assignment
+        Split by object id.
+
     Raises
     ------
     ConfigError, InputError
@@ -71,34 +76,33 @@ def select_assets(
     max_ambiguity: float | None = None,
     splits: Mapping[str, Split] | None = None,
 ) -> NDArray[np.int64]:
-    """Return the indices of assets that a split has, in the order of the store.
+    """Return the rows of the assets in a split, in the order of the store.
 
     Parameters
     ----------
     store : Store
         An open store.
     split : {"train", "val", "test"}, optional
-        Which objects, as `split_objects` decides; all if not given.
+        Only objects of this split, see `split_objects`.
     shares : Shares
         Shares of the splits.
     verdicts : collection of str, optional
-        Verdicts that are good enough, such as ``("good",)``; all if not given.
+        Only assets with one of these verdicts, such as ``("good",)``.
     max_ambiguity : float, optional
-        Largest ``asset/ambiguity`` that is good enough. An asset without that
-        number is then left out.
+        Only assets with at most this ``asset/ambiguity``; those without a number are left out.
     splits : mapping of str to {"train", "val", "test"}, optional
-        Split by object id, such as those of `assign_store`, instead of the hash.
+        Split of each object by id, such as from `assign_store`; by default the split by hash.
 
     Returns
     -------
     ndarray of int64
-        Indices for `Store.read`. Assets without one valid voxel are left out:
-        they have nothing to learn from and nothing to measure.
+        Rows for `Store.read`. Assets without a valid voxel are left out, since they have no
+        labels to train on or to measure against.
 
     Raises
     ------
     ConfigError
-        If a split or a verdict has no such name.
+        If there is no such split or verdict.
     StoreError
         If the store cannot be read.
     """

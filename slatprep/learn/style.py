@@ -1,3 +1,3 @@
-"""Colours of the figures: text and data, and what they are compared with."""
+"""Colours of the figures: text and data, and references."""
 
 INK, MUTED = "#1F2328", "#6B7280"

@@ -1,4 +1,4 @@
-"""SLAT-Phys's training recipe: read, predict, weigh the losses, step, validate."""
+"""Train a decoder as SLAT-Phys does."""
 
 from __future__ import annotations
 
@@ -11,14 +11,13 @@ from typing import Any, Literal
 
 import numpy as np
 import torch
-from torch import Tensor
-from torch.nn import functional
 
 from slatprep.errors import ConfigError
 from slatprep.learn.augment import Augmentation
-from slatprep.learn.baselines import VoxelBaseline, fit_baselines
-from slatprep.learn.dataset import IGNORED, SlatDataset, SlatLoader, SparseBatch, require_confidence
+from slatprep.learn.baselines import fit_baselines
+from slatprep.learn.dataset import SlatDataset, SlatLoader, SparseBatch, require_confidence
 from slatprep.learn.decoder import SIZES, Prediction, make_decoder
+from slatprep.learn.loss import loss_of
 from slatprep.learn.predict import (
     Checkpoint,
     checkpoint_state,
@@ -35,48 +34,44 @@ from slatprep.workers import Progress
 PRECISIONS = ("auto", "fp32", "bf16")
 KEEPS = ("best", "last")
 
-PROPERTY_WEIGHT = 1.0
-CLASS_WEIGHT = 0.5
-"""SLAT-Phys: 1 for the MSE of each property, 0.5 for the cross-entropy of the classes."""
-
 
 @dataclass(frozen=True)
 class TrainParameters:
-    """Everything that decides a training run.
+    """The parameters of a training run.
 
     Attributes
     ----------
     size : str
         Size of the decoder: small, medium or large.
     epochs : int
-        Passes over the training objects; the cosine ends with the last.
+        Passes over the training objects; the cosine schedule ends with the last.
     steps : int, optional
-        Steps of the optimiser to do instead of `epochs`; the last pass may be a part of one.
+        Steps of the optimiser, instead of `epochs`; the last pass may be incomplete.
     batch_size, accumulate : int
-        Assets in a batch, and batches in a step of the optimiser.
+        Assets in a batch, and batches per step of the optimiser.
     learning_rate : float
-        Of AdamW, before the cosine lowers it to 0.
+        Initial learning rate of AdamW; a cosine schedule lowers it to 0.
     precision : str
         ``fp32``, ``bf16`` for mixed precision, or ``auto``: see `precision_of`.
     keep : {"best", "last"}
-        Which epoch's weights are kept: those of the least validation loss, or those of the
-        last, which no object to validate on and no patience has a say in.
+        Whether to keep the weights of the epoch with the least validation loss, or of the last
+        epoch; ``last`` needs no objects to validate on and ignores `patience`.
     patience : int
-        Epochs without a better validation loss after which training stops.
+        Number of epochs without a better validation loss after which training stops.
     augmentation : str
         none, upright or all, see `slatprep.learn.augment`.
     verdicts : tuple of str
-        Verdicts of alignments that are good enough.
+        Only assets with one of these verdicts.
     max_ambiguity : float, optional
-        Largest ambiguity that is good enough.
+        Only assets with at most this ambiguity.
     split_by : str
-        What parts the objects, see `slatprep.readers.splits.assign_splits`.
+        The rule of the split, see `slatprep.readers.splits.assign_splits`.
     shares : Shares
         Shares of train, val and test.
     weigh_by_confidence : bool
-        Weigh each voxel's loss by how likely its class is right.
+        Whether to weight each voxel's loss by the probability that its class is right.
     seed : int
-        Of weights, order and augmentation.
+        Seed of initial weights, order and augmentation.
     """
 
     size: str = "large"
@@ -106,17 +101,17 @@ class TrainParameters:
 
 @dataclass(frozen=True)
 class TrainSummary:
-    """What came of a run.
+    """The result of a training run.
 
     Attributes
     ----------
     history : list of EpochRecord
         All epochs.
     best_epoch : int
-        The one whose weights are kept.
+        The epoch whose weights are kept.
     references : dict of str to float
-        Validation MSE of the training mean and of a per-voxel linear model; empty where
-        there is nothing to validate on.
+        Validation MSE of the training mean and of a per-voxel linear model; empty if there
+        are no objects to validate on.
     predictions : Path
         Predictions of the test objects, for `slatprep evaluate`.
     """
@@ -125,26 +120,6 @@ class TrainSummary:
     best_epoch: int
     references: dict[str, float]
     predictions: Path
-
-
-def loss_of(prediction: Prediction, batch: SparseBatch, weigh: bool = False) -> Tensor:
-    """Return SLAT-Phys's loss over the valid voxels of a batch.
-
-    The sum of the three mean squared errors, and half the cross-entropy. With
-    `weigh` the means are weighed by the voxels' confidence.
-    """
-    if not bool(batch.valid.any()):
-        return prediction.properties.sum() * 0.0 + prediction.logits.sum() * 0.0
-    squared = (prediction.properties - batch.properties)[batch.valid].square()
-    if weigh:
-        weights = batch.confidence[batch.valid]
-        weights = weights / weights.sum()
-        entropies = functional.cross_entropy(
-            prediction.logits[batch.valid], batch.material[batch.valid], reduction="none"
-        )
-        return PROPERTY_WEIGHT * (weights @ squared).sum() + CLASS_WEIGHT * weights @ entropies
-    entropy = functional.cross_entropy(prediction.logits, batch.material, ignore_index=IGNORED)
-    return PROPERTY_WEIGHT * squared.mean(dim=0).sum() + CLASS_WEIGHT * entropy
 
 
 def train(
@@ -158,19 +133,19 @@ def train(
     steps: Progress | None = None,
     stop_after: int | None = None,
 ) -> TrainSummary:
-    """Train a decoder, or go on with a run that was stopped.
+    """Train a decoder, or resume a run that was stopped.
 
-    On one machine's CPU a run that was stopped and resumed has the very
-    weights of one that was not; a GPU's sums may differ in the last bits.
+    On a CPU, a run that was stopped and resumed gets the same weights as one that was not; on a
+    GPU the last bits may differ.
 
     Parameters
     ----------
     store : Place
         The store.
     out : Path
-        Directory of the run, see `slatprep.learn.runs.Run`.
+        Folder of the run, see `slatprep.learn.runs.Run`.
     parameters : TrainParameters
-        What to do.
+        The parameters of the run.
     device : str
         ``cpu`` or ``cuda``.
     workers : int
@@ -178,9 +153,14 @@ def train(
     progress : callable, optional
         Called after each epoch.
     steps : callable, optional
-        Called with the batches done and those of all epochs, from where this call begins.
+        Called with the number of batches done and of all batches, both of this call alone.
     stop_after : int, optional
-        Stop when so many epochs are done, as if interrupted.
+        Stop after this number of epochs, as if interrupted.
+
+    Returns
+    -------
+    TrainSummary
+        Its epochs, and where the predictions of the test objects are.
 
     Raises
     ------
@@ -208,7 +188,7 @@ def train(
         )
     with Run(out) as run:
         if parameters.precision == "auto":
-            # A run goes on as it began, whatever processor it goes on with.
+            # A resumed run keeps its precision, on whatever processor it continues.
             known = run.parameters.get("precision") or precision_of(device)
             parameters = replace(parameters, precision=known)
         run.begin(asdict(parameters) | {"store": str(opened.attributes["manifest"])}, assignment)
@@ -232,7 +212,7 @@ def train(
         if val_set is not None:
             names = "mean of the training voxels", "linear in each voxel"
             baselines = zip(names, fit_baselines(train_set), strict=True)
-            references = {name: _reference(baseline, val_set) for name, baseline in baselines}
+            references = {name: baseline.error(val_set) for name, baseline in baselines}
             run.draw(session.history, references)
         predictions = run.path / "predictions"
         _write_predictions(load_checkpoint(run.path / BEST, device), test_set, predictions)
@@ -240,21 +220,21 @@ def train(
 
 
 def precision_of(device: str) -> str:
-    """Return the fastest precision of a device: ``bf16`` where it computes in it, else ``fp32``.
+    """Return the fastest precision of a device: ``bf16`` if it has instructions for it.
 
-    On a CPU without such instructions bf16 takes five times as long as fp32.
+    On a CPU without them bf16 takes five times as long as ``fp32``.
     """
     if device != "cpu":
         return "bf16"
     try:
         flags = set(Path("/proc/cpuinfo").read_text(encoding="utf-8", errors="replace").split())
     except OSError:
-        return "fp32"  # Nothing tells: not Linux.
+        return "fp32"  # Not Linux: the instructions are not known.
     return "bf16" if flags & {"amx_bf16", "avx512_bf16"} else "fp32"
 
 
 class _Session:
-    """Everything that changes while a model is trained."""
+    """The state of a training run: model, optimiser and history."""
 
     def __init__(
         self, parameters: TrainParameters, dataset: SlatDataset, device: str, workers: int
@@ -282,7 +262,8 @@ class _Session:
     def best_epoch(self) -> int:
         if self.parameters.keep == "last":
             return self.epoch - 1
-        return int(np.argmin([record.val_loss for record in self.history]))
+        losses = [record.val_loss for record in self.history]
+        return int(np.argmin(np.nan_to_num(losses, nan=np.inf)))  # NaN where training diverged.
 
     @property
     def finished(self) -> bool:
@@ -304,7 +285,7 @@ class _Session:
         for number, batch in enumerate(islice(self.loader, batches)):
             moved = batch.to(self.device)
             loss = loss_of(self._predict(moved), moved, self.parameters.weigh_by_confidence)
-            # The last step of an epoch may have fewer batches.
+            # The last step of an epoch may have fewer batches to average.
             first = number - number % accumulate
             (loss / min(accumulate, len(self.loader) - first)).backward()  # type: ignore[no-untyped-call]
             losses.append(float(loss.detach()))
@@ -320,7 +301,7 @@ class _Session:
 
     @torch.no_grad()
     def validate(self, dataset: SlatDataset | None) -> tuple[float, float, float]:
-        """Return loss, MSE and class accuracy, each a mean over assets; NaN where there is none."""
+        """Return loss, MSE and class accuracy, means over assets; NaN where not defined."""
         if dataset is None:
             return math.nan, math.nan, math.nan
         self.model.eval()
@@ -343,10 +324,10 @@ class _Session:
         }
 
     def restore(self, state: dict[str, Any]) -> None:
-        """Go on from a checkpoint; ValueError and others where it is of another model."""
+        """Resume from a checkpoint; raises ValueError and others if it does not fit the model."""
         from pydantic import TypeAdapter
 
-        # Order, augmentation and learning rate follow from seed and epoch: no more is needed.
+        # Order, augmentation and learning rate follow from seed and epoch and are not saved.
         self.model.load_state_dict(state["model"])
         self.optimizer.load_state_dict(state["optimizer"])
         for parameter, moments in self.optimizer.state.items():
@@ -383,17 +364,8 @@ def _dataset(
     )
 
 
-def _reference(baseline: VoxelBaseline, dataset: SlatDataset) -> float:
-    errors = []
-    for item in (dataset[k] for k in range(len(dataset))):
-        predicted, _ = baseline.predict(item)
-        valid = item.valid.numpy()
-        errors.append(np.square(predicted - item.properties.numpy())[valid].mean())
-    return float(np.mean(errors))
-
-
 def _write_predictions(checkpoint: Checkpoint, dataset: SlatDataset, folder: Path) -> None:
-    """Write what `slatprep evaluate` reads of each asset, decoded one by one."""
+    """Write the predictions for a split, decoded asset by asset."""
     for index, asset_id in zip(dataset.indices.tolist(), dataset.asset_ids, strict=True):
         rows = dataset.store.read(index, ("coords", "feats"))
         done = dataset.store.contents.latents.standardised

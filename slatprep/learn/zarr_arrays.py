@@ -1,8 +1,7 @@
-"""Read one array of a Zarr hierarchy that somebody wrote, without zarr-python.
+"""Read an array of an untrusted Zarr hierarchy without zarr-python.
 
-zarr-python runs whatever codec the metadata name, and unpacks as much as a chunk
-claims to hold. Here codecs are slatprep's own, and what is set aside is what the
-array's shape allows.
+zarr-python runs any codec that the metadata name, and allocates as much memory as a chunk claims
+to hold. Here codecs are slatprep's own, and memory is bounded by the shape that is allowed.
 """
 
 from __future__ import annotations
@@ -32,22 +31,27 @@ _MAX_CHUNKS = 4096
 
 
 def read_array(path: Path, root: Path, spec: ArraySpec) -> NDArray[Any]:
-    """Read an array of Zarr format 3 whole.
+    """Read a whole array of Zarr format 3.
 
     Parameters
     ----------
     path : Path
         Folder with its ``zarr.json``.
     root : Path
-        The hierarchy that it is of; no link may lead out of it.
+        The root of the hierarchy; no link may lead out of it.
     spec : ArraySpec
-        What it may look like.
+        Its allowed types and shapes.
+
+    Returns
+    -------
+    ndarray
+        All values.
 
     Raises
     ------
     StoreError
-        If it is none, is packed in another way than with zstd, blosc or nothing,
-        or a file of it is damaged.
+        If it is not such an array, is compressed with another codec than zstd or blosc, or is
+        damaged.
     InputError
         If its type or shape are not those of `spec`, or a link leads out of `root`.
     """
@@ -71,7 +75,7 @@ def read_array(path: Path, root: Path, spec: ArraySpec) -> NDArray[Any]:
 
 
 def _refuse_links_out(path: Path, root: Path) -> None:
-    """Raise InputError where an array's folder, or anything in it, is a link out of the root."""
+    """Raise InputError if an array's folder, or anything in it, is a link out of the root."""
     whole = root.resolve()
     links = (path / name for name, size in local_files(path).items() if size == LINK)
     for place in (path, *links):
@@ -86,7 +90,7 @@ def _read_chunks(
     decoder = ChunkDecoder.of(dtype, steps, metadata["codecs"], 0)
     corners = [range(0, n, step) for n, step in zip(shape, steps, strict=True)]
     chunks = math.prod(map(len, corners))
-    # A writer may cut short arrays by the rows of long ones, but not rows wider than they are.
+    # Chunks may have more rows than a short array, but no other axis longer than the array's.
     wide = any(step > n for step, n in zip(steps[1:], shape[1:], strict=True))
     if wide or chunks > _MAX_CHUNKS or not 0 < decoder.nbytes <= _MAX_CHUNK_BYTES:
         raise ValueError(f"{chunks} chunks of {steps}")
@@ -102,9 +106,9 @@ def _read_chunks(
         try:
             file = folder.open(separator.join(["c", *map(str, places)]))
         except FileNotFoundError:
-            continue  # Zarr leaves out chunks of fill values alone.
+            continue  # Zarr omits chunks that hold only fill values.
         with file:
-            # A chunk that did not shrink is only a little larger than its values.
+            # An incompressible chunk is only a little larger than its values.
             if file.size() > decoder.nbytes + 65_536:
                 raise ValueError(f"a chunk of {file.size()} bytes")
             decoder.decode(file.pread(file.size(), 0), block)

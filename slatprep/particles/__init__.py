@@ -1,1 +1,1 @@
-"""Materials for particles in place of voxels: Gaussians, point clouds, and their simulation."""
+"""Materials of particles, such as Gaussians and point clouds, and their simulation."""

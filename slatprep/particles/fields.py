@@ -1,4 +1,4 @@
-"""Materials on voxels, as a store holds them or a decoder predicts them."""
+"""Materials on voxels, from a store or predicted by a decoder."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ class VoxelField:
     properties : ndarray of float32, shape (K, 3)
         Young's modulus [Pa], density [kg/m^3], Poisson's ratio.
     place_map : PlaceMap, optional
-        Leads from the SLAT frame to the voxels' frame; None where they are one.
+        The map from the SLAT frame to the voxels' frame; None if the frames are the same.
     """
 
     voxels: NDArray[np.uint8]
@@ -51,7 +51,7 @@ class VoxelField:
     place_map: PlaceMap | None = None
 
     def locate(self, points: ArrayLike) -> NDArray[np.float64]:
-        """Carry points (N, 3) of the SLAT frame into the frame of the voxels."""
+        """Map points (N, 3) of the SLAT frame to the frame of the voxels."""
         if self.place_map is None:
             return np.asarray(points, dtype=np.float64)
         return self.place_map.to_pixieverse(points)
@@ -67,13 +67,18 @@ def stored_field(store: Store, asset_id: str, points: Points = "slat") -> VoxelF
     asset_id : str
         The asset.
     points : {"slat", "grid"}
-        The valid SLAT voxels, which are a surface, or the annotated voxels of
-        the PixieVerse field, which are a solid.
+        The valid SLAT voxels, a surface, or the annotated voxels of the PixieVerse field, a
+        solid.
+
+    Returns
+    -------
+    VoxelField
+        At least one voxel.
 
     Raises
     ------
     StoreError
-        If the store cannot be read, has no such asset, or none of these properties.
+        If the store cannot be read, has no such asset, or lacks one of the properties.
     ConfigError
         If no voxel of the asset has a material.
     """
@@ -100,12 +105,11 @@ def predicted_field(path: Path, normalization: Normalization | None) -> VoxelFie
     Parameters
     ----------
     path : Path
-        An npz with ``coords`` (N, 3) or (N, 4) integers; ``material`` (N,)
-        integers 0..6; ``properties`` (N, 3) normalised, or ``properties_si``
-        (N, 3) in Pa, kg/m^3 and 1; and, where not all voxels count, ``valid``
-        (N,) bool. What `slatprep export --format npz` writes is one.
+        An npz with integer ``coords`` (N, 3) or (N, 4); integer ``material`` (N,), 0..6;
+        ``properties`` (N, 3) normalised, or ``properties_si`` (N, 3) in Pa, kg/m^3 and 1; and
+        optionally boolean ``valid`` (N,). `slatprep export --format npz` writes such files.
     normalization : Normalization or None
-        The ranges of ``properties``; None where they are not known.
+        The ranges of ``properties``; None if not known.
 
     Returns
     -------
@@ -153,7 +157,7 @@ def predicted_field(path: Path, normalization: Normalization | None) -> VoxelFie
 
 
 def _check_columns(path: Path, data: bytes) -> None:
-    """Refuse a prediction that names other properties than those that a solver takes."""
+    """Refuse a prediction of other properties than PixieVerse's, which solvers need."""
     named = npz_small_arrays(data, path, ArraySpec(shapes=(), kinds="U"))[0].get("columns")
     if named is not None and tuple(named.tolist()) != PROPERTY_COLUMNS:
         raise InputError(

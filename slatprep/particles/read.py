@@ -19,7 +19,7 @@ SAVED_AXES: dict[Axes, NDArray[np.float64]] = {
     "glb": np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]]),
     "slat": np.eye(3),
 }
-"""What positions of the SLAT frame are multiplied with in a file of each kind.
+"""The matrix from the SLAT frame to the axes of each kind of file.
 
 TRELLIS saves Gaussians as (x, -z, y) (``Gaussian.save_ply``), and meshes as
 (x, z, -y) (``to_glb``).
@@ -30,27 +30,27 @@ FRAMES: dict[Axes, str] = {
     "trellis": "frame TRELLIS as it saves Gaussians, unit cube -0.5..0.5, y down",
     "glb": "frame TRELLIS as it saves meshes, unit cube -0.5..0.5, y up",
 }
-"""What a PLY written here says of its frame, in a comment."""
+"""The comment on the frame in a PLY written here."""
 
 _GAUSSIAN = ("f_dc_0", "opacity", "scale_0", "rot_0")
 _REACH = 0.6
-"""Farther out TRELLIS decodes no Gaussian: its voxels end at 0.5, its offsets within two voxels."""
+"""Largest coordinate of TRELLIS's Gaussians: voxels end at 0.5, offsets are below 2 voxels."""
 _KEYS = ("positions", "points", "xyz")
 
 
 @dataclass(frozen=True)
 class Particles:
-    """Particles as their file has them.
+    """The particles of a file.
 
     Attributes
     ----------
     positions : ndarray of float64, shape (N, 3)
         As in the file.
     axes : {"trellis", "glb", "slat"}
-        The frame of the file: turned as TRELLIS saves Gaussians, or meshes, or the SLAT's.
+        The axes of the file: those of TRELLIS's Gaussians, of its meshes, or of the SLAT frame.
     foreign : str
-        By what Gaussians are another tool's than TRELLIS, whose axes and scale
-        are not known; empty where nothing says so.
+        Why the Gaussians are not from TRELLIS, so that their axes and scale are not known;
+        empty if nothing indicates that.
     """
 
     positions: NDArray[np.float64]
@@ -72,11 +72,10 @@ def read_particles(path: Path, axes: Axes | None = None) -> Particles:
         A PLY with ``x y z``; an npy of shape (N, 3); or an npz that holds such
         an array as ``positions``, ``points`` or ``xyz``.
     axes : {"trellis", "glb", "slat"}, optional
-        The frame of the file. By default it is what a PLY of slatprep says it
-        is; a PLY with the fields of Gaussians (``f_dc_0``, ``opacity``,
-        ``scale_0``, ``rot_0``) is as TRELLIS saves it, unless it has ``f_rest_*``,
-        has no normals or leaves the unit cube, as no Gaussians of TRELLIS do;
-        and everything else is in the SLAT frame.
+        The axes of the file. By default those that a PLY of slatprep states; ``trellis`` for
+        a PLY with the fields of Gaussians (``f_dc_0``, ``opacity``, ``scale_0``, ``rot_0``),
+        unless it has ``f_rest_*``, no normals, or positions outside the unit cube, unlike
+        TRELLIS's; and ``slat`` for all others.
 
     Returns
     -------
@@ -117,7 +116,7 @@ def read_particles(path: Path, axes: Axes | None = None) -> Particles:
 
 
 def _by_another_tool(positions: NDArray[np.float64], names: frozenset[str]) -> str:
-    """Say by what Gaussians are not TRELLIS's; empty where they may be."""
+    """Return why Gaussians are not from TRELLIS; empty if they may be."""
     signs = []
     if "f_rest_0" in names:
         signs.append("it has f_rest_*")

@@ -1,8 +1,8 @@
-"""Let particles fall, or stand in the wind, with an existing engine, and measure what each suffers.
+"""Simulate particles that fall or stand in the wind, and measure their deformation.
 
 The engine is Newton's implicit material point method (Linux Foundation,
-https://github.com/newton-physics/newton), which runs on a CPU. Being
-implicit, it takes jelly and steel in one object with the same time step.
+https://github.com/newton-physics/newton), which runs on a CPU. It is implicit, so one time step
+suits jelly and steel in the same object.
 """
 
 from __future__ import annotations
@@ -20,28 +20,28 @@ ELASTIC = (0, 1, 6)
 """Classes that are simulated as elastic solids: jelly, metal, stationary."""
 
 _NEVER = 1.0e15
-"""Pascal; a yield stress that nothing reaches."""
+"""A yield stress [Pa] above all stresses."""
 
 
 class Yielding(NamedTuple):
-    """Where a material stops being elastic, which neither PixieVerse nor a store says.
+    """Where a material stops being elastic; PixieVerse has no such properties.
 
     Attributes
     ----------
     friction : float
-        Shear stress at yield over pressure; 0.68 is an angle of repose of 34 degrees.
+        Ratio of shear stress to pressure at yield; 0.68 is an angle of repose of 34 degrees.
     pressure : float
-        At which it is crushed [Pa].
+        Yield pressure [Pa].
     tension : float
-        Share of `pressure` that it bears in tension.
+        Yield stress in tension as a share of `pressure`.
     stress : float
         Shear stress at yield without pressure [Pa].
     hardening : float
-        How much compaction strengthens and loosening weakens it.
+        How much compaction strengthens and loosening weakens the material.
     dilatancy : float
-        Change of volume that goes with shear, 0 to 1.
+        Change of volume by shear, 0 to 1.
     viscosity : float
-        Where it flows [Pa s].
+        Viscosity after yield [Pa s].
     """
 
     friction: float = 0.0
@@ -60,10 +60,10 @@ YIELDING = {
     4: Yielding(viscosity=1e-3),
     5: Yielding(friction=0.5, pressure=3e3, tension=0.2, hardening=10.0, dilatancy=1.0),
 }
-"""What is assumed of each class: dry sand, mud for visplas, water, fresh snow."""
+"""Assumptions for each class: dry sand, mud for visplas, water, fresh snow."""
 
 AIR, DRAG = 1.2, 1.0
-"""Density of air [kg/m^3], and the drag coefficient of what stands in it."""
+"""Density of air [kg/m^3], and the drag coefficient of a face."""
 
 
 def simulate(
@@ -81,7 +81,7 @@ def simulate(
     substeps: int = 2,
     progress: Callable[[int, int], None] | None = None,
 ) -> NDArray[np.float64]:
-    """Let an object fall on the ground from rest, in still air or in the wind.
+    """Simulate an object that falls to the ground from rest, in still air or in the wind.
 
     Parameters
     ----------
@@ -92,31 +92,31 @@ def simulate(
     properties : array_like, shape (N, 3)
         Young's modulus [Pa], density [kg/m^3] and Poisson's ratio of each.
     spacing : float
-        Of the lattice [m]; the engine's grid is twice as wide.
+        Spacing of the lattice [m]; the cells of the engine's grid are twice as wide.
     height : float
-        Free fall of the lowest particle [m].
+        Height of the lowest particle above the ground at the start [m].
     gravity : float
-        Downwards [m/s^2]. The shape at rest is without load: what stands as
-        it was seen bears its weight already, and sags a second time with it.
+        Downward acceleration [m/s^2]. The initial shape is taken to be without stress, so an
+        object whose shape already includes the sag under its weight sags further.
     wind : array_like, shape (3,)
-        Velocity of the air [m/s]. Where a face of a particle's cell is free and
-        meets the wind, it presses with ``AIR * DRAG / 2`` times the square of
-        the velocity relative to the particle; nothing gives shelter.
+        Velocity of the air [m/s]. On each free face of a particle's cell that faces the wind
+        the pressure is ``AIR * DRAG / 2`` times the square of the velocity relative to the
+        particle; parts do not shelter each other.
     fixed : array_like of bool, shape (N,), optional
-        Particles that never move, as the roots of a plant.
+        Particles that do not move, such as the roots of a plant.
     seconds : float
-        Length of the motion.
+        Simulated time.
     rate : int
         Frames a second.
     substeps : int
         Time steps a frame.
     progress : callable, optional
-        Called with the frames done and the frames in all.
+        Called with the number of frames done and the number of all frames.
 
     Returns
     -------
     ndarray of float64, shape (F, N, 3)
-        Positions in every frame [m], the first at rest; the ground is at z = 0.
+        Positions in every frame [m], first those at the start; the ground is at z = 0.
 
     Raises
     ------
@@ -135,7 +135,7 @@ def simulate(
     builder.add_particles(
         pos=[warp.vec3(*point) for point in rest],
         vel=[warp.vec3(0.0)] * len(rest),
-        mass=np.where(held, 0.0, mass).tolist(),  # which the engine takes for infinite
+        mass=np.where(held, 0.0, mass).tolist(),  # The engine takes 0 for infinite.
         radius=[spacing / 2] * len(rest),
     )
     builder.add_ground_plane()
@@ -151,7 +151,7 @@ def simulate(
             voxel_size=2 * spacing,
             tolerance=1e-6,
             max_iterations=100,
-            # One strain a cell leaves modes without resistance, in which steel would creep.
+            # With one strain per cell some modes have no resistance, and steel creeps.
             strain_basis="P1d",
         ),
     )
@@ -188,22 +188,22 @@ def _limits(mpm: Any) -> tuple[Any, ...]:
 
 
 def windward(positions: ArrayLike, wind: ArrayLike, spacing: float) -> NDArray[np.float64]:
-    """Return the area that each particle's free faces turn to the wind.
+    """Return the area of each particle's free faces, projected on the plane across the wind.
 
     Parameters
     ----------
     positions : array_like, shape (N, 3)
         Particles on a cubic lattice.
     wind : array_like, shape (3,)
-        Where it blows to; its strength does not matter.
+        Direction to which it blows; its length does not matter.
     spacing : float
-        Of the lattice.
+        Spacing of the lattice.
 
     Returns
     -------
     ndarray of float64, shape (N,)
-        Across the wind, in the square of the unit of `spacing`; 0 where
-        other particles lie upwind of all of a particle's faces, or without wind.
+        In the square of the unit of `spacing`; 0 if no free face is on the upwind side, or
+        without wind.
     """
     rest, way = np.asarray(positions, dtype=np.float64), np.asarray(wind, dtype=np.float64)
     area = np.zeros(len(rest))
@@ -222,23 +222,23 @@ def windward(positions: ArrayLike, wind: ArrayLike, spacing: float) -> NDArray[n
 def strain(
     rest: ArrayLike, moved: ArrayLike, part: ArrayLike, spacing: float
 ) -> NDArray[np.float64]:
-    """Measure how much each particle's surroundings are deformed; motion and turns do not count.
+    """Measure the strain around each particle; rigid motion does not count.
 
     Parameters
     ----------
     rest, moved : array_like, shape (N, 3)
         The particles before and after.
     part : array_like of int, shape (N,)
-        Which part each belongs to; only neighbours of the same part count.
+        The part of each particle; only neighbours of the same part count.
     spacing : float
-        Of the lattice at rest; the 26 particles around one are its neighbours.
+        Spacing of the lattice at rest; the neighbours are the 26 particles around each.
 
     Returns
     -------
     ndarray of float64, shape (N,)
         Largest absolute principal value of the Green-Lagrange strain
-        (F^T F - I) / 2, with F the least-squares fit of the neighbours' motion.
-        NaN where the neighbours do not span the space.
+        (F^T F - I) / 2, where F is the least-squares fit to the neighbours' motion.
+        NaN if the neighbours do not span the space.
     """
     from scipy.spatial import cKDTree
 
@@ -259,7 +259,7 @@ def strain(
 
 
 def rigid_deviation(rest: ArrayLike, moved: ArrayLike) -> float:
-    """Return how far (root mean square) points are from the best rigid motion of them.
+    """Return the root mean square distance of points from their best rigid motion.
 
     Parameters
     ----------
@@ -269,7 +269,7 @@ def rigid_deviation(rest: ArrayLike, moved: ArrayLike) -> float:
     Returns
     -------
     float
-        In the unit of the positions; 0 where the part only moved and turned.
+        In the unit of the positions; 0 for a rigid motion.
 
     Notes
     -----

@@ -1,7 +1,7 @@
-"""Carry materials from voxels to particles: those of a Gaussian PLY, or any points.
+"""Transfer materials from voxels to particles, such as the Gaussians of a PLY.
 
-What simulates is particles; what the store holds, and what a decoder
-predicts, is voxels. Each particle takes the values of the voxel nearest to it.
+Simulations use particles, while stores and predictions have voxels. Each particle takes the
+values of its nearest voxel.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ __all__ = [
 Far = Literal["background", "drop", "nearest"]
 
 MANY_FAR, MOST_FAR = 0.2, 0.5
-"""Shares of far particles above which other axes are tried, and above which nothing is written."""
+"""Shares of far particles above which other axes are tried, and above which it is an error."""
 
 
 @dataclass(frozen=True)
@@ -45,15 +45,15 @@ class Transferred:
     Attributes
     ----------
     rows : ndarray of intp, shape (M,)
-        The particle of each row; all of them, in order, unless some were dropped.
+        The particle of each row, ascending; all particles unless some were dropped.
     material : ndarray of uint8, shape (M,)
         Class 0..6; 7 for background.
     properties : ndarray of float32, shape (M, 3)
         Young's modulus [Pa], density [kg/m^3], Poisson's ratio; 0 for background.
     distance : ndarray of float64, shape (M,)
-        To the nearest voxel, in voxels of the field.
+        Distance to the nearest voxel, in voxels of the field.
     far : int
-        Particles that had no voxel within `max_distance`.
+        Number of particles without a voxel within `max_distance`.
     """
 
     rows: NDArray[np.intp]
@@ -75,11 +75,10 @@ def transfer(
     field : VoxelField
         The materials.
     max_distance : float
-        Voxels; a particle without a voxel this near is far from the object.
+        Distance [voxel] to the nearest voxel above which a particle is far.
     far : {"background", "drop", "nearest"}
-        What becomes of such a particle: class 7 with properties 0, as empty
-        voxels of PixieVerse have; no row at all; or the nearest voxel's
-        material all the same.
+        What far particles get: class 7 and properties 0, like empty voxels of PixieVerse; no
+        row; or the nearest voxel's material.
 
     Returns
     -------
@@ -89,7 +88,7 @@ def transfer(
     Raises
     ------
     ConfigError
-        If `far` or `max_distance` makes no sense.
+        If `far` or `max_distance` is not an allowed value.
     """
     from slatprep.geometry.nearest import Lattice
 
@@ -112,7 +111,7 @@ def transfer(
 def doubt_axes(
     particles: Particles, field: VoxelField, result: Transferred, max_distance: float
 ) -> str:
-    """Say why many particles are far, if they are: other axes, another scale, a surface, an object.
+    """Explain why many particles are far: wrong axes, another scale, or a surface of voxels.
 
     Parameters
     ----------
@@ -121,20 +120,20 @@ def doubt_axes(
     field : VoxelField
         The materials.
     result : Transferred
-        What `transfer` gave them.
+        From `transfer`.
     max_distance : float
-        Voxels.
+        As for `transfer` [voxel].
 
     Returns
     -------
     str
-        One line; empty where at most `MANY_FAR` of the particles are far.
+        One line; empty if at most `MANY_FAR` of the particles are far.
 
     Raises
     ------
     ConfigError
-        If more than `MOST_FAR` of them are, or other axes leave a tenth as many,
-        with the same line.
+        With the same line, if more than `MOST_FAR` of them are far, or with other axes less
+        than a tenth as many.
     """
     count = len(particles.positions)
     if result.far <= MANY_FAR * count:
@@ -187,27 +186,27 @@ def _enclosed(field: VoxelField, points: NDArray[np.float64]) -> float:
 def write_transferred(
     path: Path, particles: Particles, result: Transferred, *, max_distance: float, in_slat: bool
 ) -> None:
-    """Write materials at particles as Pixie's PLY for PhysGaussian.
+    """Write the materials of particles as Pixie's PLY for PhysGaussian.
 
     Parameters
     ----------
     path : Path
-        The file; a material PLY that is there is replaced.
+        The file; an existing material PLY is replaced.
     particles : Particles
         The particles.
     result : Transferred
-        What `transfer` gave them.
+        From `transfer`.
     max_distance : float
-        Voxels at which ``conf`` is 0.
+        Distance [voxel] at which ``conf`` is 0.
     in_slat : bool
-        Whether positions are written in the SLAT frame, or as in the particles' file.
+        Whether to write positions in the SLAT frame instead of the file's.
 
     Raises
     ------
     ConfigError
-        If something else is at `path`.
+        If another file is at `path`.
     SlatprepError
-        If nothing can be written there.
+        If it cannot be written.
     """
     from slatprep.export import target
     from slatprep.export.ply import write_points

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import os
+import shutil
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -14,6 +15,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import zarr
 from click.testing import CliRunner, Result
 from support.trees import tree
 
@@ -82,6 +84,16 @@ def test_the_card_is_read_by_the_hubs_library(root: Path) -> None:
     document = json.loads((root / "me" / "store" / "croissant.json").read_text())
     assert document["license"] == "https://spdx.org/licenses/CC-BY-4.0"
     assert document["distribution"][0]["contentUrl"] == "mixed.zarr/zarr.json"
+
+
+def test_only_assets_that_went_into_shards_are_counted(
+    mixed_build: BuildSummary, tmp_path: Path
+) -> None:
+    store = shutil.copytree(str(mixed_build.store), tmp_path / "s.zarr")
+    zarr.open_group(store, mode="r+")["asset/verdict"][0] = "failed"
+    words = (store, "--data", "webdataset", "--pictures", 0, "--json")
+    left = json.loads(run(*words, "--out", tmp_path / "hub").stdout)["assets"]
+    assert left == len(open_store(store)) - 1
 
 
 def test_a_card_says_what_is_not_known(mixed_build: BuildSummary) -> None:

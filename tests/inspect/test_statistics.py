@@ -17,14 +17,14 @@ from click.testing import CliRunner, Result
 from slatprep import open_store
 from slatprep.cli.commands import slatprep
 from slatprep.cli.output import as_json
-from slatprep.inspect.pictures.statistics import draw_statistics
-from slatprep.inspect.statistics import (
+from slatprep.inspect.distributions import (
     QUANTILES,
     PropertyStatistics,
     SideStatistics,
     StoreStatistics,
-    store_statistics,
 )
+from slatprep.inspect.pictures.statistics import draw_statistics
+from slatprep.inspect.statistics import store_statistics
 from slatprep.pipeline.dataset import BuildSummary
 
 CATEGORIES = ["b", "", "a", "=b", "b"]

@@ -22,9 +22,10 @@ from slatprep.learn import train as module
 from slatprep.learn.baselines import fit_baselines
 from slatprep.learn.dataset import IGNORED, SlatDataset, SlatLoader, SparseBatch, collate
 from slatprep.learn.decoder import Prediction, make_decoder
+from slatprep.learn.loss import loss_of
 from slatprep.learn.runs import BEST, LAST, Run
 from slatprep.learn.splits import Shares, split_of
-from slatprep.learn.train import TrainParameters, loss_of, precision_of, train
+from slatprep.learn.train import TrainParameters, precision_of, train
 from slatprep.storage.lock import take_lock
 
 SHARES = Shares(0.4, 0.3, 0.3)
@@ -138,6 +139,17 @@ def test_stops_when_validation_gets_no_better(learn_store: Path, tmp_path: Path)
     summary = train(learn_store, tmp_path / "still", still)
     assert summary.best_epoch == 0
     assert len(summary.history) == 3
+
+
+def test_an_epoch_that_diverged_is_not_the_best(learn_store: Path, tmp_path: Path) -> None:
+    out = tmp_path / "diverged"
+    train(learn_store, out, SHORT, stop_after=1)
+    state = torch.load(out / LAST, weights_only=True)
+    state["model"]["regression.bias"].fill_(math.nan)
+    torch.save(state, out / LAST)
+    summary = train(learn_store, out, SHORT)
+    assert [math.isnan(record.val_loss) for record in summary.history] == [False, True, True]
+    assert summary.best_epoch == 0
 
 
 def test_baselines_are_what_numpy_finds(learn_store: Path) -> None:

@@ -15,6 +15,7 @@ from support.synthetic import QUARTER_TURN, SMALL_SHARDS, make_asset
 from slatprep import build_store, compare_stores, export_store, open_store, store_statistics
 from slatprep.cli.commands import slatprep as command
 from slatprep.errors import ConfigError, StoreError
+from slatprep.inspect.check import check_alignment
 from slatprep.inspect.pictures.statistics import draw_statistics
 from slatprep.inspect.verify import verify_store
 from slatprep.learn.compare import compare_methods
@@ -273,6 +274,9 @@ def test_a_frame_that_is_known_is_checked(tmp_path: Path, suffix: str) -> None:
     assert wrong.columns["verdict"] == "failed"
     assert wrong.columns["confidence"] < 0.5 < 0.9 < right.columns["confidence"]
     np.testing.assert_array_equal(right.transform, QUARTER_TURN)
+    # Nothing was searched, so there is no margin to compare.
+    assert np.isnan(right.columns["margin"])
+    assert check_alignment(store, "a").ok
     # The file is a source as others are: another frame is other work.
     np.save(tmp_path / "voxels" / "b.frame.npy", QUARTER_TURN)
     (tmp_path / "voxels" / "b.frame.json").write_text(json.dumps(QUARTER_TURN.tolist()))

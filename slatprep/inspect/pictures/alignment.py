@@ -33,13 +33,13 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 WIDTH, HEIGHT = 1800, 1140
-"""Pixels of a picture; of one with a deformation the width is larger by `WIDER`."""
+"""Pixels of a picture; with a deformation it is `WIDER` pixels wider."""
 
 PANEL = 300
 _LEFT, _TOP, _GAP = 48, 142, 14
 WIDER = 2 * (PANEL + _GAP)
 _MOST_LINES = 10
-"""Lines of reasons for which the column at the right has room."""
+"""Most lines of reasons in the column at the right."""
 
 COLUMNS = (
     ("before", "PixieVerse classes, SLAT outlined"),
@@ -56,7 +56,7 @@ DEFORMED_COLUMNS = (
     ("displacement", "by the deformation, scale below"),
     *COLUMNS[2:],
 )
-"""The same where a deformation was kept."""
+"""The same for an alignment with a deformation."""
 
 
 def draw_alignment(
@@ -74,26 +74,26 @@ def draw_alignment(
     scene : Scene
         From `slatprep.inspect.pictures.scene.scene_of`.
     check : AlignmentCheck
-        Its verdict and figures.
+        The verdict and the figures.
     title, subtitle : str
-        What the asset is.
+        Name of the asset, and how it was aligned.
     alignment : Alignment
-        Its starts and their scores.
+        The starts and their scores.
     finer : int
-        By how much the panels are finer than the pixels of the figure.
+        Pixels of the panels per pixel of the figure, along each edge.
 
     Returns
     -------
     Figure
-        Of `WIDTH` (with a deformation `WIDER`) x `HEIGHT` pixels; the same for the same
-        arguments. It is drawn in `STYLE`, and has to be saved in it.
+        Of `WIDTH` x `HEIGHT` pixels, with a deformation `WIDER` pixels more. Deterministic.
+        It must be drawn and saved within `slatprep.inspect.pictures.canvas.STYLE`.
     """
     figure = new_figure(WIDTH + (WIDER if scene.deformed else 0), HEIGHT)
     reasons = _head(figure, check, title, subtitle)
     _panels(figure, scene, finer)
     _legend(figure, scene)
     tops = [_TOP + row * (PANEL + _GAP) for row in range(3)]
-    # Long reasons push down what stands below them, as far as there is room.
+    # Long reasons move the blocks below them down.
     figures = draw_figures(figure, check, scene, max(tops[0], reasons + 26))
     histogram = max(tops[1] + 12, figures + 44)
     draw_histogram(figure, scene, check.radius, histogram)
@@ -104,10 +104,19 @@ def draw_alignment(
 def outlined(scene: Scene, view: View, *sets: Placed) -> list[NDArray[np.float64]]:
     """Draw voxel sets by class, each over the outlined SLAT.
 
+    Parameters
+    ----------
+    scene : Scene
+        The asset.
+    view : View
+        The direction.
+    *sets : Placed
+        The voxel sets.
+
     Returns
     -------
     list of ndarray of float64, shape (n, n, 3)
-        A picture in 0..1 a set; the SLAT is pale where nothing covers it.
+        A picture of each set in 0..1; the SLAT is pale where the set does not cover it.
     """
     grey = np.broadcast_to(rgb(palette.RULE), (len(scene.slat), 3))
     slat = draw_voxels(scene.slat, grey, np.eye(4), view, contrast=0.5)
@@ -123,13 +132,13 @@ def outlined(scene: Scene, view: View, *sets: Placed) -> list[NDArray[np.float64
 
 
 def error_picture(scene: Scene, view: View) -> NDArray[np.float64]:
-    """Draw the SLAT's surface by the error of each voxel, nearly unshaded, (n, n, 3) in 0..1."""
+    """Draw the SLAT's surface coloured by each voxel's error, (n, n, 3) in 0..1."""
     colours = distance_colours(scene.error)
     return draw_voxels(scene.surface, colours, np.eye(4), view, contrast=0.35).rgb
 
 
 def panels(scene: Scene, view: View) -> tuple[NDArray[np.float64], ...]:
-    """Draw one direction: the columns of `COLUMNS` or `DEFORMED_COLUMNS`, each (n, n, 3)."""
+    """Draw one row of a picture: `COLUMNS` or `DEFORMED_COLUMNS`, each (n, n, 3) in 0..1."""
     field = scene.pixieverse, scene.pixieverse_material
     sets: list[Placed] = [(*field, np.eye(4)), (*field, scene.transform)]
     moved = []
@@ -143,12 +152,12 @@ def panels(scene: Scene, view: View) -> tuple[NDArray[np.float64], ...]:
 
 
 def displacement_scale(deformed: Deformed) -> float:
-    """Return the end of the scale of displacements: the largest one, up to the next voxel."""
+    """Return the end of the scale of displacements: the largest one, rounded up to a voxel."""
     return max(float(np.ceil(deformed.displacement.max())), 1.0)
 
 
 def _outline(drawing: Drawing) -> NDArray[np.float64]:
-    """Return a line of about two pixels along the edge of what a drawing covers."""
+    """Return the outline of a drawing, about two pixels wide."""
     cover = np.pad(drawing.cover, 2)
     n = len(drawing.cover)
     disc = [(1, 2), (2, 1), (2, 3), (3, 2), (2, 2), (1, 1), (1, 3), (3, 1), (3, 3)]
@@ -194,7 +203,7 @@ def _axes_triad(figure: Figure, view: View, x: float, y: float) -> None:
 
 
 def _head(figure: Figure, check: AlignmentCheck, title: str, subtitle: str) -> int:
-    """Write what the asset is and how good; return where the last reason stands."""
+    """Write title, verdict and reasons; return the height of the last reason."""
     write(figure, _LEFT, 50, title, weight="bold", size=13)
     write(figure, _LEFT, 76, subtitle, size=7.5, color=palette.MUTED)
     colour = palette.VERDICT_COLOURS[check.verdict]
@@ -246,7 +255,7 @@ def _legend(figure: Figure, scene: Scene) -> None:
 
 
 def _scale(figure: Figure, farthest: float, x: int, y: int) -> None:
-    """Draw the colours of displacements from none to `farthest` voxels, under their column."""
+    """Draw the colour scale of displacements, 0 to `farthest` voxels, below their column."""
     along = np.linspace(0.0, farthest, PANEL)
     bar = np.broadcast_to(distance_colours(along, farthest)[None], (10, PANEL, 3))
     figure.figimage(np.rint(bar * 255).astype(np.uint8), xo=x, yo=HEIGHT - y - 1, origin="upper")

@@ -1,4 +1,4 @@
-"""What the pictures of alignments are drawn on: a figure whose places are counted in pixels."""
+"""Figures with positions in pixels, and the style and formats of all pictures."""
 
 from __future__ import annotations
 
@@ -27,10 +27,10 @@ STYLE: dict[str, Any] = {
     "xtick.labelsize": 7.0,
     "ytick.labelsize": 7.0,
     "figure.facecolor": palette.PAPER,
-    "svg.hashsalt": "slatprep",  # else names within a file are drawn at random
+    "svg.hashsalt": "slatprep",  # Otherwise ids within a file are random.
     "pdf.fonttype": 42,
 }
-"""How matplotlib draws here."""
+"""Settings of matplotlib."""
 
 
 FORMATS: dict[str, dict[str, None]] = {
@@ -38,18 +38,18 @@ FORMATS: dict[str, dict[str, None]] = {
     "svg": {"Date": None},
     "pdf": {"CreationDate": None, "Creator": None, "Producer": None},
 }
-"""The formats of a picture, with what is left out so that the same picture has the same bytes."""
+"""Formats of a picture, with the metadata to leave out so that its bytes do not vary."""
 
 
 def in_format(figure: Figure, kind: str = "png") -> bytes:
-    """Return a figure as a file of one of `FORMATS` that holds nothing but the picture."""
+    """Return a figure as the bytes of a file in one of `FORMATS`."""
     buffer = BytesIO()
     figure.savefig(buffer, format=kind, dpi=figure.dpi, metadata=FORMATS[kind])
     return buffer.getvalue()
 
 
 def new_figure(width: float, height: float) -> Figure:
-    """Return an empty figure of so many pixels."""
+    """Return an empty figure of a size in pixels."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
@@ -64,7 +64,7 @@ def size_of(figure: Figure) -> tuple[float, float]:
 
 
 def write(figure: Figure, x: float, y: float, words: str, **style: Any) -> None:
-    """Write at a pixel of the figure, counted from its upper left corner."""
+    """Write text at a pixel of the figure, from its upper left corner."""
     width, height = size_of(figure)
-    # A stranger's name with a $ in it is no formula.
+    # Names may contain $, which would begin a formula.
     figure.text(x / width, 1 - y / height, words, parse_math=False, **style)

@@ -1,4 +1,4 @@
-"""What a picture of an alignment shows: two voxel sets, their classes, and the error per voxel."""
+"""The content of a picture of an alignment: two voxel sets, their classes, and errors."""
 
 from __future__ import annotations
 
@@ -23,11 +23,10 @@ from slatprep.records import BACKGROUND, MATERIAL_COLOURS, RESOLUTION
 from slatprep.store.reader import StoredAsset
 
 FARTHEST = 3.0
-"""End of the scale of distances [voxel]; all beyond it looks the same."""
+"""End of the scale of distances [voxel]."""
 
 VIEWPOINTS = ((300.0, 22.0), (60.0, 22.0), (205.0, 50.0))
-"""Azimuth and elevation [degree] of the three directions a picture looks from."""
-
+"""Azimuth and elevation [degree] of the three views of a picture."""
 
 Placed = tuple[NDArray[np.uint8], NDArray[np.uint8], NDArray[np.float64]]
 """Voxels (K, 3), the class of each (K,), and the transform (4, 4) that puts them in a picture."""
@@ -42,22 +41,20 @@ class Scene:
     pixieverse : ndarray of uint8, shape (K, 3)
         Boundary voxels of the PixieVerse field, PixieVerse frame.
     pixieverse_material : ndarray of uint8, shape (K,)
-        Their classes; 255 where not annotated.
+        Their classes; 255 if not annotated.
     slat : ndarray of uint8, shape (N, 3)
         SLAT voxels.
     slat_material : ndarray of uint8, shape (N,)
-        The classes they were given; 255 where none.
+        Their classes by the lookup; 255 if not valid.
     transform : ndarray of float64, shape (4, 4)
         PixieVerse frame to SLAT frame.
     surface : ndarray of uint8, shape (M, 3)
         The SLAT's outer voxels, on which errors are measured.
     error, error_before : ndarray of float64, shape (M,)
-        Distance [voxel] of each to the nearest outer voxel of the PixieVerse
-        field: where it was looked up, and before; that is under the transform
-        alone where a deformation follows it, else with the frames laid on each
-        other as they are.
+        Distance [voxel] of each to the nearest outer voxel of the PixieVerse field, after and
+        before the alignment. With a deformation, "before" is under the transform alone.
     deformed : Deformed or None
-        What the deformation does, where there is one.
+        The deformation, if there is one.
     """
 
     pixieverse: NDArray[np.uint8]
@@ -72,7 +69,7 @@ class Scene:
 
     @property
     def placed(self) -> Placed:
-        """The PixieVerse field on the SLAT, through all of the map between the frames."""
+        """The PixieVerse field in the SLAT frame, deformation included."""
         if self.deformed is not None:
             return self.deformed.voxels, self.deformed.material, np.eye(4)
         return self.pixieverse, self.pixieverse_material, self.transform
@@ -80,15 +77,15 @@ class Scene:
 
 @dataclass(frozen=True)
 class Deformed:
-    """What a deformation does to an asset.
+    """The effect of a deformation on an asset.
 
     Attributes
     ----------
     voxels, material : ndarray of uint8, shapes (D, 3) and (D,)
-        The PixieVerse field as the SLAT's lattice sees it: its cells whose
-        centres are looked up in an occupied voxel, but for those inside.
+        The deformed PixieVerse field on the SLAT's grid: boundary of the cells whose centre is
+        looked up in an occupied voxel.
     displacement : ndarray of float64, shape (N,)
-        How far it moves where each SLAT voxel is looked up, in voxels.
+        Distance [voxel] by which it moves the place of each SLAT voxel.
     """
 
     voxels: NDArray[np.uint8]
@@ -97,12 +94,22 @@ class Deformed:
 
 
 def scene_of(asset: StoredAsset) -> Scene:
-    """Return the scene of an asset as the store holds it.
+    """Return the scene of an asset as stored.
+
+    Parameters
+    ----------
+    asset : StoredAsset
+        The asset.
+
+    Returns
+    -------
+    Scene
+        Ready to be drawn.
 
     Raises
     ------
     StoreError
-        If the asset is deformed, and its record, which holds how, cannot be read.
+        If the asset is deformed and its record, which holds the deformation, cannot be read.
     """
     occupancy = asset.grid_material != BACKGROUND
     shell = voxels_of(boundary(occupancy))
@@ -146,7 +153,7 @@ def surface_distance(
     transform: ArrayLike,
     way: PlaceMap | None = None,
 ) -> NDArray[np.float64]:
-    """Return how far each SLAT voxel is from the nearest PixieVerse voxel.
+    """Return the distance of each SLAT voxel to the nearest PixieVerse voxel.
 
     Parameters
     ----------
@@ -155,12 +162,12 @@ def surface_distance(
     transform : array_like, shape (4, 4)
         PixieVerse frame to SLAT frame.
     way : PlaceMap, optional
-        The map of which the transform is a part, if that is not all of it.
+        The whole map, if the transform is only a part of it.
 
     Returns
     -------
     ndarray of float64, shape (M,)
-        Voxels of the SLAT frame.
+        In voxels of the SLAT frame.
     """
     from slatprep.geometry.nearest import Lattice
 
@@ -172,7 +179,7 @@ def surface_distance(
 
 
 def views(scene: Scene, size: int) -> tuple[View, ...]:
-    """Return the three views, at one scale that holds the sets before and after."""
+    """Return the three views, at one scale at which the sets fit before and after."""
     here = voxel_centres(scene.pixieverse)
     voxels, _, transform = scene.placed
     after = (
@@ -186,7 +193,7 @@ def views(scene: Scene, size: int) -> tuple[View, ...]:
         seen = points @ rotation.T
         low, high = seen.min(axis=0), seen.max(axis=0)
         placed.append((rotation, rotation.T @ ((low + high) / 2), (high - low)[:2].max() / 2))
-    # Room for the voxels at the edge, as wide as their diagonal, and the outline.
+    # Room for the diagonal of voxels at the edge, and for the outline.
     half_width = max(reach for _, _, reach in placed) + 2 * VOXEL_SIZE
     return tuple(View(rotation, centre, float(half_width), size) for rotation, centre, _ in placed)
 

@@ -1,4 +1,4 @@
-"""A contact sheet: many alignments at a glance, each as laid on the other side, and its error."""
+"""A contact sheet: for each of many alignments the two sides together, and the error."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from slatprep.inspect.pictures.canvas import STYLE, in_format, new_figure, write
 from slatprep.inspect.pictures.scene import FARTHEST, Scene, views
 
 MOST = 60
-"""Assets on one sheet."""
+"""Most assets on one sheet."""
 
 _ACROSS = 4
 _THUMBNAIL = 200
 _MARGIN, _HEAD, _GAP = 40, 84, 20
 _TITLE = 26
-"""Characters of a title that leave room for the verdict."""
+"""Most characters of a title beside the verdict."""
 _CELL_WIDTH, _CELL_HEIGHT = 2 * _THUMBNAIL + _GAP, _THUMBNAIL + 66
 
 
@@ -31,7 +31,7 @@ def draw_sheet(
     Parameters
     ----------
     scenes, checks, titles : sequences of one length
-        The assets in the order they are shown, at most `MOST`.
+        The assets in the order of the sheet, at most `MOST`.
 
     Returns
     -------

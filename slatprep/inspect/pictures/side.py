@@ -1,4 +1,4 @@
-"""What stands beside the panels of a picture: figures, the spread of errors, the starts."""
+"""The column beside the panels of a picture: figures, histogram of errors, starts."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 SIDE_WIDTH, SIDE_MARGIN = 402, 48
-"""Pixels of the column, and between it and the picture's edge."""
+"""Width of the column, and of the margin at its right, in pixels."""
 
 SHOWN = (
     "confidence",
@@ -32,22 +32,18 @@ SHOWN = (
     "ambiguity",
     "margin",
 )
-"""The figures of a check that a picture shows, named as the store names them."""
-
+"""The figures of a check on a picture, by their names in the store."""
 
 _LINE = 21
 
 
 def side_of(figure: Figure) -> float:
-    """Return where the column begins, in pixels from the left."""
+    """Return the left edge of the column in pixels."""
     return size_of(figure)[0] - SIDE_MARGIN - SIDE_WIDTH
 
 
 def draw_figures(figure: Figure, check: AlignmentCheck, scene: Scene, y: float) -> float:
-    """Write the figures, what is good, and how far the map between the frames moves things.
-
-    Returns where the last line stands.
-    """
+    """Write figures, thresholds and the size of the map; return the height of the last line."""
     left = side_of(figure)
     columns = (left, left + 275, left + SIDE_WIDTH)
     for x, name, ha in zip(columns, ("figure", "value", "good"), ("left", "right", "right"),
@@ -60,7 +56,7 @@ def draw_figures(figure: Figure, check: AlignmentCheck, scene: Scene, y: float) 
         worse = one.passes is False
         colour = palette.VERDICT_COLOURS["failed"] if worse else palette.INK
         write(figure, columns[0], line, one.name, size=7.5)
-        # Adding zero takes the sign from a rounded -0.
+        # Adding 0 turns a rounded -0 into 0.
         value = f"{round(one.value, 3) + 0.0:.3f}"
         write(figure, columns[1], line, value, size=7.5, ha="right", color=colour)
         limit = one.threshold_text.replace(">=", "\u2265").replace("<=", "\u2264")
@@ -84,7 +80,7 @@ def draw_figures(figure: Figure, check: AlignmentCheck, scene: Scene, y: float) 
 
 
 def draw_histogram(figure: Figure, scene: Scene, radius: float, y: float) -> None:
-    """Draw how many voxels have which error, and as a line how many had it before."""
+    """Draw the histogram of errors, and as a line that of the errors before."""
     write(figure, side_of(figure), y, "error per SLAT surface voxel", weight="bold", size=8.5)
     share = float((scene.error <= radius).mean())
     before = "before" if scene.deformed is None else "undeformed"
@@ -111,7 +107,7 @@ def draw_histogram(figure: Figure, scene: Scene, radius: float, y: float) -> Non
 
 
 def draw_candidates(figure: Figure, alignment: Alignment, y: float) -> None:
-    """Draw the score of each start of the search by quarter turns."""
+    """Draw the coarse fitness of each distinct start, the best first."""
     candidates = alignment.candidates
     write(figure, side_of(figure), y, "starts of the search", weight="bold", size=8.5)
     if not candidates:

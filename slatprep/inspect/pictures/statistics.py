@@ -1,4 +1,4 @@
-"""What the voxels of a store are, as one picture: properties by class, together, and classes."""
+"""The statistics of a store as a picture: histograms by class, joint histogram, classes."""
 
 from __future__ import annotations
 
@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from slatprep.inspect.distributions import Histogram, JointHistogram, StoreStatistics
 from slatprep.inspect.pictures import palette
 from slatprep.inspect.pictures.canvas import STYLE, in_format, new_figure, size_of, write
-from slatprep.inspect.statistics import Histogram, JointHistogram, StoreStatistics
 from slatprep.records import CLASS_COLOURS
 from slatprep.store.reader import Store
 
@@ -18,15 +18,15 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 MOST_CATEGORIES = 16
-"""Categories with a bar; of a store with more those with most assets."""
+"""Most categories with a bar: those with most assets."""
 
 _WIDTH, _HEAD, _FOOT = 1500, 170, 60
 _LEFT, _GAP, _PLOT = 210, 100, 535
-"""From the left edge to the plots, between the two columns of them, and their width, in pixels."""
+"""Left margin, gap between the two columns of plots, and width of a plot, in pixels."""
 _HISTOGRAM, _JOINT, _BAR, _BETWEEN = 190, 480, 26, 90
-"""Heights in pixels, and what lies between two rows of plots."""
-_COLOURS = (*CLASS_COLOURS.values(),)
-"""Of classes by their index: a store without classes has one of its own."""
+"""Heights of the kinds of plots, and of the gap between two rows, in pixels."""
+_COLOURS = tuple(CLASS_COLOURS.values())
+"""Colours of the classes by index."""
 _SIDES = (("field", "PixieVerse fields, before the lookup"), ("slat", "SLAT voxels, after it"))
 
 
@@ -126,7 +126,7 @@ def _joint(
     shares = np.ma.masked_equal(_shares(getattr(joint, side)), 0.0)
     first, second = (one for one in statistics.histograms if one.name in joint.names)
     colours = LinearSegmentedColormap.from_list("shares", palette.DISTANCE_COLOURS[1:])
-    # Below five powers of ten all is as pale as the least that is told apart.
+    # The scale ends at 1e-5; smaller shares have its palest colour.
     mesh = axes.pcolormesh(
         *joint.edges, shares.T, cmap=colours, norm=LogNorm(1e-5, 1.0), rasterized=True
     )
@@ -149,7 +149,7 @@ def _bars(axes: Axes, names: list[str], bars: list[dict[str, float]]) -> None:
         left = left + shares
     axes.set_xlim(0, 1)
     axes.set_ylim(max(len(bars), 1) - 0.5, -0.5)
-    axes.set_yticks(places, names, parse_math=False)  # A $ in a name is no formula.
+    axes.set_yticks(places, names, parse_math=False)  # Names may contain $.
     axes.set_xlabel("share of annotated voxels, by category (assets)")
 
 

@@ -1,8 +1,4 @@
-"""An alignment in Open3D's viewer, to be turned by hand.
-
-The viewer turns triangles on the graphics card, `pictures.voxels` draws pixels
-of one view by numpy: the two share the voxels' colours, but no drawing.
-"""
+"""An alignment as meshes in Open3D's interactive viewer."""
 
 from __future__ import annotations
 
@@ -19,7 +15,7 @@ from slatprep.inspect.pictures.scene import Scene, class_colours, distance_colou
 from slatprep.records import RESOLUTION
 
 APART = 1.25
-"""Distance between the parts shown, in edges of the unit cube."""
+"""Distance between two parts, in edges of the unit cube."""
 
 
 def has_screen(environment: Mapping[str, str] = os.environ, platform: str = sys.platform) -> bool:
@@ -30,25 +26,30 @@ def has_screen(environment: Mapping[str, str] = os.environ, platform: str = sys.
 
 
 def show_alignment(scene: Scene, title: str) -> bool:
-    """Open a window with four parts: before, after, result and error; wait until it is closed.
+    """Show before, after, result and error in a window; return when it is closed.
 
     Parameters
     ----------
     scene : Scene
         From `slatprep.inspect.pictures.scene.scene_of`.
     title : str
-        Of the window.
+        Title of the window.
 
     Returns
     -------
     bool
-        False if no window could be opened.
+        Whether a window could be opened.
+
+    Raises
+    ------
+    SlatprepError
+        If Open3D is not installed.
     """
     from slatprep.align import require_engine
     from slatprep.align.open3d_icp import load_open3d
     from slatprep.parameters import PRESETS
 
-    require_engine(PRESETS["paper"].align)  # which brings the window, too
+    require_engine(PRESETS["paper"].align)  # Its extra installs the viewer too.
     open3d = load_open3d()
     window = open3d.visualization.Visualizer()
     if not window.create_window(window_name=title, width=1600, height=700):
@@ -90,7 +91,7 @@ def meshes(scene: Scene) -> tuple[Mesh, ...]:
 def cube_mesh(
     voxels: NDArray[np.uint8], colours: NDArray[np.float64], transform: ArrayLike
 ) -> Mesh:
-    """Return the outside of voxels as triangles, with four vertices a side.
+    """Return the exposed faces of voxels as triangles, with four vertices a face.
 
     Parameters
     ----------
@@ -99,12 +100,12 @@ def cube_mesh(
     colours : ndarray of float64, shape (N, 3)
         Their colours in 0..1.
     transform : array_like, shape (4, 4)
-        To the frame that is shown.
+        From their frame to the frame that is shown.
 
     Returns
     -------
     Mesh
-        Triangles turn counterclockwise seen from outside.
+        Triangles are counterclockwise seen from outside.
     """
     empty = ~np.pad(occupancy_of(voxels), 1)
     corners, painted = [], []

@@ -1,9 +1,8 @@
-"""Voxels drawn as shaded cubes, by numpy alone.
+"""Voxels drawn as shaded cubes with numpy.
 
-An orthographic view shows at most three sides of every cube, and each of them
-as the same parallelogram. So the pixels of one side are worked out once and
-laid down at every exposed face, with a depth buffer: ten thousand voxels take
-some hundredths of a second.
+An orthographic view shows at most three sides of every cube, each as the same parallelogram.
+Its pixels are computed once and copied to every exposed face, with a depth buffer: ten thousand
+voxels take some hundredths of a second.
 """
 
 from __future__ import annotations
@@ -17,10 +16,10 @@ from slatprep.geometry.frames import VOXEL_SIZE, apply_transform, voxel_centres
 from slatprep.geometry.voxels import occupancy_of
 
 SUPERSAMPLING = 3
-"""Pixels drawn for each pixel of the picture, along each side."""
+"""Pixels drawn per pixel of the picture, along each edge."""
 
 LIGHT = np.array([-0.35, 0.75, 0.56])
-"""Towards the light, in the axes of the picture: from the upper left, behind the viewer."""
+"""Direction to the light in the axes of the picture: upper left, behind the viewer."""
 
 _DEPTH_STEPS = 1 << 20
 _FACE_BITS = 24
@@ -31,16 +30,16 @@ _OUTLINE_STEP = 2.5 * VOXEL_SIZE
 
 @dataclass(frozen=True)
 class View:
-    """Where the viewer stands, and how much of the world the picture holds.
+    """An orthographic camera.
 
     Attributes
     ----------
     rotation : ndarray of float64, shape (3, 3)
-        Rows are the picture's right, its up, and the direction to the viewer.
+        Rows are the directions right, up and towards the viewer.
     centre : ndarray of float64, shape (3,)
         The point in the middle of the picture.
     half_width : float
-        From there to the picture's edge, in the unit of the cube.
+        Half the width of the picture, in edges of the cube.
     size : int
         Pixels along each side of the picture.
     """
@@ -51,7 +50,7 @@ class View:
     size: int
 
     def to_view(self, points: ArrayLike) -> NDArray[np.float64]:
-        """Return points (N, 3) along the picture's right, up and towards the viewer."""
+        """Return points (N, 3) in the axes right, up and towards the viewer."""
         rotated: NDArray[np.float64] = (np.asarray(points) - self.centre) @ self.rotation.T
         return rotated
 
@@ -73,7 +72,7 @@ def view_rotation(azimuth: float, elevation: float) -> NDArray[np.float64]:
     Parameters
     ----------
     azimuth : float
-        Degrees about z from the x axis to where the viewer stands.
+        Degrees about z from the x axis to the viewer.
     elevation : float
         Degrees above the xy plane.
 
@@ -109,16 +108,17 @@ def draw_voxels(
     colours : ndarray of float64, shape (N, 3)
         Red, green and blue in 0..1 of each.
     transform : array_like, shape (4, 4)
-        From the voxels' frame to the frame that is looked at.
+        From the voxels' frame to the frame of the view.
     view : View
-        Where from.
+        The camera.
     contrast : float
-        How much darker sides turned from the light are, 0..1: little where a
-        colour is a number to be read.
+        How much darker sides are that face away from the light, 0..1. Small values keep
+        colours readable as numbers.
 
     Returns
     -------
     Drawing
+        The picture.
     """
     side = view.size * SUPERSAMPLING
     pixels_per_unit = side / (2 * view.half_width)
@@ -151,7 +151,7 @@ def draw_voxels(
         face = drawn + np.arange(len(exposed), dtype=np.int64)
         key = (quantised.astype(np.int64) << _FACE_BITS) | (face[:, None] << 1) | seams
         inside = (x >= 0) & (x < side) & (y >= 0) & (y < side)
-        # The largest key is the nearest face, in whatever order they are laid down.
+        # The largest key is the nearest face; the order of faces does not matter.
         np.maximum.at(buffer, (y * side + x)[inside], key[inside])
         normal = sign * linear[:, axis] / np.linalg.norm(linear[:, axis])
         owners.append(exposed)
@@ -166,10 +166,9 @@ def draw_voxels(
 def _side_pixels(
     spanned: NDArray[np.float64],
 ) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.int64]] | None:
-    """Return the pixels of a cube's side around its middle, how near they are, and its seam.
+    """Return the pixels of a cube's side relative to its centre, their depths, and its seams.
 
-    `spanned` (3, 2) holds the two edges of the side in pixels; None where it
-    is seen edge-on.
+    `spanned` (3, 2) holds the two edges of the side in pixels. None if it is seen edge-on.
     """
     plane = spanned[:2]
     if abs(np.linalg.det(plane)) < 1e-3:
@@ -178,7 +177,7 @@ def _side_pixels(
     grid = np.arange(-reach, reach + 1)
     offsets = np.stack(np.meshgrid(grid, grid, indexing="ij"), axis=-1).reshape(-1, 2)
     along = offsets @ np.linalg.inv(plane).T
-    # Half a pixel more on every side, as the middle is rounded to a pixel.
+    # Half a pixel more on every edge, since centres are rounded to pixels.
     slack = 0.5 * np.abs(np.linalg.inv(plane)).sum(axis=1)
     inside = (np.abs(along) <= 0.5 + slack).all(axis=1)
     seam = (np.abs(along) > 0.5 - slack).any(axis=1)
@@ -191,7 +190,7 @@ def _shade(normal: NDArray[np.float64], contrast: float) -> float:
 
 
 def _resolve(buffer: NDArray[np.int64], lit: NDArray[np.float64], view: View) -> Drawing:
-    """Turn the buffer into colours: seams and outlines darker, then averaged over pixels."""
+    """Turn the buffer into colours, with darker seams and outlines, at the picture's size."""
     covered = buffer >= 0
     face = (buffer & ((1 << _FACE_BITS) - 1)) >> 1
     tone = np.where(buffer & 1, 1.0, _SEAM)
@@ -210,7 +209,7 @@ def _averaged(image: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _steps_down(depth: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Where a pixel beside this one lies much farther away."""
+    """Return the pixels that have a much farther neighbour."""
     step = np.zeros(depth.shape, dtype=bool)
     padded = np.pad(depth, 1, constant_values=-np.inf)
     rows, columns = depth.shape

@@ -1,4 +1,4 @@
-"""Write the pictures of checked alignments."""
+"""Write pictures of alignments as files."""
 
 from __future__ import annotations
 
@@ -39,12 +39,12 @@ def write_pictures(
     checks : sequence of AlignmentCheck
         The assets to draw, in the order of the contact sheet.
     target : Path
-        A file that ends in the name of one of `FORMATS` for one asset, a folder otherwise: it gets
-        a PNG an asset, named by its id, and a contact sheet of several.
+        For one asset, a file with a suffix of `FORMATS`. Otherwise a folder, with a PNG for
+        each asset, named by its id, and a contact sheet if there are several.
     jobs : int
-        Worker processes; what is drawn does not depend on them.
+        Worker processes; the pictures do not depend on them.
     progress : callable, optional
-        Called with the assets done and the assets in all.
+        Called with the number of assets done and the number of all assets.
 
     Returns
     -------
@@ -103,12 +103,12 @@ def _drawn(path: Place, check: AlignmentCheck, kind: str) -> tuple[str, bytes, S
 
 
 def title_of(asset: StoredAsset) -> str:
-    """Return what a picture calls an asset, whose id stands below: its category."""
+    """Return the title of an asset's picture: its category."""
     return str(asset.columns["category"]).replace("_", " ") or "category unknown"
 
 
 def subtitle_of(asset: StoredAsset) -> str:
-    """Return an asset's id, its size and how it was aligned, in one line."""
+    """Return an asset's id, its number of voxels and how it was aligned, in one line."""
     columns = asset.columns
     how = f"engine {columns['engine']}, {columns['model']}, starts {columns['search']}"
     return f"{asset.asset_id}   {len(asset.coords):,} SLAT voxels   {how}"

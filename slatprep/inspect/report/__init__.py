@@ -1,4 +1,4 @@
-"""One page for a dataset: a single HTML file that needs nothing but a browser."""
+"""The report on a dataset: a single HTML file that opens in a browser without a network."""
 
 from __future__ import annotations
 
@@ -31,18 +31,18 @@ from slatprep.workers.local import run_unordered
 __all__ = ["ReportSummary", "write_report"]
 
 ASSETS_IN_DETAIL = 5_000
-"""Assets with thumbnail and 3D view at most; a store with more shows some of them."""
+"""Most assets with a thumbnail and a 3D view."""
 
 VOXEL_BYTES = 36_000_000
-"""Bytes of voxels at most, before base64 makes them a third larger."""
+"""Most bytes of voxels at full detail, before base64 makes them a third larger."""
 
 TASK_ASSETS = 16
-"""Assets that a worker draws at a time."""
+"""Assets drawn by one task of a worker."""
 
 
 @dataclass(frozen=True)
 class ReportSummary:
-    """What a page holds.
+    """The size and contents of a page.
 
     Attributes
     ----------
@@ -51,11 +51,11 @@ class ReportSummary:
     size : int
         Its bytes.
     assets : int
-        Rows of its table: assets of the store and those that did not go in.
+        Rows of its table: assets of the store, and those that are not in it.
     in_detail : int
         Assets with a thumbnail and a 3D view.
     side : int
-        Voxels a side of the 3D views: 64, or 32 where 64 took too much.
+        Voxels per edge of the 3D views: 64, or 32 where 64 would exceed `VOXEL_BYTES`.
     """
 
     path: Path
@@ -67,7 +67,7 @@ class ReportSummary:
 
 @dataclass(frozen=True)
 class Drawn:
-    """What is drawn of an asset of the store: thumbnail, and voxels by level of detail."""
+    """An asset of the store as drawn: thumbnail, and voxels by level of detail."""
 
     index: int
     thumbnail: NDArray[np.uint8]
@@ -89,19 +89,19 @@ def write_report(
     store : Store
         From `slatprep.store.open_store`.
     out : Path
-        The HTML file; an older one is replaced when the new one is complete.
+        The HTML file; an existing file is replaced when the new one is complete.
     manifests : Path, optional
-        Directory of the build's records. Without them the page cannot say
-        what did not go in, and why.
+        Folder of the build's records. Without them the page cannot say which assets are
+        not in the store, and why.
     jobs : int
         Worker processes. The page's bytes do not depend on it.
     progress : callable, optional
-        Called with the assets done and the assets in all.
+        Called with the number of assets done and the number of all assets.
 
     Returns
     -------
     ReportSummary
-        What went into it.
+        Its size and contents.
 
     Raises
     ------
@@ -163,11 +163,11 @@ def _refuse_other_words(store: Store) -> None:
 
 
 def _chosen(store: Store) -> list[int]:
-    """Return the indices of the assets that are shown in detail, all where there are few."""
+    """Return the rows of the assets shown in detail, at most `ASSETS_IN_DETAIL`."""
     total = len(store)
     if total <= ASSETS_IN_DETAIL:
         return list(range(total))
-    # Those that want looking at come first, the rest is spread over the store.
+    # First those that are not good, then others at even steps through the store.
     doubtful = np.flatnonzero(store.column("verdict") != str(Verdict.GOOD))
     doubtful = doubtful[: ASSETS_IN_DETAIL // 2]
     spread = np.linspace(0, total - 1, ASSETS_IN_DETAIL - len(doubtful)).round().astype(int)
@@ -175,7 +175,7 @@ def _chosen(store: Store) -> list[int]:
 
 
 def _draw(path: Path, indices: Sequence[int]) -> tuple[list[Drawn], dict[str, Tally]]:
-    """Draw some assets of a store, and count by category, in a worker."""
+    """Draw some assets of a store and tally their voxels by category, in a worker."""
     store = open_store(path)
     records = StoredRecords(store)
     max_distance = store.about.build.parameters.sample.max_distance

@@ -1,4 +1,4 @@
-"""What the page says, as one JSON document; how it looks is the page's own affair."""
+"""The content of the page as one JSON document, without its layout."""
 
 from __future__ import annotations
 
@@ -26,8 +26,8 @@ from slatprep.records import (
 )
 from slatprep.store.reader import Store
 
-# Matplotlib's viridis (CC0) at even steps: light and dark tell the values apart
-# whatever colours a person sees.
+# Matplotlib's viridis (CC0) at even steps: its lightness rises with the value, so that
+# colour-blind readers can order the colours too.
 _PROPERTY_COLOURS = ("#440154", "#472D7B", "#3B528B", "#2C728E", "#21918C", "#28AE80",
                      "#5EC962", "#ADDC30", "#FDE725")  # fmt: skip
 
@@ -56,19 +56,19 @@ def page_content(
     outcomes : sequence of Outcome or None
         From its records, where there are any.
     tallies : mapping of str to Tally
-        Counts over the voxels of each category.
+        Tally of the voxels of each category.
     chosen : sequence of int
-        Assets with a thumbnail and a 3D view, ascending.
+        Rows of the assets with a thumbnail and a 3D view, ascending.
     side : int
-        Voxels a side of the 3D views.
+        Voxels per edge of the 3D views.
     created : str or None
-        When the store was built, if a record says so.
+        When the store was built, if known from its records.
 
     Returns
     -------
     dict
-        JSON-ready. Table columns are lists of one entry an asset, those of
-        the store first; not-a-number and what is unknown are None.
+        JSON-ready. Columns of the table are lists with an entry for each asset, first those
+        of the store; NaN and unknown values are None.
     """
     build = store.about.build
     return {
@@ -122,7 +122,7 @@ def _properties(
     outcomes: Sequence[Outcome] | None,
     tallies: Mapping[str, Tally],
 ) -> list[dict[str, Any]]:
-    """Return the spread of each property, by class, and the ranges it is held against."""
+    """Return the histograms of each property by class, and its ranges."""
     normalization, published = store.normalization, {one.name: one for one in PIXIE_RANGES.ranges}
     total = sum(tallies.values(), start=no_tally(len(normalization.ranges), BINS))
     clipped = np.zeros(len(normalization.ranges), dtype=np.int64)
@@ -154,7 +154,7 @@ def _properties(
 
 
 def _balance(store: Store, tallies: Mapping[str, Tally]) -> list[dict[str, Any]]:
-    """Return the SLAT voxels of each class by category; the last count is of those not valid."""
+    """Return the number of SLAT voxels of each class by category, last of those not valid."""
     assets = Counter(str(category) for category in store.column("category"))
     return [
         {
@@ -211,7 +211,7 @@ def _table(
     return columns
 
 
-# "failed" is the verdict on an alignment; these could not be aligned at all.
+# Not "failed", which is a verdict on an alignment: these were not aligned at all.
 _ABSENT = {Status.FAILED: "not built", Status.SKIPPED: "skipped"}
 
 

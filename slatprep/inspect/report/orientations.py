@@ -1,4 +1,4 @@
-"""Which quarter turn an alignment is nearest to."""
+"""The quarter turn nearest to an alignment."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from slatprep.geometry.frames import split_transform
 
 
 def nearest_quarter_turn(transform: ArrayLike) -> tuple[int, float]:
-    """Return which of the 24 quarter turns is nearest to a transform's rotation.
+    """Return the quarter turn, of 24, that is nearest to a transform's rotation.
 
     Parameters
     ----------
@@ -33,7 +33,7 @@ def nearest_quarter_turn(transform: ArrayLike) -> tuple[int, float]:
 
 
 def quarter_turns() -> tuple[str, ...]:
-    """Return in words where each of the 24 quarter turns takes x, y and z.
+    """Return in words where each of the 24 quarter turns takes the axes x, y and z.
 
     Examples
     --------

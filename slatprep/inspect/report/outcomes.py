@@ -1,4 +1,4 @@
-"""What the records of a build say about each asset that its store does not."""
+"""The outcome of each asset of a build, as its records have it."""
 
 from __future__ import annotations
 
@@ -13,32 +13,32 @@ from slatprep.provenance.record_json import read_record
 from slatprep.records import Place, Status
 
 MOST_TIES = 8
-"""Tied placements of an asset that a page can show."""
+"""Most tied placements of an asset on the page."""
 
 _NUMBER = re.compile(r"\d[\d,]*(?:\.\d+)?(?:e[-+]?\d+)?")
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """What became of one asset.
+    """The outcome of one asset.
 
     Attributes
     ----------
     asset_id, category : str
-        Of its record.
+        From its record.
     status : Status
-        ``ok`` where it is in the store.
+        ``ok`` if it is in the store.
     reasons : tuple of str
         Why it is not in the store, or why its verdict is not ``good``.
     tied : int
         Distinct placements that fit about as well as the best.
     displacement : float or None
         Largest distance [voxel] between the best placement and a tied one;
-        None where there is none.
+        None if there are no ties.
     clipped : tuple of int
         Values of ``voxel/properties`` outside the range, by property.
     ties : tuple of tuple of float
-        Transforms of the first `MOST_TIES` tied placements, three rows of four each.
+        Transforms of the first `MOST_TIES` tied placements, each as three rows of four numbers.
     """
 
     asset_id: str
@@ -57,9 +57,14 @@ def read_outcomes(manifests: Place, build_id: str) -> Iterator[Outcome]:
     Parameters
     ----------
     manifests : Path
-        Directory of ``assets.jsonl`` and ``build.json``.
+        Folder of ``assets.jsonl`` and ``build.json``.
     build_id : str
         Id of the build that wrote the store.
+
+    Yields
+    ------
+    Outcome
+        Of each record.
 
     Raises
     ------
@@ -77,7 +82,7 @@ def read_outcomes(manifests: Place, build_id: str) -> Iterator[Outcome]:
 
 
 def kind_of(reason: str) -> str:
-    """Return a reason without what is special to one asset: its file and its numbers.
+    """Return a reason without the file and the numbers of the asset.
 
     Examples
     --------
@@ -90,7 +95,7 @@ def kind_of(reason: str) -> str:
 
 
 def kinds_of(reasons: Iterable[str]) -> dict[str, str]:
-    """Return the kind of each reason, with the numbers that all of one kind have in common.
+    """Return the kind of each reason, with the numbers that all reasons of one kind share.
 
     Examples
     --------

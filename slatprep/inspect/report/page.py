@@ -1,8 +1,7 @@
-"""The page as text: one template, its style and scripts, and the data, all inside.
+"""The page as text: a template with its style, its scripts and the data.
 
-Whatever comes from data stays data: it lies in blocks that no browser runs,
-is shown as text alone, and a content security policy lists the page's own
-scripts by their hash, so that nothing else could run, and nothing be fetched.
+Data cannot run as code: it is in blocks that browsers do not execute and is shown only as text.
+A content security policy allows the page's own scripts by their hashes, and no requests.
 """
 
 from __future__ import annotations
@@ -16,7 +15,7 @@ from importlib import resources
 from typing import Any, TextIO
 
 SCRIPTS = ("format", "data", "charts", "table", "viewer", "sections", "app")
-"""The page's own scripts, each of which uses those before it."""
+"""The page's own scripts; each may use those before it."""
 
 
 def write_page(
@@ -33,13 +32,13 @@ def write_page(
     file : text file
         Open for writing in UTF-8, with plain line feeds.
     title : str
-        Of the page.
+        Title of the page.
     content : mapping
         From `slatprep.inspect.report.content.page_content`.
     sheets : iterable of bytes
         PNG files of thumbnails.
     packs : iterable of list of str
-        For each sheet, its assets' voxels in base64.
+        For each sheet, the voxels of its assets in base64.
     """
     style = _asset("style.css")
     script = "\n".join(_asset("js", f"{name}.js") for name in SCRIPTS)
@@ -52,7 +51,7 @@ def write_page(
     for name, text in (("style", style), ("policy", policy), ("title", html.escape(title))):
         head = head.replace(f"{{{{{name}}}}}", text)
     file.write(head)
-    # The table can be used while the pictures below it are still being read.
+    # The data come first, so that the table works while the browser still reads the pictures.
     _block(file, "content", "application/json", _json(content))
     file.write(f"<script>{script}</script>\n")
     _block(file, "library", "text/plain", library)
@@ -64,13 +63,13 @@ def write_page(
 
 
 def _json(content: Mapping[str, Any]) -> str:
-    """Return JSON that no string inside can end the block of."""
+    """Return JSON without characters that could end its block."""
     text = json.dumps(content, ensure_ascii=False, allow_nan=False, separators=(",", ":"))
     return text.replace("<", "\\u003c").replace(">", "\\u003e").replace("&", "\\u0026")
 
 
 def _block(file: TextIO, name: str, kind: str, text: str) -> None:
-    """Write a block of data, which a browser keeps and does not run."""
+    """Write a block of data, which browsers do not execute."""
     if "</script" in text.lower() or "<!--" in text:
         raise ValueError(f"the block {name} would end before its end")
     file.write(f'<script type="{kind}" id="{name}">{text}</script>\n')

@@ -1,18 +1,18 @@
-"""An asset's voxels in the few kilobytes that the 3D view is drawn from.
+"""An asset's voxels in a few kilobytes, for the 3D view.
 
-One asset is one stream of raw deflate (RFC 1951), which a browser undoes by
-itself. It holds, for n voxels a side and voxels in C order of the grid::
+An asset is one stream of raw deflate (RFC 1951), which browsers can unpack. It holds, for n
+voxels per edge and voxels in C order of the grid::
 
     n^3 / 8 bytes   occupancy of the SLAT, most significant bit first
     n^3 / 8 bytes   occupancy of the PixieVerse boundary, in its own frame
     N bytes each    class, E, density, Poisson's ratio, distance of the SLAT voxels
     K bytes         class of the boundary voxels
 
-and where the asset is deformed also::
+and for a deformed asset also::
 
-    4 bytes         a step in edges of the cube, float32, least significant byte first
-    3 K bytes       how many steps, signed, the centre of each boundary voxel moves along
-                    x, y and z of its own frame before the transform takes it to its place
+    4 bytes         a step in edges of the cube, float32, little-endian
+    3 K bytes       displacement of the centre of each boundary voxel along x, y and z of its
+                    own frame before the transform, int8, in steps
 
 Properties are quantised to `LEVELS` over [-1, 1] and distances over 0 to the
 largest distance allowed; 255 means not valid, for a class as well.
@@ -32,12 +32,12 @@ from slatprep.records import BACKGROUND, RESOLUTION, UNANNOTATED
 from slatprep.store import StoredAsset
 
 LEVELS = 64
-"""Steps of a quantised property or distance: finer than a colour scale can show."""
+"""Steps of a quantised property or distance, finer than a colour scale can show."""
 
 NOT_VALID = 255
 
 FULL, COARSE = RESOLUTION, RESOLUTION // 2
-"""Voxels a side of the two levels of detail."""
+"""Voxels per edge of the two levels of detail."""
 
 
 def encode_asset(asset: StoredAsset, way: PlaceMap, max_distance: float, side: int) -> bytes:
@@ -50,14 +50,14 @@ def encode_asset(asset: StoredAsset, way: PlaceMap, max_distance: float, side: i
     way : PlaceMap
         The map between its frames.
     max_distance : float
-        Distance [voxel] at the end of its scale.
+        Distance [voxel] at the end of the scale.
     side : int
-        `FULL`, or `COARSE`: then one voxel of each 2 x 2 x 2 stands for all.
+        `FULL`, or `COARSE`, where one voxel stands for 2 x 2 x 2.
 
     Returns
     -------
     bytes
-        See the module.
+        In the form that this module describes.
     """
     first, occupied = _cells(asset.coords, side)
     grid, material = _boundary_of(asset.grid_material)
@@ -91,7 +91,7 @@ def _boundary_of(grid_material: NDArray[np.uint8]) -> tuple[NDArray[np.intp], ND
 
 
 def _cells(voxels: NDArray[np.integer], side: int) -> tuple[NDArray[np.intp], bytes]:
-    """Return the first voxel of each cell, which stands for it, in C order; and the cells' bits."""
+    """Return the first voxel of each occupied cell, and the bits of all cells, in C order."""
     cells = voxels.astype(np.intp) // (RESOLUTION // side)
     flat, first = np.unique(np.ravel_multi_index(tuple(cells.T), (side,) * 3), return_index=True)
     occupancy = np.zeros(side**3, dtype=bool)
@@ -100,7 +100,7 @@ def _cells(voxels: NDArray[np.integer], side: int) -> tuple[NDArray[np.intp], by
 
 
 def _quantised(share: NDArray[np.float64]) -> NDArray[np.uint8]:
-    """Return shares 0..1 in `LEVELS` steps; not-a-number as `NOT_VALID`."""
+    """Return shares 0..1 in `LEVELS` steps; NaN as `NOT_VALID`."""
     known = np.isfinite(share)
     steps = np.round(np.clip(np.where(known, share, 0.0), 0.0, 1.0) * (LEVELS - 1))
     return np.where(known, steps, NOT_VALID).astype(np.uint8)

@@ -1,8 +1,7 @@
-"""Is a store what it says it is? Every fault is found and named.
+"""Verify a store against its contract, its digests, its records and, on request, its sources.
 
-`verify_store` goes from the outside in: metadata against the contract, files
-against their digests, then every asset's values and record, and on request
-the sources that the records name.
+`verify_store` checks metadata against the contract, files against their digests, then every
+asset's values and record, and finally the source files that the records name.
 """
 
 from __future__ import annotations
@@ -31,22 +30,22 @@ ASSETS_IN_TASK = 8
 
 @dataclass(frozen=True)
 class Verification:
-    """What a verification found.
+    """The result of a verification.
 
     Attributes
     ----------
     store : Place
         The store.
     assets : int
-        Assets whose values were checked.
+        Number of assets whose values were checked.
     files : int
-        Files of the store, all of which were compared with the digests.
+        Number of the store's files; all were compared with their digests.
     sources : int
-        Source files whose digest was compared.
+        Number of source files whose digest was compared.
     manifests : Place or None
-        Folder of the records that were compared; None where there are none.
+        Folder of the records that were compared; None if there are none.
     findings : tuple of Finding
-        Everything that is wrong, sorted by file.
+        All faults, sorted by file.
     """
 
     store: Place
@@ -58,7 +57,7 @@ class Verification:
 
     @property
     def ok(self) -> bool:
-        """Whether nothing is wrong."""
+        """Whether there are no findings."""
         return not self.findings
 
 
@@ -71,23 +70,22 @@ def verify_store(
     jobs: Jobs = 1,
     progress: Progress | None = None,
 ) -> Verification:
-    """Check everything about a store that can be checked.
+    """Verify a store.
 
     Parameters
     ----------
     path : Place
-        The store; on an object store its current version is checked.
+        The store; on an object store, its current version.
     manifests : Place, optional
-        Folder of the build's records; by default the one beside the store, if
-        there is one.
+        Folder of the build's records; by default the one beside the store, if it exists.
     sources : bool
         Whether to compare the source files with the records.
     roots : SourceRoots, optional
-        Where the sources lie now; by default the roots that ``build.json`` names.
+        Where the sources are now; by default the roots in ``build.json``.
     jobs : int or Workers
         Worker processes, or a `slatprep.workers.dask.Cluster`.
     progress : callable, optional
-        Called with the assets done and the assets in all.
+        Called with the number of assets done and the number of all assets.
 
     Returns
     -------
@@ -97,14 +95,13 @@ def verify_store(
     Raises
     ------
     StoreError
-        If there is no store at all, or sources are asked for and nobody says
-        where they lie.
+        If there is no store, or sources are to be compared and their roots are not known.
     """
     path = storage_of(place_of(path)).current_version()
     try:
-        store = open_store(path.absolute())  # workers may stand in another folder
+        store = open_store(path.absolute())  # Workers may run in another folder.
     except AttributesError:
-        # Values mean nothing without them; of what is there the files tell.
+        # Without attributes values have no meaning; only metadata and files can be checked.
         document = read_metadata(path / "zarr.json")
         files, found = file_findings(Store(path, document), jobs)
         findings = {*metadata_findings(path), *found}

@@ -1,4 +1,4 @@
-"""One asset: its values against their ranges, against its grid, and against its record."""
+"""Verify an asset's values against their ranges, its grid and its record."""
 
 from __future__ import annotations
 
@@ -40,32 +40,32 @@ from slatprep.store.records import RECORD_ARRAY
 from slatprep.store.shard_reader import DamagedFileError
 
 CONFIDENCE_TOLERANCE = 1e-5
-"""By so much a voxel's probability may differ: another machine may round its sums otherwise."""
+"""Largest difference of a voxel's probability: another machine may round sums differently."""
 
 
 def asset_findings(
     path: Place, rows: range, roots: SourceRoots | None, run: str
 ) -> tuple[list[Finding], int]:
-    """Check some assets of a store.
+    """Verify some assets of a store.
 
     Parameters
     ----------
     path : Place
         The store.
     rows : range
-        Which assets, by index.
+        Rows of the assets.
     roots : SourceRoots or None
-        Where the sources lie, if they are to be compared.
+        Where the sources are, if they are to be compared.
     run : str
-        Unique to this verification: a worker caches opened stores and digests,
-        and must not use those of an earlier run, as files may have changed.
+        Unique to this verification. A worker caches opened stores and digests and must not
+        use those of an earlier run, since files may have changed.
 
     Returns
     -------
     findings : list of Finding
-        What is wrong with them.
+        The faults.
     sources : int
-        How many source files were compared.
+        Number of source files that were compared.
     """
     store, records = _opened(path, run)
     findings: list[Finding] = []
@@ -91,7 +91,7 @@ def asset_findings(
             findings.append(Finding(RECORD_ARRAY, asset_id, f"no record ({error})", "one a row"))
             continue
         findings += record_findings(asset, record, store)
-        if not own:  # Values that are no probabilities, classes or places give none.
+        if not own:  # From invalid values no confidence can be computed.
             findings += confidence_findings(asset, record)
         if roots is not None:
             findings += source_findings(record, roots, run)
@@ -100,7 +100,7 @@ def asset_findings(
 
 
 def value_findings(asset: StoredAsset) -> Iterator[Finding]:
-    """Yield values of an asset that the contract does not allow."""
+    """Yield findings on values that the contract does not allow."""
     coords, valid, material = asset.coords, asset.valid, asset.material
     checks = {
         "voxel/coords": (
@@ -155,20 +155,20 @@ def value_findings(asset: StoredAsset) -> Iterator[Finding]:
     for where, (fine, what, expected) in checks.items():
         if not fine:
             yield Finding(where, asset.asset_id, what, expected)
-    # Coordinates that are out of range, which was found above, may share a cell.
+    # Coordinates out of range, found above, may share a cell with others.
     if np.bincount(flat_index(coords)).max(initial=0) > 1:
         yield Finding("voxel/coords", asset.asset_id, "a coordinate occurs twice", "each once")
 
 
 def lookup_findings(asset: StoredAsset) -> Iterator[Finding]:
-    """Yield where an annotation is not what the grid and the stored places give."""
+    """Yield findings where the annotation differs from what grid and places give."""
     try:
         _, differences = recompute_annotation(asset)
     except (KeyError, TypeError, ValueError, np.linalg.LinAlgError) as error:
         yield Finding("asset", asset.asset_id, f"cannot be sampled ({error})", "sound parameters")
         return
     for where, difference in differences.items():
-        # A NaN is no difference within bounds.
+        # Not `difference > TOLERANCES[where]`, which is false for NaN.
         wrong = np.count_nonzero(~(difference <= TOLERANCES[where]))
         if wrong:
             yield Finding(
@@ -180,12 +180,12 @@ def lookup_findings(asset: StoredAsset) -> Iterator[Finding]:
 
 
 def fault_findings(where: str, asset_id: str, error: RecordError) -> list[Finding]:
-    """Return what is wrong with a record that cannot be read, three faults at most."""
+    """Return the faults of a record that cannot be read, at most three."""
     return [Finding(where, asset_id, fault, "the published schema") for fault in error.faults[:3]]
 
 
 def record_findings(asset: StoredAsset, record: AssetRecord, store: Store) -> Iterator[Finding]:
-    """Yield where an asset's record disagrees with its row, its map with the places included."""
+    """Yield findings where an asset's record disagrees with its row or its stored places."""
     for name, said, held in _claims(asset, record, store):
         if not _equal(said, held):
             yield Finding(
@@ -204,7 +204,7 @@ def record_findings(asset: StoredAsset, record: AssetRecord, store: Store) -> It
 
 
 def confidence_findings(asset: StoredAsset, record: AssetRecord) -> Iterator[Finding]:
-    """Yield where ``voxel/confidence`` is not what the field, the map and the record give."""
+    """Yield a finding where ``voxel/confidence`` differs from what grid and record give."""
     if asset.store.format_version == 1 or asset.merged:
         return
     annotation = Annotation(
@@ -221,7 +221,7 @@ def confidence_findings(asset: StoredAsset, record: AssetRecord) -> Iterator[Fin
 
 
 def source_findings(record: AssetRecord, roots: SourceRoots, run: str) -> Iterator[Finding]:
-    """Yield sources of an asset that are gone or are not what its record says."""
+    """Yield findings on sources that are missing or differ from the record."""
     for source in record.sources:
         root = roots.slat if source.role == "slat" else roots.pixieverse
         path = root / source.path
@@ -254,7 +254,7 @@ def _is_spread(asset: StoredAsset) -> bool:
 
 
 def _normalised(values: NDArray[np.float32], where: NDArray[np.bool_]) -> bool:
-    """Whether values (..., rows) are in [-1, 1] at the rows of a mask and NaN at all others."""
+    """Whether values (..., rows) are in [-1, 1] where the mask is true and NaN elsewhere."""
     missing = np.isnan(values)
     return bool((missing == ~where).all() and (missing | (np.abs(values) <= 1)).all())
 
@@ -262,12 +262,12 @@ def _normalised(values: NDArray[np.float32], where: NDArray[np.bool_]) -> bool:
 def _claims(
     asset: StoredAsset, record: AssetRecord, store: Store
 ) -> Iterator[tuple[str, object, object]]:
-    """Yield what a record says and what the store holds, by name."""
+    """Yield the name of each entry that both have, its value in the record and in the store."""
     yield "asset_id", record.asset_id, asset.asset_id
     columns = columns_of(record)
     del columns["property_ambiguity"]
     change = record.judgement.ambiguity.property_change
-    said: object = change  # A record may have other properties than its store.
+    said: object = change  # A faulty record may have another number of properties.
     if len(change) == len(store.normalization.ranges):
         said = normalize_change([change], store.normalization)[0]
     yield "property_ambiguity", said, asset.columns["property_ambiguity"]
@@ -287,8 +287,8 @@ def _claims(
     for name in ("align", "sample"):
         said_parameters = getattr(record.parameters, name)
         held = parameters.get(name)
-        with suppress(TypeError):  # Where they are no parameters at all, so not the same.
-            # What an older format did not know yet has its default on both sides.
+        with suppress(TypeError):  # Not parameters at all, so they differ as they are.
+            # Parameters that an older format lacks get their defaults on both sides.
             held = _in_json(type(said_parameters)(**held))
         yield f"parameters/{name}", _in_json(said_parameters), held
 
@@ -311,5 +311,5 @@ def _opened(path: Place, run: str) -> tuple[Store, StoredRecords]:
 
 @lru_cache(maxsize=64)
 def _digest(path: Place, run: str) -> str:
-    # One file may hold the SLATs of many assets.
+    # Cached, since one file may hold the SLATs of many assets.
     return file_digest(path)

@@ -1,4 +1,4 @@
-"""Ids, offsets and the columns of numbers: what is small and spans all assets."""
+"""Verify the ``asset/*`` arrays: ids, offsets and columns."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ SHARES = ("fitness", "fitness_backward", "overlap", "ambiguity", "valid_share")
 """Columns of shares, 0 to 1."""
 
 PROBABILITIES = ("confidence", "expected_accuracy")
-"""Columns of probabilities, 0 to 1, or NaN in a store of format 1, which does not tell."""
+"""Columns of probabilities, 0 to 1, or NaN in a store of format 1, which has none."""
 
 DISTANCES = ("inlier_rmse", "inlier_rmse_backward", "margin")
-"""Columns of numbers that are not negative, or NaN where there is nothing to tell."""
+"""Columns of numbers of at least 0, or NaN where they are not defined."""
 
 WORDS = {
     name: tuple(map(str, words))
@@ -30,14 +30,14 @@ WORDS = {
         ("verdict", Verdict),
     )
 }
-"""Columns of words, and those allowed."""
+"""Allowed words by column."""
 
 # R of a similarity satisfies R^T R = s^2 I; rounding leaves this much.
 _TOLERANCE = 1e-6
 
 
 def index_findings(store: Store) -> Iterator[Finding]:
-    """Yield what is wrong with the ``asset/*`` arrays."""
+    """Yield findings on the ``asset/*`` arrays."""
     ids = store.ids
     begins = store.attributes.get("segments", [0])
     if not isinstance(begins, list) or begins[:1] != [0]:

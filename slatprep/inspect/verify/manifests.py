@@ -1,4 +1,4 @@
-"""The records beside a store, ``assets.jsonl`` and ``build.json``, against it."""
+"""Verify the manifests beside a store, ``assets.jsonl`` and ``build.json``, against it."""
 
 from __future__ import annotations
 
@@ -29,12 +29,22 @@ from slatprep.store.reader import Store
 
 
 def source_roots(manifests: Place | None) -> SourceRoots:
-    """Return where the sources lay when the store was built.
+    """Return where the sources were when the store was built.
+
+    Parameters
+    ----------
+    manifests : Place or None
+        Folder of the build's records, if there is one.
+
+    Returns
+    -------
+    SourceRoots
+        Roots that still exist.
 
     Raises
     ------
     StoreError
-        If no record says so.
+        If no record names them, or they do not exist any more.
     """
     advice = "name the roots with --pixieverse and --slat"
     if manifests is None:
@@ -61,7 +71,7 @@ def source_roots(manifests: Place | None) -> SourceRoots:
 
 
 def manifest_findings(store: Store, folder: Place) -> Iterator[Finding]:
-    """Yield where the records of a build break their schemas or disagree with the store."""
+    """Yield findings where the records break their schemas or disagree with the store."""
     build_file, assets_file = str(folder / BUILD), str(folder / ASSETS)
     manifest, build = store.attributes.get("manifest"), None
     try:
@@ -99,7 +109,7 @@ def manifest_findings(store: Store, folder: Place) -> Iterator[Finding]:
 
 
 def _stated_id(text: bytes) -> object:
-    """Return the id that a faulty record of a build states."""
+    """Return the id in a faulty build record, if it can be parsed."""
     try:
         document = orjson.loads(text)
     except ValueError:
@@ -108,13 +118,13 @@ def _stated_id(text: bytes) -> object:
 
 
 def _id_of_lines(folder: Place) -> str:
-    """Return what `records_id` was for records that lacked fields which they have today."""
+    """Return the id of records of an older format, which lack fields of today's."""
     digest = hashlib.sha256()
     for _, line in lines_in(folder):
         try:
             record = parse_document(line)
         except ValueError:
-            continue  # A fault of its own.
+            continue  # Found by `_checked`.
         left_out = {"duration_s": 0.0, "reason": "", "traceback": ""}
         record |= {name: empty for name, empty in left_out.items() if name in record}
         digest.update(orjson.dumps(record))
@@ -124,7 +134,7 @@ def _id_of_lines(folder: Place) -> str:
 def _checked(
     store: Store, folder: Place, seen: Counter[str], faults: list[Finding]
 ) -> Iterator[Record]:
-    """Yield the records of a file one by one, and note what is wrong with each."""
+    """Yield the records of ``assets.jsonl``; count their statuses and collect their faults."""
     rows = {asset_id: row for row, asset_id in enumerate(store.ids)}
     stored = StoredRecords(store)
     file = str(folder / ASSETS)
