@@ -1,4 +1,4 @@
-"""The command line: it parses and prints, and leaves the work to the stages."""
+"""The command line: it parses arguments and prints results."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ from slatprep.workers.local import THREAD_VARIABLES
 
 def main() -> None:
     """Run `slatprep`; the entry point of the console script."""
-    # One process is one job and computes on one thread: `--jobs` alone decides how
-    # many cores are busy, and the numbers do not depend on a thread count. The
-    # libraries read these once, when they are loaded; workers inherit them.
+    # Each process computes on one thread, so that only `--jobs` decides how many cores are
+    # used and no result depends on a thread count. Libraries read these variables when they
+    # are loaded; workers inherit them.
     for variable in THREAD_VARIABLES:
         os.environ[variable] = "1"
-    # A batch system's request to stop is as good as Ctrl-C: clean up, then go.
+    # A batch system stops jobs with SIGTERM: clean up and exit as after Ctrl-C.
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     from slatprep.cli.commands import slatprep
 

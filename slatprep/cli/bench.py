@@ -35,7 +35,7 @@ def align(
 ) -> None:
     """Align assets with known truth by each engine; print accuracy and time.
 
-    Times are processor seconds of one thread, an asset; every engine aligns
+    Times are processor seconds of one thread per asset; the engines align
     each asset in turn. open3d-64 is the paper's protocol as published, open3d
     the same without repeated rotations (the preset 'paper'), small_gicp GICP
     from the same rotations, cpd-affine and cpd-deformable Coherent Point Drift
@@ -46,8 +46,8 @@ def align(
     -------
     --data: Folder with pixieverse/, slat/ and truth/, or of such folders. [default: demo data]
     --engine: Engine to measure; may be repeated. [default: all that are installed]
-    --assets: At most so many assets of each folder. [default: 25 of the demo, all of --data]
-    --repeats: How often each is measured.
+    --assets: Most assets of each folder. [default: 25 of the demo, all of --data]
+    --repeats: Number of measurements.
     --seed: Seed of the demo data.
 
     Example
@@ -103,7 +103,7 @@ def _show_align(output: Output, result: AlignBench) -> None:
         ],
     )
     output.note(
-        f"the floor: reading both files {result.reading * 1e3:.1f} ms, "
+        f"for comparison: reading both files {result.reading * 1e3:.1f} ms, "
         f"their distance fields {result.fields * 1e3:.1f} ms"
     )
 
@@ -118,13 +118,13 @@ def read(output: Output, store: Place, assets: int | None, repeats: int, seed: i
 
     Compares slatprep's reader with npz (one file an asset, plain and
     compressed), one HDF5 file, zarr-python, and zarrs and tensorstore where
-    they are installed. 'cold' is after asking the system to forget the files.
+    they are installed. 'cold' is after asking the system to drop the files from its cache.
 
     Options
     -------
-    --assets: At most so many. [default: all]
-    --repeats: How often each is measured.
-    --seed: Of the order of reading.
+    --assets: Most assets to read. [default: all]
+    --repeats: Number of measurements.
+    --seed: Seed of the order of reading.
 
     Example
     -------

@@ -1,4 +1,4 @@
-"""`slatprep build-store` and `slatprep align`: the main job, and its alignment alone."""
+"""`slatprep build-store`, and `slatprep align`, which only aligns."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ _ASSETS_PER_JOB = 20
 """Assets that the default engine aligns in the time that a worker takes to start, 1.6 s."""
 
 DAMAGES_LISTED = 10
-"""How many faults of an older store are printed; ``--json`` has all."""
+"""Most faults of an existing store that are printed; ``--json`` has all."""
 
 
 @command("build-store")
@@ -48,26 +48,25 @@ def build_store(output: Output, out: Path, dry_run: bool, **options: Any) -> Non
 
     Pairs the assets of both sides by id, aligns them, looks the material and
     its properties up at every SLAT voxel, normalises and writes. An asset that
-    cannot go in never stops the others: it is named on standard error and in
-    the records, and the exit code is 1.
+    cannot be built does not stop the others: it is named on standard error and
+    in the records, and the exit code is 1.
 
     Assets whose sources, parameters and code did not change are not aligned
-    again, their rows are taken over, and a build that was interrupted goes on
-    where it stopped.
+    again: their rows are reused. An interrupted build is resumed.
 
     Options
     -------
-    --out: The store, a path or URL; an existing one is updated, and replaced in one step.
+    --out: The store, a path or URL; an existing store is updated, and replaced in one step.
     --manifests: Folder for the records. [default: beside the store]
-    --strict: Stop at the first asset that cannot go in.
+    --strict: Stop at the first asset that cannot be built.
     --consensus: Settle ties by the rotation that most assets share.
-    --witness: Settle ties by what the latents say, and name assets whose labels they contradict.
-    --fresh: Reuse nothing of an earlier build.
-    --rehash: Hash all sources, also those whose size, times and inode are as they were.
-    --compact: Order rows by id, as a first build does; an update adds new assets behind.
-    --keep-work: Keep all assets' arrays beside the store, about 1 MB each, so that sources
-        are not read again where all must be packed anew.
-    --dry-run: Say what would be done, and why; write nothing.
+    --witness: Settle ties by comparing latents, and name assets whose labels they contradict.
+    --fresh: Reuse nothing from an earlier build.
+    --rehash: Hash all sources, also those whose size, times and inode did not change.
+    --compact: Order rows by id, as a first build does; an update appends new assets.
+    --keep-work: Keep all assets' arrays beside the store, about 1 MB each, so that an update
+        that packs all assets again does not read their sources.
+    --dry-run: Print what would be done, and why; write nothing.
 
     Example
     -------
@@ -101,13 +100,13 @@ def build_store(output: Output, out: Path, dry_run: bool, **options: Any) -> Non
 def align(output: Output, out: Path, **options: Any) -> None:
     """Align without building a store.
 
-    Writes one JSON record an asset: the transform, its quality, and the score
-    of every candidate.
+    Writes a JSON record for each asset: the transform, its quality, and the
+    score of every candidate.
 
     Options
     -------
-    --out: One JSON record an asset: transform, quality, candidates.
-    --strict: Stop at the first asset that cannot go in.
+    --out: The file, with a record on each line.
+    --strict: Stop at the first asset that cannot be aligned.
 
     Example
     -------
@@ -124,13 +123,13 @@ def align(output: Output, out: Path, **options: Any) -> None:
 
 
 def _by_work(output: Output, parameters: BuildParameters) -> dict[str, Any]:
-    """Return what keeps small builds from starting workers, and what tells of long beginnings."""
+    """Return options that keep small builds from starting workers and report slow starts."""
     per_job = _ASSETS_PER_JOB if parameters.align.engine == "field" else 1
     return {"assets_per_job": per_job, "note": output.note}
 
 
 def _show_damaged(output: Output, damaged: Sequence[str]) -> None:
-    """Say what of the store that was there is not as it was written."""
+    """Print the faults that were found in the existing store."""
     for line in damaged[:DAMAGES_LISTED]:
         output.problem(f"damaged, made anew: {line}")
     if len(damaged) > DAMAGES_LISTED:
@@ -138,7 +137,7 @@ def _show_damaged(output: Output, damaged: Sequence[str]) -> None:
 
 
 def _show_plan(output: Output, plan: BuildPlan) -> None:
-    """Print what would be done with each asset, and why; unchanged ones are counted alone."""
+    """Print what would be done with each asset, and why; unchanged assets are only counted."""
     _show_damaged(output, plan.damaged)
 
     def show() -> None:
@@ -167,7 +166,7 @@ def _show_plan(output: Output, plan: BuildPlan) -> None:
 
 
 def report(output: Output, summary: BuildSummary) -> None:
-    """Print what became of the assets, name those that did not go in, and set the exit code."""
+    """Print the outcome of a build and the assets that failed, and set the exit code."""
     from slatprep.records import Verdict
 
     _show_damaged(output, summary.damaged)

@@ -1,4 +1,4 @@
-"""`slatprep check-alignment`: whether an alignment is good, in figures and pictures."""
+"""`slatprep check-alignment`: check alignments by figures and pictures."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ _COLUMNS = {
     "valid": "valid_share",
     "tied": "ambiguity",
 }
-"""Figures by their short titles, of which a line has room for six."""
+"""Figures by their short titles; a line has room for six."""
 
 
 @command("check-alignment")
@@ -55,7 +55,7 @@ def check_alignment(
     show: bool,
     jobs: int,
 ) -> None:
-    """Say and show whether the alignment of an asset is good.
+    """Check whether the alignment of an asset is good, and draw it.
 
     Its quality is recomputed from the stored arrays, and compared with the
     stored figures. A picture shows both sides before and after from three
@@ -65,11 +65,11 @@ def check_alignment(
     Options
     -------
     --asset: An asset; may be repeated.
-    --worst: N assets, failed ones first, then doubtful ones, each by their confidence.
+    --worst: The N worst assets: failed ones first, then doubtful ones, each by confidence.
     --ambiguous: Assets whose ties would change the class of more than 5 % of the voxels.
     --picture: A .png, .svg or .pdf for one asset, else a folder. [default: NAME.pictures beside
         the store]
-    --show: Open it in Open3D's viewer, where there is a screen.
+    --show: Open it in Open3D's viewer, if there is a screen.
 
     Exit codes
     ----------
@@ -196,7 +196,7 @@ def _documents(checks: list[AlignmentCheck], pictures: list[Path]) -> list[dict[
 
 
 def _show(output: Output, store: Store, asset_ids: list[str], file: Path | None) -> None:
-    """Open the viewer, or say why not and where to look instead."""
+    """Open the viewer, or print why that is not possible and where the picture is."""
     from slatprep.inspect.pictures.scene import scene_of
     from slatprep.inspect.pictures.viewer import has_screen, show_alignment
 

@@ -1,4 +1,4 @@
-"""The table of commands, and the group that loads each when it is used."""
+"""The table of commands, and the group that imports each when it is used."""
 
 from __future__ import annotations
 
@@ -37,15 +37,15 @@ COMMANDS = {
     "evaluate": "slatprep.cli.evaluate:evaluate",
     "bench": "slatprep.cli.bench:bench",
 }
-"""Name of each command and where it lives; to add one, add its line here.
+"""Name of each command and its function; to add a command, add its line here.
 
-The modules are loaded by `slatprep --help`, so they import nothing heavy
-before a command runs.
+`slatprep --help` imports all these modules, so they import heavy packages only when a command
+runs.
 """
 
 
 class LazyGroup(click.Group):
-    """A group that imports a command when it is asked for, and prints errors in one line."""
+    """A group that imports a command when it is used, and prints errors in one line."""
 
     def list_commands(self, ctx: click.Context) -> list[str]:
         """Return the names in the order of the table, which is the order of use."""
@@ -64,14 +64,14 @@ class LazyGroup(click.Group):
     def resolve_command(
         self, ctx: click.Context, args: list[str]
     ) -> tuple[str | None, click.Command | None, list[str]]:
-        """Find the command; for one that there is not, name the one that may be meant."""
+        """Find the command; for an unknown name, suggest a similar one."""
         close = difflib.get_close_matches(args[0], COMMANDS, n=1)
         if close and args[0] not in COMMANDS:
             ctx.fail(f"no such command {args[0]!r}; did you mean {close[0]}?")
         return super().resolve_command(ctx, args)
 
     def invoke(self, ctx: click.Context) -> Any:
-        """Run the command; an error made on purpose is one line and an exit code."""
+        """Run the command; print an expected error in one line and set the exit code."""
         try:
             return super().invoke(ctx)
         except SlatprepError as error:

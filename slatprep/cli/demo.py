@@ -33,19 +33,19 @@ def make_demo(output: Output, directory: Path, levels: tuple[int, ...], **recipe
 
     Options
     -------
-    --assets: Objects; fourteen hold every category once.
+    --assets: Number of objects; fourteen have every category once.
     --seed: The same seed gives the same bytes.
     --level: Difficulty, 0 (quarter turns) to 4 (warped), 5 (a generated shape), 6 (a NeRF's
-        field), 7 (both); may be repeated, levels take turns. [default: 0 to 4]
-    --views: SLATs of each object.
+        field), 7 (both); may be repeated: assets take the levels in turn. [default: 0 to 4]
+    --views: SLATs per object.
     --habitual-share: Share of the objects that have one quarter turn in common.
-    --latents: What the latents are made of: noise with TRELLIS's statistics, or something that
-        depends on the material.
+    --latents: Noise with TRELLIS's statistics (placeholder), or latents that depend on the
+        material.
     --grid-form: Raw grids, or predictions of 11 or 4 channels.
     --slat-form: Files of (N,3) or (N,4) coordinates, HDF5, or one HDF5 for all.
     --slat-names: Name SLATs by object, or by sha256 with a metadata.csv.
-    --results: Also write results/: grids as a method that errs might predict them, 12 MB each,
-        for `slatprep evaluate --grids`.
+    --results: Also write results/: grids as predicted by a method with errors, 12 MB each, for
+        `slatprep evaluate --grids`.
 
     Example
     -------

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 
 _ASKED_FOR = ("license", "cite_as", "date_published")
-"""What a description may do without, but readers of Croissant warn of."""
+"""Optional metadata whose absence Croissant's validator warns of."""
 
 
 @command(context_settings={"show_default": False})

@@ -1,4 +1,4 @@
-"""`slatprep diff`: what differs between two stores."""
+"""`slatprep diff`: the differences between two stores."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ if TYPE_CHECKING:
 
 _SHOWN = 20
 _COLUMNS = 3
-"""Columns that are named where no more differ; --json names all."""
+"""Most columns that are named in a line; --json names all."""
 
 _VALUE = 20
-"""Characters of a setting: a number fits, and of a digest its beginning."""
+"""Characters of a setting: enough for a number or the beginning of a digest."""
 
 
 @command()
@@ -28,15 +28,15 @@ _VALUE = 20
 @option("--worst", POSITIVE, metavar="N")
 @jobs_option
 def diff(output: Output, a: Place, b: Place, worst: int | None, jobs: int) -> None:
-    """Say what changed from store A to store B, in sum and asset by asset.
+    """Show what changed from store A to store B, in total and by asset.
 
-    Assets that one store alone has; sources, verdicts, placements, labels, properties
-    in SI units and latents of those that both have; and what differs of ranges,
-    parameters and versions.
+    Lists assets in only one of the stores; changed sources, verdicts, placements, labels,
+    properties in SI units and latents of assets in both; and different ranges, parameters
+    and versions.
 
     Options
     -------
-    --worst: Name so many of the assets that changed, those first whose labels changed most.
+    --worst: Number of changed assets to list, those with most changed labels first.
         [default: 20; with --json all]
 
     Exit codes
@@ -61,7 +61,7 @@ def diff(output: Output, a: Place, b: Place, worst: int | None, jobs: int) -> No
                 open_store(a), open_store(b), worst=worst, jobs=jobs, progress=progress
             )
     except StoreError as error:
-        raise ConfigError(str(error)) from error  # 1 means different here, as it does of diff.
+        raise ConfigError(str(error)) from error  # Exit code 1 means different, as for diff.
     output.result(found, lambda: _show(output, found), complete=found.same)
 
 
@@ -112,7 +112,7 @@ def _show(output: Output, found: StoreDifference) -> None:
 
 
 def _how(found: StoreDifference, what: str) -> str:
-    """Say how much it is, where that can be said of all assets together."""
+    """Return the extent of a kind of change over all assets, where it has one."""
     if what == "verdict":
         return ", ".join(f"{count:,} {words}" for words, count in found.verdicts.items())
     if what == "placement":
@@ -137,6 +137,6 @@ def _line(one: AssetChange, length: int | None) -> tuple[Cell, ...]:
 
 
 def _value(value: object) -> str:
-    """Show a setting in what three columns leave of 80; ``--json`` has it whole."""
+    """Return a setting cut to `_VALUE` characters; ``--json`` has all of it."""
     text = "-" if value is None else str(value)
     return text if len(text) <= _VALUE else f"{text[: _VALUE - 3]}..."

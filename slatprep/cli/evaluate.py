@@ -1,4 +1,4 @@
-"""`slatprep evaluate`: predictions by Pixie's protocol."""
+"""`slatprep evaluate`: measure predictions by Pixie's protocol."""
 
 from __future__ import annotations
 
@@ -53,26 +53,26 @@ def evaluate(
 ) -> None:
     """Measure PREDICTIONS by Pixie's protocol.
 
-    PREDICTIONS is a directory of npz files, one an asset, or a Zarr or HDF5
-    store with one group an asset; each has properties (N,3) in normalised
-    space, and may have material (N,) or logits (N,8), coords (N,3), and
-    ranges (3,2), where they are not the store's. Errors are means over
-    valid voxels, then over objects. Exit code 1 says that an asset of the
-    split has no prediction. Predictions beside the run.json of a training
-    are of the objects that it says, unless --split-by or --shares are given.
+    PREDICTIONS is a folder with an npz for each asset, or a Zarr group or
+    HDF5 file with a group for each asset. Each has properties (N,3) in
+    normalised space, and may have material (N,) or logits (N,8), coords
+    (N,3), and ranges (3,2) if they differ from the store's. Errors are means
+    over valid voxels, then over objects. The exit code is 1 if an asset of
+    the split has no prediction. Beside the run.json of a training, the split
+    is that of the run, unless --split-by or --shares is given.
 
     Options
     -------
-    --store: Has the truth.
-    --grids: Grids that Pixie, or another method, predicted: DIR/ID/sample_0_pred.npy, of 11 or 4
+    --store: The store with the labels.
+    --grids: Grids predicted by Pixie or another method: DIR/ID/sample_0_pred.npy, of 11 or 4
         channels; may be repeated. They are measured on their own voxels and looked up at the
         SLAT's, on the same objects as PREDICTIONS, which may be left out.
-    --split: Objects to measure on.
+    --split: Only objects of this split.
     --spread: Standard error or standard deviation over objects, or what Pixie prints.
     --csv: Also write the table to this file.
-    --picture: --grids: also draw the table, as a PNG.
-    --beside: Also print the published table of Pixie, which has NeRF2Physics too, those of
-        SLAT-Phys, or one of your own: a name, then columns named as here; may be repeated.
+    --picture: With --grids, also draw the table as a PNG.
+    --beside: Also print the published scores of Pixie (with NeRF2Physics) or of SLAT-Phys, or a
+        CSV with names in the first column and columns named as here; may be repeated.
 
     Example
     -------
@@ -126,8 +126,8 @@ def evaluate(
         problems = [f"{predictions}: no prediction of {name}" for name in result.missing]
         if result.converted:
             output.note(
-                f"note:    {result.converted} predictions were normalised by other ranges, and "
-                "were brought to the store's"
+                f"note:    {result.converted} predictions were normalised by other ranges and "
+                "converted to the store's"
             )
     if csv_file is not None:
         _write_csv(csv_file, what, measures, spread)
@@ -156,7 +156,7 @@ def evaluate(
 
 
 def _folders(grids: tuple[str, ...]) -> dict[str, Path]:
-    """Return the folders of ``--grids`` by the method's name, by default the folder's own."""
+    """Return the folders of ``--grids`` by the method's name, by default the folder's name."""
     folders: dict[str, Path] = {}
     for text in grids:
         name, _, rest = text.rpartition("=")
@@ -175,8 +175,8 @@ def _folders(grids: tuple[str, ...]) -> dict[str, Path]:
 def _note_methods(output: Output, result: Comparison) -> None:
     if result.problems:
         output.note(
-            f"note:    {len(result.problems)} assets have not a prediction of every method, and "
-            "are left out of all"
+            f"note:    {len(result.problems)} assets have no usable prediction of some method "
+            "and are left out of all"
         )
     if result.partly_annotated:
         output.note(
@@ -223,11 +223,11 @@ def _show_beside(
         if score.spreads
     ]
     if spreads:
-        output.table("Their spreads, as printed", ("method", *names, "what they are"), spreads)
+        output.table("Their spreads, as printed", ("method", *names, "kind"), spreads)
 
 
 def _in_short(measures: Mapping[str, Measure]) -> list[tuple[str | int, ...]]:
-    """Return the rows for people: each mean with its spread, where there is one."""
+    """Return the rows of the printed table: each mean with its spread, if there is one."""
     rows: list[tuple[str | int, ...]] = []
     for name, m in measures.items():
         cells = (

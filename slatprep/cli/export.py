@@ -1,4 +1,4 @@
-"""`slatprep export`: a store's assets in the formats of other tools."""
+"""`slatprep export`: write a store's assets in the formats of other tools."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from slatprep.errors import ConfigError
 if TYPE_CHECKING:
     from slatprep.records import Place
 
-# Which options belong to which format; an option without effect is a mistake.
+# The format of each option; giving it with another format is an error.
 _ONLY_FOR = {"points": "ply", "frame": "ply", "shard_size": "webdataset", "latent_model": "npz"}
 
 
@@ -57,21 +57,21 @@ def export(
     """Write assets of STORE in a format of other tools.
 
     Properties are in SI units in PLY, normalised in WebDataset and npz, and
-    both in HDF5. Every folder gets an index.json that says what is in it.
+    both in HDF5. Every folder gets an index.json that lists its contents.
 
     Options
     -------
-    --format: Point clouds with Pixie's fields, one HDF5 file, tar shards, or what TRELLIS's
-        data set loads (npz and metadata.csv) with the targets added.
+    --format: Point clouds with Pixie's fields, one HDF5 file, tar shards, or the files of
+        TRELLIS's dataset (npz and metadata.csv) with the targets added.
     --out: The file (hdf5) or folder (all others); an existing export is replaced when the new
         one is complete.
-    --asset: The asset; may be repeated. [default: all]
-    --split: Only objects of this split, parted as `slatprep train` parts them.
+    --asset: An asset; may be repeated. [default: all]
+    --split: Only objects of this split, as `slatprep train` splits them.
     --points: ply: SLAT voxels, or the voxels of the PixieVerse field. [default: slat]
-    --frame: ply: the SLAT's unit cube, or PixieVerse's world. [default: slat]
+    --frame: ply: the SLAT's unit cube, or PixieVerse's world coordinates. [default: slat]
     --shard-size: webdataset: assets a shard. [default: 256]
-    --latent-model: npz: the encoder's name, which TRELLIS's configuration gives as latent_model.
-        [default: the one of TRELLIS's own configurations]
+    --latent-model: npz: the encoder's name, latent_model in TRELLIS's configurations. [default:
+        that of TRELLIS's published configurations]
 
     Example
     -------
@@ -95,7 +95,7 @@ def export(
     if split != "all":
         others |= _of_split(output, store, split, split_rule(split_by, shares), **others)
     elif split_by is not None or shares is not None:
-        raise ConfigError("--split-by and --shares part the objects, and --split chooses: give it")
+        raise ConfigError("--split-by and --shares define splits; choose one with --split")
     with output.progress("export") as progress:
         chosen = ExportOptions(**options)
         summary = export_store(store, out, kind, options=chosen, progress=progress, **others)

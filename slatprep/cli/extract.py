@@ -1,4 +1,4 @@
-"""`slatprep extract-slat` and `decode-slat`: latents of images, and Gaussians of latents."""
+"""`slatprep extract-slat` and `decode-slat`: images to latents, latents to Gaussians."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _Command = TypeVar("_Command", bound=Callable[..., object])
 
 
 def _model_options(command: _Command) -> _Command:
-    """Add what says which of TRELLIS's models runs, and where."""
+    """Add the options for TRELLIS's model and its device."""
     options = (
         option("--model", text="Repository of the model, or its folder.",
                default="microsoft/TRELLIS-image-large"),
@@ -52,17 +52,17 @@ def extract_slat(
 ) -> None:
     """Turn IMAGES into structured latents with TRELLIS's image pipeline.
 
-    Every image and seed gives <id>.npz, or <id>/<view>.npz where there are
-    views, in the form that build-store reads, and a JSON beside it that says
+    Every image and seed gives <id>.npz, or <id>/<view>.npz if there are
+    views, in the form that build-store reads, and a JSON beside it with
     image, seed, model and revision. Existing files are kept, so that a stopped
-    run goes on. TRELLIS itself must be installed.
+    run can be continued. TRELLIS itself must be installed.
 
     Options
     -------
-    --out: The --slat of build-store.
-    --seed: Seed of what is drawn; may be repeated, each seed is a view.
+    --out: Folder of the latents, which build-store takes as --slat.
+    --seed: Seed of the sampling; may be repeated, each seed gives a view.
     --by-folder: Images are named <id>/<view>, not <id>.
-    --no-preprocess: Images are cut out and cropped already.
+    --no-preprocess: The background is removed already, and the images are cropped.
 
     Example
     -------
@@ -118,8 +118,8 @@ def decode_slat(
 
     Options
     -------
-    --out: Folder of the Gaussians; those of other assets stay.
-    --asset: Decode this asset alone; may be repeated.
+    --out: Folder of the Gaussians; files of other assets are kept.
+    --asset: Decode only this asset; may be repeated.
 
     Example
     -------

@@ -1,4 +1,4 @@
-"""`slatprep info`: what is in a store."""
+"""`slatprep info`: the contents of a store."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 @command()
 @store_argument
 def info(output: Output, store: Place) -> None:
-    """Say what is in STORE, and how good its alignments are.
+    """Show what is in STORE, and how good its alignments are.
 
     Without STORE, the one that `make align` built last under data/ is taken.
 
@@ -58,8 +58,8 @@ def info(output: Output, store: Place) -> None:
 def show_quality(output: Output, overview: StoreOverview) -> None:
     """Print how good the alignments of a store are, by category and in all.
 
-    ``labels`` is the share of right classes to be expected. Below the table a
-    line says how many assets to look at, and how.
+    ``labels`` is the expected share of right classes. Lines below the table say which
+    assets to look at, and how.
     """
     from slatprep.inspect.check import AT_MOST
     from slatprep.inspect.overview import UNKNOWN
@@ -78,7 +78,7 @@ def show_quality(output: Output, overview: StoreOverview) -> None:
     if unknown:
         say(
             f'unknown: the category of {unknown:,}; categories = "obj_ids_metadata.json" under '
-            "[pairing] of a --config FILE tells it"
+            "[pairing] of a --config FILE gives it"
         )
     doubted = [name for name, count in total.verdicts.items() if count and name != "good"]
     if doubted:

@@ -1,4 +1,4 @@
-"""`slatprep subset` and `slatprep concat`: stores made of stores."""
+"""`slatprep subset`, `concat` and `upgrade`: new stores from existing ones."""
 
 from __future__ import annotations
 
@@ -42,12 +42,12 @@ def subset(
 ) -> None:
     """Make a store of some assets of STORE, without aligning them again.
 
-    Rows, records and ranges are taken over as they are. Verdicts and categories
-    choose together; assets named by --asset go in as well.
+    Rows, records and ranges are copied unchanged. Assets must have one of the verdicts and
+    one of the categories; assets named by --asset are taken as well.
 
     Options
     -------
-    --out: The new store, a path or URL; an existing one is replaced in one step.
+    --out: The new store, a path or URL; an existing store is replaced in one step.
     --asset: An asset; may be repeated.
     --verdict: Assets with this verdict; may be repeated.
     --category: Assets of this category; may be repeated.
@@ -82,12 +82,12 @@ def concat(output: Output, stores: tuple[Place, ...], out: Place, manifests: Pat
     """Make one store of the assets of all STORES, without aligning them again.
 
     The stores must have been built with the same parameters, and no id may be in two
-    of them. Where their ranges differ because each has those of its own dataset,
-    properties are brought to the ranges of all.
+    of them. If each has the ranges of its own dataset, properties are converted to the
+    ranges of all.
 
     Options
     -------
-    --out: The new store, a path or URL; an existing one is replaced in one step.
+    --out: The new store, a path or URL; an existing store is replaced in one step.
     --manifests: Folder for the records. [default: beside the new store]
 
     Example
@@ -106,10 +106,10 @@ def concat(output: Output, stores: tuple[Place, ...], out: Place, manifests: Pat
 @option("--out", PLACE, metavar="STORE.zarr")
 @option("--manifests", NEW_FOLDER)
 def upgrade(output: Output, store: Place, out: Place | None, manifests: Path | None) -> None:
-    """Bring a STORE of an older format to today's, without aligning again.
+    """Convert a STORE of an older format to today's, without aligning again.
 
-    Its sources are not needed: places, confidences and verdicts follow from
-    what it holds, and all other rows are taken over as they are.
+    Its sources are not needed: places, confidences and verdicts are computed
+    from the store, and all other rows are copied unchanged.
 
     Options
     -------

@@ -1,4 +1,4 @@
-"""The latents that a command takes: of a file, of a folder of files, or of a store."""
+"""Read the latents of a file, a folder of files, or a store, for a command."""
 
 from __future__ import annotations
 
@@ -20,17 +20,17 @@ standardised_option = option(
     "--standardised",
     click.Choice(["auto", "yes", "no"]),
     "auto",
-    "Whether the latents of files have been standardised already; auto looks.",
+    "Whether the latents of files are standardised already; auto: judged by their values.",
 )
 
 
 class LatentsReader:
-    """The latents of a source, one asset after the other; what cannot be read is told and left.
+    """Reads a source asset by asset; prints and skips latents that cannot be read.
 
     Raises
     ------
     ConfigError
-        If there is no asset of a name, or a store's latents are those of another encoder.
+        If there is no such asset, or a store's latents are from another encoder.
     """
 
     def __init__(
@@ -76,7 +76,7 @@ class LatentsReader:
             yield latents
 
     def _of_file(self, latents: StructuredLatents) -> StructuredLatents:
-        """Return the latents of a file, saying whether they have been standardised."""
+        """Return the latents of a file with `standardised` set."""
         from slatprep.readers.encoders import in_words, look_standardised
 
         if self.standardised != "auto":
@@ -104,7 +104,7 @@ class LatentsReader:
 
 
 def _match(source: Place, name: str, ids: list[str]) -> str:
-    """Return the id, or the one that begins so, as `Store.match` does for a store's."""
+    """Return the id that is `name`, or the only id with this prefix, like `Store.match`."""
     alike = [name] if name in ids else [known for known in ids if known.startswith(name)]
     if len(alike) != 1:
         there = ", ".join(alike[:5]) if alike else f"it has {len(ids):,}"
@@ -113,7 +113,7 @@ def _match(source: Place, name: str, ids: list[str]) -> str:
 
 
 def _require_encoder(source: Place, held: LatentSpace, space: LatentSpace) -> None:
-    """Refuse latents of another encoder; one of the same width and moments has another name."""
+    """Refuse latents of another encoder; equal widths and moments mean the same encoder."""
     same = (held.channels, held.resolution) == (space.channels, space.resolution)
     if not same or (held.encoder != space.encoder and held.mean != space.mean):
         raise ConfigError(

@@ -1,4 +1,4 @@
-"""`slatprep list`: the assets of a store, one a line."""
+"""`slatprep list`: the assets of a store, one on each line."""
 
 from __future__ import annotations
 
@@ -25,18 +25,17 @@ def list_assets(
     max_confidence: float | None,
     ids: bool,
 ) -> None:
-    """List the assets of STORE, and why one is to be doubted.
+    """List the assets of STORE, with the reasons of their verdicts.
 
-    On a terminal ids are shortened, but to no less than tells them apart; wherever a
-    command takes an id, such a beginning of it will do. Without STORE, the one that
-    `make align` built last under data/ is taken.
+    On a terminal ids are shortened to prefixes that no other id has; all commands accept
+    such prefixes. Without STORE, the one that `make align` built last under data/ is taken.
 
     Options
     -------
     --verdict: Only assets with this verdict; may be repeated. [default: all]
     --category: Only assets of this category; may be repeated. [default: all]
-    --max-confidence: Only assets whose confidence is this or less.
-    --ids: Print whole ids alone, one a line.
+    --max-confidence: Only assets with at most this confidence.
+    --ids: Print only the full ids, one on each line.
 
     Example
     -------

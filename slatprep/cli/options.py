@@ -1,4 +1,4 @@
-"""How a command declares itself and its options, and the options that several share."""
+"""Declaring commands and options, and the options that several commands share."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ NEW_FOLDER = click.Path(path_type=Path, file_okay=False)
 
 
 class PlaceType(click.Path):
-    """A path as click takes it, or the URL of an object store, of which nothing is asked here."""
+    """A path, which click checks, or the URL of an object store, which is not checked here."""
 
     def convert(
         self, value: Any, parameter: click.Parameter | None, context: click.Context | None
@@ -55,17 +55,17 @@ class PlaceType(click.Path):
 
 
 class ChoiceOf(_Choice):
-    """One of the words that a module lists; it is imported when the words are needed.
+    """A choice of words from a module, which is imported when the words are needed.
 
-    ``slatprep --help`` loads every command, and must not load numpy with them.
+    ``slatprep --help`` imports every command, and must not import numpy with them.
 
     Parameters
     ----------
     name : str
-        Of an enum, a Literal, a mapping or a sequence of words, as
+        Name of an enum, a Literal, a mapping or a sequence of words, as
         ``package.module:NAME``.
     *others : str
-        More words that the option takes.
+        More words.
     """
 
     def __init__(self, name: str, *others: str) -> None:
@@ -89,10 +89,10 @@ def option(
     name: str | None = None,
     **others: Any,
 ) -> Callable[[_Function], _Function]:
-    """Declare an option: its flag, type, default and, where commands share it, its help.
+    """Declare an option: its flag, type, default and, if commands share it, its help.
 
-    `name` is the parameter of the function that takes the value, where it is
-    not the flag's name; all other arguments are `click.option`'s.
+    `name` is the function's parameter for the value, if it differs from the flag; all other
+    arguments are those of `click.option`.
     """
     if default is not None:
         others["default"] = default
@@ -102,15 +102,14 @@ def option(
 def command(name: str | None = None, **settings: Any) -> Callable[[_Function], click.Command]:
     """Make a command of a function, whose docstring is its help.
 
-    A section ``Options`` of the docstring says what each option does; every
-    other section, such as ``Example``, is printed below the options. The
-    function gets an `Output` as its first argument, and the command the
-    options ``--json``, ``-q`` and ``-v`` that it is made from.
+    The section ``Options`` of the docstring has the help of each option; all other sections,
+    such as ``Example``, are printed below the options. The function gets an `Output` as its
+    first argument, made from the options ``--json``, ``-q`` and ``-v``.
 
     Raises
     ------
     ValueError
-        If the docstring and the declared options do not name the same ones.
+        If the docstring and the declaration do not have the same options.
     """
 
     def declare(function: _Function) -> click.Command:
@@ -129,7 +128,7 @@ def command(name: str | None = None, **settings: Any) -> Callable[[_Function], c
                 words = " ".join(helps.pop(parameter.opts[0], "").split())
                 parameter.help = words.replace(" [default:", "  [default:")
                 undescribed |= not words
-        # Python's -OO leaves no docstrings, and no help.
+        # Python's -OO removes docstrings, and the help with them.
         if function.__doc__ and (helps or undescribed):
             raise ValueError(f"{made.name}: its docstring does not describe its options")
         return made
@@ -138,7 +137,7 @@ def command(name: str | None = None, **settings: Any) -> Callable[[_Function], c
 
 
 PLACE = PlaceType(path_type=Path)
-"""A path or a URL, of something that need not exist."""
+"""A path or a URL, which need not exist."""
 
 EXISTING_FOLDER = PlaceType(path_type=Path, exists=True, file_okay=False)
 """A folder that exists, a store as well, or a URL."""
@@ -147,12 +146,12 @@ EXISTING_FOLDER = PlaceType(path_type=Path, exists=True, file_okay=False)
 _PIXIEVERSE = "Root of the PixieVerse grids or predictions, a folder or a URL."
 _MAP = "CSV that joins the ids of the two sides, or TRELLIS's metadata.csv."
 _SAMPLES = (
-    "What becomes of several annotations of one object: refused, the first taken, an asset "
-    "each, or one asset of all.  [default: one]"
+    "Where an object has several annotations: refuse it, take the first, make an asset of each, "
+    "or merge their labels in one asset.  [default: one]"
 )
-_ENCODER = "What made the latents.  [default: trellis]"
+_ENCODER = "The encoder of the latents.  [default: trellis]"
 _RANGES = "Where the normalisation ranges come from; p1-p99: percentiles.  [default: dataset]"
-_RANGES_OF = "Objects whose ranges are taken, where they are the dataset's.  [default: all]"
+_RANGES_OF = "Objects that ranges of the dataset are computed from.  [default: all]"
 _PRESET = "Named parameters; 'paper' is the protocol of SLAT-Phys, in Pixie's ranges."
 
 
@@ -160,7 +159,7 @@ def source_options(command: _Function) -> _Function:
     """Add the options that decide the parameters of a build."""
     preset = ChoiceOf("slatprep.parameters:PRESETS")
     options = (
-        option("--config", FILE, text="Dataset definition (TOML); options win over it."),
+        option("--config", FILE, text="Dataset definition (TOML); options override it."),
         option("--pixieverse", PLACE, text=_PIXIEVERSE),
         option("--slat", PLACE, text="Root of the TRELLIS latents, or one HDF5 file, or a URL."),
         option("--samples", ChoiceOf("slatprep.parameters:Samples"), text=_SAMPLES),
@@ -175,7 +174,7 @@ def source_options(command: _Function) -> _Function:
 
 
 def chosen_store(store: Place | None) -> Place:
-    """Return the store that was named, else the one that `make align` built last."""
+    """Return the named store, or else the one that `make align` built last."""
     if store is not None:
         return store
     built = sorted(Path("data").glob("*.zarr"), key=lambda path: path.stat().st_mtime)
@@ -201,7 +200,7 @@ store_option = option(
 
 
 def beside(store: Place, suffix: str) -> Path:
-    """Return NAME`suffix` beside NAME.zarr; in the working folder if that is on no local disk."""
+    """Return NAME`suffix` beside NAME.zarr, or in the working folder for an object store."""
     name = f"{store.name.removesuffix('.zarr')}{suffix}"
     local = storage_of(store).local
     return local.with_name(name) if local else Path(name)
@@ -210,7 +209,7 @@ def beside(store: Place, suffix: str) -> Path:
 def complete_asset(
     context: click.Context, parameter: click.Parameter, incomplete: str
 ) -> list[str]:
-    """Offer the store's asset ids to the shell."""
+    """Return the store's asset ids, for completion in the shell."""
     from slatprep.store import open_store
     from slatprep.store.reader import is_store
 
@@ -229,11 +228,11 @@ verdicts_option = option(
     multiple=True,
     callback=lambda _context, _parameter, given: () if "all" in given else given or None,
 )
-"""The verdicts; none where all are taken, None where the option was not given."""
+"""The verdicts; empty for all, None if the option was not given."""
 
 
 def require_categories(store: Store, categories: Sequence[str]) -> None:
-    """Refuse a category that no asset of a store has, and name the one that may be meant."""
+    """Refuse a category that no asset of a store has, and suggest a similar one."""
     known = sorted(set(map(str, store.column("category"))))
     for category in categories:
         if category not in known:
@@ -245,7 +244,7 @@ def require_categories(store: Store, categories: Sequence[str]) -> None:
 
 
 def note_left_out(output: Output, store: Store) -> None:
-    """Say how many assets of a store their verdict leaves out where none is asked for."""
+    """Print how many assets of a store are left out by the default verdicts."""
     from slatprep.records import USABLE
 
     left = Counter(str(v) for v in store.column("verdict") if v not in USABLE)
@@ -272,9 +271,9 @@ jobs_option = option(
 
 
 def workers_options(command: _Function) -> _Function:
-    """Add ``--jobs`` and ``--scheduler``, of which the command gets what was chosen as `jobs`.
+    """Add ``--jobs`` and ``--scheduler``; the function gets the choice as `jobs`.
 
-    It stands below `command`, whose `Output` it takes and hands on.
+    As a decorator it stands below `command`, since it passes on the `Output`.
     """
 
     @jobs_option
@@ -302,12 +301,17 @@ def workers_options(command: _Function) -> _Function:
 
 
 def parameters_of(options: dict[str, Any]) -> BuildParameters:
-    """Take the options of `source_options`, and those of passes, out of those given.
+    """Load parameters from the options of `source_options` and of the passes.
+
+    Parameters
+    ----------
+    options : dict
+        The values of all options of a command; those used here are removed.
 
     Returns
     -------
     BuildParameters
-        What they ask for.
+        The parameters.
     """
     from slatprep.parameters.files import OPTIONS, load_parameters
 
@@ -328,18 +332,19 @@ def parameters_of(options: dict[str, Any]) -> BuildParameters:
 
 
 def split_options(command: _Function) -> _Function:
-    """Add ``--split-by`` and ``--shares``, of which `split_rule` makes what decides a split."""
+    """Add ``--split-by`` and ``--shares``, for `split_rule`."""
     by = option(
         "--split-by",
-        text="What parts the objects: a hash of their ids; Pixie's rule; one category to test on; "
-        "or a file of ids, a list to test on or a JSON object of the lists train, val and test.  "
+        text="How objects are split: by a hash of their ids; by Pixie's rule; one category for "
+        "testing; or by a file of ids: a list for testing, or a JSON object with the lists train, "
+        "val and test.  "
         "[default: hash]",
         metavar="hash|pixie|category:NAME|FILE",
     )
     shares = option(
         "--shares",
-        text="Shares of the objects by the hash, which also parts what no rule tests on into "
-        "train and val.  [default: 0.8,0.1,0.1]",
+        text="Shares of the split by hash, which also divides objects that another rule does not "
+        "test on into train and val.  [default: 0.8,0.1,0.1]",
         metavar="TRAIN,VAL,TEST",
     )
     return by(shares(command))
@@ -356,7 +361,7 @@ def split_rule(split_by: str | None, shares: str | None) -> dict[str, Any]:
 
 
 def note_split(output: Output, assignment: Assignment, how: str) -> None:
-    """Say how objects are parted, and what of a file's ids and of the store's objects is not."""
+    """Print the sizes of the splits, and ids of a file and of the store that are in none."""
     counts = ", ".join(f"{len(ids):,} {split}" for split, ids in assignment.lists().items())
     output.note(f"split:   {how}: {counts}")
     for ids, what in (

@@ -1,6 +1,6 @@
-"""What every command prints with: tables, notes, JSON and a progress bar.
+"""Printing for all commands: tables, notes, JSON and a progress bar.
 
-Results go to standard output, all else to standard error. On a terminal
+Results go to standard output, everything else to standard error. On a terminal
 tables are drawn with rich, which respects NO_COLOR; in a pipe they are plain
 aligned columns; with ``--json`` standard output is one JSON document.
 """
@@ -37,12 +37,12 @@ _Command = TypeVar("_Command", bound=Callable[..., object])
 _STYLES = {"good": "green", "doubtful": "yellow", "failed": "red"}
 
 _MAY_SHRINK = ("category", "group", "model", "why", "A", "B")
-"""Columns whose texts are cut, or broken between words, where a terminal is narrow."""
+"""Columns whose texts are cut, or wrapped between words, on a narrow terminal."""
 _LEAST_WIDTH, _GAP = 12, 2
 _LEAST_ID = 8
 _SECONDS_BETWEEN_LINES = 30.0
-_TELLING = 2
-"""From so many on the assets that are done say how long the others will take."""
+_LEAST_DONE = 2
+"""Fewest assets done for an estimate of the time left."""
 
 
 class Output:
@@ -53,9 +53,9 @@ class Output:
     as_json : bool
         One JSON document on standard output instead of tables.
     verbosity : int
-        -1 prints errors and what was asked for alone, 1 prints more than the usual.
+        -1 prints only errors and results, 1 prints more details.
     command : str
-        What a JSON document says it is of.
+        Name of the command in JSON documents.
     """
 
     def __init__(self, as_json: bool = False, verbosity: int = 0, command: str = "") -> None:
@@ -64,10 +64,11 @@ class Output:
         self.command = command
 
     def result(self, document: object, show: Callable[[], None], complete: bool = True) -> None:
-        """Print a result: the document as JSON, or what `show` prints for people.
+        """Print a result: the document as JSON, or else what `show` prints.
 
-        The document is a mapping or a dataclass; command, version and whether it is `complete`
-        (``ok``) are put before it. Where it is not, end with the exit code that says so.
+        The document is a mapping or a dataclass; command, version and ``ok``, whether the result
+        is `complete`, are put before its entries. If it is not complete, exit with
+        `EXIT_INCOMPLETE`.
         """
         if self.as_json:
             fields = vars(document) if dataclasses.is_dataclass(document) else document
@@ -82,7 +83,7 @@ class Output:
 
     @contextmanager
     def failing(self) -> Iterator[None]:
-        """Say what ends the command in JSON as well, where that was asked for."""
+        """Print an error that ends the command as JSON too, with ``--json``."""
         try:
             yield
         except (SlatprepError, click.UsageError) as error:
@@ -91,7 +92,7 @@ class Output:
             raise
 
     def made(self, document: object, show: Callable[[], None], complete: bool = True) -> None:
-        """Print what was made, as `result` does what was asked; where quiet, in JSON alone."""
+        """Print a summary of what was written, as `result` does; if quiet, only as JSON."""
         self.result(document, show if self.verbosity >= 0 else lambda: None, complete)
 
     def note(self, message: str) -> None:
@@ -100,7 +101,7 @@ class Output:
             say(message, err=True)
 
     def problem(self, message: str) -> None:
-        """Print one line on standard error about something that did not go in."""
+        """Print a line on standard error about something that failed."""
         say(message, err=True)
 
     def table(self, title: str, columns: Sequence[str], rows: Iterable[Sequence[Cell]]) -> None:
@@ -113,7 +114,7 @@ class Output:
         draw(title, columns, [[_text(cell) for cell in row] for row in rows], numeric)
 
     def id_length(self, ids: Iterable[str]) -> int | None:
-        """Return how much of ids to print: on a terminal enough to tell them apart, else all."""
+        """Return the length of unique prefixes of ids on a terminal, else None for whole ids."""
         if not sys.stdout.isatty():
             return None
         length, ids = _LEAST_ID, sorted(ids)
@@ -128,12 +129,11 @@ class Output:
 
     @contextmanager
     def progress(self, label: str, unit: str = "assets") -> Iterator[Progress]:
-        """Show how far a job is, on standard error, and how long it will still take.
+        """Show progress and the estimated time left on standard error.
 
-        The time left comes from the assets that are done, none of which is
-        forgotten, and is not told before two are. Nothing done is a new
-        beginning. Where standard error is no terminal, a line is printed
-        every half minute instead of a bar.
+        The estimate is the mean over all assets done, from two on. An update with none done
+        restarts the clock. If standard error is not a terminal, a line is printed every half
+        minute instead of a bar.
         """
         if self.verbosity < 0:
             yield lambda done, total: None
@@ -145,7 +145,7 @@ class Output:
 
 
 def write_csv(file: Path, header: Sequence[str], rows: Iterable[Sequence[object]]) -> None:
-    """Write a table as a spreadsheet takes it: no text of a stranger's becomes a formula.
+    """Write a table as CSV in which no text becomes a formula in a spreadsheet.
 
     Raises
     ------
@@ -170,14 +170,14 @@ def _for_spreadsheet(value: object) -> object:
 
 
 def say(text: object = "", *, err: bool = False, nl: bool = True) -> None:
-    """Print text as `printable` has it: every command prints by this alone."""
+    """Print text through `printable`; all commands print with this function."""
     click.echo(printable(str(text)), err=err, nl=nl)
 
 
 def printable(text: str) -> str:
-    r"""Return text with whatever a terminal would obey written as JSON escapes.
+    r"""Return text with control characters written as JSON escapes.
 
-    Names and categories may be a stranger's. Lines and tabs stay.
+    Names and categories are not trusted. Line breaks and tabs are kept.
 
     Examples
     --------
@@ -196,12 +196,10 @@ def _escaped(character: str) -> str:
 
 OUTPUT_OPTIONS = (
     click.Option(["--json", "as_json"], is_flag=True, help="Print JSON instead of tables."),
-    click.Option(
-        ["-q", "--quiet"], is_flag=True, help="Print errors, and what is asked for, alone."
-    ),
-    click.Option(["-v", "--verbose"], is_flag=True, help="Print more than the usual."),
+    click.Option(["-q", "--quiet"], is_flag=True, help="Print only errors and results."),
+    click.Option(["-v", "--verbose"], is_flag=True, help="Print more details."),
 )
-"""What every command takes, and `with_output` reads."""
+"""The options of every command, which `with_output` reads."""
 
 
 def with_output(command: _Command) -> _Command:
@@ -224,7 +222,7 @@ def _local(value: Any) -> Any:
     if is_place(value) and str(value) != in_unicode(str(value)):
         raise click.UsageError(f"{in_unicode(str(value))}: expected a path in UTF-8")
     if not isinstance(value, Path):
-        return value  # Options that may be a URL make a place of it themselves.
+        return value  # Options that may be a URL are converted by their type.
     place = place_of(value)
     if storage_of(place).local is None:
         raise click.UsageError(f"{place}: expected a path of the local disk")
@@ -232,7 +230,7 @@ def _local(value: Any) -> Any:
 
 
 def as_json(document: object) -> str:
-    """Return a result as JSON: paths and URLs as strings, not-a-number as null."""
+    """Return a result as JSON: paths and URLs as strings, NaN as null."""
     import orjson
 
     options = orjson.OPT_INDENT_2 | orjson.OPT_SERIALIZE_NUMPY | orjson.OPT_NON_STR_KEYS
@@ -316,7 +314,7 @@ def _progress_lines(label: str, unit: str) -> Progress:
         now = time.monotonic()
         if done == 0:
             start = now
-        elif done >= _TELLING and now - last >= _SECONDS_BETWEEN_LINES:
+        elif done >= _LEAST_DONE and now - last >= _SECONDS_BETWEEN_LINES:
             left = _clock((now - start) / done * (total - done))
             say(f"{label}: {done:,} of {total:,} {unit}, {left} left", err=True)
             last = now
@@ -331,13 +329,13 @@ def _progress_bar(label: str) -> Iterator[Progress]:
     from rich.text import Text
 
     class Numbers(rich.ProgressColumn):
-        """How many are done, the time taken, and the time left once it can be told."""
+        """Number done, time taken, and the estimated time left."""
 
         def render(self, task: rich.Task) -> Text:
             if task.total is None:
                 return Text("starting ...")
             parts = [f"{task.completed:,.0f}/{task.total:,.0f}", _clock(task.elapsed or 0.0)]
-            if _TELLING <= task.completed < task.total:
+            if _LEAST_DONE <= task.completed < task.total:
                 parts.append(
                     f"{_clock((task.elapsed or 0.0) * (task.total / task.completed - 1))} left"
                 )

@@ -1,4 +1,4 @@
-"""`slatprep predict`: material fields from latents, by a trained decoder."""
+"""`slatprep predict`: predict material fields from latents with a trained decoder."""
 
 from __future__ import annotations
 
@@ -47,22 +47,22 @@ def predict(
     """Predict material fields of SOURCE with a trained decoder.
 
     SOURCE is a SLAT (npz or HDF5), a folder of them, a store, or an image,
-    whose latents are drawn by TRELLIS, where that is installed. Each asset
-    gives <id>.npz with coords, properties in [-1,1] and properties_si in Pa,
+    whose latents TRELLIS samples if it is installed. Each asset gives
+    <id>.npz with coords, properties in [-1,1] and properties_si in Pa,
     kg/m^3 and 1, material, probabilities of the eight classes, ranges, the
-    checkpoint's SHA-256 and the seconds of its decoding: what `slatprep
-    evaluate` measures, and `slatprep transfer --prediction` puts on particles.
+    checkpoint's SHA-256 and the seconds of its decoding. `slatprep evaluate`
+    and `slatprep transfer --prediction` read these files.
     Needs PyTorch: pip install 'slatprep[train]'.
 
     Options
     -------
     --checkpoint: best.pt of a run of `slatprep train`, or the folder of the run.
-    --out: Folder of the predictions; those of other assets stay.
-    --asset: Predict this asset alone; may be repeated.
+    --out: Folder of the predictions; files of other assets are kept.
+    --asset: Predict only this asset; may be repeated.
     --gaussians: Also decode an image's latents to Gaussians, and write those with their materials.
     --seed: Seed of an image's latents.
     --device: Where to compute.
-    --batch-voxels: Assets are decoded together until they have so many voxels.
+    --batch-voxels: Number of voxels up to which assets are decoded together.
 
     Example
     -------
@@ -85,7 +85,7 @@ def predict(
     image = _draw(output, source, out, seed, device) if is_image else None
     space = decoder.contents.latents
     if image is not None:
-        standardised = "no"  # TRELLIS draws them as its decoders want them.
+        standardised = "no"  # TRELLIS samples them as its decoders take them.
     read = LatentsReader(output, image.latents if image else source, assets, space, standardised)
     predicted, voxels, decoding, writing = 0, 0, 0.0, 0.0
     with output.progress("predict") as progress:
@@ -132,7 +132,7 @@ def predict(
 
 @dataclass(frozen=True)
 class _Image:
-    """Latents drawn for an image: where they are, by what, and how long each stage took."""
+    """Latents of an image: their file, the pipeline that sampled them, and time by stage."""
 
     latents: Path
     session: Session
@@ -140,7 +140,7 @@ class _Image:
 
 
 def _draw(output: Output, source: Place, out: Path, seed: int, device: str) -> _Image:
-    """Draw the latents of an image."""
+    """Sample the latents of an image."""
     from slatprep import extract as work
 
     session = work.load_session(device=device)

@@ -1,4 +1,4 @@
-"""`slatprep publish`: a store as a dataset of a hub."""
+"""`slatprep publish`: write a store as a dataset for a hub."""
 
 from __future__ import annotations
 
@@ -45,18 +45,18 @@ def publish(
     pictures: int,
     **stated: str,
 ) -> None:
-    """Write what STORE needs to be a dataset on a hub, such as Hugging Face's.
+    """Write STORE as a dataset for a hub, such as Hugging Face's.
 
-    A folder with the card (README.md, with statistics and a picture), the data, the
+    Writes a folder with the card (README.md, with statistics and a picture), the data, the
     checksum of every file and, beside a store, the description that catalogues read
-    (croissant.json). Nothing is sent: the hub's own tool does that.
+    (croissant.json). Nothing is uploaded: the hub's own tool does that.
 
     Options
     -------
-    --out: The folder; one published before is replaced when the new one is complete.
+    --out: The folder; an earlier result is replaced when the new one is complete.
     --data: The store itself, which `slatprep.open_store("hf://datasets/...")` reads, or shards
         for `datasets.load_dataset`.
-    --pictures: Assets on the card's picture.
+    --pictures: Number of assets in the card's picture.
     --name: Name of the dataset. [default: the store's]
     --license: Its licence, such as CC-BY-4.0.
     --url: Its home page.
@@ -103,7 +103,7 @@ def publish(
 
 
 def _picture(store: Store, count: int) -> bytes:
-    """Draw some assets: of every category one, before any has two."""
+    """Draw some assets, of as many categories as possible."""
     from slatprep.inspect.pictures.write import sheet_of
 
     seen: dict[str, int] = {}

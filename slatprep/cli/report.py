@@ -1,4 +1,4 @@
-"""`slatprep report`: one page for the dataset."""
+"""`slatprep report`: write a page about a store."""
 
 from __future__ import annotations
 
@@ -28,11 +28,11 @@ if TYPE_CHECKING:
 def report(
     output: Output, store: Place, out: Path | None, manifests: Place | None, jobs: int
 ) -> None:
-    """Write one page about STORE that opens in a browser.
+    """Write a page about STORE that opens in a browser.
 
-    A single HTML file, which needs no network: how many assets are in which
-    state and why, the spread of quality, orientations, classes and properties,
-    and a table of all assets that opens each in 3D. Without STORE, the one
+    A single HTML file, which needs no network: the number of assets by state
+    with reasons, histograms of quality, orientations, classes and properties,
+    and a table of all assets that shows each in 3D. Without STORE, the one
     that `make align` built last under data/ is taken.
 
     Options

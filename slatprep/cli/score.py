@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 def score(output: Output, store: Place, truth_dir: Path) -> None:
     """Score STORE against known truth.
 
-    TRUTH_DIR holds an npz an asset, as make-demo writes it. Each level's
+    TRUTH_DIR holds an npz for each asset, as make-demo writes it. Each level's
     figures are over assets that have one right placement only: success is a
     mean displacement less than 1.5 voxels above that of the best similarity
     (0 where the shapes are the same); displacement is the median, p90 the 90th

@@ -1,4 +1,4 @@
-"""`slatprep stats`: what the voxels of a store are."""
+"""`slatprep stats`: statistics of a store's voxels."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from slatprep.records import Place
 
 _CATEGORIES = 20
-"""Categories in a table; the files have all."""
+"""Most categories in a table; the files have all."""
 
 
 @command()
@@ -44,7 +44,7 @@ def stats(
     picture: Path | None,
     jobs: int,
 ) -> None:
-    """Say what the voxels of STORE are: classes and properties, by category and in all.
+    """Show statistics of the voxels of STORE: classes and properties, by category and in total.
 
     Both before the lookup (the annotated voxels of the PixieVerse fields) and after it
     (the valid SLAT voxels). Without STORE, the one that `make align` built last under
@@ -54,9 +54,9 @@ def stats(
     -------
     --verdict: Only assets with this verdict; may be repeated. [default: all]
     --category: Only assets of this category; may be repeated. [default: all]
-    --weight: What weighs one: every voxel, or all voxels of an asset together.
+    --weight: Give each voxel the same weight, or each asset.
     --csv: Also write a table to this file: a line for each group, side, property and scale.
-    --picture: Also draw them in this file.
+    --picture: Also draw them to this file.
 
     Example
     -------
@@ -147,7 +147,7 @@ def _voxels(group: GroupStatistics) -> tuple[Cell, ...]:
 
 
 def _name(group: GroupStatistics) -> str:
-    """Return what a group is called: a category may have the name of a class."""
+    """Return the label of a group: a category may have the name of a class."""
     return f"class {group.name}" if group.by == "class" else group.name
 
 

@@ -1,4 +1,4 @@
-"""`slatprep train`: SLAT-Phys's decoder on a store."""
+"""`slatprep train`: train SLAT-Phys's decoder on a store."""
 
 from __future__ import annotations
 
@@ -77,21 +77,22 @@ def train(
 
     Options
     -------
-    --out: Folder of the run; a stopped one goes on.
+    --out: Folder of the run; a stopped run is resumed.
     --size: 0.20, 1.19 or 6.32 million weights.
-    --all-sizes: Train all three, each in its own directory.
+    --all-sizes: Train all three, each in a folder of its own.
     --epochs: Passes over the training objects.
-    --steps: Steps of the optimiser to do instead, whatever part of a pass the last ones are.
+    --steps: Steps of the optimiser, instead of --epochs; the last pass may be incomplete.
     --batch-size: Assets in a batch.
-    --accumulate: Batches in a step of the optimiser.
-    --learning-rate: Of AdamW, before the cosine.
-    --precision: bf16: mixed precision; auto: that where the processor computes in it, else fp32.
-    --keep: Weights of the epoch that validates best, or of the last, whatever validation says.
-    --patience: Stop after so many epochs without progress.
-    --augment: Quarter turns and flips: of 8 or 48 kinds.
+    --accumulate: Batches per step of the optimiser.
+    --learning-rate: Initial learning rate of AdamW; a cosine schedule lowers it to 0.
+    --precision: bf16: mixed precision; auto: bf16 if the processor has instructions for it, else
+        fp32.
+    --keep: Weights of the epoch with the least validation loss, or of the last epoch.
+    --patience: Stop after this number of epochs without a better validation loss.
+    --augment: Symmetries to draw from: 8 that keep z up, or all 48 of the cube.
     --max-ambiguity: Leave out assets that are more ambiguous.
-    --weigh-by-confidence: Weigh voxels by how likely their class is right.
-    --seed: Of weights, order and augmentation.
+    --weigh-by-confidence: Weight voxels by the probability that their class is right.
+    --seed: Seed of initial weights, order and augmentation.
     --device: Where to compute.
     --workers: Processes that read ahead.
     --threads: Threads to compute with.

@@ -1,4 +1,4 @@
-"""`slatprep transfer`: materials at the particles that a simulation moves."""
+"""`slatprep transfer`: give materials to the particles of a simulation."""
 
 from __future__ import annotations
 
@@ -49,8 +49,8 @@ def transfer(
     """Give each particle of PARTICLES the material of the nearest voxel.
 
     PARTICLES is a PLY of Gaussians as TRELLIS saves it, any other PLY with
-    x, y and z, or an npy or npz of positions. What is written is a PLY with
-    the fields of Pixie's material fields, in SI units, for PhysGaussian.
+    x, y and z, or an npy or npz of positions. The result is a PLY with the
+    fields of Pixie's material fields, in SI units, for PhysGaussian.
 
     Options
     -------
@@ -61,10 +61,10 @@ def transfer(
     --out: Where to write the particles with their materials.
     --points: Take an asset's materials from its SLAT voxels, a surface, or from its PixieVerse
         field, a solid.
-    --axes: Frame of the particles: turned as TRELLIS saves Gaussians, or meshes, or the SLAT's, as
-        they are. [default: what a PLY of slatprep says; trellis for TRELLIS's Gaussians; slat]
-    --frame: Write positions as the particles' file has them, or in the SLAT frame.
-    --max-distance: A particle without a voxel this near is far.
+    --axes: Axes of the particles: those of TRELLIS's Gaussians, of its meshes, or of the SLAT
+        frame. [default: as a PLY of slatprep states; trellis for TRELLIS's Gaussians; else slat]
+    --frame: Write positions as in the particles' file, or in the SLAT frame.
+    --max-distance: Distance to the nearest voxel above which a particle is far.
     --far: Give far particles class 7 and properties 0, leave them out, or give them the nearest
         material.
 

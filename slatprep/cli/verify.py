@@ -1,4 +1,4 @@
-"""`slatprep verify`: whether a store is what it says it is."""
+"""`slatprep verify`: verify a store."""
 
 from __future__ import annotations
 
@@ -30,10 +30,10 @@ def verify(
 ) -> None:
     """Check that STORE is whole, unchanged and consistent.
 
-    Metadata against the contract, every file against its digest, every chunk
-    against its checksum, values against their ranges, annotations against what
-    the stored grid and transform give, records against their schema and the
-    rows. Every fault is named. Exit code 0: nothing is wrong; 1: something is.
+    Compares metadata with the contract, every file with its digest, every chunk
+    with its checksum, values with their ranges, annotations with the stored grid
+    and transform, and records with their schema and the rows. Every fault is
+    named. Exit code 0: no faults; 1: at least one.
 
     Options
     -------

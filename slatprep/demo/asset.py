@@ -1,4 +1,4 @@
-"""One demo asset: an object, seen from both sides, with the truth."""
+"""A demo asset: both sides of an object, and the truth."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ from slatprep.records import BACKGROUND, RESOLUTION
 # does not change what another one draws.
 _SHAPE, _FRAME, _DAMAGE, _LATENTS, _HABIT, _GENERATED = range(6)
 
-# A bent shape is looked at over a longer way, since its distances are less certain.
+# Distances to bent shapes are known less tightly and are needed over a longer range.
 _GENERATED_REACH = 0.12
 
 
@@ -201,6 +201,6 @@ def _slat_side(
     stuff = solid.stuff_at(frames.slat_to_object(centres))
     feats = make_latents(rng, latents, coords, material[stuff], properties[stuff])
     places = frames.places(centres)
-    # Where the shape is the object's own, its transform leads to the places exactly.
+    # Without a distortion the transform of the poses is exact.
     transform = nearest_similarity(places, centres) if frames.distortion else frames.transform()
     return DemoView(view, coords, feats, transform, material[stuff], properties[stuff], places)

@@ -1,4 +1,4 @@
-"""The demo's objects: what stands for each PixieVerse category.
+"""The demo's objects: one builder for each PixieVerse category.
 
 A builder's `variant` counts the objects of its category, so that a dataset
 holds each kind in turn.
@@ -29,4 +29,4 @@ CATALOGUE: dict[str, Builder] = {
     "rocks": things.rocks,
     "water-like_bodies": things.water,
 }
-"""PixieVerse's categories and what stands for each in the demo."""
+"""The builder of the demo's objects for each of PixieVerse's categories."""

@@ -41,10 +41,10 @@ EMPTY, UNLABELLED = -1, -2
 
 @dataclass(frozen=True)
 class Difficulty:
-    """What makes one level: angles in degrees, lengths in voxels, scale as a share.
+    """The settings of a level: angles in degrees, lengths in voxels, scale as a share.
 
-    ``proportions`` and ``bend`` are of a generated shape, see
-    `slatprep.demo.generated.draw_distortion`; ``room`` is what a NeRF's field needs
+    ``proportions`` and ``bend`` are for a generated shape, see
+    `slatprep.demo.generated.draw_distortion`; ``room`` is the margin for a NeRF's field
     on each side of the grid.
     """
 
@@ -87,8 +87,7 @@ LEVELS: dict[int, Difficulty] = {
 }
 
 SAME_SHAPE_LEVELS = (0, 1, 2, 3, 4)
-"""Levels whose sides show one clean shape: what a demo has where nothing else is asked for."""
-
+"""Levels whose sides show the same clean shape, the default of a demo."""
 
 QUARTER_TURNS = tuple(turn.astype(float) for turn in cube_symmetries() if np.linalg.det(turn) > 0)
 """The 24 rotations of a cube."""
@@ -129,7 +128,7 @@ class Frames:
     distortion: Distortion | None = None
 
     def transform(self) -> Array:
-        """Return the transform of the poses, PixieVerse frame to SLAT frame, and of these alone."""
+        """Return the transform from the PixieVerse to the SLAT frame, by the poses only."""
         slat, pixieverse = self.slat, self.pixieverse
         rotation = slat.rotation @ pixieverse.rotation.T
         scale = slat.scale / pixieverse.scale
@@ -168,7 +167,7 @@ def draw_frames(rng: Rng, solid: Solid, difficulty: Difficulty, quarter: Array) 
     solid : Solid
         The object.
     difficulty : Difficulty
-        What its level asks for.
+        The settings of its level.
     quarter : ndarray, shape (3, 3)
         Quarter turn of the PixieVerse side; the SLAT side stands upright.
 
@@ -216,11 +215,11 @@ def generate(rng: Rng, frames: Frames, difficulty: Difficulty, solid: Solid, ski
     frames : Frames
         Of the same asset, without a warp; the rotation of its SLAT side is kept.
     difficulty : Difficulty
-        What its level asks for.
+        The settings of its level.
     solid : Solid
         The object.
     skin : ndarray of float64, shape (K, 3)
-        Points of the object's skin, no part of it farther than a voxel from one.
+        Points on the object's surface, at most a voxel apart.
 
     Returns
     -------
@@ -230,7 +229,7 @@ def generate(rng: Rng, frames: Frames, difficulty: Difficulty, solid: Solid, ski
     distortion = draw_distortion(rng, solid.extent, difficulty.proportions, difficulty.bend)
     turned = distortion.inverse(skin) @ frames.slat.rotation.T
     low, high = turned.min(axis=0), turned.max(axis=0)
-    # What lies between the points of the skin may reach a voxel farther.
+    # Between these points the surface may extend a voxel farther.
     size = (_FULL - 2.0 * VOXEL_SIZE) / float((high - low).max())
     middle = frames.slat.rotation.T @ ((low + high) / 2.0)
     pose = Pose(frames.slat.rotation, size, middle, np.zeros(3))
@@ -261,7 +260,7 @@ def _any_rotation(rng: Rng) -> Array:
 def damage(
     rng: Rng, stuff: NDArray[np.int16], distance: Callable[[Array], Array], stuffs: int
 ) -> NDArray[np.int16]:
-    """Bite pieces out of a grid and add floaters, as a NeRF's density does.
+    """Remove pieces of a grid and add floaters, as in the density of a NeRF.
 
     Parameters
     ----------
@@ -272,7 +271,7 @@ def damage(
     distance : callable
         Distance bound of the solid in the grid's frame.
     stuffs : int
-        How many stuffs the asset has; a floater is of any.
+        Number of stuffs of the asset, from which floaters get theirs.
 
     Returns
     -------

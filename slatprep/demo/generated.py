@@ -1,9 +1,8 @@
-"""The shape that a generator makes up from one image of an object.
+"""The shape that a generator makes from one image of an object.
 
-Its proportions are off, it is bent, and most of all on the side that the image
-does not see. A `Distortion` leads from a point of the generated shape back to
-the same point of the object, so that the true place of a SLAT voxel is
-evaluated, not fitted.
+Its proportions are wrong and it is bent, most on the side that the image does not show. A
+`Distortion` maps points of the generated shape to the same points of the object, so that the
+true place of a SLAT voxel is computed and not fitted.
 """
 
 from __future__ import annotations
@@ -18,13 +17,13 @@ from slatprep.demo.model import Array, Rng, direction
 from slatprep.geometry.frames import VOXEL_SIZE
 
 _LARGEST_SLOPE = 0.7
-"""No bend changes by more than this share of a way; below 1 nothing folds."""
+"""Bound on the change of a bend per distance; below 1 the map does not fold."""
 
 _REACH = 0.75
-"""Half edge, in sizes of the object, of the cube in which a bend is bounded; it holds any shape."""
+"""Half edge of the cube in which bends are bounded, in sizes of the object; all shapes fit."""
 
 _EDGE = 4.0
-"""How quickly a bend grows from the seen side to the unseen one, per size of the object."""
+"""Rate at which a bend grows from the seen to the unseen side, per size of the object."""
 
 
 @dataclass(frozen=True)
@@ -66,12 +65,12 @@ class Warp:
 
     @property
     def reach(self) -> float:
-        """No point moves farther than this."""
+        """Bound on the displacement of any point."""
         return float(self.sizes[0].sum())
 
     @property
     def stretch(self) -> float:
-        """No distance grows by more than this factor."""
+        """Bound on the factor by which distances grow."""
         amplitude, wave = self.sizes
         return 1.0 + float((amplitude * wave).sum())
 
@@ -98,7 +97,7 @@ class Distortion:
     away : ndarray of float64, shape (3,)
         Unit vector that points away from the image's camera.
     slope : float
-        Bound on how much the bend changes over a way, as a share of it.
+        Bound on the change of the bend per distance.
     """
 
     middle: Array
@@ -129,7 +128,7 @@ class Distortion:
 
     @property
     def stretch(self) -> float:
-        """No distance grows by more than this factor from the generated shape to the object."""
+        """Bound on the factor by which distances grow from the generated shape to the object."""
         return (1.0 + self.slope) / float(self.proportions.min())
 
     def bend(self, q: Array) -> Array:
@@ -169,7 +168,7 @@ def _slope(waves: Warp, away: Array) -> float:
 def draw_distortion(
     rng: Rng, extent: Array, proportions: tuple[float, float], bend: float
 ) -> Distortion:
-    """Draw what a generator makes of an object.
+    """Draw the distortion of a generated shape.
 
     Parameters
     ----------
@@ -185,7 +184,7 @@ def draw_distortion(
     Returns
     -------
     Distortion
-        One that folds nowhere.
+        Without folds.
     """
     stretch = np.ones(3)
     stretch[rng.integers(3)] += rng.choice([-1.0, 1.0]) * rng.uniform(*proportions)
@@ -207,12 +206,17 @@ def draw_distortion(
 
 
 def nearest_similarity(source: NDArray[np.floating[Any]], target: Array) -> Array:
-    """Return the similarity (4, 4) that maps points onto others with least squares.
+    """Return the similarity that maps points onto others with least squares.
 
     Parameters
     ----------
     source, target : ndarray of float64, shape (P, 3)
-        The points, at least three that are not on a line, and where they should go.
+        The points, at least three that are not on a line, and their targets.
+
+    Returns
+    -------
+    ndarray of float64, shape (4, 4)
+        With a rotation, a positive scale and a shift.
 
     References
     ----------

@@ -1,4 +1,4 @@
-"""Stand-ins for the eight latent channels of a SLAT.
+"""Synthetic latents of a SLAT.
 
 Mean and standard deviation of each channel are TRELLIS's, see `slatprep.records`.
 """

@@ -1,4 +1,4 @@
-"""What the demo's parts are made of, in plausible ranges.
+"""The materials of the demo's parts, in plausible ranges.
 
 Ranges are SI and lie within the span that Pixie publishes for PixieVerse
 (density 50 to 7,400 kg/m^3, Young's modulus 1e3 to 7.6e10 Pa, Poisson's ratio

@@ -22,8 +22,7 @@ Array = NDArray[np.float64]
 class Model:
     """An object of the demo.
 
-    ``symmetric`` is true where its geometry cannot tell several placements
-    apart, whatever its materials.
+    ``symmetric`` is true if several placements have the same geometry, whatever the materials.
     """
 
     name: str

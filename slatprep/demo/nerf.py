@@ -1,8 +1,7 @@
-"""An object as a NeRF's density has it, on the grid of PixieVerse.
+"""The density of a NeRF of an object, on PixieVerse's grid.
 
-The field is thicker than the object and rough, has hollows inside and blobs
-afloat, lacks some of what is thin, and now and then shows a piece of the ground
-that the object stood on.
+The field is thicker than the object and rough, with hollows inside and floating blobs. Some thin
+parts are missing, and some fields include a piece of the ground.
 """
 
 from __future__ import annotations
@@ -17,21 +16,20 @@ from slatprep.geometry.frames import VOXEL_SIZE, voxel_centres
 from slatprep.records import RESOLUTION
 
 THICKENING = 0.5
-"""How far [voxel] the surface lies outside that of the exact grid.
+"""Distance [voxel] of the surface outside that of the exact grid.
 
-That one is thicker than the object already, since every voxel that the object's
-surface meets is filled.
+The exact grid is itself thicker than the object, since all voxels on the surface are filled.
 """
 
 ROUGHNESS = 0.6
-"""Standard deviation [voxel] of the surface; it stays within `_MOST_ROUGH` of them."""
+"""Standard deviation [voxel] of the surface, which is cut at `_MOST_ROUGH` deviations."""
 
 GROUND_SHARE = 1.0 / 3.0
 """Share of the assets with a slab of ground."""
 
 _MOST_ROUGH = 2.0
 _THIN = 1.5  # Half the thickness [voxel] below which a part may be lost.
-_MOST_LOST = 0.15  # Share of an object that is lost at most with its thin parts.
+_MOST_LOST = 0.15  # Largest share of an object to lose with its thin parts.
 
 
 def nerf_field(
@@ -48,13 +46,12 @@ def nerf_field(
     up : ndarray of float64, shape (3,)
         Unit vector of the grid's frame that points up from the ground.
     stuffs : int
-        How many stuffs the asset has; blobs and ground are of any.
+        Number of stuffs of the asset, from which blobs and ground get theirs.
 
     Returns
     -------
     ndarray of int16, shape (64, 64, 64)
-        The grid, in the same frame: what is left of the object lies where it lay.
-        `UNLABELLED` marks the voxels of one blob that carry no label.
+        The degraded grid, in the same frame. The voxels of one blob are `UNLABELLED`.
     """
     kept = _without_thin_parts(rng, stuff >= 0)
     away, nearest = ndimage.distance_transform_edt(~kept, return_indices=True)
@@ -77,14 +74,14 @@ def _smooth_noise(rng: Rng, sigma: float) -> NDArray[np.float64]:
 
 
 def _without_thin_parts(rng: Rng, occupied: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Remove some of what a ball of radius `_THIN` does not fit into, piece by piece."""
+    """Remove some of the pieces into which a ball of radius `_THIN` does not fit."""
     core = ndimage.distance_transform_edt(occupied) > _THIN
     opened = ndimage.distance_transform_edt(~core) <= _THIN
     thin = occupied & ~opened & (_smooth_noise(rng, 4.0) > 0.0)
     pieces, count = ndimage.label(thin, np.ones((3, 3, 3)))
     sizes = np.bincount(pieces.ravel(), minlength=count + 1)[1:]
     order = rng.permutation(count)
-    # Where most is thin, as of grass, an object must stay what it is.
+    # An object of mostly thin parts, such as grass, must not lose most of them.
     lost = order[np.cumsum(sizes[order]) <= _MOST_LOST * occupied.sum()]
     left: NDArray[np.bool_] = occupied & ~np.isin(pieces, lost + 1)
     return left

@@ -1,4 +1,4 @@
-"""Primitive solids as signed distance bounds, and what they are made of.
+"""Primitive solids as signed distance bounds, and their materials.
 
 Every shape gives, at any point, a number that is negative inside, positive
 outside and never larger in magnitude than the distance to its surface; the
@@ -195,7 +195,7 @@ def half_space(point: ArrayLike, normal: ArrayLike) -> Region:
 
 @dataclass(frozen=True)
 class Stuff:
-    """What a part is made of, in SI units: class 0..6, Pa, kg/m^3, no unit."""
+    """The material of a part: class 0..6, and properties in Pa, kg/m^3 and 1."""
 
     material: int
     youngs_modulus: float
@@ -213,7 +213,7 @@ class Part:
 
 
 class Solid:
-    """The union of parts: where it is, and which stuff is at a point.
+    """The union of parts, with the distance and the stuff at any point.
 
     A point belongs to the part whose distance there is smallest.
 
@@ -222,15 +222,15 @@ class Solid:
     parts : sequence of Part
         At least one.
     reach : float
-        Distances are known up to this share of the largest edge of the solid's box.
+        Distances are computed up to this share of the largest edge of the solid's box.
     """
 
     def __init__(self, parts: Sequence[Part], reach: float = 0.08) -> None:
         self.parts = tuple(parts)
         self.shapes = tuple(part.shape for part in self.parts)
         self.extent = bounding_box(self.shapes, np.eye(3))
-        # A part is evaluated only near its own box; elsewhere its distance is at
-        # least this, which is all that the voxelisation needs.
+        # A part is evaluated only near its own box. Elsewhere its distance is at least this,
+        # and the voxelisation needs no more.
         self.reach = reach * float((self.extent[1] - self.extent[0]).max())
         self._boxes = [shape.box() for shape in self.shapes]
         self.stuffs: list[Stuff] = []

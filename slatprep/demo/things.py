@@ -61,7 +61,7 @@ def ball(rng: Rng, variant: int) -> Model:
         parts.add(skin, ellipsoid((0, 0, 0), (long, round_, round_)))
         parts.add(lace, capsule((-0.22, 0, round_), (0.22, 0, round_), 0.045))
         parts.add(lace, *(capsule((x, -0.09, top), (x, 0.09, top), 0.04) for x in (-0.16, 0, 0.16)))
-        # Turned half round about z it is the same.
+        # Half a turn about z leaves it unchanged.
         return Model("oval ball", parts, symmetric=True)
     coats = ((shapes.half_space((0, 0, 0), direction(rng)), paint),) if variant % 3 == 0 else ()
     name = "half-painted ball" if coats else "plain ball"
@@ -83,7 +83,7 @@ def soda_can(rng: Rng, variant: int) -> Model:
         middle = around(rng.uniform(0, 2.0 * np.pi), r + 0.16, rng.uniform(0.35, 0.6) * h)
         content = carve(content, sphere(middle, 0.27 + 0.06))
         walls = [carve(wall, sphere(middle, 0.27)) for wall in walls]
-    # The content lies deep inside; the surface meets the metal alone.
+    # The content is deep inside; only metal is on the surface.
     parts = Parts(Part(wall, metal, ((content.distance, drink),)) for wall in walls)
     parts.add(metal, shapes.torus((0, 0, h), (0, 0, 1), 0.78 * r, 0.03))
     if dented:

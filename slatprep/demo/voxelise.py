@@ -1,9 +1,9 @@
-"""Voxels that a surface passes through, and solids filled.
+"""Voxelise the surface and the inside of a solid.
 
 TRELLIS voxelises the surface of a mesh (Open3D's
 ``create_from_triangle_mesh_within_bounds``): a voxel is occupied if the
 surface meets its cube. Here the surface is the zero set of a signed distance
-bound, and the same question is answered by subdivision.
+bound, and cubes are subdivided to decide whether they meet it.
 """
 
 from __future__ import annotations
@@ -41,11 +41,9 @@ def voxelise(distance: Distance) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
 
     Notes
     -----
-    A cube whose centre is farther from the surface than half the cube's
-    diagonal is certainly not met; one in which two points lie on different
-    sides certainly is. What is left is halved three times. Only a surface
-    that enters a cube by less than a tenth of a voxel, between the points looked
-    at, can be missed.
+    A cube whose centre is farther from the surface than half the cube's diagonal does not meet
+    it; a cube with points on both sides does. All others are halved three times. Only a surface
+    that enters a cube by less than a tenth of a voxel, between the sampled points, is missed.
     """
     near, inside = _near_voxels(distance)
     candidates = np.argwhere(near)

@@ -67,7 +67,7 @@ def _prediction(grid: NDArray[np.float32], form: GridForm) -> NDArray[np.float32
     values = grid[..., :3].astype(np.float64)
     values[..., :2] = np.log10(values[..., :2] + 1e-6)
     values = 2.0 * (np.clip(values, _PIXIE_LO, _PIXIE_HI) - _PIXIE_LO) / (_PIXIE_HI - _PIXIE_LO) - 1
-    # A prediction knows no -1: a voxel without a label is background in it.
+    # A prediction has no class -1: voxels without a label become background.
     ids = np.where(grid[..., 3] < 0, BACKGROUND, grid[..., 3])
     classes = ids[..., None] if form == "prediction-ids" else ids[..., None] == np.arange(8)
     channels = np.concatenate([values, classes], axis=-1)
@@ -75,11 +75,10 @@ def _prediction(grid: NDArray[np.float32], form: GridForm) -> NDArray[np.float32
 
 
 def write_results(root: Path, asset: DemoAsset) -> None:
-    """Write what a method that errs might predict of an asset, as Pixie lays its results out.
+    """Write the prediction of a method with errors, in the layout of Pixie's results.
 
-    The field is off by up to a voxel along each axis, so that voxels at the rim are
-    predicted to be background, and its properties by a share of their range: as a whole,
-    and voxel by voxel.
+    The field is shifted by up to a voxel along each axis, so that voxels at its boundary are
+    predicted to be background. Its properties have noise, for the whole field and for each voxel.
     """
     rng = np.random.default_rng(int.from_bytes(asset.object_id.encode(), "big"))
     shifted = np.roll(asset.grid, rng.integers(-1, 2, size=3), axis=(0, 1, 2))
@@ -116,7 +115,7 @@ def write_slat(root: Path, asset: DemoAsset, form: SlatForm, names: SlatNames) -
 
 
 def write_truth(root: Path, asset: DemoAsset) -> None:
-    """Write what is true of each row of an asset to ``<root>/<row id>.npz``."""
+    """Write the truth of each row of an asset to ``<root>/<row id>.npz``."""
     root.mkdir(parents=True, exist_ok=True)
     for view in asset.views:
         truth: dict[str, NDArray[Any]] = {
