@@ -22,8 +22,8 @@ class Form:
 
 FORMS = {
     "raw grid (npy)": Form("grid", {}),
-    "prediction (npy, 11 channels)": Form("grid", {"grid_form": "prediction"}),
-    "prediction (npy, 4 channels)": Form("grid", {"grid_form": "prediction-ids"}),
+    "prediction (npy, 11 channels)": Form("grid", {"source": "pixie-predictions"}),
+    "prediction (npy, 4 channels)": Form("grid", {"source": "pixie-prediction-ids"}),
     "mask (npy)": Form("mask", {}),
     "bounds (npz)": Form("bounds", {}),
     "SLAT (npz)": Form("slat", {"slat_form": "npz"}),

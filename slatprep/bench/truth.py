@@ -3,13 +3,15 @@
 The truth of an asset is ``<truth_dir>/<asset id>.npz`` with ``transform``
 (4, 4), ``material`` (N,), ``name``, ``level`` and ``symmetric``, and, where the two
 shapes differ, ``places`` (N, 3): where each SLAT voxel truly lies in the PixieVerse
-frame. There ``transform`` is the similarity that comes nearest to the places.
+frame. There ``transform`` is the similarity that comes nearest to the places. Of a store
+without classes voxels are right whose properties are those of ``properties`` (N, P), a
+column for each name in ``columns`` (P,).
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -24,13 +26,19 @@ from slatprep.geometry.frames import (
     voxel_centres,
 )
 from slatprep.readers.files import ArraySpec, load_source, npz_arrays
-from slatprep.records import BACKGROUND, Place
+from slatprep.records import MAX_PROPERTIES, Place
 from slatprep.store import StoredAsset, open_store
 from slatprep.workers import Progress
 
 SUCCESS_DISPLACEMENT = 1.5
 """An asset is placed right where its mean displacement [voxel] is less than this above the
 least that a similarity can have."""
+
+SAME_VALUE = 0.01
+"""Share of a property's true value by which one that is the same may be off."""
+
+MOST_VALUES = 255
+"""True rows of properties that an asset may have, each other than the others."""
 
 ANSWERABLE_DISTANCE = 2.0
 """A SLAT voxel has a true answer where an annotation lies so near its true place [voxel]."""
@@ -43,6 +51,10 @@ _TRUTH = {
     "symmetric": ArraySpec(((),), "b"),
 }
 _PLACES = {"places": ArraySpec(((None, 3),), "f")}
+_VALUES = {
+    "properties": ArraySpec(tuple((None, n + 1) for n in range(MAX_PROPERTIES)), "f"),
+    "columns": ArraySpec(tuple((n + 1,) for n in range(MAX_PROPERTIES)), "U"),
+}
 
 
 @dataclass(frozen=True)
@@ -55,7 +67,7 @@ class Truth:
 
     path: Path
     transform: NDArray[np.float64]
-    material: NDArray[np.uint8]
+    material: NDArray[np.integer[Any]]
     name: str
     level: int
     symmetric: bool
@@ -74,8 +86,8 @@ class TruthScore:
         Mean distance [voxel] over the SLAT voxels between where they were
         looked up in the PixieVerse frame and where they truly lie.
     label_accuracy : float
-        Share of the answerable voxels whose class is right; a voxel without
-        a label is wrong.
+        Share of the answerable voxels whose class is right (of a store without
+        classes, all of whose properties are); a voxel without a label is wrong.
     truth_own : float
         The same share for the annotated voxel nearest to each true place: what
         is left to lose by the lookup alone.
@@ -197,18 +209,50 @@ def _summarise_level(level: int, scores: Sequence[TruthScore]) -> LevelScore:
 
 
 def _score_asset(asset: StoredAsset, path: Path) -> TruthScore:
-    annotated = np.argwhere(asset.grid_material < BACKGROUND)
+    truth, field = read_truth(path), asset.field
+    material, annotated_material = asset.material, field.material
+    if not field.classified:
+        names, values = _true_values(path, len(truth.material))
+        known, labels = np.unique(values, axis=0, return_inverse=True)
+        if len(known) > MOST_VALUES:
+            raise InputError(
+                path, f"has {len(known)} different rows of properties", f"at most {MOST_VALUES}"
+            )
+        columns = asset.store.columns_of(names)
+        truth = replace(truth, material=labels.reshape(-1))
+        material = _row_of(asset.properties_si[:, columns], known)
+        annotated_material = _row_of(field.properties[:, columns], known)
     return compare_with_truth(
         asset.asset_id,
-        read_truth(path),
+        truth,
         coords=asset.coords,
         transform=asset.transform,
-        material=asset.material,
+        material=material,
         valid=asset.valid,
-        annotated=annotated,
-        annotated_material=asset.grid_material[tuple(annotated.T)],
+        annotated=field.voxels,
+        annotated_material=annotated_material,
         places=asset.place,
     )
+
+
+def _true_values(path: Path, count: int) -> tuple[tuple[str, ...], NDArray[np.floating[Any]]]:
+    """Return the true properties (N, P) of SLAT voxels, and their names."""
+    data, _ = load_source(path, path.parent, "truth")
+    arrays = npz_arrays(data, path, _VALUES)
+    names, values = tuple(map(str, arrays["columns"])), arrays["properties"]
+    if values.shape != (count, len(names)):
+        raise InputError(path, f"properties has shape {values.shape}", f"({count}, {len(names)})")
+    return names, values
+
+
+def _row_of(
+    values: NDArray[np.float32], known: NDArray[np.floating[Any]]
+) -> NDArray[np.integer[Any]]:
+    """Return which of the known rows each row of values (N, P) is; as many as there are if none."""
+    found = np.full(len(values), len(known))
+    for number, row in enumerate(known):
+        found[np.isclose(values, row, rtol=SAME_VALUE, atol=1e-6).all(axis=1)] = number
+    return found
 
 
 def compare_with_truth(
@@ -217,10 +261,10 @@ def compare_with_truth(
     *,
     coords: NDArray[np.uint8],
     transform: NDArray[np.float64],
-    material: NDArray[np.uint8],
+    material: NDArray[np.integer[Any]],
     valid: NDArray[np.bool_],
     annotated: NDArray[np.integer[Any]],
-    annotated_material: NDArray[np.uint8],
+    annotated_material: NDArray[np.integer[Any]],
     places: NDArray[np.floating[Any]] | None = None,
 ) -> TruthScore:
     """Compare one asset's places and labels with its truth.

@@ -25,7 +25,8 @@ def score(output: Output, store: Place, truth_dir: Path) -> None:
     figures are over assets that have one right placement only: success is a
     mean displacement less than 1.5 voxels above that of the best similarity
     (0 where the shapes are the same); displacement is the median, p90 the 90th
-    percentile; labels is the share of right classes, beside what the best
+    percentile; labels is the share of right classes (of a store without
+    classes, of voxels with the right properties), beside what the best
     similarity and the true places themselves would give. Exit code 1 says that
     an asset with a truth is not in the store.
 

@@ -3,7 +3,7 @@
 `shapes` and `materials` are what objects are built of, `catalogue` lists the
 objects, `voxelise`, `difficulty`, `generated` and `nerf` are how two pipelines
 see them, `asset` puts both sides and the truth together, `write` lays them out
-on disk.
+on disk, `sources` as other sources do.
 """
 
 from __future__ import annotations
@@ -17,21 +17,22 @@ from typing import Any
 
 from slatprep.demo.asset import DemoAsset, make_asset
 from slatprep.demo.difficulty import LEVELS, SAME_SHAPE_LEVELS
-from slatprep.demo.latents import LatentKind
+from slatprep.demo.latents import CHANNELS, Encoder, LatentKind
+from slatprep.demo.sources import ONE_FRAME, TABLE, Source, classes_of, write_description
 from slatprep.demo.write import (
-    GridForm,
     SlatForm,
     SlatNames,
     row_id,
     slat_name,
+    write_annotated,
     write_categories,
-    write_pixieverse,
     write_results,
     write_slat,
     write_trellis_metadata,
     write_truth,
 )
 from slatprep.errors import ConfigError
+from slatprep.records import RESOLUTION
 from slatprep.workers.local import run_unordered
 
 __all__ = ["DemoAsset", "DemoSummary", "make_asset", "make_demo"]
@@ -59,10 +60,17 @@ class _Recipe:
     views: int
     latents: LatentKind
     habitual_share: float
-    grid_form: GridForm
+    source: Source
+    encoder: Encoder
     slat_form: SlatForm
     slat_names: SlatNames
     results: bool
+
+    @property
+    def adapter(self) -> str:
+        """What reads the source, and the name of its folder."""
+        kind = self.source.partition("-")[0]
+        return "pixieverse" if kind == "pixie" else kind
 
 
 def make_demo(
@@ -70,11 +78,12 @@ def make_demo(
     assets: int,
     seed: int,
     *,
-    levels: tuple[int, ...] = SAME_SHAPE_LEVELS,
+    levels: tuple[int, ...] = (),
     views: int = 1,
     latents: LatentKind = "placeholder",
     habitual_share: float = 0.0,
-    grid_form: GridForm = "raw",
+    source: Source = "pixieverse",
+    encoder: Encoder = "trellis",
     slat_form: SlatForm = "npz",
     slat_names: SlatNames = "id",
     results: bool = False,
@@ -90,16 +99,17 @@ def make_demo(
     Parameters
     ----------
     directory : str or Path
-        Where to write ``pixieverse/``, ``slat/``, ``truth/``,
-        ``obj_ids_metadata.json``, ``dataset.toml`` (the dataset's definition
+        Where to write ``pixieverse/`` (or the folder of another source), ``slat/``,
+        ``truth/``, ``obj_ids_metadata.json``, ``dataset.toml`` (the dataset's definition
         for `slatprep build-store --config`) and ``demo.json`` (what was made).
         It is made if missing; it must be empty or hold the same demo.
     assets, seed : int
         Number of objects, and the seed of everything random.
     levels : tuple of int
-        Levels of difficulty, gone through in turn; see `slatprep.demo.difficulty`. The
-        default has those whose sides show one clean shape; 5 to 7, a generated shape, a
-        NeRF's field and both, are made where they are named.
+        Levels of difficulty, gone through in turn; see `slatprep.demo.difficulty`. By
+        default those whose sides show one clean shape, or 0 alone where `source` shares
+        the frame of the SLAT; 5 to 7, a generated shape, a NeRF's field and both, are made
+        where they are named.
     views : int
         SLATs of each object; with several, rows are named ``<object id>.<view>``.
     latents : {"placeholder", "material"}
@@ -107,8 +117,12 @@ def make_demo(
     habitual_share : float
         Share of assets with the dataset's one quarter turn between the sides,
         in 0..1; the others have any of the 24.
-    grid_form : {"raw", "prediction", "prediction-ids"}
-        Material grids, or predictions of 11 or of 4 channels.
+    source : str
+        What the annotated side is, one of `slatprep.demo.sources.Source`: PixieVerse's
+        grids, predictions of 11 or of 4 channels, VoMP's or PhysXNet's voxels, or plain
+        voxels, with ten properties (in HDF5 without classes).
+    encoder : {"trellis", "sam3d", "trellis2", "plain"}
+        Whose latents they are; ``plain`` has 16 channels, described by ``encoder.json``.
     slat_form : {"npz", "npz-batch", "hdf5", "hdf5-groups"}
         Coordinates (N, 3) uint8 or (N, 4) int32 in an npz, or HDF5, a file or
         a group an asset.
@@ -131,9 +145,10 @@ def make_demo(
     ConfigError
         If an argument makes no sense or the directory holds something else.
     """
+    levels = tuple(levels) or ((0,) if source in ONE_FRAME else SAME_SHAPE_LEVELS)
     recipe = _Recipe(
-        assets, seed, tuple(levels), views, latents, habitual_share,
-        grid_form, slat_form, slat_names, results,
+        assets, seed, levels, views, latents, habitual_share,
+        source, encoder, slat_form, slat_names, results,
     )  # fmt: skip
     _check(recipe)
     root = Path(directory)
@@ -172,6 +187,13 @@ def _check(recipe: _Recipe) -> None:
                 f"{name} = {value!r} makes no demo: assets and views are at least 1, seed at least "
                 f"0, habitual_share in 0..1, levels some of {', '.join(map(str, LEVELS))}"
             )
+    if recipe.source in ONE_FRAME and (set(recipe.levels) != {0} or recipe.views > 1):
+        raise ConfigError(
+            f"source {recipe.source!r} is made of the mesh that its SLAT was encoded from: level 0 "
+            "alone, and 1 view"
+        )
+    if recipe.encoder == "trellis2" and (recipe.slat_form != "npz" or recipe.views > 1):
+        raise ConfigError("encoder 'trellis2' has an npz an object: slat_form 'npz', and 1 view")
     if recipe.slat_form == "hdf5-groups" and recipe.views > 1:
         raise ConfigError("slat_form 'hdf5-groups' holds one view an object: use 'hdf5', or 1 view")
 
@@ -208,12 +230,14 @@ def _make_one(root: Path, recipe: _Recipe, index: int) -> tuple[int, dict[str, A
         views=recipe.views,
         latents=recipe.latents,
         habitual_share=recipe.habitual_share,
+        channels=CHANNELS[recipe.encoder],
+        one_frame=recipe.source in ONE_FRAME,
     )
-    write_pixieverse(root / "pixieverse", asset, recipe.grid_form)
+    write_annotated(root / recipe.adapter, asset, recipe.source)
     if recipe.results:
         write_results(root / "results", asset)
-    write_slat(root / "slat", asset, recipe.slat_form, recipe.slat_names)
-    write_truth(root / "truth", asset)
+    write_slat(root / "slat", asset, recipe.slat_form, recipe.slat_names, recipe.encoder)
+    write_truth(root / "truth", asset, recipe.source)
     return index, {
         "id": asset.object_id,
         "name": asset.name,
@@ -240,14 +264,22 @@ def _write_definition(root: Path, recipe: _Recipe, entries: list[dict[str, Any]]
         f'name = "demo-{recipe.seed}"',
         "",
         "[pixieverse]",
-        'root = "pixieverse"',
-        "",
-        "[slat]",
-        f'root = "{slat_root}"',
-        "",
-        "[pairing]",
-        'categories = "obj_ids_metadata.json"',
+        f'root = "{recipe.adapter}"',
     ]
+    if recipe.adapter != "pixieverse":
+        lines.append(f'adapter = "{recipe.adapter}"')
+    lines += ["", "[slat]", f'root = "{slat_root}"']
+    if recipe.encoder == "plain":
+        space = {"encoder": "plain", "channels": CHANNELS["plain"], "resolution": RESOLUTION}
+        _write_json(root / "encoder.json", space)
+        lines.append('encoder = "encoder.json"')
+    elif recipe.encoder != "trellis":
+        lines.append(f'encoder = "{recipe.encoder}"')
+    if recipe.adapter == "voxels":
+        write_description(root / "voxels", TABLE, classes_of(recipe.source))
+    if recipe.source in ONE_FRAME:
+        lines += ["", "[align]", 'engine = "known"']
+    lines += ["", "[pairing]", 'categories = "obj_ids_metadata.json"']
     if recipe.slat_names == "sha256":
         rows = ((e["slat"], e["id"], e["rows"][0]["voxels"]) for e in entries)
         write_trellis_metadata(root / "metadata.csv", rows)

@@ -47,7 +47,7 @@ class DemoView:
         Name of the view; empty where the object has one only.
     coords : ndarray of uint8, shape (N, 3)
         SLAT voxels in C order.
-    feats : ndarray of float32, shape (N, 8)
+    feats : ndarray of float32, shape (N, channels)
         Latents.
     transform : ndarray of float64, shape (4, 4)
         PixieVerse frame to SLAT frame; of a generated shape, the similarity that takes
@@ -97,6 +97,8 @@ def make_asset(
     views: int = 1,
     latents: LatentKind = "placeholder",
     habitual_share: float = 0.0,
+    channels: int = 8,
+    one_frame: bool = False,
 ) -> DemoAsset:
     """Make asset number `index` of a demo dataset.
 
@@ -116,6 +118,11 @@ def make_asset(
     habitual_share : float
         Share of assets whose PixieVerse side has the dataset's one quarter
         turn; the others have any of the 24.
+    channels : int
+        Channels of the latents.
+    one_frame : bool
+        Whether both sides were made from one mesh: the transform is the identity then.
+        It goes with level 0, and one view.
 
     Returns
     -------
@@ -136,6 +143,8 @@ def make_asset(
     if rng.uniform() < habitual_share:
         quarter = int(np.random.default_rng([seed, _HABIT]).integers(len(QUARTER_TURNS)))
     frames = draw_frames(rng, solid, difficulty, QUARTER_TURNS[quarter])
+    if one_frame:
+        frames = replace(frames, pixieverse=frames.slat)
     stuff = _pixieverse_side(solid, frames)
     skin = frames.pixieverse.to_object(voxel_centres(np.argwhere(boundary(stuff >= 0))))
     rng = np.random.default_rng([seed, index, _DAMAGE])
@@ -150,7 +159,8 @@ def make_asset(
             rng = np.random.default_rng([seed, index, _GENERATED, v])
             seen = generate(rng, seen, difficulty, solid, skin)
         rng = np.random.default_rng([seed, index, _LATENTS, v])
-        view = _slat_side(rng, f"view_{v}" if views > 1 else "", solid, seen, latents)
+        name = f"view_{v}" if views > 1 else ""
+        view = _slat_side(rng, name, solid, seen, latents, channels)
         made.append(view if difficulty.has_places else replace(view, places=None))
     return DemoAsset(
         object_id(seed, index),
@@ -192,14 +202,19 @@ def _material_grid(solid: Solid, stuff: NDArray[np.int16]) -> NDArray[np.float32
 
 
 def _slat_side(
-    rng: np.random.Generator, view: str, solid: Solid, frames: Frames, latents: LatentKind
+    rng: np.random.Generator,
+    view: str,
+    solid: Solid,
+    frames: Frames,
+    latents: LatentKind,
+    channels: int,
 ) -> DemoView:
     surface = voxelise(frames.slat_distance(solid))[0]
     coords = np.argwhere(surface).astype(np.uint8)
     centres = voxel_centres(coords)
     material, properties = solid.table()
     stuff = solid.stuff_at(frames.slat_to_object(centres))
-    feats = make_latents(rng, latents, coords, material[stuff], properties[stuff])
+    feats = make_latents(rng, latents, coords, material[stuff], properties[stuff], channels)
     places = frames.places(centres)
     # Without a distortion the transform of the poses is exact.
     transform = nearest_similarity(places, centres) if frames.distortion else frames.transform()

@@ -1,6 +1,7 @@
-"""Synthetic latents of a SLAT.
+"""Synthetic latents of a SLAT, with eight channels or as many as an encoder gives.
 
-Mean and standard deviation of each channel are TRELLIS's, see `slatprep.records`.
+Mean and standard deviation of each channel are TRELLIS's, see `slatprep.records`; for
+encoders with more channels they repeat every eight.
 """
 
 from __future__ import annotations
@@ -14,6 +15,11 @@ from slatprep.geometry.frames import voxel_centres
 from slatprep.records import FEATS_MEAN, FEATS_STD
 
 LatentKind = Literal["placeholder", "material"]
+
+Encoder = Literal["trellis", "sam3d", "trellis2", "plain"]
+
+CHANNELS: dict[Encoder, int] = {"trellis": 8, "sam3d": 8, "trellis2": 32, "plain": 16}
+"""How many channels the latents of an encoder have; ``plain`` stands for any other."""
 
 MEAN, STD = np.array(FEATS_MEAN), np.array(FEATS_STD)
 
@@ -31,8 +37,9 @@ def make_latents(
     coords: NDArray[np.uint8],
     material: NDArray[np.uint8],
     properties: NDArray[np.float32],
+    channels: int = 8,
 ) -> NDArray[np.float32]:
-    """Return latents (N, 8) float32 for SLAT voxels.
+    """Return latents (N, channels) float32 for SLAT voxels.
 
     Parameters
     ----------
@@ -40,19 +47,23 @@ def make_latents(
         Source of the noise.
     kind : {"placeholder", "material"}
         ``placeholder`` is normal noise. ``material`` is `NOISE` times that, and
-        `clean_latents` of what is there; then TRELLIS's mean and standard
-        deviation are applied.
+        `clean_latents` of what is there in its first eight channels; then mean and
+        standard deviation are applied.
     coords : ndarray of uint8, shape (N, 3)
         SLAT voxels.
     material : ndarray of uint8, shape (N,)
         Class of each, 0..6.
     properties : ndarray of float32, shape (N, 3)
         Young's modulus, density and Poisson's ratio of each, SI.
+    channels : int
+        At least eight.
     """
-    z = rng.normal(size=(len(coords), 8))
+    z = rng.normal(size=(len(coords), channels))
     if kind == "material":
-        z = clean_latents(coords, material, properties) + NOISE * z
-    feats: NDArray[np.float32] = (MEAN + STD * z).astype(np.float32)
+        z *= NOISE
+        z[:, :8] += clean_latents(coords, material, properties)
+    mean, std = np.resize(MEAN, channels), np.resize(STD, channels)
+    feats: NDArray[np.float32] = (mean + std * z).astype(np.float32)
     return feats
 
 

@@ -1,4 +1,4 @@
-"""Demo data on disk, in the layouts of PixieVerse and TRELLIS."""
+"""Demo data on disk, in the layouts of PixieVerse and TRELLIS, and the truth."""
 
 from __future__ import annotations
 
@@ -13,10 +13,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slatprep.demo.asset import DemoAsset, DemoView
+from slatprep.demo.latents import Encoder
+from slatprep.demo.sources import Source, columns_of, write_field
 from slatprep.geometry.frames import VOXEL_SIZE
 from slatprep.records import BACKGROUND, RESOLUTION
 
-GridForm = Literal["raw", "prediction", "prediction-ids"]
 SlatForm = Literal["npz", "npz-batch", "hdf5", "hdf5-groups"]
 SlatNames = Literal["id", "sha256"]
 
@@ -38,11 +39,14 @@ def slat_name(asset: DemoAsset, names: SlatNames) -> str:
     return asset.object_id
 
 
-def write_pixieverse(root: Path, asset: DemoAsset, form: GridForm) -> None:
-    """Write grid or prediction, mask and bounds of an asset below `root`."""
+def write_annotated(root: Path, asset: DemoAsset, source: Source) -> None:
+    """Write the annotated side of an asset below `root`: a grid with mask and bounds, or voxels."""
+    if not source.startswith("pixie"):
+        write_field(root, source, asset.object_id, asset.grid, asset.views[0].coords)
+        return
     folder = root / asset.object_id
     mask = asset.occupancy.astype(np.float32)
-    if form == "raw":
+    if source == "pixieverse":
         (folder / "sample_0").mkdir(parents=True, exist_ok=True)
         np.save(folder / "sample_0" / "material_grid.npy", asset.grid)
         np.save(folder / "clip_features_mask.npy", mask)
@@ -58,18 +62,19 @@ def write_pixieverse(root: Path, asset: DemoAsset, form: GridForm) -> None:
         )
         return
     folder.mkdir(parents=True, exist_ok=True)
-    np.save(folder / "sample_0_pred.npy", _prediction(asset.grid, form))
+    scores = source == "pixie-predictions"
+    np.save(folder / "sample_0_pred.npy", _prediction(asset.grid, scores))
     np.save(folder / "sample_0_mask.npy", mask)
 
 
-def _prediction(grid: NDArray[np.float32], form: GridForm) -> NDArray[np.float32]:
-    """Return a grid as Pixie's network would predict it: channels first, normalised."""
+def _prediction(grid: NDArray[np.float32], scores: bool = True) -> NDArray[np.float32]:
+    """Return a grid as Pixie's network predicts it: channels first, classes as scores or ids."""
     values = grid[..., :3].astype(np.float64)
     values[..., :2] = np.log10(values[..., :2] + 1e-6)
     values = 2.0 * (np.clip(values, _PIXIE_LO, _PIXIE_HI) - _PIXIE_LO) / (_PIXIE_HI - _PIXIE_LO) - 1
     # A prediction has no class -1: voxels without a label become background.
     ids = np.where(grid[..., 3] < 0, BACKGROUND, grid[..., 3])
-    classes = ids[..., None] if form == "prediction-ids" else ids[..., None] == np.arange(8)
+    classes = ids[..., None] == np.arange(8) if scores else ids[..., None]
     channels = np.concatenate([values, classes], axis=-1)
     return np.ascontiguousarray(np.moveaxis(channels, -1, 0), dtype=np.float32)
 
@@ -82,7 +87,7 @@ def write_results(root: Path, asset: DemoAsset) -> None:
     """
     rng = np.random.default_rng(int.from_bytes(asset.object_id.encode(), "big"))
     shifted = np.roll(asset.grid, rng.integers(-1, 2, size=3), axis=(0, 1, 2))
-    prediction = _prediction(shifted, "prediction")
+    prediction = _prediction(shifted)
     prediction[:3] += rng.normal(0.0, 0.1, size=(3, 1, 1, 1))
     prediction[:3] += rng.normal(0.0, 0.1, size=prediction[:3].shape)
     folder = root / asset.object_id
@@ -91,9 +96,16 @@ def write_results(root: Path, asset: DemoAsset) -> None:
     np.save(folder / "sample_0_mask.npy", asset.occupancy.astype(np.float32))
 
 
-def write_slat(root: Path, asset: DemoAsset, form: SlatForm, names: SlatNames) -> None:
+SHAPE_LATENTS = "shape_latents/shape_enc_next_dc_f16c32_fp16_1024"
+"""Where TRELLIS.2's toolkit puts the latents of a shape, at resolution 1024."""
+
+
+def write_slat(
+    root: Path, asset: DemoAsset, form: SlatForm, names: SlatNames, encoder: Encoder = "trellis"
+) -> None:
     """Write the SLATs of an asset below `root`: a file each, or a group each of ``latents.h5``."""
     name = slat_name(asset, names)
+    root = root / SHAPE_LATENTS if encoder == "trellis2" else root
     root.mkdir(parents=True, exist_ok=True)
     for view in asset.views:
         stem = root / name / view.view if view.view else root / name
@@ -114,14 +126,16 @@ def write_slat(root: Path, asset: DemoAsset, form: SlatForm, names: SlatNames) -
                     group.create_dataset(key, data=value, track_times=False)
 
 
-def write_truth(root: Path, asset: DemoAsset) -> None:
+def write_truth(root: Path, asset: DemoAsset, source: Source) -> None:
     """Write the truth of each row of an asset to ``<root>/<row id>.npz``."""
     root.mkdir(parents=True, exist_ok=True)
     for view in asset.views:
+        columns = columns_of(source, view.material, view.properties)
         truth: dict[str, NDArray[Any]] = {
             "transform": view.transform,
             "material": view.material,
-            "properties": view.properties,
+            "properties": np.stack(list(columns.values()), axis=1),
+            "columns": np.array(list(columns)),
             "symmetric": np.array(asset.symmetric, dtype=bool),
             "name": np.array(asset.name),
             "level": np.array(asset.level, dtype=np.int64),

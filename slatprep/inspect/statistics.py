@@ -95,7 +95,7 @@ def store_statistics(
     make = _Summariser(
         store.normalization,
         tuple(one.unit for one in store.contents.properties),
-        store.contents.classes[:BACKGROUND] or ("annotated",),
+        store.contents.labels,
     )
     total = nothing = no_tally(len(ranges), BINS)
     done, groups = 0, []

@@ -252,9 +252,9 @@ def evaluate_store(
                 missing.append(asset_id)
                 continue
             rows = store.read(index, ("coords", "properties", "material", "valid"))
-            prediction = check_prediction(
-                f"{predictions}/{asset_id}", arrays, rows.pop("coords"), store.normalization
-            )
+            source, coords = f"{predictions}/{asset_id}", rows.pop("coords")
+            classes = store.contents.n_classes
+            prediction = check_prediction(source, arrays, coords, store.normalization, classes)
             converted += prediction.converted
             scored.append(index)
             if not store.contents.classes:

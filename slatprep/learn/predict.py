@@ -22,7 +22,13 @@ from slatprep.learn.decoder import PhysicsDecoder, make_decoder
 from slatprep.learn.runs import read_state
 from slatprep.normalize import denormalize_properties, normalization_of
 from slatprep.readers.files import refusing
-from slatprep.records import PIXIEVERSE, Contents, Normalization, StructuredLatents
+from slatprep.records import (
+    BACKGROUND,
+    PIXIEVERSE,
+    Contents,
+    Normalization,
+    StructuredLatents,
+)
 from slatprep.storage.atomic import staged
 from slatprep.storage.files import file_digest
 from slatprep.storage.names import file_name
@@ -231,7 +237,7 @@ def _decode(checkpoint: Checkpoint, assets: list[StructuredLatents]) -> Iterator
             coords=latents.coords,
             properties=own,
             properties_si=denormalize_properties(own, checkpoint.normalization),
-            material=likely[:, : max(likely.shape[1] - 1, 1)].argmax(axis=1).astype(np.uint8),
+            material=likely[:, :BACKGROUND].argmax(axis=1).astype(np.uint8),
             probabilities=likely,
             seconds=seconds * len(own),
         )

@@ -54,7 +54,7 @@ _NUMBERS = "iuf"
 _SPECS = {
     "properties": ArraySpec(tuple((None, n + 1) for n in range(MAX_PROPERTIES)), _NUMBERS),
     "material": ArraySpec(((None,),), _NUMBERS),
-    "logits": ArraySpec(((None, CLASSES),), _NUMBERS),
+    "logits": ArraySpec(tuple((None, n + 1) for n in range(CLASSES)), _NUMBERS),
     "coords": ArraySpec(((None, 3),), _NUMBERS),
     "ranges": ArraySpec(tuple((n + 1, 2) for n in range(MAX_PROPERTIES)), _NUMBERS),
 }
@@ -175,6 +175,7 @@ def check_prediction(
     arrays: Mapping[str, NDArray[Any]],
     coords: NDArray[np.uint8],
     normalization: Normalization,
+    classes: int = CLASSES,
 ) -> VoxelPrediction:
     """Check a prediction and put its voxels in the order of the store.
 
@@ -183,13 +184,15 @@ def check_prediction(
     source : str
         Name of the prediction in messages.
     arrays : mapping of str to ndarray
-        ``properties`` (N, P); optionally ``material`` (N,) or ``logits`` (N, 8), ``coords``
+        ``properties`` (N, P); optionally ``material`` (N,) or ``logits`` (N, classes), ``coords``
         (N, 3) and ``ranges`` (P, 2). Without ``coords`` and ``ranges`` order and ranges are
         taken to be the store's.
     coords : ndarray of uint8, shape (N, 3)
         Voxels of the store.
     normalization : Normalization
         The store's ranges.
+    classes : int
+        How many the store has.
 
     Returns
     -------
@@ -225,9 +228,9 @@ def check_prediction(
     material = None
     if "material" in arrays:
         material = _shaped(source, "material", arrays, (count,))
-        material = _whole(source, "class", material, CLASSES)
+        material = _whole(source, "class", material, classes)
     elif "logits" in arrays:
-        logits = _shaped(source, "logits", arrays, (count, CLASSES))
+        logits = _shaped(source, "logits", arrays, (count, classes))
         if np.isnan(logits).any():
             raise InputError(source, "logits are not all numbers", "a score for each class")
         material = logits.argmax(axis=1)

@@ -109,6 +109,7 @@ class SlatSource(_Group):
         "{id}/{view}.h5",
         "{id}/{view}.hdf5",
         "latents/*/{id}.npz",
+        "shape_latents/*_1024/{id}.npz",
     )
     group: str = "{id}"
     encoder: str = "trellis"

@@ -10,12 +10,18 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from slatprep.align.deformation import PlaceMap
-from slatprep.errors import ConfigError, InputError
+from slatprep.errors import ConfigError, InputError, StoreError
 from slatprep.normalize import denormalize_properties
 from slatprep.provenance.stored import StoredRecords
 from slatprep.readers.files import ArraySpec, load_source, npz_arrays, npz_small_arrays
 from slatprep.readers.slat import check_coords
-from slatprep.records import BACKGROUND, PROPERTY_COLUMNS, RESOLUTION, Normalization
+from slatprep.records import (
+    BACKGROUND,
+    MATERIAL_CLASSES,
+    PROPERTY_COLUMNS,
+    RESOLUTION,
+    Normalization,
+)
 from slatprep.store import Store
 
 Points = Literal["slat", "grid"]
@@ -78,11 +84,17 @@ def stored_field(store: Store, asset_id: str, points: Points = "slat") -> VoxelF
     Raises
     ------
     StoreError
-        If the store cannot be read, has no such asset, or lacks one of the properties.
+        If the store cannot be read, has no such asset, lacks one of the properties, or has
+        classes of its own.
     ConfigError
         If no voxel of the asset has a material.
     """
     asset, columns = store.asset(asset_id), store.columns_of(PROPERTY_COLUMNS)
+    if store.contents.classes not in (MATERIAL_CLASSES, ()):
+        raise StoreError(
+            f"{store.path} has classes of its own ({', '.join(store.contents.classes)}); expected "
+            f"those of PhysGaussian's solver ({', '.join(MATERIAL_CLASSES[:BACKGROUND])}), or none"
+        )
     if points == "grid":
         grid = asset.field
         place_map = StoredRecords(store).place_map(asset)

@@ -10,7 +10,8 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from slatprep.errors import InputError, SlatprepError
+from slatprep.errors import InputError
+from slatprep.readers.points import ply_points
 
 Axes = Literal["trellis", "glb", "slat"]
 
@@ -129,26 +130,12 @@ def _by_another_tool(positions: NDArray[np.float64], names: frozenset[str]) -> s
 
 def _read_ply(path: Path) -> tuple[NDArray[np.float64], frozenset[str], tuple[str, ...]]:
     try:
-        import plyfile
-    except ImportError as error:
-        raise SlatprepError(
-            "reading a PLY needs the package plyfile; install it with "
-            "`pip install 'slatprep[simulate]'`"
-        ) from error
-    try:
-        read = plyfile.PlyData.read(path)
-        vertex = read["vertex"].data
-    except (OSError, KeyError, ValueError, UnicodeDecodeError, plyfile.PlyParseError) as error:
-        raise InputError(
-            path, f"is no readable PLY with vertices ({error})", "a PLY of Gaussians or points"
-        ) from None
-    names = vertex.dtype.names or ()
-    if not {"x", "y", "z"} <= set(names):
-        raise InputError(path, f"has vertices of {', '.join(names)}", "fields x, y and z")
-    if any(vertex.dtype[axis].kind not in "fiu" for axis in "xyz"):
-        raise InputError(path, "has x, y, z that are lists", "a number each")
-    positions = np.column_stack([np.asarray(vertex[axis], dtype=np.float64) for axis in "xyz"])
-    return positions, frozenset(names), tuple(read.comments)
+        data = path.read_bytes()
+    except OSError as error:
+        raise InputError(path, f"cannot be read ({error.strerror})", "a readable file") from None
+    vertices, comments = ply_points(data, path)
+    positions = np.column_stack([np.asarray(vertices[axis], dtype=np.float64) for axis in "xyz"])
+    return positions, frozenset(vertices.dtype.names or ()), comments
 
 
 def _read_numpy(path: Path) -> NDArray[np.float64]:

@@ -18,6 +18,7 @@ STAGES = (
     "slatprep.readers.pixieverse",
     "slatprep.readers.voxels",
     "slatprep.readers.vomp",
+    "slatprep.readers.physxnet",
     "slatprep.readers.transforms",
     "slatprep.readers.slat",
     "slatprep.align",

@@ -87,6 +87,7 @@ SOURCES = {
     "pixieverse": "slatprep.readers.pixieverse:PixieVerse",
     "voxels": "slatprep.readers.voxels:PlainVoxels",
     "vomp": "slatprep.readers.vomp:VoMP",
+    "physxnet": "slatprep.readers.physxnet:PhysXNet",
 }
 """slatprep's own source adapters."""
 

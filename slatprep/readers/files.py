@@ -33,6 +33,9 @@ MAX_FILE_BYTES = 128 * 2**20
 MAX_MEMBERS = 256
 """An npz with more members is refused: each costs memory before it is looked at."""
 
+MAX_FILES = 4096
+"""A Zarr hierarchy of one asset with more files is refused."""
+
 _MAX_HEADER_BYTES = 4096
 
 _KIND_NAMES = {
@@ -83,7 +86,7 @@ class ArraySpec:
     Attributes
     ----------
     shapes : tuple of shapes
-        Allowed shapes; None in a shape stands for 0 to 64^3 rows. Empty: any
+        Allowed shapes; None in a shape stands for 0 to `max_rows` rows. Empty: any
         shape of at most `max_items` items.
     kinds : str
         Allowed numpy dtype kinds.
@@ -91,12 +94,15 @@ class ArraySpec:
         Bound on the number of items where `shapes` is empty.
     note : str
         What an error says of the shapes beside them.
+    max_rows : int
+        Bound on a size that is None in `shapes`.
     """
 
     shapes: tuple[tuple[int | None, ...], ...]
     kinds: str
     max_items: int = 64
     note: str = ""
+    max_rows: int = RESOLUTION**3
 
     def check(self, where: str | Place, shape: tuple[int, ...], dtype: np.dtype[Any]) -> None:
         """Raise InputError, naming `where`, unless shape and dtype are allowed."""
@@ -109,26 +115,23 @@ class ArraySpec:
         if dtype.kind not in self.kinds or not 0 < dtype.itemsize <= 512:
             kinds = " or ".join(_KIND_NAMES[kind] for kind in self.kinds)
             raise InputError(where, f"has dtype {dtype.str}", f"a {kinds} array")
-        if self.shapes and not any(_fits(shape, allowed) for allowed in self.shapes):
-            allowed_text = " or ".join(_shape_text(allowed) for allowed in self.shapes)
-            raise InputError(
-                where, f"has shape {_shape_text(shape)}", f"shape {allowed_text}{self.note}"
-            )
+        if self.shapes and not any(self._fits(shape, allowed) for allowed in self.shapes):
+            texts = " or ".join(_shape_text(allowed, self.max_rows) for allowed in self.shapes)
+            raise InputError(where, f"has shape {_shape_text(shape)}", f"shape {texts}{self.note}")
         if not self.shapes and (len(shape) > 8 or not 0 < math.prod(shape) <= self.max_items):
             raise InputError(
                 where, f"has shape {_shape_text(shape)}", f"1 to {self.max_items} values"
             )
 
+    def _fits(self, shape: tuple[int, ...], allowed: tuple[int | None, ...]) -> bool:
+        return len(shape) == len(allowed) and all(
+            0 <= n <= self.max_rows if m is None else n == m
+            for n, m in zip(shape, allowed, strict=True)
+        )
 
-def _fits(shape: tuple[int, ...], allowed: tuple[int | None, ...]) -> bool:
-    return len(shape) == len(allowed) and all(
-        0 <= n <= RESOLUTION**3 if m is None else n == m
-        for n, m in zip(shape, allowed, strict=True)
-    )
 
-
-def _shape_text(shape: tuple[int | None, ...]) -> str:
-    text = ", ".join(f"N <= {RESOLUTION**3}" if n is None else str(n) for n in shape)
+def _shape_text(shape: tuple[int | None, ...], most: int = 0) -> str:
+    text = ", ".join(f"N <= {most}" if n is None else str(n) for n in shape)
     return f"({text},)" if len(shape) == 1 else f"({text})"
 
 
@@ -156,6 +159,9 @@ def require_complete(pair: AssetPair) -> tuple[Place, Place]:
 def load_source(path: Place, root: Place, role: str) -> tuple[bytes, SourceFile]:
     """Read a whole file once; return its bytes and what the provenance keeps of it.
 
+    A Zarr hierarchy, a folder whose name ends in ``.zarr``, is read as the bytes of an archive
+    of its files, so that it has a size and a hash as a file has.
+
     Parameters
     ----------
     path : Place
@@ -170,6 +176,8 @@ def load_source(path: Place, root: Place, role: str) -> tuple[bytes, SourceFile]
     InputError
         If the file cannot be read, is empty, or is larger than `MAX_FILE_BYTES`.
     """
+    if path.suffix.lower() == ".zarr":
+        return _load_hierarchy(path, root, role)
     file, name = storage_of(root).locate(path)
     try:
         data = storage_of(file).read(MAX_FILE_BYTES)
@@ -186,6 +194,27 @@ def load_source(path: Place, root: Place, role: str) -> tuple[bytes, SourceFile]
     if not data:
         raise InputError(path, "has zero bytes", _COMPLETE)
     return data, SourceFile(role, name, len(data), hashlib.sha256(data).hexdigest())
+
+
+def _load_hierarchy(path: Place, root: Place, role: str) -> tuple[bytes, SourceFile]:
+    """See `load_source`; the same files give the same bytes."""
+    try:
+        names = sorted(storage_of(path).files())
+    except OSError as error:
+        raise InputError(path, f"cannot be listed ({error.strerror})", "a Zarr group") from None
+    if not 0 < len(names) <= MAX_FILES:
+        raise InputError(path, f"has {len(names)} files", f"a Zarr group of at most {MAX_FILES}")
+    packed, size = io.BytesIO(), 0
+    with zipfile.ZipFile(packed, "w") as archive:
+        for name in names:
+            data, source = load_source(path / name, root, role)
+            size += len(data)
+            if size > MAX_FILE_BYTES:
+                raise InputError(path, f"is larger than {MAX_FILE_BYTES >> 20} MiB", "one asset")
+            archive.writestr(zipfile.ZipInfo(name), data)
+    whole = packed.getvalue()
+    below = source.path.removesuffix(f"/{name}")
+    return whole, SourceFile(role, below, size, hashlib.sha256(whole).hexdigest())
 
 
 def npy_array(data: bytes, where: str | Place, spec: ArraySpec) -> NDArray[Any]:

@@ -113,6 +113,11 @@ def checked_latents(
     latents = StructuredLatents(
         check_coords(coords, where), _check_feats(feats, where, warnings), sources
     )
+    if len(coords) >= ENOUGH and latents.coords.max() < RESOLUTION // 2:
+        warnings.append(
+            f"no coordinate is above {latents.coords.max()}: if it lies on a grid of less than "
+            f"{RESOLUTION}^3, its places are wrong"
+        )
     enough = len(coords) >= ENOUGH and not space.standardised
     if enough and look_standardised(latents.moments, space):
         warnings.append(

@@ -31,6 +31,7 @@ def field_of_voxels(
     *,
     resolution: int = RESOLUTION,
     material: NDArray[Any] | None = None,
+    classes: int = BACKGROUND,
     table: Sequence[Property] = PROPERTIES,
     max_unphysical: float = 0.0,
     sources: Sequence[SourceFile] = (),
@@ -55,7 +56,9 @@ def field_of_voxels(
     resolution : int
         Voxels along each axis of the source's grid.
     material : ndarray of int, shape (K,), optional
-        Class 0..6 of each; all are of class 0 where the source has no classes.
+        Class of each; all are of class 0 where the source has no classes.
+    classes : int
+        How many classes there are, at most 7.
     table : sequence of Property
         What the columns are.
     max_unphysical : float
@@ -85,9 +88,11 @@ def field_of_voxels(
         row = int(np.argmin(inside))
         expected = "points of [-0.5, 0.5]^3" if voxels.dtype.kind == "f" else f"0..{resolution - 1}"
         raise InputError(where, f"voxel {voxels[row].tolist()} in row {row} is outside", expected)
-    classes = np.zeros(count, np.int64) if material is None else np.asarray(material, np.int64)
-    if classes.shape != (count,) or ((classes < 0) | (classes >= BACKGROUND)).any():
-        raise InputError(where, "has classes that are none", f"{count} of 0..{BACKGROUND - 1}")
+    given = np.zeros(count, np.int64) if material is None else np.asarray(material)
+    with np.errstate(invalid="ignore"):
+        own = given.astype(np.int64)
+    if given.shape != (count,) or ((own < 0) | (own >= classes) | (own != given)).any():
+        raise InputError(where, "has classes that are none", f"{count} of 0..{classes - 1}")
     with np.errstate(over="ignore"):  # what float32 cannot hold becomes infinite, and a fault
         values = np.asarray(properties).astype(np.float32)
     if values.shape != (count, len(table)):
@@ -104,16 +109,16 @@ def field_of_voxels(
     if resolution > RESOLUTION:
         cells = (2 * cells + 1) * RESOLUTION // (2 * resolution)
     flat = (cells[:, 0] * side + cells[:, 1]) * side + cells[:, 2]
-    own, labels, means = _merged(flat[keep], classes[keep], values[keep], table)
-    if len(own) < np.count_nonzero(keep):
-        notes.append(f"{np.count_nonzero(keep)} voxels were merged into {len(own)} of {side}^3")
+    cell, labels, means = _merged(flat[keep], own[keep], values[keep], table)
+    if len(cell) < np.count_nonzero(keep):
+        notes.append(f"{np.count_nonzero(keep)} voxels were merged into {len(cell)} of {side}^3")
     there = np.full(side**3, -1, dtype=np.int64)
-    there[flat] = len(own)  # occupied at least
-    there[own] = np.arange(len(own))
+    there[flat] = len(cell)  # occupied at least
+    there[cell] = np.arange(len(cell))
     # A cell of the 64^3 grid takes what the source has at its centre.
     steps = (2 * np.arange(RESOLUTION) + 1) * side // (2 * RESOLUTION)
     rows = there.reshape((side,) * 3)[np.ix_(steps, steps, steps)]
-    annotated = (rows >= 0) & (rows < len(own))
+    annotated = (rows >= 0) & (rows < len(cell))
     return MaterialField(
         occupancy=rows >= 0,
         voxels=voxels_of(annotated),

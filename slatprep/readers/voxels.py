@@ -1,28 +1,33 @@
-"""Plain voxels: an npz or HDF5 file an object, and a file that says what its columns are.
+"""Plain voxels: npz, HDF5, Zarr or PLY an object, and a file that says what its columns are.
 
 ``source.json`` in the root describes them all::
 
     {"properties": [{"name": "yield_stress", "unit": "Pa", "scale": "log10"}, ...],
-     "classes": false, "resolution": 64, "aligned": true}
+     "classes": ["wood", "steel"], "resolution": 64, "aligned": true}
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
 from annotated_types import Ge, Le, MaxLen, MinLen
+from numpy.typing import NDArray
 
 from slatprep.errors import ConfigError, InputError
 from slatprep.parameters import PixieverseSource
 from slatprep.readers.adapters import FoundField, Holding, find_by_pattern, patterns_of
 from slatprep.readers.files import ArraySpec, load_source, npz_arrays, require_complete
 from slatprep.readers.hdf5 import SUFFIXES, load_datasets
+from slatprep.readers.points import ply_points
 from slatprep.readers.voxel_sets import MAX_RESOLUTION, field_of_voxels
+from slatprep.readers.zarr_groups import group_arrays
 from slatprep.records import (
+    BACKGROUND,
+    CLASS_NAME,
     MATERIAL_CLASSES,
     MAX_PROPERTIES,
     AssetPair,
@@ -37,8 +42,12 @@ from slatprep.storage.listing import Listing
 DESCRIPTION = "source.json"
 _MAX_BYTES = 2**16
 
-_COLUMN = ArraySpec(shapes=((None,),), kinds="fiu")
-_VOXELS = ArraySpec(shapes=((None, 3),), kinds="fiu")
+_MAX_VOXELS = 2**21
+"""Of one object; all of a grid of 128^3."""
+
+_COLUMN = ArraySpec(shapes=((None,),), kinds="fiu", max_rows=_MAX_VOXELS)
+_VOXELS = ArraySpec(shapes=((None, 3),), kinds="fiu", max_rows=_MAX_VOXELS)
+_GROUP = "/zarr.json"
 
 
 @dataclass(frozen=True)
@@ -59,7 +68,7 @@ class _Description:
     __pydantic_config__: ClassVar[dict[str, object]] = {"extra": "forbid"}
 
     properties: Annotated[tuple[_Column, ...], MinLen(1), MaxLen(MAX_PROPERTIES)]
-    classes: bool = True
+    classes: bool | tuple[str, ...] = True
     resolution: Annotated[int, Ge(2), Le(MAX_RESOLUTION)] = 64
     aligned: bool = False
 
@@ -71,20 +80,33 @@ class _Description:
             for one in self.properties
         )
 
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The names of the classes; PhysGaussian's have one for the background, too."""
+        if not self.classes:
+            return ()
+        known = self.classes in (True, MATERIAL_CLASSES[:BACKGROUND])
+        return MATERIAL_CLASSES if known else self.classes
+
 
 class PlainVoxels:
-    """``<id>.npz``, ``.h5`` or ``.hdf5``: ``voxels`` (K, 3), a column a property, ``material``."""
+    """``<id>.npz``, ``.h5``, ``.hdf5`` or ``.zarr``: ``voxels`` (K, 3), a column a property.
 
-    patterns = ("{id}.npz", "{id}.h5", "{id}.hdf5")
+    There is ``material``, too, where there are classes. In an ``<id>.ply`` the voxels are
+    its vertices.
+    """
+
+    patterns = ("{id}.npz", "{id}.h5", "{id}.hdf5", f"{{id}}.zarr{_GROUP}", "{id}.ply")
 
     def describe(self, source: PixieverseSource) -> Holding:
         """Read ``source.json``."""
         said = _description(source.root)
-        return Holding(said.table, MATERIAL_CLASSES if said.classes else ())
+        return Holding(said.table, said.names)
 
     def find(self, source: PixieverseSource, listing: Listing) -> Iterator[FoundField]:
         """Find the fields by the names of their files."""
-        return find_by_pattern(patterns_of(self, source), listing, {}, DESCRIPTION)
+        for found in find_by_pattern(patterns_of(self, source), listing, {}, DESCRIPTION):
+            yield replace(found, path=found.path.removesuffix(_GROUP))
 
     def read(self, pair: AssetPair, max_unphysical: float) -> MaterialField:
         """Read a field; see `slatprep.readers.adapters.SourceAdapter`."""
@@ -97,7 +119,8 @@ class PlainVoxels:
             arrays, file = load_datasets(path, root, "", specs, role="grid")
         else:
             data, file = load_source(path, root, "grid")
-            arrays = npz_arrays(data, path, specs)
+            read = {".zarr": group_arrays, ".ply": _ply_arrays}.get(path.suffix.lower(), npz_arrays)
+            arrays = read(data, path, specs)
         _, about = load_source(root / DESCRIPTION, root, "description")
         columns: list[Any] = [arrays[one.name] for one in said.properties]
         lengths = {len(column) for column in arrays.values()}
@@ -109,11 +132,27 @@ class PlainVoxels:
             np.stack(columns, axis=1),
             resolution=said.resolution,
             material=arrays.get("material"),
+            classes=len(said.names[:BACKGROUND]) or 1,
             table=said.table,
             max_unphysical=max_unphysical,
             sources=(file, about),
             frame=np.eye(4) if said.aligned else None,
         )
+
+
+def _ply_arrays(
+    data: bytes, where: str | Place, specs: Mapping[str, ArraySpec]
+) -> dict[str, NDArray[Any]]:
+    vertices, _ = ply_points(data, where)
+    names = set(vertices.dtype.names or ())
+    missing = [name for name in specs if name != "voxels" and name not in names]
+    if missing:
+        raise InputError(where, f"has no property {missing[0]!r}", "one for each of source.json")
+    arrays = {name: vertices[name] for name in specs if name != "voxels"}
+    arrays["voxels"] = np.stack([vertices[axis] for axis in "xyz"], axis=1)
+    for name, array in arrays.items():
+        specs[name].check(f"{where} [{name}]", array.shape, array.dtype)
+    return arrays
 
 
 @lru_cache(maxsize=4)
@@ -124,6 +163,13 @@ def _parsed(text: bytes, where: str) -> _Description:
         read: _Description = TypeAdapter(_Description).validate_json(text, strict=True)
         if len({one.name for one in read.properties}) < len(read.properties):
             raise ValueError("a property has two columns")
+        named = read.classes if isinstance(read.classes, tuple) else ("any",)
+        if not all(map(CLASS_NAME.fullmatch, named)) or "background" in named:
+            raise ValueError(f"the names of classes are {', '.join(named)}")
+        if not 1 <= len(set(named)) == len(named) <= BACKGROUND:
+            raise ValueError(
+                f"there are {len(named)} classes, not 1 to {BACKGROUND} of a name each"
+            )
     except ValueError as error:
         reason = " ".join(str(error).split())[:300]
         raise ConfigError(

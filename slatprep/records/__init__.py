@@ -50,12 +50,14 @@ from slatprep.records.sources import (
     StructuredLatents,
 )
 from slatprep.records.tables import (
+    CLASS_NAME,
     MAX_CHANNELS,
     MAX_PROPERTIES,
     PIXIEVERSE,
     PROPERTIES,
     PROPERTY_COLUMNS,
     TRELLIS,
+    ClassName,
     Contents,
     LatentMoments,
     LatentSpace,
@@ -84,6 +86,7 @@ from slatprep.records.words import (
 __all__ = [
     "BACKGROUND",
     "CLASS_COLOURS",
+    "CLASS_NAME",
     "FEATS_MEAN",
     "FEATS_STD",
     "MATERIAL_CLASSES",
@@ -105,6 +108,7 @@ __all__ = [
     "Annotation",
     "AssetPair",
     "Candidate",
+    "ClassName",
     "Consensus",
     "Contents",
     "Contribution",

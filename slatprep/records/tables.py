@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass, field
 from typing import Annotated
 
@@ -11,6 +12,7 @@ from numpy.typing import NDArray
 
 from slatprep.records.json_types import InJson
 from slatprep.records.words import (
+    BACKGROUND,
     FEATS_MEAN,
     FEATS_STD,
     MATERIAL_CLASSES,
@@ -22,6 +24,11 @@ MAX_PROPERTIES, MAX_CHANNELS = 32, 256
 
 PropertyName = Annotated[str, InJson({"type": "str", "pattern": r"^[a-z][a-z0-9_]{0,63}$"})]
 """Name of a property: lower-case letters, digits and ``_``, a letter first."""
+
+
+CLASS_NAME = re.compile(r"[a-z][a-z0-9_ -]{0,63}")
+ClassName = Annotated[str, InJson({"type": "str", "pattern": f"^{CLASS_NAME.pattern}$"})]
+"""Name of a class: as that of a property, and blanks and ``-``."""
 
 
 @dataclass(frozen=True)
@@ -142,6 +149,11 @@ class Contents:
     properties: tuple[Property, ...] = PROPERTIES
     classes: tuple[str, ...] = MATERIAL_CLASSES
     latents: LatentSpace = TRELLIS
+
+    @property
+    def labels(self) -> tuple[str, ...]:
+        """What a voxel may be, by the class that the arrays have."""
+        return self.classes[:BACKGROUND] or ("annotated",)
 
     @property
     def n_classes(self) -> int:

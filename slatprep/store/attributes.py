@@ -12,11 +12,13 @@ from annotated_types import MaxLen, MinLen
 
 from slatprep.parameters import Length, SampleParameters
 from slatprep.records import (
+    BACKGROUND,
     MATERIAL_CLASSES,
     MAX_PROPERTIES,
     PROPERTIES,
     RESOLUTION,
     TRELLIS,
+    ClassName,
     Contents,
     Digest,
     InJson,
@@ -87,7 +89,7 @@ class RootAttributes:
     format: Annotated[str, _one_of(FORMAT)]
     format_version: Annotated[int, _one_of(*READABLE_VERSIONS)]
     resolution: Annotated[int, _one_of(RESOLUTION)]
-    material_classes: tuple[Annotated[str, _one_of(*MATERIAL_CLASSES)], ...]
+    material_classes: tuple[ClassName, ...]
     property_columns: Annotated[tuple[PropertyName, ...], MinLen(1), MaxLen(MAX_PROPERTIES)]
     normalization: dict[str, StoredRange]
     manifest: Digest
@@ -96,8 +98,11 @@ class RootAttributes:
     latents: LatentSpace = TRELLIS
 
     def __post_init__(self) -> None:
-        if self.material_classes not in (MATERIAL_CLASSES, ()):
-            raise ValueError(f"material_classes must be {', '.join(MATERIAL_CLASSES)}, or none")
+        named = self.material_classes
+        if named != MATERIAL_CLASSES and len({*named, "background"}) != len(named) + 1:
+            raise ValueError("material_classes must have a name each, none of them background")
+        if named != MATERIAL_CLASSES and len(named) > BACKGROUND:
+            raise ValueError(f"material_classes must be PhysGaussian's, or at most {BACKGROUND}")
         columns = set(self.property_columns)
         if not columns == self.normalization.keys() or len(columns) < len(self.property_columns):
             raise ValueError("property_columns and normalization must name the same properties")

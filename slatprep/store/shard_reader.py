@@ -21,8 +21,9 @@ from numpy.typing import NDArray
 from slatprep.errors import StoreError
 from slatprep.parameters import MAX_SHARD_CHUNKS
 from slatprep.records import MAX_NAME_BYTES
+from slatprep.storage.chunks import whole_sizes
+from slatprep.storage.codecs import MAX_TEXT_BYTES, ChunkDecoder, crc32c_holds
 from slatprep.storage.place import Folder, RangeFile
-from slatprep.store.codecs import MAX_TEXT_BYTES, ChunkDecoder, crc32c_holds
 from slatprep.store.records import MAX_RECORD_BYTES, RECORD_ARRAY
 
 MISSING = 2**64 - 1
@@ -53,13 +54,6 @@ BAD_METADATA = (
 
 MAX_TEXT = {RECORD_ARRAY: MAX_RECORD_BYTES}
 """What the texts of a chunk may have on average, where that is more than a name may have."""
-
-
-def whole_sizes(sizes: object) -> tuple[int, ...]:
-    """Return the sizes that metadata list; ValueError where one is no integer, or negative."""
-    if not isinstance(sizes, list) or not all(type(n) is int and n >= 0 for n in sizes):
-        raise ValueError(f"sizes are {sizes!r}, not integers of at least 0")
-    return tuple(sizes)
 
 
 class DamagedFileError(StoreError):

@@ -15,8 +15,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from slatprep.storage.codecs import single_threaded_blosc
 from slatprep.storage.files import LocalFolder
-from slatprep.store.codecs import single_threaded_blosc
 from slatprep.store.contract import read_metadata
 from slatprep.store.shard_reader import MISSING, RowReader
 

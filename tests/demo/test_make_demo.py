@@ -112,16 +112,16 @@ def test_another_seed_makes_other_assets(demo, tmp_path):
     assert not set(digests(tmp_path / "truth")) & set(digests(demo.directory / "truth"))
 
 
-@pytest.mark.parametrize("form", ["prediction", "prediction-ids"])
+@pytest.mark.parametrize("form", ["pixie-predictions", "pixie-prediction-ids"])
 def test_predictions_hold_the_grid_normalised(tmp_path, form):
-    make_demo(tmp_path, 1, 7, levels=(2,), grid_form=form)
+    make_demo(tmp_path, 1, 7, levels=(2,), source=form)
     made = make_asset(7, 0, levels=(2,))
     folder = tmp_path / "pixieverse" / made.object_id
     prediction = np.load(folder / "sample_0_pred.npy")
     assert prediction.dtype == np.float32
-    assert prediction.shape == ((11 if form == "prediction" else 4), 64, 64, 64)
+    assert prediction.shape == ((11 if form == "pixie-predictions" else 4), 64, 64, 64)
     assert np.array_equal(np.load(folder / "sample_0_mask.npy") > 0, made.occupancy)
-    ids = prediction[3:].argmax(axis=0) if form == "prediction" else prediction[3]
+    ids = prediction[3:].argmax(axis=0) if form == "pixie-predictions" else prediction[3]
     known = (made.grid[..., 3] >= 0) & (made.grid[..., 3] < 7)
     assert np.array_equal(ids, np.where(known, made.grid[..., 3], 7))
     # By hand, for one voxel: (log10 v - lo) / (hi - lo), spread over -1..1.

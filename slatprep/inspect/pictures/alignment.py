@@ -27,7 +27,7 @@ from slatprep.inspect.pictures.side import (
     side_of,
 )
 from slatprep.inspect.pictures.voxels import Drawing, View, draw_voxels
-from slatprep.records import MATERIAL_CLASSES, MATERIAL_COLOURS, UNANNOTATED, Alignment
+from slatprep.records import MATERIAL_COLOURS, Alignment
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -236,7 +236,7 @@ def _legend(figure: Figure, scene: Scene) -> None:
     share = np.bincount(scene.slat_material, minlength=256) / max(len(scene.slat_material), 1)
     x = float(_LEFT)
     for index in present:
-        name = "no annotation" if index == UNANNOTATED else MATERIAL_CLASSES[index]
+        name = scene.labels[index] if index < len(scene.labels) else "no annotation"
         box = Rectangle(
             (x / width, 1 - (y + 1) / height), 13 / width, 13 / height,
             facecolor=MATERIAL_COLOURS[int(index)], edgecolor=palette.MUTED, linewidth=0.5,

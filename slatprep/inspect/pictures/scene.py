@@ -19,7 +19,7 @@ from slatprep.geometry.voxels import boundary, occupancy_of, outer_boundary, vox
 from slatprep.inspect.pictures.palette import DISTANCE_COLOURS
 from slatprep.inspect.pictures.voxels import View, view_rotation
 from slatprep.provenance.stored import StoredRecords
-from slatprep.records import BACKGROUND, MATERIAL_COLOURS, RESOLUTION
+from slatprep.records import BACKGROUND, MATERIAL_CLASSES, MATERIAL_COLOURS, RESOLUTION
 from slatprep.store.reader import StoredAsset
 
 FARTHEST = 3.0
@@ -55,6 +55,8 @@ class Scene:
         before the alignment. With a deformation, "before" is under the transform alone.
     deformed : Deformed or None
         The deformation, if there is one.
+    labels : tuple of str
+        Names of the classes.
     """
 
     pixieverse: NDArray[np.uint8]
@@ -66,6 +68,7 @@ class Scene:
     error: NDArray[np.float64]
     error_before: NDArray[np.float64]
     deformed: Deformed | None = None
+    labels: tuple[str, ...] = MATERIAL_CLASSES
 
     @property
     def placed(self) -> Placed:
@@ -132,6 +135,7 @@ def scene_of(asset: StoredAsset) -> Scene:
         error=error,
         error_before=before,
         deformed=deformed,
+        labels=asset.store.contents.labels,
     )
 
 

@@ -19,8 +19,7 @@ from slatprep.judge import THRESHOLDS
 from slatprep.normalize import PIXIE_RANGES
 from slatprep.records import (
     BACKGROUND,
-    CLASS_COLOURS,
-    MATERIAL_CLASSES,
+    MATERIAL_COLOURS,
     UNANNOTATED_COLOUR,
     Status,
 )
@@ -92,8 +91,8 @@ def page_content(
             "ambiguity": THRESHOLDS.good_ambiguity,
         },
         "classes": [
-            {"name": name if store.contents.classes else "annotated", "colour": CLASS_COLOURS[name]}
-            for name in MATERIAL_CLASSES[:BACKGROUND]
+            {"name": name, "colour": MATERIAL_COLOURS[index]}
+            for index, name in enumerate((*store.contents.labels, *[""] * BACKGROUND)[:BACKGROUND])
         ],
         "scales": {
             "none": UNANNOTATED_COLOUR,

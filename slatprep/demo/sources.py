@@ -1,0 +1,214 @@
+"""Demo data as sources other than PixieVerse have it, of the same shapes.
+
+`write_vomp`, `write_physxnet` and `write_voxels` lay out annotated voxels as those
+sources do; each takes plain arrays, so that other data can be written with it too.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from slatprep.records import BACKGROUND, PROPERTIES
+
+Source = Literal[
+    "pixieverse", "pixie-predictions", "pixie-prediction-ids",
+    "vomp", "physxnet", "voxels-npz", "voxels-hdf5", "voxels-zarr", "voxels-ply",
+]  # fmt: skip
+"""The forms that a demo's annotated side can have."""
+
+ONE_FRAME = ("vomp", "physxnet")
+"""Sources whose voxels were made from the mesh that the latents were encoded from."""
+
+CLASSES = ("elastic", "metal", "granular", "viscous", "liquid", "snow", "rigid")
+"""What plain voxels of a demo call the classes 0 to 6."""
+
+# Of each of these classes: friction angle, damping, restitution, friction, conductivities.
+_BY_CLASS = np.array([
+    [0.0, 0.20, 0.60, 0.80, 0.2, 1e-9],
+    [0.0, 0.02, 0.50, 0.40, 50.0, 1e7],
+    [34.0, 0.60, 0.05, 0.60, 0.3, 1e-4],
+    [12.0, 0.70, 0.10, 0.50, 0.8, 1e-2],
+    [0.0, 0.90, 0.00, 0.01, 0.6, 5e-2],
+    [25.0, 0.80, 0.02, 0.10, 0.1, 1e-6],
+    [0.0, 0.05, 0.40, 0.50, 2.0, 1e-12],
+])  # fmt: skip
+
+TABLE: tuple[dict[str, Any], ...] = (
+    {"name": "density", "unit": "kg/m^3", "scale": "log10"},
+    {"name": "youngs_modulus", "unit": "Pa", "scale": "log10"},
+    {"name": "poissons_ratio", "unit": "1", "scale": "linear", "least": 0, "most": 0.5},
+    {"name": "yield_stress", "unit": "Pa", "scale": "log10"},
+    {"name": "friction_angle", "unit": "degree", "scale": "linear", "least": 0, "most": 90},
+    {"name": "damping", "unit": "1", "scale": "linear", "least": 0, "most": 1},
+    {"name": "restitution", "unit": "1", "scale": "linear", "least": 0, "most": 1},
+    {"name": "friction", "unit": "1", "scale": "linear", "least": 0, "most": 2},
+    {"name": "thermal_conductivity", "unit": "W/(m K)", "scale": "log10"},
+    {"name": "electrical_conductivity", "unit": "S/m", "scale": "log10"},
+)
+"""The properties of plain voxels of a demo, as ``source.json`` has them."""
+
+
+def columns_of(
+    source: Source, material: NDArray[Any], properties: NDArray[np.float32]
+) -> dict[str, NDArray[np.float32]]:
+    """Return what a source says of some voxels: a column (K,) a property, SI.
+
+    Parameters
+    ----------
+    source : str
+        One of `Source`.
+    material : ndarray of int, shape (K,)
+        Their classes, 0..6.
+    properties : ndarray of float32, shape (K, 3)
+        Their Young's modulus, density and Poisson's ratio, from which the others follow:
+        a yield stress of 1 % of the modulus, and what is usual for the class, times a
+        factor of 0.5 to 1.5 that follows the Poisson's ratio.
+    """
+    known = dict(zip((one.name for one in PROPERTIES), properties.T, strict=True))
+    if source == "physxnet":
+        return {"density": known["density"]}
+    if not source.startswith("voxels"):
+        return known
+    factor = np.clip(0.5 + 2.0 * known["poissons_ratio"], 0.5, 1.5)[:, None]
+    others = (_BY_CLASS[material.astype(np.intp)] * factor).astype(np.float32)
+    others[:, 1:3] = np.minimum(others[:, 1:3], 1.0)
+    known["yield_stress"] = np.float32(0.01) * known["youngs_modulus"]
+    known |= dict(zip((str(one["name"]) for one in TABLE[4:]), others.T, strict=True))
+    return {str(one["name"]): known[str(one["name"])] for one in TABLE}
+
+
+def classes_of(source: Source) -> tuple[str, ...]:
+    """Return the classes of plain voxels of a demo; those in HDF5 have none."""
+    return () if source == "voxels-hdf5" else CLASSES
+
+
+def write_field(
+    root: Path, source: Source, name: str, grid: NDArray[np.float32], surface: NDArray[np.uint8]
+) -> None:
+    """Write the annotated side of an object, of any source but Pixie's.
+
+    Parameters
+    ----------
+    root : Path
+        The folder of the source.
+    source : str
+        One of `Source`.
+    name : str
+        The object's.
+    grid : ndarray of float32, shape (64, 64, 64, 4)
+        As PixieVerse has it; voxels of class -1 are left out.
+    surface : ndarray of uint8, shape (N, 3)
+        Voxels of its SLAT; those of PhysXNet are the same.
+    """
+    known = (grid[..., 3] >= 0) & (grid[..., 3] < BACKGROUND)
+    voxels = np.argwhere(known)
+    if source == "physxnet":
+        voxels = surface.astype(np.intp)[known[tuple(surface.T)]]
+    rows = grid[tuple(voxels.T)]
+    material = rows[:, 3].astype(np.uint8)
+    columns = columns_of(source, material, rows[:, [1, 0, 2]])
+    if source == "vomp":
+        write_vomp(root, name, voxels, columns)
+    elif source == "physxnet":
+        write_physxnet(root, name, voxels, columns["density"])
+    else:
+        form = source.removeprefix("voxels-")
+        extra = {"material": material} if classes_of(source) else {}
+        write_voxels(root, name, form, {"voxels": voxels.astype(np.int32)} | columns | extra)
+
+
+def write_vomp(
+    root: Path, name: str, voxels: NDArray[Any], columns: Mapping[str, NDArray[np.float32]]
+) -> None:
+    """Write voxels (K, 3) of 64^3 as VoMP does: a structured array, lower corners for places."""
+    names = ("x", "y", "z", "youngs_modulus", "poissons_ratio", "density")
+    rows = np.zeros(len(voxels), [*((key, "<f4") for key in names), ("segment_id", "<U32")])
+    for key, axis in zip("xyz", voxels.T, strict=True):
+        rows[key] = axis / 64.0 - 0.5
+    for key in names[3:]:
+        rows[key] = columns[key]
+    rows["segment_id"] = "segment_0"
+    folder = root / "voxels"
+    folder.mkdir(parents=True, exist_ok=True)
+    np.savez(folder / f"{name}_with_materials.npz", voxel_data=rows)
+
+
+def write_physxnet(
+    root: Path, name: str, voxels: NDArray[Any], density: NDArray[np.float32]
+) -> None:
+    """Write voxels (K, 3) of 64^3 and their density [kg/m^3] as PhysX-3D's toolkit does."""
+    for folder in ("property", "voxels"):
+        (root / folder).mkdir(parents=True, exist_ok=True)
+    rows = np.full((len(voxels), 14), -1.0)
+    rows[:, 0] = 30.0  # the object's largest dimension [cm]
+    rows[:, 1] = 1.0  # the part's rank among those that one would touch
+    rows[:, 2] = density / 1000.0  # g/cm^3
+    rows[:, 3] = rows[:, 13] = 0.0  # the group that moves together, and how it does
+    np.save(root / "property" / f"{name}2.npy", rows)
+    write_points(root / "voxels" / f"{name}.ply", {
+        axis: ((one + 0.5) / 64.0 - 0.5).astype(np.float32)
+        for axis, one in zip("xyz", voxels.T, strict=True)
+    })  # fmt: skip
+
+
+def write_points(path: Path, columns: Mapping[str, NDArray[Any]]) -> None:
+    """Write a binary PLY of points with a property a column (K,)."""
+    kinds = {"f4": "float", "f8": "double", "i4": "int", "u1": "uchar"}
+    rows = np.rec.fromarrays(list(columns.values()), names=list(columns))
+    lines = [f"property {kinds[rows.dtype[key].str[1:]]} {key}" for key in columns]
+    head = ["ply", "format binary_little_endian 1.0", f"element vertex {len(rows)}", *lines]
+    path.write_bytes("\n".join([*head, "end_header\n"]).encode() + rows.tobytes())
+
+
+def write_description(
+    root: Path,
+    properties: tuple[dict[str, Any], ...],
+    classes: tuple[str, ...] | bool,
+    **others: object,
+) -> None:
+    """Write ``source.json`` of plain voxels, with names for its classes or without classes."""
+    root.mkdir(parents=True, exist_ok=True)
+    about = {"properties": properties, "classes": classes or False, **others}
+    text = json.dumps(about, indent=1)
+    (root / "source.json").write_text(text + "\n", encoding="utf-8")
+
+
+def write_voxels(root: Path, name: str, form: str, arrays: Mapping[str, NDArray[Any]]) -> None:
+    """Write plain voxels of an object: ``voxels`` (K, 3) and a column (K,) a property.
+
+    Parameters
+    ----------
+    root : Path
+        The folder of the source.
+    name : str
+        The object's.
+    form : {"npz", "hdf5", "zarr", "ply"}
+        In a PLY the voxels are the points of their centres.
+    arrays : mapping of str to ndarray
+        What to write.
+    """
+    root.mkdir(parents=True, exist_ok=True)
+    if form == "npz":
+        np.savez(root / f"{name}.npz", allow_pickle=False, **dict(arrays))
+    elif form == "hdf5":
+        import h5py
+
+        with h5py.File(root / f"{name}.h5", "w") as file:
+            for key, array in arrays.items():
+                file.create_dataset(key, data=array, track_times=False)
+    elif form == "zarr":
+        import zarr
+
+        group = zarr.open_group(root / f"{name}.zarr", mode="w", zarr_format=3)
+        for key, array in arrays.items():
+            group.create_array(key, data=np.ascontiguousarray(array))
+    else:
+        columns = {key: array for key, array in arrays.items() if key != "voxels"}
+        points = ((arrays["voxels"] + 0.5) / 64.0 - 0.5).astype(np.float32)
+        write_points(root / f"{name}.ply", dict(zip("xyz", points.T, strict=True)) | columns)

@@ -1,0 +1,73 @@
+"""Arrays of a Zarr group that somebody wrote; see `slatprep.storage.chunks`."""
+
+from __future__ import annotations
+
+import io
+import json
+import zipfile
+from collections.abc import Mapping
+from typing import Any
+
+from numpy.typing import NDArray
+
+from slatprep.errors import InputError, StoreError
+from slatprep.readers.files import ArraySpec, refusing
+from slatprep.records import Place
+from slatprep.storage.chunks import array_form, read_chunks
+
+_MAX_METADATA = 2**16
+_EXPECTED = (
+    "a Zarr group of format 3 with an array for each of {}, not in shards, packed with zstd, "
+    "blosc or nothing; or npz, HDF5 or PLY"
+)
+
+
+def group_arrays(
+    data: bytes, where: str | Place, specs: Mapping[str, ArraySpec]
+) -> dict[str, NDArray[Any]]:
+    """Read the named arrays of a group.
+
+    Parameters
+    ----------
+    data : bytes
+        What `slatprep.readers.files.load_source` gives for it: an archive of its files.
+    where : str or Place
+        What errors call it.
+    specs : mapping of str to ArraySpec
+        The arrays wanted and what they may look like.
+
+    Raises
+    ------
+    InputError
+        If an array is missing, not as wanted, or packed in another way.
+    """
+    expected = _EXPECTED.format(", ".join(specs))
+    with zipfile.ZipFile(io.BytesIO(data)) as files:
+        return {
+            name: _array(files, f"{where} [{name}]", name, spec, expected)
+            for name, spec in specs.items()
+        }
+
+
+def _array(
+    files: zipfile.ZipFile, where: str, name: str, spec: ArraySpec, expected: str
+) -> NDArray[Any]:
+    def fetch(key: str, most: int) -> bytes | None:
+        try:
+            chunk = files.getinfo(f"{name}/{key}")
+        except KeyError:
+            return None
+        if chunk.file_size > most:
+            raise ValueError(f"{key} has {chunk.file_size} bytes")
+        return files.read(chunk)
+
+    text = fetch("zarr.json", _MAX_METADATA)
+    if text is None:
+        raise InputError(where, "is not in it", expected)
+    with refusing(where, "is no readable array", expected):
+        metadata = json.loads(text)
+        spec.check(where, *array_form(metadata))
+        try:
+            return read_chunks(metadata, fetch)
+        except StoreError as error:
+            raise ValueError(str(error)) from None

@@ -1,0 +1,109 @@
+"""Demo data of every source and encoder: two commands build it, and a third holds it to truth."""
+
+from __future__ import annotations
+
+import json
+import shlex
+from pathlib import Path
+from typing import get_args
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+from slatprep import open_store
+from slatprep.cli.commands import slatprep as command
+from slatprep.demo import make_demo
+from slatprep.demo.latents import CHANNELS, Encoder
+from slatprep.demo.sources import CLASSES, ONE_FRAME, TABLE, Source, columns_of
+from slatprep.errors import ConfigError
+
+NAMES = [str(one["name"]) for one in TABLE]
+HELD = {
+    "physxnet": ["density"],
+    **dict.fromkeys(("voxels-npz", "voxels-hdf5", "voxels-zarr", "voxels-ply"), NAMES),
+}
+
+
+def run(*arguments: str) -> str:
+    result = CliRunner().invoke(command, arguments)
+    assert result.exit_code == 0, result.output
+    return result.output
+
+
+def printed(output: str, word: str) -> list[str]:
+    (line,) = (line for line in output.splitlines() if line.startswith(word))
+    return shlex.split(line.removeprefix(f"{word} slatprep"))
+
+
+@pytest.mark.parametrize("source", get_args(Source))
+def test_two_commands_show_a_source_and_a_third_its_truth(tmp_path: Path, source: Source) -> None:
+    out = str(tmp_path / "demo")
+    said = run("make-demo", out, "--assets", "2", "--level", "0", "--source", source)
+    run(*printed(said, "next:"))
+    score = json.loads(run(*printed(said, "then:"), "--json"))
+    assert len(score["assets"]) == 2
+    for asset in score["assets"]:
+        assert asset["displacement"] < 0.1
+        assert asset["label_accuracy"] > 0.98
+        assert asset["valid_share"] > 0.98
+    store = open_store(tmp_path / "demo.zarr")
+    held = HELD.get(source, ["youngs_modulus", "density", "poissons_ratio"])
+    assert store.attributes["property_columns"] == held
+    named = store.attributes["material_classes"]
+    if source in (*ONE_FRAME, "voxels-hdf5"):
+        assert named == []
+        assert set(store.column("engine")) == {"field" if source == "voxels-hdf5" else "known"}
+    else:
+        assert named[:2] == (list(CLASSES[:2]) if source in HELD else ["jelly", "metal"])
+    # Values, against the truth that was written beside them, where the labels are right.
+    for asset in store:
+        with np.load(tmp_path / "demo" / "truth" / f"{asset.asset_id}.npz") as truth:
+            columns, values = truth["columns"].tolist(), truth["properties"]
+        assert sorted(columns) == sorted(held)
+        own = asset.properties_si[:, [held.index(name) for name in columns]]
+        right = np.isclose(own, values, rtol=2e-3, atol=1e-3).all(axis=1)
+        assert right.mean() > 0.97
+
+
+def test_properties_of_plain_voxels_are_what_a_material_can_have() -> None:
+    material = np.arange(7)
+    properties = np.stack([np.full(7, 1e6), np.full(7, 900.0), np.linspace(0.2, 0.5, 7)], axis=1)
+    columns = columns_of("voxels-npz", material, properties.astype(np.float32))
+    assert list(columns) == NAMES
+    for one in TABLE:
+        values = columns[str(one["name"])]
+        assert np.isfinite(values).all()
+        assert (values > 0).all() or one["scale"] == "linear"
+        assert values.min() >= one.get("least", -np.inf)
+        assert values.max() <= one.get("most", np.inf)
+
+
+@pytest.mark.parametrize("encoder", [name for name in get_args(Encoder) if name != "trellis"])
+def test_latents_of_every_encoder_are_carried(tmp_path: Path, encoder: Encoder) -> None:
+    out = str(tmp_path / "demo")
+    options = ("--level", "0", "--encoder", encoder, "--latents", "material")
+    said = run("make-demo", out, "--assets", "1", *options)
+    run(*printed(said, "next:"))
+    store = open_store(tmp_path / "demo.zarr")
+    assert store.contents.latents.encoder == encoder
+    assert store.contents.latents.channels == CHANNELS[encoder]
+    assert not store.contents.latents.standardised
+    (asset,) = store
+    (file,) = (tmp_path / "demo" / "slat").rglob("*.npz")
+    with np.load(file) as latents:
+        np.testing.assert_array_equal(asset.feats, latents["feats"])
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"source": "vomp", "levels": (1,)},
+        {"source": "physxnet", "views": 2},
+        {"encoder": "trellis2", "slat_form": "hdf5"},
+    ],
+)
+def test_what_does_not_go_together_is_refused(tmp_path: Path, wrong: dict[str, object]) -> None:
+    with pytest.raises(ConfigError, match=str(next(iter(wrong.values())))):
+        make_demo(tmp_path / "demo", 1, 0, **wrong)  # type: ignore[arg-type]
+    assert not (tmp_path / "demo").exists()

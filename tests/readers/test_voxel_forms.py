@@ -1,0 +1,265 @@
+"""Forms of annotated voxels: each is read as it was written, and what cannot be read is said."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+import zarr
+
+from slatprep.demo.sources import (
+    write_description,
+    write_physxnet,
+    write_points,
+    write_vomp,
+    write_voxels,
+)
+from slatprep.errors import ConfigError, InputError
+from slatprep.inspect.verify import verify_store
+from slatprep.parameters import BuildParameters, PixieverseSource, SlatSource
+from slatprep.pipeline.dataset import build_store
+from slatprep.readers import discover, read_field
+from slatprep.records import MaterialField
+
+TABLE = (
+    {"name": "density", "unit": "kg/m^3", "scale": "log10"},
+    {"name": "damping", "unit": "1", "scale": "linear", "least": 0, "most": 1},
+)
+CLASSES = ("wood", "steel", "glass")
+FORMS = ("npz", "hdf5", "zarr", "ply")
+
+
+def rows_of(count: int, side: int = 64, seed: int = 0) -> dict[str, np.ndarray]:
+    """Return voxels in no order, each once, and columns that tell them apart."""
+    rng = np.random.default_rng(seed)
+    cells = rng.choice(side**3, count, replace=False)
+    voxels = np.stack(np.unravel_index(cells, (side,) * 3), axis=1).astype(np.int32)
+    return {
+        "voxels": voxels,
+        "density": (100.0 + cells % 5000).astype(np.float32),
+        "damping": (cells % 97 / 97).astype(np.float32),
+        "material": (cells % 3).astype(np.uint8),
+        "segment": np.zeros(3, np.float32),  # not asked for
+    }
+
+
+def field_at(root: Path, adapter: str = "voxels") -> MaterialField:
+    """Read the one field below a root, for which a SLAT is made."""
+    slat = root.parent / "slat"
+    slat.mkdir(exist_ok=True)
+    np.savez(slat / "a.npz", coords=np.zeros((1, 3), np.uint8), feats=np.ones((1, 8), np.float32))
+    source = PixieverseSource(root, adapter=adapter)
+    (pair,) = discover(BuildParameters(source, SlatSource(slat)))
+    return read_field(pair)
+
+
+def by_voxel(field: MaterialField) -> dict[tuple[int, ...], tuple[float, ...]]:
+    rows = np.column_stack([field.material, field.properties]).tolist()
+    return {
+        tuple(map(int, voxel)): tuple(row) for voxel, row in zip(field.voxels, rows, strict=True)
+    }
+
+
+@pytest.fixture
+def root(tmp_path: Path) -> Path:
+    write_description(tmp_path / "voxels", TABLE, CLASSES)
+    return tmp_path / "voxels"
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_every_form_holds_the_same_72_000_voxels(root: Path, form: str) -> None:
+    rows = rows_of(72_000)
+    if form == "ply":
+        del rows["segment"]
+    write_voxels(root, "a", form, rows)
+    field = field_at(root)
+    columns = (rows["material"], rows["density"], rows["damping"])
+    expected = {
+        tuple(map(int, voxel)): tuple(map(float, row))
+        for voxel, *row in zip(rows["voxels"], *columns, strict=True)
+    }
+    assert by_voxel(field) == expected
+    assert field.occupancy.sum() == 72_000
+    assert [source.role for source in field.sources] == ["grid", "description"]
+    assert field.sources[0].path.startswith("a.")
+
+
+def test_a_grid_of_128_may_be_fuller_than_all_of_64(root: Path) -> None:
+    write_description(root, TABLE, CLASSES, resolution=128)
+    rows = rows_of(300_000, side=128)
+    write_voxels(root, "a", "npz", rows)
+    field = field_at(root)
+    cells = np.unique(rows["voxels"] // 2, axis=0)
+    np.testing.assert_array_equal(field.voxels, cells)
+
+
+def test_a_structured_array_of_72_000_voxels_is_read(tmp_path: Path) -> None:
+    rows = rows_of(72_000)
+    columns = {
+        "youngs_modulus": rows["density"] * np.float32(1000),
+        "poissons_ratio": rows["damping"] * np.float32(0.4),
+        "density": rows["density"],
+    }
+    write_vomp(tmp_path / "gvm", "a", rows["voxels"], columns)
+    field = field_at(tmp_path / "gvm", "vomp")
+    assert not field.classified
+    at = {tuple(map(int, voxel)): k for k, voxel in enumerate(rows["voxels"])}
+    order = [at[tuple(map(int, voxel))] for voxel in field.voxels]
+    for column, name in enumerate(("youngs_modulus", "density", "poissons_ratio")):
+        np.testing.assert_array_equal(field.properties[:, column], columns[name][order])
+
+
+def test_physxnet_gives_the_density_of_the_voxels_beside_it(tmp_path: Path) -> None:
+    rows, root = rows_of(500), tmp_path / "physx"
+    write_physxnet(root, "a", rows["voxels"], rows["density"])
+    field = field_at(root, "physxnet")
+    assert [one.name for one in field.table] == ["density"]
+    found = {voxel: row[1] for voxel, row in by_voxel(field).items()}
+    for voxel, density in zip(rows["voxels"], rows["density"], strict=True):
+        assert found[tuple(map(int, voxel))] == pytest.approx(density, rel=1e-6)
+    np.testing.assert_array_equal(field.frame, np.eye(4))
+    # A row less, and the two no longer belong together.
+    np.save(root / "property" / "a2.npy", np.ones((499, 14)))
+    with pytest.raises(InputError, match=r"has 499 rows; expected 500, a row a vertex of a\.ply"):
+        field_at(root, "physxnet")
+
+
+def test_physxnet_without_voxels_says_what_is_lacking(tmp_path: Path) -> None:
+    rows, root = rows_of(50), tmp_path / "physx"
+    write_physxnet(root, "a", rows["voxels"], rows["density"])
+    (root / "voxels" / "a.ply").unlink()
+    with pytest.raises(InputError, match=r"nothing says where its rows lie, as there is no voxels"):
+        field_at(root, "physxnet")
+    (root / "finaljson").mkdir()
+    with pytest.raises(ConfigError, match="annotations of the parts of meshes, which have no vox"):
+        field_at(root, "physxnet")
+
+
+@pytest.mark.parametrize(
+    ("classes", "said"),
+    [
+        (["wood", "wood"], "there are 2 classes"),
+        ([], "there are 0 classes"),
+        ([f"c{k}" for k in range(8)], "there are 8 classes"),
+        (["background"], "the names of classes are background"),
+        (["Wood"], "the names of classes are Wood"),
+    ],
+)
+def test_class_tables_that_no_store_can_have_are_refused(
+    root: Path, classes: list[str], said: str
+) -> None:
+    about = json.loads((root / "source.json").read_text()) | {"classes": classes}
+    (root / "source.json").write_text(json.dumps(about))
+    write_voxels(root, "a", "npz", rows_of(10))
+    with pytest.raises(ConfigError, match=said):
+        field_at(root)
+
+
+def test_a_class_that_the_table_does_not_have_is_refused(root: Path) -> None:
+    for material in (3, -1, 0.5):
+        rows = rows_of(10)
+        rows["material"] = np.full(10, material, np.float32)
+        write_voxels(root, "a", "npz", rows)
+        with pytest.raises(InputError, match=r"has classes that are none; expected 10 of 0\.\.2"):
+            field_at(root)
+
+
+def damaged(root: Path, how: str) -> None:
+    rows = rows_of(3000)
+    write_voxels(root, "a", "zarr", rows)
+    group = root / "a.zarr"
+    about = group / "density" / "zarr.json"
+    if how == "missing":
+        shutil.rmtree(group / "density")
+    elif how == "shards":
+        shutil.rmtree(group / "density")
+        opened = zarr.open_group(group, mode="a")
+        opened.create_array("density", data=rows["density"], chunks=(500,), shards=(3000,))
+    elif how == "version 2":
+        shutil.rmtree(group / "density")
+        zarr.save_array(group / "density", rows["density"], zarr_format=2)
+    elif how == "codec":
+        text = about.read_text().replace('"zstd"', '"numcodecs.pickle"')
+        about.write_text(text)
+    elif how == "rows":
+        metadata = json.loads(about.read_text())
+        metadata["shape"] = [2**40]
+        about.write_text(json.dumps(metadata))
+    elif how == "bomb":
+        import numcodecs
+
+        chunk = next((group / "density" / "c").rglob("0"))
+        chunk.write_bytes(numcodecs.Zstd().encode(bytes(2**24)))
+    else:
+        (group / "density" / "c" / "0").write_bytes(b"torn")
+
+
+@pytest.mark.parametrize(
+    ("how", "said"),
+    [
+        ("missing", "is not in it"),
+        ("shards", "sharding_indexed"),
+        ("version 2", "is not in it"),
+        ("codec", "numcodecs.pickle"),
+        ("rows", "N <= 2097152"),
+        ("bomb", "it holds 16777216 bytes"),
+        ("torn", "cannot be unpacked|it holds"),
+    ],
+)
+def test_zarr_that_cannot_be_read_is_said(root: Path, how: str, said: str) -> None:
+    damaged(root, how)
+    with pytest.raises(InputError, match=rf"a\.zarr \[density\].*({said})"):
+        field_at(root)
+
+
+def test_any_file_of_a_zarr_group_decides_what_it_is(root: Path) -> None:
+    rows = rows_of(100)
+    write_voxels(root, "a", "zarr", rows)
+    before = field_at(root).sources[0]
+    assert field_at(root).sources[0] == before
+    chunk = next((root / "a.zarr" / "damping" / "c").rglob("0"))
+    write_voxels(root, "b", "zarr", rows | {"damping": rows["damping"][::-1]})
+    shutil.copy(next((root / "b.zarr" / "damping" / "c").rglob("0")), chunk)
+    shutil.rmtree(root / "b.zarr")
+    assert field_at(root).sources[0].sha256 != before.sha256
+
+
+def test_a_ply_that_claims_more_than_it_has_is_refused(root: Path) -> None:
+    columns = {axis: np.zeros(3, np.float32) for axis in "xyz"}
+    rest = {"density": np.ones(3, np.float32), "damping": np.ones(3, np.float32)}
+    write_points(root / "a.ply", columns | rest)
+    with pytest.raises(InputError, match="has no property 'material'"):
+        field_at(root)
+    text = (root / "a.ply").read_bytes().replace(b"vertex 3", b"vertex 99999999999")
+    (root / "a.ply").write_bytes(text)
+    with pytest.raises(InputError, match="announces more rows than it has"):
+        field_at(root)
+
+
+def test_changed_voxels_of_a_zarr_group_are_looked_up_anew(
+    root: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from slatprep.pipeline import seen
+
+    monkeypatch.setattr(seen, "_FINE_NS", 0)
+    box = np.argwhere(np.ones((20, 14, 9))) + 22
+    rows = {"voxels": box, "density": np.full(len(box), 500.0), "damping": np.full(len(box), 0.5)}
+    rows["material"] = np.zeros(len(box), np.uint8)
+    rows["material"][box[:, 0] > 30] = 1
+    write_description(root, TABLE, CLASSES, aligned=True)
+    write_voxels(root, "a", "zarr", rows)
+    slat = root.parent / "slat"
+    slat.mkdir()
+    feats = np.random.default_rng(0).normal(0, 3, (len(box), 8)).astype(np.float32)
+    np.savez(slat / "a.npz", coords=box.astype(np.uint8), feats=feats)
+    parameters = BuildParameters(PixieverseSource(root, adapter="voxels"), SlatSource(slat))
+    first = build_store(parameters, root.parent / "s.zarr")
+    assert build_store(parameters, root.parent / "s.zarr").build_id == first.build_id
+    assert not verify_store(root.parent / "s.zarr", sources=True).findings
+    write_voxels(root, "a", "zarr", rows | {"density": np.full(len(box), 600.0)})
+    (finding,) = verify_store(root.parent / "s.zarr", sources=True).findings
+    assert "bytes" in finding.what
+    assert build_store(parameters, root.parent / "s.zarr").build_id != first.build_id
