@@ -78,7 +78,7 @@ def make_demo(
     assets: int,
     seed: int,
     *,
-    levels: tuple[int, ...] = (),
+    levels: tuple[int, ...] | None = None,
     views: int = 1,
     latents: LatentKind = "placeholder",
     habitual_share: float = 0.0,
@@ -105,7 +105,7 @@ def make_demo(
         It is made if missing; it must be empty or hold the same demo.
     assets, seed : int
         Number of objects, and the seed of everything random.
-    levels : tuple of int
+    levels : tuple of int, optional
         Levels of difficulty, gone through in turn; see `slatprep.demo.difficulty`. By
         default those whose sides show one clean shape, or 0 alone where `source` shares
         the frame of the SLAT; 5 to 7, a generated shape, a NeRF's field and both, are made
@@ -145,9 +145,9 @@ def make_demo(
     ConfigError
         If an argument makes no sense or the directory holds something else.
     """
-    levels = tuple(levels) or ((0,) if source in ONE_FRAME else SAME_SHAPE_LEVELS)
+    usual = (0,) if source in ONE_FRAME else SAME_SHAPE_LEVELS
     recipe = _Recipe(
-        assets, seed, levels, views, latents, habitual_share,
+        assets, seed, usual if levels is None else tuple(levels), views, latents, habitual_share,
         source, encoder, slat_form, slat_names, results,
     )  # fmt: skip
     _check(recipe)
