@@ -210,7 +210,8 @@ def _summarise_level(level: int, scores: Sequence[TruthScore]) -> LevelScore:
 
 def _score_asset(asset: StoredAsset, path: Path) -> TruthScore:
     truth, field = read_truth(path), asset.field
-    material, annotated_material = asset.material, field.material
+    material: NDArray[np.integer[Any]] = asset.material
+    annotated_material: NDArray[np.integer[Any]] = field.material
     if not field.classified:
         names, values = _true_values(path, len(truth.material))
         known, labels = np.unique(values, axis=0, return_inverse=True)

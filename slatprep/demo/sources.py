@@ -160,7 +160,8 @@ def write_physxnet(
 def write_points(path: Path, columns: Mapping[str, NDArray[Any]]) -> None:
     """Write a binary PLY of points with a property a column (K,)."""
     kinds = {"f4": "float", "f8": "double", "i4": "int", "u1": "uchar"}
-    rows = np.rec.fromarrays(list(columns.values()), names=list(columns))
+    dtype = np.dtype([(key, array.dtype.newbyteorder("<")) for key, array in columns.items()])
+    rows = np.rec.fromarrays(list(columns.values()), dtype=dtype)
     lines = [f"property {kinds[rows.dtype[key].str[1:]]} {key}" for key in columns]
     head = ["ply", "format binary_little_endian 1.0", f"element vertex {len(rows)}", *lines]
     path.write_bytes("\n".join([*head, "end_header\n"]).encode() + rows.tobytes())

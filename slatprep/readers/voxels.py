@@ -83,10 +83,9 @@ class _Description:
     @property
     def names(self) -> tuple[str, ...]:
         """The names of the classes; PhysGaussian's have one for the background, too."""
-        if not self.classes:
-            return ()
-        known = self.classes in (True, MATERIAL_CLASSES[:BACKGROUND])
-        return MATERIAL_CLASSES if known else self.classes
+        if isinstance(self.classes, bool):
+            return MATERIAL_CLASSES if self.classes else ()
+        return MATERIAL_CLASSES if self.classes == MATERIAL_CLASSES[:BACKGROUND] else self.classes
 
 
 class PlainVoxels:
