@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from slatprep.align.quality import measure_quality
 from slatprep.judge import THRESHOLDS, verdict_of
 from slatprep.normalize import normalize_properties
+from slatprep.provenance.stored import StoredRecords
 from slatprep.records import Place, StructuredLatents, Verdict
 from slatprep.sample import sample
 from slatprep.store.reader import Store, StoredAsset, open_store
@@ -177,6 +178,7 @@ def check_alignment(store: Store, asset_id: str) -> AlignmentCheck:
         quality,
         valid_share,
         ambiguity,
+        len(StoredRecords(store).of(asset_id).alignment.open_placements),
         # The confidence was computed for the stored fit and holds for no other.
         confidence=confidence if same_fit else math.nan,
         expected_accuracy=expected,

@@ -17,7 +17,6 @@ from slatprep.records import (
     Annotation,
     FitFigures,
     MaterialField,
-    Placement,
     StructuredLatents,
 )
 
@@ -111,7 +110,7 @@ def surroundings_of(
         before = places_of(latents.coords, alignment.transform).astype(np.float32)
         moved = np.linalg.norm(annotation.place - before, axis=1) / np.float32(VOXEL_SIZE)
     tied = np.zeros(count, dtype=np.float32)
-    ties = _open(alignment)
+    ties = alignment.open_placements
     # Of a SLAT with far more voxels than usual some ties stand for all.
     some = ties[:: thinning(count)]
     for placement in some:
@@ -122,11 +121,6 @@ def surroundings_of(
         tied *= np.float32(len(ties) / len(some))
     tied /= np.float32(len(ties) + 1)
     return Surroundings(others, solid, annotation.distance, moved, tied)
-
-
-def _open(alignment: Alignment) -> tuple[Placement, ...]:
-    """Return the placements that tie where neither consensus nor latents chose among them."""
-    return alignment.placements if alignment.settled_by is None else ()
 
 
 def evidence_of(
@@ -158,7 +152,7 @@ def evidence_of(
     ndarray of float64, shape (len(FIGURES),)
         All finite but for the margin, which is NaN where it says nothing.
     """
-    count, margin = len(_open(alignment)), min(alignment.margin, MARGIN_CAP)
+    count, margin = len(alignment.open_placements), min(alignment.margin, MARGIN_CAP)
     if (count and ambiguity <= HARMLESS) or alignment.settled_by is not None:
         count, margin = 0, math.nan
     fit = alignment.figures or measure_figures(field, latents, alignment)

@@ -28,8 +28,8 @@ class Thresholds:
     Attributes
     ----------
     good_confidence, failed_confidence : float
-        Probability that the placement is right: at least the first is good,
-        below the second is failed.
+        Probability that the placement is right, from which on it is good; and that one
+        of the tied placements is, below which it is failed.
     good_accuracy : float
         Expected share of right labels; below it the asset is doubtful.
     good_valid_share : float
@@ -114,7 +114,7 @@ def judge_with_voxels(
         alignment.quality,
         float(valid.mean()),
         ambiguity.material_share,
-        len(alignment.placements),
+        len(alignment.open_placements),
         confidence,
         expected,
         next(iter(causes_of_doubt(evidence))),
@@ -209,7 +209,7 @@ def verdict_of(
     ambiguity : float
         Share of SLAT voxels whose class depends on the choice among ties, 0..1.
     ties : int
-        How many placements tie with the one chosen; 0 where that is not known.
+        How many placements tie with the one chosen, and nothing chose among them.
     confidence : float
         Probability that the placement is right; NaN where it is not known.
     expected_accuracy : float
@@ -233,7 +233,9 @@ def verdict_of(
     if math.isnan(confidence):
         failed = _judge_by_fitness(quality, reasons)
     elif confidence < limits.good_confidence:
-        failed = confidence < limits.failed_confidence
+        # As the chosen one is the likeliest, that any of the tied ones is right is no likelier.
+        possible = confidence * (1 + ties if ambiguity > limits.good_ambiguity else 1)
+        failed = possible < limits.failed_confidence
         because = f": {_WORDS[cause]}" if cause else ""
         reasons.append(
             f"the placement is right with a probability of {confidence:.1%} only "

@@ -290,3 +290,8 @@ class Alignment:
     settled_by: Consensus | LatentChoice | None = None
     deformation: Deformation | None = None
     figures: FitFigures | None = None
+
+    @property
+    def open_placements(self) -> tuple[Placement, ...]:
+        """The placements that tie where neither consensus nor latents chose among them."""
+        return self.placements if self.settled_by is None else ()

@@ -226,3 +226,19 @@ def test_verdicts_follow_from_confidence(
     assert given is verdict
     assert word in " ".join(reasons)
     assert bool(reasons) == (verdict is not Verdict.GOOD)
+
+
+@pytest.mark.parametrize(
+    ("ties", "ambiguity", "verdict"),
+    [
+        (0, 0.4, Verdict.FAILED),
+        (1, 0.4, Verdict.DOUBTFUL),  # One of the two is right with 0.6 at most.
+        (3, THRESHOLDS.good_ambiguity, Verdict.FAILED),  # They differ in nothing: they are one.
+    ],
+)
+def test_only_what_is_wrong_with_all_that_ties_is_failed(
+    ties: int, ambiguity: float, verdict: Verdict
+) -> None:
+    fits = Quality(1.0, 0.5, 1.0, 0.5, 1.0, 1.0)
+    given, _ = verdict_of(fits, 1.0, ambiguity, ties, confidence=0.3, cause="placement")
+    assert given is verdict

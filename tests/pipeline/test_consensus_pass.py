@@ -13,9 +13,12 @@ from support.trees import records_of, tree
 
 from slatprep.bench.truth import score_against_truth
 from slatprep.demo import make_demo
+from slatprep.inspect.check import check_alignment
+from slatprep.judge import THRESHOLDS
 from slatprep.parameters import BuildParameters, ConsensusParameters
 from slatprep.parameters.files import load_parameters
 from slatprep.pipeline.dataset import build_store, plan_build
+from slatprep.store import open_store
 
 
 @pytest.fixture(scope="module")
@@ -80,6 +83,15 @@ def test_what_was_settled_is_recorded_and_can_be_undone(stores: tuple[Path, Path
         assert entry["placements"][0]["transform"] == alone[asset_id]["alignment"]["transform"]
         assert together[asset_id]["first_pass"]["alignment"] == alone[asset_id]["alignment"]
     assert not any(record["alignment"]["settled_by"] for record in alone.values())
+
+
+def test_the_store_alone_gives_the_verdicts_on_ties(stores: tuple[Path, Path]) -> None:
+    for path in stores:
+        store = open_store(path)
+        assert (store.column("ambiguity") > THRESHOLDS.good_ambiguity).any()
+        for asset_id, given in zip(store.ids, store.column("verdict"), strict=True):
+            check = check_alignment(store, asset_id)
+            assert check.consistent and check.verdict == given
 
 
 def test_building_without_it_brings_the_first_placements_back(
