@@ -16,6 +16,7 @@ import argparse
 import subprocess
 import sys
 from collections.abc import Mapping, Sequence
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -44,8 +45,12 @@ GROWS = {"score_slat", "score_pixieverse", "score_similarity", "within_1", "with
 RIGHT_LABELS = 0.9
 """A placement that ties with others that have the same classes is right from this share on."""
 
+KNEE = 0.02
+"""Share of the right placements beyond a figure's knee, where another weight begins."""
+
 RIDGE = 3e-2
-KNOTS = 24
+KNOT_STEP, LEAST_WEIGHT = 0.3, 1e-3
+"""Step of the logarithm of the odds from knot to knot of a curve, and least share of the mix."""
 
 Array = NDArray[np.float64]
 Table = dict[str, NDArray[Any]]
@@ -99,11 +104,15 @@ def weights_of(table: Table, rows: NDArray[np.bool_], prior: Mapping[str, float]
 
 
 def fit(
-    names: tuple[str, ...], values: Array, right: NDArray[np.bool_], weights: Array
-) -> Logistic:
+    names: tuple[str, ...], values: Array, right: NDArray[np.bool_], weights: Array,
+    knees: bool = False,
+) -> Logistic:  # fmt: skip
     """Fit a `Logistic` with weights of the signs that `GROWS` says."""
     low, high = np.nanquantile(values, (0.005, 0.995), axis=0)
     usual = np.nanmean(np.where(right[:, None], np.clip(values, low, high), np.nan), axis=0)
+    if knees:
+        names, values, low, high = with_knees(names, values, right, low, high)
+        usual = np.clip(usual[[FIGURES.index(name) for name in names]], low, high)
     clipped = np.clip(values, low, high) - usual
     spread = np.nanstd(clipped, axis=0) + 1e-9
     x = np.nan_to_num(clipped / spread)
@@ -128,18 +137,33 @@ def fit(
     return Logistic(figures, float(f"{found[-1]:.6g}"), ())
 
 
+def with_knees(
+    names: tuple[str, ...], values: Array, right: NDArray[np.bool_], low: Array, high: Array
+) -> tuple[tuple[str, ...], Array, Array, Array]:
+    """Part each figure's bounds at the value beyond which few right ones lie."""
+    parts: list[tuple[int, float, float]] = []
+    for k, name in enumerate(names):
+        knee = float(np.nanquantile(values[right, k], KNEE if name in GROWS else 1.0 - KNEE))
+        ends = [low[k], float(f"{knee:.6g}"), high[k]] if low[k] < knee < high[k] else None
+        parts += [(k, a, b) for a, b in pairwise(ends or [low[k], high[k]])]
+    which = [k for k, _, _ in parts]
+    bounds = np.array([(a, b) for _, a, b in parts]).T
+    return tuple(names[k] for k in which), values[:, which], bounds[0], bounds[1]
+
+
 def with_curve(
     model: Logistic, values: Array, right: NDArray[np.bool_], weights: Array
 ) -> Logistic:
-    """Add the curve that isotonic regression gives; its knots are denser where in doubt."""
+    """Add the curve that isotonic regression gives, with knots at even steps of the odds."""
     odds = model.contributions(values).sum(axis=1) + model.intercept
-    order = np.argsort(odds, kind="stable")
-    likely = expit(odds[order])
-    sums = np.cumsum(weights[order] * np.sqrt(likely * (1.0 - likely)))
-    bins = np.minimum((sums / sums[-1] * KNOTS).astype(int), KNOTS - 1)
-    total = np.bincount(bins, weights[order])
-    at = np.bincount(bins, weights[order] * odds[order]) / total
-    share = np.bincount(bins, weights[order] * right[order]) / total
+    steps = ((odds - odds.min()) / KNOT_STEP).astype(int)
+    share = np.bincount(steps, weights)
+    # What too little of the mix lies between counts as one step.
+    below = ((np.cumsum(share) - share) / LEAST_WEIGHT).astype(int)
+    bins = np.unique(below, return_inverse=True)[1][steps]
+    total = np.bincount(bins, weights)
+    at = np.bincount(bins, weights * odds) / total
+    share = np.bincount(bins, weights * right) / total
     share = isotonic_regression(share, weights=total).x
     curve = tuple((float(f"{a:.5g}"), float(f"{s:.5g}")) for a, s in zip(at, share, strict=True))
     return Logistic(model.figures, model.intercept, curve)
@@ -148,7 +172,7 @@ def with_curve(
 def fit_placement(table: Table) -> Logistic:
     rows = table["known"]
     weights = weights_of(table, rows)
-    return fit(FIGURES, table["figures"][rows], table["placed"][rows], weights[rows])
+    return fit(FIGURES, table["figures"][rows], table["placed"][rows], weights[rows], knees=True)
 
 
 def fit_voxel(table: Table, placement: Logistic) -> Logistic:
@@ -225,13 +249,18 @@ def report(table: Table, placement: Logistic, voxel: Logistic, picture: Path | N
         "own, alike": table["harmless"] & (table["kind"] == "own"),
         "own, torn": table["torn"] & (table["kind"] == "own"),
     }
-    # As in the verdict: of placements that tie, at most so likely is any right.
-    possible = confidence * np.exp(table["figures"][:, FIGURES.index("ties")])
+    # What `slatprep.judge.verdict_of` makes of them; `likely` is of all voxels here.
+    tied, valid = (table["figures"][:, FIGURES.index(name)] for name in ("ties", "valid_share"))
+    sums = np.bincount(table["voxel_row"], likely, len(every))
+    expected = sums / np.maximum(np.bincount(table["voxel_row"], minlength=len(every)), 1)
+    good = (confidence >= THRESHOLDS.good_confidence) & (tied == 0)
+    good &= (valid >= THRESHOLDS.good_valid_share) & (expected >= THRESHOLDS.good_accuracy)
+    failed = confidence * np.exp(tied) < THRESHOLDS.failed_confidence
     for name, rows in groups.items():
         c = confidence[rows]
         if len(c):
-            print(f"{name:16s} {len(c):4d}  good {np.mean(c >= THRESHOLDS.good_confidence):.3f}  "
-                  f"failed {np.mean(possible[rows] < THRESHOLDS.failed_confidence):.3f}  quantiles "
+            print(f"{name:16s} {len(c):4d}  good {good[rows].mean():.3f}  "
+                  f"failed {failed[rows].mean():.3f}  quantiles "
                   f"{np.round(np.quantile(c, (0.01, 0.05, 0.5, 0.95, 0.99)), 3)}")  # fmt: skip
     if picture:
         draw(picture, assets, diagrams["voxels"])

@@ -69,7 +69,8 @@ class Surroundings:
         How far the deformation moves the voxel's place, in voxels.
     tied : ndarray of float32, shape (N,)
         Share of the placements that fit about as well, the one chosen among
-        them, that have another class at the voxel; 0 where a consensus chose.
+        them, that have another class at the voxel; 0 where a consensus chose, and
+        where the mean is no more than `HARMLESS`.
     """
 
     others: NDArray[np.float32]
@@ -120,6 +121,8 @@ def surroundings_of(
     if len(some) < len(ties):
         tied *= np.float32(len(ties) / len(some))
     tied /= np.float32(len(ties) + 1)
+    if tied.mean() <= HARMLESS:
+        tied[:] = 0.0  # They count as one: at their few voxels the chosen one is right as often.
     return Surroundings(others, solid, annotation.distance, moved, tied)
 
 

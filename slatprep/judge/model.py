@@ -17,8 +17,9 @@ FLOOR = 1e-3
 class Figure:
     """One figure of a model: clipped to `low`..`high`, less `usual`, times `weight`.
 
-    ``usual`` is the mean over right ones, so that the product is what the
-    figure adds to the logarithm of the odds, compared with a usual right one.
+    ``usual`` is the mean over right ones, within the same bounds, so that the
+    product is what the figure adds to the logarithm of the odds, compared with a
+    usual right one. Two of one name, whose bounds meet, are a line with a knee.
     """
 
     name: str
@@ -35,7 +36,7 @@ class Logistic:
     Attributes
     ----------
     figures : tuple of Figure
-        What it looks at.
+        What it looks at; those of one name stand together.
     intercept : float
         Logarithm of the odds where all figures are as usual.
     curve : tuple of (float, float)
@@ -45,6 +46,15 @@ class Logistic:
     figures: tuple[Figure, ...]
     intercept: float
     curve: tuple[tuple[float, float], ...]
+
+    @cached_property
+    def names(self) -> tuple[str, ...]:
+        """The figures it looks at, in the order of values."""
+        return tuple(dict.fromkeys(figure.name for figure in self.figures))
+
+    @cached_property
+    def _columns(self) -> list[int]:
+        return [self.names.index(figure.name) for figure in self.figures]
 
     @cached_property
     def _table(self) -> NDArray[np.float64]:
@@ -63,16 +73,19 @@ class Logistic:
         ndarray of float64, shape (..., F)
         """
         weight, usual, low, high = self._table
-        added: NDArray[np.float64] = weight * (np.clip(values, low, high) - usual)
-        return np.where(np.isnan(added), 0.0, added)
+        parts = weight * (np.clip(values[..., self._columns], low, high) - usual)
+        first = [self._columns.index(k) for k in range(len(self.names))]
+        added: NDArray[np.float64] = np.add.reduceat(np.nan_to_num(parts), first, axis=-1)
+        return added
 
     def probability(self, values: NDArray[np.floating]) -> NDArray[np.float64]:
         """Return the probability for figures (..., F), within `FLOOR` of 0 and 1."""
         odds = np.full(values.shape[:-1], self.intercept)
         # Column by column, without those of no weight: there may be thousands of rows.
-        for figure, column in zip(self.figures, np.moveaxis(values, -1, 0), strict=True):
+        for figure, column in zip(self.figures, self._columns, strict=True):
             if figure.weight:
-                added = figure.weight * (np.clip(column, figure.low, figure.high) - figure.usual)
+                clipped = np.clip(values[..., column], figure.low, figure.high)
+                added = figure.weight * (clipped - figure.usual)
                 odds += np.where(np.isnan(added), 0.0, added)
         return self.calibrated(odds)
 
@@ -82,5 +95,5 @@ class Logistic:
         if self.curve:
             at, share = np.array(self.curve).T
             found = np.interp(odds, at, share)
-        clipped: NDArray[np.float64] = np.clip(found, FLOOR, 1.0 - FLOOR)
-        return clipped
+        bounded: NDArray[np.float64] = np.clip(found, FLOOR, 1.0 - FLOOR)
+        return bounded
