@@ -149,6 +149,9 @@ def _same(own: Mapping[str, Any], copy: object) -> bool:
     """Whether metadata equal their consolidated copy; groups may repeat an empty consolidation."""
     if not isinstance(copy, dict):
         return False
-    left, right = ({**m, "consolidated_metadata": None} for m in (own, copy))
+    left, right = ({**one, "consolidated_metadata": None} for one in (own, copy))
+    nested = [one.get("consolidated_metadata") for one in (own, copy)]
+    if any(one not in (None, {**_CONSOLIDATED, "metadata": {}}) for one in nested):
+        return False
     # A fill value of NaN does not equal its copy, but is written like it.
     return left == right or repr(left) == repr(right)

@@ -235,6 +235,16 @@ def test_a_root_that_is_no_json_is_a_finding(store: Path) -> None:
     assert [finding.file for finding in found(store)] == ["zarr.json"]
 
 
+def test_an_edited_repetition_within_the_consolidated_metadata_is_found(store: Path) -> None:
+    def edit(document: dict) -> None:
+        copy = document["consolidated_metadata"]["metadata"]["voxel"]
+        copy["consolidated_metadata"]["must_undurstand"] = False
+
+    edit_json(store / "zarr.json", edit)
+    findings = of_file(found(store), "voxel/zarr.json")
+    assert any("differs from its copy" in finding.what for finding in findings)
+
+
 @pytest.mark.parametrize(
     ("key", "value"),
     [
