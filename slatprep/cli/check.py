@@ -123,8 +123,10 @@ def _target(store: Place, picture: str | None, assets: int) -> Path | None:
         return None
     if picture is None:
         return beside(store, ".pictures")
+    from slatprep.inspect.pictures.canvas import FORMATS
+
     target = Path(picture)
-    if assets > 1 and target.suffix.lower() in (".png", ".svg", ".pdf"):
+    if assets > 1 and target.suffix.lower()[1:] in FORMATS:
         raise click.UsageError(f"--picture {target} is one file; {assets} assets need a folder")
     return target
 

@@ -15,7 +15,8 @@ from numpy.typing import NDArray
 from slatprep.export.croissant import DESCRIPTION
 from slatprep.store import Store
 
-_SIZES = ((1_000, "n<1K"), (10_000, "1K<n<10K"), (100_000, "10K<n<100K"))
+_SIZES = ((1_000, "n<1K"), (10_000, "1K<n<10K"), (100_000, "10K<n<100K"),
+          (1_000_000, "100K<n<1M"))  # fmt: skip
 """Hugging Face's size categories, each below a number of samples."""
 
 _TAGS = ("3d", "physics", "material-properties", "structured-latents", "zarr", "slatprep")
@@ -71,7 +72,13 @@ class Stated:
         return f"https://spdx.org/licenses/{self.license}"
 
 
-def card_of(store: Store, stated: Stated, data: str, pictures: Sequence[str]) -> str:
+def card_of(
+    store: Store,
+    stated: Stated,
+    data: str,
+    pictures: Sequence[str],
+    verdicts: Sequence[str] = (),
+) -> str:
     """Return the card: Markdown with metadata in YAML, as Hugging Face expects it.
 
     Parameters
@@ -84,18 +91,22 @@ def card_of(store: Store, stated: Stated, data: str, pictures: Sequence[str]) ->
         Path of the data, relative to the card: the name of the store, or a pattern of shards.
     pictures : sequence of str
         Names of pictures beside the card.
+    verdicts : sequence of str
+        The data have only assets with one of these verdicts; empty for all.
 
     Returns
     -------
     str
         The text of the file.
     """
+    verdict = store.column("verdict").astype(str)
+    kept = np.isin(verdict, verdicts) if verdicts else np.ones(len(store), dtype=bool)
     title = stated.name or store.name.removesuffix(".zarr")
     shards = data.endswith(".tar")
     head: dict[str, Any] = {
         "pretty_name": title,
         "tags": list(_TAGS),
-        "size_categories": [next((w for n, w in _SIZES if len(store) < n), "100K<n<1M")],
+        "size_categories": [next((w for n, w in _SIZES if kept.sum() < n), "1M<n<10M")],
     }
     if stated.license and "://" not in stated.license:
         head["license"] = stated.license.lower()
@@ -116,7 +127,7 @@ def card_of(store: Store, stated: Stated, data: str, pictures: Sequence[str]) ->
             for one in pictures
         ),
         "## What is in it",
-        "\n".join(_table(store)),
+        "\n".join(_table(store, kept)),
         "`good`, `doubtful` and `failed` are verdicts on the alignment; `labels_right` is the "
         "share of material classes that can be expected to be right, `valid` that of the voxels "
         "with an annotation. Confidence and `labels_right` are medians over assets.",
@@ -137,12 +148,12 @@ def card_of(store: Store, stated: Stated, data: str, pictures: Sequence[str]) ->
     return "\n\n".join(parts) + "\n"
 
 
-def _table(store: Store) -> Iterator[str]:
+def _table(store: Store, kept: NDArray[np.bool_]) -> Iterator[str]:
     columns = {
-        name: np.asarray(store.column(name))
+        name: np.asarray(store.column(name))[kept]
         for name in ("category", "verdict", "confidence", "expected_accuracy", "valid_share")
     }
-    columns["voxels"] = np.diff(store.offsets)
+    columns["voxels"] = np.diff(store.offsets)[kept]
     figures = ("good", "doubtful", "failed", "confidence", "labels_right", "valid")
     head = ("category", "assets", "voxels", *figures)
     yield f"| {' | '.join(head)} |"
@@ -151,7 +162,7 @@ def _table(store: Store) -> Iterator[str]:
     for name in names:
         yield _row(_plain(name) or "(unknown)", columns, columns["category"] == name)
     if len(names) > 1:
-        yield _row("all", columns, np.ones(len(store), dtype=bool))
+        yield _row("all", columns, np.ones(kept.sum(), dtype=bool))
 
 
 def _row(name: str, columns: dict[str, NDArray[Any]], chosen: NDArray[np.bool_]) -> str:

@@ -11,7 +11,7 @@ from typing import Literal
 from slatprep.errors import ConfigError
 from slatprep.export import croissant, export_store, target
 from slatprep.export.card import Stated, card_of
-from slatprep.records import Place
+from slatprep.records import USABLE, Place
 from slatprep.storage.files import file_digest, local_files
 from slatprep.storage.place import place_of, storage_of
 from slatprep.store import open_store
@@ -84,6 +84,7 @@ def publish_store(
         raise ConfigError(f"{out} lies inside the store; expected a path outside {place}")
     opened = open_store(place)
     assets = len(opened)
+    chosen: Sequence[str] = ()
     with target.directory(out) as folder:
         if data == "store":
             where = opened.name
@@ -102,12 +103,13 @@ def publish_store(
             (folder / DESCRIPTION).write_text(croissant.to_json(document), encoding="utf-8")
         else:
             where = f"{SHARDS}/*.tar"
+            chosen = USABLE if verdicts is None else tuple(verdicts)
             assets = export_store(
-                place, folder / SHARDS, "webdataset", verdicts=verdicts, progress=progress
+                place, folder / SHARDS, "webdataset", verdicts=chosen, progress=progress
             ).assets
         for name, content in (pictures or {}).items():
             (folder / name).write_bytes(content)
-        card = card_of(opened, stated, where, list(pictures or ()))
+        card = card_of(opened, stated, where, list(pictures or ()), chosen)
         (folder / CARD).write_text(card, encoding="utf-8")
         names = list(local_files(folder))
         lines = (f"{file_digest(folder / name)}  {name}\n" for name in names)

@@ -24,6 +24,7 @@ from slatprep.inspect.distributions import (
     Weight,
 )
 from slatprep.inspect.listing import rows_chosen
+from slatprep.inspect.overview import UNKNOWN
 from slatprep.inspect.tallies import JOINT_BINS, SideTally, Tally, no_tally, pooled, tally
 from slatprep.records import BACKGROUND, Normalization, Place, Verdict
 from slatprep.store import Store, open_store
@@ -107,7 +108,7 @@ def store_statistics(
             if progress:
                 progress(done, len(rows))
         total += here
-        name = column[own[0]] or "(unknown)"
+        name = column[own[0]] or UNKNOWN
         groups.append(make.group("category", name, here, Counter(verdict_of[r] for r in own)))
     everything = make.group("all", "all", total, Counter(verdict_of[row] for row in rows))
     classes = [

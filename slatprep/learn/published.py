@@ -48,37 +48,13 @@ def _score(method: str, *values: float, spread: str = "") -> PublishedScore:
 
 
 PIXIE_TABLE = (
-    _score(
-        "NeRF2Physics",
-        1.115,
-        0.997,
-        0.462,
-        0.858,
-        0.274,
-        0.165,
-        0.162,
-        0.106,
-        0.109,
-        0.010,
-        spread=_BY_PIXIE,
-    ),
+    _score("NeRF2Physics", 1.115, 0.997, 0.462, 0.858, 0.274, 0.165, 0.162, 0.106, 0.109, 0.010,
+           spread=_BY_PIXIE),
     _score("Pixie, occupancy", 0.149, 0.105, 0.124, 0.126, 0.643),
     _score("Pixie, RGB", 0.196, 0.045, 0.079, 0.106, 0.722),
-    _score(
-        "Pixie",
-        0.022,
-        0.112,
-        0.034,
-        0.056,
-        0.985,
-        0.004,
-        0.009,
-        0.006,
-        0.005,
-        0.011,
-        spread=_BY_PIXIE,
-    ),
-)
+    _score("Pixie", 0.022, 0.112, 0.034, 0.056, 0.985, 0.004, 0.009, 0.006, 0.005, 0.011,
+           spread=_BY_PIXIE),
+)  # fmt: skip
 """Le et al., "Pixie: Fast and Generalizable Supervised Learning of 3D Physics from Pixels",
 arXiv 2508.17437, Table 1: NeRF2Physics, measured by Pixie's authors, and Pixie with three kinds
 of features. On PixieVerse's test objects, over the voxels of Pixie's grids, normalised by
@@ -86,24 +62,12 @@ Pixie's ranges."""
 
 SLAT_PHYS_TABLE = (
     *(score for score in PIXIE_TABLE if score.method in ("NeRF2Physics", "Pixie")),
-    _score(
-        "SLAT-Phys",
-        0.017,
-        0.036,
-        0.054,
-        0.036,
-        0.9453,
-        0.025,
-        0.049,
-        0.074,
-        0.049,
-        0.112,
-        spread=_BY_SLAT_PHYS,
-    ),
+    _score("SLAT-Phys", 0.017, 0.036, 0.054, 0.036, 0.9453, 0.025, 0.049, 0.074, 0.049, 0.112,
+           spread=_BY_SLAT_PHYS),
     _score("SLAT-Phys, small", 0.0285, 0.0630, 0.0674, 0.0530, 0.9107),
     _score("SLAT-Phys, medium", 0.0195, 0.0433, 0.0573, 0.0400, 0.9355),
     _score("SLAT-Phys, large", 0.0173, 0.0361, 0.0540, 0.0358, 0.9453),
-)
+)  # fmt: skip
 """The tables of SLAT-Phys: its comparison, with rows from Pixie's table, and its ablation of the
 decoder's size (2,000 steps), with the means of the three printed errors. Over SLAT voxels,
 normalised by Pixie's ranges."""

@@ -7,7 +7,6 @@ suits jelly and steel in the same object.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -79,7 +78,6 @@ def simulate(
     seconds: float = 0.5,
     rate: int = 60,
     substeps: int = 2,
-    progress: Callable[[int, int], None] | None = None,
 ) -> NDArray[np.float64]:
     """Simulate an object that falls to the ground from rest, in still air or in the wind.
 
@@ -110,8 +108,6 @@ def simulate(
         Frames a second.
     substeps : int
         Time steps a frame.
-    progress : callable, optional
-        Called with the number of frames done and the number of all frames.
 
     Returns
     -------
@@ -158,8 +154,8 @@ def simulate(
     now, after = model.state(), model.state()
     air = np.asarray(wind, dtype=np.float64)
     area = windward(rest, air, spacing)
-    frames, count = [rest], round(seconds * rate)
-    for frame in range(count):
+    frames = [rest]
+    for _ in range(round(seconds * rate)):
         for _ in range(substeps):
             if area.any():
                 past = air - now.particle_qd.numpy()
@@ -169,8 +165,6 @@ def simulate(
             solver.project_outside(after, after, 1.0 / (rate * substeps))
             now, after = after, now
         frames.append(now.particle_q.numpy().astype(np.float64))
-        if progress:
-            progress(frame + 1, count)
     return np.stack(frames)
 
 

@@ -94,6 +94,10 @@ def test_only_assets_that_went_into_shards_are_counted(
     words = (store, "--data", "webdataset", "--pictures", 0, "--json")
     left = json.loads(run(*words, "--out", tmp_path / "hub").stdout)["assets"]
     assert left == len(open_store(store)) - 1
+    card = (tmp_path / "hub" / "README.md").read_text()
+    table = card.partition("## What is in it\n\n")[2].partition("\n\n")[0]
+    rows = [line.strip("| ").split(" | ") for line in table.splitlines()[2:]]
+    assert rows and all(row[5] == "0" for row in rows), table
 
 
 def test_a_card_says_what_is_not_known(mixed_build: BuildSummary) -> None:

@@ -57,7 +57,7 @@ def draw_figures(figure: Figure, check: AlignmentCheck, scene: Scene, y: float) 
         colour = palette.VERDICT_COLOURS["failed"] if worse else palette.INK
         write(figure, columns[0], line, one.name, size=7.5)
         # Adding 0 turns a rounded -0 into 0.
-        value = f"{round(one.value, 3) + 0.0:.3f}"
+        value = "-" if np.isnan(one.value) else f"{round(one.value, 3) + 0.0:.3f}"
         write(figure, columns[1], line, value, size=7.5, ha="right", color=colour)
         limit = one.threshold_text.replace(">=", "\u2265").replace("<=", "\u2264")
         write(figure, columns[2] - 26, line, limit, size=7.5, ha="right", color=palette.MUTED)

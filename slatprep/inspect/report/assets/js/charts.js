@@ -54,7 +54,7 @@ const Charts = (() => {
     );
     const label = `${spec.title}. ${spec.sub}`;
     const plot = el("div", { class: "plot", role: spec.choose ? "group" : "img", "aria-label": label }, ...bars, ...marks);
-    // Bars say nothing without a number: that of the highest stands at the axis' end.
+    // The axis is labelled with the number of the highest bar.
     plot.append(el("span", { class: "most", "aria-hidden": "true" }, `highest: ${Format.count(highest)}`));
     if (spec.choose) roving(plot, bars);
     const ticks = spec.ticks.map((tick) => el("span", { style: { left: `${place(tick.at)}%` } }, tick.text));

@@ -25,7 +25,7 @@ const Format = (() => {
   const share = (x, digits = 1) => {
     if (x === null) return NONE;
     const text = (100 * x).toFixed(digits);
-    // Nothing that is not all is called all, and nothing that is not nothing is called nothing.
+    // Rounding must not turn a share into 0 % or 100 %.
     if (x < 1 && Number(text) === 100) return `>${(100 - 10 ** -digits).toFixed(digits)} %`;
     if (x > 0 && Number(text) === 0) return `<${(10 ** -digits).toFixed(digits)} %`;
     return `${text} %`;
