@@ -57,7 +57,7 @@ def report(
         manifests = next((folder for folder in usual if folder.is_dir()), None)
     if manifests is None:
         output.problem(
-            f"no records of {store} found; the page cannot say what did not go in, and why. "
+            f"no records of {store} found; the page cannot list assets that are not in the store. "
             "Name their folder with --manifests"
         )
     with output.progress("report") as progress:

@@ -219,7 +219,7 @@ def _assets(store: Store) -> dict[str, Any]:
     fields["end_row"] = "sc:Integer", "the row after its last"
     offsets = store.offsets.tolist()
     rows = zip(*columns, offsets[:-1], offsets[1:], strict=True)
-    description = "One row an asset: what it is, and how good its alignment is."
+    description = "One row per asset: what it is, and how good its alignment is."
     return _record_set("assets", description, fields, rows)
 
 

@@ -135,8 +135,8 @@ def _replace_files(new: Path, out: Path, own: frozenset[str], others: set[str]) 
     names = sorted(_names_below(new), key=lambda name: (name == INDEX, name))
     if taken := sorted(others.intersection(names)):
         raise ConfigError(
-            f"{out / taken[0]} is of no export of slatprep, and a file of this one would have its "
-            "name; move it away, or export to a new path"
+            f"{out / taken[0]} is of no export of slatprep, and the new export has a "
+            "file of this name; move it away, or export to a new path"
         )
     flush_tree(new)
     # Only names found below `out`: the index may contain any path.

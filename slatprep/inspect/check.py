@@ -225,8 +225,8 @@ def recompute_annotation(asset: StoredAsset) -> tuple[float, dict[str, NDArray[n
     asset : StoredAsset
         The asset.
 
-    The grid is that of one annotation. Where labels are merged of several, those are
-    compared in which all agree or which it alone reaches.
+    The stored grid is one annotation. Labels merged from several annotations are compared only
+    where all agree, or where only the stored one has a label.
 
     Returns
     -------

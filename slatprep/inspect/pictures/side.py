@@ -115,7 +115,7 @@ def draw_candidates(figure: Figure, alignment: Alignment, y: float) -> None:
         write(figure, side_of(figure), y + 20, words, size=7, color=palette.MUTED)
         return
     own = sorted((c for c in candidates if c.same_as is None), key=lambda c: (-c.fitness, c.index))
-    words = f"{len(own)} different of {len(candidates)}, by coarse fitness; some end alike"
+    words = f"{len(own)} distinct of {len(candidates)}, by coarse fitness"
     write(figure, side_of(figure), y + 20, words, size=7, color=palette.MUTED)
     axes = _axes(figure, y + 36, 190)
     wide = alignment.search is Search.SO3

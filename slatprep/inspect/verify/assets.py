@@ -252,7 +252,7 @@ _IS_GRID_CLASS = np.isin(np.arange(256), (*range(BACKGROUND + 1), UNANNOTATED))
 
 
 def _is_spread(asset: StoredAsset) -> bool:
-    """Whether spreads are where several annotations are, of all properties, and not negative."""
+    """Whether spreads are at least 0, of all properties or none, and only of merged labels."""
     missing = np.isnan(asset.spread)
     may = asset.valid & asset.merged
     rows_agree = (missing.all(axis=1) == missing.any(axis=1)).all()

@@ -66,7 +66,7 @@ def source_roots(manifests: Place | None) -> SourceRoots:
             f"({text}); verify those, or {advice} of one folder with all sources"
         )
     if text == NO_ROOT:
-        raise StoreError(f"{manifests / BUILD}: says not where its sources lie; {advice}")
+        raise StoreError(f"{manifests / BUILD}: does not say where its sources are; {advice}")
     raise StoreError(f"{manifests / BUILD}: its sources are not at {gone[0]} any more; {advice}")
 
 
