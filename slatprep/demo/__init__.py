@@ -1,9 +1,8 @@
 """Demo data: procedural assets with exactly known truth, in the layouts of real ones.
 
-`shapes` and `materials` are what objects are built of, `catalogue` lists the
-objects, `voxelise`, `difficulty`, `generated` and `nerf` are how two pipelines
-see them, `asset` puts both sides and the truth together, `write` lays them out
-on disk, `sources` as other sources do.
+`shapes` and `materials` define parts, and `catalogue` the objects; `voxelise`, `difficulty`,
+`generated` and `nerf` make both sides of an object; `asset` adds the truth; `write` and `sources`
+write the files.
 """
 
 from __future__ import annotations
@@ -68,7 +67,7 @@ class _Recipe:
 
     @property
     def adapter(self) -> str:
-        """What reads the source, and the name of its folder."""
+        """The adapter of the source, and the name of its folder."""
         kind = self.source.partition("-")[0]
         return "pixieverse" if kind == "pixie" else kind
 
@@ -102,38 +101,36 @@ def make_demo(
         Where to write ``pixieverse/`` (or the folder of another source), ``slat/``,
         ``truth/``, ``obj_ids_metadata.json``, ``dataset.toml`` (the dataset's definition
         for `slatprep build-store --config`) and ``demo.json`` (what was made).
-        It is made if missing; it must be empty or hold the same demo.
+        It is created if missing; it must be empty or hold the same demo.
     assets, seed : int
         Number of objects, and the seed of everything random.
     levels : tuple of int, optional
-        Levels of difficulty, gone through in turn; see `slatprep.demo.difficulty`. By
-        default those whose sides show one clean shape, or 0 alone where `source` shares
-        the frame of the SLAT; 5 to 7, a generated shape, a NeRF's field and both, are made
-        where they are named.
+        Levels of difficulty, which assets take in turn; see `slatprep.demo.difficulty`. By
+        default 0 to 4, or only 0 if `source` shares the frame of the SLAT.
     views : int
         SLATs of each object; with several, rows are named ``<object id>.<view>``.
     latents : {"placeholder", "material"}
-        What the latents are made of; see `slatprep.demo.latents`.
+        Noise, or latents that depend on the material; see `slatprep.demo.latents`.
     habitual_share : float
         Share of assets with the dataset's one quarter turn between the sides,
         in 0..1; the others have any of the 24.
     source : str
-        What the annotated side is, one of `slatprep.demo.sources.Source`: PixieVerse's
-        grids, predictions of 11 or of 4 channels, VoMP's or PhysXNet's voxels, or plain
-        voxels, with ten properties (in HDF5 without classes).
+        The source of the annotated side, one of `slatprep.demo.sources.Source`: PixieVerse's
+        grids, predictions with 11 or 4 channels, VoMP's or PhysXNet's voxels, or plain voxels
+        with ten properties (in HDF5 without classes).
     encoder : {"trellis", "sam3d", "trellis2", "plain"}
-        Whose latents they are; ``plain`` has 16 channels, described by ``encoder.json``.
+        The encoder of the latents; ``plain`` has 16 channels, described in ``encoder.json``.
     slat_form : {"npz", "npz-batch", "hdf5", "hdf5-groups"}
         Coordinates (N, 3) uint8 or (N, 4) int32 in an npz, or HDF5, a file or
         a group an asset.
     slat_names : {"id", "sha256"}
         Name the SLATs by object id, or by sha256 with TRELLIS's ``metadata.csv``.
     results : bool
-        Also write ``results/``: what a method that errs might predict, 12 MB an asset.
+        Also write ``results/``: predictions of a method with errors, 12 MB for each asset.
     jobs : int
         Processes.
     progress : callable, optional
-        Called with the number of assets done and of all, after each.
+        Called with the number of assets done and the number of all assets.
 
     Returns
     -------
@@ -143,7 +140,7 @@ def make_demo(
     Raises
     ------
     ConfigError
-        If an argument makes no sense or the directory holds something else.
+        If an argument is not allowed or the folder holds something else.
     """
     usual = (0,) if source in ONE_FRAME else SAME_SHAPE_LEVELS
     recipe = _Recipe(

@@ -114,7 +114,7 @@ def make_asset(
         SLATs of the object; from the second on the SLAT side is turned about z, and
         where shapes are generated, each is another one.
     latents : {"placeholder", "material"}
-        What the latents are made of.
+        Noise, or latents that depend on the material; see `slatprep.demo.latents`.
     habitual_share : float
         Share of assets whose PixieVerse side has the dataset's one quarter
         turn; the others have any of the 24.
@@ -122,7 +122,7 @@ def make_asset(
         Channels of the latents.
     one_frame : bool
         Whether both sides were made from one mesh: the transform is the identity then.
-        It goes with level 0, and one view.
+        Only for level 0 and one view.
 
     Returns
     -------

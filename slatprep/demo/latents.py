@@ -1,4 +1,4 @@
-"""Synthetic latents of a SLAT, with eight channels or as many as an encoder gives.
+"""Synthetic latents of a SLAT, with the number of channels of an encoder.
 
 Mean and standard deviation of each channel are TRELLIS's, see `slatprep.records`; for
 encoders with more channels they repeat every eight.
@@ -19,7 +19,7 @@ LatentKind = Literal["placeholder", "material"]
 Encoder = Literal["trellis", "sam3d", "trellis2", "plain"]
 
 CHANNELS: dict[Encoder, int] = {"trellis": 8, "sam3d": 8, "trellis2": 32, "plain": 16}
-"""How many channels the latents of an encoder have; ``plain`` stands for any other."""
+"""Number of channels of each encoder's latents; ``plain`` stands for any other encoder."""
 
 MEAN, STD = np.array(FEATS_MEAN), np.array(FEATS_STD)
 
@@ -46,9 +46,9 @@ def make_latents(
     rng : numpy.random.Generator
         Source of the noise.
     kind : {"placeholder", "material"}
-        ``placeholder`` is normal noise. ``material`` is `NOISE` times that, and
-        `clean_latents` of what is there in its first eight channels; then mean and
-        standard deviation are applied.
+        ``placeholder`` is normal noise. ``material`` is `NOISE` times that, with
+        `clean_latents` added to the first eight channels. Both are then scaled to the
+        encoder's mean and standard deviation.
     coords : ndarray of uint8, shape (N, 3)
         SLAT voxels.
     material : ndarray of uint8, shape (N,)
@@ -70,14 +70,13 @@ def make_latents(
 def clean_latents(
     coords: NDArray[np.uint8], material: NDArray[np.uint8], properties: NDArray[np.float32]
 ) -> NDArray[np.float64]:
-    """Return the part of ``material`` latents that is no noise, standardised (N, 8).
+    """Return ``material`` latents without noise, standardised (N, 8).
 
     ``2 * code[material] + p @ code[:3] + sin(pi * x) @ code[3:6] / 2``, with
     ``code`` eight fixed orthonormal vectors, ``p`` the three properties (log10
     Young's modulus, log10 density, Poisson's ratio) mapped to about -1..1, and
-    ``x`` the voxel's centre. It is linear in what is to be learnt, so a linear
-    model of each voxel has the form of the truth; what it cannot do is to look
-    at the neighbours, whose noise is independent.
+    ``x`` the voxel's centre. It is linear in the targets, so a linear model of single voxels
+    has the right form; but it cannot use neighbouring voxels, whose noise is independent.
 
     Parameters
     ----------

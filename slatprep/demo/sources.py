@@ -1,7 +1,7 @@
-"""Demo data as sources other than PixieVerse have it, of the same shapes.
+"""Demo data in the layouts of other sources than PixieVerse.
 
-`write_vomp`, `write_physxnet` and `write_voxels` lay out annotated voxels as those
-sources do; each takes plain arrays, so that other data can be written with it too.
+`write_vomp`, `write_physxnet` and `write_voxels` take plain arrays, so that they can write other
+data in these layouts too.
 """
 
 from __future__ import annotations
@@ -20,15 +20,15 @@ Source = Literal[
     "pixieverse", "pixie-predictions", "pixie-prediction-ids",
     "vomp", "physxnet", "voxels-npz", "voxels-hdf5", "voxels-zarr", "voxels-ply",
 ]  # fmt: skip
-"""The forms that a demo's annotated side can have."""
+"""Sources, and their forms, that the annotated side of a demo can have."""
 
 ONE_FRAME = ("vomp", "physxnet")
 """Sources whose voxels were made from the mesh that the latents were encoded from."""
 
 CLASSES = ("elastic", "metal", "granular", "viscous", "liquid", "snow", "rigid")
-"""What plain voxels of a demo call the classes 0 to 6."""
+"""Names of the classes 0 to 6 in plain voxels of a demo."""
 
-# Of each of these classes: friction angle, damping, restitution, friction, conductivities.
+# Columns: friction angle, damping, restitution, friction, and the two conductivities.
 _BY_CLASS = np.array([
     [0.0, 0.20, 0.60, 0.80, 0.2, 1e-9],
     [0.0, 0.02, 0.50, 0.40, 50.0, 1e7],
@@ -51,13 +51,13 @@ TABLE: tuple[dict[str, Any], ...] = (
     {"name": "thermal_conductivity", "unit": "W/(m K)", "scale": "log10"},
     {"name": "electrical_conductivity", "unit": "S/m", "scale": "log10"},
 )
-"""The properties of plain voxels of a demo, as ``source.json`` has them."""
+"""The properties of plain voxels of a demo, in the form of ``source.json``."""
 
 
 def columns_of(
     source: Source, material: NDArray[Any], properties: NDArray[np.float32]
 ) -> dict[str, NDArray[np.float32]]:
-    """Return what a source says of some voxels: a column (K,) a property, SI.
+    """Return the properties that a source has of some voxels.
 
     Parameters
     ----------
@@ -66,9 +66,14 @@ def columns_of(
     material : ndarray of int, shape (K,)
         Their classes, 0..6.
     properties : ndarray of float32, shape (K, 3)
-        Their Young's modulus, density and Poisson's ratio, from which the others follow:
-        a yield stress of 1 % of the modulus, and what is usual for the class, times a
-        factor of 0.5 to 1.5 that follows the Poisson's ratio.
+        Their Young's modulus, density and Poisson's ratio. The other properties follow from
+        them: a yield stress of 1 % of the modulus, and values by class, multiplied by 0.5
+        to 1.5 depending on Poisson's ratio.
+
+    Returns
+    -------
+    dict of str to ndarray of float32, shape (K,)
+        By name, in SI units.
     """
     known = dict(zip((one.name for one in PROPERTIES), properties.T, strict=True))
     if source == "physxnet":
@@ -91,7 +96,7 @@ def classes_of(source: Source) -> tuple[str, ...]:
 def write_field(
     root: Path, source: Source, name: str, grid: NDArray[np.float32], surface: NDArray[np.uint8]
 ) -> None:
-    """Write the annotated side of an object, of any source but Pixie's.
+    """Write the annotated side of an object, for any source but Pixie's.
 
     Parameters
     ----------
@@ -100,11 +105,11 @@ def write_field(
     source : str
         One of `Source`.
     name : str
-        The object's.
+        Id of the object.
     grid : ndarray of float32, shape (64, 64, 64, 4)
-        As PixieVerse has it; voxels of class -1 are left out.
+        In PixieVerse's form; voxels of class -1 are left out.
     surface : ndarray of uint8, shape (N, 3)
-        Voxels of its SLAT; those of PhysXNet are the same.
+        Voxels of its SLAT, which PhysXNet annotates.
     """
     known = (grid[..., 3] >= 0) & (grid[..., 3] < BACKGROUND)
     voxels = np.argwhere(known)
@@ -126,7 +131,7 @@ def write_field(
 def write_vomp(
     root: Path, name: str, voxels: NDArray[Any], columns: Mapping[str, NDArray[np.float32]]
 ) -> None:
-    """Write voxels (K, 3) of 64^3 as VoMP does: a structured array, lower corners for places."""
+    """Write voxels (K, 3) of 64^3 as VoMP does: a structured array of lower corners."""
     names = ("x", "y", "z", "youngs_modulus", "poissons_ratio", "density")
     rows = np.zeros(len(voxels), [*((key, "<f4") for key in names), ("segment_id", "<U32")])
     for key, axis in zip("xyz", voxels.T, strict=True):
@@ -147,7 +152,7 @@ def write_physxnet(
         (root / folder).mkdir(parents=True, exist_ok=True)
     rows = np.full((len(voxels), 14), -1.0)
     rows[:, 0] = 30.0  # the object's largest dimension [cm]
-    rows[:, 1] = 1.0  # the part's rank among those that one would touch
+    rows[:, 1] = 1.0  # rank of the part by how likely it is touched
     rows[:, 2] = density / 1000.0  # g/cm^3
     rows[:, 3] = rows[:, 13] = 0.0  # the group that moves together, and how it does
     np.save(root / "property" / f"{name}2.npy", rows)
@@ -158,7 +163,7 @@ def write_physxnet(
 
 
 def write_points(path: Path, columns: Mapping[str, NDArray[Any]]) -> None:
-    """Write a binary PLY of points with a property a column (K,)."""
+    """Write a binary PLY of points with a property for each column (K,)."""
     kinds = {"f4": "float", "f8": "double", "i4": "int", "u1": "uchar"}
     dtype = np.dtype([(key, array.dtype.newbyteorder("<")) for key, array in columns.items()])
     rows = np.rec.fromarrays(list(columns.values()), dtype=dtype)
@@ -181,18 +186,18 @@ def write_description(
 
 
 def write_voxels(root: Path, name: str, form: str, arrays: Mapping[str, NDArray[Any]]) -> None:
-    """Write plain voxels of an object: ``voxels`` (K, 3) and a column (K,) a property.
+    """Write plain voxels of an object: ``voxels`` (K, 3) and a column (K,) for each property.
 
     Parameters
     ----------
     root : Path
         The folder of the source.
     name : str
-        The object's.
+        Id of the object.
     form : {"npz", "hdf5", "zarr", "ply"}
-        In a PLY the voxels are the points of their centres.
+        A PLY has the centres of the voxels as points.
     arrays : mapping of str to ndarray
-        What to write.
+        The arrays by name.
     """
     root.mkdir(parents=True, exist_ok=True)
     if form == "npz":

@@ -125,6 +125,7 @@ def export_store(
             for written in writer.write(file, about, map(opened.asset, ids)):
                 entries.append(_entry(written))
                 tell(len(entries), len(ids))
+            sizes = [file.stat().st_size]
     else:
         with target.directory(out) as directory:
             tasks = (
@@ -139,14 +140,14 @@ def export_store(
             if writer.finish is not None:
                 about |= {"files": writer.finish(directory, entries)}
             target.write_index(directory, about, entries)
-    files = [out] if out.is_file() else [path for path in out.rglob("*") if path.is_file()]
+            sizes = [path.stat().st_size for path in directory.rglob("*") if path.is_file()]
     return ExportSummary(
         format=format,
         path=out,
         assets=len(entries),
         points=sum(entry["points"] for entry in entries),
-        files=len(files),
-        size=sum(path.stat().st_size for path in files),
+        files=len(sizes),
+        size=sum(sizes),
         seconds=time.perf_counter() - begin,
         notes=writer.notes,
     )

@@ -192,7 +192,7 @@ def check_prediction(
     normalization : Normalization
         The store's ranges.
     classes : int
-        How many the store has.
+        Number of classes of the store.
 
     Returns
     -------

@@ -1,6 +1,6 @@
 """Read an array of an untrusted Zarr hierarchy without zarr-python.
 
-See `slatprep.storage.chunks`; arrays in shards are read as a store's are.
+Plain arrays are read by `slatprep.storage.chunks`, arrays in shards like those of a store.
 """
 
 from __future__ import annotations

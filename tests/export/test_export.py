@@ -138,11 +138,13 @@ def test_what_lies_beside_an_export_stays(format: Any, store: Path, tmp_path: Pa
     (tmp_path / "outside.txt").write_text("mine")
     before = tree(store)
 
-    export_store(out / "s.zarr", out, format, assets=["dog"])
+    written = export_store(out / "s.zarr", out, format, assets=["dog"])
     assert tree(out / "s.zarr") == before
     assert (out / "notes.txt").read_text() == (tmp_path / "outside.txt").read_text() == "mine"
     assert (out / "link").is_symlink()
     export_store(out / "s.zarr", fresh, format, assets=["dog"])
+    assert written.files == len(bytes_of(fresh))
+    assert written.size == sum(map(len, bytes_of(fresh).values()))
     kept = {"s.zarr", "notes.txt", "empty", "link"}
     assert {path.name for path in out.iterdir()} - kept == {path.name for path in fresh.iterdir()}
     for name, content in bytes_of(fresh).items():
