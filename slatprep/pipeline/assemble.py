@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from itertools import chain
 from pathlib import Path
 
 import numpy as np
@@ -22,16 +23,21 @@ from slatprep.provenance.make import complete_record, origin
 from slatprep.provenance.record import AssetRecord, Clipped, Record, property_counts
 from slatprep.provenance.record_json import read_asset_record, to_json
 from slatprep.records import Normalization
+from slatprep.storage.place import storage_of
+from slatprep.storage.upload import Staged
 from slatprep.store import open_store
 from slatprep.store.writer import finish_store
-from slatprep.workers.local import Jobs
+from slatprep.workers.local import Jobs, run_in_order
+
+_RECORDS_A_TASK = 64
 
 
 @dataclass(frozen=True)
 class Assembled:
     """A new store that is not in place yet, and what goes into the summary of it.
 
-    ``clipped`` has the values of voxels outside the ranges, (A, P) by row and property.
+    ``clipped`` has the values of voxels outside the ranges, (A, P) by row and property;
+    ``staged`` what is not in ``store``, as it lies on an object store already.
     """
 
     store: Path
@@ -40,6 +46,7 @@ class Assembled:
     normalization: Normalization
     counts: Counts
     clipped: NDArray[np.int64]
+    staged: Staged | None
 
 
 def assemble(
@@ -72,23 +79,35 @@ def assemble(
             rows.made, work.spool, parameters.normalize, jobs, contents.properties
         )
     store, records = work.scratch / "store.zarr", work.scratch / "assets.jsonl"
+    how, remote = parameters.store, storage_of(work.shards).remote
     packed = pack_store(
-        store, work.spool, rows.usable, normalization, parameters.store, jobs, contents, carried
+        store, work.spool, rows.usable, normalization, how, jobs, contents, carried, remote
     )
-    completed = _completed_records(work.spool, rows, normalization, packed)
+    completed = _completed_records(work.spool, rows, normalization, packed, jobs)
     build_id = write_all_records(store, records, completed, packed.records)
-    finish_store(store, normalization, build_id, origin(parameters), contents, known=packed.digests)
+    build, files = origin(parameters), (packed.digests, packed.elsewhere)
+    finish_store(store, normalization, build_id, build, contents, *files)
     counts, clipped = counts_in(open_store(store)), packed.clipped["voxel"]
-    return Assembled(store, records, build_id, normalization, counts, clipped)
+    staged = None if remote is None else Staged(remote, packed.elsewhere, packed.digests)
+    return Assembled(store, records, build_id, normalization, counts, clipped, staged)
 
 
 def _completed_records(
-    spool: Spool, rows: Rows, normalization: Normalization, packed: Packed
+    spool: Spool, rows: Rows, normalization: Normalization, packed: Packed, jobs: Jobs
 ) -> Iterator[tuple[int, Record | bytes]]:
     """Yield rows and records of a build by asset id, with the ranges and what they clip."""
     everything: list[tuple[int, Row | FailedAsset]] = [*enumerate(rows.usable)]
     everything += [(-1, asset) for asset in rows.failed]
-    for row, asset in sorted(everything, key=lambda one: one[1].asset_id):
+    everything.sort(key=lambda one: one[1].asset_id)
+    made = [(row, one.key) for row, one in everything if not isinstance(one, KeptAsset)]
+    counts = np.stack([packed.clipped["voxel"], packed.clipped["grid"]], axis=1)
+    parts = (made[at : at + _RECORDS_A_TASK] for at in range(0, len(made), _RECORDS_A_TASK))
+    tasks = (
+        (spool, [(key, None if row < 0 else counts[row]) for row, key in part], normalization)
+        for part in parts
+    )
+    records = chain.from_iterable(run_in_order(complete_records, tasks, jobs))
+    for row, asset in everything:
         if isinstance(asset, KeptAsset):
             carried = rows.carried
             if carried is None:
@@ -98,11 +117,31 @@ def _completed_records(
                 where = f"{carried.previous.path}: record of {asset.asset_id}"
                 text = to_json(asset.names.applied(read_asset_record(text, where)))
             yield row, text
-            continue
-        record = spool.record(asset.key)
-        if isinstance(record, AssetRecord):
-            clipped = Clipped(
-                *(property_counts(packed.clipped[g][row], normalization) for g in ("voxel", "grid"))
-            )
+        else:
+            yield row, next(records)
+
+
+def complete_records(
+    spool: Spool,
+    assets: Sequence[tuple[str, NDArray[np.int64] | None]],
+    normalization: Normalization,
+) -> list[Record]:
+    """Read records of finished assets, and add the ranges and what they clip.
+
+    Parameters
+    ----------
+    spool : Spool
+        Where they lie.
+    assets : sequence of (str, ndarray of int64 or None)
+        Their keys; of those that go in, the clipped values, (2, P), of voxels and of the grid.
+    normalization : Normalization
+        The ranges.
+    """
+    records = []
+    for key, counts in assets:
+        record = spool.record(key)
+        if isinstance(record, AssetRecord) and counts is not None:
+            clipped = Clipped(*(property_counts(own, normalization) for own in counts))
             record = complete_record(record, normalization, clipped)
-        yield row, record
+        records.append(record)
+    return records

@@ -109,13 +109,15 @@ def build_store(
     begin = time.perf_counter()
     crew = Crew(jobs, assets_per_job, progress, note)
     place, wanted = Destination(out, manifests), Wanted.of(parameters, compact)
-    with work_beside(place.store, fresh=fresh, keep=keep_work) as work:
-        place.look()
-        pairs = _discover(parameters, jobs, work.scratch)
+    elsewhere = not isinstance(jobs, int)
+    with work_beside(
+        place.store, fresh=fresh, keep=keep_work, look=place.look, private_disks=elsewhere
+    ) as work:
+        pairs = _discover(parameters, jobs, work.shared())
         check_objects(pairs, parameters.normalize)
         there = None if fresh else store_there(place.store)
         context = BuildContext(parameters, recipe_of(parameters), work.spool, there, strict)
-        update = Update.begun(pairs, context, place, wanted, rehash, begin)
+        update = Update.begun(pairs, context, place, wanted, rehash, begin, work.scratch)
         if summary := update.untouched():
             return summary
         if not fresh:
@@ -129,7 +131,7 @@ def build_store(
         with writing(str(place.out), work_directory(place.store).parent):
             packing = crew.of(len(rows.made))
             assembled = assemble(rows, wanted.given, work, parameters, packing)
-            place.replace(assembled.store)
+            place.replace(assembled.store, assembled.staged)
         summary = _publish(update, rows, assembled)
         if keep_work:
             work.spool.keep_only({asset.key for asset in rows.usable})
@@ -217,7 +219,7 @@ def align_pairs(
     return summarise_build(counts, failed, records=out, build_id=build_id, seconds=seconds)
 
 
-def _discover(parameters: BuildParameters, jobs: Jobs, *shared: Path) -> list[AssetPair]:
+def _discover(parameters: BuildParameters, jobs: Jobs, *shared: Place) -> list[AssetPair]:
     """Return the pairs; see that the workers find the first one's files, and `shared`."""
     pairs = discover(parameters)
     sources = next(([pair.grid, pair.slat] for pair in pairs if pair.grid and pair.slat), [])

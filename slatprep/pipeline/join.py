@@ -284,8 +284,7 @@ def write_rows(
         assets.append(spooled(record, _NO_EXTENT))
         if record.counts.clipped:
             clipped.append(_counts(record.counts.clipped.voxel))
-    with work_beside(place.store) as work:
-        place.look()
+    with work_beside(place.store, look=place.look) as work:
         store, records = work.scratch / "store.zarr", work.scratch / "assets.jsonl"
         with writing(str(place.out), work_directory(place.store).parent):
             offsets = [0, *accumulate(asset.n_voxels for asset in assets)]

@@ -19,11 +19,20 @@ from slatprep.pipeline.carry import Carried, KeptAsset, Row
 from slatprep.pipeline.previous import PreviousBuild
 from slatprep.pipeline.spool import Spool, SpooledAsset
 from slatprep.readers.encoders import ENOUGH, in_words, look_standardised, settle_latents
-from slatprep.records import BACKGROUND, UNANNOTATED, Contents, LatentSpace, Normalization
+from slatprep.records import (
+    BACKGROUND,
+    UNANNOTATED,
+    Contents,
+    LatentSpace,
+    Normalization,
+    Place,
+)
 from slatprep.storage.faults import reached
+from slatprep.storage.place import storage_of
+from slatprep.storage.remote import put_objects
 from slatprep.store import Store
 from slatprep.store.layout import ARRAYS, MERGED, ArrayLayout, overlaps
-from slatprep.store.shard_writer import ShardWriter
+from slatprep.store.shard_writer import ShardWriter, Written
 from slatprep.store.writer import Shard, create_store, merges, open_for_writing, shards
 from slatprep.workers.local import Jobs, run_unordered
 
@@ -32,18 +41,18 @@ Arrays = dict[str, NDArray[Any]]
 
 
 def write_shard(
-    path: Path,
+    path: Place,
     spool: Spool,
     shard: Shard,
     normalization: Normalization,
     previous: PreviousBuild | None = None,
-) -> tuple[Shard, NDArray[np.int64]]:
+) -> tuple[Shard, NDArray[np.int64], dict[str, Written]]:
     """Normalise and write one shard of every array of its group.
 
     Parameters
     ----------
-    path : Path
-        The store, made by `create_store`.
+    path : Place
+        Where the store is made; `create_store` wrote the metadata of its arrays.
     spool : Spool
         Where the assets lie.
     shard : Shard
@@ -59,6 +68,8 @@ def write_shard(
         The same.
     clipped : ndarray of int64, shape (len(shard.keys), P)
         How many of the values of the spool's assets lay outside the range, by property.
+    files : dict of str to Written
+        What was written, by name.
     """
     name = f"{shard.group} {shard.rows[0]}"
     reached("shard begun", name)
@@ -92,7 +103,7 @@ def write_shard(
                         writer.append_fill(own.stop - own.start)
         reached("shard filled", name)
     reached("shard written", name)
-    return shard, clipped
+    return shard, clipped, {writer.file: writer.written() for writer in writers.values()}
 
 
 def arrays_in(group: str, several: bool) -> list[str]:
@@ -216,14 +227,24 @@ def latent_warnings(
 
 @dataclass(frozen=True)
 class Packed:
-    """What became of packing: values clipped, (A, P) by group, and what was taken over.
+    """What became of packing.
 
-    `digests` are those of files that were taken over, `records` the shards of records among them.
+    Attributes
+    ----------
+    clipped : dict of str to ndarray of int64, shape (A, P)
+        Values outside the ranges, by group.
+    digests : dict of str to str
+        Of the shards, by file.
+    records : frozenset of int
+        Shards of records that were taken over.
+    elsewhere : dict of str to int
+        Bytes of the files that do not lie where the store is made, but where it belongs.
     """
 
     clipped: Mapping[str, NDArray[np.int64]]
     digests: Mapping[str, str]
     records: frozenset[int]
+    elsewhere: Mapping[str, int]
 
 
 def pack_store(
@@ -235,8 +256,12 @@ def pack_store(
     jobs: Jobs,
     contents: Contents,
     carried: Carried | None = None,
+    at: Place | None = None,
 ) -> Packed:
-    """Write the store's arrays, a task a shard; take over what `carried` has."""
+    """Write the store's arrays, a task a shard; take over what `carried` has.
+
+    Shards go to `at`, if given, a place on an object store that all workers reach.
+    """
     keys = [asset.row if isinstance(asset, KeptAsset) else asset.key for asset in assets]
     offsets = [0, *accumulate(asset.n_voxels for asset in assets)]
     several = any(asset.several for asset in assets)
@@ -247,14 +272,21 @@ def pack_store(
     shape = len(keys), len(contents.properties)
     clipped = {group: np.zeros(shape, dtype=np.int64) for group in ("voxel", "grid")}
     same = carried.rows if carried else None
+    if (remote := None if at is None else storage_of(at).remote) is not None:
+        arrays = [*arrays_in("voxel", several), *arrays_in("grid", several)]
+        put_objects(path, remote, [f"{name}/zarr.json" for name in arrays])
     tasks = (
-        (path, spool, shard, normalization, previous)
+        (remote or path, spool, shard, normalization, previous)
         for shard in shards(keys, offsets, parameters, same)
     )
-    for shard, counts in run_unordered(write_shard, tasks, jobs):
+    written: dict[str, Written] = {}
+    for shard, counts, files in run_unordered(write_shard, tasks, jobs):
         clipped[shard.group][shard.first : shard.first + len(shard.keys)] += counts
+        written |= files
     for row, asset in enumerate(assets):
         if isinstance(asset, KeptAsset):
             clipped["voxel"][row] = asset.clipped
-    taken = carried.take_shards(path, parameters) if carried else ({}, frozenset())
-    return Packed(clipped, *taken)
+    digests, records = carried.take_shards(path, parameters) if carried else ({}, frozenset())
+    elsewhere = {name: file.size for name, file in written.items()} if remote else {}
+    digests |= {name: file.sha256 for name, file in written.items()}
+    return Packed(clipped, digests, records, elsewhere)

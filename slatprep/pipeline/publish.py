@@ -30,7 +30,7 @@ from slatprep.records import Place
 from slatprep.storage.atomic import replace_directory
 from slatprep.storage.faults import reached
 from slatprep.storage.place import place_of, storage_of
-from slatprep.storage.upload import PublishedState, Upload, published_state, upload_store
+from slatprep.storage.upload import PublishedState, Staged, Upload, published_state, upload_store
 from slatprep.store.reader import is_store
 from slatprep.store.records import RecordWriter
 from slatprep.store.writer import open_for_writing
@@ -82,10 +82,18 @@ class Destination:
         if self._remote is not None:
             self._before = published_state(self._remote)
 
-    def replace(self, new: Path) -> None:
-        """Put a finished store in place; on an object store it is not published yet."""
+    def replace(self, new: Path, staged: Staged | None = None) -> None:
+        """Put a finished store in place; on an object store it is not published yet.
+
+        Parameters
+        ----------
+        new : Path
+            The store.
+        staged : Staged, optional
+            What of it is on the object store already.
+        """
         if self._before is not None:
-            self._upload = upload_store(new, self._before)
+            self._upload = upload_store(new, self._before, staged)
         elif (path := storage_of(self.store).local) is not None:
             replace_directory(new, path)
         reached("store replaced", str(self.store))

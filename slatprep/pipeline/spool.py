@@ -1,4 +1,4 @@
-"""Finished assets on disk, between the pass that aligns and the pass that packs.
+"""Finished assets as files, between the pass that aligns and the pass that packs.
 
 A worker leaves an asset's arrays here, in SI units, and hands the parent only
 a `SpooledAsset`, so the parent's memory does not grow with voxels. A file is
@@ -13,10 +13,11 @@ from __future__ import annotations
 import hashlib
 import uuid
 import zipfile
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,12 +32,18 @@ from slatprep.records import (
     Annotation,
     LatentMoments,
     MaterialField,
+    Place,
     Property,
     Status,
     StructuredLatents,
 )
 from slatprep.storage.atomic import writing
 from slatprep.storage.faults import reached
+from slatprep.storage.place import storage_of
+from slatprep.storage.versions import is_spooled
+
+if TYPE_CHECKING:
+    from numpy.lib.npyio import NpzFile
 
 Arrays = dict[str, NDArray[Any]]
 
@@ -101,13 +108,13 @@ class Spool:
 
     Parameters
     ----------
-    directory : Path
-        Where; it must exist.
+    directory : Place
+        Where; on a disk it must exist.
     arrays : bool
         Whether arrays are kept, or records alone.
     """
 
-    def __init__(self, directory: Path, arrays: bool = True) -> None:
+    def __init__(self, directory: Place, arrays: bool = True) -> None:
         self.directory = directory
         self.arrays = arrays
 
@@ -158,7 +165,7 @@ class Spool:
     def find(self, key: str) -> tuple[AssetRecord, SpooledAsset] | None:
         """Return a finished asset, or None if there is none under this key that is whole."""
         try:
-            with np.load(self._path(key), allow_pickle=False) as file:
+            with self._open(key) as file:
                 arrays = {name: file[name] for name in file.files}  # Reads, so checks, them all.
             record = read_record(arrays["record"].tobytes(), str(self._path(key)))
             extent = arrays["extent"]
@@ -170,34 +177,39 @@ class Spool:
 
     def holds_any(self) -> bool:
         """Whether anything at all is finished."""
-        return any(self.directory.glob("[0-9a-f][0-9a-f]/*.npz"))
+        directory = storage_of(self.directory).local
+        if directory is None:
+            return any(name.endswith(".npz") for name in storage_of(self.directory).files())
+        return any(directory.glob("[0-9a-f][0-9a-f]/*.npz"))
 
     def amend(self, record: AssetRecord) -> None:
         """Replace the record of a finished asset."""
-        with np.load(self._path(record.key), allow_pickle=False) as file:
+        with self._open(record.key) as file:
             arrays = {name: file[name] for name in file.files if name != "record"}
         self._write(record.key, record, arrays)
 
     def keep_only(self, keys: set[str]) -> None:
         """Remove everything but these assets' files."""
-        for path in self.directory.rglob("*"):
-            if path.is_file() and (path.stem not in keys or path.suffix != ".npz"):
-                path.unlink()
+        storage = storage_of(self.directory)
+        kept = {f"{key[:2]}/{key}.npz" for key in keys}
+        # Below the URL of a store others may keep what is theirs.
+        ours = (n for n in storage.files() if storage.remote is None or is_spooled(n))
+        storage.remove(name for name in ours if name not in kept)
 
     def record(self, key: str) -> Record:
         """Read an asset's record back."""
-        with np.load(self._path(key), allow_pickle=False) as arrays:
+        with self._open(key) as arrays:
             return read_record(arrays["record"].tobytes(), str(self._path(key)))
 
     def voxels(self, key: str) -> Arrays:
         """Read an asset's rows of the ``voxel/*`` arrays, properties in SI units."""
-        with np.load(self._path(key), allow_pickle=False) as arrays:
+        with self._open(key) as arrays:
             there = (name for name in (*_VOXEL_ARRAYS, *_MERGED) if name in arrays)
             return {name: arrays[name] for name in there}
 
     def field(self, key: str) -> MaterialField:
         """Read an asset's PixieVerse field, without its sources."""
-        with np.load(self._path(key), allow_pickle=False) as arrays:
+        with self._open(key) as arrays:
             return MaterialField(
                 occupancy=np.unpackbits(arrays["grid_occupancy"])
                 .astype(bool)
@@ -214,23 +226,42 @@ class Spool:
                 classified=bool(arrays["grid_classified"]),
             )
 
-    def _path(self, key: str) -> Path:
+    def _path(self, key: str) -> Place:
         return self.directory / key[:2] / f"{key}.npz"
 
+    @contextmanager
+    def _open(self, key: str) -> Iterator[NpzFile]:
+        with (
+            storage_of(self._path(key)).open_scattered() as file,
+            np.load(file, allow_pickle=False) as arrays,
+        ):
+            yield arrays
+
     def _write(self, key: str, record: Record, arrays: Arrays) -> None:
-        path = self._path(key)
         everything: Arrays = {**arrays, "record": np.frombuffer(to_json(record), np.uint8)}
+        with (
+            writing(record.asset_id, self.directory),
+            self._staged(self._path(key)) as partial,
+            partial.open("wb") as file,
+        ):
+            np.savez(file, **everything)  # type: ignore[arg-type]
+        reached("asset spooled", record.asset_id)
+
+    @contextmanager
+    def _staged(self, place: Place) -> Iterator[Path]:
+        path = storage_of(place).local
+        if path is None:
+            with storage_of(place).staged() as partial:
+                yield partial
+            return
         # A name of its own: a worker that outlives a killed build may write the same asset.
         partial = path.with_suffix(f".{uuid.uuid4().hex}.partial")
-        with writing(record.asset_id, self.directory):
-            path.parent.mkdir(exist_ok=True)
-            try:
-                with partial.open("wb") as file:
-                    np.savez(file, **everything)  # type: ignore[arg-type]
-                partial.replace(path)
-            finally:
-                partial.unlink(missing_ok=True)
-        reached("asset spooled", record.asset_id)
+        path.parent.mkdir(exist_ok=True)
+        try:
+            yield partial
+            partial.replace(path)
+        finally:
+            partial.unlink(missing_ok=True)
 
 
 def spooled(record: AssetRecord, extent: NDArray[np.float64]) -> SpooledAsset:

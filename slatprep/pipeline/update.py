@@ -122,6 +122,8 @@ class Update:
         What this build and the last one saw.
     begin : float
         When it began, by `time.perf_counter`.
+    scratch : Path
+        A folder of this build alone, where it writes.
     damaged : tuple of str
         What of the store that is there is not as it was written.
     """
@@ -132,6 +134,7 @@ class Update:
     wanted: Wanted
     looked: Looked
     begin: float
+    scratch: Path
     damaged: tuple[str, ...] = ()
 
     @classmethod
@@ -143,6 +146,7 @@ class Update:
         wanted: Wanted,
         rehash: bool,
         begin: float = 0.0,
+        scratch: Path = Path(),
     ) -> Update:
         """Look at the sources, and read what the last build saw; with `rehash` trust none of it."""
         recipe = context.recipe.key("", {"": str((wanted.declared, context.parameters.slat))})
@@ -151,7 +155,8 @@ class Update:
             bound = bound_to(context.previous.build_id, recipe)
             seen = read_seen(storage_of(place.records().parent).local, bound)
         known = {} if rehash else known_keys(seen, states)
-        return cls(pairs, context, place, wanted, Looked(states, seen, known, recipe), begin)
+        looked = Looked(states, seen, known, recipe)
+        return cls(pairs, context, place, wanted, looked, begin, scratch)
 
     @property
     def seconds(self) -> float:
@@ -259,10 +264,10 @@ class Update:
         )
         parameters = self.context.parameters
         if not _are_published(summary.records, build_record(summary, parameters), untouched):
-            scratch = self.context.spool.directory / ASSETS
-            with writing(str(self.place.out), scratch.parent):
-                write_records(scratch, _all_records(others, previous, self.context))
-            publish_manifests(scratch, summary, parameters)
+            file = self.scratch / ASSETS
+            with writing(str(self.place.out), self.scratch):
+                write_records(file, _all_records(others, previous, self.context))
+            publish_manifests(file, summary, parameters)
         return summary
 
 

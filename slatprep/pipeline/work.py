@@ -6,15 +6,21 @@ killed leaves it; the next one to the same target removes all but the spool
 and goes on from there. Where others may write beside NAME, something else may
 lie there under that name: only a folder that a build of this user made is
 taken, and only what builds make is removed from it.
+
+Where workers have disks of their own and the store belongs on an object store,
+the spool lies there, below the store's URL, and so does the version that they
+write; the work folder then holds what the command itself writes.
 """
 
 from __future__ import annotations
 
 import os
+import platform
 import shutil
 import stat
 import tempfile
-from collections.abc import Iterator
+import warnings
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -22,10 +28,11 @@ from pathlib import Path
 from slatprep.errors import StoreError
 from slatprep.pipeline.spool import Spool
 from slatprep.records import Place
-from slatprep.storage.atomic import restore_directory
+from slatprep.storage.atomic import restore_directory, writing
 from slatprep.storage.faults import reached
 from slatprep.storage.lock import take_lock
 from slatprep.storage.place import storage_of
+from slatprep.storage.versions import BUILDER, SPOOL, new_version
 
 LOCK, _PREFIX = "lock", "build-"
 
@@ -40,15 +47,39 @@ class Work:
         Finished assets; outlives a build that is interrupted.
     scratch : Path
         A folder of this build alone, with a name that no other build had.
+    shards : Place
+        Where workers put the shards of the new store.
     """
 
     spool: Spool
     scratch: Path
+    shards: Place
+
+    def shared(self) -> Place:
+        """Return a place that all workers must see, after making it.
+
+        Raises
+        ------
+        StoreError
+            If it cannot be written.
+        """
+        place = self.spool.directory / BUILDER
+        if storage_of(place).local is not None:
+            return self.scratch
+        with writing(str(place.parent.parent), place), storage_of(place).staged() as file:
+            file.write_text(f"process {os.getpid()} on {platform.node()}\n")
+        return place
 
 
 @contextmanager
 def work_beside(
-    target: Place, *, arrays: bool = True, fresh: bool = False, keep: bool = False
+    target: Place,
+    *,
+    arrays: bool = True,
+    fresh: bool = False,
+    keep: bool = False,
+    look: Callable[[], object] = lambda: None,
+    private_disks: bool = False,
 ) -> Iterator[Work]:
     """Make the work folder of a target, hold its lock, and clean up.
 
@@ -62,6 +93,10 @@ def work_beside(
         Begin with an empty spool.
     keep : bool
         Keep the spool after success as well.
+    look : callable
+        Called with the lock held, before anything is written: raises what `target` is refused for.
+    private_disks : bool
+        Whether workers have no disk in common, so that a spool belongs where `target` is.
 
     Raises
     ------
@@ -70,7 +105,8 @@ def work_beside(
         the lock; the message names that build.
     """
     directory = work_directory(target)
-    spool = Spool(directory / "spool", arrays)
+    folder, remote = directory / SPOOL, storage_of(target).remote if private_disks else None
+    spool = Spool(folder if remote is None else remote / SPOOL, arrays)
     finished, lock = False, None
     try:
         with _making(directory):
@@ -80,14 +116,17 @@ def work_beside(
             reached("work folder locked", directory.name)
             _restore(directory, target)
             _remove_builds(directory)
-            if not os.path.lexists(spool.directory):
-                spool.directory.mkdir()
-            elif spool.directory.is_symlink() or not spool.directory.is_dir():
-                raise _refusal(spool.directory, "is no folder")
-            if fresh:
-                spool.keep_only(set())
+            if not os.path.lexists(folder):
+                folder.mkdir()
+            elif folder.is_symlink() or not folder.is_dir():
+                raise _refusal(folder, "is no folder")
             scratch = Path(tempfile.mkdtemp(prefix=_PREFIX, dir=directory))
-        yield Work(spool, scratch)
+        look()
+        if fresh:
+            with writing(str(target), spool.directory):
+                spool.keep_only(set())
+        shards = scratch / "store.zarr" if remote is None else new_version(remote)
+        yield Work(spool, scratch, shards)
         finished = True
     except KeyboardInterrupt:
         if lock is None:
@@ -98,8 +137,10 @@ def work_beside(
         if lock is not None:
             _restore(directory, target)
             _remove_builds(directory)
-            if (finished and not keep) or not spool.holds_any():
-                shutil.rmtree(spool.directory, ignore_errors=True)
+            if finished and not keep:
+                _clear_spool(target)
+            if (finished and not keep) or not Spool(folder).holds_any():
+                shutil.rmtree(folder, ignore_errors=True)
                 # Last, as a folder without a lock is not taken for a build's.
                 (directory / LOCK).unlink(missing_ok=True)
                 with suppress(OSError):  # Somebody's files, or the next build's lock.
@@ -110,6 +151,20 @@ def work_beside(
 def work_directory(target: Place) -> Path:
     """Return the work folder of a target: beside it, or in the cache if it is on no local disk."""
     return storage_of(target).work_folder()
+
+
+def _clear_spool(target: Place) -> None:
+    """Remove what this cluster's build, or one that was killed, left below a remote store."""
+    if storage_of(target).remote is None:
+        return
+    try:
+        Spool(target / SPOOL).keep_only(set())
+    except OSError as error:
+        # The store is complete all the same, and the next build will try again.
+        warnings.warn(
+            f"{target / SPOOL}: finished assets could not be removed ({error.strerror})",
+            stacklevel=2,
+        )
 
 
 def _restore(directory: Path, target: Place) -> None:

@@ -16,9 +16,13 @@ import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from slatprep.errors import StoreError
 from slatprep.storage.faults import reached
+
+if TYPE_CHECKING:
+    from slatprep.records import Place
 
 _AT_FDCWD = -100
 _RENAME_EXCHANGE = 2
@@ -133,8 +137,8 @@ def _user() -> int:
 
 
 @contextmanager
-def writing(what: str, where: Path) -> Iterator[None]:
-    """Turn a disk's refusal into an error that names what was to be written.
+def writing(what: str, where: Place) -> Iterator[None]:
+    """Turn the refusal of a disk or object store into an error that names what was to be written.
 
     Raises
     ------

@@ -11,7 +11,7 @@ import io
 import re
 import stat
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path, PurePosixPath
 from typing import IO, TYPE_CHECKING, TypeGuard
@@ -22,7 +22,13 @@ from slatprep.storage.cache import cached_file, folder_for
 from slatprep.storage.copies import copied_version
 from slatprep.storage.files import LocalFile, LocalFolder, local_files, open_regular
 from slatprep.storage.listing import Listing, RemoteListing
-from slatprep.storage.remote import RemoteFile, RemoteFolder, RemotePlace, list_objects
+from slatprep.storage.remote import (
+    RemoteFile,
+    RemoteFolder,
+    RemotePlace,
+    list_objects,
+    remove_objects,
+)
 from slatprep.storage.versions import current_version
 
 if TYPE_CHECKING:
@@ -149,6 +155,16 @@ class Storage:
             # read() would allocate all that it is allowed to return.
             return file.pread(min(file.size(), limit + 1), 0)
 
+    def open_scattered(self) -> IO[bytes]:
+        """Open a file to read it here and there; of an object store it is fetched whole, at once.
+
+        Raises
+        ------
+        OSError
+            As `open` does.
+        """
+        return self.open()
+
     def size(self) -> int:
         """Return the bytes of a file."""
         return self._path.stat().st_size
@@ -170,6 +186,11 @@ class Storage:
     def copied_version(self) -> Path:
         """Return a path of the local disk with the store, of which this is a version, if remote."""
         return self._path
+
+    def remove(self, names: Iterable[str]) -> None:
+        """Remove files below the place; that one is gone is no error."""
+        for name in names:
+            (self._path / name).unlink(missing_ok=True)
 
     def staged(self) -> AbstractContextManager[Path]:
         """Yield a local file that becomes the place's content, whole, when all went well."""
@@ -208,6 +229,9 @@ class _ObjectStore(Storage):
     def read(self, limit: int) -> bytes:
         return RemoteFile(self.place).pread(limit + 1, 0)
 
+    def open_scattered(self) -> IO[bytes]:
+        return io.BytesIO(self.place.read_bytes())
+
     def size(self) -> int:
         return RemoteFile(self.place).size()
 
@@ -219,6 +243,9 @@ class _ObjectStore(Storage):
 
     def copied_version(self) -> Path:
         return copied_version(self.place)
+
+    def remove(self, names: Iterable[str]) -> None:
+        remove_objects(self.place, names)
 
     @contextmanager
     def staged(self) -> Iterator[Path]:

@@ -1,7 +1,7 @@
 """Places on object stores, which are reached through fsspec.
 
 A `RemotePlace` has the few methods of `slatprep.records.Place` and no others.
-Nothing can be changed at one but by `RemotePlace.upload`.
+Nothing can be changed at one but by `RemotePlace.upload`, `put_objects` and `remove_objects`.
 
 Credentials and endpoints are the libraries' own matter: those of S3, for
 instance, come from ``AWS_*`` variables or ``~/.aws``.
@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import errno
 import io
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from functools import cached_property
 from pathlib import Path, PurePosixPath
@@ -162,6 +162,10 @@ class RemoteFile(io.RawIOBase):
         """Read a range with one request, and keep it until the next."""
         self._prefetched = (offset, self.pread(length, offset))
 
+    def readall(self) -> bytes:
+        """Read on to the end, by blocks as `io.BufferedReader` has them: Python's own are 8 kB."""
+        return b"".join(iter(lambda: self.read(BUFFER_BYTES) or b"", b""))
+
     def readable(self) -> bool:
         """Return True."""
         return True
@@ -220,6 +224,27 @@ def list_objects(place: RemotePlace) -> dict[str, dict[str, Any]]:
         if key.startswith(base) and entry["type"] == "file"
     }
     return {key: entry for key, entry in sorted(below.items()) if _is_plain(key)}
+
+
+def put_objects(folder: Path, place: RemotePlace, names: Iterable[str], at_once: int = 16) -> None:
+    """Put files of a folder below a place, under the same names, so many at a time."""
+    names = list(names)
+    if not names:
+        return
+    with connected(place) as (system, root):
+        options = multipart_options(system, files_at_once=at_once)
+        system.put(
+            [str(folder / name) for name in names], [f"{root}/{n}" for n in names], **options
+        )
+
+
+def remove_objects(place: RemotePlace, names: Iterable[str]) -> None:
+    """Remove objects below a place by their names; those that are not there are no error."""
+    names = list(names)
+    if not names:
+        return
+    with connected(place) as (system, root):
+        system.rm([f"{root}/{name}" for name in names])
 
 
 def _is_plain(name: str) -> bool:

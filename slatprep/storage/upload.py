@@ -7,7 +7,9 @@ when the build began: on S3 the server itself compares them.
 A version's name comes from its content and from the pointer it is to replace.
 So an upload that is repeated finds what the first one left; and whoever
 removes a version's objects has replaced that pointer before, which makes
-this build's own replacement fail. What remains cannot be seen half.
+this build's own replacement fail. What remains cannot be seen half. Where
+workers of a cluster put a version's large files in place themselves, its
+content is not known before, so its name is one that nobody has.
 """
 
 from __future__ import annotations
@@ -23,19 +25,46 @@ from typing import Any
 from slatprep.errors import StoreError
 from slatprep.storage.faults import reached
 from slatprep.storage.files import file_digest, local_files
-from slatprep.storage.remote import RemotePlace, connected, list_objects, multipart_options
+from slatprep.storage.remote import (
+    RemotePlace,
+    connected,
+    list_objects,
+    put_objects,
+    remove_objects,
+)
 from slatprep.storage.versions import (
     MANIFESTS,
     POINTER,
+    SPOOL,
     VERSIONS,
     Pointer,
+    is_spooled,
     is_version,
     is_version_name,
     read_pointer,
 )
 
 # A small file is held in memory whole while it is uploaded.
-_SMALL_BYTES, _SMALL_FILES_AT_ONCE = 8 * 2**20, 16
+_SMALL_BYTES = 8 * 2**20
+
+
+@dataclass(frozen=True)
+class Staged:
+    """Files of a version that are in place already.
+
+    Attributes
+    ----------
+    version : RemotePlace
+        Where it is made.
+    sizes : dict of str to int
+        Bytes of the files by name.
+    digests : dict of str to str
+        Their SHA-256 in hex.
+    """
+
+    version: RemotePlace
+    sizes: Mapping[str, int]
+    digests: Mapping[str, str]
 
 
 @dataclass(frozen=True)
@@ -129,9 +158,7 @@ class Upload:
             raise StoreError(_refused(self.target, error)) from None
         reached("pointer replaced", str(self.target))
         try:
-            if old:
-                with connected(self.target) as (system, root):
-                    system.rm([f"{root}/{name}" for name in old])
+            remove_objects(self.target, old)
         except OSError as error:
             # The new store is complete all the same, and the next build will try again.
             warnings.warn(
@@ -165,11 +192,10 @@ class Upload:
 
     def _unneeded(self) -> list[str]:
         keep = {self.pointer.version, self.pointer.previous}
-        names = list_objects(self.target)
-        return [name for name in names if name != POINTER and _is_ours(name, but=keep)]
+        return [name for name in list_objects(self.target) if _is_of_version(name, but=keep)]
 
 
-def upload_store(new: Path, before: PublishedState) -> Upload:
+def upload_store(new: Path, before: PublishedState, staged: Staged | None = None) -> Upload:
     """Upload all files of a finished store as a new version, and see that all are there.
 
     Parameters
@@ -179,6 +205,9 @@ def upload_store(new: Path, before: PublishedState) -> Upload:
     before : PublishedState
         Where it belongs, and what was there when the build began. If that has
         the same content, nothing is uploaded.
+    staged : Staged, optional
+        The files that `new` lacks, and the version that they are of. What is there of it
+        is removed if it is not needed.
 
     Raises
     ------
@@ -186,12 +215,19 @@ def upload_store(new: Path, before: PublishedState) -> Upload:
         If something cannot be uploaded.
     """
     files = local_files(new)
-    content = _digest(f"{name} {file_digest(new / name)}\n" for name in files)
+    digests = {name: file_digest(new / name) for name in files}
+    sizes = dict(files)
+    if staged is not None:
+        digests |= staged.digests
+        sizes |= staged.sizes
+    content = _digest(f"{name} {digests[name]}\n" for name in sorted(digests))
     if before.pointer is not None and before.pointer.content == content:
+        if staged is not None:
+            _remove_version(staged.version)
         return Upload(before, before.pointer)
     previous = before.pointer.version if before.pointer else ""
     pointer = Pointer(
-        version=_digest((previous, content))[:16],
+        version=staged.version.name if staged else _digest((previous, content))[:16],
         previous=previous,
         content=content,
         published=datetime.now(UTC).isoformat(timespec="seconds"),
@@ -202,12 +238,12 @@ def upload_store(new: Path, before: PublishedState) -> Upload:
         missing = [name for name in files if not _is_same(there.get(name), new / name)]
         small = [name for name in missing if files[name] <= _SMALL_BYTES]
         large = [name for name in missing if files[name] > _SMALL_BYTES]
-        _put(new, upload.version, small, at_once=_SMALL_FILES_AT_ONCE)
-        _put(new, upload.version, large, at_once=1)
+        put_objects(new, upload.version, small)
+        put_objects(new, upload.version, large, at_once=1)
         there = list_objects(upload.version)
     except OSError as error:
         raise StoreError(_refused(before.target, error)) from None
-    for name, size in files.items():
+    for name, size in sizes.items():
         if there.get(name, {}).get("size") != size:
             raise StoreError(
                 f"{upload.version / name}: is not there as it was uploaded; nothing was replaced. "
@@ -216,12 +252,11 @@ def upload_store(new: Path, before: PublishedState) -> Upload:
     return upload
 
 
-def _put(new: Path, version: RemotePlace, names: list[str], at_once: int) -> None:
-    if not names:
-        return
-    with connected(version) as (system, root):
-        options = multipart_options(system, files_at_once=at_once)
-        system.put([str(new / name) for name in names], [f"{root}/{n}" for n in names], **options)
+def _remove_version(version: RemotePlace) -> None:
+    try:
+        remove_objects(version, list_objects(version))
+    except OSError as error:
+        raise StoreError(_refused(version.parent.parent, error)) from None
 
 
 def _is_same(entry: Mapping[str, Any] | None, file: Path) -> bool:
@@ -233,7 +268,13 @@ def _is_same(entry: Mapping[str, Any] | None, file: Path) -> bool:
     return str(entry.get("ETag", "")).strip('"') == digest
 
 
-def _is_ours(name: str, but: Iterable[str] = ()) -> bool:
+def _is_ours(name: str) -> bool:
+    """Whether an object below a store is part of some version, its records or the spool."""
+    kind, _, rest = name.partition("/")
+    return _is_of_version(name) or (kind == SPOOL and is_spooled(rest))
+
+
+def _is_of_version(name: str, but: Iterable[str] = ()) -> bool:
     """Whether an object below a store is part of some version or its records."""
     kind, _, rest = name.partition("/")
     version = rest.partition("/")[0]

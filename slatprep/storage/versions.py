@@ -4,7 +4,8 @@ Below the store's URL lie
 
 - ``current.json``, the pointer, which is replaced in one step;
 - ``versions/NAME/``, a store as it would lie on a disk, never changed;
-- ``manifests/NAME/``, the records of the build that made it.
+- ``manifests/NAME/``, the records of the build that made it;
+- ``spool/``, while a cluster builds the next one, the assets that are finished.
 
 Plain zarr opens a version's own URL.
 """
@@ -13,6 +14,7 @@ from __future__ import annotations
 
 import json
 import re
+import secrets
 from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING
 
@@ -22,12 +24,16 @@ from slatprep.storage.remote import RemotePlace
 if TYPE_CHECKING:
     from slatprep.records import Place
 
-POINTER, VERSIONS, MANIFESTS = "current.json", "versions", "manifests"
+POINTER, VERSIONS, MANIFESTS, SPOOL = "current.json", "versions", "manifests", "spool"
+
+BUILDER = "builder"
+"""Object in the spool that says who builds."""
 
 FORMAT = "slatprep-store-pointer"
 
 # Names come from whoever wrote the pointer, and lead to objects.
 _NAME = re.compile(r"[0-9a-f]{16}")
+_SPOOLED = re.compile(rf"{BUILDER}|[0-9a-z]{{2}}/(none-)?[0-9a-f]{{32,64}}\.npz")
 _MAX_POINTER_BYTES = 2**16
 
 
@@ -131,6 +137,16 @@ def current_version(store: RemotePlace) -> RemotePlace:
 def is_version(place: Place) -> bool:
     """Whether a place is that of a version of a store."""
     return place.parent.name == VERSIONS and is_version_name(place.name)
+
+
+def new_version(store: RemotePlace) -> RemotePlace:
+    """Return where a version may be made whose content is not known yet: a name nobody has."""
+    return store / VERSIONS / secrets.token_hex(8)
+
+
+def is_spooled(name: str) -> bool:
+    """Whether a build calls an object of the spool so."""
+    return _SPOOLED.fullmatch(name) is not None
 
 
 def store_name(place: Place) -> str:

@@ -27,7 +27,11 @@ ATTRIBUTES = "zarr.json#attributes"
 """Name under which the digest of the root's attributes is kept."""
 
 
-def write_digests(path: Path, known: Mapping[str, str] = MappingProxyType({})) -> None:
+def write_digests(
+    path: Path,
+    known: Mapping[str, str] = MappingProxyType({}),
+    elsewhere: Mapping[str, int] = MappingProxyType({}),
+) -> None:
     """Add the digests of all files to a store that is otherwise complete.
 
     What no array accounts for is removed first.
@@ -38,6 +42,8 @@ def write_digests(path: Path, known: Mapping[str, str] = MappingProxyType({})) -
         The store; its root attributes are written, metadata not yet consolidated.
     known : mapping of str to str
         Digests, by name, of files that need not be read again.
+    elsewhere : mapping of str to int
+        Bytes, by name, of files that are not here, but where the store will lie.
 
     Raises
     ------
@@ -50,11 +56,13 @@ def write_digests(path: Path, known: Mapping[str, str] = MappingProxyType({})) -
     meant = dict(_files_of(root))
     for name in local_files(path).keys() - meant.keys() - {"zarr.json"}:
         (path / name).unlink()
-    names = sorted(name for name in meant if (path / name).exists())
-    for name in meant.keys() - set(names):
+    there = {name: (path / name).stat().st_size for name in meant if (path / name).exists()}
+    there |= {name: size for name, size in elsewhere.items() if name in meant}
+    for name in meant.keys() - there.keys():
         if meant[name]:
             raise StoreError(f"{path / name}: was not written; nothing was replaced. Run again")
-    sizes = [(path / name).stat().st_size for name in names]
+    names = sorted(there)
+    sizes = [there[name] for name in names]
     digests = [known.get(name) or file_digest(path / name) for name in names]
     attributes = dict(root.attrs)
     names.append(ATTRIBUTES)

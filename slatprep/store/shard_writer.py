@@ -2,25 +2,37 @@
 
 The file is the one that zarr-python writes, byte for byte, given all rows at
 once: chunks one after the other, then their index (see `slatprep.store.shard_reader`).
+On an object store it is written to the worker's own disk first, in the folder for temporary files.
 """
 
 from __future__ import annotations
 
+import hashlib
 import uuid
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from types import TracebackType
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from slatprep.records import Place
+from slatprep.storage.atomic import writing
 from slatprep.storage.codecs import single_threaded_blosc
-from slatprep.storage.files import LocalFolder
+from slatprep.storage.place import storage_of
 from slatprep.store.contract import read_metadata
 from slatprep.store.shard_reader import MISSING, RowReader
 
 _SHUFFLES = {"noshuffle": 0, "shuffle": 1, "bitshuffle": 2}
+
+
+class Written(NamedTuple):
+    """A file as it was written: its bytes, and their SHA-256 in hex."""
+
+    size: int
+    sha256: str
 
 
 class ShardWriter:
@@ -28,17 +40,22 @@ class ShardWriter:
 
     Parameters
     ----------
-    store : Path
+    store : Place
         The store, with the array created.
     name : str
         Name of the array, such as ``voxel/feats``.
     start : int
         Its first row.
+
+    Attributes
+    ----------
+    file : str
+        Name of the shard's file below the store.
     """
 
-    def __init__(self, store: Path, name: str, start: int) -> None:
+    def __init__(self, store: Place, name: str, start: int) -> None:
         metadata = read_metadata(store / name / "zarr.json")
-        layout = RowReader.of(LocalFolder(store), name, metadata)
+        layout = RowReader.of(storage_of(store).folder(), name, metadata)
         if layout is None or not layout.sharded:
             raise ValueError(f"{name} is not laid out as slatprep lays arrays out")
         self._encode = _encoder(metadata["codecs"][0]["configuration"]["codecs"])
@@ -46,14 +63,12 @@ class ShardWriter:
         self._chunk = np.empty(layout.decoder.shape, layout.dtype)
         self._fill_value = layout.fill_value
         self._rows = self._chunks = self._bytes = 0
-        self._path = store / layout.key(start // layout.shard_rows)
-        self._path.parent.mkdir(parents=True, exist_ok=True)
-        # Beside the store, where what a killed worker leaves is no part of it; with a name of
-        # its own, as a worker that a cluster has given up may still be writing the same shard.
-        partials = store.with_name(f"{store.name}.partial")
-        partials.mkdir(exist_ok=True)
-        self._partial = partials / uuid.uuid4().hex
-        self._file = self._partial.open("wb")
+        self.file = layout.key(start // layout.shard_rows)
+        self._stack = ExitStack()
+        partial = self._stack.enter_context(_staged(store, self.file))
+        self._file = self._stack.enter_context(partial.open("wb"))
+        self._digest = hashlib.sha256()
+        self._size = 0
 
     def append(self, rows: NDArray[Any]) -> None:
         """Take the next rows."""
@@ -77,7 +92,7 @@ class ShardWriter:
         """Take the next chunks as `RowReader.packed` gives them; the last rows filled one."""
         if self._rows:
             raise ValueError(f"{self._rows} rows of a chunk are waiting; expected none")
-        self._file.write(data)
+        self._write(data)
         for length in lengths:
             self._index[self._chunks] = self._bytes, length
             self._chunks, self._bytes = self._chunks + 1, self._bytes + length
@@ -87,7 +102,11 @@ class ShardWriter:
         if self._rows:
             self._chunk[self._rows :] = self._fill_value
             self._flush(self._chunk)
-        self._file.write(_with_checksum(self._index.tobytes()))
+        self._write(_with_checksum(self._index.tobytes()))
+
+    def written(self) -> Written:
+        """Return what the file holds, after exit."""
+        return Written(self._size, self._digest.hexdigest())
 
     def __enter__(self) -> ShardWriter:
         return self
@@ -98,20 +117,43 @@ class ShardWriter:
         error: BaseException | None,
         trace: TracebackType | None,
     ) -> None:
-        try:
-            with self._file:
-                if kind is None:
-                    self.finish()
-            if kind is None:
-                self._partial.replace(self._path)
-        finally:
-            self._partial.unlink(missing_ok=True)
+        if kind is not None:
+            self._stack.__exit__(kind, error, trace)
+            return
+        with self._stack:
+            self.finish()
+
+    def _write(self, data: bytes) -> None:
+        self._file.write(data)
+        self._digest.update(data)
+        self._size += len(data)
 
     def _flush(self, chunk: NDArray[Any]) -> None:
         data = self._encode(chunk)
-        self._file.write(data)
+        self._write(data)
         self._index[self._chunks] = self._bytes, len(data)
         self._chunks, self._bytes, self._rows = self._chunks + 1, self._bytes + len(data), 0
+
+
+@contextmanager
+def _staged(store: Place, file: str) -> Iterator[Path]:
+    """Yield a file of the local disk that becomes one of a store, whole, when all went well."""
+    folder = storage_of(store).local
+    if folder is None:
+        with writing(file, store), storage_of(store / file).staged() as partial:
+            yield partial
+        return
+    (folder / file).parent.mkdir(parents=True, exist_ok=True)
+    # Beside the store, where what a killed worker leaves is no part of it; with a name of
+    # its own, as a worker that a cluster has given up may still be writing the same shard.
+    partials = folder.with_name(f"{folder.name}.partial")
+    partials.mkdir(exist_ok=True)
+    partial = partials / uuid.uuid4().hex
+    try:
+        yield partial
+        partial.replace(folder / file)
+    finally:
+        partial.unlink(missing_ok=True)
 
 
 def _encoder(codecs: list[Mapping[str, Any]]) -> Callable[[NDArray[Any]], bytes]:

@@ -11,10 +11,11 @@ import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 from slatprep.parameters import StoreParameters
-from slatprep.records import PIXIEVERSE, Contents, Normalization
+from slatprep.records import PIXIEVERSE, Contents, Normalization, Place
 from slatprep.store.coordinates import write_coordinates
 from slatprep.store.digests import write_digests
 from slatprep.store.layout import (
@@ -76,7 +77,7 @@ def create_store(
     create_record_array(root, n_assets, parameters.compression_level)
 
 
-def merges(path: Path) -> bool:
+def merges(path: Place) -> bool:
     """Whether a store that `create_store` made has arrays of merged labels."""
     return all((path / layout.name).is_dir() for layout in MERGED)
 
@@ -117,8 +118,8 @@ def finish_store(
     build_id: str,
     build: Mapping[str, object],
     contents: Contents = PIXIEVERSE,
-    *,
-    known: Mapping[str, str] | None = None,
+    known: Mapping[str, str] = MappingProxyType({}),
+    elsewhere: Mapping[str, int] = MappingProxyType({}),
 ) -> None:
     """Write the root's attributes and all files' digests; gather all metadata in one file.
 
@@ -134,8 +135,10 @@ def finish_store(
         Parameters and versions that made the content.
     contents : Contents
         What it holds.
-    known : mapping of str to str, optional
-        Digests of files that were taken over, which has been seen to be true.
+    known : mapping of str to str
+        Digests of files, as they were written or have been seen to be true.
+    elsewhere : mapping of str to int
+        Bytes of files that are not at `path`; see `write_digests`.
     """
     import zarr
 
@@ -143,7 +146,7 @@ def finish_store(
     ids = root["asset/id"][:]
     root.attrs.update(root_attributes(normalization, build_id, build, contents, ids))
     write_coordinates(path, [one.name for one in contents.properties])
-    write_digests(path, known or {})
+    write_digests(path, known, elsewhere)
     with warnings.catch_warnings():
         # Zarr says that consolidated metadata are not in format 3's text yet.
         # They only save reads: a reader that ignores them finds every array.

@@ -18,11 +18,14 @@ faults = Path(__file__).parent
 
 
 def reached(step, name):
-    if step == "shard filled":
-        try:
-            (faults / "kill-once").unlink()
-        except FileNotFoundError:
-            return
+    if step == "asset aligned":
+        with (faults / "aligned").open("a") as log:
+            log.write(f"{name}\\n")
+    try:
+        (faults / f"kill at {step}").unlink()
+    except FileNotFoundError:
+        pass
+    else:
         os.kill(os.getpid(), signal.SIGKILL)
     if step != "asset begun":
         return
@@ -38,12 +41,33 @@ def reached(step, name):
 """
 
 
+PRIVATE = """
+import os, sys
+
+root, *seen = os.environ["ONLY_SEES"].split(os.pathsep)
+paths = {"open": 1, "os.listdir": 1, "os.scandir": 1, "os.mkdir": 1, "os.rename": 2, "os.link": 2}
+
+
+def refuse(event, arguments):
+    for path in arguments[:paths.get(event, 0)]:
+        if isinstance(path, (str, bytes, os.PathLike)):
+            path = os.path.abspath(os.fsdecode(path))
+            if path.startswith(root) and not path.startswith(tuple(seen)):
+                raise PermissionError(13, "is the disk of another machine", path)
+
+
+sys.addaudithook(refuse)
+"""
+"""Hides a folder from a process, but for parts of it, as if it ran on another machine."""
+
+
 class Processes:
     """Dask's own commands, in a folder that tells them how to fail."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
         (folder / "faults.py").write_text(FAULTS)
+        (folder / "private.py").write_text(PRIVATE)
         self._started: list[subprocess.Popen[bytes]] = []
 
     def scheduler(self) -> str:
@@ -63,12 +87,25 @@ class Processes:
             "--local-directory", str(self.folder), *options, path=path,
         )  # fmt: skip
 
+    def worker_elsewhere(
+        self, address: str, root: Path, **variables: str
+    ) -> subprocess.Popen[bytes]:
+        """Start a worker that sees nothing of `root` but a disk of its own, and how to fail."""
+        disk = self.folder.with_name(f"{self.folder.name}-disk-{len(self._started)}")
+        disk.mkdir()
+        return self._start(
+            "worker", address, "--nthreads", "1", "--no-dashboard",
+            "--local-directory", str(disk), "--preload", str(self.folder / "private.py"),
+            TMPDIR=str(disk), SLATPREP_CACHE=str(disk / "cache"),
+            ONLY_SEES=os.pathsep.join(map(str, (root, disk, self.folder))), **variables,
+        )  # fmt: skip
+
     def stop(self) -> None:
         """End all of them."""
         for process in self._started:
             end(process)
 
-    def _start(self, *arguments: str, path: str = "") -> subprocess.Popen[bytes]:
+    def _start(self, *arguments: str, path: str = "", **variables: str) -> subprocess.Popen[bytes]:
         paths = (
             path,
             str(self.folder),
@@ -82,6 +119,7 @@ class Processes:
             "PYTHONPATH": os.pathsep.join(filter(None, paths)),
             # Two dead workers are enough to give a task up; by default it takes four.
             "DASK_DISTRIBUTED__SCHEDULER__ALLOWED_FAILURES": "1",
+            **variables,
         }
         with (self.folder / f"{arguments[0]}-{len(self._started)}.log").open("wb") as log:
             process = subprocess.Popen(

@@ -115,7 +115,7 @@ def test_a_worker_that_is_killed_with_a_shard_open_leaves_nothing_of_it(
     shared: tuple[Processes, str], address: str, local: tuple[Dataset, Path], tmp_path: Path
 ) -> None:
     dataset, expected = local
-    once = shared[0].folder / "kill-once"
+    once = shared[0].folder / "kill at shard filled"
     once.touch()
     with Cluster(address) as cluster:
         summary = build_store(dataset.parameters("pixie"), tmp_path / "s.zarr", jobs=cluster)

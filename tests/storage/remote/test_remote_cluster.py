@@ -1,0 +1,159 @@
+"""A cluster whose workers have a disk each writes a store on S3: its bytes, and after kills."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from distributed import Client
+from support.dask_processes import Processes, end, wait_until
+from support.faults import environment as with_fault
+from support.remote import Made, current, put, versions
+from support.synthetic import Dataset
+from support.trees import contents, tree
+
+from slatprep.errors import SlatprepError
+from slatprep.inspect.verify import verify_store
+from slatprep.pipeline.dataset import build_store
+from slatprep.storage.place import place_of
+from slatprep.storage.versions import read_pointer
+from slatprep.workers.dask import Cluster
+
+
+@pytest.fixture(scope="module")
+def shared(
+    environment: None, tmp_path_factory: pytest.TempPathFactory
+) -> Iterator[tuple[Processes, str]]:
+    """A scheduler and three workers, each with a disk of its own."""
+    started = Processes(tmp_path_factory.mktemp("dask"))
+    address = started.scheduler()
+    for _ in range(3):
+        started.worker_elsewhere(address, tmp_path_factory.getbasetemp())
+    yield started, address
+    started.stop()
+
+
+@pytest.fixture
+def address(shared: tuple[Processes, str]) -> str:
+    with Client(shared[1], set_as_default=False) as client:
+        client.wait_for_workers(3, timeout=180)  # One may have been killed just now.
+    (shared[0].folder / "aligned").unlink(missing_ok=True)
+    return shared[1]
+
+
+@pytest.fixture
+def sources(s3: Any, bucket: str, undisturbed: Made) -> str:
+    s3.put(f"{undisturbed[0].root}/", f"{bucket}/data/", recursive=True)
+    return f"s3://{bucket}/data"
+
+
+def left_behind(s3: Any, url: str) -> set[str]:
+    """Return what lies below a store besides the version that is current and the one before."""
+    pointer = read_pointer(place_of(url))
+    assert pointer is not None
+    known = {f"{kind}/{name}" for kind in ("versions", "manifests")
+             for name in (pointer.version, pointer.previous)}  # fmt: skip
+    return {name for name in contents(s3, url) if "/".join(name.split("/")[:2]) not in known} - {
+        "current.json"
+    }
+
+
+def test_killed_workers_with_disks_of_their_own_write_the_bytes_of_one_machine(
+    s3: Any, url: str, sources: str, undisturbed: Made, shared: Any, address: str, tmp_path: Path
+) -> None:
+    kills = [shared[0].folder / f"kill at {step}"
+             for step in ("asset spooled", "shard filled", "shard written")]  # fmt: skip
+    for kill in kills:
+        kill.touch()
+    with Cluster(address) as cluster:
+        parameters = Dataset(place_of(sources)).parameters("pixie")
+        summary = build_store(parameters, url, jobs=cluster)
+    assert summary.complete
+    assert not any(kill.exists() for kill in kills)
+    assert current(s3, url) == tree(undisturbed[1])
+    assert left_behind(s3, url) == set()
+    assert verify_store(url).ok
+    # No array was on the disk of the machine that ran the command, and nothing stays there.
+    assert not [path for path in (tmp_path / "cache").rglob("*") if path.is_file()]
+
+
+def test_a_command_that_is_killed_again_and_again_goes_on_where_it_was(
+    s3: Any,
+    url: str,
+    sources: str,
+    undisturbed: Made,
+    another: Made,
+    shared: Any,
+    address: str,
+    tmp_path: Path,
+) -> None:
+    faults = shared[0].folder
+    put(another[1], url)
+    (tmp_path / "dataset.toml").write_text(
+        f'[pixieverse]\nroot = "{sources}/pixieverse"\n[slat]\nroot = "{sources}/slat"\n'
+        '[normalize]\nranges = "pixie"\n[store]\nvoxel_chunk = 128\nvoxel_chunks_per_shard = 4\n'
+        "grid_assets_per_shard = 2\ncompression_level = 1\n"
+    )
+
+    def build(fault: str = "") -> subprocess.Popen[bytes]:
+        command = ["build-store", "--config", "dataset.toml", "--out", url, "--scheduler", address]
+        return subprocess.Popen(
+            [sys.executable, "-m", "slatprep", *command],
+            cwd=tmp_path, env=with_fault(tmp_path / "faults", fault),
+        )  # fmt: skip
+
+    # While one worker holds an asset, and others have been finished.
+    (faults / "hold-c").touch()
+    first = build()
+    wait_until(lambda: len(spooled(s3, url)) == 2)
+    first.kill()
+    first.wait()
+    wait_until((faults / "held").exists)
+    os.kill(int((faults / "held").read_text()), 9)
+    (faults / "held").unlink()
+    assert current(s3, url) == tree(another[1])
+    for step in ("store created", "records written", "store replaced", "manifests published"):
+        killed = build(f"if step == {step!r}:\n    kill_self()")
+        assert killed.wait(300) == -9, step
+        assert current(s3, url) == tree(another[1])
+    assert len(spooled(s3, url)) == 3
+    assert build().wait(300) == 0
+    assert current(s3, url) == tree(undisturbed[1])
+    assert left_behind(s3, url) == set()
+    assert len(versions(s3, url)) == 2
+    aligned = (faults / "aligned").read_text().split()
+    assert sorted(aligned) == ["a", "b", "c"]
+
+
+def spooled(s3: Any, url: str) -> list[str]:
+    return [name for name in s3.find(f"{url}/spool") if name.endswith(".npz")]
+
+
+def test_a_worker_that_does_not_reach_the_store_is_named_before_any_work(
+    url: str, sources: str, shared: Any, address: str, tmp_path_factory: Any
+) -> None:
+    lost = shared[0].worker_elsewhere(
+        address, tmp_path_factory.getbasetemp(), AWS_ACCESS_KEY_ID="", AWS_SECRET_ACCESS_KEY=""
+    )
+    try:
+        with Client(address, set_as_default=False) as client:
+            client.wait_for_workers(4, timeout=180)
+        told = rf"worker tcp://.*: sees nothing it may read .*credentials.* {url}/spool/builder"
+        with Cluster(address) as cluster, pytest.raises(SlatprepError, match=told):
+            build_store(Dataset(place_of(sources)).parameters("pixie"), url, jobs=cluster)
+    finally:
+        end(lost)
+
+
+def test_what_others_keep_beside_a_spool_is_refused_and_stays(
+    s3: Any, url: str, undisturbed: Made, address: str
+) -> None:
+    s3.pipe_file(f"{url}/spool/notes.txt", b"keep")
+    with Cluster(address) as cluster, pytest.raises(SlatprepError, match="holds spool/notes"):
+        build_store(undisturbed[0].parameters("pixie"), url, jobs=cluster, fresh=True)
+    assert contents(s3, url).keys() == {"spool/notes.txt"}
