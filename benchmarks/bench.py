@@ -95,6 +95,11 @@ MEASUREMENTS = (
         (70, 0, 900), (6, 0, 240), (DEMO,),
     ),
     Measurement(
+        "cluster-traffic", "What passes through the command's machine when a cluster writes to S3",
+        "cluster", "python benchmarks/cluster_traffic.py {folder}/demo/dataset.toml --workers 2",
+        (60, 0, 900), (4, 0, 240), (DEMO,),
+    ),
+    Measurement(
         "empty-tasks", "How many tasks a second one scheduler hands out",
         "cluster", "python benchmarks/cluster_cost.py --empty {size} --workers 2",
         (0, 100_000, 300), (0, 2_000, 120),
