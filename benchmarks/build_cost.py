@@ -29,7 +29,7 @@ import zarr
 
 from slatprep.parameters import BuildParameters, PixieverseSource, SlatSource
 from slatprep.parameters.files import load_parameters
-from slatprep.pipeline import assemble, publish
+from slatprep.pipeline import assemble, finish, publish
 from slatprep.pipeline import asset as process
 from slatprep.pipeline import dataset as build
 from slatprep.readers import discover
@@ -65,7 +65,7 @@ def measure(parameters: BuildParameters, folder: Path, jobs: bool) -> dict[str, 
     steps: dict[str, float] = defaultdict(float)
     for name in STEPS:
         setattr(process, name, timed(getattr(process, name), steps, name))
-    rooms = {"finish_asset": build, "pack_store": assemble, "replace_directory": publish}
+    rooms = {"finish_asset": finish, "pack_store": assemble, "replace_directory": publish}
     for name, room in rooms.items():
         setattr(room, name, timed(getattr(room, name), steps, name))
     begin = cpu()
