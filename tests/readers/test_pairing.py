@@ -78,6 +78,9 @@ def test_several_samples_need_a_choice(find):
     assert pair.problem == ""
     assert pair.grid.parent.name == "sample_1"
 
+    (pair,) = find([grid("b")], ["b.npz"], pixieverse={"sample": "1"})[1:]
+    assert "looked for b/sample_1/material_grid.npy" in pair.problem
+
 
 def test_several_samples_by_number(find):
     numbers = (10, 0, 2)
@@ -108,9 +111,6 @@ def test_each_sample_with_each_view(find):
 def test_one_sample_is_named_or_all_are_asked_for(find):
     with pytest.raises(ValueError, match="samples = 'one' where `sample` names"):
         find([grid("a")], ["a.npz"], pixieverse={"samples": "merge", "sample": "1"})
-
-    (pair,) = find([grid("b")], ["b.npz"], pixieverse={"sample": "1"})[1:]
-    assert "looked for b/sample_1/material_grid.npy" in pair.problem
 
 
 def test_missing_partners_are_yielded_with_what_was_looked_for(find, tmp_path):
