@@ -11,6 +11,7 @@ from slatprep.align.deformation import map_of
 from slatprep.errors import InputError
 from slatprep.judge import judge_with_voxels, merged, voxel_confidence
 from slatprep.parameters import BuildParameters
+from slatprep.provenance.record import StageParameters
 from slatprep.readers import read_field, read_latents
 from slatprep.readers.identity import hash_sources
 from slatprep.records import (
@@ -44,7 +45,7 @@ def place(
     pair: AssetPair,
     field: MaterialField,
     latents: StructuredLatents,
-    parameters: BuildParameters,
+    parameters: BuildParameters | StageParameters,
     alignment: Alignment | None = None,
     judgement: Judgement | None = None,
 ) -> Placed:

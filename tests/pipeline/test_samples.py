@@ -208,3 +208,29 @@ def test_by_default_several_are_a_fault(several: Dataset, tmp_path: Path) -> Non
     (several.root / "slat/b.npz").unlink()
     with pytest.raises(StoreError, match="3 samples"):
         build_store(several.parameters(), tmp_path / "t.zarr")
+
+
+@pytest.mark.parametrize("name", ["spread", "votes", "confidence", "properties", "material"])
+def test_labels_that_the_sources_do_not_give_are_found(
+    several: Dataset, merged: BuildSummary, name: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The file is written with its digest, as a faulty build would have done."""
+    from slatprep.pipeline import several as stage
+
+    right = stage.merge
+
+    def wrong(*args: object) -> object:
+        made = right(*args)
+        values = getattr(made, name).copy()
+        # Where samples differ the grid alone cannot tell.
+        row = int(np.flatnonzero(made.votes < 1)[0])
+        values[row] = {"material": 2, "votes": 0.5}.get(name, values[row] * 0.9)
+        return replace(made, **{name: values})
+
+    monkeypatch.setattr(stage, "merge", wrong)
+    out = str(merged.store)
+    build_store(asked(several, "merge"), out, fresh=True)
+    assert verify_store(out).findings == ()
+    found = verify_store(out, sources=True).findings
+    assert {finding.file for finding in found} == {f"voxel/{name}"}
+    assert all("1 of" in finding.what for finding in found)

@@ -15,6 +15,7 @@ from slatprep.align.deformation import map_of
 from slatprep.errors import InputError, StoreError
 from slatprep.geometry.voxels import flat_index
 from slatprep.inspect.check import TOLERANCES, recompute_annotation
+from slatprep.inspect.verify.merged import merged_findings
 from slatprep.judge import voxel_confidence
 from slatprep.normalize import normalize_change
 from slatprep.pipeline.previous import PLACE_TOLERANCE
@@ -95,8 +96,11 @@ def asset_findings(
         if not own:  # From invalid values no confidence can be computed.
             findings += confidence_findings(asset, record)
         if roots is not None:
-            findings += source_findings(record, roots, run)
+            changed = list(source_findings(record, roots, run))
+            findings += changed
             sources += len(record.sources)
+            if record.merged and not (own or changed):
+                findings += merged_findings(asset, record, roots)
     return findings, sources
 
 
@@ -192,6 +196,10 @@ def record_findings(asset: StoredAsset, record: AssetRecord, store: Store) -> It
             yield Finding(
                 RECORD_ARRAY, asset.asset_id, f"{name} is {said!r}", f"{held!r}, as the store has"
             )
+    if bool(record.merged) != asset.merged:
+        what = f"merges {len(record.merged)} annotations"
+        expected = "several, as voxel/votes says" if asset.merged else "none, as voxel/votes says"
+        yield Finding(RECORD_ARRAY, asset.asset_id, what, expected)
     alignment = record.alignment
     bends = alignment.model in (Model.AFFINE, Model.DEFORMABLE)
     if bends != (alignment.deformation is not None):

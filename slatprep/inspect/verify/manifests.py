@@ -58,7 +58,7 @@ def source_roots(manifests: Place | None) -> SourceRoots:
     except (OSError, StoreError) as error:
         raise StoreError(f"{manifests / BUILD}: names no sources ({error}); {advice}") from None
     if not gone:
-        return SourceRoots(*roots)
+        return SourceRoots(*roots, adapter=build.parameters.pixieverse.adapter)
     text = str(build.parameters.pixieverse.root)
     if APART in text:
         raise StoreError(

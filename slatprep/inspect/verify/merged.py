@@ -1,0 +1,88 @@
+"""Labels that are merged of several annotations, made again of the sources."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+
+import numpy as np
+
+from slatprep.errors import SlatprepError
+from slatprep.inspect.check import TOLERANCES
+from slatprep.normalize import normalize_change, normalize_properties
+from slatprep.pipeline.several import place
+from slatprep.provenance.record import AssetRecord
+from slatprep.readers import read_field
+from slatprep.records import AssetPair, Contribution, SourceRoots, StructuredLatents
+from slatprep.sample import merge
+from slatprep.store.contract import Finding
+from slatprep.store.reader import StoredAsset
+
+TOLERANCE = 1e-5
+"""By so much shares and normalised spreads may differ: another machine may round otherwise."""
+
+
+def merged_findings(
+    asset: StoredAsset, record: AssetRecord, roots: SourceRoots
+) -> Iterator[Finding]:
+    """Yield where merged labels are not what the sources and the recorded alignments give."""
+    latents = StructuredLatents(asset.coords, asset.feats)
+    parts = []
+    for one in record.merged:
+        if one.left_out or one.alignment is None or one.judgement is None:
+            continue
+        try:
+            pair = _pair_of(asset, record, one, roots)
+            field = read_field(pair, record.parameters.sample.max_unphysical)
+        except (IndexError, SlatprepError) as error:
+            where = f"sample {one.sample} cannot be looked up again ({error})"
+            yield Finding("sources", asset.asset_id, where, "the sources of the build")
+            return
+        placed = place(pair, field, latents, record.parameters, one.alignment, one.judgement)
+        parts.append(placed.annotation)
+    if not parts:
+        yield Finding("asset/record", asset.asset_id, "merges no annotation", "one at least")
+        return
+    made = merge(parts, asset.store.contents.properties)
+    ranges = asset.store.normalization
+    spread = None if made.spread is None else normalize_change(made.spread, ranges)
+    for name, values, limit in (
+        ("valid", made.valid, TOLERANCES["voxel/valid"]),
+        ("material", made.material, TOLERANCES["voxel/material"]),
+        (
+            "properties",
+            normalize_properties(made.properties, ranges),
+            TOLERANCES["voxel/properties"],
+        ),
+        ("confidence", made.confidence, TOLERANCE),
+        ("spread", spread, TOLERANCE),
+        ("votes", made.votes, TOLERANCE),
+    ):
+        held, given = getattr(asset, name), np.asarray(values, dtype=np.float64)
+        same = np.isclose(held, given, rtol=0.0, atol=limit, equal_nan=True)
+        wrong = int(np.count_nonzero(~same.reshape(len(same), -1).all(axis=1)))
+        if wrong:
+            what = f"{wrong} of {len(same)} voxels differ"
+            yield Finding(f"voxel/{name}", asset.asset_id, what, "what the sources give, merged")
+
+
+def _pair_of(
+    asset: StoredAsset, record: AssetRecord, one: Contribution, roots: SourceRoots
+) -> AssetPair:
+    """Return where the files of one annotation lie now."""
+    files = {record.sources[k].role: roots.pixieverse / record.sources[k].path for k in one.sources}
+    slat = next(roots.slat / file.path for file in record.sources if file.role == "slat")
+    return AssetPair(
+        record.asset_id,
+        record.object_id,
+        record.view,
+        record.category,
+        replace(roots, contents=asset.store.contents),
+        files.get("grid"),
+        files.get("mask"),
+        files.get("bounds"),
+        slat,
+        transform=files.get("transform"),
+        beside=files.get("description"),
+        sample=one.sample,
+    )
