@@ -24,6 +24,7 @@ from slatprep.cli.output import Output
 @option("--slat-form", ChoiceOf("slatprep.demo.write:SlatForm"), "npz")
 @option("--slat-names", ChoiceOf("slatprep.demo.write:SlatNames"), "id")
 @option("--results", is_flag=True)
+@option("--samples", POSITIVE, 1)
 @jobs_option
 def make_demo(output: Output, directory: Path, levels: tuple[int, ...], **recipe: Any) -> None:
     """Make procedural assets with known truth in DIRECTORY.
@@ -50,11 +51,14 @@ def make_demo(output: Output, directory: Path, levels: tuple[int, ...], **recipe
     --slat-names: Name SLATs by object, or by sha256 with a metadata.csv.
     --results: Also write results/: grids as predicted by a method with errors, 12 MB each, for
         `slatprep evaluate --grids`.
+    --samples: Annotations of each object; several have errors, part by part, and dataset.toml
+        asks for a merge.
 
     Example
     -------
     slatprep make-demo demo --assets 14 --seed 0
     slatprep make-demo hard --assets 6 --seed 1 --level 3 --level 4
+    slatprep make-demo doubts --assets 6 --samples 5
     slatprep make-demo shapes --assets 6 --seed 1 --level 5 --level 6 --level 7
     slatprep make-demo other --assets 4 --seed 2 --source pixie-predictions --slat-form hdf5
     slatprep make-demo vomp --assets 4 --source vomp --encoder trellis2

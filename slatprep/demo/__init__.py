@@ -17,6 +17,7 @@ from typing import Any
 from slatprep.demo.asset import DemoAsset, make_asset
 from slatprep.demo.difficulty import LEVELS, SAME_SHAPE_LEVELS
 from slatprep.demo.latents import CHANNELS, Encoder, LatentKind
+from slatprep.demo.samples import sample_grids, write_samples
 from slatprep.demo.sources import ONE_FRAME, TABLE, Source, classes_of, write_description
 from slatprep.demo.write import (
     SlatForm,
@@ -64,6 +65,7 @@ class _Recipe:
     slat_form: SlatForm
     slat_names: SlatNames
     results: bool
+    samples: int
 
     @property
     def adapter(self) -> str:
@@ -86,6 +88,7 @@ def make_demo(
     slat_form: SlatForm = "npz",
     slat_names: SlatNames = "id",
     results: bool = False,
+    samples: int = 1,
     jobs: int = 1,
     progress: Callable[[int, int], None] | None = None,
 ) -> DemoSummary:
@@ -127,6 +130,8 @@ def make_demo(
         Name the SLATs by object id, or by sha256 with TRELLIS's ``metadata.csv``.
     results : bool
         Also write ``results/``: predictions of a method with errors, 12 MB for each asset.
+    samples : int
+        Annotations of each object; several have the errors that `slatprep.demo.samples` says.
     jobs : int
         Processes.
     progress : callable, optional
@@ -145,7 +150,7 @@ def make_demo(
     usual = (0,) if source in ONE_FRAME else SAME_SHAPE_LEVELS
     recipe = _Recipe(
         assets, seed, usual if levels is None else tuple(levels), views, latents, habitual_share,
-        source, encoder, slat_form, slat_names, results,
+        source, encoder, slat_form, slat_names, results, samples,
     )  # fmt: skip
     _check(recipe)
     root = Path(directory)
@@ -176,13 +181,14 @@ def _check(recipe: _Recipe) -> None:
         ("assets", recipe.assets, recipe.assets >= 1),
         ("seed", recipe.seed, recipe.seed >= 0),
         ("views", recipe.views, recipe.views >= 1),
+        ("samples", recipe.samples, recipe.samples >= 1),
         ("habitual_share", recipe.habitual_share, 0.0 <= recipe.habitual_share <= 1.0),
         ("levels", recipe.levels, recipe.levels and set(recipe.levels) <= set(LEVELS)),
     ):
         if not allowed:
             raise ConfigError(
-                f"{name} = {value!r} makes no demo: assets and views are at least 1, seed at least "
-                f"0, habitual_share in 0..1, levels some of {', '.join(map(str, LEVELS))}"
+                f"{name} = {value!r} makes no demo: assets, views and samples are at least 1, seed "
+                f"at least 0, habitual_share in 0..1, levels some of {', '.join(map(str, LEVELS))}"
             )
     if recipe.source in ONE_FRAME and (set(recipe.levels) != {0} or recipe.views > 1):
         raise ConfigError(
@@ -191,6 +197,8 @@ def _check(recipe: _Recipe) -> None:
         )
     if recipe.encoder == "trellis2" and (recipe.slat_form != "npz" or recipe.views > 1):
         raise ConfigError("encoder 'trellis2' has an npz an object: slat_form 'npz', and 1 view")
+    if recipe.samples > 1 and recipe.source != "pixieverse":
+        raise ConfigError("several samples are grids: source 'pixieverse', or 1 sample")
     if recipe.slat_form == "hdf5-groups" and recipe.views > 1:
         raise ConfigError("slat_form 'hdf5-groups' holds one view an object: use 'hdf5', or 1 view")
 
@@ -231,6 +239,9 @@ def _make_one(root: Path, recipe: _Recipe, index: int) -> tuple[int, dict[str, A
         one_frame=recipe.source in ONE_FRAME,
     )
     write_annotated(root / recipe.adapter, asset, recipe.source)
+    if recipe.samples > 1:
+        grids = sample_grids(recipe.seed, index, asset, recipe.samples)
+        write_samples(root / recipe.adapter, asset, grids)
     if recipe.results:
         write_results(root / "results", asset)
     write_slat(root / "slat", asset, recipe.slat_form, recipe.slat_names, recipe.encoder)
@@ -263,6 +274,8 @@ def _write_definition(root: Path, recipe: _Recipe, entries: list[dict[str, Any]]
         "[pixieverse]",
         f'root = "{recipe.adapter}"',
     ]
+    if recipe.samples > 1:
+        lines.append('samples = "merge"')
     if recipe.adapter != "pixieverse":
         lines.append(f'adapter = "{recipe.adapter}"')
     lines += ["", "[slat]", f'root = "{slat_root}"']
