@@ -28,6 +28,9 @@ COLUMNS = (
 TARGETS = ("properties", "material", "valid")
 """The arrays that a decoder is trained to predict."""
 
+MERGED = ("spread", "votes")
+"""What a store says besides where labels are merged of several annotations."""
+
 
 class Exported(NamedTuple):
     """An asset that was written, the name of its file, and its number of points."""
@@ -35,6 +38,11 @@ class Exported(NamedTuple):
     asset: StoredAsset
     file: str
     points: int
+
+
+def with_merged(store: Store, *names: str) -> tuple[str, ...]:
+    """Return names of an asset's arrays, and those of `MERGED` where the store has them."""
+    return (*names, *MERGED) if store.merges else names
 
 
 def choose_ids(store: Store, assets: Sequence[str], verdicts: Sequence[str]) -> list[str]:

@@ -8,7 +8,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from slatprep.export.assets import Exported, describe_columns
+from slatprep.export.assets import MERGED, Exported, describe_columns, with_merged
 from slatprep.export.formats import ExportOptions, Writer
 from slatprep.export.target import FORMAT
 from slatprep.storage.names import file_name
@@ -30,6 +30,10 @@ _DATASETS: dict[str, dict[str, Any]] = {
     "valid": {"description": "an annotation was found near enough"},
     "distance": {"description": "distance to the annotation used", "units": "voxel"},
     "place": {"description": "where it was looked up, PixieVerse frame, [-0.5, 0.5]^3"},
+    "spread": {
+        "description": "standard deviation of normalised properties over the annotations",
+    },
+    "votes": {"description": "share of the annotations that give the class"},
     "transform": {
         "description": "PixieVerse frame to SLAT frame, both the unit cube [-0.5, 0.5]^3"
     },
@@ -74,11 +78,12 @@ def write(path: Path, about: dict[str, Any], assets: Iterable[StoredAsset]) -> I
 def _write_group(file: h5py.File, asset: StoredAsset) -> None:
     group = file.create_group(file_name(asset.asset_id))
     group.attrs.update(describe_columns(asset))
-    for name, attributes in _DATASETS.items():
+    names = with_merged(asset.store, *(name for name in _DATASETS if name not in MERGED))
+    for name, attributes in ((name, _DATASETS[name]) for name in names):
         packing = {} if name == "transform" else {"compression": "gzip", "shuffle": True}
         dataset = group.create_dataset(name, data=getattr(asset, name), **packing)
         dataset.attrs.update(attributes)
-        if name.startswith("properties"):
+        if name.startswith("properties") or name == "spread":
             table = asset.store.contents.properties
             dataset.attrs["columns"] = [one.name for one in table]
             if name == "properties_si":

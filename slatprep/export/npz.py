@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from slatprep.errors import ConfigError
-from slatprep.export.assets import TARGETS, Exported
+from slatprep.export.assets import TARGETS, Exported, with_merged
 from slatprep.export.formats import ExportOptions, Writer
 from slatprep.storage.names import file_name
 from slatprep.store import Store, StoredAsset
@@ -67,7 +67,8 @@ def write(
     (directory / folder).mkdir(parents=True, exist_ok=True)
     for asset in assets:
         name = str(folder / f"{_stem(asset.asset_id)}.npz")
-        arrays = {key: getattr(asset, key) for key in ("coords", *TARGETS)}
+        names = with_merged(asset.store, "coords", *TARGETS)
+        arrays = {key: getattr(asset, key) for key in names}
         # TRELLIS's dataset standardises the latents that it reads.
         arrays["feats"] = asset.store.contents.latents.as_encoded(asset.feats)
         np.savez_compressed(directory / name, **arrays)

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import orjson
 
-from slatprep.export.assets import TARGETS, Exported, describe_columns
+from slatprep.export.assets import TARGETS, Exported, describe_columns, with_merged
 from slatprep.export.formats import ExportOptions, Writer
 from slatprep.storage.names import file_name
 from slatprep.store import Store, StoredAsset
@@ -47,7 +47,7 @@ def write(directory: Path, number: int, assets: Iterable[StoredAsset]) -> Iterat
             key = file_name(asset.asset_id, dots=False)
             about = {**describe_columns(asset), "transform": asset.transform.tolist()}
             _add(tar, f"{key}.json", orjson.dumps(about))
-            names = ("coords", "feats", *TARGETS, "distance", "place")
+            names = with_merged(asset.store, "coords", "feats", *TARGETS, "distance", "place")
             # Not compressed, since a training loop reads it repeatedly.
             packed = io.BytesIO()
             np.savez(packed, **{name: getattr(asset, name) for name in names})

@@ -207,6 +207,13 @@ def check_alignment(store: Store, asset_id: str) -> AlignmentCheck:
     if store.format_version > 1:
         figures.append(Figure("confidence", confidence, confidence, 0))
         figures.append(Figure("expected_accuracy", expected, expected, 0))
+    if asset.merged:
+        means = [("votes for its class", asset.votes[asset.valid])]
+        spreads = zip(store.about.property_columns, asset.spread.T, strict=True)
+        means += [(f"spread of {name}", own[~np.isnan(own)]) for name, own in spreads]
+        for name, values in means:
+            mean = float(values.mean(dtype=np.float64)) if len(values) else math.nan
+            figures.append(Figure(f"mean {name}", mean, mean, 0))
     return AlignmentCheck(
         asset_id, verdict, reasons, str(columns["verdict"]), tuple(figures), asset.transform, radius
     )

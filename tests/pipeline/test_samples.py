@@ -13,10 +13,12 @@ from support.synthetic import Dataset, make_asset
 from support.trees import records_of, tree
 
 from slatprep.errors import StoreError
+from slatprep.export import export_store
 from slatprep.inspect.check import check_alignment
 from slatprep.inspect.verify import verify_store
 from slatprep.parameters import BuildParameters, ConsensusParameters, Samples
 from slatprep.pipeline.dataset import BuildSummary, build_store, plan_build
+from slatprep.pipeline.join import concat_stores, subset_store
 from slatprep.store import open_store
 
 MakeDataset = Callable[..., Dataset]
@@ -109,6 +111,11 @@ def test_a_store_of_merged_labels_is_sound(merged: BuildSummary) -> None:
     store = open_store(str(merged.store))
     check = check_alignment(store, "a")
     assert check.consistent
+    asset = store.asset("a")
+    np.testing.assert_allclose(check.value("mean votes for its class"), asset.votes.mean())
+    np.testing.assert_allclose(
+        check.value("mean spread of youngs_modulus"), asset.spread[:, 0].mean(), rtol=1e-6
+    )
 
 
 def test_without_several_a_merge_is_the_build_it_was(
@@ -234,3 +241,42 @@ def test_labels_that_the_sources_do_not_give_are_found(
     found = verify_store(out, sources=True).findings
     assert {finding.file for finding in found} == {f"voxel/{name}"}
     assert all("1 of" in finding.what for finding in found)
+
+
+def test_exports_carry_spread_and_votes(merged: BuildSummary, tmp_path: Path) -> None:
+    import h5py
+
+    asset = open_store(str(merged.store)).asset("a")
+    export_store(str(merged.store), tmp_path / "npz", "npz")
+    export_store(str(merged.store), tmp_path / "all.h5", "hdf5")
+    (path,) = (tmp_path / "npz").rglob("a.npz")
+    with np.load(path) as npz, h5py.File(tmp_path / "all.h5") as file:
+        for name in ("spread", "votes"):
+            np.testing.assert_array_equal(npz[name], getattr(asset, name))
+            np.testing.assert_array_equal(file["a"][name][:], getattr(asset, name))
+
+
+def test_joined_and_chosen_stores_keep_their_spread(
+    several: Dataset, merged: BuildSummary, tmp_path: Path
+) -> None:
+    """Ranges of the joined store are wider, so that spreads in its units are smaller."""
+    subset_store(str(merged.store), tmp_path / "b.zarr", ["b"])
+    assert not open_store(tmp_path / "b.zarr").merges
+    subset_store(str(merged.store), tmp_path / "a.zarr", ["a"])
+    assert open_store(tmp_path / "a.zarr").asset("a").merged
+    other = Dataset(tmp_path / "other")
+    other.add("c", 2)
+    other.write_grid("c", sample_grid(2, 100.0))
+    build_store(other.parameters(), tmp_path / "c.zarr")
+    concat_stores([tmp_path / "a.zarr", tmp_path / "c.zarr"], tmp_path / "joined.zarr")
+    joined = open_store(tmp_path / "joined.zarr")
+    before = open_store(str(merged.store))
+    width = [s.normalization.ranges[0].hi - s.normalization.ranges[0].lo for s in (before, joined)]
+    assert width[1] > width[0]
+    np.testing.assert_allclose(
+        joined.asset("a").spread[:, 0] * width[1],
+        before.asset("a").spread[:, 0] * width[0],
+        rtol=1e-5,
+    )
+    assert not joined.asset("c").merged
+    assert verify_store(tmp_path / "joined.zarr").findings == ()
