@@ -59,7 +59,7 @@ endif
 	    --jobs $(JOBS) $(if $(filter-out default,$(PRESET)),--preset $(PRESET)) || status=$$?; \
 	[ $$status -le 1 ] && [ -e $(STORE) ] || exit $$status; \
 	$(if $(filter manifests/demo.toml,$(DATA)),$(BIN)/slatprep score $(STORE) $(DEMO)/truth;) \
-	$(BIN)/slatprep report $(STORE) --manifests $(MANIFESTS) --out data/$(NAME).html --quiet; \
+	$(BIN)/slatprep report $(STORE) --manifests $(MANIFESTS) --out data/$(NAME).html; \
 	echo "results: $(STORE) (the store), $(MANIFESTS) (a record of every asset)"; \
 	echo "look:    open data/$(NAME).html in a browser"; \
 	echo "next:    . $(BIN)/activate && slatprep info $(STORE)"; \
@@ -67,7 +67,7 @@ endif
 
 $(DEMO)/.assets-$(ASSETS)-seed-$(SEED): | $(INSTALLED)
 	rm -rf $(DEMO)
-	$(BIN)/slatprep make-demo $(DEMO) --assets $(ASSETS) --seed $(SEED) --quiet
+	$(BIN)/slatprep make-demo $(DEMO) --assets $(ASSETS) --seed $(SEED)
 	@touch $@
 
 # -- development ------------------------------------------------------------

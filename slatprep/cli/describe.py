@@ -51,8 +51,8 @@ def describe(output: Output, store: Place, out: Path | None, location: str, **st
 
     Example
     -------
-    slatprep describe demo.zarr
-    slatprep describe demo.zarr --out demo.croissant.json --name demo
+    slatprep describe data/demo.zarr
+    slatprep describe data/demo.zarr --out demo.croissant.json --name demo
     """
     from slatprep.export import croissant
     from slatprep.storage.atomic import staged, writing

@@ -27,6 +27,9 @@ if TYPE_CHECKING:
     from slatprep.learn.published import PublishedScore
     from slatprep.records import Place
 
+_LISTED = 10
+"""How many assets without a prediction are named; ``--json`` has all."""
+
 
 @command()
 @click.argument("predictions", required=False, type=click.Path(path_type=Path, exists=True))
@@ -76,11 +79,11 @@ def evaluate(
 
     Example
     -------
-    slatprep evaluate runs/small/predictions --store demo.zarr
-    slatprep evaluate predictions.h5 --store demo.zarr --split all --spread sd --csv scores.csv
+    slatprep evaluate runs/small/predictions --store data/demo.zarr
+    slatprep evaluate predictions.h5 --store data/demo.zarr --split all --spread sd --csv scores.csv
     slatprep evaluate predictions --store pixieverse.zarr --split-by test_set.json
     slatprep evaluate runs/large/predictions --store pixieverse.zarr --beside pixie
-    slatprep evaluate runs/large/predictions --store demo.zarr --grids Pixie=results --picture m.png
+    slatprep evaluate predictions --store data/demo.zarr --grids Pixie=results --picture m.png
     """
     from slatprep.learn.metrics import SPREADS, evaluate_store
     from slatprep.learn.predictions import RUN_FILE, selection_of_run
@@ -147,8 +150,10 @@ def evaluate(
         for name, scores in others.items():
             _show_beside(output, ours, scores, name)
 
-    for problem in problems:
+    for problem in problems[:_LISTED]:
         output.problem(problem)
+    if len(problems) > _LISTED:
+        output.problem(f"and {len(problems) - _LISTED:,} more: --json lists them")
     document = vars(result) | {"store": store}
     if beside:
         document["beside"] = [score for scores in others.values() for score in scores]

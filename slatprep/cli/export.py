@@ -75,12 +75,12 @@ def export(
 
     Example
     -------
-    slatprep export demo.zarr --format ply --out demo.ply.d --verdict good
-    slatprep export demo.zarr --format ply --out world --points grid --frame pixieverse
-    slatprep export demo.zarr --format hdf5 --out demo.h5 --asset 5f61cc --asset 803c1a
-    slatprep export demo.zarr --format webdataset --out shards --shard-size 128 --jobs 2
-    slatprep export demo.zarr --format npz --out trellis
-    slatprep export demo.zarr --format webdataset --out train --split train --split-by pixie
+    slatprep export data/demo.zarr --format ply --out demo.ply.d --verdict good
+    slatprep export data/demo.zarr --format ply --out world --points grid --frame pixieverse
+    slatprep export data/demo.zarr --format hdf5 --out demo.h5 --asset 5f61cc --asset 803c1a
+    slatprep export data/demo.zarr --format webdataset --out shards --shard-size 128 --jobs 2
+    slatprep export data/demo.zarr --format npz --out trellis
+    slatprep export data/demo.zarr --format webdataset --out train --split train --split-by pixie
     """
     options = {name: value for name in _ONLY_FOR if (value := others.pop(name)) is not None}
     for name in options:

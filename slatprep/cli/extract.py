@@ -124,7 +124,7 @@ def decode_slat(
     Example
     -------
     slatprep decode-slat slat/cup.npz --out gaussians
-    slatprep decode-slat demo.zarr --asset 5f61cc --out gaussians
+    slatprep decode-slat data/demo.zarr --asset 5f61cc --out gaussians
     """
     from slatprep import extract as work
     from slatprep.records import TRELLIS

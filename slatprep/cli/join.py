@@ -55,8 +55,8 @@ def subset(
 
     Example
     -------
-    slatprep subset demo.zarr --verdict good --out good.zarr
-    slatprep subset demo.zarr --asset 5f61cc --asset 803c1a --out two.zarr
+    slatprep subset data/demo.zarr --verdict good --out good.zarr
+    slatprep subset data/demo.zarr --asset 5f61cc --asset 803c1a --out two.zarr
     """
     if not (assets or verdicts or categories):
         raise click.UsageError("say which assets: --asset ID, --verdict or --category")

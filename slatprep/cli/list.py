@@ -39,8 +39,8 @@ def list_assets(
 
     Example
     -------
-    slatprep list demo.zarr --verdict doubtful --verdict failed
-    slatprep list demo.zarr --category tree --ids
+    slatprep list data/demo.zarr --verdict doubtful --verdict failed
+    slatprep list data/demo.zarr --category tree --ids
     """
     from slatprep.inspect.listing import list_assets as listed_of
     from slatprep.store import open_store

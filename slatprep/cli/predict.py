@@ -67,7 +67,7 @@ def predict(
     Example
     -------
     slatprep predict latents --checkpoint runs/small --out predictions
-    slatprep predict demo.zarr --checkpoint runs/small/best.pt --out predictions --device cuda
+    slatprep predict data/demo.zarr --checkpoint runs/small/best.pt --out predictions --device cuda
     slatprep predict cup.png --checkpoint runs/large --out cup --gaussians cup.ply --device cuda
     """
     from slatprep.learn import require_torch

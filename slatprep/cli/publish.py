@@ -66,8 +66,8 @@ def publish(
 
     Example
     -------
-    slatprep publish demo.zarr --out hub --license CC-BY-4.0
-    slatprep publish demo.zarr --out hub --data webdataset --name "My demo"
+    slatprep publish data/demo.zarr --out hub --license CC-BY-4.0
+    slatprep publish data/demo.zarr --out hub --data webdataset --name "My demo"
     """
     from slatprep.errors import ConfigError
     from slatprep.export.card import Stated

@@ -60,8 +60,8 @@ def stats(
 
     Example
     -------
-    slatprep stats demo.zarr
-    slatprep stats demo.zarr --verdict good --weight asset --picture demo.png --csv demo.csv
+    slatprep stats data/demo.zarr
+    slatprep stats data/demo.zarr --verdict good --weight asset --picture demo.png --csv demo.csv
     """
     from slatprep.inspect.pictures.canvas import FORMATS
 

@@ -99,9 +99,9 @@ def train(
 
     Example
     -------
-    slatprep train demo.zarr --out runs/small --size small --epochs 8 --learning-rate 0.003
-    slatprep train demo.zarr --out runs/sizes --all-sizes
-    slatprep train demo.zarr --out runs/large --steps 2000 --keep last --split-by test_set.json
+    slatprep train data/demo.zarr --out runs/small --size small --epochs 8 --learning-rate 0.003
+    slatprep train data/demo.zarr --out runs/sizes --all-sizes
+    slatprep train data/demo.zarr --out runs/large --steps 2000 --keep last --split-by test_set.json
     """
     from slatprep.learn import require_torch
 

@@ -70,9 +70,9 @@ def transfer(
 
     Example
     -------
-    slatprep transfer gaussians.ply --store demo.zarr --asset 5f61cc --out materials.ply
-    slatprep transfer solid.npy --store demo.zarr --asset 5f61cc --points grid --out solid.ply
-    slatprep transfer gaussians.ply --prediction 0a1b2c.npz --store demo.zarr --out predicted.ply
+    slatprep transfer gaussians.ply --store data/demo.zarr --asset 5f61cc --out materials.ply
+    slatprep transfer solid.npy --store data/demo.zarr --asset 5f61cc --points grid --out solid.ply
+    slatprep transfer gaussians.ply --prediction predictions/5f61cc.npz --out predicted.ply
     """
     from slatprep.particles import transfer as work
 

@@ -14,8 +14,10 @@ import subprocess
 import sys
 from pathlib import Path
 
+import nbformat
 import pytest
 from click.testing import CliRunner
+from nbclient import NotebookClient
 
 from slatprep.cli.commands import slatprep
 from slatprep.pipeline.dataset import BuildSummary
@@ -67,6 +69,29 @@ def test_the_notebook_is_the_tutorial() -> None:
         if language != "text"
     ]
     assert code == expected
+
+
+def test_the_notebook_runs_in_jupyter_and_prints_what_the_tutorial_shows(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("PATH", f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}")
+    for folder in ("IPYTHONDIR", "JUPYTER_RUNTIME_DIR", "JUPYTER_CONFIG_DIR"):
+        monkeypatch.setenv(folder, str(tmp_path / "jupyter"))
+    notebook = nbformat.read(ROOT / "examples" / "tutorial.ipynb", as_version=4)
+    place = {"metadata": {"path": str(tmp_path)}}
+    # Raises where a cell does, of Python or of the shell.
+    NotebookClient(notebook, timeout=None, resources=place).execute()
+    cells = iter(cell for cell in notebook.cells if cell.cell_type == "code")
+    printed, compared = "", 0
+    for language, text in blocks("tutorial.md"):
+        if language == "text":
+            assert printed == text
+            compared += 1
+        else:
+            outputs = next(cells).outputs
+            printed = "".join(out.text for out in outputs if out.get("name") == "stdout")
+    assert compared >= 10
+    assert (tmp_path / "shards" / "shard-000001.tar").exists()
 
 
 # -- messages ---------------------------------------------------------------

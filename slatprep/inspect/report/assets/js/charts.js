@@ -54,12 +54,13 @@ const Charts = (() => {
     );
     const label = `${spec.title}. ${spec.sub}`;
     const plot = el("div", { class: "plot", role: spec.choose ? "group" : "img", "aria-label": label }, ...bars, ...marks);
-    // The axis is labelled with the number of the highest bar.
-    plot.append(el("span", { class: "most", "aria-hidden": "true" }, `highest: ${Format.count(highest)}`));
     if (spec.choose) roving(plot, bars);
     const ticks = spec.ticks.map((tick) => el("span", { style: { left: `${place(tick.at)}%` } }, tick.text));
     const body = bars.length ? [plot, el("div", { class: "axis", "aria-hidden": "true" }, ...ticks)] : [el("div", { class: "empty" }, spec.empty ?? "nothing to show")];
-    const figure = el("figure", { class: "chart" }, el("figcaption", {}, el("h3", {}, spec.title), sub), ...body);
+    // Bars say nothing without a number: that of the highest, where no mark's text comes.
+    const most = el("span", { "aria-hidden": "true" }, bars.length ? `highest: ${Format.count(highest)}` : "");
+    const head = el("div", { class: "head" }, el("h3", {}, spec.title), most);
+    const figure = el("figure", { class: "chart" }, el("figcaption", {}, head, sub), ...body);
     figure.press = (chosen) => bars.forEach((bar) => bar.setAttribute("aria-pressed", String(bar.bin === chosen)));
     return figure;
   }

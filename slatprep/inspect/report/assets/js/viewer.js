@@ -86,7 +86,7 @@ const Viewer = (() => {
     three.renderer.setPixelRatio(Math.min(devicePixelRatio, 2));
     three.renderer.setSize(width, height, false);
     three.camera.aspect = width / height;
-    three.camera.fov = width < height ? 48 : 35;
+    three.camera.fov = width < 1.2 * height ? 48 : 35; // so that the axes are seen, too
     three.camera.updateProjectionMatrix();
     stale = true;
   }
