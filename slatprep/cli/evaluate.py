@@ -147,6 +147,12 @@ def evaluate(
             (what, "n", *next(iter(measures.values())).means),
             _in_short(measures),
         )
+        if TABLES.keys() & others:
+            output.note(
+                "note: those beside were measured on PixieVerse's test objects; they compare only "
+                "with predictions of the same objects, normalised by Pixie's ranges (--ranges "
+                "pixie)"
+            )
         for name, scores in others.items():
             _show_beside(output, ours, scores, name)
 
@@ -213,14 +219,7 @@ def _show_beside(
         (name, *measure.means.values()) for name, measure in ours.items()
     ]
     rows += [(score.method, *(score.means.get(name) for name in names)) for score in others]
-    if beside in TABLES:
-        title = f"Beside {TABLES[beside][0]}"
-        output.note(
-            "note: those were measured on PixieVerse's test objects; they compare only with "
-            "predictions of the same objects, normalised by Pixie's ranges (--ranges pixie)"
-        )
-    else:
-        title = f"Beside {beside}"
+    title = f"Beside {TABLES[beside][0] if beside in TABLES else beside}"
     output.table(title, ("method", *names), rows)
     spreads = [
         (score.method, *(score.spreads.get(name) for name in names), score.spread)
