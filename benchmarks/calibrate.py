@@ -281,7 +281,7 @@ def draw(path: Path, assets: list[Any], voxels: list[Any]) -> None:
         ax.bar(said, weight, width=0.06, color="#cfd8e6", label="share of the mix")
         ax.plot(said, found, "o-", color="#2a5caa", label="right")
         ax.set(xlabel="confidence", ylabel="share", title=name, xlim=(0, 1), ylim=(0, 1.02))
-    axes[0].legend(frameon=False, loc="upper left")
+    axes[1].legend(frameon=False, loc="upper left")
     path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path, metadata={"Date": None})
 

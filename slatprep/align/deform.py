@@ -74,6 +74,11 @@ class Similarity:
     scale: float
     offset: float
 
+    def inverse(self, points: Array) -> Array:
+        """Return where points (N, 3) of the SLAT frame lie in the PixieVerse frame, in voxels."""
+        places: Array = (points - self.shift) @ self.rotation / self.scale
+        return places
+
 
 @dataclass(frozen=True)
 class Warp:
@@ -262,6 +267,12 @@ class Deformed:
     deformation: Deformation | None
     figures: FitFigures
 
+    def moved(self, points: Array) -> Array:
+        """Return points (N, 3) of the SLAT frame, in voxels, as the deformation moves them."""
+        if self.deformation is None:
+            return points
+        return deform(self.deformation, points * VOXEL_SIZE) / VOXEL_SIZE
+
 
 def places_of(pose: Similarity, warp: Warp, points: Array) -> Array:
     """Return where points (N, 3) of the SLAT frame lie in the PixieVerse frame, all in voxels."""
@@ -270,8 +281,7 @@ def places_of(pose: Similarity, warp: Warp, points: Array) -> Array:
         added = np.empty_like(moved)
         displacements(points, warp.origin, warp.spacing, warp.coefficients, added)
         moved += added
-    places: Array = (moved - pose.shift) @ pose.rotation / pose.scale
-    return places
+    return pose.inverse(moved)
 
 
 def deform_if_earned(

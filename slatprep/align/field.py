@@ -1,6 +1,6 @@
 """The default engine: two filled voxel sets laid on each other by their distance fields.
 
-The method in five steps (docs/method.md has the equations):
+The method in six steps (docs/method.md has the equations):
 
 1. Fill both voxel sets and measure the signed distance to their surfaces.
 2. From each of the 24 distinct start rotations, centroid on centroid and size
@@ -10,7 +10,7 @@ The method in five steps (docs/method.md has the equations):
 4. Refine what is left on all samples, choose the best, list the ties.
 5. Keep the scale at one where the data do not ask for another.
 6. Where a tenth of the misfit goes away in samples that a trial fit did not
-   see, deform: `slatprep.align.deform`.
+   see, deform: `slatprep.align.deform`; and then those that tie as well.
 """
 
 from __future__ import annotations
@@ -88,6 +88,9 @@ SCALE_PRIOR = 0.04
 RANK_STANDING = 0.01
 """By so much another placement must rank above the one that fits best as a similarity."""
 
+MOST_CONTESTED = 4
+"""Where the best placement is deformed, so many, of those within twice `TIE`, are deformed too."""
+
 RIGID_IF_SCALE_WITHIN = 0.04
 RIGID_LOSS = 0.004
 """A scale this near to one is kept only if it raises the score by more than this."""
@@ -149,10 +152,13 @@ def align(
         if pair.may_deform and poses[0].score < POOR:
             poses = pair.ranked(pair.distinct([*poses, *wide]))
 
-    tied = [pose for pose in poses if pose.merit > poses[0].merit - TIE]
-    tied, deformed = pair.finish(tied, rough=poses[0].score < CLEAN)
+    may_contest = pair.may_deform and poses[0].score < POOR
+    reach = 2 * TIE if may_contest else TIE
+    near = [pose for pose in poses if pose.merit > poses[0].merit - reach]
+    tied, deformed = pair.finish(near, rough=poses[0].score < CLEAN)
     best = tied[0]
-    others = pair.distinct([*tied, *poses])[1:]
+    # A contest said more of them than the scores that they had before.
+    others = pair.distinct([*tied, *poses[len(near) if may_contest else 0 :]])[1:]
 
     fitted = {s.index: (fit.fitness, fit.rmse) for s, fit in zip(starts, fits, strict=True)}
     transform = best.transform
@@ -201,6 +207,21 @@ def _is_poor(poses: Sequence[Pose]) -> bool:
     score = poses[0].score
     unclear = len(poses) > 1 and score - poses[1].score < CLEAR
     return score < POOR or (score < FAIR and unclear)
+
+
+def _scale_penalty(pose: Pose) -> float:
+    return float(SCALE_PRIOR * (np.log(pose.scale) / 0.25) ** 2)
+
+
+def _rank(pose: Pose, deformed: Deformed) -> float:
+    figures = deformed.figures
+    return 0.5 * (figures.score_slat + figures.score_pixieverse) - _scale_penalty(pose)
+
+
+def _apart_from_all(places: NDArray[np.float64], others: Iterable[NDArray[np.float64]]) -> bool:
+    """Whether similarities did not deform into one and the same placement."""
+    apart = (np.sqrt(((places - other) ** 2).sum(axis=1).mean()) for other in others)
+    return all(distance >= 2.0 * DISTINCT for distance in apart)
 
 
 class _Pair:
@@ -294,16 +315,14 @@ class _Pair:
         ranked = []
         for index, pose in enumerate(likely):
             trial = try_out(self.slat, self.pixie, pose.similarity, RANK_SAMPLES)
-            merit = trial.whole - SCALE_PRIOR * (np.log(pose.scale) / 0.25) ** 2
+            merit = trial.whole - _scale_penalty(pose)
             merit += RANK_STANDING if index == 0 else 0.0
             places = places_of(pose.similarity, trial.bent, points)
             ranked.append((replace(pose, bonus=float(merit) - pose.score), places))
         ranked.sort(key=lambda entry: -entry[0].merit)
         kept: list[tuple[Pose, NDArray[np.float64]]] = []
         for pose, places in ranked:
-            # Similarities some voxels apart may deform into one and the same placement.
-            apart = (np.sqrt(((places - p) ** 2).sum(axis=1).mean()) for _, p in kept)
-            if all(distance >= 2.0 * DISTINCT for distance in apart):
+            if _apart_from_all(places, (p for _, p in kept)):
                 kept.append((pose, places))
         return self.distinct([*(pose for pose, _ in kept), *poses[len(likely) :]])
 
@@ -320,12 +339,34 @@ class _Pair:
         return self.distinct(self.refine(survivors, POLISH_SAMPLES, POLISH_TAUS, 0.01))
 
     def finish(self, poses: Sequence[Pose], rough: bool) -> tuple[list[Pose], Deformed]:
-        """Refine poses on all samples, best first, and deform the best one if that is earned."""
+        """Refine poses on all samples, best first, and deform the best one if that is earned.
+
+        Then those that fit about as well are deformed too: the order is by what that leaves.
+        """
         fine = self.refine(poses, FINE_SAMPLES, FINE_TAUS, 0.002, size_by_slat=rough)
         first, *others = self.distinct(fine)
-        best, model = self._simplest(first, rough)
-        deformed = deform_if_earned(self.slat, self.pixie, best.similarity, model, self.parameters)
-        return [best, *others], deformed
+        best, deformed = self._deformed(first, rough)
+        if deformed.deformation is None:
+            return [best, *others], deformed
+        few, rest = others[: MOST_CONTESTED - 1], others[MOST_CONTESTED - 1 :]
+        contested = [(best, deformed), *(self._deformed(pose, rough) for pose in few)]
+        ranks = [_rank(*entry) + RANK_STANDING * (k == 0) for k, entry in enumerate(contested)]
+        highest = max(pose.merit for pose, _ in contested)
+        points = self.slat.subset(RANK_SAMPLES).points
+        kept: list[tuple[Pose, Deformed, NDArray[np.float64]]] = []
+        for k in sorted(range(len(ranks)), key=lambda k: -ranks[k]):
+            pose, deformed = contested[k]
+            places = pose.similarity.inverse(deformed.moved(points))
+            if _apart_from_all(places, (others for _, _, others in kept)):
+                bonus = highest - (max(ranks) - ranks[k]) - pose.score
+                kept.append((replace(pose, bonus=bonus), deformed, places))
+        return [*(pose for pose, _, _ in kept), *rest], kept[0][1]
+
+    def _deformed(self, pose: Pose, rough: bool) -> tuple[Pose, Deformed]:
+        best, model = self._simplest(pose, rough)
+        return best, deform_if_earned(
+            self.slat, self.pixie, best.similarity, model, self.parameters
+        )
 
     def _simplest(self, pose: Pose, rough: bool) -> tuple[Pose, Model]:
         """Return the pose with its scale set to one where that fits as well, and the model."""
