@@ -8,8 +8,8 @@ import pytest
 from slatprep.geometry.frames import make_transform, places_of, voxel_centres
 from slatprep.geometry.voxels import occupancy_of
 from slatprep.parameters import SampleParameters
-from slatprep.records import MaterialField
-from slatprep.sample import sample
+from slatprep.records import PROPERTIES, UNANNOTATED, Annotation, MaterialField
+from slatprep.sample import merge, sample
 
 NEAREST = SampleParameters(method="nearest")
 
@@ -96,3 +96,48 @@ def test_labels_alone_are_the_same_labels(method: str) -> None:
         np.testing.assert_array_equal(getattr(alone, name), getattr(whole, name))
     np.testing.assert_array_equal(alone.distance[alone.valid], whole.distance[alone.valid])
     assert np.isinf(alone.distance[~alone.valid]).all()
+
+
+def _said(material: list[int], modulus: list[float], ratio: list[float]) -> Annotation:
+    """Return what one annotation says of voxels; class 255 stands for one it does not reach."""
+    classes = np.array(material, dtype=np.uint8)
+    valid = classes != 255
+    values = np.stack([modulus, np.full(len(classes), 1e3), ratio], axis=1).astype(np.float32)
+    values[~valid] = np.nan
+    likely = np.where(valid, 0.8, 0.0).astype(np.float32)
+    nothing = np.zeros(len(classes), np.float32)
+    return Annotation(values, classes, valid, nothing, np.zeros((len(classes), 3)), likely)
+
+
+def test_annotations_merge_to_mean_spread_and_votes() -> None:
+    """Four voxels: all agree; three differ; a tie of classes; one annotation alone reaches it."""
+    one = _said([0, 1, 4, 255], [1e6, 1e5, 1e6, np.nan], [0.3, 0.3, 0.2, np.nan])
+    two = _said([0, 1, 2, 255], [1e6, 1e6, 1e6, np.nan], [0.3, 0.3, 0.3, np.nan])
+    three = _said([0, 3, 255, 5], [1e6, 1e7, np.nan, 2e9], [0.3, 0.3, np.nan, 0.4])
+    made = merge([one, two, three], PROPERTIES)
+    np.testing.assert_allclose(made.properties[:, 0], [1e6, 1e6, 1e6, 2e9], rtol=1e-6)
+    np.testing.assert_allclose(made.properties[:, 2], [0.3, 0.3, 0.25, 0.4], rtol=1e-6)
+    assert made.material.tolist() == [0, 1, 2, 5]
+    assert made.valid.all()
+    assert made.spread is not None
+    assert made.votes is not None
+    assert made.confidence is not None
+    np.testing.assert_allclose(made.spread[:3, 0], [0, np.std([5, 6, 7]), 0], rtol=1e-6)
+    np.testing.assert_allclose(made.spread[:3, 2], [0, 0, 0.05], atol=1e-7)
+    assert not made.spread[0].any()
+    assert np.isnan(made.spread[3]).all()
+    np.testing.assert_allclose(made.votes, [1, 2 / 3, 1 / 2, 1], rtol=1e-6)
+    # Half where a property is off: 1e5 is a tenth of 1e6, and 0.3 is 0.05 off 0.25, just a fifth.
+    np.testing.assert_allclose(
+        made.confidence, 0.8 * np.array([1, (0.5 + 1) / 3, 1 / 2, 1]), rtol=1e-6
+    )
+
+
+def test_voxels_that_no_annotation_reaches_stay_without_labels() -> None:
+    nowhere = _said([255], [np.nan], [np.nan])
+    made = merge([nowhere, nowhere], PROPERTIES)
+    assert not made.valid.any()
+    assert made.material.tolist() == [UNANNOTATED]
+    assert np.isnan(made.properties).all()
+    assert np.isnan(made.spread).all()
+    assert made.votes.tolist() == made.confidence.tolist() == [0.0]
