@@ -257,6 +257,8 @@ def _text(cell: Cell) -> str:
         return f"{cell:,}"
     if isinstance(cell, float):
         size = abs(cell)
+        if 0 < size < 5e-4:
+            return f"{cell:.1e}"
         return f"{cell:.3f}" if size < 1e4 else f"{cell:,.0f}" if size < 1e7 else f"{cell:.3g}"
     # A cell is one line.
     return printable(str(cell)).replace("\n", "\\n")

@@ -9,10 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slatprep.geometry.frames import VOXEL_SIZE, places_of, split_transform
-from slatprep.judge.ambiguity import thinning
+from slatprep.judge.ambiguity import NOTABLE, thinning
+from slatprep.normalize import property_extent, to_mapped
 from slatprep.records import (
-    BACKGROUND,
     RESOLUTION,
+    UNANNOTATED,
     Alignment,
     Annotation,
     FitFigures,
@@ -62,7 +63,8 @@ class Surroundings:
     ----------
     others, solid : ndarray of float32, shape (N, 4)
         Of the cells at `RADII`: the share that is annotated with another class
-        (of the annotated ones), and the share that is annotated at all.
+        (of the annotated ones; without classes, with other properties), and the
+        share that is annotated at all.
     distance : ndarray of float32, shape (N,)
         To the annotation used, in voxels.
     moved : ndarray of float32, shape (N,)
@@ -102,9 +104,10 @@ def surroundings_of(
     """
     from slatprep.geometry.surroundings import shares_around
 
-    grid = np.full((RESOLUTION,) * 3, BACKGROUND, dtype=np.uint8)
-    grid[tuple(field.voxels.T)] = field.material
-    others, solid = shares_around(grid, annotation.place, annotation.material, RADII, BACKGROUND)
+    cells, labels = _labels_of(field, annotation)
+    grid = np.full((RESOLUTION,) * 3, UNANNOTATED, dtype=np.uint8)
+    grid[tuple(field.voxels.T)] = cells
+    others, solid = shares_around(grid, annotation.place, labels, RADII, UNANNOTATED)
     count = len(annotation.place)
     moved = np.zeros(count, dtype=np.float32)
     if alignment.deformation is not None:
@@ -116,7 +119,7 @@ def surroundings_of(
     some = ties[:: thinning(count)]
     for placement in some:
         places = places_of(latents.coords, placement.transform).astype(np.float32)
-        other, there = shares_around(grid, places, annotation.material, (0,), BACKGROUND)
+        other, there = shares_around(grid, places, labels, (0,), UNANNOTATED)
         tied += np.where(there[:, 0] > 0, other[:, 0], 0.0)
     if len(some) < len(ties):
         tied *= np.float32(len(ties) / len(some))
@@ -124,6 +127,32 @@ def surroundings_of(
     if tied.mean() <= HARMLESS:
         tied[:] = 0.0  # They count as one: at their few voxels the chosen one is right as often.
     return Surroundings(others, solid, annotation.distance, moved, tied)
+
+
+def _labels_of(
+    field: MaterialField, annotation: Annotation
+) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
+    """Return a label of each annotated voxel (K,), and of each SLAT voxel (N,).
+
+    Without classes, voxels have the same label if the same multiple of `NOTABLE` times the
+    extent is nearest to each property; of more than 255 combinations, of coarser multiples.
+    """
+    if field.classified:
+        return field.material, annotation.material
+    ends = property_extent(field)
+    span = np.where(ends[:, 1] > ends[:, 0], ends[:, 1] - ends[:, 0], 1.0)
+    values = np.concatenate([field.properties, annotation.properties[annotation.valid]])
+    steps = (to_mapped(values, field.table) - ends[:, 0]) / (NOTABLE * span)
+    coarse = 1
+    while True:
+        found, number = np.unique(np.rint(steps / coarse), axis=0, return_inverse=True)
+        if len(found) <= UNANNOTATED or coarse > 1.0 / NOTABLE:
+            break
+        coarse *= 2
+    every = np.minimum(number.reshape(-1), UNANNOTATED - 1).astype(np.uint8)
+    own = np.full(len(annotation.valid), UNANNOTATED, dtype=np.uint8)
+    own[annotation.valid] = every[len(field.properties) :]
+    return every[: len(field.properties)], own
 
 
 def evidence_of(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import shlex
 from pathlib import Path
 from typing import get_args
@@ -93,6 +94,29 @@ def test_latents_of_every_encoder_are_carried(tmp_path: Path, encoder: Encoder) 
     (file,) = (tmp_path / "demo" / "slat").rglob("*.npz")
     with np.load(file) as latents:
         np.testing.assert_array_equal(asset.feats, latents["feats"])
+
+
+TURN = np.array([[1.0, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
+
+
+@pytest.mark.parametrize("source", ["pixieverse", "pixie-predictions", *HELD, "vomp"])
+def test_a_wrong_frame_of_any_source_is_caught(tmp_path: Path, source: Source) -> None:
+    made = make_demo(tmp_path / "demo", 2, 0, levels=(0,), source=source)
+    text = made.config.read_text()
+    if "[align]" not in text:
+        text += '\n[align]\nengine = "known"\n'
+    root = made.directory / re.findall(r'^root = "(\w+)"$', text, re.M)[0]
+    made.config.write_text(text.replace("[slat]", 'transform = "{id}.frame.npy"\n\n[slat]'))
+    for wrong, expected in ((False, "good"), (True, "failed")):
+        for truth in (made.directory / "truth").iterdir():
+            with np.load(truth) as file:
+                frame = file["transform"]
+            np.save(root / f"{truth.stem}.frame.npy", TURN @ frame if wrong else frame)
+        out = tmp_path / f"{expected}.zarr"
+        run("build-store", "--config", str(made.config), "--out", str(out))
+        store = open_store(out)
+        assert set(store.column("engine")) == {"known"}
+        assert set(store.column("verdict")) == {expected}
 
 
 @pytest.mark.parametrize(

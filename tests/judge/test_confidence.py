@@ -106,6 +106,45 @@ def test_labels_are_right_as_often_as_they_are_said_to_be(
         assert judgement.expected_accuracy == pytest.approx(own[annotation.valid].mean(), abs=1e-6)
 
 
+def test_without_classes_it_is_said_how_likely_the_properties_are_right(
+    cases: list[Case],
+) -> None:
+    # Of the same objects, as a source without classes has them: the same values, all of class 0.
+    likely, right = [], []
+    for field, latents, truth in cases:
+        plain = replace(field, material=np.zeros_like(field.material), classified=False)
+        judgement, own, annotation = _judged(plain, latents)
+        if judgement.ambiguity.material_share > 0:
+            continue
+        with np.load(truth.path) as file:
+            true = file["properties"]
+        same = np.isclose(annotation.properties, true, rtol=0.01).all(axis=1)
+        likely.append(own[annotation.valid])
+        right.append(same[annotation.valid])
+        assert judgement.expected_accuracy == pytest.approx(likely[-1].mean(), abs=1e-6)
+    assert len(likely) >= 5
+    said, so = np.concatenate(likely), np.concatenate(right)
+    assert abs(said.mean() - so.mean()) < 0.05
+    order = np.argsort(said, kind="stable")
+    shares = [so[part].mean() for part in np.array_split(order, 4)]
+    assert shares[0] < 0.95 < shares[-1]
+
+
+def test_properties_that_differ_little_are_one_label(
+    of_a_chair: tuple[MaterialField, StructuredLatents, Alignment, Annotation],
+) -> None:
+    field, latents, alignment, annotation = of_a_chair
+    plain = replace(field, material=np.zeros_like(field.material), classified=False)
+    by_value = voxel_confidence(plain, latents, alignment, annotation, 0.9)
+    by_class = voxel_confidence(field, latents, alignment, annotation, 0.9)
+    # The chair's two classes have two sets of properties.
+    np.testing.assert_array_equal(by_value, by_class)
+    noise = np.random.default_rng(0).uniform(0.999, 1.001, field.properties.shape)
+    rough = replace(plain, properties=(field.properties * noise).astype(np.float32))
+    near = sample(rough, annotation.place, SampleParameters())
+    np.testing.assert_array_equal(voxel_confidence(rough, latents, alignment, near, 0.9), by_value)
+
+
 def test_own_objects_pass_and_other_objects_fail(cases: list[Case], judged: list[Judged]) -> None:
     confidences = [judgement.confidence for judgement, _, _ in judged]
     assert np.median(confidences) > 0.9

@@ -66,7 +66,7 @@ def voxels_of(seed: int) -> tuple[np.ndarray, dict[str, np.ndarray], np.ndarray]
 
 
 def write(
-    root: Path, names: str, *, classes: bool = True, form: str = "npz", **said: object
+    root: Path, names: str, *, classes: bool | list[str] = True, form: str = "npz", **said: object
 ) -> None:
     """Write plain voxels, and SLATs that lie a quarter turn away."""
     (root / "slat").mkdir(parents=True)
@@ -175,6 +175,48 @@ def test_without_classes_no_accuracy_is_claimed(tmp_path: Path) -> None:
     means = evaluate_store(run / "predictions", out, split=None).overall.means
     assert np.isnan(means["accuracy"])
     assert np.isfinite(means["mean"])
+
+
+def test_classes_of_a_source_s_own_go_all_the_way_to_scores(tmp_path: Path) -> None:
+    from click.testing import CliRunner
+
+    own = ["soft wood", "steel"]
+    write(tmp_path, "abcdefgh", classes=own, properties=SOLID)
+    out, run = tmp_path / "s.zarr", tmp_path / "run"
+    build_store(parameters_of(tmp_path), out)
+    store = open_store(out)
+    assert store.attributes["material_classes"] == own
+    assert store.contents.n_classes == 2
+    assert not verify_store(out).findings
+    found = store_statistics(store)
+    counts = [np.bincount(voxels_of(seed)[2]) for seed in range(8)]
+    assert [one.name for one in found.classes] == own
+    shares = np.sum(counts, axis=0) / np.sum(counts)
+    assert [found.total.field.classes[name] for name in own] == pytest.approx(shares)
+    summary = train(out, run, TrainParameters(size="small", epochs=1, precision="fp32"))
+    assert 0 <= summary.history[-1].val_accuracy <= 1
+    assert np.isfinite(
+        evaluate_store(run / "predictions", out, split=None).overall.means["accuracy"]
+    )
+    predicted = tmp_path / "predicted"
+    source = ("--checkpoint", str(run / "best.pt"), "--out", str(predicted))
+    result = CliRunner().invoke(command, ["predict", str(tmp_path / "slat"), *source])
+    assert result.exit_code == 0, result.output
+    with np.load(next(predicted.glob("*.npz"))) as file:
+        assert file["probabilities"].shape[1] == 2
+        np.testing.assert_array_equal(file["material"], file["probabilities"].argmax(axis=1))
+    for name in ("report", "info", "describe"):
+        result = CliRunner().invoke(command, [name, str(out)])
+        assert result.exit_code == 0, result.output
+    for form in ("npz", "hdf5", "webdataset", "ply"):
+        assert export_store(out, tmp_path / form, form).assets == 8
+    with pytest.raises(StoreError, match=r"has classes of its own \(soft wood, steel\)"):
+        stored_field(store, "a")
+    # Another name is another table: nothing is taken over.
+    about = json.loads((tmp_path / "voxels" / "source.json").read_text()) | {"classes": ["a", "b"]}
+    (tmp_path / "voxels" / "source.json").write_text(json.dumps(about))
+    build_store(parameters_of(tmp_path), out)
+    assert open_store(out).attributes["material_classes"] == ["a", "b"]
 
 
 def test_particles_and_points_take_their_properties_by_name(tmp_path: Path) -> None:

@@ -217,8 +217,11 @@ def confidence_findings(asset: StoredAsset, record: AssetRecord) -> Iterator[Fin
     if asset.store.format_version == 1 or asset.merged:
         return
     annotation = Annotation(
-        asset.properties, asset.material, asset.valid, asset.distance, asset.place
+        asset.properties_si, asset.material, asset.valid, asset.distance, asset.place
     )
+    clipped = record.counts.clipped
+    if not asset.field.classified and clipped and any(clipped.grid.values()):
+        return  # The confidence came of values that the store does not hold.
     latents = StructuredLatents(asset.coords, asset.feats)
     confidence = record.judgement.confidence
     likely = voxel_confidence(asset.field, latents, record.alignment, annotation, confidence)
