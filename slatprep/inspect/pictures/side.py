@@ -20,19 +20,19 @@ if TYPE_CHECKING:
 SIDE_WIDTH, SIDE_MARGIN = 402, 48
 """Width of the column, and of the margin at its right, in pixels."""
 
-SHOWN = (
-    "confidence",
-    "expected_accuracy",
-    "fitness",
-    "inlier_rmse",
-    "fitness_backward",
-    "inlier_rmse_backward",
-    "overlap",
-    "valid_share",
-    "ambiguity",
-    "margin",
-)
-"""The figures of a check on a picture, by their names in the store."""
+SHOWN = {
+    "confidence": "confidence",
+    "expected_accuracy": "labels expected right",
+    "fitness": "fitness, PixieVerse to SLAT",
+    "inlier_rmse": "inlier rmse [voxel]",
+    "fitness_backward": "fitness, SLAT to PixieVerse",
+    "inlier_rmse_backward": "inlier rmse [voxel]",
+    "overlap": "overlap",
+    "valid_share": "valid share",
+    "ambiguity": "class ambiguous",
+    "margin": "margin",
+}
+"""The figures of a check on a picture: their names in the store, and what the picture says."""
 
 _LINE = 21
 
@@ -55,7 +55,7 @@ def draw_figures(figure: Figure, check: AlignmentCheck, scene: Scene, y: float) 
         line = y + 30 + _LINE * number
         worse = one.passes is False
         colour = palette.VERDICT_COLOURS["failed"] if worse else palette.INK
-        write(figure, columns[0], line, one.name, size=7.5)
+        write(figure, columns[0], line, SHOWN[one.name], size=7.5)
         # Adding 0 turns a rounded -0 into 0.
         value = "-" if np.isnan(one.value) else f"{round(one.value, 3) + 0.0:.3f}"
         write(figure, columns[1], line, value, size=7.5, ha="right", color=colour)
