@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-import zipfile
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from slatprep.errors import InputError
+from slatprep.readers.files import ArraySpec, npy_array, npz_arrays
 from slatprep.readers.points import ply_points
 
 Axes = Literal["trellis", "glb", "slat"]
@@ -37,6 +37,7 @@ _GAUSSIAN = ("f_dc_0", "opacity", "scale_0", "rot_0")
 _REACH = 0.6
 """Largest coordinate of TRELLIS's Gaussians: voxels end at 0.5, offsets are below 2 voxels."""
 _KEYS = ("positions", "points", "xyz")
+_POINTS = ArraySpec(((None, 3),), "fiu", max_rows=100_000_000)
 
 
 @dataclass(frozen=True)
@@ -140,21 +141,16 @@ def _read_ply(path: Path) -> tuple[NDArray[np.float64], frozenset[str], tuple[st
 
 def _read_numpy(path: Path) -> NDArray[np.float64]:
     try:
-        loaded: Any = np.load(path, allow_pickle=False)
-        if not isinstance(loaded, np.ndarray):
-            with loaded:
-                held = [key for key in _KEYS if key in loaded.files]
-                if len(held) != 1:
-                    raise InputError(
-                        path,
-                        f"holds {', '.join(loaded.files) or 'nothing'}",
-                        f"one array named {' or '.join(_KEYS)}",
-                    )
-                loaded = loaded[held[0]]
-    except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
+        data = path.read_bytes()
+    except OSError as error:
+        raise InputError(path, f"cannot be read ({error.strerror})", "a readable file") from None
+    if not data.startswith(b"PK"):
+        return npy_array(data, path, _POINTS).astype(np.float64)
+    arrays = npz_arrays(data, path, dict.fromkeys(_KEYS, _POINTS), partial=True)
+    if len(arrays) != 1:
         raise InputError(
-            path, f"cannot be read ({error})", "particles as PLY, npy or npz"
-        ) from None
-    if loaded.ndim != 2 or loaded.shape[1] != 3 or loaded.dtype.kind not in "fiu":
-        raise InputError(path, f"has shape {loaded.shape}, dtype {loaded.dtype}", "numbers (N, 3)")
-    return np.asarray(loaded, dtype=np.float64)
+            path,
+            f"has {' and '.join(arrays) or 'no particles'}",
+            f"one array named {' or '.join(_KEYS)}",
+        )
+    return next(iter(arrays.values())).astype(np.float64)
