@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from slatprep.errors import InputError, StoreError
 from slatprep.readers.files import ArraySpec
-from slatprep.storage.chunks import array_form, read_chunks
+from slatprep.storage.chunks import MAX_CHUNK_BYTES, array_form, read_chunks
 from slatprep.storage.documents import read_document
 from slatprep.storage.files import LINK, LocalFolder, local_files
 from slatprep.store.contract import MAX_METADATA_BYTES
@@ -50,7 +50,10 @@ def read_array(path: Path, root: Path, spec: ArraySpec) -> NDArray[Any]:
         shape, dtype = array_form(metadata)
         spec.check(path, shape, dtype)
         if metadata["codecs"][0]["name"] == "sharding_indexed":
-            return RowReader.of(LocalFolder(path.parent), path.name, metadata).read(0, shape[0])
+            reader = RowReader.of(LocalFolder(path.parent), path.name, metadata)
+            if reader.decoder.nbytes > MAX_CHUNK_BYTES:
+                raise ValueError(f"chunks of {reader.decoder.shape}")
+            return reader.read(0, shape[0])
         folder = LocalFolder(path)
 
         def fetch(name: str, most: int) -> bytes | None:

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from slatprep.errors import InputError
 from slatprep.readers.files import ArraySpec, npy_array, npz_arrays
 from slatprep.readers.points import ply_points
+from slatprep.storage.files import open_regular
 
 Axes = Literal["trellis", "glb", "slat"]
 
@@ -130,20 +131,14 @@ def _by_another_tool(positions: NDArray[np.float64], names: frozenset[str]) -> s
 
 
 def _read_ply(path: Path) -> tuple[NDArray[np.float64], frozenset[str], tuple[str, ...]]:
-    try:
-        data = path.read_bytes()
-    except OSError as error:
-        raise InputError(path, f"cannot be read ({error.strerror})", "a readable file") from None
+    data = _bytes_of(path)
     vertices, comments = ply_points(data, path)
     positions = np.column_stack([np.asarray(vertices[axis], dtype=np.float64) for axis in "xyz"])
     return positions, frozenset(vertices.dtype.names or ()), comments
 
 
 def _read_numpy(path: Path) -> NDArray[np.float64]:
-    try:
-        data = path.read_bytes()
-    except OSError as error:
-        raise InputError(path, f"cannot be read ({error.strerror})", "a readable file") from None
+    data = _bytes_of(path)
     if not data.startswith(b"PK"):
         return npy_array(data, path, _POINTS).astype(np.float64)
     arrays = npz_arrays(data, path, dict.fromkeys(_KEYS, _POINTS), partial=True)
@@ -154,3 +149,11 @@ def _read_numpy(path: Path) -> NDArray[np.float64]:
             f"one array named {' or '.join(_KEYS)}",
         )
     return next(iter(arrays.values())).astype(np.float64)
+
+
+def _bytes_of(path: Path) -> bytes:
+    try:
+        with open_regular(path) as file:
+            return file.readall()
+    except OSError as error:
+        raise InputError(path, f"cannot be read ({error.strerror})", "a readable file") from None

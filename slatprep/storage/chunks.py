@@ -21,7 +21,7 @@ _DTYPES = (
     *(f"{kind}{bits}" for kind in ("int", "uint") for bits in (8, 16, 32, 64)),
     *(f"float{bits}" for bits in (16, 32, 64)),
 )
-_MAX_CHUNK_BYTES = 2**26
+MAX_CHUNK_BYTES = 2**26
 _MAX_CHUNKS = 4096
 
 
@@ -75,7 +75,7 @@ def read_chunks(
     chunks = math.prod(map(len, corners))
     # A writer may cut short arrays by the rows of long ones, but not rows wider than they are.
     wide = any(step > n for step, n in zip(steps[1:], shape[1:], strict=True))
-    if wide or chunks > _MAX_CHUNKS or not 0 < decoder.nbytes <= _MAX_CHUNK_BYTES:
+    if wide or chunks > _MAX_CHUNKS or not 0 < decoder.nbytes <= MAX_CHUNK_BYTES:
         raise ValueError(f"{chunks} chunks of {steps}")
     keys = metadata["chunk_key_encoding"]
     separator = keys.get("configuration", {}).get("separator", "/")

@@ -197,6 +197,19 @@ def test_metadata_of_arrays_are_taken_at_their_word(
         read_array(file.parent, file.parents[1], spec)
 
 
+@pytest.mark.parametrize("sharded", [True, False])
+def test_a_chunk_of_few_rows_that_unpacks_to_much_is_refused(tmp_path: Path, sharded: bool) -> None:
+    root, spec = zarr.open_group(tmp_path / "p.zarr", mode="w"), ArraySpec(((None, 3),), "u")
+    cut = (2**25, 3)  # 96 MiB, of 3 kB packed
+    array = root.create_array(
+        "a", shape=(8, 3), dtype="uint8", chunks=cut, shards=cut if sharded else None
+    )
+    array[:] = 1
+    assert sum(file.stat().st_size for file in tmp_path.rglob("*") if file.is_file()) < 20_000
+    with pytest.raises(StoreError, match="chunks of"):
+        read_array(tmp_path / "p.zarr/a", tmp_path / "p.zarr", spec)
+
+
 def test_a_pipe_is_not_waited_for(learn_store: Path, tmp_path: Path) -> None:
     (tmp_path / "p").mkdir()
     os.mkfifo(tmp_path / "p/a.npz")
