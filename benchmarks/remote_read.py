@@ -13,8 +13,6 @@ from __future__ import annotations
 import argparse
 import asyncio
 import os
-import subprocess
-import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator
@@ -22,22 +20,16 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+import checkout
 import fsspec
 import numpy as np
 from s3fs.core import S3FileSystem
+from support import object_store
 
 from slatprep.storage.place import place_of
 from slatprep.storage.upload import published_state, upload_store
 from slatprep.store import Store, open_store
 
-SERVER = """
-import sys
-from moto.server import ThreadedMotoServer
-server = ThreadedMotoServer(ip_address="127.0.0.1", port=0, verbose=False)
-server.start()
-print("http://%s:%s" % server.get_host_and_port(), flush=True)
-sys.stdin.read()
-"""
 URL = "s3://bench/demo.zarr"
 
 made: list[str] = []
@@ -45,19 +37,8 @@ made: list[str] = []
 
 @contextmanager
 def server(latency: float) -> Iterator[None]:
-    with (
-        tempfile.TemporaryDirectory() as cache,
-        subprocess.Popen(
-            [sys.executable, "-c", SERVER], stdin=subprocess.PIPE, stdout=subprocess.PIPE,
-            stderr=subprocess.DEVNULL, text=True,
-        ) as process,
-    ):  # fmt: skip
-        assert process.stdout is not None
-        os.environ |= {
-            "AWS_ENDPOINT_URL": process.stdout.readline().strip(),
-            "AWS_ACCESS_KEY_ID": "key", "AWS_SECRET_ACCESS_KEY": "secret",
-            "SLATPREP_CACHE": cache,
-        }  # fmt: skip
+    with tempfile.TemporaryDirectory() as cache, object_store.running() as address:
+        os.environ |= {**object_store.environment(address), "SLATPREP_CACHE": cache}
         fsspec.filesystem("s3").mkdir("bench")
         call = S3FileSystem._call_s3
 
@@ -68,7 +49,6 @@ def server(latency: float) -> Iterator[None]:
 
         S3FileSystem._call_s3 = later
         yield
-        process.kill()
 
 
 def report(what: str, step: Callable[[], Any], times: int = 1) -> Any:
@@ -109,6 +89,8 @@ def main() -> None:
         report("an asset, from the copy", lambda: read(copy), len(order))
         report("an asset, from the local store", lambda: read(local), len(order))
 
+
+assert checkout.ROOT  # Importing it made the tests' server known.
 
 if __name__ == "__main__":
     main()

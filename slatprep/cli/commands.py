@@ -77,6 +77,12 @@ class LazyGroup(click.Group):
         except SlatprepError as error:
             say(f"slatprep: error: {error}", err=True)
             ctx.exit(EXIT_USAGE if isinstance(error, ConfigError) else EXIT_INCOMPLETE)
+        except OSError as error:
+            # A disk, or an object store, that fails where no room has words of its own for it.
+            if error.filename is None:
+                raise
+            say(f"slatprep: error: {error.filename}: {error.strerror}; run again", err=True)
+            ctx.exit(EXIT_INCOMPLETE)
         except KeyboardInterrupt:
             say("\nslatprep: stopped; nothing was replaced", err=True)
             ctx.exit(EXIT_INTERRUPTED)

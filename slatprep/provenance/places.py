@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from slatprep.errors import StoreError
 from slatprep.records import Place
 from slatprep.storage.versions import MANIFESTS, is_version
 
@@ -17,7 +18,16 @@ def manifests_of(store: Place) -> Place:
 
 
 def manifests_beside(store: Place) -> Place | None:
-    """Return the folder of a store's records if there is one."""
+    """Return the folder of a store's records if there is one.
+
+    Raises
+    ------
+    StoreError
+        If the object store does not say.
+    """
     folder = manifests_of(store)
     files = (folder / "build.json", folder / "assets.jsonl")
-    return folder if any(file.exists() for file in files) else None
+    try:
+        return folder if any(file.exists() for file in files) else None
+    except OSError as error:
+        raise StoreError(f"{folder}: cannot be reached ({error.strerror})") from None

@@ -16,7 +16,7 @@ from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path, PurePosixPath
 from typing import IO, TYPE_CHECKING, TypeGuard
 
-from slatprep.errors import InputError
+from slatprep.errors import InputError, StoreError
 from slatprep.storage.atomic import staged
 from slatprep.storage.cache import cached_file, folder_for
 from slatprep.storage.copies import copied_version
@@ -101,7 +101,20 @@ class Storage:
         self.local = self._path = path
 
     def files(self) -> dict[str, int]:
-        """Return the names of all files below the place, and their bytes; see `local_files`."""
+        """Return the names of all files below the place, and their bytes; see `local_files`.
+
+        Raises
+        ------
+        StoreError
+            If they cannot be listed.
+        """
+        try:
+            return self._sizes()
+        except OSError as error:
+            where = self.local or self.remote
+            raise StoreError(f"{where}: cannot be listed ({error.strerror})") from None
+
+    def _sizes(self) -> dict[str, int]:
         return local_files(self._path)
 
     def listing(self) -> Listing:
@@ -207,7 +220,7 @@ class _ObjectStore(Storage):
     def __init__(self, place: RemotePlace) -> None:
         self.local, self.remote, self.place = None, place, place
 
-    def files(self) -> dict[str, int]:
+    def _sizes(self) -> dict[str, int]:
         return {name: int(entry["size"]) for name, entry in list_objects(self.place).items()}
 
     def listing(self) -> Listing:

@@ -177,8 +177,14 @@ class Upload:
                         condition["IfMatch"] = self.before.tag
                     system.pipe_file(name, self.pointer.encode(), **condition)
                     return
-        except OSError:
-            now = read_pointer(self.target)
+        except OSError as error:
+            try:
+                now = read_pointer(self.target)
+            except OSError:
+                raise StoreError(
+                    f"{self.target}: no answer came when its pointer was written "
+                    f"({error.strerror}); the store is the old one or the new one, whole. Run again"
+                ) from None
             if now == self.before.pointer:
                 raise
         now = read_pointer(self.target)

@@ -106,7 +106,4 @@ class Arrays:
 
     @cached_property
     def _bytes(self) -> int:
-        try:
-            return sum(max(size, 0) for size in storage_of(self.path).files().values())
-        except OSError as error:
-            raise StoreError(f"{self.path}: cannot be listed ({error.strerror})") from None
+        return sum(max(size, 0) for size in storage_of(self.path).files().values())

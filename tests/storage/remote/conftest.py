@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
 import uuid
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -13,30 +11,17 @@ import fsspec
 import pytest
 from joblib.externals.loky import get_reusable_executor
 from s3fs.core import S3FileSystem
+from support import object_store
 from support.synthetic import Dataset
 
 from slatprep.pipeline.dataset import build_store
-
-SERVER = """
-import sys
-from moto.server import ThreadedMotoServer
-server = ThreadedMotoServer(ip_address="127.0.0.1", port=0, verbose=False)
-server.start()
-print("http://%s:%s" % server.get_host_and_port(), flush=True)
-sys.stdin.read()  # Until the tests end, however they do.
-"""
 
 
 @pytest.fixture(scope="session")
 def server() -> Iterator[str]:
     """Run moto's S3 in a process of its own; return its address."""
-    with subprocess.Popen(
-        [sys.executable, "-c", SERVER],
-        stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True,
-    ) as process:  # fmt: skip
-        assert process.stdout is not None
-        yield process.stdout.readline().strip()
-        process.kill()
+    with object_store.running() as address:
+        yield address
 
 
 @pytest.fixture(scope="session", autouse=True)
@@ -44,15 +29,7 @@ def environment(server: str, tmp_path_factory: pytest.TempPathFactory) -> Iterat
     """Say where the server is, and let nobody's own settings in."""
     none = str(tmp_path_factory.mktemp("aws") / "none")
     with pytest.MonkeyPatch.context() as monkeypatch:
-        for name, value in {
-            "AWS_ENDPOINT_URL": server,
-            "AWS_ACCESS_KEY_ID": "key",
-            "AWS_SECRET_ACCESS_KEY": "secret",
-            "AWS_DEFAULT_REGION": "us-east-1",
-            "AWS_EC2_METADATA_DISABLED": "true",
-            "AWS_CONFIG_FILE": none,
-            "AWS_SHARED_CREDENTIALS_FILE": none,
-        }.items():
+        for name, value in object_store.environment(server, none).items():
             monkeypatch.setenv(name, value)
         # Worker processes that other tests left would not have these.
         get_reusable_executor().shutdown(wait=True)

@@ -183,3 +183,27 @@ def test_an_answer_that_is_lost_does_not_make_a_failure_of_a_success(
     made.publish()
     assert len(lost) == 1
     assert current(s3, url) == tree(undisturbed[1])
+
+
+def test_without_any_answer_nobody_says_that_nothing_was_replaced(
+    s3: Any, url: str, undisturbed: Made, another: Made, change_client: Any
+) -> None:
+    put(another[1], url)
+    made = upload_store(undisturbed[1], published_state(place_of(url)))
+    pipe, cat, lost = S3FileSystem._pipe_file, S3FileSystem._cat_file, []
+
+    async def deaf(*args: Any, **options: Any) -> Any:
+        lost.append(await pipe(*args, **options))
+        raise OSError("connection lost")
+
+    async def dead(*args: Any, **options: Any) -> Any:
+        if lost:
+            raise OSError("connection lost")
+        return await cat(*args, **options)
+
+    change_client("_pipe_file", deaf)
+    change_client("_cat_file", dead)
+    with pytest.raises(StoreError, match="the store is the old one or the new one, whole"):
+        made.publish()
+    lost.clear()
+    assert current(s3, url) == tree(undisturbed[1])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import multiprocessing
 import threading
 from dataclasses import replace
@@ -12,12 +13,16 @@ import fsspec
 import numpy as np
 import pytest
 import zarr
+from click.testing import CliRunner
+from s3fs.core import S3FileSystem
 from support.faults import inject
 from support.remote import Made, current, put, versions
 from support.synthetic import Dataset
 from support.trees import contents, tree
 
+from slatprep.cli.commands import slatprep
 from slatprep.errors import StoreError
+from slatprep.inspect.overview import overview_of
 from slatprep.inspect.verify import verify_store
 from slatprep.parameters import StoreParameters
 from slatprep.pipeline.dataset import build_store, plan_build
@@ -238,6 +243,57 @@ def test_places_that_cannot_be_written_are_told_before_the_work(
         with pytest.raises(StoreError, match=r"cannot be reached .*Unable to locate credentials"):
             refused()
     assert begun == []
+
+
+@pytest.mark.parametrize("use", ["build", "verify", "info"])
+def test_a_store_that_cannot_be_listed_is_refused_in_words(
+    url: str, another: Made, change_client: Any, use: str
+) -> None:
+    put(another[1], url)
+
+    async def deaf(*args: Any, **options: Any) -> Any:
+        raise OSError("connection lost")
+
+    change_client("_lsdir", deaf)
+    with pytest.raises(StoreError, match=r"cannot be listed \(connection lost"):
+        if use == "build":
+            build_store(another[0].parameters("pixie"), url)
+        elif use == "verify":
+            verify_store(url)
+        else:
+            overview_of(open_store(url))
+
+
+def test_records_that_cannot_be_asked_for_end_a_command_in_words(
+    url: str, another: Made, change_client: Any, tmp_path: Path
+) -> None:
+    put(another[1], url)
+    head = S3FileSystem._info
+
+    async def deaf(filesystem: Any, path: str, *args: Any, **options: Any) -> Any:
+        if "/manifests/" in path:
+            raise OSError("connection lost")
+        return await head(filesystem, path, *args, **options)
+
+    change_client("_info", deaf)
+    with pytest.raises(StoreError, match=r"manifests/.*: cannot be reached \(connection lost"):
+        verify_store(url)
+    command = ["subset", url, "--asset", "z", "--out", str(tmp_path / "s.zarr")]
+    done = CliRunner().invoke(slatprep, command)
+    assert done.exit_code == 1 and "connection lost" in done.stderr
+    assert not (tmp_path / "s.zarr").exists()
+
+
+def test_an_error_that_no_room_has_words_for_is_one_line(
+    another: Made, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def lost(*args: Any) -> None:
+        raise OSError(errno.EIO, "connection lost", "s3://bucket/x")
+
+    monkeypatch.setattr("slatprep.inspect.overview.overview_of", lost)
+    done = CliRunner().invoke(slatprep, ["info", str(another[1])])
+    assert done.exit_code == 1
+    assert done.stderr == "slatprep: error: s3://bucket/x: connection lost; run again\n"
 
 
 def test_records_may_be_kept_on_the_local_disk(
