@@ -63,5 +63,5 @@ def test_an_npy_that_claims_more_than_it_holds_is_refused(shape: str, tmp_path: 
     header = f"{{'descr': '<f8', 'fortran_order': False, 'shape': {shape}, }}".ljust(117) + "\n"
     content = b"\x93NUMPY\x01\x00" + struct.pack("<H", len(header)) + header.encode() + b"1234"
     (tmp_path / "p.npy").write_bytes(content)
-    with pytest.raises(InputError, match="p.npy: "):
+    with pytest.raises(InputError, match=r"p\.npy: "):
         read_particles(tmp_path / "p.npy")
