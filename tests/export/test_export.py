@@ -254,7 +254,7 @@ def test_splits_go_out_apart_and_together_they_are_all(store: Path, tmp_path: Pa
     empty = export(*none, "--split", "test", "--shares", "1,0,0", code=2)
     assert "no asset is in the split test" in empty
     assert "both choose" in export(*none, "--split", "test", "--asset", "cup", code=2)
-    assert "--split chooses" in export(*none, "--split-by", "pixie", code=2)
+    assert "choose one with --split" in export(*none, "--split-by", "pixie", code=2)
     assert not (tmp_path / "none").exists()
 
 
