@@ -29,13 +29,19 @@ import zarr
 
 from slatprep.parameters import BuildParameters, PixieverseSource, SlatSource
 from slatprep.parameters.files import load_parameters
-from slatprep.pipeline import assemble, finish, publish
+from slatprep.pipeline import annotate, assemble, finish, publish
 from slatprep.pipeline import asset as process
 from slatprep.pipeline import dataset as build
 from slatprep.readers import discover
 from slatprep.store.layout import create_arrays
 
-STEPS = ("read_field", "read_latents", "align", "sample", "judge_with_voxels")
+STEPS = {
+    "read_field": process,
+    "read_latents": process,
+    "align": annotate,
+    "sample": annotate,
+    "judge_with_voxels": annotate,
+}
 
 
 def main() -> None:
@@ -63,9 +69,9 @@ def measure(parameters: BuildParameters, folder: Path, jobs: bool) -> dict[str, 
     for pair in pairs[:3]:
         process.process_asset(pair, parameters)
     steps: dict[str, float] = defaultdict(float)
-    for name in STEPS:
-        setattr(process, name, timed(getattr(process, name), steps, name))
-    rooms = {"finish_asset": finish, "pack_store": assemble, "replace_directory": publish}
+    rooms = {
+        **STEPS, "finish_asset": finish, "pack_store": assemble, "replace_directory": publish
+    }  # fmt: skip
     for name, room in rooms.items():
         setattr(room, name, timed(getattr(room, name), steps, name))
     begin = cpu()

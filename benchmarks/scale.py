@@ -34,18 +34,18 @@ from pathlib import Path
 from dataclasses import replace
 from support.synthetic import Dataset
 from slatprep.parameters import StoreParameters
-from slatprep.pipeline import asset
+from slatprep.pipeline import annotate
 from slatprep.pipeline.dataset import build_store
 
 jobs = int(sys.argv[3])
 if jobs == 1:
-    found, search = {}, asset.align
+    found, search = {}, annotate.align
     def given(field, latents, parameters):
         key = hashlib.sha256(field.occupancy.tobytes() + latents.coords.tobytes()).digest()
         if key not in found:
             found[key] = search(field, latents, parameters)
         return found[key]
-    asset.align = given
+    annotate.align = given
 
 started = time.process_time()
 parameters = replace(Dataset(Path(sys.argv[1])).parameters(), store=StoreParameters())

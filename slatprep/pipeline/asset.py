@@ -13,11 +13,12 @@ from dataclasses import replace
 
 from slatprep.errors import MissingPartnerError, SlatprepError, StoreError
 from slatprep.parameters import BuildParameters
+from slatprep.pipeline.annotate import annotate
 from slatprep.pipeline.context import BuildContext
 from slatprep.pipeline.plan import Action, PlannedAsset
 from slatprep.pipeline.previous import PreviousBuild
 from slatprep.pipeline.recipe import Recipe
-from slatprep.pipeline.several import place, process_several
+from slatprep.pipeline.several import process_several
 from slatprep.pipeline.spool import FailedAsset, Spool, SpooledAsset
 from slatprep.provenance.make import record_of, record_of_failed
 from slatprep.provenance.record import AssetRecord
@@ -58,8 +59,8 @@ def process_asset(
     latents = read_latents(pair)
     reached("asset read", pair.asset_id)
     before = (known.alignment, known.judgement) if known else ()
-    placed = place(pair, field, latents, parameters, *before)
-    return Finished(pair, field, latents, placed.alignment, placed.annotation, placed.judgement)
+    one = annotate(pair, field, latents, parameters, *before)
+    return Finished(pair, field, latents, one.alignment, one.annotation, one.judgement)
 
 
 def finish_asset(

@@ -2,67 +2,27 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
-from slatprep.align import align
-from slatprep.align.deformation import map_of
 from slatprep.errors import InputError
-from slatprep.judge import judge_with_voxels, merged, voxel_confidence
+from slatprep.judge import merged
 from slatprep.parameters import BuildParameters
-from slatprep.provenance.record import StageParameters
+from slatprep.pipeline.annotate import Annotated, annotate
 from slatprep.readers import read_field, read_latents
 from slatprep.readers.identity import hash_sources
 from slatprep.records import (
     Alignment,
-    Annotation,
     AssetPair,
     Contribution,
     Finished,
-    Judgement,
     MaterialField,
     SourceFile,
     StructuredLatents,
     Verdict,
 )
-from slatprep.sample import merge, sample
-from slatprep.storage.faults import reached
-
-
-@dataclass(frozen=True, eq=False)
-class Placed:
-    """One annotation of an object, looked up at the SLAT's voxels through its own alignment."""
-
-    pair: AssetPair
-    field: MaterialField
-    alignment: Alignment
-    judgement: Judgement
-    annotation: Annotation
-
-
-def place(
-    pair: AssetPair,
-    field: MaterialField,
-    latents: StructuredLatents,
-    parameters: BuildParameters | StageParameters,
-    alignment: Alignment | None = None,
-    judgement: Judgement | None = None,
-) -> Placed:
-    """Align a field, look it up and judge it; an alignment and a judgement that are known stand."""
-    reused = alignment is not None
-    if alignment is None:
-        alignment = align(field, latents, parameters.align)
-    reached("asset reused" if reused else "asset aligned", pair.asset_id)
-    annotation = sample(field, map_of(alignment).places(latents.coords), parameters.sample)
-    if judgement is None:
-        judgement, likely = judge_with_voxels(
-            field, latents, alignment, annotation, parameters.sample
-        )
-    else:
-        confidence = judgement.confidence
-        likely = voxel_confidence(field, latents, alignment, annotation, confidence)
-    return Placed(pair, field, alignment, judgement, replace(annotation, confidence=likely))
+from slatprep.sample import merge
 
 
 def process_several(
@@ -95,7 +55,7 @@ def process_several(
     sources, _ = hash_sources(pair)
     before = {one.sample: one for one in known}
     latents: StructuredLatents | None = None
-    placed: list[Placed] = []
+    annotated: list[Annotated] = []
     faults: dict[str, InputError] = {}
     for one in pair.annotations:
         try:
@@ -105,15 +65,15 @@ def process_several(
             continue
         latents = latents or read_latents(one)
         found = before.get(one.sample)
-        alignment = found.alignment if found else _same_alignment(field, placed)
+        alignment = found.alignment if found else _same_alignment(field, annotated)
         judgement = found.judgement if found else None
-        placed.append(place(one, field, latents, parameters, alignment, judgement))
+        annotated.append(annotate(one, field, latents, parameters, alignment, judgement))
     if latents is None:
         raise _refused(pair, faults)
-    good = [one for one in placed if one.judgement.verdict is not Verdict.FAILED] or placed
+    good = [one for one in annotated if one.judgement.verdict is not Verdict.FAILED] or annotated
     first = good[0]
     annotation = merge([one.annotation for one in good], first.field.table)
-    told = {one.pair.sample: one for one in placed}
+    told = {one.pair.sample: one for one in annotated}
     contributions = tuple(
         _contribution(one, told.get(one.sample), faults.get(one.sample), good, sources)
         for one in pair.annotations
@@ -134,9 +94,9 @@ def process_several(
     )
 
 
-def _same_alignment(field: MaterialField, placed: list[Placed]) -> Alignment | None:
+def _same_alignment(field: MaterialField, annotated: list[Annotated]) -> Alignment | None:
     """Return the alignment of a field with the same geometry, which is all that engines use."""
-    for one in placed:
+    for one in annotated:
         frames = [own.frame is None or own.frame.tobytes() for own in (field, one.field)]
         if frames[0] == frames[1] and np.array_equal(field.occupancy, one.field.occupancy):
             return one.alignment
@@ -145,16 +105,18 @@ def _same_alignment(field: MaterialField, placed: list[Placed]) -> Alignment | N
 
 def _contribution(
     pair: AssetPair,
-    placed: Placed | None,
+    annotated: Annotated | None,
     fault: InputError | None,
-    good: list[Placed],
+    good: list[Annotated],
     sources: tuple[SourceFile, ...],
 ) -> Contribution:
-    if placed is None:
+    if annotated is None:
         return Contribution(pair.sample, (), " ".join(str(fault).split()))
-    left_out = "" if placed in good else f"its alignment failed: {placed.judgement.reasons[0]}"
-    files = tuple(k for k, file in enumerate(sources) if file in placed.field.sources)
-    return Contribution(pair.sample, files, left_out, placed.alignment, placed.judgement)
+    left_out = (
+        "" if annotated in good else f"its alignment failed: {annotated.judgement.reasons[0]}"
+    )
+    files = tuple(k for k, file in enumerate(sources) if file in annotated.field.sources)
+    return Contribution(pair.sample, files, left_out, annotated.alignment, annotated.judgement)
 
 
 def _refused(pair: AssetPair, faults: dict[str, InputError]) -> InputError:

@@ -10,7 +10,7 @@ import numpy as np
 from slatprep.errors import SlatprepError
 from slatprep.inspect.check import TOLERANCES
 from slatprep.normalize import normalize_change, normalize_properties
-from slatprep.pipeline.several import place
+from slatprep.pipeline.annotate import annotate
 from slatprep.provenance.record import AssetRecord
 from slatprep.readers import read_field
 from slatprep.records import AssetPair, Contribution, SourceRoots, StructuredLatents
@@ -38,7 +38,7 @@ def merged_findings(
             where = f"sample {one.sample} cannot be looked up again ({error})"
             yield Finding("sources", asset.asset_id, where, "the sources of the build")
             return
-        placed = place(pair, field, latents, record.parameters, one.alignment, one.judgement)
+        placed = annotate(pair, field, latents, record.parameters, one.alignment, one.judgement)
         parts.append(placed.annotation)
     if not parts:
         yield Finding("asset/record", asset.asset_id, "merges no annotation", "one at least")
