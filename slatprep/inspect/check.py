@@ -227,13 +227,13 @@ def check_stored(path: Place, asset_id: str) -> AlignmentCheck:
 def recompute_annotation(asset: StoredAsset) -> tuple[float, dict[str, NDArray[np.float64]]]:
     """Sample an asset's annotation again from the stored grid and compare it with the store.
 
+    The stored grid is one annotation. Labels merged from several annotations are compared only
+    where all agree, or where only the stored one has a label.
+
     Parameters
     ----------
     asset : StoredAsset
         The asset.
-
-    The stored grid is one annotation. Labels merged from several annotations are compared only
-    where all agree, or where only the stored one has a label.
 
     Returns
     -------
