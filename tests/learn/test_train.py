@@ -211,8 +211,8 @@ def test_the_command_weighs_voxels_by_their_confidence(learn_store: Path, tmp_pa
         losses.append(epoch["train_loss"])
         told = json.loads((run / "run.json").read_text())
         assert told["weigh_by_confidence"] is bool(weigh)
-    # No class is certain, so each voxel weighs less than one, and the loss with it.
-    assert losses[1] == losses[2] < losses[0]
+    # Means with weights that sum to one: which is larger depends on where the doubtful voxels are.
+    assert losses[1] == losses[2] != losses[0]
 
 
 def test_a_run_is_trained_by_one_process_at_a_time(learn_store: Path, tmp_path: Path) -> None:
