@@ -3,7 +3,7 @@
 Work done by other code must be done again, but a new command, a new comment
 or a new release must not cost a day of alignment. So the fingerprint is of
 the statements, without comments, docstrings and layout, of the modules that
-the stages read, align and sample can reach, and of nothing else.
+the stages read, align, sample and judge can reach, and of nothing else.
 """
 
 from __future__ import annotations
@@ -24,18 +24,26 @@ STAGES = (
     "slatprep.align",
     "slatprep.sample",
     "slatprep.judge",
+    "slatprep.pipeline.annotate",
+    "slatprep.pipeline.several",
 )
 """Where an asset's numbers are made; a package stands for all of its modules."""
 
 # Parameters enter an asset's key as values, so their defaults may change; the
-# words of an error are no numbers; and of slatprep itself it is only the version.
+# words of an error are no numbers; a record holds numbers and makes none; and of
+# slatprep itself it is only the version.
 _NOT_NUMBERS = (
     "slatprep",
     "slatprep.errors",
     "slatprep.parameters",
+    "slatprep.provenance.record",
     "slatprep.workers",
     "slatprep.workers.local",
 )
+
+# Whichever way bytes come from a disk or a network, their digest tells them; but
+# these make values of them.
+_DECODING = ("slatprep.storage.chunks", "slatprep.storage.codecs")
 
 
 @lru_cache(maxsize=1)
@@ -54,8 +62,8 @@ def numeric_modules() -> dict[str, Path]:
     waiting = list(STAGES)
     while waiting:
         name = waiting.pop()
-        # Whichever way bytes come from a disk or a network, their digest tells them.
-        if name in found or name in _NOT_NUMBERS or name.startswith("slatprep.storage"):
+        carries = name.startswith("slatprep.storage") and name not in _DECODING
+        if name in found or name in _NOT_NUMBERS or carries:
             continue
         path = _source(name)
         if path is None:

@@ -87,8 +87,16 @@ def test_it_covers_every_module_that_an_asset_runs_through() -> None:
     assert loaded - set(numeric_modules()) <= uncounted | finding | carrying
 
 
+@pytest.mark.parametrize(
+    "name", ["pipeline.annotate", "pipeline.several", "storage.chunks", "storage.codecs"]
+)
+def test_what_merges_annotations_and_unpacks_values_is_in_it(name: str) -> None:
+    assert f"slatprep.{name}" in numeric_modules()
+
+
 def test_what_makes_no_numbers_is_not_in_it() -> None:
     names = set(numeric_modules())
+    assert not {n for n in names if n.startswith(("slatprep.provenance", "slatprep.storage.pl"))}
     assert not {n for n in names if n.startswith(("slatprep.cli", "slatprep.store"))}
     assert "slatprep.pipeline.dataset" not in names
     for path in numeric_modules().values():
