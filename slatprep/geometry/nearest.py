@@ -20,7 +20,7 @@ from slatprep.geometry.distance import NOTHING, spread
 from slatprep.records import RESOLUTION
 
 _REACH = 3  # voxels searched by cells before columns are
-_SURE = _REACH + 0.5  # no voxel beyond the cells can be nearer than this
+_SURE = _REACH + 0.5  # beyond the cells voxels are this far off, or farther
 _BLOCK = 4  # cells a side of what is passed over at once
 _ROUNDING = 1e-6  # voxels by which a bound is loosened, so that no rounding passes over a voxel
 
@@ -69,9 +69,9 @@ class Lattice:
         position = _in_voxels(points)
         near = self._blocks_near(min(limit, _SURE))
         distance, nearest = _search(position, self._row, near, *_cells(), float(limit) ** 2)
-        if limit > _SURE:
+        if limit >= _SURE:
             # Of a usual asset few points lie so far off that their cells cannot tell.
-            far = np.flatnonzero(~(distance <= _SURE))
+            far = np.flatnonzero(~(distance < _SURE))
             if len(far):
                 below, above, apart = _columns(self._row)
                 distance[far], nearest[far] = _search_columns(
@@ -209,6 +209,8 @@ def _search_columns(position, row, below, above, apart, limit):  # type: ignore[
         x, y, z = position[m, 0], position[m, 1], position[m, 2]
         v, w = min(max(y, 0.0), end), min(max(z, 0.0), end)
         a, b, c = int(np.rint(min(max(x, 0.0), end))), int(np.rint(v)), int(np.rint(w))
+        # Half-way between two cells either may hold the nearest.
+        low, high = int(np.floor(w)), int(np.ceil(w))
         # How far off the grid the point lies, and the cell that knows what its slab holds.
         outside = (y - v) ** 2 + (z - w) ** 2
         aside = math.sqrt((v - b) ** 2 + (w - c) ** 2) + _ROUNDING
@@ -230,7 +232,7 @@ def _search_columns(position, row, below, above, apart, limit):  # type: ignore[
                 j = b + step if columns % 2 else b - step
                 if j < 0 or j > end or across + (y - j) ** 2 > best:
                     continue
-                for k in (below[i, j, c], above[i, j, c]):
+                for k in (below[i, j, low], above[i, j, high]):
                     if k < 0:
                         continue
                     candidate = row[i, j, k]

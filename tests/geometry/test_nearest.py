@@ -53,6 +53,22 @@ def test_every_cell_of_the_grid_finds_the_first_of_its_nearest_voxels(limit: flo
     assert np.isinf(distance[~within]).all()
 
 
+@pytest.mark.parametrize("limit", [3.5, 9.0, np.inf])
+def test_half_way_between_voxels_the_first_of_the_nearest_is_found(limit: float) -> None:
+    """Against brute force in doubled whole numbers, where every axis has ties."""
+    rng = np.random.default_rng(3)
+    corners = rng.integers(0, 63, (60, 3))
+    around = np.argwhere(np.ones((2, 2, 2), dtype=bool))
+    voxels = np.unique((corners[:, None] + around).reshape(-1, 3), axis=0).astype(np.uint8)
+    rng.shuffle(voxels)
+    doubled = rng.integers(-20, 148, (4000, 3))
+    squares = ((doubled[:, None] - 2 * voxels.astype(int)) ** 2).sum(axis=2)
+    within = squares.min(axis=1) <= (2 * limit) ** 2
+    distance, index = Lattice(voxels).nearest(voxel_centres(doubled / 2), limit=limit)
+    np.testing.assert_array_equal(index, np.where(within, squares.argmin(axis=1), -1))
+    np.testing.assert_allclose(distance[within], np.sqrt(squares.min(axis=1)[within]) / 2)
+
+
 def test_beyond_the_limit_nothing_is_found() -> None:
     voxels = np.array([[0, 0, 0]], dtype=np.uint8)
     points = voxel_centres([[2, 0, 0], [3, 0, 0], [63, 63, 63]])
