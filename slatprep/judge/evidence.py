@@ -139,20 +139,56 @@ def _labels_of(
     """
     if field.classified:
         return field.material, annotation.material
+    number, _ = _combinations(_steps(field, annotation)[0])
+    every = np.minimum(number, UNANNOTATED - 1).astype(np.uint8)
+    own = np.full(len(annotation.valid), UNANNOTATED, dtype=np.uint8)
+    own[annotation.valid] = every[len(field.properties) :]
+    return every[: len(field.properties)], own
+
+
+def labels_hold(field: MaterialField, annotation: Annotation, off: NDArray[np.float64]) -> bool:
+    """Whether the labels of voxels, see `surroundings_of`, are the same for rounded properties.
+
+    Parameters
+    ----------
+    field, annotation : MaterialField, Annotation
+        Of an asset; classes are never rounded.
+    off : ndarray of float64, shape (P,)
+        How far each mapped property may be off at most.
+    """
+    if field.classified:
+        return True
+    steps, size = _steps(field, annotation)
+    _, coarsest = _combinations(steps)
+    # A value and the extent's end that it is counted from; and both ends, by which it is divided.
+    slack = 4.0 * off / size
+    coarse = 1
+    while coarse <= coarsest:
+        to_border = np.abs(steps / coarse - np.floor(steps / coarse) - 0.5) * coarse
+        if (to_border <= slack).any():
+            return False
+        coarse *= 2
+    return True
+
+
+def _steps(
+    field: MaterialField, annotation: Annotation
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return mapped properties of annotated and of valid voxels in steps; a step's size (P,)."""
     ends = property_extent(field)
-    span = np.where(ends[:, 1] > ends[:, 0], ends[:, 1] - ends[:, 0], 1.0)
+    size = NOTABLE * np.where(ends[:, 1] > ends[:, 0], ends[:, 1] - ends[:, 0], 1.0)
     values = np.concatenate([field.properties, annotation.properties[annotation.valid]])
-    steps = (to_mapped(values, field.table) - ends[:, 0]) / (NOTABLE * span)
+    return (to_mapped(values, field.table) - ends[:, 0]) / size, size
+
+
+def _combinations(steps: NDArray[np.float64]) -> tuple[NDArray[np.intp], int]:
+    """Number the combinations of rounded steps; return also the multiple they are rounded to."""
     coarse = 1
     while True:
         found, number = np.unique(np.rint(steps / coarse), axis=0, return_inverse=True)
         if len(found) <= UNANNOTATED or coarse > 1.0 / NOTABLE:
-            break
+            return number.reshape(-1), coarse
         coarse *= 2
-    every = np.minimum(number.reshape(-1), UNANNOTATED - 1).astype(np.uint8)
-    own = np.full(len(annotation.valid), UNANNOTATED, dtype=np.uint8)
-    own[annotation.valid] = every[len(field.properties) :]
-    return every[: len(field.properties)], own
 
 
 def evidence_of(

@@ -23,7 +23,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from slatprep.errors import InputError, MissingPartnerError
+from slatprep.errors import InputError, MissingPartnerError, StoreError
 from slatprep.records import RESOLUTION, AssetPair, Place, SourceFile
 from slatprep.storage.place import storage_of
 
@@ -156,6 +156,11 @@ def require_complete(pair: AssetPair) -> tuple[Place, Place]:
     return pair.grid, pair.slat
 
 
+def is_hierarchy(path: Place) -> bool:
+    """Whether a source is named as a Zarr hierarchy, which is a folder."""
+    return path.suffix.lower() == ".zarr"
+
+
 def load_source(path: Place, root: Place, role: str) -> tuple[bytes, SourceFile]:
     """Read a whole file once; return its bytes and what the provenance keeps of it.
 
@@ -176,7 +181,7 @@ def load_source(path: Place, root: Place, role: str) -> tuple[bytes, SourceFile]
     InputError
         If the file cannot be read, is empty, or is larger than `MAX_FILE_BYTES`.
     """
-    if path.suffix.lower() == ".zarr":
+    if is_hierarchy(path):
         return _load_hierarchy(path, root, role)
     file, name = storage_of(root).locate(path)
     try:
@@ -200,8 +205,9 @@ def _load_hierarchy(path: Place, root: Place, role: str) -> tuple[bytes, SourceF
     """See `load_source`; the same files give the same bytes."""
     try:
         names = sorted(storage_of(path).files())
-    except OSError as error:
-        raise InputError(path, f"cannot be listed ({error.strerror})", "a Zarr group") from None
+    except StoreError as error:
+        fault = str(error).removeprefix(f"{path}: ")
+        raise InputError(path, fault, "a Zarr group that can be listed") from None
     if not 0 < len(names) <= MAX_FILES:
         raise InputError(path, f"has {len(names)} files", f"a Zarr group of at most {MAX_FILES}")
     packed, size = io.BytesIO(), 0
@@ -211,7 +217,9 @@ def _load_hierarchy(path: Place, root: Place, role: str) -> tuple[bytes, SourceF
             size += len(data)
             if size > MAX_FILE_BYTES:
                 raise InputError(path, f"is larger than {MAX_FILE_BYTES >> 20} MiB", "one asset")
-            archive.writestr(zipfile.ZipInfo(name), data)
+            member = zipfile.ZipInfo(name)
+            member.create_system = 3  # Of itself that of the machine; the hash must not tell it.
+            archive.writestr(member, data)
     whole = packed.getvalue()
     below = source.path.removesuffix(f"/{name}")
     return whole, SourceFile(role, below, size, hashlib.sha256(whole).hexdigest())

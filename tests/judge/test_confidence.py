@@ -15,10 +15,24 @@ from slatprep.align import align
 from slatprep.align.deformation import map_of
 from slatprep.bench.truth import Truth, read_truth
 from slatprep.demo import make_demo
+from slatprep.inspect.verify.assets import roundings
 from slatprep.judge import THRESHOLDS, judge, verdict_of, voxel_confidence
 from slatprep.judge.calibration import PLACEMENT, VOXEL
 from slatprep.judge.confidence import VOXEL_FIGURES, causes_of_doubt
-from slatprep.judge.evidence import FIGURES, evidence_of, measure_figures, surroundings_of
+from slatprep.judge.evidence import (
+    FIGURES,
+    _labels_of,
+    evidence_of,
+    labels_hold,
+    measure_figures,
+    surroundings_of,
+)
+from slatprep.normalize import (
+    PIXIE_RANGES,
+    denormalize_properties,
+    from_mapped,
+    normalize_properties,
+)
 from slatprep.parameters import (
     AlignParameters,
     BuildParameters,
@@ -143,6 +157,31 @@ def test_properties_that_differ_little_are_one_label(
     rough = replace(plain, properties=(field.properties * noise).astype(np.float32))
     near = sample(rough, annotation.place, SampleParameters())
     np.testing.assert_array_equal(voxel_confidence(rough, latents, alignment, near, 0.9), by_value)
+
+
+def test_rounding_in_a_store_changes_no_label_where_labels_are_said_to_hold(
+    of_a_chair: tuple[MaterialField, StructuredLatents, Alignment, Annotation],
+) -> None:
+    field, _, _, annotation = of_a_chair
+    rng = np.random.default_rng(0)
+    held, changed = [], 0
+    for width in [0.3] * 8 + [1e-3] * 8:
+        span = rng.uniform(0.0, width, field.properties.shape) * (4.0, 1.0, 0.2)
+        values = from_mapped(span + np.array([5.0, 3.0, 0.3])).astype(np.float32)
+        exact = replace(field, classified=False, properties=values)
+        at = replace(exact, properties=denormalize_properties(normalize_properties(values)))
+        # float32 twice, in the ranges of a whole dataset, as a store and its reader do
+        labels = []
+        for one in (exact, at):
+            own = sample(one, annotation.place, SampleParameters())
+            labels.append(np.concatenate(_labels_of(one, own)))
+        holds = labels_hold(at, own, roundings(PIXIE_RANGES))
+        held.append(holds)
+        same = np.array_equal(*labels)
+        changed += not same
+        assert same or not holds
+    assert any(held[:8])
+    assert changed
 
 
 def test_own_objects_pass_and_other_objects_fail(cases: list[Case], judged: list[Judged]) -> None:

@@ -393,3 +393,18 @@ def test_pixie_s_grids_are_not_measured_against_other_properties(tmp_path: Path)
     build_store(parameters_of(tmp_path), tmp_path / "s.zarr")
     with pytest.raises(ConfigError, match="holds density, yield_stress, friction_angle"):
         compare_methods(None, {"m": tmp_path / "slat"}, tmp_path / "s.zarr", None, splits={})
+
+
+def test_properties_next_to_the_border_of_two_labels_are_verified(tmp_path: Path) -> None:
+    """Without classes labels are rounded properties, and a store rounds them once more."""
+    write(tmp_path, "a", classes=False)
+    voxels, columns, _ = voxels_of(0)
+    half = voxels[:, 1] > np.median(voxels[:, 1])
+    near = np.where(half, 4.5000005, 4.4999995).astype(np.float32)  # of 0 to 90 a border is at 4.5
+    near[:2] = 0.0, 90.0
+    arrays = {"voxels": voxels, **columns, "friction_angle": near}
+    for name in ("density", "yield_stress"):
+        arrays[name] = np.full(len(voxels), 1000.0)
+    np.savez(tmp_path / "voxels" / "a.npz", **arrays)
+    out = build_store(parameters_of(tmp_path), tmp_path / "s.zarr").store
+    assert not verify_store(str(out)).findings

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import shutil
 from pathlib import Path
 
@@ -22,6 +23,7 @@ from slatprep.inspect.verify import verify_store
 from slatprep.parameters import BuildParameters, PixieverseSource, SlatSource
 from slatprep.pipeline.dataset import build_store
 from slatprep.readers import discover, read_field
+from slatprep.readers.files import load_source
 from slatprep.records import MaterialField
 
 TABLE = (
@@ -225,6 +227,36 @@ def test_any_file_of_a_zarr_group_decides_what_it_is(root: Path) -> None:
     shutil.copy(next((root / "b.zarr" / "damping" / "c").rglob("0")), chunk)
     shutil.rmtree(root / "b.zarr")
     assert field_at(root).sources[0].sha256 != before.sha256
+
+
+def test_the_hash_of_a_zarr_group_does_not_tell_the_system(
+    root: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    write_voxels(root, "a", "zarr", rows_of(100))
+    before = load_source(root / "a.zarr", root, "grid")
+    monkeypatch.setattr("zipfile.sys.platform", "win32")
+    assert load_source(root / "a.zarr", root, "grid") == before
+
+
+@pytest.mark.parametrize("name", ["a.zarr", "a.ZARR"])
+def test_a_zarr_group_that_cannot_be_listed_is_its_own_fault_alone(root: Path, name: str) -> None:
+    """A path longer than the system takes cannot be asked for its size, whoever asks."""
+    group = root / name
+    group.mkdir()
+    here = os.open(group, os.O_RDONLY)
+    length = len(str(group))
+    while length < 4000:
+        os.mkdir("d" * 200, dir_fd=here)
+        deeper = os.open("d" * 200, os.O_RDONLY, dir_fd=here)
+        os.close(here)
+        here, length = deeper, length + 201
+        if length + 201 > 4095:
+            break
+    for file in ("f", "f" * 250):
+        os.close(os.open(file, os.O_CREAT, dir_fd=here))
+    os.close(here)
+    with pytest.raises(InputError, match="cannot be listed"):
+        load_source(group, root, "grid")
 
 
 def test_a_ply_that_claims_more_than_it_has_is_refused(root: Path) -> None:

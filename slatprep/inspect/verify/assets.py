@@ -17,19 +17,21 @@ from slatprep.geometry.voxels import flat_index
 from slatprep.inspect.check import TOLERANCES, recompute_annotation
 from slatprep.inspect.verify.merged import merged_findings
 from slatprep.judge import voxel_confidence
+from slatprep.judge.evidence import labels_hold
 from slatprep.normalize import normalize_change
 from slatprep.pipeline.previous import PLACE_TOLERANCE
 from slatprep.provenance.columns import columns_of
 from slatprep.provenance.record import AssetRecord
 from slatprep.provenance.record_json import RecordError
 from slatprep.provenance.stored import StoredRecords
-from slatprep.readers.files import load_source
+from slatprep.readers.files import is_hierarchy, load_source
 from slatprep.records import (
     BACKGROUND,
     RESOLUTION,
     UNANNOTATED,
     Annotation,
     Model,
+    Normalization,
     Place,
     SourceRoots,
     StructuredLatents,
@@ -222,6 +224,8 @@ def confidence_findings(asset: StoredAsset, record: AssetRecord) -> Iterator[Fin
     clipped = record.counts.clipped
     if not asset.field.classified and clipped and any(clipped.grid.values()):
         return  # The confidence came of values that the store does not hold.
+    if not labels_hold(asset.field, annotation, roundings(asset.store.normalization)):
+        return  # It may have come of other labels than the rounded values have.
     latents = StructuredLatents(asset.coords, asset.feats)
     confidence = record.judgement.confidence
     likely = voxel_confidence(asset.field, latents, record.alignment, annotation, confidence)
@@ -239,7 +243,7 @@ def source_findings(record: AssetRecord, roots: SourceRoots, run: str) -> Iterat
         path = root / source.path
         expected = f"SHA-256 {source.sha256}"
         try:
-            if path.suffix == ".zarr":
+            if is_hierarchy(path):
                 found = load_source(path, root, source.role)[1]
                 size, digest = found.size, found.sha256
             else:
@@ -257,6 +261,19 @@ def source_findings(record: AssetRecord, roots: SourceRoots, run: str) -> Iterat
         except OSError as error:
             what = f"cannot be read ({error.strerror})"
         yield Finding(str(path), record.asset_id, what, expected)
+
+
+def roundings(normalization: Normalization) -> NDArray[np.float64]:
+    """Return how far a mapped property (P,) may be off that went through the store.
+
+    It is rounded to float32 twice, normalised and in SI units, each time by at most 2**-24 of
+    itself; of a power of ten that moves the exponent by less than half as much.
+    """
+    spans = normalization.ranges
+    own = [0.5 if span.log10 else max(abs(span.lo), abs(span.hi)) for span in spans]
+    return np.array([0.5 * (span.hi - span.lo) + o for span, o in zip(spans, own, strict=True)]) * (
+        2.0**-24
+    )
 
 
 _IS_GRID_CLASS = np.isin(np.arange(256), (*range(BACKGROUND + 1), UNANNOTATED))
