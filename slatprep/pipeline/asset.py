@@ -23,7 +23,7 @@ from slatprep.pipeline.spool import FailedAsset, Spool, SpooledAsset
 from slatprep.provenance.make import record_of, record_of_failed
 from slatprep.provenance.record import AssetRecord
 from slatprep.readers import read_field, read_latents
-from slatprep.readers.identity import hash_sources, reading_of, source_digests
+from slatprep.readers.identity import reading_of, source_digests
 from slatprep.records import AssetPair, Failed, Finished, Status
 from slatprep.storage.faults import reached
 
@@ -146,8 +146,8 @@ def _repeated(
 
 
 def _key(asset: Finished, recipe: Recipe) -> str:
-    if asset.pair.others:
-        return recipe.key(asset.pair.asset_id, hash_sources(asset.pair)[1])
+    if asset.digests:
+        return recipe.key(asset.pair.asset_id, asset.digests)
     sources = asset.field.sources + asset.latents.sources
     shared = asset.latents if asset.pair.slat_group else None
     digests = source_digests(sources, shared) | reading_of(asset.pair.roots)

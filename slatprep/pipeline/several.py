@@ -11,7 +11,7 @@ from slatprep.judge import merged
 from slatprep.parameters import BuildParameters
 from slatprep.pipeline.annotate import Annotated, annotate
 from slatprep.readers import read_field, read_latents
-from slatprep.readers.identity import hash_sources
+from slatprep.readers.identity import hash_sources, source_digests
 from slatprep.records import (
     Alignment,
     AssetPair,
@@ -50,9 +50,10 @@ def process_several(
     Raises
     ------
     InputError
-        If the SLAT, or none of the annotations, can be used.
+        If the SLAT, or none of the annotations, can be used, or a file was replaced
+        between its hashing, which gives the asset its key, and its reading.
     """
-    sources, _ = hash_sources(pair)
+    sources, digests = hash_sources(pair)
     before = {one.sample: one for one in known}
     latents: StructuredLatents | None = None
     annotated: list[Annotated] = []
@@ -63,7 +64,13 @@ def process_several(
         except InputError as error:
             faults[one.sample] = error
             continue
-        latents = latents or read_latents(one)
+        if not set(field.sources) <= set(sources):
+            raise _replaced(one)
+        if latents is None:
+            latents = read_latents(one)
+            shared = latents if pair.slat_group else None
+            if source_digests(latents.sources, shared)["slat"] != digests["slat"]:
+                raise _replaced(one)
         found = before.get(one.sample)
         alignment = found.alignment if found else _same_alignment(field, annotated)
         judgement = found.judgement if found else None
@@ -90,8 +97,14 @@ def process_several(
         merged(first.judgement, annotation),
         contributions,
         sources,
+        digests,
         tuple(one.field for one in good[1:]),
     )
+
+
+def _replaced(one: AssetPair) -> InputError:
+    what = f"a file of sample {one.sample} was replaced while the build read it"
+    return InputError(f"asset {one.asset_id!r}", what, "files that stay; build again")
 
 
 def _same_alignment(field: MaterialField, annotated: list[Annotated]) -> Alignment | None:

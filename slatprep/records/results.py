@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
+from dataclasses import field as with_default
 from typing import Annotated, Literal
 
 import numpy as np
@@ -88,8 +90,9 @@ class Normalization:
 class Finished:
     """An asset that went through all stages; properties in SI units.
 
-    Merged of several annotations, it has a contribution for each, the files of all, and
-    the fields that were merged after the first, whose field and alignment are its own.
+    Merged of several annotations, it has a contribution for each, the files of all with
+    their digests by role, as an asset's key takes them, and the fields that were merged
+    after the first, whose field and alignment are its own.
     """
 
     pair: AssetPair
@@ -100,6 +103,7 @@ class Finished:
     judgement: Judgement
     contributions: tuple[Contribution, ...] = ()
     sources: tuple[SourceFile, ...] = ()
+    digests: Mapping[str, str] = with_default(default_factory=dict)
     others: tuple[MaterialField, ...] = ()
 
 

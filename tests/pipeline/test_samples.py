@@ -191,6 +191,28 @@ def test_a_sample_more_redoes_that_object_alone(
     assert open_store(str(again.store)).asset("b").merged
 
 
+@pytest.mark.parametrize(("sample", "ok"), [(0, 2), (1, 1)])
+def test_a_grid_replaced_during_the_build_never_gets_the_key_of_other_labels(
+    several: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, sample: int, ok: int
+) -> None:
+    """Sample 0 has been read when it is replaced, sample 1 has been hashed alone."""
+    new = sample_grid(0, 20.0)
+
+    def replace_grid(step: str, name: str) -> None:
+        if (step, name) == ("asset aligned", "a"):
+            write_sample(several, "a", sample, new)
+
+    with monkeypatch.context() as during:
+        inject(during, replace_grid)
+        first = build_store(asked(several, "merge"), tmp_path / "s.zarr")
+    assert first.statuses["ok"] == ok
+    if ok == 1:
+        assert "sample 1 was replaced while the build read it" in first.problems[0][1]
+    again = build_store(asked(several, "merge"), tmp_path / "s.zarr")
+    fresh = build_store(asked(several, "merge"), tmp_path / "fresh.zarr")
+    assert tree(again.store) == tree(fresh.store)
+
+
 def test_a_store_gains_and_loses_its_spread(
     several: Dataset, make_dataset: MakeDataset, tmp_path: Path
 ) -> None:
