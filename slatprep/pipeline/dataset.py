@@ -27,7 +27,7 @@ from slatprep.pipeline.seen import Found
 from slatprep.pipeline.spool import FailedAsset, Spool, SpooledAsset
 from slatprep.pipeline.summary import BuildSummary, counts_of, summarise_build
 from slatprep.pipeline.update import Update, Wanted
-from slatprep.pipeline.work import work_beside, work_directory
+from slatprep.pipeline.work import spool_of, work_beside, work_directory
 from slatprep.provenance.record_json import write_records
 from slatprep.readers import discover
 from slatprep.records import AssetPair, Place
@@ -134,7 +134,7 @@ def build_store(
             place.replace(assembled.store, assembled.staged)
         summary = _publish(update, rows, assembled)
         if keep_work:
-            work.spool.keep_only({asset.key for asset in rows.usable})
+            work.keep_only({asset.key for asset in rows.usable})
     return summary
 
 
@@ -160,7 +160,9 @@ def plan_build(
         An entry an asset.
     """
     place = Destination(out)
-    spool = Spool(work_directory(place.store) / ("nothing" if fresh else "spool"))
+    spool = spool_of(place.store, private_disks=not isinstance(jobs, int))
+    if fresh:
+        spool = Spool(work_directory(place.store) / "nothing")
     pairs = _discover(parameters, jobs)
     check_objects(pairs, parameters.normalize)
     there = None if fresh else store_there(place.store)

@@ -40,7 +40,7 @@ from slatprep.records import (
 from slatprep.storage.atomic import writing
 from slatprep.storage.faults import reached
 from slatprep.storage.place import storage_of
-from slatprep.storage.versions import is_spooled
+from slatprep.storage.versions import BUILDER, is_spooled
 
 if TYPE_CHECKING:
     from numpy.lib.npyio import NpzFile
@@ -157,8 +157,8 @@ class Spool:
 
     def put_failed(self, record: FailedRecord) -> FailedAsset:
         """Write the record of an asset that cannot go in; return what the parent keeps."""
-        # It is tried again in every build, so its name need not tell what it was made from.
-        key = f"none-{hashlib.sha256(record.asset_id.encode()).hexdigest()[:32]}"
+        # It is tried again in every build. By its content, as builds may share the spool.
+        key = f"none-{hashlib.sha256(to_json(record)).hexdigest()[:32]}"
         self._write(key, record, {})
         return FailedAsset(record.asset_id, key, record.status, record.reason)
 
@@ -188,13 +188,33 @@ class Spool:
             arrays = {name: file[name] for name in file.files if name != "record"}
         self._write(record.key, record, arrays)
 
-    def keep_only(self, keys: set[str]) -> None:
-        """Remove everything but these assets' files."""
+    def keep_only(self, keys: set[str], mark: str = "") -> list[str]:
+        """Remove everything but these assets' files, if no other build is at work there.
+
+        Parameters
+        ----------
+        keys : set of str
+            Of the assets.
+        mark : str
+            Object that says that this build is at work; is removed in any case.
+
+        Returns
+        -------
+        list of str
+            Marks of other builds; where there are any, no asset was removed.
+
+        Raises
+        ------
+        StoreError, OSError
+            If the place cannot be listed, or the files not be removed.
+        """
         storage = storage_of(self.directory)
         kept = {f"{key[:2]}/{key}.npz" for key in keys}
         # Below the URL of a store others may keep what is theirs.
-        ours = (n for n in storage.files() if storage.remote is None or is_spooled(n))
-        storage.remove(name for name in ours if name not in kept)
+        ours = [n for n in storage.files() if storage.remote is None or is_spooled(n)]
+        others = [n for n in ours if n.startswith(f"{BUILDER}-") and n != mark]
+        storage.remove(n for n in ours if n not in kept and (n == mark or not others))
+        return others
 
     def record(self, key: str) -> Record:
         """Read an asset's record back."""

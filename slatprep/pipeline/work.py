@@ -9,13 +9,17 @@ taken, and only what builds make is removed from it.
 
 Where workers have disks of their own and the store belongs on an object store,
 the spool lies there, below the store's URL, and so does the version that they
-write; the work folder then holds what the command itself writes.
+write; the work folder then holds what the command itself writes. The lock does
+not keep builds on other machines out, so each marks the spool while it is at work,
+and finished assets are removed only where there is no other's mark. A build that
+is killed leaves its mark; the next one from the same work folder takes it over.
 """
 
 from __future__ import annotations
 
 import os
 import platform
+import secrets
 import shutil
 import stat
 import tempfile
@@ -32,7 +36,7 @@ from slatprep.storage.atomic import restore_directory, writing
 from slatprep.storage.faults import reached
 from slatprep.storage.lock import take_lock
 from slatprep.storage.place import storage_of
-from slatprep.storage.versions import BUILDER, SPOOL, new_version
+from slatprep.storage.versions import BUILDER, SPOOL, is_spooled, new_version
 
 LOCK, _PREFIX = "lock", "build-"
 
@@ -49,11 +53,14 @@ class Work:
         A folder of this build alone, with a name that no other build had.
     shards : Place
         Where workers put the shards of the new store.
+    mark : str
+        Object of a spool below a store that says that this build is at work; else empty.
     """
 
     spool: Spool
     scratch: Path
     shards: Place
+    mark: str = ""
 
     def shared(self) -> Place:
         """Return a place that all workers must see, after making it.
@@ -63,12 +70,43 @@ class Work:
         StoreError
             If it cannot be written.
         """
-        place = self.spool.directory / BUILDER
-        if storage_of(place).local is not None:
+        if not self.mark:
             return self.scratch
+        place = self.spool.directory / self.mark
         with writing(str(place.parent.parent), place), storage_of(place).staged() as file:
             file.write_text(f"process {os.getpid()} on {platform.node()}\n")
         return place
+
+    def keep_only(self, keys: set[str]) -> bool:
+        """Remove other assets than these from the spool, and the mark; whether that was possible.
+
+        What goes wrong is a warning: the store is complete, and the next build will try again.
+        """
+        try:
+            others = self.spool.keep_only(keys, self.mark)
+        except (OSError, StoreError) as error:
+            self._warn(f"could not be removed ({error})")
+            return False
+        if others:
+            self._warn(
+                f"were kept, as another build may need them; {others[0]} there tells which. "
+                "If that was killed, remove that object, and the next build removes the rest"
+            )
+        return True
+
+    def unmark(self) -> bool:
+        """Remove the mark alone; whether that was possible."""
+        try:
+            storage_of(self.spool.directory).remove([self.mark])
+        except FileNotFoundError:
+            return True
+        except OSError as error:
+            self._warn(f"are still marked as in use ({error})")
+            return False
+        return True
+
+    def _warn(self, what: str) -> None:
+        warnings.warn(f"{self.spool.directory}: finished assets {what}", stacklevel=3)
 
 
 @contextmanager
@@ -102,12 +140,12 @@ def work_beside(
     ------
     StoreError
         If the folder cannot be written or is not a build's, or another build has
-        the lock; the message names that build.
+        the lock; the message names that build. With `fresh`, if another build uses the spool.
     """
     directory = work_directory(target)
     folder, remote = directory / SPOOL, storage_of(target).remote if private_disks else None
-    spool = Spool(folder if remote is None else remote / SPOOL, arrays)
-    finished, lock = False, None
+    spool = spool_of(target, private_disks, arrays)
+    finished, lock, work = False, None, None
     try:
         with _making(directory):
             _claim(directory)
@@ -122,11 +160,18 @@ def work_beside(
                 raise _refusal(folder, "is no folder")
             scratch = Path(tempfile.mkdtemp(prefix=_PREFIX, dir=directory))
         look()
+        shards = scratch / "store.zarr" if remote is None else new_version(remote)
+        work = Work(spool, scratch, shards, "" if remote is None else _mark(directory))
         if fresh:
             with writing(str(target), spool.directory):
-                spool.keep_only(set())
-        shards = scratch / "store.zarr" if remote is None else new_version(remote)
-        yield Work(spool, scratch, shards)
+                others = spool.keep_only(set(), work.mark)
+            if others:
+                raise StoreError(
+                    f"{spool.directory / others[0]}: another build, which it names, uses the "
+                    "assets that --fresh removes; wait until it has ended. If it was killed, "
+                    "remove that object"
+                )
+        yield work
         finished = True
     except KeyboardInterrupt:
         if lock is None:
@@ -135,17 +180,22 @@ def work_beside(
         raise
     finally:
         if lock is not None:
-            _restore(directory, target)
-            _remove_builds(directory)
-            if finished and not keep:
-                _clear_spool(target)
-            if (finished and not keep) or not Spool(folder).holds_any():
-                shutil.rmtree(folder, ignore_errors=True)
-                # Last, as a folder without a lock is not taken for a build's.
-                (directory / LOCK).unlink(missing_ok=True)
-                with suppress(OSError):  # Somebody's files, or the next build's lock.
-                    directory.rmdir()
-            os.close(lock)
+            try:
+                _restore(directory, target)
+                _remove_builds(directory)
+                if work is not None and work.mark:
+                    clear = finished and not keep
+                    if work.keep_only(set()) if clear else work.unmark():
+                        (directory / work.mark).unlink(missing_ok=True)
+                if (finished and not keep) or not Spool(folder).holds_any():
+                    shutil.rmtree(folder, ignore_errors=True)
+                    if not any(directory.glob(f"{BUILDER}-*")):
+                        # Last, as a folder without a lock is not taken for a build's.
+                        (directory / LOCK).unlink(missing_ok=True)
+                    with suppress(OSError):  # Somebody's files, or the next build's lock.
+                        directory.rmdir()
+            finally:
+                os.close(lock)
 
 
 def work_directory(target: Place) -> Path:
@@ -153,18 +203,21 @@ def work_directory(target: Place) -> Path:
     return storage_of(target).work_folder()
 
 
-def _clear_spool(target: Place) -> None:
-    """Remove what this cluster's build, or one that was killed, left below a remote store."""
-    if storage_of(target).remote is None:
-        return
-    try:
-        Spool(target / SPOOL).keep_only(set())
-    except OSError as error:
-        # The store is complete all the same, and the next build will try again.
-        warnings.warn(
-            f"{target / SPOOL}: finished assets could not be removed ({error.strerror})",
-            stacklevel=2,
-        )
+def spool_of(target: Place, private_disks: bool, arrays: bool = True) -> Spool:
+    """Return the spool of a target; see `work_beside` for the parameters."""
+    remote = storage_of(target).remote if private_disks else None
+    return Spool((remote or work_directory(target)) / SPOOL, arrays)
+
+
+def _mark(directory: Path) -> str:
+    """Return this build's mark: that of a build that was killed in this work folder, or a new one.
+
+    The lock, which is held, tells that that build has ended.
+    """
+    there = sorted(p.name for p in directory.glob(f"{BUILDER}-*") if is_spooled(p.name))
+    name = there[0] if there else f"{BUILDER}-{secrets.token_hex(8)}"
+    (directory / name).touch()
+    return name
 
 
 def _restore(directory: Path, target: Place) -> None:

@@ -11,15 +11,17 @@ from typing import Any
 
 import pytest
 from distributed import Client
+from s3fs.core import S3FileSystem
 from support.dask_processes import Processes, end, wait_until
 from support.faults import environment as with_fault
 from support.remote import Made, current, put, versions
 from support.synthetic import Dataset
 from support.trees import contents, tree
 
-from slatprep.errors import SlatprepError
+from slatprep.errors import SlatprepError, StoreError
 from slatprep.inspect.verify import verify_store
-from slatprep.pipeline.dataset import build_store
+from slatprep.pipeline.dataset import build_store, plan_build
+from slatprep.pipeline.work import work_beside
 from slatprep.storage.place import place_of
 from slatprep.storage.versions import read_pointer
 from slatprep.workers.dask import Cluster
@@ -157,3 +159,77 @@ def test_what_others_keep_beside_a_spool_is_refused_and_stays(
     with Cluster(address) as cluster, pytest.raises(SlatprepError, match="holds spool/notes"):
         build_store(undisturbed[0].parameters("pixie"), url, jobs=cluster, fresh=True)
     assert contents(s3, url).keys() == {"spool/notes.txt"}
+
+
+ASSET = f"ab/ab{'0' * 30}.npz"
+
+
+def test_a_build_elsewhere_keeps_its_finished_assets_until_it_has_ended(
+    s3: Any, url: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    place = place_of(url)
+    with work_beside(place, private_disks=True) as running:
+        running.shared()
+        s3.pipe_file(f"{url}/spool/{ASSET}", b"done")
+        before = contents(s3, url)
+        monkeypatch.setenv("SLATPREP_CACHE", str(tmp_path / "cache of another machine"))
+        with work_beside(place):
+            pass
+        with pytest.warns(UserWarning, match="another build"), work_beside(
+            place, private_disks=True
+        ) as other:  # fmt: skip
+            other.shared()
+        with (
+            pytest.raises(StoreError, match=r"spool/builder-[0-9a-f]{16}: another build"),
+            work_beside(place, private_disks=True, fresh=True),
+        ):
+            pass
+        assert contents(s3, url) == before
+    assert contents(s3, url) == {}
+    assert not [path for path in tmp_path.rglob("cache*/**/*") if path.is_file()]
+
+
+def test_a_build_that_failed_leaves_finished_assets_but_no_mark(s3: Any, url: str) -> None:
+    with pytest.raises(RuntimeError), work_beside(place_of(url), private_disks=True) as work:
+        work.shared()
+        s3.pipe_file(f"{url}/spool/{ASSET}", b"done")
+        raise RuntimeError
+    assert contents(s3, url).keys() == {f"spool/{ASSET}"}
+
+
+def test_a_spool_that_cannot_be_emptied_does_not_fail_a_build_that_succeeded(
+    s3: Any, url: str, change_client: Any, tmp_path: Path
+) -> None:
+    listing, refused = S3FileSystem._lsdir, [True]
+
+    async def listed(*arguments: Any, **options: Any) -> Any:
+        if refused:
+            raise PermissionError(13, "Access Denied")
+        return await listing(*arguments, **options)
+
+    change_client("_lsdir", listed)
+    with (
+        pytest.warns(UserWarning, match="could not be removed .*Access Denied"),
+        work_beside(place_of(url), private_disks=True) as work,
+    ):
+        work.shared()
+        work.keep_only(set())
+    refused.clear()
+    # It holds no lock any more, and its mark is known for that of a build that has ended.
+    with work_beside(place_of(url), private_disks=True) as work:
+        work.shared()
+    assert contents(s3, url) == {}
+    assert not [path for path in (tmp_path / "cache").rglob("*") if path.is_file()]
+
+
+def test_a_dry_run_on_a_cluster_finds_what_its_build_would(
+    s3: Any, url: str, undisturbed: Made, sources: str, address: str
+) -> None:
+    parameters = Dataset(place_of(sources)).parameters("pixie")
+    with Cluster(address) as cluster:
+        build_store(parameters, url, jobs=cluster, keep_work=True)
+        s3.rm(f"{url}/current.json")
+        plan = plan_build(parameters, url, jobs=cluster)
+        fresh = plan_build(parameters, url, jobs=cluster, fresh=True)
+    assert plan.actions["resume"] == 3
+    assert fresh.actions["align"] == 3
