@@ -355,11 +355,11 @@ class _Pair:
         points = self.slat.subset(RANK_SAMPLES).points
         kept: list[tuple[Pose, Deformed, NDArray[np.float64]]] = []
         for k in sorted(range(len(ranks)), key=lambda k: -ranks[k]):
-            pose, deformed = contested[k]
-            places = pose.similarity.inverse(deformed.moved(points))
-            if _apart_from_all(places, (others for _, _, others in kept)):
+            pose, bent = contested[k]
+            places = pose.similarity.inverse(bent.moved(points))
+            if _apart_from_all(places, (there for _, _, there in kept)):
                 bonus = highest - (max(ranks) - ranks[k]) - pose.score
-                kept.append((replace(pose, bonus=bonus), deformed, places))
+                kept.append((replace(pose, bonus=bonus), bent, places))
         return [*(pose for pose, _, _ in kept), *rest], kept[0][1]
 
     def _deformed(self, pose: Pose, rough: bool) -> tuple[Pose, Deformed]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 from slatprep.errors import StoreError
@@ -45,7 +45,7 @@ class Rows:
     @property
     def made(self) -> list[SpooledAsset]:
         """The assets that lie in the spool."""
-        return [asset for asset in self.usable if isinstance(asset, SpooledAsset)]
+        return _made(self.usable)
 
 
 def settle_rows(
@@ -83,9 +83,8 @@ def settle_rows(
     assets: list[Row | FailedAsset] = [*new]
     kept = None
     if not update.damaged and not keep_work:
-        made = [asset for asset in new if isinstance(asset, SpooledAsset)]
         seen, declared = update.looked.seen, wanted.declared
-        kept = kept_assets(unchanged, plan, made, context, seen, wanted.given, declared)
+        kept = kept_assets(unchanged, plan, _made(new), context, seen, wanted.given, declared)
     assets += finish(unchanged, plan, context, crew) if kept is None else kept
     assets.sort(key=lambda asset: asset.asset_id)
     usable: list[Row] = [asset for asset in assets if not isinstance(asset, FailedAsset)]
@@ -95,10 +94,13 @@ def settle_rows(
     keys = {asset.asset_id: asset.key for asset in usable}
     if kept is None:
         jobs = crew.of(len(usable))
-        made = [asset for asset in usable if isinstance(asset, SpooledAsset)]
-        made = apply_consensus(made, spool, parameters, jobs, crew.note)
+        made = apply_consensus(_made(usable), spool, parameters, jobs, crew.note)
         usable = list(apply_witness(made, spool, parameters, jobs, crew.note))
     contents = settled_contents(usable, wanted.declared, parameters.slat.standardised)
     usable = in_order(usable, context.previous, wanted.compact)
     carried = Carried(context.previous, usable) if kept and context.previous else None
     return Rows(usable, failed, contents, carried, keys)
+
+
+def _made(assets: Iterable[Row | FailedAsset]) -> list[SpooledAsset]:
+    return [asset for asset in assets if isinstance(asset, SpooledAsset)]

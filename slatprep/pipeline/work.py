@@ -183,19 +183,25 @@ def work_beside(
             try:
                 _restore(directory, target)
                 _remove_builds(directory)
-                if work is not None and work.mark:
-                    clear = finished and not keep
-                    if work.keep_only(set()) if clear else work.unmark():
-                        (directory / work.mark).unlink(missing_ok=True)
-                if (finished and not keep) or not Spool(folder).holds_any():
-                    shutil.rmtree(folder, ignore_errors=True)
-                    if not any(directory.glob(f"{BUILDER}-*")):
-                        # Last, as a folder without a lock is not taken for a build's.
-                        (directory / LOCK).unlink(missing_ok=True)
-                    with suppress(OSError):  # Somebody's files, or the next build's lock.
-                        directory.rmdir()
+                _clear(directory, work, all_assets=finished and not keep)
             finally:
                 os.close(lock)
+
+
+def _clear(directory: Path, work: Work | None, all_assets: bool) -> None:
+    """Remove the mark, finished assets if they are not needed any more, and then the folder."""
+    if work is not None and work.mark:
+        cleared = work.keep_only(set()) if all_assets else work.unmark()
+        if cleared:
+            (directory / work.mark).unlink(missing_ok=True)
+    folder = directory / SPOOL
+    if all_assets or not Spool(folder).holds_any():
+        shutil.rmtree(folder, ignore_errors=True)
+        if not any(directory.glob(f"{BUILDER}-*")):
+            # Last, as a folder without a lock is not taken for a build's.
+            (directory / LOCK).unlink(missing_ok=True)
+        with suppress(OSError):  # Somebody's files, or the next build's lock.
+            directory.rmdir()
 
 
 def work_directory(target: Place) -> Path:

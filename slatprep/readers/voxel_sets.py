@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from slatprep.errors import InputError
 from slatprep.geometry.voxels import voxels_of
-from slatprep.normalize import to_mapped
+from slatprep.normalize import from_mapped, to_mapped
 from slatprep.records import (
     BACKGROUND,
     PROPERTIES,
@@ -177,7 +177,4 @@ def _merged(
     means = np.zeros((len(cells), len(table)))
     np.add.at(means, cell[counted], to_mapped(values[counted], table))
     means /= votes[np.arange(len(cells)), winners][:, None]
-    for column, one in enumerate(table):
-        if one.log10:
-            means[:, column] = 10.0 ** means[:, column]
-    return cells, winners, means.astype(np.float32)
+    return cells, winners, from_mapped(means, table)
