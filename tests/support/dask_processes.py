@@ -10,6 +10,8 @@ import sys
 import time
 from pathlib import Path
 
+from distributed import Client
+
 FAULTS = """
 import os, signal, time
 from pathlib import Path
@@ -59,6 +61,12 @@ def refuse(event, arguments):
 sys.addaudithook(refuse)
 """
 """Hides a folder from a process, but for parts of it, as if it ran on another machine."""
+
+
+def wait_for_workers(address: str, number: int) -> None:
+    """Wait until so many workers are there: one may have been killed just now."""
+    with Client(address, set_as_default=False) as client:
+        client.wait_for_workers(number, timeout=180)
 
 
 class Processes:

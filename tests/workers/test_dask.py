@@ -16,8 +16,8 @@ from pathlib import Path
 
 import pytest
 from click.testing import CliRunner
-from distributed import Client, LocalCluster
-from support.dask_processes import Processes, end, wait_until
+from distributed import LocalCluster
+from support.dask_processes import Processes, end, wait_for_workers, wait_until
 from support.synthetic import Dataset
 from support.trees import tree
 
@@ -47,16 +47,14 @@ def shared(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Processes
     address = started.scheduler()
     for _ in range(3):
         started.worker(address)
-    with Client(address, set_as_default=False) as client:
-        client.wait_for_workers(3, timeout=180)
+    wait_for_workers(address, 3)
     yield started, address
     started.stop()
 
 
 @pytest.fixture
 def address(shared: tuple[Processes, str]) -> str:
-    with Client(shared[1], set_as_default=False) as client:
-        client.wait_for_workers(3, timeout=180)  # One may have been killed just now.
+    wait_for_workers(shared[1], 3)
     return shared[1]
 
 

@@ -10,9 +10,8 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from distributed import Client
 from s3fs.core import S3FileSystem
-from support.dask_processes import Processes, end, wait_until
+from support.dask_processes import Processes, end, wait_for_workers, wait_until
 from support.faults import environment as with_fault
 from support.remote import Made, current, put, versions
 from support.synthetic import Dataset
@@ -42,8 +41,7 @@ def shared(
 
 @pytest.fixture
 def address(shared: tuple[Processes, str]) -> str:
-    with Client(shared[1], set_as_default=False) as client:
-        client.wait_for_workers(3, timeout=180)  # One may have been killed just now.
+    wait_for_workers(shared[1], 3)
     (shared[0].folder / "aligned").unlink(missing_ok=True)
     return shared[1]
 
@@ -143,8 +141,7 @@ def test_a_worker_that_does_not_reach_the_store_is_named_before_any_work(
         address, tmp_path_factory.getbasetemp(), AWS_ACCESS_KEY_ID="", AWS_SECRET_ACCESS_KEY=""
     )
     try:
-        with Client(address, set_as_default=False) as client:
-            client.wait_for_workers(4, timeout=180)
+        wait_for_workers(address, 4)
         told = rf"worker tcp://.*: sees nothing it may read .*credentials.* {url}/spool/builder"
         with Cluster(address) as cluster, pytest.raises(SlatprepError, match=told):
             build_store(Dataset(place_of(sources)).parameters("pixie"), url, jobs=cluster)
