@@ -11,10 +11,9 @@ every array, so one that a power failure tore is known and done again.
 from __future__ import annotations
 
 import hashlib
-import uuid
 import zipfile
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -37,10 +36,11 @@ from slatprep.records import (
     Status,
     StructuredLatents,
 )
-from slatprep.storage.atomic import writing
+from slatprep.storage.atomic import staged_apart, writing
 from slatprep.storage.faults import reached
 from slatprep.storage.place import storage_of
 from slatprep.storage.versions import BUILDER, is_spooled
+from slatprep.store.layout import MERGED_COLUMNS
 
 if TYPE_CHECKING:
     from numpy.lib.npyio import NpzFile
@@ -49,9 +49,6 @@ Arrays = dict[str, NDArray[Any]]
 
 _VOXEL_ARRAYS = ("coords", "feats", "properties", "material", "valid", "distance", "place",
                  "confidence")  # fmt: skip
-_MERGED = ("spread", "votes")
-"""Arrays of an asset whose labels are merged of several annotations."""
-
 _TORN = (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile, StoreError)
 
 
@@ -224,7 +221,7 @@ class Spool:
     def voxels(self, key: str) -> Arrays:
         """Read an asset's rows of the ``voxel/*`` arrays, properties in SI units."""
         with self._open(key) as arrays:
-            there = (name for name in (*_VOXEL_ARRAYS, *_MERGED) if name in arrays)
+            there = (name for name in (*_VOXEL_ARRAYS, *MERGED_COLUMNS) if name in arrays)
             return {name: arrays[name] for name in there}
 
     def field(self, key: str) -> MaterialField:
@@ -267,21 +264,12 @@ class Spool:
             np.savez(file, **everything)  # type: ignore[arg-type]
         reached("asset spooled", record.asset_id)
 
-    @contextmanager
-    def _staged(self, place: Place) -> Iterator[Path]:
+    def _staged(self, place: Place) -> AbstractContextManager[Path]:
         path = storage_of(place).local
         if path is None:
-            with storage_of(place).staged() as partial:
-                yield partial
-            return
-        # A name of its own: a worker that outlives a killed build may write the same asset.
-        partial = path.with_suffix(f".{uuid.uuid4().hex}.partial")
+            return storage_of(place).staged()
         path.parent.mkdir(exist_ok=True)
-        try:
-            yield partial
-            partial.replace(path)
-        finally:
-            partial.unlink(missing_ok=True)
+        return staged_apart(path, path.parent)
 
 
 def spooled(record: AssetRecord, extent: NDArray[np.float64]) -> SpooledAsset:

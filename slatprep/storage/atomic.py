@@ -131,6 +131,22 @@ def staged(path: Path) -> Iterator[Path]:
         temporary.unlink(missing_ok=True)
 
 
+@contextmanager
+def staged_apart(path: Path, folder: Path) -> Iterator[Path]:
+    """Yield a file in `folder` that takes the place of `path`, whole, when all went well.
+
+    Unlike that of `staged` it is not flushed, and has a name of its own each time: a worker that
+    outlives a killed build, or that a cluster has given up, may write the same file. Folders are
+    not made: such a worker must not bring back those that were removed.
+    """
+    temporary = folder / f"{secrets.token_hex(16)}.partial"
+    try:
+        yield temporary
+        temporary.replace(path)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
 def _user() -> int:
     """Return our number; on Windows 0, as files have there."""
     return getattr(os, "geteuid", int)()

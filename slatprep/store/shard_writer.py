@@ -8,7 +8,6 @@ On an object store it is written to the worker's own disk first, in the folder f
 from __future__ import annotations
 
 import hashlib
-import uuid
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
@@ -19,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slatprep.records import Place
-from slatprep.storage.atomic import writing
+from slatprep.storage.atomic import staged_apart, writing
 from slatprep.storage.codecs import single_threaded_blosc
 from slatprep.storage.place import storage_of
 from slatprep.store.contract import read_metadata
@@ -144,16 +143,11 @@ def _staged(store: Place, file: str) -> Iterator[Path]:
             yield partial
         return
     (folder / file).parent.mkdir(parents=True, exist_ok=True)
-    # Beside the store, where what a killed worker leaves is no part of it; with a name of
-    # its own, as a worker that a cluster has given up may still be writing the same shard.
+    # Beside the store, where what a killed worker leaves is no part of it.
     partials = folder.with_name(f"{folder.name}.partial")
     partials.mkdir(exist_ok=True)
-    partial = partials / uuid.uuid4().hex
-    try:
+    with staged_apart(folder / file, partials) as partial:
         yield partial
-        partial.replace(folder / file)
-    finally:
-        partial.unlink(missing_ok=True)
 
 
 def _encoder(codecs: list[Mapping[str, Any]]) -> Callable[[NDArray[Any]], bytes]:
