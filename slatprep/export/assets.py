@@ -11,6 +11,7 @@ import numpy as np
 from slatprep.errors import ConfigError
 from slatprep.records import Verdict
 from slatprep.store import Store, StoredAsset
+from slatprep.store.layout import MERGED_COLUMNS
 
 COLUMNS = (
     "object_id",
@@ -28,9 +29,6 @@ COLUMNS = (
 TARGETS = ("properties", "material", "valid")
 """The arrays that a decoder is trained to predict."""
 
-MERGED = ("spread", "votes")
-"""What a store says besides where labels are merged of several annotations."""
-
 
 class Exported(NamedTuple):
     """An asset that was written, the name of its file, and its number of points."""
@@ -41,8 +39,8 @@ class Exported(NamedTuple):
 
 
 def with_merged(store: Store, *names: str) -> tuple[str, ...]:
-    """Return names of an asset's arrays, and those of `MERGED` where the store has them."""
-    return (*names, *MERGED) if store.merges else names
+    """Return names of an asset's arrays, and those of merged labels where the store has them."""
+    return (*names, *MERGED_COLUMNS) if store.merges else names
 
 
 def choose_ids(store: Store, assets: Sequence[str], verdicts: Sequence[str]) -> list[str]:

@@ -8,11 +8,12 @@ from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from slatprep.export.assets import MERGED, Exported, describe_columns, with_merged
+from slatprep.export.assets import Exported, describe_columns, with_merged
 from slatprep.export.formats import ExportOptions, Writer
 from slatprep.export.target import FORMAT
 from slatprep.storage.names import file_name
 from slatprep.store import Store, StoredAsset
+from slatprep.store.layout import MERGED_COLUMNS
 
 if TYPE_CHECKING:
     import h5py
@@ -78,7 +79,7 @@ def write(path: Path, about: dict[str, Any], assets: Iterable[StoredAsset]) -> I
 def _write_group(file: h5py.File, asset: StoredAsset) -> None:
     group = file.create_group(file_name(asset.asset_id))
     group.attrs.update(describe_columns(asset))
-    names = with_merged(asset.store, *(name for name in _DATASETS if name not in MERGED))
+    names = with_merged(asset.store, *(name for name in _DATASETS if name not in MERGED_COLUMNS))
     for name, attributes in ((name, _DATASETS[name]) for name in names):
         packing = {} if name == "transform" else {"compression": "gzip", "shuffle": True}
         dataset = group.create_dataset(name, data=getattr(asset, name), **packing)

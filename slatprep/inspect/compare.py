@@ -19,15 +19,9 @@ from slatprep.provenance.stored import StoredRecords
 from slatprep.records import RESOLUTION, Place
 from slatprep.store import Store, open_store
 from slatprep.store.assets import ASSET_COLUMNS
-from slatprep.store.layout import ARRAYS, MERGED
+from slatprep.store.reader import VOXEL_COLUMNS
 from slatprep.workers import Progress
 from slatprep.workers.local import run_in_order
-
-_VOXEL_ARRAYS = tuple(
-    layout.name.removeprefix("voxel/")
-    for layout in (*ARRAYS, *MERGED)
-    if layout.name.startswith("voxel/")
-)
 
 _ROUNDING = 1e-6
 """Share of a range; rounding to float32 in two normalisations differs by less."""
@@ -237,7 +231,7 @@ def _compare_some(path_a: Place, path_b: Place, rows: Sequence[_Rows]) -> list[A
 
 def _compare(a: Store, b: Store, asset_id: str, rows: _Rows) -> AssetChange:
     """Compare the voxels of an asset."""
-    one, other = a.read(rows[0], _VOXEL_ARRAYS), b.read(rows[1], _VOXEL_ARRAYS)
+    one, other = a.read(rows[0], VOXEL_COLUMNS), b.read(rows[1], VOXEL_COLUMNS)
     coords = one.pop("coords"), other.pop("coords")
     unmatched, moved = 0, 0.0
     order = np.array_equal(*coords)

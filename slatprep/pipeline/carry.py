@@ -27,7 +27,7 @@ from slatprep.provenance.make import origin
 from slatprep.records import AssetPair, Contents, LatentMoments, Normalization
 from slatprep.storage.files import take_file
 from slatprep.storage.place import storage_of
-from slatprep.store.layout import ARRAYS, MERGED, rows_per_shard
+from slatprep.store.layout import arrays_with, rows_per_shard
 from slatprep.store.records import RECORD_ARRAY, RECORDS_IN_SHARD
 from slatprep.store.unmoved import Unmoved, unmoved
 
@@ -225,8 +225,8 @@ class Carried:
             "grid": parameters.grid_assets_per_shard,
             "record": RECORDS_IN_SHARD,
         }
-        layouts = (*ARRAYS, *(MERGED if store.merges else ()))
-        arrays = [(layout.name.partition("/")[0], layout.name) for layout in layouts]
+        names = [layout.name for layout in arrays_with(store.merges)]
+        arrays = [(name.partition("/")[0], name) for name in names]
         digests = self.previous.digests
         taken: dict[str, str] = {}
         records = set()

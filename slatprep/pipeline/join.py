@@ -23,6 +23,7 @@ from slatprep.errors import ConfigError, StoreError
 from slatprep.normalize import denormalize_properties, normalize_properties
 from slatprep.parameters import BuildParameters, StoreParameters
 from slatprep.pipeline.pack import (
+    append_rows,
     arrays_in,
     owners,
     settled_contents,
@@ -360,11 +361,8 @@ def _copy_rows(
                 source, row = rows[shard.first + asset]
                 change = _renormaliser(source.store.normalization, normalization)
                 values_of = stored_rows(source.store, shard.group, row, own, source.records.rows)
-                for name, writer in writers.items():
-                    if name in values_of:
-                        writer.append(change(values_of[name], name))
-                    else:
-                        writer.append_fill(own.stop - own.start)
+                changed = {name: change(values, name) for name, values in values_of.items()}
+                append_rows(writers, changed, own.stop - own.start)
 
 
 def _renormaliser(

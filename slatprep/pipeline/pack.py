@@ -31,7 +31,7 @@ from slatprep.storage.faults import reached
 from slatprep.storage.place import storage_of
 from slatprep.storage.remote import put_objects
 from slatprep.store import Store
-from slatprep.store.layout import ARRAYS, MERGED, ArrayLayout, overlaps
+from slatprep.store.layout import ARRAYS, ArrayLayout, arrays_with, overlaps
 from slatprep.store.shard_writer import ShardWriter, Written
 from slatprep.store.writer import Shard, create_store, merges, open_for_writing, shards
 from slatprep.workers.local import Jobs, run_unordered
@@ -96,19 +96,24 @@ def write_shard(
                 else:
                     arrays, counts = arrays_of(spool, str(key), own, normalization)
                     clipped[asset] += counts
-                for array, writer in writers.items():
-                    if array in arrays:
-                        writer.append(arrays[array])
-                    else:
-                        writer.append_fill(own.stop - own.start)
+                append_rows(writers, arrays, own.stop - own.start)
         reached("shard filled", name)
     reached("shard written", name)
     return shard, clipped, {writer.file: writer.written() for writer in writers.values()}
 
 
+def append_rows(writers: Mapping[str, ShardWriter], arrays: Arrays, rows: int) -> None:
+    """Give each writer the rows of its array; fill values where there is no such array."""
+    for name, writer in writers.items():
+        if name in arrays:
+            writer.append(arrays[name])
+        else:
+            writer.append_fill(rows)
+
+
 def arrays_in(group: str, several: bool) -> list[str]:
     """Return the full names of a group's arrays; those of merged labels where there are any."""
-    layouts = (*ARRAYS, *(MERGED if several else ()))
+    layouts = arrays_with(several)
     return [layout.name for layout in layouts if layout.name.startswith(f"{group}/")]
 
 

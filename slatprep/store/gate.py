@@ -12,7 +12,7 @@ from typing import Any
 
 from slatprep.store.contract import Finding
 from slatprep.store.digests import GROUP
-from slatprep.store.layout import ARRAYS, MERGED
+from slatprep.store.layout import arrays_with
 from slatprep.store.records import RECORD_ARRAY
 
 GROUPS = ("asset", "voxel", "grid", GROUP)
@@ -27,7 +27,7 @@ COORDINATES = (
 
 NAMES = frozenset(
     (
-        *(layout.name for layout in (*ARRAYS, *MERGED)),
+        *(layout.name for layout in arrays_with(merged=True)),
         RECORD_ARRAY,
         *(f"{GROUP}/{name}" for name in ("name", "size", "sha256")),
         *COORDINATES,

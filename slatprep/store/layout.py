@@ -261,6 +261,15 @@ MERGED = (
 """What a store has besides where labels of any asset are merged of several annotations."""
 
 
+MERGED_COLUMNS = tuple(layout.name.removeprefix("voxel/") for layout in MERGED)
+"""Their last names."""
+
+
+def arrays_with(merged: bool) -> tuple[ArrayLayout, ...]:
+    """Return every array of a store that is written, whether or not it has `MERGED`."""
+    return (*ARRAYS, *MERGED) if merged else ARRAYS
+
+
 def arrays_of(version: int) -> tuple[ArrayLayout, ...]:
     """Return the arrays that every store of a format version has."""
     return tuple(layout for layout in ARRAYS if layout.since <= version)
@@ -353,7 +362,7 @@ def create_arrays(
         "voxel": (parameters.voxel_chunk, rows_per_shard(parameters)),
         "grid": (1, parameters.grid_assets_per_shard),
     }
-    for layout in (*ARRAYS, *(MERGED if several else ())):
+    for layout in arrays_with(several):
         shape = tuple(sizes[dimension] for dimension in layout.dimensions)
         chunk, shard = chunk_and_shard[layout.name.partition("/")[0]]
         if shard is None:

@@ -22,7 +22,7 @@ from slatprep.storage.versions import store_name
 from slatprep.store.assets import ASSET_COLUMNS, AssetTable
 from slatprep.store.attributes import RootAttributes, read_attributes, width_findings
 from slatprep.store.contract import MAX_VOXELS, read_metadata
-from slatprep.store.layout import ARRAYS, FORMAT, MERGED, READABLE_VERSIONS
+from slatprep.store.layout import FORMAT, MERGED_COLUMNS, READABLE_VERSIONS, arrays_with
 
 if TYPE_CHECKING:
     import zarr
@@ -30,12 +30,12 @@ if TYPE_CHECKING:
 TRAINING_COLUMNS = ("coords", "feats", "properties")
 """What `Store.read` reads unless told otherwise."""
 
-_VOXEL_COLUMNS = [
+VOXEL_COLUMNS = tuple(
     name
-    for layout in (*ARRAYS, *MERGED)
+    for layout in arrays_with(merged=True)
     for group, _, name in (layout.name.partition("/"),)
     if group == "voxel"
-]
+)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -314,7 +314,7 @@ class Store(AssetTable):
             asset_id=self.ids[index],
             transform=np.asarray(self._column("transform")[index]),
             columns={name: self._column(name)[index] for name in ASSET_COLUMNS},
-            **self.read(index, _VOXEL_COLUMNS),
+            **self.read(index, VOXEL_COLUMNS),
         )
 
     def _voxel_rows(self, name: str, index: int, start: int, stop: int) -> NDArray[Any]:
@@ -323,7 +323,7 @@ class Store(AssetTable):
             return places_of(coords, self._column("transform")[index]).astype(np.float32)
         if name == "confidence" and self.format_version == 1:
             return np.full(stop - start, np.nan, dtype=np.float32)
-        if name in ("spread", "votes") and not self.merges:
+        if name in MERGED_COLUMNS and not self.merges:
             columns = [len(self.about.property_columns)] if name == "spread" else []
             return np.full([stop - start, *columns], np.nan, dtype=np.float32)
         return self.read_rows(f"voxel/{name}", start, stop)
