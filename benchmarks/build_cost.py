@@ -33,7 +33,7 @@ from slatprep.pipeline import annotate, assemble, finish, publish
 from slatprep.pipeline import asset as process
 from slatprep.pipeline import dataset as build
 from slatprep.readers import discover
-from slatprep.store.layout import create_arrays
+from slatprep.store.writer import create_store, open_for_writing
 
 STEPS = {
     "read_field": process,
@@ -153,8 +153,8 @@ def writing_alone(built: Path, new: Path, parameters: BuildParameters) -> float:
     source = zarr.open_group(built, mode="r")
     rows = source["voxel/coords"].shape[0]
     begin = cpu()
-    root = zarr.create_group(new, zarr_format=3)
-    create_arrays(root, source["asset/id"].shape[0], rows, parameters.store)
+    create_store(new, source["asset/id"].shape[0], rows, parameters.store)
+    root = open_for_writing(new)
     spent = cpu() - begin
     for group in ("asset", "voxel", "grid"):
         for name, array in root[group].arrays():

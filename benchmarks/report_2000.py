@@ -23,13 +23,14 @@ from itertools import cycle, islice
 from pathlib import Path
 
 import numpy as np
-import zarr
 
 from slatprep.inspect.report import write_report
 from slatprep.parameters import StoreParameters
 from slatprep.provenance.places import manifests_of
 from slatprep.store import open_store
-from slatprep.store.layout import ARRAYS, create_arrays
+from slatprep.store.layout import ARRAYS
+from slatprep.store.records import RECORD_ARRAY
+from slatprep.store.writer import create_store, open_for_writing
 
 RUNS = 3
 
@@ -64,8 +65,8 @@ def repeat_store(source: Path, folder: Path, assets: int, noise: float) -> tuple
     ids = np.array([f"{number:05d}.{store.ids[k]}" for number, k in enumerate(chosen)])
     rng = np.random.default_rng(0)
     path = folder / "repeated.zarr"
-    root = zarr.open_group(path, mode="w", zarr_format=3)
-    create_arrays(root, assets, int(offsets[-1]), StoreParameters())
+    create_store(path, assets, int(offsets[-1]), StoreParameters())
+    root = open_for_writing(path)
     root.attrs.update(store.group.attrs.asdict())
     for name in (layout.name for layout in ARRAYS):
         whole = store.group[name]
@@ -91,10 +92,10 @@ def repeat_store(source: Path, folder: Path, assets: int, noise: float) -> tuple
     shutil.copy(manifests_of(source) / "build.json", manifests)
     with (manifests_of(source) / "assets.jsonl").open(encoding="utf-8") as lines:
         records = {record["asset_id"]: record for record in map(json.loads, lines)}
-    with (manifests / "assets.jsonl").open("w", encoding="utf-8") as file:
-        for asset_id, k in zip(ids, chosen, strict=True):
-            record = {**records[store.ids[k]], "asset_id": str(asset_id)}
-            file.write(json.dumps(record) + "\n")
+    told = zip(ids, chosen, strict=True)
+    texts = [json.dumps({**records[store.ids[k]], "asset_id": str(name)}) for name, k in told]
+    root[RECORD_ARRAY][:] = np.array(texts, dtype=object)
+    (manifests / "assets.jsonl").write_text("\n".join(texts) + "\n", encoding="utf-8")
     return path, manifests
 
 

@@ -7,68 +7,21 @@ ranges of their own dataset are brought to the ranges of all of them.
 
 from __future__ import annotations
 
-import time
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import ExitStack
-from dataclasses import dataclass, replace
-from itertools import accumulate
+from collections.abc import Iterable, Sequence
+from dataclasses import replace
 from typing import Any
 
-import numpy as np
-import orjson
-from numpy.typing import NDArray
-
 from slatprep.errors import ConfigError, StoreError
-from slatprep.normalize import denormalize_properties, normalize_properties
-from slatprep.parameters import BuildParameters, StoreParameters
-from slatprep.pipeline.pack import (
-    append_rows,
-    arrays_in,
-    owners,
-    settled_contents,
-    stored_rows,
-    write_assets,
-)
-from slatprep.pipeline.publish import Destination, publish_manifests, write_all_records
+from slatprep.pipeline.pack import settled_contents
+from slatprep.pipeline.rewrite import NO_EXTENT, Source, places_of_sources, write_rows
 from slatprep.pipeline.spool import spooled
-from slatprep.pipeline.summary import BuildSummary, counts_of, summarise_build
-from slatprep.pipeline.work import work_beside, work_directory
-from slatprep.provenance.files import build_in
-from slatprep.provenance.places import manifests_beside
-from slatprep.provenance.record import AssetRecord
-from slatprep.provenance.record_json import adapter_of
+from slatprep.pipeline.summary import BuildSummary
 from slatprep.provenance.stored import StoredRecords
 from slatprep.records import Contents, Normalization, Place, PropertyRange
-from slatprep.storage.atomic import writing
-from slatprep.storage.place import storage_of
-from slatprep.store import Store, open_store
+from slatprep.store import open_store
 from slatprep.store.layout import FORMAT_VERSION
-from slatprep.store.shard_writer import ShardWriter
-from slatprep.store.writer import create_store, finish_store, merges, shards
 from slatprep.workers import Progress
-
-NO_ROOT, APART = "unknown", " | "
-"""What a build's record says of sources that no record told of, and what stands between the
-roots of sources that lie apart."""
-
-_NO_EXTENT = np.empty((0, 2))
-
-
-@dataclass(frozen=True, eq=False)
-class Source:
-    """A store that assets are taken from."""
-
-    store: Store
-    records: StoredRecords
-    build: dict[str, Any]
-    """Its attribute ``build``."""
-    places: dict[str, Any]
-    """Where its sources lay, as ``build.json`` says; unknown without it."""
-
-
-_Row = tuple[Source, int]
-"""An asset: where it is taken from, and its index there."""
 
 
 def subset_store(
@@ -181,22 +134,6 @@ def _source(place: str | Place) -> Source:
     return Source(store, StoredRecords(store), store.attributes["build"], places_of_sources(store))
 
 
-def places_of_sources(store: Store) -> dict[str, Any]:
-    """Return where a store's sources lay; nothing where no record beside it is of its build."""
-    folder = manifests_beside(store.path)
-    if folder is None:
-        return {}
-    try:
-        record = build_in(folder)
-    except StoreError:
-        return {}  # The store does not need it, and `slatprep verify` names it.
-    if record.id != store.attributes["manifest"]:
-        return {}
-    named = {name: getattr(record.parameters, name) for name in ("pixieverse", "slat", "pairing")}
-    places: dict[str, Any] = orjson.loads(orjson.dumps(named, default=str))
-    return places
-
-
 def _common_build(sources: Sequence[Source]) -> dict[str, Any]:
     """Return the attribute ``build`` of the joined store; versions that differ are all named."""
     first = sources[0]
@@ -258,149 +195,5 @@ def _common_contents(sources: Sequence[Source]) -> Contents:
     if all(source.store.contents == first for source in sources):
         return first
     unknown = replace(first, latents=replace(first.latents, mean=(), std=()))
-    rows = (spooled(record, _NO_EXTENT) for source in sources for record in source.records)
+    rows = (spooled(record, NO_EXTENT) for source in sources for record in source.records)
     return settled_contents(rows, unknown, "as said")
-
-
-def write_rows(
-    rows: Sequence[_Row],
-    normalization: Normalization,
-    build: dict[str, Any],
-    out: str | Place,
-    manifests: str | Place | None,
-    progress: Progress | None,
-    contents: Contents,
-    in_place: bool = False,
-) -> BuildSummary:
-    """Write a store of rows of others, in their order; `in_place` it may replace one of them."""
-    begin = time.perf_counter()
-    place = Destination(out, manifests)
-    sources = list(dict.fromkeys(source for source, _ in rows))
-    for source in sources:
-        if not in_place and _same_place(source.store.path, place.store):
-            raise ConfigError(f"{place.out} is a store to take assets from; choose another path")
-    parameters = _parameters(sources, build)
-    assets, clipped = [], []
-    for record in _records(rows, normalization):
-        assets.append(spooled(record, _NO_EXTENT))
-        if record.counts.clipped:
-            clipped.append(_counts(record.counts.clipped.voxel))
-    with work_beside(place.store, look=place.look) as work:
-        store, records = work.scratch / "store.zarr", work.scratch / "assets.jsonl"
-        with writing(str(place.out), work_directory(place.store).parent):
-            offsets = [0, *accumulate(asset.n_voxels for asset in assets)]
-            several = any(asset.several for asset in assets)
-            create_store(store, len(rows), offsets[-1], parameters.store, contents, several)
-            write_assets(store, assets, offsets, normalization)
-            _copy_rows(store, rows, offsets, normalization, parameters.store, progress)
-            own = enumerate(_records(rows, normalization))
-            build_id = write_all_records(store, records, own)
-            finish_store(store, normalization, build_id, build, contents)
-            place.replace(store)
-        summary = summarise_build(
-            counts_of(assets),
-            (),
-            store=place.out,
-            records=place.records(),
-            build_id=build_id,
-            seconds=time.perf_counter() - begin,
-            normalization=normalization,
-            clipped=np.sum(clipped, axis=0, dtype=np.int64),
-        )
-        publish_manifests(records, summary, parameters, build["versions"])
-        place.publish()
-    return summary
-
-
-def _same_place(one: Place, other: Place) -> bool:
-    """Whether two places are one, whatever leads there."""
-    here, there = storage_of(one).local, storage_of(other).local
-    if here is None or there is None:
-        return one == other
-    return here.resolve() == there.resolve()
-
-
-def _records(rows: Iterable[_Row], normalization: Normalization) -> Iterator[AssetRecord]:
-    """Yield the records of rows, with the ranges they have in the new store."""
-    for source, row in rows:
-        record = source.records.read(row)
-        if record.normalization != normalization:
-            clipped = record.counts.clipped
-            if clipped is None or np.any([*_counts(clipped.voxel), *_counts(clipped.grid)]):
-                raise StoreError(
-                    f"{source.store.path}: values of {record.asset_id} were clipped to its ranges, "
-                    "so it cannot be brought to others; build it again"
-                )
-            record = replace(record, normalization=normalization)
-        yield record
-
-
-def _counts(counts: Any) -> list[int]:
-    return list(counts.values())
-
-
-def _copy_rows(
-    path: Any,
-    rows: Sequence[_Row],
-    offsets: Sequence[int],
-    normalization: Normalization,
-    parameters: StoreParameters,
-    progress: Progress | None,
-) -> None:
-    """Write the shards of all arrays that have rows of voxels or grids."""
-    everything = list(shards([""] * len(rows), offsets, parameters))
-    for done, shard in enumerate(everything):
-        if progress:
-            progress(done, len(everything))
-        with ExitStack() as stack:
-            writers = {
-                name: stack.enter_context(ShardWriter(path, name, shard.rows[0]))
-                for name in arrays_in(shard.group, merges(path))
-            }
-            for asset, own in owners(shard, *shard.rows):
-                source, row = rows[shard.first + asset]
-                change = _renormaliser(source.store.normalization, normalization)
-                values_of = stored_rows(source.store, shard.group, row, own, source.records.rows)
-                changed = {name: change(values, name) for name, values in values_of.items()}
-                append_rows(writers, changed, own.stop - own.start)
-
-
-def _renormaliser(
-    old: Normalization, new: Normalization
-) -> Callable[[NDArray[Any], str], NDArray[Any]]:
-    """Return what brings the rows of an array, by its name, from one set of ranges to another."""
-    before, after = ([span.hi - span.lo for span in ranges.ranges] for ranges in (old, new))
-    scale = np.divide(before, after)
-
-    def change(values: NDArray[Any], name: str) -> NDArray[Any]:
-        if old != new and name == "voxel/spread":
-            return (values * scale).astype(np.float32)
-        if old == new or not name.endswith("/properties"):
-            return values
-        last = np.moveaxis(values, 1, -1)  # (N, 3), or of a grid (1, x, y, z, 3)
-        changed = normalize_properties(denormalize_properties(last, old), new)
-        return np.ascontiguousarray(np.moveaxis(changed, -1, 1))
-
-    return change
-
-
-def _parameters(sources: Sequence[Source], build: dict[str, Any]) -> BuildParameters:
-    """Return what the build's record says: the parameters, and where all sources lay."""
-    places: dict[str, Any] = {"pixieverse": {"root": NO_ROOT}, "slat": {"root": NO_ROOT}}
-    if all(source.places == sources[0].places for source in sources):
-        places |= sources[0].places
-    else:
-        for side in ("pixieverse", "slat"):
-            roots = (source.places.get(side, {}).get("root", NO_ROOT) for source in sources)
-            places[side] = {"root": APART.join(dict.fromkeys(roots))}
-    document = {"name": build["name"], **places, **build["parameters"]}
-    try:
-        parameters: BuildParameters = adapter_of(BuildParameters).validate_json(
-            orjson.dumps(document), strict=True
-        )
-    except ValueError as error:
-        path = sources[0].store.path
-        raise StoreError(
-            f"{path}: its attribute build does not say how it was built ({error}); build it again"
-        ) from None
-    return parameters

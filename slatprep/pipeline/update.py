@@ -39,7 +39,7 @@ from slatprep.records import AssetPair, Contents, Normalization, Place
 from slatprep.storage.atomic import writing
 from slatprep.storage.place import storage_of
 from slatprep.store import Store
-from slatprep.store.layout import segments_of
+from slatprep.store.attributes import segments_of
 from slatprep.workers.local import Jobs
 
 

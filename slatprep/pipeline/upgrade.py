@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slatprep.judge import judge_with_voxels
-from slatprep.pipeline.join import Source, places_of_sources, write_rows
+from slatprep.pipeline.rewrite import Source, places_of_sources, write_rows
 from slatprep.pipeline.summary import BuildSummary
 from slatprep.provenance.record import AssetRecord
 from slatprep.provenance.stored import StoredRecords

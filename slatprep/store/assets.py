@@ -1,22 +1,28 @@
-"""What a store says of each asset: its id, where its voxels lie, and the ``asset/*`` columns."""
+"""What a store says of itself, and of each asset: its id, its rows, the ``asset/*`` columns."""
 
 from __future__ import annotations
 
 import difflib
+from collections import Counter
+from collections.abc import Sequence
 from functools import cached_property
+from html import escape
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from slatprep.errors import StoreError, UnknownAssetError
-from slatprep.records import Place
+from slatprep.records import Contents, Normalization, Place
+from slatprep.storage.versions import store_name
 from slatprep.store.arrays import Arrays
+from slatprep.store.attributes import RootAttributes, read_attributes
 from slatprep.store.layout import ARRAYS, MERGED
 from slatprep.store.shard_reader import RowReader
 
 if TYPE_CHECKING:
     import pandas
+    import zarr
 
 ASSET_COLUMNS = [
     name
@@ -33,6 +39,10 @@ _NEWER = {
     if group == "asset" and layout.since > 1
 }
 """What a store of format 1 says by the name of an ``asset/*`` array that it does not have."""
+
+
+class AttributesError(StoreError):
+    """A store whose attributes do not say what readers rely on."""
 
 
 class AssetTable:
@@ -58,10 +68,98 @@ class AssetTable:
     def __contains__(self, asset_id: object) -> bool:
         return asset_id in self._index
 
+    def __repr__(self) -> str:
+        try:
+            verdicts = Counter(str(verdict) for verdict in self._column("verdict"))
+            counts = ", ".join(f"{count:,} {verdict}" for verdict, count in verdicts.most_common())
+            what = f"{len(self):,} assets ({counts}), {self.offsets[-1]:,} voxels"
+        except StoreError as error:
+            what = f"cannot be read ({error})"
+        return f"<Store {self.path}: {what}>"
+
+    def _repr_html_(self) -> str:
+        """Return the store as a notebook shows it: a table of what it holds."""
+        try:
+            verdicts = Counter(str(verdict) for verdict in self._column("verdict"))
+            rows = {
+                "path": self.path,
+                "assets": f"{len(self):,}",
+                **{f"assets {verdict}": f"{n:,}" for verdict, n in verdicts.most_common()},
+                "categories": f"{len(set(map(str, self._column('category'))) - {''}):,}",
+                "voxels": f"{self.offsets[-1]:,}",
+                "ranges": self.normalization.source,
+                "build": self.about.manifest[:12],
+            }
+        except StoreError as error:
+            rows = {"path": self.path, "cannot be read": error}
+        cells = "".join(
+            f"<tr><th>{escape(name)}</th><td>{escape(str(value))}</td></tr>"
+            for name, value in rows.items()
+        )
+        return f"<table><caption>slatprep store</caption>{cells}</table>"
+
     @property
     def format_version(self) -> int:
         """Version of the format that it was written in."""
         return int(self.attributes["format_version"])
+
+    @property
+    def name(self) -> str:
+        """The last part of its path, or of its URL without the version."""
+        return store_name(self.path)
+
+    @cached_property
+    def about(self) -> RootAttributes:
+        """What its attributes say, typed.
+
+        Raises
+        ------
+        AttributesError
+            If they do not say what readers rely on; `open_store` has asked already.
+        """
+        found = read_attributes(self.attributes)
+        if isinstance(found, tuple):
+            raise AttributesError(f"{self.path}/{found[0]}; run `slatprep verify`")
+        return found
+
+    @property
+    def group(self) -> zarr.Group:
+        """The root as zarr-python has it, for everything this class does not offer.
+
+        Raises
+        ------
+        StoreError
+            If its metadata name anything that `slatprep.store.gate` does not allow.
+        """
+        return self._arrays.group
+
+    @property
+    def contents(self) -> Contents:
+        """The tables of its properties and classes, and what its latents are."""
+        return self.about.contents
+
+    def columns_of(self, names: Sequence[str]) -> list[int]:
+        """Return where properties stand among its columns.
+
+        Raises
+        ------
+        StoreError
+            If it does not have them all.
+        """
+        held = list(self.about.property_columns)
+        missing = [name for name in names if name not in held]
+        if missing:
+            lacking, there = " and no ".join(missing), ", ".join(held)
+            raise StoreError(
+                f"{self.path} has no {lacking}, only {there}; expected a store with "
+                f"{', '.join(names)}"
+            )
+        return [held.index(name) for name in names]
+
+    @property
+    def normalization(self) -> Normalization:
+        """The ranges that properties were normalised with."""
+        return self.about.ranges
 
     @property
     def merges(self) -> bool:

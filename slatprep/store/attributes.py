@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, fields
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, fields
 from functools import cache
+from itertools import pairwise
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
 import orjson
@@ -29,7 +30,7 @@ from slatprep.records import (
     PropertyRange,
 )
 from slatprep.store.contract import Finding
-from slatprep.store.layout import FORMAT, READABLE_VERSIONS
+from slatprep.store.layout import FORMAT, FORMAT_VERSION, READABLE_VERSIONS
 
 if TYPE_CHECKING:
     from pydantic import TypeAdapter
@@ -81,7 +82,7 @@ class StoredBuild:
 class RootAttributes:
     """What readers rely on; attributes that they do not know are left alone.
 
-    `slatprep.store.layout.root_attributes` writes them.
+    `root_attributes` makes them.
     """
 
     __pydantic_config__: ClassVar[dict[str, object]] = {"extra": "ignore", "allow_inf_nan": False}
@@ -158,6 +159,47 @@ def width_findings(said: RootAttributes, metadata: Mapping[str, Any]) -> Iterato
         if isinstance(shape, list) and len(shape) == 2 and shape[1] != columns:
             what = f"attribute {attribute} says {columns} columns of {name}"
             yield Finding("zarr.json", "", what, f"{shape[1]!r}, as the array has")
+
+
+def segments_of(ids: Sequence[str]) -> list[int]:
+    """Return the rows at which ids begin to ascend anew: 0, and those that updates added.
+
+    Examples
+    --------
+    >>> segments_of(["a", "d", "b", "c"])
+    [0, 2]
+    """
+    return [0, *(row for row, (one, other) in enumerate(pairwise(ids), 1) if one > other)]
+
+
+def root_attributes(
+    normalization: Normalization,
+    manifest: str,
+    build: Mapping[str, object],
+    contents: Contents,
+    ids: Sequence[str],
+) -> dict[str, Any]:
+    """Return the attributes of the store's root.
+
+    `build` holds the parameters and versions that made the content, so that
+    the store explains itself without its manifests; `ids` are those of its rows.
+    """
+    return {
+        "format": FORMAT,
+        "format_version": FORMAT_VERSION,
+        "resolution": RESOLUTION,
+        "material_classes": list(contents.classes),
+        "property_columns": [one.name for one in contents.properties],
+        "property_units": [one.unit for one in contents.properties],
+        "latents": asdict(contents.latents),
+        "normalization": {
+            r.name: {"log10": r.log10, "lo": r.lo, "hi": r.hi, "source": normalization.source}
+            for r in normalization.ranges
+        },
+        "manifest": manifest,
+        "build": dict(build),
+        "segments": segments_of(ids),
+    }
 
 
 _FAULTS = 64

@@ -1,4 +1,4 @@
-"""What lies where in the store: arrays, chunks, shards, attributes.
+"""What lies where in the store: arrays, chunks, shards.
 
 The tables of arrays are `ARRAYS` and `MERGED`; writer and reader take names, types and
 shapes from them. Rows of ``voxel/*`` and ``grid/*`` are cut into shards by
@@ -8,23 +8,11 @@ shapes from them. Rows of ``voxel/*`` and ``grid/*`` are cut into shards by
 from __future__ import annotations
 
 from bisect import bisect_right
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass
-from itertools import pairwise
-from typing import TYPE_CHECKING, Any
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 
 from slatprep.parameters import StoreParameters
-from slatprep.records import (
-    BACKGROUND,
-    PIXIEVERSE,
-    RESOLUTION,
-    UNANNOTATED,
-    Contents,
-    Normalization,
-)
-
-if TYPE_CHECKING:
-    import zarr
+from slatprep.records import BACKGROUND, RESOLUTION, UNANNOTATED
 
 FORMAT = "slatprep-store"
 FORMAT_VERSION = 2
@@ -324,119 +312,3 @@ def overlaps(offsets: Sequence[int], start: int, stop: int) -> Iterator[tuple[in
         if first < last:
             yield asset, slice(first - offsets[asset], last - offsets[asset])
         asset += 1
-
-
-def create_arrays(
-    root: zarr.Group,
-    n_assets: int,
-    n_voxels: int,
-    parameters: StoreParameters,
-    contents: Contents = PIXIEVERSE,
-    several: bool = False,
-) -> None:
-    """Create every array of the store, empty.
-
-    Parameters
-    ----------
-    root : zarr.Group
-        The new store's root, format 3.
-    n_assets, n_voxels : int
-        A and N.
-    parameters : StoreParameters
-        Sizes of chunks and shards, and the compression level.
-    contents : Contents
-        How many properties and channels there are.
-    several : bool
-        Whether labels are merged of several annotations.
-    """
-    sizes = {
-        "asset": n_assets,
-        "asset_edge": n_assets + 1,
-        "voxel": n_voxels,
-        "property": len(contents.properties),
-        "latent": contents.latents.channels,
-        **FIXED_SIZES,
-    }
-    chunk_and_shard = {
-        "asset": (ASSET_CHUNK, None),
-        "voxel": (parameters.voxel_chunk, rows_per_shard(parameters)),
-        "grid": (1, parameters.grid_assets_per_shard),
-    }
-    for layout in arrays_with(several):
-        shape = tuple(sizes[dimension] for dimension in layout.dimensions)
-        chunk, shard = chunk_and_shard[layout.name.partition("/")[0]]
-        if shard is None:
-            chunk = min(chunk, shape[0])
-        attributes: dict[str, Any] = {"description": layout.description}
-        if layout.unit:
-            attributes["units"] = layout.unit
-        root.create_array(
-            layout.name,
-            shape=shape,
-            dtype=str if layout.dtype == "str" else layout.dtype,
-            chunks=(chunk, *shape[1:]),
-            shards=None if shard is None else (shard, *shape[1:]),
-            **_codecs(layout, parameters.compression_level),
-            fill_value=layout.fill_value,
-            dimension_names=layout.dimensions,
-            attributes=attributes,
-        )
-
-
-def _codecs(layout: ArrayLayout, level: int) -> dict[str, Any]:
-    """Return the codecs of an array, chosen by measurement; each chunk ends with a checksum."""
-    from zarr.codecs import BloscCodec, Crc32cCodec, ZstdCodec
-
-    compressors = {
-        "zstd": ZstdCodec(level=level),
-        "repeats": BloscCodec(typesize=1, cname="lz4hc", clevel=5, shuffle="noshuffle"),
-        "columns": BloscCodec(typesize=3, cname="lz4hc", clevel=5, shuffle="shuffle"),
-        "exponents": BloscCodec(typesize=4, cname="lz4hc", clevel=1, shuffle="shuffle"),
-    }
-    return {"compressors": (compressors[layout.packing], Crc32cCodec())}
-
-
-def segments_of(ids: Sequence[str]) -> list[int]:
-    """Return the rows at which ids begin to ascend anew: 0, and those that updates added.
-
-    Examples
-    --------
-    >>> segments_of(["a", "d", "b", "c"])
-    [0, 2]
-    """
-    return [0, *(row for row, (one, other) in enumerate(pairwise(ids), 1) if one > other)]
-
-
-def root_attributes(
-    normalization: Normalization,
-    manifest: str,
-    build: Mapping[str, object],
-    contents: Contents,
-    ids: Sequence[str],
-) -> dict[str, Any]:
-    """Return the attributes of the store's root.
-
-    `build` holds the parameters and versions that made the content, so that
-    the store explains itself without its manifests; `ids` are those of its rows.
-    """
-    return {
-        "format": FORMAT,
-        "format_version": FORMAT_VERSION,
-        "resolution": RESOLUTION,
-        "material_classes": list(contents.classes),
-        "property_columns": [one.name for one in contents.properties],
-        "property_units": [one.unit for one in contents.properties],
-        "latents": asdict(contents.latents),
-        "normalization": normalization_attribute(normalization),
-        "manifest": manifest,
-        "build": dict(build),
-        "segments": segments_of(ids),
-    }
-
-
-def normalization_attribute(normalization: Normalization) -> dict[str, dict[str, object]]:
-    """Return ranges as the store's attributes and the records hold them."""
-    return {
-        r.name: {"log10": r.log10, "lo": r.lo, "hi": r.hi, "source": normalization.source}
-        for r in normalization.ranges
-    }

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from html import escape
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,16 +14,12 @@ from slatprep.errors import StoreError
 from slatprep.geometry.frames import places_of
 from slatprep.geometry.voxels import voxels_of
 from slatprep.normalize import denormalize_properties
-from slatprep.records import BACKGROUND, Contents, MaterialField, Normalization, Place
+from slatprep.records import BACKGROUND, MaterialField, Place
 from slatprep.storage.place import place_of, storage_of
-from slatprep.storage.versions import store_name
-from slatprep.store.assets import ASSET_COLUMNS, AssetTable
-from slatprep.store.attributes import RootAttributes, read_attributes, width_findings
+from slatprep.store.assets import ASSET_COLUMNS, AssetTable, AttributesError
+from slatprep.store.attributes import width_findings
 from slatprep.store.contract import MAX_VOXELS, read_metadata
 from slatprep.store.layout import FORMAT, MERGED_COLUMNS, READABLE_VERSIONS, arrays_with
-
-if TYPE_CHECKING:
-    import zarr
 
 TRAINING_COLUMNS = ("coords", "feats", "properties")
 """What `Store.read` reads unless told otherwise."""
@@ -140,10 +134,6 @@ class StoredAsset:
         )
 
 
-class AttributesError(StoreError):
-    """A store whose attributes do not say what readers rely on."""
-
-
 class Store(AssetTable):
     """A store opened for reading; `open_store` makes one.
 
@@ -163,94 +153,6 @@ class Store(AssetTable):
 
     def __iter__(self) -> Iterator[StoredAsset]:
         return (self.asset(asset_id) for asset_id in self.ids)
-
-    def __repr__(self) -> str:
-        try:
-            verdicts = Counter(str(verdict) for verdict in self._column("verdict"))
-            counts = ", ".join(f"{count:,} {verdict}" for verdict, count in verdicts.most_common())
-            what = f"{len(self):,} assets ({counts}), {self.offsets[-1]:,} voxels"
-        except StoreError as error:
-            what = f"cannot be read ({error})"
-        return f"<Store {self.path}: {what}>"
-
-    def _repr_html_(self) -> str:
-        """Return the store as a notebook shows it: a table of what it holds."""
-        try:
-            verdicts = Counter(str(verdict) for verdict in self._column("verdict"))
-            rows = {
-                "path": self.path,
-                "assets": f"{len(self):,}",
-                **{f"assets {verdict}": f"{n:,}" for verdict, n in verdicts.most_common()},
-                "categories": f"{len(set(map(str, self._column('category'))) - {''}):,}",
-                "voxels": f"{self.offsets[-1]:,}",
-                "ranges": self.normalization.source,
-                "build": self.about.manifest[:12],
-            }
-        except StoreError as error:
-            rows = {"path": self.path, "cannot be read": error}
-        cells = "".join(
-            f"<tr><th>{escape(name)}</th><td>{escape(str(value))}</td></tr>"
-            for name, value in rows.items()
-        )
-        return f"<table><caption>slatprep store</caption>{cells}</table>"
-
-    @property
-    def name(self) -> str:
-        """The last part of its path, or of its URL without the version."""
-        return store_name(self.path)
-
-    @cached_property
-    def about(self) -> RootAttributes:
-        """What its attributes say, typed.
-
-        Raises
-        ------
-        AttributesError
-            If they do not say what readers rely on; `open_store` has asked already.
-        """
-        found = read_attributes(self.attributes)
-        if isinstance(found, tuple):
-            raise AttributesError(f"{self.path}/{found[0]}; run `slatprep verify`")
-        return found
-
-    @property
-    def group(self) -> zarr.Group:
-        """The root as zarr-python has it, for everything this class does not offer.
-
-        Raises
-        ------
-        StoreError
-            If its metadata name anything that `slatprep.store.gate` does not allow.
-        """
-        return self._arrays.group
-
-    @property
-    def contents(self) -> Contents:
-        """The tables of its properties and classes, and what its latents are."""
-        return self.about.contents
-
-    def columns_of(self, names: Sequence[str]) -> list[int]:
-        """Return where properties stand among its columns.
-
-        Raises
-        ------
-        StoreError
-            If it does not have them all.
-        """
-        held = list(self.about.property_columns)
-        missing = [name for name in names if name not in held]
-        if missing:
-            lacking, there = " and no ".join(missing), ", ".join(held)
-            raise StoreError(
-                f"{self.path} has no {lacking}, only {there}; expected a store with "
-                f"{', '.join(names)}"
-            )
-        return [held.index(name) for name in names]
-
-    @property
-    def normalization(self) -> Normalization:
-        """The ranges that properties were normalised with."""
-        return self.about.ranges
 
     def read(
         self, index: int, columns: Sequence[str] = TRAINING_COLUMNS

@@ -16,13 +16,16 @@ from typing import Any
 
 from slatprep.parameters import StoreParameters
 from slatprep.records import PIXIEVERSE, Contents, Normalization, Place
+from slatprep.store.attributes import root_attributes
 from slatprep.store.coordinates import write_coordinates
 from slatprep.store.digests import write_digests
 from slatprep.store.layout import (
+    ASSET_CHUNK,
+    FIXED_SIZES,
     MERGED,
-    create_arrays,
+    ArrayLayout,
+    arrays_with,
     overlaps,
-    root_attributes,
     row_ranges,
     rows_per_shard,
 )
@@ -69,12 +72,70 @@ def create_store(
     contents: Contents = PIXIEVERSE,
     several: bool = False,
 ) -> None:
-    """Create an empty store with every array in place; see `create_arrays`."""
+    """Create a store with every array in place, empty.
+
+    Parameters
+    ----------
+    path : Path
+        The new store.
+    n_assets, n_voxels : int
+        A and N.
+    parameters : StoreParameters
+        Sizes of chunks and shards, and the compression level.
+    contents : Contents
+        How many properties and channels there are.
+    several : bool
+        Whether labels are merged of several annotations.
+    """
     import zarr
 
     root = zarr.create_group(path, zarr_format=3)
-    create_arrays(root, n_assets, n_voxels, parameters, contents, several)
+    sizes = {
+        "asset": n_assets,
+        "asset_edge": n_assets + 1,
+        "voxel": n_voxels,
+        "property": len(contents.properties),
+        "latent": contents.latents.channels,
+        **FIXED_SIZES,
+    }
+    chunk_and_shard = {
+        "asset": (ASSET_CHUNK, None),
+        "voxel": (parameters.voxel_chunk, rows_per_shard(parameters)),
+        "grid": (1, parameters.grid_assets_per_shard),
+    }
+    for layout in arrays_with(several):
+        shape = tuple(sizes[dimension] for dimension in layout.dimensions)
+        chunk, shard = chunk_and_shard[layout.name.partition("/")[0]]
+        if shard is None:
+            chunk = min(chunk, shape[0])
+        attributes: dict[str, Any] = {"description": layout.description}
+        if layout.unit:
+            attributes["units"] = layout.unit
+        root.create_array(
+            layout.name,
+            shape=shape,
+            dtype=str if layout.dtype == "str" else layout.dtype,
+            chunks=(chunk, *shape[1:]),
+            shards=None if shard is None else (shard, *shape[1:]),
+            **_codecs(layout, parameters.compression_level),
+            fill_value=layout.fill_value,
+            dimension_names=layout.dimensions,
+            attributes=attributes,
+        )
     create_record_array(root, n_assets, parameters.compression_level)
+
+
+def _codecs(layout: ArrayLayout, level: int) -> dict[str, Any]:
+    """Return the codecs of an array, chosen by measurement; each chunk ends with a checksum."""
+    from zarr.codecs import BloscCodec, Crc32cCodec, ZstdCodec
+
+    compressors = {
+        "zstd": ZstdCodec(level=level),
+        "repeats": BloscCodec(typesize=1, cname="lz4hc", clevel=5, shuffle="noshuffle"),
+        "columns": BloscCodec(typesize=3, cname="lz4hc", clevel=5, shuffle="shuffle"),
+        "exponents": BloscCodec(typesize=4, cname="lz4hc", clevel=1, shuffle="shuffle"),
+    }
+    return {"compressors": (compressors[layout.packing], Crc32cCodec())}
 
 
 def merges(path: Place) -> bool:

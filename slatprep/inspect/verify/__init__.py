@@ -17,9 +17,10 @@ from slatprep.inspect.verify.manifests import manifest_findings, source_roots
 from slatprep.provenance.places import manifests_beside
 from slatprep.records import Place, SourceRoots
 from slatprep.storage.place import place_of, storage_of
+from slatprep.store.assets import AttributesError
 from slatprep.store.contract import Finding, read_metadata
 from slatprep.store.integrity import file_findings, metadata_findings
-from slatprep.store.reader import AttributesError, Store, open_store
+from slatprep.store.reader import Store, open_store
 from slatprep.workers import Progress
 from slatprep.workers.local import Jobs, require_shared, run_unordered
 

@@ -10,7 +10,7 @@ import orjson
 
 from slatprep.errors import StoreError
 from slatprep.inspect.verify.assets import fault_findings
-from slatprep.pipeline.join import APART, NO_ROOT
+from slatprep.pipeline.rewrite import APART, NO_ROOT
 from slatprep.provenance.files import ASSETS, BUILD, build_in, build_text, lines_in
 from slatprep.provenance.record import AssetRecord, Record
 from slatprep.provenance.record_json import (
