@@ -199,7 +199,7 @@ def change_ranges(values: ArrayLike, old: Normalization, new: Normalization) -> 
 
 
 def normalize_mapped(mapped: ArrayLike, normalization: Normalization) -> NDArray[np.float64]:
-    """Normalise mapped properties (N, 3); nothing is clipped."""
+    """Normalise mapped properties (N, P); nothing is clipped."""
     lo, hi = np.array([[one.lo, one.hi] for one in normalization.ranges]).T
     normalized: NDArray[np.float64] = 2.0 * (np.asarray(mapped) - lo) / (hi - lo) - 1.0
     return normalized

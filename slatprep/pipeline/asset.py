@@ -1,4 +1,4 @@
-"""The way of one asset: from its two source files to annotated SLAT voxels.
+"""One asset: from its two source files to annotated SLAT voxels.
 
 `process_asset` is the method, stage by stage. `finish_asset` is the task a
 worker gets: it does that, or uses what was done before, leaves the result in
@@ -109,7 +109,7 @@ def finish_asset(
 
 
 def fail_asset(pair: AssetPair, planned: PlannedAsset | None, context: BuildContext) -> FailedAsset:
-    """Note an asset that twice cost the worker its life, the second time alone."""
+    """Record as failed an asset that killed its worker twice, the second time alone in it."""
     reason = "its worker process was killed twice, probably because memory ran out"
     if context.strict:
         raise SlatprepError(f"{pair.asset_id}: {reason}")

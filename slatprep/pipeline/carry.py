@@ -1,4 +1,4 @@
-"""What of the store that is there goes into the next as it is: assets, shards, chunks.
+"""What a new store takes over unchanged from the existing one: assets, shards, chunks.
 
 An update keeps the order of the rows. What did not change stays where it is, what
 changed takes the place of what it was, and what is new comes behind, by id. So shards
@@ -34,7 +34,7 @@ from slatprep.store.unmoved import Unmoved, unmoved
 
 @dataclass(frozen=True, slots=True, eq=False)
 class KeptAsset:
-    """An asset whose rows are taken from the store that is there.
+    """An asset whose rows are taken from the existing store.
 
     Attributes
     ----------
@@ -94,7 +94,7 @@ def kept_assets(
     Parameters
     ----------
     unchanged : sequence of AssetPair
-        Those whose alignment is in the store that is there.
+        Those whose alignment is in the existing store.
     plan : mapping of str to PlannedAsset
         What is to be done by id.
     made : sequence of SpooledAsset
@@ -139,7 +139,7 @@ def kept_assets(
 
 
 def in_order(assets: Sequence[Row], previous: PreviousBuild | None, compact: bool) -> list[Row]:
-    """Return assets in the order of rows: by id, or as in the store that is there, new ones last.
+    """Return assets in the order of rows: by id, or as in the existing store, new ones last.
 
     Where so many are new that packing all rows again costs no more than they do, it is by id.
 
@@ -163,12 +163,12 @@ def in_order(assets: Sequence[Row], previous: PreviousBuild | None, compact: boo
 
 
 class Carried:
-    """What a new store takes from the one that is there.
+    """What a new store takes over from the existing one.
 
     Parameters
     ----------
     previous : PreviousBuild
-        The store that is there, every file of which has been compared with its digest.
+        The existing store, every file of which has been compared with its digest.
     assets : sequence of SpooledAsset or KeptAsset
         Those of the new store, by row.
 

@@ -1,6 +1,6 @@
 """Build a store: every asset of a dataset, brought to one scale and packed.
 
-`slatprep.pipeline.asset` is the way of one asset; `build_store` runs it over a
+`slatprep.pipeline.asset` processes one asset; `build_store` runs it over a
 dataset, for what is new or changed, and replaces the store in one step.
 """
 
@@ -67,7 +67,7 @@ def build_store(
     parameters : BuildParameters
         Sources and methods.
     out : str or Place
-        The store, a path or URL. One that is there is replaced, in one step, when the new
+        The store, a path or URL. An existing one is replaced, in one step, when the new
         one is finished; assets that did not change are not aligned again.
     manifests : str or Path, optional
         Directory of ``assets.jsonl`` and ``build.json``; by default beside the

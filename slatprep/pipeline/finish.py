@@ -1,4 +1,4 @@
-"""Bring assets into the spool: each by one worker, with the user told how far it is."""
+"""Bring assets into the spool, each by one worker; progress is reported."""
 
 from __future__ import annotations
 

@@ -41,7 +41,7 @@ def subset_store(
     store : str or Place
         The store to choose from; it stays as it is.
     out : str or Place
-        The new store, a path or URL; one that is there is replaced in one step.
+        The new store, a path or URL; an existing one is replaced in one step.
     assets : iterable of str
         Ids, or beginnings of ids that no other has.
     manifests : str or Path, optional

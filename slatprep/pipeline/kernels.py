@@ -21,7 +21,7 @@ from slatprep.sample import sample
 
 
 def compile_kernels(note: Callable[[str], None] | None = None) -> None:
-    """Have all kernels of alignment, sampling and judgement on disk, compiled.
+    """Compile all kernels of alignment, sampling and judgement, and keep them on disk.
 
     Parameters
     ----------

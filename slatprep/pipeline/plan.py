@@ -61,7 +61,7 @@ class PlannedAsset:
         Id of the row.
     action : Action
         ``align``: from its sources to the spool. ``reuse``: its alignment is
-        in the store that is there. ``resume``: an interrupted build finished
+        in the existing store. ``resume``: an interrupted build finished
         it. ``refuse``: it cannot go in. ``remove``: it is in the store but no
         longer in the dataset.
     reason : str
@@ -90,7 +90,7 @@ class BuildPlan:
     assets : tuple of PlannedAsset
         Sorted by id.
     damaged : tuple of str
-        What of the store that is there is not as it was written, and will be made anew.
+        What of the existing store is not as it was written, and will be made anew.
     """
 
     store: Place

@@ -1,4 +1,4 @@
-"""Publish a build: its store where it belongs, its records within it and beside it.
+"""Publish a build: put its store in place, with its records within it and beside it.
 
 The store and its records are replaced in one step, because the records are an
 array of it. The files beside it are copies; a build that was killed before it
@@ -104,7 +104,7 @@ class Destination:
             self._upload.publish()
 
     def records(self, version: Place | None = None) -> Place:
-        """Return the file of asset records, of the new store or of a version that is there."""
+        """Return the file of asset records, of the new store or of the existing version."""
         if self._upload is not None:
             version = self._upload.version
         beside = self.out if self._remote is None or version is None else version
@@ -135,7 +135,7 @@ def _require_records(folder: Path, store: Path | None) -> None:
     if store is not None and folder.resolve().is_relative_to(store):
         raise StoreError(f"{folder}: lies in the store; expected a folder outside of it")
     there = [name for name in _MARKS if os.path.lexists(folder / name)]
-    # One that is damaged is known by the other.
+    # Where one file is damaged, the other identifies the folder.
     if there and not any(_is_marked(folder / name, _MARKS[name]) for name in there):
         raise StoreError(
             f"{folder}: holds a {there[0]} that is not slatprep's; expected the records of a "
@@ -166,7 +166,7 @@ def write_all_records(
         The file.
     records : iterable of (int, Record or bytes)
         Rows and records, by asset id; rows of assets that do not go in are negative. A
-        record that the store that is there has may be given as its text.
+        record that the existing store has may be given as its text.
     taken : frozenset of int
         Shards of records that the new store has already.
     """

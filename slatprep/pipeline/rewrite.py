@@ -1,4 +1,4 @@
-"""A store written of rows of others, with their records, and nothing aligned again."""
+"""Write a store of rows of other stores, with their records; nothing is aligned again."""
 
 from __future__ import annotations
 
@@ -35,8 +35,7 @@ from slatprep.store.writer import create_store, finish_store, merges, shards
 from slatprep.workers import Progress
 
 NO_ROOT, APART = "unknown", " | "
-"""What a build's record says of sources that no record told of, and what stands between the
-roots of sources that lie apart."""
+"""The root that a build's record gives for unknown sources, and what separates several roots."""
 
 NO_EXTENT = np.empty((0, 2))
 

@@ -1,4 +1,4 @@
-"""Settle the rows of the next store: which assets, in which order, placed and made how."""
+"""Settle the rows of the next store: which assets, in which order, aligned or taken over."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class Rows:
     contents : Contents
         What the store holds.
     carried : Carried or None
-        What is taken from the store that is there.
+        What is taken from the existing store.
     keys : dict of str to str
         What each asset was made from and how, by id, before passes over the whole dataset.
     """
@@ -65,7 +65,7 @@ def settle_rows(
     new : sequence of SpooledAsset or FailedAsset
         The assets that are new or changed, finished.
     unchanged : sequence of AssetPair
-        Those whose alignment is in the store that is there.
+        Those whose alignment is in the existing store.
     plan : mapping of str to PlannedAsset
         What is to be done by id.
     crew : Crew

@@ -115,7 +115,7 @@ def read_seen(folder: Path | None, bound: bytes) -> Seen:
     folder : Path or None
         Of its records.
     bound : bytes
-        What `bound_to` gives for the store that is there.
+        What `bound_to` gives for the existing store.
     """
     if folder is None:
         return Seen()
@@ -141,7 +141,7 @@ def write_seen(
 ) -> None:
     """Note what a build saw and found of each asset in its store, by id.
 
-    The file is written in place: half of one is known by its digest, and costs
+    The file is written in place: half of one is noticed by its digest, and costs
     the next build some hashing. So does a disk that does not take it.
     """
     first = next(iter(found.values()))

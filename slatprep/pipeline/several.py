@@ -1,4 +1,4 @@
-"""The way of an asset that has several annotations: each by itself, then merged."""
+"""An asset that has several annotations: each is aligned by itself, then they are merged."""
 
 from __future__ import annotations
 

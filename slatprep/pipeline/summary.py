@@ -53,7 +53,7 @@ class BuildSummary:
     warnings : tuple of str
         What a person should know about the dataset as a whole.
     damaged : tuple of str
-        What of the store that was there was not as it was written, and was made anew.
+        What of the existing store was not as it was written, and was made anew.
     """
 
     records: Place

@@ -1,4 +1,4 @@
-"""Whether the store that is there is the one that a build would write."""
+"""Whether the existing store is already the one that a build would write."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ class Wanted:
     ranges : Normalization or str
         Ranges that do not depend on the dataset, or where those of the dataset come from.
     compact : bool
-        Rows by id, whatever the order of the store that is there.
+        Rows by id, whatever the order of the existing store.
     declared : Contents
         What the sources hold.
     """
@@ -125,7 +125,7 @@ class Update:
     scratch : Path
         A folder of this build alone, where it writes.
     damaged : tuple of str
-        What of the store that is there is not as it was written.
+        What of the existing store is not as it was written.
     """
 
     pairs: Sequence[AssetPair]
@@ -293,7 +293,7 @@ def _found_before(keys: Mapping[str, str], previous: PreviousBuild, seen: Seen) 
 def _all_records(
     others: Sequence[SpooledAsset | FailedAsset], previous: PreviousBuild, context: BuildContext
 ) -> Iterator[Record | bytes]:
-    """Yield the records of the store that is there and of the assets that cannot go in, by id."""
+    """Yield the records of the existing store and of the assets that cannot go in, by id."""
     rows: list[tuple[str, int | str]] = [(a, row) for row, a in enumerate(previous.store.ids)]
     rows += [(asset.asset_id, asset.key) for asset in others]
     for _, at in sorted(rows, key=lambda row: row[0]):

@@ -248,7 +248,7 @@ def _claim(directory: Path) -> None:
     directory.parent.mkdir(parents=True, exist_ok=True)
     with suppress(FileExistsError):
         directory.mkdir(mode=0o700)
-    # Not by our number: a network file system may give our files to another user.
+    # Not by our user id: on a network file system our files may have another owner.
     with tempfile.TemporaryDirectory(dir=directory.parent) as ours:
         owner = Path(ours).stat().st_uid
     try:

@@ -1,4 +1,4 @@
-"""The door through which sources and latents of any form come in.
+"""Adapters: how sources and latents of any form are found and read.
 
 A *source adapter* finds the fields below a root, reads one, and describes what
 all of them hold; a *latent adapter* reads one SLAT and describes the space of

@@ -218,7 +218,7 @@ def _load_hierarchy(path: Place, root: Place, role: str) -> tuple[bytes, SourceF
             if size > MAX_FILE_BYTES:
                 raise InputError(path, f"is larger than {MAX_FILE_BYTES >> 20} MiB", "one asset")
             member = zipfile.ZipInfo(name)
-            member.create_system = 3  # Of itself that of the machine; the hash must not tell it.
+            member.create_system = 3  # Else the machine's, and the hash would depend on it.
             archive.writestr(member, data)
     whole = packed.getvalue()
     below = source.path.removesuffix(f"/{name}")

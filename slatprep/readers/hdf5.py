@@ -1,4 +1,4 @@
-"""Safe reading of HDF5: nothing outside the file, nothing before its size is known.
+"""Safe reading of HDF5: no link out of the file is followed, and no size is taken on trust.
 
 An HDF5 file can point elsewhere in several ways: soft and external links,
 virtual datasets, external raw storage. All are refused, as are filters other
@@ -206,7 +206,7 @@ def _read_dataset(dataset: h5py.Dataset, where: str, spec: ArraySpec) -> NDArray
     stored = dataset.id.get_storage_size()
     wanted = math.prod(dataset.shape) * dataset.dtype.itemsize
     if stored != wanted:
-        # HDF5 would fill in zeros, which are values as good as any.
+        # HDF5 reads missing chunks as zeros, which would pass as values.
         raise InputError(where, f"holds {stored} of {wanted} bytes", _WRITTEN)
     array: NDArray[Any] = dataset[()]
     return array.astype(array.dtype.newbyteorder("="), copy=False)

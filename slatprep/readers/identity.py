@@ -1,4 +1,4 @@
-"""What the sources of an asset are, by content, without parsing what need not be parsed."""
+"""Digests of an asset's sources, parsed only where one file holds several assets."""
 
 from __future__ import annotations
 
@@ -77,7 +77,7 @@ def _hash_annotation(pair: AssetPair, grid: Place) -> list[SourceFile]:
     files = [(grid, "grid")] + ([(pair.mask, "mask")] if pair.mask else [])
     sources = [load_source(path, root, role)[1] for path, role in files]
     if pair.bounds:
-        with suppress(InputError):  # The supervision does without, and so does the reader.
+        with suppress(InputError):  # Not needed: the reader goes on without it, too.
             sources.append(load_source(pair.bounds, root, "bounds")[1])
     for path, role in ((pair.beside, "description"), (pair.transform, "transform")):
         if path:

@@ -72,7 +72,7 @@ def find_files(
     Yields
     ------
     Found
-        What is there besides folders, be it a link to nothing: whoever reads
+        What is there besides folders, even a broken link: whoever reads
         it will say so. Names are not checked against `NAME`. In no particular order.
 
     Raises

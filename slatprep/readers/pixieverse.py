@@ -232,7 +232,7 @@ def read_prediction(
 
 
 def _read_mask(values: NDArray[Any], path: Place, warnings: list[str]) -> NDArray[np.bool_]:
-    bad = ~((values >= 0) & (values <= 1))  # NaN is bad as well
+    bad = ~((values >= 0) & (values <= 1))  # written so that NaN is bad, too
     if bad.any():
         voxel = _first(bad)
         raise InputError(

@@ -129,7 +129,7 @@ def _each_group(
 
 
 def ordered(slats: Iterable[NamedSlat]) -> tuple[NamedSlat, ...]:
-    """Return SLATs in an order that no file system decides."""
+    """Return SLATs in an order that does not depend on the file system."""
     return tuple(sorted(slats, key=lambda slat: (slat.path, slat.group, slat.slat_id)))
 
 

@@ -122,7 +122,7 @@ class LatentSpace:
             raise ValueError(f"a mean and a std above 0 for each of {self.channels} channels")
 
     def standardise(self, feats: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Return latents (N, channels) with mean 0 and standard deviation 1; never done twice."""
+        """Return latents (N, channels) with mean 0 and standard deviation 1; done once."""
         if self.standardised:
             return feats
         mean, std = np.array(self.mean, np.float32), np.array(self.std, np.float32)

@@ -1,4 +1,4 @@
-"""The words and constants that all records share: classes, columns, engines, verdicts."""
+"""The words and constants that all records share: classes, colours, engines, verdicts."""
 
 from __future__ import annotations
 

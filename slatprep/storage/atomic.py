@@ -148,7 +148,7 @@ def staged_apart(path: Path, folder: Path) -> Iterator[Path]:
 
 
 def _user() -> int:
-    """Return our number; on Windows 0, as files have there."""
+    """Return the user id of this process; on Windows 0, the owner that files have there."""
     return getattr(os, "geteuid", int)()
 
 

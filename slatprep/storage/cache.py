@@ -26,7 +26,7 @@ def cache_folder() -> Path:
 
 
 def folder_for(place: RemotePlace) -> Path:
-    """Return the part of the folder that belongs to a place, named so that people see whose."""
+    """Return the part of the folder that belongs to a place, by a name that tells which."""
     return cache_folder() / f"{place.name}-{_short(str(place))}"
 
 

@@ -1,4 +1,4 @@
-"""A seam at which tests stop, kill or starve a build.
+"""A seam at which tests stop or kill a build, or make it fail.
 
 Each step of a build calls `reached` with its name, and with the asset or file
 that it concerns. Where the environment variable ``SLATPREP_FAULTS`` is

@@ -45,7 +45,7 @@ class Listing:
         return (self._scan(folder) if folder else self._top)[folders]
 
     def is_file(self, path: str) -> bool:
-        """Whether there is anything of this name but a folder, be it a link to nothing."""
+        """Whether this name is anything but a folder, even a broken link."""
         full = os.path.join(self._root, path)  # noqa: PTH118 - half a million times
         try:
             return not stat.S_ISDIR(os.stat(full).st_mode)  # noqa: PTH116

@@ -1,4 +1,4 @@
-"""A lock on what one process writes at a time, which its holder's end releases however it comes."""
+"""A lock on what one process writes at a time; it is released however its holder ends."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _TRIES = 100
 
 
 def take_lock(path: Path, taken: str) -> int:
-    """Return a descriptor that holds a lock until it is closed, if only by a kill.
+    """Return a descriptor that holds a lock until it is closed or the process ends.
 
     Parameters
     ----------

@@ -169,7 +169,7 @@ class Storage:
             return file.pread(min(file.size(), limit + 1), 0)
 
     def open_scattered(self) -> IO[bytes]:
-        """Open a file to read it here and there; of an object store it is fetched whole, at once.
+        """Open a file for random access; an object is fetched whole, at once.
 
         Raises
         ------

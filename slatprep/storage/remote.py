@@ -3,7 +3,7 @@
 A `RemotePlace` has the few methods of `slatprep.records.Place` and no others.
 Nothing can be changed at one but by `RemotePlace.upload`, `put_objects` and `remove_objects`.
 
-Credentials and endpoints are the libraries' own matter: those of S3, for
+Credentials and endpoints are left to the libraries: those of S3, for
 instance, come from ``AWS_*`` variables or ``~/.aws``.
 """
 

@@ -1,7 +1,7 @@
 """Put a finished store on an object store: upload all of it, then publish it in one step.
 
-Nobody reads what the pointer does not name, so an upload that ends midway
-harms nothing. The pointer is replaced only if it is the one that was there
+Readers read only what the pointer names, so an upload that ends midway
+does no harm. The pointer is replaced only if it is still the one that was read
 when the build began: on S3 the server itself compares them.
 
 A version's name comes from its content and from the pointer it is to replace.
@@ -69,7 +69,7 @@ class Staged:
 
 @dataclass(frozen=True)
 class PublishedState:
-    """The pointer that was there when a build began.
+    """The pointer as it was when a build began.
 
     Attributes
     ----------
@@ -188,7 +188,7 @@ class Upload:
             if now == self.before.pointer:
                 raise
         now = read_pointer(self.target)
-        # Ours, if the server's first answer was lost; or another build made the same.
+        # Ours, if the server's first answer was lost; or another build published the same content.
         if now is None or now.version != self.pointer.version:
             raise StoreError(
                 f"{self.target}: another build replaced it while this one ran (at "

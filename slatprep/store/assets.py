@@ -219,7 +219,7 @@ class AssetTable:
             If there is none, or several begin so; the message names them.
         """
         if name in self._index:
-            return self._index[name]  # Going through all assets must not go through all ids each.
+            return self._index[name]  # A loop over all assets must not search all ids each time.
         alike = [known for known in self.ids if known.startswith(name)] if name else []
         if not alike:
             return self.find(name)

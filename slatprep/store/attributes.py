@@ -1,4 +1,4 @@
-"""What the attributes of a store's root say, as typed values; nothing is computed with others."""
+"""What the attributes of a store's root say, as typed values; no others are used."""
 
 from __future__ import annotations
 
@@ -182,7 +182,7 @@ def root_attributes(
     """Return the attributes of the store's root.
 
     `build` holds the parameters and versions that made the content, so that
-    the store explains itself without its manifests; `ids` are those of its rows.
+    a store is understood without its manifests; `ids` are those of its rows.
     """
     return {
         "format": FORMAT,
@@ -210,7 +210,7 @@ def _shown(fault: Mapping[str, Any]) -> str:
 
 
 def _without_news(attributes: Mapping[str, Any]) -> dict[str, Any]:
-    """Leave out parameters of looking up that only newer versions know."""
+    """Leave out parameters of the lookup that only newer versions know."""
     document: dict[str, Any] = orjson.loads(orjson.dumps(attributes))
     at: Any = document
     for key in ("build", "parameters", "sample"):

@@ -37,7 +37,7 @@ DEFINING = ("asset/id", "voxel/coords", "voxel/feats", "voxel/properties")
 
 MIN_ASSET_BYTES = 256
 """No asset takes less of a store's files: its record alone, packed, has more. By this the number
-of assets that a store claims is held against the bytes that are there."""
+of assets that a store claims is held against the bytes of its files."""
 
 _MAX_CHUNK_ROWS = {"asset": ASSET_CHUNK, "voxel": MAX_VOXEL_CHUNK, "grid": 16, GROUP: MAX_FILES}
 _MAX_SHARD_ROWS = {

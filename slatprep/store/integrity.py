@@ -119,7 +119,7 @@ def _compared(
     if not isinstance(jobs, int):
         yield from run_unordered(_compare, tasks, jobs)
         return
-    # Hashing lets go of the interpreter, and a process would take longer to start.
+    # Hashing releases the interpreter lock, and a process would take longer to start.
     with ThreadPoolExecutor(jobs) as pool:
         yield from pool.map(lambda task: _compare(*task), tasks)
 

@@ -246,11 +246,11 @@ MERGED = (
         since=2,
     ),
 )
-"""What a store has besides where labels of any asset are merged of several annotations."""
+"""Further arrays of a store in which labels of any asset are merged of several annotations."""
 
 
 MERGED_COLUMNS = tuple(layout.name.removeprefix("voxel/") for layout in MERGED)
-"""Their last names."""
+"""Last names of the arrays of `MERGED`."""
 
 
 def arrays_with(merged: bool) -> tuple[ArrayLayout, ...]:

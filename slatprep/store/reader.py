@@ -274,7 +274,7 @@ def open_store(path: str | Place, *, copy: bool = False) -> Store:
             "Use the slatprep that wrote it, or a newer one"
         )
     store = Store(path, document)
-    # Refused here, and not halfway through a command.
+    # Refused when opened, not halfway through a command.
     gathered = document.get("consolidated_metadata")
     metadata = gathered.get("metadata") if isinstance(gathered, dict) else None
     for finding in width_findings(store.about, metadata if isinstance(metadata, dict) else {}):

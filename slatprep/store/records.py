@@ -1,4 +1,4 @@
-"""The records inside the store: each row's provenance travels with the row.
+"""The records inside the store: the provenance of each row is stored with it.
 
 ``asset/record`` holds, as JSON, what ``assets.jsonl`` says of each asset in
 the store, save how long it took, which is not the same in two builds. It is

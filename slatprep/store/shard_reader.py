@@ -288,7 +288,7 @@ class RowReader:
             raise self._damaged(number, "is missing (was the store replaced?)") from None
         except OSError as error:
             raise self._damaged(number, f"cannot be read ({error.strerror})") from None
-        # Two threads may both have opened it; whichever is kept is as good.
+        # Two threads may both have opened it; either may be kept.
         self._shards[number] = shard
         for oldest in list(self._shards)[:-OPEN_SHARDS]:
             self._shards.pop(oldest, None)

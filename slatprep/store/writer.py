@@ -1,8 +1,8 @@
 """Write the store: one task a shard, each shard by exactly one task.
 
 Two writers of one shard lose data, because a shard is rewritten as a whole.
-So `shards` cuts the store into tasks that share none, and `write_shard` does
-one; what is small the parent writes itself.
+So `shards` cuts the store into tasks that share none, which
+`slatprep.pipeline.pack` runs; small arrays are written by the parent.
 """
 
 from __future__ import annotations
@@ -46,13 +46,13 @@ class Shard:
     first : int
         Index of the first asset that has rows in it.
     keys : sequence of str or int
-        Of the assets that have rows in it: keys in the spool, or rows in the store
-        that is there.
+        Of the assets that have rows in it: keys in the spool, or rows in the
+        existing store.
     offsets : sequence of int
         ``voxel`` alone: first row of each of them in the store, and the last
         one's end.
     pieces : sequence of Piece
-        Its rows, and which of them the store that is there has at the same place; empty
+        Its rows, and which of them the existing store has at the same place; empty
         where none may be.
     """
 
@@ -151,7 +151,7 @@ def shards(
 ) -> Iterator[Shard]:
     """Yield every shard of a store whose assets, by key, begin at rows `offsets`.
 
-    `same` has, by group, the rows that are the same in the store that is there;
+    `same` has, by group, the rows that are the same in the existing store;
     shards that are the same as a whole are left out.
     """
     of_voxels, of_grids = (
