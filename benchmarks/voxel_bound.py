@@ -19,8 +19,8 @@ import numpy as np
 
 from slatprep.demo.latents import NOISE, clean_latents
 from slatprep.learn.dataset import Item, SlatDataset
-from slatprep.learn.splits import Shares
 from slatprep.normalize import denormalize_properties
+from slatprep.readers.splits import Shares
 
 
 def main() -> None:

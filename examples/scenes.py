@@ -27,8 +27,9 @@ from PIL import Image
 
 from slatprep.errors import SlatprepError
 from slatprep.normalize import PIXIE_RANGES
+from slatprep.particles.fields import VoxelField, predicted_field, stored_field
 from slatprep.particles.simulate import simulate
-from slatprep.particles.transfer import VoxelField, predicted_field, stored_field, transfer
+from slatprep.particles.transfer import transfer
 from slatprep.readers.ranges import read_ranges
 from slatprep.records import MATERIAL_CLASSES, MATERIAL_COLOURS
 from slatprep.store import open_store

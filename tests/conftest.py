@@ -7,10 +7,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from hypothesis import HealthCheck, settings
 from support.deformed import add_deformed
 from support.synthetic import Dataset, make_asset
 
 from slatprep.pipeline.dataset import BuildSummary, build_store
+
+# Tests must pass however busy the machine is.
+settings.register_profile("untimed", deadline=None, suppress_health_check=[HealthCheck.too_slow])
+settings.load_profile("untimed")
 
 
 @pytest.fixture

@@ -35,7 +35,7 @@ _LISTED = 10
 @click.argument("predictions", required=False, type=click.Path(path_type=Path, exists=True))
 @option("--store", EXISTING_FOLDER, required=True, metavar="STORE.zarr")
 @option("--grids", multiple=True, metavar="[NAME=]DIR")
-@option("--split", ChoiceOf("slatprep.learn.splits:SPLITS", "all"), "test")
+@option("--split", ChoiceOf("slatprep.readers.splits:SPLITS", "all"), "test")
 @split_options
 @option("--spread", ChoiceOf("slatprep.learn.metrics:SPREADS"), "se")
 @option("--csv", NEW_FILE, name="csv_file")
@@ -86,10 +86,7 @@ def evaluate(
     slatprep evaluate predictions --store data/demo.zarr --grids Pixie=results --picture m.png
     """
     from slatprep.learn.metrics import SPREADS, evaluate_store
-    from slatprep.learn.predictions import RUN_FILE, selection_of_run
     from slatprep.learn.published import TABLES, read_scores
-    from slatprep.learn.splits import assign_store
-    from slatprep.store import open_store
 
     if predictions is None and not grids:
         raise click.UsageError("nothing to measure; give PREDICTIONS, --grids, or both")
@@ -99,19 +96,8 @@ def evaluate(
     others = {
         name: TABLES[name][1] if name in TABLES else read_scores(Path(name)) for name in beside
     }
-    rule = split_rule(split_by, shares)
-    how, is_given = f"by {rule['by']}", split_by is not None or shares is not None
-    selection = None
-    if predictions is not None and not is_given:
-        selection = selection_of_run(predictions)
-    if predictions is not None and selection is not None:
-        rule |= {name: selection.pop(name) for name in ("by", "shares") if name in selection}
-        how = f"as {predictions.absolute().parent / RUN_FILE} says"
-    elif not is_given:
-        how += ", as no run lies beside the predictions (others: --split-by, --split all)"
-    assignment = assign_store(open_store(store), **rule)
-    note_split(output, assignment, f"{split}, {how}")
-    chosen: dict[str, Any] = {"splits": assignment.splits, "spread": spread, **(selection or {})}
+    chosen = _selection(output, predictions, store, split, split_by, shares)
+    chosen["spread"] = spread
     part = None if split == "all" else split
     result: Evaluation | Comparison
     if grids:
@@ -164,6 +150,34 @@ def evaluate(
     if beside:
         document["beside"] = [score for scores in others.values() for score in scores]
     output.result(document, show, complete=not problems)
+
+
+def _selection(
+    output: Output,
+    predictions: Path | None,
+    store: Place,
+    split: str,
+    split_by: str | None,
+    shares: str | None,
+) -> dict[str, Any]:
+    """Return the split of each object and which assets count, by the options or else by a run."""
+    from slatprep.learn.predictions import RUN_FILE, selection_of_run
+    from slatprep.learn.splits import assign_store
+    from slatprep.store import open_store
+
+    rule = split_rule(split_by, shares)
+    how, is_given = f"by {rule['by']}", split_by is not None or shares is not None
+    selection: dict[str, Any] | None = None
+    if predictions is not None and not is_given:
+        selection = selection_of_run(predictions)
+    if predictions is not None and selection is not None:
+        rule |= {name: selection.pop(name) for name in ("by", "shares") if name in selection}
+        how = f"as {predictions.absolute().parent / RUN_FILE} says"
+    elif not is_given:
+        how += ", as no run lies beside the predictions (others: --split-by, --split all)"
+    assignment = assign_store(open_store(store), **rule)
+    note_split(output, assignment, f"{split}, {how}")
+    return {"splits": assignment.splits, **(selection or {})}
 
 
 def _folders(grids: tuple[str, ...]) -> dict[str, Path]:

@@ -37,7 +37,7 @@ _ONLY_FOR = {"points": "ply", "frame": "ply", "shard_size": "webdataset", "laten
 @option("--out", click.Path(path_type=Path), required=True, metavar="PATH")
 @option("--asset", name="assets", multiple=True, metavar="ID", shell_complete=complete_asset)
 @verdicts_option
-@option("--split", ChoiceOf("slatprep.learn.splits:SPLITS", "all"), "all")
+@option("--split", ChoiceOf("slatprep.readers.splits:SPLITS", "all"), "all")
 @split_options
 @option("--points", ChoiceOf("slatprep.export.formats:Points"))
 @option("--frame", ChoiceOf("slatprep.export.formats:Frame"))

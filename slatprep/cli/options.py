@@ -20,8 +20,8 @@ from slatprep.cli.output import OUTPUT_OPTIONS, Output, with_output
 from slatprep.storage.place import place_of, storage_of
 
 if TYPE_CHECKING:
-    from slatprep.learn.splits import Assignment, Shares
     from slatprep.parameters import BuildParameters
+    from slatprep.readers.splits import Assignment, Shares
     from slatprep.records import Place
     from slatprep.store import Store
 
@@ -352,7 +352,7 @@ def split_options(command: _Function) -> _Function:
 
 def split_rule(split_by: str | None, shares: str | None) -> dict[str, Any]:
     """Return ``by`` and ``shares`` for `slatprep.learn.splits.assign_store`."""
-    from slatprep.learn.splits import HASH, Shares
+    from slatprep.readers.splits import HASH, Shares
 
     return {
         "by": HASH if split_by is None else split_by,
@@ -373,7 +373,7 @@ def note_split(output: Output, assignment: Assignment, how: str) -> None:
 
 
 def _shares(text: str) -> Shares:
-    from slatprep.learn.splits import Shares
+    from slatprep.readers.splits import Shares
 
     try:
         train, val, test = (float(part) for part in text.split(","))

@@ -156,13 +156,15 @@ def _write_gaussians(output: Output, image: _Image, out: Path, path: Path) -> No
     """Decode an image's latents to Gaussians, and give each the material of its voxel."""
     from slatprep.extract import decode_gaussians
     from slatprep.particles import transfer as work
+    from slatprep.particles.fields import predicted_field
+    from slatprep.particles.read import read_particles
     from slatprep.readers import read_slat
     from slatprep.storage.names import file_name
 
     plain = out / "gaussians.ply"
     decode_gaussians(image.session, read_slat(image.latents, image.latents.parent), plain)
-    field = work.predicted_field(out / f"{file_name(image.latents.stem)}.npz", None)
-    particles = work.read_particles(plain, "trellis")
+    field = predicted_field(out / f"{file_name(image.latents.stem)}.npz", None)
+    particles = read_particles(plain, "trellis")
     result = work.transfer(particles.in_slat(), field)
     if result.far:
         output.note(f"{result.far:,} of {len(result.rows):,} Gaussians have no voxel: background")

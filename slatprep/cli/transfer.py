@@ -20,7 +20,7 @@ from slatprep.cli.output import Output
 from slatprep.errors import ConfigError
 
 if TYPE_CHECKING:
-    from slatprep.particles.transfer import VoxelField
+    from slatprep.particles.fields import VoxelField
     from slatprep.records import Place
 
 
@@ -75,9 +75,10 @@ def transfer(
     slatprep transfer gaussians.ply --prediction predictions/5f61cc.npz --out predicted.ply
     """
     from slatprep.particles import transfer as work
+    from slatprep.particles.read import read_particles
 
     field = _field(**source)
-    read = work.read_particles(particles, axes)
+    read = read_particles(particles, axes)
     result = work.transfer(read.in_slat(), field, max_distance=max_distance, far=far)
     if read.foreign and axes is None:
         output.note(
@@ -106,7 +107,7 @@ def _field(
     store: Place | None, asset: str | None, prediction: Path | None, ranges: str | None, points: Any
 ) -> VoxelField:
     from slatprep.normalize import PIXIE_RANGES
-    from slatprep.particles.transfer import predicted_field, stored_field
+    from slatprep.particles.fields import predicted_field, stored_field
     from slatprep.readers.ranges import read_ranges
     from slatprep.store import open_store
 

@@ -19,12 +19,13 @@ from slatprep.learn.predictions import (
     check_prediction,
     open_predictions,
 )
-from slatprep.learn.splits import Split, select_assets
+from slatprep.learn.splits import select_assets
 from slatprep.learn.style import INK, MUTED
 from slatprep.parameters import PixieverseSource
 from slatprep.readers.adapters import FoundField
 from slatprep.readers.pairing import find_grids, one_grid
 from slatprep.readers.pixieverse import read_prediction
+from slatprep.readers.splits import Split
 from slatprep.records import (
     BACKGROUND,
     MATERIAL_CLASSES,
@@ -122,12 +123,7 @@ def compare_methods(
         If the store cannot be read.
     """
     store = open_store(store_path)
-    held = tuple(one.name for one in store.contents.properties), store.contents.classes
-    if held != (PROPERTY_COLUMNS, MATERIAL_CLASSES):
-        raise ConfigError(
-            f"{store.path} holds {', '.join(held[0])} and {len(held[1])} classes, which grids of "
-            "Pixie's form do not; expected a store of PixieVerse's properties and classes"
-        )
+    _require_pixieverse(store)
     object_ids, categories = store.column("object_id"), store.column("category")
     found = {name: find_grids(PixieverseSource(root, _GRIDS)) for name, root in grids.items()}
     names = [OURS] if predictions else []
@@ -161,27 +157,32 @@ def compare_methods(
             f"({problems[0] if problems else 'the split is empty'})",
             "predictions of the same objects",
         )
-    measured = [
-        average_objects(
-            [rows[k] for rows in scores],
-            [str(object_ids[index]) for index in scored],
-            [str(categories[index]) for index in scored],
-            spread,
-        )
-        for k in range(len(names))
-    ]
+    of_objects, of_categories = (
+        [str(column[index]) for index in scored] for column in (object_ids, categories)
+    )
+    measured = {
+        name: average_objects([rows[k] for rows in scores], of_objects, of_categories, spread)
+        for k, name in enumerate(names)
+    }
     return Comparison(
         spread,
-        {name: overall for name, (overall, _) in zip(names, measured, strict=True)},
+        {name: overall for name, (overall, _) in measured.items()},
         {
-            category: {
-                name: groups[category] for name, (_, groups) in zip(names, measured, strict=True)
-            }
-            for category in measured[0][1]
+            category: {name: groups[category] for name, (_, groups) in measured.items()}
+            for category in next(iter(measured.values()))[1]
         },
         len(partly),
         problems,
     )
+
+
+def _require_pixieverse(store: Store) -> None:
+    held = tuple(one.name for one in store.contents.properties), store.contents.classes
+    if held != (PROPERTY_COLUMNS, MATERIAL_CLASSES):
+        raise ConfigError(
+            f"{store.path} holds {', '.join(held[0])} and {len(held[1])} classes, which grids of "
+            "Pixie's form do not; expected a store of PixieVerse's properties and classes"
+        )
 
 
 class _Truth:

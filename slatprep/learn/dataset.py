@@ -13,7 +13,8 @@ from torch.utils.data import DataLoader, Dataset, Sampler
 
 from slatprep.errors import ConfigError
 from slatprep.learn.augment import Augmentation, lattice_symmetries, move
-from slatprep.learn.splits import Shares, Split, select_assets
+from slatprep.learn.splits import select_assets
+from slatprep.readers.splits import Shares, Split
 from slatprep.records import FEATS_MEAN as FEATS_MEAN
 from slatprep.records import FEATS_STD as FEATS_STD
 from slatprep.records import UNANNOTATED, Place
@@ -116,7 +117,7 @@ class SlatDataset(Dataset[Item]):
         An open store, or its path or URL. Worker processes, forked or spawned, each open it
         themselves.
     split : {"train", "val", "test"}, optional
-        Only the objects of this split, see `slatprep.learn.splits.split_objects`.
+        Only the objects of this split, see `slatprep.readers.splits.split_objects`.
     shares : Shares
         Shares of the splits.
     splits : mapping of str to {"train", "val", "test"}, optional

@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 
 from slatprep.errors import InputError
 from slatprep.learn.predictions import VoxelPrediction, check_prediction, open_predictions
-from slatprep.learn.splits import Shares, Split, select_assets
+from slatprep.learn.splits import select_assets
+from slatprep.readers.splits import Shares, Split
 from slatprep.records import Normalization, Place
 from slatprep.store import open_store
 

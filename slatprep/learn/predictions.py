@@ -18,11 +18,11 @@ from numpy.typing import NDArray
 
 from slatprep.errors import InputError, StoreError
 from slatprep.geometry.voxels import flat_index
-from slatprep.learn.splits import Shares
 from slatprep.learn.zarr_arrays import read_array
 from slatprep.normalize import change_ranges
 from slatprep.readers.files import ArraySpec, load_source, npz_arrays, refusing
 from slatprep.readers.hdf5 import group_arrays
+from slatprep.readers.splits import Shares
 from slatprep.records import (
     MATERIAL_CLASSES,
     MAX_PROPERTIES,

@@ -8,30 +8,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slatprep.errors import ConfigError
-from slatprep.readers.splits import (
-    HASH,
-    SPLITS,
-    Assignment,
-    Shares,
-    Split,
-    assign_splits,
-    split_objects,
-    split_of,
-)
+from slatprep.readers.splits import HASH, SPLITS, Assignment, Split, assign_splits
+from slatprep.readers.splits import Shares as Shares
+from slatprep.readers.splits import split_of as split_of
 from slatprep.records import Verdict
 from slatprep.store import Store
-
-__all__ = [
-    "HASH",
-    "SPLITS",
-    "Assignment",
-    "Shares",
-    "Split",
-    "assign_store",
-    "select_assets",
-    "split_objects",
-    "split_of",
-]
 
 
 def assign_store(

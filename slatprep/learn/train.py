@@ -26,7 +26,8 @@ from slatprep.learn.predict import (
     write_prediction,
 )
 from slatprep.learn.runs import BEST, LAST, EpochRecord, Run
-from slatprep.learn.splits import HASH, Assignment, Shares, Split, assign_store
+from slatprep.learn.splits import assign_store
+from slatprep.readers.splits import HASH, Assignment, Shares, Split
 from slatprep.records import USABLE, Place, StructuredLatents
 from slatprep.store import Store, open_store
 from slatprep.workers import Progress

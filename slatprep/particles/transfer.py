@@ -14,23 +14,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from slatprep.errors import ConfigError
-from slatprep.particles.fields import VoxelField, predicted_field, stored_field
-from slatprep.particles.read import FRAMES, Axes, Particles, read_particles
+from slatprep.particles.fields import VoxelField
+from slatprep.particles.read import FRAMES, Axes, Particles
 from slatprep.records import BACKGROUND, RESOLUTION
-
-__all__ = [
-    "Axes",
-    "Far",
-    "Particles",
-    "Transferred",
-    "VoxelField",
-    "doubt_axes",
-    "predicted_field",
-    "read_particles",
-    "stored_field",
-    "transfer",
-    "write_transferred",
-]
 
 Far = Literal["background", "drop", "nearest"]
 

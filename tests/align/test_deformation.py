@@ -76,7 +76,7 @@ def make_affine() -> Deformation:
     return made
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 @given(seed=st.integers(0, 10_000), voxels=st.floats(0.1, 40.0))
 def test_nothing_folds_and_nothing_moves_too_far(seed: int, voxels: float) -> None:
     made = bent(seed, voxels, (6, 5, 7))

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, given, settings
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from support.shapes import GRID, Case, chair, field_of, latents_of, surface_latents, turned
 
@@ -201,7 +201,7 @@ def test_odd_shapes_get_a_finite_answer_and_a_verdict(name: str) -> None:
         assert displacement(same.transform, np.eye(4), own.coords) < 0.01
 
 
-@settings(max_examples=15, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+@settings(max_examples=15)
 @given(
     voxels=st.sets(st.tuples(*[st.integers(0, 63)] * 3), min_size=1, max_size=40),
     other=st.sets(st.tuples(*[st.integers(0, 63)] * 3), min_size=1, max_size=40),

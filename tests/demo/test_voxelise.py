@@ -16,7 +16,7 @@ unit = st.floats(-1.0, 1.0)
 directions = st.tuples(unit, unit, unit).filter(lambda v: np.linalg.norm(v) > 0.1)
 
 
-@settings(max_examples=10, deadline=None)
+@settings(max_examples=10)
 @given(normal=directions, offset=st.floats(-0.6, 0.6))
 def test_plane_meets_the_cubes_whose_corners_it_parts(normal, offset):
     n = np.array(normal) / np.linalg.norm(normal)
@@ -32,7 +32,7 @@ def test_plane_meets_the_cubes_whose_corners_it_parts(normal, offset):
     assert np.array_equal(filled, surface | (at_centre <= 0).reshape(surface.shape))
 
 
-@settings(max_examples=10, deadline=None)
+@settings(max_examples=10)
 @given(
     centre=st.tuples(*[st.floats(-0.2, 0.2)] * 3),
     radius=st.floats(0.03, 0.3),

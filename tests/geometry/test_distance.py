@@ -22,7 +22,7 @@ def _expected(solid: np.ndarray) -> np.ndarray:
     share=st.sampled_from([0.02, 0.3, 0.5, 0.97]),
     seed=st.integers(0, 2**32 - 1),
 )
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 def test_any_set_gets_the_exact_distance(
     shape: tuple[int, int, int], share: float, seed: int
 ) -> None:

@@ -21,7 +21,7 @@ def _expected(occupancy: np.ndarray) -> np.ndarray:
     share=st.sampled_from([0.0, 0.3, 0.6, 0.7, 1.0]),
     seed=st.integers(0, 2**32 - 1),
 )
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=100)
 def test_any_set(shape: tuple[int, int, int], share: float, seed: int) -> None:
     occupancy = np.random.default_rng(seed).random(shape) < share
     np.testing.assert_array_equal(outside_of(occupancy), _expected(occupancy))

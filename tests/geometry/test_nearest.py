@@ -13,7 +13,7 @@ from slatprep.geometry.frames import voxel_centres
 from slatprep.geometry.nearest import Lattice, _columns, _search_columns
 
 
-@settings(deadline=None, max_examples=40)
+@settings(max_examples=40)
 @given(st.integers(1, 3000), st.integers(0, 2**32 - 1), st.floats(0.2, 1.5), st.integers(1, 64))
 def test_the_nearest_voxel_is_a_kd_tree_s(count: int, seed: int, spread: float, side: int) -> None:
     rng = np.random.default_rng(seed)
@@ -134,7 +134,7 @@ def test_a_vote_without_voters_is_empty() -> None:
     ).tolist() == [-1]
 
 
-@settings(deadline=None, max_examples=25)
+@settings(max_examples=25)
 @given(st.integers(0, 2**32 - 1), st.floats(0.3, 1.0))
 def test_votes_are_those_of_a_plain_count(seed: int, width: float) -> None:
     rng = np.random.default_rng(seed)

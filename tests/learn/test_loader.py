@@ -29,7 +29,8 @@ from slatprep.learn import (
     split_of,
 )
 from slatprep.learn.augment import lattice_symmetries, move
-from slatprep.learn.splits import SPLITS, select_assets, split_objects
+from slatprep.learn.splits import select_assets
+from slatprep.readers.splits import SPLITS, split_objects
 
 THIRDS = Shares(0.4, 0.3, 0.3)
 

@@ -15,9 +15,9 @@ from slatprep import ConfigError, open_store
 from slatprep.cli.commands import slatprep
 from slatprep.learn.dataset import SlatDataset, SlatLoader
 from slatprep.learn.runs import BEST, LAST
-from slatprep.learn.splits import Shares, assign_store, select_assets
+from slatprep.learn.splits import assign_store, select_assets
 from slatprep.learn.train import TrainParameters, train
-from slatprep.readers.splits import pixie_test_objects
+from slatprep.readers.splits import Shares, pixie_test_objects
 
 BY_FILE = {"train": ["a", "b", "c"], "val": ["d"], "test": ["e", "h.front"]}
 FAST = ("--size", "small", "--learning-rate", "0.002", "--threads", "1")

@@ -22,10 +22,10 @@ from slatprep.errors import InputError, StoreError
 from slatprep.learn.metrics import evaluate_store
 from slatprep.learn.predictions import selection_of_run
 from slatprep.learn.runs import LAST
-from slatprep.learn.splits import Shares
 from slatprep.learn.train import TrainParameters, train
 from slatprep.learn.zarr_arrays import read_array
 from slatprep.readers.files import ArraySpec
+from slatprep.readers.splits import Shares
 from slatprep.store import open_store
 
 SHARES = Shares(0.4, 0.3, 0.3)

@@ -24,8 +24,8 @@ from slatprep.learn.dataset import IGNORED, SlatDataset, SlatLoader, SparseBatch
 from slatprep.learn.decoder import Prediction, make_decoder
 from slatprep.learn.loss import loss_of
 from slatprep.learn.runs import BEST, LAST, Run
-from slatprep.learn.splits import Shares, split_of
 from slatprep.learn.train import TrainParameters, precision_of, train
+from slatprep.readers.splits import Shares, split_of
 from slatprep.storage.lock import take_lock
 
 SHARES = Shares(0.4, 0.3, 0.3)

@@ -15,7 +15,9 @@ from support.synthetic import JELLY, METAL, Dataset
 from slatprep.cli.commands import slatprep
 from slatprep.errors import ConfigError, InputError
 from slatprep.export import ExportOptions, export_store
-from slatprep.particles.transfer import VoxelField, predicted_field, read_particles, transfer
+from slatprep.particles.fields import VoxelField, predicted_field
+from slatprep.particles.read import read_particles
+from slatprep.particles.transfer import transfer
 from slatprep.pipeline.dataset import BuildSummary
 
 # As TRELLIS names and orders the fields of a Gaussian (`construct_list_of_attributes`).

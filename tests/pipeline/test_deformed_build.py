@@ -18,7 +18,8 @@ from slatprep.export import ExportOptions, export_store
 from slatprep.geometry.frames import VOXEL_SIZE, voxel_centres
 from slatprep.inspect.check import check_alignment
 from slatprep.inspect.verify import verify_store
-from slatprep.particles.transfer import stored_field, transfer
+from slatprep.particles.fields import stored_field
+from slatprep.particles.transfer import transfer
 from slatprep.pipeline.dataset import BuildSummary
 from slatprep.provenance.record_json import read_asset_record, to_json
 from slatprep.provenance.schemas import FOLDER

@@ -118,7 +118,8 @@ def test_ranges_of_the_objects_to_train_on(
 def test_by_hash_the_training_s_own_objects_count(
     make_dataset: MakeDataset, tmp_path: Path
 ) -> None:
-    from slatprep.learn.splits import Shares, assign_store
+    from slatprep.learn.splits import assign_store
+    from slatprep.readers.splits import Shares
 
     names = "abcdef"
     dataset, out = noisy(make_dataset(*names), *names), tmp_path / "s.zarr"

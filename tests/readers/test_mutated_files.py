@@ -10,7 +10,7 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, given, settings
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from support.raw_sources import COORDS, FEATS, raw_grid
 
@@ -20,10 +20,8 @@ from slatprep.records import AssetPair, SourceRoots
 
 SETTINGS = settings(
     max_examples=150,
-    deadline=None,
     derandomize=True,
     database=None,
-    suppress_health_check=[HealthCheck.too_slow],
 )
 
 # Where, how many bytes are replaced, and by what: a flip, a cut, an insertion, all of them.

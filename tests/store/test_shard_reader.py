@@ -36,7 +36,7 @@ def copy(mixed_build: BuildSummary, tmp_path: Path) -> Path:
     return Path(shutil.copytree(mixed_build.store, tmp_path / "s.zarr"))
 
 
-@settings(max_examples=60, deadline=None, derandomize=True, database=None)
+@settings(max_examples=60, derandomize=True, database=None)
 @given(data=st.data())
 def test_any_rows_are_those_that_zarr_reads(store: Store, data: st.DataObject) -> None:
     name = data.draw(st.sampled_from([layout.name for layout in ARRAYS]))

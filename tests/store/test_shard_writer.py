@@ -21,7 +21,6 @@ NAMES = [layout.name for layout in ARRAYS if not layout.name.startswith("asset/"
 
 @settings(
     max_examples=30,
-    deadline=None,
     derandomize=True,
     database=None,
     suppress_health_check=[HealthCheck.function_scoped_fixture],

@@ -343,7 +343,6 @@ def shared(mixed_build: BuildSummary, tmp_path_factory: pytest.TempPathFactory) 
 
 @settings(
     max_examples=40,
-    deadline=None,
     derandomize=True,
     database=None,
     suppress_health_check=[HealthCheck.function_scoped_fixture],
