@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import importlib
+import importlib.util
 import re
+import runpy
 import tomllib
 import xml.etree.ElementTree as ET
 from pathlib import Path
@@ -62,3 +64,11 @@ def test_the_index_lists_every_page() -> None:
     index = (ROOT / "docs" / "index.md").read_text("utf-8")
     pages = {path.name for path in (ROOT / "docs").glob("*.md")} - {"index.md"}
     assert pages <= set(re.findall(r"\]\(([\w.]+)\)", index))
+
+
+def test_what_changes_code_for_the_tests_names_what_there_is() -> None:
+    runner = runpy.run_path(str(ROOT / "tools" / "mutants.py"))
+    for module, tests in runner["TESTS"].items():
+        assert (ROOT / "slatprep" / f"{module}.py").exists(), module
+        assert all((ROOT / "tests" / test).exists() for test in tests), tests
+    assert all(importlib.util.find_spec(library) for library in runner["LIBRARIES"])
