@@ -18,7 +18,7 @@ MOST_VOXELS = 32_768
 """Voxels up to which each is looked at under ties: as many as TRELLIS trains on."""
 
 FEWER = 4
-"""Of more voxels at most a fourth of that number is looked at, which tells a share to a percent."""
+"""Of more voxels at most a fourth of that number is looked at: enough for a share to 1 percent."""
 
 
 def thinning(voxels: int) -> int:
@@ -64,7 +64,7 @@ def measure_ambiguity(
     change = np.zeros(len(field.table))
     if alignment.placements:
         if alignment.deformation is not None:
-            # The others are known without a deformation: like is compared with like.
+            # The others have no deformation, so the best is compared without its own.
             places = places_of(latents.coords, alignment.transform)
             annotation = sample(field, places, parameters, labels_alone=True)
         material, valid = annotation.material[few], annotation.valid[few]

@@ -1,4 +1,4 @@
-"""What the confidences weigh; written by benchmarks/calibrate.py, not by hand."""
+"""The weights of the confidences; written by benchmarks/calibrate.py, not by hand."""
 
 from slatprep.judge.model import Figure, Logistic
 

@@ -95,8 +95,8 @@ def class_confidence(
 ) -> NDArray[np.float32]:
     """Return how likely the class of each voxel is right.
 
-    Of placements that fit equally well each is as likely as any other, which no
-    data need tell: the model's probability counts for those with the same class.
+    Placements that fit equally well are taken as equally likely: the model's probability
+    counts for those with the same class.
 
     Parameters
     ----------

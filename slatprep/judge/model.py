@@ -1,4 +1,4 @@
-"""Logistic models whose numbers are data: a figure's share in a probability can be read off."""
+"""Logistic models as data, so that each figure's part in a probability is known."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class Figure:
 
 @dataclass(frozen=True)
 class Logistic:
-    """A logistic regression, and a curve that sets its probabilities right.
+    """A logistic regression, and a curve that calibrates its probabilities.
 
     Attributes
     ----------

@@ -1,4 +1,4 @@
-"""The verdict in one word, from calibrated probabilities, and why it is no better."""
+"""The verdict, from calibrated probabilities, and the reasons for it."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from slatprep.records import (
 
 @dataclass(frozen=True)
 class Thresholds:
-    """Where the verdicts part; docs/quality.md says how the numbers were chosen.
+    """The limits between verdicts; docs/quality.md says how they were chosen.
 
     Attributes
     ----------

@@ -247,7 +247,7 @@ def weigh(
     likely = model.log_likelihood(latents.feats)
     labels = material[None]
     if alignment.placements:
-        # Like with like: the others are known without a deformation.
+        # The others have no deformation, so the best is compared without its own.
         tied = (alignment.transform, *(p.transform for p in alignment.placements))
         places = (places_of(latents.coords, transform) for transform in tied)
         labels = np.stack([sample(field, place, parameters).material for place in places])
@@ -347,7 +347,7 @@ def choice_of(found: LatentEvidence, reliability: Reliability) -> tuple[int, Lat
     if reliability.factor == 0.0 or not different[best].any():
         return None
     probability = float(softmax(reliability.factor * found.support)[~different[best]].sum())
-    # No asset is surer than that its latents are of the kind that can be relied on.
+    # A choice cannot be surer than the latents of sure assets are reliable.
     probability = min(probability, (reliability.agreeing + 1.0) / (reliability.witnesses + 2.0))
     if probability < DECISIVE:
         return None

@@ -1,1 +1,1 @@
-"""What every number of a store was made from, by what, and how well: a record an asset."""
+"""The records of assets and builds: sources, parameters, versions and quality of every row."""

@@ -155,11 +155,11 @@ class Cluster:
         found: dict[str, Exception | None] = {}
         while not found:
             if not self._client.ncores():
-                # A batch system's queue may take hours; how long is too long, people know.
+                # No limit: a batch system's queue may take hours.
                 self._note(f"{self.scheduler}: has no worker yet; waiting for the first")
                 self._client.wait_for_workers(1)
             answers = self._client.run(_check, self._common, on_error="return")
-            # Those that died while we asked are none of ours.
+            # Workers that died meanwhile are not counted.
             found = {w: fault for w, fault in answers.items() if not isinstance(fault, OSError)}
         for worker, fault in sorted(found.items()):
             if isinstance(fault, SlatprepError):

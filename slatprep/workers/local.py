@@ -54,7 +54,7 @@ class Workers(Protocol):
 
 
 Jobs = int | Workers
-"""How many processes of this machine compute, or who else does."""
+"""A number of worker processes of this machine, or other workers."""
 
 
 def run_unordered(
