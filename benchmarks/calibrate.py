@@ -289,8 +289,8 @@ def draw(path: Path, assets: list[Any], voxels: list[Any]) -> None:
 def write_module(path: Path, placement: Logistic, voxel: Logistic) -> None:
     """Write the numbers as a module, so that they are part of the code that makes a store."""
     lines = [
-        '"""The weights of the confidences; written by benchmarks/calibrate.py, not by hand."""', "",
-        "from slatprep.judge.model import Figure, Logistic", "",
+        '"""The weights of the confidences; written by benchmarks/calibrate.py, not by hand."""',
+        "", "from slatprep.judge.model import Figure, Logistic", "",
         f"PLACEMENT = {placement!r}",
         '"""Whether a placement is right."""', "",
         f"VOXEL = {voxel!r}",
