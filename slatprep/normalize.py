@@ -45,25 +45,32 @@ def from_mapped(mapped: ArrayLike, table: Sequence[Property] = PROPERTIES) -> ND
     return properties.astype(np.float32)
 
 
-def property_extent(field: MaterialField) -> NDArray[np.float64]:
+def property_extent(
+    field: MaterialField, table: Sequence[Property] | None = None
+) -> NDArray[np.float64]:
     """Return the smallest and largest mapped property of a field.
 
     Parameters
     ----------
     field : MaterialField
         The field; all its annotated voxels count.
+    table : sequence of Property, optional
+        Of which properties, instead of the field's own; NaN where it lacks one.
 
     Returns
     -------
     ndarray of float64, shape (P, 2)
-        Per property of its table the minimum and maximum, of log10 where that
+        Per property of the table the minimum and maximum, of log10 where that
         is how it is normalised.
     """
+    table = field.table if table is None else table
+    own = {one.name: column for one, column in zip(field.table, field.properties.T, strict=True)}
     # log10 is monotonic, so it is taken of a few numbers and not of the whole field.
     # By column: numpy takes ten times as long along the first axis of a narrow array.
-    columns = list(field.properties.T)
+    missing = np.array([np.nan], dtype=np.float32)
+    columns = [own.get(one.name, missing) for one in table]
     ends = [[c.min() for c in columns], [c.max() for c in columns]]
-    return to_mapped(ends, field.table).T
+    return to_mapped(ends, table).T
 
 
 def ranges_from_extents(

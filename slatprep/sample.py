@@ -19,6 +19,7 @@ from slatprep.records import (
     RESOLUTION,
     UNANNOTATED,
     Annotation,
+    Contents,
     MaterialField,
     Property,
 )
@@ -87,18 +88,20 @@ def sample(
 def merge(annotations: Sequence[Annotation], table: Sequence[Property]) -> Annotation:
     """Make one annotation of several of the same SLAT voxels.
 
-    At each voxel those that are valid there count. Its properties are their mean, of
-    log10 where the table says so, and its class the one that most of them give, of
-    several such the one with the lowest id.
+    At each voxel those that are valid there count. A property is the mean of those that
+    have it, of log10 where the table says so, and the class the one that most of them give, of
+    several such the one with the lowest id. The voxel is valid where every property, and
+    the class, is given by one at least.
 
-    Its confidence is the mean of theirs, each taken fully where it gives the same class
+    Its confidence is the mean of theirs, each taken fully where it gives no other class
     and each of its properties is near the merged one, by half where a property is not,
     and not at all where it gives another class.
 
     Parameters
     ----------
     annotations : sequence of Annotation
-        Each with its confidence; place and distance are taken from the first.
+        As `in_table` gives them, each with its confidence; place and distance are taken from
+        the first.
     table : sequence of Property
         What their P properties are.
 
@@ -109,30 +112,34 @@ def merge(annotations: Sequence[Annotation], table: Sequence[Property]) -> Annot
         themselves: the square root of the mean squared deviation.
     """
     valid = np.stack([one.valid for one in annotations])
-    count = valid.sum(axis=0)
-    some, several = count > 0, count > 1
     mapped = np.stack([to_mapped(one.properties, table) for one in annotations])
-    there = valid[..., None]
+    there = ~np.isnan(mapped)
+    count = there.sum(axis=0)
     of = np.maximum(count, 1)
     # From the largest: where all are the same, the mean is that and the spread nothing.
     most = np.where(there, mapped, -np.inf).max(axis=0)
-    mean = most + np.where(there, mapped - most, 0.0).sum(axis=0) / of[:, None]
+    mean = most + np.where(there, mapped - most, 0.0).sum(axis=0) / of
     apart = np.where(there, mapped - mean, 0.0)
-    spread = np.sqrt((apart**2).sum(axis=0) / of[:, None])
+    spread = np.sqrt((apart**2).sum(axis=0) / of)
 
     classes = np.arange(BACKGROUND)[:, None]
     given = np.stack([one.material for one in annotations])
     votes = np.stack([(given == one).sum(axis=0) for one in classes])
     material = votes.argmax(axis=0).astype(np.uint8)
+    some = (count > 0).all(axis=-1) & votes.any(axis=0)
 
     powers = np.array([one.log10 for one in table])
     limit = np.where(powers, NEAR_POWER, NEAR_SHARE * np.abs(mean))
     near = (np.abs(apart) <= limit * (1.0 + 1e-6)).all(axis=-1)
     sure = np.stack([one.confidence for one in annotations if one.confidence is not None])
-    counted = np.where(given == material, np.where(near, 1.0, 0.5), 0.0)
-    confidence = (sure * counted).sum(axis=0) / of
+    agrees = (given == material) | (given == UNANNOTATED)
+    counted = np.where(agrees & valid, np.where(near, 1.0, 0.5), 0.0)
+    confidence = (sure * counted).sum(axis=0) / np.maximum(valid.sum(axis=0), 1)
+    share = votes.max(axis=0) / np.maximum(votes.sum(axis=0), 1)
 
-    mean[~some], spread[~several], material[~some] = np.nan, np.nan, UNANNOTATED
+    spread[count < 2] = np.nan
+    mean[~some], spread[~some], material[~some] = np.nan, np.nan, UNANNOTATED
+    confidence[~some] = share[~some] = 0.0
     return replace(
         annotations[0],
         properties=from_mapped(mean, table),
@@ -140,5 +147,36 @@ def merge(annotations: Sequence[Annotation], table: Sequence[Property]) -> Annot
         valid=some,
         confidence=confidence.astype(np.float32),
         spread=spread.astype(np.float32),
-        votes=(votes.max(axis=0) / of).astype(np.float32),
+        votes=share.astype(np.float32),
     )
+
+
+def lacking(field: MaterialField, contents: Contents) -> tuple[str, ...]:
+    """Return what a store holds and a field says nothing of: names of properties, ``classes``."""
+    own = {one.name for one in field.table}
+    missing = tuple(one.name for one in contents.properties if one.name not in own)
+    return (*missing, "classes") if contents.classes and not field.classified else missing
+
+
+def in_table(annotation: Annotation, field: MaterialField, contents: Contents) -> Annotation:
+    """Return an annotation with the columns of a store, as `merge` takes it.
+
+    Parameters
+    ----------
+    annotation : Annotation
+        Looked up in the field.
+    field : MaterialField
+        Its properties are among those of the store.
+    contents : Contents
+        What the store holds. Of properties that the field lacks, the values are NaN, and
+        the material is 255 where it lacks classes.
+    """
+    missing = lacking(field, contents)
+    own = {one.name: column for column, one in enumerate(field.table)}
+    columns = [own.get(one.name, -1) for one in contents.properties]
+    properties = annotation.properties[:, columns]
+    properties[:, [column < 0 for column in columns]] = np.nan
+    material = annotation.material
+    if "classes" in missing:
+        material = np.full_like(material, UNANNOTATED)
+    return replace(annotation, properties=properties, material=material)

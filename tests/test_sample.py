@@ -133,6 +133,31 @@ def test_annotations_merge_to_mean_spread_and_votes() -> None:
     )
 
 
+def test_what_an_annotation_does_not_know_is_left_to_the_others() -> None:
+    """Two know all, the third one property and no class; the last voxel it reaches alone."""
+    one = _said([0, 1, 255], [1e6, 1e5, np.nan], [0.3, 0.3, np.nan])
+    two = _said([0, 1, 255], [1e6, 1e7, np.nan], [0.3, 0.3, np.nan])
+    three = _said([0, 0, 0], [1e9, 1e9, 1e9], [0.2, 0.2, 0.2])
+    three.properties[:, 0] = three.properties[:, 2] = np.nan
+    three.properties[:, 1] = 4e3
+    three.material[:] = 255
+    made = merge([one, two, three], PROPERTIES)
+    assert made.valid.tolist() == [True, True, False]
+    assert made.material.tolist() == [0, 1, 255]
+    np.testing.assert_allclose(made.properties[:2, 0], [1e6, 1e6], rtol=1e-6)
+    np.testing.assert_allclose(made.properties[:2, 1], 1e3 * 4 ** (1 / 3), rtol=1e-6)
+    np.testing.assert_allclose(made.properties[:2, 2], 0.3, rtol=1e-6)
+    assert made.spread is not None
+    assert made.confidence is not None
+    assert made.votes is not None
+    np.testing.assert_allclose(made.spread[:2, 0], [0, 1], atol=1e-7)
+    np.testing.assert_allclose(made.spread[:2, 1], np.std(np.log10([1, 1, 4])), rtol=1e-6)
+    assert np.isnan(made.spread[2]).all()
+    assert made.votes.tolist() == [1, 1, 0]
+    # A density of 4e3 is 2.5 times the mean: half. Of the second voxel no modulus is near.
+    np.testing.assert_allclose(made.confidence, 0.8 * np.array([2.5 / 3, 1.5 / 3, 0]), rtol=1e-6)
+
+
 def test_voxels_that_no_annotation_reaches_stay_without_labels() -> None:
     nowhere = _said([255], [np.nan], [np.nan])
     made = merge([nowhere, nowhere], PROPERTIES)

@@ -19,6 +19,7 @@ if TYPE_CHECKING:
 @option("--sources", is_flag=True)
 @option("--pixieverse", EXISTING_FOLDER)
 @option("--slat", EXISTING_FOLDER)
+@option("--also", EXISTING_FOLDER, multiple=True)
 @workers_options
 def verify(
     output: Output,
@@ -26,6 +27,7 @@ def verify(
     sources: bool,
     pixieverse: Place | None,
     slat: Place | None,
+    also: tuple[Place, ...],
     **options: Any,
 ) -> None:
     """Check that STORE is whole, unchanged and consistent.
@@ -41,17 +43,21 @@ def verify(
     --sources: Compare the source files with the records, too.
     --pixieverse: Root of the PixieVerse files now. [default: as at the build]
     --slat: Folder of the latents, or of their one HDF5 file, now. [default: as at the build]
+    --also: With both: root of a further source now; once for each, in the order of [[also]].
 
     Example
     -------
     slatprep verify data/demo.zarr --jobs 2
     slatprep verify data/demo.zarr --sources --json
     """
-    if (pixieverse is None) != (slat is None):
+    if (pixieverse is None) != (slat is None) or (also and slat is None):
         raise click.UsageError("--pixieverse and --slat go together: name both, or neither")
     from slatprep.inspect.verify import SourceRoots, verify_store
 
-    roots = SourceRoots(pixieverse, slat) if pixieverse and slat else None
+    roots = None
+    if pixieverse and slat:
+        further = tuple(SourceRoots(one, slat, number=k) for k, one in enumerate(also, 1))
+        roots = SourceRoots(pixieverse, slat, also=further)
     with output.progress("verify") as progress:
         result = verify_store(
             store, sources=sources or roots is not None, roots=roots, progress=progress, **options

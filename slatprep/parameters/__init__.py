@@ -11,7 +11,7 @@ import re
 from dataclasses import dataclass, field
 from typing import Annotated, Any, ClassVar, Literal
 
-from annotated_types import Ge, Gt, Le
+from annotated_types import Ge, Gt, Le, MaxLen
 
 from slatprep.records import Engine, Place, Share
 from slatprep.storage.place import place_of
@@ -25,6 +25,9 @@ PositiveInt = Annotated[int, Gt(0)]
 MAX_VOXEL_CHUNK, MAX_VOXEL_SHARD, MAX_GRID_SHARD = 2**20, 2**28, 2**16
 """Rows of one chunk and of one shard of the voxel arrays, assets of one shard of the grids:
 what a store may have to be read, and so what it may be told to be built with."""
+
+MAX_ALSO = 15
+"""Further sources of one dataset."""
 
 MAX_SHARD_CHUNKS = 2**20
 """Chunks of one shard, whose index a reader holds in memory."""
@@ -264,11 +267,16 @@ class StoreParameters(_Group):
 
 @dataclass(frozen=True)
 class BuildParameters(_Group):
-    """Everything that decides the content of a store."""
+    """Everything that decides the content of a store.
+
+    `also` are further sources of the same objects, whose annotations are merged with
+    those of `pixieverse`.
+    """
 
     pixieverse: PixieverseSource
     slat: SlatSource
     name: str = ""
+    also: Annotated[tuple[PixieverseSource, ...], MaxLen(MAX_ALSO)] = ()
     pairing: PairingParameters = field(default_factory=PairingParameters)
     align: AlignParameters = field(default_factory=AlignParameters)
     consensus: ConsensusParameters = field(default_factory=ConsensusParameters)
@@ -278,8 +286,13 @@ class BuildParameters(_Group):
     store: StoreParameters = field(default_factory=StoreParameters)
 
     def __post_init__(self) -> None:
-        if self.pixieverse.transform and self.align.engine is not Engine.KNOWN:
+        sources = (self.pixieverse, *self.also)
+        if any(one.transform for one in sources) and self.align.engine is not Engine.KNOWN:
             raise ValueError('align.engine = "known", as pixieverse.transform is given')
+        if self.also and self.pixieverse.samples != "merge":
+            raise ValueError("pixieverse.samples = 'merge', as [[also]] names further sources")
+        if any(one.samples != "one" for one in self.also):
+            raise ValueError("samples in [pixieverse] alone: all of [[also]] are merged")
         if self.pixieverse.samples == "merge" and (self.consensus.settle or self.witness.settle):
             raise ValueError(
                 "pixieverse.samples of one, first or all with --consensus or --witness: these "

@@ -10,7 +10,7 @@ from __future__ import annotations
 import difflib
 import json
 import tomllib
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import asdict, fields, is_dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple, get_args, get_type_hints
@@ -51,8 +51,8 @@ OPTIONS = {
 """The options that give a value of the file, by its key."""
 
 _PATHS = (
-    "pixieverse.root", "slat.root", "slat.encoder", "pairing.map", "pairing.categories",
-    "normalize.ranges", "normalize.split_by",
+    "pixieverse.root", "also.root", "slat.root", "slat.encoder", "pairing.map",
+    "pairing.categories", "normalize.ranges", "normalize.split_by",
 )  # fmt: skip
 
 
@@ -99,10 +99,8 @@ def load_parameters(
         if isinstance(values, Mapping) and not isinstance(table, dict):
             raise ConfigError(f"{origin.of(group)}: {group}: expected a table [{group}]")
         data[group] = table | values if isinstance(values, Mapping) else values
-    for name in _PATHS:
-        group, _, key = name.partition(".")
-        table = data.get(group)
-        path = str(table.get(key, "")) if isinstance(table, Mapping) else ""
+    for name, table, key in _paths_of(data):
+        path = str(table[key])
         if path != in_unicode(path):
             raise ConfigError(
                 f"{origin.of(name)}: {name}: {path} is no UTF-8, so that no record can hold it; "
@@ -148,12 +146,21 @@ def _read(path: Path) -> dict[str, Any]:
     except (OSError, UnicodeDecodeError) as error:
         raise ConfigError(f"{path}: cannot be read as a dataset definition: {error}") from error
     folder = path.resolve().parent
-    for group, key in (name.split(".") for name in _PATHS):
-        table = data.get(group)
-        value = table.get(key) if isinstance(table, dict) else None
+    for _, table, key in _paths_of(data):
+        value = table[key]
         if isinstance(value, str) and value and _is_path(key, value):
-            data[group][key] = str(place_of(value, folder))
+            table[key] = str(place_of(value, folder))
     return data
+
+
+def _paths_of(data: Mapping[str, Any]) -> Iterator[tuple[str, dict[str, Any], str]]:
+    """Yield the name of each of `_PATHS` that is given, the table that has it, and its key."""
+    for name in _PATHS:
+        group, _, key = name.partition(".")
+        tables = data.get(group)
+        for table in tables if isinstance(tables, list) else (tables,):
+            if isinstance(table, dict) and key in table:
+                yield name, table, key
 
 
 def _is_path(key: str, value: object) -> bool:
@@ -190,15 +197,20 @@ def _keys_of(groups: tuple[str, ...]) -> list[str]:
     """Return the keys that a table of the file may have."""
     owner: Any = BuildParameters
     for group in groups:
+        if group.isdecimal():
+            continue  # the number of a table of several
         hint = get_type_hints(owner)[group]
         owner = next((t for t in (hint, *get_args(hint)) if is_dataclass(t)), owner)
     return [field.name for field in fields(owner)]
 
 
 def _check_paths(parameters: BuildParameters, origin: _Origin) -> None:
-    for name in _PATHS:
-        group, _, key = name.partition(".")
-        value = getattr(getattr(parameters, group), key)
+    paths = [
+        (name, key, getattr(one, key))
+        for name, (group, key) in ((name, name.split(".")) for name in _PATHS)
+        for one in (parameters.also if group == "also" else (getattr(parameters, group),))
+    ]
+    for name, key, value in paths:
         if value is None or not _is_path(key, value):
             continue
         try:

@@ -67,7 +67,8 @@ def places_of_sources(store: Store) -> dict[str, Any]:
         return {}  # The store does not need it, and `slatprep verify` names it.
     if record.id != store.attributes["manifest"]:
         return {}
-    named = {name: getattr(record.parameters, name) for name in ("pixieverse", "slat", "pairing")}
+    names = ("pixieverse", "also", "slat", "pairing")
+    named = {name: getattr(record.parameters, name) for name in names}
     places: dict[str, Any] = orjson.loads(orjson.dumps(named, default=str))
     return places
 

@@ -22,7 +22,7 @@ from slatprep.records import (
     StructuredLatents,
     Verdict,
 )
-from slatprep.sample import merge
+from slatprep.sample import in_table, lacking, merge
 
 
 def process_several(
@@ -32,6 +32,7 @@ def process_several(
 
     Left out are those that cannot be used, and those whose alignment failed where that
     of another did not. Of fields that occupy the same voxels one alignment serves all.
+    Annotations that have a part of the properties alone, or no classes, add to the others.
 
     Parameters
     ----------
@@ -45,13 +46,14 @@ def process_several(
     Returns
     -------
     Finished
-        Its field, alignment, places and distances are those of the first that is merged.
+        Its field, alignment, places and distances are those of the first that is merged and
+        has all that the store holds.
 
     Raises
     ------
     InputError
-        If the SLAT, or none of the annotations, can be used, or a file was replaced
-        between its hashing, which gives the asset its key, and its reading.
+        If the SLAT cannot be used, or no annotation that has all that the store holds, or a
+        file was replaced between its hashing, which gives the asset its key, and its reading.
     """
     sources, digests = hash_sources(pair)
     before = {one.sample: one for one in known}
@@ -78,14 +80,30 @@ def process_several(
     if latents is None:
         raise _refused(pair, faults)
     good = [one for one in annotated if one.judgement.verdict is not Verdict.FAILED] or annotated
-    first = good[0]
-    annotation = merge([one.annotation for one in good], first.field.table)
+    contents = pair.roots.contents
+    lacks = {one.pair.sample: lacking(one.field, contents) for one in good}
+    whole = [one for one in good if not lacks[one.pair.sample]]
+    if not whole:
+        what = "; ".join(
+            f"sample {sample} has no {', '.join(names)}" for sample, names in lacks.items()
+        )
+        what += "".join(f"; sample {sample}: {error}" for sample, error in faults.items())
+        raise InputError(
+            f"asset {pair.asset_id!r}",
+            f"no annotation with all that the store holds can be used ({what})",
+            "one that can be, to which others add",
+        )
+    first = whole[0]
+    good = [first, *(one for one in good if one is not first)]
+    parts = [in_table(one.annotation, one.field, contents) for one in good]
+    annotation = merge(parts, contents.properties)
     told = {one.pair.sample: one for one in annotated}
     contributions = tuple(
         _contribution(one, told.get(one.sample), faults.get(one.sample), good, sources)
         for one in pair.annotations
     )
     warnings = [f"sample {one.pair.sample}: {text}" for one in good for text in one.field.warnings]
+    warnings += [f"sample {k} has no {', '.join(names)}" for k, names in lacks.items() if names]
     left_out = ((one.sample, one.left_out) for one in contributions if one.left_out)
     warnings += [f"sample {sample} is left out: {why}" for sample, why in left_out]
     return Finished(

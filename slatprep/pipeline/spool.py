@@ -132,8 +132,8 @@ class Spool:
         StoreError
             If the disk does not take it; names the asset.
         """
-        extents = [property_extent(own) for own in (field, *others)]
-        extent = np.stack([np.min(extents, axis=0)[:, 0], np.max(extents, axis=0)[:, 1]], axis=1)
+        least, most = np.array([property_extent(own, field.table) for own in (field, *others)]).T
+        extent = np.stack([np.nanmin(least, axis=1), np.nanmax(most, axis=1)], axis=1)
         arrays: Arrays = {"extent": extent}
         if self.arrays:
             arrays |= {name: getattr(latents, name) for name in ("coords", "feats")}

@@ -149,7 +149,8 @@ class Update:
         scratch: Path = Path(),
     ) -> Update:
         """Look at the sources, and read what the last build saw; with `rehash` trust none of it."""
-        recipe = context.recipe.key("", {"": str((wanted.declared, context.parameters.slat))})
+        asked = (wanted.declared, context.parameters.slat, context.parameters.also)
+        recipe = context.recipe.key("", {"": str(asked)})
         states, seen = look(pairs), Seen()
         if context.previous is not None:
             bound = bound_to(context.previous.build_id, recipe)

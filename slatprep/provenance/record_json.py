@@ -14,9 +14,7 @@ import orjson
 
 from slatprep.errors import StoreError
 from slatprep.provenance.record import AssetRecord, BuildRecord, Record
-from slatprep.records import (
-    Status,
-)
+from slatprep.records import SourceFile, Status
 from slatprep.storage.place import is_place
 
 if TYPE_CHECKING:
@@ -49,9 +47,14 @@ def to_json(record: Record | BuildRecord, *, indent: bool = False) -> bytes:
     option = orjson.OPT_SERIALIZE_NUMPY | (orjson.OPT_INDENT_2 if indent else 0)
     written: object = record
     if isinstance(record, AssetRecord) and not record.merged:
-        names = (one.name for one in fields(record) if one.name != "merged")
-        written = {name: getattr(record, name) for name in names}
+        # What there is of merged annotations alone is not written of others.
+        files = [_without(file, "source") for file in record.sources]
+        written = {**_without(record, "merged"), "sources": files}
     return orjson.dumps(written, default=_plain, option=option)
+
+
+def _without(entry: AssetRecord | SourceFile, name: str) -> dict[str, object]:
+    return {one.name: getattr(entry, one.name) for one in fields(entry) if one.name != name}
 
 
 def read_record(text: bytes | str, where: str) -> Record:

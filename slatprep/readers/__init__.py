@@ -6,8 +6,9 @@ from dataclasses import replace
 
 from slatprep.parameters import SampleParameters
 from slatprep.readers.adapters import latent_adapter, source_adapter
+from slatprep.readers.contents import contents_of
 from slatprep.readers.files import require_complete
-from slatprep.readers.pairing import contents_of, discover
+from slatprep.readers.pairing import discover
 from slatprep.readers.slat import read_slat
 from slatprep.readers.slat_files import SlatFile, discover_slats
 from slatprep.readers.transforms import read_transform
@@ -48,10 +49,10 @@ def read_field(
         If a file cannot be used; the message names file, value and voxel.
     """
     field = source_adapter(pair.roots.adapter).read(pair, max_unphysical)
-    if pair.transform is None:
-        return field
-    frame, source = read_transform(pair.transform, pair.roots.pixieverse)
-    return replace(field, frame=frame, sources=(*field.sources, source))
+    if pair.transform is not None:
+        frame, source = read_transform(pair.transform, pair.roots.pixieverse)
+        field = replace(field, frame=frame, sources=(*field.sources, source))
+    return replace(field, sources=pair.roots.numbered(field.sources))
 
 
 def read_latents(pair: AssetPair) -> StructuredLatents:

@@ -82,7 +82,7 @@ def _hash_annotation(pair: AssetPair, grid: Place) -> list[SourceFile]:
     for path, role in ((pair.beside, "description"), (pair.transform, "transform")):
         if path:
             sources.append(load_source(path, root, role)[1])
-    return sources
+    return list(pair.roots.numbered(sources))
 
 
 def _hash_slat(

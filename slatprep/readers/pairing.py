@@ -13,11 +13,11 @@ from itertools import groupby
 from slatprep.errors import ConfigError, InputError, in_unicode
 from slatprep.parameters import BuildParameters, PixieverseSource, SlatSource
 from slatprep.readers.adapters import FoundField, patterns_of, source_adapter
-from slatprep.readers.encoders import latent_space
+from slatprep.readers.contents import contents_of
 from slatprep.readers.joins import read_categories, read_map
 from slatprep.readers.patterns import NAME, fill, find_files, list_below, tried_names
 from slatprep.readers.slat_files import NamedSlat, encoded, find_slats, ordered
-from slatprep.records import AssetPair, Contents, Place, SourceRoots
+from slatprep.records import AssetPair, Place, SourceRoots
 from slatprep.storage.listing import Listing
 
 
@@ -35,7 +35,10 @@ class _Row:
 
 @dataclass(frozen=True, slots=True)
 class _Found:
-    """What of a dataset is there, by names; `listing` is that of the PixieVerse root."""
+    """What of a dataset is there, by names; `listing` is that of the PixieVerse root.
+
+    Further sources, `also`, are as if each were the first.
+    """
 
     parameters: BuildParameters
     roots: SourceRoots
@@ -43,6 +46,7 @@ class _Found:
     one_file: bool
     grids: Mapping[str, list[FoundField]]
     categories: Mapping[str, str]
+    also: tuple[_Found, ...] = ()
 
 
 def discover(parameters: BuildParameters) -> list[AssetPair]:
@@ -66,12 +70,14 @@ def discover(parameters: BuildParameters) -> list[AssetPair]:
         is found on one side.
     """
     pixieverse, slat, pairing = parameters.pixieverse, parameters.slat, parameters.pairing
-    for root in (pixieverse.root, slat.root):
+    sources = (pixieverse, *parameters.also)
+    for root in (*(source.root for source in sources), slat.root):
         if str(root) != in_unicode(str(root)):
             raise ConfigError(f"{root}: is no UTF-8, so that no record can hold it; rename it")
     try:
-        if not pixieverse.root.is_dir():
-            raise ConfigError(f"{pixieverse.root}: no such folder; expected the PixieVerse root")
+        for source in sources:
+            if not source.root.is_dir():
+                raise ConfigError(f"{source.root}: no such folder; expected the PixieVerse root")
         if not slat.root.exists():
             raise ConfigError(
                 f"{slat.root}: does not exist; expected a folder of SLATs or an HDF5 file"
@@ -79,17 +85,10 @@ def discover(parameters: BuildParameters) -> list[AssetPair]:
         one_file = slat.root.is_file()
     except OSError as error:
         raise ConfigError(f"{error.filename}: cannot be looked at ({error.strerror})") from None
-    listing = list_below(pixieverse.root)
-    grids = find_grids(pixieverse, listing)
-    if not grids:
-        adapter = source_adapter(pixieverse.adapter)
-        patterns = patterns_of(adapter, pixieverse)
-        tried = tried_names(patterns, _settled(sample=pixieverse.sample))
-        # Plain voxels have the names that SLATs have.
-        ours = pixieverse.adapter == PixieverseSource.adapter and not one_file
-        swapped = ours and find_grids(pixieverse, list_below(slat.root))
-        hint = f"; the roots are swapped: grids lie below {slat.root}" if swapped else ""
-        raise ConfigError(f"{pixieverse.root}: no grid found; looked for {tried}{hint}")
+    listings = [list_below(source.root) for source in sources]
+    grids, *further = [
+        _grids_of(*both, slat, one_file) for both in zip(sources, listings, strict=True)
+    ]
     slats = find_slats(slat, one_file)
     claims = {} if pairing.map is None else read_map(pairing.map, grids, slats)
     categories = {} if pairing.categories is None else read_categories(pairing.categories)
@@ -98,20 +97,36 @@ def discover(parameters: BuildParameters) -> list[AssetPair]:
         rows = [own for row in rows for own in _rows_by_sample(row, grids)]
     rows.sort(key=lambda row: (row.asset_id, row.object_id))
     folder = slat.root.parent if one_file else slat.root
-    roots = SourceRoots(pixieverse.root, folder, contents_of(parameters), pixieverse.adapter)
-    return list(_pairs(rows, _Found(parameters, roots, listing, one_file, grids, categories)))
+    contents = contents_of(parameters)
+    roots = SourceRoots(pixieverse.root, folder, contents, pixieverse.adapter)
+    there = _Found(parameters, roots, listings[0], one_file, grids, categories)
+    also = tuple(
+        replace(
+            there,
+            parameters=replace(parameters, pixieverse=source, also=()),
+            roots=SourceRoots(source.root, folder, contents, source.adapter, number),
+            listing=listings[number],
+            grids=further[number - 1],
+        )
+        for number, source in enumerate(parameters.also, 1)
+    )
+    return list(_pairs(rows, replace(there, also=also)))
 
 
-def contents_of(parameters: BuildParameters) -> Contents:
-    """Return what the sources of a dataset hold, as far as it is known before they are read.
-
-    Raises
-    ------
-    ConfigError
-        If they cannot tell.
-    """
-    held = source_adapter(parameters.pixieverse.adapter).describe(parameters.pixieverse)
-    return Contents(held.properties, held.classes, latent_space(parameters.slat))
+def _grids_of(
+    source: PixieverseSource, listing: Listing, slat: SlatSource, one_file: bool
+) -> dict[str, list[FoundField]]:
+    """Return what `find_grids` does; ConfigError where that is nothing."""
+    grids = find_grids(source, listing)
+    if grids:
+        return grids
+    patterns = patterns_of(source_adapter(source.adapter), source)
+    tried = tried_names(patterns, _settled(sample=source.sample))
+    # Plain voxels have the names that SLATs have.
+    ours = source.adapter == PixieverseSource.adapter and not one_file
+    swapped = ours and find_grids(source, list_below(slat.root))
+    hint = f"; the roots are swapped: grids lie below {slat.root}" if swapped else ""
+    raise ConfigError(f"{source.root}: no grid found; looked for {tried}{hint}")
 
 
 def explain_unmatched(pairs: Collection[AssetPair], parameters: BuildParameters) -> str:
@@ -229,11 +244,21 @@ def _pair(row: _Row, there: _Found, shared: str) -> AssetPair:
         grids = [grid for grid in grids if grid.sample == row.sample]
     if samples == "first":
         grids = [grid for grid in grids if grid.sample == grids[0].sample]
-    if samples != "merge":
+    if samples != "merge" or not grids:
         return _pair_of(row, there, shared, grids)
-    apart = [list(group) for _, group in groupby(grids, key=lambda found: found.sample)]
-    first, *others = [_pair_of(row, there, shared, group) for group in apart or [[]]]
+    first, *others = [
+        _pair_of(row, source, shared, list(group))
+        for source in (there, *there.also)
+        for _, group in groupby(
+            sorted(source.grids.get(row.object_id, ()), key=_order_of), key=lambda one: one.sample
+        )
+    ]
     return replace(first, others=tuple(others))
+
+
+def _label(number: int, sample: str) -> str:
+    """Return what tells an annotation from the object's others: its sample, and its source."""
+    return ".".join(filter(None, (f"also_{number}" if number else "", sample)))
 
 
 def _order_of(found: FoundField) -> tuple[float, str, str]:
@@ -292,7 +317,7 @@ def _pair_of(row: _Row, there: _Found, shared: str, grids: Sequence[FoundField])
         problem="; ".join(dict.fromkeys(filter(None, problems))),
         transform=transform,
         beside=beside,
-        sample=grids[0].sample if grids else "",
+        sample=_label(there.roots.number, grids[0].sample if grids else ""),
     )
 
 

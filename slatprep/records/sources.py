@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import IO, Annotated, Any, Protocol, Self
 
@@ -68,22 +69,37 @@ ROLES = ("grid", "mask", "bounds", "description", "transform", "slat")
 
 @dataclass(frozen=True)
 class SourceFile:
-    """A file that was read; ``path`` is relative to its source's root, with forward slashes."""
+    """A file that was read; ``path`` is relative to its source's root, with forward slashes.
+
+    ``source`` is 0 for a file of the first source or of the latents, k for one of the k-th further
+    source, `slatprep.parameters.BuildParameters.also`.
+    """
 
     role: Annotated[str, _one_of(*ROLES)]
     path: str
     size: Count
     sha256: Digest
+    source: Count = 0
 
 
 @dataclass(frozen=True)
 class SourceRoots:
-    """The folders below which all files of the two sources lie, and what the files hold."""
+    """The folders below which the files of one source and of the latents lie, and what they hold.
+
+    ``number`` says which source of several this is, counted from 0; the first names the
+    others in ``also``.
+    """
 
     pixieverse: Place
     slat: Place
     contents: Contents = PIXIEVERSE
     adapter: str = "pixieverse"
+    number: int = 0
+    also: tuple[SourceRoots, ...] = ()
+
+    def numbered(self, files: Iterable[SourceFile]) -> tuple[SourceFile, ...]:
+        """Return files with the number of the source that they lie in."""
+        return tuple(replace(file, source=self.number) for file in files)
 
 
 @dataclass(frozen=True, slots=True)

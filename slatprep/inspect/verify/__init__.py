@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from slatprep.errors import StoreError
 from slatprep.inspect.verify.assets import asset_findings
 from slatprep.inspect.verify.index import index_findings
-from slatprep.inspect.verify.manifests import manifest_findings, source_roots
+from slatprep.inspect.verify.manifests import manifest_findings, moved, source_roots
 from slatprep.provenance.places import manifests_beside
 from slatprep.records import Place, SourceRoots
 from slatprep.storage.place import place_of, storage_of
@@ -113,9 +113,9 @@ def verify_store(
         finding = Finding("zarr.json", "", str(error), "the metadata of a slatprep store")
         return Verification(path, 0, 0, 0, None, (finding,))
     folder = manifests or manifests_beside(path)
-    if sources and roots is None:
-        roots = source_roots(folder)
-    needed = [roots.pixieverse, roots.slat] if sources and roots else []
+    if sources:
+        roots = source_roots(folder) if roots is None else moved(roots, folder)
+    needed = [roots.slat, *(one.pixieverse for one in (roots, *roots.also))] if roots else []
     require_shared(jobs, [store.path / "zarr.json", *needed])
     findings = set(metadata_findings(path))
     files, found = file_findings(store, jobs)

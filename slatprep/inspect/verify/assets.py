@@ -239,7 +239,13 @@ def confidence_findings(asset: StoredAsset, record: AssetRecord) -> Iterator[Fin
 def source_findings(record: AssetRecord, roots: SourceRoots, run: str) -> Iterator[Finding]:
     """Yield findings on sources that are missing or differ from the record."""
     for source in record.sources:
-        root = roots.slat if source.role == "slat" else roots.pixieverse
+        try:
+            own = (roots, *roots.also)[source.source]
+        except IndexError:
+            what = f"{source.path} is of [[also]] {source.source}, whose root is not known"
+            yield Finding("sources", record.asset_id, what, "its root, by --also")
+            continue
+        root = roots.slat if source.role == "slat" else own.pixieverse
         path = root / source.path
         expected = f"SHA-256 {source.sha256}"
         try:
@@ -280,11 +286,10 @@ _IS_GRID_CLASS = np.isin(np.arange(256), (*range(BACKGROUND + 1), UNANNOTATED))
 
 
 def _is_spread(asset: StoredAsset) -> bool:
-    """Whether spreads are at least 0, of all properties or none, and only of merged labels."""
+    """Whether spreads are at least 0, and only of merged labels."""
     missing = np.isnan(asset.spread)
     may = asset.valid & asset.merged
-    rows_agree = (missing.all(axis=1) == missing.any(axis=1)).all()
-    return bool(rows_agree and missing[~may].all() and (missing | (asset.spread >= 0)).all())
+    return bool(missing[~may].all() and (missing | (asset.spread >= 0)).all())
 
 
 def _normalised(values: NDArray[np.float32], where: NDArray[np.bool_]) -> bool:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 from collections import Counter, deque
 from collections.abc import Iterator
+from dataclasses import replace
 
 import orjson
 
@@ -53,12 +54,17 @@ def source_roots(manifests: Place | None) -> SourceRoots:
         build = build_in(manifests)
         slat = build.parameters.slat.root
         slat = slat.parent if slat.is_file() else slat
-        roots = build.parameters.pixieverse.root, slat
+        sources = build.parameters.pixieverse, *build.parameters.also
+        roots = *(source.root for source in sources), slat
         gone = [root for root in roots if not root.exists()]
     except (OSError, StoreError) as error:
         raise StoreError(f"{manifests / BUILD}: names no sources ({error}); {advice}") from None
     if not gone:
-        return SourceRoots(*roots, adapter=build.parameters.pixieverse.adapter)
+        first, *also = [
+            SourceRoots(source.root, slat, adapter=source.adapter, number=number)
+            for number, source in enumerate(sources)
+        ]
+        return replace(first, also=tuple(also))
     text = str(build.parameters.pixieverse.root)
     if APART in text:
         raise StoreError(
@@ -68,6 +74,19 @@ def source_roots(manifests: Place | None) -> SourceRoots:
     if text == NO_ROOT:
         raise StoreError(f"{manifests / BUILD}: does not say where its sources are; {advice}")
     raise StoreError(f"{manifests / BUILD}: its sources are not at {gone[0]} any more; {advice}")
+
+
+def moved(roots: SourceRoots, manifests: Place | None) -> SourceRoots:
+    """Return roots that were moved since the build, with the adapters that its record names."""
+    try:
+        build = None if manifests is None else build_in(manifests).parameters
+    except StoreError:
+        build = None  # It is named with the records.
+    if build is None:
+        return roots
+    sources = zip((roots, *roots.also), (build.pixieverse, *build.also), strict=False)
+    first, *also = [replace(one, adapter=source.adapter) for one, source in sources]
+    return replace(first, also=tuple(also))
 
 
 def manifest_findings(store: Store, folder: Place) -> Iterator[Finding]:

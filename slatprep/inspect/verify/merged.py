@@ -14,7 +14,7 @@ from slatprep.pipeline.annotate import annotate
 from slatprep.provenance.record import AssetRecord
 from slatprep.readers import read_field
 from slatprep.records import AssetPair, Contribution, SourceRoots, StructuredLatents
-from slatprep.sample import merge
+from slatprep.sample import in_table, merge
 from slatprep.store.contract import Finding
 from slatprep.store.reader import StoredAsset
 
@@ -26,7 +26,7 @@ def merged_findings(
     asset: StoredAsset, record: AssetRecord, roots: SourceRoots
 ) -> Iterator[Finding]:
     """Yield where merged labels are not what the sources and the recorded alignments give."""
-    latents = StructuredLatents(asset.coords, asset.feats)
+    latents, contents = StructuredLatents(asset.coords, asset.feats), asset.store.contents
     parts = []
     for one in record.merged:
         if one.left_out or one.alignment is None or one.judgement is None:
@@ -39,11 +39,11 @@ def merged_findings(
             yield Finding("sources", asset.asset_id, where, "the sources of the build")
             return
         placed = annotate(pair, field, latents, record.parameters, one.alignment, one.judgement)
-        parts.append(placed.annotation)
+        parts.append(in_table(placed.annotation, field, contents))
     if not parts:
         yield Finding("asset/record", asset.asset_id, "merges no annotation", "one at least")
         return
-    made = merge(parts, asset.store.contents.properties)
+    made = merge(parts, contents.properties)
     ranges = asset.store.normalization
     spread = None if made.spread is None else normalize_change(made.spread, ranges)
     for name, values, limit in (
@@ -70,14 +70,16 @@ def _pair_of(
     asset: StoredAsset, record: AssetRecord, one: Contribution, roots: SourceRoots
 ) -> AssetPair:
     """Return where the files of one annotation lie now."""
-    files = {record.sources[k].role: roots.pixieverse / record.sources[k].path for k in one.sources}
+    found = [record.sources[k] for k in one.sources]
+    own = (roots, *roots.also)[found[0].source]
+    files = {file.role: own.pixieverse / file.path for file in found}
     slat = next(roots.slat / file.path for file in record.sources if file.role == "slat")
     return AssetPair(
         record.asset_id,
         record.object_id,
         record.view,
         record.category,
-        replace(roots, contents=asset.store.contents),
+        replace(own, contents=asset.store.contents),
         files.get("grid"),
         files.get("mask"),
         files.get("bounds"),
