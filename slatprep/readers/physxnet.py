@@ -5,6 +5,9 @@ of its rows a row of ``property/<id>2.npy``: the object's largest dimension [cm]
 the part among those one would touch, its density [g/cm^3], the group that moves together
 and that group's parent, eight numbers of the movement, and its kind. ``property/<id>1.npy``
 are embeddings of text.
+
+The density is in g/cm^3: PhysX-3D's ``tools/1_gptanno.py`` asks for it in that unit, so that a
+part's annotation reads ``"1.2 g/cm^3"``, and the toolkit keeps the number before the blank.
 """
 
 from __future__ import annotations
