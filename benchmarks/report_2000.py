@@ -2,8 +2,8 @@
 
     python benchmarks/report_2000.py STORE.zarr [--assets 2000] [--noise 0.05] [--jobs 2]
 
-STORE.zarr is any store with its records beside it; its assets are repeated,
-each with a noise of its own added to the normalised properties if asked for,
+STORE.zarr is any store with its records beside it or in manifests/build/NAME; its
+assets are repeated, each with a noise of its own added to the normalised properties if asked for,
 until there are enough. The page is then opened from disk in a fresh headless
 Chromium, several times. Printed: the page's bytes, the seconds to make it,
 and in milliseconds the median time from opening the file to a table that can
@@ -56,8 +56,18 @@ document.querySelector('tbody tr:not(.space)').click();
 """
 
 
+def records_of(store: Path) -> Path:
+    """Return the folder of a store's records, where `slatprep report` looks for it too."""
+    usual = (manifests_of(store), Path("manifests/build") / store.stem)
+    for folder in usual:
+        if (folder / "assets.jsonl").is_file():
+            return folder
+    raise SystemExit(f"{store}: no records in {' or '.join(map(str, usual))}")
+
+
 def repeat_store(source: Path, folder: Path, assets: int, noise: float) -> tuple[Path, Path]:
     """Write a store of `assets` assets, those of `source` over and over, and its records."""
+    known = records_of(source)
     store = open_store(source)
     chosen = list(islice(cycle(range(len(store))), assets))
     lengths = np.diff(store.offsets)[chosen]
@@ -65,7 +75,7 @@ def repeat_store(source: Path, folder: Path, assets: int, noise: float) -> tuple
     ids = np.array([f"{number:05d}.{store.ids[k]}" for number, k in enumerate(chosen)])
     rng = np.random.default_rng(0)
     path = folder / "repeated.zarr"
-    create_store(path, assets, int(offsets[-1]), StoreParameters())
+    create_store(path, assets, int(offsets[-1]), StoreParameters(), store.contents)
     root = open_for_writing(path)
     root.attrs.update(store.group.attrs.asdict())
     for name in (layout.name for layout in ARRAYS):
@@ -89,8 +99,8 @@ def repeat_store(source: Path, folder: Path, assets: int, noise: float) -> tuple
             root[name][:] = values
     manifests = manifests_of(path)
     manifests.mkdir()
-    shutil.copy(manifests_of(source) / "build.json", manifests)
-    with (manifests_of(source) / "assets.jsonl").open(encoding="utf-8") as lines:
+    shutil.copy(known / "build.json", manifests)
+    with (known / "assets.jsonl").open(encoding="utf-8") as lines:
         records = {record["asset_id"]: record for record in map(json.loads, lines)}
     told = zip(ids, chosen, strict=True)
     texts = [json.dumps({**records[store.ids[k]], "asset_id": str(name)}) for name, k in told]

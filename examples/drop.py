@@ -1,6 +1,6 @@
 """Drop an object of a store: by way of transfer, to a picture.
 
-    pip install 'slatprep[simulate]'
+    pip install 'slatprep[simulate,paper]'
     python examples/drop.py --out docs/images/drop.png
     python examples/drop.py --store demo.zarr --asset ID --size 0.2 --out drop.png
 

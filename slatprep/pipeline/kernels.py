@@ -27,7 +27,7 @@ def compile_kernels(note: Callable[[str], None] | None = None) -> None:
     ----------
     note : callable, optional
         Gets a line to show when something has to be compiled, which takes
-        about 20 s in all; otherwise this takes 1 s.
+        20 to 40 s in all; otherwise this takes 1 s.
     """
     from numba.core import event
 
@@ -36,7 +36,7 @@ def compile_kernels(note: Callable[[str], None] | None = None) -> None:
 
         def on_start(self, event: Any) -> None:
             if note and not self.told:
-                note("compiling the numerical kernels, once after installing: about 20 s")
+                note("compiling the numerical kernels, once after installing: 20 to 40 s")
             self.told = True
 
         def on_end(self, event: Any) -> None:
