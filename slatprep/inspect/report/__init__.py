@@ -24,7 +24,7 @@ from slatprep.provenance.stored import StoredRecords
 from slatprep.records import Place, Verdict
 from slatprep.storage.atomic import staged, writing
 from slatprep.store import open_store
-from slatprep.store.reader import Store
+from slatprep.store.reader import Store, StoredAsset
 from slatprep.workers import Progress
 from slatprep.workers.local import run_unordered
 
@@ -67,11 +67,17 @@ class ReportSummary:
 
 @dataclass(frozen=True)
 class Drawn:
-    """An asset of the store as drawn: thumbnail, and voxels by level of detail."""
+    """An asset of the store as drawn: thumbnail, and voxels by level of detail.
+
+    Where its labels are merged, ``votes`` is the mean share of votes for a voxel's class, and
+    ``spreads`` has the mean spread of each normalised property, NaN where one annotation has it.
+    """
 
     index: int
     thumbnail: NDArray[np.uint8]
     voxels: dict[int, bytes]
+    votes: float = np.nan
+    spreads: tuple[float, ...] = ()
 
 
 def write_report(
@@ -128,7 +134,8 @@ def write_report(
     drawn.sort(key=attrgetter("index"))
     full = sum(len(one.voxels[FULL]) for one in drawn)
     side = FULL if full <= VOXEL_BYTES else COARSE
-    content = page_content(store, outcomes, tallies, chosen, side, created)
+    agreement = {one.index: (one.votes, one.spreads) for one in drawn if one.spreads}
+    content = page_content(store, outcomes, tallies, chosen, side, created, agreement)
     sheets = [drawn[start : start + PER_SHEET] for start in range(0, len(drawn), PER_SHEET)]
     with writing(str(out), Path(out).parent), staged(Path(out)) as temporary:
         with temporary.open("w", encoding="utf-8", newline="\n") as file:
@@ -185,7 +192,7 @@ def _draw(path: Path, indices: Sequence[int]) -> tuple[list[Drawn], dict[str, Ta
         asset = store.asset(store.ids[index])
         way = records.place_map(asset)
         voxels = {side: encode_asset(asset, way, max_distance, side) for side in (FULL, COARSE)}
-        drawn.append(Drawn(index, thumbnail(asset), voxels))
+        drawn.append(Drawn(index, thumbnail(asset), voxels, *_agreement(asset)))
         field, slat = (
             (asset.grid_material, asset.grid_properties),
             (asset.material, asset.properties),
@@ -193,6 +200,15 @@ def _draw(path: Path, indices: Sequence[int]) -> tuple[list[Drawn], dict[str, Ta
         counts = tally(field, slat, store.normalization, BINS)
         _add(tallies, {str(asset.columns["category"]): counts})
     return drawn, tallies
+
+
+def _agreement(asset: StoredAsset) -> tuple[float, tuple[float, ...]]:
+    """Return what `Drawn` has of merged labels."""
+    if not asset.merged or not asset.valid.any():
+        return np.nan, ()
+    spread = np.ma.masked_invalid(asset.spread.astype(np.float64)).mean(axis=0)
+    votes = asset.votes[asset.valid].mean(dtype=np.float64)
+    return float(votes), tuple(spread.filled(np.nan).tolist())
 
 
 def _add(tallies: dict[str, Tally], more: Mapping[str, Tally]) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -34,6 +35,9 @@ _FIGURES = ("confidence", "expected_accuracy", "fitness", "fitness_backward", "i
             "overlap", "valid_share", "ambiguity", "margin")  # fmt: skip
 _DIGITS = 5
 
+Agreement = Mapping[int, tuple[float, tuple[float, ...]]]
+"""Mean votes and mean spreads of rows with merged labels."""
+
 BINS = 64
 """Bins of the histograms of normalised properties, over [-1, 1]."""
 
@@ -45,6 +49,7 @@ def page_content(
     chosen: Sequence[int],
     side: int,
     created: str | None,
+    agreement: Agreement = MappingProxyType({}),
 ) -> dict[str, Any]:
     """Return the content of a page.
 
@@ -62,6 +67,8 @@ def page_content(
         Voxels per edge of the 3D views.
     created : str or None
         When the store was built, if known from its records.
+    agreement : mapping of int to (float, tuple of float)
+        Of assets with merged labels, by row: mean votes, and mean spread of each property.
 
     Returns
     -------
@@ -112,7 +119,7 @@ def page_content(
         "turns": quarter_turns(),
         "properties": _properties(store, outcomes, tallies),
         "balance": _balance(store, tallies),
-        "assets": _table(store, outcomes, chosen),
+        "assets": _table(store, outcomes, chosen, agreement),
     }
 
 
@@ -166,7 +173,10 @@ def _balance(store: Store, tallies: Mapping[str, Tally]) -> list[dict[str, Any]]
 
 
 def _table(
-    store: Store, outcomes: Sequence[Outcome] | None, chosen: Sequence[int]
+    store: Store,
+    outcomes: Sequence[Outcome] | None,
+    chosen: Sequence[int],
+    agreement: Agreement,
 ) -> dict[str, list[Any]]:
     """Return the columns of the table of assets."""
     known = {outcome.asset_id: outcome for outcome in outcomes or ()}
@@ -195,6 +205,12 @@ def _table(
         "displacement": (outcome and _number(outcome.displacement) for outcome in stored),
         "reasons": (list(outcome.reasons) if outcome else [] for outcome in stored),
         "picture": map(pictures.get, range(len(store))),
+        "annotations": ((outcome and list(outcome.annotations)) or None for outcome in stored),
+        "votes": (_number(agreement.get(row, (None, ()))[0]) for row in range(len(store))),
+        "spreads": (
+            [_number(one) for one in agreement[row][1]] if row in agreement else None
+            for row in range(len(store))
+        ),
         **{name: map(_number, store.column(name).tolist()) for name in _FIGURES},
     }
     of_absent: dict[str, list[Any]] = {

@@ -39,6 +39,9 @@ class Outcome:
         Values of ``voxel/properties`` outside the range, by property.
     ties : tuple of tuple of float
         Transforms of the first `MOST_TIES` tied placements, each as three rows of four numbers.
+    annotations : tuple of int
+        How many annotations its labels are merged of, and how many there are; empty where
+        there is one.
     """
 
     asset_id: str
@@ -49,6 +52,7 @@ class Outcome:
     displacement: float | None
     clipped: tuple[int, ...]
     ties: tuple[tuple[float, ...], ...] = ()
+    annotations: tuple[int, ...] = ()
 
 
 def read_outcomes(manifests: Place, build_id: str) -> Iterator[Outcome]:
@@ -134,4 +138,7 @@ def _outcome(record: Record) -> Outcome:
         ties=tuple(
             tuple(placement.transform[:3].ravel().tolist()) for placement in placements[:MOST_TIES]
         ),
+        annotations=(sum(not one.left_out for one in record.merged), len(record.merged))
+        if record.merged
+        else (),
     )

@@ -170,9 +170,23 @@ const Detail = (() => {
       ["Unphysical voxels left out", Format.count(value("unphysical"))],
       ["Nearest quarter turn", CONTENT.turns[value("turn")]],
       ["Angle to it", `${value("tilt").toFixed(1)}°`],
+      ...merged(value),
       [`Transform (${value("model")})`, ""],
     ];
     return [...list.flatMap(([name, text]) => [el("dt", {}, name), el("dd", {}, text)]), el("dd", { class: "matrix" }, rows.join("\n"))];
+  }
+
+  /** What several annotations say: a spread of log10 is a factor, others are differences. */
+  function merged(value) {
+    if (value("spreads") === null) return [];
+    const spreads = value("spreads").flatMap((spread, k) => {
+      const { name, log10, lo, hi } = CONTENT.properties[k];
+      const known = PROPERTY_NAMES[name];
+      const width = (spread * (hi - lo)) / 2;
+      const text = log10 ? `factor ${(10 ** width).toFixed(2)}` : `± ${Number(width.toPrecision(2))} ${known.unit}`;
+      return spread === null ? [] : [[`${known.name}, spread`, text]];
+    });
+    return [["Annotations merged", Format.annotations(value("annotations"))], ["Votes for the class", Format.share(value("votes"))], ...spreads];
   }
 
   function step(by) {

@@ -109,5 +109,11 @@ const Data = (() => {
   /** Return the mapped value (log10 or plain) of a property's step. */
   const mapped = (property, step) => property.lo + (step / (levels - 1)) * (property.hi - property.lo);
 
-  return { arrived, showThumbnail, voxels, mapped, side, levels, NOT_VALID: 255 };
+  /** Return the mean spread of an asset's normalised properties; null where nothing was merged. */
+  function spread(index) {
+    const own = (ASSETS.spreads[index] ?? []).filter((value) => value !== null);
+    return own.length ? own.reduce((sum, value) => sum + value, 0) / own.length : null;
+  }
+
+  return { arrived, spread, showThumbnail, voxels, mapped, side, levels, NOT_VALID: 255 };
 })();

@@ -48,5 +48,6 @@ const Format = (() => {
   /** Smallest and largest of many values, too many to be arguments of Math.min. */
   const extent = (values) => values.reduce(([lo, hi], x) => [Math.min(lo, x), Math.max(hi, x)], [Infinity, -Infinity]);
   const plural = (n, one, many = `${one}s`) => `${count(n)} ${n === 1 ? one : many}`;
-  return { NONE, count, fixed, share, scientific, power, quantile, extent, plural };
+  const annotations = (merged) => (!merged ? NONE : merged[0] === merged[1] ? count(merged[0]) : `${count(merged[0])} of ${count(merged[1])}`);
+  return { NONE, annotations, count, fixed, share, scientific, power, quantile, extent, plural };
 })();

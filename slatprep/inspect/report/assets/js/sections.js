@@ -25,6 +25,8 @@ const Sections = (() => {
     if (unphysical) tiles.push(["unphysical voxels left out", Format.count(unphysical)]);
     if (CONTENT.records) tiles.push(["assets with ties", Format.count(ASSETS.tied.filter((tied) => tied > 0).length)]);
     byId("tiles").replaceChildren(...tiles.map(([name, value]) => el("div", {}, el("dt", {}, name), el("dd", {}, value))));
+    const several = known(ASSETS.spreads).length;
+    if (several) tiles.push(["assets with merged labels", Format.count(several)]);
     const present = counts.filter((state) => state.count);
     byId("statebar").replaceChildren(
       ...present.map((state) => el("i", { "data-state": state.name, title: `${state.name}: ${state.count}`, style: { flex: `${state.count} 0 0`, background: "var(--tone)" } })),
@@ -129,7 +131,7 @@ const Sections = (() => {
 
   function properties() {
     const source = CONTENT.properties[0].source;
-    const range = { dataset: "the smallest and largest value of this dataset", pixie: "Pixie's published ranges" }[source] ?? `the file ${source}`;
+    const range = { dataset: "the smallest and largest value of this dataset", pixie: "Pixie's published ranges" }[source] ?? (/^(p\d|dataset of)/.test(source) ? source : `the file ${source}`);
     byId("properties-hint").textContent =
       `Before: the annotated voxels of the PixieVerse fields in physical units, not normalised. After: the valid SLAT voxels as the store holds them. ` +
       `Solid lines mark the range that becomes −1 to 1 (${range}); dashed lines, Pixie's published range.`;

@@ -5,7 +5,7 @@ const Table = (() => {
   const SPARE = 6;
   const number = (name, digits) => ({ value: (i) => ASSETS[name][i], text: (i) => Format.fixed(digits)(ASSETS[name][i]), right: true });
   const share = (name) => ({ value: (i) => ASSETS[name][i], text: (i) => Format.share(ASSETS[name][i]), right: true });
-  const COLUMNS = [
+  const COLUMNS = usable([
     { key: "picture", title: "Front, right, top", width: 194 },
     { key: "id", title: "Asset", width: 156, value: (i) => ASSETS.id[i] },
     { key: "category", title: "Category", width: 132, value: (i) => ASSETS.category[i] || null, text: (i) => ASSETS.category[i] || Format.NONE, wide: true },
@@ -21,7 +21,10 @@ const Table = (() => {
     { key: "displacement", title: "Displaced", width: 104, ...number("displacement", 1), wide: true },
     { key: "tilt", title: "Tilt", width: 68, value: (i) => ASSETS.tilt[i], text: (i) => (ASSETS.tilt[i] === null ? Format.NONE : `${ASSETS.tilt[i].toFixed(1)}°`), right: true, wide: true },
     { key: "voxels", title: "Voxels", width: 84, value: (i) => ASSETS.voxels[i], text: (i) => Format.count(ASSETS.voxels[i]), right: true, wide: true },
-  ];
+    { key: "annotations", title: "Annotations", width: 118, value: (i) => ASSETS.annotations[i]?.[0] ?? null, text: (i) => Format.annotations(ASSETS.annotations[i]), right: true, wide: true, merged: true },
+    { key: "votes", title: "Votes", width: 80, ...share("votes"), wide: true, merged: true },
+    { key: "spread", title: "Spread", width: 84, value: Data.spread, text: (i) => Format.fixed(3)(Data.spread(i)), right: true, wide: true, merged: true },
+  ]);
   const TITLES = {
     model: "Rigid, similarity, affine or deformable: what maps the PixieVerse frame to the SLAT",
     confidence: "Calibrated probability that the placement is right",
@@ -33,7 +36,16 @@ const Table = (() => {
     ambiguity: "Share of SLAT voxels whose class depends on the choice among tied placements",
     displacement: "Largest distance between tied placements, in voxels",
     tilt: "Angle to the nearest quarter turn",
+    annotations: "Annotations of the object that its labels are merged of, and how many there are",
+    votes: "Mean share of the annotations that give a voxel its class",
+    spread: "Mean standard deviation over the annotations, of properties normalised to −1 to 1",
   };
+
+  /** Leave out what only merged labels have, where there are none. */
+  function usable(columns) {
+    const merged = ASSETS.spreads.some((spreads) => spreads !== null);
+    return columns.filter((column) => merged || !column.merged);
+  }
 
   const box = byId("tablebox");
   const table = byId("table");
