@@ -32,7 +32,7 @@ from slatprep.store import Store, open_store
 try:
     import plyfile
     from drop_picture import Part, draw
-except ModuleNotFoundError as error:
+except ImportError as error:
     raise SystemExit(
         f"drop.py: {error}; it simulates and draws with pip install 'slatprep[simulate,paper]'"
     ) from None

@@ -38,7 +38,7 @@ try:
     import open3d as o3d
     from drop import fill
     from drop_picture import Shape, trace
-except ModuleNotFoundError as error:
+except ImportError as error:
     raise SystemExit(
         f"scenes.py: {error}; it simulates and draws with pip install 'slatprep[simulate,paper]'"
     ) from None

@@ -51,6 +51,27 @@ sys.exit('$pin' not in ('torch', 'torch==' + version('torch').partition('+')[0])
     fi
 }
 
+# Open3D's wheel links libraries of a desktop, which a small Debian leaves out.
+install_libraries() {
+    [ "$(uname -s)" = Linux ] || return 0
+    missing=$("$venv/bin/python" -c "
+import ctypes
+for name, package in (('X11.so.6', 'libx11-6'), ('GL.so.1', 'libgl1'), ('gomp.so.1', 'libgomp1')):
+    try:
+        ctypes.CDLL('lib' + name)
+    except OSError:
+        print(package, end=' ')
+")
+    [ -n "$missing" ] || return 0
+    if [ "$(id -u)" = 0 ] && command -v apt-get >/dev/null 2>&1; then
+        say "installing ${missing% }, without which Open3D cannot be loaded"
+        apt-get update -qq >&2 || true
+        DEBIAN_FRONTEND=noninteractive apt-get install -y -qq --no-install-recommends $missing \
+            >/dev/null 2>&1 && return 0
+    fi
+    say "Open3D cannot be loaded without ${missing% }; on Debian: sudo apt-get install ${missing% }"
+}
+
 case $what in
 run) lock=run from='--editable .' ;;
 paper) lock=test from='--editable .[paper]' ;;
@@ -63,6 +84,9 @@ test) lock=test from='--editable .[dev]' ;;
 esac
 
 [ "$what" != test ] || install_torch
+case $what in
+paper | test) install_libraries ;;
+esac
 
 if [ "$locked" != yes ]; then
     say "installing slatprep for '$what' without the lock"

@@ -62,7 +62,7 @@ def align(
 
 
 def require_engine(parameters: AlignParameters) -> None:
-    """Make sure that an engine's package is installed.
+    """Make sure that an engine's package is installed, and Open3D can be loaded.
 
     Parameters
     ----------
@@ -80,6 +80,10 @@ def require_engine(parameters: AlignParameters) -> None:
             f"the engine {parameters.engine} needs the package of that name, which is not "
             f"installed: pip install 'slatprep[{extra}]'"
         )
+    if parameters.engine is Engine.OPEN3D:
+        from slatprep.align.open3d_icp import load_open3d
+
+        load_open3d()
 
 
 def engine_versions(parameters: AlignParameters) -> dict[str, str]:

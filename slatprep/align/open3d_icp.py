@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slatprep.align.starts import Start, Transform, search_starts
+from slatprep.errors import SlatprepError
 from slatprep.geometry.frames import VOXEL_SIZE, voxel_centres
 from slatprep.geometry.voxels import boundary, voxels_of
 from slatprep.parameters import AlignParameters
@@ -64,6 +65,11 @@ def load_open3d() -> Any:
 
     Since 0.20 Open3D needs the system's libusb, though nothing here uses it; a
     copy that a wheel carries, loaded first, satisfies the dynamic linker.
+
+    Raises
+    ------
+    SlatprepError
+        If it cannot be loaded; small systems lack libraries that it links.
     """
     if sys.platform == "linux" and sys.version_info >= (3, 13):
         import ctypes
@@ -73,7 +79,13 @@ def load_open3d() -> Any:
         library = libusb_package.get_library_path()
         if library is not None:
             ctypes.CDLL(str(library), mode=ctypes.RTLD_GLOBAL)
-    import open3d
+    try:
+        import open3d
+    except ImportError as error:
+        raise SlatprepError(
+            f"Open3D is installed and cannot be loaded ({error}); it needs libraries of the "
+            "system, on Debian: apt-get install libx11-6 libgl1 libgomp1"
+        ) from None
 
     open3d.utility.set_verbosity_level(open3d.utility.VerbosityLevel.Error)
     return open3d

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
 from slatprep.cli.options import EXISTING_FOLDER, command, option, store_argument, workers_options
 from slatprep.cli.output import Output, say
+from slatprep.errors import StoreError
 
 if TYPE_CHECKING:
     from slatprep.records import Place
@@ -39,7 +41,7 @@ def verify(
 
     Options
     -------
-    --manifests: Folder of the records. [default: beside the store]
+    --manifests: Folder of the records. [default: beside the store, or manifests/build/NAME]
     --sources: Compare the source files with the records, too.
     --pixieverse: Root of the PixieVerse files now. [default: as at the build]
     --slat: Folder of the latents, or of their one HDF5 file, now. [default: as at the build]
@@ -53,11 +55,14 @@ def verify(
     if (pixieverse is None) != (slat is None) or (also and slat is None):
         raise click.UsageError("--pixieverse and --slat go together: name both, or neither")
     from slatprep.inspect.verify import SourceRoots, verify_store
+    from slatprep.provenance.places import manifests_beside
 
     roots = None
     if pixieverse and slat:
         further = tuple(SourceRoots(one, slat, number=k) for k, one in enumerate(also, 1))
         roots = SourceRoots(pixieverse, slat, also=further)
+    if options["manifests"] is None and manifests_beside(store) is None:
+        options["manifests"] = _left_by_make(store)
     with output.progress("verify") as progress:
         result = verify_store(
             store, sources=sources or roots is not None, roots=roots, progress=progress, **options
@@ -75,3 +80,16 @@ def verify(
         say(f"{store}: {found}")
 
     output.result(result, show, complete=result.ok)
+
+
+def _left_by_make(store: Place) -> Place | None:
+    """Return the folder where `make align` leaves a store's records, if they are of this build."""
+    from slatprep.provenance.files import build_in
+    from slatprep.store import open_store
+
+    folder = Path("manifests/build") / store.name.removesuffix(".zarr")
+    try:
+        own = build_in(folder).id == open_store(store).about.manifest
+    except (OSError, StoreError):
+        return None
+    return folder if own else None

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -45,6 +46,19 @@ def test_the_paper_s_protocol_gives_the_same_bits_again() -> None:
     once, again = (align(field_of(solid), latents, PRESETS["paper"].align) for _ in range(2))
     assert once.transform.tobytes() == again.transform.tobytes()
     assert once.candidates == again.candidates
+
+
+def test_an_engine_whose_libraries_are_missing_names_them(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """As Open3D on a system without a desktop."""
+    (tmp_path / "open3d").mkdir()
+    fault = "libX11.so.6: cannot open shared object file: No such file or directory"
+    (tmp_path / "open3d/__init__.py").write_text(f"raise ImportError({fault!r})")
+    monkeypatch.delitem(sys.modules, "open3d", raising=False)
+    monkeypatch.syspath_prepend(tmp_path)
+    with pytest.raises(SlatprepError, match=r"libX11\.so\.6.*apt-get install libx11-6"):
+        engine_versions(ENGINES["open3d"])
 
 
 @pytest.mark.parametrize(("engine", "extra"), [("open3d", "paper"), ("small_gicp", "bench")])
