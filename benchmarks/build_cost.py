@@ -40,7 +40,7 @@ STEPS = {
     "read_latents": process,
     "align": annotate,
     "sample": annotate,
-    "judge_with_voxels": annotate,
+    "judge": annotate,
 }
 
 

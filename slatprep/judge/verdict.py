@@ -69,7 +69,7 @@ def judge(
     alignment: Alignment,
     annotation: Annotation,
     parameters: SampleParameters,
-) -> Judgement:
+) -> tuple[Judgement, NDArray[np.float32]]:
     """Say what the alignment of an asset is worth.
 
     Parameters
@@ -85,21 +85,12 @@ def judge(
 
     Returns
     -------
-    Judgement
+    judgement : Judgement
         What ties would change, how sure placement and labels are, the verdict,
         and what kept it from being good.
+    likely : ndarray of float32, shape (N,)
+        How likely the class of each SLAT voxel is right, as `voxel_confidence` says.
     """
-    return judge_with_voxels(field, latents, alignment, annotation, parameters)[0]
-
-
-def judge_with_voxels(
-    field: MaterialField,
-    latents: StructuredLatents,
-    alignment: Alignment,
-    annotation: Annotation,
-    parameters: SampleParameters,
-) -> tuple[Judgement, NDArray[np.float32]]:
-    """Return what `judge` and `voxel_confidence` say, for little more than either costs."""
     from slatprep.judge.confidence import causes_of_doubt, class_confidence, placement_confidence
     from slatprep.judge.evidence import evidence_of, surroundings_of
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 from slatprep.align import align
 from slatprep.align.deformation import map_of
-from slatprep.judge import judge_with_voxels, voxel_confidence
+from slatprep.judge import judge, voxel_confidence
 from slatprep.parameters import BuildParameters
 from slatprep.provenance.record import StageParameters
 from slatprep.records import (
@@ -61,9 +61,7 @@ def annotate(
     reached("asset reused" if reused else "asset aligned", pair.asset_id)
     annotation = sample(field, map_of(alignment).places(latents.coords), parameters.sample)
     if judgement is None:
-        judgement, likely = judge_with_voxels(
-            field, latents, alignment, annotation, parameters.sample
-        )
+        judgement, likely = judge(field, latents, alignment, annotation, parameters.sample)
     else:
         confidence = judgement.confidence
         likely = voxel_confidence(field, latents, alignment, annotation, confidence)

@@ -54,7 +54,7 @@ class KeptAsset:
         Of its latents.
     names : Names or None
         Where its record has other ones.
-    several : bool
+    merged : bool
         Whether its labels are merged of several annotations.
     """
 
@@ -66,7 +66,7 @@ class KeptAsset:
     clipped: NDArray[np.int64]
     latents: LatentMoments | None
     names: Names | None = None
-    several: bool = False
+    merged: bool = False
 
 
 MOST_BEHIND = 0.1
@@ -131,7 +131,7 @@ def kept_assets(
         told = (*found[1:], planned.names, bool(pair.others))
         kept.append(KeptAsset(pair.asset_id, planned.key, row, sizes[row], *told))
     rows: list[Row] = [*kept, *made]
-    if not rows or store.merges != any(asset.several for asset in rows):
+    if not rows or store.merges != any(asset.merged for asset in rows):
         return None  # An array more, or less, is written anew.
     extents = [asset.extent for asset in rows]
     ranges = given or ranges_from_extents(extents, normalize.ranges, declared.properties)

@@ -14,7 +14,7 @@ import numpy as np
 from slatprep.align import align
 from slatprep.align.deformation import map_of
 from slatprep.geometry.voxels import voxels_of
-from slatprep.judge import judge_with_voxels
+from slatprep.judge import judge
 from slatprep.parameters import AlignParameters, SampleParameters
 from slatprep.records import RESOLUTION, MaterialField, StructuredLatents
 from slatprep.sample import sample
@@ -62,4 +62,4 @@ def _process_a_bent_shape() -> None:
     alignment = align(field, latents, AlignParameters(model="deformable"))
     places = map_of(alignment).places(latents.coords)
     annotation = sample(field, places, SampleParameters())
-    judge_with_voxels(field, latents, alignment, annotation, SampleParameters())
+    judge(field, latents, alignment, annotation, SampleParameters())

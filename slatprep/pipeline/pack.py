@@ -111,9 +111,9 @@ def append_rows(writers: Mapping[str, ShardWriter], arrays: Arrays, rows: int) -
             writer.append_fill(rows)
 
 
-def arrays_in(group: str, several: bool) -> list[str]:
+def arrays_in(group: str, merged: bool) -> list[str]:
     """Return the full names of a group's arrays; those of merged labels where there are any."""
-    layouts = arrays_with(several)
+    layouts = arrays_with(merged)
     return [layout.name for layout in layouts if layout.name.startswith(f"{group}/")]
 
 
@@ -269,8 +269,8 @@ def pack_store(
     """
     keys = [asset.row if isinstance(asset, KeptAsset) else asset.key for asset in assets]
     offsets = [0, *accumulate(asset.n_voxels for asset in assets)]
-    several = any(asset.several for asset in assets)
-    create_store(path, len(keys), offsets[-1], parameters, contents, several)
+    merged = any(asset.merged for asset in assets)
+    create_store(path, len(keys), offsets[-1], parameters, contents, merged)
     reached("store created", path.name)
     previous = carried.previous if carried else None
     write_assets(path, assets, offsets, normalization, previous.store if previous else None)
@@ -278,7 +278,7 @@ def pack_store(
     clipped = {group: np.zeros(shape, dtype=np.int64) for group in ("voxel", "grid")}
     same = carried.rows if carried else None
     if (remote := None if at is None else storage_of(at).remote) is not None:
-        arrays = [*arrays_in("voxel", several), *arrays_in("grid", several)]
+        arrays = [*arrays_in("voxel", merged), *arrays_in("grid", merged)]
         put_objects(path, remote, [f"{name}/zarr.json" for name in arrays])
     tasks = (
         (remote or path, spool, shard, normalization, previous)

@@ -100,8 +100,8 @@ def write_rows(
         store, records = work.scratch / "store.zarr", work.scratch / "assets.jsonl"
         with writing(str(place.out), work_directory(place.store).parent):
             offsets = [0, *accumulate(asset.n_voxels for asset in assets)]
-            several = any(asset.several for asset in assets)
-            create_store(store, len(rows), offsets[-1], parameters.store, contents, several)
+            merged = any(asset.merged for asset in assets)
+            create_store(store, len(rows), offsets[-1], parameters.store, contents, merged)
             write_assets(store, assets, offsets, normalization)
             _copy_rows(store, rows, offsets, normalization, parameters.store, progress)
             own = enumerate(_records(rows, normalization))

@@ -13,7 +13,7 @@ from dataclasses import replace
 
 from slatprep.align.deformation import map_of
 from slatprep.align.settle import refit
-from slatprep.judge import judge_with_voxels
+from slatprep.judge import judge
 from slatprep.parameters import BuildParameters
 from slatprep.pipeline.spool import Spool, SpooledAsset
 from slatprep.provenance.record import AssetRecord, FailedRecord, FirstPass
@@ -52,7 +52,7 @@ class Reopened:
             alignment = refit(alignment, self.field, self.latents, parameters.align)
         places = map_of(alignment).places(self.latents.coords)
         annotation = sample(self.field, places, parameters.sample)
-        judgement, likely = judge_with_voxels(
+        judgement, likely = judge(
             self.field, self.latents, alignment, annotation, parameters.sample
         )
         return alignment, replace(annotation, confidence=likely), judgement

@@ -74,7 +74,7 @@ class SpooledAsset:
         Of its latents; None where its record does not tell.
     damaged : str
         Why, in words, what an older store holds of it was not taken over.
-    several : bool
+    merged : bool
         Whether its labels are merged of several annotations.
     """
 
@@ -87,7 +87,7 @@ class SpooledAsset:
     columns: dict[str, Column]
     latents: LatentMoments | None = None
     damaged: str = ""
-    several: bool = False
+    merged: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -283,5 +283,5 @@ def spooled(record: AssetRecord, extent: NDArray[np.float64]) -> SpooledAsset:
         latents=record.latents,
         extent=extent,
         columns=columns_of(record),
-        several=bool(record.merged),
+        merged=bool(record.merged),
     )

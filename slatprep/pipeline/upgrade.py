@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from slatprep.judge import judge_with_voxels
+from slatprep.judge import judge
 from slatprep.pipeline.rewrite import Source, places_of_sources, write_rows
 from slatprep.pipeline.summary import BuildSummary
 from slatprep.provenance.record import AssetRecord
@@ -112,7 +112,7 @@ class _Judged(StoredRecords):
         annotation = Annotation(
             asset.properties_si, asset.material, asset.valid, asset.distance, asset.place
         )
-        judgement, likely = judge_with_voxels(
+        judgement, likely = judge(
             asset.field, latents, record.alignment, annotation, record.parameters.sample
         )
         self._known[row] = judgement, latents.moments

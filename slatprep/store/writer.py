@@ -70,7 +70,7 @@ def create_store(
     n_voxels: int,
     parameters: StoreParameters,
     contents: Contents = PIXIEVERSE,
-    several: bool = False,
+    merged: bool = False,
 ) -> None:
     """Create a store with every array in place, empty.
 
@@ -84,7 +84,7 @@ def create_store(
         Sizes of chunks and shards, and the compression level.
     contents : Contents
         How many properties and channels there are.
-    several : bool
+    merged : bool
         Whether labels are merged of several annotations.
     """
     import zarr
@@ -103,7 +103,7 @@ def create_store(
         "voxel": (parameters.voxel_chunk, rows_per_shard(parameters)),
         "grid": (1, parameters.grid_assets_per_shard),
     }
-    for layout in arrays_with(several):
+    for layout in arrays_with(merged):
         shape = tuple(sizes[dimension] for dimension in layout.dimensions)
         chunk, shard = chunk_and_shard[layout.name.partition("/")[0]]
         if shard is None:

@@ -119,7 +119,7 @@ def test_two_different_objects_fail_after_a_search_of_all_orientations() -> None
     alignment = align(field, latents, DEFAULT)
     assert alignment.search == "so3"
     annotation = sample(field, map_of(alignment).places(latents.coords), SampleParameters())
-    judgement = judge(field, latents, alignment, annotation, SampleParameters())
+    judgement, _ = judge(field, latents, alignment, annotation, SampleParameters())
     assert judgement.verdict is Verdict.FAILED
 
 
@@ -179,7 +179,7 @@ def test_odd_shapes_get_a_finite_answer_and_a_verdict(name: str) -> None:
     for latents in (own, latents_of(DEGENERATE["a dozen"]), surface_latents(BALL)):
         alignment = align(field, latents, DEFAULT)
         annotation = sample(field, map_of(alignment).places(latents.coords), SampleParameters())
-        judgement = judge(field, latents, alignment, annotation, SampleParameters())
+        judgement, _ = judge(field, latents, alignment, annotation, SampleParameters())
         ambiguity = judgement.ambiguity
         numbers = [
             *alignment.transform.ravel(),

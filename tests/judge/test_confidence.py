@@ -72,7 +72,7 @@ USUAL = np.array([_usual(name) for name in FIGURES])
 def _judged(field: MaterialField, latents: StructuredLatents) -> Judged:
     alignment = align(field, latents, AlignParameters())
     annotation = sample(field, map_of(alignment).places(latents.coords), SampleParameters())
-    judgement = judge(field, latents, alignment, annotation, SampleParameters())
+    judgement, _ = judge(field, latents, alignment, annotation, SampleParameters())
     likely = voxel_confidence(field, latents, alignment, annotation, judgement.confidence)
     return judgement, likely, annotation
 
@@ -277,7 +277,7 @@ def test_a_turned_placement_is_no_longer_sure(
     half_turn = np.diag([-1.0, -1.0, 1.0, 1.0])
     wrong = replace(alignment, transform=half_turn @ alignment.transform, figures=None)
     annotation = sample(field, map_of(wrong).places(latents.coords), SampleParameters())
-    judgement = judge(field, latents, wrong, annotation, SampleParameters())
+    judgement, _ = judge(field, latents, wrong, annotation, SampleParameters())
     assert judgement.verdict is Verdict.FAILED
     assert judgement.confidence < THRESHOLDS.failed_confidence
 
