@@ -1,6 +1,6 @@
 """The typed records that travel between the stages.
 
-Two source files become rows of the store through read, align, sample,
+Two source files become rows of the store through read, align, sample, judge,
 normalise and pack. Each stage takes the records of the one before it and
 returns its own; none of these classes touches a disk. Classes that hold arrays
 compare by identity.
