@@ -35,7 +35,6 @@ def field_of_voxels(
     table: Sequence[Property] = PROPERTIES,
     max_unphysical: float = 0.0,
     sources: Sequence[SourceFile] = (),
-    warnings: Sequence[str] = (),
     frame: NDArray[np.float64] | None = None,
 ) -> MaterialField:
     """Make a field of annotated voxels.
@@ -63,7 +62,7 @@ def field_of_voxels(
         What the columns are.
     max_unphysical : float
         See `slatprep.parameters.SampleParameters`.
-    sources, warnings, frame
+    sources, frame
         As `MaterialField` has them.
 
     Raises
@@ -71,23 +70,9 @@ def field_of_voxels(
     InputError
         If there is no voxel, one is out of range, or too many are unphysical.
     """
-    voxels, notes = np.asarray(voxels), list(warnings)
-    count = len(voxels)
-    if voxels.ndim != 2 or voxels.shape[1] != 3 or count == 0:
-        raise InputError(where, f"has voxels of shape {voxels.shape}", "(K, 3), one at least")
-    if not 2 <= resolution <= MAX_RESOLUTION:
-        raise InputError(where, f"has a grid of {resolution}^3", f"2 to {MAX_RESOLUTION} a side")
-    if voxels.dtype.kind == "f":
-        resolution = max(resolution, RESOLUTION)
-        scaled = np.floor((voxels.astype(np.float64) + 0.5) * resolution)
-        index = np.where(voxels == 0.5, resolution - 1, scaled)
-    else:
-        index = voxels.astype(np.float64)
-    inside = ((index >= 0) & (index < resolution)).all(axis=1)
-    if not inside.all():
-        row = int(np.argmin(inside))
-        expected = "points of [-0.5, 0.5]^3" if voxels.dtype.kind == "f" else f"0..{resolution - 1}"
-        raise InputError(where, f"voxel {voxels[row].tolist()} in row {row} is outside", expected)
+    cells, resolution = _cells_of(where, np.asarray(voxels), resolution)
+    count = len(cells)
+    notes: list[str] = []
     given = np.zeros(count, np.int64) if material is None else np.asarray(material)
     with np.errstate(invalid="ignore"):
         own = given.astype(np.int64)
@@ -105,7 +90,7 @@ def field_of_voxels(
 
     keep = physical_rows(where, fine, told, max_unphysical, notes)
 
-    cells, side = index.astype(np.int64), min(resolution, RESOLUTION)
+    side = min(resolution, RESOLUTION)
     if resolution > RESOLUTION:
         cells = (2 * cells + 1) * RESOLUTION // (2 * resolution)
     flat = (cells[:, 0] * side + cells[:, 1]) * side + cells[:, 2]
@@ -131,6 +116,25 @@ def field_of_voxels(
         frame=frame,
         classified=material is not None,
     )
+
+
+def _cells_of(
+    where: str | Place, voxels: NDArray[Any], resolution: int
+) -> tuple[NDArray[np.int64], int]:
+    """Return the cells (K, 3) that voxels or points lie in, and the cells along each axis."""
+    if voxels.ndim != 2 or voxels.shape[1] != 3 or len(voxels) == 0:
+        raise InputError(where, f"has voxels of shape {voxels.shape}", "(K, 3), one at least")
+    if not 2 <= resolution <= MAX_RESOLUTION:
+        raise InputError(where, f"has a grid of {resolution}^3", f"2 to {MAX_RESOLUTION} a side")
+    index, expected = voxels.astype(np.float64), f"0..{resolution - 1}"
+    if voxels.dtype.kind == "f":
+        resolution, expected = max(resolution, RESOLUTION), "points of [-0.5, 0.5]^3"
+        index = np.where(voxels == 0.5, resolution - 1, np.floor((index + 0.5) * resolution))
+    inside = ((index >= 0) & (index < resolution)).all(axis=1)
+    if not inside.all():
+        row = int(np.argmin(inside))
+        raise InputError(where, f"voxel {voxels[row].tolist()} in row {row} is outside", expected)
+    return index.astype(np.int64), resolution
 
 
 def physical_rows(
