@@ -213,7 +213,7 @@ def normalize_mapped(mapped: ArrayLike, normalization: Normalization) -> NDArray
 
 
 def normalize_change(change: ArrayLike, normalization: Normalization) -> NDArray[np.float64]:
-    """Scale differences of mapped properties to differences of normalised ones."""
+    """Scale differences (N, P) of mapped properties to differences of normalised ones."""
     spans = np.array([one.hi - one.lo for one in normalization.ranges])
     scaled: NDArray[np.float64] = np.asarray(change, dtype=np.float64) * 2.0 / spans
     return scaled

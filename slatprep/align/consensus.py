@@ -90,7 +90,7 @@ def settle(alignment: Alignment, latents: StructuredLatents, consensus: Consensu
 
 
 def degrees_between(rotation: ArrayLike, other: ArrayLike) -> float:
-    """Return the angle, in degrees, of the rotation that leads from one to the other."""
+    """Return the angle, in degrees, of the rotation from one (3, 3) to the other."""
     trace = float(np.sum(np.asarray(rotation) * np.asarray(other)))
     return float(np.degrees(np.arccos(np.clip((trace - 1.0) / 2.0, -1.0, 1.0))))
 

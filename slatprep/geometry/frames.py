@@ -67,7 +67,10 @@ def apply_transform(transform: ArrayLike, points: ArrayLike) -> NDArray[np.float
 def make_transform(
     rotation: ArrayLike, translation: ArrayLike = (0.0, 0.0, 0.0), scale: float = 1.0
 ) -> NDArray[np.float64]:
-    """Assemble ``x -> scale * rotation @ x + translation`` as a 4x4 matrix."""
+    """Return ``x -> scale * rotation @ x + translation`` as a matrix (4, 4).
+
+    The rotation is (3, 3), the translation (3,) in edges of the unit cube.
+    """
     transform = np.eye(4)
     transform[:3, :3] = scale * np.asarray(rotation, dtype=np.float64)
     transform[:3, 3] = translation
@@ -100,7 +103,13 @@ def split_transform(
 
 
 def invert_transform(transform: ArrayLike) -> NDArray[np.float64]:
-    """Return the inverse of a similarity transform (SLAT frame to PixieVerse frame)."""
+    """Return the inverse (4, 4) of a similarity transform (4, 4): SLAT frame to PixieVerse frame.
+
+    Raises
+    ------
+    ValueError
+        As `split_transform` does.
+    """
     rotation, translation, scale = split_transform(transform)
     inverse = np.eye(4)
     inverse[:3, :3] = rotation.T / scale
@@ -118,6 +127,13 @@ def displacement(transform: ArrayLike, reference: ArrayLike, slat_voxels: ArrayL
 
     Both transforms are inverted and applied to the voxel centres, so the
     distance is measured in the PixieVerse frame, where the annotation lies.
+
+    Parameters
+    ----------
+    transform, reference : array_like, shape (4, 4)
+        PixieVerse frame to SLAT frame.
+    slat_voxels : array_like of int, shape (N, 3)
+        Voxels of the SLAT frame, 0..63.
     """
     points = voxel_centres(slat_voxels)
     here = apply_transform(invert_transform(transform), points)
@@ -126,7 +142,7 @@ def displacement(transform: ArrayLike, reference: ArrayLike, slat_voxels: ArrayL
 
 
 def cube_symmetries() -> NDArray[np.int64]:
-    """Return the 48 symmetries of a cube as signed permutation matrices, the identity first."""
+    """Return the symmetries of a cube, signed permutation matrices (48, 3, 3), identity first."""
     matrices = np.zeros((48, 3, 3), np.int64)
     orders, flips = itertools.permutations(range(3)), itertools.product((1, -1), repeat=3)
     for matrix, (order, signs) in zip(matrices, itertools.product(orders, flips), strict=True):

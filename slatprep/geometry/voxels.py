@@ -41,7 +41,7 @@ def boundary(occupancy: NDArray[np.bool_]) -> NDArray[np.bool_]:
 
 
 def bounding_box(occupancy: NDArray[np.bool_]) -> tuple[slice, slice, slice]:
-    """Return the slices of the smallest box that holds all occupied voxels.
+    """Return the slices of the smallest box that holds all occupied voxels of a grid (a, b, c).
 
     Raises
     ------

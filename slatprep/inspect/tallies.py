@@ -100,7 +100,10 @@ def pooled(
     squares: NDArray[np.float64],
     axis: int,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Merge means and sums of squared differences along an axis; 0 where all weights are 0."""
+    """Merge means and sums of squared differences, of one shape with `weights`, along an axis.
+
+    Where all weights are 0, both are 0.
+    """
     total = weights.sum(axis=axis, keepdims=True)
     centre = (weights * mean).sum(axis=axis, keepdims=True) / np.where(total > 0, total, 1.0)
     merged = (squares + weights * (mean - centre) ** 2).sum(axis=axis)

@@ -27,7 +27,7 @@ def loss_of(prediction: Prediction, batch: SparseBatch, weigh: bool = False) -> 
 
     Returns
     -------
-    Tensor
+    Tensor of float, shape ()
         The sum of the properties' mean squared errors and half the cross-entropy.
     """
     if not bool(batch.valid.any()):

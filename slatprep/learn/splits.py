@@ -64,7 +64,7 @@ def select_assets(
     store : Store
         An open store.
     split : {"train", "val", "test"}, optional
-        Only objects of this split, see `split_objects`.
+        Only objects of this split, see `slatprep.readers.splits.split_objects`.
     shares : Shares
         Shares of the splits.
     verdicts : collection of str, optional
@@ -76,7 +76,7 @@ def select_assets(
 
     Returns
     -------
-    ndarray of int64
+    ndarray of int64, shape (K,)
         Rows for `Store.read`. Assets without a valid voxel are left out, since they have no
         labels to train on or to measure against.
 

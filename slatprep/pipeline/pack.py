@@ -133,7 +133,26 @@ def stored_rows(
     own: slice,
     read: Callable[[str, int, int], NDArray[Any]] | None = None,
 ) -> Arrays:
-    """Read an asset's rows of every array of a group, `own` of them, by the array's name."""
+    """Read rows of an asset from every array of a group.
+
+    Parameters
+    ----------
+    store : Store
+        The store.
+    group : str
+        ``voxel`` or ``grid``.
+    row : int
+        The asset's row in ``asset/*``.
+    own : slice
+        Which of its rows of the group, counted from its own first.
+    read : callable, optional
+        Reads rows of an array by its name; by default `Store.read_rows`.
+
+    Returns
+    -------
+    dict of str to ndarray
+        By the array's full name; properties normalised, as the store has them.
+    """
     read = read or store.read_rows
     begin = int(store.offsets[row]) if group == "voxel" else row
     rows = begin + own.start, begin + own.stop

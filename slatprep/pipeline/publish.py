@@ -231,7 +231,7 @@ def publish_manifests(
 def build_record(
     summary: BuildSummary, parameters: BuildParameters, versions: Versions | None = None
 ) -> BuildRecord:
-    """Return the record of a build that made a store."""
+    """Return the record of a build that made a store; ValueError where it made none."""
     if summary.store is None or summary.normalization is None:
         raise ValueError("a build without a store has no record")
     return BuildRecord(

@@ -83,7 +83,30 @@ def write_rows(
     contents: Contents,
     in_place: bool = False,
 ) -> BuildSummary:
-    """Write a store of rows of others, in their order; `in_place` it may replace one of them."""
+    """Write a store of rows of others, with their records.
+
+    Parameters
+    ----------
+    rows : sequence of (Source, int)
+        The assets of the new store, in its order.
+    normalization : Normalization
+        The ranges of the new store; rows with other ranges are brought to them.
+    build : dict
+        Its attribute ``build``, as JSON has it.
+    out, manifests, progress
+        As for `slatprep.pipeline.join.subset_store`.
+    contents : Contents
+        What it holds.
+    in_place : bool
+        Whether it may replace one of the stores that rows are taken from.
+
+    Raises
+    ------
+    ConfigError
+        If it would replace one of them, and may not.
+    StoreError
+        If a row cannot be read or brought to the ranges, or the disk does not take the store.
+    """
     begin = time.perf_counter()
     place = Destination(out, manifests)
     sources = list(dict.fromkeys(source for source, _ in rows))

@@ -57,7 +57,7 @@ class StoredRecords:
         return PlaceMap(asset.transform, self.read(asset.index).alignment.deformation)
 
     def rows(self, name: str, start: int, stop: int) -> NDArray[Any]:
-        """Return rows of an array of the store."""
+        """Return rows ``start:stop`` of an array of the store; see `Store.read_rows`."""
         return self.store.read_rows(name, start, stop)
 
     def read(self, row: int) -> AssetRecord:

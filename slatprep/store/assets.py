@@ -177,7 +177,7 @@ class AssetTable:
         return np.asarray(self.column("offset"), np.int64)
 
     def column(self, name: str) -> NDArray[Any]:
-        """Read one ``asset/*`` array whole, by its last name.
+        """Read one ``asset/*`` array whole, (A, ...), by its last name.
 
         Raises
         ------
@@ -277,7 +277,7 @@ class AssetTable:
         return self._columns[name]
 
     def read_rows(self, name: str, start: int, stop: int) -> NDArray[Any]:
-        """Read rows of any array by its full name, such as ``voxel/coords``.
+        """Read rows (stop - start, ...) of any array by its full name, such as ``voxel/coords``.
 
         Raises
         ------

@@ -70,7 +70,7 @@ class ShardWriter:
         self._size = 0
 
     def append(self, rows: NDArray[Any]) -> None:
-        """Take the next rows."""
+        """Write the next rows, (K, ...), of a dtype that casts to the array's."""
         while len(rows):
             room = len(self._chunk) - self._rows
             taken, rows = rows[:room], rows[room:]
@@ -83,12 +83,18 @@ class ShardWriter:
                 self._flush(self._chunk)
 
     def append_fill(self, rows: int) -> None:
-        """Take so many rows of the array's fill value."""
+        """Write so many rows of the array's fill value."""
         shape = (rows, *self._chunk.shape[1:])
         self.append(np.full(shape, self._fill_value, self._chunk.dtype))
 
     def append_packed(self, data: bytes, lengths: Iterable[int]) -> None:
-        """Take the next chunks as `RowReader.packed` gives them; the last rows filled one."""
+        """Write the next chunks, packed, as `RowReader.packed` gives them.
+
+        Raises
+        ------
+        ValueError
+            If the rows before them do not end with a chunk.
+        """
         if self._rows:
             raise ValueError(f"{self._rows} rows of a chunk are waiting; expected none")
         self._write(data)
