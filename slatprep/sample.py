@@ -7,6 +7,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import lru_cache
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -23,6 +25,9 @@ from slatprep.records import (
     MaterialField,
     Property,
 )
+
+if TYPE_CHECKING:
+    from slatprep.geometry.nearest import Lattice
 
 NEAR_POWER, NEAR_SHARE = float(np.log10(2.0)), 0.2
 """How far a property may lie off the merged one to count as the same: in log10, a factor of two,
@@ -65,16 +70,15 @@ def sample(
         In SI units; NaN and 255 where not valid. ``distance`` is to the voxel
         whose values were taken, or to the nearest where not valid.
     """
-    from slatprep.geometry.nearest import Lattice
-
-    lattice = Lattice(field.voxels)
+    lattice = _lattice_of(field)
     place = np.asarray(places, dtype=np.float32)
     points = place.astype(np.float64)
     limit = parameters.max_distance * (1.0 + 1e-12) if labels_alone else np.inf
     distance, used = lattice.nearest(points, limit)
     valid = distance <= parameters.max_distance
     if parameters.method == "vote":
-        voted = lattice.vote(points, field.material, parameters.vote_width)
+        found = distance, used
+        voted = lattice.vote(points, field.material, parameters.vote_width, found)
         changed = valid & (voted >= 0) & (voted != used)
         used = np.where(changed, voted, used)
         apart = points[changed] - voxel_centres(field.voxels[used[changed]])
@@ -83,6 +87,14 @@ def sample(
     properties[~valid] = np.nan
     material[~valid] = UNANNOTATED
     return Annotation(properties, material, valid, distance.astype(np.float32), place)
+
+
+@lru_cache(maxsize=1)
+def _lattice_of(field: MaterialField) -> Lattice:
+    """Return the field's annotated voxels by cell; a field is looked up several times in a row."""
+    from slatprep.geometry.nearest import Lattice
+
+    return Lattice(field.voxels)
 
 
 def merge(annotations: Sequence[Annotation], table: Sequence[Property]) -> Annotation:

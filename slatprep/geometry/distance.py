@@ -24,6 +24,9 @@ Its square exceeds every squared distance in a box that the solid touches on all
 sides, or within a slab of such a box, and may be added to one.
 """
 
+_VECTOR = 16
+"""How many 16-bit integers a processor takes at once."""
+
 
 def signed_distance(solid: NDArray[np.bool_]) -> NDArray[np.float32]:
     """Measure the distance of each voxel's centre to the faces of a solid.
@@ -48,7 +51,9 @@ def signed_distance(solid: NDArray[np.bool_]) -> NDArray[np.float32]:
     if max(solid.shape) > LARGEST_SIDE:
         raise ValueError(f"a side is at most {LARGEST_SIDE} voxels, got shape {solid.shape}")
     solid = np.ascontiguousarray(solid)
-    inside, outside = np.empty((2, *solid.shape), dtype=np.int16)
+    # Lines of whole vectors; what is added to them is as near as can be, and so not searched for.
+    length = -(-solid.shape[2] // _VECTOR) * _VECTOR
+    inside, outside = np.zeros((2, *solid.shape[:2], length), dtype=np.int16)
     _squares_along_last(solid, inside, outside)
     for squares in (inside, outside):
         _spread_over_others(squares)

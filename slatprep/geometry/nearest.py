@@ -17,10 +17,12 @@ from numba import njit
 from numpy.typing import NDArray
 
 from slatprep.geometry.distance import NOTHING, spread
+from slatprep.geometry.voxels import flat_index
 from slatprep.records import RESOLUTION
 
 _REACH = 3  # voxels searched by cells before columns are
 _SURE = _REACH + 0.5  # beyond the cells voxels are this far off, or farther
+_BEYOND = 1.5  # voxels in other than the 27 cells around a point are this far off, or farther
 _BLOCK = 4  # cells a side of what is passed over at once
 _ROUNDING = 1e-6  # voxels by which a bound is loosened, so that no rounding passes over a voxel
 
@@ -42,9 +44,10 @@ class Lattice:
     def __init__(self, voxels: NDArray[np.uint8]) -> None:
         if len(voxels) == 0:
             raise ValueError("the nearest voxel of an empty set does not exist")
-        self._voxels = voxels
         self._row = np.full((RESOLUTION,) * 3, -1, dtype=np.int32)
-        self._row[tuple(voxels.T)] = np.arange(len(voxels), dtype=np.int32)
+        self._row.reshape(-1)[flat_index(voxels)] = np.arange(len(voxels), dtype=np.int32)
+        self._blocks = np.zeros((RESOLUTION // _BLOCK,) * 3, dtype=bool)
+        self._blocks[tuple((voxels // _BLOCK).T)] = True
 
     def nearest(
         self, points: NDArray[np.float64], limit: float = np.inf
@@ -84,8 +87,7 @@ class Lattice:
 
         A set that fills the grid, looked up in one that does not, has mostly such points.
         """
-        near = np.zeros((RESOLUTION // _BLOCK,) * 3, dtype=bool)
-        near[tuple((self._voxels // _BLOCK).T)] = True
+        near = self._blocks.copy()
         for axis in range(3):
             own = np.moveaxis(near, axis, 0)
             before = own.copy()
@@ -95,7 +97,11 @@ class Lattice:
         return near
 
     def vote(
-        self, points: NDArray[np.float64], labels: NDArray[np.uint8], width: float
+        self,
+        points: NDArray[np.float64],
+        labels: NDArray[np.uint8],
+        width: float,
+        found: tuple[NDArray[np.float64], NDArray[np.intp]] | None = None,
     ) -> NDArray[np.intp]:
         """Find for each point the voxel that a vote of those around it chooses.
 
@@ -110,6 +116,8 @@ class Lattice:
             Label of each voxel.
         width : float
             Voxels.
+        found : tuple of ndarray, optional
+            What `nearest` gives for the points, where that is known.
 
         Returns
         -------
@@ -117,8 +125,10 @@ class Lattice:
             Row of the nearest voxel that has the winning label (the lower label
             wins a draw), or -1 where none of the 27 cells is in the set.
         """
+        position, parties = _in_voxels(points), int(labels.max()) + 1
+        found = found or self.nearest(points, limit=_BEYOND)
         chosen: NDArray[np.intp] = _vote(
-            _in_voxels(points), self._row, labels, int(labels.max()) + 1, 0.5 / width**2
+            position, self._row, labels, *found, parties, 0.5 / width**2
         )
         return chosen
 
@@ -245,7 +255,7 @@ def _search_columns(position, row, below, above, apart, limit):  # type: ignore[
 
 
 @njit(cache=True)
-def _vote(position, row, labels, n_labels, steepness):  # type: ignore[no-untyped-def]
+def _vote(position, row, labels, distance, index, n_labels, steepness):  # type: ignore[no-untyped-def]
     count, size = position.shape[0], row.shape[0]
     chosen = np.full(count, -1, dtype=np.intp)
     nearest, nearest_square = np.zeros(n_labels, dtype=np.intp), np.zeros(n_labels)
@@ -254,6 +264,9 @@ def _vote(position, row, labels, n_labels, steepness):  # type: ignore[no-untype
     for m in range(count):
         x, y, z = position[m, 0], position[m, 1], position[m, 2]
         a, b, c = int(np.rint(x)), int(np.rint(y)), int(np.rint(z))
+        if distance[m] < _BEYOND and _alike(row, labels, a, b, c, labels[index[m]]):
+            chosen[m] = index[m]  # Away from borders all voters agree.
+            continue
         voters, parties = 0, 0
         nearest_square[:] = np.inf
         for i in range(max(a - 1, 0), min(a + 2, size)):
@@ -269,7 +282,7 @@ def _vote(position, row, labels, n_labels, steepness):  # type: ignore[no-untype
                     parties += best == np.inf
                     if square < best or (square == best and voxel < nearest[label]):
                         nearest_square[label], nearest[label] = square, voxel
-        if parties == 1:  # Away from borders all voters agree.
+        if parties == 1:
             chosen[m] = nearest[voter_label[0]]
         elif parties > 1:
             votes[:] = 0.0
@@ -277,3 +290,16 @@ def _vote(position, row, labels, n_labels, steepness):  # type: ignore[no-untype
                 votes[voter_label[voter]] += math.exp(-voter_square[voter] * steepness)
             chosen[m] = nearest[np.argmax(votes)]
     return chosen
+
+
+@njit(cache=True)
+def _alike(row, labels, a, b, c, own):  # type: ignore[no-untyped-def]
+    """Whether all voxels in the 27 cells around a cell have one label."""
+    size = row.shape[0]
+    for i in range(max(a - 1, 0), min(a + 2, size)):
+        for j in range(max(b - 1, 0), min(b + 2, size)):
+            for k in range(max(c - 1, 0), min(c + 2, size)):
+                voxel = row[i, j, k]
+                if voxel >= 0 and labels[voxel] != own:
+                    return False
+    return True

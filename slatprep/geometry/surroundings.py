@@ -44,16 +44,21 @@ def shares_around(
     solid : ndarray of float32, shape (N, len(radii))
         Share of the shell's cells that are not empty.
     """
-    offsets = np.array(
-        [_direction * radius for radius in radii for _direction in _directions()]
-    ).reshape(len(radii), DIRECTIONS, 3)
+    # Beyond twice the largest radius no cell of a shell lies in the grid.
+    margin = 2 * max(radii)
+    padded = np.pad(grid, margin, constant_values=empty)
+    directions = _directions() if any(radii) else [np.zeros(3)]
+    steps = np.rint([[direction * radius for direction in directions] for radius in radii])
+    side = len(padded)
     others = np.empty((len(points), len(radii)), dtype=np.float32)
     solid = np.empty_like(others)
     _look(
-        grid,
+        padded.reshape(-1),
         np.ascontiguousarray(points, dtype=np.float64),
         labels,
-        np.rint(offsets).astype(np.int64),
+        (steps @ (side * side, side, 1)).astype(np.int64),
+        side,
+        margin,
         empty,
         others,
         solid,
@@ -68,28 +73,23 @@ def _directions() -> list[NDArray[np.float64]]:
 
 
 @njit(cache=True)
-def _look(grid, points, labels, offsets, empty, others, solid):  # type: ignore[no-untyped-def]
-    size = grid.shape[0]
+def _look(cells, points, labels, steps, side, margin, empty, others, solid):  # type: ignore[no-untyped-def]
     half = 0.5 * (RESOLUTION - 1)
+    low, high = margin // 2, side - 1 - margin // 2
     for m in range(points.shape[0]):
-        a = int(np.rint(points[m, 0] * RESOLUTION + half))
-        b = int(np.rint(points[m, 1] * RESOLUTION + half))
-        c = int(np.rint(points[m, 2] * RESOLUTION + half))
+        a = int(np.rint(points[m, 0] * RESOLUTION + half)) + margin
+        b = int(np.rint(points[m, 1] * RESOLUTION + half)) + margin
+        c = int(np.rint(points[m, 2] * RESOLUTION + half)) + margin
+        if min(a, b, c) < low or max(a, b, c) > high:
+            others[m], solid[m] = 0.0, 0.0
+            continue
         own = labels[m]
-        for shell in range(offsets.shape[0]):
+        place = (a * side + b) * side + c
+        for shell in range(steps.shape[0]):
             there, differ = 0, 0
-            for n in range(offsets.shape[1]):
-                i, j, k = (
-                    a + offsets[shell, n, 0],
-                    b + offsets[shell, n, 1],
-                    c + offsets[shell, n, 2],
-                )
-                if i < 0 or j < 0 or k < 0 or i >= size or j >= size or k >= size:
-                    continue
-                label = grid[i, j, k]
-                if label == empty:
-                    continue
-                there += 1
-                differ += label != own
+            for n in range(steps.shape[1]):
+                label = cells[place + steps[shell, n]]
+                there += label != empty
+                differ += (label != empty) & (label != own)
             others[m, shell] = differ / there if there else 0.0
-            solid[m, shell] = there / offsets.shape[1]
+            solid[m, shell] = there / steps.shape[1]

@@ -79,7 +79,9 @@ def filled(occupancy: NDArray[np.bool_]) -> NDArray[np.bool_]:
 
 def voxels_of(occupancy: NDArray[np.bool_]) -> NDArray[np.uint8]:
     """Return the indices (N, 3) uint8 of the occupied voxels, in C order."""
-    return np.argwhere(occupancy).astype(np.uint8)
+    # By way of flat indices, as numpy finds those of one axis far faster than those of three.
+    places = np.unravel_index(np.flatnonzero(occupancy), occupancy.shape)
+    return np.stack(places, axis=1, dtype=np.uint8, casting="unsafe")
 
 
 def outer_boundary(occupancy: NDArray[np.bool_]) -> NDArray[np.uint8]:

@@ -78,16 +78,16 @@ def voxel_figures(around: Surroundings, confidence: float) -> NDArray[np.float32
     count = len(around.distance)
     distance = np.minimum(around.distance, np.float32(5.0))
     whole = (unsure, rough, distance.mean(), around.moved.mean())
+    # A column after the other in memory, as the model looks at them.
     return np.concatenate(
         [
-            around.others,
-            around.others * rough,
-            around.others * unsure,
-            np.stack([distance, np.abs(around.depth), around.moved], axis=1),
-            np.broadcast_to(np.array(whole, dtype=np.float32), (count, len(whole))),
-        ],
-        axis=1,
-    )
+            around.others.T,
+            around.others.T * rough,
+            around.others.T * unsure,
+            np.stack([distance, np.abs(around.depth), around.moved]),
+            np.broadcast_to(np.array(whole, dtype=np.float32)[:, None], (len(whole), count)),
+        ]
+    ).T
 
 
 def class_confidence(

@@ -18,6 +18,7 @@ import zlib
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -369,25 +370,32 @@ def _header(
 
     `prefix` holds the header, `size` is that of header and data together.
     """
-    # No more than a bounded prefix is parsed: the header's length field may claim 4 GB.
-    start = io.BytesIO(prefix[:_MAX_HEADER_BYTES])
     with refusing(where, "is no readable npy array", "an array as numpy.save writes it"):
-        version = np.lib.format.read_magic(start)
-        if version == (1, 0):
-            shape, fortran, dtype = np.lib.format.read_array_header_1_0(start)
-        elif version == (2, 0):
-            shape, fortran, dtype = np.lib.format.read_array_header_2_0(start)
-        else:  # 3.0 is for field names, which no plain array has
-            raise ValueError(f"format version {version}")
+        # No more than a bounded prefix is parsed: the header's length field may claim 4 GB.
+        length = prefix[8 : 10 if prefix[6:7] == b"\x01" else 12]
+        end = 8 + len(length) + int.from_bytes(length, "little")
+        shape, fortran, dtype, offset = _parsed(prefix[: min(end, _MAX_HEADER_BYTES)])
     if any(type(size) is not int for size in shape):  # True is a number, too
         raise InputError(where, f"has shape {shape}", "whole numbers for a shape")
     spec.check(where, shape, dtype)
     wanted = math.prod(shape) * dtype.itemsize
-    held = size - start.tell()
+    held = size - offset
     if held != wanted:
         raise InputError(
             where,
             f"is truncated or damaged: its header announces {wanted} bytes of data, it has {held}",
             _COMPLETE,
         )
-    return shape, fortran, dtype, start.tell()
+    return shape, fortran, dtype, offset
+
+
+@lru_cache(maxsize=64)
+def _parsed(header: bytes) -> tuple[tuple[int, ...], bool, np.dtype[Any], int]:
+    """Read an npy header, as most assets have the same ones; see `_header`."""
+    start = io.BytesIO(header)
+    version = np.lib.format.read_magic(start)
+    if version == (1, 0):
+        return *np.lib.format.read_array_header_1_0(start), start.tell()
+    if version == (2, 0):
+        return *np.lib.format.read_array_header_2_0(start), start.tell()
+    raise ValueError(f"format version {version}")  # 3.0 is for field names: in no plain array

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slatprep.errors import InputError
+from slatprep.geometry.voxels import voxels_of
 from slatprep.normalize import (
     PIXIE_RANGES,
     change_ranges,
@@ -142,7 +143,7 @@ def read_grid(
         raise InputError(path, "no voxel is occupied: all are background", "an occupied voxel")
     annotated = _annotated(occupancy, material, path, warnings)
 
-    voxels = np.argwhere(annotated)
+    voxels = voxels_of(annotated)
     properties = _gather(channels, annotated)
 
     def told(row: int, column: int) -> tuple[str, str]:
@@ -163,9 +164,9 @@ def read_grid(
         bounds = _read_bounds(pair.bounds, pair.roots.pixieverse, sources, warnings)
     return MaterialField(
         occupancy=occupancy,
-        voxels=voxels.astype(np.uint8),
+        voxels=voxels,
         material=material[annotated][keep].astype(np.uint8),
-        properties=properties,
+        properties=np.ascontiguousarray(properties),
         unphysical=unphysical,
         bounds=bounds,
         sources=tuple(sources),
@@ -248,6 +249,7 @@ def _read_mask(values: NDArray[Any], path: Place, warnings: list[str]) -> NDArra
 
 
 def _classes_of_ids(ids: NDArray[Any], path: Place) -> NDArray[np.int8]:
+    ids = np.ascontiguousarray(ids)  # Every fourth value of a raw grid, looked at several times.
     known = (ids >= UNLABELLED) & (ids <= BACKGROUND) & (ids == np.rint(ids))
     if not known.all():
         voxel = _first(~known)
@@ -256,7 +258,7 @@ def _classes_of_ids(ids: NDArray[Any], path: Place) -> NDArray[np.int8]:
             f"unknown class {ids[voxel]:g} at voxel {voxel}",
             f"whole class ids from {UNLABELLED} to {BACKGROUND}",
         )
-    return np.ascontiguousarray(ids).astype(np.int8)
+    return ids.astype(np.int8)
 
 
 def _classes_of_scores(
@@ -316,10 +318,13 @@ def _note(warnings: list[str], voxels: NDArray[np.bool_], what: str) -> None:
 
 
 def _gather(channels: NDArray[Any], where: NDArray[np.bool_]) -> NDArray[np.float32]:
-    """Return the properties (K, 3) at the voxels of a mask, ordered as PROPERTY_COLUMNS."""
+    """Return the properties (K, 3) at the voxels of a mask, ordered as PROPERTY_COLUMNS.
+
+    They lie in memory a column after the other, as they are looked at.
+    """
     with np.errstate(over="ignore"):  # what float32 cannot hold becomes infinite, and a fault
         columns = [channels[k][where].astype(np.float32) for k in _CHANNEL_ORDER]
-    return np.stack(columns, axis=1)
+    return np.stack(columns).T
 
 
 def _physical(properties: NDArray[np.float32], raw: bool) -> NDArray[np.bool_]:
