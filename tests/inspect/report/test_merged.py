@@ -57,6 +57,7 @@ def test_assets_say_how_many_annotations_agree(
 
     browser.get("about:blank")
     browser.get(f"{path.as_uri()}#asset=a")
+    assert "assets with merged labels\n2" in browser.find_element("id", "tiles").text
     text = browser.find_element("id", "asset-figures").text.split("\n")
     figures = dict(zip(text[::2], text[1::2], strict=False))
     assert figures["Annotations merged"] == "2"

@@ -24,9 +24,9 @@ const Sections = (() => {
     const unphysical = sum(known(ASSETS.unphysical));
     if (unphysical) tiles.push(["unphysical voxels left out", Format.count(unphysical)]);
     if (CONTENT.records) tiles.push(["assets with ties", Format.count(ASSETS.tied.filter((tied) => tied > 0).length)]);
+    const merged = known(ASSETS.spreads).length;
+    if (merged) tiles.push(["assets with merged labels", Format.count(merged)]);
     byId("tiles").replaceChildren(...tiles.map(([name, value]) => el("div", {}, el("dt", {}, name), el("dd", {}, value))));
-    const several = known(ASSETS.spreads).length;
-    if (several) tiles.push(["assets with merged labels", Format.count(several)]);
     const present = counts.filter((state) => state.count);
     byId("statebar").replaceChildren(
       ...present.map((state) => el("i", { "data-state": state.name, title: `${state.name}: ${state.count}`, style: { flex: `${state.count} 0 0`, background: "var(--tone)" } })),

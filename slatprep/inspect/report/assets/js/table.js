@@ -23,7 +23,7 @@ const Table = (() => {
     { key: "voxels", title: "Voxels", width: 84, value: (i) => ASSETS.voxels[i], text: (i) => Format.count(ASSETS.voxels[i]), right: true, wide: true },
     { key: "annotations", title: "Annotations", width: 118, value: (i) => ASSETS.annotations[i]?.[0] ?? null, text: (i) => Format.annotations(ASSETS.annotations[i]), right: true, wide: true, merged: true },
     { key: "votes", title: "Votes", width: 80, ...share("votes"), wide: true, merged: true },
-    { key: "spread", title: "Spread", width: 84, value: Data.spread, text: (i) => Format.fixed(3)(Data.spread(i)), right: true, wide: true, merged: true },
+    { key: "spread", title: "Spread", width: 94, value: Data.spread, text: (i) => Format.fixed(3)(Data.spread(i)), right: true, wide: true, merged: true },
   ]);
   const TITLES = {
     model: "Rigid, similarity, affine or deformable: what maps the PixieVerse frame to the SLAT",
