@@ -35,9 +35,14 @@ from slatprep.align.consensus import degrees_between
 from slatprep.align.deformation import map_of
 from slatprep.demo.asset import DemoView, make_asset
 from slatprep.demo.difficulty import LEVELS
-from slatprep.demo.generated import nearest_similarity
 from slatprep.geometry.fill import outside_of
-from slatprep.geometry.frames import VOXEL_SIZE, places_of, split_transform, voxel_centres
+from slatprep.geometry.frames import (
+    VOXEL_SIZE,
+    nearest_similarity,
+    places_of,
+    split_transform,
+    voxel_centres,
+)
 from slatprep.geometry.voxels import boundary, occupancy_of
 from slatprep.judge import judge
 from slatprep.parameters import AlignParameters, SampleParameters

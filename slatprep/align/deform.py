@@ -8,16 +8,16 @@ difference of shapes continues from block to block; a field's roughness does not
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from slatprep.align.bspline import displacements, refined
 from slatprep.align.deform_solver import affine_step, lattice_step, linearise
-from slatprep.align.deformation import bending_of, deform, make_deformation
+from slatprep.align.deformation import bending_of, deform
 from slatprep.align.surface import Surface
+from slatprep.align.warp import Similarity, Warp, from_nearest, halved
 from slatprep.geometry.frames import VOXEL_SIZE
 from slatprep.parameters import AlignParameters
 from slatprep.records import Deformation, FitFigures, Model
@@ -63,56 +63,6 @@ PIXIEVERSE_WEIGHT = 0.5
 """Weight of a PixieVerse sample in a fit: floaters and ground are surface that only they have."""
 
 _RIDGE, _DAMPING = 1e-4, 1e-6
-
-
-@dataclass(frozen=True)
-class Similarity:
-    """The similarity that is deformed: as `slatprep.align.field.Pose`, in voxels."""
-
-    rotation: Array
-    shift: Array
-    scale: float
-    offset: float
-
-    def inverse(self, points: Array) -> Array:
-        """Return where points (N, 3) of the SLAT frame lie in the PixieVerse frame, in voxels."""
-        places: Array = (points - self.shift) @ self.rotation / self.scale
-        return places
-
-
-@dataclass(frozen=True)
-class Warp:
-    """A deformation while it is fitted; lengths in voxels, positions from the cube's centre."""
-
-    affine: Array
-    offset: float
-    origin: Array = field(default_factory=lambda: np.zeros(3))
-    spacing: float = 1e6
-    coefficients: Array = field(default_factory=lambda: np.zeros((4, 4, 4, 3)))
-
-    @property
-    def has_lattice(self) -> bool:
-        """Whether there is a lattice, be it all zeros."""
-        return self.spacing < 1e6
-
-    @property
-    def is_bent(self) -> bool:
-        """Whether there is more to it than the affine part."""
-        return bool(self.coefficients.any())
-
-    def record(self, box: Array, max_displacement: float) -> Deformation | None:
-        """Return it bounded, not folded and rounded; `box` (2, 3) is the SLAT's."""
-        affine = self.affine.copy()
-        affine[:, 3] *= VOXEL_SIZE
-        bent = self.is_bent
-        return make_deformation(
-            affine,
-            self.origin * VOXEL_SIZE if bent else np.zeros(3),
-            self.spacing * VOXEL_SIZE if bent else 1.0,
-            self.coefficients * VOXEL_SIZE if bent else np.zeros((0, 0, 0, 3)),
-            box * VOXEL_SIZE,
-            max_displacement,
-        )
 
 
 class Pairing:
@@ -224,11 +174,6 @@ class Pairing:
         )
 
 
-def halved(warp: Warp) -> Warp:
-    """Return the same warp on a lattice of half the spacing."""
-    return replace(warp, spacing=0.5 * warp.spacing, coefficients=refined(warp.coefficients))
-
-
 @dataclass(frozen=True)
 class Trial:
     """A trial fit: warps with an affine part only and with a coarse lattice, and their scores.
@@ -261,8 +206,9 @@ def try_out(slat: Surface, pixie: Surface, pose: Similarity, samples: int = TRIA
 
 @dataclass(frozen=True)
 class Deformed:
-    """What came of it: the model, the deformation (None without) and figures of the fit."""
+    """What came of it: the similarity, the model, the deformation (None without) and figures."""
 
+    pose: Similarity
     model: Model
     deformation: Deformation | None
     figures: FitFigures
@@ -272,16 +218,6 @@ class Deformed:
         if self.deformation is None:
             return points
         return deform(self.deformation, points * VOXEL_SIZE) / VOXEL_SIZE
-
-
-def places_of(pose: Similarity, warp: Warp, points: Array) -> Array:
-    """Return where points (N, 3) of the SLAT frame lie in the PixieVerse frame, all in voxels."""
-    moved = points @ warp.affine[:, :3].T + warp.affine[:, 3]
-    if warp.has_lattice:
-        added = np.empty_like(moved)
-        displacements(points, warp.origin, warp.spacing, warp.coefficients, added)
-        moved += added
-    return pose.inverse(moved)
 
 
 def deform_if_earned(
@@ -317,19 +253,23 @@ def deform_if_earned(
         trial = try_out(slat, pixie, pose, TRIAL_SAMPLES if before < CLEAN else TRIAL_SAMPLES // 2)
         evidence = trial.scores[1] - trial.scores[0], trial.scores[2] - trial.scores[1]
         wanted = wanted or earned(trial)
-        if wanted:
-            warp = fit(slat, pixie, pose, trial, wanted)
-            box = np.array([slat.points.min(axis=0), slat.points.max(axis=0)])
+        box = np.array([slat.points.min(axis=0), slat.points.max(axis=0)])
+        # What bends too far or folds may still be stretched.
+        for tried in {"": (), "affine": ("affine",)}.get(wanted, ("deformable", "affine")):
+            warp, nearest = fit(slat, pixie, pose, trial, tried), pose
             kept = warp.record(box, parameters.max_displacement)
-            if kept is None and wanted == "deformable":
-                wanted = "affine"
-                warp = fit(slat, pixie, pose, trial, wanted)
-                kept = warp.record(box, parameters.max_displacement)
             if kept is None:
-                warp = start
-            else:
-                warp, model = replace(warp, **_in_voxels(kept)), Model(wanted)
-    return Deformed(model, kept, _figures(pairing, warp, before, evidence, kept, slat))
+                points = slat.subset(FIT_SAMPLES).points
+                nearest, warp = from_nearest(pose, warp, points, parameters.scale_bounds)
+                kept = warp.record(box, parameters.max_displacement)
+            if kept is not None:
+                model, warp = Model(tried), replace(warp, **_in_voxels(kept))
+                if nearest is not pose:
+                    pose = nearest
+                    pairing = Pairing(slat, pixie, pose, CHECK_SAMPLES, first=FIT_SAMPLES)
+                break
+            warp = start
+    return Deformed(pose, model, kept, _figures(pairing, warp, before, evidence, kept, slat))
 
 
 def earned(trial: Trial) -> str:

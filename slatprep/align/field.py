@@ -21,17 +21,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from slatprep.align.deform import (
-    CLEAN,
-    Deformed,
-    Similarity,
-    deform_if_earned,
-    places_of,
-    try_out,
-)
+from slatprep.align.deform import CLEAN, Deformed, deform_if_earned, try_out
 from slatprep.align.quality import compare
 from slatprep.align.starts import candidates_of, distinct_starts, so3_starts
 from slatprep.align.surface import Surface, surface_of
+from slatprep.align.warp import Similarity, places_of
 from slatprep.geometry.frames import VOXEL_SIZE, make_transform, split_transform
 from slatprep.geometry.voxels import occupancy_of
 from slatprep.parameters import AlignParameters
@@ -88,6 +82,9 @@ SCALE_PRIOR = 0.04
 RANK_STANDING = 0.01
 """By so much another placement must rank above the one that fits best as a similarity."""
 
+CLOSE = 0.02
+"""The same of placements that were deformed, whose scores tell more."""
+
 MOST_CONTESTED = 4
 """Where the best placement is deformed, so many, of those within twice `TIE`, are deformed too."""
 
@@ -103,7 +100,8 @@ class Pose:
     ``shift`` and ``offset`` are in voxels, positions relative to the cube's
     centre; ``score`` is the mean robust kernel over the samples of both sides,
     1 for a perfect fit; ``fitness`` the share of samples within one voxel.
-    ``bonus`` is what a trial deformation added to the score, where one was made.
+    ``bonus`` is what a trial deformation added to the score, where one was made;
+    ``standing`` counts in the order of placements, and not in how far they are apart.
     """
 
     rotation: NDArray[np.float64]
@@ -114,11 +112,17 @@ class Pose:
     fitness: float = 0.0
     rmse: float = 0.0
     bonus: float = 0.0
+    standing: float = 0.0
 
     @property
     def merit(self) -> float:
-        """What placements are ordered by."""
+        """How well it fits, once deformed where that was tried."""
         return self.score + self.bonus
+
+    @property
+    def rank(self) -> float:
+        """What placements are ordered by."""
+        return self.merit + self.standing
 
     @property
     def similarity(self) -> Similarity:
@@ -158,7 +162,7 @@ def align(
     tied, deformed = pair.finish(near, rough=poses[0].score < CLEAN)
     best = tied[0]
     # A contest said more of them than the scores that they had before.
-    others = pair.distinct([*tied, *poses[len(near) if may_contest else 0 :]])[1:]
+    others = pair.others(best, [*tied[1:], *poses[len(near) if may_contest else 0 :]])
 
     fitted = {s.index: (fit.fitness, fit.rmse) for s, fit in zip(starts, fits, strict=True)}
     transform = best.transform
@@ -174,7 +178,7 @@ def align(
         placements=tuple(
             Placement(pose.transform, pose.score, float(pair.apart([pose], best)[0]))
             for pose in others[:MOST_SURVIVORS]
-            if pose.merit > best.merit - TIE
+            if pose.merit > best.merit - (CLOSE if may_contest else TIE)
         ),
         score=best.score,
         deformation=deformed.deformation,
@@ -279,7 +283,7 @@ class _Pair:
         )  # fmt: skip
         return [
             Pose(rotation, shift, float(scale), float(offset), 0.5 * (here + back), within, rmse,
-                 pose.bonus)
+                 pose.bonus, pose.standing)
             for pose, rotation, shift, scale, offset, (here, back, within, rmse) in zip(
                 poses, rotations, shifts, scales, offsets, fits.tolist(), strict=True
             )
@@ -315,11 +319,11 @@ class _Pair:
         ranked = []
         for index, pose in enumerate(likely):
             trial = try_out(self.slat, self.pixie, pose.similarity, RANK_SAMPLES)
-            merit = trial.whole - _scale_penalty(pose)
-            merit += RANK_STANDING if index == 0 else 0.0
+            bonus = float(trial.whole) - _scale_penalty(pose) - pose.score
+            standing = RANK_STANDING if index == 0 else 0.0
             places = places_of(pose.similarity, trial.bent, points)
-            ranked.append((replace(pose, bonus=float(merit) - pose.score), places))
-        ranked.sort(key=lambda entry: -entry[0].merit)
+            ranked.append((replace(pose, bonus=bonus, standing=standing), places))
+        ranked.sort(key=lambda entry: -entry[0].rank)
         kept: list[tuple[Pose, NDArray[np.float64]]] = []
         for pose, places in ranked:
             if _apart_from_all(places, (p for _, p in kept)):
@@ -350,23 +354,30 @@ class _Pair:
             return [best, *others], deformed
         few, rest = others[: MOST_CONTESTED - 1], others[MOST_CONTESTED - 1 :]
         contested = [(best, deformed), *(self._deformed(pose, rough) for pose in few)]
-        ranks = [_rank(*entry) + RANK_STANDING * (k == 0) for k, entry in enumerate(contested)]
+        ranks = np.array([_rank(*entry) for entry in contested])
+        standing = RANK_STANDING * (np.arange(len(ranks)) == 0)
+        order = np.argsort(-(ranks + standing), kind="stable")
         highest = max(pose.merit for pose, _ in contested)
         points = self.slat.subset(RANK_SAMPLES).points
         kept: list[tuple[Pose, Deformed, NDArray[np.float64]]] = []
-        for k in sorted(range(len(ranks)), key=lambda k: -ranks[k]):
+        for k in order:
             pose, bent = contested[k]
             places = pose.similarity.inverse(bent.moved(points))
             if _apart_from_all(places, (there for _, _, there in kept)):
-                bonus = highest - (max(ranks) - ranks[k]) - pose.score
-                kept.append((replace(pose, bonus=bonus), bent, places))
+                below = max(float(ranks[order[0]] - ranks[k]), 0.0)
+                bonus = highest - below - pose.score
+                kept.append((replace(pose, bonus=bonus, standing=0.0), bent, places))
         return [*(pose for pose, _, _ in kept), *rest], kept[0][1]
 
     def _deformed(self, pose: Pose, rough: bool) -> tuple[Pose, Deformed]:
         best, model = self._simplest(pose, rough)
-        return best, deform_if_earned(
-            self.slat, self.pixie, best.similarity, model, self.parameters
-        )
+        found = deform_if_earned(self.slat, self.pixie, best.similarity, model, self.parameters)
+        nearer = found.pose
+        best = replace(
+            best, rotation=nearer.rotation, shift=nearer.shift, scale=nearer.scale,
+            offset=nearer.offset,
+        )  # fmt: skip
+        return best, found
 
     def _simplest(self, pose: Pose, rough: bool) -> tuple[Pose, Model]:
         """Return the pose with its scale set to one where that fits as well, and the model."""
@@ -392,6 +403,12 @@ class _Pair:
         distance: NDArray[np.float64] = np.linalg.norm(places[:-1] - places[-1], axis=1)
         return distance
 
+    def others(self, best: Pose, poses: Sequence[Pose]) -> list[Pose]:
+        """Return the distinct ones of poses that do not repeat `best`, whatever their scores."""
+        apart = self.apart(poses, best) >= DISTINCT
+        far = [pose for pose, ok in zip(poses, apart, strict=True) if ok]
+        return self.distinct(far) if far else []
+
     def _places(self, poses: Sequence[Pose]) -> NDArray[np.float64]:
         """Return poses as points in 12 dimensions whose distances are those of `apart`.
 
@@ -406,7 +423,7 @@ class _Pair:
 
     def distinct(self, poses: Sequence[Pose]) -> list[Pose]:
         """Return the poses best first, without those that repeat a better one."""
-        rest = sorted(poses, key=lambda pose: -pose.merit)
+        rest = sorted(poses, key=lambda pose: -pose.rank)
         places = self._places(rest)
         left = np.arange(len(rest))
         kept: list[Pose] = []

@@ -25,9 +25,8 @@ from slatprep.align.deformation import map_of
 from slatprep.align.starts import euler_starts
 from slatprep.align.surface import surface_of
 from slatprep.bench.truth import LevelScore, TruthScore, compare_with_truth, read_truth, summarise
-from slatprep.demo.generated import nearest_similarity
 from slatprep.errors import ConfigError, SlatprepError
-from slatprep.geometry.frames import voxel_centres
+from slatprep.geometry.frames import nearest_similarity, voxel_centres
 from slatprep.geometry.voxels import occupancy_of
 from slatprep.parameters import PRESETS, AlignParameters
 from slatprep.parameters.files import load_parameters

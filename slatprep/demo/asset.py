@@ -20,12 +20,11 @@ from slatprep.demo.difficulty import (
     draw_frames,
     generate,
 )
-from slatprep.demo.generated import nearest_similarity
 from slatprep.demo.latents import LatentKind, make_latents
 from slatprep.demo.nerf import nerf_field
 from slatprep.demo.shapes import Solid
 from slatprep.demo.voxelise import voxelise
-from slatprep.geometry.frames import voxel_centres
+from slatprep.geometry.frames import nearest_similarity, voxel_centres
 from slatprep.geometry.voxels import boundary
 from slatprep.records import BACKGROUND, RESOLUTION
 

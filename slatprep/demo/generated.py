@@ -8,10 +8,9 @@ true place of a SLAT voxel is computed and not fitted.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any, Self
+from typing import Self
 
 import numpy as np
-from numpy.typing import NDArray
 
 from slatprep.demo.model import Array, Rng, direction
 from slatprep.geometry.frames import VOXEL_SIZE
@@ -203,31 +202,3 @@ def draw_distortion(
         away=away,
         slope=less * slope,
     )
-
-
-def nearest_similarity(source: NDArray[np.floating[Any]], target: Array) -> Array:
-    """Return the similarity that maps points onto others with least squares.
-
-    Parameters
-    ----------
-    source, target : ndarray of float64, shape (P, 3)
-        The points, at least three that are not on a line, and their targets.
-
-    Returns
-    -------
-    ndarray of float64, shape (4, 4)
-        With a rotation, a positive scale and a shift.
-
-    References
-    ----------
-    S. Umeyama, "Least-squares estimation of transformation parameters between
-    two point patterns", IEEE TPAMI 13(4), 1991.
-    """
-    a, b = source - source.mean(axis=0), target - target.mean(axis=0)
-    u, values, v = np.linalg.svd(b.T @ a)
-    signs = np.array([1.0, 1.0, np.sign(np.linalg.det(u @ v))])
-    linear = (u * signs) @ v * (float(values @ signs) / float((a * a).sum()))
-    transform = np.eye(4)
-    transform[:3, :3] = linear
-    transform[:3, 3] = target.mean(axis=0) - linear @ source.mean(axis=0)
-    return transform

@@ -8,6 +8,7 @@ that map points of the PixieVerse frame to points of the SLAT frame.
 from __future__ import annotations
 
 import itertools
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -139,6 +140,36 @@ def displacement(transform: ArrayLike, reference: ArrayLike, slat_voxels: ArrayL
     here = apply_transform(invert_transform(transform), points)
     there = apply_transform(invert_transform(reference), points)
     return float(np.linalg.norm(here - there, axis=1).mean() * RESOLUTION)
+
+
+def nearest_similarity(
+    source: NDArray[np.floating[Any]], target: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Return the similarity that maps points onto others with least squares.
+
+    Parameters
+    ----------
+    source, target : ndarray of float64, shape (P, 3)
+        The points, at least three that are not on a line, and their targets.
+
+    Returns
+    -------
+    ndarray of float64, shape (4, 4)
+        With a rotation, a positive scale and a shift.
+
+    References
+    ----------
+    S. Umeyama, "Least-squares estimation of transformation parameters between
+    two point patterns", IEEE TPAMI 13(4), 1991.
+    """
+    a, b = source - source.mean(axis=0), target - target.mean(axis=0)
+    u, values, v = np.linalg.svd(b.T @ a)
+    signs = np.array([1.0, 1.0, np.sign(np.linalg.det(u @ v))])
+    linear = (u * signs) @ v * (float(values @ signs) / float((a * a).sum()))
+    transform = np.eye(4)
+    transform[:3, :3] = linear
+    transform[:3, 3] = target.mean(axis=0) - linear @ source.mean(axis=0)
+    return transform
 
 
 def cube_symmetries() -> NDArray[np.int64]:

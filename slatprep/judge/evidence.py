@@ -267,8 +267,9 @@ def measure_figures(
     FitFigures
         Under the transform, with the offset between the surfaces that suits it best.
     """
-    from slatprep.align.deform import CHECK_SAMPLES, FIT_SAMPLES, Pairing, Similarity
+    from slatprep.align.deform import CHECK_SAMPLES, FIT_SAMPLES, Pairing
     from slatprep.align.surface import surface_of
+    from slatprep.align.warp import Similarity
     from slatprep.geometry.voxels import occupancy_of
 
     rotation, shift, scale = split_transform(alignment.transform)

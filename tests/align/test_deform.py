@@ -10,8 +10,8 @@ from support.deformed import Move, bend, occupancy, stretch
 from support.shapes import chair, field_of, latents_of, surface_latents
 
 from slatprep.align import align
-from slatprep.align.deform import Warp, halved
 from slatprep.align.deformation import is_proper, map_of
+from slatprep.align.warp import Similarity, Warp, from_nearest, halved, places_of
 from slatprep.geometry.frames import voxel_centres
 from slatprep.geometry.voxels import boundary, voxels_of
 from slatprep.parameters import AlignParameters
@@ -65,6 +65,40 @@ def test_a_known_stretch_is_found_as_an_affine_map() -> None:
     low, high = affine.figures.stretch
     # The similarity has taken the mean scale already.
     assert high / low == pytest.approx(1.15 / 0.95, abs=0.05)
+
+
+@pytest.mark.parametrize("factors", [(1.45, 0.8, 1.2), (1.5, 0.75, 0.9)])
+def test_proportions_that_no_similarity_finds_are_bounded_from_the_nearest_one(
+    factors: tuple[float, float, float],
+) -> None:
+    # The search comes to a scale and heading from which the affine map is beyond the bounds.
+    field, latents = pair(lambda points: points / factors)
+    alignment = align(field, latents, DEFAULT)
+    assert alignment.deformation is not None
+    assert mistakes(alignment, latents, lambda points: points / factors).mean() < 0.8
+    stretches = np.linalg.svd(alignment.deformation.affine[:, :3], compute_uv=False)
+    assert 0.6 <= stretches[-1] <= stretches[0] <= 1.6
+
+
+@pytest.mark.parametrize("bounds", [(0.6, 1.6), (1.0, 1.0)])
+def test_a_warp_from_the_nearest_similarity_is_the_same_map(bounds: tuple[float, float]) -> None:
+    rng = np.random.default_rng(4)
+    turn, _ = np.linalg.qr(rng.normal(size=(3, 3)))
+    pose = Similarity(turn * np.linalg.det(turn), rng.normal(size=3), 1.2, 0.1)
+    affine = np.eye(3, 4) + rng.normal(scale=0.1, size=(3, 4))
+    warp = Warp(affine, 0.0, np.full(3, -32.0), 32.0, rng.normal(size=(5, 5, 5, 3)))
+    points = rng.uniform(-30, 30, (500, 3))
+    nearest, rest = from_nearest(pose, warp, points, bounds)
+    assert places_of(nearest, rest, points) == pytest.approx(places_of(pose, warp, points))
+    assert nearest.rotation @ nearest.rotation.T == pytest.approx(np.eye(3))
+    assert bounds[0] <= nearest.scale <= bounds[1]
+    # Centroid on centroid, no turn and, within the bounds, no growth are left.
+    moved = rest.moved(points) - points.mean(axis=0)
+    there = points - points.mean(axis=0)
+    assert moved.mean(axis=0) == pytest.approx(np.zeros(3), abs=1e-9)
+    assert moved.T @ there == pytest.approx((moved.T @ there).T)
+    if bounds[0] < 1.0:
+        assert (moved * there).sum() == pytest.approx((there**2).sum())
 
 
 def test_the_same_shape_is_not_deformed_and_keeps_the_bytes_of_a_rigid_fit() -> None:

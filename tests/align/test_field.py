@@ -20,6 +20,7 @@ from slatprep.align.deformation import map_of
 from slatprep.align.field import FINE_SAMPLES
 from slatprep.align.starts import distinct_starts
 from slatprep.geometry.frames import displacement, make_transform, split_transform
+from slatprep.geometry.voxels import boundary, voxels_of
 from slatprep.judge import judge
 from slatprep.parameters import AlignParameters, SampleParameters
 from slatprep.records import Verdict
@@ -38,6 +39,24 @@ def test_a_quarter_turn_is_found_exactly(index: int) -> None:
     assert alignment.model == "rigid"
     assert alignment.search == "euler64"
     assert alignment.quality.fitness == alignment.quality.fitness_backward == 1.0
+
+
+@pytest.mark.parametrize("half", [(24, 12, 8), (22, 13, 6)])
+def test_the_ties_of_a_box_are_its_three_half_turns(half: tuple[int, int, int]) -> None:
+    def box(size: np.ndarray, at: tuple[float, float, float]) -> np.ndarray:
+        return (abs(GRID - 31.5 - np.array(at)) < size).all(axis=-1)
+
+    # A little larger and off the lattice: the one that is chosen is not the one that scores most.
+    larger = box(1.01 * np.array(half), (0.4, 0.2, 0.3))
+    latents = latents_of(voxels_of(boundary(larger)))
+    alignment = align(field_of(box(np.array(half), (0.0, 0.0, 0.0))), latents, DEFAULT)
+    chosen, _, _ = split_transform(alignment.transform)
+    turns = [split_transform(p.transform)[0] @ chosen.T for p in alignment.placements]
+    assert len(turns) == 3
+    assert [np.trace(turn) for turn in turns] == pytest.approx([-1.0] * 3, abs=0.01)
+    assert {int(np.argmax(np.diag(turn))) for turn in turns} == {0, 1, 2}
+    assert min(p.displacement for p in alignment.placements) > 1.5
+    assert alignment.margin == pytest.approx(0.0, abs=0.002)
 
 
 # The median and worst displacement [voxel] over the level's assets without

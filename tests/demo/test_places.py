@@ -18,9 +18,10 @@ from slatprep.demo.difficulty import (
     draw_frames,
     generate,
 )
-from slatprep.demo.generated import draw_distortion, nearest_similarity
+from slatprep.demo.generated import draw_distortion
 from slatprep.demo.nerf import nerf_field
 from slatprep.demo.shapes import Solid
+from slatprep.geometry.frames import nearest_similarity
 
 CUBE = np.array([[-0.5, -0.5, -0.5], [0.5, 0.5, 0.5]])
 KINDS = [list(CATALOGUE).index(c) for c in ("flowers", "rubber_ducks_and_toys", "soda_cans")]

@@ -1,0 +1,125 @@
+"""A similarity and a deformation of it while they are fitted; lengths are in voxels."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from slatprep.align.bspline import displacements, refined
+from slatprep.align.deformation import make_deformation
+from slatprep.geometry.frames import VOXEL_SIZE, nearest_similarity, split_transform
+from slatprep.records import Deformation
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Similarity:
+    """The similarity that is deformed: as `slatprep.align.field.Pose`, in voxels."""
+
+    rotation: Array
+    shift: Array
+    scale: float
+    offset: float
+
+    def inverse(self, points: Array) -> Array:
+        """Return where points (N, 3) of the SLAT frame lie in the PixieVerse frame, in voxels."""
+        places: Array = (points - self.shift) @ self.rotation / self.scale
+        return places
+
+
+@dataclass(frozen=True)
+class Warp:
+    """A deformation while it is fitted; lengths in voxels, positions from the cube's centre."""
+
+    affine: Array
+    offset: float
+    origin: Array = field(default_factory=lambda: np.zeros(3))
+    spacing: float = 1e6
+    coefficients: Array = field(default_factory=lambda: np.zeros((4, 4, 4, 3)))
+
+    @property
+    def has_lattice(self) -> bool:
+        """Whether there is a lattice, be it all zeros."""
+        return self.spacing < 1e6
+
+    @property
+    def is_bent(self) -> bool:
+        """Whether there is more to it than the affine part."""
+        return bool(self.coefficients.any())
+
+    def moved(self, points: Array) -> Array:
+        """Return points (N, 3) of the SLAT frame as the warp moves them."""
+        moved: Array = points @ self.affine[:, :3].T + self.affine[:, 3]
+        if self.has_lattice:
+            added = np.empty_like(moved)
+            displacements(points, self.origin, self.spacing, self.coefficients, added)
+            moved += added
+        return moved
+
+    def record(self, box: Array, max_displacement: float) -> Deformation | None:
+        """Return it bounded, not folded and rounded; `box` (2, 3) is the SLAT's."""
+        affine = self.affine.copy()
+        affine[:, 3] *= VOXEL_SIZE
+        bent = self.is_bent
+        return make_deformation(
+            affine,
+            self.origin * VOXEL_SIZE if bent else np.zeros(3),
+            self.spacing * VOXEL_SIZE if bent else 1.0,
+            self.coefficients * VOXEL_SIZE if bent else np.zeros((0, 0, 0, 3)),
+            box * VOXEL_SIZE,
+            max_displacement,
+        )
+
+
+def halved(warp: Warp) -> Warp:
+    """Return the same warp on a lattice of half the spacing."""
+    return replace(warp, spacing=0.5 * warp.spacing, coefficients=refined(warp.coefficients))
+
+
+def places_of(pose: Similarity, warp: Warp, points: Array) -> Array:
+    """Return where points (N, 3) of the SLAT frame lie in the PixieVerse frame, all in voxels."""
+    return pose.inverse(warp.moved(points))
+
+
+def from_nearest(
+    pose: Similarity, warp: Warp, points: Array, scale_bounds: tuple[float, float]
+) -> tuple[Similarity, Warp]:
+    """Return the same map as a warp of the similarity that is nearest to it.
+
+    Where shapes differ much, the search comes to a similarity of another size or
+    heading, and what corrects that is no deformation.
+
+    Parameters
+    ----------
+    pose, warp
+        The map: from the SLAT frame through the warp and back through the pose.
+    points : ndarray of float64, shape (N, 3)
+        Of the SLAT; nearest is meant over them.
+    scale_bounds : tuple of float
+        Within these the pose's scale stays.
+
+    Returns
+    -------
+    pose : Similarity
+    warp : Warp
+    """
+    moved = warp.moved(points)
+    transform = nearest_similarity(points, moved)
+    turn, _, grown = split_transform(transform)
+    low, high = scale_bounds
+    grown = pose.scale / float(np.clip(pose.scale / grown, low, high))
+    centre, there = points.mean(axis=0), moved.mean(axis=0)
+    back = turn.T / grown
+    affine = np.column_stack(
+        [back @ warp.affine[:, :3], centre + back @ (warp.affine[:, 3] - there)]
+    )
+    nearest = Similarity(
+        turn.T @ pose.rotation,
+        centre + back @ (pose.shift - there),
+        pose.scale / grown,
+        pose.offset,
+    )
+    return nearest, replace(warp, affine=affine, coefficients=warp.coefficients @ back.T)
