@@ -13,7 +13,7 @@ from dataclasses import replace
 from typing import Any
 
 from slatprep.errors import ConfigError, StoreError
-from slatprep.pipeline.pack import settled_contents
+from slatprep.pipeline.pack import resolved_contents
 from slatprep.pipeline.rewrite import NO_EXTENT, Source, places_of_sources, write_rows
 from slatprep.pipeline.spool import spooled
 from slatprep.pipeline.summary import BuildSummary
@@ -196,4 +196,4 @@ def _common_contents(sources: Sequence[Source]) -> Contents:
         return first
     unknown = replace(first, latents=replace(first.latents, mean=(), std=()))
     rows = (spooled(record, NO_EXTENT) for source in sources for record in source.records)
-    return settled_contents(rows, unknown, "as said")
+    return resolved_contents(rows, unknown, "as said")

@@ -18,7 +18,7 @@ from slatprep.parameters import StoreParameters
 from slatprep.pipeline.carry import Carried, KeptAsset, Row
 from slatprep.pipeline.previous import PreviousBuild
 from slatprep.pipeline.spool import Spool, SpooledAsset
-from slatprep.readers.encoders import ENOUGH, in_words, look_standardised, settle_latents
+from slatprep.readers.encoders import ENOUGH, in_words, look_standardised, resolve_latents
 from slatprep.records import (
     BACKGROUND,
     UNANNOTATED,
@@ -223,10 +223,10 @@ def _dtype(layout: ArrayLayout) -> Any:
     return object if layout.dtype == "str" else layout.dtype
 
 
-def settled_contents(assets: Iterable[Row], declared: Contents, standardised: str) -> Contents:
-    """Return what a store holds, its latents as `settle_latents` finds them to be."""
+def resolved_contents(assets: Iterable[Row], declared: Contents, standardised: str) -> Contents:
+    """Return what a store holds, its latents as `resolve_latents` finds them to be."""
     moments = [(asset.n_voxels, asset.latents) for asset in assets]
-    return replace(declared, latents=settle_latents(declared.latents, standardised, moments))
+    return replace(declared, latents=resolve_latents(declared.latents, standardised, moments))
 
 
 def latent_warnings(

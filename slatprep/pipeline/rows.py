@@ -9,7 +9,7 @@ from slatprep.errors import StoreError
 from slatprep.pipeline.carry import Carried, Row, in_order, kept_assets
 from slatprep.pipeline.consensus import apply_consensus
 from slatprep.pipeline.finish import Crew, finish
-from slatprep.pipeline.pack import settled_contents
+from slatprep.pipeline.pack import resolved_contents
 from slatprep.pipeline.plan import PlannedAsset
 from slatprep.pipeline.spool import FailedAsset, SpooledAsset
 from slatprep.pipeline.summary import nothing_usable
@@ -96,7 +96,7 @@ def settle_rows(
         jobs = crew.of(len(usable))
         made = apply_consensus(_made(usable), spool, parameters, jobs, crew.note)
         usable = list(apply_witness(made, spool, parameters, jobs, crew.note))
-    contents = settled_contents(usable, wanted.declared, parameters.slat.standardised)
+    contents = resolved_contents(usable, wanted.declared, parameters.slat.standardised)
     usable = in_order(usable, context.previous, wanted.compact)
     carried = Carried(context.previous, usable) if kept and context.previous else None
     return Rows(usable, failed, contents, carried, keys)

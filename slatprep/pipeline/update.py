@@ -34,7 +34,7 @@ from slatprep.provenance.make import origin
 from slatprep.provenance.record import BuildRecord, Record
 from slatprep.provenance.record_json import read_record, records_id, to_json, write_records
 from slatprep.readers import contents_of
-from slatprep.readers.encoders import settle_latents
+from slatprep.readers.encoders import resolve_latents
 from slatprep.records import AssetPair, Contents, Normalization, Place
 from slatprep.storage.atomic import writing
 from slatprep.storage.place import storage_of
@@ -238,7 +238,7 @@ class Update:
         sizes = dict(zip(store.ids, np.diff(store.offsets).tolist(), strict=True))
         moments = [(sizes[asset_id], found[asset_id].latents) for asset_id in sorted(found)]
         declared, slat = self.wanted.declared, self.context.parameters.slat
-        latents = settle_latents(declared.latents, slat.standardised, moments)
+        latents = resolve_latents(declared.latents, slat.standardised, moments)
         return replace(declared, latents=latents)
 
     def _repeated(

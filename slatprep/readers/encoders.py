@@ -67,7 +67,7 @@ def _read_space(path: Place) -> LatentSpace:
     return space
 
 
-def settle_latents(
+def resolve_latents(
     declared: LatentSpace,
     standardised: str,
     moments: Sequence[tuple[int, LatentMoments | None]],

@@ -130,7 +130,7 @@ def find_groups(
     pattern : str
         Group names by levels; see `slatprep.readers.patterns`.
     known : mapping of str to str
-        Fields that are settled already.
+        Fields that are known already.
 
     Yields
     ------

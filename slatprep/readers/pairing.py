@@ -121,7 +121,7 @@ def _grids_of(
     if grids:
         return grids
     patterns = patterns_of(source_adapter(source.adapter), source)
-    tried = tried_names(patterns, _settled(sample=source.sample))
+    tried = tried_names(patterns, _known(sample=source.sample))
     # Plain voxels have the names that SLATs have.
     ours = source.adapter == PixieverseSource.adapter and not one_file
     swapped = ours and find_grids(source, list_below(slat.root))
@@ -279,7 +279,7 @@ def _pair_of(row: _Row, there: _Found, shared: str, grids: Sequence[FoundField])
         if len(grids) > 1:
             problems.append(_several_grids(row.object_id, grids))
         if NAME.fullmatch(row.object_id):
-            known = _settled(id=row.object_id, sample=grids[0].sample or source.sample)
+            known = _known(id=row.object_id, sample=grids[0].sample or source.sample)
             if source.adapter == "pixieverse":
                 mask = _find_one(there, source.mask, known, "mask", problems)
                 bounds = _find_one(there, source.bounds, known, "bounds", problems)
@@ -292,7 +292,7 @@ def _pair_of(row: _Row, there: _Found, shared: str, grids: Sequence[FoundField])
                     tried = fill(source.transform, known)
                     problems.append(f"no transform for id {row.object_id!r}; looked for {tried}")
     else:
-        tried = tried_names(source.grid, _settled(id=row.object_id, sample=source.sample))
+        tried = tried_names(source.grid, _known(id=row.object_id, sample=source.sample))
         problems.append(f"no grid for id {row.object_id!r}; looked for {tried} below {source.root}")
     found = [slat for slat in row.slats if slat.path]
     if not found:
@@ -390,6 +390,6 @@ def _find_one(
     return None
 
 
-def _settled(**fields: str) -> dict[str, str]:
+def _known(**fields: str) -> dict[str, str]:
     """Return the fields of a pattern that have a value."""
     return {name: value for name, value in fields.items() if value}

@@ -65,7 +65,7 @@ def find_files(
     pattern : str
         Relative path with fields, such as ``{id}/sample_{sample}/material_grid.npy``.
     known : mapping of str to str
-        Fields that are settled already; they match their value alone.
+        Fields that are known already; they match their value alone.
     skip : collection of str
         Ids that are not looked for.
 
@@ -109,7 +109,7 @@ def match(component: str, known: Mapping[str, str], name: str) -> dict[str, str]
     component : str
         Of a pattern; a field stands for at least one character, ``*`` also for none.
     known : mapping of str to str
-        Fields that are settled already; they match their value alone.
+        Fields that are known already; they match their value alone.
     name : str
         A file's, folder's or group's.
 

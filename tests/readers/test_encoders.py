@@ -12,7 +12,7 @@ import pytest
 from slatprep.errors import ConfigError, InputError
 from slatprep.parameters import SlatSource
 from slatprep.readers import read_latents
-from slatprep.readers.encoders import latent_space, look_standardised, settle_latents
+from slatprep.readers.encoders import latent_space, look_standardised, resolve_latents
 from slatprep.records import FEATS_MEAN, FEATS_STD, TRELLIS, LatentMoments, LatentSpace
 
 
@@ -34,7 +34,7 @@ def test_raw_and_standardised_latents_are_told_apart(seed: int, narrow: float) -
 def test_unpublished_moments_are_those_of_all_voxels_of_the_dataset() -> None:
     rng = np.random.default_rng(1)
     parts = [rng.normal(size=(n, 4)) * 3 + shift for n, shift in ((100, 5.0), (700, -2.0))]
-    space = settle_latents(
+    space = resolve_latents(
         LatentSpace("mine", 4, 64), "auto", [(len(part), moments_of(part)) for part in parts]
     )
     every = np.concatenate(parts)
