@@ -3,11 +3,12 @@
     python tools/mutants.py --budget 1500 --seed 0          # what `make mutants` does
     python tools/mutants.py --budget 300 judge sample       # some modules alone
 
-Each change (a mutant) is made in a copy of the tree and given to the tests of
-its module. Processes are forked from one that has the libraries loaded, which
-takes most of the time of a test run here. Mutants are taken in turn from all
-modules, in an order drawn by the seed, until the budget [s of wall clock] is
-spent. A mutant is caught if a test fails, or runs ten times as long as without
+Each change (a mutant) is given to the tests of its module. These are collected
+and run once, and then each mutant is put into the functions of a process forked
+from there, so that it costs what its tests take. A module that Numba compiles is
+changed in a copy of the tree instead, and imported anew for each mutant. Mutants
+are drawn by the seed; each module gets the same share of the budget [s of wall
+clock]. A mutant is caught if a test fails, or runs ten times as long as without
 it. Those that survive are printed: each is a test that is missing, or a change
 that makes no difference.
 """
@@ -18,6 +19,7 @@ import argparse
 import ast
 import compileall
 import copy
+import enum
 import json
 import os
 import random
@@ -26,9 +28,11 @@ import signal
 import sys
 import tempfile
 import time
-from collections.abc import Iterator
+import types
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -116,34 +120,128 @@ def measure(
     folder: Path, modules: dict[str, list[str]], seed: int, end: float
 ) -> dict[str, dict[str, int]]:
     """Return by module how many mutants there are, were tried and were caught."""
-    order, score, limits = random.Random(seed), {}, {}
-    queues: dict[str, list[Mutant]] = {}
-    for module, tests in modules.items():
-        begin, whole = time.monotonic(), tuple(tests)
-        if whole not in limits:
-            if not passes(folder, tests, limit=1200.0):
-                raise SystemExit(f"{module}: its tests fail without any mutant; mend them first")
-            limits[whole] = 10.0 * (time.monotonic() - begin) + 10.0
-        queues[module] = list(mutants_of(folder, module))
-        order.shuffle(queues[module])
-        score[module] = {"mutants": len(queues[module]), "tried": 0, "caught": 0}
-    while any(queues.values()) and time.monotonic() < end:
-        for module in [name for name, queue in queues.items() if queue]:
-            mutant, place = queues[module].pop(), folder / "slatprep" / f"{module}.py"
-            original = place.read_text("utf-8")
-            place.write_text(mutant.text, "utf-8")
-            survived = passes(folder, modules[module], limits[tuple(modules[module])])
-            place.write_text(original, "utf-8")
-            score[module]["tried"] += 1
-            score[module]["caught"] += not survived
-            if survived:
+    order, score = random.Random(seed), {}
+    for left, (module, tests) in zip(range(len(modules), 0, -1), modules.items(), strict=True):
+        queue = list(mutants_of(folder, module))
+        order.shuffle(queue)
+        compiled = "njit" in (folder / "slatprep" / f"{module}.py").read_text("utf-8")
+        trial = imported_anew if compiled else collected_once
+        until = time.monotonic() + (end - time.monotonic()) / left
+        survived = list(trial(folder, module, tests, queue, until))
+        for mutant, survives in zip(queue, survived, strict=False):
+            if survives:
                 print(f"slatprep/{module}.py:{mutant.line}: {mutant.change}", flush=True)
-            if time.monotonic() > end:
-                break
+        caught = survived.count(False)
+        score[module] = {"mutants": len(queue), "tried": len(survived), "caught": caught}
     total = {
         key: sum(part[key] for part in score.values()) for key in ("mutants", "tried", "caught")
     }
     return {**score, "all": total}
+
+
+def imported_anew(
+    folder: Path, module: str, tests: list[str], queue: list[Mutant], until: float
+) -> Iterator[bool]:
+    """Yield whether each mutant survives, written into the copy of the tree."""
+    begin = time.monotonic()
+    if not passes(lambda: run_tests(folder, tests), limit=1200.0):
+        raise SystemExit(f"{module}: its tests fail without any mutant; mend them first")
+    limit = 10.0 * (time.monotonic() - begin) + 10.0
+    place = folder / "slatprep" / f"{module}.py"
+    original = place.read_text("utf-8")
+    for mutant in queue:
+        if time.monotonic() > until:
+            break
+        place.write_text(mutant.text, "utf-8")
+        yield passes(lambda: run_tests(folder, tests), limit)
+        place.write_text(original, "utf-8")
+
+
+def collected_once(
+    folder: Path, module: str, tests: list[str], queue: list[Mutant], until: float
+) -> list[bool]:
+    """Return whether each mutant survives, put into a process that has run its tests before."""
+    found = folder / "survived.json"
+    found.unlink(missing_ok=True)
+    trials = Trials(f"slatprep.{module.replace('/', '.')}", queue, until, found)
+    limit = 1200.0 + 2.0 * max(until - time.monotonic(), 0.0)
+    if not passes(lambda: run_tests(folder, tests, [trials]), limit) or not found.exists():
+        raise SystemExit(f"{module}: its tests fail without any mutant; mend them first")
+    survived: list[bool] = json.loads(found.read_text("utf-8"))
+    return survived
+
+
+class Trials:
+    """A plugin of pytest that runs the tests, and then forks a process for each mutant."""
+
+    def __init__(self, module: str, queue: list[Mutant], until: float, found: Path) -> None:
+        self.module, self.queue, self.until, self.found = module, queue, until, found
+
+    def pytest_runtestloop(self, session: Any) -> bool:
+        """Run the tests unchanged, which makes what they share, and then with each mutant."""
+        begin = time.monotonic()
+        if not all_pass(session.items):
+            session.testsfailed = 1
+            return True
+        limit = 10.0 * (time.monotonic() - begin) + 10.0
+        text = Path(str(sys.modules[self.module].__file__)).read_text("utf-8")
+        same = Mutant(self.module, 0, "nothing is changed", text)
+        if not passes(lambda: self.trial(same, session.items), limit):
+            session.testsfailed = 1  # Then no mutant that is caught would say anything.
+            return True
+        survived = []
+        for mutant in self.queue:
+            if time.monotonic() > self.until:
+                break
+            survived.append(passes(lambda one=mutant: self.trial(one, session.items), limit))
+        self.found.write_text(json.dumps(survived), "utf-8")
+        return True
+
+    def trial(self, mutant: Mutant, items: list[Any]) -> None:
+        """Put a mutant into the module and run the tests; ends the process."""
+        module = sys.modules[self.module]
+        changed = {"__name__": self.module, "__file__": module.__file__,
+                   "__package__": module.__package__}  # fmt: skip
+        try:
+            exec(compile(mutant.text, str(module.__file__), "exec"), changed)
+            put_into(vars(module), changed, module)
+            os._exit(not all_pass(items))
+        except BaseException:
+            os._exit(1)
+
+
+def all_pass(items: list[Any]) -> bool:
+    """Run collected tests, again if they have been run; stop at the first that fails."""
+    from _pytest.runner import runtestprotocol
+
+    for item, following in zip(items, [*items[1:], items[0]], strict=True):
+        item._initrequest()
+        # With an item to follow, fixtures of the session stay for the next process.
+        if any(report.failed for report in runtestprotocol(item, nextitem=following, log=False)):
+            return False
+    return True
+
+
+def put_into(there: Any, changed: Any, owner: object) -> None:
+    """Give functions new code in place, wherever they are known; plain values a new value."""
+    for name, new in dict(changed).items():
+        old = there.get(name)
+        if old is new:
+            continue  # what the module imports
+        for inner in ("__func__", "__wrapped__", "fget", "func"):
+            if hasattr(new, inner) and hasattr(old, inner):
+                if hasattr(old, "cache_clear"):
+                    old.cache_clear()
+                old, new = getattr(old, inner), getattr(new, inner)
+        if isinstance(old, types.FunctionType) and isinstance(new, types.FunctionType):
+            if old.__module__ == new.__module__:
+                old.__code__, old.__defaults__ = new.__code__, new.__defaults__
+                old.__kwdefaults__ = new.__kwdefaults__
+        elif isinstance(old, type) and isinstance(new, type):
+            if old.__module__ == new.__module__ and not issubclass(old, enum.Enum):
+                put_into(vars(old), vars(new), old)
+        elif isinstance(new, int | float | tuple | frozenset) and not name.startswith("__"):
+            setattr(owner, name, new)
 
 
 def mutants_of(folder: Path, module: str) -> Iterator[Mutant]:
@@ -188,13 +286,13 @@ def changes_of(node: ast.AST) -> Iterator[ast.AST]:
     yield changed
 
 
-def passes(folder: Path, tests: list[str], limit: float) -> bool:
-    """Return whether tests pass in the copy; run in a process forked from this one."""
+def passes(run: Callable[[], None], limit: float) -> bool:
+    """Return whether a process forked from this one, in which `run` ends it, exits with 0."""
     sys.stdout.flush()
     child = os.fork()
     if not child:
         os.setsid()
-        run_tests(folder, tests)
+        run()
     end = time.monotonic() + limit
     while time.monotonic() < end:
         done, status = os.waitpid(child, os.WNOHANG)
@@ -206,7 +304,7 @@ def passes(folder: Path, tests: list[str], limit: float) -> bool:
     return False
 
 
-def run_tests(folder: Path, tests: list[str]) -> None:
+def run_tests(folder: Path, tests: list[str], plugins: list[object] | None = None) -> None:
     """Run tests on the copy and end this process with pytest's exit code."""
     import pytest
 
@@ -218,7 +316,7 @@ def run_tests(folder: Path, tests: list[str]) -> None:
     sys.path.insert(0, str(folder))
     os.environ.update(PYTHONPATH=str(folder), PYTHONDONTWRITEBYTECODE="1")
     options = ["-x", "-q", "-p", "no:cacheprovider"]
-    os._exit(int(pytest.main([*options, *(f"tests/{test}" for test in tests)])))
+    os._exit(int(pytest.main([*options, *(f"tests/{test}" for test in tests)], plugins)))
 
 
 if __name__ == "__main__":

@@ -12,6 +12,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from importlib.util import find_spec
 from itertools import islice
@@ -145,17 +146,7 @@ def bench_align(
     SlatprepError
         If an engine that is named is not installed.
     """
-    engines = engines or installed_engines()
-    unknown = set(engines) - set(ENGINES)
-    if unknown:
-        raise ConfigError(f"no engine {sorted(unknown)}; expected some of {', '.join(ENGINES)}")
-    for engine in engines:
-        if extra := missing_extra(engine):
-            raise SlatprepError(
-                f"the engine {engine} needs {_NEEDS[engine][0]}, which is not installed: "
-                f"pip install 'slatprep[{extra}]'"
-            )
-    chosen = [REFERENCE, *(e for e in ENGINES if e in engines and e != REFERENCE)]
+    chosen = _chosen(engines or installed_engines())
     pairs = list(pairs_with_truth(folder, limit))
     if not pairs:
         raise ConfigError(
@@ -172,17 +163,14 @@ def bench_align(
         for number, (pair, truth_path) in enumerate(pairs):
             truth = read_truth(truth_path)
             for repeat in range(repeats):
-                begin = time.process_time()
-                field, latents = read_field(pair), read_latents(pair)
-                reading.append(time.process_time() - begin)
-                begin = time.process_time()
-                surface_of(field.occupancy)
-                surface_of(occupancy_of(latents.coords))
-                fields.append(time.process_time() - begin)
+                with _timed(reading):
+                    field, latents = read_field(pair), read_latents(pair)
+                with _timed(fields):
+                    surface_of(field.occupancy)
+                    surface_of(occupancy_of(latents.coords))
                 for position, engine in enumerate(chosen):
-                    begin = time.process_time()
-                    transform, places = _align(engine, field, latents)
-                    seconds[engine].append(time.process_time() - begin)
+                    with _timed(seconds[engine]):
+                        transform, places = _align(engine, field, latents)
                     if repeat == 0:
                         preset = PRESETS["default" if engine == REFERENCE else "paper"]
                         annotation = sample(field, places, preset.sample)
@@ -210,6 +198,28 @@ def bench_align(
             _result(e, seconds[e], seconds[REFERENCE], scores[e], start_up[e]) for e in chosen
         ),
     )
+
+
+def _chosen(engines: Sequence[str]) -> list[str]:
+    """Return engines in the order of `ENGINES`, the default one first; see `bench_align`."""
+    unknown = set(engines) - set(ENGINES)
+    if unknown:
+        raise ConfigError(f"no engine {sorted(unknown)}; expected some of {', '.join(ENGINES)}")
+    for engine in engines:
+        if extra := missing_extra(engine):
+            raise SlatprepError(
+                f"the engine {engine} needs {_NEEDS[engine][0]}, which is not installed: "
+                f"pip install 'slatprep[{extra}]'"
+            )
+    return [REFERENCE, *(e for e in ENGINES if e in engines and e != REFERENCE)]
+
+
+@contextmanager
+def _timed(into: list[float]) -> Iterator[None]:
+    """Append the processor seconds of what is done within."""
+    begin = time.process_time()
+    yield
+    into.append(time.process_time() - begin)
 
 
 def pairs_with_truth(folder: Path, limit: int | None = None) -> Iterator[tuple[AssetPair, Path]]:
