@@ -31,7 +31,7 @@ def installed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]
     about.mkdir(parents=True)
     (site / "mine.py").write_text(blocks("python")[0])
     (about / "METADATA").write_text("Metadata-Version: 2.1\nName: mine\nVersion: 1.0\n")
-    name, value = re.findall(r'^(\w+) = "(mine:\w+)"$', blocks("toml")[1], re.M)[0]
+    name, value = re.findall(r'^(\w+) = "(mine:\w+)"$', "\n".join(blocks("toml")), re.M)[0]
     (about / "entry_points.txt").write_text(f"[slatprep.sources]\n{name} = {value}\n")
     monkeypatch.syspath_prepend(str(site))
     adapters._others.cache_clear()
