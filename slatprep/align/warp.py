@@ -17,7 +17,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Similarity:
-    """The similarity that is deformed: as `slatprep.align.field.Pose`, in voxels."""
+    """The similarity that is deformed: as `slatprep.align.pose.Pose`, in voxels."""
 
     rotation: Array
     shift: Array
