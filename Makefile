@@ -113,7 +113,7 @@ BENCH ?=
 bench: $(VENV)/.installed-dev
 	$(BIN)/python benchmarks/bench.py $(BENCH)
 
-# Half an hour of one core; MUTANTS='--budget 300 judge sample' is a part of it.
+# Half an hour of one core; MUTANTS='--budget 300 normalize sample' is a part of it.
 MUTANTS ?= --budget 1500 --seed 0
 mutants: $(VENV)/.installed-dev
 	nice -n 10 $(BIN)/python tools/mutants.py $(MUTANTS)

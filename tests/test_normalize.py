@@ -14,9 +14,12 @@ from hypothesis import strategies as st
 from slatprep.errors import ConfigError
 from slatprep.normalize import (
     PIXIE_RANGES,
+    change_ranges,
     denormalize_properties,
     normalize_and_count,
     normalize_change,
+    normalize_mapped,
+    normalize_properties,
     property_extent,
     ranges_from_extents,
 )
@@ -48,6 +51,33 @@ def test_the_ends_are_not_clipped_and_what_lies_beyond_is_counted() -> None:
     np.testing.assert_array_equal(values[:2], [[-1, -1, -1], [1, 1, 1]])
     np.testing.assert_allclose(values[2:], [[-1, 1, 0], [1, 0, 1]], atol=1e-6)
     assert clipped.tolist() == [2, 1, 1]
+
+
+def test_mapped_values_by_hand_are_not_clipped() -> None:
+    # 13 lies a decade above 4..12, an eighth of its width: 1 + 2 / 8.
+    values = normalize_mapped([[6.0, 3.0, 0.35], [13.0, 1.0, 0.5]], DECADES)
+    np.testing.assert_allclose(values, [[-0.5, 0.0, 0.5], [1.25, -2.0, 2.0]], atol=1e-12)
+
+
+def test_values_of_other_ranges_by_hand_are_not_clipped() -> None:
+    wide = Normalization(
+        (
+            PropertyRange("youngs_modulus", True, 0.0, 16.0),
+            PropertyRange("density", True, 2.0, 6.0),
+            PropertyRange("poissons_ratio", False, 0.3, 0.4),
+        ),
+        source="by hand",
+    )
+    # Of 4..12, 2..4 and 0.2..0.4: -0.5 is 6, 2.5 and 0.25; 1 is 12, 4 and 0.4.
+    values = change_ranges([[-0.5] * 3, [1.0] * 3], DECADES, wide)
+    np.testing.assert_allclose(values, [[-0.25, -0.75, -2.0], [0.5, 0.0, 1.0]], atol=1e-12)
+
+
+def test_what_is_normalised_alone_is_what_is_counted_too() -> None:
+    rows = [[1e6, 1e3, 0.35], [1e13, 1e5, 0.1]]
+    np.testing.assert_array_equal(
+        normalize_properties(rows, DECADES), normalize_and_count(rows, DECADES)[0]
+    )
 
 
 def test_nan_passes_through_uncounted() -> None:

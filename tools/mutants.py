@@ -1,7 +1,7 @@
 """Change one operator or number at a time and see whether the tests notice.
 
     python tools/mutants.py --budget 1500 --seed 0          # what `make mutants` does
-    python tools/mutants.py --budget 300 judge sample       # some modules alone
+    python tools/mutants.py --budget 300 normalize sample   # some modules alone
 
 Each change (a mutant) is given to the tests of its module. These are collected
 and run once, and then each mutant is put into the functions of a process forked
@@ -9,8 +9,9 @@ from there, so that it costs what its tests take. A module that Numba compiles i
 changed in a copy of the tree instead, and imported anew for each mutant. Mutants
 are drawn by the seed; each module gets the same share of the budget [s of wall
 clock]. A mutant is caught if a test fails, or runs ten times as long as without
-it. Those that survive are printed: each is a test that is missing, or a change
-that makes no difference.
+it. Constants of a module are changed only where Numba compiles it. Those that
+survive are printed: each is a test that is missing, or a change that makes no
+difference.
 """
 
 from __future__ import annotations
@@ -122,9 +123,10 @@ def measure(
     """Return by module how many mutants there are, were tried and were caught."""
     order, score = random.Random(seed), {}
     for left, (module, tests) in zip(range(len(modules), 0, -1), modules.items(), strict=True):
-        queue = list(mutants_of(folder, module))
+        text = (folder / "slatprep" / f"{module}.py").read_text("utf-8")
+        compiled, inside = "njit" in text, lines_in_functions(text)
+        queue = [one for one in mutants_of(folder, module) if compiled or one.line in inside]
         order.shuffle(queue)
-        compiled = "njit" in (folder / "slatprep" / f"{module}.py").read_text("utf-8")
         trial = imported_anew if compiled else collected_once
         until = time.monotonic() + (end - time.monotonic()) / left
         survived = list(trial(folder, module, tests, queue, until))
@@ -137,6 +139,15 @@ def measure(
         key: sum(part[key] for part in score.values()) for key in ("mutants", "tried", "caught")
     }
     return {**score, "all": total}
+
+
+def lines_in_functions(text: str) -> set[int]:
+    """Return the lines of a module that are part of a function.
+
+    A constant that others have imported by name cannot be changed in a process that runs.
+    """
+    functions = (n for n in ast.walk(ast.parse(text)) if isinstance(n, ast.FunctionDef))
+    return {line for n in functions for line in range(n.lineno, (n.end_lineno or n.lineno) + 1)}
 
 
 def imported_anew(
