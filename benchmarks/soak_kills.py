@@ -20,6 +20,7 @@ from __future__ import annotations
 import argparse
 import hashlib
 import json
+import multiprocessing
 import os
 import random
 import shutil
@@ -29,15 +30,23 @@ import sys
 import tempfile
 import time
 from collections import Counter
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, nullcontext, suppress
+from functools import partial
+from multiprocessing.context import ForkProcess as Running
 from pathlib import Path
 
 import aimed_kill
 import zarr
 from checkout import ROOT, environment
+from joblib.externals.loky.backend.context import set_start_method
 from support.synthetic import Dataset
 from support.trees import tree
+
+from slatprep.pipeline.dataset import build_store
+from slatprep.storage.faults import VARIABLE
+from slatprep.workers.dask import Cluster
+from slatprep.workers.local import Jobs
 
 PHASES = {
     "plan": ("asset compared",),
@@ -52,24 +61,18 @@ PHASES = {
 
 STATES = 4
 ENDED = "ended before its kill, so not counted"
-BUILD = """
+CLUSTER = """
 import sys
-from contextlib import nullcontext
-from pathlib import Path
-from support.synthetic import Dataset
-from slatprep import build_store
-if sys.argv[3] == "aimed":
-    import aimed_kill
-    aimed_kill.begin()
-if sys.argv[4]:
-    from slatprep.workers.dask import Cluster
-    workers = Cluster(sys.argv[4])
-else:
-    workers = nullcontext(2)
-with workers as jobs:
-    parameters = Dataset(Path(sys.argv[1])).parameters()
-    build_store(parameters, Path(sys.argv[2]), jobs=jobs, compact=True)
+from distributed import LocalCluster
+if __name__ == "__main__":
+    with LocalCluster(
+        n_workers=2, threads_per_worker=1, protocol="tcp://", dashboard_address=None,
+        silence_logs=50,
+    ) as started:
+        print(started.scheduler_address, flush=True)
+        sys.stdin.read()
 """
+"""A cluster in an interpreter of its own: builds are forked from a process without threads."""
 
 
 def main() -> None:
@@ -95,14 +98,14 @@ def main() -> None:
 @contextmanager
 def cluster() -> Iterator[str]:
     """Run two workers that stand at the seam, and are started again when they are killed."""
-    from distributed import LocalCluster
-
-    os.environ["SLATPREP_FAULTS"] = "aimed_kill:reached"
-    with LocalCluster(
-        n_workers=2, threads_per_worker=1, protocol="tcp://", dashboard_address=None,
-        silence_logs=50,
+    variables = {**os.environ, VARIABLE: "aimed_kill:reached"}
+    with subprocess.Popen(
+        [sys.executable, "-c", CLUSTER], env=variables, text=True,
+        stdin=subprocess.PIPE, stdout=subprocess.PIPE,
     ) as started:  # fmt: skip
-        yield started.scheduler_address
+        assert started.stdin is not None and started.stdout is not None
+        yield started.stdout.readline().strip()
+        started.stdin.close()
 
 
 @contextmanager
@@ -120,7 +123,8 @@ def soak(folder: Path, given: argparse.Namespace, scheduler: str) -> dict[str, o
             dataset.add(f"asset-{number:03}", seed=number + (state if number % 5 == 0 else 0))
         sources.append(dataset.root)
         begin = time.perf_counter()
-        subprocess.run(build_command(dataset.root, folder / f"reference-{state}.zarr"), check=True)
+        # In this process: what it has imported and compiled is there in those forked from it.
+        build(dataset.root, folder / f"reference-{state}.zarr", jobs=1)
         whole = min(whole, time.perf_counter() - begin)
         expected.append(tree(folder / f"reference-{state}.zarr"))
     allowed = [fingerprint(hashes) for hashes in expected]
@@ -135,11 +139,10 @@ def soak(folder: Path, given: argparse.Namespace, scheduler: str) -> dict[str, o
         state = turn // 3 % STATES
         before = fingerprint(tree(out))
         if given.phase:
-            command = build_command(sources[state], out, "aimed", scheduler)
-            outcome, code = aimed_build(command, chance, given, folder / "aims")
+            start = partial(begun, sources[state], out, scheduler)
+            outcome, code = aimed_build(start, chance, given, folder / "aims")
         else:
-            command = build_command(sources[state], out, scheduler=scheduler)
-            outcome, code = killed_build(command, chance, whole)
+            outcome, code = killed_build(begun(sources[state], out, scheduler), chance, whole)
         after = fingerprint(tree(out))
         wanted = (allowed[state],) if code == 0 else (before, allowed[state])
         assert after in wanted, f"kill {turn} ({outcome}): a store that nobody built"
@@ -150,7 +153,7 @@ def soak(folder: Path, given: argparse.Namespace, scheduler: str) -> dict[str, o
         told["store replaced" if after != before else "store as before"] += 1
         if sys.stderr.isatty():
             print(f"\r{done} of {given.kills}", end="", file=sys.stderr)
-    subprocess.run(build_command(sources[-1], out, scheduler=scheduler), check=True)
+    assert ended(begun(sources[-1], out, scheduler), 300) == 0, "the last build fails"
     assert tree(out) == expected[-1], "the last build is not what one from nothing is"
     left = {path.name for path in folder.iterdir() if "store" in path.name}
     assert left == {"store.zarr", "store.manifests"}, left
@@ -164,51 +167,83 @@ def soak(folder: Path, given: argparse.Namespace, scheduler: str) -> dict[str, o
 
 
 def aimed_build(
-    command: list[str], chance: random.Random, given: argparse.Namespace, aims: Path
+    start: Callable[..., Running], chance: random.Random, given: argparse.Namespace, aims: Path
 ) -> tuple[str, int]:
     """Run a build that is killed at a step; return what was killed where, and the exit code."""
     phase = chance.choice(given.phase)
     step, whom = chance.choice(PHASES[phase]), chance.choice(("self", "parent", "all"))
-    calls = chance.randrange(given.assets) if step.startswith(("asset", "shard")) else 0
+    # Two processes share the assets, and what is finished is not done again.
+    calls = chance.randrange(given.assets // 2) if step.startswith(("asset", "shard")) else 0
     aimed_kill.aim(aims, step, calls, whom)
-    variables = {**os.environ, "SLATPREP_FAULTS": "aimed_kill:reached"}
-    build = start(command, variables)
-    try:
-        code = build.wait(timeout=300)
-    except subprocess.TimeoutExpired as error:
-        raise AssertionError(f"a build hangs after a kill at {step!r}, {whom}") from error
+    code = ended(start(faults="aimed_kill:reached"), 300)
+    assert code is not None, f"a build hangs after a kill at {step!r}, {whom}"
     return (f"{phase}, {step}: {whom} killed" if aimed_kill.struck(aims) else ENDED), code
 
 
-def killed_build(command: list[str], chance: random.Random, whole: float) -> tuple[str, int]:
-    """Start a build and kill something of it at a random time; return what, and the exit code."""
-    build = start(command, dict(os.environ))
+def killed_build(build: Running, chance: random.Random, whole: float) -> tuple[str, int]:
+    """Kill something of a build at a random time; return what, and the exit code."""
     whom = chance.choice(("all", "parent", "worker"))
-    try:
-        return ENDED, build.wait(timeout=chance.uniform(0.1, 1.1) * whole)
-    except subprocess.TimeoutExpired:
-        pass
+    code = ended(build, chance.uniform(0.1, 1.1) * whole)
+    if code is not None:
+        return ENDED, code
+    assert build.pid is not None
     if whom == "worker":
         workers = children(build.pid)
         if workers:
             os.kill(chance.choice(workers), signal.SIGKILL)
-            try:
-                code = build.wait(timeout=120)
-            except subprocess.TimeoutExpired as error:
-                raise AssertionError("a build hangs after its worker was killed") from error
+            code = ended(build, 120)
+            assert code is not None, "a build hangs after its worker was killed"
             return f"a worker killed, and {'ended well' if code == 0 else 'told so'}", code
         whom = "all"
     if whom == "parent":
         build.kill()
     else:
         os.killpg(build.pid, signal.SIGKILL)
-    return f"{whom} killed", build.wait()
+    code = ended(build, 120)
+    assert code is not None
+    return f"{whom} killed", code
 
 
-def start(command: list[str], variables: dict[str, str]) -> subprocess.Popen[bytes]:
-    return subprocess.Popen(
-        command, env=variables, start_new_session=True, stderr=subprocess.DEVNULL
+def begun(sources: Path, out: Path, scheduler: str = "", faults: str = "") -> Running:
+    """Begin a build in a process group of its own.
+
+    It is forked, as its workers are: to start three interpreters and load compiled kernels takes
+    longer than such a build.
+    """
+    running = multiprocessing.get_context("fork").Process(
+        target=_build_apart, args=(sources, out, scheduler, faults)
     )
+    running.start()
+    assert running.pid is not None
+    with suppress(ProcessLookupError, PermissionError):  # Whoever is first, it or we.
+        os.setpgid(running.pid, running.pid)
+    return running
+
+
+def _build_apart(sources: Path, out: Path, scheduler: str, faults: str) -> None:
+    os.setpgid(0, 0)
+    os.dup2(os.open(os.devnull, os.O_WRONLY), 2)
+    set_start_method("fork")
+    if faults:
+        os.environ[VARIABLE] = faults
+        aimed_kill.begin()
+    code = 1
+    try:
+        with Cluster(scheduler) if scheduler else nullcontext(2) as jobs:
+            build(sources, out, jobs)
+        code = 0
+    finally:
+        os._exit(code)  # Else it would wait for workers that are idle; they see that it is gone.
+
+
+def build(sources: Path, out: Path, jobs: Jobs) -> None:
+    build_store(Dataset(sources).parameters(), out, jobs=jobs, compact=True)
+
+
+def ended(build: Running, seconds: float) -> int | None:
+    """Return a build's exit code; None if it takes longer than this."""
+    build.join(seconds)
+    return build.exitcode
 
 
 def children(pid: int) -> list[int]:
@@ -233,10 +268,6 @@ def read_whole(path: Path) -> None:
         if isinstance(part, zarr.Array):
             assert part[...].shape == part.shape
     assert group["voxel/coords"].shape[0] == rows
-
-
-def build_command(sources: Path, out: Path, aimed: str = "", scheduler: str = "") -> list[str]:
-    return [sys.executable, "-c", BUILD, str(sources), str(out), aimed, scheduler]
 
 
 def fingerprint(hashes: dict[str, str]) -> str:
