@@ -8,13 +8,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-from slatprep.errors import ConfigError
+from slatprep.errors import ConfigError, StoreError
 from slatprep.export import croissant, export_store, target
 from slatprep.export.card import Stated, card_of
 from slatprep.records import USABLE, Place
 from slatprep.storage.files import file_digest, local_files
 from slatprep.storage.place import place_of, storage_of
-from slatprep.store import open_store
+from slatprep.store import Store, open_store
+from slatprep.store.integrity import file_findings
 
 Data = Literal["store", "webdataset"]
 
@@ -74,7 +75,8 @@ def publish_store(
         If the store is not on a local disk, or `out` lies in it or holds something that
         `publish_store` did not write.
     StoreError
-        If the store cannot be read.
+        If the store cannot be read, or a file that is to be copied is not what it was when the
+        store was built.
     """
     place, stated, out = place_of(store), stated or Stated(), Path(out)
     local = storage_of(place).local
@@ -88,7 +90,7 @@ def publish_store(
     with target.directory(out) as folder:
         if data == "store":
             where = opened.name
-            _copy(local, folder / where)
+            _copy(opened, local, folder / where)
             # For shards, hubs generate a description themselves.
             document = croissant.describe(
                 opened,
@@ -125,10 +127,12 @@ def publish_store(
     return PublishSummary(out, where, assets, len(names), size, missing)
 
 
-def _copy(store: Path, to: Path) -> None:
-    """Copy the regular files of a store; links and others raise an error."""
-    for name, size in local_files(store).items():
-        if size < 0:
-            raise ConfigError(f"{store / name}: is no regular file; `slatprep verify` says more")
+def _copy(store: Store, local: Path, to: Path) -> None:
+    """Copy a store whose files are all what its digests say."""
+    # First, as an error while copying is taken for one of writing.
+    _, findings = file_findings(store, jobs=1)
+    for finding in sorted(findings, key=str):
+        raise StoreError(f"{local}/{finding}; `slatprep verify` says more")
+    for name in local_files(local):
         (to / name).parent.mkdir(parents=True, exist_ok=True)
-        shutil.copyfile(store / name, to / name)
+        shutil.copyfile(local / name, to / name)

@@ -7,8 +7,9 @@ from pathlib import Path
 
 from slatprep.errors import StoreError
 from slatprep.storage.cache import folder_for
+from slatprep.storage.files import file_digest
 from slatprep.storage.remote import RemotePlace, connected, list_objects, multipart_options
-from slatprep.storage.versions import is_version
+from slatprep.storage.versions import content_of, is_version, read_pointer
 
 
 def copied_version(place: RemotePlace) -> Path:
@@ -22,7 +23,8 @@ def copied_version(place: RemotePlace) -> Path:
     Raises
     ------
     StoreError
-        If it is no version, cannot be copied whole, or the disk does not take it.
+        If it is no version, cannot be copied whole, differs from what its pointer says, or the
+        disk does not take it.
     """
     if not is_version(place):
         raise StoreError(
@@ -35,6 +37,7 @@ def copied_version(place: RemotePlace) -> Path:
     if copy.is_dir():
         return copy
     try:
+        pointer = read_pointer(store)
         objects = list_objects(place)  # Names that lead out of a folder are not among them.
         folder.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(dir=folder) as own:
@@ -48,6 +51,13 @@ def copied_version(place: RemotePlace) -> Path:
             for name, entry in objects.items():
                 if (part / name).stat().st_size != entry["size"]:
                     raise StoreError(f"{place / name}: changed while it was copied; run again")
+            if pointer is not None and pointer.version == place.name and pointer.content:
+                digests = {name: file_digest(part / name) for name in objects}
+                if content_of(digests) != pointer.content:
+                    raise StoreError(
+                        f"{place}: the copy is not what was published there; run again, and if "
+                        f"that does not help, `slatprep verify {store}` names what is damaged"
+                    )
             if not copy.is_dir():  # Another process may have been faster.
                 part.rename(copy)
     except OSError as error:

@@ -19,6 +19,9 @@ from typing import IO, Any
 
 from slatprep.errors import ConfigError
 
+PART_BYTES = 2**24
+"""Of large objects, what is uploaded or fetched by one request."""
+
 BUFFER_BYTES = 8 * 2**20
 """What one request of a file that is read from its beginning asks for."""
 
@@ -257,7 +260,7 @@ def multipart_options(system: Any, files_at_once: int | None = None) -> dict[str
     S3 takes 10,000 parts, and so 160 GiB a file. `files_at_once` is for
     transfers of several files.
     """
-    parts = {"chunksize": 2**24, "max_concurrency": 4} if "s3" in system.protocol else {}
+    parts = {"chunksize": PART_BYTES, "max_concurrency": 4} if "s3" in system.protocol else {}
     if files_at_once is None or not system.async_impl:
         return parts
     return parts | {"batch_size": files_at_once}

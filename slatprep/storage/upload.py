@@ -15,10 +15,12 @@ content is not known before, so its name is one that nobody has.
 from __future__ import annotations
 
 import hashlib
+import re
 import warnings
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from datetime import UTC, datetime
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +28,7 @@ from slatprep.errors import StoreError
 from slatprep.storage.faults import reached
 from slatprep.storage.files import file_digest, local_files
 from slatprep.storage.remote import (
+    PART_BYTES,
     RemotePlace,
     connected,
     list_objects,
@@ -38,6 +41,7 @@ from slatprep.storage.versions import (
     SPOOL,
     VERSIONS,
     Pointer,
+    content_of,
     is_spooled,
     is_version,
     is_version_name,
@@ -46,6 +50,9 @@ from slatprep.storage.versions import (
 
 # A small file is held in memory whole while it is uploaded.
 _SMALL_BYTES = 8 * 2**20
+
+_MD5 = re.compile(r"[0-9a-f]{32}(-[0-9]+)?")
+"""What S3 tags an object with, of several parts with their number."""
 
 
 @dataclass(frozen=True)
@@ -226,14 +233,16 @@ def upload_store(new: Path, before: PublishedState, staged: Staged | None = None
     if staged is not None:
         digests |= staged.digests
         sizes |= staged.sizes
-    content = _digest(f"{name} {digests[name]}\n" for name in sorted(digests))
+    content = content_of(digests)
     if before.pointer is not None and before.pointer.content == content:
         if staged is not None:
             _remove_version(staged.version)
         return Upload(before, before.pointer)
     previous = before.pointer.version if before.pointer else ""
     pointer = Pointer(
-        version=staged.version.name if staged else _digest((previous, content))[:16],
+        version=staged.version.name
+        if staged
+        else hashlib.sha256(f"{previous}{content}".encode()).hexdigest()[:16],
         previous=previous,
         content=content,
         published=datetime.now(UTC).isoformat(timespec="seconds"),
@@ -247,14 +256,17 @@ def upload_store(new: Path, before: PublishedState, staged: Staged | None = None
         put_objects(new, upload.version, small)
         put_objects(new, upload.version, large, at_once=1)
         there = list_objects(upload.version)
+        for name, size in sizes.items():
+            arrived = there.get(name, {}).get("size") == size
+            if arrived and name in files and _is_tagged_otherwise(there[name], new / name):
+                arrived = file_digest(upload.version / name) == digests[name]
+            if not arrived:
+                raise StoreError(
+                    f"{upload.version / name}: is not there as it was uploaded; nothing was "
+                    "replaced. If another build has just replaced the store, run again"
+                )
     except OSError as error:
         raise StoreError(_refused(before.target, error)) from None
-    for name, size in sizes.items():
-        if there.get(name, {}).get("size") != size:
-            raise StoreError(
-                f"{upload.version / name}: is not there as it was uploaded; nothing was replaced. "
-                "If another build has just replaced the store, run again"
-            )
     return upload
 
 
@@ -269,9 +281,27 @@ def _is_same(entry: Mapping[str, Any] | None, file: Path) -> bool:
     """Whether an object is known to hold what a file holds: S3 tags most by their MD5."""
     if entry is None or entry["size"] != file.stat().st_size:
         return False
+    return bool(_tag_in(entry)) and not _is_tagged_otherwise(entry, file)
+
+
+def _is_tagged_otherwise(entry: Mapping[str, Any], file: Path) -> bool:
+    """Whether an object's tag looks like an MD5 and is not the file's.
+
+    It may hold the same all the same: where S3 encrypts, a tag is something else.
+    """
+    tag = _tag_in(entry)
     with file.open("rb") as content:
-        digest = hashlib.file_digest(content, "md5").hexdigest()
-    return str(entry.get("ETag", "")).strip('"') == digest
+        if "-" not in tag:
+            return tag not in ("", hashlib.file_digest(content, "md5").hexdigest())
+        # Of several parts: the MD5 of theirs.
+        parts = [hashlib.md5(part) for part in iter(partial(content.read, PART_BYTES), b"")]
+    whole = hashlib.md5(b"".join(part.digest() for part in parts))
+    return tag != f"{whole.hexdigest()}-{len(parts)}"
+
+
+def _tag_in(entry: Mapping[str, Any]) -> str:
+    tag = str(entry.get("ETag", "")).strip('"')
+    return tag if _MD5.fullmatch(tag) else ""
 
 
 def _is_ours(name: str) -> bool:
@@ -293,13 +323,6 @@ def _tag(place: RemotePlace) -> str:
             return str(system.info(name).get("ETag", ""))
     except FileNotFoundError:
         return ""
-
-
-def _digest(parts: Iterable[str]) -> str:
-    digest = hashlib.sha256()
-    for part in parts:
-        digest.update(part.encode())
-    return digest.hexdigest()
 
 
 def _refused(target: RemotePlace, error: OSError) -> str:

@@ -12,9 +12,11 @@ Plain zarr opens a version's own URL.
 
 from __future__ import annotations
 
+import hashlib
 import json
 import re
 import secrets
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING
 
@@ -110,6 +112,12 @@ def read_pointer(store: RemotePlace) -> Pointer | None:
             f"{store / POINTER}: names no version of a store ({error}); remove it and build the "
             "store again, or open a version below it by its own URL"
         ) from None
+
+
+def content_of(digests: Mapping[str, str]) -> str:
+    """Return what a pointer says of the content of a version with files of these SHA-256."""
+    lines = "".join(f"{name} {digests[name]}\n" for name in sorted(digests))
+    return hashlib.sha256(lines.encode()).hexdigest()
 
 
 def current_version(store: RemotePlace) -> RemotePlace:

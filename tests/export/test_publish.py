@@ -86,6 +86,25 @@ def test_the_card_is_read_by_the_hubs_library(root: Path) -> None:
     assert document["distribution"][0]["contentUrl"] == "mixed.zarr/zarr.json"
 
 
+def test_a_damaged_store_is_not_published(mixed_build: BuildSummary, tmp_path: Path) -> None:
+    store = Path(shutil.copytree(str(mixed_build.store), tmp_path / "s.zarr"))
+    assert run(store, "--out", tmp_path / "hub", "--pictures", 0).exit_code == 0
+    before = tree(tmp_path / "hub")
+    shard = store / "voxel/feats/c/0/0"
+    content = bytearray(shard.read_bytes())
+    content[100] ^= 1
+    shard.write_bytes(content)
+    told = run(store, "--out", tmp_path / "hub", "--pictures", 0)
+    assert (told.exit_code, tree(tmp_path / "hub")) == (1, before)
+    assert "voxel/feats/c/0/0: its bytes changed" in told.stderr
+    shard.unlink()
+    shard.symlink_to(tmp_path / "hub" / "README.md")
+    assert (
+        "voxel/feats/c/0/0: is a link"
+        in run(store, "--out", tmp_path / "hub", "--pictures", 0).stderr
+    )
+
+
 def test_only_assets_that_went_into_shards_are_counted(
     mixed_build: BuildSummary, tmp_path: Path
 ) -> None:

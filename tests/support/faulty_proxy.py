@@ -45,7 +45,10 @@ READING = ("truncated", "short", "long", "flipped", "404", "403")
 
 LISTING = ("truncated", "stale")
 CONDITIONAL = ("409", "412")
-KINDS = (*BEFORE, *AFTER, *READING, "stale", *CONDITIONAL)
+UPLOAD = "upload flipped"
+"""What may happen to what is put there: the server takes it with another bit."""
+
+KINDS = (*BEFORE, *AFTER, *READING, "stale", *CONDITIONAL, UPLOAD)
 
 CHANGING = re.compile(r"list-type|current\.json")
 """Addresses whose answers change, and may be stale: listings, and the pointer of a store."""
@@ -65,8 +68,8 @@ class Faults:
         What may.
     lasting : bool
         Whether a request that is repeated meets the same again.
-    spared : str
-        A pattern of addresses that nothing happens to.
+    only : str
+        A pattern of the addresses that something may happen to.
     told : Counter
         What happened, and how often.
     """
@@ -75,7 +78,7 @@ class Faults:
     chance: float = 0.0
     kinds: tuple[str, ...] = KINDS
     lasting: bool = False
-    spared: str = "$^"
+    only: str = ""
     told: Counter[str] = field(default_factory=Counter)
     _asked: Counter[str] = field(default_factory=Counter)
     _lock: threading.Lock = field(default_factory=threading.Lock)
@@ -86,9 +89,10 @@ class Faults:
             self._asked[f"{method} {address}"] += 1
             times = ANY_NUMBER if self.lasting else self._asked[f"{method} {address}"]
         chance = random.Random(f"{self.seed} {method} {address} {times}")
-        if chance.random() >= self.chance or re.search(self.spared, address):
+        if chance.random() >= self.chance or not re.search(self.only, address):
             return "", chance
         fitting = [*BEFORE, *AFTER, *(CONDITIONAL if conditional else ())]
+        fitting += [UPLOAD] if method == "PUT" else []
         if method in ("GET", "HEAD"):
             fitting += LISTING if "list-type" in address else READING
             fitting += ["stale"] if "current.json" in address else []
@@ -122,7 +126,9 @@ class _Handler(BaseHTTPRequestHandler):
         elif kind in ERRORS:
             self._refuse(kind)
         else:
-            status, headers, content = self._forward(body)
+            status, headers, content = self._forward(
+                _flipped(body, chance) if body and kind == UPLOAD else body
+            )
             if kind == "twice":
                 status, headers, content = self._forward(body)
             self._reply(kind, chance, status, headers, content)
@@ -181,9 +187,7 @@ class _Handler(BaseHTTPRequestHandler):
         elif kind == "long":
             content += chance.randbytes(chance.randrange(1, 2000))
         elif content and kind == "flipped":
-            at = chance.randrange(len(content))
-            flipped = bytes([content[at] ^ 1 << chance.randrange(8)])
-            content = content[:at] + flipped + content[at + 1 :]
+            content = _flipped(content, chance)
         if content and kind == "truncated":
             self._send(status, headers, content[: chance.randrange(len(content))], len(content))
             return self._reset()
@@ -215,6 +219,12 @@ class _Handler(BaseHTTPRequestHandler):
         self.connection.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
         self.connection.close()
         self.close_connection = True
+
+
+def _flipped(content: bytes, chance: random.Random) -> bytes:
+    at = chance.randrange(len(content))
+    flipped = bytes([content[at] ^ 1 << chance.randrange(8)])
+    return content[:at] + flipped + content[at + 1 :]
 
 
 class _Server(ThreadingHTTPServer):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import shutil
 import signal
 import socket
@@ -103,9 +104,10 @@ def test_a_build_whose_worker_is_killed_gives_the_same_bytes(
     os.kill(int((faults / "held").read_text()), signal.SIGKILL)
     (faults / "held").unlink()
 
-    _, errors = build.communicate(timeout=120)
+    _, errors = build.communicate(timeout=300)
     assert build.returncode == 0, errors
-    assert errors == f"{address}: 3 workers\n"
+    # On a busy machine it takes long enough for a line of progress.
+    assert re.sub(r"build: \d of 6 assets, [\w: ]+ left\n", "", errors) == f"{address}: 3 workers\n"
     assert tree(tmp_path / "s.zarr") == tree(expected)
 
 

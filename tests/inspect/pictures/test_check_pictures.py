@@ -81,6 +81,26 @@ def test_the_picture_is_whole_and_the_same_each_time(copy: Path, tmp_path: Path)
             assert image[top : top + 300, left : left + 300, :3].std() > 0.05, (top, left)
 
 
+def test_on_a_full_disk_the_picture_that_is_there_stays(copy: Path, tmp_path: Path) -> None:
+    """A limit on the size of files refuses writes midway, as a full disk does."""
+    code = (
+        "import resource, signal, sys\n"
+        "from slatprep.cli.commands import slatprep\n"
+        "signal.signal(signal.SIGXFSZ, signal.SIG_IGN)\n"
+        "resource.setrlimit(resource.RLIMIT_FSIZE, (10_000,) * 2)\n"
+        "slatprep(sys.argv[1:])\n"
+    )
+    picture = tmp_path / "pictures" / "ant.png"
+    picture.parent.mkdir()
+    picture.write_bytes(b"a good one")
+    words = ("check-alignment", "--asset", "ant", "--store", copy, "--picture", picture)
+    command = [sys.executable, "-c", code, *map(str, words)]
+    told = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert told.returncode == 1
+    assert f"the picture: cannot be written to {picture} (File too large)" in told.stderr
+    assert [file.read_bytes() for file in picture.parent.iterdir()] == [b"a good one"]
+
+
 def test_no_words_are_cut_or_written_over_others(copy: Path) -> None:
     group = zarr.open_group(copy, mode="r+")
     for name, value in (("confidence", 0.4), ("expected_accuracy", 0.5), ("ambiguity", 0.9)):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import multiprocessing
+import shutil
 import threading
 from dataclasses import replace
 from pathlib import Path
@@ -16,6 +17,7 @@ import zarr
 from click.testing import CliRunner
 from s3fs.core import S3FileSystem
 from support.faults import inject
+from support.faulty_proxy import Faults, faulty
 from support.remote import Made, current, put, versions
 from support.synthetic import Dataset
 from support.trees import contents, tree
@@ -338,6 +340,48 @@ def test_a_copy_is_made_once_and_holds_no_name_that_leads_out(
     assert_same(open_store(url, copy=True), open_store(undisturbed[1]))
     assert [key for _, key in requests.made] == ["stores/demo.zarr/current.json"]
     assert storage_of(undisturbed[1]).copied_version() == undisturbed[1]
+
+
+def test_a_copy_that_differs_from_what_was_published_is_none(
+    s3: Any, url: str, undisturbed: Made, tmp_path: Path
+) -> None:
+    version = put(undisturbed[1], url)
+    shard = bytearray(s3.cat_file(f"{version}/voxel/feats/c/0/0"))
+    shard[100] ^= 1
+    s3.pipe_file(f"{version}/voxel/feats/c/0/0", bytes(shard))
+    with pytest.raises(StoreError, match=r"copy is not what was published there.*slatprep verify"):
+        open_store(url, copy=True)
+    assert not list((tmp_path / "cache").rglob("zarr.json"))
+
+
+@pytest.mark.parametrize("part_bytes", [None, 5 * 2**20])
+def test_an_upload_that_arrives_with_another_bit_is_not_published(
+    part_bytes: int | None,
+    s3: Any,
+    url: str,
+    server: str,
+    undisturbed: Made,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    new_clients: Any,
+) -> None:
+    store = Path(shutil.copytree(undisturbed[1], tmp_path / "s.zarr"))
+    spoiled = "voxel/feats/c/0/0"
+    if part_bytes is not None:  # Large enough for several parts.
+        monkeypatch.setattr("slatprep.storage.remote.PART_BYTES", part_bytes)
+        monkeypatch.setattr("slatprep.storage.upload.PART_BYTES", part_bytes)
+        (store / spoiled).write_bytes(bytes(12 * 2**20))
+    faults = Faults(chance=1.0, kinds=("upload flipped",), only=spoiled)
+    with faulty(server, faults) as proxy, monkeypatch.context() as through:
+        through.setenv("AWS_ENDPOINT_URL", proxy)
+        new_clients()
+        with pytest.raises(StoreError, match=f"{spoiled}: is not there as it was uploaded"):
+            put(store, url)
+    new_clients()
+    assert faults.told["upload flipped"] > 0
+    assert not s3.exists(f"{url}/current.json")
+    put(store, url)
+    assert current(s3, url) == tree(store)
 
 
 def test_a_store_that_was_copied_there_as_it_is_can_be_read(
