@@ -9,13 +9,12 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
-import orjson
 
 from slatprep.errors import ConfigError, InputError
 from slatprep.parameters import CATEGORY, NAMED_SPLITS
 from slatprep.readers.files import ArraySpec, is_text, npy_array
 from slatprep.records import Place
-from slatprep.storage.documents import read_bounded
+from slatprep.storage.documents import parse_json, read_bounded
 from slatprep.storage.place import place_of
 
 Split = Literal["train", "val", "test"]
@@ -221,7 +220,7 @@ def read_lists(path: Place) -> dict[Split, tuple[str, ...]]:
                 raise ValueError("it holds no text")
             listed: Any = names.tolist()
         elif path.suffix == ".json":
-            listed = orjson.loads(data)
+            listed = parse_json(data)
         else:
             listed = [
                 line.strip() for line in data.decode("utf-8-sig").splitlines() if line.strip()

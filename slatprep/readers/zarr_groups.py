@@ -61,10 +61,10 @@ def _array(
             raise ValueError(f"{key} has {chunk.file_size} bytes")
         return files.read(chunk)
 
-    text = fetch("zarr.json", _MAX_METADATA)
-    if text is None:
-        raise InputError(where, "is not in it", expected)
     with refusing(where, "is no readable array", expected):
+        text = fetch("zarr.json", _MAX_METADATA)
+        if text is None:
+            raise InputError(where, "is not in it", expected)
         metadata = json.loads(text)
         spec.check(where, *array_form(metadata))
         try:

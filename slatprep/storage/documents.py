@@ -31,7 +31,15 @@ def read_bounded(place: Place, limit: int) -> bytes:
 
 
 def parse_document(data: bytes | str) -> dict[str, Any]:
-    """Return a JSON object, all of whose texts are Unicode.
+    """Return a JSON object, as `parse_json` parses it; ValueError if it is none."""
+    document = parse_json(data)
+    if not isinstance(document, dict):
+        raise ValueError("no JSON object")
+    return document
+
+
+def parse_json(data: bytes | str) -> Any:
+    """Return a JSON value, all of whose texts are Unicode.
 
     Raises
     ------
@@ -39,9 +47,7 @@ def parse_document(data: bytes | str) -> dict[str, Any]:
         If it is none, or nested more deeply than `MAX_DEPTH`.
     """
     document = orjson.loads(data)
-    if not isinstance(document, dict):
-        raise ValueError("no JSON object")
-    level: list[Any] = [document]
+    level = [document] if isinstance(document, dict | list) else []
     for _ in range(MAX_DEPTH):
         inner = (value.values() if isinstance(value, dict) else value for value in level)
         level = [value for value in chain.from_iterable(inner) if isinstance(value, dict | list)]

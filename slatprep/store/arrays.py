@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
+from contextlib import nullcontext
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 from slatprep.errors import StoreError
 from slatprep.records import Place
 from slatprep.storage.place import storage_of
+from slatprep.storage.remote import connected
 from slatprep.store.contract import (
     DEFINING,
     MIN_ASSET_BYTES,
@@ -51,9 +53,13 @@ class Arrays:
         import zarr
 
         self._refuse(f for entry in self._metadata.items() for f in gate_findings(*entry))
+        remote = storage_of(self.path).remote
         try:
             # Consolidated, so that zarr-python reads no metadata but those just looked at.
-            return zarr.open_group(str(self.path), mode="r", zarr_format=3, use_consolidated=True)
+            with connected(remote) if remote else nullcontext():
+                return zarr.open_group(
+                    str(self.path), mode="r", zarr_format=3, use_consolidated=True
+                )
         except (*BAD_METADATA, OSError) as error:
             raise StoreError(f"{self.path}: bad metadata ({error!r})") from None
 

@@ -19,7 +19,7 @@ import pytest
 from click.testing import CliRunner
 from nbclient import NotebookClient
 
-from slatprep.cli.commands import slatprep
+from slatprep.cli.commands import COMMANDS, slatprep
 from slatprep.pipeline.dataset import BuildSummary
 
 ROOT = Path(__file__).parents[2]
@@ -53,6 +53,13 @@ def test_tutorial_runs_and_prints_what_it_shows(
                 assert result.exit_code == 0, f"{line}: {result.output}"
     assert compared >= 10
     assert (tmp_path / "shards" / "shard-000001.tar").exists()
+
+
+def test_the_page_on_security_says_what_each_command_does_with_files() -> None:
+    text = (ROOT / "SECURITY.md").read_text("utf-8")
+    _, _, table = text.partition("| command | reads | writes |")
+    rows = [row.split("|")[1] for row in table.partition("\n\n")[0].splitlines()[2:]]
+    assert set(re.findall(r"`([a-z-]+)`", " ".join(rows))) == COMMANDS.keys()
 
 
 def test_the_notebook_is_the_tutorial() -> None:

@@ -69,10 +69,10 @@ def test_shares_without_training_are_refused() -> None:
 def written(path: Path, ids: Any) -> str:
     if path.suffix == ".npy":
         np.save(path, ids)
-    elif path.suffix == ".json":
-        path.write_text(json.dumps(ids))
-    else:
+    elif isinstance(ids, bytes):
         path.write_bytes(ids)
+    else:
+        path.write_text(json.dumps(ids))
     return str(path)
 
 
@@ -118,6 +118,7 @@ def test_an_object_in_two_lists_is_an_error(tmp_path: Path) -> None:
         ("a.json", {"train": SOME[0]}, "holds str for train"),
         ("a.json", [SOME[0], 3], "'3', which is no text"),
         ("a.json", "x", "holds str for test"),
+        ("a.json", b'{"test":[' + 1000 * b"[" + 1000 * b"]" + b"]}", "nested more deeply than 64"),
         ("a.json", {"train": [], "test": []}, "has no id"),
         ("a.json", ["nobody"], "has none of the dataset's 60 objects"),
         ("a.npy", np.array(SOME, object), "Python objects"),

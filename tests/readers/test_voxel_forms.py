@@ -190,6 +190,8 @@ def damaged(root: Path, how: str) -> None:
         metadata = json.loads(about.read_text())
         metadata["shape"] = [2**40]
         about.write_text(json.dumps(metadata))
+    elif how == "metadata":
+        about.write_text(about.read_text() + " " * 2**16)
     elif how == "bomb":
         import numcodecs
 
@@ -207,6 +209,7 @@ def damaged(root: Path, how: str) -> None:
         ("version 2", "is not in it"),
         ("codec", "numcodecs.pickle"),
         ("rows", "N <= 2097152"),
+        ("metadata", r"zarr\.json has 6\d{4} bytes"),
         ("bomb", "it holds 16777216 bytes"),
         ("torn", "cannot be unpacked|it holds"),
     ],

@@ -14,6 +14,7 @@ import fsspec
 import numpy as np
 import pytest
 import zarr
+from botocore.exceptions import FlexibleChecksumError
 from click.testing import CliRunner
 from s3fs.core import S3FileSystem
 from support.faults import inject
@@ -264,6 +265,23 @@ def test_a_store_that_cannot_be_listed_is_refused_in_words(
             verify_store(url)
         else:
             overview_of(open_store(url))
+
+
+def test_an_answer_that_zarr_cannot_use_ends_a_command_in_words(
+    url: str, another: Made, change_client: Any
+) -> None:
+    put(another[1], url)
+    whole = S3FileSystem._cat_file
+
+    async def spoiled(filesystem: Any, path: str, **options: Any) -> Any:
+        if not options:  # zarr-python asks for files, slatprep for ranges
+            raise FlexibleChecksumError(error_msg="another checksum")
+        return await whole(filesystem, path, **options)
+
+    change_client("_cat_file", spoiled)
+    done = CliRunner().invoke(slatprep, ["describe", url])
+    assert (done.exit_code, done.stdout) == (1, "")
+    assert "bad metadata" in done.stderr and "another checksum" in done.stderr
 
 
 def test_records_that_cannot_be_asked_for_end_a_command_in_words(
