@@ -11,7 +11,7 @@ import time
 import traceback
 from dataclasses import replace
 
-from slatprep.errors import MissingPartnerError, SlatprepError, StoreError
+from slatprep.errors import InputError, MissingPartnerError, SlatprepError, StoreError
 from slatprep.parameters import BuildParameters
 from slatprep.pipeline.annotate import annotate
 from slatprep.pipeline.context import BuildContext
@@ -22,10 +22,14 @@ from slatprep.pipeline.several import process_several
 from slatprep.pipeline.spool import FailedAsset, Spool, SpooledAsset
 from slatprep.provenance.make import record_of, record_of_failed
 from slatprep.provenance.record import AssetRecord
+from slatprep.provenance.record_json import faults_of
 from slatprep.readers import read_field, read_latents
 from slatprep.readers.identity import reading_of, source_digests
 from slatprep.records import AssetPair, Failed, Finished, Status
 from slatprep.storage.faults import reached
+
+_REASON, _TRACEBACK = 4_000, 100_000
+"""Most letters of why an asset failed, and of where, which a stranger's names may be part of."""
 
 
 def process_asset(
@@ -97,13 +101,16 @@ def finish_asset(
             return resumed
     try:
         asset, key, damaged = _processed(pair, planned, context)
+        record = record_of(asset, context.parameters, context.recipe.code, key)
+        if faults := faults_of(record):
+            what = f"what was found is more than a record may hold ({'; '.join(faults[:3])})"
+            raise InputError(f"asset {pair.asset_id!r}", what, "sources of a usual kind")
     except Exception as error:
         # A fault in one asset, even of slatprep's own, must not cost the others.
         if context.strict:
             raise
         return _failed(_failure(pair, error), context, time.perf_counter() - begin)
-    seconds = time.perf_counter() - begin
-    record = record_of(asset, context.parameters, context.recipe.code, key, seconds)
+    record = replace(record, duration_s=round(time.perf_counter() - begin, 4))
     kept = context.spool.put(record, asset.field, asset.latents, asset.annotation, asset.others)
     return replace(kept, damaged=damaged)
 
@@ -173,6 +180,8 @@ def _failed(asset: Failed, context: BuildContext, seconds: float = 0.0) -> Faile
 def _failure(pair: AssetPair, error: Exception) -> Failed:
     """Say why an asset cannot go in, in one line, and where slatprep itself is at fault."""
     line = " ".join(str(error).split())
+    if len(line) > _REASON:
+        line = f"{line[:_REASON]} ..."
     if isinstance(error, MissingPartnerError):
         return Failed(pair, Status.SKIPPED, line)
     if isinstance(error, SlatprepError):
@@ -181,4 +190,4 @@ def _failure(pair: AssetPair, error: Exception) -> Failed:
         line = f"memory ran out ({line or 'no more could be had'}); run with fewer jobs"
         return Failed(pair, Status.FAILED, line)
     line = f"internal error, please report: {type(error).__name__}: {line}"
-    return Failed(pair, Status.FAILED, line, traceback.format_exc())
+    return Failed(pair, Status.FAILED, line, traceback.format_exc()[-_TRACEBACK:])

@@ -10,6 +10,7 @@ from slatprep.errors import InputError
 from slatprep.judge import merged
 from slatprep.parameters import BuildParameters
 from slatprep.pipeline.annotate import Annotated, annotate
+from slatprep.provenance.record import MAX_SOURCES
 from slatprep.readers import read_field, read_latents
 from slatprep.readers.identity import hash_sources, source_digests
 from slatprep.records import (
@@ -56,6 +57,9 @@ def process_several(
         file was replaced between its hashing, which gives the asset its key, and its reading.
     """
     sources, digests = hash_sources(pair)
+    if len(sources) > MAX_SOURCES:
+        what = f"has {len(pair.annotations):,} annotations in {len(sources):,} files to be merged"
+        raise InputError(f"asset {pair.asset_id!r}", what, f"at most {MAX_SOURCES} files")
     before = {one.sample: one for one in known}
     latents: StructuredLatents | None = None
     annotated: list[Annotated] = []

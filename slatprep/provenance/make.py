@@ -11,6 +11,7 @@ import orjson
 from slatprep.geometry.voxels import boundary
 from slatprep.parameters import BuildParameters
 from slatprep.provenance.record import (
+    MAX_WARNINGS,
     AssetRecord,
     Clipped,
     FailedRecord,
@@ -21,9 +22,7 @@ from slatprep.provenance.versions import library_versions
 from slatprep.records import Failed, Finished, Normalization, Status
 
 
-def record_of(
-    asset: Finished, parameters: BuildParameters, code: str, key: str, seconds: float = 0.0
-) -> AssetRecord:
+def record_of(asset: Finished, parameters: BuildParameters, code: str, key: str) -> AssetRecord:
     """Return the record of an asset that went through all stages.
 
     Parameters
@@ -36,13 +35,11 @@ def record_of(
         Fingerprint of the code that made the numbers.
     key : str
         What the asset was made from and how, see `slatprep.pipeline.recipe`.
-    seconds : float
-        Spent on it.
 
     Returns
     -------
     AssetRecord
-        `complete_record` adds what only the whole dataset can tell.
+        Without the seconds spent; `complete_record` adds what only the whole dataset can tell.
     """
     pair, field, latents = asset.pair, asset.field, asset.latents
     return AssetRecord(
@@ -62,9 +59,16 @@ def record_of(
         counts=counts_of(asset),
         merged=asset.contributions,
         latents=latents.moments,
-        warnings=field.warnings + latents.warnings,
-        duration_s=round(seconds, 4),
+        warnings=_first(field.warnings + latents.warnings),
     )
+
+
+def _first(warnings: tuple[str, ...]) -> tuple[str, ...]:
+    """Return as many warnings as a record may hold, the last of them about the others."""
+    if len(warnings) <= MAX_WARNINGS:
+        return warnings
+    kept = warnings[: MAX_WARNINGS - 1]
+    return (*kept, f"{len(warnings) - len(kept):,} more warnings")
 
 
 def record_of_failed(

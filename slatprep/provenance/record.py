@@ -37,7 +37,7 @@ if TYPE_CHECKING:
 
 RECORD_VERSION: Final = 2
 
-MAX_SOURCES = 256
+MAX_SOURCES = MAX_WARNINGS = 256
 """Files of one asset: several for each of its annotations, of which there are seldom many."""
 
 _CHECKED: dict[str, object] = {
@@ -167,7 +167,7 @@ class AssetRecord:
     text where there is one annotation."""
     latents: LatentMoments | None = None
     """Mean and standard deviation of each channel of its latents, as they lie in the file."""
-    warnings: Annotated[tuple[str, ...], MaxLen(256)]
+    warnings: Annotated[tuple[str, ...], MaxLen(MAX_WARNINGS)]
     """What a person should know about the sources."""
     duration_s: Seconds = 0.0
     """Seconds spent on the asset; 0 inside a store, where equal builds are equal bytes."""

@@ -16,6 +16,7 @@ from slatprep.errors import StoreError
 from slatprep.provenance.record import AssetRecord, BuildRecord, Record
 from slatprep.records import SourceFile, Status
 from slatprep.storage.place import is_place
+from slatprep.store.records import MAX_RECORD_BYTES
 
 if TYPE_CHECKING:
     from pydantic import TypeAdapter, ValidationError
@@ -80,6 +81,21 @@ def read_asset_record(text: bytes | str, where: str) -> AssetRecord:
     """Read the record of a row; see `read_record`."""
     record: AssetRecord = _read(AssetRecord, text, where)
     return record
+
+
+def faults_of(record: AssetRecord) -> tuple[str, ...]:
+    """Return why nobody could read a record back, before it is written; nothing where one can.
+
+    It may grow to twice its size, by what was found before a pass over the whole dataset.
+    """
+    text = to_json(record)
+    if len(text) > MAX_RECORD_BYTES // 2:
+        return (f"{len(text):,} bytes",)
+    try:
+        read_asset_record(text, record.asset_id)
+    except RecordError as error:
+        return error.faults
+    return ()
 
 
 def read_build_record(text: bytes | str, where: str) -> BuildRecord:

@@ -15,6 +15,9 @@ from slatprep.records import Place, SourceFile
 _MATRIX = ArraySpec(shapes=((4, 4),), kinds="fiu")
 _EXPECTED = "a 4x4 matrix, source frame to SLAT frame, as numpy.save writes it or as JSON"
 
+_FAR = 100.0
+"""Both sides lie in unit cubes: what is scaled or shifted by more is a mistake."""
+
 
 def read_transform(path: Place, root: Place) -> tuple[NDArray[np.float64], SourceFile]:
     """Read a similarity from a JSON list of rows or an npy file.
@@ -43,7 +46,9 @@ def read_transform(path: Place, root: Place) -> tuple[NDArray[np.float64], Sourc
     else:
         matrix = npy_array(data, path, _MATRIX).astype(np.float64)
     try:
-        split_transform(matrix)
+        _, shift, scale = split_transform(matrix)
+        if not (1 / _FAR < scale < _FAR and np.abs(shift).max() < _FAR):
+            raise ValueError(f"scale {scale:g} and shift {shift.tolist()} lead out of a unit cube")
         if (matrix[3] != (0, 0, 0, 1)).any():
             raise ValueError(f"the last row must be 0, 0, 0, 1, got {matrix[3].tolist()}")
     except ValueError as error:

@@ -355,6 +355,8 @@ def test_every_file_that_decides_an_asset_is_looked_at_again(
         (np.diag([1.0, 1, -1, 1]), "mirror"),
         (np.diag([1.0, 2, 1, 1]), "shear"),
         (np.full((4, 4), np.nan), "finite"),
+        (np.diag([1e6, 1e6, 1e6, 1.0]), "scale 1e"),
+        (np.eye(4) + 1e300 * np.eye(4, k=3), "out of a unit cube"),
     ],
 )
 def test_a_frame_that_is_no_similarity_fails_its_asset_alone(

@@ -1,0 +1,71 @@
+"""What a source can say is never more than the readers of a store take back."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from support.synthetic import Dataset
+from support.trees import tree
+
+from slatprep.inspect.verify import verify_store
+from slatprep.pipeline.dataset import build_store
+from slatprep.provenance.record import MAX_WARNINGS
+from slatprep.provenance.stored import StoredRecords
+from slatprep.store import open_store
+
+MakeDataset = Callable[..., Dataset]
+
+
+def test_more_annotations_than_a_record_holds_cost_their_asset_alone(
+    make_dataset: MakeDataset, tmp_path: Path
+) -> None:
+    dataset = make_dataset("ab")
+    folder = dataset.root / "pixieverse" / "a"
+    for sample in range(1, 256):
+        (folder / f"sample_{sample}").mkdir()
+        grid = f"sample_{sample}/material_grid.npy"
+        os.link(folder / "sample_0/material_grid.npy", folder / grid)
+    parameters = dataset.parameters("pixie")
+    parameters = replace(parameters, pixieverse=replace(parameters.pixieverse, samples="merge"))
+    summary = build_store(parameters, tmp_path / "s.zarr")
+    assert (summary.statuses["ok"], summary.statuses["failed"]) == (1, 1)
+    assert "256 annotations in 257 files" in dict(summary.problems)["a"]
+    assert verify_store(tmp_path / "s.zarr").ok
+
+
+def test_more_warnings_than_a_record_holds_are_counted(
+    make_dataset: MakeDataset, tmp_path: Path
+) -> None:
+    dataset = make_dataset("a")
+    path = dataset.root / "pixieverse/a/sample_0/material_grid.npy"
+    grid = np.load(path)
+    grid[tuple(np.argwhere(grid[..., 3] != 7)[0])] = (np.nan, np.nan, np.nan, -1)
+    np.save(path, grid)
+    nowhere = {f"bounds_{k}": np.full(3, np.nan) for k in range(256)}
+    np.savez(path.with_name("clip_features.npz"), **nowhere)
+    out = tmp_path / "s.zarr"
+    build_store(dataset.parameters("pixie"), out)
+    warnings = StoredRecords(open_store(out)).of("a").warnings
+    assert len(warnings) == MAX_WARNINGS and warnings[-1].endswith("more warnings")
+    assert verify_store(out).ok
+    before = tree(out)
+    build_store(dataset.parameters("pixie"), out)
+    assert tree(out) == before
+
+
+def test_a_record_that_nobody_could_read_costs_its_asset_alone(
+    make_dataset: MakeDataset, tmp_path: Path
+) -> None:
+    """Texts of the bounds are taken into the record as they are."""
+    dataset = make_dataset("ab")
+    beside = dataset.root / "pixieverse/a/sample_0/clip_features.npz"
+    np.savez_compressed(beside, names=np.array(["x" * 20_000] * 60))
+    out = tmp_path / "s.zarr"
+    summary = build_store(dataset.parameters("pixie"), out)
+    assert (summary.statuses["ok"], summary.statuses["failed"]) == (1, 1)
+    assert "more than a record may hold (1,2" in dict(summary.problems)["a"]
+    assert verify_store(out).ok
