@@ -11,18 +11,23 @@ import errno
 import os
 import secrets
 import shutil
-import stat
 import sys
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from slatprep.errors import StoreError
 from slatprep.storage.faults import reached
+from slatprep.storage.files import is_at, is_only_ours
 
 if TYPE_CHECKING:
     from slatprep.records import Place
+
+# Neither follow a link nor wait at a pipe; Windows has neither flag.
+_OWN = os.O_WRONLY | os.O_CREAT
+for _name in ("O_CLOEXEC", "O_NOFOLLOW", "O_NONBLOCK"):
+    _OWN |= getattr(os, _name, 0)
 
 _AT_FDCWD = -100
 _RENAME_EXCHANGE = 2
@@ -110,25 +115,49 @@ def staged(path: Path) -> Iterator[Path]:
     """Yield a file beside `path` that takes its place, whole and on disk, when all went well.
 
     Its name is the same each time, so what a killed process leaves is replaced
-    by the next; two processes must not stage one path at a time. Where a link
-    or somebody else's file has that name, it is left alone for another one.
+    by the next. Where a link, somebody else's file or that of a running process
+    has that name, it is left alone for another one.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{path.name}.partial")
-    if os.path.lexists(temporary):
-        state = temporary.lstat()
-        if stat.S_ISREG(state.st_mode) and state.st_uid == _user():
-            temporary.unlink()
-        else:
-            temporary = path.with_name(f".{path.name}.{secrets.token_hex(8)}.partial")
+    temporary, held = _claimed(path)
     try:
-        os.close(os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o666))
         yield temporary
         flush(temporary)
         temporary.replace(path)
-        flush(path.parent)
-    finally:
+    except BaseException:
         temporary.unlink(missing_ok=True)
+        raise
+    finally:
+        os.close(held)
+    flush(path.parent)
+
+
+def _claimed(path: Path) -> tuple[Path, int]:
+    """Return an empty file beside a path, and a descriptor that locks it against `staged`."""
+    temporary = path.with_name(f".{path.name}.partial")
+    with suppress(OSError):
+        held = os.open(temporary, _OWN, 0o666)
+        try:
+            if is_only_ours(os.fstat(held)) and _lock(held) and is_at(held, temporary):
+                os.ftruncate(held, 0)
+                return temporary, os.dup(held)
+        finally:
+            os.close(held)
+    temporary = path.with_name(f".{path.name}.{secrets.token_hex(8)}.partial")
+    return temporary, os.open(temporary, _OWN | os.O_EXCL, 0o666)
+
+
+def _lock(descriptor: int) -> bool:
+    """Whether no other process holds a lock on a file, and from now on this one does."""
+    try:
+        import fcntl
+    except ImportError:  # on Windows
+        return True
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return False
+    return True
 
 
 @contextmanager
@@ -145,11 +174,6 @@ def staged_apart(path: Path, folder: Path) -> Iterator[Path]:
         temporary.replace(path)
     finally:
         temporary.unlink(missing_ok=True)
-
-
-def _user() -> int:
-    """Return the user id of this process; on Windows 0, the owner that files have there."""
-    return getattr(os, "geteuid", int)()
 
 
 @contextmanager

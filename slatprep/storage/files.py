@@ -123,6 +123,14 @@ def is_only_ours(state: os.stat_result) -> bool:
     return stat.S_ISREG(state.st_mode) and state.st_nlink == 1 and state.st_uid == user
 
 
+def is_at(descriptor: int, path: Path) -> bool:
+    """Whether an open file is still the one that lies at a path."""
+    try:
+        return os.path.samestat(os.fstat(descriptor), path.stat())
+    except FileNotFoundError:
+        return False
+
+
 def take_file(source: Path, target: Path) -> None:
     """Give a file a second name, or copy it where it is not ours alone or that cannot be done.
 

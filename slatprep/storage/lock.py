@@ -12,6 +12,7 @@ from pathlib import Path
 
 from slatprep.errors import StoreError
 from slatprep.storage.documents import parse_document
+from slatprep.storage.files import is_at
 
 # Neither follow a link nor wait at a pipe; Windows has neither flag.
 _FLAGS = os.O_RDWR | os.O_CREAT
@@ -62,7 +63,7 @@ def take_lock(path: Path, taken: str) -> int:
                 raise StoreError(
                     f"{taken} ({who}); wait until it has ended, or choose another path"
                 ) from None
-            if not _is_at(descriptor, path):
+            if not is_at(descriptor, path):
                 continue  # What we locked has been removed; lock what is there now.
             _sign(descriptor, path)
             unless_held.pop_all()
@@ -87,13 +88,6 @@ def _sign(descriptor: int, path: Path) -> None:
         "since": datetime.now(UTC).isoformat(timespec="seconds"),
     }
     os.pwrite(descriptor, json.dumps(told).encode(), 0)
-
-
-def _is_at(descriptor: int, path: Path) -> bool:
-    try:
-        return os.path.samestat(os.fstat(descriptor), path.stat())
-    except FileNotFoundError:
-        return False
 
 
 def _holder(descriptor: int) -> str:

@@ -23,7 +23,7 @@ MakeDataset = Callable[..., Dataset]
 def test_more_annotations_than_a_record_holds_cost_their_asset_alone(
     make_dataset: MakeDataset, tmp_path: Path
 ) -> None:
-    dataset = make_dataset("ab")
+    dataset = make_dataset("a", "b")
     folder = dataset.root / "pixieverse" / "a"
     for sample in range(1, 256):
         (folder / f"sample_{sample}").mkdir()
@@ -61,7 +61,7 @@ def test_a_record_that_nobody_could_read_costs_its_asset_alone(
     make_dataset: MakeDataset, tmp_path: Path
 ) -> None:
     """Texts of the bounds are taken into the record as they are."""
-    dataset = make_dataset("ab")
+    dataset = make_dataset("a", "b")
     beside = dataset.root / "pixieverse/a/sample_0/clip_features.npz"
     np.savez_compressed(beside, names=np.array(["x" * 20_000] * 60))
     out = tmp_path / "s.zarr"

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import errno
 import os
+import subprocess
+import sys
 from collections.abc import Callable
 from pathlib import Path
 
@@ -166,6 +168,24 @@ def test_what_a_killed_process_left_of_a_file_is_replaced(tmp_path: Path) -> Non
     with staged(tmp_path / "r.html") as file:
         file.write_text("report")
     assert (tmp_path / "r.html").read_text() == "report"
+    assert [path.name for path in tmp_path.iterdir()] == ["r.html"]
+
+
+def test_two_processes_that_write_one_file_each_write_it_whole(tmp_path: Path) -> None:
+    code = (
+        "import sys\n"
+        "from pathlib import Path\n"
+        "from slatprep.storage.atomic import staged\n"
+        "with staged(Path(sys.argv[1])) as file:\n"
+        "    file.write_text('theirs')\n"
+    )
+    report = tmp_path / "r.html"
+    with staged(report) as file, file.open("w") as ours:
+        ours.write("ou")
+        subprocess.run([sys.executable, "-c", code, str(report)], check=True)
+        assert report.read_text() == "theirs"
+        ours.write("rs")
+    assert report.read_text() == "ours"
     assert [path.name for path in tmp_path.iterdir()] == ["r.html"]
 
 
