@@ -8,8 +8,9 @@ from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
 
-# The made data (`support.synthetic`) are part of the tests, not of the package.
-sys.path.insert(0, str(ROOT / "tests"))
+# The made data (`support.synthetic`) are part of the tests, not of the package, and an
+# installed package may be that of another checkout.
+sys.path[:0] = [str(ROOT), str(ROOT / "tests")]
 
 
 def environment() -> dict[str, str]:

@@ -143,6 +143,7 @@ def soak(folder: Path, given: argparse.Namespace, scheduler: str) -> dict[str, o
             outcome, code = aimed_build(start, chance, given, folder / "aims")
         else:
             outcome, code = killed_build(begun(sources[state], out, scheduler), chance, whole)
+        assert code == 0 or outcome != ENDED, f"build {turn}, that nobody killed, failed"
         after = fingerprint(tree(out))
         wanted = (allowed[state],) if code == 0 else (before, allowed[state])
         assert after in wanted, f"kill {turn} ({outcome}): a store that nobody built"

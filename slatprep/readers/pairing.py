@@ -317,7 +317,7 @@ def _pair_of(row: _Row, there: _Found, shared: str, grids: Sequence[FoundField])
         problem="; ".join(dict.fromkeys(filter(None, problems))),
         transform=transform,
         beside=beside,
-        sample=_label(there.roots.number, grids[0].sample if grids else ""),
+        sample=_label(there.roots.number, in_unicode(grids[0].sample) if grids else ""),
     )
 
 

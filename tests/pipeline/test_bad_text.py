@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -16,9 +17,11 @@ from support.trees import records_of
 
 from slatprep.cli.commands import slatprep
 from slatprep.errors import ConfigError, StoreError
+from slatprep.inspect.verify import verify_store
 from slatprep.parameters import PairingParameters
 from slatprep.parameters.files import load_parameters
 from slatprep.pipeline.dataset import build_store
+from slatprep.provenance.stored import StoredRecords
 from slatprep.store import open_store
 
 MakeDataset = Callable[..., Dataset]
@@ -55,6 +58,22 @@ def test_a_name_that_is_not_utf_8_costs_its_asset_alone(
     assert len(records_of(summary.records)) == sum(summary.statuses.values())
     again = build_store(dataset.parameters(), tmp_path / "s.zarr")
     assert again.build_id == summary.build_id
+
+
+def test_a_sample_whose_name_is_not_utf_8_is_left_out_of_those_that_are_merged(
+    make_dataset: MakeDataset, tmp_path: Path
+) -> None:
+    dataset = make_dataset("a")
+    samples = dataset.root / "pixieverse/a"
+    shutil.copytree(samples / "sample_0", samples / f"sample_{BAD}")
+    parameters = dataset.parameters("pixie")
+    parameters = replace(parameters, pixieverse=replace(parameters.pixieverse, samples="merge"))
+    summary = build_store(parameters, tmp_path / "s.zarr")
+    assert summary.statuses == {"ok": 1, "failed": 0, "skipped": 0}
+    used, left_out = StoredRecords(open_store(summary.store)).of("a").merged
+    assert (used.sample, used.left_out, left_out.sample) == ("0", "", "b\\udcff")
+    assert "is no UTF-8" in left_out.left_out
+    assert verify_store(summary.store).ok
 
 
 def test_a_category_that_is_no_text_is_written_out(

@@ -41,12 +41,12 @@ def test_more_warnings_than_a_record_holds_are_counted(
     make_dataset: MakeDataset, tmp_path: Path
 ) -> None:
     dataset = make_dataset("a")
-    path = dataset.root / "pixieverse/a/sample_0/material_grid.npy"
-    grid = np.load(path)
+    folder = dataset.root / "pixieverse/a"
+    grid = np.load(folder / "sample_0/material_grid.npy")
     grid[tuple(np.argwhere(grid[..., 3] != 7)[0])] = (np.nan, np.nan, np.nan, -1)
-    np.save(path, grid)
+    np.save(folder / "sample_0/material_grid.npy", grid)
     nowhere = {f"bounds_{k}": np.full(3, np.nan) for k in range(256)}
-    np.savez(path.with_name("clip_features.npz"), **nowhere)
+    np.savez(folder / "clip_features.npz", **nowhere)
     out = tmp_path / "s.zarr"
     build_store(dataset.parameters("pixie"), out)
     warnings = StoredRecords(open_store(out)).of("a").warnings
@@ -62,7 +62,7 @@ def test_a_record_that_nobody_could_read_costs_its_asset_alone(
 ) -> None:
     """Texts of the bounds are taken into the record as they are."""
     dataset = make_dataset("a", "b")
-    beside = dataset.root / "pixieverse/a/sample_0/clip_features.npz"
+    beside = dataset.root / "pixieverse/a/clip_features.npz"
     np.savez_compressed(beside, names=np.array(["x" * 20_000] * 60))
     out = tmp_path / "s.zarr"
     summary = build_store(dataset.parameters("pixie"), out)
