@@ -253,15 +253,14 @@ def deform_if_earned(
         trial = try_out(slat, pixie, pose, TRIAL_SAMPLES if before < CLEAN else TRIAL_SAMPLES // 2)
         evidence = trial.scores[1] - trial.scores[0], trial.scores[2] - trial.scores[1]
         wanted = wanted or earned(trial)
-        box = np.array([slat.points.min(axis=0), slat.points.max(axis=0)])
         # What bends too far or folds may still be stretched.
         for tried in {"": (), "affine": ("affine",)}.get(wanted, ("deformable", "affine")):
             warp, nearest = fit(slat, pixie, pose, trial, tried), pose
-            kept = warp.record(box, parameters.max_displacement)
+            kept = warp.record(slat.points, parameters.max_displacement)
             if kept is None:
                 points = slat.subset(FIT_SAMPLES).points
                 nearest, warp = from_nearest(pose, warp, points, parameters.scale_bounds)
-                kept = warp.record(box, parameters.max_displacement)
+                kept = warp.record(slat.points, parameters.max_displacement)
             if kept is not None:
                 model, warp = Model(tried), replace(warp, **_in_voxels(kept))
                 if nearest is not pose:

@@ -8,7 +8,6 @@ solves for the point by Newton's method.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from itertools import product
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -147,7 +146,7 @@ def make_deformation(
     origin: ArrayLike,
     spacing: float,
     coefficients: ArrayLike,
-    box: ArrayLike,
+    points: ArrayLike,
     max_displacement: float,
 ) -> Deformation | None:
     """Make a deformation that is bounded and does not fold.
@@ -156,10 +155,10 @@ def make_deformation(
     ----------
     affine, origin, spacing, coefficients
         As `Deformation` describes them, in edges of the unit cube.
-    box : array_like, shape (2, 3)
-        Lower and upper corner of the SLAT, in the SLAT frame.
+    points : array_like, shape (N, 3)
+        Of the SLAT, in the SLAT frame.
     max_displacement : float
-        Voxels. Neither the affine part nor the bending moves a point of the box
+        Voxels. Neither the affine part nor the bending moves one of the points
         farther: coefficients are shortened to it, and a spline lies in the
         convex hull of its coefficients.
 
@@ -179,8 +178,8 @@ def make_deformation(
     ):
         return None
     limit = max_displacement / RESOLUTION
-    corners = np.array(list(product(*np.asarray(box, dtype=np.float64).T)))
-    moved = corners @ matrix.T + made.affine[:, 3] - corners
+    points = np.asarray(points, dtype=np.float64)
+    moved = points @ matrix.T + made.affine[:, 3] - points
     if np.linalg.norm(moved, axis=1).max() > limit:
         return None
     if not made.coefficients.size:

@@ -59,8 +59,8 @@ class Warp:
             moved += added
         return moved
 
-    def record(self, box: Array, max_displacement: float) -> Deformation | None:
-        """Return it bounded, not folded and rounded; `box` (2, 3) is the SLAT's."""
+    def record(self, points: Array, max_displacement: float) -> Deformation | None:
+        """Return it bounded, not folded and rounded; `points` (N, 3) are the SLAT's."""
         affine = self.affine.copy()
         affine[:, 3] *= VOXEL_SIZE
         bent = self.is_bent
@@ -69,7 +69,7 @@ class Warp:
             self.origin * VOXEL_SIZE if bent else np.zeros(3),
             self.spacing * VOXEL_SIZE if bent else 1.0,
             self.coefficients * VOXEL_SIZE if bent else np.zeros((0, 0, 0, 3)),
-            box * VOXEL_SIZE,
+            points * VOXEL_SIZE,
             max_displacement,
         )
 

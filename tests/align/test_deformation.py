@@ -106,6 +106,15 @@ def test_an_affine_part_that_flattens_mirrors_or_moves_too_far_is_refused() -> N
         assert make_deformation(affine, np.zeros(3), 1.0, nothing, BOX, 16.0) is None
 
 
+def test_how_far_is_asked_of_the_points_and_not_of_corners_where_nothing_is() -> None:
+    grown, nothing = 1.5 * IDENTITY, np.zeros((0, 0, 0, 3))
+    cross = np.concatenate([0.45 * np.eye(3), -0.45 * np.eye(3)])  # moved by 14.4 voxels
+    corner = np.full((1, 3), 0.45)  # moved by 24.9
+    assert make_deformation(grown, np.zeros(3), 1.0, nothing, cross, 16.0) is not None
+    assert make_deformation(grown, np.zeros(3), 1.0, nothing, cross, 14.0) is None
+    assert make_deformation(grown, np.zeros(3), 1.0, nothing, corner, 16.0) is None
+
+
 def test_the_derivative_is_the_derivative() -> None:
     made, x, step = bent(), points(200, 0.24), 1e-6
     for axis in range(3):
