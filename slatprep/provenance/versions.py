@@ -10,8 +10,10 @@ from slatprep.align import engine_versions
 from slatprep.parameters import AlignParameters
 
 
+@lru_cache(maxsize=8)
 def library_versions(parameters: AlignParameters) -> dict[str, str]:
     """Return the versions of everything that makes an asset's numbers."""
+    # Cached: asking for them takes longer than reading an asset.
     return {
         "slatprep": metadata.version("slatprep"),
         "python": platform.python_version(),
@@ -22,7 +24,6 @@ def library_versions(parameters: AlignParameters) -> dict[str, str]:
 @lru_cache(maxsize=8)
 def numeric_versions(parameters: AlignParameters) -> dict[str, str]:
     """Return the versions of the libraries that make an asset's numbers."""
-    # Cached: asking for them takes longer than reading an asset.
     return {
         "numpy": metadata.version("numpy"),
         "scipy": metadata.version("scipy"),
