@@ -32,10 +32,13 @@ COLUMNS = (("density", "kg/m^3", "log10"), ("youngs_modulus", "Pa", "log10"),
            ("poisson_ratio", "1", "linear"))  # fmt: skip
 
 BUILD = """
+import gc, multiprocessing
 from dataclasses import replace
 from pathlib import Path
 from slatprep.parameters import AlignParameters, BuildParameters, PixieverseSource, SlatSource
 from slatprep.pipeline import asset, dataset
+from slatprep.pipeline.asset import finish_asset
+from slatprep.workers.local import single_threaded
 root, once, stages = Path(sys.argv[1]), sys.argv[4] == "True", {}
 computed, compute = {}, asset.process_asset
 def repeated(pair, *others):
@@ -47,8 +50,21 @@ def repeated(pair, *others):
         replace(side.sources[0], path=own.name), *side.sources[1:]))
     return replace(one, pair=pair, field=named(one.field, pair.grid),
         latents=named(one.latents, pair.slat))
+class Forked:
+    '''Workers that have what was put in the place of a function here.'''
+    def run_unordered(self, function, tasks, died=None):
+        gc.freeze()
+        calls = ((function, task) for task in tasks)
+        with multiprocessing.get_context("fork").Pool(int(sys.argv[3])) as pool:
+            yield from pool.imap_unordered(called, calls, 16 if function is finish_asset else 1)
+    def require_shared(self, paths):
+        pass
+def called(call):
+    with single_threaded():
+        return call[0](*call[1])
 if once:
     asset.process_asset = repeated
+jobs = Forked() if once else int(sys.argv[3])
 def timed(name, stage):
     def measured(*given, **named):
         begin, cpu = time.perf_counter(), time.process_time()
@@ -67,7 +83,7 @@ def progress(done, count):
         print(done, now(), file=sys.stderr, flush=True)
 parameters = BuildParameters(PixieverseSource(root / "voxels", adapter="voxels"),
     SlatSource(root / "slat"), align=AlignParameters(engine="known"))
-summary = dataset.build_store(parameters, Path(sys.argv[2]), jobs=int(sys.argv[3]),
+summary = dataset.build_store(parameters, Path(sys.argv[2]), jobs=jobs,
     assets_per_job=20, progress=progress)
 told = {"assets": summary.statuses["ok"], "failed": summary.statuses["failed"],
     **{f"{name}, wall and CPU [s]": both for name, both in stages.items()}}
@@ -102,7 +118,7 @@ def main() -> None:
     parser.add_argument("--new", type=int, default=50, help="assets that the update adds")
     parser.add_argument("--reads", type=int, default=1000, help="assets that are read at random")
     parser.add_argument("--jobs", type=int, default=1)
-    parser.add_argument("--once", action="store_true", help="compute each shape once; one job")
+    parser.add_argument("--once", action="store_true", help="compute each shape once")
     parser.add_argument("--folder", type=Path, help="where to work, and what to go on with")
     arguments = parser.parse_args()
     with tempfile.TemporaryDirectory(prefix="half-million-") as folder:
@@ -115,7 +131,8 @@ def measure(folder: Path, arguments: argparse.Namespace) -> Iterator[dict[str, A
     build = (BUILD, folder, out, jobs, arguments.once)
     if not out.exists():
         begin = time.perf_counter()
-        add(folder, "m", count)
+        if not (folder / "slat").exists():
+            add(folder, "m", count)
         yield {"step": "make the sources", "wall [s]": round(time.perf_counter() - begin, 1)}
         yield step("build", *build)
         yield {"step": "what is there", **sizes(out), "records [MB]": megabytes(records(out))}
@@ -195,7 +212,7 @@ def records(out: Path) -> Path:
 
 
 def sizes(out: Path) -> dict[str, float]:
-    found = [os.stat(Path(folder, name)).st_size for folder, _, names in os.walk(out)
+    found = [(Path(folder) / name).stat().st_size for folder, _, names in os.walk(out)
              for name in names]  # fmt: skip
     return {"files": len(found), "store [MB]": round(sum(found) / 1e6, 1)}
 

@@ -1,13 +1,10 @@
 """Cost, memory and files of builds and updates against the number of assets.
 
     python benchmarks/scale.py 100 1000 10000
-    python benchmarks/scale.py 20000 --given
 
 Sources are small made assets; their files are linked, so that any number fits
 anywhere. Time is CPU time of the build and its workers. The second build finds that nothing
-changed, the third gets new assets (``--new``), the fourth loses one. With ``--given`` alignments
-are not searched but taken from the first asset of each shape, so that what is left is what
-grows with the number of assets.
+changed, the third gets new assets (``--new``), the fourth loses one.
 """
 
 from __future__ import annotations
@@ -29,40 +26,23 @@ from support.synthetic import Dataset, make_asset
 
 VARIANTS = 8
 BUILD = """
-import hashlib, json, os, resource, sys, time
+import json, resource, sys, time
 from pathlib import Path
 from dataclasses import replace
 from support.synthetic import Dataset
 from slatprep.parameters import StoreParameters
-from slatprep.pipeline import annotate
 from slatprep.pipeline.dataset import build_store
-
-jobs = int(sys.argv[3])
-if jobs == 1:
-    found, search = {}, annotate.align
-    def given(field, latents, parameters):
-        key = hashlib.sha256(field.occupancy.tobytes() + latents.coords.tobytes()).digest()
-        if key not in found:
-            found[key] = search(field, latents, parameters)
-        return found[key]
-    annotate.align = given
 
 started = time.process_time()
 parameters = replace(Dataset(Path(sys.argv[1])).parameters(), store=StoreParameters())
-summary = build_store(parameters, Path(sys.argv[2]), jobs=jobs, assets_per_job=20)
-if jobs > 1:
-    from joblib.externals.loky import get_reusable_executor
-    get_reusable_executor().shutdown()
-written = 0
-for line in Path("/proc/self/io").read_text().splitlines() if jobs == 1 else ():
-    name, _, value = line.partition(": ")
-    written = int(value) if name == "wchar" else written
+summary = build_store(parameters, Path(sys.argv[2]), jobs=2, assets_per_job=20)
+from joblib.externals.loky import get_reusable_executor
+get_reusable_executor().shutdown()
 peak = lambda who: resource.getrusage(who).ru_maxrss / 1024
 print(json.dumps({
     "parent [MB]": round(peak(resource.RUSAGE_SELF)),
     "worker [MB]": round(peak(resource.RUSAGE_CHILDREN)),
     "start [s]": round(started, 1),
-    "written [MB]": round(written / 1e6),
     "assets": summary.statuses["ok"],
 }))
 """
@@ -72,13 +52,12 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("assets", type=int, nargs="+")
     parser.add_argument("--new", type=int, default=50, help="assets that the update adds")
-    parser.add_argument("--given", action="store_true", help="do not search alignments; one job")
     parser.add_argument("--folder", type=Path, help="where to work")
     arguments = parser.parse_args()
     rows = []
     for count in arguments.assets:
         with tempfile.TemporaryDirectory(prefix="scale-", dir=arguments.folder) as folder:
-            rows.append(measure(Path(folder), count, arguments.new, 1 if arguments.given else 2))
+            rows.append(measure(Path(folder), count, arguments.new))
             print(json.dumps(rows[-1]), flush=True)
     if len(rows) < 2:
         return
@@ -90,7 +69,7 @@ def main() -> None:
         print(f"{name}: {start:.2f} + {slope:.5f} an asset, off by at most {worst:.1%}")
 
 
-def measure(folder: Path, count: int, new: int, jobs: int) -> dict[str, float]:
+def measure(folder: Path, count: int, new: int) -> dict[str, float]:
     dataset = Dataset(folder / "sources")
     gone = f"m{count // 2:06}"
     for number in range(count):
@@ -101,7 +80,7 @@ def measure(folder: Path, count: int, new: int, jobs: int) -> dict[str, float]:
         path.unlink()
         path.write_bytes(content)
     out = folder / "s.zarr"
-    spent, first = build(dataset.root, out, jobs)
+    spent, first = build(dataset.root, out)
     files = [path.stat().st_size for path in out.rglob("*") if path.is_file()]
     begin = time.perf_counter()
     code = f"from slatprep.store import open_store; len(open_store({str(out)!r}))"
@@ -118,16 +97,17 @@ def measure(folder: Path, count: int, new: int, jobs: int) -> dict[str, float]:
         "records [MB]": round((folder / "s.manifests" / "assets.jsonl").stat().st_size / 1e6, 2),
         "open, with start of Python [s]": round(time.perf_counter() - begin, 2),
     }
-    row["CPU, nothing changed [s]"], again = build(dataset.root, out, jobs)
+    row["CPU, nothing changed [s]"], again = build(dataset.root, out)
     row["parent, nothing changed [MB]"] = again["parent [MB]"]
+    row["written, nothing changed [MB]"] = again["written [MB]"]
     # Ids in between the others, in files of their own: a new link to a file changes its state.
     for number in range(new):
         add(dataset, number, "mm")
-    row[f"CPU, {new} new [s]"], added = build(dataset.root, out, jobs)
+    row[f"CPU, {new} new [s]"], added = build(dataset.root, out)
     row[f"written, {new} new [MB]"] = added["written [MB]"]
     shutil.rmtree(dataset.root / "pixieverse" / gone)
     (dataset.root / "slat" / f"{gone}.npz").unlink()
-    row["CPU, one gone [s]"], less = build(dataset.root, out, jobs)
+    row["CPU, one gone [s]"], less = build(dataset.root, out)
     if less["assets"] != count + new - 1:
         raise RuntimeError(f"{less} after {count} and {new} assets, less one")
     shutil.rmtree(out)
@@ -151,10 +131,10 @@ def add(dataset: Dataset, number: int, prefix: str) -> None:
         os.link(dataset.root / old, dataset.root / copy)
 
 
-def build(sources: Path, out: Path, jobs: int) -> tuple[float, dict[str, float]]:
-    before = resource.getrusage(resource.RUSAGE_CHILDREN)
+def build(sources: Path, out: Path) -> tuple[float, dict[str, float]]:
+    before, begin = resource.getrusage(resource.RUSAGE_CHILDREN), written()
     told = subprocess.run(
-        [sys.executable, "-c", BUILD, str(sources), str(out), str(jobs)],
+        [sys.executable, "-c", BUILD, str(sources), str(out)],
         check=True,
         env=environment(),
         capture_output=True,
@@ -162,7 +142,14 @@ def build(sources: Path, out: Path, jobs: int) -> tuple[float, dict[str, float]]
     )
     after = resource.getrusage(resource.RUSAGE_CHILDREN)
     spent = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
-    return round(spent, 1), json.loads(told.stdout.splitlines()[-1])
+    found = json.loads(told.stdout.splitlines()[-1])
+    return round(spent, 1), {**found, "written [MB]": round((written() - begin) / 1e6)}
+
+
+def written() -> int:
+    """Return the bytes that the processes have written that this one started and that ended."""
+    lines = (line.partition(": ") for line in Path("/proc/self/io").read_text().splitlines())
+    return next(int(value) for name, _, value in lines if name == "wchar")
 
 
 if __name__ == "__main__":
