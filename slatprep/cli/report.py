@@ -67,6 +67,7 @@ def report(
 
     def show() -> None:
         say(f"page:   {summary.path} ({summary.size / 1e6:,.1f} MB)")
-        say(f"assets: {summary.assets:,}, {summary.in_detail:,} of them with a 3D view")
+        listed = f"{summary.listed:,} in the table, " if summary.listed < summary.assets else ""
+        say(f"assets: {summary.assets:,}, {listed}{summary.in_detail:,} of them with a 3D view")
 
     output.made(summary, show)

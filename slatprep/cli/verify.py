@@ -22,6 +22,7 @@ if TYPE_CHECKING:
 @option("--pixieverse", EXISTING_FOLDER)
 @option("--slat", EXISTING_FOLDER)
 @option("--also", EXISTING_FOLDER, multiple=True)
+@option("--sample", click.IntRange(min=1), metavar="N")
 @workers_options
 def verify(
     output: Output,
@@ -30,6 +31,7 @@ def verify(
     pixieverse: Place | None,
     slat: Place | None,
     also: tuple[Place, ...],
+    sample: int | None,
     **options: Any,
 ) -> None:
     """Check that STORE is whole, unchanged and consistent.
@@ -46,6 +48,8 @@ def verify(
     --pixieverse: Root of the PixieVerse files now. [default: as at the build]
     --slat: Folder of the latents, or of their one HDF5 file, now. [default: as at the build]
     --also: With both: root of a further source now; once for each, in the order of [[also]].
+    --sample: Compare values, records and sources of N assets, evenly chosen, not of all.
+        Files and the columns of all assets are compared whole nevertheless.
 
     Example
     -------
@@ -65,7 +69,12 @@ def verify(
         options["manifests"] = _left_by_make(store)
     with output.progress("verify") as progress:
         result = verify_store(
-            store, sources=sources or roots is not None, roots=roots, progress=progress, **options
+            store,
+            sources=sources or roots is not None,
+            roots=roots,
+            sample=sample,
+            progress=progress,
+            **options,
         )
 
     def show() -> None:

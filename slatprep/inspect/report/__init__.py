@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from slatprep.errors import StoreError
 from slatprep.inspect.report.content import BINS, page_content
-from slatprep.inspect.report.outcomes import Outcome, read_outcomes
+from slatprep.inspect.report.outcomes import Outcomes, gather_outcomes
 from slatprep.inspect.report.page import write_page
 from slatprep.inspect.report.thumbnails import PER_SHEET, sheet, thumbnail
 from slatprep.inspect.report.voxels import COARSE, FULL, encode_asset
@@ -33,6 +33,9 @@ __all__ = ["ReportSummary", "write_report"]
 ASSETS_IN_DETAIL = 5_000
 """Most assets with a thumbnail and a 3D view."""
 
+ASSETS_LISTED = 50_000
+"""Most assets in the table; of a larger store it has a sample, those in detail."""
+
 VOXEL_BYTES = 36_000_000
 """Most bytes of voxels at full detail, before base64 makes them a third larger."""
 
@@ -51,7 +54,9 @@ class ReportSummary:
     size : int
         Its bytes.
     assets : int
-        Rows of its table: assets of the store, and those that are not in it.
+        Assets of the store, and those that are not in it.
+    listed : int
+        How many of them its table has: all, or a sample of more than `ASSETS_LISTED`.
     in_detail : int
         Assets with a thumbnail and a 3D view.
     side : int
@@ -61,6 +66,7 @@ class ReportSummary:
     path: Path
     size: int
     assets: int
+    listed: int
     in_detail: int
     side: int
 
@@ -115,13 +121,14 @@ def write_report(
         If the store or its records cannot be read, or belong to different builds.
     """
     _refuse_other_words(store)
-    outcomes: list[Outcome] | None = None
+    chosen = _chosen(store)
+    listed = range(len(store)) if len(store) <= ASSETS_LISTED else chosen
+    outcomes: Outcomes | None = None
     created = None
     if manifests is not None:
         created = f"{build_in(manifests).created:%Y-%m-%d}"
-        outcomes = list(read_outcomes(manifests, store.about.manifest))
-        _refuse_other_records(store, outcomes, manifests)
-    chosen = _chosen(store)
+        names = {store.ids[row] for row in listed}
+        outcomes = gather_outcomes(manifests, store, names, ASSETS_LISTED)
     drawn: list[Drawn] = []
     tallies: dict[str, Tally] = {}
     starts = range(0, len(chosen), TASK_ASSETS)
@@ -135,7 +142,7 @@ def write_report(
     full = sum(len(one.voxels[FULL]) for one in drawn)
     side = FULL if full <= VOXEL_BYTES else COARSE
     agreement = {one.index: (one.votes, one.spreads) for one in drawn if one.spreads}
-    content = page_content(store, outcomes, tallies, chosen, side, created, agreement)
+    content = page_content(store, outcomes, tallies, listed, chosen, side, created, agreement)
     sheets = [drawn[start : start + PER_SHEET] for start in range(0, len(drawn), PER_SHEET)]
     with writing(str(out), Path(out).parent), staged(Path(out)) as temporary:
         with temporary.open("w", encoding="utf-8", newline="\n") as file:
@@ -147,16 +154,8 @@ def write_report(
                 packs=([_base64(one.voxels[side]) for one in own] for own in sheets),
             )
         size = temporary.stat().st_size
-    return ReportSummary(Path(out), size, len(content["assets"]["id"]), len(chosen), side)
-
-
-def _refuse_other_records(store: Store, outcomes: Sequence[Outcome], manifests: Place) -> None:
-    missing = set(store.ids) - {outcome.asset_id for outcome in outcomes}
-    if missing:
-        raise StoreError(
-            f"{manifests} has no record of {len(missing)} assets of {store.path}, such as "
-            f"{min(missing)!r}; name the folder of its own records with --manifests"
-        )
+    total, in_table = content["all"]["assets"], len(content["assets"]["id"])
+    return ReportSummary(Path(out), size, total, in_table, len(chosen), side)
 
 
 def _refuse_other_words(store: Store) -> None:

@@ -12,7 +12,7 @@ import numpy as np
 
 from slatprep.inspect.pictures.palette import DISTANCE_COLOURS
 from slatprep.inspect.report.orientations import nearest_quarter_turn, quarter_turns
-from slatprep.inspect.report.outcomes import Outcome, kinds_of
+from slatprep.inspect.report.outcomes import Outcomes, kinds_of
 from slatprep.inspect.report.thumbnails import COLUMNS, PER_SHEET, VIEWS
 from slatprep.inspect.report.voxels import LEVELS
 from slatprep.inspect.tallies import Tally, no_tally
@@ -44,8 +44,9 @@ BINS = 64
 
 def page_content(
     store: Store,
-    outcomes: Sequence[Outcome] | None,
+    outcomes: Outcomes | None,
     tallies: Mapping[str, Tally],
+    listed: Sequence[int],
     chosen: Sequence[int],
     side: int,
     created: str | None,
@@ -57,12 +58,14 @@ def page_content(
     ----------
     store : Store
         The store.
-    outcomes : sequence of Outcome or None
+    outcomes : Outcomes or None
         From its records, where there are any.
     tallies : mapping of str to Tally
         Tally of the voxels of each category.
+    listed : sequence of int
+        Rows of the assets in the table, ascending.
     chosen : sequence of int
-        Rows of the assets with a thumbnail and a 3D view, ascending.
+        Those of the assets with a thumbnail and a 3D view, ascending.
     side : int
         Voxels per edge of the 3D views.
     created : str or None
@@ -74,9 +77,12 @@ def page_content(
     -------
     dict
         JSON-ready. Columns of the table are lists with an entry for each asset, first those
-        of the store; NaN and unknown values are None.
+        of the store; ``all`` counts what is not in the table, too; NaN and unknown values are None.
     """
     build = store.about.build
+    states = Counter(map(str, store.column("verdict")))
+    for status, count in (outcomes.absent if outcomes else Counter[Status]()).items():
+        states[_ABSENT[status]] += count
     return {
         "title": store.name,
         "name": build.name,
@@ -119,22 +125,25 @@ def page_content(
         "turns": quarter_turns(),
         "properties": _properties(store, outcomes, tallies),
         "balance": _balance(store, tallies),
-        "assets": _table(store, outcomes, chosen, agreement),
+        "assets": _table(store, outcomes, listed, chosen, agreement),
+        "all": {
+            "stored": len(store),
+            "assets": sum(states.values()),
+            "states": states,
+            "tied": outcomes and outcomes.tied,
+        },
     }
 
 
 def _properties(
     store: Store,
-    outcomes: Sequence[Outcome] | None,
+    outcomes: Outcomes | None,
     tallies: Mapping[str, Tally],
 ) -> list[dict[str, Any]]:
     """Return the histograms of each property by class, and its ranges."""
     normalization, published = store.normalization, {one.name: one for one in PIXIE_RANGES.ranges}
     total = sum(tallies.values(), start=no_tally(len(normalization.ranges), BINS))
-    clipped = np.zeros(len(normalization.ranges), dtype=np.int64)
-    for outcome in outcomes or ():
-        if outcome.clipped:
-            clipped += outcome.clipped
+    clipped = outcomes.clipped if outcomes else [0] * len(normalization.ranges)
     return [
         {
             "name": span.name,
@@ -174,24 +183,27 @@ def _balance(store: Store, tallies: Mapping[str, Tally]) -> list[dict[str, Any]]
 
 def _table(
     store: Store,
-    outcomes: Sequence[Outcome] | None,
+    outcomes: Outcomes | None,
+    listed: Sequence[int],
     chosen: Sequence[int],
     agreement: Agreement,
 ) -> dict[str, list[Any]]:
     """Return the columns of the table of assets."""
-    known = {outcome.asset_id: outcome for outcome in outcomes or ()}
-    stored = [known.get(asset_id) for asset_id in store.ids]
+    known = outcomes.known if outcomes else {}
+    rows = np.array(listed, dtype=np.intp)
+    ids = [store.ids[row] for row in listed]
+    stored = [known.get(asset_id) for asset_id in ids]
     absent = [outcome for outcome in known.values() if outcome.status is not Status.OK]
-    transforms = store.column("transform")
+    transforms = store.column("transform")[rows]
     nearest = [nearest_quarter_turn(transform) for transform in transforms]
     pictures = {index: number for number, index in enumerate(chosen)}
     of_stored: dict[str, Iterable[Any]] = {
-        "id": store.ids,
-        "category": map(str, store.column("category")),
-        "state": map(str, store.column("verdict")),
-        "voxels": np.diff(store.offsets).tolist(),
-        "unphysical": store.column("unphysical").tolist(),
-        "model": map(str, store.column("model")),
+        "id": ids,
+        "category": map(str, store.column("category")[rows]),
+        "state": map(str, store.column("verdict")[rows]),
+        "voxels": np.diff(store.offsets)[rows].tolist(),
+        "unphysical": store.column("unphysical")[rows].tolist(),
+        "model": map(str, store.column("model")[rows]),
         "turn": (index for index, _ in nearest),
         "tilt": (round(angle, 2) for _, angle in nearest),
         "transform": (
@@ -204,14 +216,14 @@ def _table(
         ),
         "displacement": (outcome and _number(outcome.displacement) for outcome in stored),
         "reasons": (list(outcome.reasons) if outcome else [] for outcome in stored),
-        "picture": map(pictures.get, range(len(store))),
+        "picture": map(pictures.get, listed),
         "annotations": ((outcome and list(outcome.annotations)) or None for outcome in stored),
-        "votes": (_number(agreement.get(row, (None, ()))[0]) for row in range(len(store))),
+        "votes": (_number(agreement.get(row, (None, ()))[0]) for row in listed),
         "spreads": (
             [_number(one) for one in agreement[row][1]] if row in agreement else None
-            for row in range(len(store))
+            for row in listed
         ),
-        **{name: map(_number, store.column(name).tolist()) for name in _FIGURES},
+        **{name: map(_number, store.column(name)[rows].tolist()) for name in _FIGURES},
     }
     of_absent: dict[str, list[Any]] = {
         "id": [outcome.asset_id for outcome in absent],

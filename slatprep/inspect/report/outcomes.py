@@ -3,14 +3,19 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Iterator
+from collections import Counter
+from collections.abc import Collection, Iterable, Iterator
 from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
 
 from slatprep.errors import StoreError
 from slatprep.provenance.files import build_in, lines_in
 from slatprep.provenance.record import FailedRecord, Record
 from slatprep.provenance.record_json import read_record
 from slatprep.records import Place, Status
+from slatprep.store.reader import Store
 
 MOST_TIES = 8
 """Most tied placements of an asset on the page."""
@@ -53,6 +58,72 @@ class Outcome:
     clipped: tuple[int, ...]
     ties: tuple[tuple[float, ...], ...] = ()
     annotations: tuple[int, ...] = ()
+
+
+@dataclass(frozen=True)
+class Outcomes:
+    """The outcomes of a build: of all assets in sums, of those on the page each.
+
+    Attributes
+    ----------
+    known : dict of str to Outcome
+        Of assets of the store that the page lists, and of those not in it, by id.
+    clipped : ndarray of int64, shape (P,)
+        Values outside the range, by property, of all assets.
+    tied : int
+        Assets with ties.
+    absent : Counter
+        Assets that are not in the store, by status.
+    """
+
+    known: dict[str, Outcome]
+    clipped: NDArray[np.int64]
+    tied: int
+    absent: Counter[Status]
+
+
+def gather_outcomes(
+    manifests: Place, store: Store, listed: Collection[str], most_absent: int
+) -> Outcomes:
+    """Gather the outcomes of a build.
+
+    Parameters
+    ----------
+    manifests : Path
+        Folder of its records.
+    store : Store
+        The store that it wrote.
+    listed : collection of str
+        Ids of the assets of which each is wanted.
+    most_absent : int
+        The most assets that are not in the store of which each is wanted.
+
+    Raises
+    ------
+    StoreError
+        If the records cannot be read, belong to another build, or lack an asset of the store.
+    """
+    known: dict[str, Outcome] = {}
+    missing, absent, tied = set(store.ids), Counter[Status](), 0
+    clipped = np.zeros(len(store.normalization.ranges), dtype=np.int64)
+    for outcome in read_outcomes(manifests, store.about.manifest):
+        missing.discard(outcome.asset_id)
+        tied += outcome.tied > 0
+        if outcome.clipped:
+            clipped += outcome.clipped
+        if outcome.status is not Status.OK:
+            absent[outcome.status] += 1
+            if absent.total() > most_absent:
+                continue
+        elif outcome.asset_id not in listed:
+            continue
+        known[outcome.asset_id] = outcome
+    if missing:
+        raise StoreError(
+            f"{manifests} has no record of {len(missing)} assets of {store.path}, such as "
+            f"{min(missing)!r}; name the folder of its own records with --manifests"
+        )
+    return Outcomes(known, clipped, tied, absent)
 
 
 def read_outcomes(manifests: Place, build_id: str) -> Iterator[Outcome]:

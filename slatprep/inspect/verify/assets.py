@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from functools import lru_cache
 from typing import Any
@@ -48,7 +48,7 @@ CONFIDENCE_TOLERANCE = 1e-5
 
 
 def asset_findings(
-    path: Place, rows: range, roots: SourceRoots | None, run: str
+    path: Place, rows: Sequence[int], roots: SourceRoots | None, run: str
 ) -> tuple[list[Finding], int]:
     """Verify some assets of a store.
 
@@ -56,7 +56,7 @@ def asset_findings(
     ----------
     path : Place
         The store.
-    rows : range
+    rows : sequence of int
         Rows of the assets.
     roots : SourceRoots or None
         Where the sources are, if they are to be compared.

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from collections import Counter, deque
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from dataclasses import replace
 
 import orjson
@@ -89,8 +89,14 @@ def moved(roots: SourceRoots, manifests: Place | None) -> SourceRoots:
     return replace(first, also=tuple(also))
 
 
-def manifest_findings(store: Store, folder: Place) -> Iterator[Finding]:
-    """Yield findings where the records break their schemas or disagree with the store."""
+def manifest_findings(
+    store: Store, folder: Place, only: Collection[str] | None = None
+) -> Iterator[Finding]:
+    """Yield findings where the records break their schemas or disagree with the store.
+
+    With `only`, ids of a sample, records of other assets are not read, and so their id and
+    statuses are not compared.
+    """
     build_file, assets_file = str(folder / BUILD), str(folder / ASSETS)
     manifest, build = store.attributes.get("manifest"), None
     try:
@@ -109,19 +115,22 @@ def manifest_findings(store: Store, folder: Place) -> Iterator[Finding]:
     seen: Counter[str] = Counter({str(status): 0 for status in Status})
     faults: list[Finding] = []
     try:
-        checked = _checked(store, folder, seen, faults)
-        if store.format_version == FORMAT_VERSION:
-            found = records_id(checked)
+        checked = _checked(store, folder, seen, faults, only)
+        if only is None and store.format_version == FORMAT_VERSION:
+            found: object = records_id(checked)
         else:
             deque(checked, maxlen=0)
-            found = _id_of_lines(folder)
+            found = _id_of_lines(folder) if only is None else manifest
     except StoreError as error:
         yield Finding(assets_file, "", str(error), "a JSON record a line")
         return
     yield from faults
     if found != manifest:
         yield Finding(assets_file, "", f"its content has the id {found}", f"{manifest}")
-    if build and build.statuses != dict(seen):
+    if only is not None and not faults and seen[Status.OK] != len(only):
+        what = f"has {seen[Status.OK]} records of {len(only)} assets"
+        yield Finding(assets_file, "", what, "one of each")
+    if only is None and build and build.statuses != dict(seen):
         yield Finding(build_file, "", f"statuses are {build.statuses}", f"{dict(seen)}")
     if build and build.counts.voxels != store.shape("voxel/coords")[0]:
         yield Finding(build_file, "", "counts other voxels", f"{store.shape('voxel/coords')[0]}")
@@ -151,13 +160,19 @@ def _id_of_lines(folder: Place) -> str:
 
 
 def _checked(
-    store: Store, folder: Place, seen: Counter[str], faults: list[Finding]
+    store: Store,
+    folder: Place,
+    seen: Counter[str],
+    faults: list[Finding],
+    only: Collection[str] | None,
 ) -> Iterator[Record]:
     """Yield the records of ``assets.jsonl``; count their statuses and collect their faults."""
     rows = {asset_id: row for row, asset_id in enumerate(store.ids)}
     stored = StoredRecords(store)
     file = str(folder / ASSETS)
     for where, line in lines_in(folder):
+        if only is not None and _id_in(line) not in only:
+            continue
         try:
             record = read_record(line, where)
         except RecordError as error:
@@ -170,6 +185,13 @@ def _checked(
                 what = "differs from asset/record"
                 faults.append(Finding(file, record.asset_id, what, "the same record"))
         yield record
+
+
+def _id_in(line: bytes | str) -> object:
+    try:
+        return parse_document(line).get("asset_id")
+    except ValueError:
+        return None
 
 
 def _same(record: AssetRecord, stored: StoredRecords, row: int) -> bool:

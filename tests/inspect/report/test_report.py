@@ -179,6 +179,29 @@ def test_a_store_too_large_is_shown_in_part_and_coarsely(
     np.testing.assert_array_equal(unpack(page, 2)["slat"], np.unique(dog.coords // 2, axis=0))
 
 
+def test_of_a_store_too_large_to_list_a_sample_is_listed_and_all_are_counted(
+    hostile: Report, page: Page, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(report, "ASSETS_IN_DETAIL", 3)
+    monkeypatch.setattr(report, "ASSETS_LISTED", 4)
+    store = open_store(hostile.store)
+    summary = write_report(store, tmp_path / "page.html", manifests=hostile.manifests)
+    found, whole = Page(tmp_path / "page.html").content, page.content
+    absent = [name for name in whole["assets"]["id"] if name not in store.ids]
+    assert (summary.assets, summary.listed, summary.in_detail) == (7, 5, 3)
+    assert found["assets"]["id"] == [*IDS[::2], *absent]
+    for name, values in found["assets"].items():
+        if name not in ("picture", "kinds"):
+            assert values == [*whole["assets"][name][:5:2], *whole["assets"][name][5:]], name
+    assert found["assets"]["picture"] == [0, 1, 2, None, None]
+    states = {state: whole["assets"]["state"].count(state) for state in whole["assets"]["state"]}
+    tied = sum(1 for tied in whole["assets"]["tied"] if tied)
+    expected = {"stored": 5, "assets": 7, "states": states, "tied": tied}
+    assert found["all"] == whole["all"] == expected
+    clips = [[one["clipped"] for one in content["properties"]] for content in (found, whole)]
+    assert clips[0] == clips[1]
+
+
 @pytest.mark.parametrize(("angle", "expected"), [(0.0, 0.0), (10.0, 10.0), (44.0, 44.0)])
 def test_nearest_quarter_turn(angle: float, expected: float) -> None:
     transform = QUARTER_TURN.copy()

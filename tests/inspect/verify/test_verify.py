@@ -62,6 +62,33 @@ def test_a_sound_store_has_no_findings(mixed_build: BuildSummary) -> None:
     assert one.manifests == mixed_build.records.parent
 
 
+def test_a_sample_is_looked_at_and_nothing_else(store: Path) -> None:
+    assert verify_store(store, sample=2).assets == 2
+    assert verify_store(store, sample=9).assets == 5
+    ids = open_store(store).ids
+    for row, known in ((1, True), (0, False)):  # Of five, two at even steps are the second, fourth.
+        first = int(open_store(store).offsets[row])
+        rewrite(store, "voxel/distance", slice(first, first + 1), -1.0)
+        named = {finding.asset for finding in found(store, sample=2)}
+        assert (ids[row] in named) is known
+    assert ids[0] in {finding.asset for finding in found(store)}
+
+
+def test_of_a_sample_the_records_beside_the_store_are_compared(store: Path) -> None:
+    file = store.with_suffix(".manifests") / "assets.jsonl"
+    lines = file.read_bytes().splitlines(keepends=True)
+    ids = open_store(store).ids
+    for name, known in ((ids[1], True), (ids[0], False)):
+        other = [
+            line.replace(b'"annotated":', b'"annotated":1') if name.encode() in line else line
+            for line in lines
+        ]
+        file.write_bytes(b"".join(other))
+        assert (name in {one.asset for one in found(store, sample=2)}) is known
+    file.write_bytes(b"".join(line for line in lines if ids[1].encode() not in line))
+    assert "has 1 records of 2 assets" in {one.what for one in found(store, sample=2)}
+
+
 SHARDS = [
     "voxel/coords/c/0/0",
     "voxel/feats/c/1/0",

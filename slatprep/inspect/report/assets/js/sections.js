@@ -5,8 +5,8 @@ const Sections = (() => {
   const known = (values) => values.filter((value) => value !== null);
 
   function states(filter) {
-    const counts = STATES.map((state) => ({ ...state, count: ASSETS.state.filter((own) => own === state.name).length }));
-    const inStore = stored.filter(Boolean).length;
+    const counts = STATES.map((state) => ({ ...state, count: CONTENT.all.states[state.name] ?? 0 }));
+    const { stored: inStore, assets: total, tied } = CONTENT.all;
     byId("title").textContent = CONTENT.name || CONTENT.title;
     const engine = CONTENT.engine.join(", ");
     byId("lede").textContent =
@@ -15,15 +15,15 @@ const Sections = (() => {
     const valid = known(ASSETS.valid_share.map((share, k) => (share === null ? null : share * ASSETS.voxels[k])));
     const sum = (values) => values.reduce((total, value) => total + value, 0);
     const tiles = [
-      ["assets good", Format.share(counts[0].count / TOTAL)],
+      ["assets good", Format.share(counts[0].count / total)],
       ["SLAT voxels", Format.count(CONTENT.voxels)],
-      ["of them annotated", Format.share(sum(valid) / CONTENT.voxels, 2)],
+      ["of them annotated", Format.share(sum(valid) / sum(known(ASSETS.voxels)), 2)],
       ["median fitness", Format.fixed(3)(Format.quantile(known(ASSETS.fitness), 0.5))],
       ["median rmse, voxels", Format.fixed(3)(Format.quantile(known(ASSETS.inlier_rmse), 0.5))],
     ];
     const unphysical = sum(known(ASSETS.unphysical));
     if (unphysical) tiles.push(["unphysical voxels left out", Format.count(unphysical)]);
-    if (CONTENT.records) tiles.push(["assets with ties", Format.count(ASSETS.tied.filter((tied) => tied > 0).length)]);
+    if (CONTENT.records) tiles.push(["assets with ties", Format.count(tied)]);
     const merged = known(ASSETS.spreads).length;
     if (merged) tiles.push(["assets with merged labels", Format.count(merged)]);
     byId("tiles").replaceChildren(...tiles.map(([name, value]) => el("div", {}, el("dt", {}, name), el("dd", {}, value))));
@@ -33,7 +33,7 @@ const Sections = (() => {
     );
     byId("statelist").replaceChildren(
       ...counts.map((state) =>
-        el("button", { type: "button", class: "chip", title: state.means, onclick: () => filter.only("states", [state.name]) }, stateTag(state.name), ` ${Format.count(state.count)} · ${Format.share(state.count / TOTAL)}`),
+        el("button", { type: "button", class: "chip", title: state.means, onclick: () => filter.only("states", [state.name]) }, stateTag(state.name), ` ${Format.count(state.count)} · ${Format.share(state.count / total)}`),
       ),
     );
     why(filter);
@@ -214,8 +214,9 @@ const Sections = (() => {
 
   function colophon() {
     const { side, assets } = CONTENT.detail;
-    const inStore = stored.filter(Boolean).length;
+    const { stored: inStore, assets: total } = CONTENT.all;
     const notes = [];
+    if (TOTAL < total) notes.push(`This page shows a sample: ${Format.count(TOTAL)} of ${Format.count(total)} assets are in its table and in its charts and medians; counts of assets by state and with ties, and of SLAT voxels, are of all.`);
     if (side < 64) notes.push(`To keep this page small, 3D views show ${side}³ voxels: each stands for 2 × 2 × 2 of the store's.`);
     if (assets < inStore) notes.push(`${Format.count(assets)} of ${Format.count(inStore)} assets have a thumbnail and a 3D view, and make up the distributions: those with a doubtful or failed alignment first, the rest evenly chosen.`);
     byId("detail-hint").textContent = notes.join(" ");
