@@ -18,9 +18,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import brentq
-from scipy.special import expit, logsumexp, softmax
-from scipy.stats import binomtest
+from scipy.special import bdtrc, expit, logsumexp, softmax
 
 from slatprep.geometry.frames import places_of
 from slatprep.geometry.nearest import Lattice
@@ -310,7 +308,8 @@ def reliability_of(evidence: Sequence[LatentEvidence]) -> Reliability:
     compared = [one.against for one in evidence if one.against]
     agreeing = sum(min(float(blocks.sum()) for blocks in against) > 0 for against in compared)
     factor = 0.0
-    if compared and binomtest(agreeing, len(compared), 0.5, alternative="greater").pvalue < CHANCE:
+    # The probability of so many heads or more.
+    if compared and bdtrc(agreeing - 1, len(compared), 0.5) < CHANCE:
         factor = _factor([np.concatenate(against) for against in compared])
     gains = np.array([one.gain for one in evidence])
     least = min(0.0, float(np.quantile(gains, RARE))) if factor else -np.inf
@@ -319,6 +318,9 @@ def reliability_of(evidence: Sequence[LatentEvidence]) -> Reliability:
 
 def _factor(compared: Sequence[Array]) -> float:
     """Return the factor that makes log likelihoods of blocks (B,) log odds, by asset alike."""
+    # Late: it takes half a second of CPU, which a build that has nothing to do would pay, too.
+    from scipy.optimize import brentq
+
     blocks = np.concatenate(compared)
     weight = np.concatenate([np.full(len(some), 1.0 / len(some)) for some in compared])
     unit = float(np.sqrt(np.average(blocks**2, weights=weight)))

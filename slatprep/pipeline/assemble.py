@@ -37,7 +37,7 @@ class Assembled:
     """A new store that is not in place yet, and what goes into the summary of it.
 
     ``clipped`` has the values of voxels outside the ranges, (A, P) by row and property;
-    ``staged`` what is not in ``store``, as it lies on an object store already.
+    ``staged`` what is not in ``store``, as an object store has it already.
     """
 
     store: Path
@@ -46,7 +46,7 @@ class Assembled:
     normalization: Normalization
     counts: Counts
     clipped: NDArray[np.int64]
-    staged: Staged | None
+    staged: Staged
 
 
 def assemble(
@@ -88,7 +88,8 @@ def assemble(
     build, files = origin(parameters), (packed.digests, packed.elsewhere)
     finish_store(store, normalization, build_id, build, contents, *files)
     counts, clipped = counts_in(open_store(store)), packed.clipped["voxel"]
-    staged = None if remote is None else Staged(remote, packed.elsewhere, packed.digests)
+    before = storage_of(carried.previous.path).remote if carried else None
+    staged = Staged(packed.elsewhere, packed.digests, remote, before, packed.copied)
     return Assembled(store, records, build_id, normalization, counts, clipped, staged)
 
 

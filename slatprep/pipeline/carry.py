@@ -29,6 +29,7 @@ from slatprep.storage.files import take_file
 from slatprep.storage.place import storage_of
 from slatprep.store.layout import arrays_with, rows_per_shard
 from slatprep.store.records import RECORD_ARRAY, RECORDS_IN_SHARD
+from slatprep.store.shard_writer import Written
 from slatprep.store.unmoved import Unmoved, unmoved
 
 
@@ -109,7 +110,7 @@ def kept_assets(
         What the sources hold.
     """
     previous, parameters = context.previous, context.parameters
-    if previous is None or storage_of(previous.path).local is None:
+    if previous is None:
         return None
     if parameters.consensus.settle or parameters.witness.settle:
         return None
@@ -202,20 +203,23 @@ class Carried:
 
     def take_shards(
         self, path: Path, parameters: StoreParameters
-    ) -> tuple[dict[str, str], frozenset[int]]:
+    ) -> tuple[dict[str, Written], frozenset[int]]:
         """Give a new store the shards that are the same as a whole.
+
+        On an object store they are named alone, as the server copies them when the others
+        are uploaded.
 
         Parameters
         ----------
         path : Path
-            The new store, on the disk of the other; its arrays are created.
+            The new store, on the disk of the other if that is on one; its arrays are created.
         parameters : StoreParameters
             Sizes of the shards of both.
 
         Returns
         -------
-        digests : dict of str to str
-            Of the files taken over.
+        files : dict of str to Written
+            The files taken over.
         records : frozenset of int
             Shards of records among them.
         """
@@ -227,8 +231,8 @@ class Carried:
         }
         names = [layout.name for layout in arrays_with(store.merges)]
         arrays = [(name.partition("/")[0], name) for name in names]
-        digests = self.previous.digests
-        taken: dict[str, str] = {}
+        there, local = self.previous.files, storage_of(store.path).local
+        taken: dict[str, Written] = {}
         records = set()
         for group, name in (*arrays, ("record", RECORD_ARRAY)):
             if group not in sizes:
@@ -237,8 +241,9 @@ class Carried:
             for shard in range(-(-rows.new // per_shard)):
                 if rows.holds(shard * per_shard, (shard + 1) * per_shard):
                     file = store.reader(name).key(shard)
-                    take_file(Path(str(store.path), file), path / file)
-                    taken[file] = digests[file]
+                    if local is not None:
+                        take_file(local / file, path / file)
+                    taken[file] = there[file]
                     if group == "record":
                         records.add(shard)
         return taken, frozenset(records)

@@ -262,13 +262,16 @@ class Packed:
     records : frozenset of int
         Shards of records that were taken over.
     elsewhere : dict of str to int
-        Bytes of the files that do not lie where the store is made, but where it belongs.
+        Bytes of the files that do not lie where the store is made, but on an object store.
+    copied : frozenset of str
+        Names of those that lie in the version that is there.
     """
 
     clipped: Mapping[str, NDArray[np.int64]]
     digests: Mapping[str, str]
     records: frozenset[int]
     elsewhere: Mapping[str, int]
+    copied: frozenset[str]
 
 
 def pack_store(
@@ -310,7 +313,9 @@ def pack_store(
     for row, asset in enumerate(assets):
         if isinstance(asset, KeptAsset):
             clipped["voxel"][row] = asset.clipped
-    digests, records = carried.take_shards(path, parameters) if carried else ({}, frozenset())
-    elsewhere = {name: file.size for name, file in written.items()} if remote else {}
-    digests |= {name: file.sha256 for name, file in written.items()}
-    return Packed(clipped, digests, records, elsewhere)
+    taken, records = carried.take_shards(path, parameters) if carried else ({}, frozenset())
+    copied = taken if previous and storage_of(previous.path).remote else {}
+    afar = copied | written if remote else copied
+    elsewhere = {name: file.size for name, file in afar.items()}
+    digests = {name: file.sha256 for name, file in (written | taken).items()}
+    return Packed(clipped, digests, records, elsewhere, frozenset(copied))

@@ -17,6 +17,7 @@ from slatprep.store.integrity import file_findings, metadata_findings
 from slatprep.store.layout import FORMAT_VERSION
 from slatprep.store.reader import Store, is_store, open_store
 from slatprep.store.records import RECORD_ARRAY, RECORDS_IN_SHARD
+from slatprep.store.shard_writer import Written
 from slatprep.workers.local import Jobs
 
 PLACE_TOLERANCE = 2.0**-23
@@ -63,11 +64,14 @@ class PreviousBuild:
         return f"the store has format {found}, and {FORMAT_VERSION} is written"
 
     @cached_property
-    def digests(self) -> dict[str, str]:
-        """SHA-256 of its files by name, as it holds them."""
-        files = self.store.shape("file/name")[0]
-        names, digests = (self.store.read_rows(f"file/{n}", 0, files) for n in ("name", "sha256"))
-        return dict(zip(map(str, names), map(str, digests), strict=True))
+    def files(self) -> dict[str, Written]:
+        """Bytes and SHA-256 of its files by name, as it holds them."""
+        store, files = self.store, self.store.shape("file/name")[0]
+        names, *told = (store.read_rows(f"file/{n}", 0, files) for n in ("name", "size", "sha256"))
+        return {
+            str(name): Written(int(size), str(digest))
+            for name, size, digest in zip(names, *told, strict=True)
+        }
 
     @cached_property
     def records(self) -> StoredRecords:

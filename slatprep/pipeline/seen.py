@@ -28,7 +28,7 @@ from slatprep.records import AssetPair, LatentMoments, Place
 from slatprep.storage.files import open_regular, private_file
 
 NAME = "sources.seen"
-"""Of the file, in the folder of the records."""
+"""Of the file, in the folder of the records, or on this machine's disk where those are not."""
 
 
 def _row(properties: int, channels: int) -> np.dtype[Any]:
@@ -107,18 +107,16 @@ class Seen:
         return Found(key, row["extent"], row["clipped"], moments)
 
 
-def read_seen(folder: Path | None, bound: bytes) -> Seen:
+def read_seen(folder: Path, bound: bytes) -> Seen:
     """Read what the last build saw; nothing where there is no such file or it is not whole.
 
     Parameters
     ----------
-    folder : Path or None
-        Of its records.
+    folder : Path
+        Where it was kept.
     bound : bytes
         What `bound_to` gives for the existing store.
     """
-    if folder is None:
-        return Seen()
     try:
         with open_regular(folder / NAME) as file:
             data = file.read()

@@ -154,7 +154,7 @@ class Update:
         states, seen = look(pairs), Seen()
         if context.previous is not None:
             bound = bound_to(context.previous.build_id, recipe)
-            seen = read_seen(storage_of(place.records().parent).local, bound)
+            seen = read_seen(_seen_folder(place), bound)
         known = {} if rehash else known_keys(seen, states)
         looked = Looked(states, seen, known, recipe)
         return cls(pairs, context, place, wanted, looked, begin, scratch)
@@ -228,10 +228,10 @@ class Update:
     def note(self, summary: BuildSummary, found: Mapping[str, Found]) -> None:
         """Write down what was seen and found of the assets of a store that is in place."""
         folder, path = (storage_of(p).local for p in (summary.records.parent, self.place.store))
+        bound, state = bound_to(summary.build_id, self.looked.recipe), b""
         if folder is not None and path is not None:
-            bound = bound_to(summary.build_id, self.looked.recipe)
             state = store_state(path, _record_files(folder), wait=True)
-            write_seen(folder, bound, state, self.looked.states, found)
+        write_seen(_seen_folder(self.place), bound, state, self.looked.states, found)
 
     def _contents(self, store: Store, found: Mapping[str, Found]) -> Contents:
         """Return what a store of the assets that are there holds."""
@@ -270,6 +270,12 @@ class Update:
                 write_records(file, _all_records(others, previous, self.context))
             publish_manifests(file, summary, parameters)
         return summary
+
+
+def _seen_folder(place: Destination) -> Path:
+    """Return where it is kept what a build saw: with the records, if those are on the disk."""
+    folder = storage_of(place.records().parent).local
+    return folder or storage_of(place.store).work_folder().parent
 
 
 def _record_files(folder: Path) -> list[Path]:

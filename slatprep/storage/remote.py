@@ -1,7 +1,8 @@
 """Places on object stores, which are reached through fsspec.
 
 A `RemotePlace` has the few methods of `slatprep.records.Place` and no others.
-Nothing can be changed at one but by `RemotePlace.upload`, `put_objects` and `remove_objects`.
+Nothing can be changed at one but by `RemotePlace.upload`, `put_objects`, `copy_objects` and
+`remove_objects`.
 
 Credentials and endpoints are left to the libraries: those of S3, for
 instance, come from ``AWS_*`` variables or ``~/.aws``.
@@ -239,6 +240,16 @@ def put_objects(folder: Path, place: RemotePlace, names: Iterable[str], at_once:
         system.put(
             [str(folder / name) for name in names], [f"{root}/{n}" for n in names], **options
         )
+
+
+def copy_objects(source: RemotePlace, target: RemotePlace, names: Iterable[str]) -> None:
+    """Have the server copy objects below a place to another, under the same names."""
+    names = list(names)
+    if not names:
+        return
+    with connected(source) as (system, root), connected(target) as (_, other):
+        options = {"batch_size": 16} if system.async_impl else {}
+        system.copy([f"{root}/{n}" for n in names], [f"{other}/{n}" for n in names], **options)
 
 
 def remove_objects(place: RemotePlace, names: Iterable[str]) -> None:

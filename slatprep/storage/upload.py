@@ -31,6 +31,7 @@ from slatprep.storage.remote import (
     PART_BYTES,
     RemotePlace,
     connected,
+    copy_objects,
     list_objects,
     put_objects,
     remove_objects,
@@ -57,21 +58,27 @@ _MD5 = re.compile(r"[0-9a-f]{32}(-[0-9]+)?")
 
 @dataclass(frozen=True)
 class Staged:
-    """Files of a version that are in place already.
+    """Files of a version that are on the object store already.
 
     Attributes
     ----------
-    version : RemotePlace
-        Where it is made.
     sizes : dict of str to int
         Bytes of the files by name.
     digests : dict of str to str
         Their SHA-256 in hex.
+    version : RemotePlace or None
+        Where some are in place, as workers put them there.
+    before : RemotePlace or None
+        The version that the others are to be copied from, by the server.
+    copied : frozenset of str
+        Names of those.
     """
 
-    version: RemotePlace
     sizes: Mapping[str, int]
     digests: Mapping[str, str]
+    version: RemotePlace | None = None
+    before: RemotePlace | None = None
+    copied: frozenset[str] = frozenset()
 
 
 @dataclass(frozen=True)
@@ -219,8 +226,7 @@ def upload_store(new: Path, before: PublishedState, staged: Staged | None = None
         Where it belongs, and what was there when the build began. If that has
         the same content, nothing is uploaded.
     staged : Staged, optional
-        The files that `new` lacks, and the version that they are of. What is there of it
-        is removed if it is not needed.
+        The files that `new` lacks. What workers put in place is removed if it is not needed.
 
     Raises
     ------
@@ -234,14 +240,15 @@ def upload_store(new: Path, before: PublishedState, staged: Staged | None = None
         digests |= staged.digests
         sizes |= staged.sizes
     content = content_of(digests)
+    place = staged and staged.version
     if before.pointer is not None and before.pointer.content == content:
-        if staged is not None:
-            _remove_version(staged.version)
+        if place is not None:
+            _remove_version(place)
         return Upload(before, before.pointer)
     previous = before.pointer.version if before.pointer else ""
     pointer = Pointer(
-        version=staged.version.name
-        if staged
+        version=place.name
+        if place
         else hashlib.sha256(f"{previous}{content}".encode()).hexdigest()[:16],
         previous=previous,
         content=content,
@@ -255,6 +262,10 @@ def upload_store(new: Path, before: PublishedState, staged: Staged | None = None
         large = [name for name in missing if files[name] > _SMALL_BYTES]
         put_objects(new, upload.version, small)
         put_objects(new, upload.version, large, at_once=1)
+        if staged is not None and staged.before is not None:
+            # One that an upload left is the same: a version's name tells its content.
+            others = [n for n in staged.copied if there.get(n, {}).get("size") != sizes[n]]
+            copy_objects(staged.before, upload.version, sorted(others))
         there = list_objects(upload.version)
         for name, size in sizes.items():
             arrived = there.get(name, {}).get("size") == size

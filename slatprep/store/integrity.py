@@ -77,6 +77,8 @@ def metadata_findings(path: Place) -> Iterator[Finding]:
 def file_findings(store: Store, jobs: Jobs, below: str = "") -> tuple[int, set[Finding]]:
     """Compare every file of a store, or those whose names begin with `below`, with its digest.
 
+    Of the others the sizes are compared.
+
     Returns
     -------
     files : int
@@ -103,7 +105,8 @@ def file_findings(store: Store, jobs: Jobs, below: str = "") -> tuple[int, set[F
     for name in expected.keys() - present:
         findings.add(Finding(name, "", "is missing", f"a file of {expected[name][0]} bytes"))
     places = {digest: name for name, (_, digest) in expected.items()}
-    common = sorted(name for name in present & expected.keys() if name.startswith(below))
+    both = sorted(present & expected.keys())
+    common = [name for name in both if name.startswith(below) or files[name] != expected[name][0]]
     tasks = ((store.path, name, files[name], *expected[name]) for name in common)
     for name, what, digest in _compared(tasks, jobs):
         if what:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -179,7 +180,12 @@ class Store(AssetTable):
             If there is no such asset or array, or a file is missing or damaged.
         """
         start, stop = self.rows(index)
-        return {name: self._voxel_rows(name, index, start, stop) for name in columns}
+        if storage_of(self.path).local is not None:
+            return {name: self._voxel_rows(name, index, start, stop) for name in columns}
+        # Each array is an object of its own, and an answer takes long to come.
+        with ThreadPoolExecutor(max(len(columns), 1)) as pool:
+            read = pool.map(lambda name: self._voxel_rows(name, index, start, stop), columns)
+            return dict(zip(columns, read, strict=True))
 
     def rows(self, index: int) -> tuple[int, int]:
         """Return the first row of an asset in ``voxel/*``, and the one after its last.

@@ -1,0 +1,230 @@
+"""Reading whole assets at random from S3, by slatprep and by what one would do without it.
+
+    python benchmarks/remote_ways.py STORE [--latency 0.02] [--assets 60]
+
+A server on loopback answers requests for objects as S3 does, each after the latency; nothing
+limits the bandwidth. Every way reads coords, feats and properties of the same assets in the same
+shuffled order, from one, two and four processes at a time, each with its part of them. Prints
+milliseconds an asset and process, best of the repeats, after one asset that opens what has to be
+opened, and requests an asset.
+"""
+
+from __future__ import annotations
+
+import argparse
+import io
+import json
+import multiprocessing
+import os
+import subprocess
+import sys
+import tempfile
+import time
+import urllib.request
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import checkout
+import numpy as np
+from support import object_store
+
+from slatprep.bench.read import write_forms
+from slatprep.store import open_store
+from slatprep.store.reader import TRAINING_COLUMNS
+
+SERVER = """
+import asyncio, pathlib, sys
+from aiohttp import web
+root, latency, made = pathlib.Path(sys.argv[1]), float(sys.argv[2]), [0]
+MISSING = "<Error><Code>NoSuchKey</Code><Message>no such key</Message></Error>"
+async def answer(request):
+    if request.path == "/requests":
+        return web.Response(text=str(made[0]))
+    made[0] += 1
+    await asyncio.sleep(latency)
+    file = root / request.path.removeprefix("/bench/")
+    if not file.is_file():
+        return web.Response(status=404, text=MISSING, content_type="application/xml")
+    return web.FileResponse(file, headers={"ETag": '"x"'})
+async def main():
+    app = web.Application()
+    app.router.add_get("/{name:.*}", answer)
+    runner = web.AppRunner(app)
+    await runner.setup()
+    site = web.TCPSite(runner, "127.0.0.1", 0)
+    await site.start()
+    print(runner.addresses[0][1], flush=True)
+    await asyncio.Event().wait()
+asyncio.run(main())
+"""
+
+Reader = Callable[[int], dict[str, Any]]
+
+
+def by_slatprep(_: str) -> Reader:
+    return open_store("s3://bench/store").read
+
+
+def by_zarr(_: str) -> Reader:
+    import zarr
+
+    group: Any = zarr.open_group("s3://bench/store", mode="r")
+    arrays = {name: group[f"voxel/{name}"] for name in TRAINING_COLUMNS}
+    offsets = group["asset/offset"][:].tolist()
+
+    def read(row: int) -> dict[str, Any]:
+        rows = slice(offsets[row], offsets[row + 1])
+        return {name: array[rows] for name, array in arrays.items()}
+
+    return read
+
+
+def by_tensorstore(address: str) -> Reader:
+    import tensorstore
+
+    offsets = open_store("s3://bench/store").offsets.tolist()
+    # Without room for it, the index of a shard is asked for again with every asset.
+    context = tensorstore.Context({"cache_pool": {"total_bytes_limit": 2**26}})
+    arrays = {
+        name: tensorstore.open(
+            {
+                "driver": "zarr3",
+                "recheck_cached_data": "open",
+                "recheck_cached_metadata": "open",
+                "kvstore": {
+                    "driver": "s3",
+                    "bucket": "bench",
+                    "path": f"store/voxel/{name}/",
+                    "endpoint": address,
+                    "aws_region": "us-east-1",
+                },
+            },
+            context=context,
+            read=True,
+        ).result()
+        for name in TRAINING_COLUMNS
+    }
+
+    def read(row: int) -> dict[str, Any]:
+        rows = slice(offsets[row], offsets[row + 1])
+        pending = {name: array[rows].read() for name, array in arrays.items()}
+        return {name: future.result() for name, future in pending.items()}
+
+    return read
+
+
+def by_npz(_: str) -> Reader:
+    import fsspec
+
+    system = fsspec.filesystem("s3")
+
+    def read(row: int) -> dict[str, Any]:
+        with np.load(io.BytesIO(system.cat_file(f"bench/npz/{row}.npz"))) as file:
+            return {name: file[name] for name in TRAINING_COLUMNS}
+
+    return read
+
+
+def by_hdf5(_: str) -> Reader:
+    import fsspec
+    import h5py
+
+    file = h5py.File(fsspec.filesystem("s3").open("bench/all.h5", block_size=2**20), "r")
+
+    def read(row: int) -> dict[str, Any]:
+        return {name: file[str(row)][name][()] for name in TRAINING_COLUMNS}
+
+    return read
+
+
+WAYS = {
+    "slatprep": by_slatprep,
+    "tensorstore": by_tensorstore,
+    "zarr-python": by_zarr,
+    "npz, one an asset": by_npz,
+    "one HDF5 file": by_hdf5,
+}
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("store", type=Path)
+    parser.add_argument("--latency", type=float, default=0.02)
+    parser.add_argument("--assets", type=int, default=60)
+    parser.add_argument("--repeats", type=int, default=3)
+    parser.add_argument("--processes", type=int, nargs="+", default=[1, 2, 4])
+    arguments = parser.parse_args()
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        assets = min(arguments.assets, len(open_store(arguments.store)))
+        write_forms(arguments.store, folder, assets)
+        (folder / "store").symlink_to(arguments.store.resolve())
+        order = np.random.default_rng(0).permutation(assets).tolist()
+        expected = open_store(arguments.store).read(order[0])
+        with serving(folder, arguments.latency) as address:
+            for way, opened in WAYS.items():
+                row: dict[str, Any] = {"way": way}
+                found, before = opened(address), asked(address)
+                for number in order:
+                    arrays = found(number)
+                    if number == order[0]:
+                        assert all(np.array_equal(arrays[k], expected[k]) for k in expected)
+                row["requests an asset"] = round((asked(address) - before) / assets, 1)
+                for processes in arguments.processes:
+                    times = [at_once(way, address, order, processes)
+                             for _ in range(arguments.repeats)]  # fmt: skip
+                    row[f"{processes} at a time [ms]"] = round(1e3 * min(times), 1)
+                print(json.dumps(row), flush=True)
+
+
+@contextmanager
+def serving(folder: Path, latency: float) -> Iterator[str]:
+    command = [sys.executable, "-c", SERVER, str(folder), str(latency)]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None
+        address = f"http://127.0.0.1:{process.stdout.readline().strip()}"
+        os.environ |= object_store.environment(address)
+        try:
+            yield address
+        finally:
+            process.kill()
+
+
+def asked(address: str) -> int:
+    with urllib.request.urlopen(f"{address}/requests") as answer:
+        return int(answer.read())
+
+
+def at_once(way: str, address: str, order: list[int], processes: int) -> float:
+    """Return the seconds that a process takes for an asset, where so many read at a time."""
+    context = multiprocessing.get_context("spawn")
+    start = context.Barrier(processes + 1)
+    parts = [order[number::processes] for number in range(processes)]
+    workers = [context.Process(target=work, args=(way, address, part, start)) for part in parts]
+    for worker in workers:
+        worker.start()
+    start.wait(120)
+    begin = time.perf_counter()
+    for worker in workers:
+        worker.join()
+    seconds = time.perf_counter() - begin
+    if any(worker.exitcode for worker in workers):
+        raise RuntimeError(f"a process that reads by {way} failed")
+    return seconds / (len(order) / processes)
+
+
+def work(way: str, address: str, order: list[int], start: Any) -> None:
+    read = WAYS[way](address)
+    read(order[-1])
+    start.wait(120)
+    for row in order:
+        read(row)
+    os._exit(0)  # What a way tears down is not reading.
+
+
+assert checkout.ROOT  # Importing it made the tests' server known.
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,123 @@
+"""An update of a store on S3: what did not change is copied by the server, and not read."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+from s3fs.core import S3FileSystem
+from support.faults import inject
+from support.remote import current
+from support.synthetic import Dataset
+from support.trees import tree
+
+from slatprep.errors import StoreError
+from slatprep.inspect.verify import verify_store
+from slatprep.pipeline import carry, seen
+from slatprep.pipeline.dataset import build_store
+from slatprep.store import open_store
+
+
+@pytest.fixture(autouse=True)
+def small(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let one new asset of five be few, and trust files however new they are."""
+    monkeypatch.setattr(carry, "MOST_BEHIND", 1.0)
+    monkeypatch.setattr(seen, "_FINE_NS", 0)
+    monkeypatch.setattr(seen, "_COARSE_NS", 0)
+
+
+@pytest.fixture
+def built(make_dataset: Callable[..., Dataset], url: str, tmp_path: Path) -> tuple[Dataset, Path]:
+    """Four assets; a store of them on S3, and the same on the disk."""
+    dataset = make_dataset("a", "c", "e", "g")
+    for out in (url, tmp_path / "s.zarr"):
+        build_store(dataset.parameters(), out)
+    return dataset, tmp_path / "s.zarr"
+
+
+def below(names: list[str], version: str) -> set[str]:
+    return {name.partition(f"{version}/")[2] for name in names} - {""}
+
+
+def test_shards_that_did_not_change_are_copied_by_the_server(
+    s3: Any,
+    url: str,
+    built: tuple[Dataset, Path],
+    requests: Any,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    dataset, beside = built
+    before = tree(beside)
+    dataset.add("b", seed=1)
+    begun: list[str] = []
+    inject(monkeypatch, lambda step, name: begun.append(name) if step == "asset begun" else None)
+    old = open_store(url).path.name
+    requests.made.clear()
+    build_store(dataset.parameters(), url)
+    assert begun == ["b"]
+    new = open_store(url).path.name
+    build_store(dataset.parameters(), beside)
+    after = tree(beside)
+    # The same bytes as where the store lies on a disk, which took over the same shards.
+    assert current(s3, url) == after
+    groups = ("voxel/", "grid/", "asset/record/")
+    same = {name for name in before.items() & after.items() if name[0].startswith(groups)}
+    # What names the axes is written with every store.
+    axes = {"axis", "property", "x", "y", "z"}
+    same_shards = {name for name, _ in same if "/c/" in name and name.split("/")[1] not in axes}
+    assert len(same_shards) > 20
+    copied = below(requests.of("copy_object"), new)
+    assert same_shards == copied
+    # Of what was copied nothing came here, and nothing went back.
+    voxels = {name for name in copied if not name.startswith("asset/")}
+    assert voxels
+    assert not voxels & below(requests.of("get_object"), old)
+    assert not copied & below(requests.of("put_object"), new)
+    assert verify_store(url, sources=True).ok
+
+
+def test_a_shard_that_is_gone_from_the_server_is_made_again(
+    s3: Any, url: str, built: tuple[Dataset, Path]
+) -> None:
+    dataset, beside = built
+    s3.rm(f"{open_store(url).path}/voxel/feats/c/0/0")
+    dataset.add("b", seed=1)
+    summary = build_store(dataset.parameters(), url)
+    assert any("voxel/feats/c/0/0" in told for told in summary.damaged)
+    build_store(dataset.parameters(), beside)
+    assert current(s3, url) == tree(beside)
+
+
+def test_where_the_server_does_not_copy_the_old_store_stays(
+    s3: Any, url: str, built: tuple[Dataset, Path]
+) -> None:
+    dataset, beside = built
+    dataset.add("b", seed=1)
+
+    async def denied(*_: Any, **__: Any) -> None:
+        raise PermissionError("Access Denied")
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(S3FileSystem, "_cp_file", denied)
+        with pytest.raises(StoreError, match=r"cannot be written .*nothing was replaced"):
+            build_store(dataset.parameters(), url)
+    assert current(s3, url) == tree(beside)
+    build_store(dataset.parameters(), url)
+    build_store(dataset.parameters(), beside)
+    assert current(s3, url) == tree(beside)
+
+
+def test_without_what_was_seen_all_is_packed_again_and_nothing_aligned(
+    s3: Any, url: str, built: tuple[Dataset, Path], tmp_path: Path, requests: Any
+) -> None:
+    dataset, beside = built
+    shutil.rmtree(tmp_path / "cache")
+    dataset.add("h", seed=1)
+    requests.made.clear()
+    build_store(dataset.parameters(), url)
+    assert requests.of("copy_object") == []
+    build_store(dataset.parameters(), beside)
+    assert current(s3, url) == tree(beside)
