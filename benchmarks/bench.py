@@ -75,9 +75,9 @@ MEASUREMENTS = (
         (0, 10_000, 1800), (0, 40, 180),
     ),
     Measurement(
-        "scale-given", "The same with alignments given, so that what grows is left",
-        "reliability", "python benchmarks/scale.py {size} --given",
-        (0, 50_000, 7200), (0, 100, 180),
+        "half-million", "Half a million tiny assets, with alignments given",
+        "reliability", "python benchmarks/half_million.py {size} --once --jobs 2",
+        (0, 500_000, 14_400), (0, 100, 180),
     ),
     Measurement(
         "kills", "Whether a store survives builds that are killed",
@@ -108,6 +108,11 @@ MEASUREMENTS = (
         "remote", "Reading a store on an object store",
         "remote", "python benchmarks/remote_read.py {folder}/demo.zarr --assets {size}",
         (60, 50, 600), (6, 5, 180), (DEMO, STORE),
+    ),
+    Measurement(
+        "remote-ways", "Reading whole assets from an object store, by several ways",
+        "remote", "python benchmarks/remote_ways.py {folder}/demo.zarr --assets {size}",
+        (60, 60, 900), (6, 5, 240), (DEMO, STORE),
     ),
     Measurement(
         "loader", "Loading for training beside npz",

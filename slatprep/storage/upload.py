@@ -240,7 +240,7 @@ def upload_store(new: Path, before: PublishedState, staged: Staged | None = None
         digests |= staged.digests
         sizes |= staged.sizes
     content = content_of(digests)
-    place = staged and staged.version
+    place = staged.version if staged else None
     if before.pointer is not None and before.pointer.content == content:
         if place is not None:
             _remove_version(place)
