@@ -23,8 +23,10 @@ from slatprep.errors import SlatprepError
 from slatprep.geometry.frames import voxel_centres
 from slatprep.geometry.voxels import boundary, filled, occupancy_of
 from slatprep.parameters import BuildParameters, PixieverseSource, SlatSource
-from slatprep.particles import transfer
+from slatprep.particles.fields import stored_field
+from slatprep.particles.read import read_particles
 from slatprep.particles.simulate import ELASTIC, rigid_deviation, simulate, strain
+from slatprep.particles.transfer import transfer, write_transferred
 from slatprep.pipeline.dataset import build_store
 from slatprep.records import BACKGROUND, MATERIAL_CLASSES, RESOLUTION
 from slatprep.store import Store, open_store
@@ -166,10 +168,10 @@ def particles(
     np.save(folder / "solid.npy", fill(store.asset(name).coords, count))
 
     # What `slatprep transfer solid.npy --store STORE --asset NAME --points grid --far drop` does.
-    solid = transfer.read_particles(folder / "solid.npy")
-    field = transfer.stored_field(store, name, points="grid")
-    result = transfer.transfer(solid.in_slat(), field, far="drop")
-    transfer.write_transferred(folder / "solid.ply", solid, result, max_distance=2.0, in_slat=True)
+    solid = read_particles(folder / "solid.npy")
+    field = stored_field(store, name, points="grid")
+    result = transfer(solid.in_slat(), field, far="drop")
+    write_transferred(folder / "solid.ply", solid, result, max_distance=2.0, in_slat=True)
 
     vertex = plyfile.PlyData.read(folder / "solid.ply")["vertex"]
     columns = [np.column_stack([vertex[n] for n in names]) for names in

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
+from slatprep.errors import StoreError
 from slatprep.inspect.check import AlignmentCheck, check_alignment
 from slatprep.inspect.pictures.alignment import draw_alignment
 from slatprep.inspect.pictures.canvas import FORMATS, STYLE, in_format
@@ -12,7 +13,7 @@ from slatprep.inspect.pictures.scene import Scene, scene_of
 from slatprep.inspect.pictures.sheet import MOST, draw_sheet
 from slatprep.provenance.stored import StoredRecords
 from slatprep.records import Place
-from slatprep.storage.atomic import staged, writing
+from slatprep.storage.atomic import staged
 from slatprep.storage.names import file_name
 from slatprep.store.reader import Store, StoredAsset, open_store
 from slatprep.workers import Progress
@@ -115,5 +116,11 @@ def subtitle_of(asset: StoredAsset) -> str:
 
 
 def _write(path: Path, content: bytes) -> None:
-    with writing("the picture", path), staged(path) as file:
-        file.write_bytes(content)
+    try:
+        with staged(path) as file:
+            file.write_bytes(content)
+    except OSError as error:
+        raise StoreError(
+            f"the picture: cannot be written to {path} ({error.strerror or error}); make room "
+            "there, or name another place with --picture, or --picture none"
+        ) from error
