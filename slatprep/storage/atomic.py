@@ -19,15 +19,10 @@ from typing import TYPE_CHECKING
 
 from slatprep.errors import StoreError
 from slatprep.storage.faults import reached
-from slatprep.storage.files import is_at, is_only_ours
+from slatprep.storage.files import OWN_FILE, is_at, is_only_ours, locks_alone
 
 if TYPE_CHECKING:
     from slatprep.records import Place
-
-# Neither follow a link nor wait at a pipe; Windows has neither flag.
-_OWN = os.O_WRONLY | os.O_CREAT
-for _name in ("O_CLOEXEC", "O_NOFOLLOW", "O_NONBLOCK"):
-    _OWN |= getattr(os, _name, 0)
 
 _AT_FDCWD = -100
 _RENAME_EXCHANGE = 2
@@ -136,28 +131,15 @@ def _claimed(path: Path) -> tuple[Path, int]:
     """Return an empty file beside a path, and a descriptor that locks it against `staged`."""
     temporary = path.with_name(f".{path.name}.partial")
     with suppress(OSError):
-        held = os.open(temporary, _OWN, 0o666)
+        held = os.open(temporary, os.O_WRONLY | OWN_FILE, 0o666)
         try:
-            if is_only_ours(os.fstat(held)) and _lock(held) and is_at(held, temporary):
+            if is_only_ours(os.fstat(held)) and locks_alone(held) and is_at(held, temporary):
                 os.ftruncate(held, 0)
                 return temporary, os.dup(held)
         finally:
             os.close(held)
     temporary = path.with_name(f".{path.name}.{secrets.token_hex(8)}.partial")
-    return temporary, os.open(temporary, _OWN | os.O_EXCL, 0o666)
-
-
-def _lock(descriptor: int) -> bool:
-    """Whether no other process holds a lock on a file, and from now on this one does."""
-    try:
-        import fcntl
-    except ImportError:  # on Windows
-        return True
-    try:
-        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError:
-        return False
-    return True
+    return temporary, os.open(temporary, os.O_WRONLY | os.O_EXCL | OWN_FILE, 0o666)
 
 
 @contextmanager

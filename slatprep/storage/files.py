@@ -7,6 +7,7 @@ import hashlib
 import os
 import shutil
 import stat
+import sys
 from contextlib import suppress
 from io import BufferedWriter, BytesIO, FileIO
 from pathlib import Path
@@ -18,6 +19,10 @@ if TYPE_CHECKING:
 
 _AT = os.open in os.supports_dir_fd
 _NO_WAITING = getattr(os, "O_NONBLOCK", 0)  # a pipe's reader would wait for a writer
+_NO_LINK = getattr(os, "O_NOFOLLOW", 0)
+
+OWN_FILE = os.O_CREAT | getattr(os, "O_CLOEXEC", 0) | _NO_LINK | _NO_WAITING
+"""How to open a file of our own, made if need be: no link is followed, no pipe waited for."""
 
 
 class LocalFile(FileIO):
@@ -104,8 +109,7 @@ def private_file(path: Path) -> BufferedWriter:
     OSError
         If it cannot be written, or is a link, has other names, or is somebody else's.
     """
-    flags = os.O_WRONLY | os.O_CREAT | _NO_WAITING | getattr(os, "O_NOFOLLOW", 0)
-    file = LocalFile(os.open(path, flags, 0o600), "wb")
+    file = LocalFile(os.open(path, os.O_WRONLY | OWN_FILE, 0o600), "wb")
     try:
         file.size()
         if not is_only_ours(os.fstat(file.fileno())):
@@ -129,6 +133,22 @@ def is_at(descriptor: int, path: Path) -> bool:
         return os.path.samestat(os.fstat(descriptor), path.stat())
     except FileNotFoundError:
         return False
+
+
+def locks_alone(descriptor: int) -> bool:
+    """Whether no other process holds a lock on an open file; from now on this one does.
+
+    It is released however the process ends. Windows has no such lock, there all hold it.
+    """
+    if sys.platform == "win32":
+        return True
+    import fcntl
+
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return False
+    return True
 
 
 def take_file(source: Path, target: Path) -> None:

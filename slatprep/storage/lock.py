@@ -6,18 +6,14 @@ import json
 import os
 import platform
 import stat
+import sys
 from contextlib import ExitStack
 from datetime import UTC, datetime
 from pathlib import Path
 
 from slatprep.errors import StoreError
 from slatprep.storage.documents import parse_document
-from slatprep.storage.files import is_at
-
-# Neither follow a link nor wait at a pipe; Windows has neither flag.
-_FLAGS = os.O_RDWR | os.O_CREAT
-for _name in ("O_CLOEXEC", "O_NOFOLLOW", "O_NONBLOCK"):
-    _FLAGS |= getattr(os, _name, 0)
+from slatprep.storage.files import OWN_FILE, is_at, locks_alone
 
 _TRIES = 100
 """How often a lock is looked for again that its holder has just removed."""
@@ -41,28 +37,24 @@ def take_lock(path: Path, taken: str) -> int:
     OSError
         If it cannot be written, or is a link.
     """
-    try:
-        import fcntl
-    except ImportError:  # On Windows, where `--help` and reading must work all the same.
+    if sys.platform == "win32":
         raise StoreError(
             f"{path}: cannot be locked, as Windows has no flock; expected Linux or macOS "
             "(on Windows, the Linux subsystem WSL)"
-        ) from None
+        )
     for _ in range(_TRIES):
         path.parent.mkdir(parents=True, exist_ok=True)
         try:
-            descriptor = os.open(path, _FLAGS, 0o666)
+            descriptor = os.open(path, os.O_RDWR | OWN_FILE, 0o666)
         except FileNotFoundError:
             continue  # The holder before us has just removed its folder.
         with ExitStack() as unless_held:
             unless_held.callback(os.close, descriptor)
-            try:
-                fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except BlockingIOError:
+            if not locks_alone(descriptor):
                 who = _holder(descriptor) or "which has only just begun"
                 raise StoreError(
                     f"{taken} ({who}); wait until it has ended, or choose another path"
-                ) from None
+                )
             if not is_at(descriptor, path):
                 continue  # What we locked has been removed; lock what is there now.
             _sign(descriptor, path)
