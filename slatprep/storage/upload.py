@@ -257,9 +257,9 @@ def upload_store(new: Path, before: PublishedState, staged: Staged | None = None
     upload = Upload(before, pointer)
     try:
         there = list_objects(upload.version)
-        missing = [name for name in files if not _is_same(there.get(name), new / name)]
-        small = [name for name in missing if files[name] <= _SMALL_BYTES]
-        large = [name for name in missing if files[name] > _SMALL_BYTES]
+        missing = {name for name in files if not _is_same(there.get(name), new / name)}
+        small = [name for name in sorted(missing) if files[name] <= _SMALL_BYTES]
+        large = [name for name in sorted(missing) if files[name] > _SMALL_BYTES]
         put_objects(new, upload.version, small)
         put_objects(new, upload.version, large, at_once=1)
         if staged is not None and staged.before is not None:
@@ -269,7 +269,7 @@ def upload_store(new: Path, before: PublishedState, staged: Staged | None = None
         there = list_objects(upload.version)
         for name, size in sizes.items():
             arrived = there.get(name, {}).get("size") == size
-            if arrived and name in files and _is_tagged_otherwise(there[name], new / name):
+            if arrived and name in missing and _is_tagged_otherwise(there[name], new / name):
                 arrived = file_digest(upload.version / name) == digests[name]
             if not arrived:
                 raise StoreError(
