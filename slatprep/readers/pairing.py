@@ -239,21 +239,29 @@ def _pairs(rows: list[_Row], there: _Found) -> Iterator[AssetPair]:
 
 def _pair(row: _Row, there: _Found, shared: str) -> AssetPair:
     samples = there.parameters.pixieverse.samples
-    grids = sorted(there.grids.get(row.object_id, ()), key=_order_of)
-    if row.sample is not None:
-        grids = [grid for grid in grids if grid.sample == row.sample]
+    annotations = _annotations(row.object_id, there)
+    if samples == "merge" and annotations:
+        first, *others = [
+            _pair_of(row, source, shared, grids)
+            for source in (there, *there.also)
+            for grids in _annotations(row.object_id, source)
+        ]
+        return replace(first, others=tuple(others))
     if samples == "first":
-        grids = [grid for grid in grids if grid.sample == grids[0].sample]
-    if samples != "merge" or not grids:
-        return _pair_of(row, there, shared, grids)
-    first, *others = [
-        _pair_of(row, source, shared, list(group))
-        for source in (there, *there.also)
-        for _, group in groupby(
-            sorted(source.grids.get(row.object_id, ()), key=_order_of), key=lambda one: one.sample
-        )
+        annotations = annotations[:1]
+    grids = [
+        grid
+        for sample in annotations
+        for grid in sample
+        if row.sample is None or grid.sample == row.sample
     ]
-    return replace(first, others=tuple(others))
+    return _pair_of(row, there, shared, grids)
+
+
+def _annotations(object_id: str, there: _Found) -> list[list[FoundField]]:
+    """Return the grids of an object, by sample; two of one sample are one too many."""
+    grids = sorted(there.grids.get(object_id, ()), key=_order_of)
+    return [list(group) for _, group in groupby(grids, key=lambda grid: grid.sample)]
 
 
 def _label(number: int, sample: str) -> str:
