@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
@@ -60,6 +61,43 @@ def process_several(
     if len(sources) > MAX_SOURCES:
         what = f"has {len(pair.annotations):,} annotations in {len(sources):,} files to be merged"
         raise InputError(f"asset {pair.asset_id!r}", what, f"at most {MAX_SOURCES} files")
+    latents, annotated, faults = _annotations(pair, parameters, known, sources, digests)
+    contents = pair.roots.contents
+    good = [one for one in annotated if one.judgement.verdict is not Verdict.FAILED] or annotated
+    lacks = {one.pair.sample: lacking(one.field, contents) for one in good}
+    first = next((one for one in good if not lacks[one.pair.sample]), None)
+    if first is None:
+        raise _incomplete(pair, lacks, faults)
+    good = [first, *(one for one in good if one is not first)]
+    parts = [in_table(one.annotation, one.field, contents) for one in good]
+    annotation = merge(parts, contents.properties)
+    told = {one.pair.sample: one for one in annotated}
+    contributions = tuple(
+        _contribution(one, told.get(one.sample), faults.get(one.sample), good, sources)
+        for one in pair.annotations
+    )
+    return Finished(
+        pair,
+        replace(first.field, warnings=_warnings(good, lacks, contributions)),
+        latents,
+        first.alignment,
+        annotation,
+        merged(first.judgement, annotation),
+        contributions,
+        sources,
+        digests,
+        tuple(one.field for one in good[1:]),
+    )
+
+
+def _annotations(
+    pair: AssetPair,
+    parameters: BuildParameters,
+    known: tuple[Contribution, ...],
+    sources: tuple[SourceFile, ...],
+    digests: Mapping[str, str],
+) -> tuple[StructuredLatents, list[Annotated], dict[str, InputError]]:
+    """Return the latents, each annotation that can be used, and why the others cannot."""
     before = {one.sample: one for one in known}
     latents: StructuredLatents | None = None
     annotated: list[Annotated] = []
@@ -83,44 +121,31 @@ def process_several(
         annotated.append(annotate(one, field, latents, parameters, alignment, judgement))
     if latents is None:
         raise _refused(pair, faults)
-    good = [one for one in annotated if one.judgement.verdict is not Verdict.FAILED] or annotated
-    contents = pair.roots.contents
-    lacks = {one.pair.sample: lacking(one.field, contents) for one in good}
-    whole = [one for one in good if not lacks[one.pair.sample]]
-    if not whole:
-        what = "; ".join(
-            f"sample {sample} has no {', '.join(names)}" for sample, names in lacks.items()
-        )
-        what += "".join(f"; sample {sample}: {error}" for sample, error in faults.items())
-        raise InputError(
-            f"asset {pair.asset_id!r}",
-            f"no annotation with all that the store holds can be used ({what})",
-            "one that can be, to which others add",
-        )
-    first = whole[0]
-    good = [first, *(one for one in good if one is not first)]
-    parts = [in_table(one.annotation, one.field, contents) for one in good]
-    annotation = merge(parts, contents.properties)
-    told = {one.pair.sample: one for one in annotated}
-    contributions = tuple(
-        _contribution(one, told.get(one.sample), faults.get(one.sample), good, sources)
-        for one in pair.annotations
-    )
-    warnings = [f"sample {one.pair.sample}: {text}" for one in good for text in one.field.warnings]
-    warnings += [f"sample {k} has no {', '.join(names)}" for k, names in lacks.items() if names]
+    return latents, annotated, faults
+
+
+def _warnings(
+    good: list[Annotated],
+    lacks: Mapping[str, tuple[str, ...]],
+    contributions: tuple[Contribution, ...],
+) -> tuple[str, ...]:
     left_out = ((one.sample, one.left_out) for one in contributions if one.left_out)
-    warnings += [f"sample {sample} is left out: {why}" for sample, why in left_out]
-    return Finished(
-        pair,
-        replace(first.field, warnings=tuple(warnings)),
-        latents,
-        first.alignment,
-        annotation,
-        merged(first.judgement, annotation),
-        contributions,
-        sources,
-        digests,
-        tuple(one.field for one in good[1:]),
+    return (
+        *(f"sample {one.pair.sample}: {text}" for one in good for text in one.field.warnings),
+        *(f"sample {sample} has no {', '.join(names)}" for sample, names in lacks.items() if names),
+        *(f"sample {sample} is left out: {why}" for sample, why in left_out),
+    )
+
+
+def _incomplete(
+    pair: AssetPair, lacks: Mapping[str, tuple[str, ...]], faults: Mapping[str, InputError]
+) -> InputError:
+    reasons = [f"sample {sample} has no {', '.join(names)}" for sample, names in lacks.items()]
+    reasons += [f"sample {sample}: {error}" for sample, error in faults.items()]
+    return InputError(
+        f"asset {pair.asset_id!r}",
+        f"no annotation with all that the store holds can be used ({'; '.join(reasons)})",
+        "one that can be, to which others add",
     )
 
 
