@@ -126,22 +126,6 @@ def evaluate(
         draw_comparison(measures, SPREADS[spread], picture)
         output.note(f"picture: {picture}")
 
-    def show() -> None:
-        output.table(
-            "Mean squared error in normalised space, class accuracy "
-            f"(± {SPREADS[spread]} over n objects)",
-            (what, "n", *next(iter(measures.values())).means),
-            _in_short(measures),
-        )
-        if TABLES.keys() & others:
-            output.note(
-                "note: those beside were measured on PixieVerse's test objects; they compare only "
-                "with predictions of the same objects, normalised by Pixie's ranges (--ranges "
-                "pixie)"
-            )
-        for name, scores in others.items():
-            _show_beside(output, ours, scores, name)
-
     for problem in problems[:_LISTED]:
         output.problem(problem)
     if len(problems) > _LISTED:
@@ -149,7 +133,35 @@ def evaluate(
     document = vars(result) | {"store": store}
     if beside:
         document["beside"] = [score for scores in others.values() for score in scores]
-    output.result(document, show, complete=not problems)
+    output.result(
+        document,
+        lambda: _show(output, SPREADS[spread], what, measures, ours, others),
+        complete=not problems,
+    )
+
+
+def _show(
+    output: Output,
+    spread: str,
+    what: str,
+    measures: Mapping[str, Measure],
+    ours: Mapping[str, Measure],
+    others: Mapping[str, tuple[PublishedScore, ...]],
+) -> None:
+    from slatprep.learn.published import TABLES
+
+    output.table(
+        f"Mean squared error in normalised space, class accuracy (± {spread} over n objects)",
+        (what, "n", *next(iter(measures.values())).means),
+        _in_short(measures),
+    )
+    if TABLES.keys() & others:
+        output.note(
+            "note: those beside were measured on PixieVerse's test objects; they compare only "
+            "with predictions of the same objects, normalised by Pixie's ranges (--ranges pixie)"
+        )
+    for name, scores in others.items():
+        _show_beside(output, ours, scores, name)
 
 
 def _selection(
