@@ -330,12 +330,7 @@ class _Pair:
     def _deformed(self, pose: Pose, rough: bool) -> tuple[Pose, Deformed]:
         best, model = self._simplest(pose, rough)
         found = deform_if_earned(self.slat, self.pixie, best.similarity, model, self.parameters)
-        nearer = found.pose
-        best = replace(
-            best, rotation=nearer.rotation, shift=nearer.shift, scale=nearer.scale,
-            offset=nearer.offset,
-        )  # fmt: skip
-        return best, found
+        return replace(best, **vars(found.pose)), found
 
     def _simplest(self, pose: Pose, rough: bool) -> tuple[Pose, Model]:
         """Return the pose with its scale set to one where that fits as well, and the model."""

@@ -182,7 +182,8 @@ class Store(AssetTable):
         start, stop = self.rows(index)
         if storage_of(self.path).local is not None:
             return {name: self._voxel_rows(name, index, start, stop) for name in columns}
-        # Each array is an object of its own, and an answer takes long to come.
+        # Each array is an object of its own, and an answer takes long to come. Threads that were
+        # kept for the next call would not be there in a forked process.
         with ThreadPoolExecutor(max(len(columns), 1)) as pool:
             read = pool.map(lambda name: self._voxel_rows(name, index, start, stop), columns)
             return dict(zip(columns, read, strict=True))

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
-from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -50,7 +49,7 @@ def page_content(
     chosen: Sequence[int],
     side: int,
     created: str | None,
-    agreement: Agreement = MappingProxyType({}),
+    agreement: Agreement,
 ) -> dict[str, Any]:
     """Return the content of a page.
 
