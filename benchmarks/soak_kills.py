@@ -29,6 +29,7 @@ import subprocess
 import sys
 import tempfile
 import time
+import traceback
 from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, nullcontext, suppress
@@ -60,6 +61,9 @@ PHASES = {
 """Steps of a build by phase, as `slatprep.storage.faults` names them."""
 
 STATES = 4
+SAID = "said"
+"""File with what the last build printed as an error."""
+
 ENDED = "ended before its kill, so not counted"
 CLUSTER = """
 import sys
@@ -143,7 +147,8 @@ def soak(folder: Path, given: argparse.Namespace, scheduler: str) -> dict[str, o
             outcome, code = aimed_build(start, chance, given, folder / "aims")
         else:
             outcome, code = killed_build(begun(sources[state], out, scheduler), chance, whole)
-        assert code == 0 or outcome != ENDED, f"build {turn}, that nobody killed, failed"
+        told_by_it = (out.parent / SAID).read_text()
+        assert code == 0 or outcome != ENDED, f"build {turn}, that nobody killed: {told_by_it}"
         after = fingerprint(tree(out))
         wanted = (allowed[state],) if code == 0 else (before, allowed[state])
         assert after in wanted, f"kill {turn} ({outcome}): a store that nobody built"
@@ -223,7 +228,7 @@ def begun(sources: Path, out: Path, scheduler: str = "", faults: str = "") -> Ru
 
 def _build_apart(sources: Path, out: Path, scheduler: str, faults: str) -> None:
     os.setpgid(0, 0)
-    os.dup2(os.open(os.devnull, os.O_WRONLY), 2)
+    os.dup2(os.open(out.parent / SAID, os.O_WRONLY | os.O_CREAT | os.O_TRUNC), 2)
     set_start_method("fork")
     if faults:
         os.environ[VARIABLE] = faults
@@ -233,6 +238,9 @@ def _build_apart(sources: Path, out: Path, scheduler: str, faults: str) -> None:
         with Cluster(scheduler) if scheduler else nullcontext(2) as jobs:
             build(sources, out, jobs)
         code = 0
+    except Exception:
+        traceback.print_exc()
+        sys.stderr.flush()
     finally:
         os._exit(code)  # Else it would wait for workers that are idle; they see that it is gone.
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import uuid
 from collections.abc import Callable
 from functools import cached_property, lru_cache
 
@@ -36,8 +37,7 @@ class PreviousBuild:
     path : Place
         The store.
     build_id : str
-        Id of its build: a process that lives on must not answer with what it
-        read of an older store at the same path.
+        Id of its build.
     damaged : frozenset of str
         Files of records that are not as they were written.
     """
@@ -46,9 +46,12 @@ class PreviousBuild:
         self.path = path
         self.build_id = build_id
         self.damaged = damaged
+        # A process that lives on must not answer with what it read of an older store at the same
+        # path, whose rows may have been in another order under the same id.
+        self._run = uuid.uuid4().hex
 
     def __reduce__(self) -> tuple[Callable[..., PreviousBuild], tuple[object, ...]]:
-        return _in_this_process, (self.path, self.build_id, self.damaged)
+        return _in_this_process, (self.path, self.build_id, self.damaged, self._run)
 
     @cached_property
     def store(self) -> Store:
@@ -125,7 +128,9 @@ class PreviousBuild:
 
 
 @lru_cache(maxsize=1)
-def _in_this_process(path: Place, build_id: str, damaged: frozenset[str]) -> PreviousBuild:
+def _in_this_process(
+    path: Place, build_id: str, damaged: frozenset[str], run: str
+) -> PreviousBuild:
     return PreviousBuild(path, build_id, damaged)
 
 

@@ -292,9 +292,10 @@ def _hash_shared(path: Place, root: Place) -> SourceFile:
     file, name = storage_of(root).locate(path)
     copy = storage_of(file).on_disk()
     state = copy.stat()
-    return SourceFile("slat", name, state.st_size, _sha256(copy, state.st_size, state.st_mtime_ns))
+    known = state.st_size, state.st_mtime_ns, state.st_ctime_ns, state.st_ino
+    return SourceFile("slat", name, state.st_size, _sha256(copy, known))
 
 
 @lru_cache(maxsize=64)
-def _sha256(path: Path, size: int, mtime_ns: int) -> str:
+def _sha256(path: Path, known: tuple[int, ...]) -> str:
     return file_digest(path)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import pickle
 import random
 import shutil
 from collections.abc import Callable
@@ -20,6 +21,7 @@ from slatprep.inspect.verify import verify_store
 from slatprep.parameters import BuildParameters
 from slatprep.pipeline import carry, seen
 from slatprep.pipeline.dataset import build_store, plan_build
+from slatprep.pipeline.previous import previous_build
 from slatprep.store import open_store
 from slatprep.store.unmoved import Unmoved
 
@@ -411,3 +413,21 @@ def test_rows_of_chunks_that_are_the_same() -> None:
             ends = [min(start + chunk, length) for length in (old, new)]
             expected = ends[0] == ends[1] and all(same[start : ends[1]])
             assert rows.holds(start, start + chunk) is expected, (runs, old, new, start, chunk)
+
+
+def test_a_worker_that_lives_on_reads_the_store_of_today(built: tuple[Dataset, Path]) -> None:
+    """A cluster's workers outlive builds, and rows in another order have the same build id."""
+    dataset, out = built
+    dataset.add("b", seed=5)
+    build_store(dataset.parameters(), out)
+
+    def in_the_worker() -> list[str]:
+        there = previous_build(out, 1)[0]
+        worker = pickle.loads(pickle.dumps(there))
+        ids = worker.store.ids
+        assert [worker.store.asset(one).asset_id for one in ids] == list(ids)
+        return list(ids)
+
+    assert in_the_worker() == ["a", "c", "e", "g", "b"]
+    build_store(dataset.parameters(), out, compact=True)
+    assert in_the_worker() == ["a", "b", "c", "e", "g"]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import os
 from dataclasses import replace
 
 import h5py
@@ -108,6 +109,16 @@ def test_shared_file_is_hashed_again_when_it_changed(make_pair):
     hdf5_pair(pair, "b", coords=COORDS, feats=FEATS)
     after = read_latents(pair).sources[0].sha256
     assert before != after == hashlib.sha256(pair.slat.read_bytes()).hexdigest()
+
+
+def test_shared_file_is_hashed_again_when_it_changed_in_the_same_tick(make_pair):
+    pair = hdf5_pair(make_pair(), "a", coords=COORDS, feats=FEATS)
+    before, state = read_latents(pair).sources[0].sha256, pair.slat.stat()
+    with h5py.File(pair.slat, "r+") as file:
+        file["a/feats"][0, 0] += 1
+    os.utime(pair.slat, ns=(state.st_atime_ns, state.st_mtime_ns))
+    assert pair.slat.stat().st_size == state.st_size
+    assert read_latents(pair).sources[0].sha256 != before
 
 
 def _set(array, index, value):
