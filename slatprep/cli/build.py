@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any
 from slatprep.cli.info import show_quality
 from slatprep.cli.options import (
     NEW_FILE,
-    NEW_FOLDER,
     PLACE,
+    RECORDS_FOLDER,
     command,
     option,
     parameters_of,
@@ -33,7 +33,7 @@ DAMAGES_LISTED = 10
 @command("build-store")
 @source_options
 @option("--out", PLACE, required=True, metavar="STORE.zarr")
-@option("--manifests", NEW_FOLDER)
+@option("--manifests", RECORDS_FOLDER)
 @option("--strict", is_flag=True)
 @option("--consensus", is_flag=True)
 @option("--witness", is_flag=True)

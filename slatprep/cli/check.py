@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from slatprep.cli.options import (
+    NEW_PATH,
     POSITIVE,
     beside,
     chosen_store,
@@ -42,7 +43,7 @@ _COLUMNS = {
 @option("--worst", POSITIVE)
 @option("--ambiguous", is_flag=True)
 @store_option
-@option("--picture", metavar="PATH|none")
+@option("--picture", NEW_PATH, metavar="PATH|none")
 @option("--show", is_flag=True)
 @jobs_option
 def check_alignment(
@@ -51,7 +52,7 @@ def check_alignment(
     worst: int | None,
     ambiguous: bool,
     store: Place | None,
-    picture: str | None,
+    picture: Path | None,
     show: bool,
     jobs: int,
 ) -> None:
@@ -118,17 +119,16 @@ def check_alignment(
     output.result(document, print_all, complete=all(one.ok for one in checks))
 
 
-def _target(store: Place, picture: str | None, assets: int) -> Path | None:
-    if picture == "none":
-        return None
+def _target(store: Place, picture: Path | None, assets: int) -> Path | None:
     if picture is None:
         return beside(store, ".pictures")
+    if picture == Path("none"):
+        return None
     from slatprep.inspect.pictures.canvas import FORMATS
 
-    target = Path(picture)
-    if assets > 1 and target.suffix.lower()[1:] in FORMATS:
-        raise click.UsageError(f"--picture {target} is one file; {assets} assets need a folder")
-    return target
+    if assets > 1 and picture.suffix.lower()[1:] in FORMATS:
+        raise click.UsageError(f"--picture {picture} is one file; {assets} assets need a folder")
+    return picture
 
 
 def _print(output: Output, checks: list[AlignmentCheck]) -> None:

@@ -9,6 +9,7 @@ import click
 
 from slatprep.cli.options import (
     EXISTING_FOLDER,
+    NEW_PATH,
     POSITIVE,
     ChoiceOf,
     command,
@@ -34,7 +35,7 @@ _ONLY_FOR = {"points": "ply", "frame": "ply", "shard_size": "webdataset", "laten
 @command()
 @click.argument("store", type=EXISTING_FOLDER)
 @option("--format", ChoiceOf("slatprep.export:FORMATS"), name="kind", required=True)
-@option("--out", click.Path(path_type=Path), required=True, metavar="PATH")
+@option("--out", NEW_PATH, required=True, metavar="PATH")
 @option("--asset", name="assets", multiple=True, metavar="ID", shell_complete=complete_asset)
 @verdicts_option
 @option("--split", ChoiceOf("slatprep.readers.splits:SPLITS", "all"), "all")

@@ -10,8 +10,8 @@ import click
 from slatprep.cli.build import report
 from slatprep.cli.options import (
     EXISTING_FOLDER,
-    NEW_FOLDER,
     PLACE,
+    RECORDS_FOLDER,
     ChoiceOf,
     command,
     complete_asset,
@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 @option("--asset", name="assets", multiple=True, metavar="ID", shell_complete=complete_asset)
 @option("--verdict", ChoiceOf("slatprep.records:Verdict"), name="verdicts", multiple=True)
 @option("--category", name="categories", multiple=True)
-@option("--manifests", NEW_FOLDER)
+@option("--manifests", RECORDS_FOLDER)
 def subset(
     output: Output,
     store: Place,
@@ -77,7 +77,7 @@ def subset(
 @command()
 @click.argument("stores", type=EXISTING_FOLDER, nargs=-1, required=True)
 @option("--out", PLACE, required=True, metavar="STORE.zarr")
-@option("--manifests", NEW_FOLDER)
+@option("--manifests", RECORDS_FOLDER)
 def concat(output: Output, stores: tuple[Place, ...], out: Place, manifests: Path | None) -> None:
     """Make one store of the assets of all STORES, without aligning them again.
 
@@ -104,7 +104,7 @@ def concat(output: Output, stores: tuple[Place, ...], out: Place, manifests: Pat
 @command()
 @click.argument("store", type=EXISTING_FOLDER)
 @option("--out", PLACE, metavar="STORE.zarr")
-@option("--manifests", NEW_FOLDER)
+@option("--manifests", RECORDS_FOLDER)
 def upgrade(output: Output, store: Place, out: Place | None, manifests: Path | None) -> None:
     """Convert a STORE of an older format to today's, without aligning again.
 

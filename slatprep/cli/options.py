@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any, TypeVar, get_args
 import click
 
 from slatprep.cli.output import OUTPUT_OPTIONS, Output, with_output
+from slatprep.cli.targets import NewPath
 from slatprep.storage.place import place_of, storage_of
 
 if TYPE_CHECKING:
@@ -37,8 +38,11 @@ _OPTION = re.compile(r"^(--[\w-]+): (.*(?:\n .*)*)", re.M)
 POSITIVE = click.IntRange(min=1)
 FILE = click.Path(path_type=Path, exists=True, dir_okay=False)
 FOLDER = click.Path(path_type=Path, exists=True, file_okay=False)
-NEW_FILE = click.Path(path_type=Path, dir_okay=False)
-NEW_FOLDER = click.Path(path_type=Path, file_okay=False)
+NEW_PATH = NewPath(path_type=Path)
+NEW_FILE = NewPath(path_type=Path, dir_okay=False)
+NEW_FOLDER = NewPath(path_type=Path, file_okay=False)
+RECORDS_FOLDER = click.Path(path_type=Path, file_okay=False)
+"""Of a build, which looks itself at what lies there."""
 
 
 class PlaceType(click.Path):

@@ -22,6 +22,7 @@ from typing import Any, TypeVar
 
 import click
 
+from slatprep.cli.targets import require_apart
 from slatprep.errors import SlatprepError, in_unicode
 from slatprep.storage.place import is_place, place_of, storage_of
 from slatprep.workers import Progress
@@ -209,9 +210,11 @@ def with_output(command: _Command) -> _Command:
     def run(*, as_json: bool, quiet: bool, verbose: bool, **options: Any) -> object:
         given = {name: _local(value) for name, value in options.items()}
         # Without the program: "info", "bench align".
-        name = click.get_current_context().command_path.partition(" ")[2]
+        context = click.get_current_context()
+        name = context.command_path.partition(" ")[2]
         output = Output(as_json, int(verbose) - int(quiet), name)
         with output.failing():
+            require_apart(context.command, given)
             return command(output, **given)
 
     return run  # type: ignore[return-value]

@@ -18,8 +18,9 @@ from slatprep.export import target
 from slatprep.export.assets import Exported, choose_ids, describe_columns
 from slatprep.export.formats import ExportOptions, Writer
 from slatprep.records import USABLE, Place
-from slatprep.storage.place import place_of, storage_of
+from slatprep.storage.place import place_of
 from slatprep.store import Store, open_store
+from slatprep.store.reader import require_outside
 from slatprep.workers.local import run_unordered
 
 __all__ = ["FORMATS", "ExportOptions", "ExportSummary", "export_store"]
@@ -100,7 +101,7 @@ def export_store(
     Raises
     ------
     ConfigError
-        If no asset is left, an id is unknown, or `out` lies in the store or holds something
+        If no asset is left, an id is unknown, or `out` lies in a store or holds something
         that is not an export.
     StoreError
         If the store cannot be read.
@@ -110,9 +111,7 @@ def export_store(
         raise ConfigError(f"format is {format!r}; expected one of {', '.join(FORMATS)}")
     options, store, out = options or ExportOptions(), place_of(store), Path(out)
     opened = open_store(store)
-    local = storage_of(store).local
-    if local is not None and local.resolve() in out.resolve().parents:
-        raise ConfigError(f"{out} lies inside the store; expected a path outside {store}")
+    require_outside(out)
     if verdicts is None:
         verdicts = () if assets else USABLE
     ids = choose_ids(opened, assets, verdicts)

@@ -16,6 +16,7 @@ from slatprep.storage.files import file_digest, local_files
 from slatprep.storage.place import place_of, storage_of
 from slatprep.store import Store, open_store
 from slatprep.store.integrity import file_findings
+from slatprep.store.reader import require_outside
 
 Data = Literal["store", "webdataset"]
 
@@ -72,7 +73,7 @@ def publish_store(
     Raises
     ------
     ConfigError
-        If the store is not on a local disk, or `out` lies in it or holds something that
+        If the store is not on a local disk, or `out` lies in one or holds something that
         `publish_store` did not write.
     StoreError
         If the store cannot be read, or a file that is to be copied is not what it was when the
@@ -82,8 +83,7 @@ def publish_store(
     local = storage_of(place).local
     if local is None:
         raise ConfigError(f"{place} is on no local disk; copy it there to publish it")
-    if local.resolve() in (out.resolve(), *out.resolve().parents):
-        raise ConfigError(f"{out} lies inside the store; expected a path outside {place}")
+    require_outside(out)
     opened = open_store(place)
     assets = len(opened)
     chosen: Sequence[str] = ()

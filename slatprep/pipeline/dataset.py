@@ -19,7 +19,7 @@ from slatprep.pipeline.finish import Crew, Note, Progress, finish
 from slatprep.pipeline.pack import latent_warnings
 from slatprep.pipeline.plan import Action, BuildPlan, PlannedAsset, plan_assets
 from slatprep.pipeline.previous import store_there
-from slatprep.pipeline.publish import Destination, publish_manifests
+from slatprep.pipeline.publish import Destination, publish_manifests, require_records_file
 from slatprep.pipeline.ranges import check_objects
 from slatprep.pipeline.recipe import recipe_of
 from slatprep.pipeline.rows import Rows, settle_rows
@@ -205,8 +205,11 @@ def align_pairs(
     ------
     InputError
         With `strict`, for the first asset that cannot be used.
+    ConfigError
+        If `out` lies in a store, or is a file of something else than records.
     """
     begin = time.perf_counter()
+    require_records_file(Path(out))
     out, crew = Path(out), Crew(jobs, assets_per_job, progress, note)
     with work_beside(out.absolute(), arrays=False) as work:
         context = BuildContext(parameters, recipe_of(parameters), work.spool, None, strict)

@@ -14,9 +14,10 @@ from collections.abc import Iterable, Iterator
 from datetime import UTC, datetime
 from pathlib import Path
 
-from slatprep.errors import StoreError, in_unicode
+from slatprep.errors import ConfigError, StoreError, in_unicode
 from slatprep.parameters import BuildParameters
 from slatprep.pipeline.summary import BuildSummary
+from slatprep.provenance.files import build_in
 from slatprep.provenance.make import build_versions
 from slatprep.provenance.places import manifests_of
 from slatprep.provenance.record import (
@@ -31,7 +32,7 @@ from slatprep.storage.atomic import replace_directory
 from slatprep.storage.faults import reached
 from slatprep.storage.place import place_of, storage_of
 from slatprep.storage.upload import PublishedState, Staged, Upload, published_state, upload_store
-from slatprep.store.reader import is_store
+from slatprep.store.reader import is_store, require_outside
 from slatprep.store.records import RecordWriter
 from slatprep.store.writer import open_for_writing
 
@@ -59,8 +60,10 @@ class Destination:
     Raises
     ------
     StoreError
-        If there is something other than a store, or the folder of records lies in
-        it or holds files of other origin.
+        If there is something other than a store, or the folder of records holds
+        files of other origin or the records of another store.
+    ConfigError
+        If the folder of records lies in another store.
     """
 
     def __init__(self, out: str | Place, manifests: str | Place | None = None) -> None:
@@ -74,6 +77,8 @@ class Destination:
         self.store: Place = self.out if path is None else _replaceable(path)
         if self._manifests is not None:
             _require_records(self._manifests, storage_of(self.store).local)
+        if path is not None:
+            _require_own(self._manifests or path.parent / manifests_of(path).name, path)
         self._before: PublishedState | None = None
         self._upload: Upload | None = None
 
@@ -134,6 +139,7 @@ def _require_records(folder: Path, store: Path | None) -> None:
     """Raise unless nothing but records of builds would be overwritten in a folder."""
     if store is not None and folder.resolve().is_relative_to(store):
         raise StoreError(f"{folder}: lies in the store; expected a folder outside of it")
+    require_outside(folder)
     there = [name for name in _MARKS if os.path.lexists(folder / name)]
     # Where one file is damaged, the other identifies the folder.
     if there and not any(_is_marked(folder / name, _MARKS[name]) for name in there):
@@ -141,6 +147,34 @@ def _require_records(folder: Path, store: Path | None) -> None:
             f"{folder}: holds a {there[0]} that is not slatprep's; expected the records of a "
             "build, or another folder"
         )
+
+
+def require_records_file(file: Path) -> None:
+    """Raise ConfigError if a file to write lies in a store, or holds what is no record."""
+    require_outside(file)
+    if os.path.lexists(file) and not _is_marked(file, _MARKS["assets.jsonl"]):
+        raise ConfigError(
+            f"{file} exists and holds no records of slatprep; expected such records to replace, "
+            "or a new path"
+        )
+
+
+def _require_own(folder: Path, store: Path) -> None:
+    """Raise if a folder holds the records of another store, which is still there.
+
+    ``demo`` and ``demo.zarr`` have one folder, by default.
+    """
+    try:
+        name = build_in(folder).store
+        others = store.with_name(name), folder.with_name(name)
+    except (StoreError, ValueError):
+        return  # None, or damaged ones, which are written anew.
+    for other in others:
+        if name != store.name and is_store(other) and other.resolve() != store.resolve():
+            raise StoreError(
+                f"{folder}: holds the records of {other}; expected --manifests FOLDER, or another "
+                f"name for {store}"
+            )
 
 
 def _is_marked(file: Path, mark: bytes) -> bool:

@@ -6,12 +6,13 @@ from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cached_property
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from slatprep.errors import StoreError
+from slatprep.errors import ConfigError, StoreError
 from slatprep.geometry.frames import places_of
 from slatprep.geometry.voxels import voxels_of
 from slatprep.normalize import denormalize_properties
@@ -293,6 +294,26 @@ def is_store(path: Place) -> bool:
     """Whether a slatprep store of any format version lies at a place itself."""
     document = _root_document(path)
     return bool(document.get("attributes", {}).get("format") == FORMAT)
+
+
+def require_outside(out: Path) -> None:
+    """Raise unless a path that something is to be written to lies outside of every store.
+
+    Raises
+    ------
+    ConfigError
+        If it is a store, lies inside one, or cannot be looked at.
+    """
+    try:
+        target = out.resolve()
+        around = next((path for path in (target, *target.parents) if is_store(path)), None)
+    except (OSError, RuntimeError) as error:  # loops of links
+        raise ConfigError(
+            f"{out}: cannot be looked at ({error}); expected a path that may be written"
+        ) from None
+    if around is not None:
+        where = f"lies inside the store {around}" if around != target else "is a store"
+        raise ConfigError(f"{out} {where}; expected a path outside of any store")
 
 
 def _require_there(path: Place) -> None:

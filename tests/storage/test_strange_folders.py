@@ -14,6 +14,7 @@ from support.synthetic import Dataset
 
 from slatprep.errors import StoreError
 from slatprep.pipeline.dataset import build_store
+from slatprep.pipeline.join import subset_store
 from slatprep.pipeline.work import work_beside
 from slatprep.storage.atomic import staged, writing
 from slatprep.storage.lock import take_lock
@@ -228,3 +229,33 @@ def test_a_folder_for_records_within_the_store_is_refused(
     out = tmp_path / "s.zarr"
     with pytest.raises(StoreError, match="lies in the store"):
         build_store(undisturbed[0].parameters(), out, manifests=out / "records")
+
+
+def test_two_stores_in_a_folder_do_not_share_records(
+    undisturbed: tuple[Dataset, Path], tmp_path: Path
+) -> None:
+    """``demo`` and ``demo.zarr`` both have ``demo.manifests`` by default."""
+    parameters = undisturbed[0].parameters()
+    first, second = tmp_path / "demo.zarr", tmp_path / "demo"
+    build_store(parameters, first)
+    records = (tmp_path / "demo.manifests" / "build.json").read_bytes()
+    told = r"demo\.manifests: holds the records of .*demo\.zarr; expected --manifests FOLDER"
+    for named in (None, tmp_path / "demo.manifests"):
+        with pytest.raises(StoreError, match=told):
+            build_store(parameters, second, manifests=named)
+    with pytest.raises(StoreError, match=told):
+        subset_store(first, second, ["a"])
+    assert not second.exists()
+    assert (tmp_path / "demo.manifests" / "build.json").read_bytes() == records
+    build_store(parameters, second, manifests=tmp_path / "other")
+    build_store(parameters, first)
+
+
+def test_records_of_a_store_that_was_renamed_with_them_stay_its_own(
+    undisturbed: tuple[Dataset, Path], tmp_path: Path
+) -> None:
+    build_store(undisturbed[0].parameters(), tmp_path / "demo.zarr")
+    for suffix in ("zarr", "manifests"):
+        (tmp_path / f"demo.{suffix}").rename(tmp_path / f"new.{suffix}")
+    build_store(undisturbed[0].parameters("pixie"), tmp_path / "new.zarr")
+    assert b'"new.zarr"' in (tmp_path / "new.manifests" / "build.json").read_bytes()

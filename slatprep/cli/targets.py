@@ -1,0 +1,76 @@
+"""Where commands write: never into a store, nor over what they read."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import click
+
+from slatprep.storage.place import is_place, storage_of
+
+
+class NewPath(click.Path):
+    """A path of the local disk that a command writes, which `require_apart` looks at."""
+
+
+def require_apart(command: click.Command, given: Mapping[str, Any]) -> None:
+    """Refuse a file or folder to write that is, or lies in, a store or what a command reads.
+
+    Parameters
+    ----------
+    command : click.Command
+        The command. What it writes are its parameters of the type `NewPath`.
+    given : mapping of str to object
+        The values of its parameters by name.
+
+    Raises
+    ------
+    ConfigError
+        If a path to write lies inside a store.
+    click.BadParameter
+        If it is one of the inputs, or lies in one, or is a pipe or device.
+    """
+    written = {
+        parameter.name: (parameter, Path(given[parameter.name]))
+        for parameter in command.params
+        if isinstance(parameter.type, NewPath) and given.get(str(parameter.name)) is not None
+    }
+    if not written:
+        return
+    from slatprep.store.reader import require_outside
+
+    read = list(_inputs({name: value for name, value in given.items() if name not in written}))
+    for parameter, out in written.values():
+        require_outside(out)
+        target = out.resolve()
+        if target.exists() and not (target.is_file() or target.is_dir()):
+            raise click.BadParameter(
+                f"{out} is a pipe or device; expected a file or folder", param=parameter
+            )
+        for place in read:
+            if place.resolve() in (target, *target.parents):
+                what = "is" if place.resolve() == target else f"lies in {place},"
+                raise click.BadParameter(
+                    f"{out} {what} what the command reads; expected another path", param=parameter
+                )
+
+
+def _inputs(given: Mapping[str, Any]) -> Iterator[Path]:
+    """Yield files and folders among options, and the records of stores."""
+    from slatprep.provenance.places import manifests_of
+    from slatprep.store.reader import is_store
+
+    for value in given.values():
+        for one in value if isinstance(value, tuple) else (value,):
+            if isinstance(one, str):
+                # A word, or a file: [NAME=]DIR of grids, FILE of ranges or of ids.
+                path = one.rpartition("=")[2]
+                if os.path.isfile(path):  # noqa: PTH113 - a word too long for a name is no error
+                    yield Path(path)
+            elif is_place(one) and (local := storage_of(one).local) is not None:
+                yield local
+                if is_store(local):
+                    yield local.parent / manifests_of(local).name

@@ -1,0 +1,115 @@
+"""No command writes into a store, or over what it reads."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+from click.testing import CliRunner, Result
+from support.synthetic import Dataset
+from support.trees import tree
+
+from slatprep.cli.commands import slatprep
+
+
+@pytest.fixture
+def folder(undisturbed: tuple[Dataset, Path], tmp_path: Path) -> Path:
+    """Sources, a store of them, its records, and predictions."""
+    dataset, store = undisturbed
+    shutil.copytree(dataset.root, tmp_path / "sources")
+    shutil.copytree(store, tmp_path / "s.zarr")
+    shutil.copytree(store.with_name("s.manifests"), tmp_path / "s.manifests")
+    (tmp_path / "predictions").mkdir()
+    (tmp_path / "predictions" / "a.npz").write_bytes(b"")
+    np.save(tmp_path / "p.npy", np.zeros((4, 3)))
+    (tmp_path / "ids.json").write_text("{}")
+    return tmp_path
+
+
+def run(line: str, folder: Path) -> Result:
+    words = (word.replace("@", f"{folder}/") for word in line.split())
+    return CliRunner().invoke(slatprep, list(words))
+
+
+INTO_A_STORE = (
+    "report @s.zarr --out @s.zarr/zarr.json",
+    "report @s.zarr --out @s.zarr/new.html",
+    "describe @s.zarr --out @s.zarr/zarr.json",
+    "stats @s.zarr --csv @s.zarr/zarr.json",
+    "stats @s.zarr --picture @s.zarr/p.png",
+    "check-alignment --asset a --store @s.zarr --picture @s.zarr/a.png",
+    "check-alignment --asset a --store @s.zarr --picture @s.zarr",
+    "evaluate @predictions --store @s.zarr --csv @s.zarr/zarr.json",
+    "export @s.zarr --format hdf5 --out @s.zarr/zarr.json",
+    "export @s.zarr --format npz --out @s.zarr/npz",
+    "publish @s.zarr --out @s.zarr/hub",
+    "publish @s.zarr --out @s.zarr",
+    "train @s.zarr --out @s.zarr",
+    "train @s.zarr --out @s.zarr/run",
+    "predict @s.zarr --checkpoint @p.npy --out @s.zarr/voxel",
+    "decode-slat @s.zarr --out @s.zarr",
+    "extract-slat @p.npy --out @s.zarr/slat",
+    "transfer @p.npy --store @s.zarr --asset a --out @s.zarr/zarr.json",
+    "align --pixieverse @sources/pixieverse --slat @sources/slat --out @s.zarr/zarr.json",
+    "make-demo @s.zarr/demo --assets 1",
+    "subset @s.zarr --asset a --out @n.zarr --manifests @s.zarr/voxel",
+)
+
+OVER_WHAT_IS_READ = (
+    "report @s.zarr --out @s.manifests/build.json",
+    "report @s.zarr --manifests @s.manifests --out @s.manifests/assets.jsonl",
+    "describe @s.zarr --out @s.manifests/build.json",
+    "stats @s.zarr --csv @s.manifests/assets.jsonl",
+    "evaluate @predictions --store @s.zarr --csv @predictions/a.npz",
+    "evaluate --grids A=@ids.json --store @s.zarr --csv @ids.json",
+    "evaluate @predictions --store @s.zarr --split-by @ids.json --csv @ids.json",
+    "transfer @p.npy --store @s.zarr --asset a --out @p.npy",
+    "align --pixieverse @sources/pixieverse --slat @sources/slat --out @sources/slat/a.npz",
+    "predict @sources/slat --checkpoint @p.npy --out @sources/slat",
+    "decode-slat @sources/slat --out @sources/slat",
+    "subset @s.zarr --asset a --out @n.zarr --manifests @s.manifests",
+)
+
+
+@pytest.mark.parametrize("line", [*INTO_A_STORE, *OVER_WHAT_IS_READ])
+def test_refused_in_words_and_nothing_changes(folder: Path, line: str) -> None:
+    before = tree(folder)
+    done = run(line, folder)
+    assert isinstance(done.exception, SystemExit), done.exception
+    assert done.exit_code in (1, 2), done.output
+    words = ("lies inside the store", "is a store", "lies in the store", "the command reads",
+             "holds the records of")  # fmt: skip
+    assert any(one in " ".join(done.stderr.split()) for one in words), done.stderr
+    assert tree(folder) == before
+
+
+def test_a_link_into_a_store_is_no_way_in(folder: Path) -> None:
+    (folder / "link").symlink_to(folder / "s.zarr" / "zarr.json")
+    assert "lies inside the store" in run("report @s.zarr --out @link", folder).stderr
+
+
+def test_sources_of_a_dataset_definition_are_not_overwritten(folder: Path) -> None:
+    definition = folder / "d.toml"
+    definition.write_text(
+        '[pixieverse]\nroot = "sources/pixieverse"\n[slat]\nroot = "sources/slat"\n'
+    )
+    before = tree(folder)
+    for name in ("d.toml", "sources/slat/a.npz", "s.manifests/build.json"):
+        assert run(f"align --config @d.toml --out @{name}", folder).exit_code == 2
+    assert tree(folder) == before
+    assert run("align --config @d.toml --out @new.jsonl", folder).exit_code == 0
+    assert run("align --config @d.toml --out @new.jsonl", folder).exit_code == 0
+
+
+def test_a_device_is_not_replaced(folder: Path) -> None:
+    assert "is a pipe or device" in run("report @s.zarr --out /dev/null", folder).stderr
+    assert Path("/dev/null").is_char_device()
+
+
+def test_results_beside_a_store_and_beside_sources_are_written(folder: Path) -> None:
+    for _ in range(2):
+        assert run("describe @s.zarr --out @s.json", folder).exit_code == 0
+        assert run("stats @s.zarr --csv @sources/s.csv", folder).exit_code == 0
+        assert run("export @s.zarr --format npz --out @sources/npz", folder).exit_code == 0
