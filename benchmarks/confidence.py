@@ -188,7 +188,7 @@ def _row(kind: str, asset: Asset, owner: Asset, alignment: Alignment) -> Row:
     score = compare_with_truth(
         asset_id,
         truth,
-        coords=latents.coords,
+        centres=latents.centres,
         transform=alignment.transform,
         material=annotation.material,
         valid=annotation.valid,
@@ -231,7 +231,7 @@ def _displacement(
         true = truth.places
     else:
         inverse = np.linalg.inv(truth.transform)
-        true = voxel_centres(latents.coords) @ inverse[:3, :3].T + inverse[:3, 3]
+        true = latents.centres @ inverse[:3, :3].T + inverse[:3, 3]
     apart: NDArray[np.float64] = np.linalg.norm(place - true, axis=1) / VOXEL_SIZE
     return apart
 

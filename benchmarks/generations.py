@@ -148,8 +148,8 @@ def _judge(field_of: Pair, latents_of: Pair) -> tuple[bool, float, float, str]:
     found = align(field, latents, AlignParameters())
     annotation = sample(field, map_of(found).places(latents.coords), parameters)
     verdict = judge(field, latents, found, annotation, parameters)[0].verdict
-    best = nearest_similarity(latents_of.places, voxel_centres(latents.coords))
-    gaps = np.linalg.norm(places_of(latents.coords, best) - latents_of.places, axis=1) / VOXEL_SIZE
+    best = nearest_similarity(latents_of.places, latents.centres)
+    gaps = np.linalg.norm(places_of(latents.centres, best) - latents_of.places, axis=1) / VOXEL_SIZE
     turn = degrees_between(split_transform(found.transform)[0], split_transform(best)[0])
     labels = float((annotation.material == latents_of.material)[annotation.valid].mean())
     return turn < WRONG_HEADING, float(np.percentile(gaps, 95)), labels, str(verdict)

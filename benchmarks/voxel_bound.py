@@ -18,6 +18,7 @@ from pathlib import Path
 import numpy as np
 
 from slatprep.demo.latents import NOISE, clean_latents
+from slatprep.geometry.frames import voxel_centres
 from slatprep.learn.dataset import Item, SlatDataset
 from slatprep.normalize import denormalize_properties
 from slatprep.readers.splits import Shares
@@ -58,7 +59,9 @@ def score(item: Item, stuffs: np.ndarray, counts: np.ndarray, normalization) -> 
     si = denormalize_properties(stuffs[:, :3], normalization)
     for k, stuff in enumerate(stuffs):
         same = np.full(len(feats), int(stuff[3]), np.uint8)
-        clean = clean_latents(coords, same, np.broadcast_to(si[k], (len(feats), 3)).copy())
+        clean = clean_latents(
+            voxel_centres(coords), same, np.broadcast_to(si[k], (len(feats), 3)).copy()
+        )
         chances[:, k] = np.log(counts[k]) - np.square(feats - clean).sum(1) / (2 * NOISE**2)
     chances = np.exp(chances - chances.max(axis=1, keepdims=True))
     chances /= chances.sum(axis=1, keepdims=True)

@@ -59,7 +59,9 @@ def measure(folder: Path, alone: Path, heard: Path) -> None:
         tied = [first.alignment.transform, *(p.transform for p in first.alignment.placements)]
         labels = np.stack(
             [
-                sample(asset.field, places_of(asset.coords, t), first.parameters.sample).material
+                sample(
+                    asset.field, places_of(asset.latents.centres, t), first.parameters.sample
+                ).material
                 for t in tied
             ]
         )

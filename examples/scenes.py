@@ -26,6 +26,7 @@ from matplotlib.figure import Figure
 from PIL import Image
 
 from slatprep.errors import SlatprepError
+from slatprep.geometry.voxels import shown_in_cells
 from slatprep.normalize import PIXIE_RANGES
 from slatprep.particles.fields import VoxelField, predicted_field, stored_field
 from slatprep.particles.simulate import simulate
@@ -95,7 +96,8 @@ def objects(options: argparse.Namespace) -> dict[str, tuple[np.ndarray, VoxelFie
         store = open_store(options.store)
         for name in options.asset:
             asset = store.asset(store.ids[store.match(name)])
-            found[asset.asset_id] = asset.coords, stored_field(store, asset.asset_id, "grid")
+            cells, _ = shown_in_cells(asset.coords, asset.latents.resolution)
+            found[asset.asset_id] = cells, stored_field(store, asset.asset_id, "grid")
     ranges = options.ranges
     if ranges is not None:
         ranges = PIXIE_RANGES if ranges == "pixie" else read_ranges(Path(ranges))

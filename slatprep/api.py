@@ -12,6 +12,7 @@ from slatprep.align.deformation import PlaceMap, map_of
 from slatprep.geometry.voxels import occupancy_of, voxels_of
 from slatprep.parameters import AlignParameters, SampleParameters
 from slatprep.records import (
+    MAX_LATENT_RESOLUTION,
     RESOLUTION,
     Alignment,
     Annotation,
@@ -22,7 +23,11 @@ from slatprep.sample import sample
 
 
 def align_voxels(
-    pixieverse: ArrayLike, slat: ArrayLike, parameters: AlignParameters | None = None
+    pixieverse: ArrayLike,
+    slat: ArrayLike,
+    parameters: AlignParameters | None = None,
+    *,
+    resolution: int = RESOLUTION,
 ) -> Alignment:
     """Find the map that lays one voxel set on another.
 
@@ -36,6 +41,8 @@ def align_voxels(
         is dropped.
     parameters : AlignParameters, optional
         Engine, model and scale bounds; the defaults of a build otherwise.
+    resolution : int
+        Voxels of the SLAT's grid along each axis.
 
     Returns
     -------
@@ -69,14 +76,15 @@ def align_voxels(
     >>> round(alignment.quality.fitness, 2)
     1.0
     """
-    source, target = _voxels(pixieverse, "pixieverse"), _voxels(slat, "slat")
+    source, target = _voxels(pixieverse, "pixieverse"), _voxels(slat, "slat", resolution)
     field = MaterialField(
         occupancy=occupancy_of(source),
         voxels=source,
         material=np.zeros(len(source), dtype=np.uint8),
         properties=np.ones((len(source), 3), dtype=np.float32),
     )
-    latents = StructuredLatents(target, np.zeros((len(target), 8), dtype=np.float32))
+    feats = np.zeros((len(target), 8), dtype=np.float32)
+    latents = StructuredLatents(target, feats, resolution=resolution)
     return align(field, latents, parameters or AlignParameters())
 
 
@@ -85,6 +93,8 @@ def annotate_voxels(
     coords: ArrayLike,
     transform: Alignment | ArrayLike,
     parameters: SampleParameters | None = None,
+    *,
+    resolution: int = RESOLUTION,
 ) -> Annotation:
     """Look the material and its properties up at SLAT voxels.
 
@@ -93,12 +103,14 @@ def annotate_voxels(
     field : MaterialField
         The PixieVerse field, as `read_field` gives it.
     coords : array_like, shape (N, 3)
-        SLAT voxels in 0..63.
+        SLAT voxels in 0..resolution - 1.
     transform : Alignment, or array_like, shape (4, 4)
         What `align_voxels` found, its deformation included; or a similarity,
         PixieVerse frame to SLAT frame.
     parameters : SampleParameters, optional
         How far an annotation may be; the defaults of a build otherwise.
+    resolution : int
+        Voxels of the SLAT's grid along each axis.
 
     Returns
     -------
@@ -115,25 +127,27 @@ def annotate_voxels(
         place_map = map_of(transform)
     else:
         place_map = PlaceMap(np.asarray(transform, dtype=np.float64))
-    places = place_map.places(_voxels(coords, "coords"))
+    places = place_map.places(_voxels(coords, "coords", resolution), resolution)
     return sample(field, places, parameters or SampleParameters())
 
 
-def _voxels(voxels: ArrayLike, name: str) -> NDArray[np.uint8]:
+def _voxels(voxels: ArrayLike, name: str, side: int = RESOLUTION) -> NDArray[np.uint8]:
     """Return voxels (N, 3) uint8 of an occupancy or of a list of voxels."""
+    if not 2 <= side <= MAX_LATENT_RESOLUTION:
+        raise ValueError(f"resolution is {side}; expected 2 to {MAX_LATENT_RESOLUTION}")
     array: NDArray[Any] = np.asarray(voxels)
-    if array.shape == (RESOLUTION,) * 3:
+    if array.shape == (side,) * 3:
         array = voxels_of(array.astype(bool))
     if array.ndim == 2 and array.shape[1] == 4 and not array[:, 0].any():
         array = array[:, 1:]
     if array.ndim != 2 or array.shape[1] != 3 or len(array) == 0:
         raise ValueError(
-            f"{name} has shape {array.shape}; expected an occupancy of (64, 64, 64) with a voxel "
+            f"{name} has shape {array.shape}; expected an occupancy of {(side,) * 3} with a voxel "
             "in it, or voxels (N, 3)"
         )
-    if not ((array >= 0) & (array < RESOLUTION) & (array == np.floor(array))).all():
+    if not ((array >= 0) & (array < side) & (array == np.floor(array))).all():
         raise ValueError(
             f"{name} has values from {array.min()} to {array.max()}; "
-            "expected whole numbers in 0..63"
+            f"expected whole numbers in 0..{side - 1}"
         )
     return array.astype(np.uint8)

@@ -15,6 +15,8 @@ import pytest
 from support.synthetic import JELLY, METAL, QUARTER_TURN, make_asset
 
 import slatprep
+from slatprep.parameters import AlignParameters, SampleParameters
+from slatprep.records import Engine
 
 NAMES = sorted(slatprep.__all__)
 MODULES = sorted(
@@ -118,6 +120,32 @@ def test_a_field_is_looked_up_at_slat_voxels() -> None:
         here = found.material == stuff[0]
         assert here.any()
         np.testing.assert_allclose(found.properties[here], [stuff[1:]] * here.sum(), rtol=1e-6)
+
+
+def test_eight_voxels_of_a_finer_grid_are_placed_and_looked_up_as_the_one_they_fill() -> None:
+    asset = make_asset(3)
+    material = asset.grid[..., 3]
+    voxels = np.argwhere(material != 7).astype(np.uint8)
+    row = tuple(voxels.T)
+    field = slatprep.MaterialField(
+        material != 7, voxels, material[row].astype(np.uint8), asset.grid[row][:, [1, 0, 2]]
+    )
+    corners = np.indices((2, 2, 2)).reshape(3, -1).T
+    fine = (2 * asset.coords[:, None].astype(int) + corners).reshape(-1, 3)
+    for parameters in (None, AlignParameters(engine=Engine.KNOWN)):
+        coarse = slatprep.align_voxels(material != 7, asset.coords, parameters)
+        again = slatprep.align_voxels(material != 7, fine, parameters, resolution=128)
+        np.testing.assert_array_equal(again.transform, coarse.transform)
+        assert again.quality == coarse.quality
+    nearest = SampleParameters(method="nearest")
+    one = slatprep.annotate_voxels(field, asset.coords, QUARTER_TURN, nearest)
+    eight = slatprep.annotate_voxels(field, fine, QUARTER_TURN, nearest, resolution=128)
+    np.testing.assert_array_equal(eight.material, np.repeat(one.material, 8))
+    np.testing.assert_allclose(eight.distance, np.sqrt(3) / 4, atol=1e-5)
+    with pytest.raises(ValueError, match=r"whole numbers in 0\.\.31"):
+        slatprep.align_voxels(material != 7, fine, resolution=32)
+    with pytest.raises(ValueError, match="resolution is 512"):
+        slatprep.align_voxels(material != 7, fine, resolution=512)
 
 
 @pytest.mark.parametrize(

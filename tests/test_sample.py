@@ -43,7 +43,7 @@ def test_values_come_from_the_nearest_voxel_and_end_at_the_limit() -> None:
 def test_voxels_are_carried_by_the_inverse_transform() -> None:
     # (x, y, z) -> (-y, x, z): field voxel (20, 10, 10) lies at SLAT (53, 20, 10).
     turn = make_transform([[0, -1, 0], [1, 0, 0], [0, 0, 1]])
-    found = sample(_field(), places_of([[53, 20, 10]], turn), NEAREST)
+    found = sample(_field(), places_of(voxel_centres([[53, 20, 10]]), turn), NEAREST)
     assert found.material.tolist() == [4]
     assert found.distance.tolist() == [0.0]
 
@@ -54,7 +54,9 @@ def test_distances_are_in_voxels_of_the_pixieverse_frame() -> None:
     occupancy = np.zeros((64, 64, 64), dtype=bool)
     occupancy[31, 31, 31] = True
     field = MaterialField(occupancy, voxels, np.ones(1, np.uint8), np.ones((1, 3), np.float32))
-    found = sample(field, places_of(voxels, make_transform(np.eye(3), scale=2.0)), NEAREST)
+    found = sample(
+        field, places_of(voxel_centres(voxels), make_transform(np.eye(3), scale=2.0)), NEAREST
+    )
     np.testing.assert_allclose(found.distance, [np.sqrt(3) / 4], rtol=1e-6)
 
 
@@ -71,8 +73,8 @@ def test_a_vote_changes_the_class_and_takes_that_class_s_nearest_values() -> Non
     field = MaterialField(occupancy, block.astype(np.uint8), classes, properties)
     shift = make_transform(np.eye(3), np.array([0.3, 0, 0]) / 64)
     coords = np.array([[32, 32, 32]], dtype=np.uint8)  # looks at (31.7, 32, 32)
-    assert sample(field, places_of(coords, shift), NEAREST).material.tolist() == [0]
-    voted = sample(field, places_of(coords, shift), SampleParameters())
+    assert sample(field, places_of(voxel_centres(coords), shift), NEAREST).material.tolist() == [0]
+    voted = sample(field, places_of(voxel_centres(coords), shift), SampleParameters())
     assert voted.material.tolist() == [3]
     np.testing.assert_array_equal(voted.properties[0], properties[0])
     np.testing.assert_allclose(voted.distance, [0.7], rtol=1e-5)

@@ -52,9 +52,11 @@ class PlaceMap:
             return carried
         return undeform(self.deformation, carried)
 
-    def places(self, coords: NDArray[np.uint8]) -> NDArray[np.float64]:
-        """Return where SLAT voxels (N, 3) lie in the PixieVerse frame."""
-        return self.to_pixieverse(voxel_centres(coords))
+    def places(
+        self, coords: NDArray[np.integer], resolution: int = RESOLUTION
+    ) -> NDArray[np.float64]:
+        """Return where SLAT voxels (N, 3), of a grid of this resolution, lie in PixieVerse's."""
+        return self.to_pixieverse(voxel_centres(coords, resolution))
 
 
 def map_of(alignment: Alignment) -> PlaceMap:

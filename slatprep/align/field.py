@@ -98,7 +98,11 @@ def align(
     field: MaterialField, latents: StructuredLatents, parameters: AlignParameters
 ) -> Alignment:
     """Align by distance fields; see `slatprep.align.align`."""
-    pair = _Pair(surface_of(occupancy_of(latents.coords)), surface_of(field.occupancy), parameters)
+    pair = _Pair(
+        surface_of(occupancy_of(latents.coords, latents.resolution)),
+        surface_of(field.occupancy),
+        parameters,
+    )
 
     starts = distinct_starts()
     fits = pair.refine(
@@ -151,7 +155,11 @@ def refined_at(
     parameters: AlignParameters,
 ) -> Alignment:
     """Finish an alignment's placement as `align` finishes the best one; see `settle.refit`."""
-    pair = _Pair(surface_of(occupancy_of(latents.coords)), surface_of(field.occupancy), parameters)
+    pair = _Pair(
+        surface_of(occupancy_of(latents.coords, latents.resolution)),
+        surface_of(field.occupancy),
+        parameters,
+    )
     rotation, shift, scale = split_transform(alignment.transform)
     start = Pose(rotation, shift / VOXEL_SIZE, scale)
     (best,), deformed = pair.finish([start], rough=alignment.score < CLEAN)

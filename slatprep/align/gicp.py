@@ -16,7 +16,7 @@ import numpy as np
 from slatprep.align.quality import compare
 from slatprep.align.starts import Transform, search_starts
 from slatprep.geometry.frames import VOXEL_SIZE, voxel_centres
-from slatprep.geometry.voxels import boundary, voxels_of
+from slatprep.geometry.voxels import boundary, shown_in_cells, voxels_of
 from slatprep.parameters import AlignParameters
 from slatprep.records import RESOLUTION, Alignment, MaterialField, StructuredLatents
 
@@ -31,13 +31,14 @@ def align(
     import small_gicp
 
     surface = voxels_of(boundary(field.occupancy))
+    cells, _ = shown_in_cells(latents.coords, latents.resolution)
 
     def clouds(edge: float) -> list[tuple[Any, Any]]:
         return [
             small_gicp.preprocess_points(
                 voxel_centres(voxels) * RESOLUTION, downsampling_resolution=edge, num_threads=1
             )
-            for voxels in (surface, latents.coords)
+            for voxels in (surface, cells)
         ]
 
     thin, all_voxels = clouds(THINNED), clouds(0.25)
@@ -57,7 +58,7 @@ def align(
 
     def first(start: Transform) -> tuple[float, float, Transform]:
         pose = gicp(thin, start)
-        quality = compare(surface, latents.coords, _in_unit_cube(pose), parameters.radius)
+        quality = compare(surface, cells, _in_unit_cube(pose), parameters.radius)
         return quality.fitness, quality.inlier_rmse, pose
 
     def last(start: Transform) -> Transform:

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from slatprep.align.starts import Start, Transform, search_starts
 from slatprep.errors import SlatprepError
 from slatprep.geometry.frames import VOXEL_SIZE, voxel_centres
-from slatprep.geometry.voxels import boundary, voxels_of
+from slatprep.geometry.voxels import boundary, shown_in_cells, voxels_of
 from slatprep.parameters import AlignParameters
 from slatprep.records import Alignment, MaterialField, StructuredLatents
 from slatprep.workers.local import single_threaded
@@ -41,7 +41,7 @@ def align(
     method = registration.TransformationEstimationPointToPoint()
     criteria = registration.ICPConvergenceCriteria(max_iteration=parameters.icp_iterations)
     source = _cloud(o3d, voxel_centres(voxels_of(boundary(field.occupancy))))
-    target = _cloud(o3d, voxel_centres(latents.coords))
+    target = _cloud(o3d, voxel_centres(shown_in_cells(latents.coords, latents.resolution)[0]))
     wide = parameters.icp_radius * VOXEL_SIZE
     tight = parameters.radius * VOXEL_SIZE
 

@@ -36,7 +36,7 @@ def measure_quality(
     """
     return compare(
         outer_boundary(field.occupancy),
-        outer_boundary(occupancy_of(latents.coords)),
+        outer_boundary(occupancy_of(latents.coords, latents.resolution)),
         transform,
         radius,
     )

@@ -97,6 +97,6 @@ def _apart_from(
     placement: Placement, others: tuple[Placement, ...], latents: StructuredLatents
 ) -> tuple[Placement, ...]:
     return tuple(
-        replace(p, displacement=displacement(p.transform, placement.transform, latents.coords))
+        replace(p, displacement=displacement(p.transform, placement.transform, latents.centres))
         for p in others
     )

@@ -27,7 +27,7 @@ from slatprep.align.starts import euler_starts
 from slatprep.align.surface import surface_of
 from slatprep.bench.truth import LevelScore, TruthScore, compare_with_truth, read_truth, summarise
 from slatprep.errors import ConfigError, SlatprepError
-from slatprep.geometry.frames import nearest_similarity, voxel_centres
+from slatprep.geometry.frames import nearest_similarity
 from slatprep.geometry.voxels import occupancy_of
 from slatprep.parameters import PRESETS, AlignParameters
 from slatprep.parameters.files import load_parameters
@@ -167,7 +167,7 @@ def bench_align(
                     field, latents = read_field(pair), read_latents(pair)
                 with _timed(fields):
                     surface_of(field.occupancy)
-                    surface_of(occupancy_of(latents.coords))
+                    surface_of(occupancy_of(latents.coords, latents.resolution))
                 for position, engine in enumerate(chosen):
                     with _timed(seconds[engine]):
                         transform, places = _align(engine, field, latents)
@@ -177,7 +177,7 @@ def bench_align(
                         score = compare_with_truth(
                             pair.asset_id,
                             truth,
-                            coords=latents.coords,
+                            centres=latents.centres,
                             transform=transform,
                             places=places,
                             material=annotation.material,
@@ -255,9 +255,9 @@ def _align(
         from slatprep.bench.cpd import cpd_places
 
         places = cpd_places(field, latents, deformable=engine == "cpd-deformable")
-        return nearest_similarity(places, voxel_centres(latents.coords)), places
+        return nearest_similarity(places, latents.centres), places
     alignment = _aligned(engine, field, latents)
-    return alignment.transform, map_of(alignment).places(latents.coords)
+    return alignment.transform, map_of(alignment).to_pixieverse(latents.centres)
 
 
 def _aligned(engine: str, field: MaterialField, latents: StructuredLatents) -> Alignment:

@@ -49,7 +49,7 @@ def cpd_places(field: MaterialField, latents: StructuredLatents, deformable: boo
     from pycpd import AffineRegistration, DeformableRegistration
 
     pixie = _Cloud(voxel_centres(voxels_of(boundary(field.occupancy))))
-    slat = _Cloud(voxel_centres(outer_boundary(occupancy_of(latents.coords))))
+    slat = _Cloud(voxel_centres(outer_boundary(occupancy_of(latents.coords, latents.resolution))))
 
     def affine(points: int, steps: int, start: Array) -> tuple[Array, Array]:
         drift: Any = AffineRegistration(
@@ -73,7 +73,7 @@ def cpd_places(field: MaterialField, latents: StructuredLatents, deformable: boo
     starts = (affine(START_POINTS, START_STEPS, start.rotation) for start in distinct_starts())
     best = min(starts, key=misfit)
     linear, shift = affine(FINAL_POINTS, FINAL_STEPS, best[0])
-    places = slat.unit(voxel_centres(latents.coords)) @ linear + shift
+    places = slat.unit(latents.centres) @ linear + shift
     if deformable:
         source = slat.thinned(FINAL_POINTS) @ linear + shift
         drift: Any = DeformableRegistration(

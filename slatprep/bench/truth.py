@@ -226,7 +226,7 @@ def _score_asset(asset: StoredAsset, path: Path) -> TruthScore:
     return compare_with_truth(
         asset.asset_id,
         truth,
-        coords=asset.coords,
+        centres=asset.latents.centres,
         transform=asset.transform,
         material=material,
         valid=asset.valid,
@@ -260,7 +260,7 @@ def compare_with_truth(
     asset_id: str,
     truth: Truth,
     *,
-    coords: NDArray[np.uint8],
+    centres: NDArray[np.float64],
     transform: NDArray[np.float64],
     material: NDArray[np.integer[Any]],
     valid: NDArray[np.bool_],
@@ -276,9 +276,9 @@ def compare_with_truth(
         For the score's name.
     truth : Truth
         What `read_truth` gave.
-    coords, transform, material, valid : ndarray
-        SLAT voxels (N, 3), the estimated transform (4, 4), and what was looked
-        up at the voxels (N,).
+    centres, transform, material, valid : ndarray
+        Centres of the SLAT voxels (N, 3) in the SLAT frame, the estimated transform (4, 4),
+        and what was looked up at the voxels (N,).
     annotated, annotated_material : ndarray
         Annotated voxels (K, 3) of the PixieVerse frame and their classes (K,).
     places : ndarray, shape (N, 3), optional
@@ -296,7 +296,6 @@ def compare_with_truth(
     """
     from scipy.spatial import cKDTree
 
-    centres = voxel_centres(coords)
     by_similarity = apply_transform(invert_transform(truth.transform), centres)
     true_places = by_similarity if truth.places is None else truth.places
     for name, kind, found, expected in (

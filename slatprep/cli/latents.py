@@ -48,7 +48,7 @@ class LatentsReader:
 
         self.output, self.space, self.standardised = output, space, standardised
         self.store = open_store(source) if is_store(source) else None
-        files = [] if self.store else discover_slats(SlatSource(root=source))
+        files = [] if self.store else discover_slats(SlatSource(root=source, encoder=space.encoder))
         self.files = {file.asset_id: file for file in files}
         there = self.store.ids if self.store else list(self.files)
         self.rows = {asset_id: row for row, asset_id in enumerate(there)}
@@ -112,11 +112,17 @@ def _match(source: Place, name: str, ids: list[str]) -> str:
     return alike[0]
 
 
+def _size(space: LatentSpace, other: LatentSpace) -> str:
+    """Say how wide latents are, and of which grid where the other's is not the same."""
+    grid = "" if space.resolution == other.resolution else f", a grid of {space.resolution}^3"
+    return f"{space.channels} channels{grid}"
+
+
 def _require_encoder(source: Place, held: LatentSpace, space: LatentSpace) -> None:
     """Refuse latents of another encoder; equal widths and moments mean the same encoder."""
     same = (held.channels, held.resolution) == (space.channels, space.resolution)
     if not same or (held.encoder != space.encoder and held.mean != space.mean):
         raise ConfigError(
-            f"{source} holds latents of {held.encoder} ({held.channels} channels); expected those "
-            f"of {space.encoder} ({space.channels} channels)"
+            f"{source} holds latents of {held.encoder} ({_size(held, space)}); expected those of "
+            f"{space.encoder} ({_size(space, held)})"
         )

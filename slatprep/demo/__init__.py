@@ -16,7 +16,7 @@ from typing import Any
 
 from slatprep.demo.asset import DemoAsset, make_asset
 from slatprep.demo.difficulty import LEVELS, SAME_SHAPE_LEVELS
-from slatprep.demo.latents import CHANNELS, Encoder, LatentKind
+from slatprep.demo.latents import GRIDS, Encoder, LatentKind
 from slatprep.demo.samples import sample_grids, write_samples
 from slatprep.demo.sources import ONE_FRAME, TABLE, Source, classes_of, write_description
 from slatprep.demo.write import (
@@ -32,7 +32,6 @@ from slatprep.demo.write import (
     write_truth,
 )
 from slatprep.errors import ConfigError
-from slatprep.records import RESOLUTION
 from slatprep.workers.local import run_unordered
 
 __all__ = ["DemoAsset", "DemoSummary", "make_asset", "make_demo"]
@@ -121,8 +120,9 @@ def make_demo(
         The source of the annotated side, one of `slatprep.demo.sources.Source`: PixieVerse's
         grids, predictions with 11 or 4 channels, VoMP's or PhysXNet's voxels, or plain voxels
         with ten properties (in HDF5 without classes).
-    encoder : {"trellis", "sam3d", "trellis2", "plain"}
-        The encoder of the latents; ``plain`` has 16 channels, described in ``encoder.json``.
+    encoder : {"trellis", "sam3d", "trellis2", "trellis2-512", "plain", "plain-128"}
+        The encoder of the latents; ``trellis2-512`` has a grid of 32^3. ``plain`` has 16 channels,
+        described in ``encoder.json``, and ``plain-128`` the same on a grid of 128^3.
     slat_form : {"npz", "npz-batch", "hdf5", "hdf5-groups"}
         Coordinates (N, 3) uint8 or (N, 4) int32 in an npz, or HDF5, a file or
         a group an asset.
@@ -195,8 +195,11 @@ def _check(recipe: _Recipe) -> None:
             f"source {recipe.source!r} is made of the mesh that its SLAT was encoded from: level 0 "
             "alone, and 1 view"
         )
-    if recipe.encoder == "trellis2" and (recipe.slat_form != "npz" or recipe.views > 1):
-        raise ConfigError("encoder 'trellis2' has an npz an object: slat_form 'npz', and 1 view")
+    npz_alone = recipe.slat_form == "npz" and recipe.views == 1
+    if recipe.encoder.startswith("trellis2") and not npz_alone:
+        raise ConfigError(
+            f"encoder {recipe.encoder!r} has an npz an object: slat_form 'npz', and 1 view"
+        )
     if recipe.samples > 1 and recipe.source != "pixieverse":
         raise ConfigError("several samples are grids: source 'pixieverse', or 1 sample")
     if recipe.slat_form == "hdf5-groups" and recipe.views > 1:
@@ -228,6 +231,7 @@ def _recipe_in(mark: Path) -> object:
 
 def _make_one(root: Path, recipe: _Recipe, index: int) -> tuple[int, dict[str, Any]]:
     """Make and write one asset; return its number, and what is known of it."""
+    channels, resolution = GRIDS[recipe.encoder]
     asset = make_asset(
         recipe.seed,
         index,
@@ -235,10 +239,11 @@ def _make_one(root: Path, recipe: _Recipe, index: int) -> tuple[int, dict[str, A
         views=recipe.views,
         latents=recipe.latents,
         habitual_share=recipe.habitual_share,
-        channels=CHANNELS[recipe.encoder],
+        channels=channels,
+        resolution=resolution,
         one_frame=recipe.source in ONE_FRAME,
     )
-    write_annotated(root / recipe.adapter, asset, recipe.source)
+    write_annotated(root / recipe.adapter, asset, recipe.source, resolution)
     if recipe.samples > 1:
         grids = sample_grids(recipe.seed, index, asset, recipe.samples)
         write_samples(root / recipe.adapter, asset, grids)
@@ -279,8 +284,9 @@ def _write_definition(root: Path, recipe: _Recipe, entries: list[dict[str, Any]]
     if recipe.adapter != "pixieverse":
         lines.append(f'adapter = "{recipe.adapter}"')
     lines += ["", "[slat]", f'root = "{slat_root}"']
-    if recipe.encoder == "plain":
-        space = {"encoder": "plain", "channels": CHANNELS["plain"], "resolution": RESOLUTION}
+    if recipe.encoder in ("plain", "plain-128"):
+        channels, resolution = GRIDS[recipe.encoder]
+        space = {"encoder": recipe.encoder, "channels": channels, "resolution": resolution}
         _write_json(root / "encoder.json", space)
         lines.append('encoder = "encoder.json"')
     elif recipe.encoder != "trellis":

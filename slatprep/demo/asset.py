@@ -97,6 +97,7 @@ def make_asset(
     latents: LatentKind = "placeholder",
     habitual_share: float = 0.0,
     channels: int = 8,
+    resolution: int = RESOLUTION,
     one_frame: bool = False,
 ) -> DemoAsset:
     """Make asset number `index` of a demo dataset.
@@ -119,6 +120,8 @@ def make_asset(
         turn; the others have any of the 24.
     channels : int
         Channels of the latents.
+    resolution : int
+        Voxels of the SLAT along each axis: 64 times a power of two, or divided by one.
     one_frame : bool
         Whether both sides were made from one mesh: the transform is the identity then.
         Only for level 0 and one view.
@@ -159,7 +162,7 @@ def make_asset(
             seen = generate(rng, seen, difficulty, solid, skin)
         rng = np.random.default_rng([seed, index, _LATENTS, v])
         name = f"view_{v}" if views > 1 else ""
-        view = _slat_side(rng, name, solid, seen, latents, channels)
+        view = _slat_side(rng, name, solid, seen, latents, channels, resolution)
         made.append(view if difficulty.has_places else replace(view, places=None))
     return DemoAsset(
         object_id(seed, index),
@@ -207,13 +210,17 @@ def _slat_side(
     frames: Frames,
     latents: LatentKind,
     channels: int,
+    resolution: int,
 ) -> DemoView:
-    surface = voxelise(frames.slat_distance(solid))[0]
-    coords = np.argwhere(surface).astype(np.uint8)
-    centres = voxel_centres(coords)
+    surface = voxelise(frames.slat_distance(solid), max(resolution, RESOLUTION))[0]
+    # The surface meets a coarse voxel if it meets a fine one in it.
+    fine = len(surface) // resolution
+    blocks = surface.reshape((resolution, fine) * 3)
+    coords = np.argwhere(np.any(blocks, axis=(1, 3, 5))).astype(np.uint8)
+    centres = voxel_centres(coords, resolution)
     material, properties = solid.table()
     stuff = solid.stuff_at(frames.slat_to_object(centres))
-    feats = make_latents(rng, latents, coords, material[stuff], properties[stuff], channels)
+    feats = make_latents(rng, latents, centres, material[stuff], properties[stuff], channels)
     places = frames.places(centres)
     # Without a distortion the transform of the poses is exact.
     transform = nearest_similarity(places, centres) if frames.distortion else frames.transform()

@@ -11,15 +11,22 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from slatprep.geometry.frames import voxel_centres
 from slatprep.records import FEATS_MEAN, FEATS_STD
 
 LatentKind = Literal["placeholder", "material"]
 
-Encoder = Literal["trellis", "sam3d", "trellis2", "plain"]
+Encoder = Literal["trellis", "sam3d", "trellis2", "trellis2-512", "plain", "plain-128"]
 
-CHANNELS: dict[Encoder, int] = {"trellis": 8, "sam3d": 8, "trellis2": 32, "plain": 16}
-"""Number of channels of each encoder's latents; ``plain`` stands for any other encoder."""
+GRIDS: dict[Encoder, tuple[int, int]] = {
+    "trellis": (8, 64),
+    "sam3d": (8, 64),
+    "trellis2": (32, 64),
+    "trellis2-512": (32, 32),
+    "plain": (16, 64),
+    "plain-128": (16, 128),
+}
+"""Channels of each encoder's latents, and voxels along each axis; ``plain`` and ``plain-128``
+stand for any other encoder."""
 
 MEAN, STD = np.array(FEATS_MEAN), np.array(FEATS_STD)
 
@@ -34,7 +41,7 @@ _PROPERTY_SPREAD = np.array([4.0, 1.1, 0.12])
 def make_latents(
     rng: np.random.Generator,
     kind: LatentKind,
-    coords: NDArray[np.uint8],
+    centres: NDArray[np.float64],
     material: NDArray[np.uint8],
     properties: NDArray[np.float32],
     channels: int = 8,
@@ -49,8 +56,8 @@ def make_latents(
         ``placeholder`` is normal noise. ``material`` is `NOISE` times that, with
         `clean_latents` added to the first eight channels. Both are then scaled to the
         encoder's mean and standard deviation.
-    coords : ndarray of uint8, shape (N, 3)
-        SLAT voxels.
+    centres : ndarray of float64, shape (N, 3)
+        Centres of SLAT voxels in the unit cube.
     material : ndarray of uint8, shape (N,)
         Class of each, 0..6.
     properties : ndarray of float32, shape (N, 3)
@@ -58,17 +65,17 @@ def make_latents(
     channels : int
         At least eight.
     """
-    z = rng.normal(size=(len(coords), channels))
+    z = rng.normal(size=(len(centres), channels))
     if kind == "material":
         z *= NOISE
-        z[:, :8] += clean_latents(coords, material, properties)
+        z[:, :8] += clean_latents(centres, material, properties)
     mean, std = np.resize(MEAN, channels), np.resize(STD, channels)
     feats: NDArray[np.float32] = (mean + std * z).astype(np.float32)
     return feats
 
 
 def clean_latents(
-    coords: NDArray[np.uint8], material: NDArray[np.uint8], properties: NDArray[np.float32]
+    centres: NDArray[np.float64], material: NDArray[np.uint8], properties: NDArray[np.float32]
 ) -> NDArray[np.float64]:
     """Return ``material`` latents without noise, standardised (N, 8).
 
@@ -80,13 +87,13 @@ def clean_latents(
 
     Parameters
     ----------
-    coords, material, properties : ndarray
+    centres, material, properties : ndarray
         As in `make_latents`.
     """
     mapped = properties.astype(np.float64)
     mapped[:, :2] = np.log10(mapped[:, :2])
     mapped = (mapped - _PROPERTY_CENTRE) / _PROPERTY_SPREAD
-    place = np.sin(np.pi * voxel_centres(coords))
+    place = np.sin(np.pi * centres)
     z: NDArray[np.float64] = (
         2.0 * _CODES[material] + mapped @ _CODES[:3] + 0.5 * place @ _CODES[3:6]
     )

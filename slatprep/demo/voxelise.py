@@ -13,7 +13,7 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from slatprep.geometry.frames import VOXEL_SIZE, voxel_centres
+from slatprep.geometry.frames import voxel_centres
 from slatprep.records import RESOLUTION
 
 Distance = Callable[[NDArray[np.float64]], NDArray[np.float64]]
@@ -23,7 +23,9 @@ _HALF_DIAGONAL = 3.0**0.5 / 2.0
 _CORNERS = np.array([(i, j, k) for i in (0, 1) for j in (0, 1) for k in (0, 1)])
 
 
-def voxelise(distance: Distance) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+def voxelise(
+    distance: Distance, side: int = RESOLUTION
+) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
     """Return the surface voxels and the filled voxels of a solid in the unit cube.
 
     Parameters
@@ -32,11 +34,13 @@ def voxelise(distance: Distance) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
         Maps points (P, 3) of the cube [-0.5, 0.5]^3 to (P,): negative or zero
         inside, positive outside, in magnitude no greater than the distance to
         the surface (it may be cut off at any value above half the diagonal of
-        a block of 4 voxels, 0.054).
+        a block of 4 voxels of 64, 0.054).
+    side : int
+        Voxels along each axis, 64 or a multiple.
 
     Returns
     -------
-    surface, filled : ndarray of bool, shape (64, 64, 64)
+    surface, filled : ndarray of bool, shape (side, side, side)
         Voxels whose cube the surface meets; those and all voxels inside.
 
     Notes
@@ -45,20 +49,20 @@ def voxelise(distance: Distance) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
     it; a cube with points on both sides does. All others are halved three times. Only a surface
     that enters a cube by less than a tenth of a voxel, between the sampled points, is missed.
     """
-    near, inside = _near_voxels(distance)
+    near, inside = _near_voxels(distance, side)
     candidates = np.argwhere(near)
     met = _changes_sign(distance, candidates, inside)
     open_ones = candidates[~met]
-    met[~met] = _subdivide(distance, open_ones, inside[tuple(open_ones.T)])
+    met[~met] = _subdivide(distance, open_ones, inside[tuple(open_ones.T)], side)
     surface = np.zeros_like(inside)
     surface[tuple(candidates[met].T)] = True
     filled: NDArray[np.bool_] = surface | inside
     return surface, filled
 
 
-def _near_voxels(distance: Distance) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+def _near_voxels(distance: Distance, side: int) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
     """Return the voxels that may be met, and whether each voxel's centre is inside."""
-    blocks = RESOLUTION // _BLOCK
+    blocks = side // _BLOCK
     index = np.argwhere(np.ones((blocks,) * 3, dtype=bool))
     at_blocks = distance((index + 0.5) / blocks - 0.5).reshape((blocks,) * 3)
     block_near = np.abs(at_blocks) <= _HALF_DIAGONAL / blocks
@@ -66,9 +70,9 @@ def _near_voxels(distance: Distance) -> tuple[NDArray[np.bool_], NDArray[np.bool
     inside = np.kron(at_blocks <= 0, ones)
     near = np.kron(block_near, ones)
     voxels = np.argwhere(near)
-    at_voxels = distance(voxel_centres(voxels))
+    at_voxels = distance(voxel_centres(voxels, side))
     inside[tuple(voxels.T)] = at_voxels <= 0
-    near[tuple(voxels.T)] = np.abs(at_voxels) <= _HALF_DIAGONAL * VOXEL_SIZE
+    near[tuple(voxels.T)] = np.abs(at_voxels) <= _HALF_DIAGONAL / side
     return near, inside
 
 
@@ -77,10 +81,11 @@ def _changes_sign(
 ) -> NDArray[np.bool_]:
     """Return whether a corner lies on the other side than the voxel's centre."""
     corners = voxels[:, None, :] + _CORNERS
-    lattice = np.zeros((RESOLUTION + 1,) * 3, dtype=bool)
+    side = len(inside)
+    lattice = np.zeros((side + 1,) * 3, dtype=bool)
     lattice[tuple(corners.reshape(-1, 3).T)] = True
     needed = np.argwhere(lattice)
-    points: NDArray[np.float64] = needed.astype(np.float64) * VOXEL_SIZE - 0.5
+    points: NDArray[np.float64] = needed.astype(np.float64) / side - 0.5
     lattice[tuple(needed.T)] = distance(points) <= 0
     at_corners = lattice[tuple(np.moveaxis(corners, -1, 0))]
     differs: NDArray[np.bool_] = at_corners != inside[tuple(voxels.T)][:, None]
@@ -89,13 +94,17 @@ def _changes_sign(
 
 
 def _subdivide(
-    distance: Distance, voxels: NDArray[np.intp], inside: NDArray[np.bool_], depth: int = 3
+    distance: Distance,
+    voxels: NDArray[np.intp],
+    inside: NDArray[np.bool_],
+    side: int,
+    depth: int = 3,
 ) -> NDArray[np.bool_]:
     """Return whether a cell centre of the halved cubes lies on the other side."""
     met = np.zeros(len(voxels), dtype=bool)
     owner = np.arange(len(voxels))
-    centres = voxel_centres(voxels)
-    edge = VOXEL_SIZE
+    centres = voxel_centres(voxels, side)
+    edge = 1.0 / side
     for _ in range(depth):
         edge /= 2.0
         centres = (centres[:, None, :] + (_CORNERS - 0.5) * edge).reshape(-1, 3)

@@ -13,9 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slatprep.demo.asset import DemoAsset, DemoView
-from slatprep.demo.latents import Encoder
+from slatprep.demo.latents import GRIDS, Encoder
 from slatprep.demo.sources import Source, columns_of, write_field
 from slatprep.geometry.frames import VOXEL_SIZE
+from slatprep.geometry.voxels import shown_in_cells
 from slatprep.records import BACKGROUND, RESOLUTION
 
 SlatForm = Literal["npz", "npz-batch", "hdf5", "hdf5-groups"]
@@ -39,10 +40,13 @@ def slat_name(asset: DemoAsset, names: SlatNames) -> str:
     return asset.object_id
 
 
-def write_annotated(root: Path, asset: DemoAsset, source: Source) -> None:
+def write_annotated(
+    root: Path, asset: DemoAsset, source: Source, resolution: int = RESOLUTION
+) -> None:
     """Write the annotated side of an asset below `root`: a grid with mask and bounds, or voxels."""
     if not source.startswith("pixie"):
-        write_field(root, source, asset.object_id, asset.grid, asset.views[0].coords)
+        cells, _ = shown_in_cells(asset.views[0].coords, resolution)
+        write_field(root, source, asset.object_id, asset.grid, cells)
         return
     folder = root / asset.object_id
     mask = asset.occupancy.astype(np.float32)
@@ -96,8 +100,8 @@ def write_results(root: Path, asset: DemoAsset) -> None:
     np.save(folder / "sample_0_mask.npy", asset.occupancy.astype(np.float32))
 
 
-SHAPE_LATENTS = "shape_latents/shape_enc_next_dc_f16c32_fp16_1024"
-"""Where TRELLIS.2's toolkit puts the latents of a shape, at resolution 1024."""
+SHAPE_LATENTS = "shape_latents/shape_enc_next_dc_f16c32_fp16"
+"""Where TRELLIS.2's toolkit puts the latents of a shape; the resolution follows."""
 
 
 def write_slat(
@@ -105,7 +109,8 @@ def write_slat(
 ) -> None:
     """Write the SLATs of an asset below `root`: a file each, or a group each of ``latents.h5``."""
     name = slat_name(asset, names)
-    root = root / SHAPE_LATENTS if encoder == "trellis2" else root
+    if encoder.startswith("trellis2"):
+        root /= f"{SHAPE_LATENTS}_{16 * GRIDS[encoder][1]}"
     root.mkdir(parents=True, exist_ok=True)
     for view in asset.views:
         stem = root / name / view.view if view.view else root / name

@@ -69,8 +69,10 @@ def write(
         name = str(folder / f"{_stem(asset.asset_id)}.npz")
         names = with_merged(asset.store, "coords", *TARGETS)
         arrays = {key: getattr(asset, key) for key in names}
+        space = asset.store.contents.latents
+        arrays |= space.beside_voxels
         # TRELLIS's dataset standardises the latents that it reads.
-        arrays["feats"] = asset.store.contents.latents.as_encoded(asset.feats)
+        arrays["feats"] = space.as_encoded(asset.feats)
         np.savez_compressed(directory / name, **arrays)
         yield Exported(asset, name, len(asset.coords))
 

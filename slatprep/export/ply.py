@@ -114,7 +114,7 @@ def write(
         else:
             valid = asset.valid
             material, values = asset.material[valid], asset.properties_si[valid]
-            in_slat = voxel_centres(asset.coords[valid])
+            in_slat = asset.latents.centres[valid]
             conf = np.clip(1.0 - asset.distance[valid] / max_distance, 0.0, 1.0)
             in_pixieverse = asset.place[valid].astype(np.float64)
         positions = in_slat

@@ -19,13 +19,15 @@ VOXEL_SIZE = 1.0 / RESOLUTION
 """Edge of a voxel in the unit cube."""
 
 
-def voxel_centres(voxels: ArrayLike) -> NDArray[np.float64]:
+def voxel_centres(voxels: ArrayLike, resolution: int = RESOLUTION) -> NDArray[np.float64]:
     """Return the centres of voxels in the unit cube.
 
     Parameters
     ----------
     voxels : array_like of int, shape (N, 3)
-        Voxel indices in 0..63.
+        Voxel indices in 0..resolution - 1.
+    resolution : int
+        Voxels along each axis of the cube.
 
     Returns
     -------
@@ -37,7 +39,7 @@ def voxel_centres(voxels: ArrayLike) -> NDArray[np.float64]:
     >>> voxel_centres([[0, 32, 63]]).tolist()
     [[-0.4921875, 0.0078125, 0.4921875]]
     """
-    return (np.asarray(voxels, dtype=np.float64) + 0.5) * VOXEL_SIZE - 0.5
+    return (np.asarray(voxels, dtype=np.float64) + 0.5) / resolution - 0.5
 
 
 def apply_transform(transform: ArrayLike, points: ArrayLike) -> NDArray[np.float64]:
@@ -118,27 +120,25 @@ def invert_transform(transform: ArrayLike) -> NDArray[np.float64]:
     return inverse
 
 
-def places_of(coords: ArrayLike, transform: ArrayLike) -> NDArray[np.float64]:
-    """Return where SLAT voxels (N, 3) lie in the PixieVerse frame, as points (N, 3)."""
-    return apply_transform(invert_transform(transform), voxel_centres(coords))
+def places_of(points: ArrayLike, transform: ArrayLike) -> NDArray[np.float64]:
+    """Return where points (N, 3) of the SLAT frame lie in the PixieVerse frame."""
+    return apply_transform(invert_transform(transform), points)
 
 
-def displacement(transform: ArrayLike, reference: ArrayLike, slat_voxels: ArrayLike) -> float:
-    """Mean distance, in voxels, between where two transforms look a SLAT voxel up.
+def displacement(transform: ArrayLike, reference: ArrayLike, points: ArrayLike) -> float:
+    """Mean distance, in voxels, between where two transforms look SLAT voxels up.
 
-    Both transforms are inverted and applied to the voxel centres, so the
+    Both transforms are inverted and applied to the voxels' centres, so the
     distance is measured in the PixieVerse frame, where the annotation lies.
 
     Parameters
     ----------
     transform, reference : array_like, shape (4, 4)
         PixieVerse frame to SLAT frame.
-    slat_voxels : array_like of int, shape (N, 3)
-        Voxels of the SLAT frame, 0..63.
+    points : array_like, shape (N, 3)
+        Centres of the SLAT's voxels, in the SLAT frame.
     """
-    points = voxel_centres(slat_voxels)
-    here = apply_transform(invert_transform(transform), points)
-    there = apply_transform(invert_transform(reference), points)
+    here, there = places_of(points, transform), places_of(points, reference)
     return float(np.linalg.norm(here - there, axis=1).mean() * RESOLUTION)
 
 

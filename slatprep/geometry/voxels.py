@@ -93,15 +93,53 @@ def outer_boundary(occupancy: NDArray[np.bool_]) -> NDArray[np.uint8]:
     return voxels_of(boundary(filled(occupancy)))
 
 
-def flat_index(voxels: ArrayLike) -> NDArray[np.intp]:
-    """Return the place (N,) of each voxel (N, 3) in the flattened grid, in C order."""
+def flat_index(voxels: ArrayLike, side: int = RESOLUTION) -> NDArray[np.intp]:
+    """Return the place (N,) of each voxel (N, 3) in the flattened grid (side,)*3, in C order."""
     index = np.asarray(voxels).astype(np.intp)
-    flat: NDArray[np.intp] = (index[:, 0] * RESOLUTION + index[:, 1]) * RESOLUTION + index[:, 2]
+    flat: NDArray[np.intp] = (index[:, 0] * side + index[:, 1]) * side + index[:, 2]
     return flat
 
 
-def occupancy_of(voxels: ArrayLike) -> NDArray[np.bool_]:
-    """Return the (64, 64, 64) occupancy of a list of voxels (N, 3)."""
+def shown_in_cells(
+    voxels: NDArray[np.uint8], resolution: int
+) -> tuple[NDArray[np.uint8], NDArray[np.intp]]:
+    """Return the cells of the frames' 64^3 grid that voxels of any grid occupy.
+
+    A cell is occupied if its centre lies in a voxel, or a voxel's centre in it: of a coarser
+    grid a voxel has several cells, of a finer one a cell may have several voxels.
+
+    Parameters
+    ----------
+    voxels : ndarray of uint8, shape (N, 3)
+        Voxels in 0..resolution - 1, each once.
+    resolution : int
+        Voxels along each axis of their grid, 2 to 256.
+
+    Returns
+    -------
+    cells : ndarray of uint8, shape (M, 3)
+        Those of a 64^3 grid as they are; of others in C order.
+    row : ndarray of intp, shape (M,)
+        The voxel that each cell shows, the first of several.
+    """
+    if resolution == RESOLUTION:
+        return voxels, np.arange(len(voxels))
+    index = voxels.astype(np.intp)
+    if resolution > RESOLUTION:
+        cells = (2 * index + 1) * RESOLUTION // (2 * resolution)
+        _, first = np.unique(flat_index(cells), return_index=True)
+        return cells[first].astype(np.uint8), first
+    rows = np.full((resolution,) * 3, -1, dtype=np.intp)
+    rows[tuple(index.T)] = np.arange(len(index))
+    steps = (2 * np.arange(RESOLUTION) + 1) * resolution // (2 * RESOLUTION)
+    rows = rows[np.ix_(steps, steps, steps)]
+    return voxels_of(rows >= 0), rows[rows >= 0]
+
+
+def occupancy_of(voxels: ArrayLike, resolution: int = RESOLUTION) -> NDArray[np.bool_]:
+    """Return the (64, 64, 64) occupancy of voxels (N, 3) of a grid; see `shown_in_cells`."""
+    if resolution != RESOLUTION:
+        voxels, _ = shown_in_cells(np.asarray(voxels, dtype=np.uint8), resolution)
     occupancy = np.zeros(RESOLUTION**3, dtype=bool)
     occupancy[flat_index(voxels)] = True
     return occupancy.reshape((RESOLUTION,) * 3)

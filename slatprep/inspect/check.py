@@ -13,7 +13,7 @@ from slatprep.align.quality import measure_quality
 from slatprep.judge import THRESHOLDS, verdict_of
 from slatprep.normalize import normalize_properties
 from slatprep.provenance.stored import StoredRecords
-from slatprep.records import Place, StructuredLatents, Verdict
+from slatprep.records import Place, Verdict
 from slatprep.sample import sample
 from slatprep.store.reader import Store, StoredAsset, open_store
 
@@ -166,8 +166,7 @@ def check_alignment(store: Store, asset_id: str) -> AlignmentCheck:
     asset = store.asset(asset_id)
     radius = store.about.build.parameters.align.radius
     valid_share, differs = recompute_annotation(asset)
-    latents = StructuredLatents(asset.coords, asset.feats)
-    quality = measure_quality(asset.field, latents, asset.transform, radius)
+    quality = measure_quality(asset.field, asset.latents, asset.transform, radius)
     columns = asset.columns
     ambiguity, margin = float(columns["ambiguity"]), float(columns["margin"])
     confidence, expected = float(columns["confidence"]), float(columns["expected_accuracy"])

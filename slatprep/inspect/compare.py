@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slatprep.errors import StoreError
-from slatprep.geometry.frames import displacement
+from slatprep.geometry.frames import displacement, voxel_centres
 from slatprep.inspect.difference import AssetChange, PropertyChange, Setting, StoreDifference
 from slatprep.normalize import denormalize_properties
 from slatprep.provenance.stored import StoredRecords
@@ -234,9 +234,14 @@ def _compare(a: Store, b: Store, asset_id: str, rows: _Rows) -> AssetChange:
     one, other = a.read(rows[0], VOXEL_COLUMNS), b.read(rows[1], VOXEL_COLUMNS)
     coords = one.pop("coords"), other.pop("coords")
     unmatched, moved = 0, 0.0
-    order = np.array_equal(*coords)
+    # Voxels of another grid are others.
+    sides = [store.contents.latents.resolution for store in (a, b)]
+    order = sides[0] == sides[1] and np.array_equal(*coords)
     if not order:
-        codes = [own.astype(np.int64) @ (1 << 40, 1 << 20, 1) for own in coords]
+        codes = [
+            own.astype(np.int64) @ (1 << 40, 1 << 20, 1) + (side << 50)
+            for own, side in zip(coords, sides, strict=True)
+        ]
         found, mine, theirs = np.intersect1d(codes[0], codes[1], return_indices=True)
         one = {name: values[mine] for name, values in one.items()}
         other = {name: values[theirs] for name, values in other.items()}
@@ -247,7 +252,7 @@ def _compare(a: Store, b: Store, asset_id: str, rows: _Rows) -> AssetChange:
             for store, row in zip((b, a), reversed(rows), strict=True)
         ]
         try:
-            moved = displacement(transforms[0], transforms[1], coords[0])
+            moved = displacement(transforms[0], transforms[1], voxel_centres(coords[0], sides[0]))
         except ValueError as error:
             raise StoreError(f"{a.path} or {b.path}: asset {asset_id}: {error}; run `slatprep "
                              "verify`") from None  # fmt: skip

@@ -59,18 +59,18 @@ def measure_ambiguity(
     times = thinning(len(latents.coords))
     # An odd step: an even one would, of a grid in order, take some layers alone.
     few = slice(None, None, FEWER * times + 1 if times > 1 else 1)
-    coords = latents.coords[few]
-    differs = np.zeros(len(coords), dtype=bool)
+    centres = latents.centres[few]
+    differs = np.zeros(len(centres), dtype=bool)
     change = np.zeros(len(field.table))
     if alignment.placements:
         if alignment.deformation is not None:
             # The others have no deformation, so the best is compared without its own.
-            places = places_of(latents.coords, alignment.transform)
+            places = places_of(latents.centres, alignment.transform)
             annotation = sample(field, places, parameters, labels_alone=True)
         material, valid = annotation.material[few], annotation.valid[few]
         mapped = to_mapped(annotation.properties[few], field.table)
         for placement in alignment.placements:
-            places = places_of(coords, placement.transform)
+            places = places_of(centres, placement.transform)
             other = sample(field, places, parameters, labels_alone=True)
             differs |= other.material != material
             both = valid & other.valid

@@ -111,14 +111,14 @@ def surroundings_of(
     count = len(annotation.place)
     moved = np.zeros(count, dtype=np.float32)
     if alignment.deformation is not None:
-        before = places_of(latents.coords, alignment.transform).astype(np.float32)
+        before = places_of(latents.centres, alignment.transform).astype(np.float32)
         moved = np.linalg.norm(annotation.place - before, axis=1) / np.float32(VOXEL_SIZE)
     tied = np.zeros(count, dtype=np.float32)
     ties = alignment.open_placements
     # Of a SLAT with far more voxels than usual some ties stand for all.
     some = ties[:: thinning(count)]
     for placement in some:
-        places = places_of(latents.coords, placement.transform).astype(np.float32)
+        places = places_of(latents.centres, placement.transform).astype(np.float32)
         other, there = shares_around(grid, places, labels, (0,), UNANNOTATED)
         tied += np.where(there[:, 0] > 0, other[:, 0], 0.0)
     if len(some) < len(ties):
@@ -273,7 +273,10 @@ def measure_figures(
     from slatprep.geometry.voxels import occupancy_of
 
     rotation, shift, scale = split_transform(alignment.transform)
-    slat, pixie = surface_of(occupancy_of(latents.coords)), surface_of(field.occupancy)
+    slat, pixie = (
+        surface_of(occupancy_of(latents.coords, latents.resolution)),
+        surface_of(field.occupancy),
+    )
     pose = Similarity(rotation, shift / VOXEL_SIZE, scale, 0.0)
     pairing = Pairing(slat, pixie, pose, CHECK_SAMPLES, first=FIT_SAMPLES)
     warp = pairing.start()

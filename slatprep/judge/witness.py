@@ -247,7 +247,7 @@ def weigh(
     if alignment.placements:
         # The others have no deformation, so the best is compared without its own.
         tied = (alignment.transform, *(p.transform for p in alignment.placements))
-        places = (places_of(latents.coords, transform) for transform in tied)
+        places = (places_of(latents.centres, transform) for transform in tied)
         labels = np.stack([sample(field, place, parameters).material for place in places])
     shared = (labels != UNANNOTATED).all(axis=0)
     rows = np.flatnonzero(shared)
@@ -274,11 +274,12 @@ def _against(
     if len(latents.coords) < 2:
         return  # One voxel has no axes.
     lattice = Lattice(field.voxels)
-    places = places_of(latents.coords, alignment.transform)
+    places = places_of(latents.centres, alignment.transform)
     centre = places.mean(axis=0)
     _, axes = np.linalg.eigh(np.cov((places - centre).T))
     steps = (RESOLUTION // BLOCK) ** np.arange(3)
-    blocks = (latents.coords // BLOCK).astype(np.intp) @ steps
+    cells = ((latents.centres + 0.5) * RESOLUTION).astype(np.intp)
+    blocks = cells // BLOCK @ steps
     for axis in axes.T:
         turned = centre + (places - centre) @ (2.0 * np.outer(axis, axis) - np.eye(3))
         _, used = lattice.nearest(turned, limit=REACH)

@@ -42,22 +42,26 @@ def lattice_symmetries(kind: Augmentation) -> NDArray[np.int64]:
     return symmetries[symmetries[:, 2, 2] == 1] if kind == "upright" else symmetries
 
 
-def move(coords: NDArray[np.int32], symmetry: NDArray[np.int64]) -> NDArray[np.int32]:
+def move(
+    coords: NDArray[np.int32], symmetry: NDArray[np.int64], resolution: int = RESOLUTION
+) -> NDArray[np.int32]:
     """Move voxels by a symmetry about the centre of the grid.
 
     Parameters
     ----------
     coords : ndarray of int32, shape (N, 3)
-        Voxels, 0 to 63.
+        Voxels, 0 to resolution - 1.
     symmetry : ndarray of int64, shape (3, 3)
         Signed permutation matrix.
+    resolution : int
+        Voxels along each axis of the grid.
 
     Returns
     -------
     ndarray of int32, shape (N, 3)
-        Indices of the voxel centres ``(i + 0.5) / 64 - 0.5`` multiplied by the matrix.
+        Indices of the voxel centres ``(i + 0.5) / resolution - 0.5`` multiplied by the matrix.
     """
     # Twice the distance from the centre is an odd integer, so the arithmetic is exact.
-    doubled = 2 * coords.astype(np.int64) - (RESOLUTION - 1)
+    doubled = 2 * coords.astype(np.int64) - (resolution - 1)
     moved = doubled @ symmetry.T
-    return ((moved + (RESOLUTION - 1)) // 2).astype(np.int32)
+    return ((moved + (resolution - 1)) // 2).astype(np.int32)

@@ -236,7 +236,9 @@ def _ours(predictions: Path | None, read: ReadAsset, truth: _Truth) -> VoxelPred
     if arrays is None:
         raise InputError(predictions, f"no prediction of {truth.asset_id}", "one of every asset")
     source = f"{predictions}/{truth.asset_id}"
-    return check_prediction(source, arrays, truth.voxels["coords"], truth.store.normalization)
+    store, coords = truth.store, truth.voxels["coords"]
+    held = store.contents.n_classes, store.contents.latents.resolution
+    return check_prediction(source, arrays, coords, store.normalization, *held)
 
 
 def draw_comparison(methods: Mapping[str, Measure], what: str, path: Path) -> None:

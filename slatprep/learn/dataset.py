@@ -193,9 +193,10 @@ class SlatDataset(Dataset[Item]):
             valid = valid & (confidence >= self.min_confidence)
         material = rows["material"].astype(np.int64)
         material[~valid | (rows["material"] == UNANNOTATED)] = IGNORED
+        symmetry, side = self._symmetry(asset_id, draw), self._latents.resolution
         return Item(
             asset_id,
-            torch.from_numpy(move(rows["coords"].astype(np.int32), self._symmetry(asset_id, draw))),
+            torch.from_numpy(move(rows["coords"].astype(np.int32), symmetry, side)),
             torch.from_numpy(self._latents.standardise(rows["feats"])),
             torch.from_numpy(np.where(valid[:, None], rows["properties"], np.float32(0))),
             torch.from_numpy(material),

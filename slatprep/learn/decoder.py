@@ -16,7 +16,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from slatprep.records import PIXIEVERSE, RESOLUTION, Contents
+from slatprep.records import MAX_LATENT_RESOLUTION, PIXIEVERSE, Contents
 
 WINDOW = 8
 
@@ -92,7 +92,7 @@ def partition(coords: Tensor, window: int, shift: int) -> Windows:
         The groups.
     """
     cell = torch.div(coords[:, 1:].long() + shift, window, rounding_mode="floor")
-    across = (RESOLUTION + window) // window + 1
+    across = (MAX_LATENT_RESOLUTION + window) // window + 1
     key = ((coords[:, 0].long() * across + cell[:, 0]) * across + cell[:, 1]) * across + cell[:, 2]
     order = torch.argsort(key, stable=True)
     counts = torch.unique_consecutive(key[order], return_counts=True)[1]

@@ -254,8 +254,8 @@ def evaluate_store(
                 continue
             rows = store.read(index, ("coords", "properties", "material", "valid"))
             source, coords = f"{predictions}/{asset_id}", rows.pop("coords")
-            classes = store.contents.n_classes
-            prediction = check_prediction(source, arrays, coords, store.normalization, classes)
+            held = store.contents.n_classes, store.contents.latents.resolution
+            prediction = check_prediction(source, arrays, coords, store.normalization, *held)
             converted += prediction.converted
             scored.append(index)
             if not store.contents.classes:

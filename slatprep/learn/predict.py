@@ -280,5 +280,6 @@ def write_prediction(
             columns=np.array([span.name for span in checkpoint.normalization.ranges]),
             checkpoint=np.array(checkpoint.sha256),
             seconds=np.array(field.seconds),
+            **checkpoint.contents.latents.beside_voxels,  # type: ignore[arg-type]
         )
     return path

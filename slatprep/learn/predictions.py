@@ -176,6 +176,7 @@ def check_prediction(
     coords: NDArray[np.uint8],
     normalization: Normalization,
     classes: int = CLASSES,
+    resolution: int = RESOLUTION,
 ) -> VoxelPrediction:
     """Check a prediction and put its voxels in the order of the store.
 
@@ -193,6 +194,8 @@ def check_prediction(
         The store's ranges.
     classes : int
         Number of classes of the store.
+    resolution : int
+        Voxels along each axis of the store's latents.
 
     Returns
     -------
@@ -235,7 +238,7 @@ def check_prediction(
             raise InputError(source, "logits are not all numbers", "a score for each class")
         material = logits.argmax(axis=1)
     if "coords" in arrays:
-        order = _order(source, _shaped(source, "coords", arrays, (count, 3)), coords)
+        order = _order(source, _shaped(source, "coords", arrays, (count, 3)), coords, resolution)
         properties = properties[order]
         material = None if material is None else material[order]
     return VoxelPrediction(properties, material, converted)
@@ -250,8 +253,13 @@ def _checked_ranges(
     return ranges
 
 
-def _order(source: str, ours: NDArray[Any], theirs: NDArray[np.uint8]) -> NDArray[np.int64]:
-    keys = flat_index(_whole(source, "coordinate", ours, RESOLUTION)), flat_index(theirs)
+def _order(
+    source: str, ours: NDArray[Any], theirs: NDArray[np.uint8], side: int
+) -> NDArray[np.int64]:
+    keys = (
+        flat_index(_whole(source, "coordinate", ours, side), side),
+        flat_index(theirs, side),
+    )
     mine, stored = (np.argsort(key, kind="stable") for key in keys)
     if not np.array_equal(keys[0][mine], keys[1][stored]):
         raise InputError(source, "has other voxels than the store", "the store's voxel/coords")

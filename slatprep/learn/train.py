@@ -369,7 +369,12 @@ def _write_predictions(checkpoint: Checkpoint, dataset: SlatDataset, folder: Pat
     """Write the predictions for a split, decoded asset by asset."""
     for index, asset_id in zip(dataset.indices.tolist(), dataset.asset_ids, strict=True):
         rows = dataset.store.read(index, ("coords", "feats"))
-        done = dataset.store.contents.latents.standardised
-        latents = StructuredLatents(rows["coords"], rows["feats"], standardised=done)
+        space = dataset.store.contents.latents
+        latents = StructuredLatents(
+            rows["coords"],
+            rows["feats"],
+            standardised=space.standardised,
+            resolution=space.resolution,
+        )
         (field,) = predict(checkpoint, [latents])
         write_prediction(folder, asset_id, field, checkpoint)

@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from slatprep.align.deformation import PlaceMap
 from slatprep.errors import ConfigError, InputError, StoreError
+from slatprep.geometry.voxels import shown_in_cells
 from slatprep.normalize import denormalize_properties
 from slatprep.provenance.stored import StoredRecords
 from slatprep.readers.files import ArraySpec, load_source, npz_arrays, npz_small_arrays
@@ -18,6 +19,7 @@ from slatprep.readers.slat import check_coords
 from slatprep.records import (
     BACKGROUND,
     MATERIAL_CLASSES,
+    MAX_LATENT_RESOLUTION,
     PROPERTY_COLUMNS,
     RESOLUTION,
     Normalization,
@@ -32,6 +34,7 @@ _SPECS = {
 }
 _PROPERTIES = ArraySpec(shapes=((None, 3),), kinds="f")
 _VALID = ArraySpec(shapes=((None,),), kinds="b")
+_SIDE = ArraySpec(shapes=((),), kinds="iu")
 _ANY = ArraySpec(shapes=(), kinds="biuf", max_items=16 * RESOLUTION**3)
 
 
@@ -102,7 +105,8 @@ def stored_field(store: Store, asset_id: str, points: Points = "slat") -> VoxelF
     else:
         valid = asset.valid
         values = asset.properties_si[valid][:, columns]
-        field = VoxelField(asset.coords[valid], asset.material[valid], values)
+        side = store.contents.latents.resolution
+        field = _on_cells(asset.coords[valid], asset.material[valid], values, side)
     if len(field.voxels) == 0:
         raise ConfigError(
             f"{store.path}: no voxel of {asset_id} has a material; expected an asset whose "
@@ -119,7 +123,8 @@ def predicted_field(path: Path, normalization: Normalization | None) -> VoxelFie
     path : Path
         An npz with integer ``coords`` (N, 3) or (N, 4); integer ``material`` (N,), 0..6;
         ``properties`` (N, 3) normalised, or ``properties_si`` (N, 3) in Pa, kg/m^3 and 1; and
-        optionally boolean ``valid`` (N,). `slatprep export --format npz` writes such files.
+        optionally boolean ``valid`` (N,), and ``resolution``, the voxels along each axis where
+        these are not 64. `slatprep export --format npz` writes such files.
     normalization : Normalization or None
         The ranges of ``properties``; None if not known.
 
@@ -138,7 +143,12 @@ def predicted_field(path: Path, normalization: Normalization | None) -> VoxelFie
     data, _ = load_source(path, path.parent, "slat")
     arrays = npz_arrays(data, path, _SPECS)
     held = npz_small_arrays(data, path, _ANY)[0]
-    coords = check_coords(arrays["coords"], path)
+    side = RESOLUTION
+    if "resolution" in held:
+        side = int(npz_arrays(data, path, {"resolution": _SIDE})["resolution"])
+    if not 2 <= side <= MAX_LATENT_RESOLUTION:
+        raise InputError(path, f"has a grid of {side}^3", f"2 to {MAX_LATENT_RESOLUTION} a side")
+    coords = check_coords(arrays["coords"], path, side)
     material = arrays["material"]
     _check_columns(path, data)
     if "properties_si" in held:
@@ -163,9 +173,20 @@ def predicted_field(path: Path, normalization: Normalization | None) -> VoxelFie
             "as many of each, and at least one valid voxel",
         )
     _check_values(path, material, values, valid)
-    return VoxelField(
-        coords[valid], material[valid].astype(np.uint8), values[valid].astype(np.float32)
+    return _on_cells(
+        coords[valid], material[valid].astype(np.uint8), values[valid].astype(np.float32), side
     )
+
+
+def _on_cells(
+    coords: NDArray[np.uint8],
+    material: NDArray[np.uint8],
+    properties: NDArray[np.float32],
+    side: int,
+) -> VoxelField:
+    """Return the materials of SLAT voxels of a grid, on the 64^3 grid of the frame."""
+    cells, row = shown_in_cells(coords, side)
+    return VoxelField(cells, material[row], properties[row])
 
 
 def _check_columns(path: Path, data: bytes) -> None:

@@ -59,7 +59,7 @@ def annotate(
     if alignment is None:
         alignment = align(field, latents, parameters.align)
     reached("asset reused" if reused else "asset aligned", pair.asset_id)
-    annotation = sample(field, map_of(alignment).places(latents.coords), parameters.sample)
+    annotation = sample(field, map_of(alignment).to_pixieverse(latents.centres), parameters.sample)
     if judgement is None:
         judgement, likely = judge(field, latents, alignment, annotation, parameters.sample)
     else:

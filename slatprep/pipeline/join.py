@@ -18,7 +18,7 @@ from slatprep.pipeline.rewrite import NO_EXTENT, Source, places_of_sources, writ
 from slatprep.pipeline.spool import spooled
 from slatprep.pipeline.summary import BuildSummary
 from slatprep.provenance.stored import StoredRecords
-from slatprep.records import Contents, Normalization, Place, PropertyRange
+from slatprep.records import Contents, LatentSpace, Normalization, Place, PropertyRange
 from slatprep.store import open_store
 from slatprep.store.layout import FORMAT_VERSION
 from slatprep.workers import Progress
@@ -175,6 +175,11 @@ def _common_ranges(sources: Sequence[Source]) -> Normalization:
     return Normalization(tuple(spans), "dataset")
 
 
+def _in_words(space: LatentSpace) -> str:
+    grid = f"{space.channels} channels, {space.resolution}^3 voxels"
+    return f"{space.encoder!r} ({grid}, standardised: {space.standardised})"
+
+
 def _common_contents(sources: Sequence[Source]) -> Contents:
     """Return what all stores hold; moments of latents that a build measured are pooled."""
     first = sources[0].store.contents
@@ -188,9 +193,8 @@ def _common_contents(sources: Sequence[Source]) -> Contents:
                 )
         if replace(other.latents, mean=(), std=()) != replace(first.latents, mean=(), std=()):
             raise ConfigError(
-                f"{source.store.path} has latents of {other.latents.encoder!r} (standardised: "
-                f"{other.latents.standardised}), {sources[0].store.path} of "
-                f"{first.latents.encoder!r} ({first.latents.standardised}); expected the same"
+                f"{source.store.path} has latents of {_in_words(other.latents)}, "
+                f"{sources[0].store.path} of {_in_words(first.latents)}; expected the same"
             )
     if all(source.store.contents == first for source in sources):
         return first

@@ -120,7 +120,7 @@ class PreviousBuild:
             return False
         places = np.asarray(asset.annotation.place, np.float64)
         if record.first_pass is not None:
-            places = map_of(record.alignment).places(asset.latents.coords)
+            places = map_of(record.alignment).to_pixieverse(asset.latents.centres)
         elif not np.array_equal(held["material"], asset.annotation.material):
             return False
         same_rows = held["place"].shape == places.shape

@@ -40,7 +40,8 @@ class Reopened:
         arrays = spool.voxels(asset.key)
         self._asset, self._spool = asset, spool
         self.record: AssetRecord = record
-        self.latents = StructuredLatents(arrays.pop("coords"), arrays.pop("feats"))
+        del arrays["coords"], arrays["feats"]
+        self.latents: StructuredLatents = spool.latents(asset.key)
         self.annotation = Annotation(**arrays)
         self.field: MaterialField = spool.field(asset.key)
 
@@ -50,7 +51,7 @@ class Reopened:
         """Look up and judge under another alignment; fit it first if its placement is another."""
         if alignment.transform is not self.record.alignment.transform:
             alignment = refit(alignment, self.field, self.latents, parameters.align)
-        places = map_of(alignment).places(self.latents.coords)
+        places = map_of(alignment).to_pixieverse(self.latents.centres)
         annotation = sample(self.field, places, parameters.sample)
         judgement, likely = judge(
             self.field, self.latents, alignment, annotation, parameters.sample

@@ -137,6 +137,7 @@ class Spool:
         arrays: Arrays = {"extent": extent}
         if self.arrays:
             arrays |= {name: getattr(latents, name) for name in ("coords", "feats")}
+            arrays["slat_resolution"] = np.array(latents.resolution)
             arrays |= {name: getattr(annotation, name) for name in _VOXEL_ARRAYS[2:]}
             if annotation.spread is not None and annotation.votes is not None:
                 arrays |= {"spread": annotation.spread, "votes": annotation.votes}
@@ -223,6 +224,12 @@ class Spool:
         with self._open(key) as arrays:
             there = (name for name in (*_VOXEL_ARRAYS, *MERGED_COLUMNS) if name in arrays)
             return {name: arrays[name] for name in there}
+
+    def latents(self, key: str) -> StructuredLatents:
+        """Read an asset's SLAT, without its sources."""
+        with self._open(key) as arrays:
+            resolution = int(arrays["slat_resolution"])
+            return StructuredLatents(arrays["coords"], arrays["feats"], resolution=resolution)
 
     def field(self, key: str) -> MaterialField:
         """Read an asset's PixieVerse field, without its sources."""

@@ -23,7 +23,6 @@ from slatprep.records import (
     Judgement,
     LatentMoments,
     Place,
-    StructuredLatents,
 )
 from slatprep.store import Store, open_store
 from slatprep.store.layout import FORMAT_VERSION
@@ -108,12 +107,11 @@ class _Judged(StoredRecords):
 
     def _judge(self, row: int, record: AssetRecord) -> None:
         asset = self.store.asset(self.store.ids[row])
-        latents = StructuredLatents(asset.coords, asset.feats)
         annotation = Annotation(
             asset.properties_si, asset.material, asset.valid, asset.distance, asset.place
         )
         judgement, likely = judge(
-            asset.field, latents, record.alignment, annotation, record.parameters.sample
+            asset.field, asset.latents, record.alignment, annotation, record.parameters.sample
         )
-        self._known[row] = judgement, latents.moments
+        self._known[row] = judgement, asset.latents.moments
         self._rows = row, {"place": asset.place, "confidence": likely}

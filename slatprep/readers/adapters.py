@@ -82,6 +82,9 @@ class LatentAdapter(Protocol):
     def read(self, path: Place, root: Place, group: str, space: LatentSpace) -> StructuredLatents:
         """Read one SLAT; `space` says whether it has been standardised."""
 
+    # An adapter may also have `patterns`, where its files lie below the root unless the dataset
+    # definition says otherwise.
+
 
 SOURCES = {
     "pixieverse": "slatprep.readers.pixieverse:PixieVerse",
@@ -95,6 +98,7 @@ LATENTS = {
     "trellis": "slatprep.readers.slat:trellis",
     "sam3d": "slatprep.readers.slat:sam3d",
     "trellis2": "slatprep.readers.slat:trellis2",
+    "trellis2-512": "slatprep.readers.slat:trellis2_512",
 }
 """slatprep's own latent adapters."""
 

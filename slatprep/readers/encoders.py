@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from slatprep.errors import ConfigError
 from slatprep.parameters import SlatSource
 from slatprep.readers.adapters import adapter_names, latent_adapter
-from slatprep.records import RESOLUTION, LatentMoments, LatentSpace, Place
+from slatprep.records import LatentMoments, LatentSpace, Place
 from slatprep.storage.documents import read_document
 from slatprep.storage.place import place_of
 
@@ -34,15 +34,10 @@ def latent_space(source: SlatSource) -> LatentSpace:
     Raises
     ------
     ConfigError
-        If there is no such encoder, its grid is another, or the file does not say what it must.
+        If there is no such encoder, or the file does not say what it must.
     """
     adapter = latent_adapter(source.encoder)
     known = adapter.space if adapter else _read_space(place_of(source.encoder))
-    if known.resolution != RESOLUTION:
-        raise ConfigError(
-            f"slat.encoder: latents of {known.encoder} lie on a grid of {known.resolution}^3; only "
-            f"those of {RESOLUTION}^3 can be placed (TRELLIS.2's of resolution 1024 do)"
-        )
     return replace(known, standardised=source.standardised == "yes")
 
 

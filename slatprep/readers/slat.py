@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from slatprep.errors import InputError
 from slatprep.geometry.voxels import flat_index
+from slatprep.parameters import SlatSource
 from slatprep.readers.encoders import ENOUGH, in_words, look_standardised
 from slatprep.readers.files import ArraySpec, load_source, npz_arrays
 from slatprep.readers.hdf5 import SUFFIXES, load_datasets
@@ -28,6 +29,7 @@ class _Slat:
     """Reads latents that lie as TRELLIS's tools save them."""
 
     space: LatentSpace
+    patterns: tuple[str, ...] = ()
 
     def read(self, path: Place, root: Place, group: str, space: LatentSpace) -> StructuredLatents:
         """Read one SLAT; see `read_slat`."""
@@ -47,6 +49,12 @@ def sam3d() -> _Slat:
 def trellis2() -> _Slat:
     """Return what reads TRELLIS.2's shape latents of resolution 1024; no moments are published."""
     return _Slat(LatentSpace("trellis2", 32, RESOLUTION))
+
+
+def trellis2_512() -> _Slat:
+    """Return what reads those of resolution 512, which TRELLIS.2's toolkit puts beside them."""
+    patterns = tuple(one.replace("_1024/", "_512/") for one in SlatSource.pattern)
+    return _Slat(LatentSpace("trellis2-512", 32, RESOLUTION // 2), patterns)
 
 
 _COORDS = ArraySpec(shapes=((None, 3), (None, 4)), kinds="iu")
@@ -111,12 +119,15 @@ def checked_latents(
         raise InputError(where, "the SLAT is empty", "at least one voxel")
     warnings: list[str] = []
     latents = StructuredLatents(
-        check_coords(coords, where), _check_feats(feats, where, warnings), sources
+        check_coords(coords, where, space.resolution, f" (slat.encoder: {space.encoder})"),
+        _check_feats(feats, where, warnings),
+        sources,
+        resolution=space.resolution,
     )
-    if len(coords) >= ENOUGH and latents.coords.max() < RESOLUTION // 2:
+    if len(coords) >= ENOUGH and latents.coords.max() < space.resolution // 2:
         warnings.append(
             f"no coordinate is above {latents.coords.max()}: if it lies on a grid of less than "
-            f"{RESOLUTION}^3, its places are wrong"
+            f"{space.resolution}^3, its places are wrong"
         )
     enough = len(coords) >= ENOUGH and not space.standardised
     if enough and look_standardised(latents.moments, space):
@@ -127,8 +138,12 @@ def checked_latents(
     return replace(latents, warnings=tuple(warnings))
 
 
-def check_coords(coords: NDArray[Any], where: str | Place) -> NDArray[np.uint8]:
+def check_coords(
+    coords: NDArray[Any], where: str | Place, side: int = RESOLUTION, whose: str = ""
+) -> NDArray[np.uint8]:
     """Return SLAT coordinates as (N, 3) uint8, without the batch column where there is one.
+
+    `side` is the number of voxels along each axis, and `whose` what an error says of it.
 
     Raises
     ------
@@ -145,17 +160,17 @@ def check_coords(coords: NDArray[Any], where: str | Place) -> NDArray[np.uint8]:
                 "one asset per file, batch index 0 throughout",
             )
         coords = coords[:, 1:]
-    outside = ((coords < 0) | (coords >= RESOLUTION)).any(axis=1)
+    outside = ((coords < 0) | (coords >= side)).any(axis=1)
     if outside.any():
         row = int(np.argmax(outside))
         raise InputError(
             where,
             f"coordinate {_triple(coords[row])} in row {row} is out of range",
-            f"coordinates in 0..{RESOLUTION - 1}",
+            f"coordinates in 0..{side - 1}{whose}",
         )
     voxels = np.ascontiguousarray(coords).astype(np.uint8)
-    flat = flat_index(voxels)
-    counts = np.bincount(flat, minlength=RESOLUTION**3)
+    flat = flat_index(voxels, side)
+    counts = np.bincount(flat)
     if counts.max() > 1:
         rows = np.flatnonzero(counts[flat] > 1)
         first, second = np.flatnonzero(flat == flat[rows[0]])[:2]

@@ -8,6 +8,7 @@ from urllib.parse import quote
 
 from slatprep.errors import ConfigError, InputError
 from slatprep.parameters import SlatSource
+from slatprep.readers.adapters import latent_adapter
 from slatprep.readers.patterns import find_files, list_below, tried_names
 from slatprep.records import Place
 
@@ -86,12 +87,18 @@ def find_slats(source: SlatSource, one_file: bool) -> dict[str, list[NamedSlat]]
     for slat in _each_slat(source, one_file):
         slats.setdefault(slat.slat_id, []).append(slat)
     if not slats:
-        tried = f"groups {source.group}" if one_file else tried_names(source.pattern, {})
+        tried = f"groups {source.group}" if one_file else tried_names(_patterns_of(source), {})
         raise ConfigError(f"{source.root}: no SLAT found; looked for {tried}")
     problems = [slat.problem for found in slats.values() for slat in found if slat.problem]
     if one_file and problems:
         raise ConfigError(problems[0])
     return slats
+
+
+def _patterns_of(source: SlatSource) -> tuple[str, ...]:
+    """Return the patterns of the dataset definition, or the encoder's own where it has none."""
+    own = getattr(latent_adapter(source.encoder), "patterns", ())
+    return own if own and source.pattern == SlatSource.pattern else source.pattern
 
 
 def _each_slat(source: SlatSource, one_file: bool) -> Iterator[NamedSlat]:
@@ -100,7 +107,7 @@ def _each_slat(source: SlatSource, one_file: bool) -> Iterator[NamedSlat]:
         return
     listing = list_below(source.root)
     unlisted: set[str] = set()
-    for pattern in source.pattern:
+    for pattern in _patterns_of(source):
         for fields, path, problem in find_files(listing, pattern, {}):
             if path in unlisted:
                 continue

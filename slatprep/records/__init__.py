@@ -52,6 +52,7 @@ from slatprep.records.sources import (
 from slatprep.records.tables import (
     CLASS_NAME,
     MAX_CHANNELS,
+    MAX_LATENT_RESOLUTION,
     MAX_PROPERTIES,
     PIXIEVERSE,
     PROPERTIES,

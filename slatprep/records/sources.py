@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from slatprep.records.json_types import Count, Digest, _one_of
 from slatprep.records.tables import PIXIEVERSE, PROPERTIES, Contents, LatentMoments, Property
+from slatprep.records.words import RESOLUTION
 
 
 class Place(Protocol):
@@ -205,9 +206,10 @@ class MaterialField:
 class StructuredLatents:
     """A SLAT: occupied surface voxels and their latents.
 
-    ``coords`` is (N, 3) uint8 in 0..63 in the order of the source file,
+    ``coords`` is (N, 3) uint8 in 0..resolution - 1 in the order of the source file,
     ``feats`` is (N, channels) float32; ``standardised`` says whether these have
-    been standardised already.
+    been standardised already. ``resolution`` is that of the encoder's grid, voxels along
+    each axis of the unit cube: of 64 they are those of the frame.
     """
 
     coords: NDArray[np.uint8]
@@ -215,6 +217,12 @@ class StructuredLatents:
     sources: tuple[SourceFile, ...] = ()
     warnings: tuple[str, ...] = ()
     standardised: bool = False
+    resolution: int = RESOLUTION
+
+    @cached_property
+    def centres(self) -> NDArray[np.float64]:
+        """The centres (N, 3) of its voxels in the unit cube [-0.5, 0.5]^3 of the SLAT frame."""
+        return (self.coords.astype(np.float64) + 0.5) / self.resolution - 0.5
 
     @cached_property
     def moments(self) -> LatentMoments:

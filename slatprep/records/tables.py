@@ -22,6 +22,9 @@ from slatprep.records.words import (
 MAX_PROPERTIES, MAX_CHANNELS = 32, 256
 """Columns of properties, and channels of latents, that one store may have."""
 
+MAX_LATENT_RESOLUTION = 256
+"""Voxels along each axis of the finest grid of latents: coordinates are bytes."""
+
 PropertyName = Annotated[str, InJson({"type": "str", "pattern": r"^[a-z][a-z0-9_]{0,63}$"})]
 """Name of a property: lower-case letters, digits and ``_``, a letter first."""
 
@@ -111,7 +114,7 @@ class LatentSpace:
 
     encoder: str
     channels: Annotated[int, Ge(1), Le(MAX_CHANNELS)]
-    resolution: Annotated[int, Ge(2), Le(256)]
+    resolution: Annotated[int, Ge(2), Le(MAX_LATENT_RESOLUTION)]
     mean: tuple[float, ...] = ()
     std: tuple[float, ...] = ()
     standardised: bool = False
@@ -120,6 +123,11 @@ class LatentSpace:
         counts = {len(self.mean), len(self.std)}
         if counts not in ({0}, {self.channels}) or not all(s > 0 for s in self.std):
             raise ValueError(f"a mean and a std above 0 for each of {self.channels} channels")
+
+    @property
+    def beside_voxels(self) -> dict[str, NDArray[np.int64]]:
+        """What an npz says beside its voxels: their ``resolution``, unless it is the frames'."""
+        return {} if self.resolution == RESOLUTION else {"resolution": np.array(self.resolution)}
 
     def standardise(self, feats: NDArray[np.float32]) -> NDArray[np.float32]:
         """Return latents (N, channels) with mean 0 and standard deviation 1; done once."""

@@ -13,10 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slatprep.errors import ConfigError, StoreError
-from slatprep.geometry.frames import places_of
+from slatprep.geometry.frames import places_of, voxel_centres
 from slatprep.geometry.voxels import voxels_of
 from slatprep.normalize import denormalize_properties
-from slatprep.records import BACKGROUND, MaterialField, Place
+from slatprep.records import BACKGROUND, MaterialField, Place, StructuredLatents
 from slatprep.storage.place import place_of, storage_of
 from slatprep.store.assets import ASSET_COLUMNS, AssetTable, AttributesError
 from slatprep.store.attributes import width_findings
@@ -50,7 +50,7 @@ class StoredAsset:
     asset_id : str
         Id of the row.
     coords : ndarray of uint8, shape (N, 3)
-        SLAT voxels.
+        SLAT voxels of the encoder's grid; ``latents.centres`` says where they lie.
     feats : ndarray of float32, shape (N, channels)
         Their latents; ``store.contents.latents`` says what they are.
     properties : ndarray of float32, shape (N, P)
@@ -105,6 +105,17 @@ class StoredAsset:
     def merged(self) -> bool:
         """Whether its labels are merged of several annotations."""
         return not np.isnan(self.votes[:1]).all()
+
+    @cached_property
+    def latents(self) -> StructuredLatents:
+        """Its SLAT, as it was read."""
+        space = self.store.contents.latents
+        return StructuredLatents(
+            self.coords,
+            self.feats,
+            standardised=space.standardised,
+            resolution=space.resolution,
+        )
 
     @cached_property
     def properties_si(self) -> NDArray[np.float32]:
@@ -229,8 +240,8 @@ class Store(AssetTable):
 
     def _voxel_rows(self, name: str, index: int, start: int, stop: int) -> NDArray[Any]:
         if name == "place" and self.format_version == 1:
-            coords = self.read_rows("voxel/coords", start, stop)
-            return places_of(coords, self._column("transform")[index]).astype(np.float32)
+            centres = voxel_centres(self.read_rows("voxel/coords", start, stop))
+            return places_of(centres, self._column("transform")[index]).astype(np.float32)
         if name == "confidence" and self.format_version == 1:
             return np.full(stop - start, np.nan, dtype=np.float32)
         if name in MERGED_COLUMNS and not self.merges:

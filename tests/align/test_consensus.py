@@ -61,7 +61,7 @@ def test_a_tie_goes_to_the_common_rotation_and_can_be_undone() -> None:
     latents = surface_latents(turned(_box(), COMMON))
     before = align(field_of(_box()), latents, AlignParameters())
     after = settle(before, latents, consensus)
-    assert displacement(after.transform, make_transform(COMMON), latents.coords) < 0.05
+    assert displacement(after.transform, make_transform(COMMON), latents.centres) < 0.05
     choices = [before.transform, *(p.transform for p in before.placements)]
     others = [after.transform, *(p.transform for p in after.placements)]
     assert {c.tobytes() for c in choices} == {c.tobytes() for c in others}
@@ -121,7 +121,7 @@ def test_a_planted_rotation_raises_the_share_of_symmetric_assets_placed_right() 
             ("before", alignment),
             ("after", settle(alignment, latents, consensus)),
         ):
-            apart = displacement(settled.transform, make_transform(COMMON), latents.coords)
+            apart = displacement(settled.transform, make_transform(COMMON), latents.centres)
             right[when] += apart < 1.5
     assert len(ambiguous) == 8
     assert right["after"] == 8

@@ -171,7 +171,7 @@ def test_the_lookup_goes_through_the_map() -> None:
     way = PlaceMap(np.eye(4), bent(voxels=1.0))
     through = sample(field, way.places(latents.coords), SampleParameters())
     assert through.place.tobytes() == way.places(latents.coords).astype(np.float32).tobytes()
-    plain = sample(field, places_of(latents.coords, np.eye(4)), SampleParameters())
+    plain = sample(field, places_of(latents.centres, np.eye(4)), SampleParameters())
     none = sample(field, PlaceMap(np.eye(4)).places(latents.coords), SampleParameters())
     assert plain.distance.tobytes() == none.distance.tobytes()
     assert plain.distance.tobytes() != through.distance.tobytes()

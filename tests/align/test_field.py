@@ -35,7 +35,7 @@ def test_a_quarter_turn_is_found_exactly(index: int) -> None:
     solid = chair()
     latents = surface_latents(turned(solid, rotation))
     alignment = align(field_of(solid), latents, DEFAULT)
-    assert displacement(alignment.transform, make_transform(rotation), latents.coords) < 0.01
+    assert displacement(alignment.transform, make_transform(rotation), latents.centres) < 0.01
     assert alignment.model == "rigid"
     assert alignment.search == "euler64"
     assert alignment.quality.fitness == alignment.quality.fitness_backward == 1.0
@@ -83,7 +83,7 @@ def test_accuracy_on_demo_data(level: int, demo_cases: Callable[[int], list[Case
             compare_with_truth(
                 truth.name,
                 truth,
-                coords=latents.coords,
+                centres=latents.centres,
                 transform=alignment.transform,
                 material=annotation.material,
                 valid=annotation.valid,
@@ -130,7 +130,7 @@ def test_a_poor_fit_widens_the_search_and_says_so(monkeypatch: pytest.MonkeyPatc
     monkeypatch.setattr("slatprep.align.field.distinct_starts", lambda: same)
     alignment = align(field_of(chair()), latents, DEFAULT)
     assert alignment.search == "so3"
-    assert displacement(alignment.transform, make_transform(rotation), latents.coords) < 0.01
+    assert displacement(alignment.transform, make_transform(rotation), latents.centres) < 0.01
 
 
 def test_two_different_objects_fail_after_a_search_of_all_orientations() -> None:
@@ -148,7 +148,7 @@ def test_a_missing_part_and_a_stray_part_do_not_pull() -> None:
     damaged = solid & (((GRID - np.array([42, 30, 24])) ** 2).sum(axis=-1) > 64)
     damaged |= ((GRID - np.array([56, 8, 8])) ** 2).sum(axis=-1) < 16
     alignment = align(field_of(damaged), latents, DEFAULT)
-    assert displacement(alignment.transform, np.eye(4), latents.coords) < 0.05
+    assert displacement(alignment.transform, np.eye(4), latents.centres) < 0.05
 
 
 def test_the_search_looks_at_no_more_of_a_grid_full_of_voxels(
@@ -217,7 +217,7 @@ def test_odd_shapes_get_a_finite_answer_and_a_verdict(name: str) -> None:
         assert (judgement.verdict is Verdict.GOOD) == (not judgement.reasons)
     if name in ("a dozen", "two far blobs"):
         same = align(field, own, DEFAULT)
-        assert displacement(same.transform, np.eye(4), own.coords) < 0.01
+        assert displacement(same.transform, np.eye(4), own.centres) < 0.01
 
 
 @settings(max_examples=15)

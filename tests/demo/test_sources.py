@@ -15,7 +15,7 @@ from click.testing import CliRunner
 from slatprep import open_store
 from slatprep.cli.commands import slatprep as command
 from slatprep.demo import make_demo
-from slatprep.demo.latents import CHANNELS, Encoder
+from slatprep.demo.latents import GRIDS, Encoder
 from slatprep.demo.sources import CLASSES, ONE_FRAME, TABLE, Source, columns_of
 from slatprep.errors import ConfigError
 
@@ -88,7 +88,7 @@ def test_latents_of_every_encoder_are_carried(tmp_path: Path, encoder: Encoder) 
     run(*printed(said, "next:"))
     store = open_store(tmp_path / "demo.zarr")
     assert store.contents.latents.encoder == encoder
-    assert store.contents.latents.channels == CHANNELS[encoder]
+    assert store.contents.latents.channels == GRIDS[encoder][0]
     assert not store.contents.latents.standardised
     (asset,) = store
     (file,) = (tmp_path / "demo" / "slat").rglob("*.npz")

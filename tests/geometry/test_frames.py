@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import itertools
+import math
+from fractions import Fraction
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -16,7 +20,13 @@ from slatprep.geometry.frames import (
     split_transform,
     voxel_centres,
 )
-from slatprep.geometry.voxels import boundary, bounding_box, occupancy_of, voxels_of
+from slatprep.geometry.voxels import (
+    boundary,
+    bounding_box,
+    occupancy_of,
+    shown_in_cells,
+    voxels_of,
+)
 
 numbers = st.floats(-2, 2)
 poses = st.tuples(
@@ -100,9 +110,37 @@ def test_an_empty_set_has_no_box() -> None:
 
 def test_displacement_by_hand() -> None:
     shifted = make_transform(np.eye(3), [3 / 64, 4 / 64, 0])
-    assert displacement(shifted, np.eye(4), [[1, 2, 3], [60, 5, 9]]) == pytest.approx(5.0)
+    assert displacement(
+        shifted, np.eye(4), voxel_centres([[1, 2, 3], [60, 5, 9]])
+    ) == pytest.approx(5.0)
     # Scaled by 2, the inverse looks half as far from the centre: 0.5 voxel at
     # the voxel whose centre is one voxel off on one axis... and root 3 of it on all.
     doubled = make_transform(np.eye(3), scale=2.0)
     voxel = [[32, 32, 32]]  # centred half a voxel off on each axis
-    assert displacement(doubled, np.eye(4), voxel) == pytest.approx(np.sqrt(3) * 0.25)
+    assert displacement(doubled, np.eye(4), voxel_centres(voxel)) == pytest.approx(
+        np.sqrt(3) * 0.25
+    )
+
+
+@pytest.mark.parametrize("side", [2, 31, 32, 48, 64, 96, 128, 256])
+def test_cells_of_voxels_of_any_grid_are_those_that_centres_say(side: int) -> None:
+    voxels = np.unique(np.random.default_rng(side).integers(0, side, (300, 3)), axis=0)
+    voxels = np.random.default_rng(0).permutation(voxels).astype(np.uint8)
+    cells, row = shown_in_cells(voxels, side)
+    known = {tuple(voxel): number for number, voxel in enumerate(voxels.tolist())}
+    expected: dict[tuple[int, ...], int] = {}
+    for number, voxel in enumerate(voxels.tolist()):
+        # The cell that the voxel's centre lies in; on a border, the one that begins there.
+        cell = tuple(math.floor(Fraction(2 * i + 1, 2 * side) * 64) for i in voxel)
+        if side >= 64 and cell not in expected:
+            expected[cell] = number
+    if side < 64:
+        holder = [math.floor(Fraction(2 * i + 1, 128) * side) for i in range(64)]
+        for cell in itertools.product(range(64), repeat=3):
+            number = known.get(tuple(holder[i] for i in cell), -1)
+            if number >= 0:
+                expected[cell] = number
+    assert dict(zip(map(tuple, cells.tolist()), row.tolist(), strict=True)) == expected
+    assert cells.dtype == np.uint8
+    occupied = {tuple(cell) for cell in np.argwhere(occupancy_of(voxels, side)).tolist()}
+    assert occupied == expected.keys()

@@ -137,8 +137,8 @@ def test_voxels_are_matched_wherever_they_lie(mixed_build: BuildSummary, copy: P
     assert of.keys() == {"ant", "dog"}
     assert of["ant"].what == ("voxels",) and of["ant"].unmatched == 0
     dog_before = before.asset("dog")
-    assert of["dog"].unmatched == 2 and of["dog"].voxels == len(dog_before.coords) - 1
-    assert of["dog"].moved == displacement(turned, dog_before.transform, dog_before.coords)
+    assert of["dog"].unmatched == 2 and of["dog"].voxels == len(dog_before.latents.centres) - 1
+    assert of["dog"].moved == displacement(turned, dog_before.transform, dog_before.latents.centres)
     assert of["dog"].moved == pytest.approx(2)
     assert set(of["dog"].what) == {"voxels", "placement", "columns"}
 

@@ -11,7 +11,7 @@ import pytest
 
 from slatprep.errors import ConfigError, InputError
 from slatprep.parameters import SlatSource
-from slatprep.readers import read_latents
+from slatprep.readers import read_latents, read_slat
 from slatprep.readers.encoders import latent_space, look_standardised, resolve_latents
 from slatprep.records import FEATS_MEAN, FEATS_STD, TRELLIS, LatentMoments, LatentSpace
 
@@ -98,8 +98,22 @@ def test_an_unknown_encoder_is_named_with_those_there_are(tmp_path: Path) -> Non
         latent_space(SlatSource(tmp_path, encoder="trelis"))
 
 
-def test_a_grid_that_cannot_be_placed_is_refused(tmp_path: Path) -> None:
+def test_voxels_are_of_the_encoder_s_grid(tmp_path: Path) -> None:
     path = tmp_path / "coarse.json"
-    path.write_text(json.dumps({"encoder": "coarse", "channels": 32, "resolution": 32}))
-    with pytest.raises(ConfigError, match=r"coarse lie on a grid of 32\^3; only those of 64\^3"):
+    path.write_text(json.dumps({"encoder": "coarse", "channels": 2, "resolution": 32}))
+    space = latent_space(SlatSource(tmp_path, encoder=str(path)))
+    coords, feats = np.array([[0, 15, 31]], np.uint8), np.ones((1, 2), np.float32)
+    np.savez(tmp_path / "a.npz", coords=coords, feats=feats)
+    read = read_slat(tmp_path / "a.npz", tmp_path, space=space)
+    np.testing.assert_allclose(read.centres, [[-31 / 64, -1 / 64, 31 / 64]])
+    np.savez(tmp_path / "a.npz", coords=coords + 1, feats=feats)
+    with pytest.raises(InputError, match=r"\(1, 16, 32\).*0\.\.31.*slat\.encoder: coarse"):
+        read_slat(tmp_path / "a.npz", tmp_path, space=space)
+
+
+@pytest.mark.parametrize("resolution", [1, 257])
+def test_a_grid_that_coordinates_cannot_have_is_refused(tmp_path: Path, resolution: int) -> None:
+    path = tmp_path / "mine.json"
+    path.write_text(json.dumps({"encoder": "mine", "channels": 2, "resolution": resolution}))
+    with pytest.raises(ConfigError, match=r"mine\.json.*resolution"):
         latent_space(SlatSource(tmp_path, encoder=str(path)))

@@ -15,7 +15,13 @@ from slatprep.geometry.frames import (
     split_transform,
     voxel_centres,
 )
-from slatprep.geometry.voxels import boundary, occupancy_of, outer_boundary, voxels_of
+from slatprep.geometry.voxels import (
+    boundary,
+    occupancy_of,
+    outer_boundary,
+    shown_in_cells,
+    voxels_of,
+)
 from slatprep.inspect.pictures.palette import DISTANCE_COLOURS
 from slatprep.inspect.pictures.voxels import View, view_rotation
 from slatprep.provenance.stored import StoredRecords
@@ -43,7 +49,7 @@ class Scene:
     pixieverse_material : ndarray of uint8, shape (K,)
         Their classes; 255 if not annotated.
     slat : ndarray of uint8, shape (N, 3)
-        SLAT voxels.
+        Cells of the 64^3 grid that SLAT voxels occupy: the voxels themselves, of a SLAT of 64^3.
     slat_material : ndarray of uint8, shape (N,)
         Their classes by the lookup; 255 if not valid.
     transform : ndarray of float64, shape (4, 4)
@@ -117,19 +123,20 @@ def scene_of(asset: StoredAsset) -> Scene:
     occupancy = asset.grid_material != BACKGROUND
     shell = voxels_of(boundary(occupancy))
     outer = outer_boundary(occupancy)
-    surface = outer_boundary(occupancy_of(asset.coords))
+    cells, row = shown_in_cells(asset.coords, asset.store.contents.latents.resolution)
+    surface = outer_boundary(occupancy_of(cells))
     way = StoredRecords(asset.store).place_map(asset)
     under = surface_distance(surface, outer, asset.transform)
     if way.deformation is None:
         deformed, error, before = None, under, surface_distance(surface, outer, np.eye(4))
     else:
-        deformed = _deformed(asset, way)
+        deformed = _deformed(asset, way, row)
         error, before = surface_distance(surface, outer, asset.transform, way), under
     return Scene(
         pixieverse=shell,
         pixieverse_material=asset.grid_material[tuple(shell.T)],
-        slat=asset.coords,
-        slat_material=asset.material,
+        slat=cells,
+        slat_material=asset.material[row],
         transform=asset.transform,
         surface=surface,
         error=error,
@@ -139,7 +146,7 @@ def scene_of(asset: StoredAsset) -> Scene:
     )
 
 
-def _deformed(asset: StoredAsset, way: PlaceMap) -> Deformed:
+def _deformed(asset: StoredAsset, way: PlaceMap, row: NDArray[np.intp]) -> Deformed:
     cells = np.indices((RESOLUTION,) * 3, dtype=np.uint8).reshape(3, -1).T
     found = np.rint((way.places(cells) + 0.5) * RESOLUTION - 0.5).astype(np.intp)
     inside = ((found >= 0) & (found < RESOLUTION)).all(axis=1)
@@ -147,7 +154,7 @@ def _deformed(asset: StoredAsset, way: PlaceMap) -> Deformed:
     material[inside] = asset.grid_material[tuple(found[inside].T)]
     grid = material.reshape((RESOLUTION,) * 3)
     shell = voxels_of(boundary(grid != BACKGROUND))
-    moved = asset.place - places_of(asset.coords, asset.transform)
+    moved = (asset.place - places_of(asset.latents.centres, asset.transform))[row]
     return Deformed(shell, grid[tuple(shell.T)], np.linalg.norm(moved, axis=1) / VOXEL_SIZE)
 
 
@@ -176,7 +183,8 @@ def surface_distance(
     from slatprep.geometry.nearest import Lattice
 
     _, _, scale = split_transform(transform)
-    points = places_of(slat, transform) if way is None else way.places(slat)
+    points = voxel_centres(slat)
+    points = places_of(points, transform) if way is None else way.to_pixieverse(points)
     distance, _ = Lattice(pixieverse).nearest(points)
     scaled: NDArray[np.float64] = distance * scale
     return scaled

@@ -14,6 +14,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from slatprep.geometry.voxels import shown_in_cells
 from slatprep.records import (
     BACKGROUND,
     CLASS_COLOURS,
@@ -55,7 +56,8 @@ def thumbnail(asset: StoredAsset) -> NDArray[np.uint8]:
     """
     grid = np.zeros((RESOLUTION,) * 3, dtype=np.uint8)
     colour = np.where(asset.material == UNANNOTATED, BACKGROUND, asset.material)
-    grid[tuple(asset.coords.T.astype(np.intp))] = 1 + colour
+    cells, row = shown_in_cells(asset.coords, asset.store.contents.latents.resolution)
+    grid[tuple(cells.T.astype(np.intp))] = 1 + colour[row]
     views = (
         grid.transpose(1, 2, 0)[:, ::-1, :],  # depth y, rows from z = 63 down, columns x
         grid.transpose(0, 2, 1)[::-1, ::-1, :],  # depth from x = 63 down, columns y

@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 
 from slatprep.align.deformation import PlaceMap
 from slatprep.geometry.frames import apply_transform, invert_transform, voxel_centres
-from slatprep.geometry.voxels import boundary, filled
+from slatprep.geometry.voxels import boundary, filled, shown_in_cells
 from slatprep.records import BACKGROUND, RESOLUTION, UNANNOTATED
 from slatprep.store import StoredAsset
 
@@ -59,7 +59,9 @@ def encode_asset(asset: StoredAsset, way: PlaceMap, max_distance: float, side: i
     bytes
         In the form that this module describes.
     """
-    first, occupied = _cells(asset.coords, side)
+    cells, row = shown_in_cells(asset.coords, asset.store.contents.latents.resolution)
+    first, occupied = _cells(cells, side)
+    first = row[first]
     grid, material = _boundary_of(asset.grid_material)
     chosen, grid_occupied = _cells(grid, side)
     scalars = np.column_stack(

@@ -27,14 +27,12 @@ from slatprep.provenance.stored import StoredRecords
 from slatprep.readers.files import is_hierarchy, load_source
 from slatprep.records import (
     BACKGROUND,
-    RESOLUTION,
     UNANNOTATED,
     Annotation,
     Model,
     Normalization,
     Place,
     SourceRoots,
-    StructuredLatents,
 )
 from slatprep.storage.files import file_digest
 from slatprep.storage.place import storage_of
@@ -109,11 +107,12 @@ def asset_findings(
 def value_findings(asset: StoredAsset) -> Iterator[Finding]:
     """Yield findings on values that the contract does not allow."""
     coords, valid, material = asset.coords, asset.valid, asset.material
+    side = asset.store.contents.latents.resolution
     checks = {
         "voxel/coords": (
-            coords.max(initial=0) < RESOLUTION,
-            "a coordinate above 63",
-            "0 to 63",
+            coords.max(initial=0) < side,
+            f"a coordinate above {side - 1}",
+            f"0 to {side - 1}",
         ),
         "voxel/feats": (np.isfinite(asset.feats).all(), "NaN or infinite", "finite latents"),
         "voxel/material": (
@@ -162,8 +161,7 @@ def value_findings(asset: StoredAsset) -> Iterator[Finding]:
     for where, (fine, what, expected) in checks.items():
         if not fine:
             yield Finding(where, asset.asset_id, what, expected)
-    # Coordinates out of range, found above, may share a cell with others.
-    if np.bincount(flat_index(coords)).max(initial=0) > 1:
+    if len(np.unique(flat_index(coords, 256))) < len(coords):
         yield Finding("voxel/coords", asset.asset_id, "a coordinate occurs twice", "each once")
 
 
@@ -207,7 +205,7 @@ def record_findings(asset: StoredAsset, record: AssetRecord, store: Store) -> It
     if bends != (alignment.deformation is not None):
         what = f"model is {str(alignment.model)!r}, {'without' if bends else 'with'} a deformation"
         yield Finding(RECORD_ARRAY, asset.asset_id, what, "one where it is affine or deformable")
-    places = map_of(alignment).places(asset.coords)
+    places = map_of(alignment).to_pixieverse(asset.latents.centres)
     wrong = np.count_nonzero(~(np.abs(places - asset.place).max(axis=1) <= PLACE_TOLERANCE))
     if wrong:
         what = f"{wrong} of {len(places)} voxels differ"
@@ -226,9 +224,8 @@ def confidence_findings(asset: StoredAsset, record: AssetRecord) -> Iterator[Fin
         return  # The confidence came of values that the store does not hold.
     if not labels_hold(asset.field, annotation, roundings(asset.store.normalization)):
         return  # It may have come of other labels than the rounded values have.
-    latents = StructuredLatents(asset.coords, asset.feats)
     confidence = record.judgement.confidence
-    likely = voxel_confidence(asset.field, latents, record.alignment, annotation, confidence)
+    likely = voxel_confidence(asset.field, asset.latents, record.alignment, annotation, confidence)
     wrong = np.count_nonzero(~(np.abs(likely - asset.confidence) <= CONFIDENCE_TOLERANCE))
     if wrong:
         what = f"{wrong} of {len(likely)} voxels differ"

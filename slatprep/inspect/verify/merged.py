@@ -13,7 +13,7 @@ from slatprep.normalize import normalize_change, normalize_properties
 from slatprep.pipeline.annotate import annotate
 from slatprep.provenance.record import AssetRecord
 from slatprep.readers import read_field
-from slatprep.records import AssetPair, Contribution, SourceRoots, StructuredLatents
+from slatprep.records import AssetPair, Contribution, SourceRoots
 from slatprep.sample import in_table, merge
 from slatprep.store.contract import Finding
 from slatprep.store.reader import StoredAsset
@@ -26,7 +26,7 @@ def merged_findings(
     asset: StoredAsset, record: AssetRecord, roots: SourceRoots
 ) -> Iterator[Finding]:
     """Yield where merged labels are not what the sources and the recorded alignments give."""
-    latents, contents = StructuredLatents(asset.coords, asset.feats), asset.store.contents
+    latents, contents = asset.latents, asset.store.contents
     parts = []
     for one in record.merged:
         if one.left_out or one.alignment is None or one.judgement is None:
