@@ -46,6 +46,8 @@ class Lattice:
             raise ValueError("the nearest voxel of an empty set does not exist")
         self._row = np.full((RESOLUTION,) * 3, -1, dtype=np.int32)
         self._row.reshape(-1)[flat_index(voxels)] = np.arange(len(voxels), dtype=np.int32)
+        self._voxels = voxels
+        self._alike: tuple[NDArray[np.uint8], NDArray[np.bool_]] | None = None
         self._blocks = np.zeros((RESOLUTION // _BLOCK,) * 3, dtype=bool)
         self._blocks[tuple((voxels // _BLOCK).T)] = True
 
@@ -127,8 +129,10 @@ class Lattice:
         """
         position, parties = _in_voxels(points), int(labels.max()) + 1
         found = found or self.nearest(points, limit=_BEYOND)
+        if self._alike is None or self._alike[0] is not labels:
+            self._alike = labels, _alike_around(self._voxels, labels)
         chosen: NDArray[np.intp] = _vote(
-            position, self._row, labels, *found, parties, 0.5 / width**2
+            position, self._row, labels, self._alike[1], *found, parties, 0.5 / width**2
         )
         return chosen
 
@@ -254,8 +258,27 @@ def _search_columns(position, row, below, above, apart, limit):  # type: ignore[
     return distance, nearest
 
 
+def _alike_around(voxels: NDArray[np.uint8], labels: NDArray[np.uint8]) -> NDArray[np.bool_]:
+    """Say of each cell of the grid with a margin of one whether all voxels around it agree.
+
+    Around it are the 27 cells; where none of them is in the set the answer means nothing.
+    """
+    shape = (RESOLUTION + 4,) * 3
+    cells = np.ravel_multi_index(tuple((voxels.astype(np.intp) + 2).T), shape)
+    low, high = np.full(shape, 255, np.uint8), np.zeros(shape, np.uint8)
+    low.reshape(-1)[cells] = high.reshape(-1)[cells] = labels
+    for axis in range(3):
+        few, many = np.moveaxis(low, axis, 0), np.moveaxis(high, axis, 0)
+        few = np.minimum(np.minimum(few[:-2], few[1:-1]), few[2:])
+        many = np.maximum(np.maximum(many[:-2], many[1:-1]), many[2:])
+        low, high = np.moveaxis(few, 0, axis), np.moveaxis(many, 0, axis)
+    return np.ascontiguousarray(low == high)
+
+
 @njit(cache=True)
-def _vote(position, row, labels, distance, index, n_labels, steepness):  # type: ignore[no-untyped-def]
+def _vote(  # type: ignore[no-untyped-def]
+    position, row, labels, alike, distance, index, n_labels, steepness
+):
     count, size = position.shape[0], row.shape[0]
     chosen = np.full(count, -1, dtype=np.intp)
     nearest, nearest_square = np.zeros(n_labels, dtype=np.intp), np.zeros(n_labels)
@@ -264,7 +287,7 @@ def _vote(position, row, labels, distance, index, n_labels, steepness):  # type:
     for m in range(count):
         x, y, z = position[m, 0], position[m, 1], position[m, 2]
         a, b, c = int(np.rint(x)), int(np.rint(y)), int(np.rint(z))
-        if distance[m] < _BEYOND and _alike(row, labels, a, b, c, labels[index[m]]):
+        if distance[m] < _BEYOND and alike[a + 1, b + 1, c + 1]:
             chosen[m] = index[m]  # Away from borders all voters agree.
             continue
         voters, parties = 0, 0
@@ -290,16 +313,3 @@ def _vote(position, row, labels, distance, index, n_labels, steepness):  # type:
                 votes[voter_label[voter]] += math.exp(-voter_square[voter] * steepness)
             chosen[m] = nearest[np.argmax(votes)]
     return chosen
-
-
-@njit(cache=True)
-def _alike(row, labels, a, b, c, own):  # type: ignore[no-untyped-def]
-    """Whether all voxels in the 27 cells around a cell have one label."""
-    size = row.shape[0]
-    for i in range(max(a - 1, 0), min(a + 2, size)):
-        for j in range(max(b - 1, 0), min(b + 2, size)):
-            for k in range(max(c - 1, 0), min(c + 2, size)):
-                voxel = row[i, j, k]
-                if voxel >= 0 and labels[voxel] != own:
-                    return False
-    return True
