@@ -65,20 +65,24 @@ def signed_distance(solid: NDArray[np.bool_]) -> NDArray[np.float32]:
 @njit(cache=True)
 def _squares_along_last(solid, inside, outside):  # type: ignore[no-untyped-def]
     """Squared distance within each line to the nearest voxel of the other kind; 0 in that kind."""
+    length = solid.shape[2]
+    apart = np.empty(length, np.int16)
     for i in range(solid.shape[0]):
         for j in range(solid.shape[1]):
-            to_empty, to_solid = NOTHING, NOTHING
-            for k in range(solid.shape[2]):
-                to_empty = min(to_empty + 1, NOTHING) if solid[i, j, k] else 0
-                to_solid = 0 if solid[i, j, k] else min(to_solid + 1, NOTHING)
-                inside[i, j, k] = to_empty * to_empty
-                outside[i, j, k] = to_solid * to_solid
-            to_empty, to_solid = NOTHING, NOTHING
-            for k in range(solid.shape[2] - 1, -1, -1):
-                to_empty = min(to_empty + 1, NOTHING) if solid[i, j, k] else 0
-                to_solid = 0 if solid[i, j, k] else min(to_solid + 1, NOTHING)
-                inside[i, j, k] = min(inside[i, j, k], to_empty * to_empty)
-                outside[i, j, k] = min(outside[i, j, k], to_solid * to_solid)
+            line = solid[i, j]
+            steps = NOTHING
+            for k in range(length):
+                steps = 1 if k and line[k] != line[k - 1] else min(steps + 1, NOTHING)
+                apart[k] = steps
+            steps = NOTHING
+            for k in range(length - 1, -1, -1):
+                changed = k + 1 < length and line[k] != line[k + 1]
+                steps = 1 if changed else min(steps + 1, NOTHING)
+                apart[k] = min(apart[k], steps)
+            for k in range(length):
+                square = apart[k] * apart[k]
+                inside[i, j, k] = square if line[k] else 0
+                outside[i, j, k] = 0 if line[k] else square
 
 
 @njit(cache=True)
