@@ -29,20 +29,22 @@ _OFFSET_PRIOR = 0.02
 _LEVER = 30.0  # voxels; what a turn or a change of scale moves at the object's rim
 _LONGEST_TURN = 0.35
 _LARGEST_GROWTH = 0.1
+_BLOCK = 64  # samples whose products are summed at once: they stay in the processor's first cache
 
 
-@njit(cache=True, inline="always")
+@njit(cache=True, inline="always", error_model="numpy")
 def interpolate(f, x, y, z):  # type: ignore[no-untyped-def]
     """Trilinear value and gradient; outside the box the distance to it is added."""
     n0, n1, n2 = f.shape
     cx = min(max(x, 0.0), n0 - 1.000001)
     cy = min(max(y, 0.0), n1 - 1.000001)
     cz = min(max(z, 0.0), n2 - 1.000001)
-    i, j, k = int(cx), int(cy), int(cz)
-    u, v, w = cx - i, cy - j, cz - k
-    f000, f001, f010, f011 = f[i, j, k], f[i, j, k + 1], f[i, j + 1, k], f[i, j + 1, k + 1]
-    i += 1
-    f100, f101, f110, f111 = f[i, j, k], f[i, j, k + 1], f[i, j + 1, k], f[i, j + 1, k + 1]
+    # Unsigned, so that no negative index has to be provided for.
+    i, j, k, one = np.uint64(cx), np.uint64(cy), np.uint64(cz), np.uint64(1)
+    u, v, w = cx - np.float64(i), cy - np.float64(j), cz - np.float64(k)
+    f000, f001, f010, f011 = f[i, j, k], f[i, j, k + one], f[i, j + one, k], f[i, j + one, k + one]
+    i += one
+    f100, f101, f110, f111 = f[i, j, k], f[i, j, k + one], f[i, j + one, k], f[i, j + one, k + one]
     f00 = f000 + (f001 - f000) * w
     f01 = f010 + (f011 - f010) * w
     f10 = f100 + (f101 - f100) * w
@@ -64,63 +66,104 @@ def interpolate(f, x, y, z):  # type: ignore[no-untyped-def]
     return value, gx, gy, gz
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def _accumulate(  # type: ignore[no-untyped-def]
-    points, values, field, origin, rotation, shift, scale, offset, centre, tau, forward, normal, rhs
+    points, values, field, origin, rotation, shift, scale, offset, centre, tau, forward, equations
 ):
-    """Add one side's residuals to the normal equations; return its summed weight and fit."""
-    jacobian = np.zeros(UNKNOWNS)
+    """Add one side's residuals to the normal equations; return its summed weight and fit.
+
+    With the rows A = (J, r), a sample a row, the equations are A^T W A: the
+    normal matrix, and beside it, as the last column, the right-hand side.
+    """
+    rows, weighted = np.empty((_BLOCK, UNKNOWNS + 1)), np.empty((_BLOCK, UNKNOWNS + 1))
     weight_sum, inliers, squares = 0.0, 0, 0.0
     sign = -1.0 if forward else 1.0
-    inverse = rotation.T / scale
     r00, r01, r02 = rotation[0, 0], rotation[0, 1], rotation[0, 2]
     r10, r11, r12 = rotation[1, 0], rotation[1, 1], rotation[1, 2]
     r20, r21, r22 = rotation[2, 0], rotation[2, 1], rotation[2, 2]
+    # Out of the loop, as the compiler cannot know that what it writes is not one of these.
+    i00, i01, i02 = r00 / scale, r10 / scale, r20 / scale
+    i10, i11, i12 = r01 / scale, r11 / scale, r21 / scale
+    i20, i21, i22 = r02 / scale, r12 / scale, r22 / scale
+    s0, s1, s2 = shift[0], shift[1], shift[2]
+    o0, o1, o2 = origin[0], origin[1], origin[2]
+    c0, c1, c2 = centre[0], centre[1], centre[2]
+    n = 0
     for m in range(points.shape[0]):
         px, py, pz = points[m, 0], points[m, 1], points[m, 2]
         if forward:  # a SLAT sample looks up the PixieVerse distance
-            ax, ay, az = px - shift[0], py - shift[1], pz - shift[2]
+            ax, ay, az = px - s0, py - s1, pz - s2
             value, a, b, c = interpolate(
                 field,
-                inverse[0, 0] * ax + inverse[0, 1] * ay + inverse[0, 2] * az - origin[0],
-                inverse[1, 0] * ax + inverse[1, 1] * ay + inverse[1, 2] * az - origin[1],
-                inverse[2, 0] * ax + inverse[2, 1] * ay + inverse[2, 2] * az - origin[2],
+                i00 * ax + i01 * ay + i02 * az - o0,
+                i10 * ax + i11 * ay + i12 * az - o1,
+                i20 * ax + i21 * ay + i22 * az - o2,
             )
             gx = r00 * a + r01 * b + r02 * c
             gy = r10 * a + r11 * b + r12 * c
             gz = r20 * a + r21 * b + r22 * c
-            carried = scale * value
-            residual = carried - values[m] - offset
+            residual = scale * value - values[m] - offset
         else:  # a PixieVerse sample looks up the SLAT distance
-            ax = scale * (r00 * px + r01 * py + r02 * pz) + shift[0]
-            ay = scale * (r10 * px + r11 * py + r12 * pz) + shift[1]
-            az = scale * (r20 * px + r21 * py + r22 * pz) + shift[2]
-            value, gx, gy, gz = interpolate(field, ax - origin[0], ay - origin[1], az - origin[2])
-            px, py, pz = ax, ay, az
-            carried = scale * values[m]
-            residual = value - carried + offset
-        qx, qy, qz = px - centre[0], py - centre[1], pz - centre[2]
-        jacobian[0] = sign * (qy * gz - qz * gy)
-        jacobian[1] = sign * (qz * gx - qx * gz)
-        jacobian[2] = sign * (qx * gy - qy * gx)
-        jacobian[3] = sign * gx
-        jacobian[4] = sign * gy
-        jacobian[5] = sign * gz
-        jacobian[6] = sign * (gx * qx + gy * qy + gz * qz)
-        jacobian[7] = sign
+            ax, ay, az = px, py, pz
+            px = scale * (r00 * ax + r01 * ay + r02 * az) + s0
+            py = scale * (r10 * ax + r11 * ay + r12 * az) + s1
+            pz = scale * (r20 * ax + r21 * ay + r22 * az) + s2
+            value, gx, gy, gz = interpolate(field, px - o0, py - o1, pz - o2)
+            residual = value - scale * values[m] + offset
+        qx, qy, qz = px - c0, py - c1, pz - c2
         square = residual * residual
         kernel = 1.0 / (1.0 + square / (tau * tau))
-        weight = kernel * kernel
         weight_sum += kernel
-        if square <= 1.0:
-            inliers += 1
-            squares += square
-        for i in range(UNKNOWNS):
-            weighted = weight * jacobian[i]
-            rhs[i] += weighted * residual
-            for j in range(i, UNKNOWNS):
-                normal[i, j] += weighted * jacobian[j]
+        near = square <= 1.0
+        inliers += near
+        squares += square if near else 0.0
+        row = rows[n]
+        row[0] = sign * (qy * gz - qz * gy)
+        row[1] = sign * (qz * gx - qx * gz)
+        row[2] = sign * (qx * gy - qy * gx)
+        row[3] = sign * gx
+        row[4] = sign * gy
+        row[5] = sign * gz
+        row[6] = sign * (gx * qx + gy * qy + gz * qz)
+        row[7] = sign
+        row[8] = residual
+        for i in range(UNKNOWNS + 1):
+            weighted[n, i] = kernel * kernel * row[i]
+        n += 1
+        if n == _BLOCK or m == points.shape[0] - 1:
+            _add_products(weighted[:n], rows[:n], equations)
+            n = 0
     return weight_sum, inliers, squares
+
+
+@njit(cache=True)
+def _add_products(left, right, out):  # type: ignore[no-untyped-def]
+    """Add the sum over m of ``left[m, i] * right[m, j]`` to ``out[i, j]``, the upper triangle.
+
+    By blocks of three rows and columns, written out, so that the compiler keeps
+    the sums in registers; below the diagonal blocks nothing is added.
+    """
+    for i in range(0, UNKNOWNS + 1, 3):
+        for j in range(i, UNKNOWNS + 1, 3):
+            to = out[i : i + 3, j : j + 3]
+            a, b, c = to[0, 0], to[0, 1], to[0, 2]
+            d, e, f = to[1, 0], to[1, 1], to[1, 2]
+            g, h, k = to[2, 0], to[2, 1], to[2, 2]
+            for m in range(left.shape[0]):
+                p, q, r = left[m, i], left[m, i + 1], left[m, i + 2]
+                x, y, z = right[m, j], right[m, j + 1], right[m, j + 2]
+                a += p * x
+                b += p * y
+                c += p * z
+                d += q * x
+                e += q * y
+                f += q * z
+                g += r * x
+                h += r * y
+                k += r * z
+            to[0, 0], to[0, 1], to[0, 2] = a, b, c
+            to[1, 0], to[1, 1], to[1, 2] = d, e, f
+            to[2, 0], to[2, 1], to[2, 2] = g, h, k
 
 
 @njit(cache=True)
@@ -164,33 +207,34 @@ def solve(  # type: ignore[no-untyped-def]
         centre += slat_points[m]
     centre /= slat_points.shape[0]
     samples = slat_points.shape[0] + pixie_points.shape[0]
+    equations = np.zeros((UNKNOWNS + 1, UNKNOWNS + 1))
+    by_slat = np.zeros((UNKNOWNS + 1, UNKNOWNS + 1))
     normal, rhs = np.zeros((UNKNOWNS, UNKNOWNS)), np.zeros(UNKNOWNS)
-    by_slat, rhs_by_slat = np.zeros((UNKNOWNS, UNKNOWNS)), np.zeros(UNKNOWNS)
     step = np.zeros(UNKNOWNS)
     fits = np.zeros((len(scales), 4))
     for pose in range(len(scales)):
         rotation, shift = rotations[pose], shifts[pose]
         scale, offset = scales[pose], offsets[pose]
         for tau in taus:
-            normal[:] = 0.0
-            rhs[:] = 0.0
+            equations[:] = 0.0
             _accumulate(
                 slat_points, slat_values, pixie_field, pixie_origin,
-                rotation, shift, scale, offset, centre, tau, True, normal, rhs,
+                rotation, shift, scale, offset, centre, tau, True, equations,
             )  # fmt: skip
-            by_slat[:], rhs_by_slat[:] = normal, rhs
+            by_slat[:] = equations
             _accumulate(
                 pixie_points, pixie_values, slat_field, slat_origin,
-                rotation, shift, scale, offset, centre, tau, False, normal, rhs,
+                rotation, shift, scale, offset, centre, tau, False, equations,
             )  # fmt: skip
+            if size_by_slat:
+                equations[6:, 6:] = 2.0 * by_slat[6:, 6:]
             for i in range(UNKNOWNS):
-                for j in range(i):
-                    normal[i, j] = normal[j, i]
+                rhs[i] = equations[i, UNKNOWNS]
+                for j in range(UNKNOWNS):
+                    normal[i, j] = equations[min(i, j), max(i, j)]
             if size_by_slat:
                 for i in range(6, UNKNOWNS):
-                    rhs[i] = 2.0 * rhs_by_slat[i]
-                    for j in range(UNKNOWNS):
-                        normal[i, j] = 2.0 * by_slat[min(i, j), max(i, j)]
+                    normal[i, :6] = 2.0 * by_slat[:6, i]
             # On a ball, offset and scale cannot be told apart: a weak prior keeps
             # the offset near 0. A little damping keeps a plane's slide at rest.
             normal[7, 7] += _OFFSET_PRIOR * samples
@@ -219,11 +263,11 @@ def solve(  # type: ignore[no-untyped-def]
                 break
         here, near, squares = _accumulate(
             slat_points, slat_values, pixie_field, pixie_origin,
-            rotation, shift, scale, offset, centre, 1.0, True, normal, rhs,
+            rotation, shift, scale, offset, centre, 1.0, True, equations,
         )  # fmt: skip
         back, near_back, squares_back = _accumulate(
             pixie_points, pixie_values, slat_field, slat_origin,
-            rotation, shift, scale, offset, centre, 1.0, False, normal, rhs,
+            rotation, shift, scale, offset, centre, 1.0, False, equations,
         )  # fmt: skip
         inliers = near + near_back
         scales[pose], offsets[pose] = scale, offset
