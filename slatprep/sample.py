@@ -70,7 +70,7 @@ def sample(
         In SI units; NaN and 255 where not valid. ``distance`` is to the voxel
         whose values were taken, or to the nearest where not valid.
     """
-    lattice = _lattice_of(field)
+    lattice = lattice_of(field)
     place = np.asarray(places, dtype=np.float32)
     points = place.astype(np.float64)
     limit = parameters.max_distance * (1.0 + 1e-12) if labels_alone else np.inf
@@ -90,7 +90,7 @@ def sample(
 
 
 @lru_cache(maxsize=1)
-def _lattice_of(field: MaterialField) -> Lattice:
+def lattice_of(field: MaterialField) -> Lattice:
     """Return the field's annotated voxels by cell; a field is looked up several times in a row."""
     from slatprep.geometry.nearest import Lattice
 

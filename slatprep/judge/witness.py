@@ -21,7 +21,6 @@ from numpy.typing import NDArray
 from scipy.special import bdtrc, expit, logsumexp, softmax
 
 from slatprep.geometry.frames import places_of
-from slatprep.geometry.nearest import Lattice
 from slatprep.judge.evidence import HARMLESS
 from slatprep.parameters import SampleParameters
 from slatprep.records import (
@@ -33,7 +32,7 @@ from slatprep.records import (
     MaterialField,
     StructuredLatents,
 )
-from slatprep.sample import sample
+from slatprep.sample import lattice_of, sample
 
 FOLDS = 5
 """Parts of a dataset, by object, each judged by a model of the others."""
@@ -273,7 +272,7 @@ def _against(
 ) -> Iterator[Array]:
     if len(latents.coords) < 2:
         return  # One voxel has no axes.
-    lattice = Lattice(field.voxels)
+    lattice = lattice_of(field)
     places = places_of(latents.centres, alignment.transform)
     centre = places.mean(axis=0)
     _, axes = np.linalg.eigh(np.cov((places - centre).T))

@@ -19,9 +19,14 @@ from slatprep.pipeline.rows import Rows
 from slatprep.pipeline.spool import FailedAsset, Spool
 from slatprep.pipeline.summary import Counts, counts_in
 from slatprep.pipeline.work import Work
-from slatprep.provenance.make import complete_record, origin
-from slatprep.provenance.record import AssetRecord, Clipped, Record, property_counts
-from slatprep.provenance.record_json import read_asset_record, to_json
+from slatprep.provenance.make import origin
+from slatprep.provenance.record import Clipped, property_counts
+from slatprep.provenance.record_json import (
+    RecordText,
+    completed,
+    read_asset_record,
+    to_json,
+)
 from slatprep.records import Normalization
 from slatprep.storage.place import storage_of
 from slatprep.storage.upload import Staged
@@ -83,8 +88,8 @@ def assemble(
     packed = pack_store(
         store, work.spool, rows.usable, normalization, how, jobs, contents, carried, remote
     )
-    completed = _completed_records(work.spool, rows, normalization, packed, jobs)
-    build_id = write_all_records(store, records, completed, packed.records)
+    texts = _completed_records(work.spool, rows, normalization, packed, jobs)
+    build_id = write_all_records(store, records, texts, packed.records)
     build, files = origin(parameters), (packed.digests, packed.elsewhere)
     finish_store(store, normalization, build_id, build, contents, *files)
     counts, clipped = counts_in(open_store(store)), packed.clipped["voxel"]
@@ -95,7 +100,7 @@ def assemble(
 
 def _completed_records(
     spool: Spool, rows: Rows, normalization: Normalization, packed: Packed, jobs: Jobs
-) -> Iterator[tuple[int, Record | bytes]]:
+) -> Iterator[tuple[int, RecordText | bytes]]:
     """Yield rows and records of a build by asset id, with the ranges and what they clip."""
     everything: list[tuple[int, Row | FailedAsset]] = [*enumerate(rows.usable)]
     everything += [(-1, asset) for asset in rows.failed]
@@ -126,7 +131,7 @@ def complete_records(
     spool: Spool,
     assets: Sequence[tuple[str, NDArray[np.int64] | None]],
     normalization: Normalization,
-) -> list[Record]:
+) -> list[RecordText]:
     """Read records of finished assets, and add the ranges and what they clip.
 
     Parameters
@@ -140,9 +145,8 @@ def complete_records(
     """
     records = []
     for key, counts in assets:
-        record = spool.record(key)
-        if isinstance(record, AssetRecord) and counts is not None:
+        clipped = None
+        if counts is not None:
             clipped = Clipped(*(property_counts(own, normalization) for own in counts))
-            record = complete_record(record, normalization, clipped)
-        records.append(record)
+        records.append(completed(spool.record_text(key), normalization, clipped))
     return records

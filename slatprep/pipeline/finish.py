@@ -11,7 +11,7 @@ from slatprep.pipeline.kernels import compile_kernels
 from slatprep.pipeline.plan import Action, PlannedAsset
 from slatprep.pipeline.spool import FailedAsset, SpooledAsset
 from slatprep.records import AssetPair
-from slatprep.workers.local import Jobs, at_most, run_unordered
+from slatprep.workers.local import Jobs, at_most, run_unordered, start_early
 
 Progress = Callable[[int, int], None]
 """Called with the assets done and the assets in all; at the beginning with none done."""
@@ -68,7 +68,8 @@ def finish(
     jobs = crew.of(len(pairs))
     actions = {planned.action if (planned := plan.get(p.asset_id)) else Action.ALIGN for p in pairs}
     if isinstance(jobs, int) and Action.ALIGN in actions:
-        compile_kernels(crew.note)  # Before workers of this machine start, each to compile all.
+        start_early(finish_asset, jobs)
+        compile_kernels(crew.note)  # Before workers of this machine work, each to compile all.
     tasks = ((pair, plan.get(pair.asset_id), context) for pair in pairs)
     assets: list[SpooledAsset | FailedAsset] = []
     if crew.progress and pairs:

@@ -26,7 +26,7 @@ from slatprep.provenance.record import (
     Record,
     Versions,
 )
-from slatprep.provenance.record_json import content_of, to_json, write_records
+from slatprep.provenance.record_json import RecordText, content_of, to_json, write_records
 from slatprep.records import Place
 from slatprep.storage.atomic import replace_directory
 from slatprep.storage.faults import reached
@@ -187,7 +187,7 @@ def _is_marked(file: Path, mark: bytes) -> bool:
 def write_all_records(
     store: Path,
     path: Path,
-    records: Iterable[tuple[int, Record | bytes]],
+    records: Iterable[tuple[int, Record | RecordText | bytes]],
     taken: frozenset[int] = frozenset(),
 ) -> str:
     """Write all records to a file, and those of rows into the new store; return the build's id.
@@ -198,7 +198,7 @@ def write_all_records(
         The new store.
     path : Path
         The file.
-    records : iterable of (int, Record or bytes)
+    records : iterable of (int, Record, RecordText or bytes)
         Rows and records, by asset id; rows of assets that do not go in are negative. A
         record that the existing store has may be given as its text.
     taken : frozenset of int
@@ -206,7 +206,7 @@ def write_all_records(
     """
     writer = RecordWriter(open_for_writing(store), taken)
 
-    def passing() -> Iterator[Record | bytes]:
+    def passing() -> Iterator[Record | RecordText | bytes]:
         for row, record in records:
             if row >= 0:
                 writer.add(row, content_of(record))

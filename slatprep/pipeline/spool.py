@@ -216,8 +216,13 @@ class Spool:
 
     def record(self, key: str) -> Record:
         """Read an asset's record back."""
+        return read_record(self.record_text(key), str(self._path(key)))
+
+    def record_text(self, key: str) -> bytes:
+        """Read an asset's record back as its JSON, unchecked."""
         with self._open(key) as arrays:
-            return read_record(arrays["record"].tobytes(), str(self._path(key)))
+            text: bytes = arrays["record"].tobytes()
+        return text
 
     def voxels(self, key: str) -> Arrays:
         """Read an asset's rows of the ``voxel/*`` arrays, properties in SI units."""

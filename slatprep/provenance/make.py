@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from importlib import metadata
 
 import numpy as np
@@ -13,13 +12,12 @@ from slatprep.parameters import BuildParameters
 from slatprep.provenance.record import (
     MAX_WARNINGS,
     AssetRecord,
-    Clipped,
     FailedRecord,
     StageParameters,
     VoxelCounts,
 )
 from slatprep.provenance.versions import library_versions
-from slatprep.records import Failed, Finished, Normalization, Status
+from slatprep.records import Failed, Finished, Status
 
 
 def record_of(asset: Finished, parameters: BuildParameters, code: str, key: str) -> AssetRecord:
@@ -39,7 +37,8 @@ def record_of(asset: Finished, parameters: BuildParameters, code: str, key: str)
     Returns
     -------
     AssetRecord
-        Without the seconds spent; `complete_record` adds what only the whole dataset can tell.
+        Without the seconds spent; `slatprep.provenance.record_json.completed` adds what only the
+        whole dataset can tell.
     """
     pair, field, latents = asset.pair, asset.field, asset.latents
     return AssetRecord(
@@ -103,14 +102,6 @@ def counts_of(asset: Finished) -> VoxelCounts:
         valid=int(np.count_nonzero(asset.annotation.valid)),
         unphysical=asset.field.unphysical,
     )
-
-
-def complete_record(
-    record: AssetRecord, normalization: Normalization, clipped: Clipped
-) -> AssetRecord:
-    """Return a record with what only the whole dataset can tell: ranges and clipped values."""
-    counts = replace(record.counts, clipped=clipped)
-    return replace(record, normalization=normalization, counts=counts)
 
 
 def origin(parameters: BuildParameters) -> dict[str, object]:

@@ -7,14 +7,14 @@ from collections.abc import Iterable, Iterator
 from dataclasses import fields, replace
 from functools import lru_cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
 import numpy as np
 import orjson
 
 from slatprep.errors import StoreError
-from slatprep.provenance.record import AssetRecord, BuildRecord, Record
-from slatprep.records import SourceFile, Status
+from slatprep.provenance.record import AssetRecord, BuildRecord, Clipped, Record
+from slatprep.records import Normalization, SourceFile, Status
 from slatprep.storage.place import is_place
 from slatprep.store.records import MAX_RECORD_BYTES
 
@@ -41,6 +41,13 @@ class RecordError(StoreError):
             "build again to have it written anew"
         )
         self.faults = faults
+
+
+class RecordText(NamedTuple):
+    """A record as a line of ``assets.jsonl``, and as what of it counts in `records_id`."""
+
+    line: bytes
+    content: bytes
 
 
 def to_json(record: Record | BuildRecord, *, indent: bool = False) -> bytes:
@@ -98,13 +105,35 @@ def faults_of(record: AssetRecord) -> tuple[str, ...]:
     return ()
 
 
+def completed(text: bytes, normalization: Normalization, clipped: Clipped | None) -> RecordText:
+    """Add to a record what only the whole dataset can tell.
+
+    Parameters
+    ----------
+    text : bytes
+        What `to_json` gave for it. It is not checked again, which takes ten times as long.
+    normalization : Normalization
+        The ranges.
+    clipped : Clipped or None
+        Values outside of them; None for an asset that is not in the store, whose record stays.
+    """
+    document = orjson.loads(text)
+    untold: dict[str, object] = {"duration_s": 0.0}
+    if clipped is None:
+        untold |= {"reason": "", "traceback": ""}
+    else:
+        document["normalization"] = normalization
+        document["counts"]["clipped"] = clipped
+    return RecordText(orjson.dumps(document), orjson.dumps(document | untold))
+
+
 def read_build_record(text: bytes | str, where: str) -> BuildRecord:
     """Read ``build.json``; see `read_record`."""
     record: BuildRecord = _read(BuildRecord, text, where)
     return record
 
 
-def records_id(records: Iterable[Record | bytes]) -> str:
+def records_id(records: Iterable[Record | RecordText | bytes]) -> str:
     """Return the id of a build: SHA-256, in hex, of its records in the order of asset ids.
 
     How long things took and in what words they failed are left out: they
@@ -117,21 +146,30 @@ def records_id(records: Iterable[Record | bytes]) -> str:
     return digest.hexdigest()
 
 
-def content_of(record: Record | bytes) -> bytes:
+def content_of(record: Record | RecordText | bytes) -> bytes:
     """Return what of a record counts in `records_id`; of a row's it is what its store holds."""
     if isinstance(record, bytes):
         return record
+    if isinstance(record, RecordText):
+        return record.content
     if isinstance(record, AssetRecord):
         return to_json(record.without_duration())
     return to_json(replace(record, duration_s=0.0, reason="", traceback=""))
 
 
-def write_records(path: Path, records: Iterable[Record | bytes]) -> str:
+def write_records(path: Path, records: Iterable[Record | RecordText | bytes]) -> str:
     """Write records, in the order of their asset ids, as JSON Lines; return `records_id`."""
 
-    def passing() -> Iterator[Record | bytes]:
+    def passing() -> Iterator[Record | RecordText | bytes]:
         for record in records:
-            file.write((record if isinstance(record, bytes) else to_json(record)) + b"\n")
+            match record:
+                case bytes():
+                    line = record
+                case RecordText():
+                    line = record.line
+                case _:
+                    line = to_json(record)
+            file.write(line + b"\n")
             yield record
 
     with path.open("wb") as file:

@@ -9,7 +9,7 @@ import time
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future
 from contextlib import contextmanager
-from functools import lru_cache
+from functools import lru_cache, partial
 from typing import TYPE_CHECKING, Any, Protocol, TypeVar
 
 from slatprep.workers.pool import Pool, run_in_pools
@@ -95,6 +95,26 @@ def run_unordered(
             yield result
     else:
         yield from run_in_pools(_Processes(jobs), _Processes(1), function, tasks, died)
+
+
+def start_early(function: Callable[..., Any], jobs: Jobs) -> None:
+    """Have worker processes of this machine start, and import what a function needs, meanwhile.
+
+    Parameters
+    ----------
+    function : callable
+        What `run_unordered` will be given.
+    jobs : int or Workers
+        As it will be given there; where no processes are started for it nothing is done.
+    """
+    if isinstance(jobs, int) and jobs > 1:
+        processes = _Processes(jobs)
+        for _ in range(jobs):
+            processes.submit(partial(_imported, function))
+
+
+def _imported(function: Callable[..., Any]) -> None:
+    """Do nothing: to be handed the function, a process has imported its module."""
 
 
 def run_in_order(
