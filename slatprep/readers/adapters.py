@@ -18,6 +18,7 @@ from typing import Any, Protocol
 
 from slatprep.errors import ConfigError
 from slatprep.parameters import PixieverseSource
+from slatprep.readers.foreign import guarded
 from slatprep.readers.patterns import find_files
 from slatprep.records import (
     MATERIAL_CLASSES,
@@ -151,9 +152,12 @@ def _loaded(group: str, name: str) -> Any:
     where = _OWN[group].get(name) or others[name][0]
     try:
         made: Callable[[], Any] = pkgutil.resolve_name(where)
-        return made()
-    except (ImportError, AttributeError, TypeError, ValueError) as error:
-        raise ConfigError(f"adapter {name!r} ({where}) cannot be loaded: {error}") from error
+        adapter = made()
+    except (Exception, SystemExit) as error:  # Another package's code may raise anything.
+        raise ConfigError(f"adapter {name!r} ({where}) cannot be loaded: {error!r}") from error
+    if name in _OWN[group]:
+        return adapter
+    return guarded(group, adapter, name, others[name][1] or where)
 
 
 @lru_cache(maxsize=2)

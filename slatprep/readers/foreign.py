@@ -1,0 +1,191 @@
+"""Adapters of other packages: what they raise is named as theirs, what they return is checked.
+
+They run as they are, being installed by whoever runs them; but a fault in one
+must neither look like slatprep's own, nor stop other assets, nor get into a store.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import orjson
+
+from slatprep.errors import InputError, SlatprepError
+from slatprep.geometry.voxels import flat_index
+from slatprep.parameters import PixieverseSource
+from slatprep.records import (
+    BACKGROUND,
+    MATERIAL_CLASSES,
+    RESOLUTION,
+    AssetPair,
+    LatentSpace,
+    MaterialField,
+    Place,
+    Property,
+    SourceFile,
+    StructuredLatents,
+)
+from slatprep.records.tables import CLASS_NAME, MAX_PROPERTIES
+from slatprep.storage.listing import Listing
+
+
+@dataclass(frozen=True)
+class _Foreign:
+    """An adapter, its name, and its package with its version."""
+
+    adapter: Any
+    name: str
+    package: str
+
+    @contextmanager
+    def _blamed(self) -> Iterator[None]:
+        """Name the adapter for whatever it raises that is no error of slatprep's."""
+        try:
+            yield
+        except (SlatprepError, MemoryError):
+            raise
+        except (Exception, SystemExit) as error:  # It is not ours, and may raise anything.
+            raise self._fault(f"raises {type(error).__name__}: {error}") from error
+
+    def _fault(self, what: str) -> InputError:
+        who = f"adapter {self.name!r} of {self.package}"
+        return InputError(who, what, "what slatprep asks of an adapter; tell its makers")
+
+    def _require(self, holds: object, what: str) -> None:
+        if not holds:
+            raise self._fault(f"gives {what}")
+
+    def _require_arrays(self, of: object, *specs: tuple[str, type, tuple[int, ...]]) -> None:
+        for name, dtype, shape in specs:
+            got = np.asarray(getattr(of, name))
+            self._require(
+                got.dtype == dtype and got.shape == shape and 0 not in shape,
+                f"{name} as {got.dtype} {got.shape}; expected {dtype.__name__} {shape}, not empty",
+            )
+
+    def _require_told(self, of: MaterialField | StructuredLatents) -> None:
+        """Require that a record can hold the rest: files, and words."""
+        known = all(isinstance(one, SourceFile) for one in of.sources)
+        self._require(known and of.sources, "no `sources`, the files that it read")
+        self._require(all(isinstance(one, str) for one in of.warnings), "warnings that are no text")
+
+
+class ForeignSource(_Foreign):
+    """A source adapter; see `slatprep.readers.adapters.SourceAdapter`."""
+
+    @property
+    def patterns(self) -> Sequence[str]:
+        """Return its patterns."""
+        with self._blamed():
+            return tuple(map(str, self.adapter.patterns))
+
+    def describe(self, source: PixieverseSource) -> Any:
+        """Return what the source holds."""
+        with self._blamed():
+            held = self.adapter.describe(source)
+            tables = held.properties, held.classes
+            names = [one.name for one in held.properties if isinstance(one, Property)]
+            self._require(all(isinstance(one, tuple) for one in tables), "lists, not tuples")
+            self._require(
+                0 < len(set(names)) == len(held.properties) <= MAX_PROPERTIES,
+                f"{len(names)} properties; expected 1 to {MAX_PROPERTIES}, of a name each",
+            )
+            named = all(CLASS_NAME.fullmatch(one) for one in held.classes)
+            few = held.classes == MATERIAL_CLASSES or len(held.classes) <= BACKGROUND
+            self._require(named and few, f"classes {held.classes!r}")
+            return held
+
+    def find(self, source: PixieverseSource, listing: Listing) -> Iterator[Any]:
+        """Yield its fields."""
+        with self._blamed():
+            for found in self.adapter.find(source, listing):
+                texts = found.object_id, found.path, found.sample, found.problem, found.beside
+                named = all(isinstance(one, str) for one in texts)
+                self._require(named, f"{found!r} as a field that it found")
+                yield found
+
+    def read(self, pair: AssetPair, max_unphysical: float) -> MaterialField:
+        """Read a field, and see that it is one."""
+        with self._blamed():
+            field: MaterialField = self.adapter.read(pair, max_unphysical)
+            self._require(isinstance(field, MaterialField), f"{type(field).__name__} as a field")
+            rows, side, table = len(field.voxels), (RESOLUTION,) * 3, field.table
+            self._require_arrays(
+                field,
+                ("occupancy", np.bool_, side),
+                ("voxels", np.uint8, (rows, 3)),
+                ("material", np.uint8, (rows,)),
+                ("properties", np.float32, (rows, len(table))),
+            )
+            contents = pair.roots.contents
+            whole = pair.roots.number == 0 and not pair.others
+            known = tuple(one for one in contents.properties if one in table)
+            self._require(
+                table == (contents.properties if whole else known),
+                "a table of properties other than it described",
+            )
+            self._require(field.voxels.max() < RESOLUTION, f"voxels above {RESOLUTION - 1}")
+            cells = flat_index(field.voxels)
+            self._require((np.diff(cells) > 0).all(), "voxels not each once in C order")
+            there = field.occupancy.reshape(-1)[cells]
+            self._require(there.all(), "annotated voxels that are not occupied")
+            labels = len(contents.labels) if field.classified else 1
+            self._require(field.material.max() < labels, f"classes above {labels - 1}")
+            for one, values in zip(table, field.properties.T, strict=True):
+                self._require(one.physical(values).all(), f"values that are not {one.allowed}")
+            frame = np.eye(4) if field.frame is None else np.asarray(field.frame, np.float64)
+            self._require(frame.shape == (4, 4) and np.isfinite(frame).all(), "a frame of NaN")
+            orjson.dumps(field.bounds)
+            self._require_told(field)
+            return field
+
+
+class ForeignLatents(_Foreign):
+    """A latent adapter; see `slatprep.readers.adapters.LatentAdapter`."""
+
+    @property
+    def space(self) -> LatentSpace:
+        """Return the space of its latents."""
+        with self._blamed():
+            space: LatentSpace = self.adapter.space
+            self._require(isinstance(space, LatentSpace), f"{space!r} as its space")
+            named = space.encoder == self.name
+            self._require(named, f"latents of {space.encoder!r}; expected its own name")
+            return space
+
+    def read(self, path: Place, root: Place, group: str, space: LatentSpace) -> StructuredLatents:
+        """Read a SLAT, and see that it is one."""
+        with self._blamed():
+            read: StructuredLatents = self.adapter.read(path, root, group, space)
+            rows = len(read.coords)
+            self._require_arrays(
+                read,
+                ("coords", np.uint8, (rows, 3)),
+                ("feats", np.float32, (rows, space.channels)),
+            )
+            self._require(read.coords.max() < RESOLUTION, f"coords above {RESOLUTION - 1}")
+            once = len(np.unique(flat_index(read.coords))) == rows
+            self._require(once, "a coordinate twice")
+            self._require(np.isfinite(read.feats).all(), "feats that are not finite")
+            self._require_told(read)
+            return read
+
+
+def guarded(group: str, adapter: Any, name: str, package: str) -> ForeignSource | ForeignLatents:
+    """Return an adapter of another package so that its faults are named as its own.
+
+    Parameters
+    ----------
+    group : str
+        ``slatprep.sources`` or ``slatprep.latents``.
+    adapter : object
+        What its entry point made.
+    name, package : str
+        Of the adapter; and of its package, with the version.
+    """
+    kind = ForeignSource if group == "slatprep.sources" else ForeignLatents
+    return kind(adapter, name, package)
