@@ -148,6 +148,12 @@ class ForeignLatents(_Foreign):
     """A latent adapter; see `slatprep.readers.adapters.LatentAdapter`."""
 
     @property
+    def patterns(self) -> tuple[str, ...]:
+        """Return its patterns, if it has any."""
+        with self._blamed():
+            return tuple(map(str, getattr(self.adapter, "patterns", ())))
+
+    @property
     def space(self) -> LatentSpace:
         """Return the space of its latents."""
         with self._blamed():
@@ -167,8 +173,10 @@ class ForeignLatents(_Foreign):
                 ("coords", np.uint8, (rows, 3)),
                 ("feats", np.float32, (rows, space.channels)),
             )
-            self._require(read.coords.max() < RESOLUTION, f"coords above {RESOLUTION - 1}")
-            once = len(np.unique(flat_index(read.coords))) == rows
+            side = space.resolution
+            self._require(read.resolution == side, f"latents of a grid of {read.resolution}^3")
+            self._require(read.coords.max() < side, f"coords above {side - 1}")
+            once = len(np.unique(flat_index(read.coords, side))) == rows
             self._require(once, "a coordinate twice")
             self._require(np.isfinite(read.feats).all(), "feats that are not finite")
             self._require_told(read)

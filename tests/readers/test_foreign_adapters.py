@@ -72,6 +72,7 @@ SLATS: dict[str, Callable[[Any], Any]] = {
     "channels": lambda slat: replace(slat, feats=slat.feats[:, :5]),
     "rows": lambda slat: replace(slat, feats=slat.feats[:-1]),
     "out of the grid": lambda slat: replace(slat, coords=slat.coords + np.uint8(100)),
+    "another grid": lambda slat: replace(slat, resolution=32),
     "twice": lambda slat: replace(slat, coords=np.zeros_like(slat.coords)),
     "another type": lambda slat: replace(slat, coords=slat.coords.astype(np.int64)),
     "no files": lambda slat: replace(slat, sources=()),
