@@ -75,7 +75,8 @@ def make_demo(output: Output, directory: Path, levels: tuple[int, ...], **recipe
         title = f"Demo data in {summary.directory}"
         output.table(title, ("category", "objects"), sorted(summary.categories.items()))
         store = f"{summary.directory}.zarr"
-        output.note(f"next: slatprep build-store --config {summary.config} --out {store}")
-        output.note(f"then: slatprep score {store} {summary.directory / 'truth'}")
+        # Also right where `make align` goes on by itself.
+        output.note(f"a store of it: slatprep build-store --config {summary.config} --out {store}")
+        output.note(f"its score:     slatprep score {store} {summary.directory / 'truth'}")
 
     output.made(summary, show)

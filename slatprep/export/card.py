@@ -186,7 +186,7 @@ def _ranges(store: Store) -> Iterator[str]:
     yield "| --- | --- | --- | ---: | ---: |"
     for one, held in zip(store.normalization.ranges, store.contents.properties, strict=True):
         scale = "log10" if one.log10 else "linear"
-        unit = _plain(held.unit.replace("^3", "³"))
+        unit = _plain(held.sign or "1")
         yield f"| {one.name} | {unit} | {scale} | {one.lo:.6g} | {one.hi:.6g} |"
 
 

@@ -6,6 +6,7 @@ that start without it would each compile all of them, at the same time.
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
 from typing import Any
 
@@ -27,7 +28,7 @@ def compile_kernels(note: Callable[[str], None] | None = None) -> None:
     ----------
     note : callable, optional
         Gets a line to show when something has to be compiled, which takes
-        20 to 40 s in all; otherwise this takes 1 s.
+        20 to 40 s in all, and one when that is done; otherwise this takes 1 s.
     """
     from numba.core import event
 
@@ -42,8 +43,11 @@ def compile_kernels(note: Callable[[str], None] | None = None) -> None:
         def on_end(self, event: Any) -> None:
             pass
 
-    with event.install_listener("numba:compile", Told()):
+    start, told = time.monotonic(), Told()
+    with event.install_listener("numba:compile", told):
         _process_a_bent_shape()
+    if note and told.told:
+        note(f"compiled in {time.monotonic() - start:.0f} s")
 
 
 def _process_a_bent_shape() -> None:

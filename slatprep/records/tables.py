@@ -33,6 +33,9 @@ CLASS_NAME = re.compile(r"[a-z][a-z0-9_ -]{0,63}")
 ClassName = Annotated[str, InJson({"type": "str", "pattern": f"^{CLASS_NAME.pattern}$"})]
 """Name of a class: as that of a property, and blanks and ``-``."""
 
+_TITLES = {"youngs_modulus": "Young's modulus", "poissons_ratio": "Poisson's ratio"}
+"""Names in plain English that are not the column's name with blanks."""
+
 
 @dataclass(frozen=True)
 class Property:
@@ -66,12 +69,21 @@ class Property:
         return fine & (values >= self.least) & (values <= self.most)
 
     @property
+    def title(self) -> str:
+        """Its name in plain English, for figures and sentences."""
+        return _TITLES.get(self.name, self.name.replace("_", " "))
+
+    @property
+    def sign(self) -> str:
+        """Its unit as figures show it; empty where it has none."""
+        return "" if self.unit == "1" else self.unit.replace("^2", "²").replace("^3", "³")
+
+    @property
     def allowed(self) -> str:
         """What its values may be, in words."""
-        name = self.name.replace("_", " ")
         bounds = f" in [{self.least:g}, {self.most:g}]" if np.isfinite(self.most) else ""
         above = " above 0" if self.log10 else ""
-        return f"a finite {name}{above}{bounds}" + ("" if self.unit == "1" else f" {self.unit}")
+        return f"a finite {self.title}{above}{bounds}" + ("" if self.unit == "1" else f" {self.unit}")
 
 
 PROPERTIES = (

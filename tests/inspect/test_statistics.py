@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import json
 import math
+import re
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -222,6 +223,24 @@ def test_a_picture_is_the_same_each_time_and_takes_any_name(
     run(copy, "--picture", file)
     start = {"png": b"\x89PNG", "svg": b"<?xml", "pdf": b"%PDF"}[kind]
     assert file.read_bytes().startswith(start)
+
+
+def test_axes_have_english_names_and_the_units_of_the_store(store: Path) -> None:
+    opened = open_store(store)
+    found = store_statistics(opened)
+    own = ("GPa", "g/cm^3", "$1$")
+    other = tuple(replace(h, unit=unit) for h, unit in zip(found.histograms, own, strict=True))
+    for statistics, names in (
+        (found, ("log10 of Young's modulus [Pa]", "log10 of density [kg/m³]", "Poisson's ratio")),
+        (
+            replace(found, histograms=other),
+            ("log10 of Young's modulus [GPa]", "log10 of density [g/cm³]", "Poisson's ratio [$1$]"),
+        ),
+    ):
+        # In an SVG every text is told in a comment.
+        picture = draw_statistics(opened, statistics, "svg").decode()
+        told = set(re.findall(r"<!-- (.*?) -->", picture))
+        assert {one for one in told if one.endswith(("]", "ratio"))} == set(names)
 
 
 def test_nothing_chosen_is_nothing_counted(store: Path, tmp_path: Path) -> None:

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from slatprep.inspect.distributions import Histogram, JointHistogram, StoreStatistics
 from slatprep.inspect.pictures import palette
 from slatprep.inspect.pictures.canvas import STYLE, in_format, new_figure, size_of, write
-from slatprep.records import CLASS_COLOURS
+from slatprep.records import CLASS_COLOURS, Property
 from slatprep.store.reader import Store
 
 if TYPE_CHECKING:
@@ -114,7 +114,7 @@ def _histogram(axes: Axes, histogram: Histogram, side: str) -> None:
     axes.set_xlim(histogram.edges[0], histogram.edges[-1])
     most = max(_shares(own).sum(axis=0).max() for own in (histogram.field, histogram.slat))
     axes.set_ylim(0, 1.05 * most or 1.0)
-    axes.set_xlabel(_label(histogram))
+    axes.set_xlabel(_label(histogram), parse_math=False)
     axes.set_ylabel("share")
 
 
@@ -136,8 +136,8 @@ def _joint(
         bar.set_label("share of voxels")
     axes.set_xlim(first.edges[0], first.edges[-1])
     axes.set_ylim(second.edges[0], second.edges[-1])
-    axes.set_xlabel(_label(first))
-    axes.set_ylabel(_label(second))
+    axes.set_xlabel(_label(first), parse_math=False)
+    axes.set_ylabel(_label(second), parse_math=False)
 
 
 def _bars(axes: Axes, names: list[str], bars: list[dict[str, float]]) -> None:
@@ -158,8 +158,9 @@ def _shares(weights: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _label(histogram: Histogram) -> str:
-    unit = "" if histogram.unit == "1" else f" [{histogram.unit}]"
-    return f"{'log10 of ' * histogram.log10}{histogram.name.replace('_', ' ')}{unit}"
+    shown = Property(histogram.name, histogram.unit, histogram.log10)
+    unit = f" [{shown.sign}]" if shown.sign else ""
+    return f"{'log10 of ' * shown.log10}{shown.title}{unit}"
 
 
 def _percent(share: float) -> str:

@@ -90,6 +90,8 @@ def test_distributions_count_every_voxel_in_its_bin(page: Page, hostile: Report)
             assert entry["field"][kind] == expected.tolist()
         stored = group.attrs["normalization"][entry["name"]]
         assert (entry["lo"], entry["hi"]) == (stored["lo"], stored["hi"])
+    shown = [(entry["title"], entry["unit"]) for entry in page.content["properties"]]
+    assert shown == [("Young's modulus", "Pa"), ("density", "kg/m³"), ("Poisson's ratio", "")]
 
 
 def test_class_balance_is_by_category(page: Page, hostile: Report) -> None:

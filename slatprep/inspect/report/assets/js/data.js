@@ -12,14 +12,10 @@ const STATES = [
   { name: "skipped", sign: "–", means: "a partner is missing, not in the store" },
 ];
 
-const PROPERTY_NAMES = {
-  youngs_modulus: { name: "Young's modulus", symbol: "E", unit: "Pa" },
-  density: { name: "Density", symbol: "ρ", unit: "kg/m³" },
-  poissons_ratio: { name: "Poisson's ratio", symbol: "ν", unit: "" },
-};
-for (const { name, unit } of CONTENT.properties) {
-  const words = name.replaceAll("_", " ");
-  PROPERTY_NAMES[name] ??= { name: words, symbol: words, unit: unit === "1" ? "" : unit };
+const SYMBOLS = { youngs_modulus: "E", density: "ρ", poissons_ratio: "ν" };
+const PROPERTY_NAMES = {};
+for (const { name, title, unit } of CONTENT.properties) {
+  PROPERTY_NAMES[name] = { name: title[0].toUpperCase() + title.slice(1), symbol: SYMBOLS[name] ?? title, unit };
 }
 
 const Data = (() => {
