@@ -1,7 +1,7 @@
 # `make` alone lists what there is; every target sets up what it needs.
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help align test bench lint docs schema wheel sdist simulate mutants lock clean
+.PHONY: help align test bench lint docs schema wheel sdist simulate hub mutants lock clean
 
 PYTHON ?= python3
 VENV   ?= .venv
@@ -33,6 +33,7 @@ help:
 	@echo "  make wheel            a wheel, in dist, tried from another folder"
 	@echo "  make sdist            a source archive, in dist, that can run its tests"
 	@echo "  make simulate         the tests of the simulation, with its engine (0.5 GB, some minutes)"
+	@echo "  make hub              the tests of a published dataset, with the hub's library datasets (0.2 GB)"
 	@echo "  make mutants          change one operator or number at a time: do the tests notice?"
 	@echo "  make lock             resolve the versions in requirements/ anew"
 	@echo "  make clean            remove the environment, the demo data and caches; never your stores"
@@ -107,6 +108,11 @@ sdist: $(VENV)/.installed-dev
 simulate: $(VENV)/.installed-dev
 	$(BIN)/python -m pip install --quiet --editable '.[simulate]'
 	$(BIN)/python -m pytest tests/particles
+
+# Not a part of `make test` either: pyarrow would bring the tests' environment above 2.5 GB.
+hub: $(VENV)/.installed-dev
+	$(BIN)/python -m pip install --quiet datasets
+	$(BIN)/python -m pytest tests/export/test_publish.py
 
 # Hours; BENCH=--quick takes minutes, BENCH='--only scale' one of them, BENCH=--list names them.
 BENCH ?=

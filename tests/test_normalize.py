@@ -217,6 +217,20 @@ def test_bad_files_of_pixie_s_form_are_named(tmp_path: Path, text: str) -> None:
         read_ranges(tmp_path / "ranges.yaml")
 
 
+@pytest.mark.parametrize("name", ["r.json", "r.yaml", "lines.yaml"])
+def test_a_number_that_is_there_twice_is_an_error(tmp_path: Path, name: str) -> None:
+    numbers: dict[str, object] = {**PIXIE_S_FILE}
+    if name == "r.json":
+        numbers = {r.name: {"lo": r.lo, "hi": r.hi} for r in DECADES.ranges}
+    pairs = [f"{json.dumps(key)}: {json.dumps(value)}" for key, value in numbers.items()]
+    text = "{" + ", ".join([*pairs, pairs[0]]) + "}"
+    if name == "lines.yaml":
+        text = "density_min: 1\n" + "".join(f"{key}: {value}\n" for key, value in numbers.items())
+    (tmp_path / name).write_text(text)
+    with pytest.raises(ConfigError, match=f"{name}.*the key '{next(iter(numbers))}' occurs twice"):
+        read_ranges(tmp_path / name)
+
+
 @pytest.mark.parametrize(
     "text",
     [

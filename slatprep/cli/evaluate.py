@@ -92,6 +92,8 @@ def evaluate(
         raise click.UsageError("nothing to measure; give PREDICTIONS, --grids, or both")
     if picture is not None and not grids:
         raise click.UsageError("--picture draws methods side by side; give --grids as well")
+    if picture is not None and picture.suffix.lower() != ".png":
+        raise click.BadParameter(f"{picture} does not end in .png", param_hint="--picture")
     folders = _folders(grids)
     others = {
         name: TABLES[name][1] if name in TABLES else read_scores(Path(name)) for name in beside
@@ -115,8 +117,8 @@ def evaluate(
         problems = [f"{predictions}: no prediction of {name}" for name in result.missing]
         if result.converted:
             output.note(
-                f"note:    {result.converted} predictions were normalised by other ranges and "
-                "converted to the store's"
+                "note:    predictions normalised by other ranges, converted to the store's: "
+                f"{result.converted}"
             )
     if csv_file is not None:
         _write_csv(csv_file, what, measures, spread)
@@ -200,7 +202,9 @@ def _folders(grids: tuple[str, ...]) -> dict[str, Path]:
         folder = Path(text) if Path(text).is_dir() else Path(rest)
         if not rest or not folder.is_dir():
             raise click.BadParameter(f"{text!r} is no folder", param_hint="--grids")
-        name = folder.resolve().name if folder == Path(text) else name
+        name = folder.resolve().name if folder == Path(text) else name.strip()
+        if not name:
+            raise click.BadParameter(f"{text!r} has no name before =", param_hint="--grids")
         if name in folders:
             raise click.BadParameter(
                 f"two folders are called {name!r}; name them apart: NAME=DIR", param_hint="--grids"
@@ -212,13 +216,13 @@ def _folders(grids: tuple[str, ...]) -> dict[str, Path]:
 def _note_methods(output: Output, result: Comparison) -> None:
     if result.problems:
         output.note(
-            f"note:    {len(result.problems)} assets have no usable prediction of some method "
-            "and are left out of all"
+            "note:    assets without a usable prediction of some method, left out of all: "
+            f"{len(result.problems)}"
         )
     if result.partly_annotated:
         output.note(
-            f"note:    {result.partly_annotated} objects have occupied voxels without an "
-            "annotation, which are not scored; Pixie's loader drops such objects"
+            "note:    objects with occupied voxels that have no annotation and are not scored: "
+            f"{result.partly_annotated}; Pixie's loader leaves such objects out"
         )
 
 

@@ -68,12 +68,16 @@ class LatentsReader:
             try:
                 latents = self._latents(asset_id)
             except (InputError, StoreError) as error:
-                self.problems.append(str(error))
-                self.output.problem(f"slatprep: {error}")
+                self.leave_out(error)
                 continue
             self.seconds += time.perf_counter() - begin
             self.done.append(asset_id)
             yield latents
+
+    def leave_out(self, error: InputError | StoreError) -> None:
+        """Print why an asset is left out, and count it."""
+        self.problems.append(str(error))
+        self.output.problem(f"slatprep: {error}")
 
     def _of_file(self, latents: StructuredLatents) -> StructuredLatents:
         """Return the latents of a file with `standardised` set."""

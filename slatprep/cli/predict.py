@@ -72,7 +72,7 @@ def predict(
     """
     from slatprep.learn import require_torch
 
-    require_torch()
+    require_torch(device)
     from slatprep.learn import predict as work
 
     is_image = source.suffix.lower() in _IMAGES
@@ -90,12 +90,16 @@ def predict(
     predicted, voxels, decoding, writing = 0, 0, 0.0, 0.0
     with output.progress("predict") as progress:
         progress(0, len(read.ids))
-        for field in work.predict(decoder, read, batch_voxels=batch_voxels):
+        for number, field in enumerate(work.predict(decoder, read, batch_voxels=batch_voxels)):
             begin = time.perf_counter()
-            work.write_prediction(out, read.done[predicted], field, decoder)
+            try:
+                work.write_prediction(out, read.done[number], field, decoder)
+            except InputError as error:
+                read.leave_out(error)
+            else:
+                predicted += 1
+                voxels += len(field.coords)
             writing += time.perf_counter() - begin
-            predicted += 1
-            voxels += len(field.coords)
             decoding += field.seconds
             progress(predicted + len(read.problems), len(read.ids))
     counts = {"predicted": predicted, "voxels": voxels}

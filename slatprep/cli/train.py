@@ -105,7 +105,7 @@ def train(
     """
     from slatprep.learn import require_torch
 
-    require_torch()
+    require_torch(device)
     import torch
 
     from slatprep.learn.splits import assign_store

@@ -27,17 +27,22 @@ def __getattr__(name: str) -> object:
         raise
 
 
-def require_torch() -> None:
-    """Make sure that PyTorch is installed.
+def require_torch(device: str = "cpu") -> None:
+    """Make sure that PyTorch is installed, and finds the device.
 
     Raises
     ------
     SlatprepError
-        If it cannot be imported; the message says what to install.
+        If it cannot be imported, when the message says what to install, or finds no ``cuda``.
     """
     try:
-        import torch  # noqa: F401
+        import torch
     except ImportError as error:
         raise SlatprepError(
             f"PyTorch cannot be imported ({error}); install it with `pip install 'slatprep[train]'`"
         ) from error
+    if device == "cuda" and not torch.cuda.is_available():
+        raise SlatprepError(
+            f"PyTorch {torch.__version__} finds no CUDA device; expected an NVIDIA GPU and a build "
+            "of PyTorch for it, or --device cpu"
+        )

@@ -18,6 +18,7 @@ from slatprep.learn.predictions import (
     VoxelPrediction,
     check_prediction,
     open_predictions,
+    require_normalised,
 )
 from slatprep.learn.splits import select_assets
 from slatprep.learn.style import INK, MUTED
@@ -42,6 +43,15 @@ OURS = "these predictions"
 """Name of the method whose predictions are for SLAT voxels."""
 
 _BARS = "#AFC3DC"
+
+_TITLES = {
+    "log10 E": "log10 of Young's modulus",
+    "log10 density": "log10 of density",
+    "nu": "Poisson's ratio",
+    "mean": "mean of the errors",
+    "accuracy": "share of right classes",
+}
+"""Metrics in plain English."""
 
 _GRIDS = (*PixieverseSource.grid, "{id}.npy")
 
@@ -207,6 +217,7 @@ class _Truth:
         annotated = self.grid < BACKGROUND
         ranges = self.store.normalization
         properties, material = read_prediction(path, root, annotated, ranges)
+        require_normalised(path, properties)
         # The values are normalised ones: the lookup copies them whatever their unit.
         field = MaterialField(
             occupancy=annotated,
@@ -280,11 +291,11 @@ def draw_comparison(methods: Mapping[str, Measure], what: str, path: Path) -> No
                 axes.annotate(f"{mean:.3f}", (mean + spreads[place, k], place), (5, 0), va="center",
                               textcoords="offset points", fontsize=8, color=INK)  # fmt: skip
         axes.set_xlim(0, 1.35 * (1.0 if metric == "accuracy" else most))
-        axes.set_title(metric, fontsize=9, color=INK)
+        axes.set_title(_TITLES.get(metric, metric), fontsize=9, color=INK)
         axes.tick_params(labelsize=8, colors=MUTED, length=0)
         axes.locator_params(axis="x", nbins=4)
         axes.spines[["top", "right", "left"]].set_visible(False)
-    panels[0].set_yticks(places, names, color=INK)
+    panels[0].set_yticks(places, names, color=INK, parse_math=False)  # Names may contain $.
     panels[0].invert_yaxis()
     count = methods[names[0]].objects
     figure.supxlabel(

@@ -266,7 +266,17 @@ def write_prediction(
     -------
     Path
         ``<asset id>.npz`` in the folder.
+
+    Raises
+    ------
+    InputError
+        If the prediction is not finite; nothing is written.
     """
+    if not (np.isfinite(field.properties).all() and np.isfinite(field.probabilities).all()):
+        encoder = checkpoint.contents.latents.encoder
+        raise InputError(
+            asset_id, "what is predicted of its latents is not finite", f"latents of {encoder}"
+        )
     path = folder / f"{file_name(asset_id)}.npz"
     with staged(path) as file, file.open("wb") as stream:
         np.savez_compressed(

@@ -28,6 +28,7 @@ from slatprep.records import (
     MAX_PROPERTIES,
     RESOLUTION,
     Normalization,
+    Place,
     Share,
     Verdict,
 )
@@ -46,6 +47,9 @@ SPLITS_FILE = "splits.json"
 
 RUN_BYTES = 2**20
 """Most bytes of a `RUN_FILE`."""
+
+_FARTHEST = 100.0
+"""No decoder errs by so many ranges; SI values, which may be given by mistake, are beyond it."""
 
 _FORMS = "a directory of <asset id>.npz, a Zarr group or an HDF5 file with a group an asset"
 
@@ -170,6 +174,14 @@ def open_predictions(path: Path) -> Iterator[ReadAsset]:
         yield partial(_hdf5, file, path)
 
 
+def require_normalised(source: str | Place, properties: NDArray[np.float64]) -> None:
+    """Raise InputError, naming `source`, if properties (N, P) are far from normalised ones."""
+    largest = np.abs(properties).max(initial=0)
+    if largest > _FARTHEST:
+        expected = "normalised properties, which are -1 to 1 within the ranges, not SI values"
+        raise InputError(source, f"properties reach {largest:.4g}", expected)
+
+
 def check_prediction(
     source: str,
     arrays: Mapping[str, NDArray[Any]],
@@ -205,8 +217,8 @@ def check_prediction(
     Raises
     ------
     InputError
-        If an array is missing, has another type or shape or is not finite, or the voxels
-        differ from the store's.
+        If an array is missing, has another type or shape, is not finite or not normalised,
+        or the voxels differ from the store's.
     """
     count = len(coords)
     if "properties" not in arrays:
@@ -215,6 +227,7 @@ def check_prediction(
     properties = _shaped(source, "properties", arrays, (count, columns)).astype(np.float64)
     if not np.isfinite(properties).all():
         raise InputError(source, "properties are not all finite", "numbers in normalised space")
+    require_normalised(source, properties)
     converted = False
     if "ranges" in arrays:
         spans = _checked_ranges(source, arrays, columns).tolist()

@@ -102,12 +102,24 @@ def read_scores(path: Path) -> tuple[PublishedScore, ...]:
     expected = f"a CSV with a name in the first column and some of {', '.join(METRICS)}"
     try:
         with path.open(encoding="utf-8", newline="") as file:
-            header, *rows = [row for row in csv.reader(file) if row]
+            lines = [row for row in csv.reader(file) if row]
+        if not lines:
+            raise ValueError("it is empty")
     except (OSError, UnicodeDecodeError, csv.Error, ValueError) as error:
         raise InputError(path, f"cannot be read ({error})", expected) from error
+    header, *rows = lines
     places = {name: header.index(name) for name in METRICS if name in header[1:]}
     if not places:
         raise InputError(path, f"has the columns {', '.join(header)}", expected)
+    twice = [name for name in places if header.count(name) > 1]
+    if twice:
+        raise InputError(path, f"has the column {twice[0]} twice", expected)
+    longer = [row for row in rows if len(row) > len(header)]
+    if longer:
+        found = (
+            f"has {len(longer[0])} entries under {len(header)} columns, for {longer[0][0][:80]!r}"
+        )
+        raise InputError(path, found, expected)
     try:
         return tuple(
             PublishedScore(row[0], {n: float(row[k]) for n, k in places.items() if row[k].strip()})

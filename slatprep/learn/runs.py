@@ -259,7 +259,7 @@ class Run:
         ):
             axes.annotate(name, (1.0, height), (6, 0), va="center", textcoords="offset points",
                           xycoords="axes fraction", fontsize=9, color=INK)  # fmt: skip
-        axes.set(xlabel="epoch (the first is 0)", ylabel="validation MSE (normalised)")
+        axes.set(xlabel="epoch (the first is 0)", ylabel="validation error (mean square)")
         axes.set_ylim(0, top)
         axes.xaxis.set_major_locator(MaxNLocator(integer=True))
         axes.spines[["top", "right"]].set_visible(False)

@@ -40,13 +40,13 @@ MAX_FILES = 4096
 _MAX_HEADER_BYTES = 4096
 
 _KIND_NAMES = {
-    "b": "boolean",
-    "i": "integer",
-    "u": "unsigned integer",
-    "f": "floating-point",
+    "b": "booleans",
+    "i": "integers",
+    "u": "unsigned integers",
+    "f": "floating-point numbers",
     "S": "byte text",
     "U": "text",
-    "V": "structured",
+    "V": "records",
 }
 
 _COMPLETE = "a complete file; copy or make it again"
@@ -115,7 +115,7 @@ class ArraySpec:
             )
         if dtype.kind not in self.kinds or not 0 < dtype.itemsize <= 512:
             kinds = " or ".join(_KIND_NAMES[kind] for kind in self.kinds)
-            raise InputError(where, f"has dtype {dtype.str}", f"a {kinds} array")
+            raise InputError(where, f"has dtype {dtype.str}", f"an array of {kinds}")
         if self.shapes and not any(self._fits(shape, allowed) for allowed in self.shapes):
             texts = " or ".join(_shape_text(allowed, self.max_rows) for allowed in self.shapes)
             raise InputError(where, f"has shape {_shape_text(shape)}", f"shape {texts}{self.note}")

@@ -6,11 +6,11 @@ import csv
 import io
 import json
 import re
-from collections import Counter
 from collections.abc import Collection
 
 from slatprep.errors import ConfigError, in_unicode
 from slatprep.records import MAX_NAME_BYTES, Place
+from slatprep.storage.documents import unique
 from slatprep.storage.place import storage_of
 
 MAX_JSON_BYTES = 256 * 2**20
@@ -88,7 +88,7 @@ def read_categories(path: Place) -> dict[str, str]:
         data = storage_of(path).read(MAX_JSON_BYTES)
         if len(data) > MAX_JSON_BYTES:
             raise ConfigError(f"{path}: is larger than {MAX_JSON_BYTES >> 20} MiB")
-        entries = json.loads(data, object_pairs_hook=_unique)
+        entries = json.loads(data, object_pairs_hook=unique)
     except (OSError, ValueError, RecursionError) as error:
         raise ConfigError(f"{path}: cannot be read as JSON ({error})") from None
     if not isinstance(entries, dict):
@@ -105,14 +105,6 @@ def read_categories(path: Place) -> dict[str, str]:
             )
         categories[object_id] = in_unicode(category)
     return categories
-
-
-def _unique(pairs: list[tuple[str, object]]) -> dict[str, object]:
-    entries = dict(pairs)
-    if len(entries) < len(pairs):
-        name, _ = Counter(name for name, _ in pairs).most_common(1)[0]
-        raise ValueError(f"the key {name[:80]!r} occurs twice")
-    return entries
 
 
 def _object_of(file_identifier: str) -> str:

@@ -5,14 +5,14 @@ from __future__ import annotations
 import json
 import tomllib
 from collections.abc import Sequence
-from typing import TypeGuard
+from typing import Any, TypeGuard
 
 import numpy as np
 
 from slatprep.errors import ConfigError
 from slatprep.normalize import PIXIE_RANGES, normalization_of
 from slatprep.records import PROPERTIES, PROPERTY_COLUMNS, Normalization, Place, Property
-from slatprep.storage.documents import read_bounded
+from slatprep.storage.documents import read_bounded, unique
 
 _MAX_BYTES = 2**20
 
@@ -47,7 +47,7 @@ def read_ranges(path: Place, properties: Sequence[Property] = PROPERTIES) -> Nor
         if path.suffix in (".yaml", ".yml"):
             table = _of_pixie(text)
         else:
-            table = json.loads(text) if path.suffix == ".json" else tomllib.loads(text)
+            table = _of_json(text) if path.suffix == ".json" else tomllib.loads(text)
     except (OSError, ValueError, RecursionError) as error:
         raise ConfigError(f"{path}: cannot read ranges ({error})") from error
     ranges = []
@@ -81,17 +81,21 @@ def pixie_ranges(table: Sequence[Property]) -> Normalization:
     return Normalization(tuple(published[one.name] for one in table), PIXIE_RANGES.source)
 
 
+def _of_json(text: str) -> Any:
+    return json.loads(text, object_pairs_hook=unique)
+
+
 def _of_pixie(text: str) -> dict[str, dict[str, object]]:
     """Return the tables of a file of Pixie's, whose JSON is YAML as well; ValueError if it is none.
 
     YAML itself, which could name objects to be made, is not needed for twelve numbers.
     """
     if text.lstrip().startswith("{"):
-        numbers = json.loads(text)
+        numbers = _of_json(text)
     else:
         lines = (line.partition("#")[0].strip() for line in text.splitlines())
         pairs = (line.partition(":") for line in lines if line not in ("", "---"))
-        numbers = {name.strip(): float(value) for name, _, value in pairs}
+        numbers = unique([(name.strip(), float(value)) for name, _, value in pairs])
     return {
         name: {
             end: numbers.get(f"{word}_{percentile}", numbers.get(f"{word}_{limit}"))

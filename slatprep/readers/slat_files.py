@@ -9,6 +9,7 @@ from urllib.parse import quote
 from slatprep.errors import ConfigError, InputError
 from slatprep.parameters import SlatSource
 from slatprep.readers.adapters import latent_adapter
+from slatprep.readers.hdf5 import SUFFIXES
 from slatprep.readers.patterns import find_files, list_below, tried_names
 from slatprep.records import Place
 
@@ -60,6 +61,10 @@ def discover_slats(source: SlatSource) -> list[SlatFile]:
     root, one_file = source.root, source.root.is_file()
     if not one_file and not root.exists():
         raise ConfigError(f"{root}: does not exist; expected a SLAT, or a folder of them")
+    if one_file and root.suffix not in (".npz", *SUFFIXES):
+        raise ConfigError(
+            f"{root}: expected a SLAT as .npz, {' or '.join(SUFFIXES)}, or a folder of them"
+        )
     groups = one_file and root.suffix != ".npz"
     slats = list(_each_slat(source, True)) if groups else []
     if one_file and not slats:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import json
 from collections import Counter
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
@@ -14,7 +15,7 @@ from slatprep.errors import ConfigError, InputError
 from slatprep.parameters import CATEGORY, NAMED_SPLITS
 from slatprep.readers.files import ArraySpec, is_text, npy_array
 from slatprep.records import Place
-from slatprep.storage.documents import parse_json, read_bounded
+from slatprep.storage.documents import parse_json, read_bounded, unique
 from slatprep.storage.place import place_of
 
 Split = Literal["train", "val", "test"]
@@ -221,6 +222,7 @@ def read_lists(path: Place) -> dict[Split, tuple[str, ...]]:
             listed: Any = names.tolist()
         elif path.suffix == ".json":
             listed = parse_json(data)
+            json.loads(data, object_pairs_hook=unique)  # What is read above takes the last.
         else:
             listed = [
                 line.strip() for line in data.decode("utf-8-sig").splitlines() if line.strip()

@@ -83,7 +83,9 @@ class Property:
         """What its values may be, in words."""
         bounds = f" in [{self.least:g}, {self.most:g}]" if np.isfinite(self.most) else ""
         above = " above 0" if self.log10 else ""
-        return f"a finite {self.title}{above}{bounds}" + ("" if self.unit == "1" else f" {self.unit}")
+        return f"a finite {self.title}{above}{bounds}" + (
+            "" if self.unit == "1" else f" {self.unit}"
+        )
 
 
 PROPERTIES = (

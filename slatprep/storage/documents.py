@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+from collections import Counter
+from collections.abc import Sequence
 from itertools import chain
-from typing import Any
+from typing import Any, TypeVar
 
 import orjson
 
 from slatprep.records import Place
 from slatprep.storage.place import storage_of
+
+_Value = TypeVar("_Value")
 
 MAX_DEPTH = 64
 """Objects and lists within each other; a store's metadata have a dozen."""
@@ -54,6 +58,18 @@ def parse_json(data: bytes | str) -> Any:
         if not level:
             return document
     raise ValueError(f"nested more deeply than {MAX_DEPTH} levels")
+
+
+def unique(pairs: Sequence[tuple[str, _Value]]) -> dict[str, _Value]:
+    """Return the entries of an object; ValueError if a key occurs twice.
+
+    A hook for `json.loads`, which by itself takes the last, for files that people write.
+    """
+    entries = dict(pairs)
+    if len(entries) < len(pairs):
+        name, _ = Counter(name for name, _ in pairs).most_common(1)[0]
+        raise ValueError(f"the key {name[:80]!r} occurs twice")
+    return entries
 
 
 def read_document(place: Place, limit: int) -> dict[str, Any]:

@@ -178,8 +178,8 @@ def test_a_store_is_read_from_the_hub(hub: str, mixed_build: BuildSummary, tmp_p
 def test_shards_are_a_dataset_of_the_hubs_library(
     root: Path, mixed_build: BuildSummary, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Where the library `datasets` is installed."""
-    why = "with pyarrow it is 180 MB, and tests' environment would be above 2.5 GB"
+    """`make hub` installs the library `datasets`, and a job of continuous integration runs it."""
+    why = "with pyarrow it is 190 MB, and tests' environment would be above 2.5 GB; see make hub"
     datasets = pytest.importorskip("datasets", reason=f"no library datasets: {why}")
     loaded = datasets.load_dataset(
         str(root / "me" / "shards"), split="train", cache_dir=str(tmp_path)

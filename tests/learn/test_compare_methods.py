@@ -201,6 +201,11 @@ BAD: dict[str, tuple[Callable[[Path], None], str]] = {
                           + np.zeros((4, 64, 64, 64))),
         "youngs_modulus inf",
     ),
+    "si": (
+        lambda path: save(path, np.array([7850.0, 1e6, 0.3, 0.0])[:, None, None, None]
+                          + np.zeros((4, 64, 64, 64))),
+        "expected normalised properties",
+    ),
     "negative": (lambda path: save(path, np.full((64, 64, 64, 4), -1.0)), "youngs_modulus -1"),
     "two": (
         lambda path: save(path.with_name("sample_1_pred.npy"), np.load(path)),
@@ -268,6 +273,8 @@ def test_side_by_side_on_the_same_objects(case: Case, tmp_path: Path) -> None:
         (("--grids", "nowhere"), "is no folder"),
         (("--grids", "{results}", "--grids", "{results}"), "two folders are called 'eleven'"),
         (("{results}", "--picture", "x.png"), "--picture draws methods"),
+        (("--grids", "={results}"), "has no name before ="),
+        (("--grids", "{results}", "--picture", "x.gif"), "x.gif does not end in .png"),
     ],
 )
 def test_what_cannot_be_compared_is_said(
@@ -297,7 +304,7 @@ def test_occupied_voxels_without_a_class_are_counted(
     assert found.partly_annotated == 1
     assert found.methods["m, own grid"].means["accuracy"] == 1.0
     done = run("evaluate", "--store", one.store, "--split", "all", "--grids", one.results)
-    assert "1 objects have occupied voxels without an annotation" in done.stderr
+    assert "have no annotation and are not scored: 1;" in done.stderr
 
 
 def test_spreads_by_hand() -> None:

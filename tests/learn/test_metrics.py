@@ -128,6 +128,7 @@ def test_perfect_predictions_score_perfectly(learn_store: Path, tmp_path: Path) 
         ({"properties": np.zeros((5, 3))}, "properties has shape"),
         ({"properties": None, "material": 9}, "class 9"),
         ({"properties": np.nan}, "not all finite"),
+        ({"properties": 7850.0}, "properties reach 7850; expected normalised properties"),
         ({"properties": None, "coords": 1}, "other voxels"),
     ],
 )
@@ -203,6 +204,8 @@ def test_table_is_printed_beside(
         ("method,mean\nmine,good\n", "not numbers"),
         ("method,nu,mean\nmine,0.1\n", "not numbers"),
         ("", "cannot be read"),
+        ("method,nu,nu\nmine,0.1,0.2\n", "has the column nu twice"),
+        ("method,nu\nmine,0,1\n", "has 3 entries under 2 columns, for 'mine'"),
     ],
 )
 def test_own_tables(tmp_path: Path, text: str, message: str | None) -> None:

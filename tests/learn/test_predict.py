@@ -104,12 +104,15 @@ def test_a_folder_of_slats_and_a_file_that_cannot_be_read(checkpoint: Path, tmp_
     save(slats / "a.npz", random_latents(1))
     save(slats / "b" / "front.npz", random_latents(2))
     (slats / "c.npz").write_bytes(b"no zip")
+    huge = random_latents(3)
+    save(slats / "d.npz", replace(huge, feats=huge.feats * np.float32(1e30)))
     told = run(slats, "--checkpoint", checkpoint, "--out", out, code=1)
     assert told["predicted"] == 2
     assert told["voxels"] == 600
     assert told["checkpoint"] == hashlib.sha256((checkpoint / "best.pt").read_bytes()).hexdigest()
-    (problem,) = told["problems"]  # type: ignore[misc]
-    assert "c.npz" in problem
+    one, other = told["problems"]  # type: ignore[misc]
+    assert "c.npz" in one
+    assert other.startswith("d: what is predicted of its latents is not finite")
     assert sorted(path.name for path in out.iterdir()) == ["a.npz", "b.front.npz"]
     with np.load(out / "a.npz") as held:
         assert np.array_equal(held["coords"], random_latents(1).coords)
@@ -124,6 +127,18 @@ def test_a_folder_of_slats_and_a_file_that_cannot_be_read(checkpoint: Path, tmp_
     assert np.array_equal(carried.voxels, random_latents(1).coords)
 
 
+@pytest.mark.parametrize("command", ["predict", "train"])
+def test_a_device_that_is_not_there_is_named(
+    checkpoint: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, command: str
+) -> None:
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    weights = ["--checkpoint", str(checkpoint)] if command == "predict" else []
+    options = [str(tmp_path), *weights, "--out", str(tmp_path / "out"), "--device", "cuda"]
+    result = CliRunner().invoke(slatprep, [command, *options])
+    assert result.exit_code == 1 and "finds no CUDA device" in result.stderr
+    assert not (tmp_path / "out").exists()
+
+
 def test_one_file_of_either_kind(checkpoint: Path, tmp_path: Path) -> None:
     latents = random_latents(4)
     save(tmp_path / "one.npz", latents)
@@ -132,6 +147,10 @@ def test_one_file_of_either_kind(checkpoint: Path, tmp_path: Path) -> None:
     with h5py.File(tmp_path / "many.h5", "w") as file:
         for name in ("x", "y"):
             file[f"{name}/coords"], file[f"{name}/feats"] = latents.coords, latents.feats
+    wrong = CliRunner().invoke(
+        slatprep, ["predict", __file__, "--checkpoint", str(checkpoint), "--out", str(tmp_path)]
+    )
+    assert wrong.exit_code == 2 and "expected a SLAT as .npz, .h5 or .hdf5" in wrong.stderr
     for name, ids in (("one.npz", ["one"]), ("two.h5", ["two"]), ("many.h5", ["x", "y"])):
         out = tmp_path / f"out-{name}"
         told = run(tmp_path / name, "--checkpoint", checkpoint, "--out", out)

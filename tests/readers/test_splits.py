@@ -120,6 +120,7 @@ def test_an_object_in_two_lists_is_an_error(tmp_path: Path) -> None:
         ("a.json", "x", "holds str for test"),
         ("a.json", b'{"test":[' + 1000 * b"[" + 1000 * b"]" + b"]}", "nested more deeply than 64"),
         ("a.json", {"train": [], "test": []}, "has no id"),
+        ("a.json", b'{"test": ["x"], "test": ["y"]}', "the key 'test' occurs twice"),
         ("a.json", ["nobody"], "has none of the dataset's 60 objects"),
         ("a.npy", np.array(SOME, object), "Python objects"),
         ("a.npy", np.arange(4), "dtype"),
