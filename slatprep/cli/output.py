@@ -166,8 +166,11 @@ def write_csv(file: Path, header: Sequence[str], rows: Iterable[Sequence[object]
 
 
 def _for_spreadsheet(value: object) -> object:
-    formula = isinstance(value, str) and value.lstrip()[:1] in ("=", "+", "-", "@")
-    return f"'{value}" if formula else value
+    if not isinstance(value, str):
+        return value
+    # A table is printed on terminals as well.
+    text = printable(value)
+    return f"'{text}" if text.lstrip()[:1] in ("=", "+", "-", "@") else text
 
 
 def say(text: object = "", *, err: bool = False, nl: bool = True) -> None:

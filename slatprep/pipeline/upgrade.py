@@ -13,11 +13,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from slatprep.errors import StoreError
 from slatprep.judge import judge
 from slatprep.pipeline.rewrite import Source, places_of_sources, write_rows
 from slatprep.pipeline.summary import BuildSummary
 from slatprep.provenance.record import AssetRecord
 from slatprep.provenance.stored import StoredRecords
+from slatprep.readers.slat import checked_latents
 from slatprep.records import (
     Annotation,
     Judgement,
@@ -25,6 +27,7 @@ from slatprep.records import (
     Place,
 )
 from slatprep.store import Store, open_store
+from slatprep.store.integrity import file_findings, metadata_findings
 from slatprep.store.layout import FORMAT_VERSION
 from slatprep.workers import Progress
 
@@ -58,11 +61,16 @@ def upgrade_store(
     Raises
     ------
     StoreError
-        If it cannot be read, or the disk does not take the new one.
+        If it cannot be read or is not as it was written, or the disk does not take the new one.
+    InputError
+        If what it holds of an asset is no SLAT.
     """
     opened = open_store(store)
     if opened.format_version == FORMAT_VERSION:
         return None
+    damaged = [*metadata_findings(opened.path), *file_findings(opened, jobs=1)[1]]
+    for finding in sorted(damaged, key=str):
+        raise StoreError(f"{opened.path}/{finding}; `slatprep verify` says more")
     judged = _Judged(opened)
     source = Source(opened, judged, opened.attributes["build"], places_of_sources(opened))
     rows = [(source, row) for row in range(len(opened))]
@@ -110,8 +118,10 @@ class _Judged(StoredRecords):
         annotation = Annotation(
             asset.properties_si, asset.material, asset.valid, asset.distance, asset.place
         )
+        where = f"{self.store.path} [{asset.asset_id}]"
+        latents = checked_latents(asset.coords, asset.feats, where)
         judgement, likely = judge(
-            asset.field, asset.latents, record.alignment, annotation, record.parameters.sample
+            asset.field, latents, record.alignment, annotation, record.parameters.sample
         )
-        self._known[row] = judgement, asset.latents.moments
+        self._known[row] = judgement, latents.moments
         self._rows = row, {"place": asset.place, "confidence": likely}

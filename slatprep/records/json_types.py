@@ -49,12 +49,16 @@ def _invertible() -> InJson:
         matrix: NDArray[np.float64] = read.then(values)
         if (matrix[3] != (0, 0, 0, 1)).any() or not 1e-9 < np.linalg.det(matrix[:3, :3]) < 1e9:
             raise ValueError("no map of the frames: it has no inverse, or mirrors")
+        turned = matrix[:3, :3] / np.cbrt(np.linalg.det(matrix[:3, :3]))
+        if np.abs(turned @ turned.T - np.eye(3)).max() > _SHEAR:
+            raise ValueError("no similarity: it shears, or scales one axis more than another")
         return matrix
 
     return InJson(read.schema, map_of)
 
 
 _MAX_SIDE = 32
+_SHEAR = 1e-6  # as `slatprep.geometry.frames.split_transform` has it
 _FINITE = {"type": "float", "allow_inf_nan": False}
 
 
@@ -83,7 +87,7 @@ Digest = Annotated[str, InJson({"type": "str", "pattern": "^[0-9a-f]{64}$"})]
 
 
 Transform = Annotated[NDArray[np.float64], _invertible()]
-"""Homogeneous, (4, 4): PixieVerse frame to SLAT frame."""
+"""Homogeneous, (4, 4): PixieVerse frame to SLAT frame, a similarity."""
 
 
 Rotation = Annotated[NDArray[np.float64], _array(3, 3)]

@@ -241,7 +241,10 @@ class Store(AssetTable):
     def _voxel_rows(self, name: str, index: int, start: int, stop: int) -> NDArray[Any]:
         if name == "place" and self.format_version == 1:
             centres = voxel_centres(self.read_rows("voxel/coords", start, stop))
-            return places_of(centres, self._column("transform")[index]).astype(np.float32)
+            try:
+                return places_of(centres, self._column("transform")[index]).astype(np.float32)
+            except ValueError as error:
+                raise StoreError(f"{self.path}/asset/transform: row {index}: {error}") from None
         if name == "confidence" and self.format_version == 1:
             return np.full(stop - start, np.nan, dtype=np.float32)
         if name in MERGED_COLUMNS and not self.merges:

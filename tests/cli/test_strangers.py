@@ -218,11 +218,11 @@ def test_a_table_of_scores_has_no_formulas(store: Path, tmp_path: Path) -> None:
     for row, asset_id in enumerate(opened.ids):
         count = len(opened.read(row, ("coords",))["coords"])
         np.savez(tmp_path / f"p/{asset_id}.npz", properties=np.zeros((count, 3)))
-    for row, category in enumerate(("=cmd|x", "+1", "-1", "@a", " =b")):
+    for row, category in enumerate(("=cmd|x", "+1", "-1", "@a\x1b[2J", " =b")):
         rewrite(store, "asset/category", row, category)
     table = tmp_path / "scores.csv"
     run("evaluate", tmp_path / "p", "--store", store, "--split", "all", "--csv", table)
     with table.open(encoding="utf-8", newline="") as file:
         first = {row[0] for row in csv.reader(file)}
     # The bear's two views are one object, of the first one's category.
-    assert first >= {"'=cmd|x", "'+1", "'@a", "' =b"}
+    assert first >= {"'=cmd|x", "'+1", "'@a\\u001b[2J", "' =b"}

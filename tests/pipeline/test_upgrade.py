@@ -3,15 +3,19 @@
 from __future__ import annotations
 
 import json
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
+import pytest
+import zarr
 from click.testing import CliRunner
 from support.format_one import write_format_one
 from support.synthetic import Dataset
 
 from slatprep.cli.commands import slatprep
+from slatprep.errors import SlatprepError, StoreError
 from slatprep.inspect.verify import verify_store
 from slatprep.pipeline.dataset import build_store
 from slatprep.pipeline.upgrade import upgrade_store
@@ -55,3 +59,52 @@ def test_upgrade_replaces_a_store_in_place(
         assert json.loads(result.stdout).get("verdicts") == verdicts
     assert open_store(old).format_version == 2
     assert verify_store(old).ok
+
+
+def test_a_store_that_is_not_as_it_was_written_is_not_upgraded(
+    make_dataset: Callable[..., Dataset], tmp_path: Path
+) -> None:
+    built, old = tmp_path / "built.zarr", tmp_path / "old.zarr"
+    build_store(make_dataset("a", "b").parameters(), built)
+    write_format_one(built, old)
+    for name in ("asset/property/c/0", "voxel/material/zarr.json", "asset/record/c/0"):
+        if not (old / name).exists():
+            continue
+        sound = (old / name).read_bytes()
+        (old / name).write_bytes(sound[:-1] + bytes([sound[-1] ^ 1]))
+        with pytest.raises(StoreError, match="slatprep verify"):
+            upgrade_store(old, tmp_path / "new.zarr")
+        assert not (tmp_path / "new.zarr").exists()
+        (old / name).write_bytes(sound)
+    assert upgrade_store(old, tmp_path / "new.zarr") is not None
+
+
+def _sheared(root: zarr.Group) -> None:
+    record = json.loads(str(root["asset/record"][0]))
+    record["alignment"]["transform"][0][1] += 5.0
+    root["asset/record"][0] = json.dumps(record)
+
+
+def _set(name: str, value: float) -> Callable[[zarr.Group], None]:
+    def change(root: zarr.Group) -> None:
+        root[name][...] = np.full(root[name].shape, value, root[name].dtype)
+
+    return change
+
+
+@pytest.mark.filterwarnings("ignore:Consolidated metadata")
+@pytest.mark.parametrize(
+    "change",
+    [_sheared, _set("asset/transform", 5), _set("voxel/coords", 200), _set("voxel/coords", 7),
+     _set("voxel/feats", np.nan)],
+)  # fmt: skip
+def test_a_strangers_store_is_refused_in_words(
+    undisturbed: tuple[Dataset, Path], tmp_path: Path, change: Callable[[zarr.Group], None]
+) -> None:
+    """Its digests are right: whoever made it wrote them."""
+    hostile = Path(shutil.copytree(undisturbed[1], tmp_path / "hostile.zarr"))
+    change(zarr.open_group(hostile, mode="r+", use_consolidated=False))
+    write_format_one(hostile, tmp_path / "old.zarr")
+    with pytest.raises(SlatprepError):
+        upgrade_store(tmp_path / "old.zarr", tmp_path / "new.zarr")
+    assert not (tmp_path / "new.zarr").exists()
