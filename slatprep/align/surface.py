@@ -9,6 +9,7 @@ thickness pulls the alignment to one side.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property, lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -58,13 +59,13 @@ class Surface:
     values: NDArray[np.float64]
     boundary: NDArray[np.uint8]
 
-    @property
+    @cached_property
     def centroid(self) -> NDArray[np.float64]:
         """Mean of the surface's samples, in voxels from the cube's centre."""
         centroid: NDArray[np.float64] = self.points.mean(axis=0)
         return centroid
 
-    @property
+    @cached_property
     def size(self) -> float:
         """Root mean square distance of the surface's samples from their centroid, in voxels."""
         return float(np.sqrt(((self.points - self.centroid) ** 2).sum(axis=1).mean()))
@@ -78,11 +79,18 @@ class Surface:
         if len(self.points) <= count:
             # Laid out in memory as a choice is, or the kernels are compiled once more.
             return replace(self, points=np.ascontiguousarray(self.points))
-        # Multiples of the golden ratio fill an interval evenly without the
-        # regular steps that would beat with the lattice.
-        fraction = (np.arange(first, first + count) * 0.618033988749895) % 1.0
-        chosen = np.unique((fraction * len(self.points)).astype(np.intp))
+        # In order, so each is compared with the one before it: numpy.unique would sort once more.
+        chosen = (_fractions(count, first) * len(self.points)).astype(np.intp)
+        chosen = chosen[np.diff(chosen, prepend=-1) > 0]
         return replace(self, points=self.points[chosen], values=self.values[chosen])
+
+
+@lru_cache(maxsize=16)
+def _fractions(count: int, first: int) -> NDArray[np.float64]:
+    """Return so many fractions of 1, even and in order, for `Surface.subset`."""
+    # Multiples of the golden ratio fill an interval evenly without the
+    # regular steps that would beat with the lattice.
+    return np.sort((np.arange(first, first + count) * 0.618033988749895) % 1.0)
 
 
 def surface_of(occupancy: NDArray[np.bool_]) -> Surface:

@@ -92,6 +92,8 @@ def _spread_over_others(squares):  # type: ignore[no-untyped-def]
     slab, least = np.empty((a, c), np.int16), np.empty((a, c), np.int16)
     for j in range(b):
         slab[:] = squares[:, j]
+        if slab[:, 0].min() == NOTHING * NOTHING:
+            continue  # Nothing of the other kind in any of its lines, so nothing to spread.
         spread(slab, least)
         squares[:, j] = least
     slab, least = np.empty((b, c), np.int16), np.empty((b, c), np.int16)
