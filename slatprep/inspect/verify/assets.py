@@ -161,7 +161,8 @@ def value_findings(asset: StoredAsset) -> Iterator[Finding]:
     for where, (fine, what, expected) in checks.items():
         if not fine:
             yield Finding(where, asset.asset_id, what, expected)
-    if len(np.unique(flat_index(coords, 256))) < len(coords):
+    cells = np.sort(flat_index(coords, 256))
+    if (cells[1:] == cells[:-1]).any():
         yield Finding("voxel/coords", asset.asset_id, "a coordinate occurs twice", "each once")
 
 
@@ -291,8 +292,9 @@ def _is_spread(asset: StoredAsset) -> bool:
 
 def _normalised(values: NDArray[np.float32], where: NDArray[np.bool_]) -> bool:
     """Whether values (..., rows) are in [-1, 1] where the mask is true and NaN elsewhere."""
-    missing = np.isnan(values)
-    return bool((missing == ~where).all() and (missing | (np.abs(values) <= 1)).all())
+    inside = np.abs(values) <= 1
+    missing = np.count_nonzero(np.isnan(values))
+    return bool((inside == where).all()) and missing == values.size - np.count_nonzero(inside)
 
 
 def _claims(
