@@ -7,8 +7,16 @@ from typing import Any
 
 import click
 
-from slatprep.cli.options import NEW_FOLDER, POSITIVE, ChoiceOf, command, jobs_option, option
+from slatprep.cli.options import (
+    NEW_FOLDER,
+    POSITIVE,
+    ChoiceOf,
+    command,
+    jobs_option,
+    option,
+)
 from slatprep.cli.output import Output
+from slatprep.cli.targets import FiniteRange
 
 
 @command("make-demo")
@@ -17,7 +25,7 @@ from slatprep.cli.output import Output
 @option("--seed", click.IntRange(min=0), 0)
 @option("--level", click.IntRange(0, 7), name="levels", multiple=True)
 @option("--views", POSITIVE, 1)
-@option("--habitual-share", click.FloatRange(0, 1), 0.0)
+@option("--habitual-share", FiniteRange(0, 1), 0.0)
 @option("--latents", ChoiceOf("slatprep.demo.latents:LatentKind"), "placeholder")
 @option("--source", ChoiceOf("slatprep.demo.sources:Source"), "pixieverse")
 @option("--encoder", ChoiceOf("slatprep.demo.latents:Encoder"), "trellis")

@@ -24,6 +24,7 @@ from slatprep.cli.options import (
     verdicts_option,
 )
 from slatprep.cli.output import Output
+from slatprep.cli.targets import FiniteRange
 
 if TYPE_CHECKING:
     from slatprep.learn.runs import EpochRecord
@@ -42,13 +43,13 @@ _SIZES = ("small", "medium", "large")
 @option("--steps", POSITIVE)
 @option("--batch-size", POSITIVE, 1)
 @option("--accumulate", POSITIVE, 1)
-@option("--learning-rate", click.FloatRange(min=0, min_open=True), 0.0001)
+@option("--learning-rate", FiniteRange(min=0, min_open=True), 0.0001)
 @option("--precision", click.Choice(["auto", "fp32", "bf16"]), "auto")
 @option("--keep", click.Choice(["best", "last"]), "best")
 @option("--patience", POSITIVE, 10)
 @option("--augment", ChoiceOf("slatprep.learn.augment:Augmentation"), "none", name="augmentation")
 @verdicts_option
-@option("--max-ambiguity", float)
+@option("--max-ambiguity", FiniteRange(min=0))
 @split_options
 @option("--weigh-by-confidence", is_flag=True)
 @option("--seed", int, 0)

@@ -17,6 +17,7 @@ from slatprep.cli.options import (
     store_option,
 )
 from slatprep.cli.output import Output
+from slatprep.cli.targets import FiniteRange
 from slatprep.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -34,7 +35,7 @@ if TYPE_CHECKING:
 @option("--points", ChoiceOf("slatprep.particles.fields:Points"), "slat")
 @option("--axes", ChoiceOf("slatprep.particles.read:Axes"))
 @option("--frame", click.Choice(["file", "slat"]), "file")
-@option("--max-distance", click.FloatRange(min=0, min_open=True), 2.0, metavar="VOXELS")
+@option("--max-distance", FiniteRange(min=0, min_open=True), 2.0, metavar="VOXELS")
 @option("--far", ChoiceOf("slatprep.particles.transfer:Far"), "background")
 def transfer(
     output: Output,

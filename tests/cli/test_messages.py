@@ -47,6 +47,25 @@ def test_a_name_that_no_asset_has_is_wrong_use_in_every_command(
         assert result.exit_code == 2 and said in result.stderr
 
 
+@pytest.mark.parametrize(
+    ("words", "number"),
+    [
+        (("train", "STORE", "--out", "OUT", "--learning-rate"), "nan"),
+        (("train", "STORE", "--out", "OUT", "--learning-rate"), "inf"),
+        (("train", "STORE", "--out", "OUT", "--max-ambiguity"), "nan"),
+        (("make-demo", "OUT", "--habitual-share"), "nan"),
+    ],
+)
+def test_numbers_are_finite(
+    words: tuple[str, ...], number: str, store: Path, tmp_path: Path
+) -> None:
+    out = tmp_path / "out"
+    places = {"STORE": store, "OUT": out}
+    result = run(*(places.get(word, word) for word in words), number)
+    assert result.exit_code == 2 and f"{number} is no finite number" in result.stderr
+    assert not out.exists()
+
+
 def test_a_misspelt_command_is_told_with_the_one_meant() -> None:
     result = run("chek-alignment", "--worst", "3")
     assert result.exit_code == 2 and "did you mean check-alignment?" in result.stderr
