@@ -66,17 +66,28 @@ SAID = "said"
 
 ENDED = "ended before its kill, so not counted"
 CLUSTER = """
-import sys
+import subprocess, sys, threading
 from distributed import LocalCluster
+def work(address):
+    line = [sys.executable, "-m", "distributed.cli.dask_worker", address]
+    while not ending.is_set():
+        subprocess.run(
+            [*line, "--nthreads", "1", "--no-nanny", "--no-dashboard", "--death-timeout", "30"],
+            stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
+        )
 if __name__ == "__main__":
+    ending = threading.Event()
     with LocalCluster(
-        n_workers=2, threads_per_worker=1, protocol="tcp://", dashboard_address=None,
-        silence_logs=50,
+        n_workers=0, protocol="tcp://", dashboard_address=None, silence_logs=50
     ) as started:
+        for _ in range(2):
+            threading.Thread(target=work, args=[started.scheduler_address], daemon=True).start()
         print(started.scheduler_address, flush=True)
         sys.stdin.read()
+        ending.set()
 """
-"""A cluster in an interpreter of its own: builds are forked from a process without threads."""
+"""A cluster in an interpreter of its own: builds are forked from a process without threads. A Dask
+nanny that fails once to start a worker again gives up; these are started again without end."""
 
 
 def main() -> None:
@@ -181,7 +192,10 @@ def aimed_build(
     # Two processes share the assets, and what is finished is not done again.
     calls = chance.randrange(given.assets // 2) if step.startswith(("asset", "shard")) else 0
     aimed_kill.aim(aims, step, calls, whom)
-    code = ended(start(faults="aimed_kill:reached"), 300)
+    running = start(faults="aimed_kill:reached")
+    code = ended(running, 300)
+    if code is None and running.pid is not None:
+        os.killpg(running.pid, signal.SIGKILL)  # Else it would hold on to the cluster.
     assert code is not None, f"a build hangs after a kill at {step!r}, {whom}"
     return (f"{phase}, {step}: {whom} killed" if aimed_kill.struck(aims) else ENDED), code
 
