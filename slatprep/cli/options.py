@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, TypeVar, get_args
 
 import click
 
-from slatprep.cli.output import OUTPUT_OPTIONS, Output, with_output
+from slatprep.cli.output import OUTPUT_OPTIONS, Output, PrintingCommand, with_output
 from slatprep.cli.targets import NewPath
 from slatprep.storage.place import place_of, storage_of
 
@@ -122,7 +122,7 @@ def command(name: str | None = None, **settings: Any) -> Callable[[_Function], c
         helps = dict(_OPTION.findall(described.pop("Options", "")))
         below = [f"\b\n{title}:\n{indent(body, '  ')}" for title, body in described.items()]
         declared = click.command(
-            name, click.Command, help=text, epilog="\n\n".join(below), **settings
+            name, PrintingCommand, help=text, epilog="\n\n".join(below), **settings
         )
         made = declared(with_output(function))
         made.params += OUTPUT_OPTIONS

@@ -89,7 +89,8 @@ class Output:
             yield
         except (SlatprepError, click.UsageError) as error:
             if self.as_json:
-                self._say_document(False, {"error": str(error)})
+                told = error.format_message() if isinstance(error, click.UsageError) else str(error)
+                self._say_document(False, {"error": told})
             raise
 
     def made(self, document: object, show: Callable[[], None], complete: bool = True) -> None:
@@ -204,6 +205,19 @@ OUTPUT_OPTIONS = (
     click.Option(["-v", "--verbose"], is_flag=True, help="Print more details."),
 )
 """The options of every command, which `with_output` reads."""
+
+
+class PrintingCommand(click.Command):
+    """A command with `OUTPUT_OPTIONS`, which prints wrong use as JSON too, with ``--json``."""
+
+    def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
+        """Parse the arguments, as click does."""
+        # Without the program, as in `with_output`; click takes parsed words out of the list.
+        output = Output(
+            "--json" in args and not ctx.resilient_parsing, 0, ctx.command_path.partition(" ")[2]
+        )
+        with output.failing():
+            return super().parse_args(ctx, args)
 
 
 def with_output(command: _Command) -> _Command:

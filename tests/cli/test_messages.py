@@ -66,6 +66,22 @@ def test_numbers_are_finite(
     assert not out.exists()
 
 
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (("evaluate", "--store", "nothing-here", "--json"), "nothing-here"),
+        (("bench", "align", "--json", "--assets", "0"), "0 is not in the range"),
+        (("info", "--json", "--colour"), "--colour"),
+    ],
+)
+def test_wrong_use_is_told_as_json(words: tuple[str, ...], said: str) -> None:
+    result = run(*words)
+    document = json.loads(result.stdout)
+    assert result.exit_code == 2 and said in document["error"] and said in result.stderr
+    command = " ".join(word for word in words[:2] if word in ("evaluate", "bench", "align", "info"))
+    assert (document["command"], document["ok"]) == (command, False)
+
+
 def test_a_misspelt_command_is_told_with_the_one_meant() -> None:
     result = run("chek-alignment", "--worst", "3")
     assert result.exit_code == 2 and "did you mean check-alignment?" in result.stderr
