@@ -17,7 +17,6 @@ from slatprep.geometry.frames import voxel_centres
 from slatprep.normalize import from_mapped, to_mapped
 from slatprep.parameters import SampleParameters
 from slatprep.records import (
-    BACKGROUND,
     RESOLUTION,
     UNANNOTATED,
     Annotation,
@@ -134,8 +133,8 @@ def merge(annotations: Sequence[Annotation], table: Sequence[Property]) -> Annot
     apart = np.where(there, mapped - mean, 0.0)
     spread = np.sqrt((apart**2).sum(axis=0) / of)
 
-    classes = np.arange(BACKGROUND)[:, None]
     given = np.stack([one.material for one in annotations])
+    classes = range(1 + int(given[given != UNANNOTATED].max(initial=0)))
     votes = np.stack([(given == one).sum(axis=0) for one in classes])
     material = votes.argmax(axis=0).astype(np.uint8)
     some = (count > 0).all(axis=-1) & votes.any(axis=0)

@@ -82,7 +82,7 @@ class GroupStatistics:
 
 @dataclass(frozen=True, eq=False)
 class Histogram:
-    """Weights of one property by class (7, bins); `edges` (bins + 1,) are of log10 if `log10`."""
+    """Weights of one property by class (C, bins); `edges` (bins + 1,) are of log10 if `log10`."""
 
     name: str
     unit: str

@@ -26,7 +26,7 @@ from slatprep.inspect.distributions import (
 from slatprep.inspect.listing import rows_chosen
 from slatprep.inspect.overview import UNKNOWN
 from slatprep.inspect.tallies import JOINT_BINS, SideTally, Tally, no_tally, pooled, tally
-from slatprep.records import BACKGROUND, Normalization, Place, Verdict
+from slatprep.records import Normalization, Place, Verdict
 from slatprep.store import Store, open_store
 from slatprep.workers import Progress
 from slatprep.workers.local import run_in_order
@@ -98,7 +98,7 @@ def store_statistics(
         tuple(one.unit for one in store.contents.properties),
         store.contents.labels,
     )
-    total = nothing = no_tally(len(ranges), BINS)
+    total = nothing = no_tally(store.contents, BINS)
     done, groups = 0, []
     for own in of_category:
         here = nothing
@@ -133,7 +133,7 @@ def _tally_some(path: Place, rows: Sequence[int], by_asset: bool) -> Tally:
     """Tally some assets of a store, in a worker."""
     store = open_store(path)
     ranges = store.normalization
-    total = no_tally(len(ranges.ranges), BINS)
+    total = no_tally(store.contents, BINS)
     for row in rows:
         # Not `store.asset`: it reads all columns of asset/*, which takes long in a large store.
         material, properties = (
@@ -145,6 +145,7 @@ def _tally_some(path: Place, rows: Sequence[int], by_asset: bool) -> Tally:
             (slat["material"], slat["properties"]),
             ranges,
             BINS,
+            contents=store.contents,
             by_asset=by_asset,
         )
     return total
@@ -168,7 +169,8 @@ class _Summariser:
     ) -> GroupStatistics:
         """Summarise all classes of a tally, or one class by its index."""
         named = {str(v): verdicts[str(v)] for v in Verdict} if verdicts is not None else {}
-        chosen = np.arange(BACKGROUND + 1) if index is None else np.array([index])
+        every = np.arange(len(counts.field.weights))
+        chosen = every if index is None else np.array([index])
         sides = (
             self._side(side, chosen, sum(named.values()) if index is None else None)
             for side in (counts.field, counts.slat)
@@ -179,7 +181,7 @@ class _Summariser:
         self, counts: SideTally, chosen: NDArray[np.int64], assets: int | None
     ) -> SideStatistics:
         weights = counts.weights[chosen]
-        annotated = chosen[chosen < BACKGROUND]
+        annotated = chosen[chosen < len(counts.weights) - 1]
         own = counts.weights[annotated]
         whole, part = float(weights.sum()), float(own.sum())
         return SideStatistics(
@@ -229,7 +231,7 @@ class _Summariser:
         """Return a property's histogram by class, in `DRAWN_BINS` bins."""
         span = self.ranges.ranges[number]
         sides = (
-            side.histogram[number].reshape(BACKGROUND, DRAWN_BINS, -1).sum(axis=-1)
+            side.histogram[number].reshape(-1, DRAWN_BINS, BINS // DRAWN_BINS).sum(axis=-1)
             for side in (counts.field, counts.slat)
         )
         edges = np.linspace(span.lo, span.hi, DRAWN_BINS + 1)

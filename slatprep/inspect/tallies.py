@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slatprep.normalize import denormalize_properties
-from slatprep.records import BACKGROUND, Normalization
+from slatprep.records import Contents, Normalization
 
 JOINT_BINS = 64
 """Bins of either axis of the joint histogram, over [-1, 1]."""
@@ -21,30 +21,28 @@ JOINT_BINS = 64
 Voxels = tuple[NDArray[np.uint8], NDArray[np.float32]]
 """Classes and normalised properties of voxels."""
 
-_CLASSES = BACKGROUND  # Material classes are the numbers below it.
-
 
 @dataclass(frozen=True, eq=False)
 class SideTally:
-    """Sums over the voxels of one side of an asset, or of many.
+    """Sums over the voxels of one side of an asset, or of many; C is `Contents.n_labels`.
 
     Attributes
     ----------
-    assets, voxels : ndarray of int64, shape (8,)
+    assets, voxels : ndarray of int64, shape (C + 1,)
         By class, the number of voxels and of assets that have any; the last entry is for
         voxels without an annotation.
-    weights : ndarray of float64, shape (8,)
+    weights : ndarray of float64, shape (C + 1,)
         Total weight of those voxels.
-    histogram : ndarray of float64, shape (P, 7, bins)
+    histogram : ndarray of float64, shape (P, C, bins)
         Weight by property, class and bin of the normalised value, over [-1, 1].
-    sums : ndarray of float64, shape (P, 7, bins)
+    sums : ndarray of float64, shape (P, C, bins)
         Weighted sum of the normalised values in each bin, whose mean is exact where all are equal.
     joint : ndarray of float64, shape (JOINT_BINS, JOINT_BINS)
         Weight by bins of the first two properties; zero if there is only one.
-    mean, squares : ndarray of float64, shape (2, P, 7)
+    mean, squares : ndarray of float64, shape (2, P, C)
         Weighted mean, and weighted sum of squared differences from it, of the
         normalised values and of those in SI units.
-    ends : ndarray of float64, shape (2, P, 7)
+    ends : ndarray of float64, shape (2, P, C)
         Smallest and largest normalised value; inf and -inf where there are no voxels.
     """
 
@@ -110,24 +108,31 @@ def pooled(
     return centre.squeeze(axis), merged
 
 
-def no_tally(properties: int, bins: int) -> Tally:
-    """Return an empty tally for a number of properties and of bins."""
+def no_tally(contents: Contents, bins: int) -> Tally:
+    """Return an empty tally of what a store holds, for a number of bins."""
+    properties, labels = len(contents.properties), contents.n_labels
     nothing = SideTally(
-        assets=np.zeros(_CLASSES + 1, np.int64),
-        voxels=np.zeros(_CLASSES + 1, np.int64),
-        weights=np.zeros(_CLASSES + 1),
-        histogram=np.zeros((properties, _CLASSES, bins)),
-        sums=np.zeros((properties, _CLASSES, bins)),
+        assets=np.zeros(labels + 1, np.int64),
+        voxels=np.zeros(labels + 1, np.int64),
+        weights=np.zeros(labels + 1),
+        histogram=np.zeros((properties, labels, bins)),
+        sums=np.zeros((properties, labels, bins)),
         joint=np.zeros((JOINT_BINS, JOINT_BINS)),
-        mean=np.zeros((2, properties, _CLASSES)),
-        squares=np.zeros((2, properties, _CLASSES)),
-        ends=np.stack([np.full((properties, _CLASSES), end) for end in (np.inf, -np.inf)]),
+        mean=np.zeros((2, properties, labels)),
+        squares=np.zeros((2, properties, labels)),
+        ends=np.stack([np.full((properties, labels), end) for end in (np.inf, -np.inf)]),
     )
     return Tally(nothing, nothing)
 
 
 def tally(
-    field: Voxels, slat: Voxels, ranges: Normalization, bins: int, *, by_asset: bool = False
+    field: Voxels,
+    slat: Voxels,
+    ranges: Normalization,
+    bins: int,
+    *,
+    contents: Contents,
+    by_asset: bool = False,
 ) -> Tally:
     """Tally the voxels of one asset.
 
@@ -140,6 +145,8 @@ def tally(
         The ranges of the properties.
     bins : int
         Bins of the histograms, over [-1, 1].
+    contents : Contents
+        What the store holds.
     by_asset : bool
         Whether all voxels of a side have weight 1 together, instead of 1 each.
 
@@ -149,12 +156,12 @@ def tally(
         Of this asset alone.
     """
     grid, values = field
-    annotated = grid < BACKGROUND
-    before = grid[grid != BACKGROUND], values[:, annotated]
-    after = slat[0], slat[1][slat[0] < BACKGROUND].T
+    labels = contents.n_labels
+    before = grid[grid != contents.background], values[:, grid < labels]
+    after = slat[0], slat[1][slat[0] < labels].T
     return Tally(
-        _side(*before, ranges, bins, by_asset),
-        _side(*after, ranges, bins, by_asset),
+        _side(*before, ranges, bins, labels, by_asset),
+        _side(*after, ranges, bins, labels, by_asset),
     )
 
 
@@ -163,16 +170,17 @@ def _side(
     properties: NDArray[np.float32],
     ranges: Normalization,
     bins: int,
+    labels: int,
     by_asset: bool,
 ) -> SideTally:
     """Tally voxels (N,), and normalised properties (P, K) of those with a class."""
     weight = np.float64(1.0 / max(len(material), 1) if by_asset else 1.0)
-    classes = np.minimum(material, BACKGROUND)
-    counts = np.bincount(classes, minlength=_CLASSES + 1).astype(np.int64)
-    own = classes[classes < BACKGROUND].astype(np.int64)
+    classes = np.minimum(material, labels)
+    counts = np.bincount(classes, minlength=labels + 1).astype(np.int64)
+    own = classes[classes < labels].astype(np.int64)
     values = np.stack([properties, denormalize_properties(properties.T, ranges).T])
     values = values.astype(np.float64)
-    size, shape = _CLASSES * bins, (len(properties), _CLASSES, bins)
+    size, shape = labels * bins, (len(properties), labels, bins)
     places = own * bins + _bins(properties, bins)
     histogram = [np.bincount(row, minlength=size) for row in places]
     sums = [np.bincount(*pair, minlength=size) for pair in zip(places, values[0], strict=True)]
@@ -180,7 +188,7 @@ def _side(
     if len(properties) > 1:
         first, second = _bins(properties[:2], JOINT_BINS)
         joint += np.bincount(first * JOINT_BINS + second, minlength=JOINT_BINS**2) * weight
-    mean = np.zeros((2, len(properties), _CLASSES))
+    mean = np.zeros((2, len(properties), labels))
     squares = np.zeros_like(mean)
     ends = np.stack([np.full(mean.shape[1:], end) for end in (np.inf, -np.inf)])
     for index in np.flatnonzero(counts[:-1]):

@@ -164,14 +164,16 @@ def fold_of(object_id: str) -> int:
     return int(hashlib.sha256(object_id.encode()).hexdigest()[:8], 16) % FOLDS
 
 
-def moments_of(feats: NDArray[np.float32], material: NDArray[np.uint8]) -> Moments:
-    """Return the moments of one asset from its latents (N, 8) and classes (N,)."""
-    known = material < BACKGROUND
+def moments_of(
+    feats: NDArray[np.float32], material: NDArray[np.uint8], labels: int = BACKGROUND
+) -> Moments:
+    """Return the moments of one asset from its latents (N, 8) and classes (N,) below `labels`."""
+    known = material < labels
     z, classes = feats[known].astype(np.float64), material[known]
     one = 1.0 / max(len(z), 1)
-    total = np.zeros((BACKGROUND, z.shape[1]))
+    total = np.zeros((labels, z.shape[1]))
     np.add.at(total, classes, z)
-    weight = np.bincount(classes, minlength=BACKGROUND).astype(np.float64)
+    weight = np.bincount(classes, minlength=labels).astype(np.float64)
     return Moments(one * weight, one * total, one * (z.T @ z))
 
 

@@ -23,7 +23,6 @@ from slatprep.learn.runs import read_state
 from slatprep.normalize import denormalize_properties, normalization_of
 from slatprep.readers.files import refusing
 from slatprep.records import (
-    BACKGROUND,
     PIXIEVERSE,
     Contents,
     Normalization,
@@ -237,7 +236,7 @@ def _decode(checkpoint: Checkpoint, assets: list[StructuredLatents]) -> Iterator
             coords=latents.coords,
             properties=own,
             properties_si=denormalize_properties(own, checkpoint.normalization),
-            material=likely[:, :BACKGROUND].argmax(axis=1).astype(np.uint8),
+            material=likely[:, : checkpoint.contents.n_labels].argmax(axis=1).astype(np.uint8),
             probabilities=likely,
             seconds=seconds * len(own),
         )

@@ -24,6 +24,7 @@ from slatprep.readers.files import ArraySpec, load_source, npz_arrays, refusing
 from slatprep.readers.hdf5 import group_arrays
 from slatprep.readers.splits import Shares
 from slatprep.records import (
+    MANY_BACKGROUND,
     MATERIAL_CLASSES,
     MAX_PROPERTIES,
     RESOLUTION,
@@ -56,9 +57,9 @@ _FORMS = "a directory of <asset id>.npz, a Zarr group or an HDF5 file with a gro
 _NUMBERS = "iuf"
 
 _SPECS = {
-    "properties": ArraySpec(tuple((None, n + 1) for n in range(MAX_PROPERTIES)), _NUMBERS),
+    "properties": ArraySpec(((None, range(1, MAX_PROPERTIES + 1)),), _NUMBERS),
     "material": ArraySpec(((None,),), _NUMBERS),
-    "logits": ArraySpec(tuple((None, n + 1) for n in range(CLASSES)), _NUMBERS),
+    "logits": ArraySpec(((None, range(1, MANY_BACKGROUND + 1)),), _NUMBERS),
     "coords": ArraySpec(((None, 3),), _NUMBERS),
     "ranges": ArraySpec(tuple((n + 1, 2) for n in range(MAX_PROPERTIES)), _NUMBERS),
 }

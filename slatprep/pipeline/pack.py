@@ -46,6 +46,7 @@ def write_shard(
     shard: Shard,
     normalization: Normalization,
     previous: PreviousBuild | None = None,
+    background: int = BACKGROUND,
 ) -> tuple[Shard, NDArray[np.int64], dict[str, Written]]:
     """Normalise and write one shard of every array of its group.
 
@@ -61,6 +62,8 @@ def write_shard(
         Ranges of the properties.
     previous : PreviousBuild, optional
         Where assets lie that are not in the spool.
+    background : int
+        Material id of an empty cell.
 
     Returns
     -------
@@ -94,7 +97,7 @@ def write_shard(
                 if isinstance(key, int) and held is not None:
                     arrays = stored_rows(held, shard.group, key, own)
                 else:
-                    arrays, counts = arrays_of(spool, str(key), own, normalization)
+                    arrays, counts = arrays_of(spool, str(key), own, normalization, background)
                     clipped[asset] += counts
                 append_rows(writers, arrays, own.stop - own.start)
         reached("shard filled", name)
@@ -160,8 +163,9 @@ def stored_rows(
 
 
 def _voxel_rows(
-    spool: Spool, key: str, own: slice, normalization: Normalization
+    spool: Spool, key: str, own: slice, normalization: Normalization, background: int
 ) -> tuple[Arrays, NDArray[np.int64]]:
+    del background  # no voxel of a SLAT is empty
     arrays = {name: array[own] for name, array in spool.voxels(key).items()}
     arrays["properties"], clipped = normalize_and_count(arrays["properties"], normalization)
     if "spread" in arrays:
@@ -170,12 +174,12 @@ def _voxel_rows(
 
 
 def _grid_rows(
-    spool: Spool, key: str, own: slice, normalization: Normalization
+    spool: Spool, key: str, own: slice, normalization: Normalization, background: int
 ) -> tuple[Arrays, NDArray[np.int64]]:
     del own  # a grid is one row
     field = spool.field(key)
     cells = flat_index(field.voxels)
-    material = np.where(field.occupancy, np.uint8(UNANNOTATED), np.uint8(BACKGROUND))
+    material = np.where(field.occupancy, np.uint8(UNANNOTATED), np.uint8(background))
     material.reshape(-1)[cells] = field.material
     normalized, clipped = normalize_and_count(field.properties, normalization)
     properties = np.full((len(clipped), material.size), np.nan, dtype=np.float32)
@@ -303,7 +307,7 @@ def pack_store(
         arrays = [*arrays_in("voxel", merged), *arrays_in("grid", merged)]
         put_objects(path, remote, [f"{name}/zarr.json" for name in arrays])
     tasks = (
-        (remote or path, spool, shard, normalization, previous)
+        (remote or path, spool, shard, normalization, previous, contents.background)
         for shard in shards(keys, offsets, parameters, same)
     )
     written: dict[str, Written] = {}

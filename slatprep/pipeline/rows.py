@@ -95,7 +95,8 @@ def settle_rows(
     if kept is None:
         jobs = crew.of(len(usable))
         made = apply_consensus(_made(usable), spool, parameters, jobs, crew.note)
-        usable = list(apply_witness(made, spool, parameters, jobs, crew.note))
+        labels = wanted.declared.n_labels
+        usable = list(apply_witness(made, spool, parameters, jobs, crew.note, labels))
     contents = resolved_contents(usable, wanted.declared, parameters.slat.standardised)
     usable = in_order(usable, context.previous, wanted.compact)
     carried = Carried(context.previous, usable) if kept and context.previous else None

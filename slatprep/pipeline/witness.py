@@ -22,7 +22,7 @@ from slatprep.judge.witness import (
 from slatprep.parameters import BuildParameters
 from slatprep.pipeline.settle import Reopened
 from slatprep.pipeline.spool import Spool, SpooledAsset
-from slatprep.records import LatentChoice, Verdict
+from slatprep.records import BACKGROUND, LatentChoice, Verdict
 from slatprep.workers.local import Jobs, run_unordered
 
 
@@ -32,6 +32,7 @@ def apply_witness(
     parameters: BuildParameters,
     jobs: Jobs,
     note: Callable[[str], None] | None = None,
+    labels: int = BACKGROUND,
 ) -> list[SpooledAsset]:
     """Settle ties by the latents and mark labels that they contradict, if asked to.
 
@@ -48,6 +49,8 @@ def apply_witness(
         Worker processes, or a cluster's.
     note : callable, optional
         Gets a line that says what came of it.
+    labels : int
+        How many classes voxels may have.
 
     Returns
     -------
@@ -58,7 +61,7 @@ def apply_witness(
     if not parameters.witness.settle:
         return list(assets)
     sure = [asset for asset in assets if asset.columns["verdict"] == Verdict.GOOD]
-    moments = dict(run_unordered(read_moments, ((asset, spool) for asset in sure), jobs))
+    moments = dict(run_unordered(read_moments, ((asset, spool, labels) for asset in sure), jobs))
     models = fit_models((_object_of(asset), moments[asset.asset_id]) for asset in sure)
     tell = note or (lambda line: None)
     if models is None:
@@ -82,10 +85,10 @@ def apply_witness(
     return [changed.get(asset.asset_id, asset) for asset in assets]
 
 
-def read_moments(asset: SpooledAsset, spool: Spool) -> tuple[str, Moments]:
+def read_moments(asset: SpooledAsset, spool: Spool, labels: int) -> tuple[str, Moments]:
     """Return an asset's id and the moments of its latents."""
     arrays = spool.voxels(asset.key)
-    return asset.asset_id, moments_of(arrays["feats"], arrays["material"])
+    return asset.asset_id, moments_of(arrays["feats"], arrays["material"], labels)
 
 
 def weigh_asset(

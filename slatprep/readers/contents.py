@@ -6,7 +6,7 @@ from slatprep.errors import ConfigError
 from slatprep.parameters import BuildParameters
 from slatprep.readers.adapters import Holding, source_adapter
 from slatprep.readers.encoders import latent_space
-from slatprep.records import Contents, Property
+from slatprep.records import Contents, Property, labels_of
 
 
 def contents_of(parameters: BuildParameters) -> Contents:
@@ -26,6 +26,10 @@ def contents_of(parameters: BuildParameters) -> Contents:
                 f"[[also]] {number} ({source.root}): {fault}; expected what [pixieverse] has, or "
                 "a part of it: name the source that has most as [pixieverse]"
             )
+    try:
+        labels_of(held.classes)
+    except ValueError as error:
+        raise ConfigError(f"{parameters.pixieverse.root}: {error}") from None
     return Contents(held.properties, held.classes, latent_space(parameters.slat))
 
 

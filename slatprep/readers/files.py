@@ -87,8 +87,8 @@ class ArraySpec:
     Attributes
     ----------
     shapes : tuple of shapes
-        Allowed shapes; None in a shape stands for 0 to `max_rows` rows. Empty: any
-        shape of at most `max_items` items.
+        Allowed shapes; None in a shape stands for 0 to `max_rows` rows, a range for the
+        sizes in it. Empty: any shape of at most `max_items` items.
     kinds : str
         Allowed numpy dtype kinds.
     max_items : int
@@ -99,7 +99,7 @@ class ArraySpec:
         Bound on a size that is None in `shapes`.
     """
 
-    shapes: tuple[tuple[int | None, ...], ...]
+    shapes: tuple[tuple[int | range | None, ...], ...]
     kinds: str
     max_items: int = 64
     note: str = ""
@@ -124,15 +124,16 @@ class ArraySpec:
                 where, f"has shape {_shape_text(shape)}", f"1 to {self.max_items} values"
             )
 
-    def _fits(self, shape: tuple[int, ...], allowed: tuple[int | None, ...]) -> bool:
+    def _fits(self, shape: tuple[int, ...], allowed: tuple[int | range | None, ...]) -> bool:
         return len(shape) == len(allowed) and all(
-            0 <= n <= self.max_rows if m is None else n == m
+            0 <= n <= self.max_rows if m is None else n in m if isinstance(m, range) else n == m
             for n, m in zip(shape, allowed, strict=True)
         )
 
 
-def _shape_text(shape: tuple[int | None, ...], most: int = 0) -> str:
-    text = ", ".join(f"N <= {most}" if n is None else str(n) for n in shape)
+def _shape_text(shape: tuple[int | range | None, ...], most: int = 0) -> str:
+    sizes = (f"{n[0]} to {n[-1]}" if isinstance(n, range) else n for n in shape)
+    text = ", ".join(f"N <= {most}" if n is None else str(n) for n in sizes)
     return f"({text},)" if len(shape) == 1 else f"({text})"
 
 

@@ -57,7 +57,7 @@ def field_of_voxels(
     material : ndarray of int, shape (K,), optional
         Class of each; all are of class 0 where the source has no classes.
     classes : int
-        How many classes there are, at most 7.
+        How many classes there are, at most 254.
     table : sequence of Property
         What the columns are.
     max_unphysical : float
@@ -174,11 +174,13 @@ def _merged(
     cells, first, cell = np.unique(flat, return_index=True, return_inverse=True)
     if len(cells) == len(flat):
         return cells, classes[first], values[first]
-    votes = np.zeros((len(cells), BACKGROUND), dtype=np.int64)
-    np.add.at(votes, (cell, classes), 1)
-    winners = votes.argmax(axis=1)
+    most = int(classes.max(initial=0)) + 1
+    parties, votes = np.unique(cell * most + classes, return_counts=True)
+    # Of each cell the class with most votes comes first, of several the lowest.
+    parties = parties[np.lexsort((parties, -votes, parties // most))]
+    winners = parties[np.searchsorted(parties // most, np.arange(len(cells)))] % most
     counted = classes == winners[cell]
     means = np.zeros((len(cells), len(table)))
     np.add.at(means, cell[counted], to_mapped(values[counted], table))
-    means /= votes[np.arange(len(cells)), winners][:, None]
+    means /= np.bincount(cell[counted])[:, None]
     return cells, winners, from_mapped(means, table)

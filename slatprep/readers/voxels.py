@@ -28,6 +28,7 @@ from slatprep.readers.zarr_groups import group_arrays
 from slatprep.records import (
     BACKGROUND,
     CLASS_NAME,
+    MANY_BACKGROUND,
     MATERIAL_CLASSES,
     MAX_PROPERTIES,
     AssetPair,
@@ -35,6 +36,7 @@ from slatprep.records import (
     Place,
     Property,
     PropertyName,
+    labels_of,
 )
 from slatprep.storage.documents import read_bounded
 from slatprep.storage.listing import Listing
@@ -131,7 +133,7 @@ class PlainVoxels:
             np.stack(columns, axis=1),
             resolution=said.resolution,
             material=arrays.get("material"),
-            classes=len(said.names[:BACKGROUND]) or 1,
+            classes=len(labels_of(said.names)) or 1,
             table=said.table,
             max_unphysical=max_unphysical,
             sources=(file, about),
@@ -165,9 +167,9 @@ def _parsed(text: bytes, where: str) -> _Description:
         named = read.classes if isinstance(read.classes, tuple) else ("any",)
         if not all(map(CLASS_NAME.fullmatch, named)) or "background" in named:
             raise ValueError(f"the names of classes are {', '.join(named)}")
-        if not 1 <= len(set(named)) == len(named) <= BACKGROUND:
+        if not 1 <= len(set(named)) == len(named) <= MANY_BACKGROUND:
             raise ValueError(
-                f"there are {len(named)} classes, not 1 to {BACKGROUND} of a name each"
+                f"there are {len(named)} classes, not 1 to {MANY_BACKGROUND} of a name each"
             )
     except ValueError as error:
         reason = " ".join(str(error).split())[:300]

@@ -64,12 +64,14 @@ from slatprep.records.tables import (
     LatentSpace,
     Property,
     PropertyName,
+    labels_of,
 )
 from slatprep.records.words import (
     BACKGROUND,
     CLASS_COLOURS,
     FEATS_MEAN,
     FEATS_STD,
+    MANY_BACKGROUND,
     MATERIAL_CLASSES,
     MATERIAL_COLOURS,
     MAX_NAME_BYTES,

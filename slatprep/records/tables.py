@@ -15,6 +15,7 @@ from slatprep.records.words import (
     BACKGROUND,
     FEATS_MEAN,
     FEATS_STD,
+    MANY_BACKGROUND,
     MATERIAL_CLASSES,
     RESOLUTION,
 )
@@ -164,6 +165,23 @@ TRELLIS = LatentSpace("trellis", 8, RESOLUTION, FEATS_MEAN, FEATS_STD)
 """TRELLIS's structured latents; SAM 3D Objects has the same."""
 
 
+def labels_of(classes: tuple[str, ...]) -> tuple[str, ...]:
+    """Return the classes that a voxel may have: of PhysGaussian's all but the background.
+
+    Raises
+    ------
+    ValueError
+        If they are more than a store can tell apart, or have not a name each.
+    """
+    if classes == MATERIAL_CLASSES:
+        return classes[:BACKGROUND]
+    if len({*classes, "background"}) != len(classes) + 1:
+        raise ValueError("classes must have a name each, none of them background")
+    if len(classes) > MANY_BACKGROUND:
+        raise ValueError(f"there are {len(classes)} classes, and at most {MANY_BACKGROUND} can be")
+    return classes
+
+
 @dataclass(frozen=True)
 class Contents:
     """What a dataset holds; without classes, every annotated voxel is of class 0."""
@@ -175,7 +193,17 @@ class Contents:
     @property
     def labels(self) -> tuple[str, ...]:
         """What a voxel may be, by the class that the arrays have."""
-        return self.classes[:BACKGROUND] or ("annotated",)
+        return labels_of(self.classes) or ("annotated",)
+
+    @property
+    def background(self) -> int:
+        """Material id of an empty cell of the grid."""
+        return BACKGROUND if len(self.labels) <= BACKGROUND else MANY_BACKGROUND
+
+    @property
+    def n_labels(self) -> int:
+        """How many ids below that of the background voxels may have."""
+        return max(len(self.labels), BACKGROUND)
 
     @property
     def n_classes(self) -> int:

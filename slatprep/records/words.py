@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from colorsys import hls_to_rgb
 from enum import StrEnum
 
 RESOLUTION = 64
@@ -39,7 +40,11 @@ FEATS_STD = (
 
 
 BACKGROUND = 7
-"""Material id of an empty voxel."""
+"""Material id of an empty voxel, unless there are more classes than its number."""
+
+
+MANY_BACKGROUND = 254
+"""Material id of an empty voxel where there are more, and so the most classes there may be."""
 
 
 UNANNOTATED = 255
@@ -69,11 +74,19 @@ UNANNOTATED_COLOUR = "#FFFFFF"
 """Colour of an occupied voxel without an annotation."""
 
 
+def _colour_beyond(index: int) -> str:
+    """Return a colour for a class that PhysGaussian does not have, unlike those before it."""
+    # Steps of the golden ratio leave no hue out and meet none again.
+    hue, lightness = index * 0.618034 % 1.0, (0.35, 0.5, 0.65)[index % 3]
+    return "#" + "".join(f"{round(255 * c):02X}" for c in hls_to_rgb(hue, lightness, 0.6))
+
+
 MATERIAL_COLOURS = {
     **{index: CLASS_COLOURS[name] for index, name in enumerate(MATERIAL_CLASSES)},
+    **{index: _colour_beyond(index) for index in range(len(MATERIAL_CLASSES), MANY_BACKGROUND)},
     UNANNOTATED: UNANNOTATED_COLOUR,
 }
-"""The same by material id, as the store holds it."""
+"""The same by material id, as the store holds it; of more classes, the others' from 8 on."""
 
 
 class Engine(StrEnum):

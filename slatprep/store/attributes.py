@@ -14,7 +14,6 @@ from annotated_types import MaxLen, MinLen
 from slatprep.parameters import Length, SampleParameters
 from slatprep.records import (
     BACKGROUND,
-    MATERIAL_CLASSES,
     MAX_PROPERTIES,
     PROPERTIES,
     RESOLUTION,
@@ -28,6 +27,7 @@ from slatprep.records import (
     Property,
     PropertyName,
     PropertyRange,
+    labels_of,
 )
 from slatprep.store.contract import Finding
 from slatprep.store.layout import FORMAT, FORMAT_VERSION, READABLE_VERSIONS
@@ -99,11 +99,7 @@ class RootAttributes:
     latents: LatentSpace = TRELLIS
 
     def __post_init__(self) -> None:
-        named = self.material_classes
-        if named != MATERIAL_CLASSES and len({*named, "background"}) != len(named) + 1:
-            raise ValueError("material_classes must have a name each, none of them background")
-        if named != MATERIAL_CLASSES and len(named) > BACKGROUND:
-            raise ValueError(f"material_classes must be PhysGaussian's, or at most {BACKGROUND}")
+        labels_of(self.material_classes)
         columns = set(self.property_columns)
         if not columns == self.normalization.keys() or len(columns) < len(self.property_columns):
             raise ValueError("property_columns and normalization must name the same properties")
@@ -189,6 +185,7 @@ def root_attributes(
         "format_version": FORMAT_VERSION,
         "resolution": RESOLUTION,
         "material_classes": list(contents.classes),
+        **({} if contents.background == BACKGROUND else {"background": contents.background}),
         "property_columns": [one.name for one in contents.properties],
         "property_units": [one.unit for one in contents.properties],
         "latents": asdict(contents.latents),

@@ -16,7 +16,7 @@ from slatprep.errors import ConfigError, StoreError
 from slatprep.geometry.frames import places_of, voxel_centres
 from slatprep.geometry.voxels import voxels_of
 from slatprep.normalize import denormalize_properties
-from slatprep.records import BACKGROUND, MaterialField, Place, StructuredLatents
+from slatprep.records import MaterialField, Place, StructuredLatents
 from slatprep.storage.place import place_of, storage_of
 from slatprep.store.assets import ASSET_COLUMNS, AssetTable, AttributesError
 from slatprep.store.attributes import width_findings
@@ -129,16 +129,17 @@ class StoredAsset:
 
     @cached_property
     def grid_material(self) -> NDArray[np.uint8]:
-        """Class 0..6, 7 background, 255 occupied but not annotated, (64, 64, 64)."""
+        """Class, ``store.contents.background``, or 255 (not annotated), (64, 64, 64)."""
         return np.asarray(self.store.read_rows("grid/material", self.index, self.index + 1)[0])
 
     @cached_property
     def field(self) -> MaterialField:
         """The PixieVerse field that the asset was made of, in SI units."""
-        annotated = self.grid_material < BACKGROUND
+        background = self.store.contents.background
+        annotated = self.grid_material < background
         values = self.grid_properties[:, annotated].T
         return MaterialField(
-            occupancy=self.grid_material != BACKGROUND,
+            occupancy=self.grid_material != background,
             voxels=voxels_of(annotated),
             material=self.grid_material[annotated],
             properties=denormalize_properties(values, self.store.normalization),

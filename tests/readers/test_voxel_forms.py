@@ -145,7 +145,7 @@ def test_physxnet_without_voxels_says_what_is_lacking(tmp_path: Path) -> None:
     [
         (["wood", "wood"], "there are 2 classes"),
         ([], "there are 0 classes"),
-        ([f"c{k}" for k in range(8)], "there are 8 classes"),
+        ([f"c{k}" for k in range(255)], "there are 255 classes"),
         (["background"], "the names of classes are background"),
         (["Wood"], "the names of classes are Wood"),
     ],

@@ -25,7 +25,7 @@ from slatprep.geometry.voxels import (
 from slatprep.inspect.pictures.palette import DISTANCE_COLOURS
 from slatprep.inspect.pictures.voxels import View, view_rotation
 from slatprep.provenance.stored import StoredRecords
-from slatprep.records import BACKGROUND, MATERIAL_CLASSES, MATERIAL_COLOURS, RESOLUTION
+from slatprep.records import MATERIAL_CLASSES, MATERIAL_COLOURS, RESOLUTION
 from slatprep.store.reader import StoredAsset
 
 FARTHEST = 3.0
@@ -120,7 +120,7 @@ def scene_of(asset: StoredAsset) -> Scene:
     StoreError
         If the asset is deformed and its record, which holds the deformation, cannot be read.
     """
-    occupancy = asset.grid_material != BACKGROUND
+    occupancy = asset.grid_material != asset.store.contents.background
     shell = voxels_of(boundary(occupancy))
     outer = outer_boundary(occupancy)
     cells, row = shown_in_cells(asset.coords, asset.store.contents.latents.resolution)
@@ -150,10 +150,11 @@ def _deformed(asset: StoredAsset, way: PlaceMap, row: NDArray[np.intp]) -> Defor
     cells = np.indices((RESOLUTION,) * 3, dtype=np.uint8).reshape(3, -1).T
     found = np.rint((way.places(cells) + 0.5) * RESOLUTION - 0.5).astype(np.intp)
     inside = ((found >= 0) & (found < RESOLUTION)).all(axis=1)
-    material = np.full(len(cells), BACKGROUND, dtype=np.uint8)
+    background = asset.store.contents.background
+    material = np.full(len(cells), background, dtype=np.uint8)
     material[inside] = asset.grid_material[tuple(found[inside].T)]
     grid = material.reshape((RESOLUTION,) * 3)
-    shell = voxels_of(boundary(grid != BACKGROUND))
+    shell = voxels_of(boundary(grid != background))
     moved = (asset.place - places_of(asset.latents.centres, asset.transform))[row]
     return Deformed(shell, grid[tuple(shell.T)], np.linalg.norm(moved, axis=1) / VOXEL_SIZE)
 

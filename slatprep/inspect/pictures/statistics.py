@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from slatprep.inspect.distributions import Histogram, JointHistogram, StoreStatistics
 from slatprep.inspect.pictures import palette
 from slatprep.inspect.pictures.canvas import STYLE, in_format, new_figure, size_of, write
-from slatprep.records import CLASS_COLOURS, Property
+from slatprep.records import MATERIAL_COLOURS, Property
 from slatprep.store.reader import Store
 
 if TYPE_CHECKING:
@@ -25,7 +25,7 @@ _LEFT, _GAP, _PLOT = 210, 100, 535
 """Left margin, gap between the two columns of plots, and width of a plot, in pixels."""
 _HISTOGRAM, _JOINT, _BAR, _BETWEEN = 190, 480, 26, 90
 """Heights of the kinds of plots, and of the gap between two rows, in pixels."""
-_COLOURS = tuple(CLASS_COLOURS.values())
+_COLOURS = tuple(MATERIAL_COLOURS.values())
 """Colours of the classes by index."""
 _SIDES = (("field", "PixieVerse fields, before the lookup"), ("slat", "SLAT voxels, after it"))
 

@@ -196,7 +196,7 @@ def _draw(path: Path, indices: Sequence[int]) -> tuple[list[Drawn], dict[str, Ta
             (asset.grid_material, asset.grid_properties),
             (asset.material, asset.properties),
         )
-        counts = tally(field, slat, store.normalization, BINS)
+        counts = tally(field, slat, store.normalization, BINS, contents=store.contents)
         _add(tallies, {str(asset.columns["category"]): counts})
     return drawn, tallies
 

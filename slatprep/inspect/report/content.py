@@ -18,9 +18,9 @@ from slatprep.inspect.tallies import Tally, no_tally
 from slatprep.judge import THRESHOLDS
 from slatprep.normalize import PIXIE_RANGES
 from slatprep.records import (
-    BACKGROUND,
     MATERIAL_COLOURS,
     UNANNOTATED_COLOUR,
+    Contents,
     Status,
 )
 from slatprep.store.reader import Store
@@ -104,7 +104,7 @@ def page_content(
         },
         "classes": [
             {"name": name, "colour": MATERIAL_COLOURS[index]}
-            for index, name in enumerate((*store.contents.labels, *[""] * BACKGROUND)[:BACKGROUND])
+            for index, name in enumerate(_names_of(store.contents))
         ],
         "scales": {
             "none": UNANNOTATED_COLOUR,
@@ -134,6 +134,11 @@ def page_content(
     }
 
 
+def _names_of(contents: Contents) -> tuple[str, ...]:
+    """Return the name of each class that a voxel may have, empty where none has the number."""
+    return (*contents.labels, *[""] * (contents.n_labels - len(contents.labels)))
+
+
 def _properties(
     store: Store,
     outcomes: Outcomes | None,
@@ -141,7 +146,7 @@ def _properties(
 ) -> list[dict[str, Any]]:
     """Return the histograms of each property by class, and its ranges."""
     normalization, published = store.normalization, {one.name: one for one in PIXIE_RANGES.ranges}
-    total = sum(tallies.values(), start=no_tally(len(normalization.ranges), BINS))
+    total = sum(tallies.values(), start=no_tally(store.contents, BINS))
     clipped = outcomes.clipped if outcomes else [0] * len(normalization.ranges)
     return [
         {

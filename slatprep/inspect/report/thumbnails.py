@@ -55,7 +55,9 @@ def thumbnail(asset: StoredAsset) -> NDArray[np.uint8]:
         its brightness.
     """
     grid = np.zeros((RESOLUTION,) * 3, dtype=np.uint8)
-    colour = np.where(asset.material == UNANNOTATED, BACKGROUND, asset.material)
+    # Of more classes some share a colour: a sheet has few.
+    shown = asset.material % BACKGROUND
+    colour = np.where(asset.material == UNANNOTATED, BACKGROUND, shown)
     cells, row = shown_in_cells(asset.coords, asset.store.contents.latents.resolution)
     grid[tuple(cells.T.astype(np.intp))] = 1 + colour[row]
     views = (

@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 from slatprep.align.deformation import PlaceMap
 from slatprep.geometry.frames import apply_transform, invert_transform, voxel_centres
 from slatprep.geometry.voxels import boundary, filled, shown_in_cells
-from slatprep.records import BACKGROUND, RESOLUTION, UNANNOTATED
+from slatprep.records import RESOLUTION, UNANNOTATED
 from slatprep.store import StoredAsset
 
 LEVELS = 64
@@ -62,7 +62,7 @@ def encode_asset(asset: StoredAsset, way: PlaceMap, max_distance: float, side: i
     cells, row = shown_in_cells(asset.coords, asset.store.contents.latents.resolution)
     first, occupied = _cells(cells, side)
     first = row[first]
-    grid, material = _boundary_of(asset.grid_material)
+    grid, material = _boundary_of(asset.grid_material, asset.store.contents.background)
     chosen, grid_occupied = _cells(grid, side)
     scalars = np.column_stack(
         [(asset.properties[first] + 1.0) / 2.0, asset.distance[first] / max_distance]
@@ -84,9 +84,11 @@ def encode_asset(asset: StoredAsset, way: PlaceMap, max_distance: float, side: i
     return deflate.compress(b"".join(parts)) + deflate.flush()
 
 
-def _boundary_of(grid_material: NDArray[np.uint8]) -> tuple[NDArray[np.intp], NDArray[np.uint8]]:
+def _boundary_of(
+    grid_material: NDArray[np.uint8], background: int
+) -> tuple[NDArray[np.intp], NDArray[np.uint8]]:
     """Return the outer surface (K, 3) of a field and the class (K,) of its voxels."""
-    occupancy = grid_material != BACKGROUND
+    occupancy = grid_material != background
     surface = boundary(filled(occupancy)) & occupancy
     material = grid_material[surface]
     return np.argwhere(surface), np.where(material == UNANNOTATED, NOT_VALID, material)

@@ -26,7 +26,6 @@ from slatprep.provenance.record_json import RecordError
 from slatprep.provenance.stored import StoredRecords
 from slatprep.readers.files import is_hierarchy, load_source
 from slatprep.records import (
-    BACKGROUND,
     UNANNOTATED,
     Annotation,
     Model,
@@ -107,7 +106,10 @@ def asset_findings(
 def value_findings(asset: StoredAsset) -> Iterator[Finding]:
     """Yield findings on values that the contract does not allow."""
     coords, valid, material = asset.coords, asset.valid, asset.material
-    side = asset.store.contents.latents.resolution
+    contents = asset.store.contents
+    side = contents.latents.resolution
+    classes = (*range(contents.n_labels), contents.background, UNANNOTATED)
+    labelled = material < contents.n_labels
     checks = {
         "voxel/coords": (
             coords.max(initial=0) < side,
@@ -116,9 +118,9 @@ def value_findings(asset: StoredAsset) -> Iterator[Finding]:
         ),
         "voxel/feats": (np.isfinite(asset.feats).all(), "NaN or infinite", "finite latents"),
         "voxel/material": (
-            ((material < BACKGROUND) == valid).all() and (material[~valid] == UNANNOTATED).all(),
+            (labelled == valid).all() and (material[~valid] == UNANNOTATED).all(),
             "a class that does not go with valid",
-            "0 to 6 where valid, 255 elsewhere",
+            f"0 to {contents.n_labels - 1} where valid, 255 elsewhere",
         ),
         "voxel/properties": (
             _normalised(asset.properties.T, valid),
@@ -148,12 +150,12 @@ def value_findings(asset: StoredAsset) -> Iterator[Finding]:
             "above 0 to 1 where valid, 0 elsewhere",
         ),
         "grid/material": (
-            _IS_GRID_CLASS[asset.grid_material].all(),
+            np.isin(np.arange(256), classes)[asset.grid_material].all(),
             "an unknown class",
-            "0 to 7, or 255",
+            f"0 to {contents.n_labels - 1}, {contents.background} or 255",
         ),
         "grid/properties": (
-            _normalised(asset.grid_properties, asset.grid_material < BACKGROUND),
+            _normalised(asset.grid_properties, asset.grid_material < contents.n_labels),
             "a property that does not go with grid/material",
             "-1 to 1 where annotated, NaN elsewhere",
         ),
@@ -280,9 +282,6 @@ def roundings(normalization: Normalization) -> NDArray[np.float64]:
     )
 
 
-_IS_GRID_CLASS = np.isin(np.arange(256), (*range(BACKGROUND + 1), UNANNOTATED))
-
-
 def _is_spread(asset: StoredAsset) -> bool:
     """Whether spreads are at least 0, and only of merged labels."""
     missing = np.isnan(asset.spread)
@@ -311,13 +310,13 @@ def _claims(
     yield "property_ambiguity", said, asset.columns["property_ambiguity"]
     for name, column in columns.items():
         yield name, column, asset.transform if name == "transform" else asset.columns[name]
-    grid = asset.grid_material
+    grid, background = asset.grid_material, asset.store.contents.background
     for name, count in (
         ("slat_voxels", len(asset.coords)),
         ("valid", asset.valid.sum()),
-        ("annotated", (grid < BACKGROUND).sum()),
+        ("annotated", (grid < background).sum()),
         ("unannotated", (grid == UNANNOTATED).sum()),
-        ("occupied", (grid != BACKGROUND).sum()),
+        ("occupied", (grid != background).sum()),
     ):
         yield f"counts/{name}", getattr(record.counts, name), int(count)
     yield "normalization", record.normalization, store.normalization
