@@ -18,7 +18,7 @@ from slatprep.errors import InputError, SlatprepError
 from slatprep.geometry.voxels import flat_index
 from slatprep.parameters import PixieverseSource
 from slatprep.records import (
-    BACKGROUND,
+    MANY_BACKGROUND,
     MATERIAL_CLASSES,
     RESOLUTION,
     AssetPair,
@@ -95,7 +95,7 @@ class ForeignSource(_Foreign):
                 f"{len(names)} properties; expected 1 to {MAX_PROPERTIES}, of a name each",
             )
             named = all(CLASS_NAME.fullmatch(one) for one in held.classes)
-            few = held.classes == MATERIAL_CLASSES or len(held.classes) <= BACKGROUND
+            few = held.classes == MATERIAL_CLASSES or len(held.classes) <= MANY_BACKGROUND
             self._require(named and few, f"classes {held.classes!r}")
             return held
 
