@@ -52,6 +52,9 @@ RIDGE = 3e-2
 KNOT_STEP, LEAST_WEIGHT = 0.3, 1e-3
 """Step of the logarithm of the odds from knot to knot of a curve, and least share of the mix."""
 
+DRAWN = 1e-4
+"""Share of the mix below which a bin, the voxels of one or two assets, is not drawn."""
+
 Array = NDArray[np.float64]
 Table = dict[str, NDArray[Any]]
 
@@ -276,7 +279,7 @@ def draw(path: Path, assets: list[Any], voxels: list[Any]) -> None:
     figure, axes = pyplot.subplots(1, 2, figsize=(7, 3.4), layout="constrained")
     both = (("placements", assets), ("voxels' classes", voxels))
     for ax, (name, bins) in zip(axes, both, strict=True):
-        said, found, weight, _ = np.array(bins).T
+        said, found, weight, _ = np.array([one for one in bins if one[2] >= DRAWN]).T
         ax.plot([0, 1], [0, 1], color="0.7", lw=1)
         ax.bar(said, weight, width=0.06, color="#cfd8e6", label="share of the mix")
         ax.plot(said, found, "o-", color="#2a5caa", label="right")
