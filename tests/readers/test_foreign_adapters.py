@@ -124,7 +124,7 @@ def test_whatever_is_raised_is_theirs(make_pair: MakePair, raising: Any) -> None
         Holding(properties=(PROPERTIES[0],) * 2),
         Holding(classes="abc"),  # type: ignore[arg-type]
         Holding(classes=("A\x1b[2J",)),
-        Holding(classes=tuple(f"c{k}" for k in range(9))),
+        Holding(classes=tuple(f"c{k}" for k in range(255))),
     ],
 )
 def test_what_a_source_cannot_hold_is_refused(held: Any) -> None:
