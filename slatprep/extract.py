@@ -11,6 +11,7 @@ import io
 import json
 import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from importlib import metadata
 from pathlib import Path
@@ -254,13 +255,18 @@ def decode_gaussians(session: Session, latents: StructuredLatents, path: Path) -
         latents as the pipeline samples them.
     path : Path
         A PLY; an existing file is replaced.
+
+    Raises
+    ------
+    InputError
+        If TRELLIS cannot decode them.
     """
     from trellis.modules.sparse import SparseTensor
 
     torch, device = session.torch, session.pipeline.device
     coords = np.insert(latents.coords.astype(np.int32), 0, 0, axis=1)
     space = replace(TRELLIS, standardised=latents.standardised)
-    with session.torch.no_grad():
+    with _named(path, f"decode its {len(coords)} voxels"), torch.no_grad():
         slat = SparseTensor(
             feats=torch.tensor(space.as_encoded(latents.feats), device=device),
             coords=torch.from_numpy(coords).to(device),
@@ -268,6 +274,19 @@ def decode_gaussians(session: Session, latents: StructuredLatents, path: Path) -
         (gaussians,) = session.pipeline.decode_slat(slat, ["gaussian"])["gaussian"]
     with staged(path) as file:
         gaussians.save_ply(str(file))
+
+
+@contextmanager
+def _named(path: Path, what: str) -> Iterator[None]:
+    """Name the file for which TRELLIS or torch raises an error, such as no memory left."""
+    try:
+        yield
+    except RuntimeError as error:
+        raise InputError(
+            path,
+            f"TRELLIS could not {what} ({type(error).__name__}: {' '.join(str(error).split())})",
+            "a GPU with enough free memory, and what TRELLIS takes",
+        ) from error
 
 
 def _extract(session: Session, extraction: Extraction, preprocess: bool) -> Extracted:
@@ -291,7 +310,8 @@ def _extract(session: Session, extraction: Extraction, preprocess: bool) -> Extr
     record: dict[str, Any] = orjson.loads(text)
     if extraction.slat.exists():
         return _kept(extraction, record)
-    coords, feats, seconds = _run(session, image, extraction.seed, preprocess)
+    with _named(extraction.image, "make latents of it"):
+        coords, feats, seconds = _run(session, image, extraction.seed, preprocess)
     check_coords(coords, extraction.image)
     if len(coords) == 0 or feats.shape != (len(coords), TRELLIS.channels):
         raise InputError(

@@ -221,6 +221,23 @@ def test_a_bad_image_does_not_stop_the_others(images: list[Path], tmp_path: Path
     assert isinstance(nothing, InputError) and not (tmp_path / "none" / "bear.npz").exists()
 
 
+def test_an_image_that_trellis_cannot_process_does_not_stop_the_others(
+    images: list[Path], tmp_path: Path
+) -> None:
+    class Failing(Pipeline):
+        def sample_slat(self, cond: dict, coords: np.ndarray, *rest: Any) -> Any:
+            if self.seen.count((518, 518)) == 1:
+                raise RuntimeError("CUDA out of memory")
+            return super().sample_slat(cond, coords, *rest)
+
+    torch = Torch()
+    session = work.Session(Failing(torch), torch, {})
+    bad, good = run(session, work.list_extractions(images, tmp_path / "slat", [0], False))
+    assert isinstance(bad, InputError) and good.voxels > 0
+    assert "cup.png: TRELLIS could not make latents of it (RuntimeError: CUDA out" in str(bad)
+    assert [path.name for path in (tmp_path / "slat").glob("*.npz")] == ["bear.npz"]
+
+
 @pytest.mark.parametrize("command", ["extract-slat", "decode-slat"])
 def test_without_trellis_the_command_says_what_to_install(
     command: str, images: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch

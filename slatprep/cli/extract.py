@@ -132,13 +132,17 @@ def decode_slat(
 
     read = LatentsReader(output, source, assets, TRELLIS, standardised)
     session = work.load_session(model, revision, device)
-    begin = time.perf_counter()
+    begin, decoded = time.perf_counter(), 0
     with output.progress("decode-slat") as progress:
         for latents in read:
             path = out / f"{file_name(read.done[-1])}.ply"
-            work.decode_gaussians(session, latents, path)
-            progress(len(read.done) + len(read.problems), len(read.ids))
-    counts = {"decoded": len(read.done), "failed": len(read.problems)}
+            try:
+                work.decode_gaussians(session, latents, path)
+                decoded += 1
+            except InputError as error:
+                read.leave_out(error)
+            progress(decoded + len(read.problems), len(read.ids))
+    counts = {"decoded": decoded, "failed": len(read.problems)}
     document = {"path": out, "model": session.model, **counts, "problems": read.problems,
                 "seconds": time.perf_counter() - begin}  # fmt: skip
     output.made(

@@ -171,7 +171,7 @@ def check_coords(
     voxels = np.ascontiguousarray(coords).astype(np.uint8)
     flat = flat_index(voxels, side)
     counts = np.bincount(flat)
-    if counts.max() > 1:
+    if (counts > 1).any():
         rows = np.flatnonzero(counts[flat] > 1)
         first, second = np.flatnonzero(flat == flat[rows[0]])[:2]
         raise InputError(

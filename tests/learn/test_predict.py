@@ -133,7 +133,9 @@ def test_a_device_that_is_not_there_is_named(
 ) -> None:
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     weights = ["--checkpoint", str(checkpoint)] if command == "predict" else []
-    options = [str(tmp_path), *weights, "--out", str(tmp_path / "out"), "--device", "cuda"]
+    source = tmp_path / "data"
+    source.mkdir()
+    options = [str(source), *weights, "--out", str(tmp_path / "out"), "--device", "cuda"]
     result = CliRunner().invoke(slatprep, [command, *options])
     assert result.exit_code == 1 and "finds no CUDA device" in result.stderr
     assert not (tmp_path / "out").exists()
@@ -353,6 +355,30 @@ def test_gaussians_of_stored_latents_and_of_standardised_ones(
     assert "c.npz" in told
     np.testing.assert_allclose(trellis.feats, latents.feats, atol=1e-5)
     assert sorted(path.name for path in out.iterdir()) == ["a1.ply", "b.ply"]
+
+
+def test_latents_that_trellis_cannot_decode_are_named_and_the_others_decoded(
+    tmp_path: Path, trellis: Pipeline, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    slats, out = tmp_path / "slat", tmp_path / "gaussians"
+    for number, name in enumerate(("a", "b", "c")):
+        save(slats / f"{name}.npz", random_latents(number, 200 + 100 * number))
+    decode = trellis.decode_slat
+
+    def decode_slat(slat: Any, formats: list[str]) -> dict[str, list[Any]]:
+        if len(slat.feats) == 300:
+            raise RuntimeError("CUDA out of memory.\nTried to allocate 20 GiB")
+        return decode(slat, formats)
+
+    monkeypatch.setattr(trellis, "decode_slat", decode_slat)
+    result = CliRunner().invoke(slatprep, ["decode-slat", str(slats), "--out", str(out), "--json"])
+    assert result.exit_code == 1, result.output
+    told = json.loads(result.stdout)
+    assert (told["decoded"], told["failed"]) == (2, 1)
+    (problem,) = told["problems"]
+    assert "b.ply: TRELLIS could not decode its 300 voxels" in problem
+    assert "out of memory. Tried to allocate 20 GiB" in problem and problem in result.stderr
+    assert sorted(path.name for path in out.iterdir()) == ["a.ply", "c.ply"]
 
 
 def test_latents_of_another_encoder_are_no_input(checkpoint: Path, tmp_path: Path) -> None:
