@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -330,10 +331,15 @@ def test_particles_that_cannot_be_used_are_named(fault: str, tmp_path: Path) -> 
 def test_wrong_calls_are_refused_and_nothing_is_lost(store: Path, tmp_path: Path) -> None:
     particles = tmp_path / "g.ply"
     write_gaussians(particles, np.zeros((1, 3)))
+    own = tmp_path / "own.ply"
+    shutil.copy(particles, own)
     before = particles.read_bytes()
     stored = ("--store", store, "--asset", "cup")
-    assert "not an export" in run_wrong(particles, *stored, "--out", particles)
-    assert particles.read_bytes() == before
+    assert "not an export" in run_wrong(particles, *stored, "--out", own)
+    itself = ["transfer", str(particles), *map(str, stored), "--out", str(particles)]
+    result = CliRunner().invoke(slatprep, itself)
+    assert (result.exit_code, "is what the command reads" in result.stderr) == (2, True)
+    assert particles.read_bytes() == own.read_bytes() == before
     out = ("--out", tmp_path / "m.ply")
     assert "either --asset" in run_wrong(particles, "--store", store, *out)
     assert "cup" in run_wrong(particles, "--store", store, "--asset", "cuo", *out)
