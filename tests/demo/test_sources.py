@@ -34,15 +34,15 @@ def run(*arguments: str) -> str:
 
 def printed(output: str, word: str) -> list[str]:
     (line,) = (line for line in output.splitlines() if line.startswith(word))
-    return shlex.split(line.removeprefix(f"{word} slatprep"))
+    return shlex.split(line.partition(" slatprep ")[2])
 
 
 @pytest.mark.parametrize("source", get_args(Source))
 def test_two_commands_show_a_source_and_a_third_its_truth(tmp_path: Path, source: Source) -> None:
     out = str(tmp_path / "demo")
     said = run("make-demo", out, "--assets", "2", "--level", "0", "--source", source)
-    run(*printed(said, "next:"))
-    score = json.loads(run(*printed(said, "then:"), "--json"))
+    run(*printed(said, "a store of it:"))
+    score = json.loads(run(*printed(said, "its score:"), "--json"))
     assert len(score["assets"]) == 2
     for asset in score["assets"]:
         assert asset["displacement"] < 0.1
@@ -85,7 +85,7 @@ def test_latents_of_every_encoder_are_carried(tmp_path: Path, encoder: Encoder) 
     out = str(tmp_path / "demo")
     options = ("--level", "0", "--encoder", encoder, "--latents", "material")
     said = run("make-demo", out, "--assets", "1", *options)
-    run(*printed(said, "next:"))
+    run(*printed(said, "a store of it:"))
     store = open_store(tmp_path / "demo.zarr")
     assert store.contents.latents.encoder == encoder
     assert store.contents.latents.channels == GRIDS[encoder][0]
