@@ -162,7 +162,8 @@ def require_records_file(file: Path) -> None:
 def _require_own(folder: Path, store: Path) -> None:
     """Raise if a folder holds the records of another store, which is still there.
 
-    ``demo`` and ``demo.zarr`` have one folder, by default.
+    ``demo`` and ``demo.zarr`` have one folder, by default. A store that was renamed with its
+    records keeps them, also where a new store has the old name: that one's folder is another.
     """
     try:
         name = build_in(folder).store
@@ -170,7 +171,9 @@ def _require_own(folder: Path, store: Path) -> None:
     except (StoreError, ValueError):
         return  # None, or damaged ones, which are written anew.
     for other in others:
-        if name != store.name and is_store(other) and other.resolve() != store.resolve():
+        renamed = folder.name == manifests_of(store).name != manifests_of(other).name
+        taken = not renamed and name != store.name and is_store(other)
+        if taken and other.resolve() != store.resolve():
             raise StoreError(
                 f"{folder}: holds the records of {other}; expected --manifests FOLDER, or another "
                 f"name for {store}"

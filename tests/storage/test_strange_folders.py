@@ -259,3 +259,16 @@ def test_records_of_a_store_that_was_renamed_with_them_stay_its_own(
         (tmp_path / f"demo.{suffix}").rename(tmp_path / f"new.{suffix}")
     build_store(undisturbed[0].parameters("pixie"), tmp_path / "new.zarr")
     assert b'"new.zarr"' in (tmp_path / "new.manifests" / "build.json").read_bytes()
+
+
+def test_a_renamed_store_is_built_on_beside_a_new_one_of_its_old_name(
+    undisturbed: tuple[Dataset, Path], tmp_path: Path
+) -> None:
+    parameters = undisturbed[0].parameters()
+    build_store(parameters, tmp_path / "demo.zarr")
+    for suffix in ("zarr", "manifests"):
+        (tmp_path / f"demo.{suffix}").rename(tmp_path / f"old.{suffix}")
+    build_store(parameters, tmp_path / "demo.zarr")
+    build_store(undisturbed[0].parameters("pixie"), tmp_path / "old.zarr")
+    assert b'"old.zarr"' in (tmp_path / "old.manifests" / "build.json").read_bytes()
+    assert b'"demo.zarr"' in (tmp_path / "demo.manifests" / "build.json").read_bytes()
