@@ -67,7 +67,8 @@ def _inputs(given: Mapping[str, Any]) -> Iterator[Path]:
     for value in given.values():
         for one in value if isinstance(value, tuple) else (value,):
             if isinstance(one, str):
-                # A word, or a file: [NAME=]DIR of grids, FILE of ranges or of ids.
+                # A word, or a file, of ranges or of ids. Folders of grids, [NAME=]DIR, are not
+                # looked at: a word like "train" may be the name of a folder that it does not mean.
                 path = one.rpartition("=")[2]
                 if os.path.isfile(path):  # noqa: PTH113 - a word too long for a name is no error
                     yield Path(path)

@@ -27,7 +27,7 @@ _DATASETS: dict[str, dict[str, Any]] = {
     "properties_si": {
         "description": "properties, NaN where not valid",
     },
-    "material": {"description": "class 0..6, 255 where not valid"},
+    "material": {"description": "class, 255 where not valid"},
     "valid": {"description": "an annotation was found near enough"},
     "distance": {"description": "distance to the annotation used", "units": "voxel"},
     "place": {"description": "where it was looked up, PixieVerse frame, [-0.5, 0.5]^3"},

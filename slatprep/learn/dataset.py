@@ -48,7 +48,7 @@ class Item:
     properties : Tensor of float32, shape (N, P)
         The store's properties in [-1, 1]; 0 where not valid.
     material : Tensor of int64, shape (N,)
-        Class 0..6; `IGNORED` where not valid.
+        Class, below `Contents.n_labels`; `IGNORED` where not valid.
     valid : Tensor of bool, shape (N,)
         Which voxels have targets.
     confidence : Tensor of float32, shape (N,)

@@ -61,7 +61,7 @@ class PredictedField:
     properties_si : ndarray of float32, shape (N, P)
         The same in SI units.
     material : ndarray of uint8, shape (N,)
-        The most probable class, 0 to 6; a voxel of a SLAT is not background.
+        The most probable class, below `Contents.n_labels`: a voxel of a SLAT is not background.
     probabilities : ndarray of float32, shape (N, C)
         Of all classes, background last, with sum 1. Without classes, one column of 1.
     seconds : float

@@ -75,7 +75,7 @@ class VoxelPrediction:
     properties : ndarray of float64, shape (N, P)
         The store's properties in normalised space.
     material : ndarray of int64, shape (N,), optional
-        Class 0..7.
+        Class, below `Contents.n_classes`.
     converted : bool
         Whether it was normalised by other ranges and converted to the store's.
     """

@@ -94,7 +94,7 @@ class VoxelCounts:
     occupied: Count
     """Occupied PixieVerse voxels."""
     annotated: Count
-    """Those with a class 0..6 and properties that a material can have."""
+    """Those with a class and properties that a material can have."""
     unannotated: Count
     """The others."""
     boundary: Count

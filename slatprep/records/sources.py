@@ -168,9 +168,9 @@ class MaterialField:
     occupancy : ndarray of bool, shape (64, 64, 64)
         Occupied voxels, axes x, y, z of the PixieVerse frame.
     voxels : ndarray of uint8, shape (K, 3)
-        The annotated voxels (occupied, class 0..6, physical), in C order of the grid.
+        The annotated voxels (occupied, with a class, physical), in C order of the grid.
     material : ndarray of uint8, shape (K,)
-        Class of each annotated voxel, 0..6.
+        Class of each annotated voxel, a place in `Contents.labels`.
     properties : ndarray of float32, shape (K, P)
         Properties of each in SI units, a column for each of `table`.
     unphysical : int

@@ -171,7 +171,7 @@ ARRAYS = (
         "uint8",
         ("voxel",),
         UNANNOTATED,
-        "class 0..6, 255 where not valid",
+        "class, 255 where not valid",
         packing="repeats",
     ),
     ArrayLayout(
@@ -221,7 +221,7 @@ ARRAYS = (
         "uint8",
         ("asset", *_XYZ),
         BACKGROUND,
-        "class 0..6, 7 background, 255 occupied but not annotated",
+        "class, 255 occupied but not annotated, background 7 or the store's attribute background",
     ),
 )
 """Every array of any store."""

@@ -56,7 +56,7 @@ class StoredAsset:
     properties : ndarray of float32, shape (N, P)
         The store's properties in [-1, 1]; NaN where not valid.
     material : ndarray of uint8, shape (N,)
-        Class 0..6; 255 where not valid.
+        Class, a place in ``store.contents.labels``; 255 where not valid.
     valid : ndarray of bool, shape (N,)
         Whether an annotation was found near enough.
     distance : ndarray of float32, shape (N,)
