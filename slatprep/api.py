@@ -37,8 +37,8 @@ def align_voxels(
         The PixieVerse side: an occupancy, (64, 64, 64) bool with axes x, y, z,
         or the occupied voxels, (K, 3) in 0..63. Solid or shell.
     slat : array_like
-        The SLAT side, in either form; a leading batch column of zeros, (N, 4),
-        is dropped.
+        The SLAT side, in either form, on its own grid; a leading batch column of
+        zeros, (N, 4), is dropped.
     parameters : AlignParameters, optional
         Engine, model and scale bounds; the defaults of a build otherwise.
     resolution : int

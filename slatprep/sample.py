@@ -135,7 +135,7 @@ def merge(annotations: Sequence[Annotation], table: Sequence[Property]) -> Annot
 
     given = np.stack([one.material for one in annotations])
     classes = range(1 + int(given[given != UNANNOTATED].max(initial=0)))
-    votes = np.stack([(given == one).sum(axis=0) for one in classes])
+    votes = np.stack([(given == one).sum(axis=0, dtype=np.uint16) for one in classes])
     material = votes.argmax(axis=0).astype(np.uint8)
     some = (count > 0).all(axis=-1) & votes.any(axis=0)
 

@@ -54,7 +54,8 @@ def make_demo(output: Output, directory: Path, levels: tuple[int, ...], **recipe
         material.
     --source: PixieVerse's grids, predictions of 11 or 4 channels, VoMP's or PhysXNet's voxels,
         or plain voxels with ten properties (in HDF5 without classes).
-    --encoder: Latents of TRELLIS, SAM 3D Objects, TRELLIS.2, or others with 16 channels.
+    --encoder: Latents of TRELLIS, SAM 3D Objects, TRELLIS.2 (-512: on a grid of 32^3), or others
+        with 16 channels (-128: on a grid of 128^3).
     --slat-form: Files of (N,3) or (N,4) coordinates, HDF5, or one HDF5 for all.
     --slat-names: Name SLATs by object, or by sha256 with a metadata.csv.
     --results: Also write results/: grids as predicted by a method with errors, 12 MB each, for

@@ -72,6 +72,7 @@ def fit_baselines(dataset: SlatDataset) -> tuple[VoxelBaseline, VoxelBaseline]:
 
 
 def _inputs(item: Item) -> NDArray[np.float64]:
+    # Of another grid than 64^3 on another scale, which the weights make up for.
     position = voxel_centres(item.coords.numpy())
     return np.hstack([item.feats.numpy(), position, np.ones((len(position), 1))])
 

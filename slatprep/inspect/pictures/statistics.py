@@ -89,6 +89,9 @@ def _head(figure: Figure, store: Store, statistics: StoreStatistics) -> None:
     from matplotlib.patches import Rectangle
 
     for group, colour in zip(statistics.classes, _COLOURS, strict=False):
+        if x + 10 * len(group.name) > width - 150:
+            write(figure, x, 103, "and others", size=7)
+            break
         place = (x / width, 1 - 104 / height)
         figure.add_artist(Rectangle(place, 12 / width, 12 / height, color=colour))
         write(figure, x + 18, 103, group.name, size=7)
