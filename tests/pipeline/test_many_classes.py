@@ -17,6 +17,7 @@ from slatprep.cli.commands import slatprep as command
 from slatprep.errors import ConfigError, InputError
 from slatprep.inspect.check import check_alignment
 from slatprep.inspect.pictures.statistics import draw_statistics
+from slatprep.inspect.report.thumbnails import SHADES, thumbnail
 from slatprep.inspect.verify import verify_store
 from slatprep.learn.metrics import evaluate_store
 from slatprep.learn.predictions import open_predictions
@@ -113,6 +114,9 @@ def test_nine_classes_go_all_the_way_to_scores(tmp_path: Path) -> None:
         _, used = cKDTree(voxels).query(np.asarray(asset.place, np.float64) * 64 + 31.5)
         assert (asset.material == classes_at(voxels, 9)[used]).mean() > 0.5
         assert {7, 8} <= set(asset.material.tolist())
+        # In the thumbnail no class has the colour of another.
+        shown = {(index - 1) // SHADES for index in np.unique(thumbnail(asset)) if index}
+        assert shown <= set(asset.material.tolist()) and shown & {7, 8}
     train(out, run, TrainParameters(size="small", epochs=1, precision="fp32"))
     assert np.isfinite(
         evaluate_store(run / "predictions", out, split=None).overall.means["accuracy"]

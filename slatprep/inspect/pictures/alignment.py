@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from slatprep.inspect.check import AlignmentCheck
 from slatprep.inspect.pictures import palette
-from slatprep.inspect.pictures.canvas import new_figure, size_of, write
+from slatprep.inspect.pictures.canvas import draw_legend, new_figure, size_of, write
 from slatprep.inspect.pictures.scene import (
     Deformed,
     Placed,
@@ -27,7 +27,7 @@ from slatprep.inspect.pictures.side import (
     side_of,
 )
 from slatprep.inspect.pictures.voxels import Drawing, View, draw_voxels
-from slatprep.records import MATERIAL_COLOURS, Alignment
+from slatprep.records import MATERIAL_CLASSES, MATERIAL_COLOURS, Alignment
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -228,28 +228,18 @@ def _head(figure: Figure, check: AlignmentCheck, title: str, subtitle: str) -> i
 
 
 def _legend(figure: Figure, scene: Scene) -> None:
-    from matplotlib.patches import Rectangle
-
-    width, height = size_of(figure)
     y = _TOP + 3 * (PANEL + _GAP) + 12
     present = np.union1d(scene.pixieverse_material, scene.slat_material)
     share = np.bincount(scene.slat_material, minlength=256) / max(len(scene.slat_material), 1)
-    x = float(_LEFT)
-    for index in present:
-        name = scene.labels[index] if index < len(scene.labels) else "no annotation"
-        box = Rectangle(
-            (x / width, 1 - (y + 1) / height), 13 / width, 13 / height,
-            facecolor=MATERIAL_COLOURS[int(index)], edgecolor=palette.MUTED, linewidth=0.5,
-        )  # fmt: skip
-        figure.add_artist(box)
-        label = f"{name}  {share[index]:.1%}"
-        write(figure, x + 20, y, label, size=7.5)
-        x += 20 + 9.2 * len(label) + 28
-    end = _LEFT + 4 * PANEL + 3 * _GAP if scene.deformed is None else x
-    write(
-        figure, end, y, "share of the SLAT voxels", size=6.8, color=palette.MUTED,
-        ha="right" if scene.deformed is None else "left",
-    )  # fmt: skip
+    if len(present) > len(MATERIAL_CLASSES):  # Perhaps not all find room: the largest do.
+        present = present[np.argsort(-share[present], kind="stable")]
+    names = [*scene.labels, *["no annotation"] * (256 - len(scene.labels))]
+    entries = [(f"{names[k]}  {share[k]:.1%}", MATERIAL_COLOURS[int(k)]) for k in present]
+    columns = 4 if scene.deformed is None else 3  # The fourth is above the scale.
+    end = _LEFT + columns * (PANEL + _GAP) - _GAP
+    words = "share of the SLAT voxels"
+    draw_legend(figure, entries, (_LEFT, y, end - 190), edgecolor=palette.MUTED, linewidth=0.5)
+    write(figure, end, y, words, size=6.8, color=palette.MUTED, ha="right")
     if scene.deformed is not None:
         _scale(figure, displacement_scale(scene.deformed), _LEFT + 3 * (PANEL + _GAP), y)
 

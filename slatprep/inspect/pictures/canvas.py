@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from io import BytesIO
 from typing import TYPE_CHECKING, Any
 
@@ -68,3 +69,46 @@ def write(figure: Figure, x: float, y: float, words: str, **style: Any) -> None:
     width, height = size_of(figure)
     # Names may contain $, which would begin a formula.
     figure.text(x / width, 1 - y / height, words, parse_math=False, **style)
+
+
+def draw_legend(
+    figure: Figure,
+    entries: Sequence[tuple[str, str]],
+    box: tuple[float, float, float],
+    rows: int = 2,
+    **style: Any,
+) -> None:
+    """Write names beside squares of their colours, from left to right and in rows.
+
+    Parameters
+    ----------
+    figure : Figure
+        From `new_figure`.
+    entries : sequence of (str, str)
+        Name and colour of each. How many found no room is written after the last that did.
+    box : tuple of float
+        Left edge, baseline of the first row, and right edge, in pixels.
+    rows : int
+        Most rows, of 20 pixels each.
+    **style
+        Of the squares' edges, as of `matplotlib.patches.Rectangle`.
+    """
+    from matplotlib.patches import Rectangle
+
+    width, height = size_of(figure)
+    left, y, right = box
+    x, last = left, y + 20 * (rows - 1)
+    for number, (name, colour) in enumerate(entries):
+        wide = 20 + 9.2 * len(name)
+        if x > left and x + wide > right and y < last:
+            x, y = left, y + 20
+        more = f"and {len(entries) - number} more"
+        after = 28 + 9.2 * len(more) if number + 1 < len(entries) and y == last else 0.0
+        if x > left and x + wide + after > right:
+            write(figure, x, y, more, size=7.5, color=palette.MUTED)
+            return
+        place = x / width, 1 - (y + 1) / height
+        square = Rectangle(place, 13 / width, 13 / height, facecolor=colour, **style)
+        figure.add_artist(square)
+        write(figure, x + 20, y, name, size=7.5)
+        x += wide + 28

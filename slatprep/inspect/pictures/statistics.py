@@ -9,8 +9,15 @@ from numpy.typing import NDArray
 
 from slatprep.inspect.distributions import Histogram, JointHistogram, StoreStatistics
 from slatprep.inspect.pictures import palette
-from slatprep.inspect.pictures.canvas import STYLE, in_format, new_figure, size_of, write
-from slatprep.records import MATERIAL_COLOURS, Property
+from slatprep.inspect.pictures.canvas import (
+    STYLE,
+    draw_legend,
+    in_format,
+    new_figure,
+    size_of,
+    write,
+)
+from slatprep.records import MATERIAL_CLASSES, MATERIAL_COLOURS, Property
 from slatprep.store.reader import Store
 
 if TYPE_CHECKING:
@@ -84,18 +91,12 @@ def _head(figure: Figure, store: Store, statistics: StoreStatistics) -> None:
         f"{_percent(statistics.total.slat.unannotated)} after"
     )
     write(figure, 40, 74, words, size=7, color=palette.MUTED)
-    x = 40.0
-    width, height = size_of(figure)
-    from matplotlib.patches import Rectangle
-
-    for group, colour in zip(statistics.classes, _COLOURS, strict=False):
-        if x + 10 * len(group.name) > width - 150:
-            write(figure, x, 103, "and others", size=7)
-            break
-        place = (x / width, 1 - 104 / height)
-        figure.add_artist(Rectangle(place, 12 / width, 12 / height, color=colour))
-        write(figure, x + 18, 103, group.name, size=7)
-        x += 50 + 10 * len(group.name)
+    entries = [
+        (group.name, colour)
+        for group, colour in zip(statistics.classes, _COLOURS, strict=False)
+        if len(statistics.classes) <= len(MATERIAL_CLASSES) or group.field.voxels
+    ]
+    draw_legend(figure, entries, (40, 103, _WIDTH - 40))
     for column, (_, title) in enumerate(_SIDES):
         left = _LEFT + column * (_PLOT + _GAP)
         write(figure, left, _HEAD - 14, title, size=8, weight="bold")

@@ -16,12 +16,9 @@ from numpy.typing import NDArray
 
 from slatprep.geometry.voxels import shown_in_cells
 from slatprep.records import (
-    BACKGROUND,
-    CLASS_COLOURS,
-    MATERIAL_CLASSES,
+    MATERIAL_COLOURS,
     RESOLUTION,
     UNANNOTATED,
-    UNANNOTATED_COLOUR,
 )
 from slatprep.store import StoredAsset
 
@@ -36,6 +33,9 @@ COLUMNS = 8
 
 SHADES = 8
 """Steps of brightness."""
+
+CLASSES = 30
+"""Classes with a colour of their own."""
 
 SIDE = RESOLUTION + 6
 """Pixels along each edge of a view, margin included."""
@@ -55,9 +55,8 @@ def thumbnail(asset: StoredAsset) -> NDArray[np.uint8]:
         its brightness.
     """
     grid = np.zeros((RESOLUTION,) * 3, dtype=np.uint8)
-    # Of more classes some share a colour: a sheet has few.
-    shown = asset.material % BACKGROUND
-    colour = np.where(asset.material == UNANNOTATED, BACKGROUND, shown)
+    # Of more classes some share a colour: a PNG's palette has 256.
+    colour = np.where(asset.material == UNANNOTATED, CLASSES, asset.material % CLASSES)
     cells, row = shown_in_cells(asset.coords, asset.store.contents.latents.resolution)
     grid[tuple(cells.T.astype(np.intp))] = 1 + colour[row]
     views = (
@@ -86,9 +85,8 @@ def sheet(pictures: Sequence[NDArray[np.uint8]]) -> bytes:
 
 
 def palette() -> NDArray[np.uint8]:
-    """Return the colours (1 + 8 * SHADES, 3): background, then each class from dark to bright."""
-    names = MATERIAL_CLASSES[:BACKGROUND]
-    colours = [*(CLASS_COLOURS[name] for name in names), UNANNOTATED_COLOUR]
+    """Return the colours (249, 3): background, each class from dark to bright, not annotated."""
+    colours = [MATERIAL_COLOURS[index] for index in (*range(CLASSES), UNANNOTATED)]
     rgb = np.array([[int(colour[k : k + 2], 16) for k in (1, 3, 5)] for colour in colours])
     shades = np.linspace(_DARKEST, _BRIGHTEST, SHADES)
     shaded = np.minimum(rgb[:, None, :] * shades[None, :, None], 255)

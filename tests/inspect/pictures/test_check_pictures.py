@@ -129,6 +129,35 @@ def test_no_words_are_cut_or_written_over_others(copy: Path) -> None:
         assert histogram.get_ylim()[1] > before.max() / len(scene.error_before)
 
 
+@pytest.mark.parametrize("count", [9, 60])
+def test_the_names_of_many_classes_stay_on_the_picture(count: int, copy: Path) -> None:
+    store = open_store(copy)
+    check = check_alignment(store, "ant")
+    alignment = StoredRecords(store).of("ant").alignment
+    one = scene_of(store.asset("ant"))
+    many = replace(
+        one,
+        slat_material=(np.arange(len(one.slat)) % count).astype(np.uint8),
+        pixieverse_material=np.zeros(len(one.pixieverse), np.uint8),
+        labels=tuple(f"material {k}" for k in range(count)),
+    )
+    with matplotlib.style.context(["default", STYLE]):
+        figure = draw_alignment(many, check, "t", "s", alignment)
+        renderer = figure.canvas.get_renderer()
+        texts = [t for t in figure.findobj(Text) if t.get_text() and t.get_visible()]
+        boxes = [text.get_window_extent(renderer) for text in texts]
+    names = [text.get_text() for text in texts if text.get_text().startswith("material ")]
+    left = [text.get_text() for text in texts if text.get_text().endswith(" more")]
+    assert len(names) >= 8 and len(set(names)) == len(names)
+    assert left == ([] if count == 9 else [f"and {count - len(names)} more"])
+    assert count > 9 or len(names) == 9
+    for k, box in enumerate(boxes):
+        assert box.x0 >= 0 and box.y0 >= 0 and box.x1 <= WIDTH and box.y1 <= HEIGHT, texts[k]
+        for other in range(k):
+            both = Bbox.intersection(box, boxes[other])
+            assert both is None or both.height <= 4, (texts[k], texts[other])
+
+
 @pytest.mark.parametrize("kind", ["svg", "pdf"])
 def test_a_picture_for_a_paper_is_of_lines_and_letters(
     kind: str, copy: Path, tmp_path: Path
