@@ -18,7 +18,10 @@ class NewPath(click.Path):
 
 
 def require_apart(command: click.Command, given: Mapping[str, Any]) -> None:
-    """Refuse a file or folder to write that is, or lies in, a store or what a command reads.
+    """Refuse a file or folder to write that is part of a store or of what a command reads.
+
+    A new file or folder below a folder that is read is nobody's loss, so it may be written; so may
+    a folder below that of a run, which holds predictions.
 
     Parameters
     ----------
@@ -32,7 +35,7 @@ def require_apart(command: click.Command, given: Mapping[str, Any]) -> None:
     ConfigError
         If a path to write lies inside a store.
     click.BadParameter
-        If it is one of the inputs, or lies in one, or is a pipe or device.
+        If it is one of the inputs, or is there already and lies in one, or is a pipe or device.
     """
     written = {
         parameter.name: (parameter, Path(given[parameter.name]))
@@ -51,31 +54,33 @@ def require_apart(command: click.Command, given: Mapping[str, Any]) -> None:
             raise click.BadParameter(
                 f"{out} is a pipe or device; expected a file or folder", param=parameter
             )
-        for place in read:
-            if place.resolve() in (target, *target.parents):
-                what = "is" if place.resolve() == target else f"lies in {place},"
+        for name, place in read:
+            inside = place.resolve() in target.parents
+            taken = target.is_file() or (target.is_dir() and name != "checkpoint")
+            if place.resolve() == target or (inside and taken):
+                what = f"lies in {place}," if inside else "is"
                 raise click.BadParameter(
                     f"{out} {what} what the command reads; expected another path", param=parameter
                 )
 
 
-def _inputs(given: Mapping[str, Any]) -> Iterator[Path]:
-    """Yield files and folders among options, and the records of stores."""
+def _inputs(given: Mapping[str, Any]) -> Iterator[tuple[str, Path]]:
+    """Yield files and folders among options, by name, and the records of stores."""
     from slatprep.provenance.places import manifests_of
     from slatprep.store.reader import is_store
 
-    for value in given.values():
+    for name, value in given.items():
         for one in value if isinstance(value, tuple) else (value,):
             if isinstance(one, str):
                 # A word, or a file, of ranges or of ids. Folders of grids, [NAME=]DIR, are not
                 # looked at: a word like "train" may be the name of a folder that it does not mean.
                 path = one.rpartition("=")[2]
                 if os.path.isfile(path):  # noqa: PTH113 - a word too long for a name is no error
-                    yield Path(path)
+                    yield name, Path(path)
             elif is_place(one) and (local := storage_of(one).local) is not None:
-                yield local
+                yield name, local
                 if is_store(local):
-                    yield local.parent / manifests_of(local).name
+                    yield name, local.parent / manifests_of(local).name
 
 
 class FiniteRange(click.FloatRange):

@@ -108,6 +108,26 @@ def test_a_device_is_not_replaced(folder: Path) -> None:
     assert Path("/dev/null").is_char_device()
 
 
+@pytest.mark.parametrize(
+    "line",
+    [
+        "align --pixieverse @sources/pixieverse --slat @sources/slat --out @sources/slat/r.jsonl",
+        "evaluate @predictions --store @s.zarr --split all --csv @predictions/scores.csv",
+    ],
+)
+def test_a_new_file_below_what_is_read_is_written(folder: Path, line: str) -> None:
+    before = tree(folder)
+    assert "expected another path" not in run(line, folder).stderr
+    assert before.items() <= tree(folder).items()
+
+
+def test_predictions_lie_below_the_run_that_made_them(folder: Path) -> None:
+    (folder / "run" / "x").mkdir(parents=True)
+    for out, refused in (("run/x", False), ("run/new", False), ("run", True)):
+        words = run(f"predict @sources/slat --checkpoint @run --out @{out}", folder).stderr
+        assert ("expected another path" in words) is refused, words
+
+
 def test_results_beside_a_store_and_beside_sources_are_written(folder: Path) -> None:
     for _ in range(2):
         assert run("describe @s.zarr --out @s.json", folder).exit_code == 0
