@@ -13,6 +13,9 @@ if TYPE_CHECKING:
 
 DPI = 150
 
+MOST_NAMES = 16
+"""Most names of a legend: more colours cannot be told apart."""
+
 STYLE: dict[str, Any] = {
     "font.family": "DejaVu Sans",
     "font.size": 8.0,
@@ -85,7 +88,8 @@ def draw_legend(
     figure : Figure
         From `new_figure`.
     entries : sequence of (str, str)
-        Name and colour of each. How many found no room is written after the last that did.
+        Name and colour of each. How many are not shown, for want of room or beyond
+        `MOST_NAMES`, is written after the last that is.
     box : tuple of float
         Left edge, baseline of the first row, and right edge, in pixels.
     rows : int
@@ -104,7 +108,7 @@ def draw_legend(
             x, y = left, y + 20
         more = f"and {len(entries) - number} more"
         after = 28 + 9.2 * len(more) if number + 1 < len(entries) and y == last else 0.0
-        if x > left and x + wide + after > right:
+        if number == MOST_NAMES or (x > left and x + wide + after > right):
             write(figure, x, y, more, size=7.5, color=palette.MUTED)
             return
         place = x / width, 1 - (y + 1) / height
