@@ -98,11 +98,7 @@ def align(
     field: MaterialField, latents: StructuredLatents, parameters: AlignParameters
 ) -> Alignment:
     """Align by distance fields; see `slatprep.align.align`."""
-    pair = _Pair(
-        surface_of(occupancy_of(latents.coords, latents.resolution)),
-        surface_of(field.occupancy),
-        parameters,
-    )
+    pair = _pair_of(field, latents, parameters)
 
     starts = distinct_starts()
     fits = pair.refine(
@@ -155,11 +151,7 @@ def refined_at(
     parameters: AlignParameters,
 ) -> Alignment:
     """Finish an alignment's placement as `align` finishes the best one; see `settle.refit`."""
-    pair = _Pair(
-        surface_of(occupancy_of(latents.coords, latents.resolution)),
-        surface_of(field.occupancy),
-        parameters,
-    )
+    pair = _pair_of(field, latents, parameters)
     rotation, shift, scale = split_transform(alignment.transform)
     start = Pose(rotation, shift / VOXEL_SIZE, scale)
     (best,), deformed = pair.finish([start], rough=alignment.score < CLEAN)
@@ -192,6 +184,13 @@ def _apart_from_all(places: NDArray[np.float64], others: Iterable[NDArray[np.flo
     """Whether similarities did not deform into one and the same placement."""
     apart = (np.sqrt(((places - other) ** 2).sum(axis=1).mean()) for other in others)
     return all(distance >= 2.0 * DISTINCT for distance in apart)
+
+
+def _pair_of(
+    field: MaterialField, latents: StructuredLatents, parameters: AlignParameters
+) -> _Pair:
+    slat = surface_of(occupancy_of(latents.coords, latents.resolution))
+    return _Pair(slat, surface_of(field.occupancy), parameters)
 
 
 class _Pair:
