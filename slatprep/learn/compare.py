@@ -248,8 +248,7 @@ def _ours(predictions: Path | None, read: ReadAsset, truth: _Truth) -> VoxelPred
         raise InputError(predictions, f"no prediction of {truth.asset_id}", "one of every asset")
     source = f"{predictions}/{truth.asset_id}"
     store, coords = truth.store, truth.voxels["coords"]
-    held = store.contents.n_classes, store.contents.latents.resolution
-    return check_prediction(source, arrays, coords, store.normalization, *held)
+    return check_prediction(source, arrays, coords, store.normalization, store.contents)
 
 
 def draw_comparison(methods: Mapping[str, Measure], what: str, path: Path) -> None:

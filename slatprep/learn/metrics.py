@@ -254,8 +254,8 @@ def evaluate_store(
                 continue
             rows = store.read(index, ("coords", "properties", "material", "valid"))
             source, coords = f"{predictions}/{asset_id}", rows.pop("coords")
-            held = store.contents.n_classes, store.contents.latents.resolution
-            prediction = check_prediction(source, arrays, coords, store.normalization, *held)
+            ranges = store.normalization
+            prediction = check_prediction(source, arrays, coords, ranges, store.contents)
             converted += prediction.converted
             scored.append(index)
             if not store.contents.classes:

@@ -25,9 +25,9 @@ from slatprep.readers.hdf5 import group_arrays
 from slatprep.readers.splits import Shares
 from slatprep.records import (
     MANY_BACKGROUND,
-    MATERIAL_CLASSES,
     MAX_PROPERTIES,
-    RESOLUTION,
+    PIXIEVERSE,
+    Contents,
     Normalization,
     Place,
     Share,
@@ -36,9 +36,6 @@ from slatprep.records import (
 from slatprep.storage.documents import read_document
 from slatprep.storage.names import file_name
 from slatprep.storage.place import storage_of
-
-CLASSES = len(MATERIAL_CLASSES)
-"""Number of classes with a score, background included."""
 
 RUN_FILE = "run.json"
 """The parameters of a training run, beside its predictions."""
@@ -188,8 +185,7 @@ def check_prediction(
     arrays: Mapping[str, NDArray[Any]],
     coords: NDArray[np.uint8],
     normalization: Normalization,
-    classes: int = CLASSES,
-    resolution: int = RESOLUTION,
+    contents: Contents = PIXIEVERSE,
 ) -> VoxelPrediction:
     """Check a prediction and put its voxels in the order of the store.
 
@@ -205,10 +201,8 @@ def check_prediction(
         Voxels of the store.
     normalization : Normalization
         The store's ranges.
-    classes : int
-        Number of classes of the store.
-    resolution : int
-        Voxels along each axis of the store's latents.
+    contents : Contents
+        What the store holds: its classes, and the grid of its latents.
 
     Returns
     -------
@@ -245,14 +239,15 @@ def check_prediction(
     material = None
     if "material" in arrays:
         material = _shaped(source, "material", arrays, (count,))
-        material = _whole(source, "class", material, classes)
+        material = _whole(source, "class", material, contents.n_classes)
     elif "logits" in arrays:
-        logits = _shaped(source, "logits", arrays, (count, classes))
+        logits = _shaped(source, "logits", arrays, (count, contents.n_classes))
         if np.isnan(logits).any():
             raise InputError(source, "logits are not all numbers", "a score for each class")
         material = logits.argmax(axis=1)
     if "coords" in arrays:
-        order = _order(source, _shaped(source, "coords", arrays, (count, 3)), coords, resolution)
+        ours = _shaped(source, "coords", arrays, (count, 3))
+        order = _order(source, ours, coords, contents.latents.resolution)
         properties = properties[order]
         material = None if material is None else material[order]
     return VoxelPrediction(properties, material, converted)
