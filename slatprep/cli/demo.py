@@ -11,12 +11,12 @@ from slatprep.cli.options import (
     NEW_FOLDER,
     POSITIVE,
     ChoiceOf,
+    FiniteRange,
     command,
     jobs_option,
     option,
 )
 from slatprep.cli.output import Output
-from slatprep.cli.targets import FiniteRange
 
 
 @command("make-demo")

@@ -6,6 +6,7 @@ import dataclasses
 import difflib
 import functools
 import inspect
+import math
 import pkgutil
 import re
 from collections import Counter
@@ -43,6 +44,19 @@ NEW_FILE = NewPath(path_type=Path, dir_okay=False)
 NEW_FOLDER = NewPath(path_type=Path, file_okay=False)
 RECORDS_FOLDER = click.Path(path_type=Path, file_okay=False)
 """Of a build, which looks itself at what lies there."""
+
+
+class FiniteRange(click.FloatRange):
+    """A range of finite numbers; NaN passes the comparisons of click's."""
+
+    def convert(
+        self, value: Any, param: click.Parameter | None, ctx: click.Context | None
+    ) -> float:
+        """Return the number; `click.BadParameter` if it is none of the range."""
+        number: float = super().convert(value, param, ctx)
+        if not math.isfinite(number):
+            self.fail(f"{value} is no finite number", param, ctx)
+        return number
 
 
 class PlaceType(click.Path):

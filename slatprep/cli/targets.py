@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import os
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -81,16 +80,3 @@ def _inputs(given: Mapping[str, Any]) -> Iterator[tuple[str, Path]]:
                 yield name, local
                 if is_store(local):
                     yield name, local.parent / manifests_of(local).name
-
-
-class FiniteRange(click.FloatRange):
-    """A range of finite numbers; NaN passes the comparisons of click's."""
-
-    def convert(
-        self, value: Any, param: click.Parameter | None, ctx: click.Context | None
-    ) -> float:
-        """Return the number; `click.BadParameter` if it is none of the range."""
-        number: float = super().convert(value, param, ctx)
-        if not math.isfinite(number):
-            self.fail(f"{value} is no finite number", param, ctx)
-        return number

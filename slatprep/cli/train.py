@@ -15,6 +15,7 @@ from slatprep.cli.options import (
     NEW_FOLDER,
     POSITIVE,
     ChoiceOf,
+    FiniteRange,
     command,
     note_left_out,
     note_split,
@@ -24,7 +25,6 @@ from slatprep.cli.options import (
     verdicts_option,
 )
 from slatprep.cli.output import Output
-from slatprep.cli.targets import FiniteRange
 
 if TYPE_CHECKING:
     from slatprep.learn.runs import EpochRecord

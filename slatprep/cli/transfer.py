@@ -11,13 +11,13 @@ from slatprep.cli.options import (
     FILE,
     NEW_FILE,
     ChoiceOf,
+    FiniteRange,
     command,
     complete_asset,
     option,
     store_option,
 )
 from slatprep.cli.output import Output
-from slatprep.cli.targets import FiniteRange
 from slatprep.errors import ConfigError
 
 if TYPE_CHECKING:
