@@ -37,12 +37,10 @@ class Reopened:
         record = spool.record(asset.key)
         if isinstance(record, FailedRecord):
             raise TypeError(f"{record.asset_id}: an asset that failed is not judged anew")
-        arrays = spool.voxels(asset.key)
         self._asset, self._spool = asset, spool
         self.record: AssetRecord = record
-        del arrays["coords"], arrays["feats"]
         self.latents: StructuredLatents = spool.latents(asset.key)
-        self.annotation = Annotation(**arrays)
+        self.annotation: Annotation = spool.annotation(asset.key)
         self.field: MaterialField = spool.field(asset.key)
 
     def placed(

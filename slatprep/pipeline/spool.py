@@ -236,6 +236,12 @@ class Spool:
             resolution = int(arrays["slat_resolution"])
             return StructuredLatents(arrays["coords"], arrays["feats"], resolution=resolution)
 
+    def annotation(self, key: str) -> Annotation:
+        """Read what was looked up at an asset's voxels, properties in SI units."""
+        with self._open(key) as arrays:
+            there = (name for name in (*_VOXEL_ARRAYS[2:], *MERGED_COLUMNS) if name in arrays)
+            return Annotation(**{name: arrays[name] for name in there})
+
     def field(self, key: str) -> MaterialField:
         """Read an asset's PixieVerse field, without its sources."""
         with self._open(key) as arrays:
