@@ -28,7 +28,7 @@ from slatprep.learn.predict import (
 from slatprep.learn.runs import BEST, LAST, EpochRecord, Run
 from slatprep.learn.splits import assign_store
 from slatprep.readers.splits import HASH, Assignment, Shares, Split
-from slatprep.records import USABLE, Place, StructuredLatents
+from slatprep.records import USABLE, Place
 from slatprep.store import Store, open_store
 from slatprep.workers import Progress
 
@@ -368,13 +368,6 @@ def _dataset(
 def _write_predictions(checkpoint: Checkpoint, dataset: SlatDataset, folder: Path) -> None:
     """Write the predictions for a split, decoded asset by asset."""
     for index, asset_id in zip(dataset.indices.tolist(), dataset.asset_ids, strict=True):
-        rows = dataset.store.read(index, ("coords", "feats"))
-        space = dataset.store.contents.latents
-        latents = StructuredLatents(
-            rows["coords"],
-            rows["feats"],
-            standardised=space.standardised,
-            resolution=space.resolution,
-        )
+        latents = dataset.store.latents_of(**dataset.store.read(index, ("coords", "feats")))
         (field,) = predict(checkpoint, [latents])
         write_prediction(folder, asset_id, field, checkpoint)

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from slatprep.errors import ConfigError, StoreError
 from slatprep.geometry.frames import places_of, voxel_centres
-from slatprep.geometry.voxels import voxels_of
+from slatprep.geometry.voxels import shown_in_cells, voxels_of
 from slatprep.normalize import denormalize_properties
 from slatprep.records import MaterialField, Place, StructuredLatents
 from slatprep.storage.place import place_of, storage_of
@@ -109,13 +109,12 @@ class StoredAsset:
     @cached_property
     def latents(self) -> StructuredLatents:
         """Its SLAT, as it was read."""
-        space = self.store.contents.latents
-        return StructuredLatents(
-            self.coords,
-            self.feats,
-            standardised=space.standardised,
-            resolution=space.resolution,
-        )
+        return self.store.latents_of(self.coords, self.feats)
+
+    @cached_property
+    def cells(self) -> tuple[NDArray[np.uint8], NDArray[np.intp]]:
+        """The cells of the 64^3 grid that it occupies, and their voxels; see `shown_in_cells`."""
+        return shown_in_cells(self.coords, self.latents.resolution)
 
     @cached_property
     def properties_si(self) -> NDArray[np.float32]:
@@ -200,6 +199,15 @@ class Store(AssetTable):
         with ThreadPoolExecutor(max(len(columns), 1)) as pool:
             read = pool.map(lambda name: self._voxel_rows(name, index, start, stop), columns)
             return dict(zip(columns, read, strict=True))
+
+    def latents_of(
+        self, coords: NDArray[np.uint8], feats: NDArray[np.float32]
+    ) -> StructuredLatents:
+        """Return voxels (N, 3) and their latents (N, channels), as `read` gives them, as a SLAT."""
+        space = self.contents.latents
+        return StructuredLatents(
+            coords, feats, standardised=space.standardised, resolution=space.resolution
+        )
 
     def rows(self, index: int) -> tuple[int, int]:
         """Return the first row of an asset in ``voxel/*``, and the one after its last.

@@ -19,7 +19,6 @@ from slatprep.geometry.voxels import (
     boundary,
     occupancy_of,
     outer_boundary,
-    shown_in_cells,
     voxels_of,
 )
 from slatprep.inspect.pictures.palette import DISTANCE_COLOURS
@@ -123,7 +122,7 @@ def scene_of(asset: StoredAsset) -> Scene:
     occupancy = asset.grid_material != asset.store.contents.background
     shell = voxels_of(boundary(occupancy))
     outer = outer_boundary(occupancy)
-    cells, row = shown_in_cells(asset.coords, asset.store.contents.latents.resolution)
+    cells, row = asset.cells
     surface = outer_boundary(occupancy_of(cells))
     way = StoredRecords(asset.store).place_map(asset)
     under = surface_distance(surface, outer, asset.transform)

@@ -14,7 +14,6 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from slatprep.geometry.voxels import shown_in_cells
 from slatprep.records import (
     MATERIAL_COLOURS,
     RESOLUTION,
@@ -57,7 +56,7 @@ def thumbnail(asset: StoredAsset) -> NDArray[np.uint8]:
     grid = np.zeros((RESOLUTION,) * 3, dtype=np.uint8)
     # Of more classes some share a colour: a PNG's palette has 256.
     colour = np.where(asset.material == UNANNOTATED, CLASSES, asset.material % CLASSES)
-    cells, row = shown_in_cells(asset.coords, asset.store.contents.latents.resolution)
+    cells, row = asset.cells
     grid[tuple(cells.T.astype(np.intp))] = 1 + colour[row]
     views = (
         grid.transpose(1, 2, 0)[:, ::-1, :],  # depth y, rows from z = 63 down, columns x

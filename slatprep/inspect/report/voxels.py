@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 
 from slatprep.align.deformation import PlaceMap
 from slatprep.geometry.frames import apply_transform, invert_transform, voxel_centres
-from slatprep.geometry.voxels import boundary, filled, shown_in_cells
+from slatprep.geometry.voxels import boundary, filled
 from slatprep.records import RESOLUTION, UNANNOTATED
 from slatprep.store import StoredAsset
 
@@ -59,7 +59,7 @@ def encode_asset(asset: StoredAsset, way: PlaceMap, max_distance: float, side: i
     bytes
         In the form that this module describes.
     """
-    cells, row = shown_in_cells(asset.coords, asset.store.contents.latents.resolution)
+    cells, row = asset.cells
     first, occupied = _cells(cells, side)
     first = row[first]
     grid, material = _boundary_of(asset.grid_material, asset.store.contents.background)
