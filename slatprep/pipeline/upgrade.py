@@ -69,8 +69,9 @@ def upgrade_store(
     if opened.format_version == FORMAT_VERSION:
         return None
     damaged = [*metadata_findings(opened.path), *file_findings(opened, jobs=1)[1]]
-    for finding in sorted(damaged, key=str):
-        raise StoreError(f"{opened.path}/{finding}; `slatprep verify` says more")
+    if damaged:
+        first = min(damaged, key=str)
+        raise StoreError(f"{opened.path}/{first}; `slatprep verify` says more")
     judged = _Judged(opened)
     source = Source(opened, judged, opened.attributes["build"], places_of_sources(opened))
     rows = [(source, row) for row in range(len(opened))]
