@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from slatprep.records import RESOLUTION
+from slatprep.records.json_types import MAX_SHEAR
 
 VOXEL_SIZE = 1.0 / RESOLUTION
 """Edge of a voxel in the unit cube."""
@@ -98,7 +99,7 @@ def split_transform(
         raise ValueError(f"a transform must not mirror or flatten, got determinant {determinant:g}")
     scale = determinant ** (1.0 / 3.0)
     rotation = matrix[:3, :3] / scale
-    if np.abs(rotation @ rotation.T - np.eye(3)).max() > 1e-6:
+    if np.abs(rotation @ rotation.T - np.eye(3)).max() > MAX_SHEAR:
         raise ValueError(
             "a transform must be a rotation, a uniform scale and a shift, without shear"
         )

@@ -50,15 +50,17 @@ def _invertible() -> InJson:
         if (matrix[3] != (0, 0, 0, 1)).any() or not 1e-9 < np.linalg.det(matrix[:3, :3]) < 1e9:
             raise ValueError("no map of the frames: it has no inverse, or mirrors")
         turned = matrix[:3, :3] / np.cbrt(np.linalg.det(matrix[:3, :3]))
-        if np.abs(turned @ turned.T - np.eye(3)).max() > _SHEAR:
+        if np.abs(turned @ turned.T - np.eye(3)).max() > MAX_SHEAR:
             raise ValueError("no similarity: it shears, or scales one axis more than another")
         return matrix
 
     return InJson(read.schema, map_of)
 
 
+MAX_SHEAR = 1e-6
+"""How far the rotation of a similarity may be from an orthogonal matrix, entry by entry."""
+
 _MAX_SIDE = 32
-_SHEAR = 1e-6  # as `slatprep.geometry.frames.split_transform` has it
 _FINITE = {"type": "float", "allow_inf_nan": False}
 
 
