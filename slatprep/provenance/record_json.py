@@ -118,13 +118,17 @@ def completed(text: bytes, normalization: Normalization, clipped: Clipped | None
         Values outside of them; None for an asset that is not in the store, whose record stays.
     """
     document = orjson.loads(text)
-    untold: dict[str, object] = {"duration_s": 0.0}
-    if clipped is None:
-        untold |= {"reason": "", "traceback": ""}
-    else:
+    if clipped is not None:
         document["normalization"] = normalization
         document["counts"]["clipped"] = clipped
-    return RecordText(orjson.dumps(document), orjson.dumps(document | untold))
+    return RecordText(orjson.dumps(document), counting(document))
+
+
+def counting(document: dict[str, Any]) -> bytes:
+    """Return what of a record's JSON counts in `records_id`, whatever format it is of."""
+    left_out = {"duration_s": 0.0, "reason": "", "traceback": ""}
+    kept = {name: empty for name, empty in left_out.items() if name in document}
+    return orjson.dumps(document | kept)
 
 
 def read_build_record(text: bytes | str, where: str) -> BuildRecord:

@@ -16,6 +16,7 @@ from slatprep.provenance.files import ASSETS, BUILD, build_in, build_text, lines
 from slatprep.provenance.record import AssetRecord, Record
 from slatprep.provenance.record_json import (
     RecordError,
+    counting,
     read_build_record,
     read_record,
     records_id,
@@ -153,9 +154,7 @@ def _id_of_lines(folder: Place) -> str:
             record = parse_document(line)
         except ValueError:
             continue  # Found by `_checked`.
-        left_out = {"duration_s": 0.0, "reason": "", "traceback": ""}
-        record |= {name: empty for name, empty in left_out.items() if name in record}
-        digest.update(orjson.dumps(record))
+        digest.update(counting(record))
     return digest.hexdigest()
 
 
@@ -197,8 +196,8 @@ def _checked(
 def _as_stored(line: bytes, rows: Mapping[str, int], stored: StoredRecords) -> bytes | None:
     """Return what counts of a line that says what the store's record of its row does, else None."""
     try:
-        document = orjson.loads(line) | {"duration_s": 0.0}
-        content, row = orjson.dumps(document), rows.get(str(document.get("asset_id")))
+        document = orjson.loads(line)
+        content, row = counting(document), rows.get(str(document.get("asset_id")))
         return content if row is not None and stored.text(row).encode() == content else None
     except (TypeError, ValueError, StoreError):  # No JSON object, or no text that can be read.
         return None
