@@ -118,6 +118,11 @@ def _attempt(
                 given_back.extend(batch[len(results) :])
                 in_time = len(results) * seconds / max(spent, 1e-9)
                 size = int(min(max(in_time, 1), LARGEST_BATCH))
+    except GeneratorExit:
+        # With nothing under way the caller has taken all results, by `next` or in a `zip`.
+        if under_way:
+            pool.abandon(under_way)
+        raise
     except BaseException:
         # Also with nothing under way that is known of: a signal may have come while a call was
         # handed over, and its worker would write on beside what the caller cleans up.

@@ -82,3 +82,11 @@ def test_a_task_that_kills_its_worker_even_alone_is_answered_for() -> None:
     tasks = [(number, 5) for number in range(20)]
     results = run_unordered(die_at, tasks, 2, died=lambda number, deadly: -number)
     assert sorted(results) == sorted(-n if n == 5 else n for n in range(20))
+
+
+def test_workers_stay_if_the_caller_drops_the_iterator_after_the_last_result() -> None:
+    results = run_unordered(os.getpid, [()] * 4, jobs=2)
+    pids = {next(results) for _ in range(4)}
+    results.close()
+    for pid in pids:
+        os.kill(pid, 0)  # raises if there is no such process
