@@ -2,7 +2,8 @@
 
 The way from the SLAT frame to the PixieVerse frame is explicit, as it is the
 one of the lookup: deform, then apply the inverse of the transform. The way back
-solves for the point by Newton's method.
+solves for the point by Newton's method. The compiled part is imported where points are bent,
+as Numba takes as long to load as all else that reads a store.
 """
 
 from __future__ import annotations
@@ -12,7 +13,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from slatprep.align.bspline import displacements, jacobians, least_stretch
 from slatprep.geometry.frames import apply_transform, invert_transform, voxel_centres
 from slatprep.records import RESOLUTION, Alignment, Deformation
 
@@ -85,6 +85,8 @@ def deform(deformation: Deformation, points: ArrayLike) -> NDArray[np.float64]:
     affine = deformation.affine
     moved: NDArray[np.float64] = points @ affine[:, :3].T + affine[:, 3]
     if deformation.coefficients.size:
+        from slatprep.align.bspline import displacements
+
         added = np.empty_like(points)
         displacements(
             points, deformation.origin, deformation.spacing, deformation.coefficients, added
@@ -98,6 +100,8 @@ def jacobian(deformation: Deformation, points: ArrayLike) -> NDArray[np.float64]
     points = np.ascontiguousarray(points, dtype=np.float64)
     slopes = np.zeros((len(points), 3, 3))
     if deformation.coefficients.size:
+        from slatprep.align.bspline import jacobians
+
         jacobians(points, deformation.origin, deformation.spacing, deformation.coefficients, slopes)
     slopes += deformation.affine[:, :3]
     return slopes
@@ -208,6 +212,8 @@ def is_proper(deformation: Deformation) -> bool:
     c, spacing = deformation.coefficients, deformation.spacing
     if not c.size:
         return bool(np.linalg.det(deformation.affine[:, :3]) > 0)
+    from slatprep.align.bspline import least_stretch
+
     fall = _largest_second_derivative(c) / spacing**2 * np.sqrt(3.0) / 2.0 * spacing
     return any(
         least_stretch(deformation.affine, spacing, c, steps) > fall / steps for steps in (2, 4)

@@ -61,8 +61,8 @@ def show_quality(output: Output, overview: StoreOverview) -> None:
     ``labels`` is the expected share of right classes. Lines below the table say which
     assets to look at, and how.
     """
-    from slatprep.inspect.check import AT_MOST
     from slatprep.inspect.overview import UNKNOWN
+    from slatprep.judge import THRESHOLDS
 
     medians = attrgetter("confidence", "expected_accuracy", "fitness", "valid_share")
     total = overview.total
@@ -87,6 +87,6 @@ def show_quality(output: Output, overview: StoreOverview) -> None:
     if total.ambiguous:
         say(
             f"tied:    {total.ambiguous:,} of {total.assets:,}: other placements fit about as "
-            f"well, and change more than {AT_MOST['ambiguity']:.0%} of the classes"
+            f"well, and change more than {THRESHOLDS.good_ambiguity:.0%} of the classes"
         )
         say(f"look:    slatprep check-alignment --ambiguous --store {overview.store}")

@@ -67,21 +67,34 @@ def test_help_lists_every_command_and_the_exit_codes() -> None:
     assert re.search(r"0 +all went in", output) and re.search(r"2 +wrong use", output)
 
 
-def test_help_imports_nothing_heavy() -> None:
+def modules_of(*words: str | Path) -> tuple[str, str]:
+    """Run a command in a process; return what it printed, and the packages that it imported."""
     script = (
-        "import sys, runpy\n"
-        "sys.argv = ['slatprep', '--help']\n"
+        "import sys\n"
         "try:\n    from slatprep.cli import main; main()\n"
         "except SystemExit: pass\n"
         "print(sorted({name.partition('.')[0] for name in sys.modules}), file=sys.stderr)\n"
     )
-    done = subprocess.run(
-        [sys.executable, "-c", script], capture_output=True, text=True, check=True
-    )
-    assert "build-store" in done.stdout
+    command = [sys.executable, "-c", script, *map(str, words)]
+    done = subprocess.run(command, capture_output=True, text=True, check=True)
+    return done.stdout, done.stderr
+
+
+def test_help_imports_nothing_heavy() -> None:
+    printed, modules = modules_of("--help")
+    assert "build-store" in printed
     heavy = ("numpy", "zarr", "scipy", "open3d", "h5py", "joblib", "pydantic", "rich", "numba")
     for module in heavy:
-        assert f"'{module}'" not in done.stderr
+        assert f"'{module}'" not in modules
+
+
+@pytest.mark.parametrize("name", ["info", "list"])
+def test_whoever_only_looks_at_a_store_loads_no_compiler(name: str, demo: Path) -> None:
+    printed, modules = modules_of(name, demo / "demo.zarr")
+    assert "good" in printed
+    assert "'numpy'" in modules
+    for module in ("numba", "scipy", "open3d"):
+        assert f"'{module}'" not in modules
 
 
 def test_entry_holds_libraries_to_one_thread() -> None:
