@@ -5,6 +5,9 @@
 
 PYTHON ?= python3
 VENV   ?= .venv
+# uv leaves modules to be compiled when they are first imported: unless that is kept,
+# each of the thousand processes of the tests compiles all that it imports.
+unexport PYTHONDONTWRITEBYTECODE
 # OMP_NUM_THREADS would lower what nproc says; it means threads, not processes.
 JOBS   ?= $(shell env -u OMP_NUM_THREADS nproc 2>/dev/null || getconf _NPROCESSORS_ONLN)
 DATA   ?= manifests/demo.toml
@@ -81,14 +84,25 @@ WHEEL = sh tools/try-wheel.sh $(BIN)/python dist
 lint: $(VENV)/.installed-dev
 	$(LINT)
 
+# A process of tests is one of $(JOBS): a library's threads would wait for each other's cores.
+# worksteal leaves no core idle at the end, and tests of one file mostly to one process.
+TESTS = OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 \
+        $(BIN)/python -m pytest -n $(JOBS) --dist worksteal
+# Once, or each process of the tests would compile the same.
+KERNELS = $(BIN)/python -c \
+          'from slatprep.pipeline.kernels import compile_kernels; compile_kernels()'
+
 # Whatever one of them finds, the others run, and the tests' closing line comes last.
 # Not by a make within make: such a line would run even under --dry-run.
 test: $(VENV)/.installed-dev
-	@status=0; \
+	@status=0; log=$$(mktemp); \
+	{ $(WHEEL) && $(KERNELS); } >"$$log" 2>&1 & \
+	wheel=$$!; \
 	{ $(LINT); } || status=1; \
 	$(DOCS) || status=1; \
-	$(WHEEL) || status=1; \
-	$(BIN)/python -m pytest -n $(JOBS) || status=1; \
+	wait $$wheel || status=1; \
+	cat "$$log"; rm "$$log"; \
+	$(TESTS) || status=1; \
 	exit $$status
 
 docs: $(VENV)/.installed-dev

@@ -21,6 +21,7 @@ class Hub(BaseHTTPRequestHandler):
 
     root: Path
     protocol_version = "HTTP/1.1"
+    wbufsize = -1  # Head and body in one packet: a second one waits 40 ms for the first's ACK.
 
     def do_GET(self) -> None:
         path = unquote(urlsplit(self.path).path).strip("/").split("/")
