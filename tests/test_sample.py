@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
+from support.shapes import field_of
 
 from slatprep.geometry.frames import make_transform, places_of, voxel_centres
 from slatprep.geometry.voxels import occupancy_of
 from slatprep.parameters import SampleParameters
-from slatprep.records import PROPERTIES, UNANNOTATED, Annotation, MaterialField
-from slatprep.sample import merge, sample
+from slatprep.records import PIXIEVERSE, PROPERTIES, UNANNOTATED, Annotation, MaterialField
+from slatprep.sample import in_table, lacking, merge, sample
 
 NEAREST = SampleParameters(method="nearest")
 
@@ -168,3 +171,51 @@ def test_voxels_that_no_annotation_reaches_stay_without_labels() -> None:
     assert np.isnan(made.properties).all()
     assert np.isnan(made.spread).all()
     assert made.votes.tolist() == made.confidence.tolist() == [0.0]
+
+
+def test_a_voxel_with_a_class_and_without_one_of_the_properties_is_not_valid() -> None:
+    one = _said([2, 2], [1e6, 1e6], [0.3, 0.3])
+    other = _said([2, 2], [1e6, 1e6], [0.3, 0.3])
+    for said in (one, other):
+        said.properties[1, 0] = np.nan
+    made = merge([one, other], PROPERTIES)
+    assert made.valid.tolist() == [True, False]
+    assert made.material.tolist() == [2, UNANNOTATED]
+    assert np.isnan(made.properties[1]).all()
+    assert made.spread is not None
+    assert np.isnan(made.spread[1]).all()
+
+
+def test_near_is_a_factor_of_two_and_a_fifth_of_the_mean() -> None:
+    """Poisson's ratio 0.2 and 0.3, mean 0.25, are off by a fifth; 0.199 and 0.301 by more."""
+    likely = []
+    for modulus, ratio in (
+        ((1e6, 4e6), (0.3, 0.3)),  # each twice or half of 2e6
+        ((1e6, 4.1e6), (0.3, 0.3)),
+        ((1e6, 1e6), (0.2, 0.3)),
+        ((1e6, 1e6), (0.199, 0.301)),
+    ):
+        said = [_said([1], [e], [nu]) for e, nu in zip(modulus, ratio, strict=True)]
+        made = merge(said, PROPERTIES)
+        assert made.confidence is not None
+        likely.append(float(made.confidence[0]))
+    np.testing.assert_allclose(likely, [0.8, 0.4, 0.8, 0.4], rtol=1e-6)
+
+
+def test_columns_of_another_table_are_put_in_those_of_the_store() -> None:
+    said = _said([1, 255], [1e6, np.nan], [0.3, np.nan])
+    table = (PROPERTIES[2], PROPERTIES[0])
+    said = replace(said, properties=said.properties[:, [2, 0]])
+    solid = np.zeros((64, 64, 64), dtype=bool)
+    solid[30, 30, 30] = True
+    field = field_of(solid)
+    field = replace(field, properties=field.properties[:, [2, 0]], table=table)
+    density = PROPERTIES[1].name
+    assert lacking(field, PIXIEVERSE) == (density,)
+    made = in_table(said, field, PIXIEVERSE)
+    np.testing.assert_allclose(made.properties[0], [1e6, np.nan, 0.3], rtol=1e-6)
+    assert made.material.tolist() == [1, UNANNOTATED]
+    unclassified = replace(field, classified=False, material=np.zeros_like(field.material))
+    assert lacking(unclassified, PIXIEVERSE) == (density, "classes")
+    assert lacking(unclassified, replace(PIXIEVERSE, classes=())) == (density,)
+    assert in_table(said, unclassified, PIXIEVERSE).material.tolist() == [UNANNOTATED] * 2

@@ -39,10 +39,10 @@ ROOT = Path(__file__).resolve().parents[1]
 
 TESTS = {
     "align/quality": ["align/test_quality.py"],
-    "align/starts": ["align/test_starts.py", "align/test_quality.py"],
+    "align/starts": ["align/test_starts.py", "align/test_reference_engines.py"],
     "align/consensus": ["align/test_consensus.py"],
     "align/surface": ["align/test_surface.py"],
-    "align/settle": ["align/test_settle.py"],
+    "align/settle": ["align/test_settle.py", "align/test_consensus.py"],
     "align/deformation": ["align/test_deformation.py"],
     "sample": ["test_sample.py"],
     "judge/ambiguity": ["judge/test_ambiguity.py"],

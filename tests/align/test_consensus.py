@@ -49,6 +49,33 @@ def test_no_rotation_is_common_where_few_agree(transforms: list[np.ndarray]) -> 
     assert find_consensus(transforms) is None
 
 
+def test_just_enough_is_enough() -> None:
+    """Five at least, and half of all at least; within 30 degrees of a quarter turn."""
+    others = [make_transform(start.rotation) for start in distinct_starts()]
+    others = [one for one in others if degrees_between(one[:3, :3], COMMON) > 1]
+    five = [make_transform(COMMON)] * 5
+    assert find_consensus(five[:4]) is None
+    found = find_consensus(five + others[:5])
+    assert found is not None
+    assert (found.winners, found.agreeing) == (10, 5)
+    assert find_consensus(five + others[:6]) is None
+    for degrees, agreeing in ((29.9, 6), (30.1, 5)):
+        turn = Rotation.from_euler("x", degrees, degrees=True).as_matrix()
+        found = find_consensus([*five, make_transform(turn @ COMMON)])
+        assert found is not None
+        assert found.agreeing == agreeing
+
+
+def test_no_turn_and_half_a_turn_are_angles_too() -> None:
+    # The trace of such a product may be rounded beyond 3, and beyond -1.
+    for rotation in Rotation.random(200, random_state=1):
+        turn = rotation.as_matrix()
+        axis = rotation.apply([0.0, 0.0, 1.0])
+        back = Rotation.from_rotvec(np.pi * axis).as_matrix() @ turn
+        assert degrees_between(turn, turn) == pytest.approx(0.0, abs=1e-5)
+        assert degrees_between(turn, back) == pytest.approx(180.0, abs=1e-5)
+
+
 def _box() -> np.ndarray:
     box = np.zeros((64, 64, 64), dtype=bool)
     box[12:52, 22:42, 27:37] = True

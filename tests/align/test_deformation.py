@@ -14,6 +14,8 @@ from support.shapes import chair, field_of, surface_latents
 from slatprep.align.bspline import refined
 from slatprep.align.deformation import (
     GRAIN,
+    LEAST_STRETCH,
+    MOST_STRETCH,
     PlaceMap,
     bending_of,
     deform,
@@ -96,6 +98,74 @@ def test_a_fold_is_seen() -> None:
     assert not is_proper(folded)
 
 
+def test_how_much_bending_is_certain_not_to_fold_by_hand() -> None:
+    """One coefficient h: its second differences are 2 h along an axis, and h along two.
+
+    So the second derivatives' Frobenius norm is at most sqrt(3 * 4 + 6) h / spacing^2. No point
+    is farther than sqrt(3) / 2 of a step from the grid where scipy's splines give the derivative.
+    """
+    from scipy.interpolate import BSpline
+    from scipy.optimize import brentq
+
+    spacing, n = 0.25, 7
+    knots = np.arange(-3.0, n + 1.0)
+    unit = np.zeros((n, n, n, 3))
+    unit[3, 3, 3, 1] = 1.0
+
+    def room(height: float, steps: int) -> float:
+        at = np.arange(steps * (n - 3) + 1) / steps
+        value = BSpline(knots, np.eye(n)[3], 3)(at)
+        slope = BSpline(knots, np.eye(n)[3], 3).derivative()(at) / spacing
+        gradient = height * np.stack(
+            [
+                np.einsum("i,j,k->ijk", slope, value, value),
+                np.einsum("i,j,k->ijk", value, slope, value),
+                np.einsum("i,j,k->ijk", value, value, slope),
+            ],
+            axis=-1,
+        )
+        determinant = 1.0 + gradient[..., 1]
+        squares = 3.0 + 2.0 * gradient[..., 1] + (gradient**2).sum(axis=-1)
+        most = np.sqrt(3 * 4 + 6) * height / spacing**2
+        return float((2 * determinant / squares).min() - most * np.sqrt(3) / 2 * spacing / steps)
+
+    limits = {steps: brentq(room, 0.0, 0.2, args=(steps,)) for steps in (2, 4)}
+    assert limits[2] < limits[4]
+    for height, proper in ((0.999 * limits[4], True), (1.001 * limits[4], False)):
+        made = Deformation(IDENTITY, np.full(3, -0.5), spacing, height * unit)
+        assert is_proper(made) is proper
+
+
+def test_bending_is_shortened_to_the_bound_and_not_further() -> None:
+    for voxels, expected in ((10.0, 10.0), (20.0, 16.0)):
+        coefficients = np.zeros((7, 7, 7, 3))
+        coefficients[..., 2] = voxels / 64  # everything moves alike, so nothing bends
+        made = make_deformation(IDENTITY, [-0.5] * 3, 0.25, coefficients, BOX, 16.0)
+        assert made is not None
+        length = np.linalg.norm(made.coefficients, axis=-1) * 64
+        np.testing.assert_allclose(length, expected, rtol=1e-5)
+        assert length.max() <= expected + 64 * GRAIN
+
+
+def test_how_much_an_affine_part_may_stretch() -> None:
+    nothing, middle = np.zeros((0, 0, 0, 3)), np.zeros((1, 3))
+    for low, high, allowed in (
+        (1.001 * LEAST_STRETCH, 0.999 * MOST_STRETCH, True),
+        (0.999 * LEAST_STRETCH, 1.0, False),
+        (1.0, 1.001 * MOST_STRETCH, False),
+    ):
+        affine = np.diag([low, 1.0, high]) @ IDENTITY
+        made = make_deformation(affine, np.zeros(3), 1.0, nothing, middle, 16.0)
+        assert (made is not None) is allowed
+
+
+def test_no_zero_is_negative() -> None:
+    coefficients = np.full((7, 7, 7, 3), -1e-15)
+    made = make_deformation(IDENTITY, [-0.5] * 3, 0.25, coefficients, BOX, 16.0)
+    assert made is not None
+    assert made.coefficients.tobytes() == np.zeros((7, 7, 7, 3)).tobytes()
+
+
 def test_an_affine_part_that_flattens_mirrors_or_moves_too_far_is_refused() -> None:
     nothing = np.zeros((0, 0, 0, 3))
     for affine in (
@@ -163,6 +233,10 @@ def test_only_bending_bends() -> None:
     quadratic[..., 0] = 0.5 * 64 * 0.01 * ((index * 0.1) ** 2)[:, None, None]
     made = Deformation(IDENTITY, np.full(3, -0.5), 0.1, quadratic)
     assert bending_of(made) == pytest.approx(0.01)
+    # u = a x y has the second derivative a twice: by x and y, and by y and x.
+    twisted = np.zeros((8, 8, 8, 3))
+    twisted[..., 2] = 64 * 0.01 * np.multiply.outer(index * 0.1, index * 0.1)[:, :, None]
+    assert bending_of(replace(made, coefficients=twisted)) == pytest.approx(0.01 * np.sqrt(2))
 
 
 def test_the_lookup_goes_through_the_map() -> None:

@@ -39,6 +39,19 @@ def test_distances_are_in_voxels_of_the_slat_frame() -> None:
     assert quality.fitness == quality.fitness_backward == 1.0
 
 
+def test_the_radius_is_in_voxels_of_the_slat_frame_both_ways() -> None:
+    # One PixieVerse voxel off is half a SLAT voxel at this scale, and three are one and a half.
+    pixieverse = np.array([[32, 32, 32]], dtype=np.uint8)
+    for off, near in ((1, 1.0), (3, 0.0)):
+        transform = make_transform(
+            np.eye(3), [0.5 * off / 64 + 0.25 / 64, 0.25 / 64, 0.25 / 64], 0.5
+        )
+        quality = compare(pixieverse, pixieverse, transform, radius=1.0)
+        assert (quality.fitness, quality.fitness_backward) == (near, near)
+        rmse = quality.inlier_rmse, quality.inlier_rmse_backward
+        assert rmse == pytest.approx((0.5 * off * near,) * 2)
+
+
 def test_far_sets_have_no_inlier_and_no_nan() -> None:
     quality = compare(LINE, LINE, make_transform(np.eye(3), [0, 0.4, 0]), radius=1.0)
     assert (quality.fitness, quality.inlier_rmse, quality.overlap) == (0.0, 0.0, 0.0)

@@ -14,7 +14,7 @@ from slatprep.align import align
 from slatprep.align.deformation import map_of
 from slatprep.align.quality import measure_quality
 from slatprep.align.settle import refit, take
-from slatprep.geometry.frames import VOXEL_SIZE, make_transform, voxel_centres
+from slatprep.geometry.frames import VOXEL_SIZE, apply_transform, make_transform, voxel_centres
 from slatprep.parameters import AlignParameters
 from slatprep.records import (
     Alignment,
@@ -89,3 +89,25 @@ def test_what_the_parameters_forbid_is_not_fitted(model: str) -> None:
     settled = refit(take(other, 0, latents, BY), field, latents, parameters)
     assert settled.model == model
     assert settled.deformation is None
+
+
+def test_taking_a_placement_leaves_the_others_and_the_model_of_a_rigid_fit() -> None:
+    latents = surface_latents(chair())
+    found = align(field_of(chair()), latents, AlignParameters())
+    turns = [
+        make_transform(Rotation.from_euler(axis, 180, degrees=True).as_matrix()) for axis in "xyz"
+    ]
+    placements = tuple(Placement(turn, 0.9 - 0.1 * k, 20.0) for k, turn in enumerate(turns))
+    taken = take(replace(found, placements=placements), 1, latents, BY)
+    np.testing.assert_array_equal(taken.transform, turns[1])
+    assert (taken.model, taken.score) == (found.model, placements[1].score)
+    assert [one.score for one in taken.placements] == [found.score, 0.9, pytest.approx(0.7)]
+    for left, transform in zip(
+        taken.placements, (found.transform, turns[0], turns[2]), strict=True
+    ):
+        np.testing.assert_array_equal(left.transform, transform)
+        there = [
+            apply_transform(np.linalg.inv(one), latents.centres) for one in (transform, turns[1])
+        ]
+        apart = np.linalg.norm(there[0] - there[1], axis=1).mean() / VOXEL_SIZE
+        assert left.displacement == pytest.approx(apart)

@@ -53,3 +53,17 @@ def test_240_starts_leave_no_orientation_far_from_one() -> None:
     anywhere = Rotation.random(2000, random_state=0).as_quat()
     dots = np.abs(anywhere @ starts.as_quat().T).max(axis=1)
     assert np.degrees(2 * np.arccos(dots.min())) < 40.0
+
+
+def test_the_spirals_advance_by_the_published_numbers() -> None:
+    """Alexa 2022: by 1 / sqrt(2) and 1 / psi of a turn, where psi^4 = psi + 4."""
+    psi = max(root.real for root in np.roots([1, 0, 0, -1, -4]) if abs(root.imag) < 1e-12)
+    x, y, z, w = Rotation.from_matrix(so3_starts(50)).as_quat().T
+    # A quaternion and its negative are one rotation, so phases are known to half a turn.
+    for phase, turns in ((np.arctan2(x, y), np.sqrt(2)), (np.arctan2(z, w), psi)):
+        off = (np.diff(phase) - 2 * np.pi / turns) / np.pi
+        np.testing.assert_allclose(off, np.round(off), atol=1e-9)
+    np.testing.assert_allclose(x**2 + y**2, (np.arange(50) + 0.5) / 50)
+    first = np.pi / np.sqrt(2), np.pi / psi
+    found = np.arctan2(x[0], y[0]), np.arctan2(z[0], w[0])
+    np.testing.assert_allclose(np.tan(found), np.tan(first))

@@ -6,8 +6,8 @@ import numpy as np
 from scipy.ndimage import binary_fill_holes
 from support.shapes import GRID, chair
 
-from slatprep.align.surface import CENTRE, DILATION, surface_of
-from slatprep.geometry.voxels import boundary, filled
+from slatprep.align.surface import BAND, CENTRE, DILATION, surface_of
+from slatprep.geometry.voxels import boundary, filled, voxels_of
 
 
 def test_a_shell_and_its_solid_have_the_same_surface() -> None:
@@ -75,3 +75,39 @@ def test_positions_are_counted_from_the_centre_of_the_cube() -> None:
     middle = np.zeros((64, 64, 64), dtype=bool)
     middle[20:44, 22:42, 30:34] = True  # as far from either end, so its centre is the cube's
     np.testing.assert_allclose(surface_of(middle).centroid, 0.0, atol=1e-12)
+
+
+def test_the_boundary_is_that_of_the_filled_set() -> None:
+    for solid in (chair(), boundary(chair())):
+        rows = np.array(sorted(map(tuple, surface_of(solid).boundary.tolist())))
+        np.testing.assert_array_equal(rows, voxels_of(boundary(filled(solid))))
+
+
+def test_samples_are_all_lattice_points_of_the_band_with_the_distance_there() -> None:
+    surface = surface_of(chair())
+    index = np.rint(surface.points - surface.origin).astype(int)
+    np.testing.assert_allclose(index + surface.origin, surface.points, atol=1e-12)
+    np.testing.assert_allclose(surface.distance[tuple(index.T)], surface.values, atol=1e-6)
+    # To the faces the distance is that less the dilation.
+    in_band = np.abs(surface.distance.astype(np.float64) - DILATION) <= BAND + 1e-6
+    assert len(index) == in_band.sum()
+
+
+def test_the_size_does_not_depend_on_where_it_is() -> None:
+    ball = ((GRID - 31.5) ** 2).sum(axis=-1) < 10**2
+    aside = np.roll(ball, (15, -12, 9), axis=(0, 1, 2))
+    assert surface_of(aside).size == surface_of(ball).size
+
+
+def test_a_subset_has_no_sample_twice_and_others_from_another_start() -> None:
+    surface = surface_of(chair())
+    total = len(surface.points)
+    assert len(surface.subset(total).points) == total
+    # Nearly as many choices as there are samples: some would be chosen twice.
+    for count in (300, total - 1):
+        some = surface.subset(count)
+        assert len(np.unique(some.points, axis=0)) == len(some.points) == len(some.values)
+    first, second = (
+        set(map(tuple, surface.subset(300, start).points.tolist())) for start in (0, 300)
+    )
+    assert first.isdisjoint(second)

@@ -121,3 +121,29 @@ def test_the_voxels_of_a_full_grid_that_are_looked_at_lie_in_all_of_its_layers(
     # Layers 0, 8, 16... change with layers 7, 15, 23...: two of eight.
     assert some.material_share == pytest.approx(0.25, abs=0.01)
     assert looked == [pytest.approx(MOST_VOXELS / FEWER, rel=0.05)]
+
+
+def test_without_classes_a_property_that_changes_notably_counts_by_hand() -> None:
+    """log10 E along x is 5, 5.45, 5.5, 6, twice, and 5 aside; half a turn about z swaps x.
+
+    So it changes by 1, 0.05, 0.05 and 1 in four layers, of a range of 1, of which a tenth is
+    notable; the two voxels aside are carried to where nothing is annotated.
+    """
+    solid = np.zeros((64, 64, 64), dtype=bool)
+    solid[30:34, 31:33, 32] = solid[40, 31:33, 32] = True
+    field = field_of(solid)
+    powers = dict(zip([30, 31, 32, 33, 40], [5.0, 5.45, 5.5, 6.0, 5.0], strict=True))
+    properties = np.full((len(field.voxels), 3), [1e5, 1e3, 0.3], dtype=np.float32)
+    properties[:, 0] = [10.0 ** powers[int(x)] for x in field.voxels[:, 0]]
+    field = replace(
+        field, properties=properties, classified=False, material=np.zeros_like(field.material)
+    )
+    latents = StructuredLatents(field.voxels, np.zeros((len(field.voxels), 8), np.float32))
+    half_a_turn = Placement(np.diag([-1.0, -1.0, 1.0, 1.0]), 1.0, 20.0)
+    found = align(field_of(chair()), surface_latents(chair()), AlignParameters())
+    alignment = replace(found, transform=np.eye(4), placements=(half_a_turn,))
+    annotation = sample(field, map_of(alignment).places(latents.coords), SampleParameters())
+    ambiguity = measure_ambiguity(field, latents, alignment, annotation, SampleParameters())
+    assert ambiguity.material_share == pytest.approx((4 + 2) / 10)
+    expected = ((1 + 0.05 + 0.05 + 1) / 4, 0.0, 0.0)
+    np.testing.assert_allclose(ambiguity.property_change, expected, atol=1e-6)
