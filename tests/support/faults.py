@@ -52,4 +52,6 @@ def environment(folder: Path, fault: str = "") -> dict[str, str]:
         body = "".join(f"    {line}\n" for line in fault.strip("\n").splitlines())
         (folder / "faulty.py").write_text(f"{head}def reached(step, name):\n{body}")
         variables[VARIABLE] = "faulty:reached"
+        # The next fault may be written within the second by which bytecode is known to be old.
+        variables["PYTHONDONTWRITEBYTECODE"] = "1"
     return variables
