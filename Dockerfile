@@ -1,4 +1,5 @@
-# slatprep as a command: docker build -t slatprep . && docker run -v "$PWD:/data" slatprep --help
+# docker build -t slatprep .
+# docker run --rm --user "$(id -u):$(id -g)" -v "$PWD:/data" -v slatprep:/home/slatprep/.cache slatprep --help
 FROM python:3.12-slim-bookworm AS build
 WORKDIR /src
 COPY requirements/run.txt requirements/
@@ -10,10 +11,14 @@ RUN /opt/slatprep/bin/pip install --no-cache-dir --no-deps .
 
 FROM python:3.12-slim-bookworm
 COPY --from=build /opt/slatprep /opt/slatprep
-RUN useradd --create-home --uid 1000 slatprep
-USER slatprep
-# Numba compiles for the processor it finds, so not here; a volume keeps what it compiled.
-ENV PATH=/opt/slatprep/bin:$PATH NUMBA_CACHE_DIR=/home/slatprep/.cache/numba
+# Any user may run it, as files under /data are to belong to who calls. Numba compiles for the
+# processor it finds, so not here; a volume on the cache keeps what it compiled.
+RUN useradd --no-create-home --uid 1000 slatprep \
+    && mkdir --parents --mode=1777 /home/slatprep/.cache \
+    && chmod 1777 /home/slatprep
+ENV PATH=/opt/slatprep/bin:$PATH HOME=/home/slatprep
+# A number, as Kubernetes sees only of a number that it is not root.
+USER 1000
 WORKDIR /data
 ENTRYPOINT ["slatprep"]
 CMD ["--help"]

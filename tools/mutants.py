@@ -124,7 +124,7 @@ def measure(
     order, score = random.Random(seed), {}
     for left, (module, tests) in zip(range(len(modules), 0, -1), modules.items(), strict=True):
         text = (folder / "slatprep" / f"{module}.py").read_text("utf-8")
-        compiled, inside = "njit" in text, lines_in_functions(text)
+        compiled, inside = "@kernel" in text, lines_in_functions(text)
         queue = [one for one in mutants_of(folder, module) if compiled or one.line in inside]
         order.shuffle(queue)
         trial = imported_anew if compiled else collected_once

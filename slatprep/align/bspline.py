@@ -9,13 +9,14 @@ axis, and a point beyond it is displaced as the nearest point of the domain is.
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
+
+from slatprep.geometry.kernel import kernel
 
 Array = NDArray[np.float64]
 
 
-@njit(cache=True, inline="always")
+@kernel(inline="always")
 def _axis_weights(position, spans, weights, at):  # type: ignore[no-untyped-def]
     """Write the four weights of a position (in spans) from ``weights[at]`` on; return the base."""
     position = min(max(position, 0.0), float(spans))
@@ -29,7 +30,7 @@ def _axis_weights(position, spans, weights, at):  # type: ignore[no-untyped-def]
     return base
 
 
-@njit(cache=True, inline="always")
+@kernel(inline="always")
 def locate(point, origin, spacing, shape, weights):  # type: ignore[no-untyped-def]
     """Write the weights (12,) of a point along the axes; return its first coefficient's index.
 
@@ -44,7 +45,7 @@ def locate(point, origin, spacing, shape, weights):  # type: ignore[no-untyped-d
     return np.uint64(3 * first)
 
 
-@njit(cache=True, inline="always")
+@kernel(inline="always")
 def gather(flat, first, strides, weights):  # type: ignore[no-untyped-def]
     """Return the displacement of a point: its coefficients, weighted and added up.
 
@@ -78,7 +79,7 @@ def gather(flat, first, strides, weights):  # type: ignore[no-untyped-def]
     )
 
 
-@njit(cache=True, inline="always")
+@kernel(inline="always")
 def scatter(flat, first, strides, weights, x, y, z):  # type: ignore[no-untyped-def]
     """Add a point's vector to its coefficients, weighted: the transpose of `gather`."""
     plane, line = strides[0], strides[1]
@@ -105,13 +106,13 @@ def scatter(flat, first, strides, weights, x, y, z):  # type: ignore[no-untyped-
         first += plane
 
 
-@njit(cache=True)
+@kernel()
 def strides_of(shape):  # type: ignore[no-untyped-def]
     """Return how many numbers lie from one plane, and from one line, to the next."""
     return np.uint64(3 * shape[1] * shape[2]), np.uint64(3 * shape[2])
 
 
-@njit(cache=True)
+@kernel()
 def displacements(points, origin, spacing, coefficients, out):  # type: ignore[no-untyped-def]
     """Write the displacement of each point (N, 3) to `out`."""
     weights, flat = np.zeros(12), coefficients.reshape(-1)
@@ -121,7 +122,7 @@ def displacements(points, origin, spacing, coefficients, out):  # type: ignore[n
         out[m, 0], out[m, 1], out[m, 2] = gather(flat, first, strides, weights)
 
 
-@njit(cache=True)
+@kernel()
 def _axis_slopes(position, spans, slopes, at):  # type: ignore[no-untyped-def]
     """Derivatives, in 1 / span, of the four weights; 0 beyond the domain."""
     if position < 0.0 or position > spans:
@@ -135,7 +136,7 @@ def _axis_slopes(position, spans, slopes, at):  # type: ignore[no-untyped-def]
     slopes[at + 3] = 0.5 * t * t
 
 
-@njit(cache=True)
+@kernel()
 def jacobians(points, origin, spacing, coefficients, out):  # type: ignore[no-untyped-def]
     """Write ``out[m, i, j]``, the derivative of displacement i along axis j, for each point."""
     weights, slopes, mixed = np.zeros(12), np.zeros(12), np.zeros(12)
@@ -152,7 +153,7 @@ def jacobians(points, origin, spacing, coefficients, out):  # type: ignore[no-un
             out[m, 0, axis], out[m, 1, axis], out[m, 2, axis] = x, y, z
 
 
-@njit(cache=True)
+@kernel()
 def least_stretch(affine, spacing, coefficients, steps):  # type: ignore[no-untyped-def]
     """Return the least of 2 det / |J|^2 over a grid of `steps` points a span; J is the derivative.
 
@@ -206,7 +207,7 @@ def refined(coefficients: Array) -> Array:
     return np.ascontiguousarray(coefficients)
 
 
-@njit(cache=True)
+@kernel()
 def bend(coefficients, strength, out):  # type: ignore[no-untyped-def]
     """Add `strength` times the gradient (halved) of the bending energy to `out`.
 

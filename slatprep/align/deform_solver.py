@@ -15,15 +15,15 @@ sample, always in the same order.
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
 from slatprep.align.bspline import bend, gather, locate, scatter, strides_of
 from slatprep.align.solver import interpolate, solve_linear
+from slatprep.geometry.kernel import kernel
 
 _INVERSE_STEPS = 2
 
 
-@njit(cache=True)
+@kernel()
 def linearise(  # type: ignore[no-untyped-def]
     points, values, field, field_origin, places, forward, bent,
     rotation, shift, scale, offset, affine, inverse, coefficients, origin, spacing,
@@ -99,7 +99,7 @@ def linearise(  # type: ignore[no-untyped-def]
     return kernels / points.shape[0]
 
 
-@njit(cache=True)
+@kernel()
 def affine_step(  # type: ignore[no-untyped-def]
     places, vectors, residuals, centre, ridge, offset, offset_prior, step
 ):
@@ -128,7 +128,7 @@ def affine_step(  # type: ignore[no-untyped-def]
     solve_linear(normal, rhs, step)
 
 
-@njit(cache=True)
+@kernel()
 def _apply(bases, weights, vectors, delta, delta_offset, strength, damping, out):  # type: ignore[no-untyped-def]
     """Write the normal matrix times (delta, delta_offset) to `out`; return the offset's part."""
     flat, to, strides = delta.reshape(-1), out.reshape(-1), strides_of(delta.shape)
@@ -146,7 +146,7 @@ def _apply(bases, weights, vectors, delta, delta_offset, strength, damping, out)
     return out_offset
 
 
-@njit(cache=True)
+@kernel()
 def lattice_step(  # type: ignore[no-untyped-def]
     bases, weights, vectors, residuals, coefficients, strength, damping,
     offset, offset_prior, iterations,

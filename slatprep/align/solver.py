@@ -21,7 +21,8 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
+
+from slatprep.geometry.kernel import kernel
 
 UNKNOWNS = 8  # rotation 3, shift 3, log scale, offset
 
@@ -32,7 +33,7 @@ _LARGEST_GROWTH = 0.1
 _BLOCK = 64  # samples whose products are summed at once: they stay in the processor's first cache
 
 
-@njit(cache=True, inline="always", error_model="numpy")
+@kernel(inline="always", error_model="numpy")
 def interpolate(f, x, y, z):  # type: ignore[no-untyped-def]
     """Trilinear value and gradient; outside the box the distance to it is added."""
     n0, n1, n2 = f.shape
@@ -66,7 +67,7 @@ def interpolate(f, x, y, z):  # type: ignore[no-untyped-def]
     return value, gx, gy, gz
 
 
-@njit(cache=True, error_model="numpy")
+@kernel(error_model="numpy")
 def _accumulate(  # type: ignore[no-untyped-def]
     points, values, field, origin, rotation, shift, scale, offset, centre, tau, forward, equations
 ):
@@ -136,7 +137,7 @@ def _accumulate(  # type: ignore[no-untyped-def]
     return weight_sum, inliers, squares
 
 
-@njit(cache=True)
+@kernel()
 def _add_products(left, right, out):  # type: ignore[no-untyped-def]
     """Add the sum over m of ``left[m, i] * right[m, j]`` to ``out[i, j]``, the upper triangle.
 
@@ -166,7 +167,7 @@ def _add_products(left, right, out):  # type: ignore[no-untyped-def]
             to[2, 0], to[2, 1], to[2, 2] = g, h, k
 
 
-@njit(cache=True)
+@kernel()
 def _rotation_of(turn):  # type: ignore[no-untyped-def]
     """Rotation matrix of a rotation vector, by way of the unit quaternion."""
     angle = math.sqrt(turn[0] ** 2 + turn[1] ** 2 + turn[2] ** 2)
@@ -182,7 +183,7 @@ def _rotation_of(turn):  # type: ignore[no-untyped-def]
     )
 
 
-@njit(cache=True)
+@kernel()
 def solve(  # type: ignore[no-untyped-def]
     slat_points, slat_values, slat_field, slat_origin,
     pixie_points, pixie_values, pixie_field, pixie_origin,
@@ -278,7 +279,7 @@ def solve(  # type: ignore[no-untyped-def]
     return fits
 
 
-@njit(cache=True)
+@kernel()
 def _product(matrix, vector):  # type: ignore[no-untyped-def]
     product = np.zeros(3)
     for i in range(3):
@@ -287,7 +288,7 @@ def _product(matrix, vector):  # type: ignore[no-untyped-def]
     return product
 
 
-@njit(cache=True)
+@kernel()
 def solve_linear(matrix, rhs, step):  # type: ignore[no-untyped-def]
     """Solve ``matrix @ step = rhs`` by elimination with partial pivoting, in place.
 

@@ -11,8 +11,9 @@ of the packages at this size threefold.
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
+
+from slatprep.geometry.kernel import kernel
 
 LARGEST_SIDE = 72
 """Longest side of a box: three squares of it still fit the integers used."""
@@ -62,7 +63,7 @@ def signed_distance(solid: NDArray[np.bool_]) -> NDArray[np.float32]:
     return distance
 
 
-@njit(cache=True)
+@kernel()
 def _squares_along_last(solid, inside, outside):  # type: ignore[no-untyped-def]
     """Squared distance within each line to the nearest voxel of the other kind; 0 in that kind."""
     length = solid.shape[2]
@@ -85,7 +86,7 @@ def _squares_along_last(solid, inside, outside):  # type: ignore[no-untyped-def]
                 outside[i, j, k] = 0 if line[k] else square
 
 
-@njit(cache=True)
+@kernel()
 def _spread_over_others(squares):  # type: ignore[no-untyped-def]
     """Take the two axes before the last into account, in place, slab by slab."""
     a, b, c = squares.shape
@@ -103,7 +104,7 @@ def _spread_over_others(squares):  # type: ignore[no-untyped-def]
         squares[i] = least
 
 
-@njit(cache=True)
+@kernel()
 def spread(slab, least):  # type: ignore[no-untyped-def]
     """Set ``least[i, k]`` to the minimum over i' of ``slab[i', k] + (i - i')^2``.
 
@@ -142,7 +143,7 @@ def spread(slab, least):  # type: ignore[no-untyped-def]
             apart += 1
 
 
-@njit(cache=True)
+@kernel()
 def _signed(solid, inside, outside, distance):  # type: ignore[no-untyped-def]
     for i in range(solid.shape[0]):
         for j in range(solid.shape[1]):

@@ -7,8 +7,9 @@ along a line in six steps and from line to line in one.
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
+
+from slatprep.geometry.kernel import kernel
 
 WORD = 64
 """Longest line that fits a word."""
@@ -46,7 +47,7 @@ def outside_of(occupancy: NDArray[np.bool_]) -> NDArray[np.bool_]:
     return outside
 
 
-@njit(cache=True)
+@kernel()
 def _flood(free, ends):  # type: ignore[no-untyped-def]
     """Flood `free` from the grid's faces; sweeps go to and fro until nothing changes."""
     rows, columns = free.shape
@@ -73,7 +74,7 @@ def _flood(free, ends):  # type: ignore[no-untyped-def]
     return flooded
 
 
-@njit(cache=True, inline="always")
+@kernel(inline="always")
 def _along_line(seeds, free):  # type: ignore[no-untyped-def]
     """Spread set bits over adjacent free ones both ways, the step doubling (Kogge and Stone)."""
     up, down = seeds, seeds

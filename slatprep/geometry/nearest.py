@@ -13,10 +13,10 @@ import math
 from functools import lru_cache
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from slatprep.geometry.distance import NOTHING, spread
+from slatprep.geometry.kernel import kernel
 from slatprep.geometry.voxels import flat_index
 from slatprep.records import RESOLUTION
 
@@ -154,7 +154,7 @@ def _cells() -> tuple[NDArray[np.int64], NDArray[np.float64]]:
     return offsets[order][sure].astype(np.int64), floors[order][sure]
 
 
-@njit(cache=True)
+@kernel()
 def _search(position, row, near, offsets, floors, limit):  # type: ignore[no-untyped-def]
     count = position.shape[0]
     size = row.shape[0]
@@ -185,7 +185,7 @@ def _search(position, row, near, offsets, floors, limit):  # type: ignore[no-unt
     return distance, nearest
 
 
-@njit(cache=True)
+@kernel()
 def _columns(row):  # type: ignore[no-untyped-def]
     """For each cell the next voxels of its column (a line along the last axis), and of its slab.
 
@@ -213,7 +213,7 @@ def _columns(row):  # type: ignore[no-untyped-def]
     return below, above, apart
 
 
-@njit(cache=True)
+@kernel()
 def _search_columns(position, row, below, above, apart, limit):  # type: ignore[no-untyped-def]
     """Search slab after slab, column after column, from a point's own to both sides."""
     count, end = position.shape[0], row.shape[0] - 1
@@ -275,7 +275,7 @@ def _alike_around(voxels: NDArray[np.uint8], labels: NDArray[np.uint8]) -> NDArr
     return np.ascontiguousarray(low == high)
 
 
-@njit(cache=True)
+@kernel()
 def _vote(  # type: ignore[no-untyped-def]
     position, row, labels, alike, distance, index, n_labels, steepness
 ):

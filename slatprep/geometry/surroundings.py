@@ -5,9 +5,9 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from slatprep.geometry.kernel import kernel
 from slatprep.records import RESOLUTION
 
 DIRECTIONS = 14
@@ -72,7 +72,7 @@ def _directions() -> list[NDArray[np.float64]]:
     return axes + [diagonal / math.sqrt(3.0) for diagonal in signs]
 
 
-@njit(cache=True)
+@kernel()
 def _look(cells, points, labels, steps, side, margin, empty, others, solid):  # type: ignore[no-untyped-def]
     half = 0.5 * (RESOLUTION - 1)
     low, high = margin // 2, side - 1 - margin // 2

@@ -14,11 +14,19 @@ import numpy as np
 
 from slatprep.align import align
 from slatprep.align.deformation import map_of
+from slatprep.geometry.kernel import KEPT
 from slatprep.geometry.voxels import voxels_of
 from slatprep.judge import judge
 from slatprep.parameters import AlignParameters, SampleParameters
 from slatprep.records import RESOLUTION, MaterialField, StructuredLatents
 from slatprep.sample import sample
+
+WHEN = (
+    "once after installing"
+    if KEPT
+    else "in each process, as no cache folder can be written to (NUMBA_CACHE_DIR names one)"
+)
+"""When kernels are compiled, for the user."""
 
 
 def compile_kernels(note: Callable[[str], None] | None = None) -> None:
@@ -37,7 +45,7 @@ def compile_kernels(note: Callable[[str], None] | None = None) -> None:
 
         def on_start(self, event: Any) -> None:
             if note and not self.told:
-                note("compiling the numerical kernels, once after installing: 20 to 40 s")
+                note(f"compiling the numerical kernels, {WHEN}: 20 to 40 s")
             self.told = True
 
         def on_end(self, event: Any) -> None:

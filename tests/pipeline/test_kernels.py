@@ -82,6 +82,31 @@ def test_a_build_compiles_nothing_that_was_not_compiled_before_it(tmp_path: Path
     assert done.returncode == 0, done.stderr
 
 
+# Root may write anywhere, so Numba is left the one folder that cannot be made.
+NOWHERE = {"NUMBA_CACHE_LOCATOR_CLASSES": "UserWideCacheLocator", "XDG_CACHE_HOME": os.devnull}
+
+UNKEPT = """
+import numpy as np
+import slatprep.align.deform_solver, slatprep.align.solver
+from slatprep.geometry.fill import outside_of
+from slatprep.pipeline import kernels
+
+shell = np.ones((3, 3, 3), dtype=bool)
+shell[1, 1, 1] = False
+assert not outside_of(shell).any()
+assert outside_of(np.zeros((2, 2, 2), dtype=bool)).all()
+assert "NUMBA_CACHE_DIR" in kernels.WHEN
+"""
+
+
+def test_where_no_folder_can_be_written_to_kernels_are_compiled_anew() -> None:
+    done = subprocess.run(
+        [sys.executable, "-c", UNKEPT],
+        capture_output=True, text=True, check=False, env=os.environ | NOWHERE,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+
+
 def test_jobs_are_no_more_than_there_is_work_for() -> None:
     assert [at_most(assets // 20, 8) for assets in (0, 19, 40, 159, 1000)] == [1, 1, 2, 7, 8]
     cluster = object()
