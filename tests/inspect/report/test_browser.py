@@ -266,3 +266,20 @@ def test_light_and_dark(browser: Chrome, hostile: Report, theme: str, other: str
     click(browser, "#theme")
     assert browser.execute_script(ground) == here
     assert_quiet(browser)
+
+
+def test_a_phone_shows_whole_headings_and_numbers(browser: Chrome, hostile: Report) -> None:
+    phone = {"width": 390, "height": 844, "deviceScaleFactor": 2, "mobile": True}
+    browser.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", phone)
+    try:
+        open_page(browser, hostile)
+        widths = """const shown = (cell) => cell.clientWidth && cell.textContent;
+            return [...document.querySelectorAll("thead button, td.right")].filter(shown)
+            .map((cell) => [cell.textContent, cell.scrollWidth <= cell.clientWidth])"""
+        fits = browser.execute_script(widths)
+        assert {"Asset", "State", "Confidence"} <= {text for text, _ in fits}
+        assert [text for text, whole in fits if not whole] == []
+        page = "return document.documentElement.scrollWidth - innerWidth"
+        assert browser.execute_script(page) == 0
+    finally:
+        browser.execute_cdp_cmd("Emulation.clearDeviceMetricsOverride", {})

@@ -13,7 +13,7 @@ const Table = (() => {
     { key: "model", title: "Model", width: 112, value: (i) => ASSETS.model[i], text: (i) => ASSETS.model[i] ?? Format.NONE, wide: true },
     { key: "confidence", title: "Confidence", width: 118, ...number("confidence", 3) },
     { key: "expected_accuracy", title: "Labels", width: 84, ...share("expected_accuracy"), wide: true },
-    { key: "fitness", title: "Fitness", width: 88, ...number("fitness", 3) },
+    { key: "fitness", title: "Fitness", width: 88, ...number("fitness", 3), wide: true },
     { key: "fitness_backward", title: "Back", width: 74, ...number("fitness_backward", 3), wide: true },
     { key: "inlier_rmse", title: "rmse", width: 76, ...number("inlier_rmse", 3), wide: true },
     { key: "valid_share", title: "Valid", width: 82, ...share("valid_share"), wide: true },
