@@ -22,17 +22,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slatprep.align.deform import CLEAN, Deformed, deform_if_earned, try_out
+from slatprep.align.ground import find_ground, is_ground
 from slatprep.align.pose import Pose
 from slatprep.align.quality import compare
 from slatprep.align.starts import candidates_of, distinct_starts, so3_starts
 from slatprep.align.surface import Surface, surface_of
 from slatprep.align.warp import places_of
 from slatprep.geometry.frames import VOXEL_SIZE, split_transform
-from slatprep.geometry.voxels import occupancy_of
+from slatprep.geometry.voxels import above, occupancy_of
 from slatprep.parameters import AlignParameters
 from slatprep.records import (
     Alignment,
     Engine,
+    Ground,
     MaterialField,
     Model,
     Placement,
@@ -60,6 +62,9 @@ DISTINCT = 1.5
 POOR, FAIR, CLEAR = 0.8, 0.9, 0.1
 """All orientations are searched if the best score from the 24 starts is poor, or if it is
 no better than fair and not clearly above that of the next distinct placement."""
+
+HOPELESS = 0.2
+"""Sides whose best score is lower have no shape in common, be there ground or not."""
 
 SO3_STARTS, SO3_HALFWAY, SO3_KEPT = 240, 4, 80
 """Starts over all orientations, and how many of them are refined further after so many steps.
@@ -99,7 +104,17 @@ def align(
 ) -> Alignment:
     """Align by distance fields; see `slatprep.align.align`."""
     pair = _pair_of(field, latents, parameters)
+    found = _search(pair)
+    ground = find_ground(pair.pixie) if HOPELESS < found.score < POOR else None
+    if ground is None:
+        return found
+    pixie = surface_of(above(field.occupancy, ground))
+    without = _search(_Pair(pair.slat, pixie, parameters))
+    return replace(without, ground=ground) if is_ground(without, found) else found
 
+
+def _search(pair: _Pair) -> Alignment:
+    parameters = pair.parameters
     starts = distinct_starts()
     fits = pair.refine(
         pair.poses((s.rotation for s in starts), pair.size_ratio), COARSE_SAMPLES, COARSE_TAUS, 0.02
@@ -151,7 +166,7 @@ def refined_at(
     parameters: AlignParameters,
 ) -> Alignment:
     """Finish an alignment's placement as `align` finishes the best one; see `settle.refit`."""
-    pair = _pair_of(field, latents, parameters)
+    pair = _pair_of(field, latents, parameters, alignment.ground)
     rotation, shift, scale = split_transform(alignment.transform)
     start = Pose(rotation, shift / VOXEL_SIZE, scale)
     (best,), deformed = pair.finish([start], rough=alignment.score < CLEAN)
@@ -187,10 +202,13 @@ def _apart_from_all(places: NDArray[np.float64], others: Iterable[NDArray[np.flo
 
 
 def _pair_of(
-    field: MaterialField, latents: StructuredLatents, parameters: AlignParameters
+    field: MaterialField,
+    latents: StructuredLatents,
+    parameters: AlignParameters,
+    ground: Ground | None = None,
 ) -> _Pair:
     slat = surface_of(occupancy_of(latents.coords, latents.resolution))
-    return _Pair(slat, surface_of(field.occupancy), parameters)
+    return _Pair(slat, surface_of(above(field.occupancy, ground)), parameters)
 
 
 class _Pair:

@@ -11,12 +11,16 @@ from slatprep.geometry.frames import (
     split_transform,
     voxel_centres,
 )
-from slatprep.geometry.voxels import occupancy_of, outer_boundary
-from slatprep.records import MaterialField, Quality, StructuredLatents
+from slatprep.geometry.voxels import above, occupancy_of, outer_boundary
+from slatprep.records import Ground, MaterialField, Quality, StructuredLatents
 
 
 def measure_quality(
-    field: MaterialField, latents: StructuredLatents, transform: ArrayLike, radius: float
+    field: MaterialField,
+    latents: StructuredLatents,
+    transform: ArrayLike,
+    radius: float,
+    ground: Ground | None = None,
 ) -> Quality:
     """Measure how well the outer surfaces of the two sides lie on each other.
 
@@ -28,6 +32,8 @@ def measure_quality(
         PixieVerse frame to SLAT frame.
     radius : float
         Voxels of the SLAT frame; partners farther apart are no inliers.
+    ground : Ground, optional
+        What of the PixieVerse side does not count.
 
     Returns
     -------
@@ -35,7 +41,7 @@ def measure_quality(
         See `compare`.
     """
     return compare(
-        outer_boundary(field.occupancy),
+        outer_boundary(above(field.occupancy, ground)),
         outer_boundary(occupancy_of(latents.coords, latents.resolution)),
         transform,
         radius,

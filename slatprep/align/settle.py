@@ -89,7 +89,9 @@ def refit(
         placement = Placement(alignment.transform, alignment.score, 0.0)
         others = _apart_from(placement, alignment.placements, latents)
         alignment = replace(alignment, placements=others)
-    quality = measure_quality(field, latents, alignment.transform, parameters.radius)
+    quality = measure_quality(
+        field, latents, alignment.transform, parameters.radius, alignment.ground
+    )
     return replace(alignment, quality=quality)
 
 

@@ -80,14 +80,14 @@ class Surface:
             # Laid out in memory as a choice is, or the kernels are compiled once more.
             return replace(self, points=np.ascontiguousarray(self.points))
         # In order, so each is compared with the one before it: numpy.unique would sort once more.
-        chosen = (_fractions(count, first) * len(self.points)).astype(np.intp)
+        chosen = (even_fractions(count, first) * len(self.points)).astype(np.intp)
         chosen = chosen[np.diff(chosen, prepend=-1) > 0]
         return replace(self, points=self.points[chosen], values=self.values[chosen])
 
 
 @lru_cache(maxsize=16)
-def _fractions(count: int, first: int) -> NDArray[np.float64]:
-    """Return so many fractions of 1, even and in order, for `Surface.subset`."""
+def even_fractions(count: int, first: int) -> NDArray[np.float64]:
+    """Return so many fractions of 1, even and in order, the numbers from `first` on."""
     # Multiples of the golden ratio fill an interval evenly without the
     # regular steps that would beat with the lattice.
     return np.sort((np.arange(first, first + count) * 0.618033988749895) % 1.0)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from slatprep.records import RESOLUTION
+from slatprep.records import RESOLUTION, Ground
 
 
 def boundary(occupancy: NDArray[np.bool_]) -> NDArray[np.bool_]:
@@ -75,6 +75,32 @@ def filled(occupancy: NDArray[np.bool_]) -> NDArray[np.bool_]:
     from slatprep.geometry.fill import outside_of
 
     return ~outside_of(occupancy)
+
+
+def above(occupancy: NDArray[np.bool_], ground: Ground | None) -> NDArray[np.bool_]:
+    """Return a voxel set without the ground.
+
+    It is filled first, as what is hollow would be open where it stood on the ground.
+
+    Parameters
+    ----------
+    occupancy : ndarray of bool, shape (64, 64, 64)
+        Occupied voxels of the PixieVerse frame.
+    ground : Ground or None
+        From an alignment.
+
+    Returns
+    -------
+    ndarray of bool, shape (64, 64, 64)
+        The filled set's voxels whose centres are above the ground; `occupancy` where there is none.
+    """
+    if ground is None:
+        return occupancy
+    centres = (np.arange(RESOLUTION) + 0.5) / RESOLUTION - 0.5
+    x, y, z = ground.normal[:, None] * centres
+    heights = x[:, None, None] + y[:, None] + z
+    higher: NDArray[np.bool_] = filled(occupancy) & (heights > ground.height)
+    return higher
 
 
 def voxels_of(occupancy: NDArray[np.bool_]) -> NDArray[np.uint8]:

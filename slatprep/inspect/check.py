@@ -166,7 +166,8 @@ def check_alignment(store: Store, asset_id: str) -> AlignmentCheck:
     asset = store.asset(asset_id)
     radius = store.about.build.parameters.align.radius
     valid_share, differs = recompute_annotation(asset)
-    quality = measure_quality(asset.field, asset.latents, asset.transform, radius)
+    alignment = StoredRecords(store).of(asset_id).alignment
+    quality = measure_quality(asset.field, asset.latents, asset.transform, radius, alignment.ground)
     columns = asset.columns
     ambiguity, margin = float(columns["ambiguity"]), float(columns["margin"])
     confidence, expected = float(columns["confidence"]), float(columns["expected_accuracy"])
@@ -177,7 +178,7 @@ def check_alignment(store: Store, asset_id: str) -> AlignmentCheck:
         quality,
         valid_share,
         ambiguity,
-        len(StoredRecords(store).of(asset_id).alignment.open_placements),
+        len(alignment.open_placements),
         # The confidence was computed for the stored fit and holds for no other.
         confidence=confidence if same_fit else math.nan,
         expected_accuracy=expected,

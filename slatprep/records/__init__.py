@@ -16,6 +16,7 @@ from slatprep.records.alignment import (
     Consensus,
     Deformation,
     FitFigures,
+    Ground,
     Judgement,
     LatentChoice,
     Placement,

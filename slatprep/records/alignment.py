@@ -243,6 +243,22 @@ class FitFigures:
 
 
 @dataclass(frozen=True, eq=False)
+class Ground:
+    """Ground that an annotated object stands on: what has no more than a height along a normal.
+
+    Attributes
+    ----------
+    normal : ndarray of float64, shape (3,)
+        Unit vector of the PixieVerse frame, from the ground to the object.
+    height : float
+        Of the ground's top along the normal, from the frame's centre, in edges of the unit cube.
+    """
+
+    normal: Point
+    height: float
+
+
+@dataclass(frozen=True, eq=False)
 class Alignment:
     """The transform from the PixieVerse frame to the SLAT frame, and how it was found.
 
@@ -276,6 +292,8 @@ class Alignment:
         frame to the PixieVerse frame; None where the model is ``rigid`` or ``similarity``.
     figures : FitFigures or None
         What the engine measured of its fit; None where it measures nothing.
+    ground : Ground or None
+        What of the annotation was not compared with the SLAT; None where all was.
     """
 
     transform: Transform
@@ -290,6 +308,7 @@ class Alignment:
     settled_by: Consensus | LatentChoice | None = None
     deformation: Deformation | None = None
     figures: FitFigures | None = None
+    ground: Ground | None = None
 
     @property
     def open_placements(self) -> tuple[Placement, ...]:

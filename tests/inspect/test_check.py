@@ -4,11 +4,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 import zarr
-from support.synthetic import QUARTER_TURN
+from support.synthetic import QUARTER_TURN, Dataset
 
 from slatprep.errors import StoreError
 from slatprep.inspect.check import AlignmentCheck, check_alignment
-from slatprep.pipeline.dataset import BuildSummary
+from slatprep.pipeline.dataset import BuildSummary, build_store
+from slatprep.provenance.stored import StoredRecords
 from slatprep.records import Verdict
 from slatprep.store import open_store
 
@@ -82,3 +83,19 @@ def test_a_changed_verdict_is_found(copy: Path) -> None:
 def test_an_unknown_asset_is_refused(mixed_build: BuildSummary) -> None:
     with pytest.raises(StoreError, match="no asset"):
         check_alignment(open_store(mixed_build.store), "nobody")
+
+
+def test_ground_does_not_count_now_either(tmp_path: Path) -> None:
+    dataset = Dataset(tmp_path)
+    dataset.add("ant", seed=0)
+    grid = dataset.assets["ant"].grid
+    grid[:, :, 23:26] = grid[20, 22, 26]
+    dataset.write_grid("ant", grid)
+    build_store(dataset.parameters(), tmp_path / "store.zarr")
+    store = open_store(tmp_path / "store.zarr")
+    check = check_alignment(store, "ant")
+    assert check.ok, (check.reasons, wrong(check))
+    assert check.value("fitness") > 0.9
+    ground = StoredRecords(store).of("ant").alignment.ground
+    assert ground is not None
+    np.testing.assert_allclose(ground.normal, [0, 0, 1], atol=0.01)

@@ -1,0 +1,135 @@
+"""Ground under an object: a flat layer at one end of an annotation that a SLAT never has.
+
+A NeRF's field may hold the object on a piece of the floor, as wide as the grid. Then the
+sizes and the centroids of the two sides say nothing of each other, and the surface of the
+floor outweighs that of the object.
+"""
+
+from __future__ import annotations
+
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import NDArray
+
+from slatprep.align.deformation import GRAIN
+from slatprep.align.surface import DILATION, Surface, even_fractions
+from slatprep.geometry.frames import VOXEL_SIZE
+from slatprep.records import Alignment, Ground
+
+Array = NDArray[np.float64]
+
+DIRECTIONS, SAMPLES, VOXELS = 250, 500, 10_000
+"""Directions in which a layer is looked for, samples of the surface that are looked at there, and
+voxels of the solid from which its top is taken."""
+
+ENDS, END = 3, 6.0
+"""So many ends of the annotation are looked at: those with most samples within so many voxels."""
+
+BLOBS = 0.02
+"""Share of the samples that may lie below the ground."""
+
+NARROWINGS = 6
+"""How often the plane of a layer is fitted to the samples near the one before."""
+
+HALF_LAYER = 3.5
+"""Samples so near the middle of a layer, in voxels, belong to it."""
+
+LEAST_FACE = 0.08
+"""A layer is looked at whose face is this share of the annotation's surface, both sides counted."""
+
+LEAST_GAIN, MOST_LOST = 0.05, 0.08
+"""A layer is ground if without it the scores of search and fit rise by so much together, and
+that of the SLAT's samples falls by less than so much, as it would were the layer the object's."""
+
+
+def find_ground(surface: Surface) -> Ground | None:
+    """Find the widest flat layer at an end of an annotation; it may be part of the object.
+
+    Parameters
+    ----------
+    surface : Surface
+        Of the PixieVerse side.
+
+    Returns
+    -------
+    Ground or None
+        Up to the layer's top; None where no layer has a face of `LEAST_FACE`, or nothing
+        lies above it.
+
+    Notes
+    -----
+    The ends with most samples of the surface are looked at. There a plane is
+    fitted, by least squares, to the samples near it, again and again. The
+    layer's top is where most voxels go away from one height to the next, and
+    the face is as large as these are many.
+    """
+    points = surface.subset(SAMPLES).points
+    solid = np.flatnonzero(surface.distance < DILATION)
+    total = len(solid)
+    if total > VOXELS:
+        solid = solid[(even_fractions(VOXELS, 0) * total).astype(np.intp)]
+    inside = np.stack(np.unravel_index(solid, surface.distance.shape), axis=1) + surface.origin
+    found = [_layer(points, inside, end) for end in _ends(points)]
+    normal, top, face = max(found, key=lambda layer: layer[2])
+    share = 2.0 * face * (total / len(solid)) / len(surface.points)
+    if share < LEAST_FACE or not (inside @ normal > top + 1.0).any():
+        return None
+    rounded = np.rint(np.append(normal, top * VOXEL_SIZE) / GRAIN) * GRAIN
+    return Ground(rounded[:3], float(rounded[3]))
+
+
+def is_ground(without: Alignment, found: Alignment) -> bool:
+    """Whether a SLAT fits better without a layer, so that this is no part of the object."""
+    here, there = without.figures, found.figures
+    if here is None or there is None:
+        return False
+    slat = here.score_slat - there.score_slat
+    both = 0.5 * (slat + here.score_pixieverse - there.score_pixieverse)
+    return slat > -MOST_LOST and without.score - found.score + both > LEAST_GAIN
+
+
+@lru_cache(maxsize=1)
+def _directions() -> Array:
+    """Return unit vectors spread evenly over the sphere: a Fibonacci lattice."""
+    k = np.arange(DIRECTIONS) + 0.5
+    z, angle = 1.0 - 2.0 * k / DIRECTIONS, np.pi * (1.0 + 5.0**0.5) * k
+    ring = np.sqrt(1.0 - z * z)
+    return np.stack([ring * np.cos(angle), ring * np.sin(angle), z], axis=1)
+
+
+def _ends(points: Array) -> list[Array]:
+    """Return the directions from the ends with most points to the middle, no two alike."""
+    heights = _directions() @ points.T
+    rank = int(BLOBS * len(points))
+    lowest = np.partition(heights, rank, axis=1)[:, rank]
+    within = (heights < lowest[:, None] + END).sum(axis=1)
+    ends: list[Array] = []
+    for k in np.argsort(-within, kind="stable"):
+        if all(_directions()[k] @ end < 0.9 for end in ends):
+            ends.append(_directions()[k])
+        if len(ends) == ENDS:
+            break
+    return ends
+
+
+def _layer(points: Array, inside: Array, normal: Array) -> tuple[Array, float, float]:
+    """Return the normal of the layer at an end, its top, and how many voxels go away there."""
+    heights = points @ normal
+    middle = float(np.quantile(heights, BLOBS)) + 0.5 * (END - 2.0)
+    reach = 0.5 * (END + 2.0)
+    for _ in range(NARROWINGS):
+        layer = points[np.abs(heights - middle) < reach]
+        if len(layer) < 4:
+            break
+        axis = np.linalg.eigh(np.cov(layer.T))[1][:, 0]
+        normal = axis if axis @ normal > 0 else -axis
+        heights = points @ normal
+        middle, reach = float(np.median(layer @ normal)), HALF_LAYER
+    # Voxels of a height, every half a voxel, and how much fewer there are one above than below.
+    edges = middle + np.arange(-8.0, 9.0, 0.5)
+    halves = np.histogram(inside @ normal, edges)[0].astype(np.float64)
+    slices = halves[:-1] + halves[1:]
+    fewer = 0.5 * (slices[:-4] + slices[1:-3] - slices[3:-1] - slices[4:])
+    at = int(np.argmax(fewer))
+    return normal, float(edges[at + 3]), float(fewer[at])

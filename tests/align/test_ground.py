@@ -1,0 +1,144 @@
+"""Objects on a slab of ground that the SLAT does not have, under maps known by construction."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.ndimage import map_coordinates
+from scipy.spatial.transform import Rotation
+from support.shapes import GRID, chair, field_of, surface_latents
+
+from slatprep.align import align
+from slatprep.align import field as engine
+from slatprep.align.deformation import map_of
+from slatprep.align.ground import find_ground
+from slatprep.align.quality import measure_quality
+from slatprep.align.settle import refit, take
+from slatprep.align.surface import surface_of
+from slatprep.geometry.frames import displacement, make_transform
+from slatprep.geometry.voxels import above
+from slatprep.judge import judge
+from slatprep.parameters import AlignParameters, SampleParameters
+from slatprep.records import Ground, LatentChoice, Placement, Verdict
+from slatprep.sample import sample
+
+DEFAULT = AlignParameters()
+HEIGHTS = GRID[..., 2].astype(float)
+FOOT = 20
+"""The lowest voxels of the chair."""
+
+
+def larger(solid: np.ndarray, scale: float) -> np.ndarray:
+    """Return a solid scaled about the cube's centre."""
+    at = (np.moveaxis(GRID, -1, 0) - 31.5) / scale + 31.5
+    return map_coordinates(solid.astype(float), at, order=1) > 0.5
+
+
+def slab(thickness: float, degrees: float = 0.0, radius: float = np.inf) -> np.ndarray:
+    """Return a slab whose top touches the chair's foot in its middle, tilted about x."""
+    normal = Rotation.from_euler("x", degrees, degrees=True).apply([0.0, 0.0, 1.0])
+    apart = GRID - [29.0, 30.0, FOOT - 0.5]
+    heights = apart @ normal
+    away = np.linalg.norm(apart - heights[..., None] * normal, axis=-1)
+    return (heights < 0) & (heights > -thickness) & (away < radius)
+
+
+@pytest.mark.parametrize(
+    ("thickness", "degrees", "radius", "scale"),
+    [(1.0, 0.0, np.inf, 1.0), (3.0, 0.0, np.inf, 1.35), (3.0, 10.0, np.inf, 1.2), (4, 0, 26, 1.35)],
+)
+def test_an_object_on_ground_is_placed_as_without(
+    thickness: float, degrees: float, radius: float, scale: float
+) -> None:
+    latents = surface_latents(larger(chair(), scale))
+    field = field_of(chair() | slab(thickness, degrees, radius))
+    found = align(field, latents, DEFAULT)
+    true = make_transform(np.eye(3), scale=scale)
+    assert displacement(found.transform, true, latents.centres) < 1.5
+    assert found.ground is not None
+    normal = Rotation.from_euler("x", degrees, degrees=True).apply([0.0, 0.0, 1.0])
+    assert np.degrees(np.arccos(found.ground.normal @ normal)) < 1.5
+    annotation = sample(field, map_of(found).places(latents.coords), SampleParameters())
+    judgement, _ = judge(field, latents, found, annotation, SampleParameters())
+    assert judgement.verdict is Verdict.GOOD
+
+
+def test_the_top_of_a_slab_is_found() -> None:
+    ground = find_ground(surface_of(chair() | slab(3.0)))
+    assert ground is not None
+    np.testing.assert_allclose(ground.normal, [0, 0, 1], atol=0.01)
+    # The slab's highest voxels have the index FOOT - 1; centres are half a voxel off.
+    assert ground.height * 64 + 31.5 == pytest.approx(FOOT - 0.5, abs=0.75)
+
+
+def test_a_flat_part_that_both_sides_have_is_no_ground() -> None:
+    """Where the SLAT shows the layer too, it is the object's, however badly the rest fits."""
+    solid = chair() | slab(3.0)
+    latents = surface_latents(solid)
+    blobs = np.zeros_like(solid)
+    for centre in np.random.default_rng(3).integers([4, 4, FOOT + 4], 60, (60, 3)):
+        blobs |= ((GRID - centre) ** 2).sum(axis=-1) < 16
+    found = align(field_of(solid | blobs), latents, DEFAULT)
+    assert found.score < engine.POOR
+    assert find_ground(surface_of(solid | blobs)) is not None
+    assert found.ground is None
+    assert displacement(found.transform, np.eye(4), latents.centres) < 2.0
+
+
+def test_where_the_sides_fit_no_ground_is_looked_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    def looked(_: object) -> None:
+        raise AssertionError("looked for ground")
+
+    monkeypatch.setattr(engine, "find_ground", looked)
+    found = align(field_of(chair()), surface_latents(chair()), DEFAULT)
+    assert found.ground is None
+
+
+def test_a_ball_has_no_layer() -> None:
+    assert find_ground(surface_of(((GRID - 31.5) ** 2).sum(axis=-1) < 400)) is None
+
+
+def test_nothing_but_a_slab_is_no_ground() -> None:
+    assert find_ground(surface_of(slab(3.0))) is None
+
+
+@pytest.mark.parametrize("count", [1, 2, 5])
+def test_a_few_voxels_have_no_ground(count: int) -> None:
+    few = np.zeros((64, 64, 64), dtype=bool)
+    few[10, 20, 30 : 30 + count] = True
+    assert find_ground(surface_of(few)) is None
+
+
+def test_quality_does_not_count_the_ground() -> None:
+    field, latents = field_of(chair() | slab(3.0)), surface_latents(chair())
+    found = align(field, latents, DEFAULT)
+    assert found.quality.fitness > 0.9
+    assert found.quality == measure_quality(field, latents, found.transform, 1.0, found.ground)
+    assert measure_quality(field, latents, found.transform, 1.0).fitness < 0.5
+
+
+def test_a_hollow_object_stays_closed_without_its_ground() -> None:
+    bell = np.zeros((64, 64, 64), dtype=bool)
+    bell[20:40, 20:40, 20:44] = True
+    solid = bell.copy()
+    bell[23:37, 23:37, 20:41] = False
+    ground = Ground(np.array([0.0, 0.0, 1.0]), (FOOT - 0.5 - 31.5) / 64)
+    np.testing.assert_array_equal(above(bell | slab(3.0), ground), solid)
+    np.testing.assert_array_equal(above(bell, None), bell)
+
+
+def test_a_placement_that_is_taken_is_fitted_without_the_ground() -> None:
+    field, latents = field_of(chair() | slab(3.0)), surface_latents(larger(chair(), 1.2))
+    found = align(field, latents, DEFAULT)
+    elsewhere = make_transform(Rotation.from_euler("x", 180, degrees=True).as_matrix())
+    other = replace(
+        found, transform=elsewhere, placements=(Placement(found.transform, found.score, 20.0),)
+    )
+    settled = refit(
+        take(other, 0, latents, LatentChoice(0.99, 12.0, 300, 40, 40)), field, latents, DEFAULT
+    )
+    assert settled.ground is found.ground
+    assert displacement(settled.transform, found.transform, latents.centres) < 0.2
+    assert settled.quality.fitness == pytest.approx(found.quality.fitness, abs=0.01)
