@@ -106,7 +106,7 @@ class Faults:
 
 class _Handler(BaseHTTPRequestHandler):
     protocol_version = "HTTP/1.1"
-    wbufsize = -1  # Head and body in one packet: a second one waits 40 ms for the first's ACK.
+    disable_nagle_algorithm = True  # A body would wait 40 ms for the ACK of its head.
     server: _Server
 
     def handle_one_request(self) -> None:
