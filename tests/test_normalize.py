@@ -16,12 +16,14 @@ from slatprep.normalize import (
     PIXIE_RANGES,
     change_ranges,
     denormalize_properties,
+    from_mapped,
     normalize_and_count,
     normalize_change,
     normalize_mapped,
     normalize_properties,
     property_extent,
     ranges_from_extents,
+    to_mapped,
 )
 from slatprep.readers.ranges import read_ranges
 from slatprep.records import MaterialField, Normalization, PropertyRange
@@ -57,6 +59,16 @@ def test_mapped_values_by_hand_are_not_clipped() -> None:
     # 13 lies a decade above 4..12, an eighth of its width: 1 + 2 / 8.
     values = normalize_mapped([[6.0, 3.0, 0.35], [13.0, 1.0, 0.5]], DECADES)
     np.testing.assert_allclose(values, [[-0.5, 0.0, 0.5], [1.25, -2.0, 2.0]], atol=1e-12)
+
+
+def test_properties_are_mapped_and_brought_back_by_hand() -> None:
+    properties = [[1e6, 1e3, 0.35], [2e11, 7850.0, 0.28]]
+    mapped = to_mapped(properties)
+    by_hand = [[6.0, 3.0, 0.35], [11 + np.log10(2), np.log10(7850), 0.28]]
+    np.testing.assert_allclose(mapped, by_hand, rtol=1e-12)
+    back = from_mapped(mapped)
+    np.testing.assert_allclose(back, properties, rtol=1e-6)
+    assert back.dtype == np.float32
 
 
 def test_values_of_other_ranges_by_hand_are_not_clipped() -> None:

@@ -17,6 +17,7 @@ from slatprep.geometry.frames import (
     displacement,
     invert_transform,
     make_transform,
+    nearest_similarity,
     split_transform,
     voxel_centres,
 )
@@ -43,6 +44,13 @@ def test_the_first_and_last_voxel_lie_half_a_voxel_inside_the_cube() -> None:
         centres,
         [[-0.5 + half] * 3, [0.5 - half] * 3, [-half, half, -0.5 + half]],
     )
+
+
+def test_a_transform_turns_and_scales_before_it_shifts() -> None:
+    # A quarter turn about z takes x to y, and y to -x.
+    turn = [[0, -1, 0], [1, 0, 0], [0, 0, 1]]
+    moved = apply_transform(make_transform(turn, (10, 20, 30), 2.0), [[1, 2, 3]])
+    assert moved.tolist() == [[10 - 4, 20 + 2, 30 + 6]]
 
 
 @given(poses)
@@ -73,6 +81,24 @@ def test_splitting_and_making_are_inverse(transform: np.ndarray) -> None:
 def test_what_is_no_similarity_is_refused(matrix: np.ndarray) -> None:
     with pytest.raises(ValueError, match="a transform"):
         split_transform(matrix)
+
+
+@given(poses)
+def test_the_nearest_similarity_of_points_that_one_has_moved_is_that(transform: np.ndarray) -> None:
+    points = np.random.default_rng(0).normal((3.0, -1.0, 2.0), size=(50, 3))
+    found = nearest_similarity(points, apply_transform(transform, points))
+    np.testing.assert_allclose(found, transform, atol=1e-9)
+    np.testing.assert_array_equal(found[3], [0, 0, 0, 1])
+
+
+def test_of_mirrored_points_the_nearest_similarity_is_no_mirror() -> None:
+    """Of a cloud of the widths 3, 2 and 1 it is the half turn that leaves the widest two right."""
+    points = np.array(
+        [one for width in (3, 2, 1) for one in np.eye(3)[3 - width] * [[width], [-width]]]
+    )
+    found = nearest_similarity(points, -points)
+    scale = (3**2 + 2**2 - 1**2) / (3**2 + 2**2 + 1**2)
+    np.testing.assert_allclose(found[:3, :3], scale * np.diag([-1.0, -1.0, 1.0]), atol=1e-12)
 
 
 def test_the_boundary_of_a_box_by_counting() -> None:
