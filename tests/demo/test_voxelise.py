@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from slatprep.demo.voxelise import voxelise
@@ -37,6 +37,7 @@ def test_plane_meets_the_cubes_whose_corners_it_parts(normal, offset):
     centre=st.tuples(*[st.floats(-0.2, 0.2)] * 3),
     radius=st.floats(0.03, 0.3),
 )
+@example(centre=(0.0, 0.0, 0.1640625), radius=0.0625)
 def test_sphere_meets_the_cubes_between_nearest_and_farthest_point(centre, radius):
     surface, filled = voxelise(lambda p: np.linalg.norm(p - centre, axis=1) - radius)
     away = np.abs(CENTRES - centre)
@@ -48,7 +49,9 @@ def test_sphere_meets_the_cubes_between_nearest_and_farthest_point(centre, radiu
     depth = np.minimum(radius - nearest, farthest - radius).reshape(surface.shape)
     missed = met & ~surface
     assert np.all(depth[missed] < HALF / 5)
-    assert missed.sum() <= 0.01 * met.sum() + 2
+    # On an axis of the grid it misses with a cube the seven that mirrors make of it, too.
+    images = 8 if sum(c == 0 for c in centre) >= 2 else 2
+    assert missed.sum() <= 0.01 * met.sum() + images
     solid = (nearest <= radius).reshape(surface.shape)
     assert not np.any(filled & ~solid)
     assert np.array_equal(filled ^ solid, missed & solid & ~filled)
