@@ -167,12 +167,12 @@ def _align_blind(
     rotation, shift, scale = split_transform(truth.transform)
     right = engine.Pose(rotation, shift / VOXEL_SIZE, scale)
 
-    class Blind(engine._Pair):
+    class Blind(engine.Pair):
         def distinct(self, poses: Any) -> Any:
             far = self.apart(poses, right) >= HIDDEN
             return super().distinct([pose for pose, ok in zip(poses, far, strict=True) if ok])
 
-    with patch.object(engine, "_Pair", Blind):
+    with patch.object(engine, "Pair", Blind):
         try:
             return engine.align(field, latents, AlignParameters())
         except (IndexError, ValueError):  # Nothing survives that is not right.

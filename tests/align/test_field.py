@@ -17,7 +17,7 @@ from support.shapes import GRID, Case, chair, field_of, latents_of, surface_late
 
 from slatprep.align import align, engine_versions, solver
 from slatprep.align.deformation import map_of
-from slatprep.align.field import FINE_SAMPLES
+from slatprep.align.pair import FINE_SAMPLES
 from slatprep.align.starts import distinct_starts
 from slatprep.geometry.frames import displacement, make_transform, split_transform
 from slatprep.geometry.voxels import boundary, voxels_of
