@@ -25,8 +25,9 @@ import tomllib
 from pathlib import Path
 from urllib.parse import urlsplit
 
+import checkout
 import fsspec
-from remote_read import SERVER
+from support import object_store
 
 
 class Counter:
@@ -69,9 +70,9 @@ def main() -> None:
     parser.add_argument("--workers", type=int, default=2)
     arguments = parser.parse_args()
     started: list[subprocess.Popen[str]] = []
-    with tempfile.TemporaryDirectory() as folder:
+    with tempfile.TemporaryDirectory() as folder, object_store.running() as address:
         try:
-            measure(arguments.dataset, arguments.workers, Path(folder), started)
+            measure(arguments.dataset, arguments.workers, Path(folder), address, started)
         finally:
             for process in reversed(started):
                 if process.poll() is None:
@@ -80,7 +81,7 @@ def main() -> None:
 
 
 def measure(
-    dataset: Path, workers: int, folder: Path, started: list[subprocess.Popen[str]]
+    dataset: Path, workers: int, folder: Path, s3: str, started: list[subprocess.Popen[str]]
 ) -> None:
     def start(*command: str, **variables: str) -> subprocess.Popen[str]:
         pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE}
@@ -93,8 +94,7 @@ def measure(
         started.append(process)
         return process
 
-    s3 = str(start("-c", SERVER).stdout.readline().strip())  # type: ignore[union-attr]
-    os.environ |= {"AWS_ACCESS_KEY_ID": "key", "AWS_SECRET_ACCESS_KEY": "secret"}
+    os.environ |= object_store.environment(s3)
     of_command, of_workers = Counter(s3), Counter(s3)
     system = fsspec.filesystem("s3", client_kwargs={"endpoint_url": s3})
     system.mkdir("bench")
@@ -154,6 +154,8 @@ def put_sources(system: fsspec.AbstractFileSystem, dataset: Path, folder: Path) 
     definition.write_text("\n".join(lines) + "\n")
     return definition
 
+
+assert checkout.ROOT  # Importing it made the tests' server known.
 
 if __name__ == "__main__":
     main()

@@ -1,23 +1,26 @@
-"""Reading whole assets at random from S3, by slatprep and by what one would do without it.
+"""Reading whole assets in shuffled order, by slatprep and by what one would do without it.
 
     python benchmarks/remote_ways.py STORE [--latency 0.02] [--assets 60]
 
-A server on loopback answers requests for objects as S3 does, each after the latency; nothing
-limits the bandwidth. Every way reads coords, feats and properties of the same assets in the same
-shuffled order, from one, two and four processes at a time, each with its part of them. Prints
-milliseconds an asset and process, best of the repeats, after one asset that opens what has to be
-opened, and requests an asset.
+From this machine's disk, as the system remembers it, and from S3: a server on loopback answers
+requests for objects as S3 does, each after the latency; nothing limits the bandwidth. Every way
+reads coords, feats and properties of the same assets in the same shuffled order, from one, two and
+four processes at a time, each with its part of them; WebDataset, which reads its shards from end
+to end, in the order that it shuffles itself. Prints milliseconds an asset and process, best of the
+repeats, after one asset that opens what has to be opened, and requests an asset.
 """
 
 from __future__ import annotations
 
 import argparse
+import hashlib
 import io
 import json
 import multiprocessing
 import os
 import subprocess
 import sys
+import tarfile
 import tempfile
 import time
 import urllib.request
@@ -30,6 +33,7 @@ import checkout
 import numpy as np
 from support import object_store
 
+from slatprep.bench import read as local
 from slatprep.bench.read import write_forms
 from slatprep.store import open_store
 from slatprep.store.reader import TRAINING_COLUMNS
@@ -139,13 +143,53 @@ def by_hdf5(_: str) -> Reader:
     return read
 
 
+def by_webdataset(address: str, assets: int) -> Reader:
+    """Return what reads the next asset, whichever was asked for."""
+    import webdataset
+    from webdataset.gopen import gopen_schemes
+
+    gopen_schemes["http"] = lambda url, mode, bufsize: urllib.request.urlopen(url)
+    shards = [f"{address}/tars/{number}.tar" for number in range(-(-assets // IN_TAR))]
+    stream = iter(
+        webdataset.WebDataset(shards, shardshuffle=len(shards), empty_check=False, seed=0)
+        .shuffle(2 * IN_TAR)
+        .repeat()
+    )
+
+    def read(_: int) -> dict[str, Any]:
+        with np.load(io.BytesIO(next(stream)["npz"])) as file:
+            return {name: file[name] for name in TRAINING_COLUMNS}
+
+    return read
+
+
+def write_tars(folder: Path, assets: int) -> None:
+    (folder / "tars").mkdir()
+    for first in range(0, assets, IN_TAR):
+        with tarfile.open(folder / "tars" / f"{first // IN_TAR}.tar", "w") as tar:
+            for row in range(first, min(first + IN_TAR, assets)):
+                tar.add(folder / "npz" / f"{row}.npz", f"{row}.npz")
+
+
+IN_TAR = 16
+WEBDATASET = "WebDataset"
 WAYS = {
     "slatprep": by_slatprep,
     "tensorstore": by_tensorstore,
     "zarr-python": by_zarr,
-    "npz, one an asset": by_npz,
+    "npz": by_npz,
     "one HDF5 file": by_hdf5,
 }
+
+
+def opened(way: str, address: str, assets: int) -> Reader:
+    """Open what a way reads: below a folder, or at a server."""
+    served = address.startswith("http")
+    if way == WEBDATASET:
+        return by_webdataset(f"{address}/bench" if served else address, assets)
+    if served:
+        return WAYS[way](address)
+    return next(one for one in local.WAYS if one.name == way).open(Path(address))
 
 
 def main() -> None:
@@ -160,23 +204,41 @@ def main() -> None:
         folder = Path(name)
         assets = min(arguments.assets, len(open_store(arguments.store)))
         write_forms(arguments.store, folder, assets)
+        write_tars(folder, assets)
         (folder / "store").symlink_to(arguments.store.resolve())
-        order = np.random.default_rng(0).permutation(assets).tolist()
-        expected = open_store(arguments.store).read(order[0])
+        for way in (*WAYS, WEBDATASET):
+            check(way, name, arguments.store, assets)
+            measured = measure(way, name, arguments, assets)
+            print(json.dumps({"from": "disk", "way": way, **measured}), flush=True)
         with serving(folder, arguments.latency) as address:
-            for way, opened in WAYS.items():
-                row: dict[str, Any] = {"way": way}
-                found, before = opened(address), asked(address)
-                for number in order:
-                    arrays = found(number)
-                    if number == order[0]:
-                        assert all(arrays[k].tobytes() == expected[k].tobytes() for k in expected)
-                row["requests an asset"] = round((asked(address) - before) / assets, 1)
-                for processes in arguments.processes:
-                    times = [at_once(way, address, order, processes)
-                             for _ in range(arguments.repeats)]  # fmt: skip
-                    row[f"{processes} at a time [ms]"] = round(1e3 * min(times), 1)
-                print(json.dumps(row), flush=True)
+            for way in (*WAYS, WEBDATASET):
+                before = asked(address)
+                check(way, address, arguments.store, assets)
+                requests = round((asked(address) - before) / assets, 1)
+                measured = measure(way, address, arguments, assets)
+                told = {"from": "S3", "way": way, **measured, "requests an asset": requests}
+                print(json.dumps(told), flush=True)
+
+
+def check(way: str, address: str, store: Path, assets: int) -> None:
+    """Raise unless a way reads each asset once, with the values that the store has."""
+    read, expected = opened(way, address, assets), open_store(store)
+    every = sorted(digest(read(row)) for row in range(assets))
+    if every != sorted(digest(expected.read(row, TRAINING_COLUMNS)) for row in range(assets)):
+        raise RuntimeError(f"{way} reads other values")
+
+
+def digest(arrays: dict[str, Any]) -> str:
+    return hashlib.sha256(b"".join(arrays[name].tobytes() for name in TRAINING_COLUMNS)).hexdigest()
+
+
+def measure(way: str, address: str, arguments: argparse.Namespace, assets: int) -> dict[str, float]:
+    order = np.random.default_rng(0).permutation(assets).tolist()
+    row = {}
+    for processes in arguments.processes:
+        times = [at_once(way, address, order, processes) for _ in range(arguments.repeats)]
+        row[f"{processes} at a time [ms]"] = round(1e3 * min(times), 2)
+    return row
 
 
 @contextmanager
@@ -202,7 +264,9 @@ def at_once(way: str, address: str, order: list[int], processes: int) -> float:
     context = multiprocessing.get_context("spawn")
     start = context.Barrier(processes + 1)
     parts = [order[number::processes] for number in range(processes)]
-    workers = [context.Process(target=work, args=(way, address, part, start)) for part in parts]
+    workers = [
+        context.Process(target=work, args=(way, address, part, len(order), start)) for part in parts
+    ]
     for worker in workers:
         worker.start()
     start.wait(120)
@@ -215,8 +279,8 @@ def at_once(way: str, address: str, order: list[int], processes: int) -> float:
     return seconds / (len(order) / processes)
 
 
-def work(way: str, address: str, order: list[int], start: Any) -> None:
-    read = WAYS[way](address)
+def work(way: str, address: str, order: list[int], assets: int, start: Any) -> None:
+    read = opened(way, address, assets)
     read(order[-1])
     start.wait(120)
     for row in order:

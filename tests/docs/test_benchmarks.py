@@ -1,7 +1,8 @@
-"""What `make bench` lists can be run: every script that it names is there."""
+"""What `make bench` lists can be run: every script is there, with what others import of it."""
 
 from __future__ import annotations
 
+import ast
 import importlib.util
 import sys
 from pathlib import Path
@@ -24,3 +25,30 @@ def test_every_measurement_names_a_script_and_a_page_that_are_there(
         program, script, *_ = one.command.split()
         assert program == "slatprep" or (ROOT / script).is_file(), one.name
         assert (ROOT / "docs" / f"{one.page}.md").is_file(), one.name
+
+
+def test_what_scripts_import_of_each_other_and_of_the_tests_is_there() -> None:
+    """Read, not run: a script takes seconds to start, and there are two dozen."""
+    folders = {"": ROOT / "benchmarks", "support": ROOT / "tests" / "support"}
+    names = {
+        (package, file.stem): {
+            name.id if isinstance(name, ast.Name) else getattr(name, "name", "")
+            for node in ast.parse(file.read_text()).body
+            for name in ast.walk(node)
+        }
+        for package, folder in folders.items()
+        for file in folder.glob("*.py")
+    }
+    seen = 0
+    for script in folders[""].glob("*.py"):
+        for node in ast.walk(ast.parse(script.read_text())):
+            if isinstance(node, ast.ImportFrom) and not node.level:
+                package, _, module = str(node.module).rpartition(".")
+                for alias in node.names:
+                    if (package, module) in names:
+                        assert alias.name in names[package, module], f"{script.name}: {alias.name}"
+                        seen += 1
+                    elif module in folders:
+                        assert (module, alias.name) in names, f"{script.name}: {alias.name}"
+                        seen += 1
+    assert seen > 20
