@@ -65,6 +65,7 @@ def test_help_lists_every_command_and_the_exit_codes() -> None:
     for name in COMMANDS:
         assert re.search(rf"^  {name} +\S", output, re.M), name
     assert re.search(r"0 +all went in", output) and re.search(r"2 +wrong use", output)
+    assert "..." not in output.partition("Commands:")[2].partition("Exit codes:")[0]
 
 
 def modules_of(*words: str | Path) -> tuple[str, str]:
