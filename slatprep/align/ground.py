@@ -7,14 +7,12 @@ floor outweighs that of the object.
 
 from __future__ import annotations
 
-from functools import lru_cache
-
 import numpy as np
 from numpy.typing import NDArray
 
 from slatprep.align.deformation import GRAIN
-from slatprep.align.surface import DILATION, Surface, even_fractions
-from slatprep.geometry.frames import VOXEL_SIZE
+from slatprep.align.surface import DILATION, Surface, even_choice
+from slatprep.geometry.frames import VOXEL_SIZE, even_directions
 from slatprep.records import Alignment, Ground
 
 Array = NDArray[np.float64]
@@ -68,7 +66,7 @@ def find_ground(surface: Surface) -> Ground | None:
     solid = np.flatnonzero(surface.distance < DILATION)
     total = len(solid)
     if total > VOXELS:
-        solid = solid[(even_fractions(VOXELS, 0) * total).astype(np.intp)]
+        solid = solid[even_choice(total, VOXELS)]
     inside = np.stack(np.unravel_index(solid, surface.distance.shape), axis=1) + surface.origin
     found = [_layer(points, inside, end) for end in _ends(points)]
     normal, top, face = max(found, key=lambda layer: layer[2])
@@ -89,25 +87,17 @@ def is_ground(without: Alignment, found: Alignment) -> bool:
     return slat > -MOST_LOST and without.score - found.score + both > LEAST_GAIN
 
 
-@lru_cache(maxsize=1)
-def _directions() -> Array:
-    """Return unit vectors spread evenly over the sphere: a Fibonacci lattice."""
-    k = np.arange(DIRECTIONS) + 0.5
-    z, angle = 1.0 - 2.0 * k / DIRECTIONS, np.pi * (1.0 + 5.0**0.5) * k
-    ring = np.sqrt(1.0 - z * z)
-    return np.stack([ring * np.cos(angle), ring * np.sin(angle), z], axis=1)
-
-
 def _ends(points: Array) -> list[Array]:
     """Return the directions from the ends with most points to the middle, no two alike."""
-    heights = _directions() @ points.T
+    directions = even_directions(DIRECTIONS)
+    heights = directions @ points.T
     rank = int(BLOBS * len(points))
     lowest = np.partition(heights, rank, axis=1)[:, rank]
     within = (heights < lowest[:, None] + END).sum(axis=1)
     ends: list[Array] = []
     for k in np.argsort(-within, kind="stable"):
-        if all(_directions()[k] @ end < 0.9 for end in ends):
-            ends.append(_directions()[k])
+        if all(directions[k] @ end < 0.9 for end in ends):
+            ends.append(directions[k])
         if len(ends) == ENDS:
             break
     return ends

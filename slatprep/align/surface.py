@@ -80,14 +80,22 @@ class Surface:
             # Laid out in memory as a choice is, or the kernels are compiled once more.
             return replace(self, points=np.ascontiguousarray(self.points))
         # In order, so each is compared with the one before it: numpy.unique would sort once more.
-        chosen = (even_fractions(count, first) * len(self.points)).astype(np.intp)
+        chosen = even_choice(len(self.points), count, first)
         chosen = chosen[np.diff(chosen, prepend=-1) > 0]
         return replace(self, points=self.points[chosen], values=self.values[chosen])
 
 
+def even_choice(total: int, count: int, first: int = 0) -> NDArray[np.intp]:
+    """Return `count` indices below `total`, even and in order; where `total` is small some twice.
+
+    Those from the number `first` on are others than the first ones.
+    """
+    return (_fractions(count, first) * total).astype(np.intp)
+
+
 @lru_cache(maxsize=16)
-def even_fractions(count: int, first: int) -> NDArray[np.float64]:
-    """Return so many fractions of 1, even and in order, the numbers from `first` on."""
+def _fractions(count: int, first: int) -> NDArray[np.float64]:
+    """Return so many fractions of 1, even and in order, for `even_choice`."""
     # Multiples of the golden ratio fill an interval evenly without the
     # regular steps that would beat with the lattice.
     return np.sort((np.arange(first, first + count) * 0.618033988749895) % 1.0)

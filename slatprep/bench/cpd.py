@@ -17,6 +17,7 @@ from scipy.spatial import cKDTree
 from scipy.spatial.distance import cdist
 
 from slatprep.align.starts import distinct_starts
+from slatprep.align.surface import even_choice
 from slatprep.geometry.frames import VOXEL_SIZE, voxel_centres
 from slatprep.geometry.voxels import boundary, occupancy_of, outer_boundary, voxels_of
 from slatprep.records import MaterialField, StructuredLatents
@@ -103,6 +104,5 @@ class _Cloud:
         return brought
 
     def thinned(self, count: int) -> Array:
-        """Return at most so many points, evenly by multiples of the golden ratio."""
-        fraction = (np.arange(count) * 0.618033988749895) % 1.0
-        return self.points[np.unique((fraction * len(self.points)).astype(np.intp))]
+        """Return at most so many points, evenly chosen."""
+        return self.points[np.unique(even_choice(len(self.points), count))]

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from slatprep.demo.shapes import Part, Shape, Stuff, capsule, carve, cone, polytope
+from slatprep.geometry.frames import even_directions
 
 Rng = np.random.Generator
 Array = NDArray[np.float64]
@@ -71,11 +72,7 @@ def curve(points: Sequence[Array] | Array, radii: Sequence[float] | Array) -> li
 def rock(rng: Rng, centre: ArrayLike, radii: ArrayLike) -> Shape:
     """Return a convex stone with irregular faces."""
     faces = 13
-    k = np.arange(faces) + 0.5  # evenly spread directions (a spherical Fibonacci lattice)
-    z, angle = 1.0 - 2.0 * k / faces, np.pi * (1.0 + 5.0**0.5) * k
-    ring = np.sqrt(1.0 - z * z)
-    normals = np.stack([ring * np.cos(angle), ring * np.sin(angle), z], axis=1)
-    normals = normals + rng.normal(0.0, 0.18, normals.shape)
+    normals = even_directions(faces) + rng.normal(0.0, 0.18, (faces, 3))
     # A plane of the scaled unit ball: normal n / r, moved to the centre.
     normals = normals / np.asarray(radii)
     length = np.linalg.norm(normals, axis=1)

@@ -173,6 +173,14 @@ def nearest_similarity(
     return transform
 
 
+def even_directions(count: int) -> NDArray[np.float64]:
+    """Return unit vectors (count, 3) spread evenly over the sphere: a Fibonacci lattice."""
+    k = np.arange(count) + 0.5
+    z, angle = 1.0 - 2.0 * k / count, np.pi * (1.0 + 5.0**0.5) * k
+    ring = np.sqrt(1.0 - z * z)
+    return np.stack([ring * np.cos(angle), ring * np.sin(angle), z], axis=1)
+
+
 def cube_symmetries() -> NDArray[np.int64]:
     """Return the symmetries of a cube, signed permutation matrices (48, 3, 3), identity first."""
     matrices = np.zeros((48, 3, 3), np.int64)

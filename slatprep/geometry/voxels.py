@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from slatprep.geometry.frames import voxel_centres
 from slatprep.records import RESOLUTION, Ground
 
 
@@ -96,8 +97,7 @@ def above(occupancy: NDArray[np.bool_], ground: Ground | None) -> NDArray[np.boo
     """
     if ground is None:
         return occupancy
-    centres = (np.arange(RESOLUTION) + 0.5) / RESOLUTION - 0.5
-    x, y, z = ground.normal[:, None] * centres
+    x, y, z = ground.normal[:, None] * voxel_centres(np.arange(RESOLUTION))
     heights = x[:, None, None] + y[:, None] + z
     higher: NDArray[np.bool_] = filled(occupancy) & (heights > ground.height)
     return higher
