@@ -114,7 +114,7 @@ class StoredAsset:
     @cached_property
     def cells(self) -> tuple[NDArray[np.uint8], NDArray[np.intp]]:
         """The cells of the 64^3 grid that it occupies, and their voxels; see `shown_in_cells`."""
-        return shown_in_cells(self.coords, self.latents.resolution)
+        return shown_in_cells(self.coords, self.store.contents.latents.resolution)
 
     @cached_property
     def properties_si(self) -> NDArray[np.float32]:
