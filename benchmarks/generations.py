@@ -21,7 +21,7 @@ from __future__ import annotations
 import argparse
 import os
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
 from unittest.mock import patch
@@ -155,8 +155,13 @@ def _judge(field_of: Pair, latents_of: Pair) -> tuple[bool, float, float, str]:
     return turn < WRONG_HEADING, float(np.percentile(gaps, 95)), labels, str(verdict)
 
 
-def _verdicts(rows: Sequence[tuple[bool, float, float, str]]) -> str:
-    counts = Counter(row[3] for row in rows)
+def _verdicts(rows: Iterable[tuple[bool, float, float, str]]) -> str:
+    return count_verdicts(row[3] for row in rows)
+
+
+def count_verdicts(verdicts: Iterable[str]) -> str:
+    """Say how many there are of each."""
+    counts = Counter(verdicts)
     return ", ".join(f"{counts[word]} {word}" for word in ("good", "doubtful", "failed"))
 
 

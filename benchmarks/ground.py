@@ -25,7 +25,6 @@ from __future__ import annotations
 
 import argparse
 import os
-from collections import Counter
 from collections.abc import Iterable, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
@@ -34,6 +33,7 @@ from pathlib import Path
 from unittest.mock import patch
 
 import numpy as np
+from generations import count_verdicts
 from numpy.typing import NDArray
 from scipy import ndimage
 
@@ -276,9 +276,8 @@ def _print(rows: Iterable[Row]) -> None:
     print(f"other objects: {_verdicts([row for row in rows if row.other])}", flush=True)
 
 
-def _verdicts(rows: Sequence[Row]) -> str:
-    counts = Counter(row.verdict for row in rows)
-    return ", ".join(f"{counts[word]} {word}" for word in ("good", "doubtful", "failed"))
+def _verdicts(rows: Iterable[Row]) -> str:
+    return count_verdicts(row.verdict for row in rows)
 
 
 if __name__ == "__main__":
