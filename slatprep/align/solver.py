@@ -30,7 +30,27 @@ _OFFSET_PRIOR = 0.02
 _LEVER = 30.0  # voxels; what a turn or a change of scale moves at the object's rim
 _LONGEST_TURN = 0.35
 _LARGEST_GROWTH = 0.1
-_BLOCK = 64  # samples whose products are summed at once: they stay in the processor's first cache
+_BLOCK = 64  # samples a step at a time: what is kept of them stays in the processor's first cache
+_VALUE, _GX, _GY, _GZ, _U, _V, _W, _X, _Y, _Z, _OX, _OY, _OZ, _BEYOND = range(
+    0, 14 * _BLOCK, _BLOCK
+)
+"""Where, of a block's numbers, those of each kind begin: in one array, which is no other's memory,
+so that the compiler makes vector instructions of the loops over them."""
+
+
+@kernel(inline="always", error_model="numpy")
+def _trilinear(f000, f001, f010, f011, f100, f101, f110, f111, u, v, w):  # type: ignore[no-untyped-def]
+    """Value and gradient at (u, v, w) in a cell, from its corners."""
+    f00 = f000 + (f001 - f000) * w
+    f01 = f010 + (f011 - f010) * w
+    f10 = f100 + (f101 - f100) * w
+    f11 = f110 + (f111 - f110) * w
+    f0 = f00 + (f01 - f00) * v
+    f1 = f10 + (f11 - f10) * v
+    gy = (f01 - f00) * (1.0 - u) + (f11 - f10) * u
+    g0 = (f001 - f000) * (1.0 - v) + (f011 - f010) * v
+    g1 = (f101 - f100) * (1.0 - v) + (f111 - f110) * v
+    return f0 + (f1 - f0) * u, f1 - f0, gy, g0 * (1.0 - u) + g1 * u
 
 
 @kernel(inline="always", error_model="numpy")
@@ -46,18 +66,7 @@ def interpolate(f, x, y, z):  # type: ignore[no-untyped-def]
     f000, f001, f010, f011 = f[i, j, k], f[i, j, k + one], f[i, j + one, k], f[i, j + one, k + one]
     i += one
     f100, f101, f110, f111 = f[i, j, k], f[i, j, k + one], f[i, j + one, k], f[i, j + one, k + one]
-    f00 = f000 + (f001 - f000) * w
-    f01 = f010 + (f011 - f010) * w
-    f10 = f100 + (f101 - f100) * w
-    f11 = f110 + (f111 - f110) * w
-    f0 = f00 + (f01 - f00) * v
-    f1 = f10 + (f11 - f10) * v
-    value = f0 + (f1 - f0) * u
-    gx = f1 - f0
-    gy = (f01 - f00) * (1.0 - u) + (f11 - f10) * u
-    g0 = (f001 - f000) * (1.0 - v) + (f011 - f010) * v
-    g1 = (f101 - f100) * (1.0 - v) + (f111 - f110) * v
-    gz = g0 * (1.0 - u) + g1 * u
+    value, gx, gy, gz = _trilinear(f000, f001, f010, f011, f100, f101, f110, f111, u, v, w)
     ox, oy, oz = x - cx, y - cy, z - cz
     outside = ox * ox + oy * oy + oz * oz
     if outside > 1e-8:
@@ -76,9 +85,28 @@ def _accumulate(  # type: ignore[no-untyped-def]
     With the rows A = (J, r), a sample a row, the equations are A^T W A: the
     normal matrix, and beside it, as the last column, the right-hand side.
     """
-    rows, weighted = np.empty((_BLOCK, UNKNOWNS + 1)), np.empty((_BLOCK, UNKNOWNS + 1))
+    block, cells = np.empty(14 * _BLOCK), np.empty(_BLOCK, np.int64)
+    corners = np.empty(8 * _BLOCK, np.float32)
+    rows, weighted = np.empty((UNKNOWNS + 1) * _BLOCK), np.empty((UNKNOWNS + 1) * _BLOCK)
     weight_sum, inliers, squares = 0.0, 0, 0.0
-    sign = -1.0 if forward else 1.0
+    for first in range(0, points.shape[0], _BLOCK):
+        own, known = points[first : first + _BLOCK], values[first : first + _BLOCK]
+        _carry(own, rotation, shift, scale, origin, field.shape, forward, block, cells)
+        _look_up(field, cells, len(own), corners, block)
+        _linearise(known, rotation, scale, offset, centre, tau, forward, block, rows, weighted)
+        for m in range(len(own)):
+            square = block[_V + m]
+            near = square <= 1.0
+            weight_sum += block[_U + m]
+            inliers += near
+            squares += square if near else 0.0
+        _add_products(weighted, rows, len(own), equations)
+    return weight_sum, inliers, squares
+
+
+@kernel(error_model="numpy")
+def _carry(points, rotation, shift, scale, origin, shape, forward, block, cells):  # type: ignore[no-untyped-def]
+    """Find the points in the SLAT frame, and their cells and places in the other side's field."""
     r00, r01, r02 = rotation[0, 0], rotation[0, 1], rotation[0, 2]
     r10, r11, r12 = rotation[1, 0], rotation[1, 1], rotation[1, 2]
     r20, r21, r22 = rotation[2, 0], rotation[2, 1], rotation[2, 2]
@@ -88,58 +116,107 @@ def _accumulate(  # type: ignore[no-untyped-def]
     i20, i21, i22 = r02 / scale, r12 / scale, r22 / scale
     s0, s1, s2 = shift[0], shift[1], shift[2]
     o0, o1, o2 = origin[0], origin[1], origin[2]
-    c0, c1, c2 = centre[0], centre[1], centre[2]
-    n = 0
-    for m in range(points.shape[0]):
-        px, py, pz = points[m, 0], points[m, 1], points[m, 2]
-        if forward:  # a SLAT sample looks up the PixieVerse distance
+    n0, n1, n2 = shape
+    if forward:  # a SLAT sample looks up the PixieVerse distance
+        for m in range(len(points)):
+            px, py, pz = points[m, 0], points[m, 1], points[m, 2]
             ax, ay, az = px - s0, py - s1, pz - s2
-            value, a, b, c = interpolate(
-                field,
-                i00 * ax + i01 * ay + i02 * az - o0,
-                i10 * ax + i11 * ay + i12 * az - o1,
-                i20 * ax + i21 * ay + i22 * az - o2,
-            )
-            gx = r00 * a + r01 * b + r02 * c
-            gy = r10 * a + r11 * b + r12 * c
-            gz = r20 * a + r21 * b + r22 * c
-            residual = scale * value - values[m] - offset
-        else:  # a PixieVerse sample looks up the SLAT distance
-            ax, ay, az = px, py, pz
+            block[_X + m], block[_Y + m], block[_Z + m] = px, py, pz
+            block[_OX + m] = i00 * ax + i01 * ay + i02 * az - o0
+            block[_OY + m] = i10 * ax + i11 * ay + i12 * az - o1
+            block[_OZ + m] = i20 * ax + i21 * ay + i22 * az - o2
+    else:  # a PixieVerse sample looks up the SLAT distance
+        for m in range(len(points)):
+            ax, ay, az = points[m, 0], points[m, 1], points[m, 2]
             px = scale * (r00 * ax + r01 * ay + r02 * az) + s0
             py = scale * (r10 * ax + r11 * ay + r12 * az) + s1
             pz = scale * (r20 * ax + r21 * ay + r22 * az) + s2
-            value, gx, gy, gz = interpolate(field, px - o0, py - o1, pz - o2)
-            residual = value - scale * values[m] + offset
-        qx, qy, qz = px - c0, py - c1, pz - c2
+            block[_X + m], block[_Y + m], block[_Z + m] = px, py, pz
+            block[_OX + m], block[_OY + m], block[_OZ + m] = px - o0, py - o1, pz - o2
+    for m in range(len(points)):
+        x, y, z = block[_OX + m], block[_OY + m], block[_OZ + m]
+        cx = min(max(x, 0.0), n0 - 1.000001)
+        cy = min(max(y, 0.0), n1 - 1.000001)
+        cz = min(max(z, 0.0), n2 - 1.000001)
+        i, j, k = np.int64(cx), np.int64(cy), np.int64(cz)
+        cells[m] = (i * n1 + j) * n2 + k
+        block[_U + m] = cx - np.float64(i)
+        block[_V + m] = cy - np.float64(j)
+        block[_W + m] = cz - np.float64(k)
+        x, y, z = x - cx, y - cy, z - cz
+        block[_OX + m], block[_OY + m], block[_OZ + m] = x, y, z
+        block[_BEYOND + m] = x * x + y * y + z * z
+
+
+@kernel(error_model="numpy")
+def _look_up(field, cells, count, corners, block):  # type: ignore[no-untyped-def]
+    """Do what `interpolate` does for a block; as vectors but for the reading of the corners."""
+    values, row = field.reshape(-1), field.shape[2]
+    plane = field.shape[1] * row
+    for m in range(count):
+        # Unsigned, so that no negative index has to be provided for.
+        for corner in range(8):
+            step = (corner >> 2) * plane + (corner >> 1 & 1) * row + (corner & 1)
+            corners[corner * _BLOCK + m] = values[np.uint64(cells[m] + step)]
+    for m in range(count):
+        value, gx, gy, gz = _trilinear(
+            corners[m], corners[_BLOCK + m], corners[2 * _BLOCK + m], corners[3 * _BLOCK + m],
+            corners[4 * _BLOCK + m], corners[5 * _BLOCK + m], corners[6 * _BLOCK + m],
+            corners[7 * _BLOCK + m], block[_U + m], block[_V + m], block[_W + m],
+        )  # fmt: skip
+        block[_VALUE + m], block[_GX + m], block[_GY + m], block[_GZ + m] = value, gx, gy, gz
+    for m in range(count):
+        outside = block[_BEYOND + m]
+        if outside > 1e-8:
+            outside = math.sqrt(outside)
+            block[_VALUE + m] += outside
+            block[_GX + m] = block[_OX + m] / outside
+            block[_GY + m] = block[_OY + m] / outside
+            block[_GZ + m] = block[_OZ + m] / outside
+
+
+@kernel(error_model="numpy")
+def _linearise(  # type: ignore[no-untyped-def]
+    values, rotation, scale, offset, centre, tau, forward, block, rows, weighted
+):
+    """Set a block's rows of A and of W A, and in `block` the kernels (U) and squares (V)."""
+    r00, r01, r02 = rotation[0, 0], rotation[0, 1], rotation[0, 2]
+    r10, r11, r12 = rotation[1, 0], rotation[1, 1], rotation[1, 2]
+    r20, r21, r22 = rotation[2, 0], rotation[2, 1], rotation[2, 2]
+    c0, c1, c2 = centre[0], centre[1], centre[2]
+    sign = -1.0 if forward else 1.0
+    if forward:
+        for m in range(len(values)):
+            a, b, c = block[_GX + m], block[_GY + m], block[_GZ + m]
+            block[_GX + m] = r00 * a + r01 * b + r02 * c
+            block[_GY + m] = r10 * a + r11 * b + r12 * c
+            block[_GZ + m] = r20 * a + r21 * b + r22 * c
+            block[_VALUE + m] = scale * block[_VALUE + m] - values[m] - offset
+    else:
+        for m in range(len(values)):
+            block[_VALUE + m] = block[_VALUE + m] - scale * values[m] + offset
+    for m in range(len(values)):
+        gx, gy, gz, residual = block[_GX + m], block[_GY + m], block[_GZ + m], block[_VALUE + m]
+        qx, qy, qz = block[_X + m] - c0, block[_Y + m] - c1, block[_Z + m] - c2
         square = residual * residual
         kernel = 1.0 / (1.0 + square / (tau * tau))
-        weight_sum += kernel
-        near = square <= 1.0
-        inliers += near
-        squares += square if near else 0.0
-        row = rows[n]
-        row[0] = sign * (qy * gz - qz * gy)
-        row[1] = sign * (qz * gx - qx * gz)
-        row[2] = sign * (qx * gy - qy * gx)
-        row[3] = sign * gx
-        row[4] = sign * gy
-        row[5] = sign * gz
-        row[6] = sign * (gx * qx + gy * qy + gz * qz)
-        row[7] = sign
-        row[8] = residual
+        block[_U + m], block[_V + m] = kernel, square
+        rows[m] = sign * (qy * gz - qz * gy)
+        rows[_BLOCK + m] = sign * (qz * gx - qx * gz)
+        rows[2 * _BLOCK + m] = sign * (qx * gy - qy * gx)
+        rows[3 * _BLOCK + m] = sign * gx
+        rows[4 * _BLOCK + m] = sign * gy
+        rows[5 * _BLOCK + m] = sign * gz
+        rows[6 * _BLOCK + m] = sign * (gx * qx + gy * qy + gz * qz)
+        rows[7 * _BLOCK + m] = sign
+        rows[8 * _BLOCK + m] = residual
         for i in range(UNKNOWNS + 1):
-            weighted[n, i] = kernel * kernel * row[i]
-        n += 1
-        if n == _BLOCK or m == points.shape[0] - 1:
-            _add_products(weighted[:n], rows[:n], equations)
-            n = 0
-    return weight_sum, inliers, squares
+            weighted[i * _BLOCK + m] = kernel * kernel * rows[i * _BLOCK + m]
 
 
 @kernel()
-def _add_products(left, right, out):  # type: ignore[no-untyped-def]
-    """Add the sum over m of ``left[m, i] * right[m, j]`` to ``out[i, j]``, the upper triangle.
+def _add_products(left, right, count, out):  # type: ignore[no-untyped-def]
+    """Add the sum over m of ``left[i, m] * right[j, m]`` to ``out[i, j]``, the upper triangle.
 
     By blocks of three rows and columns, written out, so that the compiler keeps
     the sums in registers; below the diagonal blocks nothing is added.
@@ -150,9 +227,10 @@ def _add_products(left, right, out):  # type: ignore[no-untyped-def]
             a, b, c = to[0, 0], to[0, 1], to[0, 2]
             d, e, f = to[1, 0], to[1, 1], to[1, 2]
             g, h, k = to[2, 0], to[2, 1], to[2, 2]
-            for m in range(left.shape[0]):
-                p, q, r = left[m, i], left[m, i + 1], left[m, i + 2]
-                x, y, z = right[m, j], right[m, j + 1], right[m, j + 2]
+            u, v = i * _BLOCK, j * _BLOCK
+            for m in range(count):
+                p, q, r = left[u + m], left[u + _BLOCK + m], left[u + 2 * _BLOCK + m]
+                x, y, z = right[v + m], right[v + _BLOCK + m], right[v + 2 * _BLOCK + m]
                 a += p * x
                 b += p * y
                 c += p * z
