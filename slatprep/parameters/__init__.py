@@ -251,10 +251,14 @@ def is_split_file(by: str) -> bool:
 
 @dataclass(frozen=True)
 class StoreParameters(_Group):
-    """Chunks and shards of the store, in rows (voxel arrays) and assets (grid arrays)."""
+    """Chunks and shards of the store, in rows (voxel arrays) and assets (grid arrays).
+
+    With 0 for `voxel_chunks_per_shard` it is the number of voxels that tells,
+    see `slatprep.store.layout.rows_per_shard`.
+    """
 
     voxel_chunk: Annotated[int, Gt(0), Le(MAX_VOXEL_CHUNK)] = 4_096
-    voxel_chunks_per_shard: Annotated[int, Gt(0), Le(MAX_SHARD_CHUNKS)] = 4_096
+    voxel_chunks_per_shard: Annotated[int, Ge(0), Le(MAX_SHARD_CHUNKS)] = 0
     grid_assets_per_shard: Annotated[int, Gt(0), Le(MAX_GRID_SHARD)] = 512
     compression_level: Annotated[int, Ge(0), Le(22)] = 1
 

@@ -172,6 +172,8 @@ class Carried:
         The existing store, every file of which has been compared with its digest.
     assets : sequence of SpooledAsset or KeptAsset
         Those of the new store, by row.
+    parameters : StoreParameters
+        Sizes of the chunks and shards of both.
 
     Attributes
     ----------
@@ -179,9 +181,13 @@ class Carried:
         The same.
     rows : dict of str to Unmoved
         By group, ``voxel``, ``grid`` or ``record``, the rows that stay where they are.
+    per_shard : dict of str to int
+        Likewise, rows of a shard of the new store.
     """
 
-    def __init__(self, previous: PreviousBuild, assets: Sequence[Row]) -> None:
+    def __init__(
+        self, previous: PreviousBuild, assets: Sequence[Row], parameters: StoreParameters
+    ) -> None:
         self.previous = previous
         before = previous.store.offsets.tolist()
         offsets = [0, *accumulate(asset.n_voxels for asset in assets)]
@@ -195,15 +201,20 @@ class Carried:
         grids = [(row, row + 1) for row, _ in there]
         records = [(row, row + 1) for row, asset in there if asset.names is None]
         sizes = len(before) - 1, len(assets)
+        per_shard = [rows_per_shard(parameters, rows) for rows in (before[-1], offsets[-1])]
+        self.per_shard = {
+            "voxel": per_shard[1],
+            "grid": parameters.grid_assets_per_shard,
+            "record": RECORDS_IN_SHARD,
+        }
+        alike = per_shard[0] == per_shard[1]
         self.rows: dict[str, Unmoved] = {
-            "voxel": unmoved(voxels, before[-1], offsets[-1]),
+            "voxel": unmoved(voxels, before[-1], offsets[-1], alike),
             "grid": unmoved(grids, *sizes),
             "record": unmoved(records, *sizes),
         }
 
-    def take_shards(
-        self, path: Path, parameters: StoreParameters
-    ) -> tuple[dict[str, Written], frozenset[int]]:
+    def take_shards(self, path: Path) -> tuple[dict[str, Written], frozenset[int]]:
         """Give a new store the shards that are the same as a whole.
 
         On an object store they are named alone, as the server copies them when the others
@@ -213,8 +224,6 @@ class Carried:
         ----------
         path : Path
             The new store, on the disk of the other if that is on one; its arrays are created.
-        parameters : StoreParameters
-            Sizes of the shards of both.
 
         Returns
         -------
@@ -224,22 +233,17 @@ class Carried:
             Shards of records among them.
         """
         store = self.previous.store
-        sizes = {
-            "voxel": rows_per_shard(parameters),
-            "grid": parameters.grid_assets_per_shard,
-            "record": RECORDS_IN_SHARD,
-        }
         names = [layout.name for layout in arrays_with(store.merges)]
         arrays = [(name.partition("/")[0], name) for name in names]
         there, local = self.previous.files, storage_of(store.path).local
         taken: dict[str, Written] = {}
         records = set()
         for group, name in (*arrays, ("record", RECORD_ARRAY)):
-            if group not in sizes:
+            if group not in self.rows:
                 continue
-            rows, per_shard = self.rows[group], sizes[group]
+            rows, per_shard = self.rows[group], self.per_shard[group]
             for shard in range(-(-rows.new // per_shard)):
-                if rows.holds(shard * per_shard, (shard + 1) * per_shard):
+                if rows.holds_shard(shard * per_shard, (shard + 1) * per_shard):
                     file = store.reader(name).key(shard)
                     if local is not None:
                         take_file(local / file, path / file)

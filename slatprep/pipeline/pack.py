@@ -317,7 +317,7 @@ def pack_store(
     for row, asset in enumerate(assets):
         if isinstance(asset, KeptAsset):
             clipped["voxel"][row] = asset.clipped
-    taken, records = carried.take_shards(path, parameters) if carried else ({}, frozenset())
+    taken, records = carried.take_shards(path) if carried else ({}, frozenset())
     copied = taken if previous and storage_of(previous.path).remote else {}
     afar = copied | written if remote else copied
     elsewhere = {name: file.size for name, file in afar.items()}

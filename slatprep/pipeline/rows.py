@@ -99,7 +99,9 @@ def settle_rows(
         usable = list(apply_witness(made, spool, parameters, jobs, crew.note, labels))
     contents = resolved_contents(usable, wanted.declared, parameters.slat.standardised)
     usable = in_order(usable, context.previous, wanted.compact)
-    carried = Carried(context.previous, usable) if kept and context.previous else None
+    carried = None
+    if kept and context.previous:
+        carried = Carried(context.previous, usable, parameters.store)
     return Rows(usable, failed, contents, carried, keys)
 
 

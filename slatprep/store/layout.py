@@ -11,7 +11,7 @@ from bisect import bisect_right
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
-from slatprep.parameters import StoreParameters
+from slatprep.parameters import MAX_VOXEL_SHARD, StoreParameters
 from slatprep.records import BACKGROUND, RESOLUTION, UNANNOTATED
 
 FORMAT = "slatprep-store"
@@ -267,9 +267,27 @@ FIXED_SIZES = {"row": 4, "column": 4, "axis": 3, **dict.fromkeys(_XYZ, RESOLUTIO
 """Dimensions that are the same in every store."""
 
 
-def rows_per_shard(parameters: StoreParameters) -> int:
-    """Return how many voxel rows one shard holds."""
-    return parameters.voxel_chunk * parameters.voxel_chunks_per_shard
+MOST_SHARDS = 32
+"""Shards of a voxel array of a store that is not very large. An update writes the last one anew,
+and a reader keeps so many open."""
+
+_CHUNKS_IN_SHARD = 64, 4_096
+"""Least and most chunks of a shard where parameters name no number. Of the usual chunks these are
+some 10 and 700 MB in all arrays together."""
+
+
+def rows_per_shard(parameters: StoreParameters, n_voxels: int) -> int:
+    """Return how many voxel rows one shard holds, in a store of so many.
+
+    Where parameters do not say, it is a power of two of chunks, so that updates seldom change it.
+    """
+    chunks = parameters.voxel_chunks_per_shard
+    if not chunks:
+        least, most = _CHUNKS_IN_SHARD
+        wanted = -(-n_voxels // (MOST_SHARDS * parameters.voxel_chunk))
+        chunks = min(max(1 << (wanted - 1).bit_length(), least), most)
+        chunks = min(chunks, MAX_VOXEL_SHARD // parameters.voxel_chunk)
+    return parameters.voxel_chunk * chunks
 
 
 def row_ranges(total: int, per_shard: int) -> Iterator[tuple[int, int]]:

@@ -207,7 +207,7 @@ class RowReader:
         return out
 
     def packed(self, first: int, last: int) -> Iterator[tuple[bytes, list[int]]]:
-        """Yield the bytes of chunks ``first`` to ``last - 1`` of one shard, as they are packed.
+        """Yield the bytes of chunks ``first`` to ``last - 1``, as they are packed.
 
         Yields
         ------
@@ -221,11 +221,16 @@ class RowReader:
         StoreError
             If a chunk is damaged, or they do not lie as slatprep writes them.
         """
-        number, place = divmod(first, self.chunks_per_shard)
+        for _, own in groupby(range(first, last), lambda chunk: chunk // self.chunks_per_shard):
+            chunks = list(own)
+            yield from self._packed(*divmod(chunks[0], self.chunks_per_shard), len(chunks))
+
+    def _packed(self, number: int, place: int, chunks: int) -> Iterator[tuple[bytes, list[int]]]:
+        """Yield chunks of one shard, from `place` on, as they are packed."""
         shard = self._shards.get(number) or self._open(number)
-        index = shard.index[place : place + last - first].astype(np.int64)
+        index = shard.index[place : place + chunks].astype(np.int64)
         ends = index.sum(axis=1)
-        if shard.file is None or len(index) < last - first or (ends[:-1] != index[1:, 0]).any():
+        if shard.file is None or len(index) < chunks or (ends[:-1] != index[1:, 0]).any():
             raise self._damaged(number, "its chunks do not follow one another")
         # A few at a time: a shard may be larger than memory.
         cuts = np.flatnonzero(np.diff(index[:, 0] // _COPIED_BYTES)) + 1

@@ -21,14 +21,21 @@ class Unmoved:
         Their beginnings and ends, ascending; no run touches the next.
     old, new : int
         Rows of the two arrays.
+    shards_alike : bool
+        Whether both are cut into shards of the same size.
     """
 
     runs: tuple[tuple[int, int], ...]
     old: int
     new: int
+    shards_alike: bool = True
+
+    def holds_shard(self, start: int, end: int) -> bool:
+        """Whether a shard, rows ``start`` to ``end - 1``, has the same bytes in both."""
+        return self.shards_alike and self.holds(start, end)
 
     def holds(self, start: int, end: int) -> bool:
-        """Whether a chunk or shard, rows ``start`` to ``end - 1``, has the same bytes in both.
+        """Whether chunks, rows ``start`` to ``end - 1``, have the same bytes in both.
 
         Its last rows may lie beyond the arrays: then both must end at the same row.
         """
@@ -51,7 +58,9 @@ class Unmoved:
             yield same, chunks[0], min(chunks[-1] + chunk, stop)
 
 
-def unmoved(spans: Iterable[tuple[int, int]], old: int, new: int) -> Unmoved:
+def unmoved(
+    spans: Iterable[tuple[int, int]], old: int, new: int, shards_alike: bool = True
+) -> Unmoved:
     """Return the rows that spans cover; those that touch become one run.
 
     Examples
@@ -65,4 +74,4 @@ def unmoved(spans: Iterable[tuple[int, int]], old: int, new: int) -> Unmoved:
             runs[-1] = (runs[-1][0], stop)
         else:
             runs.append((start, stop))
-    return Unmoved(tuple(runs), old, new)
+    return Unmoved(tuple(runs), old, new, shards_alike)

@@ -100,7 +100,7 @@ def create_store(
     }
     chunk_and_shard = {
         "asset": (ASSET_CHUNK, None),
-        "voxel": (parameters.voxel_chunk, rows_per_shard(parameters)),
+        "voxel": (parameters.voxel_chunk, rows_per_shard(parameters, n_voxels)),
         "grid": (1, parameters.grid_assets_per_shard),
     }
     for layout in arrays_with(merged):
@@ -157,9 +157,9 @@ def shards(
     of_voxels, of_grids = (
         same[group] if same else Unmoved((), 0, 0) for group in ("voxel", "grid")
     )
-    per_shard = rows_per_shard(parameters)
+    per_shard = rows_per_shard(parameters, offsets[-1])
     for start, stop in row_ranges(offsets[-1], per_shard):
-        if of_voxels.holds(start, start + per_shard):
+        if of_voxels.holds_shard(start, start + per_shard):
             continue
         owners = [asset for asset, _ in overlaps(offsets, start, stop)]
         first, last = owners[0], owners[-1] + 1
@@ -168,7 +168,7 @@ def shards(
         yield Shard("voxel", (start, stop), first, own, at, pieces)
     per_shard = parameters.grid_assets_per_shard
     for start, stop in row_ranges(len(keys), per_shard):
-        if not of_grids.holds(start, start + per_shard):
+        if not of_grids.holds_shard(start, start + per_shard):
             pieces = tuple(of_grids.pieces(start, stop, 1)) if same else ()
             yield Shard("grid", (start, stop), start, keys[start:stop], pieces=pieces)
 

@@ -18,11 +18,11 @@ from support.synthetic import Dataset, make_asset
 from support.trees import records_of, tree
 
 from slatprep.inspect.verify import verify_store
-from slatprep.parameters import BuildParameters
+from slatprep.parameters import BuildParameters, StoreParameters
 from slatprep.pipeline import carry, seen
 from slatprep.pipeline.dataset import build_store, plan_build
 from slatprep.pipeline.previous import previous_build
-from slatprep.store import open_store
+from slatprep.store import layout, open_store
 from slatprep.store.unmoved import Unmoved
 
 MakeDataset = Callable[..., Dataset]
@@ -118,6 +118,26 @@ def test_what_is_new_and_sorts_last_gives_the_bytes_of_a_first_build(
     dataset.add("h", seed=1)
     build_store(dataset.parameters(), out, jobs=2)
     assert tree(out) == from_nothing(dataset.parameters(), tmp_path)
+
+
+def test_shards_that_a_larger_store_has_larger_are_made_of_chunks_as_they_are(
+    make_dataset: MakeDataset,
+    monkeypatch: pytest.MonkeyPatch,
+    steps: list[tuple[str, str]],
+    tmp_path: Path,
+) -> None:
+    monkeypatch.setattr(layout, "MOST_SHARDS", 4)
+    monkeypatch.setattr(layout, "_CHUNKS_IN_SHARD", (1, 4096))
+    dataset, out = make_dataset("a", "c"), tmp_path / "s.zarr"
+    by_size = replace(dataset.parameters(), store=StoreParameters(voxel_chunk=128))
+    build_store(by_size, out)
+    before = open_store(out).reader("voxel/feats").shard_rows
+    dataset.add("h", seed=1)
+    steps.clear()
+    build_store(by_size, out)
+    assert open_store(out).reader("voxel/feats").shard_rows == 2 * before
+    assert names(steps, "asset read") == ["h"]
+    assert tree(out) == from_nothing(by_size, tmp_path)
 
 
 def test_where_much_is_new_all_rows_are_ordered_by_id(

@@ -1,10 +1,13 @@
 from itertools import accumulate
 
 import numpy as np
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from slatprep.store.layout import overlaps, row_ranges
+from slatprep.parameters import MAX_VOXEL_SHARD, StoreParameters
+from slatprep.store.layout import MOST_SHARDS, overlaps, row_ranges, rows_per_shard
+from slatprep.store.shard_reader import OPEN_SHARDS
 
 
 @given(
@@ -31,3 +34,17 @@ def test_shards_take_every_row_of_every_asset_once_and_in_place(
         ]
         assert found == [*zip(owner[start:stop], within[start:stop], strict=True)]
     assert end == offsets[-1]
+
+
+@pytest.mark.parametrize("chunk", [4_096, 128, 2**20])
+def test_shards_are_few_and_small_beside_the_store(chunk: int) -> None:
+    parameters = StoreParameters(voxel_chunk=chunk)
+    sizes = [rows_per_shard(parameters, rows) for rows in (0, 1, 10**6, 10**8, 10**9, 10**10)]
+    assert sizes == sorted(sizes)
+    for rows in (chunk * 64 * 32, chunk * 64 * 32 + 1, chunk * 10_000):
+        size = rows_per_shard(parameters, rows)
+        if size < MAX_VOXEL_SHARD:
+            assert 16 < -(-rows // size) <= MOST_SHARDS <= OPEN_SHARDS
+    assert max(sizes) <= MAX_VOXEL_SHARD
+    given = StoreParameters(voxel_chunk=chunk, voxel_chunks_per_shard=3)
+    assert rows_per_shard(given, 10**9) == 3 * chunk
