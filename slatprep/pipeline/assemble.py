@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Container, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import chain
 from pathlib import Path
@@ -23,6 +23,7 @@ from slatprep.provenance.make import origin
 from slatprep.provenance.record import Clipped, property_counts
 from slatprep.provenance.record_json import (
     RecordText,
+    build_id_of,
     completed,
     read_asset_record,
     to_json,
@@ -31,6 +32,7 @@ from slatprep.records import Normalization
 from slatprep.storage.place import storage_of
 from slatprep.storage.upload import Staged
 from slatprep.store import open_store
+from slatprep.store.records import RECORDS_IN_SHARD
 from slatprep.store.writer import finish_store
 from slatprep.workers.local import Jobs, run_in_order
 
@@ -42,7 +44,8 @@ class Assembled:
     """A new store that is not in place yet, and what goes into the summary of it.
 
     ``clipped`` has the values of voxels outside the ranges, (A, P) by row and property;
-    ``staged`` what is not in ``store``, as an object store has it already.
+    ``staged`` what is not in ``store``, as an object store has it already; ``digests`` those of
+    all records, by asset id.
     """
 
     store: Path
@@ -52,6 +55,7 @@ class Assembled:
     counts: Counts
     clipped: NDArray[np.int64]
     staged: Staged
+    digests: Mapping[str, bytes]
 
 
 def assemble(
@@ -60,6 +64,7 @@ def assemble(
     work: Work,
     parameters: BuildParameters,
     jobs: Jobs,
+    standing: Mapping[str, bytes],
 ) -> Assembled:
     """Normalise and pack the rows of a store, then write its records and its root attributes.
 
@@ -75,6 +80,8 @@ def assemble(
         The build's.
     jobs : int or Workers
         Worker processes, or a cluster's.
+    standing : mapping of str to bytes
+        Digests, by asset id, of records that are not written to the file of records.
     """
     normalization, contents, carried = given, rows.contents, rows.carried
     if normalization is None and carried is not None:
@@ -88,20 +95,29 @@ def assemble(
     packed = pack_store(
         store, work.spool, rows.usable, normalization, how, jobs, contents, carried, remote
     )
-    texts = _completed_records(work.spool, rows, normalization, packed, jobs)
-    build_id = write_all_records(store, records, texts, packed.records)
+    texts = _completed_records(work.spool, rows, normalization, packed, jobs, standing)
+    digests = write_all_records(store, records, texts, packed.records, standing)
+    build_id = build_id_of(digests.items())
     build, files = origin(parameters), (packed.digests, packed.elsewhere)
     finish_store(store, normalization, build_id, build, contents, *files)
     counts, clipped = counts_in(open_store(store)), packed.clipped["voxel"]
     before = storage_of(carried.previous.path).remote if carried else None
     staged = Staged(packed.elsewhere, packed.digests, remote, before, packed.copied)
-    return Assembled(store, records, build_id, normalization, counts, clipped, staged)
+    return Assembled(store, records, build_id, normalization, counts, clipped, staged, digests)
 
 
 def _completed_records(
-    spool: Spool, rows: Rows, normalization: Normalization, packed: Packed, jobs: Jobs
-) -> Iterator[tuple[int, RecordText | bytes]]:
-    """Yield rows and records of a build by asset id, with the ranges and what they clip."""
+    spool: Spool,
+    rows: Rows,
+    normalization: Normalization,
+    packed: Packed,
+    jobs: Jobs,
+    standing: Container[str],
+) -> Iterator[tuple[int, RecordText]]:
+    """Yield rows and records of a build by asset id, with the ranges and what they clip.
+
+    Records that neither the store nor the file lacks are left out.
+    """
     everything: list[tuple[int, Row | FailedAsset]] = [*enumerate(rows.usable)]
     everything += [(-1, asset) for asset in rows.failed]
     everything.sort(key=lambda one: one[1].asset_id)
@@ -115,6 +131,8 @@ def _completed_records(
     records = chain.from_iterable(run_in_order(complete_records, tasks, jobs))
     for row, asset in everything:
         if isinstance(asset, KeptAsset):
+            if asset.asset_id in standing and row // RECORDS_IN_SHARD in packed.records:
+                continue
             carried = rows.carried
             if carried is None:
                 raise ValueError("there is no store to take records from")
@@ -122,7 +140,7 @@ def _completed_records(
             if asset.names is not None:
                 where = f"{carried.previous.path}: record of {asset.asset_id}"
                 text = to_json(asset.names.applied(read_asset_record(text, where)))
-            yield row, text
+            yield row, RecordText(asset.asset_id, text, text)
         else:
             yield row, next(records)
 

@@ -53,6 +53,8 @@ class KeptAsset:
         Values of its voxels outside the ranges.
     latents : LatentMoments or None
         Of its latents.
+    record : bytes
+        Digest of its record as the existing store has it.
     names : Names or None
         Where its record has other ones.
     merged : bool
@@ -66,6 +68,7 @@ class KeptAsset:
     extent: NDArray[np.float64]
     clipped: NDArray[np.int64]
     latents: LatentMoments | None
+    record: bytes
     names: Names | None = None
     merged: bool = False
 

@@ -25,10 +25,11 @@ from slatprep.pipeline.recipe import recipe_of
 from slatprep.pipeline.rows import Rows, settle_rows
 from slatprep.pipeline.seen import Found
 from slatprep.pipeline.spool import FailedAsset, Spool, SpooledAsset
+from slatprep.pipeline.standing import standing_lines
 from slatprep.pipeline.summary import BuildSummary, counts_of, summarise_build
 from slatprep.pipeline.update import Update, Wanted
 from slatprep.pipeline.work import spool_of, work_beside, work_directory
-from slatprep.provenance.record_json import write_records
+from slatprep.provenance.record_json import build_id_of, write_records
 from slatprep.readers import discover
 from slatprep.records import AssetPair, Place
 from slatprep.storage.atomic import staged, writing
@@ -129,10 +130,11 @@ def build_store(
             return summary
         rows = settle_rows(update, finished, unchanged, plan, crew, keep_work)
         with writing(str(place.out), work_directory(place.store).parent):
-            packing = crew.of(len(rows.made))
-            assembled = assemble(rows, wanted.given, work, parameters, packing)
+            packing, standing = crew.of(len(rows.made)), standing_lines(update, rows)
+            lines = standing.digests
+            assembled = assemble(rows, wanted.given, work, parameters, packing, lines)
             place.replace(assembled.store, assembled.staged)
-        summary = _publish(update, rows, assembled)
+        summary = _publish(update, rows, assembled, standing.size)
         if keep_work:
             work.keep_only({asset.key for asset in rows.usable})
     return summary
@@ -217,7 +219,8 @@ def align_pairs(
         plan = _plan(pairs, context, crew)
         assets = sorted(finish(pairs, plan, context, crew), key=lambda asset: asset.asset_id)
         with writing(str(out), out.parent), staged(out) as file:
-            build_id = write_records(file, (work.spool.record(asset.key) for asset in assets))
+            digests = write_records(file, (work.spool.record(asset.key) for asset in assets))
+            build_id = build_id_of(digests.items())
     seconds = time.perf_counter() - begin
     failed = [asset for asset in assets if isinstance(asset, FailedAsset)]
     counts = counts_of(asset for asset in assets if isinstance(asset, SpooledAsset))
@@ -257,7 +260,7 @@ def _split(
     return split
 
 
-def _publish(update: Update, rows: Rows, assembled: Assembled) -> BuildSummary:
+def _publish(update: Update, rows: Rows, assembled: Assembled, behind: int) -> BuildSummary:
     """Publish the records of a store that is in place, and the store where that is a step more."""
     place, context = update.place, update.context
     standardised = context.parameters.slat.standardised
@@ -274,9 +277,13 @@ def _publish(update: Update, rows: Rows, assembled: Assembled) -> BuildSummary:
         warnings=latent_warnings(rows.usable, rows.contents.latents, standardised),
         damaged=(*update.damaged, *told),
     )
-    publish_manifests(assembled.records, summary, context.parameters)
+    publish_manifests(assembled.records, summary, context.parameters, behind=behind)
     place.publish()
     clips = zip(rows.usable, assembled.clipped, strict=True)
-    found = {a.asset_id: Found(rows.keys[a.asset_id], a.extent, c, a.latents) for a, c in clips}
+    keys, digests = rows.keys, assembled.digests
+    found = {
+        a.asset_id: Found(keys[a.asset_id], a.extent, c, a.latents, digests[a.asset_id])
+        for a, c in clips
+    }
     update.note(summary, found)
     return summary

@@ -10,9 +10,11 @@ from __future__ import annotations
 import os
 import platform
 import shutil
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import ExitStack
 from datetime import UTC, datetime
 from pathlib import Path
+from types import MappingProxyType
 
 from slatprep.errors import ConfigError, StoreError, in_unicode
 from slatprep.parameters import BuildParameters
@@ -28,7 +30,7 @@ from slatprep.provenance.record import (
 )
 from slatprep.provenance.record_json import RecordText, content_of, to_json, write_records
 from slatprep.records import Place
-from slatprep.storage.atomic import replace_directory
+from slatprep.storage.atomic import append_file, replace_directory
 from slatprep.storage.faults import reached
 from slatprep.storage.place import place_of, storage_of
 from slatprep.storage.upload import PublishedState, Staged, Upload, published_state, upload_store
@@ -190,10 +192,11 @@ def _is_marked(file: Path, mark: bytes) -> bool:
 def write_all_records(
     store: Path,
     path: Path,
-    records: Iterable[tuple[int, Record | RecordText | bytes]],
+    records: Iterable[tuple[int, Record | RecordText]],
     taken: frozenset[int] = frozenset(),
-) -> str:
-    """Write all records to a file, and those of rows into the new store; return the build's id.
+    standing: Mapping[str, bytes] = MappingProxyType({}),
+) -> dict[str, bytes]:
+    """Write records to a file, and those of rows into the new store; return all digests by id.
 
     Parameters
     ----------
@@ -201,23 +204,26 @@ def write_all_records(
         The new store.
     path : Path
         The file.
-    records : iterable of (int, Record, RecordText or bytes)
-        Rows and records, by asset id; rows of assets that do not go in are negative. A
-        record that the existing store has may be given as its text.
+    records : iterable of (int, Record or RecordText)
+        Rows and records, by asset id; rows of assets that do not go in are negative.
     taken : frozenset of int
         Shards of records that the new store has already.
+    standing : mapping of str to bytes
+        Digests of records by id that have a line already, so that they are not written to the
+        file.
     """
     writer = RecordWriter(open_for_writing(store), taken)
 
-    def passing() -> Iterator[Record | RecordText | bytes]:
+    def lines() -> Iterator[Record | RecordText]:
         for row, record in records:
             if row >= 0:
                 writer.add(row, content_of(record))
-            yield record
+            if record.asset_id not in standing:
+                yield record
 
-    build_id = write_records(path, passing())
+    digests = {**standing, **write_records(path, lines())}
     reached("records written", str(path))
-    return build_id
+    return digests
 
 
 def publish_manifests(
@@ -225,6 +231,7 @@ def publish_manifests(
     summary: BuildSummary,
     parameters: BuildParameters,
     versions: Versions | None = None,
+    behind: int = 0,
 ) -> None:
     """Move the records of a finished build to where people look for them.
 
@@ -238,6 +245,9 @@ def publish_manifests(
         What it was asked for.
     versions : dict of str to str, optional
         Of the libraries that made the numbers, where they are not those of today.
+    behind : int
+        Put the records behind what is there, a file of so many bytes. Above 0 it must be
+        on a disk; what of it a reader has read stays where it is.
 
     Raises
     ------
@@ -246,14 +256,16 @@ def publish_manifests(
     """
     folder = summary.records.parent
     try:
-        with (
-            storage_of(summary.records).staged() as records_file,
-            storage_of(folder / "build.json").staged() as build_file,
-        ):
-            try:
-                records.replace(records_file)
-            except OSError:  # on another disk
-                shutil.copyfile(records, records_file)
+        with ExitStack() as stack:
+            build_file = stack.enter_context(storage_of(folder / "build.json").staged())
+            if behind and (there := storage_of(summary.records).local) is not None:
+                append_file(records, there, behind)
+            else:
+                place = stack.enter_context(storage_of(summary.records).staged())
+                try:
+                    records.replace(place)
+                except OSError:  # on another disk
+                    shutil.copyfile(records, place)
             reached("manifests written", str(folder))
             document = to_json(build_record(summary, parameters, versions), indent=True)
             build_file.write_bytes(document + b"\n")

@@ -24,7 +24,7 @@ from slatprep.pipeline.work import work_beside, work_directory
 from slatprep.provenance.files import build_in
 from slatprep.provenance.places import manifests_beside
 from slatprep.provenance.record import AssetRecord
-from slatprep.provenance.record_json import adapter_of
+from slatprep.provenance.record_json import adapter_of, build_id_of
 from slatprep.provenance.stored import StoredRecords
 from slatprep.records import Contents, Normalization, Place
 from slatprep.storage.atomic import writing
@@ -128,7 +128,7 @@ def write_rows(
             write_assets(store, assets, offsets, normalization)
             _copy_rows(store, rows, offsets, normalization, parameters.store, progress)
             own = enumerate(_records(rows, normalization))
-            build_id = write_all_records(store, records, own)
+            build_id = build_id_of(write_all_records(store, records, own).items())
             finish_store(store, normalization, build_id, build, contents)
             place.replace(store)
         summary = summarise_build(

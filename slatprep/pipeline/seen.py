@@ -34,14 +34,15 @@ NAME = "sources.seen"
 def _row(properties: int, channels: int) -> np.dtype[Any]:
     """Return the type of a row, for so many properties, and channels of latents."""
     fields = [("state", "V16"), ("key", "V32"), ("extent", "<f8", (properties, 2)),
-              ("clipped", "<i8", (properties,)), ("moments", "<f8", (2, channels))]  # fmt: skip
+              ("clipped", "<i8", (properties,)), ("moments", "<f8", (2, channels)),
+              ("record", "V32")]  # fmt: skip
     return np.dtype(fields)
 
 
 _HEAD = 3 * 32 + 4
 """Bytes before the rows: three digests, and numbers of properties and channels."""
 
-_FORMAT = "slatprep-seen-1"
+_FORMAT = "slatprep-seen-2"
 _UNKNOWN = bytes(16)
 
 _FINE_NS, _COARSE_NS = 100_000_000, 2_000_000_000
@@ -53,13 +54,15 @@ class Found(NamedTuple):
     """What a build found of an asset.
 
     ``extent`` (P, 2) of its properties is NaN where its sources have not been read; ``clipped``
-    (P,) are values of its voxels outside the ranges.
+    (P,) are values of its voxels outside the ranges; ``record`` is the SHA-256 of what counts
+    of its record in the build's id.
     """
 
     key: str
     extent: NDArray[np.float64]
     clipped: NDArray[np.int64]
     latents: LatentMoments | None
+    record: bytes
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,7 +107,7 @@ class Seen:
         mean, std = row["moments"].tolist()
         known = np.isfinite(row["moments"]).all()
         moments = LatentMoments(tuple(mean), tuple(std)) if known else None
-        return Found(key, row["extent"], row["clipped"], moments)
+        return Found(key, row["extent"], row["clipped"], moments, row["record"].tobytes())
 
 
 def read_seen(folder: Path, bound: bytes) -> Seen:
@@ -122,7 +125,7 @@ def read_seen(folder: Path, bound: bytes) -> Seen:
             data = file.read()
     except OSError:
         return Seen()
-    if len(data) < _HEAD or hashlib.sha256(data[32:]).digest() != data[:32]:
+    if len(data) < _HEAD or _digest(data[32:]) != data[:32]:
         return Seen()
     counts = np.frombuffer(data, "<u2", 2, offset=96).tolist()
     rows = np.frombuffer(data, _row(*counts), offset=_HEAD)
@@ -149,15 +152,20 @@ def write_seen(
     rows["moments"] = np.nan
     for row, (asset_id, one) in zip(rows, found.items(), strict=True):
         row["state"], row["key"] = states[asset_id], bytes.fromhex(one.key)
-        row["extent"], row["clipped"] = one.extent, one.clipped
+        row["extent"], row["clipped"], row["record"] = one.extent, one.clipped, one.record
         if one.latents is not None:
             row["moments"] = one.latents.mean, one.latents.std
     body = bound + (store or bytes(32)) + counts.tobytes() + rows.tobytes()
     try:
         with private_file(folder / NAME) as file:
-            file.write(hashlib.sha256(body).digest() + body)
+            file.write(_digest(body) + body)
     except OSError:
         return
+
+
+def _digest(body: bytes) -> bytes:
+    """Return the digest of a file, which one of another form does not have."""
+    return hashlib.sha256(_FORMAT.encode() + body).digest()
 
 
 def bound_to(build_id: str, recipe: str) -> bytes:

@@ -32,7 +32,15 @@ from slatprep.pipeline.summary import BuildSummary, counts_in, summarise_build
 from slatprep.provenance.files import ASSETS, BUILD, build_in, lines_in
 from slatprep.provenance.make import origin
 from slatprep.provenance.record import BuildRecord, Record
-from slatprep.provenance.record_json import read_record, records_id, to_json, write_records
+from slatprep.provenance.record_json import (
+    RecordText,
+    build_id_of,
+    digest_of,
+    read_record,
+    records_id,
+    to_json,
+    write_records,
+)
 from slatprep.readers import contents_of
 from slatprep.readers.encoders import resolve_latents
 from slatprep.records import AssetPair, Contents, Normalization, Place
@@ -180,19 +188,27 @@ class Update:
         None where there is something to do.
         """
         previous, folder = self.context.previous, storage_of(self.place.records().parent).local
-        path = None if previous is None else storage_of(previous.path).local
         seen, known = self.looked.seen, self.looked.known
-        if previous is None or path is None or folder is None or not seen.store:
+        if previous is None or folder is None:
             return None
         if not len(known) == len(self.pairs) == len(seen.rows):
             return None
-        if store_state(path, _record_files(folder)) != seen.store:
+        if not self.as_left():
             return None
         # Assets that could not go in, and are gone now, were part of the build's id.
         all_in = sum(build_in(folder).statuses.values()) == len(self.pairs)
         if not all_in or not self.wanted.allows(previous.store, self.context):
             return None
         return self._repeated([], previous, seen.rows["clipped"].sum(axis=0), untouched=True)
+
+    def as_left(self) -> bool:
+        """Whether the files of the store and of its records are as the last build left them."""
+        folder, path = (
+            storage_of(p).local for p in (self.place.records().parent, self.place.store)
+        )
+        if folder is None or path is None or not self.looked.seen.store:
+            return False
+        return store_state(path, _record_files(folder)) == self.looked.seen.store
 
     def current(
         self, plan: Mapping[str, PlannedAsset], others: Sequence[SpooledAsset | FailedAsset]
@@ -218,7 +234,9 @@ class Update:
         found = _found_before(same, previous, self.looked.seen)
         if self._contents(previous.store, found) != previous.store.contents:
             return None
-        if records_id(_all_records(others, previous, self.context)) != previous.build_id:
+        digests = {asset_id: one.record for asset_id, one in found.items()}
+        digests |= {a.asset_id: digest_of(self.context.spool.record(a.key)) for a in others}
+        if build_id_of(digests.items()) != previous.build_id:
             return None
         clipped = np.sum([one.clipped for one in found.values()], axis=0)
         summary = self._repeated(others, previous, clipped, untouched=False)
@@ -292,19 +310,25 @@ def _found_before(keys: Mapping[str, str], previous: PreviousBuild, seen: Seen) 
             record = previous.records.of(asset_id)
             voxels = record.counts.clipped.voxel if record.counts.clipped else {}
             clipped = np.array(list(voxels.values()), dtype=np.int64)
-            known = Found(key, np.full((len(clipped), 2), np.nan), clipped, record.latents)
+            text = _text_of(asset_id, previous)
+            unread = np.full((len(clipped), 2), np.nan)
+            known = Found(key, unread, clipped, record.latents, digest_of(text))
         found[asset_id] = known
     return found
 
 
 def _all_records(
     others: Sequence[SpooledAsset | FailedAsset], previous: PreviousBuild, context: BuildContext
-) -> Iterator[Record | bytes]:
+) -> Iterator[Record | RecordText]:
     """Yield the records of the existing store and of the assets that cannot go in, by id."""
-    rows: list[tuple[str, int | str]] = [(a, row) for row, a in enumerate(previous.store.ids)]
-    rows += [(asset.asset_id, asset.key) for asset in others]
-    for _, at in sorted(rows, key=lambda row: row[0]):
-        yield previous.text(at) if isinstance(at, int) else context.spool.record(at)
+    keys = dict.fromkeys(previous.store.ids) | {asset.asset_id: asset.key for asset in others}
+    for asset_id, key in sorted(keys.items()):
+        yield context.spool.record(key) if key else _text_of(asset_id, previous)
+
+
+def _text_of(asset_id: str, previous: PreviousBuild) -> RecordText:
+    text = previous.text(previous.store.find(asset_id))
+    return RecordText(asset_id, text, text)
 
 
 def _are_published(records: Place, wanted: BuildRecord, untouched: bool) -> bool:

@@ -46,6 +46,7 @@ class RecordError(StoreError):
 class RecordText(NamedTuple):
     """A record as a line of ``assets.jsonl``, and as what of it counts in `records_id`."""
 
+    asset_id: str
     line: bytes
     content: bytes
 
@@ -121,7 +122,7 @@ def completed(text: bytes, normalization: Normalization, clipped: Clipped | None
     if clipped is not None:
         document["normalization"] = normalization
         document["counts"]["clipped"] = clipped
-    return RecordText(orjson.dumps(document), counting(document))
+    return RecordText(document["asset_id"], orjson.dumps(document), counting(document))
 
 
 def counting(document: dict[str, Any]) -> bytes:
@@ -137,23 +138,30 @@ def read_build_record(text: bytes | str, where: str) -> BuildRecord:
     return record
 
 
-def records_id(records: Iterable[Record | RecordText | bytes]) -> str:
-    """Return the id of a build: SHA-256, in hex, of its records in the order of asset ids.
+def records_id(records: Iterable[Record | RecordText]) -> str:
+    """Return the id of the build that has these records, in any order; see `build_id_of`.
 
     How long things took and in what words they failed are left out: they
     differ between runs, machines and folders without the content differing.
-    A record of a row may be given as the text that a store holds of it.
     """
-    digest = hashlib.sha256()
-    for record in records:
-        digest.update(content_of(record))
-    return digest.hexdigest()
+    return build_id_of((record.asset_id, digest_of(record)) for record in records)
 
 
-def content_of(record: Record | RecordText | bytes) -> bytes:
+def build_id_of(digests: Iterable[tuple[str, bytes]]) -> str:
+    """Return the id of a build: SHA-256, in hex, of its records' in the order of asset ids.
+
+    So that an update need not read the records of assets that did not change.
+    """
+    return hashlib.sha256(b"".join(digest for _, digest in sorted(digests))).hexdigest()
+
+
+def digest_of(record: Record | RecordText) -> bytes:
+    """Return the SHA-256 of what of a record counts in a build's id."""
+    return hashlib.sha256(content_of(record)).digest()
+
+
+def content_of(record: Record | RecordText) -> bytes:
     """Return what of a record counts in `records_id`; of a row's it is what its store holds."""
-    if isinstance(record, bytes):
-        return record
     if isinstance(record, RecordText):
         return record.content
     if isinstance(record, AssetRecord):
@@ -161,23 +169,15 @@ def content_of(record: Record | RecordText | bytes) -> bytes:
     return to_json(replace(record, duration_s=0.0, reason="", traceback=""))
 
 
-def write_records(path: Path, records: Iterable[Record | RecordText | bytes]) -> str:
-    """Write records, in the order of their asset ids, as JSON Lines; return `records_id`."""
-
-    def passing() -> Iterator[Record | RecordText | bytes]:
-        for record in records:
-            match record:
-                case bytes():
-                    line = record
-                case RecordText():
-                    line = record.line
-                case _:
-                    line = to_json(record)
-            file.write(line + b"\n")
-            yield record
-
+def write_records(path: Path, records: Iterable[Record | RecordText]) -> dict[str, bytes]:
+    """Write records, in their order, as JSON Lines; return `digest_of` each by asset id."""
+    digests = {}
     with path.open("wb") as file:
-        return records_id(passing())
+        for record in records:
+            line = record.line if isinstance(record, RecordText) else to_json(record)
+            file.write(line + b"\n")
+            digests[record.asset_id] = digest_of(record)
+    return digests
 
 
 @lru_cache(maxsize=4)

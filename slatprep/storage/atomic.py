@@ -142,6 +142,42 @@ def _claimed(path: Path) -> tuple[Path, int]:
     return temporary, os.open(temporary, os.O_WRONLY | os.O_EXCL | OWN_FILE, 0o666)
 
 
+def append_file(source: Path, target: Path, size: int) -> None:
+    """Put a file's content behind that of another, onto the disk; what is there is not written.
+
+    Unlike `staged` it is not one step: a kill leaves part of it.
+
+    Parameters
+    ----------
+    source : Path
+        What to add.
+    target : Path
+        The file, which is ours alone.
+    size : int
+        Its bytes.
+
+    Raises
+    ------
+    OSError
+        If the file is another one by now, or the disk does not take it; it is as it was then.
+    """
+    flags = os.O_WRONLY | os.O_APPEND | OWN_FILE & ~os.O_CREAT
+    descriptor = os.open(target, flags)
+    try:
+        state = os.fstat(descriptor)
+        if not is_only_ours(state) or state.st_size != size:
+            raise OSError(errno.EBUSY, "it was changed meanwhile")
+        try:
+            with source.open("rb") as more, os.fdopen(os.dup(descriptor), "ab") as file:
+                shutil.copyfileobj(more, file)
+            os.fsync(descriptor)
+        except OSError:
+            os.ftruncate(descriptor, size)  # Only now is nothing left that waits to be written.
+            raise
+    finally:
+        os.close(descriptor)
+
+
 @contextmanager
 def staged_apart(path: Path, folder: Path) -> Iterator[Path]:
     """Yield a file in `folder` that takes the place of `path`, whole, when all went well.

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from collections import Counter, deque
+from collections import Counter
 from collections.abc import Collection, Iterator, Mapping
 from dataclasses import replace
 
@@ -13,20 +13,21 @@ from slatprep.errors import StoreError
 from slatprep.inspect.verify.assets import fault_findings
 from slatprep.pipeline.rewrite import APART, NO_ROOT
 from slatprep.provenance.files import ASSETS, BUILD, build_in, build_text, lines_in
-from slatprep.provenance.record import AssetRecord, Record
+from slatprep.provenance.record import AssetRecord
 from slatprep.provenance.record_json import (
     RecordError,
+    RecordText,
+    build_id_of,
     counting,
+    digest_of,
     read_build_record,
     read_record,
-    records_id,
     to_json,
 )
 from slatprep.provenance.stored import StoredRecords
 from slatprep.records import Place, SourceRoots, Status
 from slatprep.storage.documents import parse_document
 from slatprep.store.contract import Finding
-from slatprep.store.layout import FORMAT_VERSION
 from slatprep.store.reader import Store
 
 
@@ -116,12 +117,9 @@ def manifest_findings(
     seen: Counter[str] = Counter({str(status): 0 for status in Status})
     faults: list[Finding] = []
     try:
-        checked = _checked(store, folder, seen, faults, only)
-        if only is None and store.format_version == FORMAT_VERSION:
-            found: object = records_id(checked)
-        else:
-            deque(checked, maxlen=0)
-            found = _id_of_lines(folder) if only is None else manifest
+        found: object = build_id_of(list(_checked(store, folder, seen, faults, only)))
+        if only is not None or (found != manifest and _older_id(folder) == manifest):
+            found = manifest
     except StoreError as error:
         yield Finding(assets_file, "", str(error), "a JSON record a line")
         return
@@ -146,8 +144,8 @@ def _stated_id(text: bytes) -> object:
     return document.get("id") if isinstance(document, dict) else None
 
 
-def _id_of_lines(folder: Place) -> str:
-    """Return the id of records of an older format, which lack fields of today's."""
+def _older_id(folder: Place) -> str:
+    """Return the id as older versions made it: of the texts themselves, in the order of ids."""
     digest = hashlib.sha256()
     for _, line in lines_in(folder):
         try:
@@ -164,10 +162,11 @@ def _checked(
     seen: Counter[str],
     faults: list[Finding],
     only: Collection[str] | None,
-) -> Iterator[Record | bytes]:
-    """Yield the records of ``assets.jsonl``; count their statuses and collect their faults.
+) -> Iterator[tuple[str, bytes]]:
+    """Yield the ids and digests of ``assets.jsonl``; count statuses and collect faults.
 
-    Of one that says what the store does of its row, the text: whoever verifies the row reads that.
+    A record that says what the store does of its row is not checked: whoever verifies the row
+    does that.
     """
     rows = {asset_id: row for row, asset_id in enumerate(store.ids)}
     stored = StoredRecords(store)
@@ -175,9 +174,9 @@ def _checked(
     for where, line in lines_in(folder):
         if only is not None and _id_in(line) not in only:
             continue
-        if (content := _as_stored(line, rows, stored)) is not None:
+        if (text := _as_stored(line, rows, stored)) is not None:
             seen[str(Status.OK)] += 1
-            yield content
+            yield text.asset_id, digest_of(text)
             continue
         try:
             record = read_record(line, where)
@@ -190,15 +189,17 @@ def _checked(
             if row is None or not _same(record, stored, row):
                 what = "differs from asset/record"
                 faults.append(Finding(file, record.asset_id, what, "the same record"))
-        yield record
+        yield record.asset_id, digest_of(record)
 
 
-def _as_stored(line: bytes, rows: Mapping[str, int], stored: StoredRecords) -> bytes | None:
-    """Return what counts of a line that says what the store's record of its row does, else None."""
+def _as_stored(line: bytes, rows: Mapping[str, int], stored: StoredRecords) -> RecordText | None:
+    """Return a line that says what the store's record of its row does, else None."""
     try:
         document = orjson.loads(line)
-        content, row = counting(document), rows.get(str(document.get("asset_id")))
-        return content if row is not None and stored.text(row).encode() == content else None
+        content, asset_id = counting(document), str(document.get("asset_id"))
+        row = rows.get(asset_id)
+        same = row is not None and stored.text(row).encode() == content
+        return RecordText(asset_id, line, content) if same else None
     except (TypeError, ValueError, StoreError):  # No JSON object, or no text that can be read.
         return None
 
