@@ -123,7 +123,7 @@ def gather_outcomes(
             f"{manifests} has no record of {len(missing)} assets of {store.path}, such as "
             f"{min(missing)!r}; name the folder of its own records with --manifests"
         )
-    return Outcomes(known, clipped, tied, absent)
+    return Outcomes(dict(sorted(known.items())), clipped, tied, absent)
 
 
 def read_outcomes(manifests: Place, build_id: str) -> Iterator[Outcome]:
