@@ -120,16 +120,13 @@ def surface_of(occupancy: NDArray[np.bool_]) -> Surface:
     The distance transform is exact and Euclidean, taken to the nearest voxel
     centre of the other kind, less half a voxel to the face between the two.
     """
-    from slatprep.geometry.distance import signed_distance
+    from slatprep.geometry.distance import near_surface, signed_distance
 
     full = filled(occupancy)
     box = bounding_box(full)
     solid = np.pad(full[box], _MARGIN)
     distance = signed_distance(solid)
-    # By way of flat indices, as numpy finds those of one axis far faster than those of three.
-    flat = np.flatnonzero(np.abs(distance) <= BAND)
-    near = np.stack(np.unravel_index(flat, distance.shape)).T
-    values = distance.reshape(-1)[flat]
+    near, values = near_surface(distance, BAND)
     # Half a voxel deep are just those that touch an empty voxel by a face.
     boundary = near[values == -0.5] + [side.start - _MARGIN for side in box]
     distance += np.float32(DILATION)

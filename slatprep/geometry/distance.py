@@ -71,6 +71,13 @@ def _squares_along_last(solid, inside, outside):  # type: ignore[no-untyped-def]
     for i in range(solid.shape[0]):
         for j in range(solid.shape[1]):
             line = solid[i, j]
+            changes = 0
+            for k in range(1, length):
+                changes += line[k] != line[k - 1]
+            if changes == 0:  # as of most lines
+                inside[i, j, :length] = NOTHING * NOTHING if line[0] else 0
+                outside[i, j, :length] = 0 if line[0] else NOTHING * NOTHING
+                continue
             steps = NOTHING
             for k in range(length):
                 steps = 1 if k and line[k] != line[k - 1] else min(steps + 1, NOTHING)
@@ -151,3 +158,41 @@ def _signed(solid, inside, outside, distance):  # type: ignore[no-untyped-def]
                 # One of the two is 0.
                 apart = np.sqrt(np.float32(inside[i, j, k] + outside[i, j, k])) - np.float32(0.5)
                 distance[i, j, k] = -apart if solid[i, j, k] else apart
+
+
+def near_surface(
+    distance: NDArray[np.float32], band: float
+) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
+    """Find the points of a lattice that are near a surface.
+
+    Parameters
+    ----------
+    distance : ndarray of float32, shape (a, b, c)
+        From `signed_distance`.
+    band : float
+        Voxels.
+
+    Returns
+    -------
+    points : ndarray of uint8, shape (M, 3)
+        Indices of those that are no farther off, in C order; a column after the other in memory.
+    values : ndarray of float32, shape (M,)
+        Their distances.
+    """
+    points = np.empty((3, np.count_nonzero(np.abs(distance) <= band)), dtype=np.uint8)
+    values = np.empty(points.shape[1], dtype=np.float32)
+    _near_surface(distance, np.float32(band), points, values)
+    return points.T, values
+
+
+@kernel()
+def _near_surface(distance, band, points, values):  # type: ignore[no-untyped-def]
+    found = 0
+    for i in range(distance.shape[0]):
+        for j in range(distance.shape[1]):
+            for k in range(distance.shape[2]):
+                value = distance[i, j, k]
+                if abs(value) <= band:
+                    points[0, found], points[1, found], points[2, found] = i, j, k
+                    values[found] = value
+                    found += 1
