@@ -50,10 +50,9 @@ def bounding_box(occupancy: NDArray[np.bool_]) -> tuple[slice, slice, slice]:
         If no voxel is occupied.
     """
     slices = []
-    # Along the last axis first, which leaves little to look at for the two others.
-    across = occupancy.any(axis=2)
-    for there in (across.any(axis=1), across.any(axis=0), occupancy.any(axis=1).any(axis=0)):
-        occupied = np.flatnonzero(there)
+    for axis in range(3):
+        others = tuple(a for a in range(3) if a != axis)
+        occupied = np.flatnonzero(occupancy.any(axis=others))
         if len(occupied) == 0:
             raise ValueError("an empty voxel set has no bounding box")
         slices.append(slice(int(occupied[0]), int(occupied[-1]) + 1))

@@ -4,19 +4,18 @@ A worker leaves an asset's arrays here, in SI units, and hands the parent only
 a `SpooledAsset`, so the parent's memory does not grow with voxels. A file is
 named by its asset's key (see `slatprep.pipeline.recipe`), so what an interrupted build
 finished is found again by the next one, and only by one that would write the
-same. It appears under its name when it is whole; npz holds a checksum of
+same. It appears under its name when it is whole, and holds a checksum of
 every array, so one that a power failure tore is known and done again.
 """
 
 from __future__ import annotations
 
 import hashlib
-import zipfile
 from collections.abc import Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,20 +35,18 @@ from slatprep.records import (
     Status,
     StructuredLatents,
 )
+from slatprep.storage.arrays import ArrayFile, write_arrays
 from slatprep.storage.atomic import staged_apart, writing
 from slatprep.storage.faults import reached
 from slatprep.storage.place import storage_of
 from slatprep.storage.versions import BUILDER, is_spooled
 from slatprep.store.layout import MERGED_COLUMNS
 
-if TYPE_CHECKING:
-    from numpy.lib.npyio import NpzFile
-
 Arrays = dict[str, NDArray[Any]]
 
 _VOXEL_ARRAYS = ("coords", "feats", "properties", "material", "valid", "distance", "place",
                  "confidence")  # fmt: skip
-_TORN = (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile, StoreError)
+_TORN = (OSError, ValueError, KeyError, StoreError)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -164,7 +161,7 @@ class Spool:
         """Return a finished asset, or None if there is none under this key that is whole."""
         try:
             with self._open(key) as file:
-                arrays = {name: file[name] for name in file.files}  # Reads, so checks, them all.
+                arrays = dict(file)  # Reads, so checks, them all.
             record = read_record(arrays["record"].tobytes(), str(self._path(key)))
             extent = arrays["extent"]
         except _TORN:
@@ -177,13 +174,13 @@ class Spool:
         """Whether anything at all is finished."""
         directory = storage_of(self.directory).local
         if directory is None:
-            return any(name.endswith(".npz") for name in storage_of(self.directory).files())
-        return any(directory.glob("[0-9a-f][0-9a-f]/*.npz"))
+            return any(name.endswith(".arrays") for name in storage_of(self.directory).files())
+        return any(directory.glob("[0-9a-f][0-9a-f]/*.arrays"))
 
     def amend(self, record: AssetRecord) -> None:
         """Replace the record of a finished asset."""
         with self._open(record.key) as file:
-            arrays = {name: file[name] for name in file.files if name != "record"}
+            arrays = {name: file[name] for name in file if name != "record"}
         self._write(record.key, record, arrays)
 
     def keep_only(self, keys: set[str], mark: str = "") -> list[str]:
@@ -207,7 +204,7 @@ class Spool:
             If the place cannot be listed, or the files not be removed.
         """
         storage = storage_of(self.directory)
-        kept = {f"{key[:2]}/{key}.npz" for key in keys}
+        kept = {f"{key[:2]}/{key}.arrays" for key in keys}
         # Below the URL of a store others may keep what is theirs.
         ours = [n for n in storage.files() if storage.remote is None or is_spooled(n)]
         others = [n for n in ours if n.startswith(f"{BUILDER}-") and n != mark]
@@ -262,15 +259,12 @@ class Spool:
             )
 
     def _path(self, key: str) -> Place:
-        return self.directory / key[:2] / f"{key}.npz"
+        return self.directory / key[:2] / f"{key}.arrays"
 
     @contextmanager
-    def _open(self, key: str) -> Iterator[NpzFile]:
-        with (
-            storage_of(self._path(key)).open_scattered() as file,
-            np.load(file, allow_pickle=False) as arrays,
-        ):
-            yield arrays
+    def _open(self, key: str) -> Iterator[ArrayFile]:
+        with storage_of(self._path(key)).open_scattered() as file:
+            yield ArrayFile(file)
 
     def _write(self, key: str, record: Record, arrays: Arrays) -> None:
         everything: Arrays = {**arrays, "record": np.frombuffer(to_json(record), np.uint8)}
@@ -279,7 +273,7 @@ class Spool:
             self._staged(self._path(key)) as partial,
             partial.open("wb") as file,
         ):
-            np.savez(file, **everything)  # type: ignore[arg-type]
+            write_arrays(file, everything)
         reached("asset spooled", record.asset_id)
 
     def _staged(self, place: Place) -> AbstractContextManager[Path]:

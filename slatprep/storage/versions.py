@@ -35,7 +35,7 @@ FORMAT = "slatprep-store-pointer"
 
 # Names come from whoever wrote the pointer, and lead to objects.
 _NAME = re.compile(r"[0-9a-f]{16}")
-_SPOOLED = re.compile(rf"{BUILDER}-[0-9a-f]{{16}}|[0-9a-z]{{2}}/(none-)?[0-9a-f]{{32,64}}\.npz")
+_SPOOLED = re.compile(rf"{BUILDER}-[0-9a-f]{{16}}|[0-9a-z]{{2}}/(none-)?[0-9a-f]{{32,64}}\.arrays")
 _MAX_POINTER_BYTES = 2**16
 
 

@@ -106,7 +106,7 @@ def test_what_was_finished_is_not_done_again(
     killed = run(script, dataset, tmp_path / "s.zarr", kill_at("asset begun", 2))
     assert killed.returncode == -signal.SIGKILL
     # A torn file, as a power failure leaves it, is known and done again.
-    torn, *_ = sorted((tmp_path / ".s.zarr.work" / "spool").rglob("*.npz"))
+    torn, *_ = sorted((tmp_path / ".s.zarr.work" / "spool").rglob("*.arrays"))
     torn.write_bytes(torn.read_bytes()[:-2000])
     # One was finished, so two alignments are enough.
     again = run(script, dataset, tmp_path / "s.zarr", kill_at("asset aligned", 2))

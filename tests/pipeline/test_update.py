@@ -236,7 +236,7 @@ def test_kept_work_is_used_and_holds_no_more_than_the_store(
     dataset, out = built
     build_store(dataset.parameters("pixie"), out, keep_work=True)
     kept = out.with_name(".s.zarr.work") / "spool"
-    assert len(list(kept.rglob("*.npz"))) == 3
+    assert len(list(kept.rglob("*.arrays"))) == 3
 
     read: list[str] = []
     inject(monkeypatch, lambda step, name: step == "asset read" and read.append(name))
@@ -245,7 +245,7 @@ def test_kept_work_is_used_and_holds_no_more_than_the_store(
     assert reasons(dataset.parameters(), out)["a"] == ("resume", "finished by an earlier build")
     build_store(dataset.parameters(), out, keep_work=True)
     assert open_store(out).ids == ["a", "b"]
-    assert len(list(kept.rglob("*.npz"))) == 2
+    assert len(list(kept.rglob("*.arrays"))) == 2
     assert aligned == read == []
 
 

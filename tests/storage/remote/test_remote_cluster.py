@@ -132,7 +132,7 @@ def test_a_command_that_is_killed_again_and_again_goes_on_where_it_was(
 
 
 def spooled(s3: Any, url: str) -> list[str]:
-    return [name for name in s3.find(f"{url}/spool") if name.endswith(".npz")]
+    return [name for name in s3.find(f"{url}/spool") if name.endswith(".arrays")]
 
 
 def test_a_worker_that_does_not_reach_the_store_is_named_before_any_work(
@@ -159,7 +159,7 @@ def test_what_others_keep_beside_a_spool_is_refused_and_stays(
     assert contents(s3, url).keys() == {"spool/notes.txt"}
 
 
-ASSET = f"ab/ab{'0' * 30}.npz"
+ASSET = f"ab/ab{'0' * 30}.arrays"
 
 
 def test_a_build_elsewhere_keeps_its_finished_assets_until_it_has_ended(

@@ -53,7 +53,7 @@ def test_a_store_is_built_from_s3_to_s3_and_equals_the_local_one(
     group = zarr.open_group(str(store.path), mode="r")
     assert (group["voxel/coords"][:] == zarr.open_group(expected)["voxel/coords"][:]).all()
     assert verify_store(url, sources=True).findings == ()
-    assert not any((tmp_path / "cache").rglob("*.npz"))
+    assert not any((tmp_path / "cache").rglob("*.arrays"))
 
 
 def assert_same(left: Store, right: Store) -> None:
