@@ -79,11 +79,12 @@ def _search(pair: Pair) -> Alignment:
     search = Search.EULER64
     if _is_poor(poses):
         search = Search.SO3
-        wide = pair.polish(pair.search_all())
+        refined, halfway = pair.search_all()
+        wide = pair.polish(refined)
         if wide[0].score > poses[0].score + WIDER_GAIN:
             poses = pair.distinct([*poses, *wide])
         if pair.may_deform and poses[0].score < POOR:
-            poses = pair.ranked(pair.distinct([*poses, *wide]))
+            poses = pair.ranked(pair.distinct([*poses, *wide]), pair.stretched(halfway))
 
     may_contest = pair.may_deform and poses[0].score < POOR
     reach = 2 * TIE if may_contest else TIE

@@ -16,7 +16,7 @@ from slatprep.align.deform import Deformed, deform_if_earned, try_out
 from slatprep.align.pose import Pose
 from slatprep.align.starts import so3_starts
 from slatprep.align.surface import Surface
-from slatprep.align.warp import places_of
+from slatprep.align.warp import Warp, from_nearest, places_of
 from slatprep.parameters import AlignParameters
 from slatprep.records import Model
 
@@ -52,6 +52,9 @@ they score after a trial deformation on so many samples."""
 
 SCALE_PRIOR = 0.04
 """By so much a scale off by 28 % (a quarter, as a logarithm) lowers the rank, squared beyond."""
+
+STRETCH_SAMPLES, STRETCH_TAUS = 60, (5.0, 4.0, 4.0, 3.0)
+STRETCH_LOOKED_AT, MOST_STRETCHED = 60, 6
 
 RANK_STANDING = 0.01
 """By so much another placement must rank above the one that fits best as a similarity."""
@@ -140,13 +143,20 @@ class Pair:
             )
         ]  # fmt: skip
 
-    def search_all(self) -> list[Pose]:
-        """Refine starts in all orientations, those that look hopeless halfway not to the end."""
+    def search_all(self) -> tuple[list[Pose], list[Pose]]:
+        """Refine starts in all orientations, those that look hopeless halfway not to the end.
+
+        Returns
+        -------
+        refined, halfway : list of Pose
+            Those that went on, and all of them halfway.
+        """
         scales = [self.size_ratio]
         if abs(scales[0] - 1.0) > SAME_SIZE:
             # Floaters, ground and missing parts falsify sizes; one is the likeliest scale.
             scales.append(1.0)
         kept: list[Pose] = []
+        everything: list[Pose] = []
         for scale in scales:
             # The second set is a supplement, and half as dense for the sake of time.
             starts = self.poses(so3_starts(SO3_STARTS)[:: 2 if kept else 1], scale)
@@ -155,17 +165,55 @@ class Pair:
             halfway = self.refine(starts, COARSE_SAMPLES, taus, 0.02, free_scale=free)
             halfway.sort(key=lambda pose: -pose.score)
             kept += halfway[: SO3_KEPT // len(scales)]
-        return self.refine(kept, COARSE_SAMPLES, COARSE_TAUS[SO3_HALFWAY:], 0.02)
+            everything += halfway
+        return self.refine(kept, COARSE_SAMPLES, COARSE_TAUS[SO3_HALFWAY:], 0.02), everything
 
-    def ranked(self, poses: Sequence[Pose]) -> list[Pose]:
+    def stretched(self, poses: Sequence[Pose]) -> list[Pose]:
+        """Return the placements that fit best if poses may be stretched, as similarities.
+
+        Squashed by a quarter, an apple fits itself better lying on its side: what it
+        scores as a similarity says little, and a search by that may not come to the
+        right placement at all.
+        """
+        from slatprep.align.stretch import stretch
+
+        slat, pixie = self._subsets(STRETCH_SAMPLES)
+        rotations = np.array([pose.rotation for pose in poses])
+        shifts = np.array([pose.shift for pose in poses])
+        scales = np.array([pose.scale for pose in poses])
+        offsets = np.array([pose.offset for pose in poses])
+        affines = np.repeat(np.eye(3, 4)[None], len(poses), axis=0)
+        scores = stretch(
+            slat.points, slat.values, slat.distance, slat.origin,
+            pixie.points, pixie.values, pixie.distance, pixie.origin,
+            rotations, shifts, scales, offsets, affines, np.array(STRETCH_TAUS),
+        )  # fmt: skip
+        inverse = rotations.transpose(0, 2, 1) / scales[:, None, None]
+        matrices, centre = inverse @ affines[:, :, :3], affines[:, :, 3] - shifts
+        places = self._coordinates(matrices, np.einsum("nij,nj->ni", inverse, centre))
+        left = np.argsort(-scores, kind="stable")[:STRETCH_LOOKED_AT]
+        found = []
+        while len(left) and len(found) < MOST_STRETCHED:
+            best, left = left[0], left[1:]
+            square = ((places[left] - places[best]) ** 2).sum(axis=1)
+            left = left[square >= (2.0 * DISTINCT) ** 2]
+            similarity, _ = from_nearest(
+                poses[best].similarity,
+                Warp(affines[best], float(offsets[best])),
+                slat.points,
+                self.parameters.scale_bounds,
+            )
+            found.append(Pose(**vars(similarity)))
+        return self.refine(found, POLISH_SAMPLES, (), 0.01)
+
+    def ranked(self, poses: Sequence[Pose], stretched: Sequence[Pose]) -> list[Pose]:
         """Order the best poses by how well they fit once deformed.
 
         Where shapes differ, the score of a similarity says little about which
         placement is right. What a trial deformation leaves says more.
         """
-        likely = [p for p in poses if p.score > poses[0].score - RANK_WITHIN][:MOST_RANKED]
-        if len(likely) == 1:
-            return list(poses)
+        near = [p for p in poses if p.score > poses[0].score - RANK_WITHIN][:MOST_RANKED]
+        likely = [*near, *stretched]
         points = self.slat.subset(RANK_SAMPLES).points
         ranked = []
         for index, pose in enumerate(likely):
@@ -179,7 +227,7 @@ class Pair:
         for pose, places in ranked:
             if _apart_from_all(places, (p for _, p in kept)):
                 kept.append((pose, places))
-        return self.distinct([*(pose for pose, _ in kept), *poses[len(likely) :]])
+        return self.distinct([*(pose for pose, _ in kept), *poses[len(near) :]])
 
     def _subsets(self, samples: int) -> tuple[Surface, Surface]:
         if samples not in self._cache:
@@ -264,8 +312,13 @@ class Pair:
         inverse = np.array([pose.rotation for pose in poses]).transpose(0, 2, 1)
         inverse = inverse / np.array([pose.scale for pose in poses])[:, None, None]
         shift = np.array([pose.shift for pose in poses])
-        centre = np.einsum("nij,nj->ni", inverse, self._mean - shift)
-        return np.concatenate([(inverse @ self._spread).reshape(-1, 9), centre], axis=1)
+        return self._coordinates(inverse, -np.einsum("nij,nj->ni", inverse, shift))
+
+    def _coordinates(
+        self, matrices: NDArray[np.float64], shifts: NDArray[np.float64]
+    ) -> NDArray[np.float64]:
+        centre = matrices @ self._mean + shifts
+        return np.concatenate([(matrices @ self._spread).reshape(-1, 9), centre], axis=1)
 
     def distinct(self, poses: Sequence[Pose]) -> list[Pose]:
         """Return the poses best first, without those that repeat a better one."""
