@@ -84,7 +84,7 @@ def _search(pair: Pair) -> Alignment:
         if wide[0].score > poses[0].score + WIDER_GAIN:
             poses = pair.distinct([*poses, *wide])
         if pair.may_deform and poses[0].score < POOR:
-            poses = pair.ranked(pair.distinct([*poses, *wide]), pair.stretched(halfway))
+            poses = pair.ranked(pair.distinct([*poses, *wide]), halfway)
 
     may_contest = pair.may_deform and poses[0].score < POOR
     reach = 2 * TIE if may_contest else TIE

@@ -53,8 +53,10 @@ they score after a trial deformation on so many samples."""
 SCALE_PRIOR = 0.04
 """By so much a scale off by 28 % (a quarter, as a logarithm) lowers the rank, squared beyond."""
 
-STRETCH_SAMPLES, STRETCH_TAUS = 60, (5.0, 4.0, 4.0, 3.0)
-STRETCH_LOOKED_AT, MOST_STRETCHED = 60, 6
+STRETCH_SAMPLES = 60, 120
+STRETCH_TAUS = (5.0, 4.0, 4.0, 3.0), (3.0, 2.0, 2.0, 1.5)
+STRETCH_KEPT = 60
+"""Samples and steps of the affine fit of all poses halfway, and of the best of them (so many)."""
 
 RANK_STANDING = 0.01
 """By so much another placement must rank above the one that fits best as a similarity."""
@@ -80,6 +82,18 @@ def _apart_from_all(places: NDArray[np.float64], others: Iterable[NDArray[np.flo
     """Whether similarities did not deform into one and the same placement."""
     apart = (np.sqrt(((places - other) ** 2).sum(axis=1).mean()) for other in others)
     return all(distance >= 2.0 * DISTINCT for distance in apart)
+
+
+def _apart(
+    places: NDArray[np.float64], order: NDArray[np.intp], distance: float
+) -> NDArray[np.intp]:
+    """Choose of `order`, best first, those that do not lie near to a better one."""
+    kept = []
+    while len(order):
+        best, order = order[0], order[1:]
+        kept.append(best)
+        order = order[((places[order] - places[best]) ** 2).sum(axis=1) >= distance**2]
+    return np.array(kept, dtype=np.intp)
 
 
 class Pair:
@@ -132,7 +146,7 @@ class Pair:
             slat.points, slat.values, slat.distance, slat.origin,
             pixie.points, pixie.values, pixie.distance, pixie.origin,
             rotations, shifts, scales, offsets,
-            np.array(taus), self.free_scale if free_scale is None else free_scale,
+            np.array(taus, dtype=np.float64), self.free_scale if free_scale is None else free_scale,
             size_by_slat, low, high, tolerance,
         )  # fmt: skip
         return [
@@ -168,58 +182,78 @@ class Pair:
             everything += halfway
         return self.refine(kept, COARSE_SAMPLES, COARSE_TAUS[SO3_HALFWAY:], 0.02), everything
 
-    def stretched(self, poses: Sequence[Pose]) -> list[Pose]:
-        """Return the placements that fit best if poses may be stretched, as similarities.
+    def stretched(self, poses: Sequence[Pose], near: Sequence[Pose]) -> list[Pose]:
+        """Return the placements that fit best if they may be stretched, best first.
 
         Squashed by a quarter, an apple fits itself better lying on its side: what it
         scores as a similarity says little, and a search by that may not come to the
-        right placement at all.
+        right placement at all. So all of `poses` are asked, and those of `near`, which fit
+        best as similarities, more closely.
         """
+        affines, offsets, scores = self._stretch(poses, None, STRETCH_SAMPLES[0], STRETCH_TAUS[0])
+        places = self._places(poses, affines)
+        kept = _apart(places, np.argsort(-scores, kind="stable")[:STRETCH_KEPT], 2.0 * DISTINCT)
+        both = [*near, *(replace(poses[k], offset=float(offsets[k])) for k in kept)]
+        affines = np.concatenate([np.repeat(np.eye(3, 4)[None], len(near), axis=0), affines[kept]])
+        affines, offsets, scores = self._stretch(
+            both, affines, STRETCH_SAMPLES[1], STRETCH_TAUS[1]
+        )
+        places = self._places(both, affines)
+        kept = _apart(places, np.argsort(-scores, kind="stable"), 2.0 * DISTINCT)
+        likely = kept[scores[kept] > scores[kept[0]] - RANK_WITHIN][:MOST_RANKED]
+        similar = [
+            from_nearest(
+                both[k].similarity,
+                Warp(affines[k], float(offsets[k])),
+                self.slat.points,
+                self.parameters.scale_bounds,
+            )[0]
+            for k in likely
+            if k >= len(near)
+        ]
+        found = [near[k] for k in likely if k < len(near)]
+        if similar:
+            found += self.refine([Pose(**vars(s)) for s in similar], POLISH_SAMPLES, (), 0.01)
+        return found
+
+    def _stretch(
+        self,
+        poses: Sequence[Pose],
+        affines: NDArray[np.float64] | None,
+        samples: int,
+        taus: Sequence[float],
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+        """Fit an affine map of each pose; return them, their offsets and scores."""
         from slatprep.align.stretch import stretch
 
-        slat, pixie = self._subsets(STRETCH_SAMPLES)
-        rotations = np.array([pose.rotation for pose in poses])
-        shifts = np.array([pose.shift for pose in poses])
-        scales = np.array([pose.scale for pose in poses])
+        slat, pixie = self._subsets(samples)
+        if affines is None:
+            affines = np.repeat(np.eye(3, 4)[None], len(poses), axis=0)
         offsets = np.array([pose.offset for pose in poses])
-        affines = np.repeat(np.eye(3, 4)[None], len(poses), axis=0)
         scores = stretch(
             slat.points, slat.values, slat.distance, slat.origin,
             pixie.points, pixie.values, pixie.distance, pixie.origin,
-            rotations, shifts, scales, offsets, affines, np.array(STRETCH_TAUS),
+            np.array([pose.rotation for pose in poses]), np.array([pose.shift for pose in poses]),
+            np.array([pose.scale for pose in poses]), offsets, affines, np.array(taus),
         )  # fmt: skip
-        inverse = rotations.transpose(0, 2, 1) / scales[:, None, None]
-        matrices, centre = inverse @ affines[:, :, :3], affines[:, :, 3] - shifts
-        places = self._coordinates(matrices, np.einsum("nij,nj->ni", inverse, centre))
-        left = np.argsort(-scores, kind="stable")[:STRETCH_LOOKED_AT]
-        found = []
-        while len(left) and len(found) < MOST_STRETCHED:
-            best, left = left[0], left[1:]
-            square = ((places[left] - places[best]) ** 2).sum(axis=1)
-            left = left[square >= (2.0 * DISTINCT) ** 2]
-            similarity, _ = from_nearest(
-                poses[best].similarity,
-                Warp(affines[best], float(offsets[best])),
-                slat.points,
-                self.parameters.scale_bounds,
-            )
-            found.append(Pose(**vars(similarity)))
-        return self.refine(found, POLISH_SAMPLES, (), 0.01)
+        return affines, offsets, scores
 
-    def ranked(self, poses: Sequence[Pose], stretched: Sequence[Pose]) -> list[Pose]:
+    def ranked(self, poses: Sequence[Pose], halfway: Sequence[Pose]) -> list[Pose]:
         """Order the best poses by how well they fit once deformed.
 
         Where shapes differ, the score of a similarity says little about which
         placement is right. What a trial deformation leaves says more.
         """
         near = [p for p in poses if p.score > poses[0].score - RANK_WITHIN][:MOST_RANKED]
-        likely = [*near, *stretched]
+        likely = self.stretched(halfway, near)
+        if not any(pose is poses[0] for pose in likely):
+            likely.append(poses[0])
         points = self.slat.subset(RANK_SAMPLES).points
         ranked = []
-        for index, pose in enumerate(likely):
+        for pose in likely:
             trial = try_out(self.slat, self.pixie, pose.similarity, RANK_SAMPLES)
             bonus = float(trial.whole) - _scale_penalty(pose) - pose.score
-            standing = RANK_STANDING if index == 0 else 0.0
+            standing = RANK_STANDING if pose is poses[0] else 0.0
             places = places_of(pose.similarity, trial.bent, points)
             ranked.append((replace(pose, bonus=bonus, standing=standing), places))
         ranked.sort(key=lambda entry: -entry[0].rank)
@@ -303,32 +337,24 @@ class Pair:
         far = [pose for pose, ok in zip(poses, apart, strict=True) if ok]
         return self.distinct(far) if far else []
 
-    def _places(self, poses: Sequence[Pose]) -> NDArray[np.float64]:
+    def _places(
+        self, poses: Sequence[Pose], affines: NDArray[np.float64] | None = None
+    ) -> NDArray[np.float64]:
         """Return poses as points in 12 dimensions whose distances are those of `apart`.
 
         Over samples of mean m and covariance L L^T, the mean square of A x + b is
-        the sum of squares of A L and of A m + b.
+        the sum of squares of A L and of A m + b. The `affines` (n, 3, 4) come before the poses.
         """
         inverse = np.array([pose.rotation for pose in poses]).transpose(0, 2, 1)
         inverse = inverse / np.array([pose.scale for pose in poses])[:, None, None]
-        shift = np.array([pose.shift for pose in poses])
-        return self._coordinates(inverse, -np.einsum("nij,nj->ni", inverse, shift))
-
-    def _coordinates(
-        self, matrices: NDArray[np.float64], shifts: NDArray[np.float64]
-    ) -> NDArray[np.float64]:
-        centre = matrices @ self._mean + shifts
+        moved = -np.array([pose.shift for pose in poses])
+        matrices = inverse
+        if affines is not None:
+            matrices, moved = inverse @ affines[:, :, :3], moved + affines[:, :, 3]
+        centre = matrices @ self._mean + np.einsum("nij,nj->ni", inverse, moved)
         return np.concatenate([(matrices @ self._spread).reshape(-1, 9), centre], axis=1)
 
     def distinct(self, poses: Sequence[Pose]) -> list[Pose]:
         """Return the poses best first, without those that repeat a better one."""
         rest = sorted(poses, key=lambda pose: -pose.rank)
-        places = self._places(rest)
-        left = np.arange(len(rest))
-        kept: list[Pose] = []
-        while len(left):
-            best, left = left[0], left[1:]
-            kept.append(rest[best])
-            square = ((places[left] - places[best]) ** 2).sum(axis=1)
-            left = left[square >= DISTINCT**2]
-        return kept
+        return [rest[k] for k in _apart(self._places(rest), np.arange(len(rest)), DISTINCT)]
