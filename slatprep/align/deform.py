@@ -14,7 +14,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from slatprep.align.deform_solver import affine_step, lattice_step, linearise
+from slatprep.align.deform_solver import (
+    OFFSET_PRIOR,
+    PIXIEVERSE_WEIGHT,
+    RIDGE,
+    affine_step,
+    lattice_step,
+    linearise,
+)
 from slatprep.align.deformation import bending_of, deform
 from slatprep.align.surface import Surface
 from slatprep.align.warp import Similarity, Warp, from_nearest, halved
@@ -58,11 +65,8 @@ the misfit."""
 SOLVER_STEPS = 6
 """Steps of conjugate gradients for each step of Gauss and Newton."""
 
-OFFSET_PRIOR = 0.01
-PIXIEVERSE_WEIGHT = 0.5
-"""Weight of a PixieVerse sample in a fit: floaters and ground are surface that only they have."""
 
-_RIDGE, _DAMPING = 1e-4, 1e-6
+_DAMPING = 1e-6
 
 
 class Pairing:
@@ -140,7 +144,7 @@ class Pairing:
             self._linearise_weighted(warp, tau)
             affine_step(
                 self._places[seen], self._vectors[seen], self._residuals[seen],
-                self.centre, _RIDGE, warp.offset, OFFSET_PRIOR * len(seen), step,
+                self.centre, RIDGE, warp.offset, OFFSET_PRIOR * len(seen), step,
             )  # fmt: skip
             change = step[:12].reshape(3, 4)
             affine = warp.affine + change

@@ -20,6 +20,10 @@ from slatprep.align.bspline import bend, gather, locate, scatter, strides_of
 from slatprep.align.solver import interpolate, solve_linear
 from slatprep.geometry.kernel import kernel
 
+OFFSET_PRIOR, RIDGE = 0.01, 1e-4
+PIXIEVERSE_WEIGHT = 0.5
+"""Weight of a PixieVerse sample in a fit: floaters and ground are surface that only they have."""
+
 _INVERSE_STEPS = 2
 
 

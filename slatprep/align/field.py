@@ -87,8 +87,7 @@ def _search(pair: Pair) -> Alignment:
             poses = pair.ranked(pair.distinct([*poses, *wide]), halfway)
 
     may_contest = pair.may_deform and poses[0].score < POOR
-    reach = 2 * TIE if may_contest else TIE
-    near = [pose for pose in poses if pose.merit > poses[0].merit - reach]
+    near = [pose for pose in poses if pose.merit > poses[0].merit - TIE]
     tied, deformed = pair.finish(near, rough=poses[0].score < CLEAN)
     best = tied[0]
     # A contest said more of them than the scores that they had before.

@@ -11,7 +11,7 @@ from slatprep.align.warp import Similarity
 from slatprep.geometry.frames import VOXEL_SIZE, make_transform
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Pose:
     """A similarity from the PixieVerse frame to the SLAT frame, and how well it fits.
 
