@@ -46,7 +46,7 @@ POOR, FAIR, CLEAR = 0.8, 0.9, 0.1
 no better than fair and not clearly above that of the next distinct placement."""
 
 HOPELESS = 0.2
-"""Sides whose best score is lower have no shape in common, be there ground or not."""
+"""Sides whose best score is lower have no shape in common, deformed or without ground."""
 
 WIDER_GAIN = 0.02
 """By so much a placement far from the quarter turns must score above the best near them."""
@@ -83,11 +83,12 @@ def _search(pair: Pair) -> Alignment:
         wide = pair.polish(refined)
         if wide[0].score > poses[0].score + WIDER_GAIN:
             poses = pair.distinct([*poses, *wide])
-        if pair.may_deform and poses[0].score < POOR:
+        if pair.may_deform and HOPELESS < poses[0].score < POOR:
             poses = pair.ranked(pair.distinct([*poses, *wide]), halfway)
 
     may_contest = pair.may_deform and poses[0].score < POOR
-    near = [pose for pose in poses if pose.merit > poses[0].merit - TIE]
+    reach = 2 * TIE if may_contest else TIE
+    near = [pose for pose in poses if pose.merit > poses[0].merit - reach]
     tied, deformed = pair.finish(near, rough=poses[0].score < CLEAN)
     best = tied[0]
     # A contest said more of them than the scores that they had before.

@@ -66,7 +66,7 @@ RANK_STANDING = 0.01
 """By so much another placement must rank above the one that fits best as a similarity."""
 
 MOST_CONTESTED = 4
-"""Where the best placement is deformed, so many, of those within `TIE`, are deformed too."""
+"""Where the best placement is deformed, so many, of those within twice `TIE`, are deformed too."""
 
 RIGID_IF_SCALE_WITHIN = 0.04
 RIGID_LOSS = 0.004
