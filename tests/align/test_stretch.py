@@ -43,7 +43,7 @@ def test_a_squashed_object_is_not_laid_on_its_side(
 
 
 def test_a_known_affine_map_is_found_from_a_pose_beside_it() -> None:
-    """The map that was applied brings the SLAT's samples to where they were, to a quarter of a voxel."""
+    """The map that was applied brings the SLAT's samples back to a quarter of a voxel."""
     shape = chair()
     inside = np.argwhere(shape) - 31.5
     linear = np.array([[1.1, 0.05, 0.0], [0.0, 0.85, 0.04], [-0.03, 0.0, 1.05]])
