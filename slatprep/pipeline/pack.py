@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
-from itertools import accumulate
+from functools import partial
+from itertools import accumulate, groupby
 from pathlib import Path
 from typing import Any
 
@@ -38,6 +39,9 @@ from slatprep.workers.local import Jobs, run_unordered
 
 Arrays = dict[str, NDArray[Any]]
 """Rows of arrays, by their full names."""
+
+_ROWS_MOVED = 65_536
+"""Rows of the existing store that are unpacked at a time, 4 MB in all arrays."""
 
 
 def write_shard(
@@ -92,17 +96,39 @@ def write_shard(
                     for data, lengths in reader.packed(first, last):
                         writer.append_packed(data, lengths)
                 continue
-            for asset, own in owners(shard, *rows):
-                key = shard.keys[asset]
-                if isinstance(key, int) and held is not None:
-                    arrays = stored_rows(held, shard.group, key, own)
-                else:
-                    arrays, counts = arrays_of(spool, str(key), own, normalization, background)
+            for there, assets in groupby(owners(shard, *rows), partial(_row_there, shard.keys)):
+                if there is not None and held is not None:
+                    _move_rows(writers, held, there, list(assets))
+                    continue
+                for asset, own in assets:
+                    key = str(shard.keys[asset])
+                    arrays, counts = arrays_of(spool, key, own, normalization, background)
                     clipped[asset] += counts
-                append_rows(writers, arrays, own.stop - own.start)
+                    append_rows(writers, arrays, own.stop - own.start)
         reached("shard filled", name)
     reached("shard written", name)
     return shard, clipped, {writer.file: writer.written() for writer in writers.values()}
+
+
+def _row_there(keys: Sequence[str | int], one: tuple[int, slice]) -> int | None:
+    """Return what assets have in common whose rows follow one another in the existing store."""
+    key = keys[one[0]]
+    return key - one[0] if isinstance(key, int) else None
+
+
+def _move_rows(
+    writers: Mapping[str, ShardWriter],
+    held: Store,
+    there: int,
+    assets: Sequence[tuple[int, slice]],
+) -> None:
+    """Write rows of voxels that follow one another in a store; `there` is the row of asset 0."""
+    (first, begin), (last, end) = assets[0], assets[-1]
+    start = int(held.offsets[there + first]) + begin.start
+    stop = int(held.offsets[there + last]) + end.stop
+    for at in range(start, stop, _ROWS_MOVED):
+        rows = min(_ROWS_MOVED, stop - at)
+        append_rows(writers, {name: held.read_rows(name, at, at + rows) for name in writers}, rows)
 
 
 def append_rows(writers: Mapping[str, ShardWriter], arrays: Arrays, rows: int) -> None:
@@ -127,39 +153,6 @@ def owners(shard: Shard, start: int, stop: int) -> Iterator[tuple[int, slice]]:
     else:
         first = shard.rows[0]
         yield from ((asset, slice(0, 1)) for asset in range(start - first, stop - first))
-
-
-def stored_rows(
-    store: Store,
-    group: str,
-    row: int,
-    own: slice,
-    read: Callable[[str, int, int], NDArray[Any]] | None = None,
-) -> Arrays:
-    """Read rows of an asset from every array of a group.
-
-    Parameters
-    ----------
-    store : Store
-        The store.
-    group : str
-        ``voxel`` or ``grid``.
-    row : int
-        The asset's row in ``asset/*``.
-    own : slice
-        Which of its rows of the group, counted from its own first.
-    read : callable, optional
-        Reads rows of an array by its name; by default `Store.read_rows`.
-
-    Returns
-    -------
-    dict of str to ndarray
-        By the array's full name; properties normalised, as the store has them.
-    """
-    read = read or store.read_rows
-    begin = int(store.offsets[row]) if group == "voxel" else row
-    rows = begin + own.start, begin + own.stop
-    return {name: read(name, *rows) for name in arrays_in(group, store.merges)}
 
 
 def _voxel_rows(

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from slatprep.errors import ConfigError, StoreError
 from slatprep.normalize import denormalize_properties, normalize_properties
 from slatprep.parameters import BuildParameters, StoreParameters
-from slatprep.pipeline.pack import append_rows, arrays_in, owners, stored_rows, write_assets
+from slatprep.pipeline.pack import append_rows, arrays_in, owners, write_assets
 from slatprep.pipeline.publish import Destination, publish_manifests, write_all_records
 from slatprep.pipeline.spool import spooled
 from slatprep.pipeline.summary import BuildSummary, counts_of, summarise_build
@@ -194,8 +194,10 @@ def _copy_rows(
             for asset, own in owners(shard, *shard.rows):
                 source, row = rows[shard.first + asset]
                 change = _renormaliser(source.store.normalization, normalization)
-                values_of = stored_rows(source.store, shard.group, row, own, source.records.rows)
-                changed = {name: change(values, name) for name, values in values_of.items()}
+                begin = int(source.store.offsets[row]) if shard.group == "voxel" else row
+                span = begin + own.start, begin + own.stop
+                names = arrays_in(shard.group, source.store.merges)
+                changed = {name: change(source.records.rows(name, *span), name) for name in names}
                 append_rows(writers, changed, own.stop - own.start)
 
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from itertools import groupby
 
 Piece = tuple[bool, int, int]
-"""Whether the rows of some whole chunks are the same, the first of them, and the end."""
+"""Whether the existing store has the rows of some whole chunks, the first of them, and the end."""
 
 
 @dataclass(frozen=True)

@@ -10,6 +10,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import groupby
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
@@ -52,8 +53,8 @@ class Shard:
         ``voxel`` alone: first row of each of them in the store, and the last
         one's end.
     pieces : sequence of Piece
-        Its rows, and which of them the existing store has at the same place; empty
-        where none may be.
+        Its rows, and which of them the existing store has as chunks, rows of voxels at the same
+        place; empty where none may be.
     """
 
     group: str
@@ -169,8 +170,24 @@ def shards(
     per_shard = parameters.grid_assets_per_shard
     for start, stop in row_ranges(len(keys), per_shard):
         if not of_grids.holds_shard(start, start + per_shard):
-            pieces = tuple(of_grids.pieces(start, stop, 1)) if same else ()
-            yield Shard("grid", (start, stop), start, keys[start:stop], pieces=pieces)
+            own = keys[start:stop]
+            pieces = tuple(_grid_pieces(own, start)) if same else ()
+            yield Shard("grid", (start, stop), start, own, pieces=pieces)
+
+
+def _grid_pieces(keys: Sequence[str | int], start: int) -> Iterator[Piece]:
+    """Yield the grids that follow one another in the existing store, which are chunks, and others.
+
+    Of the first the rows are those of the existing store.
+    """
+
+    def place(one: tuple[int, str | int]) -> tuple[bool, int]:
+        row, key = one
+        return (True, key - row) if isinstance(key, int) else (False, 0)
+
+    for (held, moved), own in groupby(enumerate(keys, start), place):
+        rows = [row for row, _ in own]
+        yield held, rows[0] + moved, rows[-1] + moved + 1
 
 
 def finish_store(
