@@ -51,8 +51,8 @@ def code_fingerprint() -> str:
     """Return the SHA-256, in hex, of the statements of `numeric_modules`."""
     digest = hashlib.sha256()
     for path in numeric_modules().values():
-        tree = _without_docstrings(ast.parse(path.read_bytes()))
-        digest.update(f"{_dump(tree)}\n".encode())
+        digest.update(f"{_dump(_parsed(path.read_bytes()))}\n".encode())
+    _parsed.cache_clear()  # Trees are large.
     return digest.hexdigest()
 
 
@@ -85,8 +85,14 @@ def _source(name: str) -> Path | None:
     return next((file for file in files if file.is_file()), None)
 
 
+@lru_cache(maxsize=256)
+def _parsed(text: bytes) -> ast.Module:
+    """Return a module without its docstrings, which is asked for twice."""
+    return _without_docstrings(ast.parse(text))
+
+
 def _imports(path: Path) -> Iterator[str]:
-    for node in _statements(ast.parse(path.read_bytes())):
+    for node in _statements(_parsed(path.read_bytes())):
         if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("slatprep"):
             yield node.module or ""
             yield from (f"{node.module}.{alias.name}" for alias in node.names)

@@ -85,6 +85,11 @@ def find_files(
         raise ConfigError(
             f"pattern {pattern!r} is not a path below its root; write it relative, without '..'"
         )
+    # One name needs no search. Most patterns stand for one: that of a file beside a grid.
+    if "*" not in (literal := fill(pattern, known)) and all(map(_parts, components)):
+        if names.is_file(literal):
+            yield Found(dict(known), literal)
+        return
     try:
         yield from _walk(names, "", components, dict(known), skip)
     except OSError as error:
