@@ -259,20 +259,23 @@ def _search_columns(position, row, below, above, apart, limit):  # type: ignore[
 
 
 def _alike_around(voxels: NDArray[np.uint8], labels: NDArray[np.uint8]) -> NDArray[np.bool_]:
-    """Say of each cell of the grid with a margin of one whether all voxels around it agree.
+    """Say of each cell of the grid with a margin of two whether all voxels around it agree.
 
     Around it are the 27 cells; where none of them is in the set the answer means nothing.
     """
-    shape = (RESOLUTION + 4,) * 3
-    cells = np.ravel_multi_index(tuple((voxels.astype(np.intp) + 2).T), shape)
-    low, high = np.full(shape, 255, np.uint8), np.zeros(shape, np.uint8)
-    low.reshape(-1)[cells] = high.reshape(-1)[cells] = labels
-    for axis in range(3):
-        few, many = np.moveaxis(low, axis, 0), np.moveaxis(high, axis, 0)
-        few = np.minimum(np.minimum(few[:-2], few[1:-1]), few[2:])
-        many = np.maximum(np.maximum(many[:-2], many[1:-1]), many[2:])
-        low, high = np.moveaxis(few, 0, axis), np.moveaxis(many, 0, axis)
-    return np.ascontiguousarray(low == high)
+    side = RESOLUTION + 4
+    low, high = np.full(side**3, 255, np.uint8), np.zeros(side**3, np.uint8)
+    cells = flat_index(voxels.astype(np.intp) + 2, side)
+    low[cells] = high[cells] = labels
+    # In flattened grids a neighbour is so many places on. What comes of the margin's far side is
+    # no neighbour, and lies in the margin, too.
+    for step in (1, side, side * side):
+        low = np.minimum(np.minimum(low[: -2 * step], low[step:-step]), low[2 * step :])
+        high = np.maximum(np.maximum(high[: -2 * step], high[step:-step]), high[2 * step :])
+    alike = np.zeros(side**3, dtype=bool)
+    margin = 1 + side + side * side
+    np.equal(low, high, out=alike[margin:-margin])
+    return alike.reshape((side,) * 3)
 
 
 @kernel()
@@ -287,7 +290,7 @@ def _vote(  # type: ignore[no-untyped-def]
     for m in range(count):
         x, y, z = position[m, 0], position[m, 1], position[m, 2]
         a, b, c = int(np.rint(x)), int(np.rint(y)), int(np.rint(z))
-        if distance[m] < _BEYOND and alike[a + 1, b + 1, c + 1]:
+        if distance[m] < _BEYOND and alike[a + 2, b + 2, c + 2]:
             chosen[m] = index[m]  # Away from borders all voters agree.
             continue
         voters, parties = 0, 0

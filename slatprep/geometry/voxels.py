@@ -106,8 +106,14 @@ def above(occupancy: NDArray[np.bool_], ground: Ground | None) -> NDArray[np.boo
 def voxels_of(occupancy: NDArray[np.bool_]) -> NDArray[np.uint8]:
     """Return the indices (N, 3) uint8 of the occupied voxels, in C order."""
     # By way of flat indices, as numpy finds those of one axis far faster than those of three.
-    places = np.unravel_index(np.flatnonzero(occupancy), occupancy.shape)
-    return np.stack(places, axis=1, dtype=np.uint8, casting="unsafe")
+    return voxels_at(np.flatnonzero(occupancy), occupancy.shape)
+
+
+def voxels_at(
+    cells: NDArray[np.intp], shape: tuple[int, ...] = (RESOLUTION,) * 3
+) -> NDArray[np.uint8]:
+    """Return the voxels (N, 3) uint8 at places of the flattened grid; undoes `flat_index`."""
+    return np.stack(np.unravel_index(cells, shape), axis=1, dtype=np.uint8, casting="unsafe")
 
 
 def outer_boundary(occupancy: NDArray[np.bool_]) -> NDArray[np.uint8]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -11,7 +12,6 @@ from numpy.typing import NDArray
 
 from slatprep.align.quality import measure_quality
 from slatprep.judge import THRESHOLDS, verdict_of
-from slatprep.normalize import normalize_properties
 from slatprep.provenance.stored import StoredRecords
 from slatprep.records import Place, Verdict
 from slatprep.sample import sample
@@ -250,9 +250,9 @@ def recompute_annotation(asset: StoredAsset) -> tuple[float, dict[str, NDArray[n
         If the store lacks its build parameters.
     """
     parameters = asset.store.about.build.parameters.sample
-    annotation = sample(asset.field, asset.place, parameters)
-    properties = normalize_properties(annotation.properties, asset.store.normalization)
-    changes = np.abs(properties - asset.properties).max(axis=1)
+    # What is looked up is copied, so it need not be brought to SI units and back.
+    annotation = sample(asset.normalised_field, asset.place, parameters)
+    changes = functools.reduce(np.maximum, np.abs(annotation.properties - asset.properties).T)
     both = annotation.valid & asset.valid
     valid, material = annotation.valid != asset.valid, annotation.material != asset.material
     share = float(annotation.valid.mean())

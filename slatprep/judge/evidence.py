@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slatprep.geometry.frames import VOXEL_SIZE, places_of, split_transform
+from slatprep.geometry.voxels import flat_index
 from slatprep.judge.ambiguity import NOTABLE, thinning
 from slatprep.normalize import property_extent, to_mapped
 from slatprep.records import (
@@ -106,7 +107,7 @@ def surroundings_of(
 
     cells, labels = _labels_of(field, annotation)
     grid = np.full((RESOLUTION,) * 3, UNANNOTATED, dtype=np.uint8)
-    grid[tuple(field.voxels.T)] = cells
+    grid.reshape(-1)[flat_index(field.voxels)] = cells
     others, solid = shares_around(grid, annotation.place, labels, RADII, UNANNOTATED)
     count = len(annotation.place)
     moved = np.zeros(count, dtype=np.float32)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from slatprep.errors import ConfigError, StoreError
 from slatprep.geometry.frames import places_of, voxel_centres
-from slatprep.geometry.voxels import shown_in_cells, voxels_of
+from slatprep.geometry.voxels import shown_in_cells, voxels_at
 from slatprep.normalize import denormalize_properties
 from slatprep.records import MaterialField, Place, StructuredLatents
 from slatprep.storage.place import place_of, storage_of
@@ -132,19 +132,25 @@ class StoredAsset:
         return np.asarray(self.store.read_rows("grid/material", self.index, self.index + 1)[0])
 
     @cached_property
-    def field(self) -> MaterialField:
-        """The PixieVerse field that the asset was made of, in SI units."""
-        background = self.store.contents.background
-        annotated = self.grid_material < background
-        values = self.grid_properties[:, annotated].T
+    def normalised_field(self) -> MaterialField:
+        """The PixieVerse field that the asset was made of, its properties in [-1, 1]."""
+        contents, material = self.store.contents, self.grid_material.reshape(-1)
+        cells = np.flatnonzero(material < contents.background)
         return MaterialField(
-            occupancy=self.grid_material != background,
-            voxels=voxels_of(annotated),
-            material=self.grid_material[annotated],
-            properties=denormalize_properties(values, self.store.normalization),
-            table=self.store.contents.properties,
-            classified=bool(self.store.contents.classes),
+            occupancy=self.grid_material != contents.background,
+            voxels=voxels_at(cells),
+            material=material[cells],
+            properties=self.grid_properties.reshape(-1, material.size)[:, cells].T,
+            table=contents.properties,
+            classified=bool(contents.classes),
         )
+
+    @cached_property
+    def field(self) -> MaterialField:
+        """The same in SI units."""
+        own = self.normalised_field
+        properties = denormalize_properties(own.properties, self.store.normalization)
+        return replace(own, properties=properties)
 
 
 class Store(AssetTable):

@@ -209,9 +209,9 @@ def record_findings(asset: StoredAsset, record: AssetRecord, store: Store) -> It
         what = f"model is {str(alignment.model)!r}, {'without' if bends else 'with'} a deformation"
         yield Finding(RECORD_ARRAY, asset.asset_id, what, "one where it is affine or deformable")
     places = map_of(alignment).to_pixieverse(asset.latents.centres)
-    wrong = np.count_nonzero(~(np.abs(places - asset.place).max(axis=1) <= PLACE_TOLERANCE))
-    if wrong:
-        what = f"{wrong} of {len(places)} voxels differ"
+    fine = np.abs(places - asset.place) <= PLACE_TOLERANCE
+    if not fine.all():
+        what = f"{np.count_nonzero(~fine.all(axis=1))} of {len(places)} voxels differ"
         yield Finding("voxel/place", asset.asset_id, what, "where the map in the record leads")
 
 
@@ -219,16 +219,17 @@ def confidence_findings(asset: StoredAsset, record: AssetRecord) -> Iterator[Fin
     """Yield a finding where ``voxel/confidence`` differs from what grid and record give."""
     if asset.store.format_version == 1 or asset.merged:
         return
-    annotation = Annotation(
-        asset.properties_si, asset.material, asset.valid, asset.distance, asset.place
-    )
+    field, properties = asset.normalised_field, asset.properties
     clipped = record.counts.clipped
-    if not asset.field.classified and clipped and any(clipped.grid.values()):
-        return  # The confidence came of values that the store does not hold.
-    if not labels_hold(asset.field, annotation, roundings(asset.store.normalization)):
+    if not field.classified:  # Else the confidence comes of classes alone.
+        if clipped and any(clipped.grid.values()):
+            return  # The confidence came of values that the store does not hold.
+        field, properties = asset.field, asset.properties_si
+    annotation = Annotation(properties, asset.material, asset.valid, asset.distance, asset.place)
+    if not labels_hold(field, annotation, roundings(asset.store.normalization)):
         return  # It may have come of other labels than the rounded values have.
     confidence = record.judgement.confidence
-    likely = voxel_confidence(asset.field, asset.latents, record.alignment, annotation, confidence)
+    likely = voxel_confidence(field, asset.latents, record.alignment, annotation, confidence)
     wrong = np.count_nonzero(~(np.abs(likely - asset.confidence) <= CONFIDENCE_TOLERANCE))
     if wrong:
         what = f"{wrong} of {len(likely)} voxels differ"
@@ -291,9 +292,9 @@ def _is_spread(asset: StoredAsset) -> bool:
 
 def _normalised(values: NDArray[np.float32], where: NDArray[np.bool_]) -> bool:
     """Whether values (..., rows) are in [-1, 1] where the mask is true and NaN elsewhere."""
-    inside = np.abs(values) <= 1
+    there = values.reshape(-1, where.size)[:, np.flatnonzero(where)]
     missing = np.count_nonzero(np.isnan(values))
-    return bool((inside == where).all()) and missing == values.size - np.count_nonzero(inside)
+    return bool((np.abs(there) <= 1).all()) and missing == values.size - there.size
 
 
 def _claims(
