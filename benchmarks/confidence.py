@@ -3,10 +3,11 @@
     python benchmarks/confidence.py table.npz [--assets 14] [--levels 0 1 2 3 4 5 6 7]
                                     [--seeds 101 102] [--jobs 2]
     python benchmarks/confidence.py table.npz --generations [--assets 33] [--seeds 911 912]
+    python benchmarks/confidence.py table.npz --ground [--seeds 521]
     python benchmarks/confidence.py table.npz --dataset DIR ...
 
-Demo assets of each level, pairs of generated shapes of one object (`generations.py`), or
-the assets of datasets with a truth, are aligned by the default engine. Each row of the
+Demo assets of each level, pairs of generated shapes of one object (`generations.py`), objects on
+slabs of ground (`ground.py`), or the assets of datasets with a truth, are aligned by the default engine. Each row of the
 table is one alignment:
 
 own      an asset's field on its own SLAT, as the engine places it;
@@ -27,12 +28,14 @@ from __future__ import annotations
 import argparse
 import tempfile
 from concurrent.futures import ProcessPoolExecutor
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 from unittest.mock import patch
 
 import numpy as np
 from generations import make_pair
+from ground import GROUNDS, make_all, on_ground
 from numpy.typing import NDArray
 
 from slatprep.align import field as engine
@@ -62,6 +65,9 @@ VOXELS = 500
 GENERATIONS, BENDS = 8, (1.5, 3.5)
 """The number that stands for pairs of generated shapes, and how far each is bent [voxel, rms]."""
 
+GROUND = 9
+"""The number that stands for objects on ground."""
+
 Asset = tuple[str, MaterialField, StructuredLatents, Truth]
 Row = dict[str, Any]
 
@@ -71,6 +77,7 @@ def main() -> None:
     parser.add_argument("table", type=Path, help="where the table goes, an npz")
     parser.add_argument("--dataset", type=Path, nargs="+", help="instead of demo data")
     parser.add_argument("--generations", action="store_true", help="instead of levels")
+    parser.add_argument("--ground", action="store_true", help="instead of levels")
     parser.add_argument("--assets", type=int, default=14, help="of each level and seed")
     parser.add_argument("--levels", type=int, nargs="+", default=list(range(8)))
     parser.add_argument("--seeds", type=int, nargs="+", default=[101, 102])
@@ -83,10 +90,14 @@ def main() -> None:
             rows += [{"seed": 0} | row for row in made]
             write(options.table, rows)
         return
-    for level in [GENERATIONS] if options.generations else options.levels:
+    if options.generations or options.ground:
+        options.levels = [GENERATIONS] * options.generations + [GROUND] * options.ground
+    for level in options.levels:
         for seed in options.seeds:
             if level == GENERATIONS:
                 assets = _generations(seed, options.assets, options.jobs)
+            elif level == GROUND:
+                assets = _on_ground(seed, options.jobs)
             else:
                 assets = _made(seed * 10 + level, options.assets, level, options.jobs)
             rows += [{"seed": seed} | row for row in _rows_of_all(assets, options.jobs)]
@@ -115,6 +126,22 @@ def _generations(seed: int, count: int, jobs: int) -> list[Asset]:
             )  # fmt: skip
             assets.append((f"{seed}-{number}", pair.field, pair.latents, truth))
     return assets
+
+
+def _on_ground(seed: int, jobs: int) -> list[Asset]:
+    """Put each object of `ground.py` on a slab of each kind."""
+    with ProcessPoolExecutor(jobs) as pool:
+        made = make_all([seed], [1, 6, 7], pool)
+    return [
+        (
+            f"{seed}-{number}-{kind}",
+            on_ground(asset, kind),
+            asset.latents,
+            replace(asset.truth, level=GROUND),
+        )
+        for number, asset in enumerate(made)
+        for kind in GROUNDS[1:]
+    ]
 
 
 def _read(root: Path) -> list[Asset]:

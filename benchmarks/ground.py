@@ -26,7 +26,7 @@ from __future__ import annotations
 import argparse
 import os
 from collections.abc import Iterable, Sequence
-from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures import Executor, ProcessPoolExecutor
 from dataclasses import dataclass, replace
 from itertools import repeat
 from pathlib import Path
@@ -128,19 +128,24 @@ def main() -> None:
     parser.add_argument("--levels", type=int, nargs="+", default=[1, 6, 7])
     parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1)
     options = parser.parse_args()
-    tasks = [
-        (seed, index, level)
-        for seed in options.seeds
-        for level in options.levels
-        for index in range(len(CATALOGUE) + len(FLAT))
-    ]
     with ProcessPoolExecutor(options.jobs) as pool:
-        assets = list(pool.map(make_one, *zip(*tasks, strict=True)))
+        assets = make_all(options.seeds, options.levels, pool)
         others = [_other(assets, at) for at in range(len(assets))]
         for looks in (True, False):
             rows = [row for some in pool.map(_rows, assets, others, repeat(looks)) for row in some]
             print("as it is" if looks else "without looking for ground")
             _print(rows)
+
+
+def make_all(seeds: Iterable[int], levels: Sequence[int], pool: Executor) -> list[Asset]:
+    """Make all objects of some seeds and levels, without ground."""
+    tasks = [
+        (seed, index, level)
+        for seed in seeds
+        for level in levels
+        for index in range(len(CATALOGUE) + len(FLAT))
+    ]
+    return list(pool.map(make_one, *zip(*tasks, strict=True)))
 
 
 def make_one(seed: int, index: int, level: int) -> Asset:

@@ -47,6 +47,7 @@ PLACEMENT = Logistic(
         Figure(name="depth", weight=-4.78472, usual=0.183766, low=0.12727, high=0.292968),
         Figure(name="depth", weight=0.0, usual=0.292968, low=0.292968, high=0.468673),
         Figure(name="alike", weight=0.0, usual=0.187947, low=0.0, high=1.0),
+        Figure(name="ground", weight=0.0, usual=0.0, low=0.0, high=1.0),
     ),
     intercept=5.23756,
     curve=(),

@@ -26,7 +26,8 @@ VOXEL_FIGURES = (
 
 _CAUSES = {
     "placement": ("margin", "ties", "alike"),
-    "shape": ("moved", "moved_most", "bending", "stretch", "scale", "within_3", "score_similarity"),
+    "shape": ("moved", "moved_most", "bending", "stretch", "scale", "within_3", "score_similarity",
+              "ground"),
     "roughness": ("score_slat", "score_pixieverse", "within_1", "within_2", "offset", "distance",
                   "depth", "fitness", "fitness_backward", "valid_share"),
 }  # fmt: skip

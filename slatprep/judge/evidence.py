@@ -43,6 +43,7 @@ FIGURES = (
     "distance",
     "depth",
     "alike",
+    "ground",
 )
 """The figures of an alignment, in the order of `evidence_of`."""
 
@@ -246,6 +247,7 @@ def evidence_of(
             np.minimum(annotation.distance, 5.0).mean(),
             around.depth.std(),
             float(math.isnan(margin)),
+            float(alignment.ground is not None),
         ],
         dtype=np.float64,
     )
