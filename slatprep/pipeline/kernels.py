@@ -59,7 +59,7 @@ def compile_kernels(note: Callable[[str], None] | None = None) -> None:
 
 
 def _process_a_bent_shape() -> None:
-    """Align, sample and judge an L whose SLAT is bent, so that it is deformed, and has a stray."""
+    """Align, sample and judge an L whose SLAT is bent so far that it is stretched, with a stray."""
     occupied = np.zeros((RESOLUTION,) * 3, dtype=bool)
     occupied[20:44, 22:36, 26:34] = occupied[20:26, 22:36, 34:50] = True
     voxels = voxels_of(occupied)
@@ -68,7 +68,7 @@ def _process_a_bent_shape() -> None:
         occupied, voxels, np.zeros(count, np.uint8), np.ones((count, 3), np.float32)
     )
     bent = voxels.copy()
-    bent[:, 2] += ((bent[:, 0] - 20) ** 2 // 100).astype(np.uint8)
+    bent[:, 2] += ((bent[:, 0] - 20) ** 2 // 25).astype(np.uint8)
     bent = np.append(bent, np.zeros((1, 3), np.uint8), axis=0)  # far from all that is annotated
     latents = StructuredLatents(bent, np.zeros((len(bent), 8), np.float32))
     alignment = align(field, latents, AlignParameters(model="deformable"))
