@@ -23,6 +23,7 @@ from slatprep.pipeline import carry, seen
 from slatprep.pipeline.dataset import build_store, plan_build
 from slatprep.pipeline.previous import previous_build
 from slatprep.store import layout, open_store
+from slatprep.store.shard_reader import RowReader
 from slatprep.store.unmoved import Unmoved
 
 MakeDataset = Callable[..., Dataset]
@@ -195,6 +196,27 @@ def test_what_is_removed_moves_the_rows_behind_it(
     build_store(dataset.parameters(), out)
     assert names(steps, "asset read") == []
     assert same_files(before, inodes(out), "voxel/feats/c/") > 3
+    assert tree(out) == from_nothing(dataset.parameters(), tmp_path)
+
+
+def test_grids_that_move_are_not_unpacked(
+    built: tuple[Dataset, Path], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    dataset, out = built
+    shutil.rmtree(dataset.root / "pixieverse" / "a")
+    (dataset.root / "slat" / "a.npz").unlink()
+    dataset.add("h", seed=1)
+    read, unpacked = RowReader.read, []
+
+    def reading(self: RowReader, start: int, stop: int) -> object:
+        unpacked.append(self.name)
+        return read(self, start, stop)
+
+    with monkeypatch.context() as context:
+        context.setattr(RowReader, "read", reading)
+        build_store(dataset.parameters(), out)
+    assert "voxel/feats" in unpacked
+    assert not [name for name in unpacked if name.startswith("grid/")]
     assert tree(out) == from_nothing(dataset.parameters(), tmp_path)
 
 
