@@ -84,7 +84,7 @@ def progress(done, count):
 parameters = BuildParameters(PixieverseSource(root / "voxels", adapter="voxels"),
     SlatSource(root / "slat"), align=AlignParameters(engine="known"))
 summary = dataset.build_store(parameters, Path(sys.argv[2]), jobs=jobs,
-    assets_per_job=20, progress=progress)
+    assets_per_job=32, progress=progress)
 told = {"assets": summary.statuses["ok"], "failed": summary.statuses["failed"],
     **{f"{name}, wall and CPU [s]": both for name, both in stages.items()}}
 """

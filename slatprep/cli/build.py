@@ -23,8 +23,8 @@ if TYPE_CHECKING:
     from slatprep.parameters import BuildParameters
     from slatprep.pipeline.dataset import BuildPlan, BuildSummary
 
-_ASSETS_PER_JOB = 20
-"""Assets that the default engine aligns in the time that a worker takes to start, 1.6 s."""
+_ASSETS_PER_JOB = 32
+"""Assets that take the default engine as long as a worker takes to start, 1.6 s."""
 
 DAMAGES_LISTED = 10
 """Most faults of an existing store that are printed; ``--json`` has all."""
