@@ -1,13 +1,16 @@
-"""Fit the confidences of slatprep.judge on a table of benchmarks/confidence.py, and test them.
+"""Fit the confidences of slatprep.judge on tables of benchmarks/confidence.py, and test them.
 
-    python benchmarks/calibrate.py other.npz ... [--picture docs/images/confidence.svg]
-                                   [--fit demo.npz ... --module slatprep/judge/calibration.py]
+    python benchmarks/calibrate.py demo.npz ... [--fit [--module slatprep/judge/calibration.py]]
+                                   [--picture docs/images/confidence.svg]
 
 Logistic regressions whose weights may only have the sign that makes sense (a better fit
-never lowers a confidence), fitted to the tables of --fit; then a curve, from isotonic
-regression on the same rows, that sets their probabilities right. Alignments are weighed
-to the mix `PRIOR`. Everything that is printed and drawn is of the other tables, of other
-objects. Without --fit the shipped numbers are tested.
+never lowers a confidence); then a curve, from isotonic regression on the same rows, that
+sets their probabilities right. Alignments are weighed to the mix `PRIOR`.
+
+With --fit the module gets what is fitted to all tables, and all that is printed and drawn is
+of objects that had no part in the fit: their seeds are divided into `PARTS`, and each part is
+judged by what is fitted to the others. Without it the shipped numbers are tested, on other objects
+only if those of the tables are.
 """
 
 from __future__ import annotations
@@ -21,6 +24,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from confidence import GROUND
 from numpy.typing import NDArray
 from scipy.optimize import isotonic_regression, minimize
 from scipy.special import expit
@@ -48,6 +52,9 @@ RIGHT_LABELS = 0.9
 KNEE = 0.02
 """Share of the right placements beyond a figure's knee, where another weight begins."""
 
+PARTS = 4
+"""Into so many parts the seeds are divided, where each is judged by a fit to the others."""
+
 RIDGE = 3e-2
 KNOT_STEP, LEAST_WEIGHT = 0.3, 1e-3
 """Step of the logarithm of the odds from knot to knot of a curve, and least share of the mix."""
@@ -61,19 +68,19 @@ Table = dict[str, NDArray[Any]]
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("tables", type=Path, nargs="+", help="what is tested")
-    parser.add_argument("--fit", type=Path, nargs="+", help="tables to fit to")
+    parser.add_argument("tables", type=Path, nargs="+", help="what is fitted to, and tested")
+    parser.add_argument("--fit", action="store_true", help="fit anew")
     parser.add_argument("--module", type=Path, help="where the numbers go")
     parser.add_argument("--picture", type=Path, help="where the reliability diagram goes")
     options = parser.parse_args()
-    placement, voxel = calibration.PLACEMENT, calibration.VOXEL
-    if options.fit:
-        table = read_tables(options.fit)
+    table = read_tables(options.tables)
+    if not options.fit:
+        report(table, *judged(table, calibration.PLACEMENT, calibration.VOXEL), options.picture)
+        return
+    if options.module:
         placement = fit_placement(table)
-        voxel = fit_voxel(table, placement)
-        if options.module:
-            write_module(options.module, placement, voxel)
-    report(read_tables(options.tables), placement, voxel, options.picture)
+        write_module(options.module, placement, fit_voxel(table, placement))
+    report(table, *judged_by_others(table), options.picture)
 
 
 def read_tables(paths: Sequence[Path]) -> Table:
@@ -181,32 +188,66 @@ def fit_placement(table: Table) -> Logistic:
 def fit_voxel(table: Table, placement: Logistic) -> Logistic:
     # What ties do is known by counting, and not fitted.
     rows = ~table["torn"]
-    values, right, weights, _ = voxels_of(table, rows, placement)
+    values, right, weights = voxels_of(table, rows, placement)
     model = fit(VOXEL_FIGURES, values, right, weights)
     return with_curve(model, values, right, weights)
 
 
 def voxels_of(
     table: Table, rows: NDArray[np.bool_], placement: Logistic
-) -> tuple[Array, NDArray[np.bool_], Array, Array]:
-    """Return figures, truth, weights and ties of the voxels of some rows."""
-    weights = weights_of(table, rows, VOXEL_PRIOR)
+) -> tuple[Array, NDArray[np.bool_], Array]:
+    """Return figures, truth and weights of the voxels of some rows."""
     confidence = placement.probability(table["figures"])
-    values, share = [], []
+    values = []
     for row in np.flatnonzero(rows):
         own = table["voxel_voxels"][table["voxel_row"] == row]
-        if len(own) == 0:
-            continue
-        around = Surroundings(own[:, :4], own[:, 4:8], own[:, 8], own[:, 9], own[:, 10])
-        values.append(voxel_figures(around, float(confidence[row])))
-        share.append(np.full(len(own), weights[row] / len(own)))
+        if len(own):
+            around = Surroundings(own[:, :4], own[:, 4:8], own[:, 8], own[:, 9], own[:, 10])
+            values.append(voxel_figures(around, float(confidence[row])))
     chosen = rows[table["voxel_row"]]
     return (
         np.concatenate(values).astype(np.float64),
         table["voxel_right"][chosen],
-        np.concatenate(share) / np.concatenate(share).sum(),
-        table["voxel_voxels"][chosen][:, 10].astype(np.float64),
+        voxel_weights(table, rows)[chosen],
     )
+
+
+def voxel_weights(table: Table, rows: NDArray[np.bool_]) -> Array:
+    """Weigh voxels to the mix `VOXEL_PRIOR`, those of a row alike; 0 where not in `rows`."""
+    counts = np.bincount(table["voxel_row"], minlength=len(rows))
+    rows = rows & (counts > 0)
+    weights = weights_of(table, rows, VOXEL_PRIOR) / np.maximum(counts, 1)
+    of_voxels: Array = weights[table["voxel_row"]]
+    return of_voxels / of_voxels.sum()
+
+
+def judged(table: Table, placement: Logistic, voxel: Logistic) -> tuple[Array, Array]:
+    """Return the confidence of each row, and of each voxel whatever ties it has."""
+    values, _, _ = voxels_of(table, np.ones(len(table["kind"]), dtype=bool), placement)
+    return placement.probability(table["figures"]), voxel.probability(values)
+
+
+def judged_by_others(table: Table) -> tuple[Array, Array]:
+    """Return what `judged` does of each part of the seeds, by a fit to the other parts."""
+    part = np.unique(table["seed"], return_inverse=True)[1] % PARTS
+    confidence, likely = np.zeros(len(part)), np.zeros(len(table["voxel_row"]))
+    for own in range(PARTS):
+        others, mine = rows_of(table, part != own), rows_of(table, part == own)
+        placement = fit_placement(others)
+        found = judged(mine, placement, fit_voxel(others, placement))
+        confidence[part == own], likely[(part == own)[table["voxel_row"]]] = found
+    return confidence, likely
+
+
+def rows_of(table: Table, rows: NDArray[np.bool_]) -> Table:
+    """Return some rows of a table, with their voxels."""
+    number = np.cumsum(rows) - 1
+    voxels = rows[table["voxel_row"]]
+    chosen = {
+        name: values[voxels if name.startswith("voxel_") else rows]
+        for name, values in table.items()
+    }
+    return chosen | {"voxel_row": number[chosen["voxel_row"]]}
 
 
 def reliability(
@@ -225,15 +266,16 @@ def reliability(
     return found
 
 
-def report(table: Table, placement: Logistic, voxel: Logistic, picture: Path | None) -> None:
+def report(table: Table, confidence: Array, likely: Array, picture: Path | None) -> None:
     clear, every = table["known"], np.ones(len(table["known"]), dtype=bool)
-    confidence = placement.probability(table["figures"])
+    likely = likely * (1.0 - table["voxel_voxels"][:, 10])
     assets = reliability(confidence[clear], table["placed"][clear], weights_of(table, clear)[clear])
     diagrams = {"placements": assets}
     for name, rows in (("voxels", ~table["torn"]), ("voxels, with ties", every)):
-        values, right, weights, tied = voxels_of(table, rows, placement)
-        likely = voxel.probability(values) * (1.0 - tied)
-        diagrams[name] = reliability(likely, right, weights)
+        weights = voxel_weights(table, rows)
+        there = weights > 0
+        right = table["voxel_right"][there]
+        diagrams[name] = reliability(likely[there], right, weights[there])
     for name, bins in diagrams.items():
         print(name)
         for said, found, weight, count in bins:
@@ -244,11 +286,15 @@ def report(table: Table, placement: Logistic, voxel: Logistic, picture: Path | N
     own = clear & (table["kind"] == "own") & ~table["symmetric"]
     groups = {f"own, right, L{k}": own & table["placed"] & (table["level"] == k)
               for k in np.unique(table["level"])}  # fmt: skip
+    ground = table["level"] == GROUND
+    for where, there in (("", ~ground), (" on ground", ground)):
+        groups |= {
+            f"own, right{where}": own & table["placed"] & there,
+            f"own, wrong{where}": own & ~table["placed"] & there,
+            f"other{where}": (table["kind"] == "other") & there,
+        }
     groups |= {
-        "own, right": own & table["placed"],
-        "own, wrong": own & ~table["placed"],
         "heading, wrong": clear & (table["kind"] == "heading") & ~table["placed"],
-        "other": table["kind"] == "other",
         "own, alike": table["harmless"] & (table["kind"] == "own"),
         "own, torn": table["torn"] & (table["kind"] == "own"),
     }
@@ -262,7 +308,7 @@ def report(table: Table, placement: Logistic, voxel: Logistic, picture: Path | N
     for name, rows in groups.items():
         c = confidence[rows]
         if len(c):
-            print(f"{name:16s} {len(c):4d}  good {good[rows].mean():.3f}  "
+            print(f"{name:20s} {len(c):4d}  good {good[rows].mean():.3f}  "
                   f"failed {failed[rows].mean():.3f}  quantiles "
                   f"{np.round(np.quantile(c, (0.01, 0.05, 0.5, 0.95, 0.99)), 3)}")  # fmt: skip
     if picture:
