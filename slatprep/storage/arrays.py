@@ -6,6 +6,8 @@ A mark, the header's length and its CRC32C; the header, JSON; then the arrays, i
 from __future__ import annotations
 
 import math
+import os
+import re
 import struct
 from collections.abc import Iterator, Mapping
 from typing import IO, Any
@@ -18,6 +20,8 @@ from slatprep.errors import StoreError
 
 _START = struct.Struct("<8sII")
 _MARK = b"SLATARR1"
+_TYPES = re.compile(r"\|b1|\|[iu]1|[<>][iuf][248]|[<>]U[1-9]\d{0,6}")
+_MOST_AXES, _MOST_BYTES = 8, 2**40
 
 
 def write_arrays(file: IO[bytes], arrays: Mapping[str, NDArray[Any]]) -> None:
@@ -60,8 +64,8 @@ class ArrayFile(Mapping[str, NDArray[Any]]):
         header = file.read(length) if mark == _MARK else b""
         if mark != _MARK or _checksum(np.frombuffer(header, np.uint8)) != checksum:
             raise StoreError("the file of arrays is damaged, or no such file")
-        self._entries: dict[str, Any] = orjson.loads(header)
         self._first = file.tell()
+        self._entries = _entries_in(header, file.seek(0, os.SEEK_END) - self._first)
 
     def __getitem__(self, name: str) -> NDArray[Any]:
         dtype, shape, at, checksum = self._entries[name]
@@ -77,6 +81,31 @@ class ArrayFile(Mapping[str, NDArray[Any]]):
 
     def __len__(self) -> int:
         return len(self._entries)
+
+
+def _entries_in(header: bytes, size: int) -> dict[str, Any]:
+    """Return what a header says of each array, all of which lie in so many bytes behind it."""
+    try:
+        entries = orjson.loads(header)
+    except ValueError:
+        entries = None
+    if not isinstance(entries, dict) or not all(_lies_in(size, one) for one in entries.values()):
+        raise StoreError("the file of arrays is damaged: its header does not tell what it holds")
+    return entries
+
+
+def _lies_in(size: int, entry: object) -> bool:
+    """Whether an entry is that of an array of numbers, bool or text within so many bytes."""
+    match entry:
+        case [str(dtype), [*shape], int(at), int()] if _TYPES.fullmatch(dtype):
+            if len(shape) > _MOST_AXES or not all(isinstance(n, int) and n >= 0 for n in shape):
+                return False
+            item = np.dtype(dtype).itemsize
+            # An array without elements may name a length that numpy refuses nevertheless.
+            if item * math.prod(n or 1 for n in shape) > _MOST_BYTES:
+                return False
+            return 0 <= at <= size - item * math.prod(shape)
+    return False
 
 
 def _checksum(data: NDArray[np.uint8]) -> int:

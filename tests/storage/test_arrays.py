@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import struct
 from pathlib import Path
 
+import google_crc32c
 import numpy as np
+import orjson
 import pytest
 
 from slatprep.errors import StoreError
@@ -49,3 +52,41 @@ def test_no_flipped_bit_and_no_lost_end_is_passed_over(path: Path) -> None:
         path.write_bytes(whole[:place])
         with path.open("rb") as file, pytest.raises(StoreError, match="damaged"):
             dict(ArrayFile(file))
+
+
+@pytest.mark.parametrize(
+    "header",
+    [
+        [],
+        "rows",
+        {"a": 1},
+        {"a": ["<f4", [1], 0]},
+        {"a": [None, [1], 0, 0]},
+        {"a": ["|O", [1], 0, 0]},
+        {"a": ["V8", [1], 0, 0]},
+        {"a": [[["x", "|O"]], [1], 0, 0]},
+        {"a": ["no type", [1], 0, 0]},
+        {"a": ["<U0", [1], 0, 0]},
+        {"a": ["<f4", 1, 0, 0]},
+        {"a": ["<f4", ["1"], 0, 0]},
+        {"a": ["<f4", [-1, -1], 0, 0]},
+        {"a": ["<f4", [2.0], 0, 0]},
+        {"a": ["<f4", [2**40, 2**40], 0, 0]},
+        {"a": ["<f4", [2**36], 0, 0]},
+        {"a": ["<f4", [0, 2**63], 0, 0]},
+        {"a": ["<f4", [1] * 99, 0, 0]},
+        {"a": ["<f4", [1], -30, 0]},
+        {"a": ["<f4", [1], 2**62, 0]},
+        {"a": ["<f4", [1], "0", 0]},
+        b"{",
+        b"",
+        b"\xff",
+    ],
+)
+def test_headers_that_nobody_wrote_are_refused(tmp_path: Path, header: object) -> None:
+    text = header if isinstance(header, bytes) else orjson.dumps(header)
+    start = struct.pack("<8sII", b"SLATARR1", len(text), google_crc32c.value(text))
+    path = tmp_path / "a.arrays"
+    path.write_bytes(start + text + bytes(64))
+    with path.open("rb") as file, pytest.raises(StoreError, match="damaged"):
+        dict(ArrayFile(file))
