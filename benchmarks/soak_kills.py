@@ -11,7 +11,8 @@ with --phase, at a random step of that phase. With --dask two workers of a
 Dask cluster compute, which outlives the builds. After every kill the store is
 opened with plain zarr and read whole, and must be, byte for byte, one of the
 stores that an undisturbed build wrote of an earlier or the present state; of
-the present one, if the build ended well. At the end a last build runs
+the present one, if the build ended well. Of the records beside it `verify` must find that they
+are another build's, or they must be those of the undisturbed build. At the end a last build runs
 undisturbed and must equal one from nothing. Builds are told to order rows by id.
 """
 
@@ -44,8 +45,11 @@ from joblib.externals.loky.backend.context import set_start_method
 from support.synthetic import Dataset
 from support.trees import records_of, tree
 
+from slatprep.inspect.verify.manifests import manifest_findings
 from slatprep.pipeline.dataset import build_store
+from slatprep.provenance.places import manifests_of
 from slatprep.storage.faults import VARIABLE
+from slatprep.store import open_store
 from slatprep.workers.dask import Cluster
 from slatprep.workers.local import Jobs
 
@@ -131,28 +135,37 @@ def no_cluster() -> Iterator[str]:
 def soak(folder: Path, given: argparse.Namespace, scheduler: str) -> dict[str, object]:
     """Return what became of the builds; raises AssertionError at the first harm."""
     chance = random.Random(given.seed)
-    sources, expected, whole = [], [], 60.0
+    sources, expected, records, whole = [], [], [], 60.0
     for state in range(STATES):
         dataset = Dataset(folder / f"state-{state}")
-        for number in range(state, state + given.assets):
-            dataset.add(f"asset-{number:03}", seed=number + (state if number % 5 == 0 else 0))
+        # From 0 to 1 and from 2 to 3 an asset is added alone, of values that there are already: so
+        # the ranges stay, and with them all other records.
+        gone, more = divmod(state, 2)
+        for number in range(gone, gone + given.assets):
+            dataset.add(f"asset-{number:03}", seed=number + (gone if number % 5 == 0 else 0))
+        if more:
+            dataset.add(f"asset-{gone + given.assets:03}", seed=gone + 1)
         sources.append(dataset.root)
         begin = time.perf_counter()
         # In this process: what it has imported and compiled is there in those forked from it.
         build(dataset.root, folder / f"reference-{state}.zarr", jobs=1)
         whole = min(whole, time.perf_counter() - begin)
         expected.append(tree(folder / f"reference-{state}.zarr"))
+        records.append(records_beside(folder / f"reference-{state}.zarr"))
     allowed = [fingerprint(hashes) for hashes in expected]
 
     out = folder / "store.zarr"
     shutil.copytree(folder / "reference-0.zarr", out)
+    lines = manifests_of(out) / "assets.jsonl"
     told: Counter[str] = Counter()
     begin = time.perf_counter()
     turn = done = 0
     while done < given.kills and time.perf_counter() - begin < 60 * given.minutes:
         # A state is tried three times, so that builds go on from what was finished.
         state = turn // 3 % STATES
-        before = fingerprint(tree(out))
+        if turn % 6 == 3:  # Only behind the records of a build that ended well are others added.
+            assert ended(begun(sources[state - 1], out, scheduler), 300) == 0, "a build fails"
+        before, added_to = fingerprint(tree(out)), file_of(lines)
         if given.phase:
             start = partial(begun, sources[state], out, scheduler)
             outcome, code = aimed_build(start, chance, given, folder / "aims")
@@ -164,6 +177,14 @@ def soak(folder: Path, given: argparse.Namespace, scheduler: str) -> dict[str, o
         wanted = (allowed[state],) if code == 0 else (before, allowed[state])
         assert after in wanted, f"kill {turn} ({outcome}): a store that nobody built"
         read_whole(out)
+        found = [str(one) for one in manifest_findings(open_store(out), lines.parent)]
+        assert code != 0 or not found, f"build {turn} ended well ({outcome}), but {found}"
+        beside = found or records_beside(out)
+        assert found or beside == records[allowed.index(after)], f"kill {turn}: other records"
+        number, size = file_of(lines)
+        if number == added_to[0] and size > added_to[1]:
+            told["lines added to the file of records"] += 1
+        told["records that verify names" if found else "records as they should be"] += 1
         told[outcome] += 1
         done += outcome != ENDED
         turn += 1
@@ -172,9 +193,9 @@ def soak(folder: Path, given: argparse.Namespace, scheduler: str) -> dict[str, o
             print(f"\r{done} of {given.kills}", end="", file=sys.stderr)
     assert ended(begun(sources[-1], out, scheduler), 300) == 0, "the last build fails"
     other = sorted({name for name, _ in tree(out).items() ^ expected[-1].items()})
-    lines = next((folder / "store.manifests").rglob("assets.jsonl"))
     told_of = {name: record.get("reason") for name, record in records_of(lines).items()}
     assert not other, f"the last build is not what one from nothing is: {other}, {told_of}"
+    assert records_beside(out) == records[-1], "the last build's records are other ones"
     left = {path.name for path in folder.iterdir() if "store" in path.name}
     assert left == {"store.zarr", "store.manifests"}, left
     return {
@@ -297,6 +318,20 @@ def read_whole(path: Path) -> None:
         if isinstance(part, zarr.Array):
             assert part[...].shape == part.shape
     assert group["voxel/coords"].shape[0] == rows
+
+
+def records_beside(store: Path) -> dict[str, dict[str, object]]:
+    """Return the records beside a store by asset id, but for how long they took."""
+    records = records_of(manifests_of(store) / "assets.jsonl")
+    return {asset_id: {**one, "duration_s": 0.0} for asset_id, one in records.items()}
+
+
+def file_of(path: Path) -> tuple[int, int]:
+    """Return the inode and size of a file; zeros where there is none."""
+    try:
+        return path.stat().st_ino, path.stat().st_size
+    except FileNotFoundError:
+        return 0, 0
 
 
 def fingerprint(hashes: dict[str, str]) -> str:
