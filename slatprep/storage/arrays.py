@@ -94,17 +94,16 @@ def _entries_in(header: bytes, size: int) -> dict[str, Any]:
     return entries
 
 
-def _lies_in(size: int, entry: object) -> bool:
+def _lies_in(size: int, entry: Any) -> bool:
     """Whether an entry is that of an array of numbers, bool or text within so many bytes."""
     match entry:
-        case [str(dtype), [*shape], int(at), int()] if _TYPES.fullmatch(dtype):
-            if len(shape) > _MOST_AXES or not all(isinstance(n, int) and n >= 0 for n in shape):
-                return False
+        case [str(dtype), list(shape), int(at), int()] if _TYPES.fullmatch(dtype):
+            lengths = [length for length in shape if isinstance(length, int) and length >= 0]
             item = np.dtype(dtype).itemsize
             # An array without elements may name a length that numpy refuses nevertheless.
-            if item * math.prod(n or 1 for n in shape) > _MOST_BYTES:
-                return False
-            return 0 <= at <= size - item * math.prod(shape)
+            fits = item * math.prod(length or 1 for length in lengths) <= _MOST_BYTES
+            whole = len(lengths) == len(shape) <= _MOST_AXES
+            return whole and fits and 0 <= at <= size - item * math.prod(lengths)
     return False
 
 
