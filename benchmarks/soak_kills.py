@@ -154,7 +154,7 @@ def soak(folder: Path, given: argparse.Namespace, scheduler: str) -> dict[str, o
         records.append(records_beside(folder / f"reference-{state}.zarr"))
     allowed = [fingerprint(hashes) for hashes in expected]
 
-    out = folder / "store.zarr"
+    out, now = folder / "store.zarr", folder / "now"
     shutil.copytree(folder / "reference-0.zarr", out)
     lines = manifests_of(out) / "assets.jsonl"
     told: Counter[str] = Counter()
@@ -164,13 +164,15 @@ def soak(folder: Path, given: argparse.Namespace, scheduler: str) -> dict[str, o
         # A state is tried three times, so that builds go on from what was finished.
         state = turn // 3 % STATES
         if turn % 6 == 3:  # Only behind the records of a build that ended well are others added.
-            assert ended(begun(sources[state - 1], out, scheduler), 300) == 0, "a build fails"
+            put(sources[state - 1], now)
+            assert ended(begun(now, out, scheduler), 300) == 0, "a build fails"
+        put(sources[state], now)
         before, added_to = fingerprint(tree(out)), file_of(lines)
         if given.phase:
-            start = partial(begun, sources[state], out, scheduler)
+            start = partial(begun, now, out, scheduler)
             outcome, code = aimed_build(start, chance, given, folder / "aims")
         else:
-            outcome, code = killed_build(begun(sources[state], out, scheduler), chance, whole)
+            outcome, code = killed_build(begun(now, out, scheduler), chance, whole)
         told_by_it = (out.parent / SAID).read_text()
         assert code == 0 or outcome != ENDED, f"build {turn}, that nobody killed: {told_by_it}"
         after = fingerprint(tree(out))
@@ -191,7 +193,8 @@ def soak(folder: Path, given: argparse.Namespace, scheduler: str) -> dict[str, o
         told["store replaced" if after != before else "store as before"] += 1
         if sys.stderr.isatty():
             print(f"\r{done} of {given.kills}", end="", file=sys.stderr)
-    assert ended(begun(sources[-1], out, scheduler), 300) == 0, "the last build fails"
+    put(sources[-1], now)
+    assert ended(begun(now, out, scheduler), 300) == 0, "the last build fails"
     other = sorted({name for name, _ in tree(out).items() ^ expected[-1].items()})
     told_of = {name: record.get("reason") for name, record in records_of(lines).items()}
     assert not other, f"the last build is not what one from nothing is: {other}, {told_of}"
@@ -205,6 +208,12 @@ def soak(folder: Path, given: argparse.Namespace, scheduler: str) -> dict[str, o
         "seconds": round(time.perf_counter() - begin, 1),
         "harm": 0,
     }
+
+
+def put(sources: Path, now: Path) -> None:
+    """Have `now` hold these sources: a dataset stays in one place, or nothing of it is trusted."""
+    shutil.rmtree(now, ignore_errors=True)
+    shutil.copytree(sources, now)
 
 
 def aimed_build(
