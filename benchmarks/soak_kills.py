@@ -163,9 +163,10 @@ def soak(folder: Path, given: argparse.Namespace, scheduler: str) -> dict[str, o
     while done < given.kills and time.perf_counter() - begin < 60 * given.minutes:
         # A state is tried three times, so that builds go on from what was finished.
         state = turn // 3 % STATES
-        if turn % 6 == 3:  # Only behind the records of a build that ended well are others added.
+        if turn % 6 == 3:
+            # Others are added behind the records of a build that read all sources and ended well.
             put(sources[state - 1], now)
-            assert ended(begun(now, out, scheduler), 300) == 0, "a build fails"
+            assert ended(begun(now, out, scheduler, fresh=True), 300) == 0, "a build fails"
         put(sources[state], now)
         before, added_to = fingerprint(tree(out)), file_of(lines)
         if given.phase:
@@ -260,14 +261,16 @@ def killed_build(build: Running, chance: random.Random, whole: float) -> tuple[s
     return f"{whom} killed", code
 
 
-def begun(sources: Path, out: Path, scheduler: str = "", faults: str = "") -> Running:
+def begun(
+    sources: Path, out: Path, scheduler: str = "", faults: str = "", fresh: bool = False
+) -> Running:
     """Begin a build in a process group of its own.
 
     It is forked, as its workers are: to start three interpreters and load compiled kernels takes
     longer than such a build.
     """
     running = multiprocessing.get_context("fork").Process(
-        target=_build_apart, args=(sources, out, scheduler, faults)
+        target=_build_apart, args=(sources, out, scheduler, faults, fresh)
     )
     running.start()
     assert running.pid is not None
@@ -276,7 +279,7 @@ def begun(sources: Path, out: Path, scheduler: str = "", faults: str = "") -> Ru
     return running
 
 
-def _build_apart(sources: Path, out: Path, scheduler: str, faults: str) -> None:
+def _build_apart(sources: Path, out: Path, scheduler: str, faults: str, fresh: bool) -> None:
     os.setpgid(0, 0)
     os.dup2(os.open(out.parent / SAID, os.O_WRONLY | os.O_CREAT | os.O_TRUNC), 2)
     set_start_method("fork")
@@ -286,7 +289,7 @@ def _build_apart(sources: Path, out: Path, scheduler: str, faults: str) -> None:
     code = 1
     try:
         with Cluster(scheduler) if scheduler else nullcontext(2) as jobs:
-            build(sources, out, jobs)
+            build(sources, out, jobs, fresh)
         code = 0
     except Exception:
         traceback.print_exc()
@@ -295,8 +298,8 @@ def _build_apart(sources: Path, out: Path, scheduler: str, faults: str) -> None:
         os._exit(code)  # Else it would wait for workers that are idle; they see that it is gone.
 
 
-def build(sources: Path, out: Path, jobs: Jobs) -> None:
-    build_store(Dataset(sources).parameters(), out, jobs=jobs, compact=True)
+def build(sources: Path, out: Path, jobs: Jobs, fresh: bool = False) -> None:
+    build_store(Dataset(sources).parameters(), out, jobs=jobs, compact=True, fresh=fresh)
 
 
 def ended(build: Running, seconds: float) -> int | None:
