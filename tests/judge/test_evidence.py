@@ -1,0 +1,389 @@
+"""The figures that confidence follows from, by hand and by geometry that can be worked out."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from support.shapes import GRID, field_of, latents_of, surface_latents
+
+from slatprep.geometry.frames import make_transform
+from slatprep.judge.confidence import VOXEL_FIGURES, class_confidence, voxel_figures
+from slatprep.judge.evidence import (
+    FIGURES,
+    HARMLESS,
+    Surroundings,
+    _labels_of,
+    evidence_of,
+    labels_hold,
+    measure_figures,
+    surroundings_of,
+)
+from slatprep.records import (
+    Alignment,
+    Annotation,
+    Consensus,
+    Deformation,
+    Engine,
+    FitFigures,
+    Ground,
+    MaterialField,
+    Model,
+    Placement,
+    Property,
+    Quality,
+    Search,
+    StructuredLatents,
+)
+
+UPSIDE_DOWN = np.diag([-1.0, 1.0, -1.0, 1.0])
+FAR_OFF = make_transform(np.eye(3), [0.5, 0.5, 0.5])
+
+FIT = FitFigures(
+    score_slat=0.81,
+    score_pixieverse=0.72,
+    score_similarity=0.63,
+    evidence_affine=math.nan,
+    evidence_deformable=math.nan,
+    within=(0.4, 0.5, 0.6),
+    offset=-0.3,
+    roughness=0.7,
+    moved=1.5,
+    moved_most=4.0,
+    stretch=(0.7, 1.2),
+    bending=0.01,
+)
+
+
+def aligned(transform: np.ndarray | None = None, *ties: np.ndarray) -> Alignment:
+    return Alignment(
+        np.eye(4) if transform is None else transform,
+        Engine.FIELD,
+        Model.SIMILARITY,
+        Search.EULER64,
+        Quality(0.9, 0.5, 0.8, 0.5, 0.7, 1.0),
+        margin=0.2,
+        placements=tuple(Placement(tie, 1.0, 9.0) for tie in ties),
+        figures=FIT,
+    )
+
+
+def annotated(material: np.ndarray, place: np.ndarray, distance: object = 0.0) -> Annotation:
+    count = len(material)
+    return Annotation(
+        np.ones((count, 3), np.float32),
+        material.astype(np.uint8),
+        material < 255,
+        np.broadcast_to(np.float32(distance), count),
+        place.astype(np.float32),
+    )
+
+
+def column(painted: int) -> tuple[MaterialField, StructuredLatents, Annotation]:
+    """Return a column of 20 voxels, the lower ones painted, in the middle of the grid.
+
+    It stands in cells 31 and 32 along the first axis, so that `UPSIDE_DOWN` keeps its shape.
+    """
+    solid = np.zeros((64, 64, 64), dtype=bool)
+    solid[31:33, 32, 22:42] = True
+    field = field_of(solid, np.where(GRID[..., 2] < 22 + painted, 3, 1))
+    latents = latents_of(field.voxels)
+    return field, latents, annotated(field.material, latents.centres)
+
+
+AROUND = Surroundings(
+    others=np.zeros((4, 4), np.float32),
+    solid=np.array([[9, 0.2, 9, 9], [9, 0.4, 9, 9], [9, 0.6, 9, 9], [9, 0.8, 9, 9]], np.float32),
+    distance=np.zeros(4, np.float32),
+    moved=np.zeros(4, np.float32),
+    tied=np.zeros(4, np.float32),
+)
+
+
+def figures(alignment: Alignment, ambiguity: float) -> dict[str, float]:
+    field, latents, _ = column(5)
+    material = np.array([1, 1, 1, 255])
+    annotation = annotated(material, np.zeros((4, 3)), np.array([0.0, 1.0, 2.0, 9.0]))
+    found = evidence_of(field, latents, alignment, annotation, AROUND, ambiguity)
+    return dict(zip(FIGURES, found.tolist(), strict=True))
+
+
+def test_each_figure_by_hand() -> None:
+    scaled = aligned(make_transform(np.eye(3), scale=0.8), UPSIDE_DOWN, FAR_OFF)
+    assert figures(scaled, 0.3) == pytest.approx(
+        {
+            "score_slat": 0.81,
+            "score_pixieverse": 0.72,
+            "score_similarity": 0.63,
+            "within_1": 0.4,
+            "within_2": 0.5,
+            "within_3": 0.6,
+            "moved": 1.5,
+            "moved_most": 4.0,
+            "bending": 0.01,
+            "stretch": -math.log(0.7),  # farther from one than 1.2
+            "scale": -math.log(0.8),
+            "offset": 0.3,
+            "margin": 0.2,
+            "ties": math.log(3),
+            "fitness": 0.9,
+            "fitness_backward": 0.8,
+            "valid_share": 0.75,
+            "distance": (0 + 1 + 2 + 5) / 4,  # beyond five voxels it says no more
+            "depth": math.sqrt((0.3**2 + 0.1**2) / 2),  # -0.3, -0.1, 0.1 and 0.3
+            "alike": 0.0,
+            "ground": 0.0,
+        }
+    )
+
+
+def test_margin_and_ties_count_unless_ties_change_no_class_or_something_chose() -> None:
+    tied = aligned(None, UPSIDE_DOWN)
+    several = figures(tied, HARMLESS + 0.001)
+    assert (several["margin"], several["alike"]) == (0.2, 0.0)
+    assert several["ties"] == pytest.approx(math.log(2))
+    settled = replace(tied, settled_by=Consensus(np.eye(3), 5, 5))
+    for alignment, ambiguity in ((tied, HARMLESS), (tied, 0.0), (settled, 1.0)):
+        one = figures(alignment, ambiguity)
+        assert math.isnan(one["margin"]) and (one["ties"], one["alike"]) == (0.0, 1.0)
+    # Without ties the margin says how far behind the next placement is, up to a limit.
+    assert figures(aligned(), 0.0)["margin"] == 0.2
+    assert figures(replace(aligned(), margin=0.5), 0.0)["margin"] == 0.3
+    on_ground = replace(aligned(), ground=Ground(np.array([0.0, 0.0, 1.0]), -0.2))
+    assert figures(on_ground, 0.0)["ground"] == 1.0
+
+
+def test_shares_around_voxels_are_of_other_classes_and_of_all_that_is_annotated() -> None:
+    tower = np.zeros((64, 64, 64), dtype=bool)
+    tower[20:44, 20:44] = True
+    field = field_of(tower, np.where(GRID[..., 2] < 32, 1, 3))
+    voxels = np.array([[32, 32, 31], [32, 32, 29], [32, 32, 10], [32, 32, 1]])
+    latents = latents_of(voxels)
+    annotation = annotated(np.array([1, 1, 1, 255]), latents.centres)
+    around = surroundings_of(field, latents, aligned(), annotation)
+    # Of 14 cells one and four lie above: 1, 2, 4 and 7 voxels along the axis, and 1, 1, 2 and 4
+    # along the diagonals of space.
+    above = np.array([[5, 5, 5, 5], [0, 0, 1, 5], [0, 0, 0, 0]]) / 14
+    np.testing.assert_allclose(around.others[:3], above, rtol=1e-6)
+    np.testing.assert_allclose(around.others[3], 1.0)  # without a class all are others
+    below = np.array([0, 1, 5, 5]) / 14  # that lie outside the grid
+    np.testing.assert_allclose(around.solid[3], 1 - below, rtol=1e-6)
+    np.testing.assert_allclose(around.depth, [0.5, 0.5, 0.5, 0.5 - 1 / 14], rtol=1e-6)
+    assert not around.moved.any() and not around.tied.any()
+
+
+def test_how_far_a_deformation_moves_is_measured_in_the_frame_of_the_annotation() -> None:
+    field, latents, annotation = column(5)
+    pushed = Deformation(np.eye(3, 4), np.zeros(3), 1.0, np.zeros((0, 0, 0, 3)))
+    alignment = replace(aligned(make_transform(np.eye(3), scale=0.5)), deformation=pushed)
+    steps = np.linspace(0.0, 3.0, len(latents.coords))
+    place = 2.0 * latents.centres + steps[:, None] * np.array([0.6, 0.0, 0.8]) / 64
+    around = surroundings_of(field, latents, alignment, replace(annotation, place=place))
+    np.testing.assert_allclose(around.moved, steps, atol=1e-4)
+
+
+def test_ties_count_by_how_many_of_them_change_the_class() -> None:
+    field, latents, annotation = column(5)
+    # Turned upside down the five lower and the five upper of twenty layers change classes.
+    changes = np.isin(latents.coords[:, 2], [*range(22, 27), *range(37, 42)])
+    for ties, share in (
+        ([UPSIDE_DOWN], 1 / 2),  # of the chosen one and one more
+        ([UPSIDE_DOWN, UPSIDE_DOWN], 2 / 3),
+        ([UPSIDE_DOWN, np.eye(4)], 1 / 3),
+        ([UPSIDE_DOWN, FAR_OFF], 1 / 3),  # where nothing is annotated nothing contradicts
+    ):
+        tied = surroundings_of(field, latents, aligned(None, *ties), annotation).tied
+        np.testing.assert_allclose(tied, np.where(changes, share, 0.0), rtol=1e-6)
+    settled = replace(aligned(None, UPSIDE_DOWN), settled_by=Consensus(np.eye(3), 5, 5))
+    assert not surroundings_of(field, latents, settled, annotation).tied.any()
+
+
+def test_ties_that_change_few_classes_count_as_one() -> None:
+    # Of 40 voxels in 20 layers four change by a painted layer, by a half each.
+    field, latents, annotation = column(2)
+    tied = surroundings_of(field, latents, aligned(None, UPSIDE_DOWN), annotation).tied
+    assert tied.mean() == pytest.approx(8 / 40 / 2)
+    one = np.where(np.arange(40) == 0, 3, 1).astype(np.uint8)  # two voxels change: 2 / 40 / 2
+    field, annotation = replace(field, material=one), replace(annotation, material=one)
+    assert not surroundings_of(field, latents, aligned(None, UPSIDE_DOWN), annotation).tied.any()
+
+
+def test_of_many_voxels_some_ties_stand_for_all(monkeypatch: pytest.MonkeyPatch) -> None:
+    field, latents, annotation = column(5)
+    changes = np.isin(latents.coords[:, 2], [*range(22, 27), *range(37, 42)])
+    monkeypatch.setattr("slatprep.judge.ambiguity.MOST_VOXELS", 20)  # of 40: every second tie
+    for ties, share in (
+        ([UPSIDE_DOWN] * 3, 3 / 4),
+        ([UPSIDE_DOWN, np.eye(4), np.eye(4)], (3 / 2) / 4),
+        ([UPSIDE_DOWN, np.eye(4), UPSIDE_DOWN], 3 / 4),
+    ):
+        tied = surroundings_of(field, latents, aligned(None, *ties), annotation).tied
+        np.testing.assert_allclose(tied, np.where(changes, share, 0.0), rtol=1e-6)
+
+
+def plain_field(values: np.ndarray) -> MaterialField:
+    """Return a field without classes, of voxels (K, P) of properties that are not mapped."""
+    voxels = np.argwhere(np.ones((64, 64, 64), dtype=bool))[: len(values)].astype(np.uint8)
+    solid = np.zeros((64, 64, 64), dtype=bool)
+    solid[tuple(voxels.T)] = True
+    table = tuple(Property(f"p{k}", "1", False) for k in range(values.shape[1]))
+    nothing = np.zeros(len(values), np.uint8)
+    return MaterialField(
+        solid, voxels, nothing, values.astype(np.float32), table=table, classified=False
+    )
+
+
+def as_annotation(field: MaterialField, rows: np.ndarray) -> Annotation:
+    """Return an annotation that shows rows of a field; -1 for none."""
+    valid = rows >= 0
+    return Annotation(
+        np.where(valid[:, None], field.properties[rows], np.nan).astype(np.float32),
+        np.where(valid, 0, 255).astype(np.uint8),
+        valid,
+        np.zeros(len(rows), np.float32),
+        np.zeros((len(rows), 3), np.float32),
+    )
+
+
+@pytest.mark.parametrize(("properties", "parts"), [(1, 10), (2, 10), (3, 5), (4, 2.5)])
+def test_labels_without_classes_are_the_nearest_tenths_or_coarser_where_these_are_too_many(
+    properties: int, parts: float
+) -> None:
+    # Eleven tenths to the power of 1, 2 and 3 are 11, 121 and 1331; six fifths are 216 at the
+    # third, 1296 at the fourth; and the three steps of 0, 0.4 and 0.8 are 81.
+    rng = np.random.default_rng(0)
+    values = rng.random((3000, properties))
+    values[:2] = [[0.0], [1.0]]
+    field = plain_field(5.0 + 3.0 * values)
+    rows = np.array([4, -1, 0, 77])
+    cells, own = _labels_of(field, as_annotation(field, rows))
+    _, expected = np.unique(np.rint(values * parts), axis=0, return_inverse=True)
+    pairs = set(zip(cells.tolist(), expected.reshape(-1).tolist(), strict=True))
+    assert len(pairs) == len({label for label, _ in pairs}) == expected.max() + 1
+    assert own.tolist() == [cells[4], 255, cells[0], cells[77]]
+
+
+def test_labels_are_made_coarser_where_255_are_too_few() -> None:
+    tenths = np.argwhere(np.ones((11,) * 3, dtype=bool)) / 10
+    for count, labels in ((255, 255), (256, None)):
+        values = np.concatenate([tenths[: count - 1], tenths[-1:]])
+        # A property that is the same everywhere changes nothing.
+        field = plain_field(np.column_stack([values, np.full(count, 4.0)]))
+        cells, _ = _labels_of(field, as_annotation(field, np.array([0])))
+        found = len(set(cells.tolist()))
+        assert found == labels if labels else found < 255
+        assert cells.max() < 255
+
+
+def test_no_label_is_that_of_nothing_however_many_combinations_there_are() -> None:
+    # Nine properties that are either 0 or 1 have 512 combinations, however coarse.
+    values = np.argwhere(np.ones((2,) * 9, dtype=bool)).astype(float)
+    field = plain_field(values)
+    cells, own = _labels_of(field, as_annotation(field, np.arange(512)))
+    np.testing.assert_array_equal(cells, np.minimum(np.arange(512), 254))
+    np.testing.assert_array_equal(own, cells)
+
+
+@pytest.mark.parametrize("value", [0.05, 0.45])
+@pytest.mark.parametrize("beside", [-0.002, 0.002])
+def test_labels_hold_where_no_value_is_as_near_to_a_border_as_rounding_may_move_it(
+    value: float, beside: float
+) -> None:
+    # Value and ends move by `off` each: value - low by two, and two more through the extent.
+    field = plain_field(np.array([[0.0], [1.0], [value + beside]]))
+    annotation = as_annotation(field, np.array([2]))
+    assert labels_hold(field, annotation, np.array([0.00049]))
+    assert not labels_hold(field, annotation, np.array([0.00051]))
+
+
+def test_borders_of_coarser_labels_count_only_where_these_are_used() -> None:
+    # 0.1 is a border of fifths, not of tenths.
+    few = plain_field(np.array([[0.0, 0.0, 0.0], [1.0, 1.0, 1.0], [0.1, 0.1, 0.1]]))
+    off = np.full(3, 1e-4)
+    assert labels_hold(few, as_annotation(few, np.array([2])), off)
+    tenths = np.argwhere(np.ones((11,) * 3, dtype=bool)) / 10
+    many = plain_field(tenths)
+    assert not labels_hold(many, as_annotation(many, np.array([2])), off)
+    # Borders of tenths count as well where fifths are used: of rounded values tenths might do.
+    levels = np.array([0.0, 0.08, 0.2, 0.4, 0.6, 0.8, 1.0])  # 343 combinations, of fifths 216
+    both = levels[np.argwhere(np.ones((7,) * 3, dtype=bool))]
+    assert labels_hold(plain_field(both), as_annotation(plain_field(both), np.array([2])), off)
+    both[-1] = 0.05
+    assert not labels_hold(plain_field(both), as_annotation(plain_field(both), np.array([2])), off)
+
+
+def ball(radius: float, at: float = 31.5) -> np.ndarray:
+    solid: np.ndarray = ((GRID - [at, 31.5, 31.5]) ** 2).sum(axis=-1) < radius**2
+    return solid
+
+
+def test_an_engine_without_figures_has_a_larger_ball_s_offset() -> None:
+    for larger in (1.0, -1.0):
+        field, latents = field_of(ball(18.0 + larger)), surface_latents(ball(18.0))
+        found = measure_figures(field, latents, aligned())
+        # At the SLAT's surface the other one's is that much farther out.
+        assert found.offset == pytest.approx(-larger, abs=0.1)
+        assert min(found.score_slat, found.score_pixieverse, *found.within) > 0.9
+        assert found.roughness < 0.3
+    # No more than two voxels are taken for an offset.
+    found = measure_figures(field_of(ball(21.0)), surface_latents(ball(18.0)), aligned())
+    assert found.offset == -2.0
+    assert found.within[0] > 0.4 and found.roughness == pytest.approx(1.0, abs=0.2)
+
+
+def test_an_engine_without_figures_has_those_of_a_shifted_ball() -> None:
+    """Archimedes: heights on a sphere are even; from each follows how far off the other one is."""
+    field, latents = field_of(ball(18.0)), surface_latents(ball(18.0, 35.5))
+    found = measure_figures(field, latents, aligned())
+    height = np.linspace(-1.0, 1.0, 100_001)
+    apart = np.abs(np.sqrt(18.0**2 + 4.0**2 - 2 * 18.0 * 4.0 * height) - 18.0)
+    assert found.offset == pytest.approx(0.0, abs=0.25)
+    # Voxels are no sphere: some heights have a few more samples than others.
+    np.testing.assert_allclose(found.within, [(apart <= k).mean() for k in (1, 2, 3)], atol=0.1)
+    assert found.roughness == pytest.approx(np.median(apart), abs=0.4)
+    mean = (1.0 / (1.0 + apart**2)).mean()
+    assert found.score_slat == pytest.approx(mean, abs=0.08)
+    assert found.score_pixieverse == pytest.approx(mean, abs=0.08)
+    assert found.score_similarity == 0.5 * (found.score_slat + found.score_pixieverse)
+    there = make_transform(np.eye(3), [4 / 64, 0, 0])
+    assert measure_figures(field, latents, aligned(there)).within[0] > 0.98
+
+
+def test_figures_of_a_voxel_by_hand() -> None:
+    others = np.array([[0.1, 0.2, 0.3, 0.4], [0.5, 0.6, 0.7, 0.8]], np.float32)
+    solid = np.array([[0, 0.25, 0, 0], [0, 0.65, 0, 0]], np.float32)
+    around = Surroundings(
+        others,
+        solid,
+        np.array([7.0, 1.0], np.float32),
+        np.array([0.5, 2.5], np.float32),
+        np.array([0.0, 0.25], np.float32),
+    )
+    doubt, rough = -math.log(0.8 / 0.2), 0.2  # depths of -0.25 and 0.15 lie 0.2 about their mean
+    rows = [
+        dict(zip(VOXEL_FIGURES, row, strict=True)) for row in voxel_figures(around, 0.8).tolist()
+    ]
+    for row, shares, distance, depth, moved in zip(
+        rows, others.tolist(), (5.0, 1.0), (0.25, 0.15), (0.5, 2.5), strict=True
+    ):
+        expected = {"distance": distance, "depth": depth, "moved": moved}
+        expected |= {"asset_unsure": doubt, "asset_rough": rough}
+        expected |= {"asset_distance": 3.0, "asset_moved": 1.5}
+        for radius, share in zip((1, 2, 4, 7), shares, strict=True):
+            expected |= {f"others_{radius}": share, f"others_{radius}_rough": share * rough}
+            expected |= {f"others_{radius}_unsure": share * doubt}
+        assert row == pytest.approx(expected, abs=1e-6)
+    # A placement that ties with another class at a quarter of them takes a quarter away.
+    free = replace(around, tied=np.zeros(2, np.float32))
+    whole = class_confidence(free, 0.8, np.array([True, True]))
+    less = class_confidence(around, 0.8, np.array([True, True]))
+    np.testing.assert_allclose(less, whole * [1.0, 0.75], rtol=1e-6)
+    assert class_confidence(around, 0.8, np.array([False, True])).tolist() == [0.0, less[1]]
+
+
+@pytest.mark.parametrize("certain", [0.0, 1.0])
+def test_a_probability_of_nought_or_one_leaves_finite_figures(certain: float) -> None:
+    unsure = voxel_figures(AROUND, certain)[:, VOXEL_FIGURES.index("asset_unsure")]
+    np.testing.assert_allclose(unsure, (1 - 2 * certain) * math.log(999), rtol=1e-4)

@@ -1,0 +1,222 @@
+"""Verdicts, and the sentences that say what kept an asset from being good."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from support.shapes import field_of, latents_of
+
+from slatprep.judge import THRESHOLDS, judge, verdict_of
+from slatprep.judge.calibration import PLACEMENT
+from slatprep.judge.confidence import causes_of_doubt
+from slatprep.judge.evidence import FIGURES
+from slatprep.judge.verdict import contradicted, merged
+from slatprep.parameters import SampleParameters
+from slatprep.records import (
+    Alignment,
+    Ambiguity,
+    Annotation,
+    Engine,
+    FitFigures,
+    Judgement,
+    Model,
+    Placement,
+    Quality,
+    Search,
+    Verdict,
+)
+
+FINE = Quality(1.0, 0.5, 1.0, 0.5, 1.0, 1.0)
+ROUGH = Quality(0.7, 0.5, 0.6, 0.5, 0.7, 1.5)
+
+
+def judgement(verdict: Verdict, expected: float) -> Judgement:
+    return Judgement(Ambiguity(0.0, (0.0,)), verdict, ("what it had",), 0.95, expected)
+
+
+def annotation(confidence: list[float] | None, valid: list[bool]) -> Annotation:
+    count = len(valid)
+    return Annotation(
+        np.ones((count, 3), np.float32),
+        np.where(valid, 1, 255).astype(np.uint8),
+        np.array(valid),
+        np.zeros(count, np.float32),
+        np.zeros((count, 3), np.float32),
+        None if confidence is None else np.array(confidence, np.float32),
+    )
+
+
+def test_an_asset_on_every_limit_is_good_for_no_reason() -> None:
+    limits = THRESHOLDS
+    assert verdict_of(
+        FINE,
+        limits.good_valid_share,
+        limits.good_ambiguity,
+        3,
+        limits.good_confidence,
+        limits.good_accuracy,
+    ) == (Verdict.GOOD, ())
+    # Where the placement is sure, the fitness does not matter.
+    assert verdict_of(ROUGH, 1.0, confidence=0.95) == (Verdict.GOOD, ())
+
+
+def test_every_reason_is_named_once() -> None:
+    verdict, reasons = verdict_of(ROUGH, 0.8, 0.4, 2, 0.6, 0.7, "roughness", contradicted=True)
+    assert verdict is Verdict.DOUBTFUL
+    assert reasons == (
+        "the placement is right with a probability of 60.0% only (good: 90%): the surfaces lie on "
+        "each other roughly only",
+        "only 70.0% of the PixieVerse boundary lies within 1.5 voxel of the other side (good: 80%)",
+        "only 60.0% of the SLAT boundary lies within 1.5 voxel of the other side (good: 80%)",
+        "only 70.0% of the labels can be expected to be right (good: 75%)",
+        "only 80.0% of the SLAT voxels found an annotation (good: 90%)",
+        "2 other placements fit about as well and would change the class of 40.0% of the voxels "
+        "(good: 5%)",
+        "its latents contradict its labels: labels drawn at random would be likelier",
+    )
+
+
+@pytest.mark.parametrize(
+    ("ties", "start"),
+    [
+        (1, "another placement fits about"),
+        (2, "2 other placements fit about"),
+        (0, "other placements fit about"),  # of a record that does not say how many
+    ],
+)
+def test_ties_are_counted(ties: int, start: str) -> None:
+    given = {"ties": ties} if ties else {}
+    verdict, (reason,) = verdict_of(FINE, 1.0, 0.06, **given)
+    assert verdict is Verdict.DOUBTFUL
+    assert reason.startswith(start)
+
+
+def test_without_a_cause_none_is_named_and_the_fitness_is() -> None:
+    _, (first, *fitnesses) = verdict_of(ROUGH, 1.0, confidence=0.6)
+    assert first.endswith("(good: 90%)")
+    assert len(fitnesses) == 2
+    # Of placements the fitness says nothing, as another one fits as well.
+    _, reasons = verdict_of(ROUGH, 1.0, confidence=0.6, cause="placement")
+    assert len(reasons) == 1
+    assert reasons[0].endswith("(good: 90%): another placement fits about as well")
+
+
+@pytest.mark.parametrize(
+    ("confidence", "ties", "ambiguity", "verdict"),
+    [
+        (0.25, 1, 0.06, Verdict.DOUBTFUL),  # one of both is right with 0.5: just not failed
+        (0.24, 1, 0.06, Verdict.FAILED),
+        (0.17, 2, 0.06, Verdict.DOUBTFUL),
+        (0.16, 2, 0.06, Verdict.FAILED),
+        (0.49, 3, THRESHOLDS.good_ambiguity, Verdict.FAILED),  # as labels they are one
+    ],
+)
+def test_the_confidence_of_all_that_ties_decides_what_is_failed(
+    confidence: float, ties: int, ambiguity: float, verdict: Verdict
+) -> None:
+    assert verdict_of(FINE, 1.0, ambiguity, ties, confidence)[0] is verdict
+
+
+@pytest.mark.parametrize(
+    ("before", "after"),
+    [
+        (Verdict.GOOD, Verdict.DOUBTFUL),
+        (Verdict.DOUBTFUL, Verdict.DOUBTFUL),
+        (Verdict.FAILED, Verdict.FAILED),
+    ],
+)
+def test_contradiction_and_samples_that_differ_make_good_ones_doubtful(
+    before: Verdict, after: Verdict
+) -> None:
+    against = contradicted(judgement(before, 0.9))
+    assert (against.verdict, against.contradicted) == (after, True)
+    assert against.reasons[0] == "what it had"
+    assert "contradict its labels" in against.reasons[1]
+    several = merged(judgement(before, 0.9), annotation([0.5, 0.5, 0.0], [True, True, False]))
+    assert (several.verdict, several.expected_accuracy) == (after, 0.5)
+    assert several.reasons == (
+        "what it had",
+        "its annotations differ: only 50.0% of the labels can be expected to be right (good: 75%)",
+    )
+
+
+@pytest.mark.parametrize(
+    ("alone", "likely"),
+    [
+        (0.9, [0.75, 0.75]),  # just enough together
+        (0.7, [0.6, 0.6]),  # too little before, which its own reasons tell
+        (0.7, [0.8, 0.9]),
+    ],
+)
+def test_samples_that_agree_add_no_reason(alone: float, likely: list[float]) -> None:
+    before = judgement(Verdict.GOOD, alone)
+    together = merged(before, annotation(likely, [True, True]))
+    assert together.expected_accuracy == pytest.approx(np.mean(likely))
+    assert replace(together, expected_accuracy=alone) == before
+
+
+def test_samples_that_agree_by_just_enough_before_and_not_together_differ() -> None:
+    several = merged(judgement(Verdict.GOOD, 0.75), annotation([0.5], [True]))
+    assert several.verdict is Verdict.DOUBTFUL
+
+
+@pytest.mark.parametrize("confidence", [None, [0.0, 0.0]])
+def test_samples_without_any_label_are_right_nowhere(confidence: list[float] | None) -> None:
+    several = merged(judgement(Verdict.GOOD, 0.9), annotation(confidence, [False, False]))
+    assert (several.verdict, several.expected_accuracy) == (Verdict.DOUBTFUL, 0.0)
+
+
+def test_what_takes_confidence_away_is_summed_by_cause_largest_first() -> None:
+    usual = np.array([[f.usual for f in PLACEMENT.figures if f.name == n][-1] for n in FIGURES])
+    rng = np.random.default_rng(1)
+    for _ in range(20):
+        figures = usual * rng.uniform(0.3, 1.7, len(FIGURES))
+        added = dict(zip(FIGURES, PLACEMENT.contributions(figures).tolist(), strict=True))
+        taken = causes_of_doubt(figures)
+        # Every figure belongs to one cause, and what adds confidence makes up for nothing.
+        lost = [-value for value in added.values() if value < 0]
+        assert sum(taken.values()) == pytest.approx(sum(lost))
+        of_placement = sum(max(-added[name], 0.0) for name in ("margin", "ties", "alike"))
+        assert taken["placement"] == pytest.approx(of_placement)
+        assert list(taken.values()) == sorted(taken.values(), reverse=True)
+
+
+def test_a_judgement_has_what_was_measured_of_its_asset() -> None:
+    """A bar of two classes that fits as well with its ends swapped."""
+    solid = np.zeros((64, 64, 64), dtype=bool)
+    solid[22:42, 31:33, 31:33] = True
+    classes = np.ones((64, 64, 64), dtype=np.uint8)
+    classes[:32] = 3
+    field = field_of(solid, classes)
+    latents = latents_of(field.voxels)
+    fit = FitFigures(0.9, 0.9, 0.9, math.nan, math.nan, (0.95, 0.97, 0.99), 0.0, 0.3)
+    swapped = Placement(np.diag([-1.0, -1.0, 1.0, 1.0]), 0.9, 9.0)
+    alignment = Alignment(
+        np.eye(4), Engine.FIELD, Model.RIGID, Search.EULER64, FINE,
+        margin=0.0, placements=(swapped,), figures=fit,
+    )  # fmt: skip
+    sampled = Annotation(
+        field.properties,
+        field.material,
+        np.ones(len(field.voxels), dtype=bool),
+        np.zeros(len(field.voxels), np.float32),
+        latents.centres.astype(np.float32),
+    )
+    found, likely = judge(field, latents, alignment, sampled, SampleParameters())
+    assert found.ambiguity.material_share == 1.0
+    assert found.verdict is not Verdict.GOOD
+    assert found.reasons[0].endswith("another placement fits about as well")
+    assert found.reasons[-1].startswith("another placement fits about as well and would change")
+    assert found.expected_accuracy == pytest.approx(likely.mean())
+    assert (likely <= 0.5).all()  # the two are as likely
+    part = replace(sampled, valid=latents.coords[:, 0] >= 32)
+    halved, likely = judge(field, latents, alignment, part, SampleParameters())
+    assert any("50.0% of the SLAT voxels" in reason for reason in halved.reasons)
+    assert halved.expected_accuracy == pytest.approx(likely[part.valid].mean())
+    nothing = replace(sampled, valid=np.zeros(len(field.voxels), dtype=bool))
+    lost, likely = judge(field, latents, alignment, nothing, SampleParameters())
+    assert lost.expected_accuracy == 0.0 and not likely.any()
+    assert lost.verdict is not Verdict.GOOD
