@@ -208,7 +208,6 @@ def test_a_judgement_has_what_was_measured_of_its_asset() -> None:
     found, likely = judge(field, latents, alignment, sampled, SampleParameters())
     assert found.ambiguity.material_share == 1.0
     assert found.verdict is not Verdict.GOOD
-    assert found.reasons[0].endswith("another placement fits about as well")
     assert found.reasons[-1].startswith("another placement fits about as well and would change")
     assert found.expected_accuracy == pytest.approx(likely.mean())
     assert (likely <= 0.5).all()  # the two are as likely
