@@ -87,7 +87,9 @@ def test_the_notebook_runs_in_jupyter_and_prints_what_the_tutorial_shows(
     notebook = nbformat.read(ROOT / "examples" / "tutorial.ipynb", as_version=4)
     place = {"metadata": {"path": str(tmp_path)}}
     # Raises where a cell does, of Python or of the shell.
-    NotebookClient(notebook, timeout=None, resources=place).execute()
+    # By itself it gives a kernel a minute to start, and then passes over output that takes 4 s.
+    patient = {"timeout": None, "startup_timeout": 600, "iopub_timeout": 600}
+    NotebookClient(notebook, resources=place, **patient).execute()
     cells = iter(cell for cell in notebook.cells if cell.cell_type == "code")
     printed, compared = "", 0
     for language, text in blocks("tutorial.md"):
