@@ -3,8 +3,8 @@
 Residuals and weights are those of `slatprep.align.deform_solver`, without its lattice.
 With g the derivative of a residual by where a sample lies in the SLAT frame, and q its
 place from the centre, with a 1 behind, the derivatives by the twelve unknowns are g q^T. So
-of a sample only the products of g with itself and of q with itself are made, ten and
-six, and the sums of their products are the normal matrix.
+of a sample only the products of g with itself and of q with itself are made, six and
+ten, and the sums of their products are the normal matrix.
 """
 
 from __future__ import annotations
