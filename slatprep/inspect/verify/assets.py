@@ -19,6 +19,7 @@ from slatprep.inspect.verify.merged import merged_findings
 from slatprep.judge import voxel_confidence
 from slatprep.judge.evidence import labels_hold
 from slatprep.normalize import normalize_change
+from slatprep.pipeline.fingerprint import code_fingerprint
 from slatprep.pipeline.previous import PLACE_TOLERANCE
 from slatprep.provenance.columns import columns_of
 from slatprep.provenance.record import AssetRecord
@@ -234,6 +235,8 @@ def confidence_findings(asset: StoredAsset, record: AssetRecord) -> Iterator[Fin
     if wrong:
         what = f"{wrong} of {len(likely)} voxels differ"
         expected = "what the grid, the places and the record give"
+        if record.code != code_fingerprint():
+            expected += " by today's code; another made the store, and building it again helps"
         yield Finding("voxel/confidence", asset.asset_id, what, expected)
 
 

@@ -218,6 +218,16 @@ def test_another_confidence_of_a_voxel_is_found(store: Path) -> None:
     assert [(f.asset, f.what) for f in findings] == [
         ("ant", f"1 of {len(asset.coords)} voxels differ")
     ]
+    assert "today's code" not in findings[0].expected
+
+
+def test_a_confidence_that_other_code_made_is_told_as_such(store: Path) -> None:
+    """Each release may have weights of its own."""
+    record = json.loads(str(open_store(store).read_rows("asset/record", 0, 1)[0]))
+    rewrite(store, "asset/record", 0, json.dumps(record | {"code": "0" * 64}))
+    rewrite(store, "voxel/confidence", 7, 0.5)
+    (finding,) = of_file(found(store), "voxel/confidence")
+    assert "by today's code; another made the store" in finding.expected
 
 
 def test_a_row_that_its_record_does_not_tell_of_is_found(store: Path) -> None:
