@@ -53,7 +53,7 @@ TESTS = {
     "judge/witness": ["judge/test_witness.py"],
     "normalize": ["test_normalize.py"],
     "geometry/frames": ["geometry"],
-    "geometry/voxels": ["geometry/test_voxels.py", "geometry/test_frames.py"],
+    "geometry/voxels": ["geometry/test_voxel_sets.py", "geometry/test_frames.py"],
     "geometry/nearest": ["geometry/test_nearest.py"],
     "geometry/fill": ["geometry/test_fill.py"],
     "geometry/distance": ["geometry/test_distance.py"],

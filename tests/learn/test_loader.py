@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -197,8 +198,11 @@ def test_a_plain_loader_takes_collate(learn_store: Path) -> None:
     assert [asset for batch in batches for asset in batch.asset_ids] == dataset.asset_ids
 
 
-def test_voxels_that_are_not_sure_enough_are_left_out(learn_store: Path) -> None:
-    store = open_store(learn_store)
+def test_voxels_that_are_not_sure_enough_are_left_out(learn_store: Path, tmp_path: Path) -> None:
+    doubtful = Path(shutil.copytree(learn_store, tmp_path / "doubtful.zarr"))
+    array = zarr.open_group(doubtful, mode="r+", use_consolidated=False)["voxel/confidence"]
+    array[:] = array[:] * np.random.default_rng(0).uniform(size=array.shape)
+    store = open_store(doubtful)
     spread = np.concatenate([asset.confidence[asset.valid] for asset in store])
     least = float(np.median(spread))
     assert (spread >= least).any() and (spread < least).any()
