@@ -65,7 +65,6 @@ the misfit."""
 SOLVER_STEPS = 6
 """Steps of conjugate gradients for each step of Gauss and Newton."""
 
-
 _DAMPING = 1e-6
 
 

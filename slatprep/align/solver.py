@@ -100,7 +100,11 @@ def _accumulate(  # type: ignore[no-untyped-def]
             weight_sum += block[_U + m]
             inliers += near
             squares += square if near else 0.0
-        _add_products(weighted, rows, len(own), equations)
+        # Of the symmetric matrix the upper triangle alone, in blocks of three.
+        for i in range(0, UNKNOWNS + 1, 3):
+            for j in range(i, UNKNOWNS + 1, 3):
+                left, right = _three(weighted, i, len(own)), _three(rows, j, len(own))
+                add_products(left, right, equations[i : i + 3, j : j + 3])
     return weight_sum, inliers, squares
 
 
@@ -215,34 +219,39 @@ def _linearise(  # type: ignore[no-untyped-def]
 
 
 @kernel()
-def _add_products(left, right, count, out):  # type: ignore[no-untyped-def]
-    """Add the sum over m of ``left[i, m] * right[j, m]`` to ``out[i, j]``, the upper triangle.
+def add_products(left, right, out):  # type: ignore[no-untyped-def]
+    """Add the sum over m of ``left[i][m] * right[j][m]`` to ``out[i, j]``; three columns of each.
 
-    By blocks of three rows and columns, written out, so that the compiler keeps
-    the sums in registers; below the diagonal blocks nothing is added.
+    Written out, so that the compiler keeps the sums in registers.
     """
-    for i in range(0, UNKNOWNS + 1, 3):
-        for j in range(i, UNKNOWNS + 1, 3):
-            to = out[i : i + 3, j : j + 3]
-            a, b, c = to[0, 0], to[0, 1], to[0, 2]
-            d, e, f = to[1, 0], to[1, 1], to[1, 2]
-            g, h, k = to[2, 0], to[2, 1], to[2, 2]
-            u, v = i * _BLOCK, j * _BLOCK
-            for m in range(count):
-                p, q, r = left[u + m], left[u + _BLOCK + m], left[u + 2 * _BLOCK + m]
-                x, y, z = right[v + m], right[v + _BLOCK + m], right[v + 2 * _BLOCK + m]
-                a += p * x
-                b += p * y
-                c += p * z
-                d += q * x
-                e += q * y
-                f += q * z
-                g += r * x
-                h += r * y
-                k += r * z
-            to[0, 0], to[0, 1], to[0, 2] = a, b, c
-            to[1, 0], to[1, 1], to[1, 2] = d, e, f
-            to[2, 0], to[2, 1], to[2, 2] = g, h, k
+    p, q, r = left
+    x, y, z = right
+    a, b, c = out[0, 0], out[0, 1], out[0, 2]
+    d, e, f = out[1, 0], out[1, 1], out[1, 2]
+    g, h, k = out[2, 0], out[2, 1], out[2, 2]
+    for m in range(len(p)):
+        a += p[m] * x[m]
+        b += p[m] * y[m]
+        c += p[m] * z[m]
+        d += q[m] * x[m]
+        e += q[m] * y[m]
+        f += q[m] * z[m]
+        g += r[m] * x[m]
+        h += r[m] * y[m]
+        k += r[m] * z[m]
+    out[0, 0], out[0, 1], out[0, 2] = a, b, c
+    out[1, 0], out[1, 1], out[1, 2] = d, e, f
+    out[2, 0], out[2, 1], out[2, 2] = g, h, k
+
+
+@kernel(inline="always")
+def _three(block, row, count):  # type: ignore[no-untyped-def]
+    at = row * _BLOCK
+    return (
+        block[at : at + count],
+        block[at + _BLOCK : at + _BLOCK + count],
+        block[at + 2 * _BLOCK : at + 2 * _BLOCK + count],
+    )
 
 
 @kernel()

@@ -14,7 +14,7 @@ import math
 import numpy as np
 
 from slatprep.align.deform_solver import OFFSET_PRIOR, PIXIEVERSE_WEIGHT, RIDGE
-from slatprep.align.solver import interpolate, solve_linear
+from slatprep.align.solver import add_products, interpolate, solve_linear
 from slatprep.geometry.kernel import kernel
 
 _LEAST, _MOST = 0.2, 5.0
@@ -92,7 +92,9 @@ def _accumulate(  # type: ignore[no-untyped-def]
         if n == _BLOCK or m == points.shape[0] - 1:
             for i in range(0, 12, 3):
                 for j in range(0 if i < 6 else 3, 12, 3):
-                    _add_products(left[:n], right[:n], i, j, sums)
+                    these = left[:n, i], left[:n, i + 1], left[:n, i + 2]
+                    those = right[:n, j], right[:n, j + 1], right[:n, j + 2]
+                    add_products(these, those, sums[i : i + 3, j : j + 3])
             n = 0
         constant[0] += factor
         constant[1] += factor * sign * residual
@@ -104,33 +106,6 @@ def _accumulate(  # type: ignore[no-untyped-def]
         linear[i, 2] += sums[6 + i, 8]
         linear[i, 3] += sums[6 + i, 9]
     return kernels / points.shape[0]
-
-
-@kernel()
-def _add_products(left, right, i, j, out):  # type: ignore[no-untyped-def]
-    """Add the sums over m of ``left[m, i] * right[m, j]`` to `out`, for three i and three j.
-
-    Nine at once and written out, so that the compiler keeps the sums in registers.
-    """
-    to = out[i : i + 3, j : j + 3]
-    a, b, c = to[0, 0], to[0, 1], to[0, 2]
-    d, e, f = to[1, 0], to[1, 1], to[1, 2]
-    g, h, k = to[2, 0], to[2, 1], to[2, 2]
-    for m in range(left.shape[0]):
-        p, q, r = left[m, i], left[m, i + 1], left[m, i + 2]
-        x, y, z = right[m, j], right[m, j + 1], right[m, j + 2]
-        a += p * x
-        b += p * y
-        c += p * z
-        d += q * x
-        e += q * y
-        f += q * z
-        g += r * x
-        h += r * y
-        k += r * z
-    to[0, 0], to[0, 1], to[0, 2] = a, b, c
-    to[1, 0], to[1, 1], to[1, 2] = d, e, f
-    to[2, 0], to[2, 1], to[2, 2] = g, h, k
 
 
 @kernel()

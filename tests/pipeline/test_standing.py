@@ -13,7 +13,7 @@ from support.synthetic import Dataset
 from support.trees import records_of, tree
 
 from slatprep.inspect.verify import verify_store
-from slatprep.pipeline import carry, publish, seen
+from slatprep.pipeline import publish
 from slatprep.pipeline.dataset import build_store
 from slatprep.store import open_store
 from slatprep.store.layout import ARRAYS
@@ -21,12 +21,7 @@ from slatprep.store.layout import ARRAYS
 MakeDataset = Callable[..., Dataset]
 
 
-@pytest.fixture(autouse=True)
-def files_are_old(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Trust the states of files however shortly ago they were written; one new asset is few."""
-    monkeypatch.setattr(seen, "_FINE_NS", 0)
-    monkeypatch.setattr(seen, "_COARSE_NS", 0)
-    monkeypatch.setattr(carry, "MOST_BEHIND", 1.0)
+pytestmark = pytest.mark.usefixtures("files_are_old", "few_are_new")
 
 
 @pytest.fixture

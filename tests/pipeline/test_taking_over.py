@@ -29,17 +29,7 @@ from slatprep.store.unmoved import Unmoved
 MakeDataset = Callable[..., Dataset]
 
 
-@pytest.fixture(autouse=True)
-def files_are_old(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Trust the states of files however shortly ago they were written."""
-    monkeypatch.setattr(seen, "_FINE_NS", 0)
-    monkeypatch.setattr(seen, "_COARSE_NS", 0)
-
-
-@pytest.fixture(autouse=True)
-def few_are_new(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Let two new assets of six be few."""
-    monkeypatch.setattr(carry, "MOST_BEHIND", 1.0)
+pytestmark = pytest.mark.usefixtures("files_are_old", "few_are_new")
 
 
 @pytest.fixture

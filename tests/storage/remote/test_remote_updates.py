@@ -16,17 +16,10 @@ from support.trees import tree
 
 from slatprep.errors import StoreError
 from slatprep.inspect.verify import verify_store
-from slatprep.pipeline import carry, seen
 from slatprep.pipeline.dataset import build_store
 from slatprep.store import open_store
 
-
-@pytest.fixture(autouse=True)
-def small(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Let one new asset of five be few, and trust files however new they are."""
-    monkeypatch.setattr(carry, "MOST_BEHIND", 1.0)
-    monkeypatch.setattr(seen, "_FINE_NS", 0)
-    monkeypatch.setattr(seen, "_COARSE_NS", 0)
+pytestmark = pytest.mark.usefixtures("files_are_old", "few_are_new")
 
 
 @pytest.fixture
