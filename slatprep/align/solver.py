@@ -31,9 +31,14 @@ _LEVER = 30.0  # voxels; what a turn or a change of scale moves at the object's 
 _LONGEST_TURN = 0.35
 _LARGEST_GROWTH = 0.1
 _BLOCK = 64  # samples a step at a time: what is kept of them stays in the processor's first cache
-_VALUE, _GX, _GY, _GZ, _U, _V, _W, _X, _Y, _Z, _OX, _OY, _OZ, _BEYOND = range(
-    0, 14 * _BLOCK, _BLOCK
+_LANES = 8  # sums of each product, of every eighth sample each: as many on any processor
+_PRODUCTS = 6 * 9  # of the upper triangle's six blocks of three rows and columns
+_VALUE, _GX, _GY, _GZ, _U, _V, _W, _X, _Y, _Z, _OX, _OY, _OZ, _BEYOND, _ROWS = range(
+    0, 15 * _BLOCK, _BLOCK
 )
+_WEIGHTED = _ROWS + (UNKNOWNS + 1) * _BLOCK
+_SUMS = _WEIGHTED + (UNKNOWNS + 1) * _BLOCK
+_NUMBERS = _SUMS + _PRODUCTS * _LANES
 """Where, of a block's numbers, those of each kind begin: in one array, which is no other's memory,
 so that the compiler makes vector instructions of the loops over them."""
 
@@ -80,32 +85,42 @@ def interpolate(f, x, y, z):  # type: ignore[no-untyped-def]
 def _accumulate(  # type: ignore[no-untyped-def]
     points, values, field, origin, rotation, shift, scale, offset, centre, tau, forward, equations
 ):
-    """Add one side's residuals to the normal equations; return its summed weight and fit.
+    """Add one side's residuals to the normal equations.
 
     With the rows A = (J, r), a sample a row, the equations are A^T W A: the
     normal matrix, and beside it, as the last column, the right-hand side.
     """
-    block, cells = np.empty(14 * _BLOCK), np.empty(_BLOCK, np.int64)
+    block, cells = np.empty(_NUMBERS), np.empty(_BLOCK, np.int64)
     corners = np.empty(8 * _BLOCK, np.float32)
-    rows, weighted = np.empty((UNKNOWNS + 1) * _BLOCK), np.empty((UNKNOWNS + 1) * _BLOCK)
-    weight_sum, inliers, squares = 0.0, 0, 0.0
+    block[_SUMS:] = 0.0
     for first in range(0, points.shape[0], _BLOCK):
         own, known = points[first : first + _BLOCK], values[first : first + _BLOCK]
         _carry(own, rotation, shift, scale, origin, field.shape, forward, block, cells)
         _look_up(field, cells, len(own), corners, block)
-        _linearise(known, rotation, scale, offset, centre, tau, forward, block, rows, weighted)
+        _weigh(known, scale, offset, tau, forward, block)
+        _linearise(len(own), rotation, centre, forward, block)
+        _add_products(len(own), block)
+    _add_sums(block, equations)
+
+
+@kernel(error_model="numpy")
+def _fit(points, values, field, origin, rotation, shift, scale, offset, forward):  # type: ignore[no-untyped-def]
+    """Of one side at tau = 1, the summed kernel, and the number and squares of the inliers."""
+    block, cells = np.empty(_ROWS), np.empty(_BLOCK, np.int64)
+    corners = np.empty(8 * _BLOCK, np.float32)
+    weight_sum, inliers, sum_of_squares = 0.0, 0, 0.0
+    for first in range(0, points.shape[0], _BLOCK):
+        own, known = points[first : first + _BLOCK], values[first : first + _BLOCK]
+        _carry(own, rotation, shift, scale, origin, field.shape, forward, block, cells)
+        _look_up(field, cells, len(own), corners, block)
+        _weigh(known, scale, offset, 1.0, forward, block)
         for m in range(len(own)):
             square = block[_V + m]
             near = square <= 1.0
             weight_sum += block[_U + m]
             inliers += near
-            squares += square if near else 0.0
-        # Of the symmetric matrix the upper triangle alone, in blocks of three.
-        for i in range(0, UNKNOWNS + 1, 3):
-            for j in range(i, UNKNOWNS + 1, 3):
-                left, right = _three(weighted, i, len(own)), _three(rows, j, len(own))
-                add_products(left, right, equations[i : i + 3, j : j + 3])
-    return weight_sum, inliers, squares
+            sum_of_squares += square if near else 0.0
+    return weight_sum, inliers, sum_of_squares
 
 
 @kernel(error_model="numpy")
@@ -180,42 +195,104 @@ def _look_up(field, cells, count, corners, block):  # type: ignore[no-untyped-de
 
 
 @kernel(error_model="numpy")
-def _linearise(  # type: ignore[no-untyped-def]
-    values, rotation, scale, offset, centre, tau, forward, block, rows, weighted
-):
-    """Set a block's rows of A and of W A, and in `block` the kernels (U) and squares (V)."""
+def _weigh(values, scale, offset, tau, forward, block):  # type: ignore[no-untyped-def]
+    """Set a block's residuals, their kernels (U) and their squares (V)."""
+    if forward:
+        for m in range(len(values)):
+            block[_VALUE + m] = scale * block[_VALUE + m] - values[m] - offset
+    else:
+        for m in range(len(values)):
+            block[_VALUE + m] = block[_VALUE + m] - scale * values[m] + offset
+    for m in range(len(values)):
+        square = block[_VALUE + m] * block[_VALUE + m]
+        block[_U + m], block[_V + m] = 1.0 / (1.0 + square / (tau * tau)), square
+
+
+@kernel(error_model="numpy")
+def _linearise(count, rotation, centre, forward, block):  # type: ignore[no-untyped-def]
+    """Set a block's rows of A and of W A; rows of zeros make it as long as all lanes."""
     r00, r01, r02 = rotation[0, 0], rotation[0, 1], rotation[0, 2]
     r10, r11, r12 = rotation[1, 0], rotation[1, 1], rotation[1, 2]
     r20, r21, r22 = rotation[2, 0], rotation[2, 1], rotation[2, 2]
     c0, c1, c2 = centre[0], centre[1], centre[2]
     sign = -1.0 if forward else 1.0
     if forward:
-        for m in range(len(values)):
+        for m in range(count):
             a, b, c = block[_GX + m], block[_GY + m], block[_GZ + m]
             block[_GX + m] = r00 * a + r01 * b + r02 * c
             block[_GY + m] = r10 * a + r11 * b + r12 * c
             block[_GZ + m] = r20 * a + r21 * b + r22 * c
-            block[_VALUE + m] = scale * block[_VALUE + m] - values[m] - offset
-    else:
-        for m in range(len(values)):
-            block[_VALUE + m] = block[_VALUE + m] - scale * values[m] + offset
-    for m in range(len(values)):
+    for m in range(count):
         gx, gy, gz, residual = block[_GX + m], block[_GY + m], block[_GZ + m], block[_VALUE + m]
         qx, qy, qz = block[_X + m] - c0, block[_Y + m] - c1, block[_Z + m] - c2
-        square = residual * residual
-        kernel = 1.0 / (1.0 + square / (tau * tau))
-        block[_U + m], block[_V + m] = kernel, square
-        rows[m] = sign * (qy * gz - qz * gy)
-        rows[_BLOCK + m] = sign * (qz * gx - qx * gz)
-        rows[2 * _BLOCK + m] = sign * (qx * gy - qy * gx)
-        rows[3 * _BLOCK + m] = sign * gx
-        rows[4 * _BLOCK + m] = sign * gy
-        rows[5 * _BLOCK + m] = sign * gz
-        rows[6 * _BLOCK + m] = sign * (gx * qx + gy * qy + gz * qz)
-        rows[7 * _BLOCK + m] = sign
-        rows[8 * _BLOCK + m] = residual
+        kernel = block[_U + m]
+        block[_ROWS + m] = sign * (qy * gz - qz * gy)
+        block[_ROWS + _BLOCK + m] = sign * (qz * gx - qx * gz)
+        block[_ROWS + 2 * _BLOCK + m] = sign * (qx * gy - qy * gx)
+        block[_ROWS + 3 * _BLOCK + m] = sign * gx
+        block[_ROWS + 4 * _BLOCK + m] = sign * gy
+        block[_ROWS + 5 * _BLOCK + m] = sign * gz
+        block[_ROWS + 6 * _BLOCK + m] = sign * (gx * qx + gy * qy + gz * qz)
+        block[_ROWS + 7 * _BLOCK + m] = sign
+        block[_ROWS + 8 * _BLOCK + m] = residual
         for i in range(UNKNOWNS + 1):
-            weighted[i * _BLOCK + m] = kernel * kernel * rows[i * _BLOCK + m]
+            block[_WEIGHTED + i * _BLOCK + m] = kernel * kernel * block[_ROWS + i * _BLOCK + m]
+    for m in range(count, -(-count // _LANES) * _LANES):
+        for i in range(UNKNOWNS + 1):
+            block[_ROWS + i * _BLOCK + m] = block[_WEIGHTED + i * _BLOCK + m] = 0.0
+
+
+@kernel()
+def _add_products(count, block):  # type: ignore[no-untyped-def]
+    """Add a block's products to their sums; of the symmetric matrix the upper triangle alone."""
+    for first in range(0, _BLOCK, _LANES):
+        if first >= count:  # as a bound of the range, it would let the compiler expect first < 0
+            break
+        _add_nine_products(block, first, 0, 0, 0)
+        _add_nine_products(block, first, 0, 3, 1)
+        _add_nine_products(block, first, 0, 6, 2)
+        _add_nine_products(block, first, 3, 3, 3)
+        _add_nine_products(block, first, 3, 6, 4)
+        _add_nine_products(block, first, 6, 6, 5)
+
+
+@kernel(inline="always")
+def _add_nine_products(block, first, row, column, number):  # type: ignore[no-untyped-def]
+    """Add those of three rows of W A and three of A, `row` and `column` the first of them.
+
+    Written out, and the numbers constants, so that the compiler makes vectors of the lanes.
+    """
+    left, right = _WEIGHTED + row * _BLOCK + first, _ROWS + column * _BLOCK + first
+    for m in range(_LANES):
+        p, q, r = block[left + m], block[left + _BLOCK + m], block[left + 2 * _BLOCK + m]
+        x, y, z = block[right + m], block[right + _BLOCK + m], block[right + 2 * _BLOCK + m]
+        at = _SUMS + 9 * number * _LANES + m
+        block[at] += p * x
+        block[at + _LANES] += p * y
+        block[at + 2 * _LANES] += p * z
+        block[at + 3 * _LANES] += q * x
+        block[at + 4 * _LANES] += q * y
+        block[at + 5 * _LANES] += q * z
+        block[at + 6 * _LANES] += r * x
+        block[at + 7 * _LANES] += r * y
+        block[at + 8 * _LANES] += r * z
+
+
+@kernel()
+def _add_sums(block, equations):  # type: ignore[no-untyped-def]
+    """Add up the lanes, and add the sums to the upper triangle of the equations."""
+    for number in range(_PRODUCTS):
+        at = _SUMS + number * _LANES
+        even = (block[at] + block[at + 4]) + (block[at + 2] + block[at + 6])
+        odd = (block[at + 1] + block[at + 5]) + (block[at + 3] + block[at + 7])
+        block[number] = even + odd
+    number = 0
+    for row in range(0, UNKNOWNS + 1, 3):
+        for column in range(row, UNKNOWNS + 1, 3):
+            for i in range(row, row + 3):
+                for j in range(column, column + 3):
+                    equations[i, j] += block[number]
+                    number += 1
 
 
 @kernel()
@@ -242,16 +319,6 @@ def add_products(left, right, out):  # type: ignore[no-untyped-def]
     out[0, 0], out[0, 1], out[0, 2] = a, b, c
     out[1, 0], out[1, 1], out[1, 2] = d, e, f
     out[2, 0], out[2, 1], out[2, 2] = g, h, k
-
-
-@kernel(inline="always")
-def _three(block, row, count):  # type: ignore[no-untyped-def]
-    at = row * _BLOCK
-    return (
-        block[at : at + count],
-        block[at + _BLOCK : at + _BLOCK + count],
-        block[at + 2 * _BLOCK : at + 2 * _BLOCK + count],
-    )
 
 
 @kernel()
@@ -349,13 +416,13 @@ def solve(  # type: ignore[no-untyped-def]
             moved = math.sqrt(step[3] ** 2 + step[4] ** 2 + step[5] ** 2)
             if moved + _LEVER * (angle + abs(growth - 1.0)) < tolerance:
                 break
-        here, near, squares = _accumulate(
+        here, near, squares = _fit(
             slat_points, slat_values, pixie_field, pixie_origin,
-            rotation, shift, scale, offset, centre, 1.0, True, equations,
+            rotation, shift, scale, offset, True,
         )  # fmt: skip
-        back, near_back, squares_back = _accumulate(
+        back, near_back, squares_back = _fit(
             pixie_points, pixie_values, slat_field, slat_origin,
-            rotation, shift, scale, offset, centre, 1.0, False, equations,
+            rotation, shift, scale, offset, False,
         )  # fmt: skip
         inliers = near + near_back
         scales[pose], offsets[pose] = scale, offset
