@@ -166,6 +166,13 @@ def _search(position, row, near, offsets, floors, limit):  # type: ignore[no-unt
         inside = min(max(a, 0), size - 1), min(max(b, 0), size - 1), min(max(c, 0), size - 1)
         if not near[inside[0] // _BLOCK, inside[1] // _BLOCK, inside[2] // _BLOCK]:
             continue
+        aside = max(abs(x - a), abs(y - b), abs(z - c))
+        if aside < 0.5 - _ROUNDING and inside == (a, b, c) and row[a, b, c] >= 0:
+            # A point in a voxel of the set is nearer to its centre than to any other.
+            square = (x - a) ** 2 + (y - b) ** 2 + (z - c) ** 2
+            if square <= limit:
+                distance[m], nearest[m] = np.sqrt(square), row[a, b, c]
+            continue
         best, found = np.inf, -1
         for n in range(offsets.shape[0]):
             # Equality goes on: an equally near voxel may have the lower row.

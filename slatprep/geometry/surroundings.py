@@ -88,7 +88,8 @@ def _look(cells, points, labels, steps, side, margin, empty, others, solid):  # 
         for shell in range(steps.shape[0]):
             there, differ = 0, 0
             for n in range(steps.shape[1]):
-                label = cells[place + steps[shell, n]]
+                # Unsigned, so that no negative index has to be provided for.
+                label = cells[np.uint64(place + steps[shell, n])]
                 there += label != empty
                 differ += (label != empty) & (label != own)
             others[m, shell] = differ / there if there else 0.0

@@ -127,8 +127,11 @@ def outer_boundary(occupancy: NDArray[np.bool_]) -> NDArray[np.uint8]:
 
 def flat_index(voxels: ArrayLike, side: int = RESOLUTION) -> NDArray[np.intp]:
     """Return the place (N,) of each voxel (N, 3) in the flattened grid (side,)*3, in C order."""
-    index = np.asarray(voxels).astype(np.intp)
-    flat: NDArray[np.intp] = (index[:, 0] * side + index[:, 1]) * side + index[:, 2]
+    x, y, z = np.asarray(voxels).T
+    flat: NDArray[np.intp] = x.astype(np.intp)
+    for one in (y, z):
+        flat *= side
+        flat += one
     return flat
 
 
