@@ -68,18 +68,21 @@ def measure_ambiguity(
             places = places_of(latents.centres, alignment.transform)
             annotation = sample(field, places, parameters, labels_alone=True)
         material, valid = annotation.material[few], annotation.valid[few]
-        mapped = to_mapped(annotation.properties[few], field.table)
+        properties = annotation.properties[few]
         for placement in alignment.placements:
             places = places_of(centres, placement.transform)
             other = sample(field, places, parameters, labels_alone=True)
             differs |= other.material != material
             both = valid & other.valid
             if both.any():
-                delta = np.abs(mapped - to_mapped(other.properties, field.table))[both]
-                change = np.maximum(change, delta.mean(axis=0))
+                # Most voxels are looked up in the same place: there is nothing to take log10 of.
+                rows = np.flatnonzero(both & (properties != other.properties).any(axis=1))
+                mapped = to_mapped(properties[rows], field.table)
+                delta = np.abs(mapped - to_mapped(other.properties[rows], field.table))
+                change = np.maximum(change, delta.sum(axis=0) / np.count_nonzero(both))
                 if not field.classified:
                     span = np.ptp(property_extent(field), axis=1)
-                    differs[both] |= (delta > NOTABLE * span).any(axis=1)
+                    differs[rows] |= (delta > NOTABLE * span).any(axis=1)
     return Ambiguity(
         material_share=float(differs.mean()),
         property_change=tuple(change.tolist()),

@@ -80,13 +80,17 @@ class Logistic:
 
     def probability(self, values: NDArray[np.floating]) -> NDArray[np.float64]:
         """Return the probability for figures (..., F), within `FLOOR` of 0 and 1."""
+        from slatprep.judge.odds import add_odds
+
         odds = np.full(values.shape[:-1], self.intercept)
-        # Column by column, without those of no weight: there may be thousands of rows.
-        for figure, column in zip(self.figures, self._columns, strict=True):
-            if figure.weight:
-                clipped = np.clip(values[..., column], figure.low, figure.high)
-                added = figure.weight * (clipped - figure.usual)
-                odds += np.where(np.isnan(added), 0.0, added)
+        # Those of no weight need not be looked at: there may be thousands of rows.
+        counted = self._table[0] != 0.0
+        add_odds(
+            values.reshape(-1, values.shape[-1]),
+            np.array(self._columns)[counted],
+            self._table[:, counted].astype(values.dtype),
+            odds.reshape(-1),
+        )
         return self.calibrated(odds)
 
     def calibrated(self, odds: NDArray[np.float64]) -> NDArray[np.float64]:
