@@ -66,8 +66,8 @@ class Measurement:
 MEASUREMENTS = (
     Measurement(
         "build-cost", "What a build costs beside reading and writing the same bytes",
-        "reliability", "python benchmarks/build_cost.py {folder}/demo/dataset.toml",
-        (140, 0, 600), (8, 0, 120), (DEMO,),
+        "reliability", "python benchmarks/build_cost.py {folder}/demo/dataset.toml --times {size}",
+        (24, 68, 900), (8, 1, 120), (DEMO,),
     ),
     Measurement(
         "scale", "How builds and updates grow with the number of assets",

@@ -2,7 +2,7 @@
 
     slatprep make-demo demo --assets 200
     python benchmarks/build_cost.py demo/dataset.toml
-    python benchmarks/build_cost.py demo/dataset.toml --times 34
+    python benchmarks/build_cost.py demo/dataset.toml --times 8  # as many as PixieVerse has
     python benchmarks/build_cost.py demo/dataset.toml --full
 
 Times are CPU seconds of the process and its children, so that other work on
@@ -119,7 +119,11 @@ def measure(parameters: BuildParameters, folder: Path, jobs: bool) -> dict[str, 
         begin = time.perf_counter()
         if not verify_store(folder / "2.zarr", jobs=2).ok:
             raise SystemExit("the store does not verify")
-        report["wall, verifying with two jobs [s]"] = round(time.perf_counter() - begin, 1)
+        verified = time.perf_counter() - begin
+        report["wall, verifying with two jobs [s]"] = round(verified, 1)
+        report["wall, from sources to a verified store with two jobs [s]"] = round(
+            both + verified, 1
+        )
         children = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss
         report["peak memory of a worker [MB]"] = round(children / 1024)
     return report
