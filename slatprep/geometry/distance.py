@@ -96,19 +96,25 @@ def _squares_along_last(solid, inside, outside):  # type: ignore[no-untyped-def]
 @kernel()
 def _spread_over_others(squares):  # type: ignore[no-untyped-def]
     """Take the two axes before the last into account, in place, slab by slab."""
+    # Copied by loops, which become vector instructions: an assignment of slices does not.
     a, b, c = squares.shape
     slab, least = np.empty((a, c), np.int16), np.empty((a, c), np.int16)
     for j in range(b):
-        slab[:] = squares[:, j]
+        for i in range(a):
+            for k in range(c):
+                slab[i, k] = squares[i, j, k]
         if slab[:, 0].min() == NOTHING * NOTHING:
             continue  # Nothing of the other kind in any of its lines, so nothing to spread.
         spread(slab, least)
-        squares[:, j] = least
-    slab, least = np.empty((b, c), np.int16), np.empty((b, c), np.int16)
+        for i in range(a):
+            for k in range(c):
+                squares[i, j, k] = least[i, k]
+    slab = np.empty((b, c), np.int16)
     for i in range(a):
-        slab[:] = squares[i]
-        spread(slab, least)
-        squares[i] = least
+        for j in range(b):
+            for k in range(c):
+                slab[j, k] = squares[i, j, k]
+        spread(slab, squares[i])
 
 
 @kernel()
