@@ -35,6 +35,35 @@ def test_of_equally_near_voxels_the_first_is_taken() -> None:
         assert index.tolist() == [0]
 
 
+def test_of_two_voxels_as_near_as_the_searched_cells_reach_the_first_is_taken() -> None:
+    """One of them, 3.5 voxels off, lies among the cells around the point, the other beyond."""
+    for first, second in ((14, 7), (7, 14)):
+        voxels = np.array([[first, 30, 30], [second, 30, 30]], dtype=np.uint8)
+        distance, index = Lattice(voxels).nearest(voxel_centres([[10.5, 30, 30]]))
+        assert (distance.tolist(), index.tolist()) == ([3.5], [0])
+
+
+@pytest.mark.parametrize("limit", [0.5, 1.5, 3.0, np.inf])
+def test_the_ends_of_the_grid_are_far_apart(limit: float) -> None:
+    """Against brute force around faces, edges and corners: no look-up runs over into another row.
+
+    Of each pair of opposite ends one alone has voxels, along a line here and there.
+    """
+    ends = np.array([[0, 9, 9], [63, 30, 30], [9, 0, 40], [40, 63, 9], [20, 9, 0], [9, 50, 63],
+                     [0, 0, 20], [63, 20, 63]], dtype=np.uint8)  # fmt: skip
+    voxels = np.unique(np.concatenate([ends, np.roll(ends, 1, axis=1)]), axis=0)
+    across = (64 * (voxels == 0)) - 64 * (voxels == 63).astype(int)
+    nearby = np.argwhere(np.ones((5, 5, 5), dtype=bool)) - 2
+    opposite = (voxels + across)[:, None] + nearby
+    index = np.concatenate([opposite, voxels[:, None] + nearby]).reshape(-1, 3) + 0.25
+    squares = ((index[:, None] - voxels.astype(int)) ** 2).sum(axis=2)
+    within = squares.min(axis=1) <= limit**2
+    distance, found = Lattice(voxels).nearest(voxel_centres(index), limit=limit)
+    assert within.any()
+    np.testing.assert_array_equal(found, np.where(within, squares.argmin(axis=1), -1))
+    np.testing.assert_allclose(distance[within], np.sqrt(squares.min(axis=1)[within]))
+
+
 @pytest.mark.parametrize("limit", [0.5, 1.0, 3.0, 6.5, 9.0, np.inf])
 def test_every_cell_of_the_grid_finds_the_first_of_its_nearest_voxels(limit: float) -> None:
     """Against all distances by brute force, in whole numbers: near, far, and often tied."""
@@ -75,6 +104,16 @@ def test_beyond_the_limit_nothing_is_found() -> None:
     distance, index = Lattice(voxels).nearest(points, limit=2.0)
     assert distance.tolist() == [2.0, np.inf, np.inf]
     assert index.tolist() == [0, -1, -1]
+
+
+@pytest.mark.parametrize("limit", [0.5, 1.0, 2.5, 3.5])
+def test_just_at_the_limit_a_voxel_is_found_wherever_it_lies(limit: float) -> None:
+    """Along a whole line of the grid, from either side."""
+    for last in range(4, 60):
+        voxels = np.array([[last, 30, 30]], dtype=np.uint8)
+        points = voxel_centres([[last - limit, 30, 30], [last + limit, 30, 30]])
+        distance, index = Lattice(voxels).nearest(points, limit=limit)
+        assert (distance.tolist(), index.tolist()) == ([limit] * 2, [0, 0])
 
 
 class _Counted:
@@ -132,6 +171,24 @@ def test_a_vote_without_voters_is_empty() -> None:
     assert Lattice(voxels).vote(
         voxel_centres([[5, 5, 5]]), np.zeros(1, np.uint8), 0.5
     ).tolist() == [-1]
+
+
+def test_each_vote_is_of_its_own_labels() -> None:
+    """Of a lattice that has voted before, with labels that all agreed where these do not."""
+    voxels = np.array([[30, 20, 20], [31, 20, 20], [31, 21, 20], [31, 19, 20]], dtype=np.uint8)
+    point = voxel_centres([[30.4, 20, 20]])
+    lattice = Lattice(voxels)
+    alike, mixed = np.zeros(4, np.uint8), np.array([2, 5, 5, 5], dtype=np.uint8)
+    assert [lattice.vote(point, labels, 1.0).tolist() for labels in (alike, mixed, alike)] == [
+        [0], [1], [0],
+    ]  # fmt: skip
+
+
+def test_of_a_drawn_vote_the_lower_label_wins() -> None:
+    voxels = np.array([[31, 20, 20], [29, 20, 20]], dtype=np.uint8)
+    point = voxel_centres([[30, 20, 20]])
+    for labels, winner in (([4, 3], 1), ([3, 4], 0), ([3, 3], 0)):
+        assert Lattice(voxels).vote(point, np.array(labels, np.uint8), 0.7).tolist() == [winner]
 
 
 @settings(max_examples=25)
