@@ -2,29 +2,127 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
-from support.shapes import chair
+from support.residuals import carried, mean_kernel, residuals, within_box
+from support.shapes import chair, crate
 
 from slatprep import align_voxels
 from slatprep.align.consensus import degrees_between
+from slatprep.align.deform_solver import OFFSET_PRIOR, PIXIEVERSE_WEIGHT, RIDGE
+from slatprep.align.pose import Pose
 from slatprep.align.stretch import stretch
-from slatprep.align.surface import surface_of
+from slatprep.align.surface import Surface, surface_of
 from slatprep.geometry.frames import split_transform
 from slatprep.parameters import AlignParameters
 
 CENTRES = np.indices((64, 64, 64)).reshape(3, -1).T - 31.5
 
 
-def crate(points: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Return which points (N, 3), in voxels, are in a crate with a pole and a flag on its lid."""
-    x, y, z = points.T
-    body = (x / 15) ** 4 + (y / 18) ** 4 + (z / 18) ** 4 < 1
-    pole = (x**2 + y**2 < 4) & (z > 0) & (z < 25)
-    flag = (abs(z - 23) < 2) & (x > 0) & (x < 9) & (abs(y) < 3)
-    return (body | pole | flag).reshape(64, 64, 64)
+def stretched(
+    slat: Surface, pixie: Surface, pose: Pose, affine: NDArray[np.float64], *taus: float
+) -> tuple[NDArray[np.float64], float, float]:
+    """Return the affine map and the offset after steps of these widths, and the score."""
+    affines, offsets = affine[None].copy(), np.array([pose.offset])
+    (score,) = stretch(
+        slat.points, slat.values, slat.distance, slat.origin,
+        pixie.points, pixie.values, pixie.distance, pixie.origin,
+        pose.rotation[None], pose.shift[None], np.array([pose.scale]), affines, offsets,
+        np.array(taus),
+    )  # fmt: skip
+    return affines[0], float(offsets[0]), float(score)
+
+
+@pytest.fixture(scope="module")
+def beside() -> tuple[Surface, Surface, Pose, NDArray[np.float64]]:
+    """Two sides beside each other, of other sizes, and a map that is nowhere along an axis.
+
+    The samples fill no whole number of blocks, and some lie outside the other's box.
+    """
+    slat = surface_of(crate(CENTRES - [3, -2, 4])).subset(150)
+    pixie = surface_of(crate((CENTRES - [-2, -5, 1]) / 0.8)).subset(200)
+    turn = Rotation.from_euler("xyz", [25, -40, 70], degrees=True).as_matrix()
+    affine = np.array([[1.1, 0.07, -0.05, 1.3], [-0.04, 0.9, 0.06, -0.7], [0.03, -0.08, 1.05, 0.4]])
+    return slat, pixie, Pose(turn, np.array([4.0, -3.0, 6.0]), 1.2, offset=0.3), affine
+
+
+Beside = tuple[Surface, Surface, Pose, NDArray[np.float64]]
+
+
+def test_without_a_step_the_score_is_the_mean_kernel_of_both_sides(beside: Beside) -> None:
+    slat, pixie, pose, affine = beside
+    forward, backward = residuals(slat, pixie, pose, affine)
+    same, offset, score = stretched(slat, pixie, pose, affine)
+    assert score == pytest.approx(0.5 * (mean_kernel(forward) + mean_kernel(backward)), rel=1e-5)
+    np.testing.assert_array_equal(same, affine)
+    assert offset == pose.offset
+
+
+@pytest.mark.parametrize("tau", [1.5, 5.0])
+def test_a_step_is_that_of_least_squares_on_numerical_derivatives(
+    beside: Beside, tau: float
+) -> None:
+    """Of Gauss and Newton, with the weights of Geman and McClure and two small priors.
+
+    Of samples within the other's box, as of others the search knows an approximate derivative.
+    """
+    slat, pixie, pose, affine = beside
+    there, here = carried(slat, pixie, pose, affine)
+    forward, backward = within_box(pixie, there), within_box(slat, here)
+    slat = replace(slat, points=slat.points[forward], values=slat.values[forward])
+    pixie = replace(pixie, points=pixie.points[backward], values=pixie.values[backward])
+    assert min(len(slat.points), len(pixie.points)) > 64  # more than one block of the sums
+    centre = slat.points.mean(axis=0)
+    count = len(slat.points) + len(pixie.points)
+
+    def after(step: NDArray[np.float64]) -> tuple[NDArray[np.float64], float]:
+        """Return map and offset after a step, a map's row and its shift at a time."""
+        rows = step[:12].reshape(3, 4)
+        change = np.column_stack([rows[:, :3], rows[:, 3] - rows[:, :3] @ centre])
+        return affine + change, pose.offset + float(step[12])
+
+    def at(step: NDArray[np.float64]) -> NDArray[np.float64]:
+        moved, offset = after(step)
+        return np.concatenate(residuals(slat, pixie, replace(pose, offset=offset), moved))
+
+    tiny = 1e-6 * np.eye(13)
+    jacobian = np.stack([(at(one) - at(-one)) / 2e-6 for one in tiny], axis=1)
+    residual = at(np.zeros(13))
+    side = np.repeat([1.0, PIXIEVERSE_WEIGHT], [len(slat.points), len(pixie.points)])
+    weight = side / (1.0 + (residual / tau) ** 2) ** 2
+    normal = jacobian.T @ (weight[:, None] * jacobian)
+    right = -jacobian.T @ (weight * residual)
+    normal[12, 12] += OFFSET_PRIOR * count
+    right[12] -= OFFSET_PRIOR * count * pose.offset
+    normal += RIDGE * np.diag(np.diag(normal)) + 1e-9 * count * np.eye(13)
+    expected, offset = after(np.linalg.solve(normal, right))
+    found, found_offset, _ = stretched(slat, pixie, pose, affine, tau)
+    np.testing.assert_allclose(found, expected, atol=1e-4)
+    assert found_offset == pytest.approx(offset, abs=1e-4)
+
+
+def test_poses_are_stretched_each_by_itself(beside: Beside) -> None:
+    slat, pixie, pose, affine = beside
+    other = replace(pose, shift=pose.shift + 2.0, scale=1.1, offset=-0.1)
+    affines, offsets = np.stack([np.eye(3, 4), affine]), np.array([other.offset, pose.offset])
+    scores = stretch(
+        slat.points, slat.values, slat.distance, slat.origin,
+        pixie.points, pixie.values, pixie.distance, pixie.origin,
+        np.stack([pose.rotation] * 2), np.stack([other.shift, pose.shift]),
+        np.array([other.scale, pose.scale]), affines, offsets, np.array([4.0, 2.0]),
+    )  # fmt: skip
+    for k, alone in enumerate(
+        [
+            stretched(slat, pixie, other, np.eye(3, 4), 4.0, 2.0),
+            stretched(slat, pixie, pose, affine, 4.0, 2.0),
+        ]
+    ):
+        np.testing.assert_array_equal(affines[k], alone[0])
+        assert (offsets[k], scores[k]) == alone[1:]
 
 
 @pytest.mark.parametrize("factors", [(1.1, 1.1, 0.7), (1.15, 1.05, 0.75)])

@@ -45,6 +45,15 @@ def chair() -> np.ndarray:
     return solid
 
 
+def crate(points: np.ndarray) -> np.ndarray:
+    """Return which points (N, 3), in voxels, are in a crate with a pole and a flag on its lid."""
+    x, y, z = points.T
+    body = (x / 15) ** 4 + (y / 18) ** 4 + (z / 18) ** 4 < 1
+    pole = (x**2 + y**2 < 4) & (z > 0) & (z < 25)
+    flag = (abs(z - 23) < 2) & (x > 0) & (x < 9) & (abs(y) < 3)
+    return np.asarray(body | pole | flag).reshape(64, 64, 64)
+
+
 def turned(occupancy: np.ndarray, rotation: np.ndarray) -> np.ndarray:
     """Turn a grid by a signed permutation about the cube's centre."""
     doubled = 2 * np.argwhere(occupancy) - 63
