@@ -1,0 +1,423 @@
+"""The steps of the search, on shapes whose placement is known."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from functools import lru_cache
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+from support.deformed import occupancy
+from support.residuals import mean_kernel, residuals
+from support.shapes import GRID, chair, crate
+
+from slatprep.align.consensus import degrees_between
+from slatprep.align.pair import (
+    DISTINCT,
+    FINE_SAMPLES,
+    FINE_TAUS,
+    MOST_CONTESTED,
+    MOST_RANKED,
+    MOST_SURVIVORS,
+    RANK_STANDING,
+    RANK_WITHIN,
+    SO3_KEPT,
+    SO3_STARTS,
+    SURVIVORS,
+    TIE,
+    Pair,
+    _apart_from_all,
+)
+from slatprep.align.pose import Pose
+from slatprep.align.starts import distinct_starts
+from slatprep.align.surface import Surface, surface_of
+from slatprep.parameters import AlignParameters
+
+Array = NDArray[np.float64]
+
+
+def ball(radius: float) -> NDArray[np.bool_]:
+    inside: NDArray[np.bool_] = ((GRID - 31.5) ** 2).sum(axis=-1) < radius**2
+    return inside
+
+
+def placed(
+    scale: float, rotation: Array | None = None, at: tuple[float, ...] = (0, 0, 0)
+) -> NDArray[np.bool_]:
+    """Return a solid without any symmetry, scaled and turned about the cube's centre and moved."""
+    turn = np.eye(3) if rotation is None else rotation
+    return occupancy(lambda points: (points - np.array(at) / 64) @ turn / scale)
+
+
+@lru_cache(maxsize=1)
+def chair_surface() -> Surface:
+    return surface_of(chair())
+
+
+def pair_of(
+    slat: NDArray[np.bool_] | None = None,
+    pixie: NDArray[np.bool_] | None = None,
+    parameters: AlignParameters | None = None,
+) -> Pair:
+    """Return a pair of two solids, each a chair where nothing else is given."""
+    surfaces = [chair_surface() if solid is None else surface_of(solid) for solid in (slat, pixie)]
+    return Pair(*surfaces, parameters or AlignParameters())
+
+
+def moved_by(*shift: float, score: float = 0.0) -> Pose:
+    return Pose(np.eye(3), np.array(shift), 1.0, score=score)
+
+
+def looked_up(pose: Pose, points: Array) -> Array:
+    """Return where the points of the SLAT lie on the other side, by the inverse of a 4x4 matrix."""
+    matrix = np.eye(4)
+    matrix[:3, :3], matrix[:3, 3] = pose.scale * pose.rotation, pose.shift
+    return (np.column_stack([points, np.ones(len(points))]) @ np.linalg.inv(matrix).T)[:, :3]
+
+
+def rms(one: Array, two: Array) -> float:
+    return float(np.sqrt(((one - two) ** 2).sum(axis=1).mean()))
+
+
+def off(pair: Pair, pose: Pose, true: Pose) -> float:
+    points = pair.slat.points
+    return rms(looked_up(pose, points), looked_up(true, points))
+
+
+def any_poses(seed: int, count: int) -> list[Pose]:
+    rng = np.random.default_rng(seed)
+    return [
+        Pose(turn, rng.normal(size=3, scale=6.0), float(rng.uniform(0.7, 1.4)))
+        for turn in Rotation.random(count, random_state=seed).as_matrix()
+    ]
+
+
+@pytest.mark.parametrize("solid", ["a chair", "one voxel"])
+def test_poses_are_apart_by_the_rms_distance_of_the_places_they_look_up(solid: str) -> None:
+    dot = np.zeros((64, 64, 64), dtype=bool)
+    dot[50, 20, 30] = True
+    pair = pair_of(dot if solid == "one voxel" else None)
+    *poses, other = any_poses(0, 8)
+    expected = [off(pair, pose, other) for pose in poses]
+    np.testing.assert_allclose(pair.apart(poses, other), expected, rtol=1e-9)
+
+
+def test_stretched_poses_are_apart_by_the_rms_distance_of_their_places() -> None:
+    pair = pair_of()
+    poses = any_poses(1, 6)
+    rng = np.random.default_rng(1)
+    affines = np.eye(3, 4) + rng.normal(size=(6, 3, 4), scale=[0.1, 0.1, 0.1, 3.0])
+    places = pair._places(poses, affines)
+    points = pair.slat.points
+    there = [
+        looked_up(pose, points @ affine[:, :3].T + affine[:, 3])
+        for pose, affine in zip(poses, affines, strict=True)
+    ]
+    expected = [rms(one, two) for one in there for two in there]
+    apart = np.linalg.norm(places[:, None] - places, axis=2).ravel()
+    np.testing.assert_allclose(apart, expected, rtol=1e-9, atol=1e-5)
+
+
+def test_a_repeated_placement_is_dropped_for_the_better_one() -> None:
+    """Shifts are as far apart as they say; the second repeats the first, and the third the second.
+
+    What is dropped drops no other: the third does not lie near to one that is kept.
+    """
+    pair = pair_of(ball(12.0))
+    first, second, third = (
+        moved_by(x, 0.0, 0.0, score=score) for x, score in ((0, 0.9), (1.2, 0.8), (2.4, 0.7))
+    )
+    just = moved_by(0.0, DISTINCT, 0.0, score=0.6)
+    within = moved_by(0.0, 0.0, DISTINCT - 0.01, score=0.5)
+    assert pair.distinct([within, third, second, just, first]) == [first, third, just]
+
+
+def test_of_others_the_score_does_not_matter_and_the_distance_does() -> None:
+    pair = pair_of(ball(12.0))
+    best = moved_by(0.0, 0.0, 0.0, score=0.5)
+    better, near = moved_by(9.0, 0.0, 0.0, score=0.9), moved_by(1.0, 0.0, 0.0, score=0.8)
+    again, just = moved_by(9.0, 1.0, 0.0, score=0.7), moved_by(0.0, -DISTINCT, 0.0, score=0.2)
+    assert pair.others(best, [just, near, again, better, best]) == [better, just]
+    assert pair.others(best, [near, best]) == []
+
+
+def test_a_start_lays_centroid_on_centroid() -> None:
+    aside = np.roll(ball(9.0), (12, -8, 5), axis=(0, 1, 2))
+    pair = pair_of(np.roll(ball(12.0), (-6, 10, 3), axis=(0, 1, 2)), aside)
+    rotations = Rotation.random(5, random_state=2).as_matrix()
+    for rotation, pose in zip(rotations, pair.poses(rotations, 1.3), strict=True):
+        np.testing.assert_array_equal(pose.rotation, rotation)
+        assert pose.scale == 1.3
+        np.testing.assert_allclose(looked_up(pose, np.array([[-6.0, 10, 3]])), [[12, -8, 5]])
+
+
+def test_the_size_of_a_start_is_that_of_the_sides_within_its_bounds() -> None:
+    def ratio(radius: float, parameters: AlignParameters) -> float:
+        return pair_of(ball(radius), ball(16.0), parameters).size_ratio
+
+    free = AlignParameters(scale_bounds=(0.7, 1.5))
+    assert ratio(20.0, free) == pytest.approx(20 / 16, abs=0.02)
+    assert ratio(28.0, free) == 1.5
+    assert ratio(8.0, free) == 0.7
+    assert ratio(20.0, AlignParameters(model="rigid")) == 1.0
+
+
+def test_scale_is_refined_only_where_it_is_free() -> None:
+    start = Pose(Rotation.from_euler("x", 4, degrees=True).as_matrix(), np.ones(3), 1.06)
+    for model, free, held in (
+        ("auto", None, False), ("auto", False, True), ("rigid", None, True), ("rigid", True, False),
+    ):  # fmt: skip
+        pair = pair_of(parameters=AlignParameters(model=model))
+        (found,) = pair.refine([start], 400, (4.0,) * 8, 1e-4, free_scale=free)
+        assert found.scale == pytest.approx(1.06 if held else 1.0, abs=0.0 if held else 0.01)
+        if not held:
+            assert off(pair, found, moved_by(0, 0, 0)) < 0.1
+            assert found.score == pytest.approx(1.0, abs=0.02)
+            assert found.fitness == 1.0
+
+
+def test_the_score_is_the_mean_kernel_of_both_sides() -> None:
+    pair = pair_of(placed(0.8), placed(0.7))
+    poses = [replace(pose, offset=0.2) for pose in any_poses(5, 4)]
+    for pose, scored in zip(poses, pair.refine(poses, 10**6, (), 0.01), strict=True):
+        forward, backward = residuals(pair.slat, pair.pixie, pose, np.eye(3, 4))
+        expected = 0.5 * (mean_kernel(forward) + mean_kernel(backward))
+        assert scored.score == pytest.approx(expected, rel=1e-5)
+        within = np.abs(np.concatenate([forward, backward])) <= 1.0
+        assert scored.fitness == pytest.approx(within.mean(), abs=1e-3)
+
+
+def test_marks_of_a_pose_outlive_its_refinement() -> None:
+    start = replace(moved_by(0.5, 0.0, 0.0), bonus=0.1, standing=0.01)
+    (found,) = pair_of().refine([start], 100, (2.0,), 0.01)
+    assert (found.bonus, found.standing) == (0.1, 0.01)
+
+
+@pytest.mark.parametrize("step", ["polish", "finish"])
+def test_a_pose_beside_the_truth_is_brought_to_it(step: str) -> None:
+    """Not only by as much as brings the next step below a voxel."""
+    pair = pair_of()
+    turn = Rotation.from_euler("xyz", [5, -4, 6], degrees=True).as_matrix()
+    start = Pose(turn, np.array([1.5, -1.0, 0.5]), 1.03, score=0.5)
+    if step == "polish":
+        (found,) = pair.polish([start])
+    else:
+        (found,), deformed = pair.finish([start], rough=False)
+        assert deformed.deformation is None
+        assert found.scale == 1.0
+    assert off(pair, found, moved_by(0, 0, 0)) < 0.02
+
+
+def test_a_scale_that_is_not_one_is_kept_and_one_that_is_nearly_one_is_not() -> None:
+    """Off the cube's centre, so that a scale of one means another shift."""
+    aside = (8, -6, 8)
+    solid, larger = placed(0.9, at=aside), placed(0.9 * 1.03, at=aside)
+    start = Pose(np.eye(3), -0.03 * np.array(aside), 1.03)
+    (found,), deformed = pair_of(larger, solid).finish([start], rough=False)
+    assert found.scale == pytest.approx(1.03, abs=0.005)
+    assert deformed.model == "similarity"
+    (same,), deformed = pair_of(solid, solid).finish([start], rough=False)
+    assert same.scale == 1.0
+    assert deformed.model == "rigid"
+    np.testing.assert_allclose(same.shift, 0.0, atol=0.02)
+
+
+def test_a_pose_whose_scale_is_set_to_one_looks_the_middle_up_where_it_did() -> None:
+    pair = pair_of(np.roll(chair(), (10, -9, 4), axis=(0, 1, 2)))
+    for pose in any_poses(3, 4):
+        shift = pair._rescaled_shift(pose)
+        middle = pair.slat.points.mean(axis=0)[None]
+        np.testing.assert_allclose(
+            looked_up(replace(pose, shift=shift, scale=1.0), middle), looked_up(pose, middle)
+        )
+
+
+class _Watched(Pair):
+    """A pair that notes how many poses each refinement was given, and their scales."""
+
+    refined: list[int]
+    scales: list[set[float]]
+
+    def refine(self, poses: Sequence[Pose], *given: object, **named: object) -> list[Pose]:
+        self.refined.append(len(poses))
+        self.scales.append({pose.scale for pose in poses})
+        return super().refine(poses, *given, **named)  # type: ignore[arg-type]
+
+
+def watched(pair: Pair) -> _Watched:
+    seen = _Watched(pair.slat, pair.pixie, pair.parameters)
+    seen.refined, seen.scales = [], []
+    return seen
+
+
+def scattered(scores: Array) -> list[Pose]:
+    """Return poses with these scores, four voxels apart."""
+    places = 4.0 * (np.argwhere(np.ones((4, 4, 4), dtype=bool)) - 1.5)
+    return [moved_by(*place, score=s) for place, s in zip(places, scores, strict=False)]
+
+
+@pytest.mark.parametrize(
+    ("scores", "survive"),
+    [
+        (np.linspace(0.9, 0.1, 12), SURVIVORS),
+        ([0.9, 0.88, 0.87, 0.86, 0.85, 0.845, 0.83, 0.5], 6),
+        (np.full(40, 0.9), MOST_SURVIVORS),
+        ([0.9, 0.2], 2),
+    ],
+)
+def test_what_is_polished_is_likely_or_among_the_first(scores: list[float], survive: int) -> None:
+    """Six of the second are within twice `TIE` of its best one."""
+    assert pytest.approx(0.03) == TIE
+    pair = watched(pair_of())
+    pair.polish(scattered(np.array(scores))[::-1])
+    assert pair.refined == [survive]
+
+
+def test_all_orientations_are_searched_and_the_likely_half_of_them_to_the_end() -> None:
+    turn = Rotation.from_euler("xyz", [40, 25, -70], degrees=True).as_matrix()
+    pair = watched(pair_of(placed(0.8, turn), placed(0.8)))
+    refined, halfway = pair.search_all()
+    assert pair.refined == [SO3_STARTS, SO3_KEPT]
+    assert (len(refined), len(halfway)) == (SO3_KEPT, SO3_STARTS)
+    scores = [pose.score for pose in halfway]
+    assert scores == sorted(scores, reverse=True)
+    best = max(refined, key=lambda pose: pose.score)
+    assert off(pair, best, Pose(turn, np.zeros(3), 1.0)) < 0.5
+
+
+def test_a_stray_part_that_makes_a_side_larger_does_not_hide_the_placement() -> None:
+    """Sizes say another scale then; half as many starts are made at scale one beside them."""
+    turn = Rotation.from_euler("xyz", [40, 25, -70], degrees=True).as_matrix()
+    stray = placed(0.6)
+    stray[56:63, 56:63, 2:9] = True
+    pair = watched(pair_of(placed(0.6, turn), stray))
+    ratio = pair.size_ratio
+    assert ratio < 0.85
+    refined, halfway = pair.search_all()
+    assert pair.scales[:2] == [{ratio}, {1.0}]
+    assert pair.refined == [SO3_STARTS, SO3_STARTS // 2, SO3_KEPT]
+    assert len(halfway) == SO3_STARTS
+    best = max(refined, key=lambda pose: pose.score)
+    assert off(pair, best, Pose(turn, np.zeros(3), 1.0)) < 1.0
+    # The supplement's scale was held, that of the poses by size was not.
+    assert not {1.0} & {pose.scale for pose in halfway}
+
+
+def test_of_rigid_poses_none_gets_a_scale() -> None:
+    pair = pair_of(placed(0.8), placed(1.0), parameters=AlignParameters(model="rigid"))
+    refined, halfway = pair.search_all()
+    assert {pose.scale for pose in [*refined, *halfway]} == {1.0}
+
+
+def test_deformed_places_are_apart_from_twice_the_usual_distance_on() -> None:
+    """As a root mean square: half of the points may lie where they did."""
+    points = np.random.default_rng(0).normal(size=(40, 3), scale=9.0)
+    half = np.arange(40)[:, None] % 2
+    for shift, apart in (
+        ((-2 * DISTINCT, 0, 0), True), ((0, 2.9, 0), False), ((1.6, 1.8, -1.9), True),
+        ((-1.6, 1.6, 1.6), False),
+    ):  # fmt: skip
+        assert _apart_from_all(points, [points + shift]) == apart
+        assert _apart_from_all(points, [points + 99, points - shift]) == apart
+        assert _apart_from_all(points, [points + 2**0.5 * half * shift]) == apart
+    assert _apart_from_all(points, [])
+
+
+class _Squashed:
+    """A crate and the same squashed, which as a similarity fits best if it lies on its side."""
+
+    def __init__(self) -> None:
+        centres = GRID.reshape(-1, 3) - 31.5
+        self.pair = pair_of(crate(centres / [1.1, 1.1, 0.7]), crate(centres))
+        starts = self.pair.poses([s.rotation for s in distinct_starts()], 1.0)
+        fits = self.pair.refine(starts, 400, (8.0, 4.0, 2.0, 2.0, 2.0), 0.02)
+        self.poses = self.pair.distinct(fits)
+        self.upright = min(self.poses, key=upright)
+
+
+def upright(pose: Pose) -> float:
+    return degrees_between(pose.rotation, np.eye(3))
+
+
+@pytest.fixture
+def squashed() -> _Squashed:
+    return _Squashed()
+
+
+def test_where_shapes_differ_the_order_is_by_what_a_trial_deformation_leaves(
+    squashed: _Squashed,
+) -> None:
+    pair, poses = squashed.pair, squashed.poses
+    assert upright(poses[0]) > 60.0
+    _, halfway = pair.search_all()
+    ranked = pair.ranked(poses, halfway)
+    assert upright(ranked[0]) < 10.0
+    assert ranked[0].score < poses[0].score - 0.1
+    ranks = [pose.rank for pose in ranked]
+    assert ranks == sorted(ranks, reverse=True)
+    # The one that fitted best as it was has a standing, and no other.
+    (standing,) = (pose for pose in ranked if pose.standing)
+    assert standing.standing == RANK_STANDING
+    assert off(pair, standing, poses[0]) == 0.0
+    # What was not tried keeps its score; it was no more than six, within a bound.
+    near = [pose for pose in poses if pose.score > poses[0].score - RANK_WITHIN][:MOST_RANKED]
+    beyond = poses[len(near) :]
+    assert {id(pose) for pose in ranked if pose.bonus == 0.0} <= set(map(id, beyond))
+    for pose in beyond:
+        assert pair.apart(ranked, pose).min() < DISTINCT
+
+
+def test_what_is_far_below_the_best_fit_is_not_tried(squashed: _Squashed) -> None:
+    pair = squashed.pair
+    scores = (0.65, 0.56, 0.65 - RANK_WITHIN - 0.01)
+    poses = [replace(p, score=s) for p, s in zip(squashed.poses[::2], scores, strict=False)]
+    ranked = pair.ranked(poses, poses[:1])
+    assert ranked[-1] is poses[2]
+    assert all(pose.bonus > 0.0 for pose in ranked[:-1])
+
+
+def test_what_fits_best_as_it_is_takes_part_if_stretching_finds_it_no_more(
+    squashed: _Squashed,
+) -> None:
+    """Stretched, a neighbour of it fits better and stands for both."""
+    pair, best = squashed.pair, squashed.poses[0]
+    turns = Rotation.random(20, random_state=6).as_rotvec() * 0.04
+    beside = [
+        replace(best, rotation=Rotation.from_rotvec(turn).as_matrix() @ best.rotation)
+        for turn in turns
+    ]
+    better = next(b for b in beside if pair.stretched([best, b], [best]) == [b])
+    ranked = pair.ranked([best, better], [best])
+    assert any(off(pair, pose, best) == 0.0 for pose in ranked)
+
+
+def test_of_contested_placements_the_one_that_fits_once_deformed_is_the_best(
+    squashed: _Squashed,
+) -> None:
+    pair, poses = squashed.pair, squashed.poses
+    chosen = [squashed.upright, *poses[:2]]
+    (best, *others), deformed = pair.finish(chosen, rough=True)
+    assert deformed.deformation is not None
+    assert upright(best) < 10.0
+    fine = pair.refine(chosen, FINE_SAMPLES, FINE_TAUS, 0.002, size_by_slat=True)
+    # It takes over the score that the best one had, and the others have less.
+    assert best.merit == pytest.approx(max(pose.score for pose in fine), abs=0.02)
+    assert others
+    assert all(0.01 < best.merit - pose.merit < 0.2 for pose in others)
+    assert {pose.standing for pose in [best, *others]} == {0.0}
+
+
+def test_of_many_placements_none_is_lost_or_doubled_where_few_are_contested(
+    squashed: _Squashed,
+) -> None:
+    pair = squashed.pair
+    fine = pair.refine(squashed.poses, FINE_SAMPLES, FINE_TAUS, 0.002, size_by_slat=True)
+    many = pair.distinct(fine)
+    assert len(many) > MOST_CONTESTED + 2
+    found, _ = pair.finish(squashed.poses, rough=True)
+    for pose in many[MOST_CONTESTED:]:
+        assert sum(off(pair, one, pose) == 0.0 for one in found) == 1
+    assert len(found) <= len(many)
