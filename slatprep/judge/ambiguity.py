@@ -76,7 +76,8 @@ def measure_ambiguity(
             both = valid & other.valid
             if both.any():
                 # Most voxels are looked up in the same place: there is nothing to take log10 of.
-                rows = np.flatnonzero(both & (properties != other.properties).any(axis=1))
+                columns = zip(properties.T, other.properties.T, strict=True)
+                rows = np.flatnonzero(both & np.any([one != two for one, two in columns], axis=0))
                 mapped = to_mapped(properties[rows], field.table)
                 delta = np.abs(mapped - to_mapped(other.properties[rows], field.table))
                 change = np.maximum(change, delta.sum(axis=0) / np.count_nonzero(both))
