@@ -1,7 +1,9 @@
-"""Which assets have rows in which shard."""
+"""How a new store is cut and packed, which assets have rows in which shard, and how it is ended."""
 
 from __future__ import annotations
 
+import hashlib
+import warnings
 from pathlib import Path
 
 import numpy as np
@@ -10,8 +12,79 @@ import zarr
 
 from slatprep.errors import StoreError
 from slatprep.parameters import StoreParameters
+from slatprep.records import Normalization, PropertyRange
 from slatprep.store.digests import write_digests
-from slatprep.store.writer import Shard, create_store, shards
+from slatprep.store.writer import Shard, create_store, finish_store, merges, shards
+
+
+def arrays_of(store: Path) -> dict[str, zarr.Array]:
+    root = zarr.open_group(store, mode="r", use_consolidated=False)
+    return {name: part for name, part in root.members(None) if isinstance(part, zarr.Array)}
+
+
+def test_arrays_are_cut_as_parameters_say(tmp_path: Path) -> None:
+    parameters = StoreParameters(voxel_chunk=4, voxel_chunks_per_shard=2, grid_assets_per_shard=3)
+    create_store(tmp_path / "s", 5, 41, parameters)
+    arrays = arrays_of(tmp_path / "s")
+    cuts = {name: (a.shape, a.chunks, a.shards) for name, a in arrays.items()}
+    assert cuts["voxel/material"] == ((41,), (4,), (8,))
+    assert cuts["voxel/coords"] == ((41, 3), (4, 3), (8, 3))
+    assert cuts["voxel/feats"] == ((41, 8), (4, 8), (8, 8))
+    cube = (64, 64, 64)
+    assert cuts["grid/material"] == ((5, *cube), (1, *cube), (3, *cube))
+    assert cuts["grid/properties"] == ((5, 3, *cube), (1, 3, *cube), (3, 3, *cube))
+    # One file has a whole column of assets, and no more rows than there are.
+    assert cuts["asset/id"] == cuts["asset/fitness"] == ((5,), (5,), None)
+    assert cuts["asset/offset"] == ((6,), (6,), None)
+    assert cuts["asset/transform"] == ((5, 4, 4), (5, 4, 4), None)
+    for name, (_, chunks, outer) in cuts.items():
+        if name.startswith("voxel/"):
+            assert (chunks[0], outer and outer[0]) == (4, 8), name
+        elif name.startswith("grid/"):
+            assert (chunks[0], outer and outer[0]) == (1, 3), name
+
+
+def test_columns_of_many_assets_are_cut(tmp_path: Path) -> None:
+    create_store(tmp_path / "s", 100_000, 1, StoreParameters(voxel_chunk=4))
+    arrays = arrays_of(tmp_path / "s")
+    for name in ("asset/id", "asset/offset", "asset/transform"):
+        assert arrays[name].chunks[0] == 65_536, name
+        assert arrays[name].shards is None
+
+
+def test_arrays_of_merged_labels_are_there_where_labels_are_merged(tmp_path: Path) -> None:
+    create_store(tmp_path / "one", 1, 6, StoreParameters(voxel_chunk=4))
+    create_store(tmp_path / "several", 1, 6, StoreParameters(voxel_chunk=4), merged=True)
+    one, several = arrays_of(tmp_path / "one"), arrays_of(tmp_path / "several")
+    assert several.keys() - one.keys() == {"voxel/spread", "voxel/votes"}
+    assert several["voxel/spread"].shape == (6, 3)
+    assert several["voxel/votes"].shape == (6,)
+    assert merges(tmp_path / "several")
+    assert not merges(tmp_path / "one")
+
+
+def test_bytes_that_recur_in_a_column_take_no_room(tmp_path: Path) -> None:
+    rng = np.random.default_rng(0)
+    coords = np.full((4096, 3), [9, 30, 0], np.uint8)
+    coords[:, 2] = rng.integers(0, 256, 4096)  # one byte of three is not known beforehand
+    feats = rng.uniform(1.0, 2.0, (4096, 8)).astype(np.float32)  # three of four: one exponent
+    create_store(tmp_path / "s", 1, 4096, StoreParameters(voxel_chunks_per_shard=1))
+    root = zarr.open_group(tmp_path / "s", mode="r+", use_consolidated=False)
+    for name, rows, unknown in (("coords", coords, 1 / 3), ("feats", feats, 3 / 4)):
+        root[f"voxel/{name}"][:] = rows
+        packed = (tmp_path / "s" / "voxel" / name / "c" / "0" / "0").stat().st_size
+        assert packed < 1.05 * unknown * rows.nbytes + 100, name
+
+
+def test_shards_of_tasks_are_those_of_the_arrays(tmp_path: Path) -> None:
+    """Where the number of voxels decides how large they are."""
+    parameters = StoreParameters(voxel_chunk=1, grid_assets_per_shard=2)
+    offsets = [0, 2048, 2049]  # 32 shards of 64 chunks, and one row more than they take
+    create_store(tmp_path / "s", 2, offsets[-1], parameters)
+    (size, _) = arrays_of(tmp_path / "s")["voxel/coords"].shards or (0, 0)
+    assert size == 128
+    found = [shard.rows for shard in shards(["a", "b"], offsets, parameters)]
+    assert found == [*((128 * n, 128 * n + 128) for n in range(16)), (2048, 2049), (0, 2)]
 
 
 def test_a_shard_has_the_keys_of_just_those_assets_with_rows_in_it() -> None:
@@ -52,3 +125,31 @@ def test_a_shard_that_was_not_written_ends_the_build(written: Path) -> None:
     (written / "voxel" / "feats" / "c" / "1" / "0").unlink()
     with pytest.raises(StoreError, match="voxel/feats/c/1/0: was not written"):
         write_digests(written)
+
+
+def test_a_finished_store_says_what_it_holds_in_one_file(written: Path) -> None:
+    root = zarr.open_group(written, mode="r+", use_consolidated=False)
+    root["asset/id"][:] = np.array(["cup"], object)
+    ranges = tuple(
+        PropertyRange(name, log10, 2.0, 5.0)
+        for name, log10 in (("youngs_modulus", True), ("density", True), ("poissons_ratio", False))
+    )
+    feats = "voxel/feats/c/0/0"
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        finish_store(
+            written, Normalization(ranges, "pixie"), "ab" * 32, {"name": "x"}, known={feats: "seen"}
+        )
+    done = zarr.open_group(written, mode="r", use_consolidated=True)
+    assert done.attrs["manifest"] == "ab" * 32
+    assert done.attrs["build"] == {"name": "x"}
+    assert done.attrs["segments"] == [0]
+    assert done.attrs["normalization"]["density"] == {
+        "log10": True, "lo": 2.0, "hi": 5.0, "source": "pixie"
+    }  # fmt: skip
+    in_one_file = {name for name, _ in done.members(max_depth=None)}
+    assert {"voxel/feats", "asset/record", "grid/x", "voxel/property", "file/sha256"} <= in_one_file
+    digests = dict(zip(done["file/name"][:], done["file/sha256"][:], strict=True))
+    for name in ("grid/material/c/0/0/0/0", "asset/id/c/0", "grid/x/zarr.json"):
+        assert digests[name] == hashlib.sha256((written / name).read_bytes()).hexdigest()
+    assert digests[feats] == "seen"  # digests that are known are not worked out again
