@@ -70,7 +70,7 @@ TESTS = {
     ],
     "store/assets": ["store/test_reader.py", "store/test_contract.py"],
     "store/attributes": ["store/test_reader.py", "store/test_contract.py"],
-    "store/shard_reader": ["store/test_shard_reader.py", "store/test_reader.py"],
+    "store/shard_reader": ["store/test_row_reader.py", "store/test_packing.py"],
     "store/shard_writer": ["store/test_packing.py"],
     "store/unmoved": ["store/test_unmoved.py"],
     "store/writer": ["store/test_unmoved.py", "store/test_writer.py", "store/test_layout.py"],

@@ -289,7 +289,7 @@ class RowReader:
             shard = _Shard(file, self._index(number, file, file.size()))
         except FileNotFoundError:
             if self.optional:
-                return _Shard(None, np.array([[MISSING, MISSING]], np.uint64))
+                return _Shard(None, np.full((self.chunks_per_shard, 2), MISSING, np.uint64))
             raise self._damaged(number, "is missing (was the store replaced?)") from None
         except OSError as error:
             raise self._damaged(number, f"cannot be read ({error.strerror})") from None

@@ -1,0 +1,407 @@
+"""Rows of one array, whatever its cut: against zarr, and against the index at a shard's end."""
+
+from __future__ import annotations
+
+import errno
+import json
+import os
+import struct
+import weakref
+from collections.abc import Callable
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import zarr
+from google_crc32c import value as crc32c
+from zarr.codecs import Crc32cCodec, ZstdCodec
+
+from slatprep.errors import StoreError
+from slatprep.parameters import MAX_SHARD_CHUNKS
+from slatprep.storage.files import LocalFile, LocalFolder
+from slatprep.store import shard_reader
+from slatprep.store.shard_reader import MAX_CHUNK_BYTES, OPEN_SHARDS, RowReader
+
+NOT_THERE = 2**64 - 1
+
+
+def make(
+    folder: Path,
+    name: str,
+    values: np.ndarray,
+    chunk: int,
+    shard: int | None,
+    fill_value: float | str = 0,
+) -> zarr.Array:
+    """Write an array by zarr alone, in shards of so many rows; chunks of fill values are none."""
+    rest = values.shape[1:]
+    root = zarr.open_group(folder, mode="a", zarr_format=3)
+    array = root.create_array(
+        name,
+        shape=values.shape,
+        dtype=str if values.dtype.hasobject else values.dtype,
+        chunks=(chunk, *rest),
+        shards=None if shard is None else (shard, *rest),
+        compressors=(ZstdCodec(level=1), Crc32cCodec()),
+        fill_value=fill_value,
+    )
+    array[...] = values
+    return array
+
+
+def metadata_of(folder: Path, name: str) -> dict[str, Any]:
+    document: dict[str, Any] = json.loads((folder / name / "zarr.json").read_text())
+    return document
+
+
+def reader_of(folder: LocalFolder, name: str) -> RowReader:
+    return RowReader.of(folder, name, metadata_of(Path(folder.path), name))
+
+
+def index_of(shard: Path, chunks: int) -> list[tuple[int, int]]:
+    """Return offset and length of each chunk, by the Zarr specification's words."""
+    tail = shard.read_bytes()[-(16 * chunks + 4) :]
+    assert struct.unpack("<I", tail[-4:])[0] == crc32c(tail[:-4])
+    return list(struct.iter_unpack("<QQ", tail[:-4]))
+
+
+def write_index(shard: Path, index: list[tuple[int, int]]) -> None:
+    """Write another index, with a checksum that holds."""
+    content = shard.read_bytes()[: -(16 * len(index) + 4)]
+    packed = b"".join(struct.pack("<QQ", *entry) for entry in index)
+    shard.write_bytes(content + packed + struct.pack("<I", crc32c(packed)))
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> LocalFolder:
+    return LocalFolder(tmp_path)
+
+
+RNG = np.random.default_rng(5)
+CUTS: dict[str, tuple[np.ndarray, int, int | None]] = {
+    "voxel/material": (RNG.integers(1, 9, 23).astype(np.uint8), 3, 6),
+    "voxel/feats": (RNG.normal(size=(23, 2)).astype(np.float32), 3, 9),
+    "grid/properties": (RNG.normal(size=(5, 3, 2, 2, 2)).astype(np.float32), 1, 2),
+    "asset/transform": (RNG.normal(size=(7, 4, 4)), 7, None),
+    "asset/offset": (RNG.integers(1, 2**40, 8), 3, None),
+    "asset/contradicted": (RNG.integers(0, 2, 9).astype(bool), 4, None),
+    "asset/record": (np.array([f"{n} \N{GREEK SMALL LETTER NU}" for n in range(11)], object), 2, 4),
+}
+
+
+@pytest.mark.parametrize("name", CUTS)
+def test_every_range_of_rows_is_the_one_that_was_written(folder: LocalFolder, name: str) -> None:
+    values, chunk, shard = CUTS[name]
+    make(Path(folder.path), name, values, chunk, shard, "" if values.dtype.hasobject else 0)
+    reader = reader_of(folder, name)
+    assert reader.shape == values.shape
+    for start in range(len(values) + 1):
+        for stop in range(start, len(values) + 1):
+            rows = reader.read(start, stop)
+            assert rows.shape == values[start:stop].shape
+            assert rows.dtype == values.dtype
+            assert rows.tolist() == values[start:stop].tolist()
+    for start, stop in ((-1, 1), (2, 1), (0, len(values) + 1)):
+        with pytest.raises(StoreError, match=f"{len(values)} rows, not {start} to {stop}"):
+            reader.read(start, stop)
+
+
+def test_a_chunk_that_was_never_written_holds_the_fill_value(folder: LocalFolder) -> None:
+    values = np.arange(24, dtype=np.float32)
+    values[3:9] = -2.5  # the second chunk of the first shard, and the first of the next
+    make(Path(folder.path), "voxel/distance", values, 3, 6, -2.5)
+    index = index_of(Path(folder.path) / "voxel/distance/c/0", 2)
+    assert index[1] == (NOT_THERE, NOT_THERE)
+    reader = reader_of(folder, "voxel/distance")
+    assert reader.read(0, 24).tolist() == values.tolist()
+    assert reader.read(5, 10).tolist() == values[5:10].tolist()
+
+
+@pytest.mark.parametrize("shard", [None, 6])
+def test_a_column_of_fill_values_alone_needs_no_file(
+    folder: LocalFolder, shard: int | None
+) -> None:
+    """As zarr leaves out what nobody wrote, of assets alone; where rows begin is always written."""
+    for name in ("asset/category", "asset/offset", "voxel/valid"):
+        fill = "" if name == "asset/category" else 0
+        values = np.array([""] * 9, object) if fill == "" else np.zeros(9, np.int64)
+        make(Path(folder.path), name, values, 3, shard, fill)
+        assert not (Path(folder.path) / name / "c").exists()
+    assert reader_of(folder, "asset/category").read(1, 9).tolist() == [""] * 8
+    for name in ("asset/offset", "voxel/valid"):
+        with pytest.raises(StoreError, match=f"{name}/c/0: is missing"):
+            reader_of(folder, name).read(0, 2)
+
+
+EDITS: dict[str, Callable[[dict[str, Any]], object]] = {
+    "an index without checksum": lambda d: sharding(d)["index_codecs"].pop(),
+    "an index at the beginning": lambda d: sharding(d).update(index_location="start"),
+    "shards that are packed again": lambda d: d["codecs"].append({"name": "crc32c"}),
+    "chunks of half rows": lambda d: sharding(d).update(chunk_shape=[3, 1]),
+    "shards of half rows": lambda d: outer(d).update(chunk_shape=[9, 1]),
+    "half chunks at a shard's end": lambda d: outer(d).update(chunk_shape=[10, 2]),
+    "chunks of nothing": lambda d: sharding(d).update(chunk_shape=[0, 2]),
+    "files named by dots": lambda d: d.update(
+        chunk_key_encoding={"name": "default", "configuration": {"separator": "."}}
+    ),
+    "too many chunks": lambda d: outer(d).update(chunk_shape=[3 * (MAX_SHARD_CHUNKS + 1), 2]),
+    "too large a chunk": lambda d: (
+        sharding(d).update(chunk_shape=[MAX_CHUNK_BYTES // 8 + 1, 2]),
+        outer(d).update(chunk_shape=[MAX_CHUNK_BYTES // 8 + 1, 2]),
+    ),
+}
+
+
+def sharding(metadata: dict[str, Any]) -> dict[str, Any]:
+    configuration: dict[str, Any] = metadata["codecs"][0]["configuration"]
+    return configuration
+
+
+def outer(metadata: dict[str, Any]) -> dict[str, Any]:
+    configuration: dict[str, Any] = metadata["chunk_grid"]["configuration"]
+    return configuration
+
+
+@pytest.mark.parametrize("case", EDITS)
+def test_arrays_cut_in_another_way_are_refused(folder: LocalFolder, case: str) -> None:
+    make(Path(folder.path), "voxel/feats", CUTS["voxel/feats"][0], 3, 9)
+    metadata = metadata_of(Path(folder.path), "voxel/feats")
+    EDITS[case](metadata)
+    with pytest.raises(StoreError, match="voxel/feats: bad metadata"):
+        RowReader.of(folder, "voxel/feats", metadata)
+
+
+def test_the_largest_chunks_and_the_most_of_a_shard_are_taken(folder: LocalFolder) -> None:
+    make(Path(folder.path), "voxel/feats", CUTS["voxel/feats"][0], 3, 9)
+    metadata = metadata_of(Path(folder.path), "voxel/feats")
+    outer(metadata)["chunk_shape"] = [3 * MAX_SHARD_CHUNKS, 2]
+    assert RowReader.of(folder, "voxel/feats", metadata).chunks_per_shard == MAX_SHARD_CHUNKS
+    rows = MAX_CHUNK_BYTES // 8
+    outer(metadata)["chunk_shape"] = sharding(metadata)["chunk_shape"] = [rows, 2]
+    assert RowReader.of(folder, "voxel/feats", metadata).chunk_rows == rows
+
+
+@pytest.fixture
+def shard(folder: LocalFolder) -> Path:
+    """The one shard of an array of four chunks of eight bytes that do not repeat."""
+    values = np.random.default_rng(1).integers(1, 256, 32).astype(np.uint8)
+    make(Path(folder.path), "voxel/material", values, 8, 32)
+    return Path(folder.path) / "voxel/material/c/0"
+
+
+def test_an_index_that_leads_out_of_its_file_is_refused(folder: LocalFolder, shard: Path) -> None:
+    index, end = index_of(shard, 4), shard.stat().st_size - 68
+    assert sum(index[-1]) == end  # The index itself begins there.
+    for wrong in ((end + 1, 1), (0, end + 1), (NOT_THERE, 1), (0, NOT_THERE)):
+        write_index(shard, [*index[:3], wrong])
+        with pytest.raises(StoreError, match="c/0: its index leads out of it"):
+            reader_of(folder, "voxel/material").read(0, 8)
+
+
+def test_an_entry_much_longer_than_its_chunk_is_refused(folder: LocalFolder, shard: Path) -> None:
+    """Nobody reads a file of any length for eight bytes."""
+    index = index_of(shard, 4)
+    shard.write_bytes(bytes(70_000) + shard.read_bytes())
+    moved = [(70_000 + offset, length) for offset, length in index]
+    write_index(shard, moved)
+    assert len(reader_of(folder, "voxel/material").read(0, 32)) == 32
+    write_index(shard, [(0, 65_536 + 17), *moved[1:]])
+    with pytest.raises(StoreError, match="its index leads out of it"):
+        reader_of(folder, "voxel/material").read(8, 16)
+
+
+def test_a_file_without_a_whole_index_is_refused(folder: LocalFolder, shard: Path) -> None:
+    content = shard.read_bytes()
+    for torn in (b"", content[-67:], content[:-1]):
+        shard.write_bytes(torn)
+        with pytest.raises(StoreError, match="has no sound index; it is damaged or cut short"):
+            reader_of(folder, "voxel/material").read(0, 8)
+    shard.write_bytes(content[-68:])  # an index of chunks that are not there
+    with pytest.raises(StoreError, match="its index leads out of it"):
+        reader_of(folder, "voxel/material").read(0, 8)
+
+
+def test_an_index_of_fill_values_alone_is_a_shard(folder: LocalFolder, shard: Path) -> None:
+    """Shorter than it is no file, and as long one is."""
+    shard.write_bytes(bytes(68))
+    write_index(shard, [(NOT_THERE, NOT_THERE)] * 4)
+    assert shard.stat().st_size == 68
+    assert reader_of(folder, "voxel/material").read(0, 32).tolist() == [0] * 32
+
+
+def test_a_file_that_is_cut_short_while_it_is_read_is_refused(
+    folder: LocalFolder, shard: Path
+) -> None:
+    reader = reader_of(folder, "voxel/material")
+    reader.read(0, 8)
+    os.truncate(shard, sum(index_of(shard, 4)[2]) - 1)
+    assert len(reader.read(8, 16)) == 8
+    with pytest.raises(StoreError, match="chunk 2 is damaged: the file ends before it does"):
+        reader.read(16, 24)
+
+
+class Watched(LocalFile):
+    """A file that tells which ranges it was asked to fetch beforehand."""
+
+    def __init__(self, name: str, asked: list[tuple[str, int, int]]) -> None:
+        super().__init__(name)
+        self.of, self.asked = name, asked
+
+    def prefetch(self, length: int, offset: int) -> None:
+        self.asked.append((self.of, offset, offset + length))
+
+
+class WatchedFolder(LocalFolder):
+    """As one on an object store, where a range that is fetched at once saves requests."""
+
+    prefetch_bytes = 2**20
+
+    def __init__(self, path: Path) -> None:
+        super().__init__(path)
+        self.asked: list[tuple[str, int, int]] = []
+        self.files: list[weakref.ref[LocalFile]] = []
+
+    def open(self, name: str) -> LocalFile:
+        file = Watched(f"{self.path}/{name}", self.asked)
+        self.files.append(weakref.ref(file))
+        return file
+
+
+def test_chunks_that_lie_side_by_side_are_asked_for_at_once(tmp_path: Path) -> None:
+    values = np.random.default_rng(2).integers(1, 256, (60, 40)).astype(np.uint8)
+    values[[*range(12, 16), *range(44, 48)]] = 0  # chunks 3 and 11, which are not there
+    make(tmp_path, "voxel/feats", values, 4, 24)
+    files = [str(tmp_path / f"voxel/feats/c/{n}/0") for n in range(3)]
+    indices = [index_of(Path(file), 6) for file in files]
+    assert indices[0][3] == indices[1][5] == (NOT_THERE, NOT_THERE)
+    folder = WatchedFolder(tmp_path)
+    reader = reader_of(folder, "voxel/feats")
+
+    def asked(start: int, stop: int) -> list[tuple[str, int, int]]:
+        folder.asked.clear()
+        assert np.array_equal(reader.read(start, stop), values[start:stop])
+        return folder.asked
+
+    assert asked(5, 19) == [(files[0], indices[0][1][0], sum(indices[0][4]))]
+    assert asked(1, 50) == [
+        (files[0], indices[0][0][0], sum(indices[0][5])),
+        (files[1], indices[1][0][0], sum(indices[1][4])),
+    ]
+    assert asked(4, 8) == asked(9, 16) == []  # One chunk is asked for when it is needed.
+
+    length = sum(indices[1][2]) - indices[1][1][0]
+    folder.prefetch_bytes = length
+    assert asked(28, 36) == [(files[1], indices[1][1][0], sum(indices[1][2]))]
+    folder.prefetch_bytes = length - 1  # more than is worth it
+    assert asked(28, 36) == []
+
+
+def test_a_column_without_a_file_has_nothing_to_fetch(tmp_path: Path) -> None:
+    make(tmp_path, "asset/category", np.array([""] * 9, object), 3, 9, "")
+    make(tmp_path, "asset/view", np.array([""] * 9, object), 3, None, "")
+    folder = WatchedFolder(tmp_path)
+    for name in ("asset/category", "asset/view"):
+        assert reader_of(folder, name).read(0, 9).tolist() == [""] * 9
+    assert folder.asked == []
+
+
+def test_the_shards_read_last_stay_open_and_no_others(tmp_path: Path) -> None:
+    values = np.arange(1, OPEN_SHARDS + 9, dtype=np.uint8)
+    make(tmp_path, "voxel/material", values, 1, 1)
+    folder = WatchedFolder(tmp_path)
+    reader = reader_of(folder, "voxel/material")
+    for row in range(len(values)):
+        assert reader.read(row, row + 1).tolist() == [row + 1]
+    opened = len(folder.files)
+    assert opened == len(values)
+    assert sum(file() is not None for file in folder.files) == OPEN_SHARDS
+    reader.read(8, len(values))
+    assert len(folder.files) == opened
+    reader.read(7, 8)
+    assert len(folder.files) == opened + 1
+
+
+class Failing(LocalFile):
+    """A disk that fails behind the index, which was read before."""
+
+    def pread(self, length: int, offset: int) -> bytes:
+        if offset < self.size() - 68:
+            raise OSError(errno.EIO, "the disk gave up")
+        return super().pread(length, offset)
+
+    prefetch = pread  # type: ignore[assignment]
+
+
+@pytest.mark.parametrize("prefetch_bytes", [0, 2**20])
+def test_a_chunk_that_cannot_be_read_names_its_file(
+    shard: Path, tmp_path: Path, prefetch_bytes: int
+) -> None:
+    class Folder(LocalFolder):
+        def open(self, name: str) -> LocalFile:
+            return Failing(f"{self.path}/{name}")
+
+    folder = Folder(tmp_path)
+    folder.prefetch_bytes = prefetch_bytes
+    reader = reader_of(folder, "voxel/material")
+    what = r"voxel/material/c/0: cannot be read \(the disk gave up\)"
+    with pytest.raises(StoreError, match=what):
+        reader.read(0, 32)
+    with pytest.raises(StoreError, match=what):
+        list(reader.packed(0, 4))
+
+
+def test_packed_chunks_are_the_bytes_of_the_files_a_few_at_a_time(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    values = np.random.default_rng(3).integers(1, 256, (70, 100)).astype(np.uint8)
+    make(tmp_path, "voxel/feats", values, 4, 40)  # 10 chunks of 400 bytes, and 8
+    monkeypatch.setattr(shard_reader, "_COPIED_BYTES", 1000)
+    reader = reader_of(LocalFolder(tmp_path), "voxel/feats")
+    files = [tmp_path / f"voxel/feats/c/{n}/0" for n in range(2)]
+    chunks = [
+        file.read_bytes()[offset : offset + length]
+        for file in files
+        for offset, length in index_of(file, 10)
+        if offset != NOT_THERE
+    ]
+    assert len(chunks) == 18
+    for first, last in ((0, 18), (3, 12), (9, 10), (4, 4), (10, 18)):
+        found = []
+        for data, lengths in reader.packed(first, last):
+            assert len(data) == sum(lengths) < 1000 + 500
+            cuts = np.cumsum([0, *lengths]).tolist()
+            found += [data[a:b] for a, b in pairwise(cuts)]
+        assert found == chunks[first:last]
+
+
+def test_packed_chunks_that_are_not_side_by_side_or_damaged_are_refused(
+    folder: LocalFolder, shard: Path
+) -> None:
+    index, content = index_of(shard, 4), shard.read_bytes()
+    no_order = [index[0], index[2], index[1], index[3]]
+    write_index(shard, no_order)
+    reader = reader_of(folder, "voxel/material")
+    (one,) = reader.packed(1, 2)
+    assert one == (content[index[2][0] : sum(index[2])], [index[2][1]])
+    for first, last in ((0, 2), (1, 3), (0, 4), (2, 4)):
+        with pytest.raises(StoreError, match="its chunks do not follow one another"):
+            list(reader_of(folder, "voxel/material").packed(first, last))
+    write_index(shard, [*index[:3], (NOT_THERE, NOT_THERE)])
+    with pytest.raises(StoreError, match="its chunks do not follow one another"):
+        list(reader_of(folder, "voxel/material").packed(2, 4))
+    for at in (index[2][0], sum(index[2]) - 1):
+        flipped = bytearray(content)
+        flipped[at] ^= 1
+        shard.write_bytes(flipped)
+        reader = reader_of(folder, "voxel/material")
+        assert sum(lengths == [n for _, n in index[:2]] for _, lengths in reader.packed(0, 2)) == 1
+        with pytest.raises(StoreError, match="c/0: a chunk is damaged"):
+            list(reader.packed(0, 4))
+
+
+def test_a_column_without_a_file_has_no_packed_chunks(tmp_path: Path) -> None:
+    make(tmp_path, "asset/category", np.array([""] * 9, object), 3, 9, "")
+    with pytest.raises(StoreError, match="do not follow one another"):
+        list(reader_of(LocalFolder(tmp_path), "asset/category").packed(0, 1))
