@@ -1,0 +1,296 @@
+"""A store's table of assets, and each asset, against the arrays that zarr wrote."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import zarr
+from support.made_store import BUILD_ID, IDS, SIZES, edit_attributes, make_store
+
+from slatprep.errors import ConfigError, StoreError, UnknownAssetError
+from slatprep.records import Contents, LatentSpace, Property
+from slatprep.store import Store, open_store
+from slatprep.store.reader import is_store, require_outside
+
+Made = tuple[Store, dict[str, np.ndarray]]
+NEWER = ("confidence", "expected_accuracy", "unphysical", "contradicted")
+MOST_VOXELS = 64**3
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> Made:
+    path = tmp_path_factory.mktemp("made") / "s.zarr"
+    arrays = make_store(path)
+    return open_store(path), arrays
+
+
+@pytest.fixture(scope="module")
+def merged(tmp_path_factory: pytest.TempPathFactory) -> Made:
+    path = tmp_path_factory.mktemp("merged") / "s.zarr"
+    arrays = make_store(path, merged=True)
+    return open_store(path), arrays
+
+
+@pytest.fixture(scope="module")
+def old(tmp_path_factory: pytest.TempPathFactory) -> Made:
+    path = tmp_path_factory.mktemp("old") / "s.zarr"
+    arrays = make_store(path, version=1)
+    return open_store(path), arrays
+
+
+@pytest.fixture
+def own(tmp_path: Path) -> Path:
+    """A store that a test may change."""
+    make_store(tmp_path / "s.zarr")
+    return tmp_path / "s.zarr"
+
+
+def rows_of(arrays: dict[str, np.ndarray], name: str, row: int) -> np.ndarray:
+    begin = sum(SIZES[:row])
+    return arrays[f"voxel/{name}"][begin : begin + SIZES[row]]
+
+
+def same(found: object, wanted: object) -> bool:
+    return np.asarray(found).tolist() == np.asarray(wanted).tolist()
+
+
+VOXELS = ("coords", "feats", "properties", "material", "valid", "distance", "place", "confidence")
+
+
+def test_each_asset_has_its_own_rows(made: Made) -> None:
+    store, arrays = made
+    assert len(store) == 4
+    for row, asset_id in enumerate(IDS):
+        asset = store.asset(asset_id)
+        assert (asset.index, asset.asset_id) == (row, asset_id)
+        for name in VOXELS:
+            assert same(getattr(asset, name), rows_of(arrays, name, row)), name
+            assert same(store.read(row, [name])[name], rows_of(arrays, name, row)), name
+        assert same(asset.transform, arrays["asset/transform"][row])
+        assert same(asset.grid_material, arrays["grid/material"][row])
+        assert asset.grid_properties.tobytes() == arrays["grid/properties"][row].tobytes()
+        for name, value in asset.columns.items():
+            assert same(value, arrays[f"asset/{name}"][row]), name
+    assert list(store.read(0)) == ["coords", "feats", "properties"]
+    assert store.read(0, ()) == {}
+
+
+def test_an_asset_without_several_annotations_says_nothing_of_how_they_differ(made: Made) -> None:
+    store, _ = made
+    for row, size in enumerate(SIZES):
+        read = store.read(row, ["spread", "votes"])
+        assert read["spread"].shape == (size, 3)
+        assert read["votes"].shape == (size,)
+        assert all(np.isnan(values).all() for values in read.values())
+        assert read["spread"].dtype == read["votes"].dtype == np.float32
+    assert not store.merges
+    assert not store.asset("ant").merged
+
+
+def test_an_asset_of_several_annotations_says_how_they_differ(merged: Made) -> None:
+    store, arrays = merged
+    assert store.merges
+    for row, asset_id in enumerate(IDS):
+        asset = store.asset(asset_id)
+        assert same(asset.spread, rows_of(arrays, "spread", row))
+        assert same(asset.votes, rows_of(arrays, "votes", row))
+        assert same(asset.coords, rows_of(arrays, "coords", row))
+        assert asset.merged == (SIZES[row] > 0)
+
+
+def test_a_store_of_format_one_says_what_follows_from_it(old: Made) -> None:
+    store, arrays = old
+    assert store.format_version == 1
+    for row, asset_id in enumerate(IDS):
+        asset = store.asset(asset_id)
+        for name in VOXELS[:6]:
+            assert same(getattr(asset, name), rows_of(arrays, name, row)), name
+        # The transforms of this store are shifts.
+        centres = (rows_of(arrays, "coords", row) + 0.5) / 64 - 0.5
+        shift = arrays["asset/transform"][row][:3, 3]
+        assert asset.place.dtype == asset.confidence.dtype == np.float32
+        np.testing.assert_allclose(asset.place, centres - shift, atol=1e-6)
+        assert asset.confidence.shape == (SIZES[row],)
+        assert np.isnan(asset.confidence).all()
+    assert np.isnan(store.column("confidence")).tolist() == [True] * 4
+    assert np.isnan(store.column("expected_accuracy")).tolist() == [True] * 4
+    assert store.column("unphysical").tolist() == [0] * 4
+    assert store.column("contradicted").tolist() == [False] * 4
+
+
+def test_columns_are_those_of_the_arrays(made: Made) -> None:
+    store, arrays = made
+    for name in (*NEWER, "fitness", "verdict", "transform", "property_ambiguity"):
+        assert same(store.column(name), arrays[f"asset/{name}"]), name
+    assert store.offsets.tolist() == [0, 5, 5, 16, 23]
+    assert store.ids == list(IDS)
+    table = store.table()
+    assert table["voxels"].tolist() == list(SIZES)
+    assert same(table["confidence"], arrays["asset/confidence"])
+    for column, name in enumerate(("youngs_modulus", "density", "poissons_ratio")):
+        change = arrays["asset/property_ambiguity"][:, column]
+        assert same(table[f"property_ambiguity_{name}"], change)
+    assert "property_ambiguity" not in table
+    with pytest.raises(StoreError, match="lacks the array asset/colour"):
+        store.column("colour")
+
+
+def test_properties_are_found_by_name(made: Made) -> None:
+    store, _ = made
+    assert store.columns_of(["poissons_ratio", "youngs_modulus"]) == [2, 0]
+    with pytest.raises(StoreError) as raised:
+        store.columns_of(["density", "colour", "taste"])
+    assert str(raised.value) == (
+        f"{store.path} has no colour and no taste, only youngs_modulus, density, poissons_ratio; "
+        "expected a store with density, colour, taste"
+    )
+
+
+def test_an_asset_is_found_by_a_beginning_that_no_other_has(made: Made) -> None:
+    store, _ = made
+    assert [store.match(name) for name in ("ant", "a", "cu", "bear.s", "bear.f")] == [0, 0, 3, 2, 1]
+    assert [store.find(one) for one in IDS] == [0, 1, 2, 3]
+    assert "cup" in store
+    assert "cu" not in store
+    assert 3 not in store
+
+
+@pytest.mark.parametrize(
+    ("name", "hint"),
+    [
+        ("bear", r"did you mean bear\.front or bear\.side\?"),
+        ("be", r"2 ids begin with 'be', such as bear\.front, bear\.side; give more of it"),
+        ("BEAR.F", r"did you mean bear\.front\?"),
+        ("cupp", r"did you mean cup\?"),
+        ("", "has no asset ''; it has 4 assets"),
+        ("zebra", "it has 4 assets"),
+    ],
+)
+def test_a_name_that_none_or_several_have_is_answered(made: Made, name: str, hint: str) -> None:
+    store, _ = made
+    with pytest.raises(UnknownAssetError, match=hint):
+        store.match(name)
+
+
+def test_a_notebook_shows_the_store_as_a_table(made: Made) -> None:
+    store, _ = made
+    shown = store._repr_html_()
+    for name, value in (
+        ("assets", "4"),
+        ("assets good", "3"),
+        ("assets failed", "1"),
+        ("categories", "2"),
+        ("voxels", "23"),
+        ("ranges", "p1-p99"),
+        ("build", BUILD_ID[:12]),
+    ):
+        assert f"<tr><th>{name}</th><td>{value}</td></tr>" in shown
+    assert repr(store).endswith(": 4 assets (3 good, 1 failed), 23 voxels>")
+
+
+def test_a_field_has_the_annotated_cells_in_si_units(made: Made) -> None:
+    store, arrays = made
+    field = store.asset("bear.side").field
+    material, properties = arrays["grid/material"][2], arrays["grid/properties"][2]
+    cells = [(x, y, 22) for x in range(3, 9) for y in (5, 6)]
+    assert field.voxels.tolist() == [list(cell) for cell in cells]
+    assert field.material.tolist() == [material[cell] for cell in cells]
+    values = np.array([properties[:, *cell] for cell in cells], np.float64)
+    share = (values + 1) / 2
+    # Ranges [2, 5], [3, 7] and [4, 9], the first two of log10.
+    expected = np.stack(
+        [10 ** (2 + 3 * share[:, 0]), 10 ** (3 + 4 * share[:, 1]), 4 + 5 * share[:, 2]], axis=1
+    )
+    np.testing.assert_allclose(field.properties, expected, rtol=1e-5)
+    assert np.array_equal(store.asset("bear.side").normalised_field.properties, values)
+    # What is occupied but not annotated is a part of the shape.
+    occupied = np.zeros((64, 64, 64), bool)
+    occupied[3:10, 5:7, 22] = True
+    assert np.array_equal(field.occupancy, occupied)
+    assert field.classified
+    assert [one.name for one in field.table] == ["youngs_modulus", "density", "poissons_ratio"]
+
+
+def test_a_store_of_other_contents_is_read_by_its_own_tables(tmp_path: Path) -> None:
+    contents = Contents(
+        (Property("density", "kg/m^3", True), Property("hue", "1", False)),
+        tuple(f"class {n}" for n in range(20)),
+        LatentSpace("other", 5, 128),
+    )
+    arrays = make_store(tmp_path / "s.zarr", contents)
+    store = open_store(tmp_path / "s.zarr")
+    assert store.contents == contents
+    assert store.about.property_units == ("kg/m^3", "1")
+    assert store.attributes["background"] == 254
+    asset = store.asset("cup")
+    assert same(asset.feats, rows_of(arrays, "feats", 3))
+    assert asset.feats.shape == (7, 5)
+    assert asset.spread.shape == (7, 2)
+    assert asset.latents.resolution == 128
+    field = asset.normalised_field
+    assert len(field.voxels) == 12
+    assert field.occupancy.sum() == 14
+    assert field.material.tolist() == arrays["grid/material"][3, 3:9, 5:7, 23].ravel().tolist()
+
+
+def test_a_store_without_classes_has_fields_without(tmp_path: Path) -> None:
+    make_store(tmp_path / "s.zarr", Contents(classes=()))
+    store = open_store(tmp_path / "s.zarr")
+    assert not store.asset("ant").field.classified
+    assert "background" not in store.attributes
+
+
+def test_rows_beyond_what_an_asset_may_have_are_refused(own: Path) -> None:
+    offsets = zarr.open_group(own, mode="r+", use_consolidated=False)["asset/offset"]
+    offsets[:] = np.cumsum([0, MOST_VOXELS, 0, MOST_VOXELS + 1, -1])
+    store = open_store(own)
+    assert store.rows(0) == (0, MOST_VOXELS)
+    assert store.rows(1) == (MOST_VOXELS, MOST_VOXELS)
+    for row in (2, 3):
+        with pytest.raises(StoreError, match=f"asset {row} has rows .* expected 0 to 262144 rows"):
+            store.rows(row)
+    for row in (-1, 4):
+        with pytest.raises(StoreError, match=f"has no asset {row}; it has 4 assets"):
+            store.rows(row)
+    offsets[0] = -1
+    with pytest.raises(StoreError, match="asset 0 has rows -1 to"):
+        open_store(own).rows(0)
+
+
+def test_a_transform_without_inverse_has_no_places(tmp_path: Path) -> None:
+    make_store(tmp_path / "s.zarr", version=1)
+    root = zarr.open_group(tmp_path / "s.zarr", mode="r+", use_consolidated=False)
+    root["asset/transform"][2] = np.nan
+    with pytest.raises(StoreError, match="asset/transform: row 2: "):
+        open_store(tmp_path / "s.zarr").read(2, ["place"])
+
+
+@pytest.mark.parametrize("version", [None, "2", True, 2.0, 0, 3])
+def test_formats_that_are_not_read_are_refused(own: Path, version: Any) -> None:
+    edit_attributes(own, format_version=version)
+    with pytest.raises(StoreError, match=f"has format version {version!r}; this slatprep reads"):
+        open_store(own)
+    assert is_store(own)
+
+
+def test_a_table_of_other_width_than_attributes_say_is_refused(own: Path) -> None:
+    latents = open_store(own).attributes["latents"]
+    edit_attributes(own, latents={**latents, "channels": 7, "mean": [], "std": []})
+    with pytest.raises(StoreError, match="latents says 7 columns of voxel/feats; expected 8"):
+        open_store(own)
+
+
+def test_nothing_is_written_into_a_store(own: Path) -> None:
+    require_outside(own.parent / "other")
+    require_outside(own.parent)
+    with pytest.raises(ConfigError, match=r"s\.zarr is a store; expected a path outside"):
+        require_outside(own)
+    for inside in (own / "x", own / "voxel" / "feats" / "c"):
+        with pytest.raises(ConfigError, match=f"{inside.name} lies inside the store {own};"):
+            require_outside(inside)
+    edit_attributes(own, format="other")
+    assert not is_store(own)
+    require_outside(own / "x")
