@@ -268,6 +268,15 @@ def test_a_transform_without_inverse_has_no_places(tmp_path: Path) -> None:
         open_store(tmp_path / "s.zarr").read(2, ["place"])
 
 
+def test_what_is_no_store_is_told_from_nothing(own: Path) -> None:
+    with pytest.raises(StoreError, match=r"not a slatprep store: .*none/zarr\.json does not"):
+        open_store(own.parent / "none")
+    for other in (own / "voxel", own / "voxel" / "feats"):
+        with pytest.raises(StoreError, match="is not a slatprep store; expected a directory that"):
+            open_store(other)
+        assert not is_store(other)
+
+
 @pytest.mark.parametrize("version", [None, "2", True, 2.0, 0, 3])
 def test_formats_that_are_not_read_are_refused(own: Path, version: Any) -> None:
     edit_attributes(own, format_version=version)

@@ -60,6 +60,15 @@ def test_ranges_and_tables_are_in_the_order_of_the_columns() -> None:
     assert found.build.parameters.sample.method == "nearest"
 
 
+def test_a_store_may_have_a_single_property() -> None:
+    attributes = said()
+    attributes["property_columns"], attributes["property_units"] = ["hue"], ["1"]
+    del attributes["normalization"]["density"]
+    found = read(attributes)
+    assert [one.name for one in found.ranges.ranges] == ["hue"]
+    assert found.ranges.source == "pixie"
+
+
 def test_what_newer_versions_add_is_left_alone() -> None:
     attributes = said()
     attributes["colour"] = "new"

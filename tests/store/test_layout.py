@@ -6,7 +6,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from slatprep.parameters import MAX_VOXEL_SHARD, StoreParameters
-from slatprep.store.layout import MOST_SHARDS, overlaps, row_ranges, rows_per_shard
+from slatprep.store.layout import (
+    ARRAYS,
+    MOST_SHARDS,
+    arrays_of,
+    overlaps,
+    row_ranges,
+    rows_per_shard,
+)
 from slatprep.store.shard_reader import OPEN_SHARDS
 
 
@@ -33,6 +40,9 @@ def test_shards_take_every_row_of_every_asset_once_and_in_place(
             for row in range(sizes[asset])[rows]
         ]
         assert found == [*zip(owner[start:stop], within[start:stop], strict=True)]
+        # An asset without rows owns none, wherever it lies.
+        owners = [asset for asset, _ in overlaps(offsets, start, stop)]
+        assert owners == sorted(set(owner[start:stop].tolist()))
     assert end == offsets[-1]
 
 
@@ -48,3 +58,29 @@ def test_shards_are_few_and_small_beside_the_store(chunk: int) -> None:
     assert max(sizes) <= MAX_VOXEL_SHARD
     given = StoreParameters(voxel_chunk=chunk, voxel_chunks_per_shard=3)
     assert rows_per_shard(given, 10**9) == 3 * chunk
+
+
+@pytest.mark.parametrize(
+    ("rows", "chunks"),
+    [
+        (0, 64),  # 262,144 rows at least
+        (64 * 32 * 4096, 64),
+        (64 * 32 * 4096 + 1, 128),  # 32 shards would not take the last row
+        (128 * 32 * 4096, 128),
+        (3000 * 32 * 4096, 4096),
+        (10**12, 4096),  # 16.8 million rows at most
+    ],
+)
+def test_a_shard_holds_the_least_power_of_two_of_chunks(rows: int, chunks: int) -> None:
+    assert rows_per_shard(StoreParameters(), rows) == 4096 * chunks
+
+
+def test_a_format_has_the_arrays_that_came_with_it_and_before() -> None:
+    newer = {
+        "voxel/place", "voxel/confidence", "asset/confidence", "asset/expected_accuracy",
+        "asset/unphysical", "asset/contradicted",
+    }  # fmt: skip
+    names = {layout.name for layout in ARRAYS}
+    assert newer < names
+    assert {layout.name for layout in arrays_of(1)} == names - newer
+    assert {layout.name for layout in arrays_of(2)} == names
