@@ -17,7 +17,8 @@ from __future__ import annotations
 import numpy as np
 
 from slatprep.align.bspline import bend, gather, locate, scatter, strides_of
-from slatprep.align.solver import interpolate, solve_linear
+from slatprep.align.interpolation import interpolate
+from slatprep.align.solver import solve_linear
 from slatprep.geometry.kernel import kernel
 
 OFFSET_PRIOR, RIDGE = 0.01, 1e-4

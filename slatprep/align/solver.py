@@ -22,6 +22,7 @@ import math
 
 import numpy as np
 
+from slatprep.align.interpolation import trilinear
 from slatprep.geometry.kernel import kernel
 
 UNKNOWNS = 8  # rotation 3, shift 3, log scale, offset
@@ -41,44 +42,6 @@ _SUMS = _WEIGHTED + (UNKNOWNS + 1) * _BLOCK
 _NUMBERS = _SUMS + _PRODUCTS * _LANES
 """Where, of a block's numbers, those of each kind begin: in one array, which is no other's memory,
 so that the compiler makes vector instructions of the loops over them."""
-
-
-@kernel(inline="always", error_model="numpy")
-def _trilinear(f000, f001, f010, f011, f100, f101, f110, f111, u, v, w):  # type: ignore[no-untyped-def]
-    """Value and gradient at (u, v, w) in a cell, from its corners."""
-    f00 = f000 + (f001 - f000) * w
-    f01 = f010 + (f011 - f010) * w
-    f10 = f100 + (f101 - f100) * w
-    f11 = f110 + (f111 - f110) * w
-    f0 = f00 + (f01 - f00) * v
-    f1 = f10 + (f11 - f10) * v
-    gy = (f01 - f00) * (1.0 - u) + (f11 - f10) * u
-    g0 = (f001 - f000) * (1.0 - v) + (f011 - f010) * v
-    g1 = (f101 - f100) * (1.0 - v) + (f111 - f110) * v
-    return f0 + (f1 - f0) * u, f1 - f0, gy, g0 * (1.0 - u) + g1 * u
-
-
-@kernel(inline="always", error_model="numpy")
-def interpolate(f, x, y, z):  # type: ignore[no-untyped-def]
-    """Trilinear value and gradient; outside the box the distance to it is added."""
-    n0, n1, n2 = f.shape
-    cx = min(max(x, 0.0), n0 - 1.000001)
-    cy = min(max(y, 0.0), n1 - 1.000001)
-    cz = min(max(z, 0.0), n2 - 1.000001)
-    # Unsigned, so that no negative index has to be provided for.
-    i, j, k, one = np.uint64(cx), np.uint64(cy), np.uint64(cz), np.uint64(1)
-    u, v, w = cx - np.float64(i), cy - np.float64(j), cz - np.float64(k)
-    f000, f001, f010, f011 = f[i, j, k], f[i, j, k + one], f[i, j + one, k], f[i, j + one, k + one]
-    i += one
-    f100, f101, f110, f111 = f[i, j, k], f[i, j, k + one], f[i, j + one, k], f[i, j + one, k + one]
-    value, gx, gy, gz = _trilinear(f000, f001, f010, f011, f100, f101, f110, f111, u, v, w)
-    ox, oy, oz = x - cx, y - cy, z - cz
-    outside = ox * ox + oy * oy + oz * oz
-    if outside > 1e-8:
-        outside = math.sqrt(outside)
-        value += outside
-        gx, gy, gz = ox / outside, oy / outside, oz / outside
-    return value, gx, gy, gz
 
 
 @kernel(error_model="numpy")
@@ -178,7 +141,7 @@ def _look_up(field, cells, count, corners, block):  # type: ignore[no-untyped-de
             step = (corner >> 2) * plane + (corner >> 1 & 1) * row + (corner & 1)
             corners[corner * _BLOCK + m] = values[np.uint64(cells[m] + step)]
     for m in range(count):
-        value, gx, gy, gz = _trilinear(
+        value, gx, gy, gz = trilinear(
             corners[m], corners[_BLOCK + m], corners[2 * _BLOCK + m], corners[3 * _BLOCK + m],
             corners[4 * _BLOCK + m], corners[5 * _BLOCK + m], corners[6 * _BLOCK + m],
             corners[7 * _BLOCK + m], block[_U + m], block[_V + m], block[_W + m],
@@ -293,32 +256,6 @@ def _add_sums(block, equations):  # type: ignore[no-untyped-def]
                 for j in range(column, column + 3):
                     equations[i, j] += block[number]
                     number += 1
-
-
-@kernel()
-def add_products(left, right, out):  # type: ignore[no-untyped-def]
-    """Add the sum over m of ``left[i][m] * right[j][m]`` to ``out[i, j]``; three columns of each.
-
-    Written out, so that the compiler keeps the sums in registers.
-    """
-    p, q, r = left
-    x, y, z = right
-    a, b, c = out[0, 0], out[0, 1], out[0, 2]
-    d, e, f = out[1, 0], out[1, 1], out[1, 2]
-    g, h, k = out[2, 0], out[2, 1], out[2, 2]
-    for m in range(len(p)):
-        a += p[m] * x[m]
-        b += p[m] * y[m]
-        c += p[m] * z[m]
-        d += q[m] * x[m]
-        e += q[m] * y[m]
-        f += q[m] * z[m]
-        g += r[m] * x[m]
-        h += r[m] * y[m]
-        k += r[m] * z[m]
-    out[0, 0], out[0, 1], out[0, 2] = a, b, c
-    out[1, 0], out[1, 1], out[1, 2] = d, e, f
-    out[2, 0], out[2, 1], out[2, 2] = g, h, k
 
 
 @kernel()

@@ -14,7 +14,8 @@ import math
 import numpy as np
 
 from slatprep.align.deform_solver import OFFSET_PRIOR, PIXIEVERSE_WEIGHT, RIDGE
-from slatprep.align.solver import add_products, interpolate, solve_linear
+from slatprep.align.interpolation import interpolate
+from slatprep.align.solver import solve_linear
 from slatprep.geometry.kernel import kernel
 
 _LEAST, _MOST = 0.2, 5.0
@@ -94,7 +95,7 @@ def _accumulate(  # type: ignore[no-untyped-def]
                 for j in range(0 if i < 6 else 3, 12, 3):
                     these = left[:n, i], left[:n, i + 1], left[:n, i + 2]
                     those = right[:n, j], right[:n, j + 1], right[:n, j + 2]
-                    add_products(these, those, sums[i : i + 3, j : j + 3])
+                    _add_products(these, those, sums[i : i + 3, j : j + 3])
             n = 0
         constant[0] += factor
         constant[1] += factor * sign * residual
@@ -195,3 +196,29 @@ def stretch(  # type: ignore[no-untyped-def]
             if not math.isfinite(offsets[pose]):
                 break
     return scores
+
+
+@kernel()
+def _add_products(left, right, out):  # type: ignore[no-untyped-def]
+    """Add the sum over m of ``left[i][m] * right[j][m]`` to ``out[i, j]``; three columns of each.
+
+    Written out, so that the compiler keeps the sums in registers.
+    """
+    p, q, r = left
+    x, y, z = right
+    a, b, c = out[0, 0], out[0, 1], out[0, 2]
+    d, e, f = out[1, 0], out[1, 1], out[1, 2]
+    g, h, k = out[2, 0], out[2, 1], out[2, 2]
+    for m in range(len(p)):
+        a += p[m] * x[m]
+        b += p[m] * y[m]
+        c += p[m] * z[m]
+        d += q[m] * x[m]
+        e += q[m] * y[m]
+        f += q[m] * z[m]
+        g += r[m] * x[m]
+        h += r[m] * y[m]
+        k += r[m] * z[m]
+    out[0, 0], out[0, 1], out[0, 2] = a, b, c
+    out[1, 0], out[1, 1], out[1, 2] = d, e, f
+    out[2, 0], out[2, 1], out[2, 2] = g, h, k
