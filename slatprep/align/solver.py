@@ -40,8 +40,8 @@ _VALUE, _GX, _GY, _GZ, _U, _V, _W, _X, _Y, _Z, _OX, _OY, _OZ, _BEYOND, _ROWS = r
 _WEIGHTED = _ROWS + (UNKNOWNS + 1) * _BLOCK
 _SUMS = _WEIGHTED + (UNKNOWNS + 1) * _BLOCK
 _NUMBERS = _SUMS + _PRODUCTS * _LANES
-"""Where, of a block's numbers, those of each kind begin: in one array, which is no other's memory,
-so that the compiler makes vector instructions of the loops over them."""
+"""How many numbers a block has, and before it where those of each kind begin: in one array, which
+is no other's memory, so that the compiler makes vector instructions of the loops over them."""
 
 
 @kernel(error_model="numpy")
@@ -209,7 +209,9 @@ def _linearise(count, rotation, centre, forward, block):  # type: ignore[no-unty
 def _add_products(count, block):  # type: ignore[no-untyped-def]
     """Add a block's products to their sums; of the symmetric matrix the upper triangle alone."""
     for first in range(0, _BLOCK, _LANES):
-        if first >= count:  # as a bound of the range, it would let the compiler expect first < 0
+        # Not the end of the range: the compiler would have to expect a negative `first`, and
+        # a check of each index keeps it from vector instructions.
+        if first >= count:
             break
         _add_nine_products(block, first, 0, 0, 0)
         _add_nine_products(block, first, 0, 3, 1)
