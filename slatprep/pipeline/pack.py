@@ -299,9 +299,11 @@ def pack_store(
     if (remote := None if at is None else storage_of(at).remote) is not None:
         arrays = [*arrays_in("voxel", merged), *arrays_in("grid", merged)]
         put_objects(path, remote, [f"{name}/zarr.json" for name in arrays])
+    # Those of grids, which take longest, first: so the last shards keep all workers at work.
+    todo = sorted(shards(keys, offsets, parameters, same), key=lambda shard: shard.group != "grid")
     tasks = (
         (remote or path, spool, shard, normalization, previous, contents.background)
-        for shard in shards(keys, offsets, parameters, same)
+        for shard in todo
     )
     written: dict[str, Written] = {}
     for shard, counts, files in run_unordered(write_shard, tasks, jobs):
