@@ -88,6 +88,7 @@ def measure(parameters: BuildParameters, folder: Path, jobs: bool) -> dict[str, 
     begin, clock = cpu(), time.perf_counter()
     summary = build.build_store(parameters, folder / "s.zarr")
     whole, wall = cpu() - begin, time.perf_counter() - clock
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     least = reading_alone(pairs) + writing_alone(folder / "s.zarr", folder / "w.zarr", parameters)
     inside = sum(steps[name] for name in STEPS)
     count = len(pairs)
@@ -105,9 +106,7 @@ def measure(parameters: BuildParameters, folder: Path, jobs: bool) -> dict[str, 
         "spool and records [CPU ms/asset]": per_asset(steps["finish_asset"] - inside),
         "pack [CPU ms/asset]": per_asset(steps["pack_store"]),
         "flush and replace [CPU ms/asset]": per_asset(steps["replace_directory"]),
-        "peak memory of this process [MB]": round(
-            resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
-        ),
+        "peak memory of one job [MB]": round(peak / 1024),
     }
     if jobs:
         begin = time.perf_counter()
