@@ -36,8 +36,9 @@ from slatprep.pipeline.dataset import build_store
 started = time.process_time()
 parameters = replace(Dataset(Path(sys.argv[1])).parameters(), store=StoreParameters())
 summary = build_store(parameters, Path(sys.argv[2]), jobs=2, assets_per_job=32)
-from joblib.externals.loky import get_reusable_executor
-get_reusable_executor().shutdown()
+if "joblib" in sys.modules:  # So that its workers end, and their time is counted.
+    from joblib.externals.loky import get_reusable_executor
+    get_reusable_executor().shutdown()
 peak = lambda who: resource.getrusage(who).ru_maxrss / 1024
 print(json.dumps({
     "parent [MB]": round(peak(resource.RUSAGE_SELF)),

@@ -91,6 +91,14 @@ class Seen:
     def _by_key(self) -> dict[bytes, int]:
         return {key: row for row, key in enumerate(self.rows["key"].tolist())}
 
+    @cached_property
+    def _finite(self) -> dict[str, list[bool]]:
+        """Whether all of what the columns say of a row is known."""
+        return {
+            name: np.isfinite(self.rows[name]).reshape(len(self.rows), -1).all(axis=1).tolist()
+            for name in ("extent", "moments")
+        }
+
     def key(self, state: bytes) -> str | None:
         """Return the key of the asset whose sources had this state; None where none had."""
         row = self._by_state.get(state) if self.trusted and state != _UNKNOWN else None
@@ -102,10 +110,10 @@ class Seen:
         if number is None:
             return None
         row = self.rows[number]
-        if not np.isfinite(row["extent"]).all():
+        if not self._finite["extent"][number]:
             return None
         mean, std = row["moments"].tolist()
-        known = np.isfinite(row["moments"]).all()
+        known = self._finite["moments"][number]
         moments = LatentMoments(tuple(mean), tuple(std)) if known else None
         return Found(key, row["extent"], row["clipped"], moments, row["record"].tobytes())
 

@@ -80,13 +80,9 @@ def find_files(
     ConfigError
         If the pattern makes no sense or the root cannot be listed.
     """
-    components = pattern.split("/")
-    if pattern.startswith("/") or any(part in ("", ".", "..") for part in components):
-        raise ConfigError(
-            f"pattern {pattern!r} is not a path below its root; write it relative, without '..'"
-        )
+    components = _components(pattern)
     # One name needs no search. Most patterns stand for one: that of a file beside a grid.
-    if "*" not in (literal := fill(pattern, known)) and all(map(_parts, components)):
+    if "*" not in (literal := fill(pattern, known)):
         if names.is_file(literal):
             yield Found(dict(known), literal)
         return
@@ -94,6 +90,19 @@ def find_files(
         yield from _walk(names, "", components, dict(known), skip)
     except OSError as error:
         raise ConfigError(f"{error.filename}: cannot be listed ({error.strerror})") from None
+
+
+@lru_cache(maxsize=64)
+def _components(pattern: str) -> tuple[str, ...]:
+    """Split a pattern at its slashes; raise ConfigError where it makes no sense."""
+    components = tuple(pattern.split("/"))
+    if pattern.startswith("/") or any(part in ("", ".", "..") for part in components):
+        raise ConfigError(
+            f"pattern {pattern!r} is not a path below its root; write it relative, without '..'"
+        )
+    for component in components:
+        _parts(component)
+    return components
 
 
 def fill(pattern: str, known: Mapping[str, str]) -> str:
@@ -133,6 +142,11 @@ def match(component: str, known: Mapping[str, str], name: str) -> dict[str, str]
     >>> match("{id}_{view}.npz", {}, "a_b_c.npz") == {"id": "a_b", "view": "c"}
     True
     """
+    return _fields(*_split(component, known), name)
+
+
+def _split(component: str, known: Mapping[str, str]) -> tuple[list[str], list[str]]:
+    """Return the texts of a component, known fields among them, and what stands between them."""
     texts, variables = [""], []
     for part in _parts(component):
         if part in known:
@@ -142,6 +156,11 @@ def match(component: str, known: Mapping[str, str], name: str) -> dict[str, str]
             texts.append("")
         else:
             texts[-1] += part[1:]
+    return texts, variables
+
+
+def _fields(texts: list[str], variables: list[str], name: str) -> dict[str, str] | None:
+    """Return what `match` does, of a component that was split."""
     begin, stop = len(texts[0]), len(name) - len(texts[-1])
     if not variables:
         return {} if name == texts[0] else None
@@ -182,30 +201,35 @@ def _parts(component: str) -> tuple[str, ...]:
 def _walk(
     names: Listing,
     prefix: str,
-    components: list[str],
+    components: tuple[str, ...],
     known: dict[str, str],
     skip: Collection[str],
 ) -> Iterator[Found]:
     component, rest = components[0], components[1:]
-    _parts(component)
     literal = fill(component, known)
+    if "*" not in literal:
+        if rest:
+            yield from _walk(names, f"{prefix}{literal}/", rest, known, skip)
+        elif names.is_file(prefix + literal):
+            yield Found(known, prefix + literal)
+        return
     try:
-        listed = [literal] if "*" not in literal else names.of_folder(prefix, folders=bool(rest))
+        listed = names.of_folder(prefix, folders=bool(rest))
     except OSError as error:
         if not prefix:
             raise
         problem = f"{error.filename}: cannot be listed ({error.strerror})"
         yield Found(known, prefix, problem)
         return
+    texts, variables = _split(component, known)
     for name in listed:
-        fields = match(component, known, name)
+        fields = _fields(texts, variables, name)
         if fields is None or fields.get("id") in skip:
             continue
-        path = prefix + name
         if rest:
-            yield from _walk(names, path + "/", rest, known | fields, skip)
-        elif "*" in literal or names.is_file(path):
-            yield Found(known | fields, path)
+            yield from _walk(names, f"{prefix}{name}/", rest, known | fields, skip)
+        else:
+            yield Found(known | fields, prefix + name)
 
 
 def tried_names(patterns: Iterable[str], known: Mapping[str, str]) -> str:

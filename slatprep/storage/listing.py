@@ -47,10 +47,14 @@ class Listing:
     def is_file(self, path: str) -> bool:
         """Whether this name is anything but a folder, even a broken link."""
         full = os.path.join(self._root, path)  # noqa: PTH118 - half a million times
+        link = False
         try:
-            return not stat.S_ISDIR(os.stat(full).st_mode)  # noqa: PTH116
+            mode = os.lstat(full).st_mode
+            if link := stat.S_ISLNK(mode):
+                mode = os.stat(full).st_mode  # noqa: PTH116
         except (OSError, ValueError):
-            return os.path.islink(full)  # noqa: PTH114
+            return link
+        return not stat.S_ISDIR(mode)
 
     @cached_property
     def _top(self) -> tuple[list[str], list[str]]:
