@@ -115,10 +115,11 @@ def _dump(node: object) -> str:
     and leave out others that are empty; so all of those are left out here.
     """
     if isinstance(node, ast.AST):
-        fields = (f"{k}={_dump(v)}" for k, v in ast.iter_fields(node) if v is not None and v != [])
+        values = [(name, getattr(node, name, None)) for name in node._fields]
+        fields = [f"{name}={_dump(v)}" for name, v in values if v is not None and v != []]
         return f"{type(node).__name__}({', '.join(fields)})"
     if isinstance(node, list):
-        return f"[{', '.join(map(_dump, node))}]"
+        return f"[{', '.join([_dump(one) for one in node])}]"
     return ascii(node)  # repr() shows what this Python's edition of Unicode calls printable
 
 

@@ -5,9 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
-from slatprep.pipeline.asset import fail_asset, finish_asset
 from slatprep.pipeline.context import BuildContext
-from slatprep.pipeline.kernels import compile_kernels
 from slatprep.pipeline.plan import Action, PlannedAsset
 from slatprep.pipeline.spool import FailedAsset, SpooledAsset
 from slatprep.records import AssetPair
@@ -65,6 +63,12 @@ def finish(
     crew : Crew
         Who does it.
     """
+    if not pairs:
+        return []
+    # Late: numba and scipy take half as long to load as a run that finds nothing changed.
+    from slatprep.pipeline.asset import fail_asset, finish_asset
+    from slatprep.pipeline.kernels import compile_kernels
+
     jobs = crew.of(len(pairs))
     actions = {planned.action if (planned := plan.get(p.asset_id)) else Action.ALIGN for p in pairs}
     if isinstance(jobs, int) and Action.ALIGN in actions:
@@ -72,7 +76,7 @@ def finish(
         compile_kernels(crew.note)  # Before workers of this machine work, each to compile all.
     tasks = ((pair, plan.get(pair.asset_id), context) for pair in pairs)
     assets: list[SpooledAsset | FailedAsset] = []
-    if crew.progress and pairs:
+    if crew.progress:
         crew.progress(0, len(pairs))
     for asset in run_unordered(finish_asset, tasks, jobs, fail_asset):
         assets.append(asset)

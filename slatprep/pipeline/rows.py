@@ -14,7 +14,6 @@ from slatprep.pipeline.plan import PlannedAsset
 from slatprep.pipeline.spool import FailedAsset, SpooledAsset
 from slatprep.pipeline.summary import nothing_usable
 from slatprep.pipeline.update import Update
-from slatprep.pipeline.witness import apply_witness
 from slatprep.records import AssetPair, Contents
 
 
@@ -93,6 +92,8 @@ def settle_rows(
         raise StoreError(nothing_usable(failed, parameters, update.pairs))
     keys = {asset.asset_id: asset.key for asset in usable}
     if kept is None:
+        from slatprep.pipeline.witness import apply_witness  # It needs scipy.
+
         jobs = crew.of(len(usable))
         made = apply_consensus(_made(usable), spool, parameters, jobs, crew.note)
         labels = wanted.declared.n_labels
