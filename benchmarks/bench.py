@@ -75,6 +75,11 @@ MEASUREMENTS = (
         (0, 10_000, 1800), (0, 40, 180),
     ),
     Measurement(
+        "scale-large", "The same of assets as large as PixieVerse's",
+        "reliability", "python benchmarks/scale.py {size} --like {folder}/demo",
+        (24, 10_000, 3600), (6, 20, 180), (DEMO,),
+    ),
+    Measurement(
         "half-million", "Half a million tiny assets, with alignments given",
         "reliability", "python benchmarks/half_million.py {size} --once --jobs 2",
         (0, 500_000, 14_400), (0, 100, 180),

@@ -1,10 +1,12 @@
 """Cost, memory and files of builds and updates against the number of assets.
 
     python benchmarks/scale.py 100 1000 10000
+    slatprep make-demo demo --assets 24 && python benchmarks/scale.py 10000 --like demo
 
-Sources are small made assets; their files are linked, so that any number fits
-anywhere. Time is CPU time of the build and its workers. The second build finds that nothing
-changed, the third gets new assets (``--new``), the fourth loses one.
+Sources are small made assets, or those of a demo (``--like``), which are as large as
+PixieVerse's; their files are linked, so that any number fits anywhere. Time is CPU time of the
+build and its workers. The second build finds that nothing changed, the third gets new assets
+(``--new``), the fourth loses one.
 """
 
 from __future__ import annotations
@@ -18,7 +20,9 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from checkout import environment
@@ -54,11 +58,12 @@ def main() -> None:
     parser.add_argument("assets", type=int, nargs="+")
     parser.add_argument("--new", type=int, default=50, help="assets that the update adds")
     parser.add_argument("--folder", type=Path, help="where to work")
+    parser.add_argument("--like", type=Path, help="a demo whose assets are taken")
     arguments = parser.parse_args()
     rows = []
     for count in arguments.assets:
         with tempfile.TemporaryDirectory(prefix="scale-", dir=arguments.folder) as folder:
-            rows.append(measure(Path(folder), count, arguments.new))
+            rows.append(measure(Path(folder), count, arguments.new, arguments.like))
             print(json.dumps(rows[-1]), flush=True)
     if len(rows) < 2:
         return
@@ -70,13 +75,13 @@ def main() -> None:
         print(f"{name}: {start:.2f} + {slope:.5f} an asset, off by at most {worst:.1%}")
 
 
-def measure(folder: Path, count: int, new: int) -> dict[str, float]:
+def measure(folder: Path, count: int, new: int, like: Path | None) -> dict[str, float]:
     dataset = Dataset(folder / "sources")
     gone = f"m{count // 2:06}"
     for number in range(count):
-        add(dataset, number, "m")
+        add(dataset, number, "m", like)
     # It goes later, and to take a link away would change the state of the files that share it.
-    for path in (*dataset.root.rglob(f"{gone}/*/*"), dataset.root / "slat" / f"{gone}.npz"):
+    for path in files_of(dataset.root, gone):
         content = path.read_bytes()
         path.unlink()
         path.write_bytes(content)
@@ -103,7 +108,7 @@ def measure(folder: Path, count: int, new: int) -> dict[str, float]:
     row["written, nothing changed [MB]"] = again["written [MB]"]
     # Ids in between the others, in files of their own: a new link to a file changes its state.
     for number in range(new):
-        add(dataset, number, "mm")
+        add(dataset, number, "mm", like)
     row[f"CPU, {new} new [s]"], added = build(dataset.root, out)
     row[f"written, {new} new [MB]"] = added["written [MB]"]
     shutil.rmtree(dataset.root / "pixieverse" / gone)
@@ -115,21 +120,35 @@ def measure(folder: Path, count: int, new: int) -> dict[str, float]:
     return row
 
 
-def add(dataset: Dataset, number: int, prefix: str) -> None:
-    """Add an asset: one of a few shapes, by a link to the files of the first of that shape."""
-    name, like = f"{prefix}{number:06}", f"{prefix}{number % VARIANTS:06}"
-    if number < VARIANTS:
+def add(dataset: Dataset, number: int, prefix: str, like: Path | None) -> None:
+    """Add an asset: one of a few shapes, by links to the files of the first of that shape."""
+    shapes = sorted(path.stem for path in like.glob("slat/*.npz")) if like else []
+    variants = len(shapes) or VARIANTS
+    name, first = f"{prefix}{number:06}", f"{prefix}{number % variants:06}"
+    if number >= variants:
+        link(files_of(dataset.root, first), dataset.root, first, dataset.root, name, os.link)
+    elif like:
+        shape = shapes[number]
+        link(files_of(like, shape), like, shape, dataset.root, name, shutil.copyfile)
+    else:
         made = make_asset(number)
         dataset.write_grid(name, made.grid)
         dataset.write_slat(f"{name}.npz", made.coords, made.feats)
-        return
-    grid = Path("sample_0", "material_grid.npy")
-    (dataset.root / "pixieverse" / name / grid).parent.mkdir(parents=True)
-    for old, copy in (
-        (f"pixieverse/{like}" / grid, f"pixieverse/{name}" / grid),
-        (Path("slat", f"{like}.npz"), Path("slat", f"{name}.npz")),
-    ):
-        os.link(dataset.root / old, dataset.root / copy)
+
+
+def files_of(root: Path, name: str) -> list[Path]:
+    """Return the source files of an asset."""
+    below = (root / "pixieverse" / name).rglob("*")
+    return [*(path for path in below if path.is_file()), root / "slat" / f"{name}.npz"]
+
+
+def link(
+    files: list[Path], root: Path, name: str, to: Path, copy: str, how: Callable[[Path, Path], Any]
+) -> None:
+    for file in files:
+        place = to / str(file.relative_to(root)).replace(name, copy)
+        place.parent.mkdir(parents=True, exist_ok=True)
+        how(file, place)
 
 
 def build(sources: Path, out: Path) -> tuple[float, dict[str, float]]:
