@@ -20,7 +20,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -77,9 +77,10 @@ def main() -> None:
 
 def measure(folder: Path, count: int, new: int, like: Path | None) -> dict[str, float]:
     dataset = Dataset(folder / "sources")
+    shapes = sorted(path.stem for path in like.glob("slat/*.npz")) if like else []
     gone = f"m{count // 2:06}"
     for number in range(count):
-        add(dataset, number, "m", like)
+        add(dataset, number, "m", like, shapes)
     # It goes later, and to take a link away would change the state of the files that share it.
     for path in files_of(dataset.root, gone):
         content = path.read_bytes()
@@ -108,7 +109,7 @@ def measure(folder: Path, count: int, new: int, like: Path | None) -> dict[str, 
     row["written, nothing changed [MB]"] = again["written [MB]"]
     # Ids in between the others, in files of their own: a new link to a file changes its state.
     for number in range(new):
-        add(dataset, number, "mm", like)
+        add(dataset, number, "mm", like, shapes)
     row[f"CPU, {new} new [s]"], added = build(dataset.root, out)
     row[f"written, {new} new [MB]"] = added["written [MB]"]
     shutil.rmtree(dataset.root / "pixieverse" / gone)
@@ -120,16 +121,16 @@ def measure(folder: Path, count: int, new: int, like: Path | None) -> dict[str, 
     return row
 
 
-def add(dataset: Dataset, number: int, prefix: str, like: Path | None) -> None:
+def add(
+    dataset: Dataset, number: int, prefix: str, like: Path | None, shapes: Sequence[str]
+) -> None:
     """Add an asset: one of a few shapes, by links to the files of the first of that shape."""
-    shapes = sorted(path.stem for path in like.glob("slat/*.npz")) if like else []
     variants = len(shapes) or VARIANTS
     name, first = f"{prefix}{number:06}", f"{prefix}{number % variants:06}"
     if number >= variants:
-        link(files_of(dataset.root, first), dataset.root, first, dataset.root, name, os.link)
+        take(dataset.root, first, dataset.root, name, os.link)
     elif like:
-        shape = shapes[number]
-        link(files_of(like, shape), like, shape, dataset.root, name, shutil.copyfile)
+        take(like, shapes[number], dataset.root, name, shutil.copyfile)
     else:
         made = make_asset(number)
         dataset.write_grid(name, made.grid)
@@ -142,10 +143,9 @@ def files_of(root: Path, name: str) -> list[Path]:
     return [*(path for path in below if path.is_file()), root / "slat" / f"{name}.npz"]
 
 
-def link(
-    files: list[Path], root: Path, name: str, to: Path, copy: str, how: Callable[[Path, Path], Any]
-) -> None:
-    for file in files:
+def take(root: Path, name: str, to: Path, copy: str, how: Callable[[Path, Path], Any]) -> None:
+    """Copy or link the files of an asset to another root, or under another name."""
+    for file in files_of(root, name):
         place = to / str(file.relative_to(root)).replace(name, copy)
         place.parent.mkdir(parents=True, exist_ok=True)
         how(file, place)

@@ -65,7 +65,7 @@ def finish(
     """
     if not pairs:
         return []
-    # Late: numba and scipy take half as long to load as a run that finds nothing changed.
+    # Late: a run that finds nothing changed needs neither numba nor scipy.
     from slatprep.pipeline.asset import fail_asset, finish_asset
     from slatprep.pipeline.kernels import compile_kernels
 

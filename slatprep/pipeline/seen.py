@@ -95,7 +95,7 @@ class Seen:
     def _finite(self) -> dict[str, list[bool]]:
         """Whether all of what the columns say of a row is known."""
         return {
-            name: np.isfinite(self.rows[name]).reshape(len(self.rows), -1).all(axis=1).tolist()
+            name: np.isfinite(self.rows[name]).all(axis=(1, 2)).tolist()
             for name in ("extent", "moments")
         }
 

@@ -36,9 +36,6 @@ THREAD_VARIABLES = (
 _IDLE_SECONDS = 300
 """How long a worker process stays without work: longer than a build needs none."""
 
-_BATCH_SECONDS = 0.2
-"""Handing over a call takes 1 ms, some 2 % of what an asset takes; progress still looks steady."""
-
 
 class Workers(Protocol):
     """Workers other than this process's own, as `slatprep.workers.dask.Cluster` has them."""
@@ -166,10 +163,6 @@ class _Processes(Pool):
     def room(self) -> int:
         """Return a call for each process, and one for it to begin with next."""
         return 2 * self._number
-
-    def batch_seconds(self) -> float:
-        """Return how long a batch should take [s]."""
-        return _BATCH_SECONDS
 
     def submit(self, call: Callable[[], Any]) -> Future[Any]:
         """Have a process make a call; new ones are started where one was killed."""
