@@ -6,10 +6,12 @@ Run by mkdocs (``hooks`` in mkdocs.yml) when `make docs` builds the site.
 from __future__ import annotations
 
 import ast
+import html
 import logging
 import re
 from pathlib import Path
 
+from latex2mathml.converter import convert
 from mkdocs.config.defaults import MkDocsConfig
 from mkdocs.structure.files import File, Files
 from mkdocs.structure.pages import Page
@@ -57,6 +59,18 @@ def on_page_markdown(markdown: str, page: Page, **_: object) -> str:
         return text
 
     return re.sub(r"\[([^\]]*)\]\(\.\./([^)]+)\)", follow, markdown)
+
+
+def on_page_content(content: str, **_: object) -> str:
+    """Write equations as MathML, which browsers draw by themselves."""
+
+    def draw(match: re.Match[str]) -> str:
+        display, latex = match["open"] == "[", html.unescape(match["latex"])
+        return convert(latex, display="block" if display else "inline")
+
+    opening = r'<(?P<tag>span|div) class="arithmatex">\\(?P<open>[(\[])'
+    equation = opening + r"(?P<latex>.*?)\\[)\]]</(?P=tag)>"
+    return re.sub(equation, draw, content, flags=re.S)
 
 
 def _from_root(text: str, source: str) -> str:

@@ -1,0 +1,103 @@
+"""Measure the prose of README, docs, help texts and messages: `python tools/prose.py`.
+
+A sentence has at most 30 words. Code blocks, tables, headings, pictures and equations do not
+count as sentences; a piece of inline code counts as one word. Design notes (docs/design) are
+for those who change the code and are measured, but not held to the budget of words.
+"""
+
+from __future__ import annotations
+
+import argparse
+import ast
+import re
+import statistics
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+ROOT = Path(__file__).parents[1]
+LONGEST = 30
+BUDGET = 22_000
+"""Words of README and docs, with their tables; without design notes and made pages."""
+
+MADE = {"benchmarks.md"}
+
+
+def sentences_of(text: str) -> Iterator[str]:
+    """Yield the sentences of a Markdown text, inline code as one word."""
+    text = re.sub(r"```.*?```|\$\$.*?\$\$", "", text, flags=re.S)
+    lines = (line for line in text.splitlines() if not line.startswith(("|", "#", "!", "<")))
+    text = re.sub(r"\[([^\]]*)\]\([^)]*\)", r"\1", "\n".join(lines))
+    text = re.sub(r"`[^`]*`|\$[^$]*\$", "X", text)
+    for paragraph in re.split(r"\n\s*\n|\n\s*(?:-|\d+\.) ", text):
+        yield from re.split(r"(?<=[.!?:;])\s+(?=[A-Z])", " ".join(paragraph.split()))
+
+
+def pages() -> dict[str, str]:
+    """Return the text of each page, by its path."""
+    paths = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
+    return {path.relative_to(ROOT).as_posix(): path.read_text("utf-8") for path in paths}
+
+
+def messages() -> Iterator[tuple[str, str]]:
+    """Yield what the package says: help texts, and texts of raised errors and printed lines."""
+    for path in sorted((ROOT / "slatprep").rglob("*.py")):
+        place = path.relative_to(ROOT).as_posix()
+        tree = ast.parse(path.read_text("utf-8"))
+        for node in ast.walk(tree):
+            if isinstance(node, ast.FunctionDef) and place.startswith("slatprep/cli/"):
+                lines = (ast.get_docstring(node) or "").splitlines()
+                yield f"{place}:{node.lineno}", "\n".join(x for x in lines if not x.startswith(" "))
+            if isinstance(node, ast.JoinedStr):
+                parts = [p.value if isinstance(p, ast.Constant) else "X" for p in node.values]
+                yield f"{place}:{node.lineno}", "".join(map(str, parts))
+            if isinstance(node, ast.Call):
+                for argument in [*node.args, *(word.value for word in node.keywords)]:
+                    if isinstance(argument, ast.Constant) and isinstance(argument.value, str):
+                        yield f"{place}:{argument.lineno}", argument.value
+
+
+def main() -> None:
+    """Print what is too long, and the counts; exit with 1 if something is."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
+    parser.add_argument("--all", action="store_true", help="print a line for each page")
+    everything = parser.parse_args().all
+    lengths: list[int] = []
+    words = 0
+    faults: list[str] = []
+    for place, text in pages().items():
+        own = [len(sentence.split()) for sentence in sentences_of(text) if sentence]
+        made = Path(place).name in MADE or "design" in Path(place).parts
+        if everything:
+            longest = sum(length > LONGEST for length in own)
+            print(f"{len(text.split()):6} words, {longest:3} long sentences  {place}")
+        if made:
+            continue
+        words += len(text.split())
+        lengths += own
+        faults += too_long(place, text)
+    for place, text in messages():
+        faults += too_long(place, text)
+    if words > BUDGET:
+        faults.append(f"README and docs have {words:,} words; at most {BUDGET:,} are allowed")
+    print("\n".join(faults), file=sys.stderr)
+    print(
+        f"README and docs: {words:,} words, {len(lengths):,} sentences, "
+        f"median {statistics.median(lengths):.0f} words; {len(faults)} findings"
+    )
+    sys.exit(bool(faults))
+
+
+def too_long(place: str, text: str) -> list[str]:
+    """Return a line for each sentence of more than 30 words."""
+    found = []
+    for sentence in sentences_of(text):
+        count = len(sentence.split())
+        if count > LONGEST:
+            start = " ".join(sentence.split()[:9])
+            found.append(f"{place}: a sentence of {count} words: {start} ...")
+    return found
+
+
+if __name__ == "__main__":
+    main()
