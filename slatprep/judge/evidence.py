@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,7 +17,6 @@ from slatprep.records import (
     UNANNOTATED,
     Alignment,
     Annotation,
-    FitFigures,
     MaterialField,
     StructuredLatents,
 )
@@ -225,7 +224,11 @@ def evidence_of(
     count, margin = len(alignment.open_placements), min(alignment.margin, MARGIN_CAP)
     if (count and ambiguity <= HARMLESS) or alignment.settled_by is not None:
         count, margin = 0, math.nan
-    fit = alignment.figures or measure_figures(field, latents, alignment)
+    fit = alignment.figures
+    if fit is None:
+        from slatprep.align.figures import measure_figures
+
+        fit = measure_figures(field, latents, alignment)
     _, _, scale = split_transform(alignment.transform)
     return np.array(
         [
@@ -250,53 +253,4 @@ def evidence_of(
             float(alignment.ground is not None),
         ],
         dtype=np.float64,
-    )
-
-
-def measure_figures(
-    field: MaterialField, latents: StructuredLatents, alignment: Alignment
-) -> FitFigures:
-    """Measure for an engine without figures of its own what the default engine measures.
-
-    Parameters
-    ----------
-    field, latents : MaterialField, StructuredLatents
-        The two sides; only their geometry is used.
-    alignment : Alignment
-        A placement without a deformation.
-
-    Returns
-    -------
-    FitFigures
-        Under the transform, with the offset between the surfaces that suits it best.
-    """
-    from slatprep.align.deform import CHECK_SAMPLES, FIT_SAMPLES, Pairing
-    from slatprep.align.surface import surface_of
-    from slatprep.align.warp import Similarity
-    from slatprep.geometry.voxels import occupancy_of
-
-    rotation, shift, scale = split_transform(alignment.transform)
-    slat, pixie = (
-        surface_of(occupancy_of(latents.coords, latents.resolution)),
-        surface_of(field.occupancy),
-    )
-    pose = Similarity(rotation, shift / VOXEL_SIZE, scale, 0.0)
-    pairing = Pairing(slat, pixie, pose, CHECK_SAMPLES, first=FIT_SAMPLES)
-    warp = pairing.start()
-    here, back = pairing.residuals(warp)
-    # The two sides' residuals have the offset with opposite signs.
-    offset = float(np.clip(np.median(np.concatenate([here, -back])), -2.0, 2.0))
-    here, back = pairing.residuals(replace(warp, offset=offset))
-    both = np.abs(np.concatenate([here, back]))
-    scores = [float((1.0 / (1.0 + side**2)).mean()) for side in (here, back)]
-    within = [float((both <= limit).mean()) for limit in (1.0, 2.0, 3.0)]
-    return FitFigures(
-        score_slat=scores[0],
-        score_pixieverse=scores[1],
-        score_similarity=0.5 * (scores[0] + scores[1]),
-        evidence_affine=math.nan,
-        evidence_deformable=math.nan,
-        within=(within[0], within[1], within[2]),
-        offset=offset,
-        roughness=float(np.median(both)),
     )

@@ -13,6 +13,7 @@ from support.shapes import GRID, chair, field_of, surface_latents
 
 from slatprep.align import align
 from slatprep.align.deformation import map_of
+from slatprep.align.figures import measure_figures
 from slatprep.bench.truth import Truth, read_truth
 from slatprep.demo import make_demo
 from slatprep.inspect.verify.assets import roundings
@@ -24,7 +25,6 @@ from slatprep.judge.evidence import (
     _labels_of,
     evidence_of,
     labels_hold,
-    measure_figures,
     surroundings_of,
 )
 from slatprep.normalize import (

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from support.shapes import GRID, field_of, latents_of, surface_latents
 
+from slatprep.align.figures import measure_figures
 from slatprep.geometry.frames import make_transform
 from slatprep.judge.confidence import VOXEL_FIGURES, class_confidence, voxel_figures
 from slatprep.judge.evidence import (
@@ -18,7 +19,6 @@ from slatprep.judge.evidence import (
     _labels_of,
     evidence_of,
     labels_hold,
-    measure_figures,
     surroundings_of,
 )
 from slatprep.records import (

@@ -1,0 +1,84 @@
+"""What a fit's residuals say of it: the figures that a verdict rests on."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+
+from slatprep.align.deformation import bending_of, deform
+from slatprep.align.residuals import Residuals
+from slatprep.align.surface import surface_of
+from slatprep.align.warp import Similarity, Warp
+from slatprep.geometry.frames import VOXEL_SIZE, split_transform
+from slatprep.geometry.voxels import above, occupancy_of
+from slatprep.records import Alignment, Deformation, FitFigures, MaterialField, StructuredLatents
+
+FIT_SAMPLES = 1_200
+"""Samples a side of the fit that is kept."""
+
+CHECK_SAMPLES = 500
+"""Samples a side, none of them used in the fit, from which its figures are taken."""
+
+_MOST_OFFSET = 2.0
+
+
+def measure_figures(
+    field: MaterialField, latents: StructuredLatents, alignment: Alignment
+) -> FitFigures:
+    """Measure, at a placement of any engine, what the default engine measures of its fit.
+
+    The alignment has no deformation. The offset is the one that suits the residuals best.
+    """
+    rotation, shift, scale = split_transform(alignment.transform)
+    slat = surface_of(occupancy_of(latents.coords, latents.resolution))
+    pixie = surface_of(above(field.occupancy, alignment.ground))
+    pose = Similarity(rotation, shift / VOXEL_SIZE, scale, 0.0)
+    residuals = Residuals(slat, pixie, pose, CHECK_SAMPLES, first=FIT_SAMPLES)
+    warp = residuals.start()
+    here, back = residuals.at(warp)
+    # The two sides' residuals have the offset with opposite signs.
+    offset = float(np.median(np.concatenate([here, -back])))
+    warp = replace(warp, offset=float(np.clip(offset, -_MOST_OFFSET, _MOST_OFFSET)))
+    return fit_figures(residuals, warp)
+
+
+def fit_figures(
+    residuals: Residuals,
+    warp: Warp,
+    before: float | None = None,
+    evidence: tuple[float, float] = (math.nan, math.nan),
+    kept: Deformation | None = None,
+) -> FitFigures:
+    """Measure a fit by residuals that it was not made from.
+
+    `before` is the score of the similarity (that of `warp` if not given), `evidence` what an
+    affine map and bending added to it in a trial, and `kept` the deformation that `warp` is.
+    """
+    here, back = residuals.at(warp)
+    both = np.abs(np.concatenate([here, back]))
+    slat, pixieverse = (float((1.0 / (1.0 + side**2)).mean()) for side in (here, back))
+    within = [float((both <= limit).mean()) for limit in (1.0, 2.0, 3.0)]
+    figures = FitFigures(
+        score_slat=slat,
+        score_pixieverse=pixieverse,
+        score_similarity=0.5 * (slat + pixieverse) if before is None else before,
+        evidence_affine=evidence[0],
+        evidence_deformable=evidence[1],
+        within=(within[0], within[1], within[2]),
+        offset=warp.offset,
+        roughness=float(np.median(both)),
+    )
+    if kept is None:
+        return figures
+    points = residuals.surface.subset(FIT_SAMPLES).points * VOXEL_SIZE
+    moved = np.linalg.norm(deform(kept, points) - points, axis=1) / VOXEL_SIZE
+    stretches = np.linalg.svd(kept.affine[:, :3], compute_uv=False)
+    return replace(
+        figures,
+        moved=float(moved.mean()),
+        moved_most=float(moved.max()),
+        stretch=(float(stretches[-1]), float(stretches[0])),
+        bending=bending_of(kept) if kept.coefficients.size else 0.0,
+    )
