@@ -1,4 +1,4 @@
-"""Reading the sources: pairs are found by name, then each side is read and checked."""
+"""Reading the sources: names give the pairs, then each side is read and checked."""
 
 from __future__ import annotations
 
@@ -40,8 +40,8 @@ def read_field(
     Returns
     -------
     MaterialField
-        Occupancy, and material and SI properties of the annotated voxels; of
-        PixieVerse as `slatprep.readers.pixieverse.read_grid` says.
+        Occupancy, and class and SI properties of the annotated voxels.
+        `slatprep.readers.pixieverse.read_grid` says what counts as annotated in PixieVerse.
 
     Raises
     ------
@@ -61,12 +61,12 @@ def read_latents(pair: AssetPair) -> StructuredLatents:
     Parameters
     ----------
     pair : AssetPair
-        A pair without a problem; of its SLAT see `slatprep.readers.slat.read_slat`.
+        A pair without a problem.
 
     Returns
     -------
     StructuredLatents
-        Coordinates and latents in the order of the file.
+        Coordinates and latents in the order of the file; see `slatprep.readers.slat.read_slat`.
 
     Raises
     ------

@@ -1,10 +1,9 @@
-"""Adapters: how sources and latents of any form are found and read.
+"""Adapters: how slatprep finds and reads sources and latents of any form.
 
-A *source adapter* finds the fields below a root, reads one, and describes what
-all of them hold; a *latent adapter* reads one SLAT and describes the space of
-its latents. Those of slatprep and those of other packages are found alike, by
-a name that stands for ``module:object``: slatprep's in the tables here, others
-as entry points of the groups ``slatprep.sources`` and ``slatprep.latents``.
+A *source adapter* finds the fields below a root, reads each, and describes what all of them
+hold. A *latent adapter* reads a SLAT and describes the space of its latents. Each has a name
+that stands for ``module:object``. The tables here name slatprep's own; other packages name
+theirs as entry points of the groups ``slatprep.sources`` and ``slatprep.latents``.
 """
 
 from __future__ import annotations
@@ -35,10 +34,9 @@ from slatprep.storage.listing import Listing
 
 @dataclass(frozen=True, slots=True)
 class FoundField:
-    """A field by its name and its file below the root.
+    """The name of a field and its file, relative to the root.
 
-    `beside` is another file that is read for it, below the root too; `problem`
-    says why it cannot be used.
+    The adapter also reads the file `beside`. `problem` says why the field cannot be used.
     """
 
     object_id: str
@@ -67,10 +65,10 @@ class SourceAdapter(Protocol):
         """Return what the source holds; a build asks once, before anything is read."""
 
     def find(self, source: PixieverseSource, listing: Listing) -> Iterator[FoundField]:
-        """Yield its fields; `find_by_pattern` does where a name is all there is to it."""
+        """Yield its fields; `find_by_pattern` is enough where only names matter."""
 
     def read(self, pair: AssetPair, max_unphysical: float) -> MaterialField:
-        """Read the field at ``pair.grid``, in SI units; raise `InputError` if it cannot be."""
+        """Read the field at ``pair.grid`` in SI units; raise `InputError` if that fails."""
 
 
 class LatentAdapter(Protocol):
@@ -105,25 +103,13 @@ LATENTS = {
 
 
 def source_adapter(name: str) -> SourceAdapter:
-    """Return a source adapter by its name.
-
-    Raises
-    ------
-    ConfigError
-        If there is none, or it cannot be loaded.
-    """
+    """Return the source adapter of a name; ConfigError if none has it or it does not load."""
     adapter: SourceAdapter = _loaded("slatprep.sources", name)
     return adapter
 
 
 def latent_adapter(name: str) -> LatentAdapter | None:
-    """Return a latent adapter by its name, None where there is none of it.
-
-    Raises
-    ------
-    ConfigError
-        If it cannot be loaded.
-    """
+    """Return the latent adapter of a name, or None; ConfigError if it does not load."""
     if name not in {**LATENTS, **_others("slatprep.latents")}:
         return None
     adapter: LatentAdapter = _loaded("slatprep.latents", name)
@@ -162,7 +148,7 @@ def _loaded(group: str, name: str) -> Any:
 
 @lru_cache(maxsize=2)
 def _others(group: str) -> dict[str, tuple[str, str]]:
-    """Return where the adapters of other packages are, and which version of what they are."""
+    """Return where other packages keep their adapters, and name and version of each package."""
     return {
         point.name: (point.value, f"{point.dist.name} {point.dist.version}" if point.dist else "")
         for point in entry_points(group=group)
@@ -178,12 +164,9 @@ def patterns_of(adapter: SourceAdapter, source: PixieverseSource) -> Sequence[st
 def find_by_pattern(
     patterns: Sequence[str], listing: Listing, known: Mapping[str, str], beside: str = ""
 ) -> Iterator[FoundField]:
-    """Yield the fields whose names match; of an object, those of the first pattern that does.
+    """Yield the fields whose names match; for an object, only those of its first matching pattern.
 
-    Raises
-    ------
-    ConfigError
-        If a pattern names no ``{id}``.
+    Raises ConfigError if a pattern has no ``{id}``.
     """
     done: dict[str, object] = {}
     for pattern in patterns:

@@ -10,12 +10,22 @@ from slatprep.records import Contents, Property, labels_of
 
 
 def contents_of(parameters: BuildParameters) -> Contents:
-    """Return what the sources of a dataset hold, as far as it is known before they are read.
+    """Return what the sources of a dataset hold, as far as known before they are read.
+
+    Parameters
+    ----------
+    parameters : BuildParameters
+        The sources and their adapters.
+
+    Returns
+    -------
+    Contents
+        Properties, classes and latent space of the dataset.
 
     Raises
     ------
     ConfigError
-        If they cannot tell, or a further source has what the first has not.
+        If a source cannot tell, or a further source holds something else than the first.
     """
     held = source_adapter(parameters.pixieverse.adapter).describe(parameters.pixieverse)
     for number, source in enumerate(parameters.also, 1):

@@ -23,18 +23,10 @@ _MAX_BYTES = 2**20
 
 
 def latent_space(source: SlatSource) -> LatentSpace:
-    """Return what the latents of a source are, as far as it is known before they are read.
+    """Return the space of a source's latents, as far as known before they are read.
 
-    Parameters
-    ----------
-    source : SlatSource
-        ``encoder`` is the name of a latent adapter, or the path of a JSON file with ``encoder``
-        (a name), ``channels``, ``resolution`` and optionally ``mean`` and ``std``.
-
-    Raises
-    ------
-    ConfigError
-        If there is no such encoder, or the file does not say what it must.
+    ``source.encoder`` names a latent adapter, or a JSON file with ``encoder`` (a name),
+    ``channels``, ``resolution`` and optionally ``mean`` and ``std``. ConfigError if neither fits.
     """
     adapter = latent_adapter(source.encoder)
     known = adapter.space if adapter else _read_space(place_of(source.encoder))
@@ -67,16 +59,10 @@ def resolve_latents(
     standardised: str,
     moments: Sequence[tuple[int, LatentMoments | None]],
 ) -> LatentSpace:
-    """Return what the latents of a whole dataset are, now that all have been read.
+    """Return the space of a dataset's latents, now that all assets have been read.
 
-    Parameters
-    ----------
-    declared : LatentSpace
-        What `latent_space` says.
-    standardised : {"auto", "yes", "no"}
-        Whether they have been standardised already; ``auto`` decides by what they look like.
-    moments : sequence of (int, LatentMoments)
-        Voxels and moments of each asset, in an order that does not depend on the number of jobs.
+    `moments` holds the voxel count and moments of each asset, in an order that does not depend on
+    the number of jobs. With `standardised` ``auto``, they decide whether latents are standardised.
     """
     known = [(count, one) for count, one in moments if one is not None and count]
     if not known:
@@ -92,18 +78,11 @@ def resolve_latents(
 
 
 def look_standardised(moments: LatentMoments, space: LatentSpace) -> bool:
-    """Whether latents look as if they had been standardised already.
+    """Whether latents look standardised already.
 
-    Their spread is near 1, half to one and a half in the median channel, and a
-    standard normal makes them likelier than normals with the encoder's own mean
-    and standard deviation; where those are not known, their mean is near 0.
-
-    Parameters
-    ----------
-    moments : LatentMoments
-        Of an asset or a dataset.
-    space : LatentSpace
-        What their encoder gives.
+    Their spread must be near 1: between 0.5 and 1.5 in the median channel. A standard normal
+    must also explain them better than normals with the encoder's mean and standard deviation.
+    Where those are unknown, their mean must be near 0 instead.
     """
     mean, std = np.array(moments.mean), np.array(moments.std)
     if not 0.5 <= np.median(std) <= 1.5:

@@ -1,9 +1,8 @@
 """Safe reading of source files: one read gives an array, its size and its hash.
 
 Source files come from strangers. Nothing here unpickles, follows a path out of
-its root, or allocates what a header merely claims: shape and dtype are held
-against what is expected, and sizes against the bytes that are really there,
-before any array is made.
+its root, or allocates what a header merely claims. Before it makes an array, it checks shape
+and dtype against the expected ones, and sizes against the bytes that are there.
 """
 
 from __future__ import annotations
@@ -87,14 +86,14 @@ class ArraySpec:
     Attributes
     ----------
     shapes : tuple of shapes
-        Allowed shapes; None in a shape stands for 0 to `max_rows` rows, a range for the
-        sizes in it. Empty: any shape of at most `max_items` items.
+        Allowed shapes. In a shape, None stands for 0 to `max_rows` rows, a range for its
+        sizes. Empty: any shape of at most `max_items` items.
     kinds : str
         Allowed numpy dtype kinds.
     max_items : int
         Bound on the number of items where `shapes` is empty.
     note : str
-        What an error says of the shapes beside them.
+        What an error adds to the allowed shapes.
     max_rows : int
         Bound on a size that is None in `shapes`.
     """
@@ -140,12 +139,7 @@ def _shape_text(shape: tuple[int | range | None, ...], most: int = 0) -> str:
 def require_complete(pair: AssetPair) -> tuple[Place, Place]:
     """Return the paths of grid and SLAT.
 
-    Raises
-    ------
-    MissingPartnerError
-        If one side does not exist.
-    InputError
-        If the pair has another problem, such as two files for one id.
+    Raises MissingPartnerError if a side is missing, and InputError if the pair has another problem.
     """
     if pair.grid is None or pair.slat is None:
         root = pair.roots.pixieverse if pair.grid is None else pair.roots.slat
@@ -164,24 +158,11 @@ def is_hierarchy(path: Place) -> bool:
 
 
 def load_source(path: Place, root: Place, role: str) -> tuple[bytes, SourceFile]:
-    """Read a whole file once; return its bytes and what the provenance keeps of it.
+    """Read a whole file once; return its bytes and its entry in the provenance.
 
-    A Zarr hierarchy, a folder whose name ends in ``.zarr``, is read as the bytes of an archive
-    of its files, so that it has a size and a hash as a file has.
-
-    Parameters
-    ----------
-    path : Place
-        File to read, below `root`.
-    root : Place
-        Folder that it must not leave.
-    role : str
-        Role of the file in the pair, as `SourceFile` has it.
-
-    Raises
-    ------
-    InputError
-        If the file cannot be read, is empty, or is larger than `MAX_FILE_BYTES`.
+    A Zarr hierarchy is a folder named ``*.zarr``. It is read as an archive of its files, so that
+    it too has a size and a hash. InputError if the file leaves `root`, is empty, is larger than
+    `MAX_FILE_BYTES` or cannot be read.
     """
     if is_hierarchy(path):
         return _load_hierarchy(path, root, role)
@@ -228,26 +209,9 @@ def _load_hierarchy(path: Place, root: Place, role: str) -> tuple[bytes, SourceF
 
 
 def npy_array(data: bytes, where: str | Place, spec: ArraySpec) -> NDArray[Any]:
-    """Read the bytes of an npy file, in native byte order.
+    """Read the bytes of an npy file as a read-only array in native byte order.
 
-    Parameters
-    ----------
-    data : bytes
-        The whole file.
-    where : str or Place
-        What errors call it.
-    spec : ArraySpec
-        What the array may look like.
-
-    Returns
-    -------
-    ndarray
-        A read-only array of the shape and kind that `spec` allows.
-
-    Raises
-    ------
-    InputError
-        If the bytes are no such array.
+    Errors call the file `where`. InputError unless the bytes are an array that `spec` allows.
     """
     shape, fortran, dtype, offset = _header(data, len(data), where, spec)
     values = np.frombuffer(data, dtype, math.prod(shape), offset)
@@ -264,29 +228,10 @@ def is_text(value: NDArray[Any]) -> bool:
 def npz_arrays(
     data: bytes, where: str | Place, specs: Mapping[str, ArraySpec], *, partial: bool = False
 ) -> dict[str, NDArray[Any]]:
-    """Read the named arrays from the bytes of an npz file.
+    """Read the named arrays of an npz file, each in native byte order.
 
-    Parameters
-    ----------
-    data : bytes
-        The whole file.
-    where : str or Place
-        What errors call it.
-    specs : mapping of str to ArraySpec
-        The arrays wanted and what they may look like.
-    partial : bool
-        Whether any of them may be missing.
-
-    Returns
-    -------
-    dict of str to ndarray
-        The arrays, each in native byte order.
-
-    Raises
-    ------
-    InputError
-        If the archive is damaged, an array is missing, or one is not as its
-        spec wants it. What is decompressed never exceeds what `specs` allow.
+    With `partial`, any of them may be missing. It decompresses no more than `specs` allow.
+    InputError if the archive is damaged, or an array is missing or not as specified.
     """
     with _open_zip(data, where) as archive:
         present = [info.filename.removesuffix(".npy") for info in archive.infolist()]
@@ -310,17 +255,9 @@ def npz_arrays(
 def npz_small_arrays(
     data: bytes, where: str | Place, spec: ArraySpec
 ) -> tuple[dict[str, NDArray[Any]], list[InputError]]:
-    """Read whatever arrays of an npz file are as `spec` wants them.
+    """Read the arrays of an npz file that fit `spec`; return them by name, and the others' faults.
 
-    Returns
-    -------
-    tuple of dict and list
-        The arrays by name, and the faults of the others.
-
-    Raises
-    ------
-    InputError
-        If the archive itself cannot be read.
+    Raises InputError if the archive itself cannot be read.
     """
     arrays, faults = {}, []
     with _open_zip(data, where) as archive:
@@ -367,9 +304,9 @@ def _read_member(
 def _header(
     prefix: bytes, size: int, where: str | Place, spec: ArraySpec
 ) -> tuple[tuple[int, ...], bool, np.dtype[Any], int]:
-    """Check an npy header before its data is read; return shape, order, dtype and its length.
+    """Check an npy header before its data is read; return shape, order, dtype and header length.
 
-    `prefix` holds the header, `size` is that of header and data together.
+    `prefix` contains the header; `size` counts header and data [bytes].
     """
     with refusing(where, "is no readable npy array", "an array as numpy.save writes it"):
         # No more than a bounded prefix is parsed: the header's length field may claim 4 GB.

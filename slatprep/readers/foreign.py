@@ -1,7 +1,7 @@
-"""Adapters of other packages: what they raise is named as theirs, what they return is checked.
+"""Adapters of other packages: slatprep blames them for their errors and checks what they return.
 
-They run as they are, being installed by whoever runs them; but a fault in one
-must neither look like slatprep's own, nor stop other assets, nor get into a store.
+They run unconfined, because the user installed them. A fault in one must not look like
+slatprep's own, stop other assets, or get into a store.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ class _Foreign:
 
     @contextmanager
     def _blamed(self) -> Iterator[None]:
-        """Name the adapter for whatever it raises that is no error of slatprep's."""
+        """Name the adapter for every error that is not slatprep's."""
         try:
             yield
         except (SlatprepError, MemoryError):
@@ -68,7 +68,7 @@ class _Foreign:
             )
 
     def _require_told(self, of: MaterialField | StructuredLatents) -> None:
-        """Require that a record can hold the rest: files, and words."""
+        """Require that files and notes have types that a record can hold."""
         known = all(isinstance(one, SourceFile) for one in of.sources)
         self._require(known and of.sources, "no `sources`, the files that it read")
         self._require(all(isinstance(one, str) for one in of.warnings), "warnings that are no text")
@@ -109,7 +109,7 @@ class ForeignSource(_Foreign):
                 yield found
 
     def read(self, pair: AssetPair, max_unphysical: float) -> MaterialField:
-        """Read a field, and see that it is one."""
+        """Read a field and check it."""
         with self._blamed():
             field: MaterialField = self.adapter.read(pair, max_unphysical)
             self._require(isinstance(field, MaterialField), f"{type(field).__name__} as a field")
@@ -164,7 +164,7 @@ class ForeignLatents(_Foreign):
             return space
 
     def read(self, path: Place, root: Place, group: str, space: LatentSpace) -> StructuredLatents:
-        """Read a SLAT, and see that it is one."""
+        """Read a SLAT and check it."""
         with self._blamed():
             read: StructuredLatents = self.adapter.read(path, root, group, space)
             rows = len(read.coords)
@@ -184,16 +184,9 @@ class ForeignLatents(_Foreign):
 
 
 def guarded(group: str, adapter: Any, name: str, package: str) -> ForeignSource | ForeignLatents:
-    """Return an adapter of another package so that its faults are named as its own.
+    """Wrap an adapter of another package so that errors name it and its package.
 
-    Parameters
-    ----------
-    group : str
-        ``slatprep.sources`` or ``slatprep.latents``.
-    adapter : object
-        What its entry point made.
-    name, package : str
-        Of the adapter; and of its package, with the version.
+    `group` is ``slatprep.sources`` or ``slatprep.latents``; `package` includes the version.
     """
     kind = ForeignSource if group == "slatprep.sources" else ForeignLatents
     return kind(adapter, name, package)

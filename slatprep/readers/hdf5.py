@@ -1,8 +1,8 @@
-"""Safe reading of HDF5: no link out of the file is followed, and no size is taken on trust.
+"""Safe reading of HDF5: no link out of the file is followed, and every size is checked.
 
-An HDF5 file can point elsewhere in several ways: soft and external links,
-virtual datasets, external raw storage. All are refused, as are filters other
-than those that are undone here with a bound.
+An HDF5 file can point elsewhere by soft and external links, virtual datasets and external raw
+storage. This module refuses all of them. It also refuses filters that it cannot undo itself
+within a bound.
 """
 
 from __future__ import annotations
@@ -43,21 +43,8 @@ def load_datasets(
 ) -> tuple[dict[str, NDArray[Any]], SourceFile]:
     """Read the named datasets of a group, and hash the file.
 
-    Parameters
-    ----------
-    path, root : Place
-        The file, and the folder that it must not leave.
-    group : str
-        Group with the datasets; empty for a file that holds one asset.
-    specs : mapping of str to ArraySpec
-        The datasets wanted and what they may look like.
-    role : str
-        Role of the file in the pair.
-
-    Raises
-    ------
-    InputError
-        If the file cannot be read or a dataset is missing or not as wanted.
+    An empty `group` is the file's root. InputError if the file leaves `root` or cannot be read, or
+    if a dataset is missing or not as specified.
     """
     import h5py
 
@@ -83,25 +70,10 @@ def group_arrays(
     *,
     partial: bool = False,
 ) -> dict[str, NDArray[Any]]:
-    """Read the named datasets of a group of an open file.
+    """Read the named datasets of a group of an open file; errors call the file `path`.
 
-    Parameters
-    ----------
-    file : h5py.File
-        Open for reading.
-    path : Place
-        What errors call it.
-    group : str
-        Group with the datasets; empty for the file's root.
-    specs : mapping of str to ArraySpec
-        The datasets wanted and what they may look like.
-    partial : bool
-        Whether any of them may be missing.
-
-    Raises
-    ------
-    InputError
-        If a dataset is missing or not as wanted.
+    An empty `group` is the file's root. With `partial`, any dataset may be missing.
+    InputError if one is missing otherwise, or not as specified.
     """
     import h5py
 
@@ -121,26 +93,9 @@ def group_arrays(
 def find_groups(
     path: Place, root: Place, pattern: str, known: Mapping[str, str]
 ) -> Iterator[tuple[dict[str, str], str]]:
-    """Find the groups of a file whose names match a pattern such as ``{id}/{view}``.
+    """Yield fields and name of each group that matches a pattern such as ``{id}/{view}``.
 
-    Parameters
-    ----------
-    path, root : Place
-        The file, and the folder that it must not leave.
-    pattern : str
-        Group names by levels; see `slatprep.readers.patterns`.
-    known : mapping of str to str
-        Fields that are known already.
-
-    Yields
-    ------
-    tuple of dict and str
-        The fields of a match, and the group's name.
-
-    Raises
-    ------
-    InputError
-        If the file cannot be read.
+    `known` holds fields that are fixed already. InputError if the file cannot be read.
     """
     import h5py
 
@@ -215,8 +170,8 @@ def _read_dataset(dataset: h5py.Dataset, where: str, spec: ArraySpec) -> NDArray
 def _read_chunks(dataset: h5py.Dataset, where: str) -> NDArray[Any]:
     """Read a chunked dataset chunk by chunk.
 
-    The filters are undone here, not by HDF5's own pipeline, which inflates
-    without bound and crashes the process on some damaged chunks.
+    It undoes the filters itself: HDF5's own pipeline inflates without bound, and some damaged
+    chunks crash it.
     """
     import h5py
 

@@ -23,22 +23,8 @@ from slatprep.records import (
 def hash_sources(pair: AssetPair) -> tuple[tuple[SourceFile, ...], dict[str, str]]:
     """Hash the files of a pair, in the order in which the readers name them.
 
-    Parameters
-    ----------
-    pair : AssetPair
-        A pair without a problem.
-
-    Returns
-    -------
-    sources : tuple of SourceFile
-        What `read_field` and `read_latents` would name as theirs.
-    digests : dict of str to str
-        What `source_digests` makes of them.
-
-    Raises
-    ------
-    InputError
-        If a file cannot be read.
+    Returns what `read_field` and `read_latents` would record as sources, and their digests by
+    role. InputError if a file cannot be read.
     """
     if pair.others:
         return _hash_several(pair)
@@ -50,7 +36,7 @@ def hash_sources(pair: AssetPair) -> tuple[tuple[SourceFile, ...], dict[str, str
 
 
 def _hash_several(pair: AssetPair) -> tuple[tuple[SourceFile, ...], dict[str, str]]:
-    """Hash what is there of an object's annotations, of which some may be unreadable."""
+    """Hash those of an object's annotations that can be read."""
     sources: list[SourceFile] = []
     digests: dict[str, str] = {}
     faults: list[InputError] = []
@@ -97,7 +83,7 @@ def _hash_slat(
 
 
 def reading_of(roots: SourceRoots) -> dict[str, str]:
-    """Return what decides, besides their bytes, what files are read as; nothing by default."""
+    """Return which options, besides the bytes, decide how files are read; empty by default."""
     space, reading = roots.contents.latents, {}
     if roots.adapter != SourceRoots.adapter:
         reading["adapter"] = f"{roots.adapter} {made_by('slatprep.sources', roots.adapter)}"
@@ -110,20 +96,10 @@ def reading_of(roots: SourceRoots) -> dict[str, str]:
 def source_digests(
     sources: Iterable[SourceFile], shared: StructuredLatents | None = None
 ) -> dict[str, str]:
-    """Return a digest of the content by role.
+    """Return the digest of the content by role.
 
-    Parameters
-    ----------
-    sources : iterable of SourceFile
-        The files of an asset.
-    shared : StructuredLatents, optional
-        The latents, where one file holds those of many assets: it changes
-        with every asset added, theirs do not.
-
-    Examples
-    --------
-    >>> source_digests([SourceFile("grid", "a.npy", 8, "9f86d081")])
-    {'grid': '9f86d081'}
+    `shared` is given where a file holds the latents of many assets. Their digest then replaces
+    the file's, which changes with every asset added.
     """
     digests = {source.role: source.sha256 for source in sources}
     if shared is not None:

@@ -1,4 +1,4 @@
-"""Reading what joins names of the two sides: maps of ids, and categories of objects."""
+"""Reading what joins the names of the two sides: maps of ids, and categories of objects."""
 
 from __future__ import annotations
 
@@ -22,27 +22,12 @@ _UID = re.compile(r"([0-9a-f]{32})/?$")
 def read_map(
     path: Place, objects: Collection[str], slats: Collection[str]
 ) -> dict[str, list[tuple[str, str]]]:
-    """Read which SLATs belong to which object.
+    """Return the SLATs of each object as (SLAT id, view or an empty string).
 
-    Parameters
-    ----------
-    path : Place
-        CSV with columns ``object_id``, ``slat_id`` and optionally ``view``; or
-        TRELLIS's ``metadata.csv``, whose ``sha256`` names the SLAT and whose
-        ``file_identifier`` is a URL that ends in the object's uid.
-    objects, slats : collection of str
-        Ids that were found. Of TRELLIS's metadata, which describes a whole
-        collection, only rows that name one of them are kept.
-
-    Returns
-    -------
-    dict of str to list of (str, str)
-        For each object, its SLAT ids, each with a view or an empty string.
-
-    Raises
-    ------
-    ConfigError
-        If the file cannot be read or is neither form.
+    The file is a CSV with columns ``object_id``, ``slat_id`` and optionally ``view``, or TRELLIS's
+    ``metadata.csv``. There, ``sha256`` names the SLAT, and ``file_identifier`` is a URL that ends
+    in the object's uid; only rows that name an id of `objects` or `slats` count. ConfigError if
+    the file is neither.
     """
     claims: dict[str, dict[tuple[str, str], None]] = {}
     try:
@@ -79,10 +64,7 @@ def read_map(
 def read_categories(path: Place) -> dict[str, str]:
     """Read the category of each object from Pixie's ``obj_ids_metadata.json``.
 
-    Raises
-    ------
-    ConfigError
-        If the file cannot be read or an entry has no ``obj_class``.
+    Raises ConfigError if the file cannot be read or an entry has no ``obj_class``.
     """
     try:
         data = storage_of(path).read(MAX_JSON_BYTES)

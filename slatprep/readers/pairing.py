@@ -1,6 +1,6 @@
-"""Finding the two sides of every row of the store, by name alone; no content is read.
+"""Finding the two sides of every asset by name alone, without reading content.
 
-Only names are held: an entry per object and per SLAT, never an array.
+Memory holds only names: an entry per object and per SLAT, never an array.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from slatprep.storage.listing import Listing
 
 @dataclass(frozen=True, slots=True)
 class _Row:
-    """What will be one row: an object and the SLATs that bear this label (one, if all is well)."""
+    """A row of the store to be: an object and the SLATs with this label, normally just one."""
 
     asset_id: str
     object_id: str
@@ -35,9 +35,9 @@ class _Row:
 
 @dataclass(frozen=True, slots=True)
 class _Found:
-    """What of a dataset is there, by names; `listing` is that of the PixieVerse root.
+    """The names of a dataset's files; `listing` lists the PixieVerse root.
 
-    Further sources, `also`, are as if each were the first.
+    `also` holds the further sources, each as if it were the first.
     """
 
     parameters: BuildParameters
@@ -55,19 +55,18 @@ def discover(parameters: BuildParameters) -> list[AssetPair]:
     Parameters
     ----------
     parameters : BuildParameters
-        Roots, patterns and maps; the other groups do not matter here.
+        Its roots, patterns and maps decide.
 
     Returns
     -------
     list of AssetPair
-        Sorted by `asset_id`, each id once. A pair that cannot be used is
-        returned too, and says why in `problem`. An entry takes 1.2 kB.
+        Sorted by `asset_id`, each id once. An unusable pair says why in `problem`.
+        An entry takes 1.2 kB.
 
     Raises
     ------
     ConfigError
-        If a root does not exist, a pattern or map makes no sense, or nothing
-        is found on one side.
+        If a root does not exist, a pattern or map makes no sense, or a side has no files.
     """
     pixieverse, slat, pairing = parameters.pixieverse, parameters.slat, parameters.pairing
     sources = (pixieverse, *parameters.also)
@@ -116,7 +115,7 @@ def discover(parameters: BuildParameters) -> list[AssetPair]:
 def _grids_of(
     source: PixieverseSource, listing: Listing, slat: SlatSource, one_file: bool
 ) -> dict[str, list[FoundField]]:
-    """Return what `find_grids` does; ConfigError where that is nothing."""
+    """Return the grids by `find_grids`; ConfigError if there are none."""
     grids = find_grids(source, listing)
     if grids:
         return grids
@@ -130,14 +129,9 @@ def _grids_of(
 
 
 def explain_unmatched(pairs: Collection[AssetPair], parameters: BuildParameters) -> str:
-    """Say in one line that the names of the two sides have nothing in common; empty if they have.
+    """Say in a line that the names of the two sides have nothing in common, or return "".
 
-    Parameters
-    ----------
-    pairs : collection of AssetPair
-        What `discover` found.
-    parameters : BuildParameters
-        By which it looked.
+    `pairs` is what `discover` returned for `parameters`.
     """
     grids = [pair.object_id for pair in pairs if pair.slat is None and pair.grid is not None]
     slats = [pair.object_id for pair in pairs if pair.grid is None and pair.slat is not None]
@@ -161,10 +155,7 @@ def find_grids(
 ) -> dict[str, list[FoundField]]:
     """Return the grids of each object, as the source's adapter finds them.
 
-    Raises
-    ------
-    ConfigError
-        If the folder cannot be listed, or a pattern makes no sense.
+    Raises ConfigError if the folder cannot be listed or a pattern makes no sense.
     """
     grids: dict[str, list[FoundField]] = {}
     found = source_adapter(source.adapter).find(source, listing or list_below(source.root))
@@ -208,7 +199,7 @@ def _slats_of(
     claims: Mapping[str, list[tuple[str, str]]],
     claimed: set[str],
 ) -> Iterator[tuple[str, NamedSlat]]:
-    """Return the SLATs of an object, each with the label that tells it from the others."""
+    """Return the SLATs of an object, each with a label that is unique within the object."""
     if object_id not in claims:
         if object_id not in claimed:
             for slat in slats.get(object_id, ()):
@@ -259,13 +250,13 @@ def _pair(row: _Row, there: _Found, shared: str) -> AssetPair:
 
 
 def _annotations(object_id: str, there: _Found) -> list[list[FoundField]]:
-    """Return the grids of an object, by sample; two of one sample are one too many."""
+    """Return the grids of an object by sample; two grids of a sample are an error."""
     grids = sorted(there.grids.get(object_id, ()), key=_order_of)
     return [list(group) for _, group in groupby(grids, key=lambda grid: grid.sample)]
 
 
 def _label(number: int, sample: str) -> str:
-    """Return what tells an annotation from the object's others: its sample, and its source."""
+    """Return the label that is unique among the object's annotations: its sample and its source."""
     return ".".join(filter(None, (f"also_{number}" if number else "", sample)))
 
 
@@ -347,7 +338,7 @@ def _unrecordable(path: str) -> str:
 def one_grid(
     root: Place, found: Sequence[FoundField], object_id: str, tried: Iterable[str]
 ) -> Place:
-    """Return the one grid of an object that `find_grids` found; InputError if it is not one."""
+    """Return the only grid of an object from `find_grids`; InputError if it has none or several."""
     if not found:
         looked = tried_names(tried, {"id": object_id})
         raise InputError(root, f"no grid for id {object_id!r}", f"one of {looked}")
@@ -385,7 +376,7 @@ def _find_one(
     role: str,
     problems: list[str],
 ) -> Place | None:
-    """Return the file that the first matching pattern finds; if it finds more, add a problem."""
+    """Return the file that the first matching pattern finds; add a problem if it finds several."""
     for pattern in patterns:
         found = sorted(find_files(there.listing, pattern, known), key=lambda one: one.path)
         problems += [one.problem or _unrecordable(one.path) for one in found]

@@ -1,7 +1,7 @@
 """Patterns of file and group names: ``{id}``, ``{sample}``, ``{view}`` and ``*``.
 
-A pattern is a relative path; its fields and ``*`` match within one component.
-Component by component only the folders that can match are listed.
+A pattern is a relative path; its fields and ``*`` match within a component.
+The search goes component by component and lists only folders that can match.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ _VARIABLE = re.compile(r"(\{[^{}]*\}|\*)")
 
 
 class Found(NamedTuple):
-    """A file that matches a pattern, or a folder on the way to some that cannot be listed."""
+    """A file that matches a pattern, or a folder on the way that cannot be listed."""
 
     fields: dict[str, str]
     """What the fields of the pattern stand for, as far as the path goes."""
@@ -40,12 +40,9 @@ class Found(NamedTuple):
 
 
 def list_below(root: Place) -> Listing:
-    """Return the names below a root: those of an object store are all asked for here.
+    """Return the names below a root; an object store lists all of them at once.
 
-    Raises
-    ------
-    ConfigError
-        If it cannot be listed.
+    Raises ConfigError if the root cannot be listed.
     """
     try:
         return storage_of(root).listing()
@@ -56,29 +53,11 @@ def list_below(root: Place) -> Listing:
 def find_files(
     names: Listing, pattern: str, known: Mapping[str, str], skip: Collection[str] = ()
 ) -> Iterator[Found]:
-    """Find the files below a folder that match a pattern.
+    """Yield the files that match a relative pattern such as ``{id}/{view}.npz``.
 
-    Parameters
-    ----------
-    names : Listing
-        What lies below the folder; `list_below` makes one.
-    pattern : str
-        Relative path with fields, such as ``{id}/sample_{sample}/material_grid.npy``.
-    known : mapping of str to str
-        Fields that are known already; they match their value alone.
-    skip : collection of str
-        Ids that are not looked for.
-
-    Yields
-    ------
-    Found
-        What is there besides folders, even a broken link: whoever reads
-        it will say so. Names are not checked against `NAME`. In no particular order.
-
-    Raises
-    ------
-    ConfigError
-        If the pattern makes no sense or the root cannot be listed.
+    `known` holds fields that are fixed already, `skip` the ids to leave out. The order is
+    arbitrary. Broken links are included, so that their reader reports them. `NAME` is not checked.
+    ConfigError if the pattern makes no sense or the root cannot be listed.
     """
     components = _components(pattern)
     # One name needs no search. Most patterns stand for one: that of a file beside a grid.
@@ -113,40 +92,17 @@ def fill(pattern: str, known: Mapping[str, str]) -> str:
 
 
 def match(component: str, known: Mapping[str, str], name: str) -> dict[str, str] | None:
-    """Match a name with one component of a pattern.
+    """Return the unknown fields of a name by a component of a pattern, None if it does not match.
 
-    Where several ways are possible, what stands first takes as much as it can.
-    The time is linear in the name, whatever the pattern.
-
-    Parameters
-    ----------
-    component : str
-        Of a pattern; a field stands for at least one character, ``*`` also for none.
-    known : mapping of str to str
-        Fields that are known already; they match their value alone.
-    name : str
-        A file's, folder's or group's.
-
-    Returns
-    -------
-    dict of str to str or None
-        The fields that were not known; None if the name does not match.
-
-    Raises
-    ------
-    ConfigError
-        If the component makes no sense.
-
-    Examples
-    --------
-    >>> match("{id}_{view}.npz", {}, "a_b_c.npz") == {"id": "a_b", "view": "c"}
-    True
+    A field takes at least one character, ``*`` also none. Where several matches are possible, the
+    leftmost takes most: ``{id}_{view}`` splits ``a_b_c`` into ``a_b`` and ``c``. Time is linear
+    in the name. ConfigError if the component makes no sense.
     """
     return _fields(*_split(component, known), name)
 
 
 def _split(component: str, known: Mapping[str, str]) -> tuple[list[str], list[str]]:
-    """Return the texts of a component, known fields among them, and what stands between them."""
+    """Return a component's literal texts, known fields filled in, and the fields between them."""
     texts, variables = [""], []
     for part in _parts(component):
         if part in known:
@@ -160,7 +116,7 @@ def _split(component: str, known: Mapping[str, str]) -> tuple[list[str], list[st
 
 
 def _fields(texts: list[str], variables: list[str], name: str) -> dict[str, str] | None:
-    """Return what `match` does, of a component that was split."""
+    """Match a name as `match` does, with a component that is split already."""
     begin, stop = len(texts[0]), len(name) - len(texts[-1])
     if not variables:
         return {} if name == texts[0] else None

@@ -1,13 +1,12 @@
 """PhysXNet as PhysX-3D's toolkit voxelises it: the density of TRELLIS's voxels of an object.
 
-Its ``voxelize.py`` writes ``voxels/<id>.ply``, the centres of an object's voxels, and for each
-of its rows a row of ``property/<id>2.npy``: the object's largest dimension [cm], the rank of
-the part among those one would touch, its density [g/cm^3], the group that moves together
-and that group's parent, eight numbers of the movement, and its kind. ``property/<id>1.npy``
-are embeddings of text.
+Its ``voxelize.py`` writes the centres of an object's voxels to ``voxels/<id>.ply``. It writes
+a row of ``property/<id>2.npy`` for each of them: the object's largest dimension [cm], the
+part's rank in touching, its density [g/cm^3], its movement group and that group's parent,
+eight numbers of the movement, and its kind. ``property/<id>1.npy`` holds embeddings of text.
 
-The density is in g/cm^3: PhysX-3D's ``tools/1_gptanno.py`` asks for it in that unit, so that a
-part's annotation reads ``"1.2 g/cm^3"``, and the toolkit keeps the number before the blank.
+PhysX-3D's ``tools/1_gptanno.py`` asks for the density in g/cm^3. A part's annotation reads
+``"1.2 g/cm^3"``, and the toolkit keeps the number before the blank.
 """
 
 from __future__ import annotations

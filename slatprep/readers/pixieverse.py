@@ -1,6 +1,6 @@
 """Reading a PixieVerse field: raw grids and the network's predictions.
 
-Both forms end as the same `MaterialField` in SI units. Raw grids and
+Both forms become the same `MaterialField` in SI units. Raw grids and
 predictions order their channels density, Young's modulus, Poisson's ratio;
 slatprep orders them as `PROPERTY_COLUMNS` does, Young's modulus first.
 """
@@ -93,32 +93,16 @@ class PixieVerse:
 def read_grid(
     pair: AssetPair, max_unphysical: float = SampleParameters.max_unphysical
 ) -> MaterialField:
-    """Read the PixieVerse side of a pair, whichever form it has.
+    """Read the PixieVerse side of a pair: a raw grid or a prediction, and its mask if any.
 
-    Parameters
-    ----------
-    pair : AssetPair
-        A pair without a problem. Its grid is (64, 64, 64, 4) float: density
-        [kg/m^3], Young's modulus [Pa], Poisson's ratio, class id; or a
-        prediction, (11, 64, 64, 64) or (4, 64, 64, 64) float: the same three
-        normalised to [-1, 1] by Pixie's published ranges, then eight class
-        scores or one class id. Its mask, if any, is (64, 64, 64).
-    max_unphysical : float
-        See `slatprep.parameters.SampleParameters`.
+    A raw grid is (64, 64, 64, 4): density [kg/m^3], Young's modulus [Pa], Poisson's ratio, class
+    id. A prediction is (11, 64, 64, 64) or (4, 64, 64, 64): the same three properties, normalised
+    to [-1, 1] by Pixie's published ranges, then eight class scores or a class id.
 
-    Returns
-    -------
-    MaterialField
-        Occupancy, and material and SI properties of the annotated voxels.
-        Occupied is what the mask says or, without a mask, what is not
-        background; annotated is an occupied voxel of class 0 to 6 whose
-        density and Young's modulus are finite and above 0 and whose Poisson's
-        ratio is in [0, 0.5] (of a prediction: finite).
-
-    Raises
-    ------
-    InputError
-        If a file cannot be used; the message names file, value and voxel.
+    A voxel is occupied if the (64, 64, 64) mask says so or, without a mask, if it is not
+    background. It is annotated if it is occupied, of class 0 to 6, its density and Young's modulus
+    are finite and positive, and its Poisson's ratio is in [0, 0.5]. Of a prediction, the
+    properties need only be finite. InputError names file, value and voxel.
     """
     path, _ = require_complete(pair)
     data, source = load_source(path, pair.roots.pixieverse, "grid")
@@ -177,33 +161,13 @@ def read_grid(
 def read_prediction(
     path: Place, root: Place, where: NDArray[np.bool_], normalization: Normalization
 ) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
-    """Read what a predicted grid says of some voxels.
+    """Read properties (K, 3) and classes (K,) of a grid at the K voxels of the mask `where`.
 
-    Parameters
-    ----------
-    path : Place
-        A prediction, (11, 64, 64, 64) or (4, 64, 64, 64), normalised by Pixie's ranges; or
-        (64, 64, 64, 4) in SI units: the forms of `read_field`. Its mask, if any, is not read.
-    root : Place
-        Folder that it must not leave.
-    where : ndarray of bool, shape (64, 64, 64)
-        K voxels.
-    normalization : Normalization
-        The ranges that the result is normalised by. What was normalised already is brought
-        to them and not clipped; SI values are normalised as Pixie does it: 1e-6 is added
-        before log10, and they are clipped.
-
-    Returns
-    -------
-    properties : ndarray of float64, shape (K, 3)
-        In the order of ``PROPERTY_COLUMNS``.
-    material : ndarray of uint8, shape (K,)
-        Class 0 to 7; background also where no class is the likeliest, or it is -1.
-
-    Raises
-    ------
-    InputError
-        If it has another form, or a value at one of the voxels is none that can be measured.
+    The grid has a form of `read_grid`; its own mask is ignored. Properties come normalised by
+    `normalization`. Normalised values are converted without clipping. SI values are normalised as
+    Pixie does it: 1e-6 is added before log10, and the result is clipped. A class is background
+    where no score is the highest, or the id is -1. InputError if the grid has another form or a
+    value at one of the voxels cannot be measured.
     """
     data, _ = load_source(path, root, "grid")
     grid = npy_array(data, path, GRID)
@@ -320,7 +284,7 @@ def _note(warnings: list[str], voxels: NDArray[np.bool_], what: str) -> None:
 def _gather(channels: NDArray[Any], where: NDArray[np.bool_]) -> NDArray[np.float32]:
     """Return the properties (K, 3) at the voxels of a mask, ordered as PROPERTY_COLUMNS.
 
-    They lie in memory a column after the other, as they are looked at.
+    Memory is column by column, as the checks read them.
     """
     with np.errstate(over="ignore"):  # what float32 cannot hold becomes infinite, and a fault
         columns = [channels[k][where].astype(np.float32) for k in _CHANNEL_ORDER]
@@ -328,7 +292,7 @@ def _gather(channels: NDArray[Any], where: NDArray[np.bool_]) -> NDArray[np.floa
 
 
 def _physical(properties: NDArray[np.float32], raw: bool) -> NDArray[np.bool_]:
-    """Return which properties (K, 3) a material can have; normalised ones need be finite only."""
+    """Return which properties (K, 3) are physical; normalised ones need only be finite."""
     good = np.isfinite(properties)
     if raw:
         ratio = properties[:, 2]
@@ -348,9 +312,9 @@ def _to_si(values: NDArray[np.float32], warnings: list[str]) -> NDArray[np.float
 def _read_bounds(
     path: Place, root: Place, sources: list[SourceFile], warnings: list[str]
 ) -> dict[str, object] | None:
-    """Return what ``clip_features.npz`` says, JSON-ready; a fault is a warning only.
+    """Return the content of ``clip_features.npz``, JSON-ready; a fault is only a warning.
 
-    Bounds serve exports to world coordinates; the supervision does without.
+    Only exports to world coordinates need the bounds.
     """
     try:
         data, source = load_source(path, root, "bounds")

@@ -1,4 +1,4 @@
-"""Points of a PLY, with a property a column."""
+"""Points of a PLY; each property is a column."""
 
 from __future__ import annotations
 
@@ -17,28 +17,10 @@ _HEADER_BYTES = 2**16
 
 
 def ply_points(data: bytes, where: str | Place) -> tuple[NDArray[Any], tuple[str, ...]]:
-    """Read the vertices of a PLY.
+    """Return the vertices of a PLY, structured (N,), and the comments of its header.
 
-    Parameters
-    ----------
-    data : bytes
-        The whole file.
-    where : str or Place
-        What errors call it.
-
-    Returns
-    -------
-    vertices : structured ndarray, shape (N,)
-        With numbers ``x``, ``y``, ``z``, and whatever else the file has.
-    comments : tuple of str
-        Of its header.
-
-    Raises
-    ------
-    InputError
-        If it holds none.
-    SlatprepError
-        If plyfile is not installed.
+    Vertices have at least numbers ``x``, ``y`` and ``z``. InputError if the file has none,
+    SlatprepError if plyfile is not installed.
     """
     try:
         import plyfile

@@ -26,21 +26,16 @@ _PIXIE_WORDS = ("E", "density", "nu")
 def read_ranges(path: Place, properties: Sequence[Property] = PROPERTIES) -> Normalization:
     """Read ranges from a TOML or JSON file, or from Pixie's ``normalization_ranges.yaml``.
 
-    The file has one table a property with ``lo`` and ``hi`` in mapped units
+    The file has a table per property with ``lo`` and ``hi`` in mapped units
     (log10 of Pa and of kg/m^3, plain Poisson's ratio)::
 
         [youngs_modulus]
         lo = 3.0
         hi = 11.0
 
-    Pixie's has ``density_p1``, ``density_p99``, ``E_p1``, ``nu_p1`` and so on, in the same
-    units, as JSON or a line each; its loader reads these, and ``density_min`` and
-    ``density_max``, which say the same, are read where they are not there.
-
-    Raises
-    ------
-    ConfigError
-        If the file cannot be read, lacks a property or has an empty range.
+    Pixie's file has ``density_p1``, ``density_p99``, ``E_p1``, ``nu_p1`` and so on in the same
+    units, as JSON or in lines. Where these are missing, ``density_min``, ``density_max`` and so on
+    count. ConfigError if the file cannot be read, lacks a property or has an empty range.
     """
     try:
         text = read_bounded(path, _MAX_BYTES).decode()
@@ -64,13 +59,7 @@ def read_ranges(path: Place, properties: Sequence[Property] = PROPERTIES) -> Nor
 
 
 def pixie_ranges(table: Sequence[Property]) -> Normalization:
-    """Return Pixie's published ranges of the properties of a table.
-
-    Raises
-    ------
-    ConfigError
-        If it has one that Pixie publishes no range of.
-    """
+    """Return Pixie's published ranges of the properties; ConfigError if one has none."""
     published = {one.name: one for one in PIXIE_RANGES.ranges}
     unknown = [one.name for one in table if one.name not in published]
     if unknown:
@@ -86,9 +75,9 @@ def _of_json(text: str) -> Any:
 
 
 def _of_pixie(text: str) -> dict[str, dict[str, object]]:
-    """Return the tables of a file of Pixie's, whose JSON is YAML as well; ValueError if it is none.
+    """Return the tables of Pixie's file, in JSON or simple YAML; ValueError if it is neither.
 
-    YAML itself, which could name objects to be made, is not needed for twelve numbers.
+    A full YAML parser could create objects, and twelve numbers do not need it.
     """
     if text.lstrip().startswith("{"):
         numbers = _of_json(text)

@@ -26,7 +26,7 @@ from slatprep.records import (
 
 @dataclass(frozen=True)
 class _Slat:
-    """Reads latents that lie as TRELLIS's tools save them."""
+    """Reader of latents in the layout of TRELLIS's tools."""
 
     space: LatentSpace
     patterns: tuple[str, ...] = ()
@@ -37,22 +37,22 @@ class _Slat:
 
 
 def trellis() -> _Slat:
-    """Return what reads TRELLIS's latents."""
+    """Return the reader of TRELLIS's latents."""
     return _Slat(TRELLIS)
 
 
 def sam3d() -> _Slat:
-    """Return what reads those of SAM 3D Objects, which are TRELLIS's."""
+    """Return the reader of SAM 3D Objects' latents, which are TRELLIS's."""
     return _Slat(replace(TRELLIS, encoder="sam3d"))
 
 
 def trellis2() -> _Slat:
-    """Return what reads TRELLIS.2's shape latents of resolution 1024; no moments are published."""
+    """Return the reader of TRELLIS.2's shape latents of resolution 1024; no moments are known."""
     return _Slat(LatentSpace("trellis2", 32, RESOLUTION))
 
 
 def trellis2_512() -> _Slat:
-    """Return what reads those of resolution 512, which TRELLIS.2's toolkit puts beside them."""
+    """Return the reader of TRELLIS.2's latents of resolution 512, which lie beside the others."""
     patterns = tuple(one.replace("_1024/", "_512/") for one in SlatSource.pattern)
     return _Slat(LatentSpace("trellis2-512", 32, RESOLUTION // 2), patterns)
 
@@ -65,21 +65,24 @@ def read_slat(
 ) -> StructuredLatents:
     """Read one SLAT from npz or HDF5.
 
-    It holds ``coords``, (N, 3) integers or (N, 4) with a leading batch column of
-    zeros, and ``feats``, float with as many channels as the encoder gives: in an
-    npz, at the top of an HDF5 file, or in a group of one. Other arrays beside
-    them are not read.
+    It holds integer ``coords``, (N, 3) or (N, 4) with a leading batch column of zeros, and float
+    ``feats``, (N, C) with the encoder's channels C. Other arrays are ignored.
 
     Parameters
     ----------
     path : Place
-        The file.
+        The npz, or the HDF5 file.
     root : Place
-        The folder that it must lie in, and that its name is recorded below.
+        The folder that must contain `path`; the recorded name is relative to it.
     group : str
-        Its group, where an HDF5 file holds several.
+        The SLAT's group in an HDF5 file with several; empty for the root.
     space : LatentSpace
         What the encoder gives.
+
+    Returns
+    -------
+    StructuredLatents
+        Coordinates and latents in the order of the file.
 
     Raises
     ------
@@ -104,12 +107,9 @@ def checked_latents(
     sources: tuple[SourceFile, ...] = (),
     space: LatentSpace = TRELLIS,
 ) -> StructuredLatents:
-    """Return coordinates (N, 3) or (N, 4) and latents as a SLAT, wherever they come from.
+    """Return coordinates (N, 3) or (N, 4) and latents (N, C) from any origin as a checked SLAT.
 
-    Raises
-    ------
-    InputError
-        If they are none; the message names the place, value and row.
+    Raises InputError that names place, value and row if they are not valid.
     """
     if len(coords) != len(feats):
         raise InputError(
@@ -141,14 +141,10 @@ def checked_latents(
 def check_coords(
     coords: NDArray[Any], where: str | Place, side: int = RESOLUTION, whose: str = ""
 ) -> NDArray[np.uint8]:
-    """Return SLAT coordinates as (N, 3) uint8, without the batch column where there is one.
+    """Return SLAT coordinates as (N, 3) uint8, without a batch column.
 
-    `side` is the number of voxels along each axis, and `whose` what an error says of it.
-
-    Raises
-    ------
-    InputError
-        If one is out of range or occurs twice, or there is more than one asset.
+    `side` is the number of voxels along an axis; `whose` explains it in errors. InputError if a
+    coordinate is out of range or occurs twice, or the batch has more than one asset.
     """
     if coords.shape[1] == 4:
         batch = coords[:, 0]

@@ -16,7 +16,7 @@ from slatprep.records import Place
 
 @dataclass(frozen=True, slots=True)
 class NamedSlat:
-    """A SLAT by its own names; `path` is empty where a map names one that does not exist."""
+    """A SLAT by its own names; `path` is empty where a map names a SLAT that does not exist."""
 
     slat_id: str
     view: str
@@ -27,9 +27,9 @@ class NamedSlat:
 
 @dataclass(frozen=True, slots=True)
 class SlatFile:
-    """A SLAT that nothing is paired with: its id, its file, the folder that holds it, its group.
+    """A SLAT without a partner: its id, its file, the folder that holds it, and its group.
 
-    `problem` says why it cannot be used, and is empty where all is well.
+    `problem` says why it cannot be used; it is empty if it can.
     """
 
     asset_id: str
@@ -45,18 +45,18 @@ def discover_slats(source: SlatSource) -> list[SlatFile]:
     Parameters
     ----------
     source : SlatSource
-        A folder of them, or a file: an npz, or an HDF5 file with one SLAT or a group each.
+        A folder of SLATs, an npz, or an HDF5 file with one SLAT or a group for each.
 
     Returns
     -------
     list of SlatFile
-        Sorted by id, ``<id>`` or ``<id>.<view>``, each once; a single file is named
-        after itself.
+        Sorted by id, ``<id>`` or ``<id>.<view>``, each once. The name of a single file
+        is its id.
 
     Raises
     ------
     ConfigError
-        If there is none.
+        If there are no SLATs.
     """
     root, one_file = source.root, source.root.is_file()
     if not one_file and not root.exists():
@@ -81,12 +81,9 @@ def discover_slats(source: SlatSource) -> list[SlatFile]:
 
 
 def find_slats(source: SlatSource, one_file: bool) -> dict[str, list[NamedSlat]]:
-    """Return the SLATs of a folder, or of an HDF5 file, by their ids.
+    """Return the SLATs of a folder or an HDF5 file by their ids.
 
-    Raises
-    ------
-    ConfigError
-        If there is none, or the one file cannot be read.
+    Raises ConfigError if there are none or the file cannot be read.
     """
     slats: dict[str, list[NamedSlat]] = {}
     for slat in _each_slat(source, one_file):
@@ -146,5 +143,5 @@ def ordered(slats: Iterable[NamedSlat]) -> tuple[NamedSlat, ...]:
 
 
 def encoded(name: str) -> str:
-    """Return a name as it is where it is a valid id, percent-encoded where it is not."""
+    """Return a valid id unchanged, and any other name percent-encoded."""
     return quote(name.encode(errors="surrogateescape"), safe="").replace("~", "%7E")

@@ -1,4 +1,4 @@
-"""Which objects are trained on, validated on and tested on: by a hash, a rule, or lists of ids."""
+"""Which objects are for training, validation and test: by a hash, a rule, or lists of ids."""
 
 from __future__ import annotations
 
@@ -24,12 +24,12 @@ SPLITS: tuple[Split, ...] = ("train", "val", "test")
 
 @dataclass(frozen=True)
 class Shares:
-    """Shares of the objects, in expectation; they add up to 1.
+    """Expected shares of the objects in each split.
 
     Raises
     ------
     ConfigError
-        If they do not, or one is negative.
+        Unless they are at least 0 and add up to 1.
     """
 
     train: float = 0.8
@@ -53,10 +53,9 @@ def position_of(object_id: str) -> float:
 
 
 def split_of(object_id: str, shares: Shares = Shares()) -> Split:
-    """Return the split of an object.
+    """Return the split of an object, by its id alone.
 
-    The id alone decides: all views of an object are in one split, and an
-    object stays in its split when the dataset grows.
+    All views of an object share a split. An object stays in its split when the dataset grows.
 
     Parameters
     ----------
@@ -72,19 +71,11 @@ def split_of(object_id: str, shares: Shares = Shares()) -> Split:
 
 
 def split_objects(object_ids: Iterable[str], shares: Shares = Shares()) -> dict[str, Split]:
-    """Return the split of every object of a dataset, none of those asked for empty.
+    """Return the split of every object of a dataset, such that no split with a share is empty.
 
-    It is the split of `split_of`, but for datasets so small that one would get
-    no object: it then takes the object whose place in [0, 1) is nearest to its
-    own, from a split that has others. That needs as many objects as splits.
-
-    Parameters
-    ----------
-    object_ids : iterable of str
-        All objects of the dataset, whatever is filtered later: the choice
-        must be the same for whoever trains and for whoever tests.
-    shares : Shares
-        Shares of the splits; one with share 0 stays empty.
+    `split_of` decides. In a dataset so small that a split would be empty, that split takes the
+    nearest object in [0, 1) from a split that has several. This needs as many objects as splits.
+    Training and test must pass the same `object_ids`: all of the dataset, before any filter.
     """
     splits = {object_id: split_of(object_id, shares) for object_id in sorted(set(object_ids))}
     ends = {"train": 0.0, "val": shares.train, "test": shares.train + shares.val}
@@ -121,7 +112,7 @@ class Assignment:
     unknown : tuple of str
         Ids of a file that the dataset does not have.
     unlisted : tuple of str
-        Objects that are in none of a file's lists, and so in no split.
+        Objects that no list of the file names; they are in no split.
     """
 
     splits: dict[str, Split]
@@ -142,28 +133,14 @@ def assign_splits(
     shares: Shares = Shares(),
     assets: Mapping[str, str] | None = None,
 ) -> Assignment:
-    """Return the split of every object of a dataset by a rule.
+    """Return the split of every object of a dataset by a rule; `objects` maps ids to categories.
 
-    Parameters
-    ----------
-    by : str
-        ``hash``: see `split_objects`. ``pixie``: see `pixie_test_objects`.
-        ``category:NAME``: all objects of a category are tested on. Anything else
-        is the path of a file, see `read_lists`.
-    objects : mapping of str to str
-        Category by object id.
-    shares : Shares
-        For ``hash``. Where the rule, or a file with a single list, says only what is tested
-        on, the other objects are parted by hash in the proportion of train and val.
-    assets : mapping of str to str, optional
-        Object id by asset id: a file may name an object by its assets.
-
-    Raises
-    ------
-    ConfigError
-        If there is no such category, or a file puts one object into two splits.
-    InputError
-        If the file cannot be used, or has no object of the dataset.
+    The rule `by` is ``hash`` (see `split_objects`), ``pixie`` (see `pixie_test_objects`),
+    ``category:NAME`` (that category is the test set), or the path of a file (see `read_lists`).
+    `shares` serve ``hash``. Where a rule gives only the test set, a hash parts the others in the
+    proportion of train and val. `assets` maps asset ids, by which a file may name objects, to
+    object ids. ConfigError if the category is unknown or a file puts an object into two splits;
+    InputError if the file is unusable or names no object of the dataset.
     """
     if by == HASH:
         return Assignment(split_objects(objects, shares))
@@ -182,11 +159,10 @@ def assign_splits(
 def pixie_test_objects(object_ids: Iterable[str]) -> list[str]:
     """Return the objects that Pixie's rule sets aside for its test: a tenth, drawn with seed 42.
 
-    Pixie splits a dataset of n objects by ``torch.utils.data.random_split`` into ``int(0.9 * n)``
-    and the rest, with a generator of seed 42, and tests on the rest (vlongle/pixie,
-    ``training_discrete.py``). It takes them in the order in which its file system lists
-    them, here they are sorted: the objects that Pixie itself tested on are those of its
-    ``test_set.json``.
+    Pixie splits n objects by ``torch.utils.data.random_split`` with a generator of seed 42 into
+    ``int(0.9 * n)`` and the rest, and tests on the rest (vlongle/pixie,
+    ``training_discrete.py``). It takes objects in the order of its file system; here they are
+    sorted. The objects that Pixie itself tested on are in its ``test_set.json``.
     """
     ordered = sorted(set(object_ids))
     # torch.randperm swaps each place with one drawn from those not yet filled: a 32-bit
@@ -199,19 +175,10 @@ def pixie_test_objects(object_ids: Iterable[str]) -> list[str]:
 
 
 def read_lists(path: Place) -> dict[Split, tuple[str, ...]]:
-    """Read which ids each split has.
+    """Read the ids of each split, of objects or assets.
 
-    Parameters
-    ----------
-    path : Place
-        Ids of objects or assets: a JSON object with some of the lists ``train``, ``val`` and
-        ``test``; or a single list, of those to test on, as JSON, as a one-dimensional npy
-        array of text, or one id a line.
-
-    Raises
-    ------
-    InputError
-        If it cannot be read, or is none of these.
+    The file is a JSON object with some of the lists ``train``, ``val`` and ``test``; or a test
+    list alone, as JSON, a one-dimensional npy of text, or an id per line. InputError otherwise.
     """
     try:
         data = read_id_file(path)
@@ -244,7 +211,7 @@ def read_lists(path: Place) -> dict[Split, tuple[str, ...]]:
 
 
 def read_id_file(path: Place) -> bytes:
-    """Read a file of ids whole; InputError if it cannot be."""
+    """Read a whole file of ids; InputError if that fails."""
     try:
         return read_bounded(path, _MAX_BYTES)
     except FileNotFoundError:
@@ -284,7 +251,7 @@ def _by_file(
 
 
 def _around(test: Iterable[str], objects: Iterable[str], shares: Shares) -> dict[str, Split]:
-    """Return splits of which that to test on is given, and a hash parts the others."""
+    """Return all splits around a given test set; a hash parts the other objects."""
     splits: dict[str, Split] = dict.fromkeys(test, "test")
     others = shares.train + shares.val
     if others == 0:

@@ -1,4 +1,4 @@
-"""Transforms that are known: a matrix in a file, of one asset or of all."""
+"""Known transforms: a matrix in a file, for one asset or for all."""
 
 from __future__ import annotations
 
@@ -20,24 +20,10 @@ _FAR = 100.0
 
 
 def read_transform(path: Place, root: Place) -> tuple[NDArray[np.float64], SourceFile]:
-    """Read a similarity from a JSON list of rows or an npy file.
+    """Read a (4, 4) similarity from a JSON list of rows or an npy file below `root`.
 
-    Parameters
-    ----------
-    path, root : Place
-        The file, and the folder that it must lie in.
-
-    Returns
-    -------
-    transform : ndarray of float64, shape (4, 4)
-        Takes points of the source's unit cube to points of the SLAT's.
-    source : SourceFile
-        The file, with the role ``transform``.
-
-    Raises
-    ------
-    InputError
-        If it holds no similarity.
+    It takes points of the source's unit cube to the SLAT's. The file is returned as a source of
+    role ``transform``. InputError if the matrix is not a similarity.
     """
     data, source = load_source(path, root, "transform")
     if path.suffix.lower() == ".json":

@@ -1,4 +1,4 @@
-"""VoMP's data set: voxels with materials, as a structured array, of meshes that have no classes."""
+"""VoMP's dataset: voxels with materials as a structured array, of meshes without classes."""
 
 from __future__ import annotations
 
@@ -21,14 +21,14 @@ _SIDE = 64
 class VoMP:
     """``voxels/<id>_with_materials.npz``: x, y, z in the unit cube, E, density and nu in SI units.
 
-    A SLAT that was encoded from the same mesh lies in the same frame: the field
-    says so, and the engine ``known`` takes it.
+    A SLAT encoded from the same mesh lies in the same frame. The field records this frame, and
+    the engine ``known`` uses it.
     """
 
     patterns = ("voxels/{id}_with_materials.npz", "{id}_with_materials.npz")
 
     def describe(self, source: PixieverseSource) -> Holding:
-        """Say that there are PixieVerse's three properties, and no classes."""
+        """Say that there are PixieVerse's three properties and no classes."""
         return Holding(PROPERTIES, ())
 
     def find(self, source: PixieverseSource, listing: Listing) -> Iterator[FoundField]:

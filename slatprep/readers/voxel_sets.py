@@ -1,4 +1,4 @@
-"""Annotated voxels of any grid, or points, to a field on the 64^3 grid of the frame."""
+"""Annotated voxels of any grid, or points, become a field on the frame's 64^3 grid."""
 
 from __future__ import annotations
 
@@ -37,38 +37,16 @@ def field_of_voxels(
     sources: Sequence[SourceFile] = (),
     frame: NDArray[np.float64] | None = None,
 ) -> MaterialField:
-    """Make a field of annotated voxels.
+    """Make a field of annotated voxels (K, 3): integers in 0..resolution - 1, or float points.
 
-    A coarser grid than 64^3 is taken cell by cell; of a finer one, and of
-    points, each cell takes the class of most of its voxels (of equally many the
-    lowest) and the mean of their properties, of log10 where they are
-    normalised so.
+    Points lie in the unit cube [-0.5, 0.5]^3. `properties` (K, P) are SI values with a column
+    for each entry of `table`. `material` (K,) are class ids, all 0 by default; `classes` counts
+    them, at most 254. Errors call the source `where`.
 
-    Parameters
-    ----------
-    where : str or Place
-        What errors call the source.
-    voxels : ndarray, shape (K, 3)
-        Integers in 0..resolution - 1; or floats, points of the unit cube [-0.5, 0.5]^3.
-    properties : ndarray, shape (K, P)
-        SI values, a column for each of `table`.
-    resolution : int
-        Voxels along each axis of the source's grid.
-    material : ndarray of int, shape (K,), optional
-        Class of each; all are of class 0 where the source has no classes.
-    classes : int
-        How many classes there are, at most 254.
-    table : sequence of Property
-        What the columns are.
-    max_unphysical : float
-        See `slatprep.parameters.SampleParameters`.
-    sources, frame
-        As `MaterialField` has them.
-
-    Raises
-    ------
-    InputError
-        If there is no voxel, one is out of range, or too many are unphysical.
+    Cells of a grid coarser than 64^3 stay whole. From a finer grid or points, each cell takes its
+    voxels' most frequent class (the lowest at a tie) and mean properties, in log10 where the
+    normalisation is. InputError if there is no voxel, one is out of range, or too many are
+    unphysical.
     """
     cells, resolution = _cells_of(where, np.asarray(voxels), resolution)
     count = len(cells)
@@ -121,7 +99,7 @@ def field_of_voxels(
 def _cells_of(
     where: str | Place, voxels: NDArray[Any], resolution: int
 ) -> tuple[NDArray[np.int64], int]:
-    """Return the cells (K, 3) that voxels or points lie in, and the cells along each axis."""
+    """Return the cells (K, 3) of voxels or points, and the number of cells along each axis."""
     if voxels.ndim != 2 or voxels.shape[1] != 3 or len(voxels) == 0:
         raise InputError(where, f"has voxels of shape {voxels.shape}", "(K, 3), one at least")
     if not 2 <= resolution <= MAX_RESOLUTION:
@@ -144,10 +122,10 @@ def physical_rows(
     max_unphysical: float,
     notes: list[str],
 ) -> NDArray[np.bool_]:
-    """Return which annotated voxels (K,) a material can have; refuse too many others, note few.
+    """Return which annotated voxels (K,) are physical; refuse too many others, note a few.
 
-    `fine` (K, P) says it of each property; `told` says of a row and a column what is there,
-    and what is expected instead.
+    `fine` (K, P) says it of each property. `told` returns, for a row and a column, the value that
+    is there and the expected one.
     """
     keep = np.asarray(fine.all(axis=1))
     bad = int(np.count_nonzero(~keep))
@@ -170,7 +148,7 @@ def _merged(
     values: NDArray[np.float32],
     table: Sequence[Property],
 ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float32]]:
-    """Return the cells that voxels lie in, sorted, with one class and one row of values each."""
+    """Return the cells that hold voxels, sorted, each with a class and a row of values."""
     cells, first, cell = np.unique(flat, return_index=True, return_inverse=True)
     if len(cells) == len(flat):
         return cells, classes[first], values[first]

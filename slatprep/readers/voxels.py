@@ -1,4 +1,4 @@
-"""Plain voxels: npz, HDF5, Zarr or PLY an object, and a file that says what its columns are.
+"""Plain voxels: an npz, HDF5, Zarr or PLY per object, and a file that describes the columns.
 
 ``source.json`` in the root describes them all::
 
@@ -54,7 +54,7 @@ _GROUP = "/zarr.json"
 
 @dataclass(frozen=True)
 class _Column:
-    """A property as ``source.json`` has it."""
+    """A property in ``source.json``."""
 
     name: PropertyName
     unit: str
@@ -65,7 +65,7 @@ class _Column:
 
 @dataclass(frozen=True)
 class _Description:
-    """What ``source.json`` says; see the documentation of the format."""
+    """The content of ``source.json``; see the documentation of the format."""
 
     __pydantic_config__: ClassVar[dict[str, object]] = {"extra": "forbid"}
 
@@ -84,17 +84,16 @@ class _Description:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """The names of the classes; PhysGaussian's have one for the background, too."""
+        """The names of the classes; PhysGaussian's include the background."""
         if isinstance(self.classes, bool):
             return MATERIAL_CLASSES if self.classes else ()
         return MATERIAL_CLASSES if self.classes == MATERIAL_CLASSES[:BACKGROUND] else self.classes
 
 
 class PlainVoxels:
-    """``<id>.npz``, ``.h5``, ``.hdf5`` or ``.zarr``: ``voxels`` (K, 3), a column a property.
+    """``<id>.npz``, ``.h5``, ``.hdf5`` or ``.zarr``: ``voxels`` (K, 3), a column per property.
 
-    There is ``material``, too, where there are classes. In an ``<id>.ply`` the voxels are
-    its vertices.
+    Sources with classes also have ``material``. In an ``<id>.ply`` the voxels are the vertices.
     """
 
     patterns = ("{id}.npz", "{id}.h5", "{id}.hdf5", f"{{id}}.zarr{_GROUP}", "{id}.ply")

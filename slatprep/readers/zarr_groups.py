@@ -1,4 +1,4 @@
-"""Arrays of a Zarr group that somebody wrote; see `slatprep.storage.chunks`."""
+"""Arrays of a Zarr group of foreign origin; see `slatprep.storage.chunks`."""
 
 from __future__ import annotations
 
@@ -25,21 +25,10 @@ _EXPECTED = (
 def group_arrays(
     data: bytes, where: str | Place, specs: Mapping[str, ArraySpec]
 ) -> dict[str, NDArray[Any]]:
-    """Read the named arrays of a group.
+    """Read the named arrays of a group from the archive of `slatprep.readers.files.load_source`.
 
-    Parameters
-    ----------
-    data : bytes
-        What `slatprep.readers.files.load_source` gives for it: an archive of its files.
-    where : str or Place
-        What errors call it.
-    specs : mapping of str to ArraySpec
-        The arrays wanted and what they may look like.
-
-    Raises
-    ------
-    InputError
-        If an array is missing, not as wanted, or packed in another way.
+    Errors call it `where`. InputError if an array is missing, not as specified, or uses another
+    compression.
     """
     expected = _EXPECTED.format(", ".join(specs))
     with zipfile.ZipFile(io.BytesIO(data)) as files:
