@@ -76,8 +76,8 @@ def export_store(
     store : str or Place
         The store.
     out : str or Path
-        The file (``hdf5``) or folder (all others) to write. An existing export is replaced
-        when the new one is complete; other files are left alone.
+        The file (``hdf5``) or folder (all others) to write. The new export replaces an old one
+        when complete; other files stay.
     format : {"ply", "hdf5", "webdataset", "npz"}
         The format, see docs/export.md.
     assets : sequence of str
@@ -88,8 +88,7 @@ def export_store(
     options : ExportOptions, optional
         Options of some formats.
     jobs : int
-        Worker processes; the bytes written do not depend on it. HDF5 is written by one
-        process.
+        Worker processes; the bytes do not depend on it. One process writes HDF5.
     progress : callable, optional
         See `Progress`.
 

@@ -44,26 +44,9 @@ def with_merged(store: Store, *names: str) -> tuple[str, ...]:
 
 
 def choose_ids(store: Store, assets: Sequence[str], verdicts: Sequence[str]) -> list[str]:
-    """Return the ids of the chosen assets, sorted.
+    """Return the sorted ids of `assets` with one of `verdicts`; an empty sequence takes all.
 
-    Parameters
-    ----------
-    store : Store
-        The store.
-    assets : sequence of str
-        Ids; empty takes all.
-    verdicts : sequence of str
-        Only assets with one of these verdicts; empty takes all.
-
-    Returns
-    -------
-    list of str
-        At least one id.
-
-    Raises
-    ------
-    ConfigError
-        If an id or a verdict is unknown, or nothing is left.
+    Raises ConfigError if an id or a verdict is unknown, or no asset is left.
     """
     unknown = sorted(set(verdicts) - set(Verdict))
     if unknown:

@@ -79,25 +79,11 @@ def card_of(
     pictures: Sequence[str],
     verdicts: Sequence[str] = (),
 ) -> str:
-    """Return the card: Markdown with metadata in YAML, as Hugging Face expects it.
+    """Return the card as Hugging Face expects it: Markdown with metadata in YAML.
 
-    Parameters
-    ----------
-    store : Store
-        The store.
-    stated : Stated
-        Metadata that the store does not hold.
-    data : str
-        Path of the data, relative to the card: the name of the store, or a pattern of shards.
-    pictures : sequence of str
-        Names of pictures beside the card.
-    verdicts : sequence of str
-        The data have only assets with one of these verdicts; empty for all.
-
-    Returns
-    -------
-    str
-        The text of the file.
+    `data` is the path of the data relative to the card: the store's name, or a pattern of shards.
+    `pictures` names the pictures beside the card. The data have only assets with one of
+    `verdicts`, or all if it is empty.
     """
     verdict = store.column("verdict").astype(str)
     kept = np.isin(verdict, verdicts) if verdicts else np.ones(len(store), dtype=bool)

@@ -1,9 +1,9 @@
 """Describe a store in Croissant, MLCommons' vocabulary for datasets.
 
 The description is JSON-LD after the Croissant 1.0 specification
-(http://mlcommons.org/croissant/1.0). Croissant cannot extract records from Zarr, so the arrays
-are only described (files, shapes, types, meaning), while the table of assets, the classes and
-the ranges are in the description as records.
+(http://mlcommons.org/croissant/1.0). Croissant cannot extract records from Zarr. The
+description therefore only lists the arrays: files, shapes, types, meaning. It contains the
+table of assets, the classes and the ranges as records.
 """
 
 from __future__ import annotations
@@ -64,27 +64,10 @@ def describe(
     version: str = "1.0.0",
     date_published: str = "",
 ) -> dict[str, Any]:
-    """Describe a store as a Croissant dataset.
+    """Describe a store as a Croissant dataset: JSON-LD, JSON-ready, the same for the same store.
 
-    Parameters
-    ----------
-    store : Store
-        The store.
-    location : str
-        Path or URL of the store for readers of the description; by default the store's name.
-    name, description, license, url, cite_as, version, date_published : str
-        Metadata that the store does not hold. Empty ones are left out, of which Croissant's
-        validator warns.
-
-    Returns
-    -------
-    dict
-        JSON-LD, JSON-ready; the same for the same store.
-
-    Raises
-    ------
-    StoreError
-        If the store's metadata cannot be read.
+    `location` is the path or URL of the store for readers; by default its name. The others are
+    metadata that the store does not hold; Croissant's validator warns of those left empty.
     """
     location = location or store.name
     stated = {

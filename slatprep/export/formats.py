@@ -46,18 +46,18 @@ class Writer:
     ----------
     write : callable
         Takes the folder, the number of a batch and its assets; writes them and yields an
-        `Exported` for each. If the export is a single file: takes the file, the description
+        `Exported` for each. For an export in a single file: takes the file, the description
         of the store, and all assets.
     batch : int
-        Assets per task of a worker; several, so that opening the store takes little of it.
+        Assets per task of a worker; several, because each task opens the store.
     notes : tuple of str
         Remarks on the result for the user.
     finish : callable, optional
         Takes the folder and the index's entries, sorted by id; writes the files that cover all
         assets and returns their names.
     is_export : callable, optional
-        Only if the export is a single file, which one process writes: whether an existing
-        file is such an export and may be replaced.
+        Only for an export in a single file, which one process writes: whether an existing
+        file is such an export, so that it may be replaced.
     """
 
     write: Callable[..., Iterable[Exported]]

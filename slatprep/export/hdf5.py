@@ -47,21 +47,9 @@ def writer(store: Store, ids: Sequence[str], options: ExportOptions) -> Writer:
 
 
 def write(path: Path, about: dict[str, Any], assets: Iterable[StoredAsset]) -> Iterator[Exported]:
-    """Write a file with a group for each asset; its columns become the group's attributes.
+    """Write a file with a group for each asset, whose attributes are the asset's columns.
 
-    Parameters
-    ----------
-    path : Path
-        The file.
-    about : dict
-        Attributes of the root; nested values are written as JSON.
-    assets : iterable of StoredAsset
-        The assets.
-
-    Yields
-    ------
-    Exported
-        For each asset.
+    `about` becomes the attributes of the root, with nested values as JSON.
     """
     import h5py
 

@@ -1,7 +1,7 @@
 """The layout that TRELLIS's dataset of structured latents loads, with the targets added.
 
-The root has ``latents/<model>/<sha256>.npz`` and ``metadata.csv``, whose columns TRELLIS uses to
-choose and find the files (its ``DATASET.md`` and ``trellis/datasets``).
+The root has ``latents/<model>/<sha256>.npz`` and ``metadata.csv``. By its columns TRELLIS
+chooses and finds the files (its ``DATASET.md`` and ``trellis/datasets``).
 """
 
 from __future__ import annotations
@@ -29,10 +29,7 @@ _NO_WORDS = frozenset({"na", "null", "none", "true", "false"})
 def writer(store: Store, ids: Sequence[str], options: ExportOptions) -> Writer:
     """Return the writer of TRELLIS's layout; see `slatprep.export.FORMATS`.
 
-    Raises
-    ------
-    ConfigError
-        If the model's name is not usable as the name of a folder.
+    Raises ConfigError if the model's name cannot name a folder.
     """
     model = options.latent_model
     if not model or model != file_name(model):
@@ -47,21 +44,7 @@ def write(
 ) -> Iterator[Exported]:
     """Write an npz for each asset: TRELLIS's ``coords`` and ``feats``, and the `TARGETS`.
 
-    Parameters
-    ----------
-    model : str
-        The encoder's name, which names the folder.
-    directory : Path
-        The root.
-    number : int
-        Number of the batch; not used, since each asset has its own file.
-    assets : iterable of StoredAsset
-        The assets of the batch.
-
-    Yields
-    ------
-    Exported
-        For each asset.
+    `model` is the encoder's name, which names the folder; `number` has no use here.
     """
     folder = PurePosixPath("latents", model)
     (directory / folder).mkdir(parents=True, exist_ok=True)
@@ -78,24 +61,10 @@ def write(
 
 
 def write_metadata(model: str, directory: Path, entries: Sequence[dict[str, Any]]) -> list[str]:
-    """Write the table by which TRELLIS's dataset finds the latents.
+    """Write the table by which TRELLIS's dataset finds the latents; return its name.
 
-    ``aesthetic_score`` is not known. Without a number TRELLIS would leave the asset out; ``inf``
-    passes every threshold and cannot be mistaken for a measured score.
-
-    Parameters
-    ----------
-    model : str
-        The encoder's name.
-    directory : Path
-        The root.
-    entries : sequence of dict
-        The index's entry of each asset.
-
-    Returns
-    -------
-    list of str
-        The name of the table.
+    ``aesthetic_score`` is not known, and TRELLIS would leave out an asset without a number. ``inf``
+    passes every threshold, and nobody mistakes it for a measured score.
     """
     with (directory / METADATA).open("w", encoding="utf-8", newline="") as file:
         table = csv.writer(file, lineterminator="\n")

@@ -74,32 +74,11 @@ def write(
     bounds: Mapping[str, Bounds],
     max_distance: float,
 ) -> Iterator[Exported]:
-    """Write a PLY of the annotated points of each asset.
+    """Write a PLY of each asset's annotated points; `number` has no use here.
 
-    Parameters
-    ----------
-    directory : Path
-        The folder of the export.
-    number : int
-        Number of the batch; not used, since each asset has its own file.
-    assets : iterable of StoredAsset
-        The assets of the batch.
-    points, frame : str
-        As in `ExportOptions`.
-    bounds : mapping
-        World bounds by asset id, for the PixieVerse frame.
-    max_distance : float
-        Distance [voxel] to the annotation at which ``conf`` is 0.
-
-    Yields
-    ------
-    Exported
-        For each asset.
-
-    Notes
-    -----
-    ``conf`` falls linearly from 1 to 0 with the distance to the annotation; for points of the
-    grid it is 1. ``part_label`` is the class, as in Pixie's own predictions.
+    `bounds` has the world bounds by asset id, for the PixieVerse frame. ``conf`` is 1 for points
+    of the grid. For others it falls linearly to 0 at `max_distance` [voxel] from the annotation.
+    ``part_label`` is the class, as in Pixie's own predictions.
     """
     for asset in assets:
         table = asset.store.contents.properties
@@ -136,24 +115,10 @@ def write_points(
     frame: str,
     more: Mapping[tuple[str, str], NDArray[np.float32]] | None = None,
 ) -> None:
-    """Write annotated points as Pixie does.
+    """Write N annotated points as Pixie does, with classes 0..7 and ``conf`` in 0..1.
 
-    Parameters
-    ----------
-    path : Path
-        The file.
-    positions : ndarray of float, shape (N, 3)
-        Positions in the frame.
-    material : ndarray of uint8, shape (N,)
-        Class of each, 0..7.
-    properties : ndarray of float32, shape (N, 3)
-        Young's modulus [Pa], density [kg/m^3], Poisson's ratio.
-    conf : ndarray of float, shape (N,)
-        Confidence in 0..1.
-    frame : str
-        Description of the frame, in one line, for a comment.
-    more : mapping, optional
-        Further properties (N,) by name and unit, written after Pixie's.
+    `properties` (N, 3) are Young's modulus [Pa], density [kg/m^3] and Poisson's ratio; `more` has
+    further ones (N,) by name and unit. The line `frame` describes the frame in a comment.
     """
     more = more or {}
     layout = np.dtype([*VERTEX.descr, *((name, "<f4") for name, _ in more)])
@@ -174,26 +139,9 @@ def write_points(
 
 
 def read_bounds(store: Store, ids: Sequence[str]) -> tuple[dict[str, Bounds], tuple[str, ...]]:
-    """Read the world bounds of assets from their records.
+    """Return the world bounds of assets by id, from their records, and remarks for the user.
 
-    Parameters
-    ----------
-    store : Store
-        The store.
-    ids : sequence of str
-        The assets.
-
-    Returns
-    -------
-    bounds : dict
-        By asset id; `UNIT_CUBE` if the sources stated none.
-    notes : tuple of str
-        Remarks for the user.
-
-    Raises
-    ------
-    StoreError
-        If a record's bounds are invalid.
+    Bounds are `UNIT_CUBE` if the sources stated none. StoreError if a record's bounds are invalid.
     """
     records = StoredRecords(store)
     stated = {asset_id: records.of(asset_id).bounds for asset_id in ids}
@@ -222,25 +170,10 @@ def _bounds(stated: dict[str, Any], where: str) -> Bounds:
 
 
 def to_world(points: ArrayLike, bounds: ArrayLike) -> NDArray[np.float64]:
-    """Convert points of the PixieVerse frame to world coordinates.
+    """Convert points (N, 3) of the PixieVerse frame, the unit cube, to world coordinates.
 
-    Parameters
-    ----------
-    points : array_like, shape (N, 3)
-        Points of the unit cube in which voxel i is centred at (i + 0.5)/64 - 0.5.
-    bounds : array_like, shape (2, 3)
-        ``min_bounds`` and ``max_bounds`` of ``clip_features.npz``.
-
-    Returns
-    -------
-    ndarray of float64, shape (N, 3)
-        Voxel i lies at ``linspace(min_bounds, max_bounds, 64)[i]``, as in Pixie's
-        ``map_pred_to_coords.py``.
-
-    Examples
-    --------
-    >>> to_world(voxel_centres([[0, 63, 21]]), ((0, 0, 0), (63, 63, 63))).round(6).tolist()
-    [[0.0, 63.0, 21.0]]
+    `bounds` (2, 3) are ``min_bounds`` and ``max_bounds`` of ``clip_features.npz``. Voxel i lies at
+    ``linspace(min_bounds, max_bounds, 64)[i]``, as in Pixie's ``map_pred_to_coords.py``.
     """
     lo, hi = np.asarray(bounds, dtype=np.float64)
     index = (np.asarray(points, dtype=np.float64) + 0.5) * RESOLUTION - 0.5

@@ -46,38 +46,12 @@ def publish_store(
     verdicts: Sequence[str] | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> PublishSummary:
-    """Write a store as a dataset for a hub.
+    """Write a store of the local disk, or WebDataset shards of it, as a dataset for a hub.
 
-    Parameters
-    ----------
-    store : str or Place
-        A store of the local disk.
-    out : Path
-        The folder; an earlier result is replaced when the new one is complete.
-    data : {"store", "webdataset"}
-        The data: a copy of the store, or WebDataset shards.
-    stated : Stated, optional
-        Licence and other metadata that the store does not hold.
-    pictures : mapping of str to bytes, optional
-        Pictures for the card by file name.
-    verdicts : sequence of str, optional
-        As in `slatprep.export.export_store`, for shards.
-    progress : callable, optional
-        Called with the number of assets done and the number of all assets, for shards.
-
-    Returns
-    -------
-    PublishSummary
-        What was written.
-
-    Raises
-    ------
-    ConfigError
-        If the store is not on a local disk, or `out` lies in one or holds something that
-        `publish_store` did not write.
-    StoreError
-        If the store cannot be read, or a file that is to be copied is not what it was when the
-        store was built.
+    An earlier result at `out` is replaced when the new one is complete. `pictures` for the card
+    are PNG bytes by file name. For shards, `verdicts` is as in `slatprep.export.export_store`, and
+    `progress` gets the number of assets done and of all. ConfigError if the store is not local, or
+    `out` lies in one or holds other files. StoreError if a file differs from its digest.
     """
     place, stated, out = place_of(store), stated or Stated(), Path(out)
     local = storage_of(place).local

@@ -24,28 +24,11 @@ INDEX = "index.json"
 
 @contextmanager
 def directory(out: Path) -> Iterator[Path]:
-    """Yield a new folder that replaces `out` on success.
+    """Yield a new empty folder that replaces `out` on success.
 
-    If `out` holds other files beside an export, the files of the export are replaced one by
-    one; otherwise the folder is replaced at once.
-
-    Parameters
-    ----------
-    out : Path
-        The target.
-
-    Yields
-    ------
-    Path
-        An empty folder to write to.
-
-    Raises
-    ------
-    ConfigError
-        If `out` exists and is neither empty nor an export, or if another file has the name of
-        a file to be written.
-    SlatprepError
-        If it cannot be written.
+    If `out` holds other files beside an export, only the export's files are replaced, one by one.
+    ConfigError if `out` is neither empty nor an export, or another file has the name of a new one.
+    SlatprepError if it cannot be written.
     """
     # A link stays; its target is replaced.
     out = out.resolve()
@@ -70,26 +53,9 @@ def directory(out: Path) -> Iterator[Path]:
 
 @contextmanager
 def file(out: Path, is_export: Callable[[Path], bool]) -> Iterator[Path]:
-    """Yield a new file that replaces `out` on success.
+    """Yield the path of a new file that replaces `out` on success.
 
-    Parameters
-    ----------
-    out : Path
-        The target.
-    is_export : callable
-        Whether an existing file is an export and may be replaced.
-
-    Yields
-    ------
-    Path
-        A path to write to.
-
-    Raises
-    ------
-    ConfigError
-        If `out` exists and is not an export.
-    SlatprepError
-        If it cannot be written.
+    Raises ConfigError if `out` exists and `is_export` denies it, SlatprepError if writing fails.
     """
     out = out.resolve()
     if out.exists() and not (out.is_file() and is_export(out)):

@@ -22,24 +22,9 @@ def writer(store: Store, ids: Sequence[str], options: ExportOptions) -> Writer:
 
 
 def write(directory: Path, number: int, assets: Iterable[StoredAsset]) -> Iterator[Exported]:
-    """Write a shard with ``<key>.json`` and ``<key>.npz`` for each asset.
+    """Write shard `number` with ``<key>.json`` and ``<key>.npz`` for each asset.
 
-    The key is the asset's id with dots encoded, since for WebDataset a key ends at the first
-    dot.
-
-    Parameters
-    ----------
-    directory : Path
-        The folder of the export.
-    number : int
-        Number of the shard.
-    assets : iterable of StoredAsset
-        The assets of the shard.
-
-    Yields
-    ------
-    Exported
-        For each asset.
+    The key is the asset's id with dots encoded: for WebDataset a key ends at the first dot.
     """
     shard = f"shard-{number:06d}.tar"
     with tarfile.open(directory / shard, "w") as tar:

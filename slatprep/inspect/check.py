@@ -47,10 +47,9 @@ AT_MOST = {"ambiguity": THRESHOLDS.good_ambiguity}
 
 @dataclass(frozen=True)
 class Figure:
-    """One number of a check.
+    """One number of a check: the `value` computed now and the `stored` one.
 
-    ``value`` was computed now, ``stored`` is in the store; ``limit`` is their largest allowed
-    difference.
+    `limit` is their largest allowed difference.
     """
 
     name: str
@@ -74,7 +73,7 @@ class Figure:
 
     @property
     def ok(self) -> bool:
-        """Whether the two agree; not-a-number, such as the margin of a known frame, is itself."""
+        """Whether the two agree; two NaN agree, such as the margins of a known frame."""
         both_unknown = math.isnan(self.value) and math.isnan(self.stored)
         return both_unknown or bool(abs(self.value - self.stored) <= self.limit)
 
@@ -94,12 +93,12 @@ class AlignmentCheck:
     stored_verdict : str
         The verdict that the store holds.
     figures : tuple of Figure
-        Every number, computed now and as stored. Ambiguity and margin are only taken from
-        the store, which does not hold the placements that they follow from.
+        Every number, computed now and as stored. Ambiguity and margin come from the store: it
+        does not hold the placements that they follow from.
     transform : ndarray of float64, shape (4, 4)
         PixieVerse frame to SLAT frame.
     radius : float
-        Voxels within which fitness counts a voxel as near the other side.
+        Distance [voxel] up to which fitness counts a voxel as near the other side.
     """
 
     asset_id: str
@@ -146,22 +145,7 @@ class AlignmentCheck:
 def check_alignment(store: Store, asset_id: str) -> AlignmentCheck:
     """Recompute an alignment's quality, and the annotation it gives, from the store alone.
 
-    Parameters
-    ----------
-    store : Store
-        From `slatprep.store.open_store`.
-    asset_id : str
-        Which asset.
-
-    Returns
-    -------
-    AlignmentCheck
-        Quality and annotation, recomputed and as stored.
-
-    Raises
-    ------
-    StoreError
-        If the store has no such asset, or lacks its build parameters.
+    Raises StoreError if the store has no such asset, or lacks its build parameters.
     """
     asset = store.asset(asset_id)
     radius = store.about.build.parameters.align.radius
@@ -227,27 +211,14 @@ def check_stored(path: Place, asset_id: str) -> AlignmentCheck:
 def recompute_annotation(asset: StoredAsset) -> tuple[float, dict[str, NDArray[np.float64]]]:
     """Sample an asset's annotation again from the stored grid and compare it with the store.
 
-    The stored grid is one annotation. Labels merged from several annotations are compared only
-    where all agree, or where only the stored one has a label.
+    Returns the share of SLAT voxels that get an annotation now, and the difference (N,) of each
+    voxel by the arrays of `TOLERANCES`: 1 where valid or material changed, the largest difference
+    of normalised properties where both are valid (0 elsewhere), and that of the distance [voxel].
+    NaN counts as a difference.
 
-    Parameters
-    ----------
-    asset : StoredAsset
-        The asset.
-
-    Returns
-    -------
-    valid_share : float
-        Share of the SLAT voxels that get an annotation now.
-    differences : dict of str to ndarray of float64, shape (N,)
-        How much each SLAT voxel differs, by the arrays of `TOLERANCES`: 1 where valid or
-        material changed, the largest difference of the normalised properties where both are
-        valid (0 elsewhere), and that of the distance [voxel]. NaN counts as a difference.
-
-    Raises
-    ------
-    StoreError
-        If the store lacks its build parameters.
+    The stored grid is a single annotation. Labels merged from several are compared only where all
+    agree, or where only the stored one has a label. StoreError if the store lacks its build
+    parameters.
     """
     parameters = asset.store.about.build.parameters.sample
     # What is looked up is copied, so it need not be brought to SI units and back.
@@ -274,27 +245,9 @@ def choose_assets(
 ) -> list[str]:
     """Choose assets to check, each once: those named, then the worst, then the ambiguous.
 
-    Parameters
-    ----------
-    store : Store
-        The store; only its ``asset/*`` arrays are read.
-    asset_ids : iterable of str
-        Ids, or prefixes that only one id has, in this order.
-    worst : int
-        Number of the worst assets: by verdict, failed ones first, then by confidence, then by
-        the lower of the two fitnesses.
-    ambiguous : bool
-        Whether to take all assets above the threshold of ambiguity, the most ambiguous first.
-
-    Returns
-    -------
-    list of str
-        Ids.
-
-    Raises
-    ------
-    StoreError
-        If no asset has one of the ids.
+    `asset_ids` may be prefixes of a single id. The `worst` assets follow by verdict, failed first,
+    then by confidence, then by the lower fitness. `ambiguous` takes all above the threshold of
+    ambiguity, the most ambiguous first. StoreError if no asset has one of the ids.
     """
     rows = [store.match(asset_id) for asset_id in asset_ids]
     if worst:

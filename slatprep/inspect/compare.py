@@ -42,8 +42,8 @@ def compare_stores(
 ) -> StoreDifference:
     """Return the differences between two stores.
 
-    Each asset is read once from either store, without ``grid/*``: those are compared by the
-    digests of their sources.
+    Each asset is read once from either store, without ``grid/*``: the digests of their sources
+    stand for those.
 
     Parameters
     ----------

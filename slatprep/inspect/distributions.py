@@ -45,7 +45,7 @@ class SideStatistics:
     Attributes
     ----------
     assets, voxels : int
-        Number of these voxels (of fields, of the occupied ones), and of assets that have any.
+        Number of these voxels (of fields: the occupied ones), and of assets that have any.
     share : float
         Their share of the weight of all voxels on this side.
     unannotated : float
@@ -69,8 +69,8 @@ class SideStatistics:
 class GroupStatistics:
     """All voxels, those of a class, or those of the assets of a category.
 
-    ``field`` is before the lookup, ``slat`` after it. ``verdicts`` counts the assets by
-    verdict; it is empty for a class, since an asset can have voxels of several.
+    ``field`` is before the lookup, ``slat`` after it. ``verdicts`` counts the assets by verdict; it
+    is empty for a class, because the voxels of an asset can have several.
     """
 
     by: Literal["all", "class", "category"]

@@ -43,24 +43,8 @@ def list_assets(
 ) -> Iterator[ListedAsset]:
     """Yield the assets of a store, sorted by id.
 
-    Parameters
-    ----------
-    store : Store
-        From `slatprep.store.open_store`.
-    verdicts, categories : collection of str
-        Only assets with one of these; empty takes all.
-    max_confidence : float, optional
-        Only assets with at most this confidence.
-
-    Yields
-    ------
-    ListedAsset
-        Each asset that passes the filters.
-
-    Raises
-    ------
-    StoreError
-        If the store, or the record of an asset that is not good, cannot be read.
+    They have one of `verdicts` and `categories`, where given, and at most `max_confidence`.
+    StoreError if the store, or the record of an asset that is not good, cannot be read.
     """
     table, records, ids = store.table(), StoredRecords(store), store.ids
     for row in sorted(rows_chosen(store, verdicts, categories), key=ids.__getitem__):

@@ -26,10 +26,10 @@ _MEDIANS = ("confidence", "expected_accuracy", "fitness", "inlier_rmse", "fitnes
 class GroupOverview:
     """Figures over some assets of a store.
 
-    ``verdicts`` counts the assets by verdict. Confidence, expected accuracy, fitness, rmse
-    [voxel] and overlap are medians over the assets; ``valid_share`` is over all their voxels.
-    ``ambiguous`` counts assets above the threshold of ambiguity; ``unphysical`` counts
-    PixieVerse voxels left out because no material has their properties.
+    ``verdicts`` counts the assets by verdict. Confidence, expected accuracy, fitness, rmse [voxel]
+    and overlap are medians over the assets; ``valid_share`` is over all their voxels. ``ambiguous``
+    counts assets above the threshold of ambiguity. ``unphysical`` counts PixieVerse voxels left out
+    because no material has their properties.
     """
 
     name: str
@@ -68,18 +68,7 @@ class StoreOverview:
 
 
 def overview_of(store: Store) -> StoreOverview:
-    """Return the contents of a store; only its ``asset/*`` arrays are read.
-
-    Parameters
-    ----------
-    store : Store
-        From `slatprep.store.open_store`.
-
-    Returns
-    -------
-    StoreOverview
-        Figures over all assets and by category.
-    """
+    """Return the contents of a store, overall and by category; read only ``asset/*`` arrays."""
     names = ("category", "verdict", *_MEDIANS, "valid_share", "ambiguity", "engine", "model",
              "unphysical")  # fmt: skip
     columns = {name: store.column(name) for name in names}

@@ -71,8 +71,8 @@ def store_statistics(
     Returns
     -------
     StoreStatistics
-        Figures over no voxels are NaN. A quantile q is the smallest value that is not
-        exceeded by at least the share q of the weight (numpy's ``inverted_cdf``), up to
+        Figures over no voxels are NaN. A quantile q is the smallest value that at least the
+        share q of the weight does not exceed (numpy's ``inverted_cdf``), up to
         `StoreStatistics.quantile_error`.
 
     Raises

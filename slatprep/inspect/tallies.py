@@ -98,9 +98,9 @@ def pooled(
     squares: NDArray[np.float64],
     axis: int,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Merge means and sums of squared differences, of one shape with `weights`, along an axis.
+    """Merge means and sums of squared differences, shaped like `weights`, along an axis.
 
-    Where all weights are 0, both are 0.
+    Both are 0 where all weights are 0.
     """
     total = weights.sum(axis=axis, keepdims=True)
     centre = (weights * mean).sum(axis=axis, keepdims=True) / np.where(total > 0, total, 1.0)
@@ -134,26 +134,11 @@ def tally(
     contents: Contents,
     by_asset: bool = False,
 ) -> Tally:
-    """Tally the voxels of one asset.
+    """Tally the voxels of one asset by `bins` of the normalised values over [-1, 1].
 
-    Parameters
-    ----------
-    field, slat : tuple of ndarray
-        Classes and normalised properties of the same voxels, in the shapes of ``grid/*``
-        ((R, R, R) and (P, R, R, R)) and of ``voxel/*`` ((N,) and (N, P)).
-    ranges : Normalization
-        The ranges of the properties.
-    bins : int
-        Bins of the histograms, over [-1, 1].
-    contents : Contents
-        What the store holds.
-    by_asset : bool
-        Whether all voxels of a side have weight 1 together, instead of 1 each.
-
-    Returns
-    -------
-    Tally
-        Of this asset alone.
+    `field` and `slat` are classes and normalised properties in the shapes of ``grid/*`` ((R, R, R)
+    and (P, R, R, R)) and of ``voxel/*`` ((N,) and (N, P)). With `by_asset`, all voxels of a side
+    have weight 1 together, otherwise 1 each.
     """
     grid, values = field
     labels = contents.n_labels

@@ -28,12 +28,17 @@ def __getattr__(name: str) -> object:
 
 
 def require_torch(device: str = "cpu") -> None:
-    """Make sure that PyTorch is installed, and finds the device.
+    """Make sure that PyTorch is installed and finds the device.
+
+    Parameters
+    ----------
+    device : str
+        ``cpu`` or ``cuda``.
 
     Raises
     ------
     SlatprepError
-        If it cannot be imported, when the message says what to install, or finds no ``cuda``.
+        If PyTorch cannot be imported, with the command that installs it, or finds no ``cuda``.
     """
     try:
         import torch

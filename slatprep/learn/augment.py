@@ -23,18 +23,10 @@ Augmentation = Literal["none", "upright", "all"]
 
 
 def lattice_symmetries(kind: Augmentation) -> NDArray[np.int64]:
-    """Return the symmetries as signed permutation matrices.
+    """Return symmetries as signed permutation matrices (S, 3, 3), the identity first.
 
-    Parameters
-    ----------
-    kind : {"none", "upright", "all"}
-        ``none``: the identity; ``upright``: the 8 quarter turns about z and flips that keep
-        the z axis up; ``all``: the 48 of the cube.
-
-    Returns
-    -------
-    ndarray of int64, shape (S, 3, 3)
-        The first is the identity.
+    ``none`` has the identity, ``upright`` the 8 quarter turns about z and flips that keep the z
+    axis up, ``all`` the 48 of the cube.
     """
     symmetries = cube_symmetries()
     if kind == "none":
@@ -45,21 +37,9 @@ def lattice_symmetries(kind: Augmentation) -> NDArray[np.int64]:
 def move(
     coords: NDArray[np.int32], symmetry: NDArray[np.int64], resolution: int = RESOLUTION
 ) -> NDArray[np.int32]:
-    """Move voxels by a symmetry about the centre of the grid.
+    """Move voxels (N, 3) of a grid by a symmetry (3, 3) about its centre.
 
-    Parameters
-    ----------
-    coords : ndarray of int32, shape (N, 3)
-        Voxels, 0 to resolution - 1.
-    symmetry : ndarray of int64, shape (3, 3)
-        Signed permutation matrix.
-    resolution : int
-        Voxels along each axis of the grid.
-
-    Returns
-    -------
-    ndarray of int32, shape (N, 3)
-        Indices of the voxel centres ``(i + 0.5) / resolution - 0.5`` multiplied by the matrix.
+    The matrix multiplies the voxel centres ``(i + 0.5) / resolution - 0.5``.
     """
     # Twice the distance from the centre is an odd integer, so the arithmetic is exact.
     doubled = 2 * coords.astype(np.int64) - (resolution - 1)

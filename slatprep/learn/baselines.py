@@ -43,17 +43,10 @@ class VoxelBaseline:
 
 
 def fit_baselines(dataset: SlatDataset) -> tuple[VoxelBaseline, VoxelBaseline]:
-    """Fit both reference models in one pass over all valid voxels, with equal weights.
+    """Fit both reference models to a dataset in one pass; all valid voxels weigh the same.
 
-    Parameters
-    ----------
-    dataset : SlatDataset
-        What they are fitted to.
-
-    Returns
-    -------
-    mean, linear : VoxelBaseline
-        The mean and the most frequent class of all voxels; a least-squares fit.
+    The first gives the mean and the most frequent class of all voxels, the second is a
+    least-squares fit.
     """
     contents = dataset.store.contents
     size, count = contents.latents.channels + 4, len(contents.properties)

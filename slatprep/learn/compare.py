@@ -96,41 +96,17 @@ def compare_methods(
     """Measure predictions of SLAT voxels and predicted grids against a store.
 
     A grid is measured twice. On its own voxels, by Pixie's protocol (vlongle/pixie,
-    ``inference_combined.py``): squared errors in normalised space and class accuracy, means
-    over the object's annotated voxels, then over objects. A voxel that is predicted to be
-    background has the wrong class; its properties count, and no prediction is clipped. At the
-    SLAT's voxels, the grid's values are looked up as the store's labels were, at the stored
-    places. The grid that the labels were made from therefore has no error there.
+    ``inference_combined.py``): squared errors in normalised space and class accuracy, means over
+    the object's annotated voxels, then over objects. A voxel predicted as background has the wrong
+    class; its properties count, and no prediction is clipped. At the SLAT's voxels, the grid's
+    values are looked up as the store's labels were, at the stored places. The grid that the labels
+    were made from therefore has no error there.
 
-    Parameters
-    ----------
-    predictions : Path, optional
-        As `slatprep.learn.predictions.open_predictions` reads them.
-    grids : mapping of str to Path
-        Folders by the name of the method; for the files see
-        `slatprep.readers.pixieverse.read_prediction`:
-        ``<object id>/sample_<k>_pred.npy``, ``<object id>/sample_<k>/material_grid.npy`` or
-        ``<object id>.npy``.
-    store_path : Place
-        The store.
-    split, splits, verdicts, max_ambiguity
-        As for `slatprep.learn.splits.select_assets`.
-    spread : str
-        As for `slatprep.learn.metrics.measure`.
-
-    Returns
-    -------
-    Comparison
-        The scores.
-
-    Raises
-    ------
-    InputError
-        If no asset has a usable prediction of every method.
-    ConfigError
-        If a folder cannot be listed, or the store holds other properties or classes.
-    StoreError
-        If the store cannot be read.
+    `predictions` is read by `slatprep.learn.predictions.open_predictions`, a file of `grids` by
+    `slatprep.readers.pixieverse.read_prediction`: ``<object id>/sample_<k>_pred.npy``, ``<object
+    id>/sample_<k>/material_grid.npy`` or ``<object id>.npy``. Split and filters are those of
+    `slatprep.learn.splits.select_assets`. InputError if no asset has a usable prediction of every
+    method; ConfigError if the store holds other properties or classes.
     """
     store = open_store(store_path)
     _require_pixieverse(store)
@@ -252,21 +228,9 @@ def _ours(predictions: Path | None, read: ReadAsset, truth: _Truth) -> VoxelPred
 
 
 def draw_comparison(methods: Mapping[str, Measure], what: str, path: Path) -> None:
-    """Draw a panel for each metric, with the mean and spread of each method.
+    """Draw a panel for each metric into a PNG, with the mean and spread of each method.
 
-    Parameters
-    ----------
-    methods : mapping of str to Measure
-        At least one method.
-    what : str
-        The kind of the spreads, in words.
-    path : Path
-        The PNG to write.
-
-    Raises
-    ------
-    StoreError
-        If it cannot be written.
+    `what` says in words which kind of spread it is. StoreError if the PNG cannot be written.
     """
     from matplotlib.figure import Figure
 

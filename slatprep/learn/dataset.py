@@ -212,18 +212,7 @@ class SlatDataset(Dataset[Item]):
 
 
 def require_confidence(store: Store) -> None:
-    """Make sure that a store has the confidence of its voxels.
-
-    Parameters
-    ----------
-    store : Store
-        The store.
-
-    Raises
-    ------
-    ConfigError
-        If it has format 1, which does not hold it.
-    """
+    """Raise ConfigError if a store has format 1, which holds no confidence of voxels."""
     if store.format_version == 1:
         raise ConfigError(
             f"{store.path} has format 1, without the confidence of voxels; expected format 2 or "

@@ -75,21 +75,9 @@ class Windows(NamedTuple):
 
 
 def partition(coords: Tensor, window: int, shift: int) -> Windows:
-    """Group voxels by window.
+    """Group voxels (N, 4), batch column first and in any order, by window.
 
-    Parameters
-    ----------
-    coords : Tensor of int, shape (N, 4)
-        Batch column and voxel, in any order.
-    window : int
-        Edge of a window [voxel].
-    shift : int
-        Shift of the windows [voxel].
-
-    Returns
-    -------
-    Windows
-        The groups.
+    Windows have edges of `window` voxels, and their grid is shifted by `shift` voxels.
     """
     cell = torch.div(coords[:, 1:].long() + shift, window, rounding_mode="floor")
     across = (MAX_LATENT_RESOLUTION + window) // window + 1
@@ -115,22 +103,10 @@ def partition(coords: Tensor, window: int, shift: int) -> Windows:
 
 
 def embed_position(coords: Tensor, channels: int) -> Tensor:
-    """Return the sinusoidal embedding of voxel indices.
+    """Return the sinusoidal embedding (N, channels) of voxel indices (N, 3).
 
-    The frequencies are 10000^(-k / K), k = 0..K-1, for each axis (Vaswani et al., "Attention is
-    all you need", 2017); channels beyond a multiple of six are 0.
-
-    Parameters
-    ----------
-    coords : Tensor of int, shape (N, 3)
-        Voxels.
-    channels : int
-        Width of the embedding.
-
-    Returns
-    -------
-    Tensor of float32, shape (N, channels)
-        Sines and cosines.
+    The frequencies are 10000^(-k / K), k = 0..K-1, for each axis (Vaswani et al., "Attention is all
+    you need", 2017); channels beyond a multiple of six are 0.
     """
     count = channels // 6
     steps = torch.arange(count, dtype=torch.float32, device=coords.device) / count
@@ -196,14 +172,8 @@ class SwinBlock(nn.Module):
 class PhysicsDecoder(nn.Module):
     """A decoder from latents to the physical properties and the class of every voxel.
 
-    Parameters
-    ----------
-    size : DecoderSize
-        One of `SIZES`, or another.
-    window : int
-        Edge of an attention window [voxel].
-    contents : Contents
-        The latents, properties and classes, which give the widths of input and heads.
+    `size` is one of `SIZES` or another, `window` the edge of an attention window [voxel]. The
+    latents, properties and classes of `contents` give the widths of input and heads.
     """
 
     def __init__(
@@ -227,19 +197,9 @@ class PhysicsDecoder(nn.Module):
             nn.init.zeros_(head.weight)
 
     def forward(self, coords: Tensor, feats: Tensor) -> Prediction:
-        """Predict.
+        """Predict from voxels (N, 4), batch column first, and standardised latents (N, channels).
 
-        Parameters
-        ----------
-        coords : Tensor of int, shape (N, 4)
-            Batch column and voxel; rows in any order.
-        feats : Tensor of float32, shape (N, channels)
-            Standardised latents.
-
-        Returns
-        -------
-        Prediction
-            In the order of the rows.
+        Rows may be in any order.
         """
         shifts = (0, self.window // 2)
         windows = [partition(coords, self.window, shift) for shift in shifts]

@@ -14,21 +14,10 @@ CLASS_WEIGHT = 0.5
 
 
 def loss_of(prediction: Prediction, batch: SparseBatch, weigh: bool = False) -> Tensor:
-    """Return SLAT-Phys's loss over the valid voxels of a batch.
+    """Return SLAT-Phys's loss over the valid voxels of a batch, a scalar.
 
-    Parameters
-    ----------
-    prediction : Prediction
-        For all voxels of the batch.
-    batch : SparseBatch
-        The batch.
-    weigh : bool
-        Whether to weight the means over voxels by their confidence.
-
-    Returns
-    -------
-    Tensor of float, shape ()
-        The sum of the properties' mean squared errors and half the cross-entropy.
+    It is the sum of the properties' mean squared errors and half the cross-entropy. With `weigh`,
+    confidence weights the means over voxels.
     """
     if not bool(batch.valid.any()):
         return prediction.properties.sum() * 0.0 + prediction.logits.sum() * 0.0

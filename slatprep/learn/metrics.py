@@ -99,23 +99,10 @@ def score_asset(
     material: NDArray[np.uint8],
     valid: NDArray[np.bool_],
 ) -> NDArray[np.float64]:
-    """Return the metrics of one asset: means over its valid voxels.
+    """Return the metrics (P + 2,) of an asset, in the order of `metrics_of`.
 
-    Parameters
-    ----------
-    prediction : VoxelPrediction
-        For N voxels.
-    properties : ndarray of float32, shape (N, P)
-        The true properties in [-1, 1].
-    material : ndarray of uint8, shape (N,)
-        The true class.
-    valid : ndarray of bool, shape (N,)
-        Which voxels have labels; at least one.
-
-    Returns
-    -------
-    ndarray of float64, shape (P + 2,)
-        As in `metrics_of`; accuracy is NaN if no class was predicted.
+    They are means over its valid voxels, of which there must be one. `properties` (N, P) in [-1, 1]
+    and `material` (N,) are the truth. Accuracy is NaN if no class was predicted.
     """
     errors = np.square(prediction.properties - properties)[valid].mean(axis=0)
     accuracy = np.nan
@@ -125,22 +112,7 @@ def score_asset(
 
 
 def measure(scores: NDArray[np.float64], spread: Spread, names: Sequence[str] = METRICS) -> Measure:
-    """Return mean and spread over objects.
-
-    Parameters
-    ----------
-    scores : ndarray of float64, shape (objects, metrics)
-        The metrics of each object; at least one object.
-    spread : str
-        See `SPREADS`.
-    names : sequence of str
-        Names of the metrics.
-
-    Returns
-    -------
-    Measure
-        By metric.
-    """
+    """Return mean and spread of scores (objects, metrics) over at least one object."""
     count = len(scores)
     deviation = np.full(len(names), np.nan)
     if count > 1:
@@ -165,21 +137,7 @@ def average_objects(
 ) -> tuple[Measure, dict[str, Measure]]:
     """Average assets per object, then objects, over all and per category.
 
-    Parameters
-    ----------
-    scores : sequence of ndarray of float64, shape (metrics,)
-        The metrics of each asset.
-    objects, categories : sequence of str
-        Object and category of each asset. The views of an object count as one object.
-    spread, names
-        As in `measure`.
-
-    Returns
-    -------
-    overall : Measure
-        Over all objects.
-    categories : dict of str to Measure
-        Over the objects of each category.
+    `scores` has the metrics (metrics,) of each asset. The views of an object count as one object.
     """
     _, first, number = np.unique(objects, return_index=True, return_inverse=True)
     rows = np.array(scores)
@@ -202,34 +160,10 @@ def evaluate_store(
     max_ambiguity: float | None = None,
     splits: Mapping[str, Split] | None = None,
 ) -> Evaluation:
-    """Measure predictions against a store.
+    """Measure predictions, as `open_predictions` reads them, against a store.
 
-    Parameters
-    ----------
-    predictions : Path
-        As `open_predictions` reads them.
-    store_path : Path
-        The store.
-    split : {"train", "val", "test"}, optional
-        Only objects of this split; all if None.
-    shares : Shares
-        Shares of the splits, as in training.
-    spread : str
-        See `SPREADS`.
-    verdicts, max_ambiguity, splits
-        As for `slatprep.learn.splits.select_assets`.
-
-    Returns
-    -------
-    Evaluation
-        The scores.
-
-    Raises
-    ------
-    InputError
-        If no asset of the split has a prediction, or a prediction cannot be used.
-    StoreError
-        If the store cannot be read.
+    `shares` are those of the training. `slatprep.learn.splits.select_assets` takes split and
+    filters. InputError if no asset of the split has a prediction, or a prediction cannot be used.
     """
     store = open_store(store_path)
     object_ids, categories = store.column("object_id"), store.column("category")

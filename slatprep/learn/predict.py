@@ -1,7 +1,7 @@
 """Predict material fields from latents with a trained decoder, and write them.
 
 A prediction is an npz that `slatprep evaluate`, `slatprep transfer` and numpy read. It holds its
-ranges, so that it can be used without the store that the decoder was trained on.
+ranges, so it serves without the store that the decoder was trained on.
 """
 
 from __future__ import annotations
@@ -82,24 +82,7 @@ def checkpoint_state(
     normalization: Normalization,
     contents: Contents = PIXIEVERSE,
 ) -> dict[str, Any]:
-    """Return the state of a decoder as saved in a checkpoint.
-
-    Parameters
-    ----------
-    model : PhysicsDecoder
-        The decoder.
-    size : str
-        The name of its size.
-    normalization : Normalization
-        The ranges of its properties.
-    contents : Contents
-        What it was trained on.
-
-    Returns
-    -------
-    dict
-        Tensors and plain values, which `load_checkpoint` reads.
-    """
+    """Return the state of a decoder for a checkpoint: tensors and plain values."""
     ranges = [[span.lo, span.hi] for span in normalization.ranges]
     # As JSON, since a checkpoint may hold only tensors and plain values.
     held = orjson.dumps(
@@ -119,24 +102,9 @@ def checkpoint_state(
 
 
 def load_checkpoint(path: Path, device: str = "cpu") -> Checkpoint:
-    """Read a decoder that `slatprep train` has written.
+    """Read a decoder of `slatprep train` for evaluation, from ``best.pt`` or the folder of its run.
 
-    Parameters
-    ----------
-    path : Path
-        ``best.pt`` of a run, or the folder of the run.
-    device : str
-        The device to compute on.
-
-    Returns
-    -------
-    Checkpoint
-        The decoder, on the device and in evaluation mode.
-
-    Raises
-    ------
-    InputError
-        If it is not such a checkpoint, or from a version whose checkpoints had no ranges.
+    Raises InputError if the file is no such checkpoint, or is too old to have ranges.
     """
     if path.is_dir():
         path = path / "best.pt"
@@ -185,23 +153,11 @@ def predict(
     *,
     batch_voxels: int = BATCH_VOXELS,
 ) -> Iterator[PredictedField]:
-    """Predict the fields of assets, in their order.
+    """Yield the predicted field of each asset, in order.
 
-    Parameters
-    ----------
-    checkpoint : Checkpoint
-        The decoder.
-    assets : iterable of StructuredLatents
-        Latents of the checkpoint's encoder; those that are not standardised are standardised
-        here.
-    batch_voxels : int
-        Assets are decoded together up to this number of voxels. The other assets of a batch
-        may change the last bits of a prediction.
-
-    Yields
-    ------
-    PredictedField
-        For each asset.
+    Latents must come from the checkpoint's encoder; they are standardised here unless they are
+    already. Assets up to `batch_voxels` voxels are decoded together, which may change the last
+    bits.
     """
     batch: list[StructuredLatents] = []
     for latents in assets:
@@ -245,31 +201,11 @@ def _decode(checkpoint: Checkpoint, assets: list[StructuredLatents]) -> Iterator
 def write_prediction(
     folder: Path, asset_id: str, field: PredictedField, checkpoint: Checkpoint
 ) -> Path:
-    """Write a prediction as an npz.
+    """Write a prediction to ``<asset id>.npz`` in a folder and return its path.
 
     It has the arrays of a `PredictedField`, ``ranges`` (P, 2) and names ``columns`` (P,) of the
-    properties, ``checkpoint`` (the SHA-256 of its file) and ``seconds``.
-
-    Parameters
-    ----------
-    folder : Path
-        The folder of the predictions.
-    asset_id : str
-        The asset, which names the file.
-    field : PredictedField
-        The prediction.
-    checkpoint : Checkpoint
-        The decoder that made it.
-
-    Returns
-    -------
-    Path
-        ``<asset id>.npz`` in the folder.
-
-    Raises
-    ------
-    InputError
-        If the prediction is not finite; nothing is written.
+    properties, ``checkpoint`` (the SHA-256 of its file) and ``seconds``. InputError, and no file,
+    if the prediction is not finite.
     """
     if not (np.isfinite(field.properties).all() and np.isfinite(field.probabilities).all()):
         encoder = checkpoint.contents.latents.encoder

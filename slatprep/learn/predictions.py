@@ -1,7 +1,7 @@
 """Read predictions by asset: npz files, Zarr or HDF5.
 
-The files are not trusted: nothing is unpickled, no link is followed out of them, and arrays of
-another type or shape than a prediction's are not read.
+The files are not trusted. Nothing is unpickled, no link leads out of them, and arrays of another
+type or shape than a prediction's are not read.
 """
 
 from __future__ import annotations
@@ -92,24 +92,10 @@ class _Selection:
 
 
 def selection_of_run(predictions: Path) -> dict[str, Any] | None:
-    """Return which assets a training run chose.
+    """Return which assets the training run beside the predictions chose, None without a run.
 
-    Parameters
-    ----------
-    predictions : Path
-        The folder of its predictions.
-
-    Returns
-    -------
-    dict or None
-        Arguments of `slatprep.learn.splits.select_assets`: ``shares``, ``verdicts`` and
-        ``max_ambiguity``, and as ``by`` the file of splits if there is one. None if the
-        predictions are not beside a run.
-
-    Raises
-    ------
-    InputError
-        If the run's file lacks one of them.
+    The result holds arguments of `slatprep.learn.splits.select_assets`, and as ``by`` the file of
+    splits if there is one. InputError if the run's file lacks one of them.
     """
     from pydantic import TypeAdapter
 
@@ -136,23 +122,10 @@ ReadAsset = Callable[[str], Mapping[str, NDArray[Any]] | None]
 
 @contextmanager
 def open_predictions(path: Path) -> Iterator[ReadAsset]:
-    """Open predictions of any form.
+    """Open predictions of any form; yield a function that reads those of an asset.
 
-    Parameters
-    ----------
-    path : Path
-        A folder of ``<asset_id>.npz``, a Zarr group of format 3, or an HDF5 file. Ids are
-        encoded by `slatprep.storage.names.file_name`.
-
-    Yields
-    ------
-    ReadAsset
-        Reads the prediction for an asset.
-
-    Raises
-    ------
-    InputError
-        If it is none of these.
+    They are a folder of ``<asset_id>.npz``, a Zarr group of format 3, or an HDF5 file, with ids
+    encoded by `slatprep.storage.names.file_name`. InputError if they are none of these.
     """
     if path.is_dir():
         zarr = any((path / name).exists() for name in ("zarr.json", ".zgroup"))
@@ -187,33 +160,12 @@ def check_prediction(
     normalization: Normalization,
     contents: Contents = PIXIEVERSE,
 ) -> VoxelPrediction:
-    """Check a prediction and put its voxels in the order of the store.
+    """Check a prediction; return it in the order and ranges of the store.
 
-    Parameters
-    ----------
-    source : str
-        Name of the prediction in messages.
-    arrays : mapping of str to ndarray
-        ``properties`` (N, P); optionally ``material`` (N,) or ``logits`` (N, classes), ``coords``
-        (N, 3) and ``ranges`` (P, 2). Without ``coords`` and ``ranges`` order and ranges are
-        taken to be the store's.
-    coords : ndarray of uint8, shape (N, 3)
-        Voxels of the store.
-    normalization : Normalization
-        The store's ranges.
-    contents : Contents
-        What the store holds: its classes, and the grid of its latents.
-
-    Returns
-    -------
-    VoxelPrediction
-        In the store's order and ranges.
-
-    Raises
-    ------
-    InputError
-        If an array is missing, has another type or shape, is not finite or not normalised,
-        or the voxels differ from the store's.
+    `arrays` has ``properties`` (N, P); optionally ``material`` (N,) or ``logits`` (N, classes),
+    ``coords`` (N, 3) and ``ranges`` (P, 2). By default coordinates and ranges are the store's,
+    `coords` (N, 3) and `normalization`. InputError, naming `source`, if an array is missing, has
+    another type or shape, is not finite or not normalised, or the voxels differ from the store's.
     """
     count = len(coords)
     if "properties" not in arrays:

@@ -80,24 +80,10 @@ TABLES = {
 
 
 def read_scores(path: Path) -> tuple[PublishedScore, ...]:
-    """Read a table of scores.
+    """Read a table of scores without spreads, such as from ``slatprep evaluate --csv``.
 
-    Parameters
-    ----------
-    path : Path
-        A CSV with the methods' names in the first column and some of the columns "log10 E",
-        "log10 density", "nu", "mean" and "accuracy", such as from ``slatprep evaluate --csv``.
-
-    Returns
-    -------
-    tuple of PublishedScore
-        A row of the table each, without spreads.
-
-    Raises
-    ------
-    InputError
-        If the file cannot be read, has none of these columns, or one of their entries is not
-        a number.
+    The CSV has the methods' names in the first column and some of the columns "log10 E", "log10
+    density", "nu", "mean" and "accuracy". InputError if it has none, or no number in one.
     """
     expected = f"a CSV with a name in the first column and some of {', '.join(METRICS)}"
     try:

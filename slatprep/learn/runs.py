@@ -38,7 +38,7 @@ _GLOBALS = ("torch", "collections OrderedDict")
 
 @dataclasses.dataclass(frozen=True)
 class EpochRecord:
-    """One line of ``log.csv``: means over an epoch.
+    """A line of ``log.csv``: means over an epoch.
 
     Validation figures are NaN if there are no objects to validate on.
     """
@@ -52,22 +52,9 @@ class EpochRecord:
 
 
 def read_state(path: Path) -> dict[str, Any]:
-    """Read a checkpoint, which is not trusted: nothing in it is executed.
+    """Read the state in an untrusted checkpoint to the CPU; nothing in it is executed.
 
-    Parameters
-    ----------
-    path : Path
-        The file.
-
-    Returns
-    -------
-    dict
-        The saved state, on the CPU.
-
-    Raises
-    ------
-    InputError
-        If the file is not a checkpoint, or damaged.
+    Raises InputError if the file is damaged or not a checkpoint.
     """
     with (
         refusing(path, "cannot be read", "a checkpoint of `slatprep train`"),
@@ -106,24 +93,8 @@ def _check_globals(pickled: bytes) -> None:
 class Run:
     """The folder of a training run; as a context manager it holds the folder's lock.
 
-    Parameters
-    ----------
-    path : Path
-        A new or empty folder, or the folder of a run.
-
-    Attributes
-    ----------
-    parameters : dict
-        Those of the run in the folder; empty for a new run.
-
-    Raises
-    ------
-    ConfigError
-        If the folder holds something else.
-    StoreError
-        If another process trains into it.
-    InputError
-        If its ``run.json`` cannot be read.
+    The folder is new, empty, or that of a run, whose `parameters` it then has. ConfigError if it
+    holds something else, StoreError if another process trains into it.
     """
 
     def __init__(self, path: Path) -> None:
@@ -160,19 +131,9 @@ class Run:
     def begin(self, parameters: dict[str, Any], assignment: Assignment | None = None) -> None:
         """Write the parameters of a new run, or continue a run with the same parameters.
 
-        The objects of each split go into ``splits.json``, their digest into ``run.json``.
-
-        Parameters
-        ----------
-        parameters : dict
-            Everything that the result depends on.
-        assignment : Assignment, optional
-            The objects of each split.
-
-        Raises
-        ------
-        ConfigError
-            If the run in the folder has other parameters; the message names them.
+        The result must depend on nothing else. The objects of each split go into ``splits.json``,
+        their digest into ``run.json``. ConfigError if the run in the folder has other parameters;
+        the message names them.
         """
         if assignment is not None:
             lists = json.dumps(assignment.lists(), indent=1) + "\n"
@@ -205,13 +166,7 @@ class Run:
             path.write_bytes(buffer.getbuffer())
 
     def load(self, name: str) -> dict[str, Any] | None:
-        """Read a checkpoint; None if there is none.
-
-        Raises
-        ------
-        InputError
-            If the file is damaged.
-        """
+        """Read a checkpoint, None if there is none; InputError if the file is damaged."""
         return read_state(self.path / name) if (self.path / name).exists() else None
 
     def reading(self, name: str) -> AbstractContextManager[None]:
@@ -234,15 +189,7 @@ class Run:
                 board.add_scalar(name, getattr(history[-1], name), history[-1].epoch)
 
     def draw(self, history: Sequence[EpochRecord], references: dict[str, float]) -> None:
-        """Draw ``curve.png``: validation error by epoch, and the errors of the references.
-
-        Parameters
-        ----------
-        history : sequence of EpochRecord
-            At least one epoch.
-        references : dict of str to float
-            Mean squared error of each of the two references, by name.
-        """
+        """Draw ``curve.png``: validation error by epoch, and the error (MSE) of each reference."""
         from matplotlib.figure import Figure
         from matplotlib.ticker import MaxNLocator
 
@@ -269,8 +216,6 @@ class Run:
 def apart(heights: Sequence[float], gap: float = 0.065) -> list[float]:
     """Return heights for labels near the given ones, in the same order and at least `gap` apart.
 
-    Examples
-    --------
     >>> apart([0.5, 0.5, 0.1], gap=0.25)
     [0.5, 0.75, 0.1]
     """

@@ -22,24 +22,7 @@ def assign_store(
 ) -> Assignment:
     """Return the split of every object of a store that has a valid voxel.
 
-    Parameters
-    ----------
-    store : Store
-        An open store.
-    by, shares
-        As for `slatprep.readers.splits.assign_splits`.
-
-    Returns
-    -------
-    Assignment
-        Split by object id.
-
-    Raises
-    ------
-    ConfigError, InputError
-        As `slatprep.readers.splits.assign_splits` raises them.
-    StoreError
-        If the store cannot be read.
+    Rule, shares and errors are those of `slatprep.readers.splits.assign_splits`.
     """
     columns = (store.ids, store.column("object_id"), store.column("category"))
     rows = np.flatnonzero(store.column("valid_share") > 0).tolist()
@@ -57,35 +40,11 @@ def select_assets(
     max_ambiguity: float | None = None,
     splits: Mapping[str, Split] | None = None,
 ) -> NDArray[np.int64]:
-    """Return the rows of the assets in a split, in the order of the store.
+    """Return the rows (K,) of the assets in a split, in the order of the store.
 
-    Parameters
-    ----------
-    store : Store
-        An open store.
-    split : {"train", "val", "test"}, optional
-        Only objects of this split, see `slatprep.readers.splits.split_objects`.
-    shares : Shares
-        Shares of the splits.
-    verdicts : collection of str, optional
-        Only assets with one of these verdicts, such as ``("good",)``.
-    max_ambiguity : float, optional
-        Only assets with at most this ``asset/ambiguity``; those without a number are left out.
-    splits : mapping of str to {"train", "val", "test"}, optional
-        Split of each object by id, such as from `assign_store`; by default the split by hash.
-
-    Returns
-    -------
-    ndarray of int64, shape (K,)
-        Rows for `Store.read`. Assets without a valid voxel are left out, since they have no
-        labels to train on or to measure against.
-
-    Raises
-    ------
-    ConfigError
-        If there is no such split or verdict.
-    StoreError
-        If the store cannot be read.
+    Assets must have one of `verdicts` and at most `max_ambiguity`; those without a number are out.
+    Assets without a valid voxel are out, too: they have no labels. `splits` gives the split of each
+    object by id, by default the split by hash. ConfigError if split or verdict is unknown.
     """
     if split is not None and split not in SPLITS:
         raise ConfigError(f"there is no split {split!r}; expected one of {', '.join(SPLITS)}")

@@ -55,10 +55,10 @@ class TrainParameters:
     precision : str
         ``fp32``, ``bf16`` for mixed precision, or ``auto``: see `precision_of`.
     keep : {"best", "last"}
-        Whether to keep the weights of the epoch with the least validation loss, or of the last
-        epoch; ``last`` needs no objects to validate on and ignores `patience`.
+        Keep the weights of the epoch with the least validation loss, or of the last. ``last``
+        needs no objects to validate on and ignores `patience`.
     patience : int
-        Number of epochs without a better validation loss after which training stops.
+        Training stops after this number of epochs without a better validation loss.
     augmentation : str
         none, upright or all, see `slatprep.learn.augment`.
     verdicts : tuple of str
@@ -134,43 +134,12 @@ def train(
     steps: Progress | None = None,
     stop_after: int | None = None,
 ) -> TrainSummary:
-    """Train a decoder, or resume a run that was stopped.
+    """Train a decoder into the folder `out`, or resume a run that was stopped.
 
-    On a CPU, a run that was stopped and resumed gets the same weights as one that was not; on a
-    GPU the last bits may differ.
-
-    Parameters
-    ----------
-    store : Place
-        The store.
-    out : Path
-        Folder of the run, see `slatprep.learn.runs.Run`.
-    parameters : TrainParameters
-        The parameters of the run.
-    device : str
-        ``cpu`` or ``cuda``.
-    workers : int
-        Processes that read ahead.
-    progress : callable, optional
-        Called after each epoch.
-    steps : callable, optional
-        Called with the number of batches done and of all batches, both of this call alone.
-    stop_after : int, optional
-        Stop after this number of epochs, as if interrupted.
-
-    Returns
-    -------
-    TrainSummary
-        Its epochs, and where the predictions of the test objects are.
-
-    Raises
-    ------
-    ConfigError
-        If `out` holds another run, or a split has no asset.
-    InputError
-        If a checkpoint is damaged.
-    StoreError
-        If the store cannot be read, or another process trains into `out`.
+    On a CPU, a resumed run gets the same weights as an uninterrupted one; on a GPU the last bits
+    may differ. `workers` processes read ahead. `steps` gets the number of batches done and of all,
+    in this call alone; `stop_after` epochs it stops, as if interrupted. ConfigError if `out` holds
+    another run, or a split has no asset; InputError if a checkpoint is damaged.
     """
     opened = open_store(store, copy=True)
     assignment = assign_store(opened, parameters.split_by, parameters.shares)

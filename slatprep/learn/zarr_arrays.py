@@ -20,29 +20,10 @@ from slatprep.store.shard_reader import BAD_METADATA, RowReader
 
 
 def read_array(path: Path, root: Path, spec: ArraySpec) -> NDArray[Any]:
-    """Read a whole array of Zarr format 3.
+    """Read a whole array of Zarr format 3 from the folder `path`; no link may lead out of `root`.
 
-    Parameters
-    ----------
-    path : Path
-        Folder with its ``zarr.json``.
-    root : Path
-        The root of the hierarchy; no link may lead out of it.
-    spec : ArraySpec
-        Its allowed types and shapes.
-
-    Returns
-    -------
-    ndarray
-        All values.
-
-    Raises
-    ------
-    StoreError
-        If it is not such an array, is compressed with another codec than zstd or blosc, or is
-        damaged.
-    InputError
-        If its type or shape are not those of `spec`, or a link leads out of `root`.
+    Raises StoreError if it is not such an array, is damaged, or compressed with another codec than
+    zstd or blosc. InputError if its type or shape is not in `spec`, or a link leads out of `root`.
     """
     _refuse_links_out(path, root)
     try:

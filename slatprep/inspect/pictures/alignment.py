@@ -67,26 +67,10 @@ def draw_alignment(
     alignment: Alignment,
     finer: int = 1,
 ) -> Figure:
-    """Draw an alignment.
+    """Draw an alignment as a figure of `WIDTH` x `HEIGHT` pixels, `WIDER` pixels more if deformed.
 
-    Parameters
-    ----------
-    scene : Scene
-        From `slatprep.inspect.pictures.scene.scene_of`.
-    check : AlignmentCheck
-        The verdict and the figures.
-    title, subtitle : str
-        Name of the asset, and how it was aligned.
-    alignment : Alignment
-        The starts and their scores.
-    finer : int
-        Pixels of the panels per pixel of the figure, along each edge.
-
-    Returns
-    -------
-    Figure
-        Of `WIDTH` x `HEIGHT` pixels, with a deformation `WIDER` pixels more. Deterministic.
-        It must be drawn and saved within `slatprep.inspect.pictures.canvas.STYLE`.
+    A pixel of the figure has `finer` pixels of a panel along each edge. The figure must be drawn
+    and saved within `slatprep.inspect.pictures.canvas.STYLE`.
     """
     figure = new_figure(WIDTH + (WIDER if scene.deformed else 0), HEIGHT)
     reasons = _head(figure, check, title, subtitle)
@@ -102,21 +86,9 @@ def draw_alignment(
 
 
 def outlined(scene: Scene, view: View, *sets: Placed) -> list[NDArray[np.float64]]:
-    """Draw voxel sets by class, each over the outlined SLAT.
+    """Draw voxel sets by class, each over the outlined SLAT, as pictures (n, n, 3) in 0..1.
 
-    Parameters
-    ----------
-    scene : Scene
-        The asset.
-    view : View
-        The direction.
-    *sets : Placed
-        The voxel sets.
-
-    Returns
-    -------
-    list of ndarray of float64, shape (n, n, 3)
-        A picture of each set in 0..1; the SLAT is pale where the set does not cover it.
+    The SLAT is pale where the set does not cover it.
     """
     grey = np.broadcast_to(rgb(palette.RULE), (len(scene.slat), 3))
     slat = draw_voxels(scene.slat, grey, np.eye(4), view, contrast=0.5)

@@ -81,21 +81,11 @@ def draw_legend(
     rows: int = 2,
     **style: Any,
 ) -> None:
-    """Write names beside squares of their colours, from left to right and in rows.
+    """Write names beside squares of their colours, from left to right, in at most so many rows.
 
-    Parameters
-    ----------
-    figure : Figure
-        From `new_figure`.
-    entries : sequence of (str, str)
-        Name and colour of each. How many are not shown, for want of room or beyond
-        `MOST_NAMES`, is written after the last that is.
-    box : tuple of float
-        Left edge, baseline of the first row, and right edge, in pixels.
-    rows : int
-        Most rows, of 20 pixels each.
-    **style
-        Of the squares' edges, as of `matplotlib.patches.Rectangle`.
+    `entries` are names and colours. The number of entries beyond the room or `MOST_NAMES` follows
+    the last one. `box` is left edge, first baseline and right edge in pixels; a row takes 20.
+    `style` goes to `matplotlib.patches.Rectangle`.
     """
     from matplotlib.patches import Rectangle
 

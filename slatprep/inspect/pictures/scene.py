@@ -48,7 +48,7 @@ class Scene:
     pixieverse_material : ndarray of uint8, shape (K,)
         Their classes; 255 if not annotated.
     slat : ndarray of uint8, shape (N, 3)
-        Cells of the 64^3 grid that SLAT voxels occupy: the voxels themselves, of a SLAT of 64^3.
+        Cells of the 64^3 grid that SLAT voxels occupy.
     slat_material : ndarray of uint8, shape (N,)
         Their classes by the lookup; 255 if not valid.
     transform : ndarray of float64, shape (4, 4)
@@ -59,7 +59,7 @@ class Scene:
         Distance [voxel] of each to the nearest outer voxel of the PixieVerse field, after and
         before the alignment. With a deformation, "before" is under the transform alone.
     deformed : Deformed or None
-        The deformation, if there is one.
+        The deformation, if the asset has one.
     labels : tuple of str
         Names of the classes.
     """
@@ -90,8 +90,8 @@ class Deformed:
     Attributes
     ----------
     voxels, material : ndarray of uint8, shapes (D, 3) and (D,)
-        The deformed PixieVerse field on the SLAT's grid: boundary of the cells whose centre is
-        looked up in an occupied voxel.
+        The deformed PixieVerse field on the SLAT's grid: boundary of the cells whose centre
+        maps into an occupied voxel.
     displacement : ndarray of float64, shape (N,)
         Distance [voxel] by which it moves the place of each SLAT voxel.
     """
@@ -104,20 +104,7 @@ class Deformed:
 def scene_of(asset: StoredAsset) -> Scene:
     """Return the scene of an asset as stored.
 
-    Parameters
-    ----------
-    asset : StoredAsset
-        The asset.
-
-    Returns
-    -------
-    Scene
-        Ready to be drawn.
-
-    Raises
-    ------
-    StoreError
-        If the asset is deformed and its record, which holds the deformation, cannot be read.
+    Raises StoreError if the asset is deformed and its record, with the deformation, is unreadable.
     """
     occupancy = asset.grid_material != asset.store.contents.background
     shell = voxels_of(boundary(occupancy))
@@ -164,21 +151,10 @@ def surface_distance(
     transform: ArrayLike,
     way: PlaceMap | None = None,
 ) -> NDArray[np.float64]:
-    """Return the distance of each SLAT voxel to the nearest PixieVerse voxel.
+    """Return the distance (M,) [voxel] of each SLAT voxel to the nearest PixieVerse voxel.
 
-    Parameters
-    ----------
-    slat, pixieverse : ndarray of uint8, shapes (M, 3) and (K, 3)
-        Surface voxels, each in its own frame.
-    transform : array_like, shape (4, 4)
-        PixieVerse frame to SLAT frame.
-    way : PlaceMap, optional
-        The whole map, if the transform is only a part of it.
-
-    Returns
-    -------
-    ndarray of float64, shape (M,)
-        In voxels of the SLAT frame.
+    Surface voxels (M, 3) and (K, 3) are each in their own frame. `transform` leads from the
+    PixieVerse frame to the SLAT's; `way` is the whole map if it is more than that.
     """
     from slatprep.geometry.nearest import Lattice
 

@@ -26,18 +26,7 @@ _CELL_WIDTH, _CELL_HEIGHT = 2 * _THUMBNAIL + _GAP, _THUMBNAIL + 66
 def draw_sheet(
     scenes: Sequence[Scene], checks: Sequence[AlignmentCheck], titles: Sequence[str]
 ) -> bytes:
-    """Draw several alignments as one PNG.
-
-    Parameters
-    ----------
-    scenes, checks, titles : sequences of one length
-        The assets in the order of the sheet, at most `MOST`.
-
-    Returns
-    -------
-    bytes
-        A PNG; the same for the same arguments.
-    """
+    """Draw at most `MOST` alignments, in this order, as one PNG."""
     import matplotlib.style
 
     columns = min(_ACROSS, max(len(scenes), 2))

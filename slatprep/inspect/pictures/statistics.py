@@ -38,22 +38,7 @@ _SIDES = (("field", "PixieVerse fields, before the lookup"), ("slat", "SLAT voxe
 
 
 def draw_statistics(store: Store, statistics: StoreStatistics, kind: str = "png") -> bytes:
-    """Draw the statistics of a store.
-
-    Parameters
-    ----------
-    store : Store
-        The store.
-    statistics : StoreStatistics
-        From `slatprep.inspect.statistics.store_statistics`.
-    kind : str
-        ``png``, ``svg`` or ``pdf``.
-
-    Returns
-    -------
-    bytes
-        The picture; the same for the same arguments.
-    """
+    """Draw the statistics of a store as a ``png``, ``svg`` or ``pdf``."""
     import matplotlib.style
 
     kept = sorted(statistics.categories, key=lambda one: -one.slat.assets)[:MOST_CATEGORIES]

@@ -28,22 +28,7 @@ def has_screen(environment: Mapping[str, str] = os.environ, platform: str = sys.
 def show_alignment(scene: Scene, title: str) -> bool:
     """Show before, after, result and error in a window; return when it is closed.
 
-    Parameters
-    ----------
-    scene : Scene
-        From `slatprep.inspect.pictures.scene.scene_of`.
-    title : str
-        Title of the window.
-
-    Returns
-    -------
-    bool
-        Whether a window could be opened.
-
-    Raises
-    ------
-    SlatprepError
-        If Open3D is not installed.
+    Returns whether a window could be opened. SlatprepError if Open3D is not installed.
     """
     from slatprep.align import require_engine
     from slatprep.align.open3d_icp import load_open3d
@@ -91,21 +76,10 @@ def meshes(scene: Scene) -> tuple[Mesh, ...]:
 def cube_mesh(
     voxels: NDArray[np.uint8], colours: NDArray[np.float64], transform: ArrayLike
 ) -> Mesh:
-    """Return the exposed faces of voxels as triangles, with four vertices a face.
+    """Return the exposed faces of voxels (N, 3) as triangles, with four vertices a face.
 
-    Parameters
-    ----------
-    voxels : ndarray of uint8, shape (N, 3)
-        Voxels of one frame.
-    colours : ndarray of float64, shape (N, 3)
-        Their colours in 0..1.
-    transform : array_like, shape (4, 4)
-        From their frame to the frame that is shown.
-
-    Returns
-    -------
-    Mesh
-        Triangles are counterclockwise seen from outside.
+    `colours` (N, 3) are in 0..1; `transform` (4, 4) leads to the frame that is shown. Triangles are
+    counterclockwise seen from outside.
     """
     empty = ~np.pad(occupancy_of(voxels), 1)
     corners, painted = [], []

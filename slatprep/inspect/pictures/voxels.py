@@ -1,8 +1,8 @@
 """Voxels drawn as shaded cubes with numpy.
 
-An orthographic view shows at most three sides of every cube, each as the same parallelogram.
-Its pixels are computed once and copied to every exposed face, with a depth buffer: ten thousand
-voxels take some hundredths of a second.
+An orthographic view shows at most three sides of every cube, each as the same parallelogram. Its
+pixels are computed once and copied to every exposed face, with a depth buffer: ten thousand voxels
+take some hundredths of a second.
 """
 
 from __future__ import annotations
@@ -67,22 +67,10 @@ class Drawing:
 
 
 def view_rotation(azimuth: float, elevation: float) -> NDArray[np.float64]:
-    """Return the axes of a view, z upwards.
+    """Return the axes (3, 3) of a view with z upwards; rows are right, up and towards the viewer.
 
-    Parameters
-    ----------
-    azimuth : float
-        Degrees about z from the x axis to the viewer.
-    elevation : float
-        Degrees above the xy plane.
+    `azimuth` is in degrees about z from the x axis to the viewer, `elevation` in degrees above xy.
 
-    Returns
-    -------
-    ndarray of float64, shape (3, 3)
-        Rows are right, up and towards the viewer.
-
-    Examples
-    --------
     >>> (view_rotation(270, 0).round() + 0.0).tolist()  # from in front: x right, z up
     [[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]]
     """
@@ -99,26 +87,10 @@ def draw_voxels(
     view: View,
     contrast: float = 1.0,
 ) -> Drawing:
-    """Draw voxels as shaded cubes.
+    """Draw voxels (N, 3) in 0..63 as shaded cubes, with colours (N, 3) in 0..1.
 
-    Parameters
-    ----------
-    voxels : ndarray of int, shape (N, 3)
-        Indices in 0..63.
-    colours : ndarray of float64, shape (N, 3)
-        Red, green and blue in 0..1 of each.
-    transform : array_like, shape (4, 4)
-        From the voxels' frame to the frame of the view.
-    view : View
-        The camera.
-    contrast : float
-        How much darker sides are that face away from the light, 0..1. Small values keep
-        colours readable as numbers.
-
-    Returns
-    -------
-    Drawing
-        The picture.
+    `transform` (4, 4) leads to the frame of the view. `contrast` in 0..1 darkens the sides that
+    face away from the light; small values keep colours readable as numbers.
     """
     side = view.size * SUPERSAMPLING
     pixels_per_unit = side / (2 * view.half_width)
@@ -168,7 +140,7 @@ def _side_pixels(
 ) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.int64]] | None:
     """Return the pixels of a cube's side relative to its centre, their depths, and its seams.
 
-    `spanned` (3, 2) holds the two edges of the side in pixels. None if it is seen edge-on.
+    `spanned` (3, 2) has the two edges of the side in pixels. None if it is seen edge-on.
     """
     plane = spanned[:2]
     if abs(np.linalg.det(plane)) < 1e-3:

@@ -31,33 +31,11 @@ def write_pictures(
     jobs: int = 1,
     progress: Progress | None = None,
 ) -> tuple[list[Path], Path | None]:
-    """Draw alignments and write them as files.
+    """Draw alignments as files; return the file of each asset, and the contact sheet if several.
 
-    Parameters
-    ----------
-    store : Store
-        The store.
-    checks : sequence of AlignmentCheck
-        The assets to draw, in the order of the contact sheet.
-    target : Path
-        For one asset, a file with a suffix of `FORMATS`. Otherwise a folder, with a PNG for
-        each asset, named by its id, and a contact sheet if there are several.
-    jobs : int
-        Worker processes; the pictures do not depend on them.
-    progress : callable, optional
-        Called with the number of assets done and the number of all assets.
-
-    Returns
-    -------
-    pictures : list of Path
-        The file of each asset.
-    sheet : Path or None
-        The contact sheet of the first `MOST` assets; None for one asset.
-
-    Raises
-    ------
-    StoreError
-        If a file cannot be written, or a record cannot be read.
+    For a single asset `target` is a file with a suffix of `FORMATS`. Otherwise it is a folder for a
+    PNG per asset, named by its id, and a contact sheet of the first `MOST`. StoreError if a file
+    cannot be written, or a record cannot be read.
     """
     kind = target.suffix.lower()[1:]
     alone = len(checks) == 1 and kind in FORMATS

@@ -54,9 +54,9 @@ class ReportSummary:
     size : int
         Its bytes.
     assets : int
-        Assets of the store, and those that are not in it.
+        Assets of the build, whether in the store or not.
     listed : int
-        How many of them its table has: all, or a sample of more than `ASSETS_LISTED`.
+        Assets in the table: all, or a sample of more than `ASSETS_LISTED`.
     in_detail : int
         Assets with a thumbnail and a 3D view.
     side : int
@@ -75,8 +75,8 @@ class ReportSummary:
 class Drawn:
     """An asset of the store as drawn: thumbnail, and voxels by level of detail.
 
-    Where its labels are merged, ``votes`` is the mean share of votes for a voxel's class, and
-    ``spreads`` has the mean spread of each normalised property, NaN where one annotation has it.
+    For merged labels, ``votes`` is the mean share of votes for a voxel's class, and ``spreads`` has
+    the mean spread of each normalised property, NaN where a single annotation has it.
     """
 
     index: int
@@ -202,7 +202,7 @@ def _draw(path: Path, indices: Sequence[int]) -> tuple[list[Drawn], dict[str, Ta
 
 
 def _agreement(asset: StoredAsset) -> tuple[float, tuple[float, ...]]:
-    """Return what `Drawn` has of merged labels."""
+    """Return votes and spreads of merged labels, as in `Drawn`."""
     if not asset.merged or not asset.valid.any():
         return np.nan, ()
     spread = np.ma.masked_invalid(asset.spread.astype(np.float64)).mean(axis=0)

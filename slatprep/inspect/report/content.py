@@ -51,32 +51,12 @@ def page_content(
     created: str | None,
     agreement: Agreement,
 ) -> dict[str, Any]:
-    """Return the content of a page.
+    """Return the content of a page, JSON-ready; NaN and unknown values are None.
 
-    Parameters
-    ----------
-    store : Store
-        The store.
-    outcomes : Outcomes or None
-        From its records, where there are any.
-    tallies : mapping of str to Tally
-        Tally of the voxels of each category.
-    listed : sequence of int
-        Rows of the assets in the table, ascending.
-    chosen : sequence of int
-        Those of the assets with a thumbnail and a 3D view, ascending.
-    side : int
-        Voxels per edge of the 3D views.
-    created : str or None
-        When the store was built, if known from its records.
-    agreement : mapping of int to (float, tuple of float)
-        Of assets with merged labels, by row: mean votes, and mean spread of each property.
-
-    Returns
-    -------
-    dict
-        JSON-ready. Columns of the table are lists with an entry for each asset, first those
-        of the store; ``all`` counts what is not in the table, too; NaN and unknown values are None.
+    `outcomes` come from the records, if any, and `tallies` count voxels by category. Rows `listed`
+    are in the table, rows `chosen` also have a thumbnail and a 3D view with `side` voxels per edge;
+    both ascend. `agreement` has mean votes and mean spreads of merged labels by row. Columns of the
+    table are lists over assets, those of the store first; ``all`` counts also assets outside it.
     """
     build = store.about.build
     states = Counter(map(str, store.column("verdict")))
@@ -135,7 +115,7 @@ def page_content(
 
 
 def _names_of(contents: Contents) -> tuple[str, ...]:
-    """Return the name of each class that a voxel may have, empty where none has the number."""
+    """Return the name of each class that a voxel may have, empty for unused numbers."""
     return (*contents.labels, *[""] * (contents.n_labels - len(contents.labels)))
 
 
@@ -174,7 +154,7 @@ def _properties(
 
 
 def _balance(store: Store, tallies: Mapping[str, Tally]) -> list[dict[str, Any]]:
-    """Return the number of SLAT voxels of each class by category, last of those not valid."""
+    """Return the number of SLAT voxels by category and class, those that are not valid last."""
     assets = Counter(str(category) for category in store.column("category"))
     return [
         {

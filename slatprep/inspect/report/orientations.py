@@ -10,19 +10,9 @@ from slatprep.geometry.frames import split_transform
 
 
 def nearest_quarter_turn(transform: ArrayLike) -> tuple[int, float]:
-    """Return the quarter turn, of 24, that is nearest to a transform's rotation.
+    """Return the quarter turn nearest to the rotation of a transform (4, 4), and their angle.
 
-    Parameters
-    ----------
-    transform : array_like, shape (4, 4)
-        PixieVerse frame to SLAT frame.
-
-    Returns
-    -------
-    index : int
-        Position in `quarter_turns`.
-    angle : float
-        Degrees between the two rotations.
+    The first is an index of `quarter_turns`, the second is in degrees.
     """
     rotation, _, _ = split_transform(transform)
     turns = np.stack([start.rotation for start in distinct_starts()])
@@ -35,8 +25,6 @@ def nearest_quarter_turn(transform: ArrayLike) -> tuple[int, float]:
 def quarter_turns() -> tuple[str, ...]:
     """Return in words where each of the 24 quarter turns takes the axes x, y and z.
 
-    Examples
-    --------
     >>> quarter_turns()[0]
     'x→+x y→+y z→+z'
     """

@@ -38,15 +38,13 @@ class Outcome:
     tied : int
         Distinct placements that fit about as well as the best.
     displacement : float or None
-        Largest distance [voxel] between the best placement and a tied one;
-        None if there are no ties.
+        Largest distance [voxel] between the best placement and a tied one; None without ties.
     clipped : tuple of int
         Values of ``voxel/properties`` outside the range, by property.
     ties : tuple of tuple of float
         Transforms of the first `MOST_TIES` tied placements, each as three rows of four numbers.
     annotations : tuple of int
-        How many annotations its labels are merged of, and how many there are; empty where
-        there is one.
+        Number of annotations that were merged and of all; empty for a single annotation.
     """
 
     asset_id: str
@@ -62,12 +60,12 @@ class Outcome:
 
 @dataclass(frozen=True)
 class Outcomes:
-    """The outcomes of a build: of all assets in sums, of those on the page each.
+    """The outcomes of a build: sums over all assets, and each asset on the page.
 
     Attributes
     ----------
     known : dict of str to Outcome
-        Of assets of the store that the page lists, and of those not in it, by id.
+        By id, assets that the page lists, whether in the store or not.
     clipped : ndarray of int64, shape (P,)
         Values outside the range, by property, of all assets.
     tied : int
@@ -85,23 +83,10 @@ class Outcomes:
 def gather_outcomes(
     manifests: Place, store: Store, listed: Collection[str], most_absent: int
 ) -> Outcomes:
-    """Gather the outcomes of a build.
+    """Gather the outcomes of a build from its records.
 
-    Parameters
-    ----------
-    manifests : Path
-        Folder of its records.
-    store : Store
-        The store that it wrote.
-    listed : collection of str
-        Ids of the assets of which each is wanted.
-    most_absent : int
-        The most assets that are not in the store of which each is wanted.
-
-    Raises
-    ------
-    StoreError
-        If the records cannot be read, belong to another build, or lack an asset of the store.
+    It keeps the assets `listed` and at most `most_absent` that are not in the store. StoreError if
+    the records cannot be read, belong to another build, or lack an asset of the store.
     """
     known: dict[str, Outcome] = {}
     missing, absent, tied = set(store.ids), Counter[Status](), 0
@@ -129,22 +114,7 @@ def gather_outcomes(
 def read_outcomes(manifests: Place, build_id: str) -> Iterator[Outcome]:
     """Yield the outcome of every asset of a build, in the order of its records.
 
-    Parameters
-    ----------
-    manifests : Path
-        Folder of ``assets.jsonl`` and ``build.json``.
-    build_id : str
-        Id of the build that wrote the store.
-
-    Yields
-    ------
-    Outcome
-        Of each record.
-
-    Raises
-    ------
-    StoreError
-        If the records cannot be read or belong to another build.
+    Raises StoreError if the records cannot be read or belong to another build.
     """
     found = build_in(manifests).id
     if found != build_id:
@@ -159,8 +129,6 @@ def read_outcomes(manifests: Place, build_id: str) -> Iterator[Outcome]:
 def kind_of(reason: str) -> str:
     """Return a reason without the file and the numbers of the asset.
 
-    Examples
-    --------
     >>> kind_of("only 76.1% of the SLAT boundary lies within 1 voxel of the other side")
     'only N% of the SLAT boundary lies within N voxel of the other side'
     >>> kind_of("a/b.npz: holds 3 voxels twice; expected distinct coordinates")
@@ -170,13 +138,7 @@ def kind_of(reason: str) -> str:
 
 
 def kinds_of(reasons: Iterable[str]) -> dict[str, str]:
-    """Return the kind of each reason, with the numbers that all reasons of one kind share.
-
-    Examples
-    --------
-    >>> kinds_of(["only 76% right (good: 80%)", "only 55% right (good: 80%)"])
-    {'only 76% right (good: 80%)': 'only N% right (good: 80%)', 'only 55% right (good: 80%)': 'only N% right (good: 80%)'}
-    """  # noqa: E501
+    """Return the kind of each reason, with the numbers that all reasons of one kind share."""
     all_reasons = list(reasons)
     common: dict[str, list[str]] = {}
     for reason in all_reasons:

@@ -1,7 +1,7 @@
 """The page as text: a template with its style, its scripts and the data.
 
-Data cannot run as code: it is in blocks that browsers do not execute and is shown only as text.
-A content security policy allows the page's own scripts by their hashes, and no requests.
+Data cannot run as code: browsers do not execute its blocks, and the page shows it only as text. A
+content security policy allows the page's own scripts by their hashes, and no requests.
 """
 
 from __future__ import annotations
@@ -25,20 +25,10 @@ def write_page(
     sheets: Iterable[bytes],
     packs: Iterable[list[str]],
 ) -> None:
-    """Write a page.
+    """Write a page to a UTF-8 file with plain line feeds.
 
-    Parameters
-    ----------
-    file : text file
-        Open for writing in UTF-8, with plain line feeds.
-    title : str
-        Title of the page.
-    content : mapping
-        From `slatprep.inspect.report.content.page_content`.
-    sheets : iterable of bytes
-        PNG files of thumbnails.
-    packs : iterable of list of str
-        For each sheet, the voxels of its assets in base64.
+    `content` is from `slatprep.inspect.report.content.page_content`. `sheets` are PNG files of
+    thumbnails; `packs` has for each of them the voxels of its assets in base64.
     """
     style = _asset("style.css")
     script = "\n".join(_asset("js", f"{name}.js") for name in SCRIPTS)

@@ -1,9 +1,9 @@
 """Thumbnails of the assets from three directions, many in one image file.
 
-Unlike `pictures.voxels.draw_voxels`, this shades by the slope of the surface: along an axis of
-the grid only one face of each cube is visible, and all faces would have one tone. It is also
-ten times as fast (3 against 30 ms an asset, 12 assets of 12,400 voxels), and palette indices
-make a sheet a third as large as colours.
+Unlike `pictures.voxels.draw_voxels`, this shades by the slope of the surface. Along an axis of the
+grid only one face of each cube is visible, and all faces would have the same tone. It is also ten
+times as fast (3 against 30 ms an asset, 12 assets of 12,400 voxels). Palette indices make a sheet a
+third as large as colours.
 """
 
 from __future__ import annotations
@@ -45,13 +45,10 @@ _SMOOTHING = 5
 
 
 def thumbnail(asset: StoredAsset) -> NDArray[np.uint8]:
-    """Draw the SLAT voxels of an asset from three directions.
+    """Draw the SLAT voxels of an asset from three directions, (SIDE, 3 * SIDE).
 
-    Returns
-    -------
-    ndarray of uint8, shape (SIDE, 3 * SIDE)
-        Indices into `palette`: 0 for the background; elsewhere the nearest voxel's class and
-        its brightness.
+    Pixels are indices into `palette`: 0 for the background, elsewhere the nearest voxel's class and
+    brightness.
     """
     grid = np.zeros((RESOLUTION,) * 3, dtype=np.uint8)
     # Of more classes some share a colour: a PNG's palette has 256.
@@ -105,8 +102,8 @@ def _project(view: NDArray[np.uint8]) -> NDArray[np.uint8]:
 def _brightness(depth: NDArray[np.intp], hit: NDArray[np.bool_]) -> NDArray[np.float64]:
     """Return the brightness of each pixel by Lambert's law, 0..1.
 
-    The slope is taken from the depth averaged over a small window, since steps of whole voxels
-    would show as stripes.
+    The slope is that of the depth averaged over a small window, because steps of whole voxels would
+    show as stripes.
     """
     from scipy.ndimage import uniform_filter
 

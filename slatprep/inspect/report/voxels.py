@@ -41,23 +41,10 @@ FULL, COARSE = RESOLUTION, RESOLUTION // 2
 
 
 def encode_asset(asset: StoredAsset, way: PlaceMap, max_distance: float, side: int) -> bytes:
-    """Return an asset's voxels for the 3D view.
+    """Return an asset's voxels for the 3D view, in the form that this module describes.
 
-    Parameters
-    ----------
-    asset : StoredAsset
-        From a store.
-    way : PlaceMap
-        The map between its frames.
-    max_distance : float
-        Distance [voxel] at the end of the scale.
-    side : int
-        `FULL`, or `COARSE`, where one voxel stands for 2 x 2 x 2.
-
-    Returns
-    -------
-    bytes
-        In the form that this module describes.
+    `way` maps between its frames. Distances [voxel] are scaled up to `max_distance`. `side` is
+    `FULL`, or `COARSE` for voxels of 2 x 2 x 2.
     """
     cells, row = asset.cells
     first, occupied = _cells(cells, side)

@@ -85,7 +85,7 @@ def verify_store(
     roots : SourceRoots, optional
         Where the sources are now; by default the roots in ``build.json``.
     sample : int, optional
-        Compare values, records and sources of so many assets, evenly chosen, not of all.
+        Compare values, records and sources of only this many assets, evenly chosen.
         Metadata, files and the ``asset/*`` arrays are always compared whole.
     jobs : int or Workers
         Worker processes, or a `slatprep.workers.dask.Cluster`.
@@ -100,7 +100,7 @@ def verify_store(
     Raises
     ------
     StoreError
-        If there is no store, or sources are to be compared and their roots are not known.
+        If the store does not exist, or `sources` is set and their roots are not known.
     """
     path = storage_of(place_of(path)).current_version()
     try:
@@ -146,7 +146,7 @@ def verify_store(
 
 
 def _chosen(total: int, sample: int | None) -> Sequence[int]:
-    """Return the rows of the assets that are compared: all, or so many at even steps."""
+    """Return the rows of the assets to compare: all, or a sample at even steps."""
     if sample is None or sample >= total:
         return range(total)
     return [(2 * number + 1) * total // (2 * sample) for number in range(sample)]

@@ -48,26 +48,10 @@ CONFIDENCE_TOLERANCE = 1e-5
 def asset_findings(
     path: Place, rows: Sequence[int], roots: SourceRoots | None, run: str
 ) -> tuple[list[Finding], int]:
-    """Verify some assets of a store.
+    """Return the faults of some assets (rows) of a store, and the number of sources compared.
 
-    Parameters
-    ----------
-    path : Place
-        The store.
-    rows : sequence of int
-        Rows of the assets.
-    roots : SourceRoots or None
-        Where the sources are, if they are to be compared.
-    run : str
-        Unique to this verification. A worker caches opened stores and digests and must not
-        use those of an earlier run, since files may have changed.
-
-    Returns
-    -------
-    findings : list of Finding
-        The faults.
-    sources : int
-        Number of source files that were compared.
+    Sources are compared if `roots` is given. `run` is unique to this verification: a worker caches
+    opened stores and digests, and files may have changed since an earlier run.
     """
     store, records = _opened(path, run)
     findings: list[Finding] = []
@@ -276,10 +260,10 @@ def source_findings(record: AssetRecord, roots: SourceRoots, run: str) -> Iterat
 
 
 def roundings(normalization: Normalization) -> NDArray[np.float64]:
-    """Return how far a mapped property (P,) may be off that went through the store.
+    """Return how far a mapped property (P,) that went through the store may be off.
 
-    It is rounded to float32 twice, normalised and in SI units, each time by at most 2**-24 of
-    itself; of a power of ten that moves the exponent by less than half as much.
+    Rounding to float32 happens twice, normalised and in SI units, each by at most 2**-24 of the
+    value. The exponent of a power of ten moves by less than half as much.
     """
     spans = normalization.ranges
     own = [0.5 if span.log10 else max(abs(span.lo), abs(span.hi)) for span in spans]

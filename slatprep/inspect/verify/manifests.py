@@ -32,22 +32,9 @@ from slatprep.store.reader import Store
 
 
 def source_roots(manifests: Place | None) -> SourceRoots:
-    """Return where the sources were when the store was built.
+    """Return the roots of the sources when the store was built.
 
-    Parameters
-    ----------
-    manifests : Place or None
-        Folder of the build's records, if there is one.
-
-    Returns
-    -------
-    SourceRoots
-        Roots that still exist.
-
-    Raises
-    ------
-    StoreError
-        If no record names them, or they do not exist any more.
+    Raises StoreError if no record names them, or they do not exist any more.
     """
     advice = "name the roots with --pixieverse and --slat"
     if manifests is None:
@@ -96,7 +83,7 @@ def manifest_findings(
 ) -> Iterator[Finding]:
     """Yield findings where the records break their schemas or disagree with the store.
 
-    With `only`, ids of a sample, records of other assets are not read, and so their id and
+    With a sample of ids, `only`, records of other assets are not read, and the records' id and
     statuses are not compared.
     """
     build_file, assets_file = str(folder / BUILD), str(folder / ASSETS)
@@ -145,7 +132,7 @@ def _stated_id(text: bytes) -> object:
 
 
 def _older_id(folder: Place) -> str:
-    """Return the id as older versions made it: of the texts themselves, in the order of ids."""
+    """Return the id as older versions made it: from the texts themselves, in the order of ids."""
     digest = hashlib.sha256()
     for _, line in lines_in(folder):
         try:
@@ -165,8 +152,7 @@ def _checked(
 ) -> Iterator[tuple[str, bytes]]:
     """Yield the ids and digests of ``assets.jsonl``; count statuses and collect faults.
 
-    A record that says what the store does of its row is not checked: whoever verifies the row
-    does that.
+    A record that agrees with the store's copy in its row is skipped: verifying the row covers it.
     """
     rows = {asset_id: row for row, asset_id in enumerate(store.ids)}
     stored = StoredRecords(store)
@@ -193,7 +179,7 @@ def _checked(
 
 
 def _as_stored(line: bytes, rows: Mapping[str, int], stored: StoredRecords) -> RecordText | None:
-    """Return a line that says what the store's record of its row does, else None."""
+    """Return a line if it equals the store's record of its row, else None."""
     try:
         document = orjson.loads(line)
         content, asset_id = counting(document), str(document.get("asset_id"))

@@ -1,4 +1,4 @@
-"""Labels that are merged of several annotations, made again of the sources."""
+"""Labels merged of several annotations, recomputed from the sources."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ TOLERANCE = 1e-5
 def merged_findings(
     asset: StoredAsset, record: AssetRecord, roots: SourceRoots
 ) -> Iterator[Finding]:
-    """Yield where merged labels are not what the sources and the recorded alignments give."""
+    """Yield findings where merged labels differ from what sources and recorded alignments give."""
     latents, contents = asset.latents, asset.store.contents
     parts = []
     for one in record.merged:
@@ -69,7 +69,7 @@ def merged_findings(
 def _pair_of(
     asset: StoredAsset, record: AssetRecord, one: Contribution, roots: SourceRoots
 ) -> AssetPair:
-    """Return where the files of one annotation lie now."""
+    """Return where the files of one annotation are now."""
     found = [record.sources[k] for k in one.sources]
     own = (roots, *roots.also)[found[0].source]
     files = {file.role: own.pixieverse / file.path for file in found}
