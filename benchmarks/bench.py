@@ -131,7 +131,7 @@ MEASUREMENTS = (
     ),
     Measurement(
         "lookup", "Which way of looking labels up is right most often",
-        "method", "python benchmarks/lookup.py {folder}/demo",
+        "design/alignment", "python benchmarks/lookup.py {folder}/demo",
         (84, 0, 900), (6, 0, 120), (DEMO,),
     ),
     Measurement(
@@ -141,7 +141,7 @@ MEASUREMENTS = (
     ),
     Measurement(
         "witness", "What latents settle",
-        "method", "python benchmarks/witness.py {folder}/demo",
+        "design/alignment", "python benchmarks/witness.py {folder}/demo",
         (96, 0, 1800), (8, 0, 240), (MATERIAL,),
     ),
 )  # fmt: skip

@@ -48,17 +48,23 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
 
 def on_page_markdown(markdown: str, page: Page, **_: object) -> str:
     """Follow links out of docs/: to a page of the site, or to the name of a file."""
+    home = (ROOT / "docs" / page.file.src_uri).parent
 
     def follow(match: re.Match[str]) -> str:
         text, target = match.groups()
         path, _, anchor = target.partition("#")
-        if path in NEIGHBOURS:
-            return f"[{text}]({NEIGHBOURS[path]}{'#' + anchor if anchor else ''})"
-        if not (ROOT / path).exists():
+        there = (home / path).resolve()
+        if there.is_relative_to(ROOT / "docs"):
+            return match.group()
+        name = there.relative_to(ROOT).as_posix()
+        if name in NEIGHBOURS:
+            up = "../" * page.file.src_uri.count("/")
+            return f"[{text}]({up}{NEIGHBOURS[name]}{'#' + anchor if anchor else ''})"
+        if not there.exists():
             log.warning("%s links to %s, which does not exist", page.file.src_uri, path)
         return text
 
-    return re.sub(r"\[([^\]]*)\]\(\.\./([^)]+)\)", follow, markdown)
+    return re.sub(r"\[([^\]]*)\]\((\.\./[^)]+)\)", follow, markdown)
 
 
 def on_page_content(content: str, **_: object) -> str:

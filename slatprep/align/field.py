@@ -1,6 +1,6 @@
 """The default engine: two filled voxel sets laid on each other by their distance fields.
 
-The method in six steps (docs/method.md has the equations):
+The method in six steps (docs/design/alignment.md has the equations):
 
 1. Fill both voxel sets and measure the signed distance to their surfaces.
 2. From each of the 24 distinct start rotations, centroid on centroid and size

@@ -19,7 +19,7 @@ from slatprep.parameters.files import load_parameters
 from slatprep.store.layout import ARRAYS, MERGED
 
 ROOT = Path(__file__).parents[2]
-PAGES = sorted([*ROOT.glob("*.md"), *ROOT.glob("docs/*.md"), *ROOT.glob("manifests/*.md")])
+PAGES = sorted([*ROOT.glob("*.md"), *ROOT.glob("docs/**/*.md"), *ROOT.glob("manifests/*.md")])
 
 
 def code_lines(language: str) -> list[tuple[str, str]]:

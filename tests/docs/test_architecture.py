@@ -1,4 +1,4 @@
-"""What docs/architecture.md and its picture say of the code is so."""
+"""What docs/design/architecture.md and its picture say of the code is so."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parents[2]
-PAGE = (ROOT / "docs" / "architecture.md").read_text("utf-8")
+PAGE = (ROOT / "docs" / "design" / "architecture.md").read_text("utf-8")
 LAYERS = [
     {room.strip() for room in layer.split("|")}
     for layer in tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["tool"][
@@ -62,8 +62,9 @@ def test_the_picture_has_the_floors_that_are_checked() -> None:
 
 def test_the_index_lists_every_page() -> None:
     index = (ROOT / "docs" / "index.md").read_text("utf-8")
-    pages = {path.name for path in (ROOT / "docs").glob("*.md")} - {"index.md"}
-    assert pages <= set(re.findall(r"\]\(([\w.]+)\)", index))
+    docs = ROOT / "docs"
+    pages = {path.relative_to(docs).as_posix() for path in docs.rglob("*.md")} - {"index.md"}
+    assert pages <= set(re.findall(r"\]\(([\w./]+)\)", index))
 
 
 def test_what_changes_code_for_the_tests_names_what_there_is() -> None:
