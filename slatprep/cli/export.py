@@ -28,8 +28,13 @@ from slatprep.errors import ConfigError
 if TYPE_CHECKING:
     from slatprep.records import Place
 
-# The format of each option; giving it with another format is an error.
-_ONLY_FOR = {"points": "ply", "frame": "ply", "shard_size": "webdataset", "latent_model": "npz"}
+# The formats of each option; giving it with another format is an error.
+_ONLY_FOR = {
+    "points": ("ply", "voxel_data"),
+    "frame": ("ply",),
+    "shard_size": ("webdataset",),
+    "latent_model": ("npz",),
+}
 
 
 @command()
@@ -57,18 +62,18 @@ def export(
 ) -> None:
     """Write assets of STORE in a format of other tools.
 
-    Properties are in SI units in PLY, normalised in WebDataset and npz, and
-    both in HDF5. Every folder gets an index.json that lists its contents.
+    Properties are in SI units in PLY and voxel_data, normalised in WebDataset
+    and npz, and both in HDF5. Every folder gets an index.json of its contents.
 
     Options
     -------
-    --format: Point clouds with Pixie's fields, one HDF5 file, tar shards, or the files of
-        TRELLIS's dataset (npz and metadata.csv) with the targets added.
+    --format: Point clouds with Pixie's fields, one HDF5 file, tar shards, the files of TRELLIS's
+        dataset (npz and metadata.csv) with the targets added, or the npz of VoMP's scripts.
     --out: The file (hdf5) or folder (all others); an existing export is replaced when the new
         one is complete.
     --asset: An asset; may be repeated. [default: all]
     --split: Only objects of this split, as `slatprep train` splits them.
-    --points: ply: SLAT voxels, or the voxels of the PixieVerse field. [default: slat]
+    --points: ply, voxel_data: SLAT voxels, or the voxels of the PixieVerse field. [default: slat]
     --frame: ply: the SLAT's unit cube, or PixieVerse's world coordinates. [default: slat]
     --shard-size: webdataset: assets a shard. [default: 256]
     --latent-model: npz: the encoder's name, latent_model in TRELLIS's configurations. [default:
@@ -81,13 +86,14 @@ def export(
     slatprep export data/demo.zarr --format hdf5 --out demo.h5 --asset 5f61cc --asset 803c1a
     slatprep export data/demo.zarr --format webdataset --out shards --shard-size 128 --jobs 2
     slatprep export data/demo.zarr --format npz --out trellis
+    slatprep export data/demo.zarr --format voxel_data --out vomp --points grid
     slatprep export data/demo.zarr --format webdataset --out train --split train --split-by pixie
     """
     options = {name: value for name in _ONLY_FOR if (value := others.pop(name)) is not None}
     for name in options:
-        if _ONLY_FOR[name] != kind:
+        if kind not in _ONLY_FOR[name]:
             flag = f"--{name.replace('_', '-')}"
-            raise ConfigError(f"{flag} is for --format {_ONLY_FOR[name]}, not {kind}")
+            raise ConfigError(f"{flag} is for --format {' or '.join(_ONLY_FOR[name])}, not {kind}")
     from slatprep.export import ExportOptions, export_store
     from slatprep.store import open_store
 

@@ -1,4 +1,4 @@
-"""Export a store as PLY, HDF5, WebDataset shards, or TRELLIS's npz.
+"""Export a store as PLY, HDF5, WebDataset shards, and npz of TRELLIS and VoMP.
 
 Each format is one module. `export_store` chooses the assets, passes batches of them to the
 format's writer, and moves the result into place when it is complete.
@@ -30,6 +30,7 @@ FORMATS = {
     "hdf5": "slatprep.export.hdf5",
     "webdataset": "slatprep.export.webdataset",
     "npz": "slatprep.export.npz",
+    "voxel_data": "slatprep.export.voxel_data",
 }
 """Name of each format and its module; to add a format, add its line here.
 
@@ -78,7 +79,7 @@ def export_store(
     out : str or Path
         The file (``hdf5``) or folder (all others) to write. The new export replaces an old one
         when complete; other files stay.
-    format : {"ply", "hdf5", "webdataset", "npz"}
+    format : {"ply", "hdf5", "webdataset", "npz", "voxel_data"}
         The format, see docs/export.md.
     assets : sequence of str
         Ids of the assets; empty takes all.

@@ -23,7 +23,8 @@ class ExportOptions:
     Attributes
     ----------
     points : {"slat", "grid"}
-        PLY: the valid voxels of the SLAT, or the annotated voxels of the PixieVerse field.
+        PLY, voxel_data: the valid voxels of the SLAT, or the annotated voxels of the PixieVerse
+        field.
     frame : {"slat", "pixieverse"}
         PLY: the unit cube of the SLAT, or PixieVerse's world coordinates.
     shard_size : int

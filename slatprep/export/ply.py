@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 from slatprep.errors import StoreError
 from slatprep.export.assets import Exported
 from slatprep.export.formats import ExportOptions, Frame, Points, Writer
-from slatprep.geometry.frames import voxel_centres
+from slatprep.export.points import annotated_points
 from slatprep.provenance.stored import StoredRecords
 from slatprep.records import MATERIAL_COLOURS, PROPERTY_COLUMNS, RESOLUTION
 from slatprep.storage.names import file_name
@@ -84,24 +84,17 @@ def write(
         table = asset.store.contents.properties
         solid = asset.store.columns_of(PROPERTY_COLUMNS)
         others = [column for column in range(len(table)) if column not in solid]
-        if points == "grid":
-            field = asset.field
-            material, values = field.material, field.properties
-            in_pixieverse = voxel_centres(field.voxels)
-            conf = np.ones(len(material))
-            in_slat = StoredRecords(asset.store).place_map(asset).to_slat(in_pixieverse)
-        else:
-            valid = asset.valid
-            material, values = asset.material[valid], asset.properties_si[valid]
-            in_slat = asset.latents.centres[valid]
-            conf = np.clip(1.0 - asset.distance[valid] / max_distance, 0.0, 1.0)
-            in_pixieverse = asset.place[valid].astype(np.float64)
-        positions = in_slat
+        there = annotated_points(asset, points)
+        conf = np.clip(1.0 - there.distance / max_distance, 0.0, 1.0)
+        positions = there.in_slat
         if frame == "pixieverse":
-            positions = to_world(in_pixieverse, bounds[asset.asset_id])
+            positions = to_world(there.in_pixieverse, bounds[asset.asset_id])
         name = f"{file_name(asset.asset_id)}.ply"
-        more = {(table[column].name, table[column].unit): values[:, column] for column in others}
-        solids = values[:, solid]
+        more = {
+            (table[column].name, table[column].unit): there.values[:, column] for column in others
+        }
+        solids = there.solid(asset)
+        material = there.material
         write_points(directory / name, positions, material, solids, conf, _COMMENTS[frame], more)
         yield Exported(asset, name, len(material))
 

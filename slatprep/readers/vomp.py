@@ -45,11 +45,11 @@ class VoMP:
         if missing or any(rows.dtype[name].kind not in "fiu" for name in (*"xyz", *columns)):
             wanted = f"numbers named x, y, z, {', '.join(columns)}"
             raise InputError(f"{path} [voxel_data]", f"has the columns {rows.dtype}", wanted)
-        # Positions are i / 64 - 0.5, the lower corners of their voxels.
-        corners = np.stack([rows[axis] for axis in "xyz"], axis=1).astype(np.float64)
+        positions = np.stack([rows[axis] for axis in "xyz"], axis=1).astype(np.float64)
         return field_of_voxels(
             path,
-            np.rint((corners + 0.5) * _SIDE).astype(np.int64),
+            # The dataset states lower corners, i / 64 - 0.5; predictions state centres.
+            np.floor((positions + 0.5) * _SIDE + 0.25).astype(np.int64),
             np.stack([rows[name] for name in columns], axis=1),
             resolution=_SIDE,
             max_unphysical=max_unphysical,
