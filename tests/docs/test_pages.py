@@ -219,7 +219,10 @@ def test_wrong_asset_is_answered_with_the_one_it_might_be(
 @pytest.mark.parametrize(
     ("options", "said"),
     [
-        (("--format", "npz", "--points", "grid"), "--points is for --format ply or voxel_data, not npz"),
+        (
+            ("--format", "npz", "--points", "grid"),
+            "--points is for --format ply or voxel_data, not npz",
+        ),
         (("--format", "ply", "--shard-size", "3"), "--shard-size is for --format webdataset"),
     ],
 )
