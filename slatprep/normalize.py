@@ -1,8 +1,8 @@
 """Physical properties to [-1, 1] and back.
 
-A property is mapped to log10 of its SI value (Young's modulus, density) or
-taken as it is (Poisson's ratio), as its table says; the mapped value v of a range lo..hi becomes
-``2 (v - lo) / (hi - lo) - 1`` (SLAT-Phys; Pixie uses the same form).
+A property is mapped to log10 of its SI value (Young's modulus, density) or stays as it is
+(Poisson's ratio), as its table says. The mapped value v of a range lo..hi becomes ``2 (v - lo) /
+(hi - lo) - 1`` (SLAT-Phys; Pixie uses the same form).
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ _HALF_WIDTH_OF_A_POINT = 0.5
 
 
 def to_mapped(properties: ArrayLike, table: Sequence[Property] = PROPERTIES) -> NDArray[np.float64]:
-    """Map SI properties (N, P) to log10 of those that are normalised so; the others stay."""
+    """Map SI properties (N, P) to their log10 where the table says so; the others stay."""
     mapped = np.array(properties, dtype=np.float64)
     columns = [column for column, one in enumerate(table) if one.log10]
     mapped[..., columns] = np.log10(mapped[..., columns])
@@ -48,20 +48,9 @@ def from_mapped(mapped: ArrayLike, table: Sequence[Property] = PROPERTIES) -> ND
 def property_extent(
     field: MaterialField, table: Sequence[Property] | None = None
 ) -> NDArray[np.float64]:
-    """Return the smallest and largest mapped property of a field.
+    """Return minimum and maximum (P, 2) of each mapped property over a field's annotated voxels.
 
-    Parameters
-    ----------
-    field : MaterialField
-        The field; all its annotated voxels count.
-    table : sequence of Property, optional
-        Of which properties, instead of the field's own; NaN where it lacks one.
-
-    Returns
-    -------
-    ndarray of float64, shape (P, 2)
-        Per property of the table the minimum and maximum, of log10 where that
-        is how it is normalised.
+    The properties are those of `table`, by default the field's; NaN where the field lacks one.
     """
     table = field.table if table is None else table
     own = {one.name: column for one, column in zip(field.table, field.properties.T, strict=True)}
@@ -76,26 +65,9 @@ def property_extent(
 def ranges_from_extents(
     extents: ArrayLike, source: str = "dataset", table: Sequence[Property] = PROPERTIES
 ) -> Normalization:
-    """Return the ranges that span a whole dataset.
+    """Return the ranges that span a dataset with extents (A, P, 2) from `property_extent`.
 
-    Parameters
-    ----------
-    extents : array_like of float64, shape (A, P, 2)
-        What `property_extent` gave for each asset.
-    source : str
-        What the ranges say of where they come from.
-    table : sequence of Property
-        The properties.
-
-    Returns
-    -------
-    Normalization
-        Dataset minimum and maximum of each property.
-
-    Raises
-    ------
-    ValueError
-        If there is no asset, or an extent is not finite.
+    The ranges record their `source`. ValueError without assets, or if an extent is not finite.
     """
     ends = np.asarray(extents, dtype=np.float64).reshape(-1, len(table), 2)
     if len(ends) == 0 or not np.isfinite(ends).all():
@@ -134,7 +106,7 @@ def normalize_properties(
         In SI units, a column for each range (Young's modulus [Pa], density
         [kg/m^3] and Poisson's ratio by default); NaN passes through.
     normalization : Normalization
-        The ranges; Pixie's published ones by default, a store's own are
+        The ranges; Pixie's published ones by default. A store's own are
         ``store.normalization``.
 
     Returns
@@ -156,7 +128,7 @@ def normalize_properties(
 def normalize_and_count(
     properties: ArrayLike, normalization: Normalization
 ) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
-    """Normalise as `normalize_properties`, and count per property (P,) what was clipped."""
+    """Normalise as `normalize_properties`, and count the clipped values per property (P,)."""
     given = np.asarray(properties)
     values = np.empty(given.shape, dtype=np.float32)
     clipped = np.zeros(len(normalization.ranges), dtype=np.int64)
@@ -181,12 +153,12 @@ def denormalize_properties(
     values : array_like, shape (N, P)
         Normalised properties, a column for each range.
     normalization : Normalization
-        The ranges they were normalised with.
+        The ranges that normalised them.
 
     Returns
     -------
     ndarray of float32, shape (N, P)
-        In SI units. What had been clipped comes back as the end of its range.
+        In SI units. Clipped values come back as the end of their range.
     """
     given = np.asarray(values)
     properties = np.empty(given.shape, dtype=np.float32)

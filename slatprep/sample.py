@@ -1,6 +1,6 @@
-"""Material and properties at SLAT voxels, from the annotated PixieVerse voxels near them.
+"""Class and properties at SLAT voxels, from the annotated PixieVerse voxels near them.
 
-`sample` looks them up in one field, `merge` makes one of what several fields say.
+`sample` looks them up in one field, `merge` combines the results of several fields.
 """
 
 from __future__ import annotations
@@ -40,34 +40,16 @@ def sample(
     *,
     labels_alone: bool = False,
 ) -> Annotation:
-    """Look material and properties up at SLAT voxels.
+    """Look class and properties up at the places (N, 3) of SLAT voxels in the PixieVerse frame.
 
-    Each SLAT voxel, carried into the PixieVerse frame, takes the values of
-    an annotated voxel there: the nearest one (SLAT-Phys, "Physics-to-SLAT
-    Annotation Alignment"), or the nearest one of the class that the annotated
-    voxels around it vote for. Background and unannotated voxels are
-    never taken.
+    Each place takes the values of the nearest annotated voxel (SLAT-Phys, "Physics-to-SLAT
+    Annotation Alignment"), or of the nearest of the class that the annotated voxels around it vote
+    for. Background and unannotated voxels never count. Places are rounded to float32 first, because
+    a store holds them so and the labels follow from what it holds.
 
-    Parameters
-    ----------
-    field : MaterialField
-        The PixieVerse field.
-    places : array_like, shape (N, 3)
-        Where the SLAT voxels lie in the PixieVerse frame, points of the unit cube;
-        `slatprep.align.deformation.PlaceMap` and `slatprep.geometry.frames.places_of`
-        carry them there. They are rounded to float32 first: a store holds them
-        so, and the labels follow from what it holds.
-    parameters : SampleParameters
-        The method, and from which distance on a SLAT voxel is not valid.
-    labels_alone : bool
-        Whether nobody asks how far off the voxels are that are not valid: their
-        ``distance`` is then infinite.
-
-    Returns
-    -------
-    Annotation
-        In SI units; NaN and 255 where not valid. ``distance`` is to the voxel
-        whose values were taken, or to the nearest where not valid.
+    The result is in SI units, NaN and 255 where not valid. ``distance`` [voxel] is to the voxel
+    whose values were taken. Where not valid it is to the nearest, or infinite with `labels_alone`,
+    which is faster.
     """
     lattice = lattice_of(field)
     place = np.asarray(places, dtype=np.float32)
@@ -90,37 +72,22 @@ def sample(
 
 @lru_cache(maxsize=1)
 def lattice_of(field: MaterialField) -> Lattice:
-    """Return the field's annotated voxels by cell; a field is looked up several times in a row."""
+    """Return the field's annotated voxels by cell; cached, for repeated lookups in a field."""
     from slatprep.geometry.nearest import Lattice
 
     return Lattice(field.voxels)
 
 
 def merge(annotations: Sequence[Annotation], table: Sequence[Property]) -> Annotation:
-    """Make one annotation of several of the same SLAT voxels.
+    """Merge several annotations of the same SLAT voxels, from `in_table`, each with its confidence.
 
-    At each voxel those that are valid there count. A property is the mean of those that
-    have it, of log10 where the table says so, and the class the one that most of them give, of
-    several such the one with the lowest id. The voxel is valid where every property, and
-    the class, is given by one at least.
+    At each voxel only valid annotations count. A property is their mean, of log10 where `table`
+    says so; the class is the most frequent one, at a tie the lowest id. The voxel is valid if at
+    least one annotation gives each property, and one the class. Place and distance come from the
+    first annotation. The spread is the square root of the mean squared deviation.
 
-    Its confidence is the mean of theirs, each taken fully where it gives no other class
-    and each of its properties is near the merged one, by half where a property is not,
-    and not at all where it gives another class.
-
-    Parameters
-    ----------
-    annotations : sequence of Annotation
-        As `in_table` gives them, each with its confidence; place and distance are taken from
-        the first.
-    table : sequence of Property
-        What their P properties are.
-
-    Returns
-    -------
-    Annotation
-        In SI units, with spread and votes. The spread is that of the annotations
-        themselves: the square root of the mean squared deviation.
+    The confidence is the mean over the valid annotations of theirs, times 0 for another class, 1/2
+    if a property is far from the merged one, and 1 otherwise.
     """
     valid = np.stack([one.valid for one in annotations])
     mapped = np.stack([to_mapped(one.properties, table) for one in annotations])
@@ -163,24 +130,16 @@ def merge(annotations: Sequence[Annotation], table: Sequence[Property]) -> Annot
 
 
 def lacking(field: MaterialField, contents: Contents) -> tuple[str, ...]:
-    """Return what a store holds and a field says nothing of: names of properties, ``classes``."""
+    """Return what a store has and a field lacks: names of properties, ``classes``."""
     own = {one.name for one in field.table}
     missing = tuple(one.name for one in contents.properties if one.name not in own)
     return (*missing, "classes") if contents.classes and not field.classified else missing
 
 
 def in_table(annotation: Annotation, field: MaterialField, contents: Contents) -> Annotation:
-    """Return an annotation with the columns of a store, as `merge` takes it.
+    """Return an annotation from a field with the columns of a store, for `merge`.
 
-    Parameters
-    ----------
-    annotation : Annotation
-        Looked up in the field.
-    field : MaterialField
-        Its properties are among those of the store.
-    contents : Contents
-        What the store holds. Of properties that the field lacks, the values are NaN, and
-        the material is 255 where it lacks classes.
+    Properties that the field lacks are NaN, and the material is 255 if it lacks classes.
     """
     missing = lacking(field, contents)
     own = {one.name: column for column, one in enumerate(field.table)}

@@ -39,7 +39,7 @@ __all__ = ["DemoAsset", "DemoSummary", "make_asset", "make_demo"]
 
 @dataclass(frozen=True)
 class DemoSummary:
-    """What was made: where it lies, and how many rows of each category and level."""
+    """The result: the folder, and the number of rows of each category and level."""
 
     directory: Path
     config: Path
@@ -94,8 +94,7 @@ def make_demo(
     """Make a demo dataset.
 
     The same arguments give the same bytes, whatever `jobs`; asset number i
-    does not depend on how many assets there are. Fourteen assets hold every
-    category once.
+    does not depend on the number of assets. Fourteen assets have every category once.
 
     Parameters
     ----------
@@ -114,24 +113,24 @@ def make_demo(
     latents : {"placeholder", "material"}
         Noise, or latents that depend on the material; see `slatprep.demo.latents`.
     habitual_share : float
-        Share of assets with the dataset's one quarter turn between the sides,
+        Share of assets with the dataset's common quarter turn between the sides,
         in 0..1; the others have any of the 24.
     source : str
-        The source of the annotated side, one of `slatprep.demo.sources.Source`: PixieVerse's
+        The source of the annotated side, a `slatprep.demo.sources.Source`: PixieVerse's
         grids, predictions with 11 or 4 channels, VoMP's or PhysXNet's voxels, or plain voxels
         with ten properties (in HDF5 without classes).
     encoder : {"trellis", "sam3d", "trellis2", "trellis2-512", "plain", "plain-128"}
         The encoder of the latents; ``trellis2-512`` has a grid of 32^3. ``plain`` has 16 channels,
         described in ``encoder.json``, and ``plain-128`` the same on a grid of 128^3.
     slat_form : {"npz", "npz-batch", "hdf5", "hdf5-groups"}
-        Coordinates (N, 3) uint8 or (N, 4) int32 in an npz, or HDF5, a file or
-        a group an asset.
+        Coordinates (N, 3) uint8 or (N, 4) int32 in an npz, or HDF5, with a file or
+        a group per asset.
     slat_names : {"id", "sha256"}
         Name the SLATs by object id, or by sha256 with TRELLIS's ``metadata.csv``.
     results : bool
         Also write ``results/``: predictions of a method with errors, 12 MB for each asset.
     samples : int
-        Annotations of each object; several have the errors that `slatprep.demo.samples` says.
+        Annotations of each object; several have the errors of `slatprep.demo.samples`.
     jobs : int
         Processes.
     progress : callable, optional
@@ -140,7 +139,7 @@ def make_demo(
     Returns
     -------
     DemoSummary
-        Where it lies and what it holds.
+        The folder and its content.
 
     Raises
     ------
@@ -222,7 +221,7 @@ def _claim(root: Path, recipe: _Recipe) -> None:
 
 
 def _recipe_in(mark: Path) -> object:
-    """Return the recipe that a directory was marked with; None where it was not."""
+    """Return the recipe that marks a directory; None without a mark."""
     try:
         return json.loads(mark.read_text("utf-8"))["recipe"]
     except (OSError, ValueError, KeyError, TypeError):
@@ -230,7 +229,7 @@ def _recipe_in(mark: Path) -> object:
 
 
 def _make_one(root: Path, recipe: _Recipe, index: int) -> tuple[int, dict[str, Any]]:
-    """Make and write one asset; return its number, and what is known of it."""
+    """Make and write an asset; return its number and its entry in the definition."""
     channels, resolution = GRIDS[recipe.encoder]
     asset = make_asset(
         recipe.seed,

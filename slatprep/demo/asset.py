@@ -43,21 +43,21 @@ class DemoView:
     Attributes
     ----------
     view : str
-        Name of the view; empty where the object has one only.
+        Name of the view; empty if the object has only one.
     coords : ndarray of uint8, shape (N, 3)
         SLAT voxels in C order.
     feats : ndarray of float32, shape (N, channels)
         Latents.
     transform : ndarray of float64, shape (4, 4)
-        PixieVerse frame to SLAT frame; of a generated shape, the similarity that takes
-        `places` onto the SLAT voxels with least squares.
+        PixieVerse frame to SLAT frame; for a generated shape, the least-squares similarity
+        from `places` to the SLAT voxels.
     material : ndarray of uint8, shape (N,)
         True class of each SLAT voxel.
     properties : ndarray of float32, shape (N, 3)
         True Young's modulus, density and Poisson's ratio of each, SI.
     places : ndarray of float64, shape (N, 3), or None
-        Where the centre of each SLAT voxel truly lies in the PixieVerse frame; None
-        on the levels whose transform says it.
+        True place of each SLAT voxel's centre in the PixieVerse frame; None on levels where
+        `transform` is the whole map.
     """
 
     view: str
@@ -100,9 +100,7 @@ def make_asset(
     resolution: int = RESOLUTION,
     one_frame: bool = False,
 ) -> DemoAsset:
-    """Make asset number `index` of a demo dataset.
-
-    It depends on these arguments alone, not on how many others are made.
+    """Make asset number `index` of a demo dataset, which depends on these arguments alone.
 
     Parameters
     ----------
@@ -111,19 +109,19 @@ def make_asset(
     levels : tuple of int
         The levels that the dataset goes through in turn.
     views : int
-        SLATs of the object; from the second on the SLAT side is turned about z, and
-        where shapes are generated, each is another one.
+        SLATs of the object; from the second on, the SLAT side is turned about z. Each
+        generated shape differs.
     latents : {"placeholder", "material"}
         Noise, or latents that depend on the material; see `slatprep.demo.latents`.
     habitual_share : float
-        Share of assets whose PixieVerse side has the dataset's one quarter
+        Share of assets whose PixieVerse side has the dataset's common quarter
         turn; the others have any of the 24.
     channels : int
         Channels of the latents.
     resolution : int
-        Voxels of the SLAT along each axis: 64 times a power of two, or divided by one.
+        Voxels of the SLAT along each axis: 64 times or divided by a power of two.
     one_frame : bool
-        Whether both sides were made from one mesh: the transform is the identity then.
+        Whether both sides come from the same mesh, so that the transform is the identity.
         Only for level 0 and one view.
 
     Returns

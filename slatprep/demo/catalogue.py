@@ -1,7 +1,6 @@
 """The demo's objects: one builder for each PixieVerse category.
 
-A builder's `variant` counts the objects of its category, so that a dataset
-holds each kind in turn.
+A builder's `variant` counts the objects of its category, so that a dataset has each kind in turn.
 """
 
 from __future__ import annotations

@@ -44,8 +44,8 @@ class Difficulty:
     """The settings of a level: angles in degrees, lengths in voxels, scale as a share.
 
     ``proportions`` and ``bend`` are for a generated shape, see
-    `slatprep.demo.generated.draw_distortion`; ``room`` is the margin for a NeRF's field
-    on each side of the grid.
+    `slatprep.demo.generated.draw_distortion`; ``room`` is the margin for a NeRF's field on each
+    side of the grid.
     """
 
     tilt: float = 0.0
@@ -67,7 +67,7 @@ class Difficulty:
 
     @property
     def has_places(self) -> bool:
-        """Whether the truth names a place for each SLAT voxel."""
+        """Whether the truth gives a place for each SLAT voxel."""
         return self.generated or self.nerf
 
 
@@ -120,7 +120,7 @@ class Pose:
 
 @dataclass(frozen=True)
 class Frames:
-    """The two poses of one asset, and how its SLAT side was warped or generated (if not None)."""
+    """The two poses of an asset, and the warp or the distortion of its SLAT side, if any."""
 
     pixieverse: Pose
     slat: Pose
@@ -158,23 +158,9 @@ class Frames:
 
 
 def draw_frames(rng: Rng, solid: Solid, difficulty: Difficulty, quarter: Array) -> Frames:
-    """Draw the poses of one asset.
+    """Draw the poses of an asset, which keep both sides within their cubes.
 
-    Parameters
-    ----------
-    rng : numpy.random.Generator
-        Source of the random parts.
-    solid : Solid
-        The object.
-    difficulty : Difficulty
-        The settings of its level.
-    quarter : ndarray, shape (3, 3)
-        Quarter turn of the PixieVerse side; the SLAT side stands upright.
-
-    Returns
-    -------
-    Frames
-        Poses that keep both sides within their cubes.
+    `quarter` (3, 3) is the quarter turn of the PixieVerse side; the SLAT side stands upright.
     """
     middle = solid.extent.mean(axis=0)
     warp = Warp.draw(rng, difficulty.warp, (0.7, 1.3)) if difficulty.warp else None
@@ -208,23 +194,8 @@ def draw_frames(rng: Rng, solid: Solid, difficulty: Difficulty, quarter: Array) 
 def generate(rng: Rng, frames: Frames, difficulty: Difficulty, solid: Solid, skin: Array) -> Frames:
     """Replace the SLAT side of an asset by a generated shape that fills the cube.
 
-    Parameters
-    ----------
-    rng : numpy.random.Generator
-        Source of the random parts.
-    frames : Frames
-        Of the same asset, without a warp; the rotation of its SLAT side is kept.
-    difficulty : Difficulty
-        The settings of its level.
-    solid : Solid
-        The object.
-    skin : ndarray of float64, shape (K, 3)
-        Points on the object's surface, at most a voxel apart.
-
-    Returns
-    -------
-    Frames
-        The same with a distortion, and with the SLAT's pose fitted to it.
+    `frames` has no warp; the rotation of its SLAT side stays, and its pose is fitted to the shape.
+    `skin` (K, 3) are points on the object's surface, at most a voxel apart.
     """
     distortion = draw_distortion(rng, solid.extent, difficulty.proportions, difficulty.bend)
     turned = distortion.inverse(skin) @ frames.slat.rotation.T
@@ -260,23 +231,10 @@ def _any_rotation(rng: Rng) -> Array:
 def damage(
     rng: Rng, stuff: NDArray[np.int16], distance: Callable[[Array], Array], stuffs: int
 ) -> NDArray[np.int16]:
-    """Remove pieces of a grid and add floaters, as in the density of a NeRF.
+    """Remove pieces of a grid (64, 64, 64) and add floaters, as in the density of a NeRF.
 
-    Parameters
-    ----------
-    rng : numpy.random.Generator
-        Source of the random parts.
-    stuff : ndarray of int16, shape (64, 64, 64)
-        Index of the stuff of each voxel, `EMPTY` where there is none.
-    distance : callable
-        Distance bound of the solid in the grid's frame.
-    stuffs : int
-        Number of stuffs of the asset, from which floaters get theirs.
-
-    Returns
-    -------
-    ndarray of int16, shape (64, 64, 64)
-        The damaged grid; one floater is `UNLABELLED`.
+    Entries of `stuff` are indices, `EMPTY` where empty; one floater is `UNLABELLED`. `distance` is
+    a bound of the solid in the grid's frame. Floaters get one of `stuffs` stuffs.
     """
     damaged = stuff.copy()
     index = np.argwhere(np.ones(stuff.shape, dtype=bool))

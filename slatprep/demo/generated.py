@@ -1,8 +1,8 @@
 """The shape that a generator makes from one image of an object.
 
 Its proportions are wrong and it is bent, most on the side that the image does not show. A
-`Distortion` maps points of the generated shape to the same points of the object, so that the
-true place of a SLAT voxel is computed and not fitted.
+`Distortion` maps points of the generated shape to the same points of the object. The true place of
+a SLAT voxel is therefore computed, not fitted.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ class Warp:
         return cls(amplitude, np.stack(wave), rng.uniform(0.0, 2.0 * np.pi, waves))
 
     def displacement(self, points: Array) -> Array:
-        """Return by how much points (P, 3) are moved."""
+        """Return the displacements of points (P, 3)."""
         moved: Array = np.sin(points @ self.wave.T + self.phase) @ self.amplitude
         return moved
 
@@ -78,10 +78,9 @@ class Warp:
 class Distortion:
     """A smooth map from the generated shape to the object, both in object coordinates.
 
-    With ``q = (y - middle) / size``, a point ``y`` of the generated shape is the
-    object's point ``middle + size * (q + w(q) b(q)) / proportions``, where ``b`` is
-    a sum of plane sine waves and ``w`` grows from 2/3 on the side that the image
-    sees to 4/3 on the other one.
+    With ``q = (y - middle) / size``, it takes a point ``y`` of the generated shape to
+    ``middle + size * (q + w(q) b(q)) / proportions``. Here ``b`` is a sum of plane sine waves, and
+    ``w`` grows from 2/3 on the side that the image sees to 4/3 on the other.
 
     Attributes
     ----------
@@ -113,10 +112,10 @@ class Distortion:
         return moved
 
     def inverse(self, points: Array, iterations: int = 40) -> Array:
-        """Map points (P, 3) of the object to the generated shape.
+        """Map points (P, 3) of the object to the generated shape by fixed-point iteration.
 
-        By fixed-point iteration: the bend is a contraction by construction, and
-        each step reduces the error at least to the share `slope`.
+        The bend is a contraction by construction: each step multiplies the error by at most
+        `slope`.
         """
         target = self.proportions * (points - self.middle) / self.size
         q = target
@@ -143,8 +142,7 @@ def _growth(q: Array, away: Array) -> Array:
 def _slope(waves: Warp, away: Array) -> float:
     """Bound the spectral norm of a bend's derivative in the cube of half edge `_REACH`.
 
-    It is taken on a lattice; between its points it changes by no more than the
-    second derivative allows.
+    The norm is computed on a lattice; the second derivative bounds its change between the points.
     """
     steps = 36
     axis = np.linspace(-_REACH, _REACH, steps)
@@ -167,23 +165,11 @@ def _slope(waves: Warp, away: Array) -> float:
 def draw_distortion(
     rng: Rng, extent: Array, proportions: tuple[float, float], bend: float
 ) -> Distortion:
-    """Draw the distortion of a generated shape.
+    """Draw the distortion of a generated shape, without folds.
 
-    Parameters
-    ----------
-    rng : numpy.random.Generator
-        Source of the random parts.
-    extent : ndarray of float64, shape (2, 3)
-        The object's bounding box.
-    proportions : tuple of float
-        Least and greatest error of the proportions along one axis, as a share.
-    bend : float
-        Root mean square of the smooth part, in voxels of a grid that the object fills.
-
-    Returns
-    -------
-    Distortion
-        Without folds.
+    `extent` (2, 3) is the object's bounding box, `proportions` the least and greatest error along
+    an axis as a share. `bend` is the root mean square of the smooth part, in voxels of a grid that
+    the object fills.
     """
     stretch = np.ones(3)
     stretch[rng.integers(3)] += rng.choice([-1.0, 1.0]) * rng.uniform(*proportions)

@@ -46,24 +46,11 @@ def make_latents(
     properties: NDArray[np.float32],
     channels: int = 8,
 ) -> NDArray[np.float32]:
-    """Return latents (N, channels) float32 for SLAT voxels.
+    """Return latents (N, channels) float32 for SLAT voxels with centres (N, 3) in the unit cube.
 
-    Parameters
-    ----------
-    rng : numpy.random.Generator
-        Source of the noise.
-    kind : {"placeholder", "material"}
-        ``placeholder`` is normal noise. ``material`` is `NOISE` times that, with
-        `clean_latents` added to the first eight channels. Both are then scaled to the
-        encoder's mean and standard deviation.
-    centres : ndarray of float64, shape (N, 3)
-        Centres of SLAT voxels in the unit cube.
-    material : ndarray of uint8, shape (N,)
-        Class of each, 0..6.
-    properties : ndarray of float32, shape (N, 3)
-        Young's modulus, density and Poisson's ratio of each, SI.
-    channels : int
-        At least eight.
+    ``placeholder`` latents are normal noise. ``material`` latents are `NOISE` times that, with
+    `clean_latents` added to the first eight channels. Both are then scaled to the encoder's mean
+    and standard deviation. `properties` (N, 3) are Young's modulus, density, Poisson's ratio, SI.
     """
     z = rng.normal(size=(len(centres), channels))
     if kind == "material":
@@ -79,16 +66,11 @@ def clean_latents(
 ) -> NDArray[np.float64]:
     """Return ``material`` latents without noise, standardised (N, 8).
 
-    ``2 * code[material] + p @ code[:3] + sin(pi * x) @ code[3:6] / 2``, with
-    ``code`` eight fixed orthonormal vectors, ``p`` the three properties (log10
-    Young's modulus, log10 density, Poisson's ratio) mapped to about -1..1, and
-    ``x`` the voxel's centre. It is linear in the targets, so a linear model of single voxels
-    has the right form; but it cannot use neighbouring voxels, whose noise is independent.
-
-    Parameters
-    ----------
-    centres, material, properties : ndarray
-        As in `make_latents`.
+    They are ``2 * code[material] + p @ code[:3] + sin(pi * x) @ code[3:6] / 2``. Here ``code`` are
+    eight fixed orthonormal vectors, ``p`` the three properties (log10 Young's modulus, log10
+    density, Poisson's ratio) mapped to about -1..1, and ``x`` the voxel's centre. They are linear
+    in the targets, so a linear model of single voxels has the right form. It cannot use
+    neighbouring voxels, whose noise is independent.
     """
     mapped = properties.astype(np.float64)
     mapped[:, :2] = np.log10(mapped[:, :2])

@@ -32,7 +32,7 @@ class Model:
 
 
 class Parts(list[Part]):
-    """The parts of an object that is being put together."""
+    """The parts of an object under construction."""
 
     def add(self, stuff: Stuff, *shapes: Shape) -> None:
         """Add shapes of one stuff."""
@@ -65,7 +65,7 @@ def direction(rng: Rng) -> Array:
 
 
 def curve(points: Sequence[Array] | Array, radii: Sequence[float] | Array) -> list[Shape]:
-    """Return capsules along a polyline of points (K, 3), one radius a segment."""
+    """Return capsules along a polyline of points (K, 3), one radius per segment."""
     return [capsule(a, b, k) for a, b, k in zip(points[:-1], points[1:], radii, strict=True)]
 
 
@@ -86,8 +86,8 @@ def vessel(
 ) -> Shape:
     """Return an upright hollow frustum, with a floor where `floor` is not 0.
 
-    The hollow goes on well beyond the ends, so that the distance bound is not
-    near zero where only the ends' planes are near.
+    The hollow extends well beyond the ends, so that the distance bound is not near zero where only
+    the ends' planes are near.
     """
     slope = (top_radius - radius) / (top - bottom)
     low, high = bottom + (floor or -0.2), top + 0.2

@@ -35,23 +35,10 @@ _MOST_LOST = 0.15  # Largest share of an object to lose with its thin parts.
 def nerf_field(
     rng: Rng, stuff: NDArray[np.int16], up: NDArray[np.float64], stuffs: int
 ) -> NDArray[np.int16]:
-    """Degrade an exact grid as the density of a NeRF would.
+    """Degrade an exact grid (64, 64, 64) of stuff indices, -1 if empty, as a NeRF's density would.
 
-    Parameters
-    ----------
-    rng : numpy.random.Generator
-        Source of the random parts.
-    stuff : ndarray of int16, shape (64, 64, 64)
-        Index of the stuff of each voxel, -1 where empty.
-    up : ndarray of float64, shape (3,)
-        Unit vector of the grid's frame that points up from the ground.
-    stuffs : int
-        Number of stuffs of the asset, from which blobs and ground get theirs.
-
-    Returns
-    -------
-    ndarray of int16, shape (64, 64, 64)
-        The degraded grid, in the same frame. The voxels of one blob are `UNLABELLED`.
+    The unit vector `up` (3,) points up from the ground. Blobs and ground get one of `stuffs`
+    stuffs; the voxels of one blob are `UNLABELLED`.
     """
     kept = _without_thin_parts(rng, stuff >= 0)
     away, nearest = ndimage.distance_transform_edt(~kept, return_indices=True)
@@ -74,7 +61,7 @@ def _smooth_noise(rng: Rng, sigma: float) -> NDArray[np.float64]:
 
 
 def _without_thin_parts(rng: Rng, occupied: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Remove some of the pieces into which a ball of radius `_THIN` does not fit."""
+    """Remove some of the pieces that a ball of radius `_THIN` does not fit into."""
     core = ndimage.distance_transform_edt(occupied) > _THIN
     opened = ndimage.distance_transform_edt(~core) <= _THIN
     thin = occupied & ~opened & (_smooth_noise(rng, 4.0) > 0.0)

@@ -1,4 +1,4 @@
-"""Several annotations of one object: what labelling it again, with errors, might give."""
+"""Several annotations of an object, as repeated labelling with errors might give."""
 
 from __future__ import annotations
 
@@ -21,23 +21,10 @@ _STREAM = 6
 
 
 def sample_grids(seed: int, index: int, asset: DemoAsset, samples: int) -> NDArray[np.float32]:
-    """Return annotations of an object that err by part, as a language model errs.
+    """Return annotations (samples, 64, 64, 64, 4) whose parts err as a language model errs.
 
-    Parameters
-    ----------
-    seed, index : int
-        Seed of the dataset and number of the asset in it.
-    asset : DemoAsset
-        The object, with the true annotation.
-    samples : int
-        How many.
-
-    Returns
-    -------
-    ndarray of float32, shape (samples, 64, 64, 64, 4)
-        As PixieVerse stores them: the logarithms of density and Young's modulus, and
-        Poisson's ratio, of each part are drawn about the true ones with `SPREAD`. A sample
-        does not depend on how many there are.
+    In each part, log density, log Young's modulus and Poisson's ratio are drawn about the true
+    values with `SPREAD`. A sample does not depend on the number of samples.
     """
     known = asset.grid[..., 3] >= 0
     known &= asset.grid[..., 3] != BACKGROUND

@@ -1,9 +1,8 @@
 """Primitive solids as signed distance bounds, and their materials.
 
-Every shape gives, at any point, a number that is negative inside, positive
-outside and never larger in magnitude than the distance to its surface; the
-voxelisation relies on that bound. It also gives its support function, from
-which exact bounding boxes follow in any orientation.
+Every shape gives a number at any point: negative inside, positive outside, and never larger in
+magnitude than the distance to its surface. The voxelisation relies on that bound. A shape also
+gives its support function, from which exact bounding boxes follow in any orientation.
 
 The distance functions follow Inigo Quilez, "Distance functions"
 (https://iquilezles.org/articles/distfunctions/).
@@ -159,12 +158,8 @@ def torus(centre: ArrayLike, axis: ArrayLike, radius: float, thickness: float) -
 def polytope(normals: ArrayLike, offsets: ArrayLike) -> Shape:
     """Return the intersection of half-spaces ``normal @ p <= offset``; it must be bounded.
 
-    Parameters
-    ----------
-    normals : array_like, shape (F, 3)
-        Unit normals that point outwards.
-    offsets : array_like, shape (F,)
-        Distance of each plane from the origin.
+    `normals` (F, 3) are unit vectors outwards, `offsets` (F,) the planes' distances from the
+    origin.
     """
     n, o = _vector(normals), _vector(offsets)
     corners = []
@@ -213,16 +208,10 @@ class Part:
 
 
 class Solid:
-    """The union of parts, with the distance and the stuff at any point.
+    """The union of at least one part, with the distance and the stuff at any point.
 
-    A point belongs to the part whose distance there is smallest.
-
-    Parameters
-    ----------
-    parts : sequence of Part
-        At least one.
-    reach : float
-        Distances are computed up to this share of the largest edge of the solid's box.
+    A point belongs to the part whose distance is smallest there. Distances are computed up to the
+    share `reach` of the largest edge of the solid's box.
     """
 
     def __init__(self, parts: Sequence[Part], reach: float = 0.08) -> None:

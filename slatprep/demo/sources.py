@@ -57,23 +57,11 @@ TABLE: tuple[dict[str, Any], ...] = (
 def columns_of(
     source: Source, material: NDArray[Any], properties: NDArray[np.float32]
 ) -> dict[str, NDArray[np.float32]]:
-    """Return the properties that a source has of some voxels.
+    """Return the properties (K,) of voxels that a source has, by name and in SI units.
 
-    Parameters
-    ----------
-    source : str
-        One of `Source`.
-    material : ndarray of int, shape (K,)
-        Their classes, 0..6.
-    properties : ndarray of float32, shape (K, 3)
-        Their Young's modulus, density and Poisson's ratio. The other properties follow from
-        them: a yield stress of 1 % of the modulus, and values by class, multiplied by 0.5
-        to 1.5 depending on Poisson's ratio.
-
-    Returns
-    -------
-    dict of str to ndarray of float32, shape (K,)
-        By name, in SI units.
+    `material` (K,) are classes 0..6, `properties` (K, 3) Young's modulus, density and Poisson's
+    ratio. The other properties follow: a yield stress of 1 % of the modulus, and values by class,
+    multiplied by 0.5 to 1.5 depending on Poisson's ratio.
     """
     known = dict(zip((one.name for one in PROPERTIES), properties.T, strict=True))
     if source == "physxnet":
@@ -98,18 +86,8 @@ def write_field(
 ) -> None:
     """Write the annotated side of an object, for any source but Pixie's.
 
-    Parameters
-    ----------
-    root : Path
-        The folder of the source.
-    source : str
-        One of `Source`.
-    name : str
-        Id of the object.
-    grid : ndarray of float32, shape (64, 64, 64, 4)
-        In PixieVerse's form; voxels of class -1 are left out.
-    surface : ndarray of uint8, shape (N, 3)
-        Voxels of its SLAT, which PhysXNet annotates.
+    `grid` (64, 64, 64, 4) has PixieVerse's form; voxels of class -1 are left out. `surface` (N, 3)
+    are the voxels of its SLAT, which PhysXNet annotates.
     """
     known = (grid[..., 3] >= 0) & (grid[..., 3] < BACKGROUND)
     voxels = np.argwhere(known)
@@ -188,16 +166,7 @@ def write_description(
 def write_voxels(root: Path, name: str, form: str, arrays: Mapping[str, NDArray[Any]]) -> None:
     """Write plain voxels of an object: ``voxels`` (K, 3) and a column (K,) for each property.
 
-    Parameters
-    ----------
-    root : Path
-        The folder of the source.
-    name : str
-        Id of the object.
-    form : {"npz", "hdf5", "zarr", "ply"}
-        A PLY has the centres of the voxels as points.
-    arrays : mapping of str to ndarray
-        The arrays by name.
+    `form` is ``npz``, ``hdf5``, ``zarr`` or ``ply``, with the centres of the voxels as points.
     """
     root.mkdir(parents=True, exist_ok=True)
     if form == "npz":

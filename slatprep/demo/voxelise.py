@@ -1,9 +1,8 @@
 """Voxelise the surface and the inside of a solid.
 
-TRELLIS voxelises the surface of a mesh (Open3D's
-``create_from_triangle_mesh_within_bounds``): a voxel is occupied if the
-surface meets its cube. Here the surface is the zero set of a signed distance
-bound, and cubes are subdivided to decide whether they meet it.
+TRELLIS voxelises the surface of a mesh (Open3D's ``create_from_triangle_mesh_within_bounds``): a
+voxel is occupied if the surface meets its cube. Here the surface is the zero set of a signed
+distance bound, and subdivided cubes show whether they meet it.
 """
 
 from __future__ import annotations
@@ -26,28 +25,15 @@ _CORNERS = np.array([(i, j, k) for i in (0, 1) for j in (0, 1) for k in (0, 1)])
 def voxelise(
     distance: Distance, side: int = RESOLUTION
 ) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-    """Return the surface voxels and the filled voxels of a solid in the unit cube.
+    """Return the surface voxels and the filled voxels of a solid, (side, side, side) each.
 
-    Parameters
-    ----------
-    distance : callable
-        Maps points (P, 3) of the cube [-0.5, 0.5]^3 to (P,): negative or zero
-        inside, positive outside, in magnitude no greater than the distance to
-        the surface (it may be cut off at any value above half the diagonal of
-        a block of 4 voxels of 64, 0.054).
-    side : int
-        Voxels along each axis, 64 or a multiple.
+    `distance` maps points (P, 3) of the cube [-0.5, 0.5]^3 to (P,): positive outside, otherwise
+    negative or zero, in magnitude at most the distance to the surface. It may be cut off above half
+    the diagonal of a block of 4 voxels of 64, 0.054. `side` is 64 or a multiple.
 
-    Returns
-    -------
-    surface, filled : ndarray of bool, shape (side, side, side)
-        Voxels whose cube the surface meets; those and all voxels inside.
-
-    Notes
-    -----
-    A cube whose centre is farther from the surface than half the cube's diagonal does not meet
-    it; a cube with points on both sides does. All others are halved three times. Only a surface
-    that enters a cube by less than a tenth of a voxel, between the sampled points, is missed.
+    A cube whose centre is farther from the surface than half its diagonal does not meet it; a cube
+    with points on both sides does. All others are halved three times. This misses only a surface
+    that enters a cube by less than a tenth of a voxel, between the sampled points.
     """
     near, inside = _near_voxels(distance, side)
     candidates = np.argwhere(near)
@@ -61,7 +47,7 @@ def voxelise(
 
 
 def _near_voxels(distance: Distance, side: int) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-    """Return the voxels that may be met, and whether each voxel's centre is inside."""
+    """Return the voxels that the surface may meet, and whether each voxel's centre is inside."""
     blocks = side // _BLOCK
     index = np.argwhere(np.ones((blocks,) * 3, dtype=bool))
     at_blocks = distance((index + 0.5) / blocks - 0.5).reshape((blocks,) * 3)
@@ -79,7 +65,7 @@ def _near_voxels(distance: Distance, side: int) -> tuple[NDArray[np.bool_], NDAr
 def _changes_sign(
     distance: Distance, voxels: NDArray[np.intp], inside: NDArray[np.bool_]
 ) -> NDArray[np.bool_]:
-    """Return whether a corner lies on the other side than the voxel's centre."""
+    """Return whether a corner is on the other side of the surface than the voxel's centre."""
     corners = voxels[:, None, :] + _CORNERS
     side = len(inside)
     lattice = np.zeros((side + 1,) * 3, dtype=bool)
@@ -100,7 +86,7 @@ def _subdivide(
     side: int,
     depth: int = 3,
 ) -> NDArray[np.bool_]:
-    """Return whether a cell centre of the halved cubes lies on the other side."""
+    """Return whether a cell centre of the halved cubes is on the other side of the surface."""
     met = np.zeros(len(voxels), dtype=bool)
     owner = np.arange(len(voxels))
     centres = voxel_centres(voxels, side)

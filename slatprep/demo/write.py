@@ -29,12 +29,12 @@ _PIXIE_HI = np.array([3.871432304382324, 10.881680488586426, 0.4492689371109009]
 
 
 def row_id(asset: DemoAsset, view: DemoView) -> str:
-    """Return the id of an asset's row: the object's, with the view where there are several."""
+    """Return the id of an asset's row: the object's, with the view if it has several."""
     return f"{asset.object_id}.{view.view}" if view.view else asset.object_id
 
 
 def slat_name(asset: DemoAsset, names: SlatNames) -> str:
-    """Return what the SLAT side calls an object: its id, or a sha256 as TRELLIS does."""
+    """Return an object's name on the SLAT side: its id, or a sha256 as TRELLIS does."""
     if names == "sha256":
         return hashlib.sha256(f"asset file of {asset.object_id}".encode()).hexdigest()
     return asset.object_id
@@ -86,8 +86,8 @@ def _prediction(grid: NDArray[np.float32], scores: bool = True) -> NDArray[np.fl
 def write_results(root: Path, asset: DemoAsset) -> None:
     """Write the prediction of a method with errors, in the layout of Pixie's results.
 
-    The field is shifted by up to a voxel along each axis, so that voxels at its boundary are
-    predicted to be background. Its properties have noise, for the whole field and for each voxel.
+    The field is shifted by up to a voxel along each axis, so it predicts background at its
+    boundary. Its properties have noise, for the whole field and for each voxel.
     """
     rng = np.random.default_rng(int.from_bytes(asset.object_id.encode(), "big"))
     shifted = np.roll(asset.grid, rng.integers(-1, 2, size=3), axis=(0, 1, 2))
@@ -107,7 +107,7 @@ SHAPE_LATENTS = "shape_latents/shape_enc_next_dc_f16c32_fp16"
 def write_slat(
     root: Path, asset: DemoAsset, form: SlatForm, names: SlatNames, encoder: Encoder = "trellis"
 ) -> None:
-    """Write the SLATs of an asset below `root`: a file each, or a group each of ``latents.h5``."""
+    """Write the SLATs of an asset below `root`: a file for each, or a group of ``latents.h5``."""
     name = slat_name(asset, names)
     if encoder.startswith("trellis2"):
         root /= f"{SHAPE_LATENTS}_{16 * GRIDS[encoder][1]}"

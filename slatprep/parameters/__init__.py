@@ -1,8 +1,7 @@
 """The parameters of a build, in a handful of typed groups with defaults.
 
-These are plain dataclasses: `slatprep.parameters.files` fills and checks them from a
-TOML file and options, the stages take the group that concerns them, and the
-provenance records them with each result.
+These are plain dataclasses. `slatprep.parameters.files` fills and checks them from a TOML file and
+options. Each stage takes its own group, and the provenance records all of them with each result.
 """
 
 from __future__ import annotations
@@ -38,13 +37,13 @@ NAMED_SPLITS, CATEGORY = ("hash", "pixie"), "category:"
 
 
 class _Group:
-    """What `slatprep.parameters.files` has pydantic refuse in every group."""
+    """Settings by which `slatprep.parameters.files` has pydantic check every group."""
 
     __pydantic_config__: ClassVar[dict[str, object]] = {"extra": "forbid", "allow_inf_nan": False}
 
 
 class _Text:
-    """Has pydantic take a place as text, of which the group itself makes the place."""
+    """Has pydantic take a place as text; the group itself then makes the place."""
 
     @staticmethod
     def __get_pydantic_core_schema__(_source: Any, handler: Any) -> Any:
@@ -61,15 +60,14 @@ Samples = Literal["one", "first", "all", "merge"]
 class PixieverseSource(_Group):
     """Where the PixieVerse side lies.
 
-    Patterns are relative to `root` and name ``{id}`` (one path component) and
-    optionally ``{sample}``; the first grid pattern that matches anything for
-    an object is used. `sample` names the one to take of an object's samples,
-    `samples` says what becomes of several otherwise: a fault (``one``), the
-    lowest is taken (``first``), each is an asset of its own (``all``), or they
-    become one asset with labels merged of all (``merge``). `adapter` is
-    what reads it, one of `slatprep.readers.adapters.SOURCES` or another
-    package's. `transform` is, for the engine ``known``, the file with the
-    transform to the SLAT frame: one for all, or a pattern that names ``{id}``.
+    Patterns are relative to `root` and name ``{id}`` (one path component) and optionally
+    ``{sample}``. For each object, the first grid pattern with a match counts. `sample` names the
+    sample to take. Otherwise `samples` decides what becomes of several: an error (``one``), the
+    lowest (``first``), an asset for each (``all``), or an asset with merged labels (``merge``).
+
+    `adapter` reads the source; it is one of `slatprep.readers.adapters.SOURCES` or another
+    package's. `transform` is for the engine ``known``: the file with the transform to the SLAT
+    frame, or a pattern that names ``{id}``.
     """
 
     root: PlaceText
@@ -94,13 +92,13 @@ class PixieverseSource(_Group):
 class SlatSource(_Group):
     """Where the SLAT side lies.
 
-    Patterns are relative to `root` and name ``{id}`` and optionally
-    ``{view}``. Where `root` is an HDF5 file, or a pattern names no ``{id}``,
-    the file holds one group an asset, named by `group`.
+    Patterns are relative to `root` and name ``{id}`` and optionally ``{view}``. Where `root` is an
+    HDF5 file, or a pattern names no ``{id}``, the file has a group for each asset, named by
+    `group`.
 
-    `encoder` is what made the latents: a name of `slatprep.readers.adapters.LATENTS`, or
-    the path of a JSON file that describes another. `standardised` says whether
-    they have been standardised already; ``auto`` decides by what they look like.
+    `encoder` made the latents: a name of `slatprep.readers.adapters.LATENTS`, or the path of a JSON
+    file that describes another. `standardised` says whether they are standardised already; with
+    ``auto``, their values decide.
     """
 
     root: PlaceText
@@ -124,11 +122,11 @@ class SlatSource(_Group):
 
 @dataclass(frozen=True)
 class PairingParameters(_Group):
-    """How names of the two sides are joined, where they differ.
+    """How to join the names of the two sides where they differ.
 
-    `map` is a CSV with columns ``object_id`` and ``slat_id`` (and optionally
-    ``view``), or TRELLIS's ``metadata.csv`` (``sha256``, ``file_identifier``);
-    `categories` is Pixie's ``obj_ids_metadata.json``.
+    `map` is a CSV with columns ``object_id`` and ``slat_id`` (and optionally ``view``), or
+    TRELLIS's ``metadata.csv`` (``sha256``, ``file_identifier``). `categories` is Pixie's
+    ``obj_ids_metadata.json``.
     """
 
     map: PlaceText | None = None
@@ -142,14 +140,13 @@ class PairingParameters(_Group):
 
 @dataclass(frozen=True)
 class AlignParameters(_Group):
-    """How the transform between the frames is found.
+    """How to find the transform between the frames.
 
-    `model` is ``rigid`` (the paper's SE(3)), ``similarity`` (one scale more),
-    ``affine``, ``deformable`` (a smooth free-form deformation) or ``auto`` (the
-    simplest that the data support). Scale stays within `scale_bounds`; neither
-    the affine map nor its bending moves a point of the SLAT farther than
-    `max_displacement` voxels; `radius` is the correspondence radius of quality
-    figures, in voxels. No engine draws anything at random.
+    `model` is ``rigid`` (the paper's SE(3)), ``similarity`` (with a scale), ``affine``,
+    ``deformable`` (a smooth free-form deformation) or ``auto`` (the simplest that the data
+    support). Scale stays within `scale_bounds`. Neither the affine map nor its bending moves a
+    point of the SLAT farther than `max_displacement` voxels. `radius` [voxel] is the correspondence
+    radius of quality figures. No engine uses random numbers.
     """
 
     engine: Engine = Engine.FIELD
@@ -163,11 +160,10 @@ class AlignParameters(_Group):
 
 @dataclass(frozen=True)
 class ConsensusParameters(_Group):
-    """Whether ties are settled by the rotation that the dataset has in common.
+    """Whether the dataset's common rotation settles ties.
 
-    With `settle`, a second pass gives each asset whose geometry cannot tell
-    placements apart the one nearest to the rotation that most assets without
-    a tie share.
+    With `settle`, a second pass treats assets whose geometry cannot decide between placements. Each
+    gets the placement nearest to the rotation that most assets without a tie share.
     """
 
     settle: bool = False
@@ -175,12 +171,11 @@ class ConsensusParameters(_Group):
 
 @dataclass(frozen=True)
 class WitnessParameters(_Group):
-    """Whether labels are compared with latents.
+    """Whether to compare labels with latents.
 
-    With `settle`, a pass after that of the consensus lets the latents of assets
-    that are sure tell what latents are like in each class: assets whose geometry
-    cannot tell placements apart get the one whose labels their latents make
-    likelier, if that is decisive, and labels that latents contradict are named.
+    With `settle`, a pass after the consensus learns from sure assets what the latents of each class
+    are like. Assets whose geometry cannot decide between placements get the one whose labels make
+    their latents likelier, if that is decisive. Labels that latents contradict are reported.
     """
 
     settle: bool = False
@@ -188,18 +183,16 @@ class WitnessParameters(_Group):
 
 @dataclass(frozen=True)
 class SampleParameters(_Group):
-    """How annotations are looked up at SLAT voxels.
+    """How to look annotations up at SLAT voxels.
 
-    `method` is ``nearest`` (the paper's: the nearest annotated voxel) or
-    ``vote``: the annotated voxels around a point vote for its class, weighted
-    by a Gaussian of `vote_width` voxels, and the nearest one of that class
-    gives the properties. Beyond `max_distance` (voxels of the PixieVerse
-    frame) from the nearest annotated voxel a SLAT voxel is not valid.
+    `method` is ``nearest`` (the paper's: the nearest annotated voxel) or ``vote``. Annotated voxels
+    around a point then vote for its class, weighted by a Gaussian of `vote_width` voxels. The
+    nearest voxel of that class gives the properties. A SLAT voxel is valid up to `max_distance`
+    (voxels of the PixieVerse frame) from the nearest annotated voxel.
 
-    A voxel whose properties no material has (a Poisson's ratio outside
-    [0, 0.5], a modulus or density that is not finite and above 0) is not
-    annotated; an asset in which more than the share `max_unphysical` of the
-    voxels with a class are such is refused.
+    A voxel is not annotated if no material has its properties: a Poisson's ratio outside [0, 0.5],
+    a modulus or density that is not finite and positive. An asset is refused if their share among
+    the voxels with a class exceeds `max_unphysical`.
     """
 
     method: Literal["vote", "nearest"] = "vote"
@@ -212,10 +205,10 @@ class SampleParameters(_Group):
 class NormalizeParameters(_Group):
     """Where the ranges come from.
 
-    `ranges` is ``dataset`` (its minimum and maximum), percentiles of it such as
-    ``p1-p99``, ``pixie``, or the path of a TOML, JSON or YAML file. Those of the
-    dataset are taken of all `objects`, or of those to train on (``train``), as
-    `split_by` and `shares` part them, see `slatprep.readers.splits.assign_splits`.
+    `ranges` is ``dataset`` (its minimum and maximum), percentiles of it such as ``p1-p99``,
+    ``pixie``, or the path of a TOML, JSON or YAML file. The dataset's ranges come from ``all`` its
+    `objects`, or from those of ``train``, which `split_by` and `shares` define: see
+    `slatprep.readers.splits.assign_splits`.
     """
 
     ranges: str = "dataset"
@@ -239,13 +232,13 @@ class NormalizeParameters(_Group):
 
 
 def percentiles_of(ranges: str) -> tuple[float, float] | None:
-    """Return the percentiles that ranges such as ``p1-p99`` go from and to; None for others."""
+    """Return the two percentiles of ranges such as ``p1-p99``; None for other ranges."""
     match = re.fullmatch(r"p(\d+(?:\.\d+)?)-p(\d+(?:\.\d+)?)", ranges, re.ASCII)
     return (float(match[1]), float(match[2])) if match else None
 
 
 def is_split_file(by: str) -> bool:
-    """Whether what parts the objects is a file of ids, and not a rule with a name."""
+    """Whether the rule of a split is a file of ids, and not a named rule."""
     return by not in NAMED_SPLITS and not by.startswith(CATEGORY)
 
 
@@ -253,8 +246,8 @@ def is_split_file(by: str) -> bool:
 class StoreParameters(_Group):
     """Chunks and shards of the store, in rows (voxel arrays) and assets (grid arrays).
 
-    With 0 for `voxel_chunks_per_shard` it is the number of voxels that tells,
-    see `slatprep.store.layout.rows_per_shard`.
+    With `voxel_chunks_per_shard` 0, the number of voxels decides, see
+    `slatprep.store.layout.rows_per_shard`.
     """
 
     voxel_chunk: Annotated[int, Gt(0), Le(MAX_VOXEL_CHUNK)] = 4_096
@@ -273,8 +266,8 @@ class StoreParameters(_Group):
 class BuildParameters(_Group):
     """Everything that decides the content of a store.
 
-    `also` are further sources of the same objects, whose annotations are merged with
-    those of `pixieverse`.
+    `also` lists further sources of the same objects, whose annotations are merged with those of
+    `pixieverse`.
     """
 
     pixieverse: PixieverseSource
@@ -308,7 +301,7 @@ class BuildParameters(_Group):
 class Preset:
     """Named parameters of the stages that decide which annotation a SLAT voxel gets.
 
-    Without ranges of its own a preset leaves those of the file.
+    Without ranges of its own, a preset keeps those of the file.
     """
 
     align: AlignParameters = AlignParameters()

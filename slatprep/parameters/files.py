@@ -1,8 +1,8 @@
 """Dataset definitions: a TOML file and options become `BuildParameters`.
 
-The file has one table for each group of `slatprep.parameters`. Relative paths
-in it are resolved against its own folder. Options win over the file, and a
-preset replaces the whole ``align`` and ``sample`` groups of the file.
+The file has a table for each group of `slatprep.parameters`. Its relative paths start from its own
+folder. Options win over the file, and a preset replaces the whole ``align`` and ``sample`` groups
+of the file.
 """
 
 from __future__ import annotations
@@ -64,12 +64,12 @@ def load_parameters(
     Parameters
     ----------
     config : Path or None
-        The TOML file; None where options say everything.
+        The TOML file; None if options give everything.
     overrides : mapping, optional
-        Values that win over the file, nested as the file is. Paths in it are
+        Values that win over the file, nested as the file is. Their paths are
         relative to the working directory.
     preset : str, optional
-        Name of one of `slatprep.parameters.PRESETS`; it replaces the align
+        One of `slatprep.parameters.PRESETS`. It replaces the align
         and sample groups of the file, and `overrides` win over it.
 
     Returns
@@ -80,9 +80,8 @@ def load_parameters(
     Raises
     ------
     ConfigError
-        If the file cannot be read, or a key or value makes no sense; the
-        message names the file or option, the key and the value, and what is
-        allowed.
+        If the file cannot be read, or a key or value makes no sense. The message names the
+        file or option, the key and the value, and what is allowed.
     """
     # Late: pydantic takes a third of a second that `slatprep --help` does not have.
     from pydantic import TypeAdapter, ValidationError
@@ -120,7 +119,7 @@ def load_parameters(
 
 
 class _Origin(NamedTuple):
-    """Where values come from, for error messages that lead back to them."""
+    """The origin of values, for error messages that lead back to them."""
 
     config: Path | None
     overrides: Overrides
@@ -154,7 +153,7 @@ def _read(path: Path) -> dict[str, Any]:
 
 
 def _paths_of(data: Mapping[str, Any]) -> Iterator[tuple[str, dict[str, Any], str]]:
-    """Yield the name of each of `_PATHS` that is given, the table that has it, and its key."""
+    """Yield each given path of `_PATHS`: its name, the table that has it, and its key."""
     for name in _PATHS:
         group, _, key = name.partition(".")
         tables = data.get(group)
@@ -164,7 +163,7 @@ def _paths_of(data: Mapping[str, Any]) -> Iterator[tuple[str, dict[str, Any], st
 
 
 def _is_path(key: str, value: object) -> bool:
-    """Whether the value of one of `_PATHS` is a path, and not a word."""
+    """Whether the value of an entry of `_PATHS` is a path and not a word."""
     if key == "ranges":
         return value not in NAMED_RANGES and percentiles_of(str(value)) is None
     if key == "encoder":
@@ -173,7 +172,7 @@ def _is_path(key: str, value: object) -> bool:
 
 
 def _explain(error: ErrorDetails, origin: _Origin) -> str:
-    """Say one fault that pydantic found in the words of the file."""
+    """Explain a fault from pydantic in the words of the file."""
     keys = tuple(str(part) for part in error["loc"])
     name = ".".join(keys)
     where = origin.of(name)

@@ -1,12 +1,11 @@
 """The typed records that travel between the stages.
 
-Two source files become rows of the store through read, align, sample, judge,
-normalise and pack. Each stage takes the records of the one before it and
-returns its own; none of these classes touches a disk. Classes that hold arrays
-compare by identity.
+Two source files become rows of the store through read, align, sample, judge, normalise and pack.
+Each stage takes the records of the one before it and returns its own; no class here touches a disk.
+Classes with arrays compare by identity.
 
-Frames: the *PixieVerse frame* and the *SLAT frame* are both the unit cube
-[-0.5, 0.5]^3 with voxel ``i`` centred at ``(i + 0.5) / 64 - 0.5`` on each axis.
+Frames: the *PixieVerse frame* and the *SLAT frame* are both the unit cube [-0.5, 0.5]^3 with voxel
+``i`` centred at ``(i + 0.5) / 64 - 0.5`` on each axis.
 """
 
 from slatprep.records.alignment import (

@@ -27,11 +27,11 @@ MAX_CANDIDATES = 4096
 
 @dataclass(frozen=True)
 class Candidate:
-    """One start orientation and how well it fitted.
+    """A start orientation and how well it fitted.
 
-    ``euler_degrees`` names the start where the protocol does (x, y, z turns);
-    ``same_as`` is the index of the candidate with the same rotation that was
-    computed in its stead, or None. Fitness is in 0..1, rmse in voxels.
+    ``euler_degrees`` names the start where the protocol does (x, y, z turns). ``same_as`` is the
+    index of the candidate with the same rotation whose result it shares, or None. Fitness is in
+    0..1, rmse in voxels.
     """
 
     index: Count
@@ -43,12 +43,11 @@ class Candidate:
 
 @dataclass(frozen=True)
 class Quality:
-    """How well two voxel sets lie on each other under a transform.
+    """How well two voxel sets fit under a transform.
 
-    Forward is PixieVerse boundary to SLAT, backward SLAT to PixieVerse
-    boundary. Fitness is the share of voxels with a partner within ``radius``,
-    rmse the root mean square distance over those; distances in voxels of the
-    SLAT frame.
+    Forward is PixieVerse boundary to SLAT, backward the reverse. Fitness is the share of voxels
+    with a partner within ``radius``, rmse the root mean square distance over those. Distances are
+    in voxels of the SLAT frame.
     """
 
     fitness: Share
@@ -63,8 +62,7 @@ class Quality:
 class Placement:
     """A distinct placement that fits about as well as the best one.
 
-    ``displacement`` is the largest distance, in voxels, between a SLAT voxel's
-    positions in the two.
+    ``displacement`` is the largest distance [voxel] between a SLAT voxel's positions in the two.
     """
 
     transform: Transform
@@ -74,12 +72,11 @@ class Placement:
 
 @dataclass(frozen=True)
 class Ambiguity:
-    """What distinct, about equally good placements mean for the supervision.
+    """The effect of distinct, about equally good placements on the supervision.
 
-    ``material_share`` is the share of SLAT voxels whose class differs in any
-    of them from the best placement's; ``property_change`` is the largest mean
-    absolute change of each property, of log10 of those that are normalised so.
-    All are 0 where nothing is tied.
+    ``material_share`` is the share of SLAT voxels whose class differs between any of them and the
+    best placement. ``property_change`` is the largest mean absolute change of each property, in
+    log10 where it is normalised so. All are 0 without ties.
     """
 
     material_share: Share
@@ -88,12 +85,11 @@ class Ambiguity:
 
 @dataclass(frozen=True)
 class Judgement:
-    """What an alignment is worth; ``reasons`` say what kept it from being good.
+    """The quality of an alignment in words and figures; ``reasons`` say why it is not good.
 
-    ``confidence`` is the calibrated probability that the placement is right,
-    ``expected_accuracy`` the share of right labels to be expected among the
-    valid ones; NaN in records of builds that did not tell. ``contradicted`` says
-    that the latents of the asset contradict its labels, where the two were compared.
+    ``confidence`` is the calibrated probability that the placement is right, ``expected_accuracy``
+    the expected share of right labels among the valid ones; NaN in records of builds without them.
+    ``contradicted`` says that the asset's latents contradict its labels, if the two were compared.
     """
 
     ambiguity: Ambiguity
@@ -115,20 +111,20 @@ class Consensus:
 
 @dataclass(frozen=True)
 class LatentChoice:
-    """What its latents say of an asset's tied placements.
+    """What its latents say about an asset's tied placements.
 
     Attributes
     ----------
     probability : float
-        That of the tied placements the one taken, or one with the same
-        labels, is right.
+        Probability that the placement taken, or one with the same labels, is the right one
+        among those tied.
     evidence : float
-        Logarithm of how much likelier the latents are under its labels than
-        under those of the next one, as if voxels were independent.
+        Log-likelihood ratio of the latents between its labels and the next placement's, with
+        voxels taken as independent.
     voxels : int
         Voxels to which those two give different classes.
     witnesses, agreeing : int
-        Other assets by which latents were tried, and those of them whose
+        Other assets that tested the latents, and those of them whose
         latents preferred their labels to wrong ones.
     """
 
@@ -141,13 +137,12 @@ class LatentChoice:
 
 @dataclass(frozen=True, eq=False)
 class Deformation:
-    """How a SLAT's shape differs from the PixieVerse object's, beyond a similarity.
+    """The difference between a SLAT's shape and the PixieVerse object's, beyond a similarity.
 
     A point x of the SLAT frame belongs to ``affine @ (x, 1) + u(x)``, still in
-    the SLAT frame, from where the inverse of the alignment's transform leads to
+    the SLAT frame. From there the inverse of the alignment's transform leads to
     the PixieVerse frame. u is a uniform cubic B-spline; lengths are in edges of
-    the unit cube. All numbers are multiples of 2^-30, so that JSON holds them
-    exactly.
+    the unit cube. All numbers are multiples of 2^-30, which JSON holds exactly.
 
     Attributes
     ----------
@@ -158,7 +153,7 @@ class Deformation:
     spacing : float
         Distance of neighbouring control points.
     coefficients : ndarray of float64, shape (n0, n1, n2, 3)
-        Displacements at the control points, at least 4 a side; (0, 0, 0, 3) where
+        Displacements at the control points, at least 4 a side; (0, 0, 0, 3) if
         the map is affine.
 
     Raises
@@ -194,11 +189,10 @@ class Deformation:
 
 @dataclass(frozen=True)
 class FitFigures:
-    """What the default engine measured of its own fit; material for a verdict.
+    """What the default engine measured of its own fit; the verdict uses it.
 
     Scores are means of 1 / (1 + r^2), r the residual in voxels, over samples
-    not used in the fit, 1 for a perfect fit; a score of 0.5 is an error of a
-    voxel everywhere.
+    not used in the fit. A perfect fit has 1; an error of a voxel everywhere gives 0.5.
 
     Attributes
     ----------
@@ -208,24 +202,24 @@ class FitFigures:
         Mean of both sides' scores under the transform alone.
     evidence_affine, evidence_deformable : float
         Rise of the score, in blocks of space that a trial fit had not seen, by
-        an affine map, and by a coarse deformation after it; NaN where no trial
+        an affine map, and by a coarse deformation after it; NaN if no trial
         was needed.
     within : tuple of float
         Shares of the samples of both sides with a residual within 1, 2 and 3
         voxels, under the final map.
     offset : float
-        Voxels by which the PixieVerse surface stands inside the SLAT's
+        Distance [voxel] of the PixieVerse surface inside the SLAT's
         (negative: it is thicker).
     roughness : float
-        Median absolute residual in voxels, under the final map.
+        Median absolute residual [voxel] under the final map.
     moved, moved_most : float
-        Mean and largest displacement of the SLAT's surface by the deformation,
-        in voxels; 0 without one.
+        Mean and largest displacement [voxel] of the SLAT's surface by the deformation; 0
+        without one.
     stretch : tuple of float
         Smallest and largest singular value of the affine part; 1 without one.
     bending : float
         Root mean square second derivative of the displacement over the
-        lattice, in 1 / voxel; 0 without one.
+        lattice [1 / voxel]; 0 without one.
     """
 
     score_slat: float
@@ -244,7 +238,7 @@ class FitFigures:
 
 @dataclass(frozen=True, eq=False)
 class Ground:
-    """Ground that an annotated object stands on: what has no more than a height along a normal.
+    """Ground under an annotated object: everything up to a height along a normal.
 
     Attributes
     ----------
@@ -265,8 +259,7 @@ class Alignment:
     Attributes
     ----------
     transform : ndarray of float64, shape (4, 4)
-        Homogeneous, PixieVerse frame to SLAT frame (a column vector is
-        multiplied from the left).
+        Homogeneous, PixieVerse frame to SLAT frame, for column vectors.
     engine : Engine
         The engine that found it.
     model : Model
@@ -274,7 +267,7 @@ class Alignment:
     search : Search
         The starts that were needed.
     quality : Quality
-        How well the two voxel sets lie on each other.
+        How well the two voxel sets fit.
     candidates : tuple of Candidate
         Every start and its score.
     margin : float
@@ -282,18 +275,17 @@ class Alignment:
     placements : tuple of Placement
         Distinct placements that fit about as well.
     score : float
-        What the engine ranks placements by, 1 for a perfect fit; NaN where it
-        ranks by fitness alone.
+        The engine's rank of placements, 1 for a perfect fit; NaN if it ranks by fitness alone.
     settled_by : Consensus, LatentChoice or None
-        The dataset's common rotation, where it moved the asset to another of its
-        tied placements; what the latents say, where they chose among those.
+        What chose among tied placements: the dataset's common rotation if it moved the asset
+        to another one, or the latents.
     deformation : Deformation or None
-        What comes before the inverse of `transform` on the way from the SLAT
-        frame to the PixieVerse frame; None where the model is ``rigid`` or ``similarity``.
+        On the way from the SLAT frame to the PixieVerse frame it comes before the inverse of
+        `transform`; None if the model is ``rigid`` or ``similarity``.
     figures : FitFigures or None
-        What the engine measured of its fit; None where it measures nothing.
+        What the engine measured of its fit, if anything.
     ground : Ground or None
-        What of the annotation was not compared with the SLAT; None where all was.
+        The part of the annotation that was not compared with the SLAT, if any.
     """
 
     transform: Transform
@@ -312,5 +304,5 @@ class Alignment:
 
     @property
     def open_placements(self) -> tuple[Placement, ...]:
-        """The placements that tie where neither consensus nor latents chose among them."""
+        """The tied placements if neither consensus nor latents chose among them."""
         return self.placements if self.settled_by is None else ()

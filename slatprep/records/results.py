@@ -1,4 +1,4 @@
-"""What is looked up at SLAT voxels, the ranges it is normalised by, and what comes of an asset."""
+"""Values looked up at SLAT voxels, their ranges, and the result of an asset."""
 
 from __future__ import annotations
 
@@ -20,18 +20,17 @@ from slatprep.records.words import Status
 
 @dataclass(frozen=True, eq=False)
 class Annotation:
-    """Material and properties looked up at every SLAT voxel, in SI units.
+    """Class and properties at every SLAT voxel, in SI units.
 
-    ``properties`` is (N, P) float32 in SI units, columns as in the field, NaN
-    where not valid; ``material`` (N,) uint8, 255 where
-    not valid; ``valid`` (N,) bool; ``distance`` (N,) float32, in voxels of the
-    PixieVerse frame, to the annotation used; ``place`` (N, 3) float32, where the
-    voxel was looked up, in the PixieVerse frame; ``confidence`` (N,) float32, how
-    likely the class is right, 0 where not valid, None until that is judged.
+    ``properties`` is (N, P) float32, columns as in the field, NaN where not valid; ``material``
+    (N,) uint8, 255 where not valid; ``valid`` (N,) bool. ``distance`` (N,) float32 is the distance
+    to the annotation used, in voxels of the PixieVerse frame. ``place`` (N, 3) float32 is the
+    voxel's place in that frame. ``confidence`` (N,) float32 is the probability that the class is
+    right, 0 where not valid, None until judged.
 
-    Merged of several, it has ``spread`` (N, P) float32, the standard deviation of each
-    property, of log10 where it is normalised so, NaN where fewer than two are valid; and
-    ``votes`` (N,) float32, the share of the valid ones that give its class, 0 where none is.
+    A merged annotation has ``spread`` (N, P) float32, the standard deviation of each property, in
+    log10 where it is normalised so, NaN where fewer than two are valid. Its ``votes`` (N,) float32
+    are the share of valid annotations that give its class, 0 without any.
     """
 
     properties: NDArray[np.float32]
@@ -46,7 +45,7 @@ class Annotation:
 
 @dataclass(frozen=True, eq=False)
 class Contribution:
-    """One of several annotations of an object, and what became of it in the merge."""
+    """One of several annotations of an object, and its part in the merge."""
 
     sample: str
     """Which it is."""
@@ -62,10 +61,10 @@ class Contribution:
 
 @dataclass(frozen=True)
 class PropertyRange:
-    """How one property is mapped to [-1, 1].
+    """How to map a property to [-1, 1].
 
-    ``lo`` and ``hi`` are in the mapped unit: log10 of the SI value where
-    ``log10`` is true, the SI value itself otherwise.
+    ``lo`` and ``hi`` are in the mapped unit: log10 of the SI value if ``log10``, else the SI value
+    itself.
     """
 
     name: PropertyName
@@ -76,10 +75,10 @@ class PropertyRange:
 
 @dataclass(frozen=True)
 class Normalization:
-    """The range of every property, in the order of the columns, and where they come from.
+    """The range of every property, in the order of the columns, and the origin of the ranges.
 
-    ``source`` is ``dataset``, ``p1-p99`` or other percentiles of it, either of which may
-    be ``of train by`` what parts the objects; ``pixie``; or the name of a file.
+    ``source`` is ``dataset``, ``p1-p99`` or other percentiles of it, ``pixie``, or the name of a
+    file. Those of the dataset may be ``of train by`` a rule of splits.
     """
 
     ranges: Annotated[tuple[PropertyRange, ...], MinLen(1), MaxLen(MAX_PROPERTIES)]
@@ -90,9 +89,9 @@ class Normalization:
 class Finished:
     """An asset that went through all stages; properties in SI units.
 
-    Merged of several annotations, it has a contribution for each, the files of all with
-    their digests by role, as an asset's key takes them, and the fields that were merged
-    after the first, whose field and alignment are its own.
+    If merged of several annotations, it has a contribution for each. It also has the files of all,
+    with their digests by role for the asset's key, and the fields after the first. Field and
+    alignment are the first one's.
     """
 
     pair: AssetPair
@@ -111,8 +110,7 @@ class Finished:
 class Failed:
     """An asset that cannot go in.
 
-    ``reason`` says why in one line; ``traceback`` where, if slatprep itself is
-    at fault.
+    ``reason`` says why in a line; ``traceback`` says where, if slatprep itself is at fault.
     """
 
     pair: AssetPair

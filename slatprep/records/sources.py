@@ -1,4 +1,4 @@
-"""Where the two sides of a pair lie, and what is read of them."""
+"""Where the two sides of a pair lie, and what is read from them."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ from slatprep.records.words import RESOLUTION
 
 
 class Place(Protocol):
-    """Where a file or a folder lies: a `pathlib.Path`, or a URL as a `RemotePlace`.
+    """The place of a file or folder: a `pathlib.Path`, or a URL as a `RemotePlace`.
 
-    `slatprep.storage.place.place_of` makes one. This is all that both offer
-    alike; for the rest, `slatprep.storage.place.storage_of` tells them apart.
+    `slatprep.storage.place.place_of` makes one. These are the operations that both share;
+    `slatprep.storage.place.storage_of` has the others.
     """
 
     @property
@@ -35,7 +35,7 @@ class Place(Protocol):
         """The folder that holds it."""
 
     def __hash__(self) -> int:
-        """Equal places have the same."""
+        """Equal places have equal hashes."""
 
     def __truediv__(self, key: str, /) -> Self:
         """Return the place of this name below it."""
@@ -44,13 +44,13 @@ class Place(Protocol):
         """Return it independent of the working folder."""
 
     def exists(self) -> bool:
-        """Whether there is a file or a folder."""
+        """Whether it is a file or a folder."""
 
     def is_dir(self) -> bool:
-        """Whether there is a folder."""
+        """Whether it is a folder."""
 
     def is_file(self) -> bool:
-        """Whether there is a file."""
+        """Whether it is a file."""
 
     def open(
         self, mode: str, *, encoding: str | None = None, newline: str | None = None
@@ -58,10 +58,10 @@ class Place(Protocol):
         """Open a file; on an object store for reading only."""
 
     def read_bytes(self) -> bytes:
-        """Read a file whole."""
+        """Read a whole file."""
 
     def read_text(self, encoding: str | None = None) -> str:
-        """Read a file whole, as text."""
+        """Read a whole file as text."""
 
 
 ROLES = ("grid", "mask", "bounds", "description", "transform", "slat")
@@ -72,8 +72,8 @@ ROLES = ("grid", "mask", "bounds", "description", "transform", "slat")
 class SourceFile:
     """A file that was read; ``path`` is relative to its source's root, with forward slashes.
 
-    ``source`` is 0 for a file of the first source or of the latents, k for one of the k-th further
-    source, `slatprep.parameters.BuildParameters.also`.
+    ``source`` is 0 for the first source and the latents, and k for the k-th further source in
+    `slatprep.parameters.BuildParameters.also`.
     """
 
     role: Annotated[str, _one_of(*ROLES)]
@@ -85,10 +85,9 @@ class SourceFile:
 
 @dataclass(frozen=True)
 class SourceRoots:
-    """The folders below which the files of one source and of the latents lie, and what they hold.
+    """The root folders of a source and of the latents, and what they hold.
 
-    ``number`` says which source of several this is, counted from 0; the first names the
-    others in ``also``.
+    ``number`` is the source's index from 0; the first one names the others in ``also``.
     """
 
     pixieverse: Place
@@ -105,36 +104,35 @@ class SourceRoots:
 
 @dataclass(frozen=True, slots=True)
 class AssetPair:
-    """Where the two sides of one row of the store lie; nothing has been read yet.
+    """The files of the two sides of a row of the store; nothing has been read yet.
 
     Attributes
     ----------
     asset_id : str
-        Unique id of the row: the object id, or ``<object_id>.<view>`` where
-        one object has several SLATs.
+        Unique id of the row: the object id, or ``<object_id>.<view>`` if
+        an object has several SLATs.
     object_id : str
         PixieVerse id of the object.
     view : str
-        The image or seed the SLAT was made from; empty where there is one only.
+        The image or seed that the SLAT was made from; empty if there is only one.
     category : str
-        PixieVerse category; empty where unknown.
+        PixieVerse category; empty if unknown.
     roots : SourceRoots
         The roots below which the files must lie; one object for all pairs.
     grid, mask, bounds, transform : Place or None
-        PixieVerse files, absolute; ``grid`` is None where the partner is missing.
+        PixieVerse files, absolute; ``grid`` is None if the partner is missing.
     slat : Place or None
-        SLAT file, absolute; None where the partner is missing.
+        SLAT file, absolute; None if the partner is missing.
     slat_group : str
-        Group inside an HDF5 file that holds many assets; empty otherwise.
+        Group inside an HDF5 file with several assets; otherwise empty.
     problem : str
-        Why the pair cannot be used (missing partner, two files for one id);
-        empty where all is well.
+        Why the pair cannot be used (missing partner, two files for one id); empty if it can.
     beside : Place or None
         Another file that the adapter of the source reads for it.
     sample : str
-        Which of an object's annotations this is; empty where nothing names it.
+        Name of this annotation among the object's; may be empty.
     others : tuple of AssetPair
-        The object's further annotations, each with the same SLAT, where they are to be merged.
+        The object's further annotations to merge, each with the same SLAT.
     """
 
     asset_id: str
@@ -161,7 +159,7 @@ class AssetPair:
 
 @dataclass(frozen=True, eq=False)
 class MaterialField:
-    """A PixieVerse field: what occupies the grid and what it is made of, in SI units.
+    """A PixieVerse field: occupied voxels, and their materials in SI units.
 
     Attributes
     ----------
@@ -170,7 +168,7 @@ class MaterialField:
     voxels : ndarray of uint8, shape (K, 3)
         The annotated voxels (occupied, with a class, physical), in C order of the grid.
     material : ndarray of uint8, shape (K,)
-        Class of each annotated voxel, a place in `Contents.labels`.
+        Class of each annotated voxel, an index of `Contents.labels`.
     properties : ndarray of float32, shape (K, P)
         Properties of each in SI units, a column for each of `table`.
     unphysical : int
@@ -180,13 +178,13 @@ class MaterialField:
     sources : tuple of SourceFile
         The files read.
     warnings : tuple of str
-        What a person should know about this field.
+        Remarks on this field for the user.
     table : tuple of Property
-        What the columns of `properties` are.
+        The columns of `properties`.
     frame : ndarray of float64, shape (4, 4), or None
-        Its frame in the SLAT's, where the source states it.
+        Its frame in the SLAT's, if the source states it.
     classified : bool
-        Whether `material` means something; without classes it is 0 throughout.
+        Whether the source has classes; without them `material` is 0 throughout.
     """
 
     occupancy: NDArray[np.bool_]
@@ -206,10 +204,10 @@ class MaterialField:
 class StructuredLatents:
     """A SLAT: occupied surface voxels and their latents.
 
-    ``coords`` is (N, 3) uint8 in 0..resolution - 1 in the order of the source file,
-    ``feats`` is (N, channels) float32; ``standardised`` says whether these have
-    been standardised already. ``resolution`` is that of the encoder's grid, voxels along
-    each axis of the unit cube: of 64 they are those of the frame.
+    ``coords`` is (N, 3) uint8 in 0..resolution - 1 in the order of the source file, ``feats`` is
+    (N, channels) float32. ``standardised`` says whether these are standardised already.
+    ``resolution`` is the number of the encoder's voxels along each axis of the unit cube, 64 in the
+    frame.
     """
 
     coords: NDArray[np.uint8]

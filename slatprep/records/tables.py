@@ -40,20 +40,19 @@ _TITLES = {"youngs_modulus": "Young's modulus", "poissons_ratio": "Poisson's rat
 
 @dataclass(frozen=True)
 class Property:
-    """One property of a material.
+    """A property of a material.
 
     Attributes
     ----------
     name : str
         Its name, as a column of every table.
     unit : str
-        SI unit of its values; ``1`` where it has none.
+        SI unit of its values; ``1`` if it has none.
     log10 : bool
-        Whether it is normalised as log10 of its value, which then must be above
-        0, or as the value itself.
+        Whether its log10 is normalised, so that it must be above 0, or the value itself.
     least, most : float
-        Values that a material can have, ends included; what reads a source asks
-        for them, and a store does not keep them.
+        Values that a material can have, ends included. Readers of sources need them; a store
+        does not keep them.
     """
 
     name: PropertyName
@@ -102,7 +101,7 @@ PROPERTY_COLUMNS = tuple(one.name for one in PROPERTIES)
 
 @dataclass(frozen=True)
 class LatentMoments:
-    """Mean and standard deviation of each channel of some latents, as they lie there."""
+    """Mean and standard deviation of each channel of some latents, as stored."""
 
     mean: Annotated[tuple[float, ...], MaxLen(MAX_CHANNELS)]
     std: Annotated[tuple[float, ...], MaxLen(MAX_CHANNELS)]
@@ -110,21 +109,21 @@ class LatentMoments:
 
 @dataclass(frozen=True)
 class LatentSpace:
-    """Where latents come from, and the numbers that standardise them.
+    """The origin of latents, and the numbers that standardise them.
 
     Attributes
     ----------
     encoder : str
-        What made them: ``trellis``, or a name of the user's.
+        The encoder: ``trellis``, or the user's name for another.
     channels : int
-        Numbers a voxel.
+        Numbers per voxel.
     resolution : int
         Voxels along each axis of its grid.
     mean, std : tuple of float
-        Of each channel before they are standardised; empty where nobody
-        published them, and a build measures its dataset's.
+        Of each channel before standardisation; empty if unpublished, so that a build measures
+        its dataset's.
     standardised : bool
-        Whether the latents as they lie there have been standardised already.
+        Whether the latents, as stored, are standardised already.
     """
 
     encoder: str
@@ -166,12 +165,22 @@ TRELLIS = LatentSpace("trellis", 8, RESOLUTION, FEATS_MEAN, FEATS_STD)
 
 
 def labels_of(classes: tuple[str, ...]) -> tuple[str, ...]:
-    """Return the classes that a voxel may have: of PhysGaussian's all but the background.
+    """Return the classes that a voxel may have: for PhysGaussian's, all but the background.
+
+    Parameters
+    ----------
+    classes : tuple of str
+        Names of the classes.
+
+    Returns
+    -------
+    tuple of str
+        Names by id.
 
     Raises
     ------
     ValueError
-        If they are more than a store can tell apart, or have not a name each.
+        If a store cannot tell so many apart, or their names are not unique.
     """
     if classes == MATERIAL_CLASSES:
         return classes[:BACKGROUND]
@@ -192,7 +201,7 @@ class Contents:
 
     @property
     def labels(self) -> tuple[str, ...]:
-        """What a voxel may be, by the class that the arrays have."""
+        """The names of the classes that the arrays have, by id."""
         return labels_of(self.classes) or ("annotated",)
 
     @property
@@ -202,12 +211,12 @@ class Contents:
 
     @property
     def n_labels(self) -> int:
-        """How many ids below that of the background voxels may have."""
+        """The number of ids that voxels may have, all below the background's."""
         return max(len(self.labels), BACKGROUND)
 
     @property
     def n_classes(self) -> int:
-        """How many classes a decoder scores: one stands for all where there are none."""
+        """The number of classes that a decoder scores; 1 without classes."""
         return max(len(self.classes), 1)
 
 

@@ -75,7 +75,7 @@ UNANNOTATED_COLOUR = "#FFFFFF"
 
 
 def _colour_beyond(index: int) -> str:
-    """Return a colour for a class that PhysGaussian does not have, unlike those before it."""
+    """Return a colour for a class beyond PhysGaussian's, unlike those before it."""
     # Steps of the golden ratio leave no hue out and meet none again.
     hue, lightness = index * 0.618034 % 1.0, (0.35, 0.5, 0.65)[index % 3]
     return "#" + "".join(f"{round(255 * c):02X}" for c in hls_to_rgb(hue, lightness, 0.6))
@@ -90,7 +90,7 @@ MATERIAL_COLOURS = {
 
 
 class Engine(StrEnum):
-    """What finds the transform."""
+    """The method that finds the transform."""
 
     FIELD = "field"
     OPEN3D = "open3d"
@@ -99,7 +99,7 @@ class Engine(StrEnum):
 
 
 class Model(StrEnum):
-    """Which maps are allowed: the scale fixed at one, free, and a deformation after it."""
+    """The allowed maps: fixed scale, free scale, affine, or with a deformation."""
 
     RIGID = "rigid"
     SIMILARITY = "similarity"
@@ -116,7 +116,7 @@ class Search(StrEnum):
 
 
 class Verdict(StrEnum):
-    """What an alignment is worth, in one word."""
+    """The quality of an alignment, in one word."""
 
     GOOD = "good"
     DOUBTFUL = "doubtful"
@@ -128,7 +128,7 @@ USABLE = (Verdict.GOOD, Verdict.DOUBTFUL)
 
 
 class Status(StrEnum):
-    """What became of an asset in a build."""
+    """The result of an asset in a build."""
 
     OK = "ok"
     FAILED = "failed"

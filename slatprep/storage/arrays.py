@@ -1,6 +1,7 @@
 """Arrays in one file, each with its checksum: written and read in a third of npz's time.
 
-A mark, the header's length and its CRC32C; the header, JSON; then the arrays, in C order.
+The file has a mark, the header's length and its CRC32C, the header as JSON, then the arrays in C
+order.
 """
 
 from __future__ import annotations
@@ -25,13 +26,7 @@ _MOST_AXES, _MOST_BYTES = 8, 2**40
 
 
 def write_arrays(file: IO[bytes], arrays: Mapping[str, NDArray[Any]]) -> None:
-    """Write arrays (numbers, bool or text) by name.
-
-    Raises
-    ------
-    OSError
-        If the disk does not take them.
-    """
+    """Write arrays of numbers, bool or text by name; OSError if the disk refuses."""
     entries, parts, at = {}, [], 0
     for name, array in arrays.items():
         data = np.asarray(array, order="C").reshape(-1).view(np.uint8)
@@ -44,17 +39,10 @@ def write_arrays(file: IO[bytes], arrays: Mapping[str, NDArray[Any]]) -> None:
 
 
 class ArrayFile(Mapping[str, NDArray[Any]]):
-    """The arrays of a file; each is read when it is asked for, and fresh.
+    """The arrays of a file that `write_arrays` wrote; each access reads from the file anew.
 
-    Parameters
-    ----------
-    file : binary file
-        Open for random access, as `write_arrays` wrote it.
-
-    Raises
-    ------
-    StoreError
-        If it is no such file, or its header is damaged; later, if an array is.
+    The file must allow random access. StoreError if it is no such file or its header is damaged,
+    and later if an array is.
     """
 
     def __init__(self, file: IO[bytes]) -> None:
@@ -84,7 +72,7 @@ class ArrayFile(Mapping[str, NDArray[Any]]):
 
 
 def _entries_in(header: bytes, size: int) -> dict[str, Any]:
-    """Return what a header says of each array, all of which lie in so many bytes behind it."""
+    """Return the header's entry for each array; all must fit into so many bytes after it."""
     try:
         entries = orjson.loads(header)
     except ValueError:
@@ -95,7 +83,7 @@ def _entries_in(header: bytes, size: int) -> dict[str, Any]:
 
 
 def _lies_in(size: int, entry: Any) -> bool:
-    """Whether an entry is that of an array of numbers, bool or text within so many bytes."""
+    """Whether an entry describes an array of numbers, bool or text within so many bytes."""
     match entry:
         case [str(dtype), list(shape), int(at), int()] if _TYPES.fullmatch(dtype):
             lengths = [length for length in shape if isinstance(length, int) and length >= 0]

@@ -1,7 +1,7 @@
 """Put a new directory in the place of an old one, in one step where the system can.
 
-Nothing is exchanged before all of the new one is on the disk itself, so that
-a power failure finds the old one whole or the new one whole.
+The exchange comes after all of the new one is on the disk. After a power failure, either the old
+one or the new one is there and complete.
 """
 
 from __future__ import annotations
@@ -29,18 +29,11 @@ _RENAME_EXCHANGE = 2
 
 
 def replace_directory(new: Path, target: Path) -> None:
-    """Move the directory `new` to `target`; what was there is removed afterwards.
+    """Move the directory `new` to `target`, then remove the old one; both on one file system.
 
-    On Linux the two directories are exchanged in one system call, so a reader
-    finds the old or the new one whole at every moment. Elsewhere, and on file
-    systems that cannot exchange, two renames leave a short moment without
-    either; `restore_directory` mends what a kill in it leaves. Both must lie
-    on one file system.
-
-    Raises
-    ------
-    OSError
-        If the directory cannot be moved; `target` is as it was.
+    On Linux one system call exchanges them, so a reader finds the old or the new one complete at
+    every moment. Elsewhere, two renames leave a short moment without either; `restore_directory`
+    repairs a kill in it. OSError if the move fails; `target` is then unchanged.
     """
     flush_tree(new)
     reached("directory flushed", str(target))
@@ -63,14 +56,14 @@ def replace_directory(new: Path, target: Path) -> None:
 
 
 def restore_directory(work: Path, target: Path) -> None:
-    """Put back what a kill between the two renames of `replace_directory` left below `work`."""
+    """Restore what a kill between the two renames of `replace_directory` left below `work`."""
     for scratch in sorted(work.glob("*")):
         if _aside(scratch).exists() and not target.exists():
             _aside(scratch).rename(target)
 
 
 def flush_tree(directory: Path) -> None:
-    """Bring every file below a directory, and the names of all, onto the disk itself."""
+    """Flush every file below a directory, and all directories' names, to the disk."""
     for parent, _, files in os.walk(directory, topdown=False):
         for name in files:
             flush(Path(parent, name))
@@ -78,7 +71,7 @@ def flush_tree(directory: Path) -> None:
 
 
 def flush(path: Path) -> None:
-    """Bring a file's content, or a directory's names, onto the disk itself."""
+    """Flush a file's content, or a directory's names, to the disk."""
     if path.is_dir() and sys.platform == "win32":
         return  # There a directory cannot be opened.
     descriptor = os.open(path, os.O_RDONLY)
@@ -107,11 +100,10 @@ def _exchange(new: Path, target: Path) -> bool:
 
 @contextmanager
 def staged(path: Path) -> Iterator[Path]:
-    """Yield a file beside `path` that takes its place, whole and on disk, when all went well.
+    """Yield a file beside `path` that replaces it, complete and on disk, unless an error occurs.
 
-    Its name is the same each time, so what a killed process leaves is replaced
-    by the next. Where a link, somebody else's file or that of a running process
-    has that name, it is left alone for another one.
+    Its name is always the same, so the next process replaces what a killed one left. If a link,
+    another user's file or a running process's file has that name, another name is used.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary, held = _claimed(path)
@@ -143,23 +135,10 @@ def _claimed(path: Path) -> tuple[Path, int]:
 
 
 def append_file(source: Path, target: Path, size: int) -> None:
-    """Put a file's content behind that of another, onto the disk; what is there is not written.
+    """Append a file to `target`, our own file of `size` bytes, and flush it to the disk.
 
-    Unlike `staged` it is not one step: a kill leaves part of it.
-
-    Parameters
-    ----------
-    source : Path
-        What to add.
-    target : Path
-        The file, which is ours alone.
-    size : int
-        Its bytes.
-
-    Raises
-    ------
-    OSError
-        If the file is another one by now, or the disk does not take it; it is as it was then.
+    Unlike `staged` this is not one step: a kill leaves a part. OSError if the file has changed
+    meanwhile or the disk refuses; the file then keeps its former content.
     """
     flags = os.O_WRONLY | os.O_APPEND | OWN_FILE & ~os.O_CREAT
     descriptor = os.open(target, flags)
@@ -180,11 +159,11 @@ def append_file(source: Path, target: Path, size: int) -> None:
 
 @contextmanager
 def staged_apart(path: Path, folder: Path) -> Iterator[Path]:
-    """Yield a file in `folder` that takes the place of `path`, whole, when all went well.
+    """Yield a file in `folder` that replaces `path`, complete, unless an error occurs.
 
-    Unlike that of `staged` it is not flushed, and has a name of its own each time: a worker that
-    outlives a killed build, or that a cluster has given up, may write the same file. Folders are
-    not made: such a worker must not bring back those that were removed.
+    Unlike with `staged` it is not flushed, and its name is new each time: a worker that outlives a
+    killed build, or that a cluster has given up, may write the same file. Folders are not created,
+    because such a worker must not bring back removed ones.
     """
     temporary = folder / f"{secrets.token_hex(16)}.partial"
     try:
@@ -196,13 +175,7 @@ def staged_apart(path: Path, folder: Path) -> Iterator[Path]:
 
 @contextmanager
 def writing(what: str, where: Place) -> Iterator[None]:
-    """Turn the refusal of a disk or object store into an error that names what was to be written.
-
-    Raises
-    ------
-    StoreError
-        In place of an `OSError`.
-    """
+    """Turn an OSError of a disk or object store into a StoreError that names what was written."""
     try:
         yield
     except OSError as error:

@@ -1,7 +1,7 @@
-"""A folder of the local disk for what belongs to places on object stores.
+"""A folder of the local disk for data of places on object stores.
 
-It holds the work folders of builds to such places, and copies of files that
-must lie on a disk to be read. All of it may be removed when nothing runs.
+It holds the work folders of builds to such places, and copies of files that must be on a disk to be
+read. All of it may be removed while nothing runs.
 """
 
 from __future__ import annotations
@@ -26,20 +26,15 @@ def cache_folder() -> Path:
 
 
 def folder_for(place: RemotePlace) -> Path:
-    """Return the part of the folder that belongs to a place, by a name that tells which."""
+    """Return the subfolder for a place, whose name identifies the place."""
     return cache_folder() / f"{place.name}-{_short(str(place))}"
 
 
 def cached_file(place: RemotePlace) -> Path:
     """Return a path of the local disk with an object's content.
 
-    The copy serves as long as the object has the same size, tag and time, and
-    one copy is kept.
-
-    Raises
-    ------
-    OSError
-        If the object cannot be read or the disk does not take it.
+    The copy is valid while the object has the same size, tag and time; only one copy is kept.
+    OSError if the object cannot be read or the disk refuses.
     """
     with connected(place) as (system, name):
         entry = system.info(name)

@@ -1,8 +1,8 @@
-"""Read a whole Zarr array of format 3 whose chunks each have a name of their own.
+"""Read a whole Zarr array of format 3 with one file per chunk.
 
-zarr-python runs whatever codec the metadata name, and unpacks as much as a chunk
-claims to hold. Here codecs are those of `slatprep.storage.codecs`, and what is set
-aside is what the array's shape allows.
+zarr-python runs whatever codec the metadata name, and unpacks as much as a chunk claims to hold.
+This module allows only the codecs of `slatprep.storage.codecs`, and allocates only what the array's
+shape allows.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ _MAX_CHUNKS = 4096
 
 
 def whole_sizes(sizes: object) -> tuple[int, ...]:
-    """Return the sizes that metadata list; ValueError where one is no integer, or negative."""
+    """Return the sizes that metadata list; ValueError if one is negative or no integer."""
     if not isinstance(sizes, list) or not all(type(n) is int and n >= 0 for n in sizes):
         raise ValueError(f"sizes are {sizes!r}, not integers of at least 0")
     return tuple(sizes)
@@ -35,10 +35,7 @@ def whole_sizes(sizes: object) -> tuple[int, ...]:
 def array_form(metadata: Mapping[str, Any]) -> tuple[tuple[int, ...], np.dtype[Any]]:
     """Return shape and dtype of an array by its ``zarr.json``.
 
-    Raises
-    ------
-    ValueError, KeyError
-        If it is no array of numbers of Zarr format 3.
+    Raises ValueError or KeyError if it is not an array of numbers of Zarr format 3.
     """
     if metadata["zarr_format"] != 3 or metadata["node_type"] != "array":
         raise ValueError("no array of Zarr format 3")
@@ -54,18 +51,10 @@ def read_chunks(
 ) -> NDArray[Any]:
     """Read an array of which each chunk is one file.
 
-    Parameters
-    ----------
-    metadata : mapping
-        Its ``zarr.json``, whose shape has been found to be allowed.
-    fetch : callable
-        Returns the bytes of a chunk by its name, such as ``c/0/1``, and by how many it may
-        have at most; None where there is no such chunk. What is longer it refuses.
-
-    Raises
-    ------
-    StoreError, ValueError, KeyError
-        If the metadata make no sense, or a chunk does not hold what they say.
+    `metadata` is its ``zarr.json``, whose shape the caller has checked. `fetch` returns the bytes
+    of a chunk by its name, such as ``c/0/1``, and by their largest number; None without such a
+    chunk. StoreError, ValueError or KeyError if the metadata make no sense, or a chunk contradicts
+    them.
     """
     shape, native = array_form(metadata)
     dtype = native.newbyteorder("<")

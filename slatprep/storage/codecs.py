@@ -1,7 +1,7 @@
-"""Undo the codecs of one chunk, into memory that is already there.
+"""Undo the codecs of a chunk, into memory that is allocated already.
 
-Only what the metadata promise is ever written: a chunk that claims to hold
-more, or less, is refused before anything is inflated.
+Nothing is written beyond what the metadata promise: a chunk that claims to hold more, or less, is
+refused before it is inflated.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ class ChunkDecoder:
     Attributes
     ----------
     dtype : numpy.dtype
-        Little-endian, as stored.
+        Little-endian, as stored; object for text.
     shape : tuple of int
         Shape of a chunk.
     compressor : str
@@ -43,8 +43,7 @@ class ChunkDecoder:
     crc32c : bool
         Whether a checksum ends each chunk.
     text : int
-        Bytes that the strings (``vlen-utf8``) of a chunk may have on average; 0 where
-        the chunks hold numbers, else `dtype` is object.
+        Mean bytes that the strings (``vlen-utf8``) of a chunk may have; 0 for numbers.
     """
 
     dtype: np.dtype[Any]
@@ -61,12 +60,9 @@ class ChunkDecoder:
         codecs: Sequence[Mapping[str, Any]],
         max_text: int,
     ) -> ChunkDecoder:
-        """Return the decoder for a list of codecs as ``zarr.json`` has it.
+        """Return the decoder for the codecs in a ``zarr.json``.
 
-        Raises
-        ------
-        ValueError
-            If the codecs are others than slatprep's, or in another order.
+        Raises ValueError if the codecs, or their order, are not slatprep's.
         """
         text = max_text if dtype.hasobject else 0
         first, rest = codecs[0], [codec["name"] for codec in codecs[1:]]
@@ -84,19 +80,9 @@ class ChunkDecoder:
         return math.prod(self.shape) * self.dtype.itemsize
 
     def decode(self, data: bytes, out: NDArray[Any]) -> None:
-        """Decode a chunk.
+        """Decode a stored chunk into `out`, a C-order array of the chunk's shape and dtype.
 
-        Parameters
-        ----------
-        data : bytes
-            The chunk as stored.
-        out : ndarray, C order, of the chunk's shape and dtype
-            Where it goes.
-
-        Raises
-        ------
-        StoreError
-            If the checksum is wrong or the chunk does not hold what the metadata say.
+        Raises StoreError if the checksum is wrong or the content contradicts the metadata.
         """
         payload = memoryview(data)
         if self.crc32c:
@@ -130,17 +116,17 @@ class ChunkDecoder:
 
 
 def crc32c_holds(data: bytes) -> bool:
-    """Whether bytes end with the CRC32C of what comes before."""
+    """Whether bytes end with the CRC32C of the bytes before."""
     import google_crc32c
 
     return len(data) >= 4 and int(google_crc32c.value(data)) == _CRC32C_RESIDUE
 
 
 def content_size(data: memoryview | bytes, compressor: str) -> int:
-    """Return how many bytes a compressed chunk says it holds; -1 if it does not say.
+    """Return how many bytes a compressed chunk claims to hold; -1 if it does not say.
 
-    Zstandard's frame header is RFC 8878, section 3.1.1.1; blosc's is of 16
-    bytes with the content's size in bytes 4 to 7.
+    Zstandard's frame header is RFC 8878, section 3.1.1.1; blosc's has 16 bytes with the content's
+    size in bytes 4 to 7.
     """
     try:
         if compressor == "blosc":

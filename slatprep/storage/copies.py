@@ -1,4 +1,4 @@
-"""A copy, on the local disk, of a store on an object store: for reading it more than once."""
+"""A local copy of a store on an object store, for reading it more than once."""
 
 from __future__ import annotations
 
@@ -13,18 +13,10 @@ from slatprep.storage.versions import content_of, is_version, read_pointer
 
 
 def copied_version(place: RemotePlace) -> Path:
-    """Return where a copy of a store lies on the local disk, after making it if there is none.
+    """Return the local copy of a store's version, after making it if needed.
 
-    Parameters
-    ----------
-    place : RemotePlace
-        A version of a store. Versions never change, so a copy is made once.
-
-    Raises
-    ------
-    StoreError
-        If it is no version, cannot be copied whole, differs from what its pointer says, or the
-        disk does not take it.
+    Versions never change, so a copy is made once. StoreError if the place is no version, differs
+    from its pointer, or the disk refuses the copy.
     """
     if not is_version(place):
         raise StoreError(

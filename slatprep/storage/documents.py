@@ -19,14 +19,9 @@ MAX_DEPTH = 64
 
 
 def read_bounded(place: Place, limit: int) -> bytes:
-    """Read a file whole.
+    """Read a whole file.
 
-    Raises
-    ------
-    OSError
-        If it cannot be read, or is no regular file.
-    ValueError
-        If it has more than `limit` bytes.
+    Raises OSError if it is unreadable or not a regular file, ValueError above `limit` bytes.
     """
     data = storage_of(place).read(limit)
     if len(data) > limit:
@@ -35,7 +30,7 @@ def read_bounded(place: Place, limit: int) -> bytes:
 
 
 def parse_document(data: bytes | str) -> dict[str, Any]:
-    """Return a JSON object, as `parse_json` parses it; ValueError if it is none."""
+    """Return a JSON object, as `parse_json` parses it; ValueError if it is something else."""
     document = parse_json(data)
     if not isinstance(document, dict):
         raise ValueError("no JSON object")
@@ -43,12 +38,9 @@ def parse_document(data: bytes | str) -> dict[str, Any]:
 
 
 def parse_json(data: bytes | str) -> Any:
-    """Return a JSON value, all of whose texts are Unicode.
+    """Return a JSON value in which all text is Unicode.
 
-    Raises
-    ------
-    ValueError
-        If it is none, or nested more deeply than `MAX_DEPTH`.
+    Raises ValueError if it is invalid, or nested more deeply than `MAX_DEPTH`.
     """
     document = orjson.loads(data)
     level = [document] if isinstance(document, dict | list) else []
@@ -63,7 +55,7 @@ def parse_json(data: bytes | str) -> Any:
 def unique(pairs: Sequence[tuple[str, _Value]]) -> dict[str, _Value]:
     """Return the entries of an object; ValueError if a key occurs twice.
 
-    A hook for `json.loads`, which by itself takes the last, for files that people write.
+    This is a hook for `json.loads`, which by itself takes the last, for files that people write.
     """
     entries = dict(pairs)
     if len(entries) < len(pairs):

@@ -1,4 +1,4 @@
-"""Files of the local disk: read by ranges, listed, and their digests."""
+"""Files of the local disk: reading by ranges, listing, and digests."""
 
 from __future__ import annotations
 
@@ -26,27 +26,21 @@ OWN_FILE = os.O_CREAT | getattr(os, "O_CLOEXEC", 0) | _NO_LINK | _NO_WAITING
 
 
 class LocalFile(FileIO):
-    """A file of the local disk, without buffer; threads may share it."""
+    """An unbuffered file of the local disk; threads may share it."""
 
     def __del__(self) -> None:
         # A reader keeps its files as long as it lives; to close them then is no oversight.
         self.close()
 
     def size(self) -> int:
-        """Return its length in bytes.
-
-        Raises
-        ------
-        OSError
-            If it is a folder, pipe or device.
-        """
+        """Return its length in bytes; OSError if it is a folder, pipe or device."""
         state = os.fstat(self.fileno())
         if not stat.S_ISREG(state.st_mode):
             raise OSError(errno.EINVAL, "it is no regular file")
         return state.st_size
 
     def pread(self, length: int, offset: int) -> bytes:
-        """Read up to `length` bytes from an offset on."""
+        """Read up to `length` bytes from an offset."""
         return os.pread(self.fileno(), length, offset)
 
     def prefetch(self, length: int, offset: int) -> None:
@@ -54,14 +48,9 @@ class LocalFile(FileIO):
 
 
 class LocalFolder:
-    """An open directory: what is read below it stays of one store, even if that is replaced.
+    """An open directory: files read below it belong to one store, even if that is replaced.
 
-    Attributes
-    ----------
-    path : str
-        What errors call it.
-    prefetch_bytes : int
-        The longest range worth a `prefetch` of its files; 0 where none is.
+    Errors call it `path`. `prefetch_bytes` is the longest range worth a `prefetch`; 0 for none.
     """
 
     prefetch_bytes = 0
@@ -85,12 +74,9 @@ class LocalFolder:
 
 
 def open_regular(path: Path) -> LocalFile:
-    """Open a regular file for reading, without buffer; whatever else lies there is not waited for.
+    """Open a regular file for unbuffered reading, without waiting for pipes.
 
-    Raises
-    ------
-    OSError
-        If there is none, or it is a folder, pipe or device.
+    Raises OSError if it does not exist, or is a folder, pipe or device.
     """
     file = LocalFile(os.open(path, os.O_RDONLY | _NO_WAITING))
     try:
@@ -102,12 +88,9 @@ def open_regular(path: Path) -> LocalFile:
 
 
 def private_file(path: Path) -> BufferedWriter:
-    """Open a file of our own for writing, in place, that nobody else may read; it is emptied.
+    """Open our own file for writing in place; it is emptied, and nobody else may read it.
 
-    Raises
-    ------
-    OSError
-        If it cannot be written, or is a link, has other names, or is somebody else's.
+    Raises OSError if it cannot be written, is a link, has other names, or another owner.
     """
     file = LocalFile(os.open(path, os.O_WRONLY | OWN_FILE, 0o600), "wb")
     try:
@@ -122,13 +105,13 @@ def private_file(path: Path) -> BufferedWriter:
 
 
 def is_only_ours(state: os.stat_result) -> bool:
-    """Whether a regular file belongs to us and has one name, by its state."""
+    """Whether a regular file, by its state, belongs to us and has only one name."""
     user = getattr(os, "geteuid", lambda: state.st_uid)()
     return stat.S_ISREG(state.st_mode) and state.st_nlink == 1 and state.st_uid == user
 
 
 def is_at(descriptor: int, path: Path) -> bool:
-    """Whether an open file is still the one that lies at a path."""
+    """Whether an open file is still the file at a path."""
     try:
         return os.path.samestat(os.fstat(descriptor), path.stat())
     except FileNotFoundError:
@@ -136,9 +119,9 @@ def is_at(descriptor: int, path: Path) -> bool:
 
 
 def locks_alone(descriptor: int) -> bool:
-    """Whether no other process holds a lock on an open file; from now on this one does.
+    """Lock an open file unless another process has locked it; return whether that worked.
 
-    It is released however the process ends. Windows has no such lock, there all hold it.
+    The lock ends with the process, however that ends. Windows has no such lock: always True.
     """
     if sys.platform == "win32":
         return True
@@ -152,14 +135,10 @@ def locks_alone(descriptor: int) -> bool:
 
 
 def take_file(source: Path, target: Path) -> None:
-    """Give a file a second name, or copy it where it is not ours alone or that cannot be done.
+    """Give a file a second name, or copy it if it is not only ours or linking fails.
 
-    A copy shares its blocks with the original where the file system can do that.
-
-    Raises
-    ------
-    OSError
-        If it cannot be read, or the disk does not take it.
+    A copy shares its blocks with the original where the file system can. OSError if the file cannot
+    be read, or the disk refuses.
     """
     target.parent.mkdir(parents=True, exist_ok=True)
     if is_only_ours(source.lstat()):
@@ -182,8 +161,8 @@ LINK, OTHER = -1, -2
 def local_files(path: Path) -> dict[str, int]:
     """Return every file below a folder and its size in bytes.
 
-    Names have forward slashes and are sorted by folder. Links are not followed;
-    their size is `LINK`, that of what is no regular file `OTHER`.
+    Names have forward slashes and are sorted by folder. Links are not followed; their size is
+    `LINK`. The size of other irregular files is `OTHER`.
     """
     found = {}
     for folder, folders, files in os.walk(path):

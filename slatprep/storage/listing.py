@@ -1,7 +1,7 @@
-"""The names of files below a root: asked of the disk one by one, of an object store all at once.
+"""The names of files below a root: a disk is asked one by one, an object store all at once.
 
-An object store has no folders; it lists a thousand names a request, whatever
-they are, and asking for one costs as much.
+An object store has no folders. It lists a thousand names in a request, and asking for a single name
+costs as much.
 """
 
 from __future__ import annotations
@@ -14,38 +14,23 @@ from pathlib import Path
 
 
 class Listing:
-    """Names below a folder of the local disk, as they are whenever one asks; those in it but once.
+    """Names below a folder of the local disk, up to date except that each folder is listed once.
 
     Names are relative to the folder, with forward slashes.
-
-    Parameters
-    ----------
-    root : Path
-        The folder.
     """
 
     def __init__(self, root: Path) -> None:
         self._root = str(root)  # os.path.join is not called so often with a Path
 
     def of_folder(self, folder: str, *, folders: bool) -> Iterable[str]:
-        """Return what is in a folder, given with a slash at its end; nothing if there is none.
+        """Return the names of a folder's files, or of its folders; none if it does not exist.
 
-        Parameters
-        ----------
-        folder : str
-            Its name; empty for the root.
-        folders : bool
-            Whether to return the names of its folders, or those of all else.
-
-        Raises
-        ------
-        OSError
-            If it cannot be listed.
+        `folder` ends with a slash, or is empty for the root. OSError if it cannot be listed.
         """
         return (self._scan(folder) if folder else self._top)[folders]
 
     def is_file(self, path: str) -> bool:
-        """Whether this name is anything but a folder, even a broken link."""
+        """Whether this name exists and is not a folder; broken links count."""
         full = os.path.join(self._root, path)  # noqa: PTH118 - half a million times
         link = False
         try:
@@ -61,7 +46,7 @@ class Listing:
         return self._scan("")  # Every pattern begins there.
 
     def _scan(self, folder: str) -> tuple[list[str], list[str]]:
-        """Return the names of all but folders in a folder, and those of the folders."""
+        """Return the names in a folder: of files and others, and of folders."""
         found: tuple[list[str], list[str]] = ([], [])
         try:
             with os.scandir(os.path.join(self._root, folder)) as entries:  # noqa: PTH118
@@ -80,13 +65,7 @@ def _is_folder(entry: os.DirEntry[str]) -> bool:
 
 
 class RemoteListing(Listing):
-    """Names below a place on an object store, as they were when it was listed.
-
-    Parameters
-    ----------
-    files : iterable of str
-        All of them, relative to the root.
-    """
+    """Names below a place on an object store when it was listed, relative to the root."""
 
     def __init__(self, files: Iterable[str]) -> None:
         self.files = frozenset(files)

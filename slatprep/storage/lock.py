@@ -1,4 +1,4 @@
-"""A lock on what one process writes at a time; it is released however its holder ends."""
+"""A lock on what only one process may write; it ends with its holder, however that ends."""
 
 from __future__ import annotations
 
@@ -22,20 +22,10 @@ _TRIES = 100
 def take_lock(path: Path, taken: str) -> int:
     """Return a descriptor that holds a lock until it is closed or the process ends.
 
-    Parameters
-    ----------
-    path : Path
-        The file to lock; it and its folder are made. Whoever holds the lock may remove it.
-    taken : str
-        What is so where another process holds it, as ``STORE: another build is writing it``.
-
-    Raises
-    ------
-    StoreError
-        If another process holds it; the message names that process. If the file
-        is something else than a lock, or its folder does not stay.
-    OSError
-        If it cannot be written, or is a link.
+    The file and its folder are created; the holder may remove the file. StoreError if another
+    process holds it, with that process and the words of `taken`, such as ``STORE: another build is
+    writing it``; also if the file is no lock, or its folder vanishes. OSError if it cannot be
+    written, or is a link.
     """
     if sys.platform == "win32":
         raise StoreError(
@@ -67,7 +57,7 @@ def take_lock(path: Path, taken: str) -> int:
 
 
 def _sign(descriptor: int, path: Path) -> None:
-    """Write into a lock who holds it."""
+    """Write into a lock which process holds it."""
     state = os.fstat(descriptor)
     if not stat.S_ISREG(state.st_mode) or (state.st_size and not _holder(descriptor)):
         raise StoreError(
@@ -83,7 +73,7 @@ def _sign(descriptor: int, path: Path) -> None:
 
 
 def _holder(descriptor: int) -> str:
-    """Return who says to hold a lock; empty where nothing does."""
+    """Return the process that a lock names as its holder, or ""."""
     try:
         told = parse_document(os.pread(descriptor, 4096, 0))
         return f"process {told['pid']} on {told['host']}, since {told['since']}"

@@ -1,4 +1,4 @@
-"""Names of files, made of ids."""
+"""File names from ids."""
 
 from __future__ import annotations
 
@@ -9,21 +9,12 @@ _LONGEST_NAME = 180
 
 
 def file_name(asset_id: str, *, dots: bool = True) -> str:
-    """Return a file name for an asset, without suffix.
+    """Return a file name for an asset of any id, without suffix.
 
-    Plain ids stay as they are. Whatever could mean something to a shell, an
-    archive or a file system is percent-encoded, as is a leading sign; a name
-    that would be too long ends in a hash instead.
+    Plain ids stay unchanged. Characters that mean something to a shell, an archive or a file system
+    are percent-encoded, as are a leading sign and, without `dots`, dots. Names that would be too
+    long end in a hash.
 
-    Parameters
-    ----------
-    asset_id : str
-        Any text.
-    dots : bool
-        Whether dots may stay.
-
-    Examples
-    --------
     >>> file_name("0a1b2c.front"), file_name("0a1b2c.front", dots=False)
     ('0a1b2c.front', '0a1b2c%2Efront')
     >>> file_name("../a b"), file_name("-rf")

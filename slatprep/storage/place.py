@@ -1,8 +1,8 @@
 """Places on the local disk and on object stores, behind one protocol.
 
-Where a place only has a name, or is read whole, `slatprep.records.Place` is
-enough: `pathlib.Path` and `RemotePlace` both are one. What has to be done in
-two ways is a method of `Storage`, and only this module asks which it is.
+`slatprep.records.Place` is enough to name a place or to read it whole: `pathlib.Path` and
+`RemotePlace` both implement it. Work that differs between the two is a method of `Storage`, and
+only this module asks which kind it is.
 """
 
 from __future__ import annotations
@@ -49,16 +49,9 @@ Folder = LocalFolder | RemoteFolder
 def place_of(text: str | Place, folder: Path | None = None) -> Place:
     """Return a path of the local disk, or a `RemotePlace` for the URL of an object store.
 
-    Parameters
-    ----------
-    text : str or Place
-        A path, a URL, or a URL that was made a path.
-    folder : Path, optional
-        What a relative path starts from; links in it are then resolved, and
-        ``~`` stands for the user's folder.
+    A relative path starts from `folder`, if given. Links in it are then resolved, and ``~`` stands
+    for the user's folder.
 
-    Examples
-    --------
     >>> print(place_of("s3://bucket/demo.zarr") / "zarr.json")
     s3://bucket/demo.zarr/zarr.json
     >>> print(place_of("file:///data/demo.zarr"))
@@ -72,26 +65,21 @@ def place_of(text: str | Place, folder: Path | None = None) -> Place:
 
 
 def is_place(value: object) -> TypeGuard[Path | RemotePlace]:
-    """Whether a value is a path, or a URL as `place_of` returns it."""
+    """Whether a value is a path, or a URL from `place_of`."""
     return isinstance(value, Path | RemotePlace)
 
 
 def storage_of(place: Place) -> Storage:
-    """Return what can be done at a place."""
+    """Return the storage of a place."""
     if not is_place(place):
         raise TypeError(f"{place!r} is no place; expected what `place_of` returns")
     return Storage(place) if isinstance(place, Path) else _ObjectStore(place)
 
 
 class Storage:
-    """What is done at a place; here on the local disk, below on an object store.
+    """Operations at a place: here on the local disk, below on an object store.
 
-    Attributes
-    ----------
-    local : Path or None
-        The place as a path; None where it is not on the local disk.
-    remote : RemotePlace or None
-        The place as that of an object store; None where it is on the local disk.
+    `local` is the place as a path, `remote` as that of an object store; one of them is None.
     """
 
     local: Path | None
@@ -101,12 +89,9 @@ class Storage:
         self.local = self._path = path
 
     def files(self) -> dict[str, int]:
-        """Return the names of all files below the place, and their bytes; see `local_files`.
+        """Return the names and bytes of all files below the place, as `local_files`.
 
-        Raises
-        ------
-        StoreError
-            If they cannot be listed.
+        Raises StoreError if they cannot be listed.
         """
         try:
             return self._sizes()
@@ -118,20 +103,17 @@ class Storage:
         return local_files(self._path)
 
     def listing(self) -> Listing:
-        """Return the names below the place as they are looked up one by one."""
+        """Return the names below the place, for looking them up one by one."""
         return Listing(self._path)
 
     def folder(self) -> Folder:
-        """Return the place as a folder whose files are read by ranges."""
+        """Return the place as a folder for reading ranges of its files."""
         return LocalFolder(self._path)
 
     def locate(self, file: Place) -> tuple[Place, str]:
-        """Return a file below the place without links on its way, and its name relative to it.
+        """Return a file below the place with links resolved, and its name relative to it.
 
-        Raises
-        ------
-        InputError
-            If it leads out of the place, does not exist, or is no regular file.
+        Raises InputError if it leads out of the place, does not exist, or is not a regular file.
         """
         path, root = Path(str(file)), self._path
         try:
@@ -153,33 +135,21 @@ class Storage:
         return resolved, relative.as_posix()
 
     def open(self) -> IO[bytes]:
-        """Open a file for reading.
-
-        Raises
-        ------
-        OSError
-            If there is none, or it is a folder, pipe or device.
-        """
+        """Open a file for reading; OSError if it does not exist, or is a folder, pipe or device."""
         return io.BufferedReader(open_regular(self._path))
 
     def read(self, limit: int) -> bytes:
-        """Read a file up to one byte more than `limit`, by which one that is larger is known."""
+        """Read at most `limit` + 1 bytes of a file; the last shows that it is too large."""
         with open_regular(self._path) as file:
             # read() would allocate all that it is allowed to return.
             return file.pread(min(file.size(), limit + 1), 0)
 
     def open_scattered(self) -> IO[bytes]:
-        """Open a file for random access; an object is fetched whole, at once.
-
-        Raises
-        ------
-        OSError
-            As `open` does.
-        """
+        """Open a file for random access; an object is fetched whole, at once. OSError as `open`."""
         return self.open()
 
     def size(self) -> int:
-        """Return the bytes of a file."""
+        """Return the size of a file in bytes."""
         return self._path.stat().st_size
 
     def on_disk(self) -> Path:
@@ -187,30 +157,24 @@ class Storage:
         return self._path
 
     def current_version(self) -> Place:
-        """Return where the files of the store at the place lie now.
-
-        Raises
-        ------
-        StoreError
-            If it cannot be reached.
-        """
+        """Return the current place of the store's files; StoreError if it cannot be reached."""
         return self._path
 
     def copied_version(self) -> Path:
-        """Return a path of the local disk with the store, of which this is a version, if remote."""
+        """Return a local path of the store; a remote version is copied."""
         return self._path
 
     def remove(self, names: Iterable[str]) -> None:
-        """Remove files below the place; that one is gone is no error."""
+        """Remove files below the place; files that do not exist are no error."""
         for name in names:
             (self._path / name).unlink(missing_ok=True)
 
     def staged(self) -> AbstractContextManager[Path]:
-        """Yield a local file that becomes the place's content, whole, when all went well."""
+        """Yield a local file that becomes the place's content, complete, unless an error occurs."""
         return staged(self._path)
 
     def work_folder(self) -> Path:
-        """Return where, on the local disk, to work on what belongs to the place."""
+        """Return the local folder for work on the place."""
         return self._path.with_name(f".{self._path.name}.work")
 
 

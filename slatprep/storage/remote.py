@@ -1,11 +1,10 @@
-"""Places on object stores, which are reached through fsspec.
+"""Places on object stores, reached through fsspec.
 
-A `RemotePlace` has the few methods of `slatprep.records.Place` and no others.
-Nothing can be changed at one but by `RemotePlace.upload`, `put_objects`, `copy_objects` and
-`remove_objects`.
+A `RemotePlace` has the few methods of `slatprep.records.Place` and no others. Only
+`RemotePlace.upload`, `put_objects`, `copy_objects` and `remove_objects` change objects.
 
-Credentials and endpoints are left to the libraries: those of S3, for
-instance, come from ``AWS_*`` variables or ``~/.aws``.
+Credentials and endpoints are left to the libraries: those of S3, for instance, come from ``AWS_*``
+variables or ``~/.aws``.
 """
 
 from __future__ import annotations
@@ -28,25 +27,11 @@ BUFFER_BYTES = 8 * 2**20
 
 
 class RemotePlace:
-    """The URL of an object, or of all objects below it.
+    """The URL of an object or of all objects below it; see `slatprep.storage.place.place_of`.
 
-    `slatprep.storage.place.place_of` makes one. Names are joined as those of a
-    path are; what pathlib offers besides is missing here.
-
-    Parameters
-    ----------
-    protocol : str
-        Such as ``s3``.
-    path : PurePosixPath
-        Bucket and key.
-
-    Raises
-    ------
-    OSError
-        By every method that asks the object store, which may refuse or not
-        answer; whatever the libraries raise is turned into one.
-    ConfigError
-        By the same, if a library is missing or the protocol is unknown.
+    `protocol` is such as ``s3``, `path` is bucket and key. Names join as in a path. Every method
+    that asks the object store turns the libraries' errors into OSError. It raises ConfigError if a
+    library is missing or the protocol is unknown.
     """
 
     # No dataclass: what writes JSON would take that for a table of its fields.
@@ -89,15 +74,15 @@ class RemotePlace:
         return self
 
     def exists(self) -> bool:
-        """Whether there is an object, or any below."""
+        """Whether it is an object, or there are objects below it."""
         return self._kind() != ""
 
     def is_dir(self) -> bool:
-        """Whether there is any object below, but none of this name."""
+        """Whether there are objects below it, and none of this name."""
         return self._kind() == "directory"
 
     def is_file(self) -> bool:
-        """Whether there is an object."""
+        """Whether it is an object."""
         return self._kind() == "file"
 
     def open(
@@ -110,17 +95,17 @@ class RemotePlace:
         return file if mode == "rb" else io.TextIOWrapper(file, encoding, newline=newline)
 
     def read_bytes(self) -> bytes:
-        """Read an object whole."""
+        """Read a whole object."""
         with self.open("rb") as file:
             return bytes(file.read())
 
     def read_text(self, encoding: str | None = None) -> str:
-        """Read an object whole, as text."""
+        """Read a whole object as text."""
         with self.open("r", encoding=encoding) as file:
             return str(file.read())
 
     def upload(self, local: Path) -> None:
-        """Put a file of the local disk here; it is seen whole or not at all."""
+        """Put a file of the local disk here; readers see it complete or not at all."""
         with connected(self) as (system, name):
             system.put_file(str(local), name, **multipart_options(system))
 
@@ -134,7 +119,7 @@ class RemotePlace:
 
 
 class RemoteFile(io.RawIOBase):
-    """An object open for reading; may be shared between threads by those who use `pread` alone."""
+    """An object open for reading; threads may share it if they use only `pread`."""
 
     def __init__(self, place: RemotePlace) -> None:
         super().__init__()
@@ -147,7 +132,7 @@ class RemoteFile(io.RawIOBase):
         return self._size
 
     def pread(self, length: int, offset: int) -> bytes:
-        """Read up to `length` bytes from an offset on: prefetched ones, or with one request."""
+        """Read up to `length` bytes from an offset: prefetched, or with one request."""
         begin, data = self._prefetched
         if begin <= offset and offset + length <= begin + len(data):
             return data[offset - begin : offset - begin + length]
@@ -167,7 +152,7 @@ class RemoteFile(io.RawIOBase):
         self._prefetched = (offset, self.pread(length, offset))
 
     def readall(self) -> bytes:
-        """Read on to the end, by blocks as `io.BufferedReader` has them: Python's own are 8 kB."""
+        """Read to the end, in blocks of `io.BufferedReader`: Python's own have 8 kB."""
         return b"".join(iter(lambda: self.read(BUFFER_BYTES) or b"", b""))
 
     def readable(self) -> bool:
@@ -175,7 +160,7 @@ class RemoteFile(io.RawIOBase):
         return True
 
     def readinto(self, buffer: Any) -> int:
-        """Read on, as `io.BufferedReader` asks it."""
+        """Read on, for `io.BufferedReader`."""
         if self._ended:
             return 0
         data = self.pread(len(buffer), self._position)
@@ -194,13 +179,7 @@ class RemoteFile(io.RawIOBase):
 
 
 class RemoteFolder:
-    """A version of a store on an object store, which stays of one store because it never changes.
-
-    Parameters
-    ----------
-    place : RemotePlace
-        Its URL.
-    """
+    """A version of a store on an object store; it belongs to one store, since it never changes."""
 
     prefetch_bytes = 64 * 2**20
 
@@ -209,15 +188,15 @@ class RemoteFolder:
         self._place = place
 
     def open(self, name: str) -> RemoteFile:
-        """Open a file for reading; nothing is asked yet."""
+        """Open a file for reading, without a request yet."""
         return RemoteFile(self._place / name)
 
 
 def list_objects(place: RemotePlace) -> dict[str, dict[str, Any]]:
-    """Return what fsspec says of every object below a place, by its name relative to that.
+    """Return fsspec's entry of every object below a place, by its name relative to that.
 
-    Objects are left out whose names no path could have: with empty parts, or
-    with ``.`` or ``..`` for one. There may be none at all.
+    Objects are left out if no path could have their name: with empty parts, ``.`` or ``..``. The
+    result may be empty.
     """
     with connected(place) as (system, name):
         found = system.find(name, detail=True)
@@ -231,7 +210,7 @@ def list_objects(place: RemotePlace) -> dict[str, dict[str, Any]]:
 
 
 def put_objects(folder: Path, place: RemotePlace, names: Iterable[str], at_once: int = 16) -> None:
-    """Put files of a folder below a place, under the same names, so many at a time."""
+    """Put files of a folder below a place, under the same names, several at a time."""
     names = list(names)
     if not names:
         return
@@ -253,7 +232,7 @@ def copy_objects(source: RemotePlace, target: RemotePlace, names: Iterable[str])
 
 
 def remove_objects(place: RemotePlace, names: Iterable[str]) -> None:
-    """Remove objects below a place by their names; those that are not there are no error."""
+    """Remove objects below a place by their names; missing ones are no error."""
     names = list(names)
     if not names:
         return
@@ -266,10 +245,9 @@ def _is_plain(name: str) -> bool:
 
 
 def multipart_options(system: Any, files_at_once: int | None = None) -> dict[str, int]:
-    """Return options that bound what a transfer holds in memory, to 64 MiB a file on S3.
+    """Return options that limit the memory of a transfer, to 64 MiB a file on S3.
 
-    S3 takes 10,000 parts, and so 160 GiB a file. `files_at_once` is for
-    transfers of several files.
+    S3 takes 10,000 parts, and so 160 GiB a file. `files_at_once` is for transfers of several files.
     """
     parts = {"chunksize": PART_BYTES, "max_concurrency": 4} if "s3" in system.protocol else {}
     if files_at_once is None or not system.async_impl:
@@ -279,15 +257,11 @@ def multipart_options(system: Any, files_at_once: int | None = None) -> dict[str
 
 @contextmanager
 def connected(place: RemotePlace) -> Iterator[tuple[Any, str]]:
-    """Yield the fsspec file system of a place, and what the place is called there.
+    """Yield the fsspec file system of a place, and the place's name in it.
 
-    Raises
-    ------
-    OSError
-        For whatever the file system raises meanwhile: of the same kind
-        (`FileNotFoundError`, `PermissionError`), with its words and the place.
-    ConfigError
-        If a library is missing or the protocol is unknown.
+    Errors of the file system become OSErrors of the same kind (`FileNotFoundError`,
+    `PermissionError`) that name the place. ConfigError if a library is missing or the protocol is
+    unknown.
     """
     try:
         from fsspec.core import url_to_fs

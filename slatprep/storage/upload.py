@@ -1,15 +1,14 @@
 """Put a finished store on an object store: upload all of it, then publish it in one step.
 
-Readers read only what the pointer names, so an upload that ends midway
-does no harm. The pointer is replaced only if it is still the one that was read
-when the build began: on S3 the server itself compares them.
+Readers read only what the pointer names, so an upload that ends midway does no harm. The pointer is
+replaced only if it is still the one from the beginning of the build: on S3 the server itself
+compares them.
 
-A version's name comes from its content and from the pointer it is to replace.
-So an upload that is repeated finds what the first one left; and whoever
-removes a version's objects has replaced that pointer before, which makes
-this build's own replacement fail. What remains cannot be seen half. Where
-workers of a cluster put a version's large files in place themselves, its
-content is not known before, so its name is one that nobody has.
+A version's name comes from its content and from the pointer that it replaces. A repeated upload
+therefore finds what the first one left. A process that removes a version's objects has replaced
+that pointer before, so this build's own replacement fails. Readers never see a partial store. Where
+workers of a cluster upload a version's large files themselves, its content is not known before. Its
+name is then new.
 """
 
 from __future__ import annotations
@@ -67,9 +66,9 @@ class Staged:
     digests : dict of str to str
         Their SHA-256 in hex.
     version : RemotePlace or None
-        Where some are in place, as workers put them there.
+        The version into which workers put some of them.
     before : RemotePlace or None
-        The version that the others are to be copied from, by the server.
+        The version from which the server is to copy the others.
     copied : frozenset of str
         Names of those.
     """
@@ -83,16 +82,16 @@ class Staged:
 
 @dataclass(frozen=True)
 class PublishedState:
-    """The pointer as it was when a build began.
+    """The pointer at the beginning of a build.
 
     Attributes
     ----------
     target : RemotePlace
         The store.
     pointer : Pointer or None
-        What it said; None where there was none.
+        Its content; None if it did not exist.
     tag : str
-        What the server calls this state of it.
+        The server's tag of this state.
     """
 
     target: RemotePlace
@@ -101,12 +100,9 @@ class PublishedState:
 
 
 def published_state(target: RemotePlace) -> PublishedState:
-    """See what a build would replace.
+    """Return the state that a build would replace.
 
-    Raises
-    ------
-    StoreError
-        If the place cannot be reached, or holds something other than a store.
+    Raises StoreError if the place cannot be reached, or holds something other than a store.
     """
     if is_version(target):
         raise StoreError(f"{target} is one version of a store; expected {target.parent.parent}")
@@ -132,12 +128,7 @@ def published_state(target: RemotePlace) -> PublishedState:
 class Upload:
     """A new version that is complete and not yet published; `upload_store` makes one.
 
-    Attributes
-    ----------
-    before : PublishedState
-        What was there when the build began.
-    pointer : Pointer
-        What will be there.
+    `before` is the state at the beginning of the build, `pointer` the new pointer.
     """
 
     before: PublishedState
@@ -150,17 +141,13 @@ class Upload:
 
     @property
     def version(self) -> RemotePlace:
-        """Where its files are."""
+        """The place of its files."""
         return self.target / VERSIONS / self.pointer.version
 
     def publish(self) -> None:
         """Replace the pointer, and remove the versions that nobody needs any more.
 
-        Raises
-        ------
-        StoreError
-            If another build has replaced it since this one began, or it
-            cannot be written.
+        Raises StoreError if another build has replaced it meanwhile, or it cannot be written.
         """
         if self.pointer == self.before.pointer:
             return
@@ -216,22 +203,11 @@ class Upload:
 
 
 def upload_store(new: Path, before: PublishedState, staged: Staged | None = None) -> Upload:
-    """Upload all files of a finished store as a new version, and see that all are there.
+    """Upload all files of a finished local store as a new version, and check that they are there.
 
-    Parameters
-    ----------
-    new : Path
-        The store, on the local disk.
-    before : PublishedState
-        Where it belongs, and what was there when the build began. If that has
-        the same content, nothing is uploaded.
-    staged : Staged, optional
-        The files that `new` lacks. What workers put in place is removed if it is not needed.
-
-    Raises
-    ------
-    StoreError
-        If something cannot be uploaded.
+    `staged` are the files that `new` lacks; those that workers uploaded are removed if not needed.
+    Nothing is uploaded if `before`, the state at the beginning of the build, has the same content.
+    StoreError if a file cannot be uploaded.
     """
     files = local_files(new)
     digests = {name: file_digest(new / name) for name in files}
@@ -289,7 +265,7 @@ def _remove_version(version: RemotePlace) -> None:
 
 
 def _is_same(entry: Mapping[str, Any] | None, file: Path) -> bool:
-    """Whether an object is known to hold what a file holds: S3 tags most by their MD5."""
+    """Whether an object surely equals a file: S3 tags most objects by their MD5."""
     if entry is None or entry["size"] != file.stat().st_size:
         return False
     return bool(_tag_in(entry)) and not _is_tagged_otherwise(entry, file)
@@ -298,7 +274,7 @@ def _is_same(entry: Mapping[str, Any] | None, file: Path) -> bool:
 def _is_tagged_otherwise(entry: Mapping[str, Any], file: Path) -> bool:
     """Whether an object's tag looks like an MD5 and is not the file's.
 
-    It may hold the same all the same: where S3 encrypts, a tag is something else.
+    The object may equal the file even so: where S3 encrypts, a tag is something else.
     """
     tag = _tag_in(entry)
     with file.open("rb") as content:
@@ -316,13 +292,13 @@ def _tag_in(entry: Mapping[str, Any]) -> str:
 
 
 def _is_ours(name: str) -> bool:
-    """Whether an object below a store is part of some version, its records or the spool."""
+    """Whether an object below a store is part of a version, its records or the spool."""
     kind, _, rest = name.partition("/")
     return _is_of_version(name) or (kind == SPOOL and is_spooled(rest))
 
 
 def _is_of_version(name: str, but: Iterable[str] = ()) -> bool:
-    """Whether an object below a store is part of some version or its records."""
+    """Whether an object below a store is part of a version or its records."""
     kind, _, rest = name.partition("/")
     version = rest.partition("/")[0]
     return kind in (VERSIONS, MANIFESTS) and is_version_name(version) and version not in but

@@ -1,11 +1,10 @@
-"""A store on an object store: whole versions of it, and a pointer to the one to read.
+"""A store on an object store: complete versions of it, and a pointer to the current one.
 
 Below the store's URL lie
 
-- ``current.json``, the pointer, which is replaced in one step;
-- ``versions/NAME/``, a store as it would lie on a disk, never changed;
-- ``manifests/NAME/``, the records of the build that made it;
-- ``spool/``, while a cluster builds the next one, the assets that are finished.
+- ``current.json``, the pointer, which is replaced in one step; - ``versions/NAME/``, a store as on
+a disk, which never changes; - ``manifests/NAME/``, the records of the build that made it; -
+``spool/``, the finished assets of the next one while a cluster builds it.
 
 Plain zarr opens a version's own URL.
 """
@@ -41,18 +40,18 @@ _MAX_POINTER_BYTES = 2**16
 
 @dataclass(frozen=True)
 class Pointer:
-    """What the pointer of a store says.
+    """The content of a store's pointer.
 
     Attributes
     ----------
     version : str
         Name of the version to read.
     previous : str
-        The one before it, which is kept for those who are reading it; may be empty.
+        The version before, kept for its readers; may be empty.
     content : str
         SHA-256 in hex over names and content of the version's files.
     published : str
-        When, in UTC.
+        Time of publication, in UTC.
     """
 
     version: str
@@ -63,18 +62,12 @@ class Pointer:
     format_version: int = 1
 
     def encode(self) -> bytes:
-        """Return it as it is written."""
+        """Return the bytes of its file."""
         return json.dumps(asdict(self), indent=2).encode() + b"\n"
 
     @classmethod
     def decode(cls, data: bytes) -> Pointer:
-        """Read it.
-
-        Raises
-        ------
-        ValueError
-            If it is none, or its names are not what they should be.
-        """
+        """Read a pointer's bytes; ValueError if they are none or have wrong names."""
         document = json.loads(data)
         if not isinstance(document, dict) or document.get("format") != FORMAT:
             raise ValueError(f"no {FORMAT}")
@@ -91,14 +84,9 @@ class Pointer:
 
 
 def read_pointer(store: RemotePlace) -> Pointer | None:
-    """Read which version of a store is current; None where there is no pointer.
+    """Read which version of a store is current; None without a pointer.
 
-    Raises
-    ------
-    OSError
-        If it cannot be reached.
-    StoreError
-        If what is there is no pointer.
+    Raises OSError if it cannot be reached, StoreError if it is not a pointer.
     """
     try:
         with (store / POINTER).open("rb") as file:
@@ -115,23 +103,16 @@ def read_pointer(store: RemotePlace) -> Pointer | None:
 
 
 def content_of(digests: Mapping[str, str]) -> str:
-    """Return what a pointer says of the content of a version with files of these SHA-256."""
+    """Return a pointer's `content` for a version with files of these SHA-256."""
     lines = "".join(f"{name} {digests[name]}\n" for name in sorted(digests))
     return hashlib.sha256(lines.encode()).hexdigest()
 
 
 def current_version(store: RemotePlace) -> RemotePlace:
-    """Return where the files of a store lie.
+    """Return the place of a store's files: its current version, or the place itself.
 
-    Parameters
-    ----------
-    store : RemotePlace
-        A store, one of its versions, or a store that was copied there as it was.
-
-    Raises
-    ------
-    StoreError
-        If the pointer cannot be reached or is none.
+    The place may be a store, one of its versions, or a plain copy of a store. StoreError if the
+    pointer cannot be reached or read.
     """
     if is_version(store):
         return store
@@ -143,25 +124,25 @@ def current_version(store: RemotePlace) -> RemotePlace:
 
 
 def is_version(place: Place) -> bool:
-    """Whether a place is that of a version of a store."""
+    """Whether a place is a version of a store."""
     return place.parent.name == VERSIONS and is_version_name(place.name)
 
 
 def new_version(store: RemotePlace) -> RemotePlace:
-    """Return where a version may be made whose content is not known yet: a name nobody has."""
+    """Return the place of a version whose content is not known yet: its name is new."""
     return store / VERSIONS / secrets.token_hex(8)
 
 
 def is_spooled(name: str) -> bool:
-    """Whether a build calls an object of the spool so."""
+    """Whether an object has the name of a spooled one."""
     return _SPOOLED.fullmatch(name) is not None
 
 
 def store_name(place: Place) -> str:
-    """Return the name of a store, or of the one that a place is a version of."""
+    """Return the name of a store, also from one of its versions."""
     return (place.parent.parent if is_version(place) else place.absolute()).name
 
 
 def is_version_name(name: str) -> bool:
-    """Whether a version may be called so."""
+    """Whether a version may have this name."""
     return _NAME.fullmatch(name) is not None

@@ -1,9 +1,8 @@
-"""Tasks on a Dask cluster that the user has.
+"""Tasks on the user's Dask cluster.
 
-The cluster decides which worker does what, and what is done again when one
-dies. What it cannot know is made sure here: that every worker, those that join
-late as well, has the code, the libraries and the files that this process has,
-and computes on one thread. Only then are the bytes the same as on one machine.
+The cluster decides which worker does a task, and repeats tasks of dead workers. This module makes
+sure that every worker, also one that joins late, has the code, the libraries and the files of this
+process, and computes on one thread. Only then are the bytes the same as on one machine.
 """
 
 from __future__ import annotations
@@ -60,23 +59,12 @@ _LIBRARIES = (
 
 
 class Cluster:
-    """The workers of a Dask cluster, given wherever a number of jobs is.
+    """The workers of a Dask cluster, in place of a number of jobs.
 
-    Parameters
-    ----------
-    scheduler : str
-        Address of its scheduler, such as ``tcp://host:8786``.
-    note : callable, optional
-        Called with a line for people, while a first worker is waited for and
-        when there is one.
+    `scheduler` is its address, such as ``tcp://host:8786``. `note` gets a line for the user while a
+    first worker is awaited and when it is there. On entering, SlatprepError if no scheduler
+    answers, or a worker is not fit.
 
-    Raises
-    ------
-    SlatprepError
-        On entering: if no scheduler answers, or a worker is not fit.
-
-    Examples
-    --------
     >>> with Cluster("tcp://host:8786") as cluster:  # doctest: +SKIP
     ...     build_store(parameters, out, jobs=cluster)
     """
@@ -123,20 +111,18 @@ class Cluster:
         tasks: Iterable[tuple[Any, ...]],
         died: Callable[..., Result] | None = None,
     ) -> Iterator[Result]:
-        """Do what `slatprep.workers.local.run_unordered` promises, on the cluster.
+        """Run tasks on the cluster as `slatprep.workers.local.run_unordered` does.
 
-        Dask itself does a task again whose worker died, and gives it up when
-        several have.
+        Dask itself repeats a task whose worker died, and gives up after several.
         """
         with self._connected():
             pool = _Pool(self._client, self._common)
             yield from run_in_pools(pool, pool, function, tasks, died)
 
     def require_shared(self, paths: Iterable[Place]) -> None:
-        """Raise `SlatprepError` unless every worker sees these files and folders as we do.
+        """Raise `SlatprepError` unless every worker sees the same files and folders as we do.
 
-        Workers that join later are asked before their first task, until other
-        files are asked for.
+        Workers that join later are checked before their first task, until the next call.
         """
         files = {}
         for path in paths:
@@ -151,7 +137,7 @@ class Cluster:
             self._check_workers()
 
     def _check_workers(self) -> int:
-        """Wait for a first worker, without limit; raise unless all are fit, or say how many."""
+        """Wait for a worker, without limit; return their number, or raise unless all are fit."""
         found: dict[str, Exception | None] = {}
         while not found:
             if not self._client.ncores():
@@ -173,7 +159,7 @@ class Cluster:
 
     @contextmanager
     def _connected(self) -> Iterator[None]:
-        """Say in words that the scheduler was lost."""
+        """Explain the loss of the scheduler in an error."""
         try:
             yield
         except (OSError, CancelledError) as error:
@@ -192,9 +178,9 @@ class _Common:
     Attributes
     ----------
     software : tuple of (str, str)
-        What computes, and its version.
+        Names and versions of what computes.
     files : tuple of (str, str)
-        Paths of files and folders, and what `_look` says of them.
+        Paths of files and folders, and the result of `_look` for each.
     """
 
     software: tuple[tuple[str, str], ...]
@@ -219,7 +205,7 @@ async def _reach(scheduler: str) -> None:
 
 
 class _Pool(Pool):
-    """The workers that a cluster has at the time, as `slatprep.workers.pool` uses them."""
+    """The workers that a cluster has now, for `slatprep.workers.pool`."""
 
     killed = distributed.KilledWorker
 
@@ -231,11 +217,11 @@ class _Pool(Pool):
         self._asked = -1.0
 
     def room(self) -> int:
-        """Return more than the workers can do at once; something even for none."""
+        """Return more calls than the workers can make at once, and a few without workers."""
         return BATCHES_A_CORE * max(self._known_cores(), 1)
 
     def batch_seconds(self) -> float:
-        """Return what the scheduler keeps up with, were all workers busy."""
+        """Return the batch time [s] that the scheduler keeps up with if all workers are busy."""
         return max(SHORTEST_BATCH_SECONDS, self._known_cores() / BATCHES_A_SECOND)
 
     def submit(self, call: Callable[[], Any]) -> Future[Any]:
@@ -244,17 +230,17 @@ class _Pool(Pool):
         return future
 
     def check(self) -> None:
-        """Raise if the scheduler was lost: results on their way then never come."""
+        """Raise if the scheduler was lost, because pending results will never come."""
         if self._client.status != "running":
             raise ConnectionError("the connection to the scheduler was lost")
 
     def abandon(self, calls: Iterable[Future[Any]]) -> None:
-        """Have the scheduler drop what it has not yet given to a worker."""
+        """Have the scheduler drop calls that no worker has begun."""
         if self._client.status == "running":
             self._executor.shutdown(wait=False)
 
     def _known_cores(self) -> int:
-        """Return how many cores the workers have, those that joined up to a second ago."""
+        """Return the number of the workers' cores, at most a second old."""
         if time.monotonic() - self._asked > 1.0:
             self.check()
             self._cores = sum(self._client.ncores().values())
@@ -275,7 +261,7 @@ def _check(common: _Common, dask_worker: Any) -> None:
 
 @lru_cache(maxsize=8)
 def _agree(common: _Common, worker: Any) -> None:
-    """Raise unless this worker is fit; asked once a process, because errors are not cached."""
+    """Raise unless this worker is fit; asked once per process, because errors are not cached."""
     name = f"worker {worker.address} on {platform.node()}"
     if worker.state.nthreads != 1:
         raise SlatprepError(
@@ -300,7 +286,7 @@ def _agree(common: _Common, worker: Any) -> None:
 
 @lru_cache(maxsize=1)
 def _software() -> tuple[tuple[str, str], ...]:
-    """Return what makes the bytes of a store: Python, all of slatprep's code, the libraries."""
+    """Return what decides the bytes of a store: Python, all of slatprep's code, the libraries."""
     package = Path(__file__).parents[1]
     code = hashlib.sha256()
     for path in sorted(package.rglob("*.py")):
@@ -315,7 +301,7 @@ def _software() -> tuple[tuple[str, str], ...]:
 
 
 def _look(place: Place) -> str:
-    """Return what lies at a place, as far as workers must agree on it."""
+    """Return the state of a file or folder that workers must agree on."""
     storage = storage_of(place)
     try:
         if storage.local is None or stat.S_ISREG(storage.local.stat().st_mode):

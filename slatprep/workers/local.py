@@ -1,4 +1,4 @@
-"""One function over many tasks, on one core or several, or on a cluster, one thread each."""
+"""One function over many tasks: on one core, several, or a cluster, one thread each."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ _IDLE_SECONDS = 300
 
 
 class Workers(Protocol):
-    """Workers other than this process's own, as `slatprep.workers.dask.Cluster` has them."""
+    """Workers outside this process, such as `slatprep.workers.dask.Cluster`."""
 
     def run_unordered(
         self,
@@ -46,11 +46,11 @@ class Workers(Protocol):
         tasks: Iterable[tuple[Any, ...]],
         died: Callable[..., Result] | None = None,
     ) -> Iterator[Result]:
-        """Do what the function `run_unordered` promises."""
+        """Run tasks as the function `run_unordered` does."""
         ...
 
     def require_shared(self, paths: Iterable[Place]) -> None:
-        """Raise `SlatprepError` unless every worker sees these files and folders as we do."""
+        """Raise `SlatprepError` unless every worker sees the same files and folders as we do."""
         ...
 
 
@@ -66,26 +66,10 @@ def run_unordered(
 ) -> Iterator[Result]:
     """Yield ``function(*task)`` for each task, in the order in which they finish.
 
-    Tasks are taken from the iterable only as workers come free, and each
-    worker computes on one thread. When a worker is killed, whatever was under
-    way is done again at the end, a task at a time.
-
-    Parameters
-    ----------
-    function : callable
-        Must be importable by a worker.
-    tasks : iterable of tuple
-        Positional arguments of each call.
-    jobs : int or Workers
-        Worker processes, 1 computes in this process; or workers elsewhere.
-    died : callable, optional
-        ``died(*task)`` stands in for the result of a task that was alone when
-        its worker was killed again. Without it that is an error.
-
-    Raises
-    ------
-    SlatprepError
-        If a task kills its worker even alone, and `died` is not given.
+    Tasks are taken from the iterable only as workers become free; each worker computes on one
+    thread. After a worker is killed, the tasks under way run again at the end, one at a time. If a
+    task kills its worker even alone, ``died(*task)`` gives its result, or else SlatprepError.
+    Workers must be able to import `function`; with 1 job it runs in this process.
     """
     if not isinstance(jobs, int):
         yield from jobs.run_unordered(function, tasks, died)
@@ -99,14 +83,9 @@ def run_unordered(
 
 
 def start_early(function: Callable[..., Any], jobs: Jobs) -> None:
-    """Have worker processes of this machine start, and import what a function needs, meanwhile.
+    """Start the worker processes that `run_unordered` will need, and let them import, meanwhile.
 
-    Parameters
-    ----------
-    function : callable
-        What `run_unordered` will be given.
-    jobs : int or Workers
-        As it will be given there; where no processes are started for it nothing is done.
+    Nothing happens where it will start no processes.
     """
     if isinstance(jobs, int) and jobs > 1:
         processes = _Processes(jobs)
@@ -115,7 +94,7 @@ def start_early(function: Callable[..., Any], jobs: Jobs) -> None:
 
 
 def _imported(function: Callable[..., Any]) -> None:
-    """Keep out of garbage collection what a process imported to be handed the function."""
+    """Keep the imports made for the function out of garbage collection."""
     # Without psutil loky collects garbage every second, and looks through all modules for it.
     gc.freeze()
 
@@ -123,7 +102,7 @@ def _imported(function: Callable[..., Any]) -> None:
 def run_in_order(
     function: Callable[..., Result], tasks: Iterable[tuple[Any, ...]], jobs: Jobs = 1
 ) -> Iterator[Result]:
-    """Yield what `run_unordered` does, in the order of the tasks: so that sums stay the same."""
+    """Yield the results of `run_unordered` in the order of the tasks, which keeps sums the same."""
     numbered = ((number, function, task) for number, task in enumerate(tasks))
     early: dict[int, Result] = {}
     following = 0
@@ -141,18 +120,18 @@ def _numbered(
 
 
 def require_shared(jobs: Jobs, paths: Iterable[Place]) -> None:
-    """Raise `SlatprepError` unless all workers see these files; those of this machine do."""
+    """Raise `SlatprepError` unless all workers see these files; local ones always do."""
     if not isinstance(jobs, int):
         jobs.require_shared(paths)
 
 
 def at_most(most: int, jobs: Jobs) -> Jobs:
-    """Return a smaller number of processes where there is less work; never less than one."""
+    """Return fewer processes where there is less work, and at least one."""
     return max(1, min(jobs, most)) if isinstance(jobs, int) else jobs
 
 
 class _Processes(Pool):
-    """Processes of this machine, which stay for whatever is run next."""
+    """Processes of this machine, kept for the next call."""
 
     def __init__(self, number: int) -> None:
         from joblib.externals.loky.process_executor import BrokenProcessPool
@@ -161,11 +140,11 @@ class _Processes(Pool):
         self._number = number
 
     def room(self) -> int:
-        """Return a call for each process, and one for it to begin with next."""
+        """Return a call for each process, and one more for each to begin with next."""
         return 2 * self._number
 
     def submit(self, call: Callable[[], Any]) -> Future[Any]:
-        """Have a process make a call; new ones are started where one was killed."""
+        """Have a process make a call; new processes replace killed ones."""
         while True:
             try:
                 future: Future[Any] = self._executor().submit(call)
@@ -174,7 +153,7 @@ class _Processes(Pool):
                 continue
 
     def abandon(self, calls: Iterable[Future[Any]]) -> None:
-        """End the processes: whoever stops early does not want them to write any more."""
+        """End the processes: after an early stop they must not write any more."""
         # Loky's own thread fails on calls that it has not yet passed on to the processes.
         while not all(call.running() or call.done() for call in calls):
             time.sleep(0.001)
@@ -205,7 +184,7 @@ def _end_with(parent: int) -> None:
 
 @contextmanager
 def single_threaded() -> Iterator[None]:
-    """Hold the numeric libraries to one thread each, loaded already or loaded within."""
+    """Hold the numeric libraries to one thread each, whether loaded before or within."""
     before = {name: os.environ.get(name) for name in THREAD_VARIABLES}
     os.environ.update(dict.fromkeys(THREAD_VARIABLES, "1"))
     try:
@@ -221,7 +200,7 @@ def single_threaded() -> Iterator[None]:
 
 @lru_cache(maxsize=1)
 def _thread_pools(modules: int) -> ThreadpoolController:
-    """Find the loaded libraries, which takes 1 to 4 ms; again where modules were imported since."""
+    """Find the loaded libraries in 1 to 4 ms; search again after further imports."""
     from threadpoolctl import ThreadpoolController
 
     return ThreadpoolController()

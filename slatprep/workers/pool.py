@@ -1,4 +1,4 @@
-"""Tasks handed to a pool of workers, in batches; what a killed worker had is done again, alone."""
+"""Tasks given to a pool of workers in batches; a killed worker's tasks run again, alone."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ class Pool(ABC):
 
     @abstractmethod
     def room(self) -> int:
-        """Return how many calls may be under way, waiting ones included."""
+        """Return how many calls may be under way, including waiting ones."""
 
     @abstractmethod
     def submit(self, call: Callable[[], Any]) -> Future[Any]:
@@ -43,14 +43,14 @@ class Pool(ABC):
 
     @abstractmethod
     def abandon(self, calls: Iterable[Future[Any]]) -> None:
-        """Drop the calls that are under way, all of them given."""
+        """Drop the given calls, which are all that are under way."""
 
     def batch_seconds(self) -> float:
         """Return how long a batch should take [s]; 0 for one task a batch."""
         return _BATCH_SECONDS
 
     def check(self) -> None:  # noqa: B027 -- nothing to ask where lost calls raise by themselves
-        """Raise if no answer can come any more; asked every second while none comes."""
+        """Raise if no answer can come any more; asked every second without an answer."""
 
 
 def run_in_pools(
@@ -60,17 +60,10 @@ def run_in_pools(
     tasks: Iterable[Task],
     died: Callable[..., Result] | None,
 ) -> Iterator[Result]:
-    """Do what `slatprep.workers.local.run_unordered` promises.
+    """Run tasks as `slatprep.workers.local.run_unordered` does, those of killed workers in `alone`.
 
-    A killed worker takes down, or brings under suspicion, whatever else waited
-    beside it. So all of that is done again at the end, a task at a time.
-
-    Parameters
-    ----------
-    pool, alone : Pool
-        Where tasks are done, and where one at a time is that was with a killed worker.
-    function, tasks, died
-        As `slatprep.workers.local.run_unordered` takes them.
+    A killed worker takes down, or makes suspect, all calls that waited beside it. All of them run
+    again at the end, one at a time.
     """
     suspects: list[Task] = []
     yield from _attempt(pool, function, tasks, suspects)
@@ -89,7 +82,7 @@ def run_in_pools(
 def _attempt(
     pool: Pool, function: Callable[..., Result], tasks: Iterable[Task], suspects: list[Task]
 ) -> Iterator[Result]:
-    """Yield results as they come; add the tasks that were with a killed worker to `suspects`."""
+    """Yield results as they come; add the tasks of a killed worker to `suspects`."""
     source = iter(tasks)
     given_back: deque[Task] = deque()
     under_way: dict[Future[Any], list[Task]] = {}
@@ -146,9 +139,9 @@ def _do_batch(
 ) -> tuple[list[Result], float]:
     """Return the results of the first task and of those that follow in time, and the time taken.
 
-    What is left is handed out again, so that no task waits for long behind a
-    slow one. So is a task that raises, unless it is the first: its error then
-    arrives as it is, after the results of those before it.
+    The rest is handed out again, so that no task waits long behind a slow one. A task that raises
+    is handed out again, too, unless it is the first. Its error then arrives after the results of
+    those before it.
     """
     begin = time.perf_counter()
     results: list[Result] = []

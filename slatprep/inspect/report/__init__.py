@@ -75,8 +75,8 @@ class ReportSummary:
 class Drawn:
     """An asset of the store as drawn: thumbnail, and voxels by level of detail.
 
-    For merged labels, ``votes`` is the mean share of votes for a voxel's class, and ``spreads`` has
-    the mean spread of each normalised property, NaN where a single annotation has it.
+    For merged labels, ``votes`` is the mean share of votes for a voxel's class. ``spreads`` has the
+    mean spread of each normalised property, NaN where a single annotation has it.
     """
 
     index: int
