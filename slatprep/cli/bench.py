@@ -5,33 +5,39 @@ from __future__ import annotations
 import tempfile
 from operator import attrgetter
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated, Any
 
 import click
 
-from slatprep.cli.options import FOLDER, POSITIVE, ChoiceOf, command, option, store_argument
+from slatprep.cli.options import ChoiceOf, Folder, LastStore, Positive
 from slatprep.cli.output import Output
+from slatprep.cli.signature import Click, command
 from slatprep.storage.place import storage_of
 
 if TYPE_CHECKING:
     from slatprep.bench.align import AlignBench
     from slatprep.bench.read import ReadBench
-    from slatprep.records import Place
 
 
 @command("align")
-@option("--data", FOLDER)
-@option("--engine", ChoiceOf("slatprep.bench.align:ENGINES"), name="engines", multiple=True)
-@option("--assets", POSITIVE)
-@option("--repeats", POSITIVE, 3)
-@option("--seed", int, 0)
 def align(
     output: Output,
-    data: Path | None,
-    engines: tuple[str, ...],
-    assets: int | None,
-    repeats: int,
-    seed: int,
+    *,
+    data: Annotated[
+        Folder | None,
+        "Folder with pixieverse/, slat/ and truth/, or of such folders. [default: demo data]",
+    ] = None,
+    engines: Annotated[
+        tuple[Any, ...],
+        ChoiceOf("slatprep.bench.align:ENGINES"),
+        "Engine to measure; may be repeated. [default: all that are installed]",
+        Click("--engine"),
+    ] = (),
+    assets: Annotated[
+        Positive | None, "Most assets of each folder. [default: 25 of the demo, all of --data]"
+    ] = None,
+    repeats: Annotated[Positive, "Number of measurements."] = 3,
+    seed: Annotated[int, "Seed of the demo data."] = 0,
 ) -> None:
     """Align assets with known truth by each engine; print accuracy and time.
 
@@ -41,14 +47,6 @@ def align(
     from the same rotations, cpd-affine and cpd-deformable Coherent Point Drift
     from them, field the default engine. All but the last need extras of
     slatprep: pip install 'slatprep[bench,paper]'.
-
-    Options
-    -------
-    --data: Folder with pixieverse/, slat/ and truth/, or of such folders. [default: demo data]
-    --engine: Engine to measure; may be repeated. [default: all that are installed]
-    --assets: Most assets of each folder. [default: 25 of the demo, all of --data]
-    --repeats: Number of measurements.
-    --seed: Seed of the demo data.
 
     Example
     -------
@@ -109,22 +107,19 @@ def _show_align(output: Output, result: AlignBench) -> None:
 
 
 @command("read")
-@store_argument
-@option("--assets", POSITIVE)
-@option("--repeats", POSITIVE, 5)
-@option("--seed", int, 0)
-def read(output: Output, store: Place, assets: int | None, repeats: int, seed: int) -> None:
+def read(
+    output: Output,
+    store: LastStore,
+    *,
+    assets: Annotated[Positive | None, "Most assets to read. [default: all]"] = None,
+    repeats: Annotated[Positive, "Number of measurements."] = 5,
+    seed: Annotated[int, "Seed of the order of reading."] = 0,
+) -> None:
     """Read shuffled whole assets (coords, feats, properties) as training does.
 
     Compares slatprep's reader with npz (one file an asset, plain and
     compressed), one HDF5 file, zarr-python, and zarrs and tensorstore where
     they are installed. 'cold' is after asking the system to drop the files from its cache.
-
-    Options
-    -------
-    --assets: Most assets to read. [default: all]
-    --repeats: Number of measurements.
-    --seed: Seed of the order of reading.
 
     Example
     -------

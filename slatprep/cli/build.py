@@ -3,21 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 from slatprep.cli.info import show_quality
 from slatprep.cli.options import (
-    NEW_FILE,
-    PLACE,
-    RECORDS_FOLDER,
-    command,
-    option,
-    parameters_of,
-    source_options,
-    workers_options,
+    NewFile,
+    PathOrUrl,
+    RecordsFolder,
+    SourceOptions,
+    WorkersOptions,
 )
 from slatprep.cli.output import Output, say
+from slatprep.cli.signature import Click, command
 
 if TYPE_CHECKING:
     from slatprep.parameters import BuildParameters
@@ -31,19 +28,38 @@ DAMAGES_LISTED = 10
 
 
 @command("build-store")
-@source_options
-@option("--out", PLACE, required=True, metavar="STORE.zarr")
-@option("--manifests", RECORDS_FOLDER)
-@option("--strict", is_flag=True)
-@option("--consensus", is_flag=True)
-@option("--witness", is_flag=True)
-@option("--fresh", is_flag=True)
-@option("--rehash", is_flag=True)
-@option("--compact", is_flag=True)
-@option("--keep-work", is_flag=True)
-@option("--dry-run", is_flag=True)
-@workers_options
-def build_store(output: Output, out: Path, dry_run: bool, **options: Any) -> None:
+def build_store(
+    output: Output,
+    *,
+    sources: SourceOptions,
+    out: Annotated[
+        PathOrUrl,
+        "The store, a path or URL; an existing store is updated, and replaced in one step.",
+        Click(metavar="STORE.zarr"),
+    ],
+    manifests: Annotated[
+        RecordsFolder | None, "Folder for the records. [default: beside the store]"
+    ] = None,
+    strict: Annotated[bool, "Stop at the first asset that cannot be built."] = False,
+    consensus: Annotated[bool, "Settle ties by the rotation that most assets share."] = False,
+    witness: Annotated[
+        bool, "Settle ties by comparing latents, and name assets whose labels they contradict."
+    ] = False,
+    fresh: Annotated[bool, "Reuse nothing from an earlier build."] = False,
+    rehash: Annotated[
+        bool, "Hash all sources, also those whose size, times and inode did not change."
+    ] = False,
+    compact: Annotated[
+        bool, "Order rows by id, as a first build does; an update appends new assets."
+    ] = False,
+    keep_work: Annotated[
+        bool,
+        "Keep all assets' arrays beside the store, about 1 MB each, so that an update that packs "
+        "all assets again does not read their sources.",
+    ] = False,
+    dry_run: Annotated[bool, "Print what would be done, and why; write nothing."] = False,
+    workers: WorkersOptions,
+) -> None:
     """Build one store of aligned, normalised supervision, or bring it up to date.
 
     Pairs the assets of both sides by id, aligns them, looks the material and
@@ -54,20 +70,6 @@ def build_store(output: Output, out: Path, dry_run: bool, **options: Any) -> Non
     Assets whose sources, parameters and code did not change are not aligned
     again: their rows are reused. An interrupted build is resumed.
 
-    Options
-    -------
-    --out: The store, a path or URL; an existing store is updated, and replaced in one step.
-    --manifests: Folder for the records. [default: beside the store]
-    --strict: Stop at the first asset that cannot be built.
-    --consensus: Settle ties by the rotation that most assets share.
-    --witness: Settle ties by comparing latents, and name assets whose labels they contradict.
-    --fresh: Reuse nothing from an earlier build.
-    --rehash: Hash all sources, also those whose size, times and inode did not change.
-    --compact: Order rows by id, as a first build does; an update appends new assets.
-    --keep-work: Keep all assets' arrays beside the store, about 1 MB each, so that an update
-        that packs all assets again does not read their sources.
-    --dry-run: Print what would be done, and why; write nothing.
-
     Example
     -------
     slatprep build-store --pixieverse demo/pixieverse --slat demo/slat --out demo.zarr --jobs 2
@@ -76,48 +78,63 @@ def build_store(output: Output, out: Path, dry_run: bool, **options: Any) -> Non
     slatprep build-store --config manifests/demo.toml --out data/demo.zarr --dry-run
     slatprep build-store --config manifests/demo.toml --out data/demo.zarr --scheduler tcp://node7:8786
     """
-    parameters = parameters_of(options)
+    parameters = sources.parameters(consensus=consensus, witness=witness)
     from slatprep.pipeline import dataset as build
 
-    if dry_run:
-        with output.progress("compare") as progress:
-            chosen = {name: options[name] for name in ("jobs", "fresh", "rehash")}
-            plan = build.plan_build(parameters, out, progress=progress, **chosen)
-        _show_plan(output, plan)
-        return
-    with output.progress("build") as progress:
-        summary = build.build_store(
-            parameters, out, progress=progress, **_by_work(output, parameters), **options
-        )
+    with workers.started(output) as jobs:
+        if dry_run:
+            with output.progress("compare") as progress:
+                plan = build.plan_build(
+                    parameters, out, jobs=jobs, fresh=fresh, rehash=rehash, progress=progress
+                )
+            _show_plan(output, plan)
+            return
+        with output.progress("build") as progress:
+            summary = build.build_store(
+                parameters,
+                out,
+                manifests=manifests,
+                jobs=jobs,
+                strict=strict,
+                fresh=fresh,
+                rehash=rehash,
+                compact=compact,
+                keep_work=keep_work,
+                progress=progress,
+                **_by_work(output, parameters),
+            )
     report(output, summary)
 
 
 @command()
-@source_options
-@option("--out", NEW_FILE, required=True, metavar="FILE.jsonl")
-@option("--strict", is_flag=True)
-@workers_options
-def align(output: Output, out: Path, **options: Any) -> None:
+def align(
+    output: Output,
+    *,
+    sources: SourceOptions,
+    out: Annotated[NewFile, "The file, with a record on each line.", Click(metavar="FILE.jsonl")],
+    strict: Annotated[bool, "Stop at the first asset that cannot be aligned."] = False,
+    workers: WorkersOptions,
+) -> None:
     """Align without building a store.
 
     Writes a JSON record for each asset: the transform, its quality, and the
     score of every candidate.
 
-    Options
-    -------
-    --out: The file, with a record on each line.
-    --strict: Stop at the first asset that cannot be aligned.
-
     Example
     -------
     slatprep align --pixieverse demo/pixieverse --slat demo/slat --out demo.jsonl --jobs 2
     """
-    parameters = parameters_of(options)
+    parameters = sources.parameters()
     from slatprep.pipeline import dataset as build
 
-    with output.progress("align") as progress:
+    with workers.started(output) as jobs, output.progress("align") as progress:
         summary = build.align_pairs(
-            parameters, out, progress=progress, **_by_work(output, parameters), **options
+            parameters,
+            out,
+            jobs=jobs,
+            strict=strict,
+            progress=progress,
+            **_by_work(output, parameters),
         )
     report(output, summary)
 

@@ -5,22 +5,21 @@ from __future__ import annotations
 import dataclasses
 from itertools import zip_longest
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import click
 
 from slatprep.cli.options import (
-    NEW_PATH,
-    POSITIVE,
+    AssetIds,
+    Jobs,
+    NewFileOrFolder,
+    Positive,
+    StoreOption,
     beside,
     chosen_store,
-    command,
-    complete_asset,
-    jobs_option,
-    option,
-    store_option,
 )
 from slatprep.cli.output import Output, say
+from slatprep.cli.signature import Click, command
 
 if TYPE_CHECKING:
     from slatprep.inspect.check import AlignmentCheck
@@ -39,22 +38,26 @@ _COLUMNS = {
 
 
 @command("check-alignment")
-@option("--asset", name="asset_ids", multiple=True, metavar="ID", shell_complete=complete_asset)
-@option("--worst", POSITIVE)
-@option("--ambiguous", is_flag=True)
-@store_option
-@option("--picture", NEW_PATH, metavar="PATH|none")
-@option("--show", is_flag=True)
-@jobs_option
 def check_alignment(
     output: Output,
-    asset_ids: tuple[str, ...],
-    worst: int | None,
-    ambiguous: bool,
-    store: Place | None,
-    picture: Path | None,
-    show: bool,
-    jobs: int,
+    *,
+    asset_ids: Annotated[AssetIds, "An asset; may be repeated."] = (),
+    worst: Annotated[
+        Positive | None,
+        "The N worst assets: failed ones first, then doubtful ones, each by confidence.",
+    ] = None,
+    ambiguous: Annotated[
+        bool, "Assets whose ties would change the class of more than 5 % of the voxels."
+    ] = False,
+    store: StoreOption | None = None,
+    picture: Annotated[
+        NewFileOrFolder | None,
+        "A .png, .svg or .pdf for one asset, else a folder. [default: NAME.pictures beside the "
+        "store]",
+        Click(metavar="PATH|none"),
+    ] = None,
+    show: Annotated[bool, "Open it in Open3D's viewer, if there is a screen."] = False,
+    jobs: Jobs = 1,
 ) -> None:
     """Check whether the alignment of an asset is good, and draw it.
 
@@ -62,15 +65,6 @@ def check_alignment(
     stored figures. A picture shows both sides before and after from three
     directions, the error of every voxel, the scores of the candidates and the
     verdict. --asset, --worst and --ambiguous may be combined.
-
-    Options
-    -------
-    --asset: An asset; may be repeated.
-    --worst: The N worst assets: failed ones first, then doubtful ones, each by confidence.
-    --ambiguous: Assets whose ties would change the class of more than 5 % of the voxels.
-    --picture: A .png, .svg or .pdf for one asset, else a folder. [default: NAME.pictures beside
-        the store]
-    --show: Open it in Open3D's viewer, if there is a screen.
 
     Exit codes
     ----------

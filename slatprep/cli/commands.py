@@ -11,44 +11,56 @@ import click
 from slatprep.cli.output import EXIT_INCOMPLETE, EXIT_INTERRUPTED, EXIT_USAGE, say
 from slatprep.errors import ConfigError, SlatprepError
 
-COMMANDS = {
-    "make-demo": "slatprep.cli.demo:make_demo",
-    "build-store": "slatprep.cli.build:build_store",
-    "align": "slatprep.cli.build:align",
-    "check-alignment": "slatprep.cli.check:check_alignment",
-    "verify": "slatprep.cli.verify:verify",
-    "info": "slatprep.cli.info:info",
-    "list": "slatprep.cli.list:list_assets",
-    "stats": "slatprep.cli.stats:stats",
-    "diff": "slatprep.cli.diff:diff",
-    "subset": "slatprep.cli.join:subset",
-    "concat": "slatprep.cli.join:concat",
-    "upgrade": "slatprep.cli.join:upgrade",
-    "report": "slatprep.cli.report:report",
-    "score": "slatprep.cli.score:score",
-    "export": "slatprep.cli.export:export",
-    "extract-slat": "slatprep.cli.extract:extract_slat",
-    "decode-slat": "slatprep.cli.extract:decode_slat",
-    "transfer": "slatprep.cli.transfer:transfer",
-    "describe": "slatprep.cli.describe:describe",
-    "publish": "slatprep.cli.publish:publish",
-    "train": "slatprep.cli.train:train",
-    "predict": "slatprep.cli.predict:predict",
-    "evaluate": "slatprep.cli.evaluate:evaluate",
-    "bench": "slatprep.cli.bench:bench",
+GROUPS = {
+    "Make and build": {
+        "make-demo": "slatprep.cli.demo:make_demo",
+        "extract-slat": "slatprep.cli.extract:extract_slat",
+        "build-store": "slatprep.cli.build:build_store",
+        "align": "slatprep.cli.build:align",
+        "subset": "slatprep.cli.join:subset",
+        "concat": "slatprep.cli.join:concat",
+    },
+    "Look and check": {
+        "info": "slatprep.cli.info:info",
+        "list": "slatprep.cli.list:list_assets",
+        "stats": "slatprep.cli.stats:stats",
+        "report": "slatprep.cli.report:report",
+        "check-alignment": "slatprep.cli.check:check_alignment",
+        "score": "slatprep.cli.score:score",
+    },
+    "Take elsewhere": {
+        "export": "slatprep.cli.export:export",
+        "transfer": "slatprep.cli.transfer:transfer",
+        "decode-slat": "slatprep.cli.extract:decode_slat",
+        "describe": "slatprep.cli.describe:describe",
+        "publish": "slatprep.cli.publish:publish",
+    },
+    "Learn": {
+        "train": "slatprep.cli.train:train",
+        "predict": "slatprep.cli.predict:predict",
+        "evaluate": "slatprep.cli.evaluate:evaluate",
+    },
+    "Maintain": {
+        "verify": "slatprep.cli.verify:verify",
+        "diff": "slatprep.cli.diff:diff",
+        "upgrade": "slatprep.cli.join:upgrade",
+        "bench": "slatprep.cli.bench:bench",
+    },
 }
-"""Name of each command and its function; to add a command, add its line here.
+"""Commands by what people do; to add a command, add its name and function here.
 
 `slatprep --help` imports all these modules, so they import heavy packages only when a command
 runs.
 """
+
+COMMANDS = {name: where for group in GROUPS.values() for name, where in group.items()}
 
 
 class LazyGroup(click.Group):
     """A group that imports a command when it is used, and prints errors in one line."""
 
     def list_commands(self, ctx: click.Context) -> list[str]:
-        """Return the names in the order of the table, which is the order of use."""
+        """Return the names in the order of the table."""
         return list(COMMANDS)
 
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
@@ -63,14 +75,17 @@ class LazyGroup(click.Group):
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         """Write what each command does, in as many lines as that takes: click cuts it to one."""
-        with formatter.section("Commands"):
-            formatter.write_dl(
-                [
-                    (name, command.get_short_help_str(limit=1_000))
-                    for name in self.list_commands(ctx)
-                    if (command := self.get_command(ctx, name))
-                ]
-            )
+        widest = max(map(len, COMMANDS))
+        for group, names in GROUPS.items():
+            commands = ((name, self.get_command(ctx, name)) for name in names)
+            with formatter.section(group):
+                formatter.write_dl(
+                    [
+                        (name.ljust(widest), one.get_short_help_str(limit=1_000))
+                        for name, one in commands
+                        if one
+                    ]
+                )
 
     def resolve_command(
         self, ctx: click.Context, args: list[str]

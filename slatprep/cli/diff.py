@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated
 
-import click
-
-from slatprep.cli.options import EXISTING_FOLDER, POSITIVE, command, jobs_option, option
+from slatprep.cli.options import FolderOrUrl, Jobs, Positive
 from slatprep.cli.output import Cell, Output, say
+from slatprep.cli.signature import Click, command
 from slatprep.errors import ConfigError, StoreError
 
 if TYPE_CHECKING:
     from slatprep.inspect.difference import AssetChange, PropertyChange, StoreDifference
-    from slatprep.records import Place
 
 _SHOWN = 20
 _COLUMNS = 3
@@ -23,21 +21,24 @@ _VALUE = 20
 
 
 @command()
-@click.argument("a", type=EXISTING_FOLDER)
-@click.argument("b", type=EXISTING_FOLDER)
-@option("--worst", POSITIVE, metavar="N")
-@jobs_option
-def diff(output: Output, a: Place, b: Place, worst: int | None, jobs: int) -> None:
+def diff(
+    output: Output,
+    a: FolderOrUrl,
+    b: FolderOrUrl,
+    *,
+    worst: Annotated[
+        Positive | None,
+        "Number of changed assets to list, those with most changed labels first. [default: 20; "
+        "with --json all]",
+        Click(metavar="N"),
+    ] = None,
+    jobs: Jobs = 1,
+) -> None:
     """Show what changed from store A to store B, in total and by asset.
 
     Lists assets in only one of the stores; changed sources, verdicts, placements, labels,
     properties in SI units and latents of assets in both; and different ranges, parameters
     and versions.
-
-    Options
-    -------
-    --worst: Number of changed assets to list, those with most changed labels first.
-        [default: 20; with --json all]
 
     Exit codes
     ----------

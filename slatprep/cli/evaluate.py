@@ -5,21 +5,20 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Annotated, Any, cast
 
 import click
 
 from slatprep.cli.options import (
-    EXISTING_FOLDER,
-    NEW_FILE,
     ChoiceOf,
-    command,
+    FileOrFolder,
+    FolderOrUrl,
+    NewFile,
+    SplitOptions,
     note_split,
-    option,
-    split_options,
-    split_rule,
 )
 from slatprep.cli.output import Output, write_csv
+from slatprep.cli.signature import Click, command
 
 if TYPE_CHECKING:
     from slatprep.learn.compare import Comparison
@@ -32,27 +31,37 @@ _LISTED = 10
 
 
 @command()
-@click.argument("predictions", required=False, type=click.Path(path_type=Path, exists=True))
-@option("--store", EXISTING_FOLDER, required=True, metavar="STORE.zarr")
-@option("--grids", multiple=True, metavar="[NAME=]DIR")
-@option("--split", ChoiceOf("slatprep.readers.splits:SPLITS", "all"), "test")
-@split_options
-@option("--spread", ChoiceOf("slatprep.learn.metrics:SPREADS"), "se")
-@option("--csv", NEW_FILE, name="csv_file")
-@option("--picture", NEW_FILE)
-@option("--beside", metavar="pixie|slat-phys|FILE.csv", multiple=True)
 def evaluate(
     output: Output,
-    predictions: Path | None,
-    store: Place,
-    grids: tuple[str, ...],
-    split: Any,
-    split_by: str | None,
-    shares: str | None,
-    spread: Any,
-    csv_file: Path | None,
-    picture: Path | None,
-    beside: tuple[str, ...],
+    predictions: FileOrFolder | None = None,
+    *,
+    store: Annotated[FolderOrUrl, "The store with the labels.", Click(metavar="STORE.zarr")],
+    grids: Annotated[
+        tuple[str, ...],
+        "Grids predicted by Pixie or another method: DIR/ID/sample_0_pred.npy, of 11 or 4 "
+        "channels; may be repeated. They are measured on their own voxels and looked up at the "
+        "SLAT's, on the same objects as PREDICTIONS, which may be left out.",
+        Click(metavar="[NAME=]DIR"),
+    ] = (),
+    split: Annotated[
+        Any, ChoiceOf("slatprep.readers.splits:SPLITS", "all"), "Only objects of this split."
+    ] = "test",
+    splits: SplitOptions,
+    spread: Annotated[
+        Any,
+        ChoiceOf("slatprep.learn.metrics:SPREADS"),
+        "Standard error or standard deviation over objects, or what Pixie prints.",
+    ] = "se",
+    csv_file: Annotated[
+        NewFile | None, "Also write the table to this file.", Click("--csv")
+    ] = None,
+    picture: Annotated[NewFile | None, "With --grids, also draw the table as a PNG."] = None,
+    beside: Annotated[
+        tuple[str, ...],
+        "Also print the published scores of Pixie (with NeRF2Physics) or of SLAT-Phys, or a CSV "
+        "with names in the first column and columns named as here; may be repeated.",
+        Click(metavar="pixie|slat-phys|FILE.csv"),
+    ] = (),
 ) -> None:
     """Measure PREDICTIONS by Pixie's protocol.
 
@@ -63,19 +72,6 @@ def evaluate(
     over valid voxels, then over objects. The exit code is 1 if an asset of
     the split has no prediction. Beside the run.json of a training, the split
     is that of the run, unless --split-by or --shares is given.
-
-    Options
-    -------
-    --store: The store with the labels.
-    --grids: Grids predicted by Pixie or another method: DIR/ID/sample_0_pred.npy, of 11 or 4
-        channels; may be repeated. They are measured on their own voxels and looked up at the
-        SLAT's, on the same objects as PREDICTIONS, which may be left out.
-    --split: Only objects of this split.
-    --spread: Standard error or standard deviation over objects, or what Pixie prints.
-    --csv: Also write the table to this file.
-    --picture: With --grids, also draw the table as a PNG.
-    --beside: Also print the published scores of Pixie (with NeRF2Physics) or of SLAT-Phys, or a
-        CSV with names in the first column and columns named as here; may be repeated.
 
     Example
     -------
@@ -98,7 +94,7 @@ def evaluate(
     others = {
         name: TABLES[name][1] if name in TABLES else read_scores(Path(name)) for name in beside
     }
-    chosen = _selection(output, predictions, store, split, split_by, shares)
+    chosen = _selection(output, predictions, store, split, splits)
     chosen["spread"] = spread
     part = None if split == "all" else split
     result: Evaluation | Comparison
@@ -171,23 +167,21 @@ def _selection(
     predictions: Path | None,
     store: Place,
     split: str,
-    split_by: str | None,
-    shares: str | None,
+    options: SplitOptions,
 ) -> dict[str, Any]:
     """Return the split of each object and which assets count, by the options or else by a run."""
     from slatprep.learn.predictions import RUN_FILE, selection_of_run
     from slatprep.learn.splits import assign_store
     from slatprep.store import open_store
 
-    rule = split_rule(split_by, shares)
-    how, is_given = f"by {rule['by']}", split_by is not None or shares is not None
+    rule, how = options.rule, f"by {options.rule['by']}"
     selection: dict[str, Any] | None = None
-    if predictions is not None and not is_given:
+    if predictions is not None and not options.given:
         selection = selection_of_run(predictions)
     if predictions is not None and selection is not None:
         rule |= {name: selection.pop(name) for name in ("by", "shares") if name in selection}
         how = f"as {predictions.absolute().parent / RUN_FILE} says"
-    elif not is_given:
+    elif not options.given:
         how += ", as no run lies beside the predictions (others: --split-by, --split all)"
     assignment = assign_store(open_store(store), **rule)
     note_split(output, assignment, f"{split}, {how}")

@@ -2,27 +2,23 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-from typing import TYPE_CHECKING, Any
-
-import click
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Annotated, Any
 
 from slatprep.cli.options import (
-    EXISTING_FOLDER,
-    NEW_PATH,
-    POSITIVE,
+    AssetIds,
     ChoiceOf,
-    command,
-    complete_asset,
-    jobs_option,
+    FolderOrUrl,
+    Jobs,
+    NewFileOrFolder,
+    Positive,
+    SplitOptions,
+    UsableVerdicts,
     note_left_out,
     note_split,
-    option,
-    split_options,
-    split_rule,
-    verdicts_option,
 )
 from slatprep.cli.output import Cell, Output
+from slatprep.cli.signature import Click, command
 from slatprep.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -38,46 +34,54 @@ _ONLY_FOR = {
 
 
 @command()
-@click.argument("store", type=EXISTING_FOLDER)
-@option("--format", ChoiceOf("slatprep.export:FORMATS"), name="kind", required=True)
-@option("--out", NEW_PATH, required=True, metavar="PATH")
-@option("--asset", name="assets", multiple=True, metavar="ID", shell_complete=complete_asset)
-@verdicts_option
-@option("--split", ChoiceOf("slatprep.readers.splits:SPLITS", "all"), "all")
-@split_options
-@option("--points", ChoiceOf("slatprep.export.formats:Points"))
-@option("--frame", ChoiceOf("slatprep.export.formats:Frame"))
-@option("--shard-size", POSITIVE)
-@option("--latent-model", metavar="NAME")
-@jobs_option
 def export(
     output: Output,
-    store: Place,
-    kind: Any,
-    out: Path,
-    split: Any,
-    split_by: str | None,
-    shares: str | None,
-    **others: Any,
+    store: FolderOrUrl,
+    *,
+    kind: Annotated[
+        Any,
+        ChoiceOf("slatprep.export:FORMATS"),
+        "Point clouds with Pixie's fields, one HDF5 file, tar shards, the files of TRELLIS's "
+        "dataset (npz and metadata.csv) with the targets added, or the npz of VoMP's scripts.",
+        Click("--format"),
+    ],
+    out: Annotated[
+        NewFileOrFolder,
+        "The file (hdf5) or folder (all others); an existing export is replaced when the new one "
+        "is complete.",
+        Click(metavar="PATH"),
+    ],
+    assets: Annotated[AssetIds, "An asset; may be repeated. [default: all]"] = (),
+    verdicts: UsableVerdicts = None,
+    split: Annotated[
+        Any,
+        ChoiceOf("slatprep.readers.splits:SPLITS", "all"),
+        "Only objects of this split, as `slatprep train` splits them.",
+    ] = "all",
+    splits: SplitOptions,
+    points: Annotated[
+        Any | None,
+        ChoiceOf("slatprep.export.formats:Points"),
+        "ply, voxel_data: SLAT voxels, or the voxels of the PixieVerse field. [default: slat]",
+    ] = None,
+    frame: Annotated[
+        Any | None,
+        ChoiceOf("slatprep.export.formats:Frame"),
+        "ply: the SLAT's unit cube, or PixieVerse's world coordinates. [default: slat]",
+    ] = None,
+    shard_size: Annotated[Positive | None, "webdataset: assets a shard. [default: 256]"] = None,
+    latent_model: Annotated[
+        str | None,
+        "npz: the encoder's name, latent_model in TRELLIS's configurations. [default: that of "
+        "TRELLIS's published configurations]",
+        Click(metavar="NAME"),
+    ] = None,
+    jobs: Jobs = 1,
 ) -> None:
     """Write assets of STORE in a format of other tools.
 
     Properties are in SI units in PLY and voxel_data, normalised in WebDataset
     and npz, and both in HDF5. Every folder gets an index.json of its contents.
-
-    Options
-    -------
-    --format: Point clouds with Pixie's fields, one HDF5 file, tar shards, the files of TRELLIS's
-        dataset (npz and metadata.csv) with the targets added, or the npz of VoMP's scripts.
-    --out: The file (hdf5) or folder (all others); an existing export is replaced when the new
-        one is complete.
-    --asset: An asset; may be repeated. [default: all]
-    --split: Only objects of this split, as `slatprep train` splits them.
-    --points: ply, voxel_data: SLAT voxels, or the voxels of the PixieVerse field. [default: slat]
-    --frame: ply: the SLAT's unit cube, or PixieVerse's world coordinates. [default: slat]
-    --shard-size: webdataset: assets a shard. [default: 256]
-    --latent-model: npz: the encoder's name, latent_model in TRELLIS's configurations. [default:
-        that of TRELLIS's published configurations]
 
     Example
     -------
@@ -89,7 +93,13 @@ def export(
     slatprep export data/demo.zarr --format voxel_data --out vomp --points grid
     slatprep export data/demo.zarr --format webdataset --out train --split train --split-by pixie
     """
-    options = {name: value for name in _ONLY_FOR if (value := others.pop(name)) is not None}
+    given: dict[str, Any] = {
+        "points": points,
+        "frame": frame,
+        "shard_size": shard_size,
+        "latent_model": latent_model,
+    }
+    options = {name: value for name, value in given.items() if value is not None}
     for name in options:
         if kind not in _ONLY_FOR[name]:
             flag = f"--{name.replace('_', '-')}"
@@ -97,15 +107,24 @@ def export(
     from slatprep.export import ExportOptions, export_store
     from slatprep.store import open_store
 
-    if others["verdicts"] is None and not others["assets"]:
+    if verdicts is None and not assets:
         note_left_out(output, open_store(store))
+    chosen: tuple[Sequence[str], Sequence[str] | None] = (assets, verdicts)
     if split != "all":
-        others |= _of_split(output, store, split, split_rule(split_by, shares), **others)
-    elif split_by is not None or shares is not None:
+        chosen = _of_split(output, store, split, splits.rule, assets, verdicts)
+    elif splits.given:
         raise ConfigError("--split-by and --shares define splits; choose one with --split")
     with output.progress("export") as progress:
-        chosen = ExportOptions(**options)
-        summary = export_store(store, out, kind, options=chosen, progress=progress, **others)
+        summary = export_store(
+            store,
+            out,
+            kind,
+            assets=chosen[0],
+            verdicts=chosen[1],
+            options=ExportOptions(**options),
+            jobs=jobs,
+            progress=progress,
+        )
 
     cells: dict[str, Cell] = {
         "format": summary.format,
@@ -125,10 +144,9 @@ def _of_split(
     place: Place,
     split: Any,
     rule: dict[str, Any],
-    assets: Any,
-    verdicts: Any,
-    **_: Any,
-) -> dict[str, Any]:
+    assets: Sequence[str],
+    verdicts: Sequence[str] | None,
+) -> tuple[list[str], Sequence[str]]:
     """Return the assets of a split and the verdicts that may go out."""
     from slatprep.learn.splits import assign_store, select_assets
     from slatprep.records import USABLE
@@ -142,7 +160,4 @@ def _of_split(
     rows = select_assets(store, split, splits=assignment.splits)
     if not len(rows):
         raise ConfigError(f"{store.path}: no asset is in the split {split}, by {rule['by']}")
-    return {
-        "assets": [store.ids[row] for row in rows],
-        "verdicts": USABLE if verdicts is None else verdicts,
-    }
+    return [store.ids[row] for row in rows], USABLE if verdicts is None else verdicts

@@ -2,53 +2,55 @@
 
 from __future__ import annotations
 
-import functools
 import time
 from collections.abc import Callable
-from pathlib import Path
-from typing import TYPE_CHECKING, TypeVar
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Annotated, TypeVar
 
 import click
 
-from slatprep.cli.latents import LatentsReader, standardised_option
-from slatprep.cli.options import FILE, NEW_FOLDER, PlaceType, command, option
+from slatprep.cli.latents import LatentsReader, Standardised
+from slatprep.cli.options import AssetIds, File, FileOrUrl, NewFolder
 from slatprep.cli.output import Output
+from slatprep.cli.signature import Click, command
 from slatprep.errors import InputError
 
 if TYPE_CHECKING:
-    from slatprep.records import Place
+    pass
 
 _Command = TypeVar("_Command", bound=Callable[..., object])
 
 
-def _model_options(command: _Command) -> _Command:
-    """Add the options for TRELLIS's model and its device."""
-    options = (
-        option("--model", text="Repository of the model, or its folder.",
-               default="microsoft/TRELLIS-image-large"),
-        option("--revision", text="Revision of the model.  [default: newest]", metavar="COMMIT"),
-        option("--device", text="Where to run it.", default="cuda"),
-    )  # fmt: skip
-    return functools.reduce(lambda decorated, add: add(decorated), reversed(options), command)
+@dataclass(frozen=True, kw_only=True)
+class ModelOptions:
+    """TRELLIS's model, and where it runs."""
+
+    model: Annotated[str, "Repository of the model, or its folder."] = (
+        "microsoft/TRELLIS-image-large"
+    )
+    revision: Annotated[
+        str | None, "Revision of the model. [default: newest]", Click(metavar="COMMIT")
+    ] = None
+    device: Annotated[str, "Where to run it."] = "cuda"
 
 
 @command("extract-slat")
-@click.argument("images", nargs=-1, required=True, type=FILE)
-@option("--out", NEW_FOLDER, required=True)
-@option("--seed", click.IntRange(min=0), (42,), name="seeds", multiple=True)
-@option("--by-folder", is_flag=True)
-@_model_options
-@option("--no-preprocess", is_flag=True)
 def extract_slat(
     output: Output,
-    images: tuple[Path, ...],
-    out: Path,
-    seeds: tuple[int, ...],
-    by_folder: bool,
-    model: str,
-    revision: str | None,
-    device: str,
-    no_preprocess: bool,
+    images: tuple[File, ...],
+    *,
+    out: Annotated[NewFolder, "Folder of the latents, which build-store takes as --slat."],
+    seeds: Annotated[
+        tuple[int, ...],
+        click.IntRange(min=0),
+        "Seed of the sampling; may be repeated, each seed gives a view.",
+        Click("--seed"),
+    ] = (42,),
+    by_folder: Annotated[bool, "Images are named <id>/<view>, not <id>."] = False,
+    model: ModelOptions,
+    no_preprocess: Annotated[
+        bool, "The background is removed already, and the images are cropped."
+    ] = False,
 ) -> None:
     """Turn IMAGES into structured latents with TRELLIS's image pipeline.
 
@@ -56,13 +58,6 @@ def extract_slat(
     views, in the form that build-store reads, and a JSON beside it with
     image, seed, model and revision. Existing files are kept, so that a stopped
     run can be continued. TRELLIS itself must be installed.
-
-    Options
-    -------
-    --out: Folder of the latents, which build-store takes as --slat.
-    --seed: Seed of the sampling; may be repeated, each seed gives a view.
-    --by-folder: Images are named <id>/<view>, not <id>.
-    --no-preprocess: The background is removed already, and the images are cropped.
 
     Example
     -------
@@ -72,7 +67,7 @@ def extract_slat(
     from slatprep import extract as work
 
     extractions = work.list_extractions(images, out, seeds, by_folder)
-    session = work.load_session(model, revision, device)
+    session = work.load_session(model.model, model.revision, model.device)
     done, problems = [], []
     with output.progress("extract-slat") as progress:
         results = work.extract(session, extractions, preprocess=not no_preprocess)
@@ -95,31 +90,20 @@ def extract_slat(
 
 
 @command("decode-slat")
-@click.argument("source", type=PlaceType(path_type=Path, exists=True))
-@option("--out", NEW_FOLDER, required=True)
-@option("--asset", metavar="ID", name="assets", multiple=True)
-@standardised_option
-@_model_options
 def decode_slat(
     output: Output,
-    source: Place,
-    out: Path,
-    assets: tuple[str, ...],
-    standardised: str,
-    model: str,
-    revision: str | None,
-    device: str,
+    source: FileOrUrl,
+    *,
+    out: Annotated[NewFolder, "Folder of the Gaussians; files of other assets are kept."],
+    assets: Annotated[AssetIds, "Decode only this asset; may be repeated."] = (),
+    standardised: Standardised = "auto",
+    model: ModelOptions,
 ) -> None:
     """Decode the structured latents of SOURCE to Gaussians with TRELLIS's decoder.
 
     SOURCE is a SLAT (npz or HDF5), a folder of them, or a store. Each asset
     gives <id>.ply, as TRELLIS saves Gaussians, to which `slatprep transfer`
     gives materials. TRELLIS itself must be installed.
-
-    Options
-    -------
-    --out: Folder of the Gaussians; files of other assets are kept.
-    --asset: Decode only this asset; may be repeated.
 
     Example
     -------
@@ -131,7 +115,7 @@ def decode_slat(
     from slatprep.storage.names import file_name
 
     read = LatentsReader(output, source, assets, TRELLIS, standardised)
-    session = work.load_session(model, revision, device)
+    session = work.load_session(model.model, model.revision, model.device)
     begin, decoded = time.perf_counter(), 0
     with output.progress("decode-slat") as progress:
         for latents in read:

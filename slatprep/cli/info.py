@@ -5,17 +5,19 @@ from __future__ import annotations
 from operator import attrgetter
 from typing import TYPE_CHECKING
 
-from slatprep.cli.options import command, store_argument
+from slatprep.cli.options import LastStore
 from slatprep.cli.output import Cell, Output, say
+from slatprep.cli.signature import command
 
 if TYPE_CHECKING:
     from slatprep.inspect.overview import StoreOverview
-    from slatprep.records import Place
 
 
 @command()
-@store_argument
-def info(output: Output, store: Place) -> None:
+def info(
+    output: Output,
+    store: LastStore,
+) -> None:
     """Show what is in STORE, and how good its alignments are.
 
     Without STORE, the one that `make align` built last under data/ is taken.

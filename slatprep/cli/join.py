@@ -2,56 +2,48 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated
 
 import click
 
 from slatprep.cli.build import report
 from slatprep.cli.options import (
-    EXISTING_FOLDER,
-    PLACE,
-    RECORDS_FOLDER,
-    ChoiceOf,
-    command,
-    complete_asset,
-    option,
+    AssetIds,
+    Categories,
+    FolderOrUrl,
+    PathOrUrl,
+    RecordsFolder,
+    Verdicts,
     require_categories,
 )
 from slatprep.cli.output import Output, say
+from slatprep.cli.signature import Click, command
 
 if TYPE_CHECKING:
-    from slatprep.records import Place
+    pass
 
 
 @command()
-@click.argument("store", type=EXISTING_FOLDER)
-@option("--out", PLACE, required=True, metavar="STORE.zarr")
-@option("--asset", name="assets", multiple=True, metavar="ID", shell_complete=complete_asset)
-@option("--verdict", ChoiceOf("slatprep.records:Verdict"), name="verdicts", multiple=True)
-@option("--category", name="categories", multiple=True)
-@option("--manifests", RECORDS_FOLDER)
 def subset(
     output: Output,
-    store: Place,
-    out: Place,
-    assets: tuple[str, ...],
-    verdicts: tuple[str, ...],
-    categories: tuple[str, ...],
-    manifests: Path | None,
+    store: FolderOrUrl,
+    *,
+    out: Annotated[
+        PathOrUrl,
+        "The new store, a path or URL; an existing store is replaced in one step.",
+        Click(metavar="STORE.zarr"),
+    ],
+    assets: Annotated[AssetIds, "An asset; may be repeated."] = (),
+    verdicts: Annotated[Verdicts, "Assets with this verdict; may be repeated."] = (),
+    categories: Annotated[Categories, "Assets of this category; may be repeated."] = (),
+    manifests: Annotated[
+        RecordsFolder | None, "Folder for the records. [default: beside the new store]"
+    ] = None,
 ) -> None:
     """Make a store of some assets of STORE, without aligning them again.
 
     Rows, records and ranges are copied unchanged. Assets must have one of the verdicts and
     one of the categories; assets named by --asset are taken as well.
-
-    Options
-    -------
-    --out: The new store, a path or URL; an existing store is replaced in one step.
-    --asset: An asset; may be repeated.
-    --verdict: Assets with this verdict; may be repeated.
-    --category: Assets of this category; may be repeated.
-    --manifests: Folder for the records. [default: beside the new store]
 
     Example
     -------
@@ -75,20 +67,24 @@ def subset(
 
 
 @command()
-@click.argument("stores", type=EXISTING_FOLDER, nargs=-1, required=True)
-@option("--out", PLACE, required=True, metavar="STORE.zarr")
-@option("--manifests", RECORDS_FOLDER)
-def concat(output: Output, stores: tuple[Place, ...], out: Place, manifests: Path | None) -> None:
+def concat(
+    output: Output,
+    stores: tuple[FolderOrUrl, ...],
+    *,
+    out: Annotated[
+        PathOrUrl,
+        "The new store, a path or URL; an existing store is replaced in one step.",
+        Click(metavar="STORE.zarr"),
+    ],
+    manifests: Annotated[
+        RecordsFolder | None, "Folder for the records. [default: beside the new store]"
+    ] = None,
+) -> None:
     """Make one store of the assets of all STORES, without aligning them again.
 
     The stores must have been built with the same parameters, and no id may be in two
     of them. If each has the ranges of its own dataset, properties are converted to the
     ranges of all.
-
-    Options
-    -------
-    --out: The new store, a path or URL; an existing store is replaced in one step.
-    --manifests: Folder for the records. [default: beside the new store]
 
     Example
     -------
@@ -102,19 +98,23 @@ def concat(output: Output, stores: tuple[Place, ...], out: Place, manifests: Pat
 
 
 @command()
-@click.argument("store", type=EXISTING_FOLDER)
-@option("--out", PLACE, metavar="STORE.zarr")
-@option("--manifests", RECORDS_FOLDER)
-def upgrade(output: Output, store: Place, out: Place | None, manifests: Path | None) -> None:
+def upgrade(
+    output: Output,
+    store: FolderOrUrl,
+    *,
+    out: Annotated[
+        PathOrUrl | None,
+        "The new store, a path or URL. [default: STORE itself, replaced in one step]",
+        Click(metavar="STORE.zarr"),
+    ] = None,
+    manifests: Annotated[
+        RecordsFolder | None, "Folder for the records. [default: beside the new store]"
+    ] = None,
+) -> None:
     """Convert a STORE of an older format to today's, without aligning again.
 
     Its sources are not needed: places, confidences and verdicts are computed
     from the store, and all other rows are copied unchanged.
-
-    Options
-    -------
-    --out: The new store, a path or URL. [default: STORE itself, replaced in one step]
-    --manifests: Folder for the records. [default: beside the new store]
 
     Example
     -------

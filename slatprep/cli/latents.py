@@ -5,23 +5,18 @@ from __future__ import annotations
 import time
 from collections.abc import Iterator
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated, Literal
 
-import click
-
-from slatprep.cli.options import option
 from slatprep.cli.output import Output
 from slatprep.errors import ConfigError, InputError, StoreError
 
 if TYPE_CHECKING:
     from slatprep.records import LatentSpace, Place, StructuredLatents
 
-standardised_option = option(
-    "--standardised",
-    click.Choice(["auto", "yes", "no"]),
-    "auto",
+Standardised = Annotated[
+    Literal["auto", "yes", "no"],
     "Whether the latents of files are standardised already; auto: judged by their values.",
-)
+]
 
 
 class LatentsReader:

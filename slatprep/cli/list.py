@@ -2,40 +2,34 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated
 
-from slatprep.cli.options import ChoiceOf, command, option, require_categories, store_argument
+from slatprep.cli.options import Categories, LastStore, Verdicts, require_categories
 from slatprep.cli.output import Output, say
+from slatprep.cli.signature import command
 
 if TYPE_CHECKING:
-    from slatprep.records import Place
+    pass
 
 
 @command("list")
-@store_argument
-@option("--verdict", ChoiceOf("slatprep.records:Verdict"), name="verdicts", multiple=True)
-@option("--category", name="categories", multiple=True)
-@option("--max-confidence", float)
-@option("--ids", is_flag=True)
 def list_assets(
     output: Output,
-    store: Place,
-    verdicts: tuple[str, ...],
-    categories: tuple[str, ...],
-    max_confidence: float | None,
-    ids: bool,
+    store: LastStore,
+    *,
+    verdicts: Annotated[
+        Verdicts, "Only assets with this verdict; may be repeated. [default: all]"
+    ] = (),
+    categories: Annotated[
+        Categories, "Only assets of this category; may be repeated. [default: all]"
+    ] = (),
+    max_confidence: Annotated[float | None, "Only assets with at most this confidence."] = None,
+    ids: Annotated[bool, "Print only the full ids, one on each line."] = False,
 ) -> None:
     """List the assets of STORE, with the reasons of their verdicts.
 
     On a terminal ids are shortened to prefixes that no other id has; all commands accept
     such prefixes. Without STORE, the one that `make align` built last under data/ is taken.
-
-    Options
-    -------
-    --verdict: Only assets with this verdict; may be repeated. [default: all]
-    --category: Only assets of this category; may be repeated. [default: all]
-    --max-confidence: Only assets with at most this confidence.
-    --ids: Print only the full ids, one on each line.
 
     Example
     -------

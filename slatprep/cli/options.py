@@ -1,23 +1,22 @@
-"""Declaring commands and options, and the options that several commands share."""
+"""The kinds of values that commands take, and the options that several commands share."""
 
 from __future__ import annotations
 
 import dataclasses
 import difflib
-import functools
-import inspect
 import math
 import pkgutil
-import re
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
-from textwrap import indent
-from typing import TYPE_CHECKING, Any, TypeVar, get_args
+from typing import TYPE_CHECKING, Annotated, Any, Literal, get_args
 
 import click
 
-from slatprep.cli.output import OUTPUT_OPTIONS, Output, PrintingCommand, with_output
+from slatprep.cli.output import Output
+from slatprep.cli.signature import Click
 from slatprep.cli.targets import NewPath
 from slatprep.storage.place import place_of, storage_of
 
@@ -26,24 +25,12 @@ if TYPE_CHECKING:
     from slatprep.readers.splits import Assignment, Shares
     from slatprep.records import Place
     from slatprep.store import Store
+    from slatprep.workers.local import Workers
 
     _Choice = click.Choice[str]
 else:
+    Place = Path  # Signatures are read without the records, which import numpy.
     _Choice = click.Choice
-
-_Function = TypeVar("_Function", bound=Callable[..., object])
-
-_SECTION = re.compile(r"^(\w[\w ]*)\n-+\n", re.M)
-_OPTION = re.compile(r"^(--[\w-]+): (.*(?:\n .*)*)", re.M)
-
-POSITIVE = click.IntRange(min=1)
-FILE = click.Path(path_type=Path, exists=True, dir_okay=False)
-FOLDER = click.Path(path_type=Path, exists=True, file_okay=False)
-NEW_PATH = NewPath(path_type=Path)
-NEW_FILE = NewPath(path_type=Path, dir_okay=False)
-NEW_FOLDER = NewPath(path_type=Path, file_okay=False)
-RECORDS_FOLDER = click.Path(path_type=Path, file_okay=False)
-"""Of a build, which looks itself at what lies there."""
 
 
 class FiniteRange(click.FloatRange):
@@ -98,97 +85,22 @@ class ChoiceOf(_Choice):
         return (*map(str, get_args(listed) or listed), *self._others)
 
 
-def option(
-    flag: str,
-    kind: Any = None,
-    default: Any = None,
-    text: str | None = None,
-    *,
-    name: str | None = None,
-    **others: Any,
-) -> Callable[[_Function], _Function]:
-    """Declare an option: its flag, type, default and, if commands share it, its help.
-
-    `name` is the function's parameter for the value, if it differs from the flag; all other
-    arguments are those of `click.option`.
-    """
-    if default is not None:
-        others["default"] = default
-    return click.option(*filter(None, (flag, name)), type=kind, help=text, **others)
-
-
-def command(name: str | None = None, **settings: Any) -> Callable[[_Function], click.Command]:
-    """Make a command of a function, whose docstring is its help.
-
-    The section ``Options`` of the docstring has the help of each option; all other sections,
-    such as ``Example``, are printed below the options. The function gets an `Output` as its
-    first argument, made from the options ``--json``, ``-q`` and ``-v``.
-
-    Raises
-    ------
-    ValueError
-        If the docstring and the declaration do not have the same options.
-    """
-
-    def declare(function: _Function) -> click.Command:
-        text, *sections = _SECTION.split(inspect.getdoc(function) or "")
-        described = dict(zip(sections[::2], sections[1::2], strict=True))
-        helps = dict(_OPTION.findall(described.pop("Options", "")))
-        below = [f"\b\n{title}:\n{indent(body, '  ')}" for title, body in described.items()]
-        declared = click.command(
-            name, PrintingCommand, help=text, epilog="\n\n".join(below), **settings
-        )
-        made = declared(with_output(function))
-        made.params += OUTPUT_OPTIONS
-        undescribed = False
-        for parameter in made.params:
-            if isinstance(parameter, click.Option) and parameter.help is None:
-                words = " ".join(helps.pop(parameter.opts[0], "").split())
-                parameter.help = words.replace(" [default:", "  [default:")
-                undescribed |= not words
-        # Python's -OO removes docstrings, and the help with them.
-        if function.__doc__ and (helps or undescribed):
-            raise ValueError(f"{made.name}: its docstring does not describe its options")
-        return made
-
-    return declare
-
-
-PLACE = PlaceType(path_type=Path)
-"""A path or a URL, which need not exist."""
-
-EXISTING_FOLDER = PlaceType(path_type=Path, exists=True, file_okay=False)
-"""A folder that exists, a store as well, or a URL."""
-
-
-_PIXIEVERSE = "Root of the PixieVerse grids or predictions, a folder or a URL."
-_MAP = "CSV that joins the ids of the two sides, or TRELLIS's metadata.csv."
-_SAMPLES = (
-    "Where an object has several annotations: refuse it, take the first, make an asset of each, "
-    "or merge their labels in one asset.  [default: one]"
-)
-_ENCODER = "The encoder of the latents.  [default: trellis]"
-_RANGES = "Where the normalisation ranges come from; p1-p99: percentiles.  [default: dataset]"
-_RANGES_OF = "Objects that ranges of the dataset are computed from.  [default: all]"
-_PRESET = "Named parameters; 'paper' is the protocol of SLAT-Phys, in Pixie's ranges."
-
-
-def source_options(command: _Function) -> _Function:
-    """Add the options that decide the parameters of a build."""
-    preset = ChoiceOf("slatprep.parameters:PRESETS")
-    options = (
-        option("--config", FILE, text="Dataset definition (TOML); options override it."),
-        option("--pixieverse", PLACE, text=_PIXIEVERSE),
-        option("--slat", PLACE, text="Root of the TRELLIS latents, or one HDF5 file, or a URL."),
-        option("--samples", ChoiceOf("slatprep.parameters:Samples"), text=_SAMPLES),
-        option("--encoder", text=_ENCODER, metavar="NAME|FILE.json"),
-        option("--map", PLACE, text=_MAP),
-        option("--ranges", text=_RANGES, metavar="dataset|pLO-pHI|pixie|FILE"),
-        option("--ranges-of", click.Choice(["all", "train"]), text=_RANGES_OF),
-        split_options,
-        option("--preset", preset, text=_PRESET),
-    )
-    return functools.reduce(lambda decorated, add: add(decorated), reversed(options), command)
+Positive = Annotated[int, click.IntRange(min=1)]
+Seed = Annotated[int, click.IntRange(min=0)]
+File = Annotated[Path, click.Path(path_type=Path, exists=True, dir_okay=False)]
+Folder = Annotated[Path, click.Path(path_type=Path, exists=True, file_okay=False)]
+FileOrFolder = Annotated[Path, click.Path(path_type=Path, exists=True)]
+NewFile = Annotated[Path, NewPath(path_type=Path, dir_okay=False)]
+NewFolder = Annotated[Path, NewPath(path_type=Path, file_okay=False)]
+NewFileOrFolder = Annotated[Path, NewPath(path_type=Path)]
+RecordsFolder = Annotated[Path, click.Path(path_type=Path, file_okay=False)]
+"""Of a build, which looks itself at what lies there."""
+PathOrUrl = Annotated[Place, PlaceType(path_type=Path)]
+"""Need not exist."""
+FileOrUrl = Annotated[Place, PlaceType(path_type=Path, exists=True)]
+"""A file or folder that exists, or a URL."""
+FolderOrUrl = Annotated[Place, PlaceType(path_type=Path, exists=True, file_okay=False)]
+"""A folder that exists, such as a store, or a URL."""
 
 
 def chosen_store(store: Place | None) -> Place:
@@ -201,20 +113,16 @@ def chosen_store(store: Place | None) -> Place:
     return built[-1]
 
 
-store_argument = click.argument(
-    "store",
-    required=False,
-    type=EXISTING_FOLDER,
-    callback=lambda _context, _parameter, store: chosen_store(store),
-)
+LastStore = Annotated[
+    FolderOrUrl, Click(required=False, callback=lambda _context, _parameter, it: chosen_store(it))
+]
 """The store, by default the one built last."""
 
-store_option = option(
-    "--store",
-    EXISTING_FOLDER,
-    text="The store.  [default: the one built last under data/]",
-    metavar="STORE.zarr",
-)
+StoreOption = Annotated[
+    FolderOrUrl,
+    "The store. [default: the one built last under data/]",
+    Click("--store", metavar="STORE.zarr"),
+]
 
 
 def beside(store: Place, suffix: str) -> Path:
@@ -238,15 +146,23 @@ def complete_asset(
     return []
 
 
-verdicts_option = option(
-    "--verdict",
+AssetIds = Annotated[tuple[str, ...], Click("--asset", metavar="ID", shell_complete=complete_asset)]
+
+Verdicts = Annotated[tuple[str, ...], ChoiceOf("slatprep.records:Verdict"), Click("--verdict")]
+
+Categories = Annotated[tuple[str, ...], Click("--category")]
+
+UsableVerdicts = Annotated[
+    tuple[str, ...] | None,
     ChoiceOf("slatprep.records:Verdict", "all"),
-    text="Only assets with this verdict; may be repeated.  [default: good and doubtful]",
-    name="verdicts",
-    multiple=True,
-    callback=lambda _context, _parameter, given: () if "all" in given else given or None,
-)
-"""The verdicts; empty for all, None if the option was not given."""
+    "Only assets with this verdict; may be repeated. [default: good and doubtful]",
+    Click(
+        "--verdict",
+        multiple=True,
+        callback=lambda _context, _parameter, given: () if "all" in given else given or None,
+    ),
+]
+"""Empty for all, None if the option was not given."""
 
 
 def require_categories(store: Store, categories: Sequence[str]) -> None:
@@ -279,31 +195,30 @@ def _at_most_the_cores(_context: click.Context, _parameter: click.Parameter, job
     return min(jobs, int(cpu_count()))
 
 
-jobs_option = option(
-    "--jobs",
-    POSITIVE,
-    1,
+Jobs = Annotated[
+    Positive,
     "Worker processes, of one thread each; no more than there are cores.",
-    callback=_at_most_the_cores,
-)
+    Click(callback=_at_most_the_cores),
+]
 
 
-def workers_options(command: _Function) -> _Function:
-    """Add ``--jobs`` and ``--scheduler``; the function gets the choice as `jobs`.
+@dataclass(frozen=True, kw_only=True)
+class WorkersOptions:
+    """Where a command computes: in processes of this machine, or on a cluster."""
 
-    As a decorator it stands below `command`, since it passes on the `Output`.
-    """
+    jobs: Jobs = 1
+    scheduler: Annotated[
+        str | None,
+        "Compute on the Dask cluster of this scheduler, as tcp://host:8786, instead of here.",
+        Click(metavar="ADDRESS"),
+    ] = None
 
-    @jobs_option
-    @option(
-        "--scheduler",
-        text="Compute on the Dask cluster of this scheduler, as tcp://host:8786, instead of here.",
-        metavar="ADDRESS",
-    )
-    @functools.wraps(command)
-    def with_workers(output: Output, *, jobs: int, scheduler: str | None, **options: Any) -> object:
-        if scheduler is None:
-            return command(output, jobs=jobs, **options)
+    @contextmanager
+    def started(self, output: Output) -> Iterator[int | Workers]:
+        """Give what `slatprep.workers` takes as `jobs`."""
+        if self.scheduler is None:
+            yield self.jobs
+            return
         given = click.get_current_context().get_parameter_source("jobs")
         if given is not click.core.ParameterSource.DEFAULT:
             raise click.UsageError(
@@ -312,70 +227,118 @@ def workers_options(command: _Function) -> _Function:
             )
         from slatprep.workers.dask import Cluster
 
-        with Cluster(scheduler, output.note) as cluster:
-            return command(output, jobs=cluster, **options)
-
-    return with_workers  # type: ignore[return-value]
+        with Cluster(self.scheduler, output.note) as cluster:
+            yield cluster
 
 
-def parameters_of(options: dict[str, Any]) -> BuildParameters:
-    """Load parameters from the options of `source_options` and of the passes.
+@dataclass(frozen=True, kw_only=True)
+class SplitOptions:
+    """How objects are split."""
 
-    Parameters
-    ----------
-    options : dict
-        The values of all options of a command; those used here are removed.
+    split_by: Annotated[
+        str | None,
+        "How objects are split: by a hash of their ids; by Pixie's rule; one category for testing; "
+        "or by a file of ids: a list for testing, or a JSON object with the lists train, val and "
+        "test. [default: hash]",
+        Click(metavar="hash|pixie|category:NAME|FILE"),
+    ] = None
+    shares: Annotated[
+        str | None,
+        "Shares of the split by hash, which also divides objects that another rule does not test "
+        "on into train and val. [default: 0.8,0.1,0.1]",
+        Click(metavar="TRAIN,VAL,TEST"),
+    ] = None
 
-    Returns
-    -------
-    BuildParameters
-        The parameters.
-    """
-    from slatprep.parameters.files import OPTIONS, load_parameters
+    @property
+    def given(self) -> bool:
+        """Whether the command line says how to split."""
+        return self.split_by is not None or self.shares is not None
 
-    given: dict[str, dict[str, object]] = {}
-    for name, flag in OPTIONS.items():
-        if (value := options.pop(flag.removeprefix("--").replace("-", "_"))) is None:
-            continue
-        group, key = name.split(".")
-        if key == "shares":
-            value = dataclasses.astuple(_shares(value))
-        elif not isinstance(value, str):
-            value = str(value.absolute())
-        given.setdefault(group, {})[key] = value
-    for name in ("consensus", "witness"):
-        if options.pop(name, False):
-            given[name] = {"settle": True}
-    return load_parameters(options.pop("config"), given, options.pop("preset"))
+    @property
+    def rule(self) -> dict[str, Any]:
+        """Return ``by`` and ``shares`` for `slatprep.learn.splits.assign_store`."""
+        from slatprep.readers.splits import HASH, Shares
 
-
-def split_options(command: _Function) -> _Function:
-    """Add ``--split-by`` and ``--shares``, for `split_rule`."""
-    by = option(
-        "--split-by",
-        text="How objects are split: by a hash of their ids; by Pixie's rule; one category for "
-        "testing; or by a file of ids: a list for testing, or a JSON object with the lists train, "
-        "val and test.  "
-        "[default: hash]",
-        metavar="hash|pixie|category:NAME|FILE",
-    )
-    shares = option(
-        "--shares",
-        text="Shares of the split by hash, which also divides objects that another rule does not "
-        "test on into train and val.  [default: 0.8,0.1,0.1]",
-        metavar="TRAIN,VAL,TEST",
-    )
-    return by(shares(command))
+        return {
+            "by": HASH if self.split_by is None else self.split_by,
+            "shares": Shares() if self.shares is None else _shares(self.shares),
+        }
 
 
-def split_rule(split_by: str | None, shares: str | None) -> dict[str, Any]:
-    """Return ``by`` and ``shares`` for `slatprep.learn.splits.assign_store`."""
-    from slatprep.readers.splits import HASH, Shares
+@dataclass(frozen=True, kw_only=True)
+class StatedOptions:
+    """What a store cannot know of itself as a dataset."""
 
-    return {
-        "by": HASH if split_by is None else split_by,
-        "shares": Shares() if shares is None else _shares(shares),
-    }
+    name: Annotated[str, "Name of the dataset. [default: the store's]"] = ""
+    license: Annotated[str, "Its licence, such as CC-BY-4.0.", Click(metavar="SPDX|URL")] = ""
+    url: Annotated[str, "Its home page."] = ""
+    cite_as: Annotated[str, "How to cite it.", Click(metavar="TEXT")] = ""
+    version: Annotated[
+        str, "Its version.", Click("--dataset-version", metavar="X.Y.Z", show_default=True)
+    ] = "1.0.0"
+    date_published: Annotated[str, "When it was published.", Click(metavar="YYYY-MM-DD")] = ""
+
+
+@dataclass(frozen=True, kw_only=True)
+class SourceOptions:
+    """What decides the parameters of a build."""
+
+    config: Annotated[File | None, "Dataset definition (TOML); options override it."] = None
+    pixieverse: Annotated[
+        PathOrUrl | None, "Root of the PixieVerse grids or predictions, a folder or a URL."
+    ] = None
+    slat: Annotated[
+        PathOrUrl | None, "Root of the TRELLIS latents, or one HDF5 file, or a URL."
+    ] = None
+    samples: Annotated[
+        str | None,
+        ChoiceOf("slatprep.parameters:Samples"),
+        "Where an object has several annotations: refuse it, take the first, make an asset of "
+        "each, or merge their labels in one asset. [default: one]",
+    ] = None
+    encoder: Annotated[
+        str | None,
+        "The encoder of the latents. [default: trellis]",
+        Click(metavar="NAME|FILE.json"),
+    ] = None
+    map: Annotated[
+        PathOrUrl | None, "CSV that joins the ids of the two sides, or TRELLIS's metadata.csv."
+    ] = None
+    ranges: Annotated[
+        str | None,
+        "Where the normalisation ranges come from; p1-p99: percentiles. [default: dataset]",
+        Click(metavar="dataset|pLO-pHI|pixie|FILE"),
+    ] = None
+    ranges_of: Annotated[
+        Literal["all", "train"] | None,
+        "Objects that ranges of the dataset are computed from. [default: all]",
+    ] = None
+    splits: SplitOptions
+    preset: Annotated[
+        str | None,
+        ChoiceOf("slatprep.parameters:PRESETS"),
+        "Named parameters; 'paper' is the protocol of SLAT-Phys, in Pixie's ranges.",
+    ] = None
+
+    def parameters(self, **passes: bool) -> BuildParameters:
+        """Return the parameters of a build; `passes` are ``consensus`` and ``witness``."""
+        from slatprep.parameters.files import OPTIONS, load_parameters
+
+        options = vars(self) | vars(self.splits)
+        given: dict[str, dict[str, object]] = {}
+        for name, flag in OPTIONS.items():
+            if (value := options[flag.removeprefix("--").replace("-", "_")]) is None:
+                continue
+            group, key = name.split(".")
+            if key == "shares":
+                value = dataclasses.astuple(_shares(value))
+            elif not isinstance(value, str):
+                value = str(value.absolute())
+            given.setdefault(group, {})[key] = value
+        for name, chosen in passes.items():
+            if chosen:
+                given[name] = {"settle": True}
+        return load_parameters(self.config, given, self.preset)
 
 
 def note_split(output: Output, assignment: Assignment, how: str) -> None:

@@ -8,7 +8,6 @@ aligned columns; with ``--json`` standard output is one JSON document.
 from __future__ import annotations
 
 import dataclasses
-import functools
 import itertools
 import json
 import math
@@ -18,11 +17,10 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import click
 
-from slatprep.cli.targets import require_apart
 from slatprep.errors import SlatprepError, in_unicode
 from slatprep.storage.place import is_place, place_of, storage_of
 from slatprep.workers import Progress
@@ -32,8 +30,6 @@ EXIT_USAGE = 2
 EXIT_INTERRUPTED = 130
 
 Cell = str | int | float | bool | None
-
-_Command = TypeVar("_Command", bound=Callable[..., object])
 
 _STYLES = {"good": "green", "doubtful": "yellow", "failed": "red"}
 
@@ -204,7 +200,7 @@ OUTPUT_OPTIONS = (
     click.Option(["-q", "--quiet"], is_flag=True, help="Print only errors and results."),
     click.Option(["-v", "--verbose"], is_flag=True, help="Print more details."),
 )
-"""The options of every command, which `with_output` reads."""
+"""The options of every command, which a command's runner reads."""
 
 
 class PrintingCommand(click.Command):
@@ -212,7 +208,7 @@ class PrintingCommand(click.Command):
 
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
         """Parse the arguments, as click does."""
-        # Without the program, as in `with_output`; click takes parsed words out of the list.
+        # Without the program; click takes parsed words out of the list.
         output = Output(
             "--json" in args and not ctx.resilient_parsing, 0, ctx.command_path.partition(" ")[2]
         )
@@ -220,24 +216,7 @@ class PrintingCommand(click.Command):
             return super().parse_args(ctx, args)
 
 
-def with_output(command: _Command) -> _Command:
-    """Give a command an `Output` as its first argument, in place of `OUTPUT_OPTIONS`."""
-
-    @functools.wraps(command)
-    def run(*, as_json: bool, quiet: bool, verbose: bool, **options: Any) -> object:
-        given = {name: _local(value) for name, value in options.items()}
-        # Without the program: "info", "bench align".
-        context = click.get_current_context()
-        name = context.command_path.partition(" ")[2]
-        output = Output(as_json, int(verbose) - int(quiet), name)
-        with output.failing():
-            require_apart(context.command, given)
-            return command(output, **given)
-
-    return run  # type: ignore[return-value]
-
-
-def _local(value: Any) -> Any:
+def local_path(value: Any) -> Any:
     """Return an option's value; refuse a path that is a URL, or that UTF-8 cannot hold."""
     if is_place(value) and str(value) != in_unicode(str(value)):
         raise click.UsageError(f"{in_unicode(str(value))}: expected a path in UTF-8")

@@ -6,13 +6,20 @@ import time
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated, Literal
 
-import click
-
-from slatprep.cli.latents import LatentsReader, standardised_option
-from slatprep.cli.options import NEW_FILE, NEW_FOLDER, POSITIVE, PlaceType, command, option
+from slatprep.cli.latents import LatentsReader, Standardised
+from slatprep.cli.options import (
+    AssetIds,
+    FileOrFolder,
+    FileOrUrl,
+    NewFile,
+    NewFolder,
+    Positive,
+    Seed,
+)
 from slatprep.cli.output import Output
+from slatprep.cli.signature import Click, command
 from slatprep.errors import ConfigError, InputError
 
 if TYPE_CHECKING:
@@ -23,26 +30,26 @@ _IMAGES = (".png", ".jpg", ".jpeg", ".webp", ".bmp")
 
 
 @command()
-@click.argument("source", type=PlaceType(path_type=Path, exists=True))
-@option("--checkpoint", click.Path(path_type=Path, exists=True), required=True)
-@option("--out", NEW_FOLDER, required=True)
-@option("--asset", metavar="ID", name="assets", multiple=True)
-@option("--gaussians", NEW_FILE, metavar="FILE.ply")
-@option("--seed", click.IntRange(min=0), 42)
-@option("--device", click.Choice(["cpu", "cuda"]), "cpu")
-@option("--batch-voxels", POSITIVE, 65_536)
-@standardised_option
 def predict(
     output: Output,
-    source: Place,
-    checkpoint: Path,
-    out: Path,
-    assets: tuple[str, ...],
-    gaussians: Path | None,
-    seed: int,
-    device: str,
-    batch_voxels: int,
-    standardised: str,
+    source: FileOrUrl,
+    *,
+    checkpoint: Annotated[
+        FileOrFolder, "best.pt of a run of `slatprep train`, or the folder of the run."
+    ],
+    out: Annotated[NewFolder, "Folder of the predictions; files of other assets are kept."],
+    assets: Annotated[AssetIds, "Predict only this asset; may be repeated."] = (),
+    gaussians: Annotated[
+        NewFile | None,
+        "Also decode an image's latents to Gaussians, and write those with their materials.",
+        Click(metavar="FILE.ply"),
+    ] = None,
+    seed: Annotated[Seed, "Seed of an image's latents."] = 42,
+    device: Annotated[Literal["cpu", "cuda"], "Where to compute."] = "cpu",
+    batch_voxels: Annotated[
+        Positive, "Number of voxels up to which assets are decoded together."
+    ] = 65536,
+    standardised: Standardised = "auto",
 ) -> None:
     """Predict material fields of SOURCE with a trained decoder.
 
@@ -53,16 +60,6 @@ def predict(
     checkpoint's SHA-256 and the seconds of its decoding. `slatprep evaluate`
     and `slatprep transfer --prediction` read these files.
     Needs PyTorch: pip install 'slatprep[train]'.
-
-    Options
-    -------
-    --checkpoint: best.pt of a run of `slatprep train`, or the folder of the run.
-    --out: Folder of the predictions; files of other assets are kept.
-    --asset: Predict only this asset; may be repeated.
-    --gaussians: Also decode an image's latents to Gaussians, and write those with their materials.
-    --seed: Seed of an image's latents.
-    --device: Where to compute.
-    --batch-voxels: Number of voxels up to which assets are decoded together.
 
     Example
     -------

@@ -2,67 +2,45 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import click
 
-from slatprep.cli.options import (
-    EXISTING_FOLDER,
-    NEW_FOLDER,
-    ChoiceOf,
-    command,
-    option,
-    verdicts_option,
-)
+from slatprep.cli.options import ChoiceOf, FolderOrUrl, NewFolder, StatedOptions, UsableVerdicts
 from slatprep.cli.output import Cell, Output
+from slatprep.cli.signature import Click, command
 
 if TYPE_CHECKING:
-    from slatprep.records import Place
     from slatprep.store import Store
 
 _PICTURES = click.IntRange(min=0, max=60)
 
 
 @command()
-@click.argument("store", type=EXISTING_FOLDER)
-@option("--out", NEW_FOLDER, required=True)
-@option("--data", ChoiceOf("slatprep.export.publish:Data"), "store")
-@verdicts_option
-@option("--pictures", _PICTURES, 12, metavar="N")
-@option("--name", default="")
-@option("--license", default="", metavar="SPDX|URL")
-@option("--url", default="")
-@option("--cite-as", default="", metavar="TEXT")
-@option("--dataset-version", name="version", default="1.0.0", metavar="X.Y.Z")
-@option("--date-published", default="", metavar="YYYY-MM-DD")
 def publish(
     output: Output,
-    store: Place,
-    out: Path,
-    data: Any,
-    verdicts: tuple[str, ...] | None,
-    pictures: int,
-    **stated: str,
+    store: FolderOrUrl,
+    *,
+    out: Annotated[
+        NewFolder, "The folder; an earlier result is replaced when the new one is complete."
+    ],
+    data: Annotated[
+        Any,
+        ChoiceOf("slatprep.export.publish:Data"),
+        'The store itself, which `slatprep.open_store("hf://datasets/...")` reads, or shards '
+        "for `datasets.load_dataset`.",
+    ] = "store",
+    verdicts: UsableVerdicts = None,
+    pictures: Annotated[
+        int, click.IntRange(0, 60), "Number of assets in the card's picture.", Click(metavar="N")
+    ] = 12,
+    stated: StatedOptions,
 ) -> None:
     """Write STORE as a dataset for a hub, such as Hugging Face's.
 
     Writes a folder with the card (README.md, with statistics and a picture), the data, the
     checksum of every file and, beside a store, the description that catalogues read
     (croissant.json). Nothing is uploaded: the hub's own tool does that.
-
-    Options
-    -------
-    --out: The folder; an earlier result is replaced when the new one is complete.
-    --data: The store itself, which `slatprep.open_store("hf://datasets/...")` reads, or shards
-        for `datasets.load_dataset`.
-    --pictures: Number of assets in the card's picture.
-    --name: Name of the dataset. [default: the store's]
-    --license: Its licence, such as CC-BY-4.0.
-    --url: Its home page.
-    --cite-as: How to cite it.
-    --dataset-version: Its version.
-    --date-published: When it was published.
 
     Example
     -------
@@ -85,7 +63,7 @@ def publish(
             store,
             out,
             data,
-            stated=Stated(**stated),
+            stated=Stated(**vars(stated)),
             pictures=drawn,
             verdicts=verdicts,
             progress=progress,

@@ -3,30 +3,29 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated
 
-from slatprep.cli.options import (
-    FOLDER,
-    NEW_FILE,
-    beside,
-    command,
-    jobs_option,
-    option,
-    store_argument,
-)
+from slatprep.cli.options import Folder, Jobs, LastStore, NewFile, beside
 from slatprep.cli.output import Output, say
+from slatprep.cli.signature import Click, command
 
 if TYPE_CHECKING:
     from slatprep.records import Place
 
 
 @command()
-@store_argument
-@option("--out", NEW_FILE, metavar="FILE.html")
-@option("--manifests", FOLDER)
-@jobs_option
 def report(
-    output: Output, store: Place, out: Path | None, manifests: Place | None, jobs: int
+    output: Output,
+    store: LastStore,
+    *,
+    out: Annotated[
+        NewFile | None, "The page. [default: beside the store]", Click(metavar="FILE.html")
+    ] = None,
+    manifests: Annotated[
+        Folder | None,
+        "Folder of the build's records. [default: beside the store, or manifests/build/NAME]",
+    ] = None,
+    jobs: Jobs = 1,
 ) -> None:
     """Write a page about STORE that opens in a browser.
 
@@ -34,12 +33,6 @@ def report(
     with reasons, histograms of quality, orientations, classes and properties,
     and a table of all assets that shows each in 3D. Without STORE, the one
     that `make align` built last under data/ is taken.
-
-    Options
-    -------
-    --out: The page. [default: beside the store]
-    --manifests: Folder of the build's records. [default: beside the store, or
-        manifests/build/NAME]
 
     Example
     -------
@@ -52,17 +45,18 @@ def report(
 
     opened = open_store(store)
     name = store.name.removesuffix(".zarr")
-    if manifests is None:
+    records: Place | None = manifests
+    if records is None:
         usual = (manifests_of(opened.path), Path("manifests/build") / name)
-        manifests = next((folder for folder in usual if folder.is_dir()), None)
-    if manifests is None:
+        records = next((folder for folder in usual if folder.is_dir()), None)
+    if records is None:
         output.problem(
             f"no records of {store} found; the page cannot list assets that are not in the store. "
             "Name their folder with --manifests"
         )
     with output.progress("report") as progress:
         summary = write_report(
-            opened, out or beside(store, ".html"), manifests=manifests, jobs=jobs, progress=progress
+            opened, out or beside(store, ".html"), manifests=records, jobs=jobs, progress=progress
         )
 
     def show() -> None:

@@ -3,22 +3,22 @@
 from __future__ import annotations
 
 from operator import attrgetter
-from pathlib import Path
 from typing import TYPE_CHECKING
 
-import click
-
-from slatprep.cli.options import EXISTING_FOLDER, FOLDER, command
+from slatprep.cli.options import Folder, FolderOrUrl
 from slatprep.cli.output import Output
+from slatprep.cli.signature import command
 
 if TYPE_CHECKING:
-    from slatprep.records import Place
+    pass
 
 
 @command()
-@click.argument("store", type=EXISTING_FOLDER)
-@click.argument("truth_dir", type=FOLDER)
-def score(output: Output, store: Place, truth_dir: Path) -> None:
+def score(
+    output: Output,
+    store: FolderOrUrl,
+    truth_dir: Folder,
+) -> None:
     """Score STORE against known truth.
 
     TRUTH_DIR holds an npz for each asset, as make-demo writes it. Each level's

@@ -2,61 +2,60 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import click
 
 from slatprep.cli.options import (
-    NEW_FILE,
+    Categories,
     ChoiceOf,
-    command,
-    jobs_option,
-    option,
+    Jobs,
+    LastStore,
+    NewFile,
+    Verdicts,
     require_categories,
-    store_argument,
 )
 from slatprep.cli.output import Cell, Output, write_csv
+from slatprep.cli.signature import Click, command
 
 if TYPE_CHECKING:
     from slatprep.inspect.distributions import Distribution, GroupStatistics, StoreStatistics
-    from slatprep.records import Place
 
 _CATEGORIES = 20
 """Most categories in a table; the files have all."""
 
 
 @command()
-@store_argument
-@option("--verdict", ChoiceOf("slatprep.records:Verdict"), name="verdicts", multiple=True)
-@option("--category", name="categories", multiple=True)
-@option("--weight", ChoiceOf("slatprep.inspect.distributions:Weight"), "voxel")
-@option("--csv", NEW_FILE, name="csv_file")
-@option("--picture", NEW_FILE, metavar="FILE.png|svg|pdf")
-@jobs_option
 def stats(
     output: Output,
-    store: Place,
-    verdicts: tuple[str, ...],
-    categories: tuple[str, ...],
-    weight: Any,
-    csv_file: Path | None,
-    picture: Path | None,
-    jobs: int,
+    store: LastStore,
+    *,
+    verdicts: Annotated[
+        Verdicts, "Only assets with this verdict; may be repeated. [default: all]"
+    ] = (),
+    categories: Annotated[
+        Categories, "Only assets of this category; may be repeated. [default: all]"
+    ] = (),
+    weight: Annotated[
+        Any,
+        ChoiceOf("slatprep.inspect.distributions:Weight"),
+        "Give each voxel the same weight, or each asset.",
+    ] = "voxel",
+    csv_file: Annotated[
+        NewFile | None,
+        "Also write a table to this file: a line for each group, side, property and scale.",
+        Click("--csv"),
+    ] = None,
+    picture: Annotated[
+        NewFile | None, "Also draw them to this file.", Click(metavar="FILE.png|svg|pdf")
+    ] = None,
+    jobs: Jobs = 1,
 ) -> None:
     """Show statistics of the voxels of STORE: classes and properties, by category and in total.
 
     Both before the lookup (the annotated voxels of the PixieVerse fields) and after it
     (the valid SLAT voxels). Without STORE, the one that `make align` built last under
     data/ is taken.
-
-    Options
-    -------
-    --verdict: Only assets with this verdict; may be repeated. [default: all]
-    --category: Only assets of this category; may be repeated. [default: all]
-    --weight: Give each voxel the same weight, or each asset.
-    --csv: Also write a table to this file: a line for each group, side, property and scale.
-    --picture: Also draw them to this file.
 
     Example
     -------

@@ -5,98 +5,96 @@ from __future__ import annotations
 import dataclasses
 import math
 import os
-from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import click
 
 from slatprep.cli.options import (
-    EXISTING_FOLDER,
-    NEW_FOLDER,
-    POSITIVE,
     ChoiceOf,
     FiniteRange,
-    command,
+    FolderOrUrl,
+    NewFolder,
+    Positive,
+    SplitOptions,
+    UsableVerdicts,
     note_left_out,
     note_split,
-    option,
-    split_options,
-    split_rule,
-    verdicts_option,
 )
 from slatprep.cli.output import Output
+from slatprep.cli.signature import Click, command
 
 if TYPE_CHECKING:
     from slatprep.learn.runs import EpochRecord
     from slatprep.learn.train import TrainSummary
-    from slatprep.records import Place
 
 _SIZES = ("small", "medium", "large")
 
 
+@dataclass(frozen=True, kw_only=True)
+class TrainingOptions:
+    """What `TrainParameters` takes as it is given."""
+
+    epochs: Annotated[Positive, "Passes over the training objects."] = 100
+    steps: Annotated[
+        Positive | None,
+        "Steps of the optimiser, instead of --epochs; the last pass may be incomplete.",
+    ] = None
+    batch_size: Annotated[Positive, "Assets in a batch."] = 1
+    accumulate: Annotated[Positive, "Batches per step of the optimiser."] = 1
+    learning_rate: Annotated[
+        float,
+        FiniteRange(min=0, min_open=True),
+        "Initial learning rate of AdamW; a cosine schedule lowers it to 0.",
+    ] = 0.0001
+    precision: Annotated[
+        Literal["auto", "fp32", "bf16"],
+        "bf16: mixed precision; auto: bf16 if the processor has instructions for it, else fp32.",
+    ] = "auto"
+    keep: Annotated[
+        Literal["best", "last"],
+        "Weights of the epoch with the least validation loss, or of the last epoch.",
+    ] = "best"
+    patience: Annotated[
+        Positive, "Stop after this number of epochs without a better validation loss."
+    ] = 10
+    augmentation: Annotated[
+        Any,
+        ChoiceOf("slatprep.learn.augment:Augmentation"),
+        "Symmetries to draw from: 8 that keep z up, or all 48 of the cube.",
+        Click("--augment"),
+    ] = "none"
+    max_ambiguity: Annotated[
+        float | None, FiniteRange(min=0), "Leave out assets that are more ambiguous."
+    ] = None
+    weigh_by_confidence: Annotated[
+        bool, "Weight voxels by the probability that their class is right."
+    ] = False
+    seed: Annotated[int, "Seed of initial weights, order and augmentation."] = 0
+
+
 @command()
-@click.argument("store", type=EXISTING_FOLDER)
-@option("--out", NEW_FOLDER, required=True)
-@option("--size", click.Choice(_SIZES), "large")
-@option("--all-sizes", is_flag=True)
-@option("--epochs", POSITIVE, 100)
-@option("--steps", POSITIVE)
-@option("--batch-size", POSITIVE, 1)
-@option("--accumulate", POSITIVE, 1)
-@option("--learning-rate", FiniteRange(min=0, min_open=True), 0.0001)
-@option("--precision", click.Choice(["auto", "fp32", "bf16"]), "auto")
-@option("--keep", click.Choice(["best", "last"]), "best")
-@option("--patience", POSITIVE, 10)
-@option("--augment", ChoiceOf("slatprep.learn.augment:Augmentation"), "none", name="augmentation")
-@verdicts_option
-@option("--max-ambiguity", FiniteRange(min=0))
-@split_options
-@option("--weigh-by-confidence", is_flag=True)
-@option("--seed", int, 0)
-@option("--device", click.Choice(["cpu", "cuda"]), "cpu")
-@option("--workers", click.IntRange(min=0), 0)
-@option("--threads", POSITIVE, lambda: os.cpu_count() or 1, show_default="all cores")
 def train(
     output: Output,
-    store: Place,
-    out: Path,
-    size: str,
-    all_sizes: bool,
-    split_by: str | None,
-    shares: str | None,
-    verdicts: tuple[str, ...] | None,
-    device: str,
-    workers: int,
-    threads: int,
-    **parameters: Any,
+    store: FolderOrUrl,
+    *,
+    out: Annotated[NewFolder, "Folder of the run; a stopped run is resumed."],
+    size: Annotated[
+        Literal["small", "medium", "large"], "0.20, 1.19 or 6.32 million weights."
+    ] = "large",
+    all_sizes: Annotated[bool, "Train all three, each in a folder of its own."] = False,
+    training: TrainingOptions,
+    verdicts: UsableVerdicts = None,
+    splits: SplitOptions,
+    device: Annotated[Literal["cpu", "cuda"], "Where to compute."] = "cpu",
+    workers: Annotated[int, click.IntRange(min=0), "Processes that read ahead."] = 0,
+    threads: Annotated[Positive | None, "Threads to compute with. [default: all cores]"] = None,
 ) -> None:
     """Train SLAT-Phys's decoder on STORE.
 
     Writes run.json, log.csv, curve.png, checkpoints and the predictions of
     the test objects, which `slatprep evaluate` measures. Needs PyTorch:
     pip install 'slatprep[train]'.
-
-    Options
-    -------
-    --out: Folder of the run; a stopped run is resumed.
-    --size: 0.20, 1.19 or 6.32 million weights.
-    --all-sizes: Train all three, each in a folder of its own.
-    --epochs: Passes over the training objects.
-    --steps: Steps of the optimiser, instead of --epochs; the last pass may be incomplete.
-    --batch-size: Assets in a batch.
-    --accumulate: Batches per step of the optimiser.
-    --learning-rate: Initial learning rate of AdamW; a cosine schedule lowers it to 0.
-    --precision: bf16: mixed precision; auto: bf16 if the processor has instructions for it, else
-        fp32.
-    --keep: Weights of the epoch with the least validation loss, or of the last epoch.
-    --patience: Stop after this number of epochs without a better validation loss.
-    --augment: Symmetries to draw from: 8 that keep z up, or all 48 of the cube.
-    --max-ambiguity: Leave out assets that are more ambiguous.
-    --weigh-by-confidence: Weight voxels by the probability that their class is right.
-    --seed: Seed of initial weights, order and augmentation.
-    --device: Where to compute.
-    --workers: Processes that read ahead.
-    --threads: Threads to compute with.
 
     Example
     -------
@@ -117,10 +115,10 @@ def train(
     from slatprep.store import open_store
 
     given = click.get_current_context().get_parameter_source("epochs")
-    if parameters["steps"] and given is not click.core.ParameterSource.DEFAULT:
+    if training.steps and given is not click.core.ParameterSource.DEFAULT:
         raise click.UsageError("--epochs and --steps both say when to end; give one of them")
-    torch.set_num_threads(threads)
-    opened, rule = open_store(store), split_rule(split_by, shares)
+    torch.set_num_threads(threads or os.cpu_count() or 1)
+    opened, rule = open_store(store), splits.rule
     note_split(output, assign_store(opened, **rule), f"by {rule['by']}")
     if verdicts is None:
         verdicts = USABLE
@@ -130,7 +128,7 @@ def train(
         split_by=rule["by"],
         shares=rule["shares"],
         verdicts=verdicts or tuple(Verdict),
-        **parameters,
+        **vars(training),
     )
     runs = {name: out / name for name in _SIZES} if all_sizes else {size: out}
     summaries = {}

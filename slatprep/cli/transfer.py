@@ -3,21 +3,11 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-import click
-
-from slatprep.cli.options import (
-    FILE,
-    NEW_FILE,
-    ChoiceOf,
-    FiniteRange,
-    command,
-    complete_asset,
-    option,
-    store_option,
-)
+from slatprep.cli.options import ChoiceOf, File, FiniteRange, NewFile, StoreOption, complete_asset
 from slatprep.cli.output import Output
+from slatprep.cli.signature import Click, command
 from slatprep.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -26,48 +16,60 @@ if TYPE_CHECKING:
 
 
 @command()
-@click.argument("particles", type=FILE)
-@store_option
-@option("--asset", metavar="ID", shell_complete=complete_asset)
-@option("--prediction", FILE, metavar="FILE.npz")
-@option("--ranges", metavar="pixie|FILE")
-@option("--out", NEW_FILE, required=True, metavar="FILE.ply")
-@option("--points", ChoiceOf("slatprep.particles.fields:Points"), "slat")
-@option("--axes", ChoiceOf("slatprep.particles.read:Axes"))
-@option("--frame", click.Choice(["file", "slat"]), "file")
-@option("--max-distance", FiniteRange(min=0, min_open=True), 2.0, metavar="VOXELS")
-@option("--far", ChoiceOf("slatprep.particles.transfer:Far"), "background")
 def transfer(
     output: Output,
-    particles: Path,
-    out: Path,
-    axes: Any,
-    frame: str,
-    max_distance: float,
-    far: Any,
-    **source: Any,
+    particles: File,
+    *,
+    store: StoreOption | None = None,
+    asset: Annotated[
+        str | None, "The asset of the store.", Click(metavar="ID", shell_complete=complete_asset)
+    ] = None,
+    prediction: Annotated[
+        File | None,
+        "Predicted materials instead of an asset: coords, material, and properties (normalised as "
+        "--store or --ranges says) or properties_si.",
+        Click(metavar="FILE.npz"),
+    ] = None,
+    ranges: Annotated[
+        str | None, "Ranges of a prediction's properties.", Click(metavar="pixie|FILE")
+    ] = None,
+    out: Annotated[
+        NewFile, "Where to write the particles with their materials.", Click(metavar="FILE.ply")
+    ],
+    points: Annotated[
+        Any,
+        ChoiceOf("slatprep.particles.fields:Points"),
+        "Take an asset's materials from its SLAT voxels, a surface, or from its PixieVerse field, "
+        "a solid.",
+    ] = "slat",
+    axes: Annotated[
+        Any | None,
+        ChoiceOf("slatprep.particles.read:Axes"),
+        "Axes of the particles: those of TRELLIS's Gaussians, of its meshes, or of the SLAT "
+        "frame. [default: as a PLY of slatprep states; trellis for TRELLIS's Gaussians; else "
+        "slat]",
+    ] = None,
+    frame: Annotated[
+        Literal["file", "slat"], "Write positions as in the particles' file, or in the SLAT frame."
+    ] = "file",
+    max_distance: Annotated[
+        float,
+        FiniteRange(min=0, min_open=True),
+        "Distance to the nearest voxel above which a particle is far.",
+        Click(metavar="VOXELS"),
+    ] = 2.0,
+    far: Annotated[
+        Any,
+        ChoiceOf("slatprep.particles.transfer:Far"),
+        "Give far particles class 7 and properties 0, leave them out, or give them the nearest "
+        "material.",
+    ] = "background",
 ) -> None:
     """Give each particle of PARTICLES the material of the nearest voxel.
 
     PARTICLES is a PLY of Gaussians as TRELLIS saves it, any other PLY with
     x, y and z, or an npy or npz of positions. The result is a PLY with the
     fields of Pixie's material fields, in SI units, for PhysGaussian.
-
-    Options
-    -------
-    --asset: The asset of the store.
-    --prediction: Predicted materials instead of an asset: coords, material, and properties
-        (normalised as --store or --ranges says) or properties_si.
-    --ranges: Ranges of a prediction's properties.
-    --out: Where to write the particles with their materials.
-    --points: Take an asset's materials from its SLAT voxels, a surface, or from its PixieVerse
-        field, a solid.
-    --axes: Axes of the particles: those of TRELLIS's Gaussians, of its meshes, or of the SLAT
-        frame. [default: as a PLY of slatprep states; trellis for TRELLIS's Gaussians; else slat]
-    --frame: Write positions as in the particles' file, or in the SLAT frame.
-    --max-distance: Distance to the nearest voxel above which a particle is far.
-    --far: Give far particles class 7 and properties 0, leave them out, or give them the nearest
-        material.
 
     Example
     -------
@@ -78,7 +80,7 @@ def transfer(
     from slatprep.particles import transfer as work
     from slatprep.particles.read import read_particles
 
-    field = _field(**source)
+    field = _field(store, asset, prediction, ranges, points)
     read = read_particles(particles, axes)
     result = work.transfer(read.in_slat(), field, max_distance=max_distance, far=far)
     if read.foreign and axes is None:

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated
 
 import click
 
-from slatprep.cli.options import EXISTING_FOLDER, command, option, store_argument, workers_options
+from slatprep.cli.options import FolderOrUrl, LastStore, Positive, WorkersOptions
 from slatprep.cli.output import Output, say
+from slatprep.cli.signature import Click, command
 from slatprep.errors import StoreError
 
 if TYPE_CHECKING:
@@ -16,23 +17,33 @@ if TYPE_CHECKING:
 
 
 @command()
-@store_argument
-@option("--manifests", EXISTING_FOLDER)
-@option("--sources", is_flag=True)
-@option("--pixieverse", EXISTING_FOLDER)
-@option("--slat", EXISTING_FOLDER)
-@option("--also", EXISTING_FOLDER, multiple=True)
-@option("--sample", click.IntRange(min=1), metavar="N")
-@workers_options
 def verify(
     output: Output,
-    store: Place,
-    sources: bool,
-    pixieverse: Place | None,
-    slat: Place | None,
-    also: tuple[Place, ...],
-    sample: int | None,
-    **options: Any,
+    store: LastStore,
+    *,
+    manifests: Annotated[
+        FolderOrUrl | None,
+        "Folder of the records. [default: beside the store, or manifests/build/NAME]",
+    ] = None,
+    sources: Annotated[bool, "Compare the source files with the records, too."] = False,
+    pixieverse: Annotated[
+        FolderOrUrl | None, "Root of the PixieVerse files now. [default: as at the build]"
+    ] = None,
+    slat: Annotated[
+        FolderOrUrl | None,
+        "Folder of the latents, or of their one HDF5 file, now. [default: as at the build]",
+    ] = None,
+    also: Annotated[
+        tuple[FolderOrUrl, ...],
+        "With both: root of a further source now; once for each, in the order of [[also]].",
+    ] = (),
+    sample: Annotated[
+        Positive | None,
+        "Compare values, records and sources of N assets, evenly chosen, not of all. Files and "
+        "the columns of all assets are compared whole nevertheless.",
+        Click(metavar="N"),
+    ] = None,
+    workers: WorkersOptions,
 ) -> None:
     """Check that STORE is whole, unchanged and consistent.
 
@@ -40,16 +51,6 @@ def verify(
     with its checksum, values with their ranges, annotations with the stored grid
     and transform, and records with their schema and the rows. Every fault is
     named. Exit code 0: no faults; 1: at least one.
-
-    Options
-    -------
-    --manifests: Folder of the records. [default: beside the store, or manifests/build/NAME]
-    --sources: Compare the source files with the records, too.
-    --pixieverse: Root of the PixieVerse files now. [default: as at the build]
-    --slat: Folder of the latents, or of their one HDF5 file, now. [default: as at the build]
-    --also: With both: root of a further source now; once for each, in the order of [[also]].
-    --sample: Compare values, records and sources of N assets, evenly chosen, not of all.
-        Files and the columns of all assets are compared whole nevertheless.
 
     Example
     -------
@@ -65,16 +66,17 @@ def verify(
     if pixieverse and slat:
         further = tuple(SourceRoots(one, slat, number=k) for k, one in enumerate(also, 1))
         roots = SourceRoots(pixieverse, slat, also=further)
-    if options["manifests"] is None and manifests_beside(store) is None:
-        options["manifests"] = _left_by_make(store)
-    with output.progress("verify") as progress:
+    if manifests is None and manifests_beside(store) is None:
+        manifests = _left_by_make(store)
+    with workers.started(output) as jobs, output.progress("verify") as progress:
         result = verify_store(
             store,
             sources=sources or roots is not None,
             roots=roots,
             sample=sample,
+            manifests=manifests,
+            jobs=jobs,
             progress=progress,
-            **options,
         )
 
     def show() -> None:

@@ -65,7 +65,15 @@ def test_help_lists_every_command_and_the_exit_codes() -> None:
     for name in COMMANDS:
         assert re.search(rf"^  {name} +\S", output, re.M), name
     assert re.search(r"0 +all went in", output) and re.search(r"2 +wrong use", output)
-    assert "..." not in output.partition("Commands:")[2].partition("Exit codes:")[0]
+    assert "..." not in output.partition("Make and build:")[2].partition("Exit codes:")[0]
+
+
+def test_help_groups_commands_as_people_work() -> None:
+    shown = re.findall(r"^([A-Z][a-z ]+):\n((?:  .*\n)+)", run("--help").output, re.M)
+    groups = {title: re.findall(r"^  ([a-z-]+) ", body, re.M) for title, body in shown}
+    assert groups.keys() >= {"Make and build", "Look and check", "Take elsewhere", "Learn"}
+    assert "build-store" in groups["Make and build"] and "verify" in groups["Maintain"]
+    assert all(body.count("\n") <= 24 for _, body in shown)
 
 
 def modules_of(*words: str | Path) -> tuple[str, str]:

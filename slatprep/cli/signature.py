@@ -1,0 +1,152 @@
+"""Commands made of functions: a signature declares each argument and option once.
+
+A parameter that may be given by position is an argument of the command, a keyword-only one an
+option. Its annotation ``Annotated[type, ...]`` holds what the command line needs to know: a
+`click.ParamType` where the type alone does not say what is allowed, the help as a string, and a
+`Click` with any other setting. A parameter without a default is required, a ``bool`` is a flag, a
+``tuple[X, ...]`` may be repeated, a ``Literal`` is a choice. A dataclass is a group of options,
+which several commands may share.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import inspect
+import re
+import types
+from collections.abc import Callable, Iterator
+from textwrap import indent
+from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
+
+import click
+
+from slatprep.cli.output import OUTPUT_OPTIONS, Output, PrintingCommand, local_path
+from slatprep.cli.targets import require_apart
+
+_Function = TypeVar("_Function", bound=Callable[..., object])
+
+_SECTION = re.compile(r"^(\w[\w ]*)\n-+\n", re.M)
+
+_PLAIN = (int, float, str)
+
+
+class Click:
+    """What click takes besides type, default and help; `flag` where it is not the name's."""
+
+    def __init__(self, flag: str | None = None, **settings: Any) -> None:
+        self.flag = flag
+        self.settings = settings
+
+
+def command(name: str | None = None, **settings: Any) -> Callable[[_Function], click.Command]:
+    """Make a command of a function; its docstring is the help.
+
+    Sections of the docstring, such as ``Example``, are printed below the options. The function
+    gets an `Output` as its first argument.
+    """
+
+    def declare(function: _Function) -> click.Command:
+        text, *sections = _SECTION.split(inspect.getdoc(function) or "")
+        pairs = zip(sections[::2], sections[1::2], strict=True)
+        below = [f"\b\n{title}:\n{indent(body, '  ')}" for title, body in pairs]
+        made = click.command(
+            name, PrintingCommand, help=text, epilog="\n\n".join(below), **settings
+        )(_runner(function))
+        # The first parameter is the `Output`.
+        declared = list(inspect.signature(function).parameters.values())[1:]
+        made.params = [*_parameters(declared, _hints(function)), *OUTPUT_OPTIONS]
+        return made
+
+    return declare
+
+
+def _runner(function: _Function) -> Callable[..., object]:
+    """Return what click calls: it hands the function its `Output` and groups of options."""
+
+    @functools.wraps(function)
+    def run(*, as_json: bool, quiet: bool, verbose: bool, **options: Any) -> object:
+        given = {name: local_path(value) for name, value in options.items()}
+        # Without the program: "info".
+        context = click.get_current_context()
+        name = context.command_path.partition(" ")[2]
+        output = Output(as_json, int(verbose) - int(quiet), name)
+        with output.failing():
+            require_apart(context.command, given)
+            _group(_hints(function), given)
+            return function(output, **given)
+
+    return run
+
+
+def _hints(declaring: Any) -> dict[str, Any]:
+    return get_type_hints(declaring, include_extras=True)
+
+
+def _group(hints: dict[str, Any], given: dict[str, Any]) -> None:
+    """Replace values that belong to groups by the groups."""
+    for name, hint in hints.items():
+        if dataclasses.is_dataclass(hint):
+            _group(_hints(hint), given)
+            names = [field.name for field in dataclasses.fields(hint)]
+            given[name] = hint(**{name: given.pop(name) for name in names})  # type: ignore[operator]
+
+
+def _parameters(
+    declared: list[inspect.Parameter], hints: dict[str, Any]
+) -> Iterator[click.Argument | click.Option]:
+    for parameter in declared:
+        hint = hints[parameter.name]
+        if dataclasses.is_dataclass(hint):
+            fields = list(inspect.signature(hint).parameters.values())  # type: ignore[arg-type]
+            yield from _parameters(fields, _hints(hint))
+        else:
+            yield _declared(parameter, hint)
+
+
+def _declared(parameter: inspect.Parameter, hint: Any) -> click.Argument | click.Option:
+    kind, repeated, told = _taken_apart(hint)
+    settings: dict[str, Any] = {"required": parameter.default is parameter.empty}
+    if parameter.default not in (parameter.empty, None, ()):
+        settings["default"] = parameter.default
+    flag, text = f"--{parameter.name.replace('_', '-')}", ""
+    for entry in told:
+        if isinstance(entry, str):
+            text = " ".join(entry.split()).replace(" [default:", "  [default:")
+        elif isinstance(entry, click.ParamType):
+            kind = entry
+        elif isinstance(entry, Click):
+            settings |= entry.settings
+            flag = entry.flag or flag
+        else:
+            raise TypeError(f"{parameter.name}: {entry!r} says nothing to the command line")
+    if get_origin(kind) is Literal:
+        kind = click.Choice(get_args(kind))
+    if not (isinstance(kind, click.ParamType) or kind in (bool, *_PLAIN)):
+        raise TypeError(f"{parameter.name}: {kind!r} needs a click.ParamType")
+    if parameter.kind is not inspect.Parameter.KEYWORD_ONLY:
+        settings |= {"nargs": -1} if repeated else {}
+        return click.Argument([parameter.name], type=kind, **settings)
+    if not text:
+        raise TypeError(f"{parameter.name}: an option without help")
+    if kind is bool:
+        settings |= {"is_flag": True}
+    elif repeated:
+        settings |= {"multiple": True}
+    kind = None if kind is bool else kind
+    return click.Option([flag, parameter.name], type=kind, help=text, **settings)
+
+
+def _taken_apart(hint: Any) -> tuple[Any, bool, tuple[Any, ...]]:
+    """Return an annotation's type, whether it may be repeated, and what `Annotated` adds."""
+    origin, arguments = get_origin(hint), get_args(hint)
+    if origin is Annotated:
+        kind, repeated, told = _taken_apart(arguments[0])
+        return kind, repeated, (*told, *arguments[1:])
+    if origin in (Union, types.UnionType):
+        (only,) = (one for one in arguments if one is not types.NoneType)
+        return _taken_apart(only)
+    if origin is tuple:
+        kind, _, told = _taken_apart(arguments[0])
+        return kind, True, told
+    return hint, False, ()

@@ -1,0 +1,104 @@
+"""Commands made of signatures: what a user may type, and what the function gets."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import click
+import pytest
+from click.testing import CliRunner
+
+from slatprep.cli.output import Output
+from slatprep.cli.signature import Click, command
+
+Few = Annotated[int, click.IntRange(1, 3)]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Inner:
+    """A group within a group."""
+
+    deep: Annotated[float, "How deep."] = 0.5
+
+
+@dataclass(frozen=True, kw_only=True)
+class Grouped:
+    """Options that several commands share."""
+
+    inner: Inner
+    wide: Annotated[str | None, "How wide. [default: as wide as it is]"] = None
+
+
+@command("probe")
+def probe(
+    output: Output,
+    source: Annotated[Path, click.Path(path_type=Path)],
+    targets: tuple[str, ...] = (),
+    *,
+    few: Annotated[Few | None, "How many."] = None,
+    kind: Annotated[Literal["a", "b"], "Which."] = "a",
+    names: Annotated[tuple[str, ...], "Called; may be repeated.", Click("--name")] = (),
+    loud: Annotated[bool, "Aloud."] = False,
+    grouped: Grouped,
+    wanted: Annotated[int, "Needed."],
+) -> None:
+    """Print what the function gets.
+
+    Example
+    -------
+    slatprep probe x
+    """
+    output.result({"got": [source, targets, few, kind, names, loud, grouped, wanted]}, lambda: None)
+
+
+def got(*words: str) -> Any:
+    done = CliRunner().invoke(probe, [*words, "--json"], prog_name="slatprep")
+    assert done.exit_code == 0, done.output
+    return json.loads(done.stdout)["got"]
+
+
+def test_function_gets_defaults() -> None:
+    group = {"inner": {"deep": 0.5}, "wide": None}
+    assert got("x", "--wanted", "4") == ["x", [], None, "a", [], False, group, 4]
+
+
+def test_function_gets_what_is_given() -> None:
+    words = "x y z --few 2 --kind b --name m --name n --loud --deep 2 --wide w --wanted 4"
+    group = {"inner": {"deep": 2.0}, "wide": "w"}
+    assert got(*words.split()) == ["x", ["y", "z"], 2, "b", ["m", "n"], True, group, 4]
+
+
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        ("x", "Missing option '--wanted'"),
+        ("--wanted 1", "Missing argument 'SOURCE'"),
+        ("x --wanted 1 --few 4", "4 is not in the range 1<=x<=3"),
+        ("x --wanted one", "'one' is not a valid integer"),
+        ("x --wanted 1 --kind c", "'c' is not one of 'a', 'b'"),
+        ("x --wanted 1 --names n", "No such option"),
+    ],
+)
+def test_wrong_use_is_refused(words: str, told: str) -> None:
+    done = CliRunner().invoke(probe, words.split())
+    assert done.exit_code == 2
+    assert told in done.output
+
+
+def test_help_has_texts_defaults_and_sections() -> None:
+    text = CliRunner().invoke(probe, ["--help"], terminal_width=90).output
+    for words in ("[TARGETS]...", "Which.", "Called; may", "[required]", "Print what the function"):
+        assert words in text
+    assert "How wide.  [default: as wide as it is]" in text
+    assert "Example:\n    slatprep probe x" in text
+
+
+def test_option_without_help_is_a_mistake_of_ours() -> None:
+    def silent(output: Output, *, few: Few = 1) -> None:
+        """Do nothing."""
+
+    with pytest.raises(TypeError, match="few: an option without help"):
+        command()(silent)
