@@ -94,7 +94,7 @@ def merge(annotations: Sequence[Annotation], table: Sequence[Property]) -> Annot
     there = ~np.isnan(mapped)
     count = there.sum(axis=0)
     of = np.maximum(count, 1)
-    # From the largest: where all are the same, the mean is that and the spread nothing.
+    # Relative to the largest: equal values then have exactly that mean, and spread 0.
     most = np.where(there, mapped, -np.inf).max(axis=0)
     mean = most + np.where(there, mapped - most, 0.0).sum(axis=0) / of
     apart = np.where(there, mapped - mean, 0.0)

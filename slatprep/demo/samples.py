@@ -14,10 +14,10 @@ SPREAD = np.array([0.03, 0.15, 0.02])
 """Standard deviation of a part's log10 density, log10 Young's modulus and Poisson's ratio."""
 
 MISTAKEN = 0.15
-"""How likely a part is taken for another class."""
+"""Probability that a part gets another class."""
 
 _STREAM = 6
-"""Of the random numbers; those of `slatprep.demo.asset` come before."""
+"""Index of the random stream; those of `slatprep.demo.asset` come before."""
 
 
 def sample_grids(seed: int, index: int, asset: DemoAsset, samples: int) -> NDArray[np.float32]:

@@ -23,7 +23,7 @@ Source = Literal[
 """Sources, and their forms, that the annotated side of a demo can have."""
 
 ONE_FRAME = ("vomp", "physxnet")
-"""Sources whose voxels were made from the mesh that the latents were encoded from."""
+"""Sources whose voxels come from the mesh that was encoded to latents."""
 
 CLASSES = ("elastic", "metal", "granular", "viscous", "liquid", "snow", "rigid")
 """Names of the classes 0 to 6 in plain voxels of a demo."""

@@ -47,7 +47,7 @@ RUN_BYTES = 2**20
 """Most bytes of a `RUN_FILE`."""
 
 _FARTHEST = 100.0
-"""No decoder errs by so many ranges; SI values, which may be given by mistake, are beyond it."""
+"""No decoder errs by so many ranges; SI values, given by mistake, exceed it."""
 
 _FORMS = "a directory of <asset id>.npz, a Zarr group or an HDF5 file with a group an asset"
 

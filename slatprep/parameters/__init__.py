@@ -16,7 +16,7 @@ from slatprep.records import Engine, Place, Share
 from slatprep.storage.place import place_of
 
 Length = Annotated[float, Gt(1e-4), Le(1e3)]
-"""A length in voxels, of which either frame has 64: neither nothing nor beyond all bounds."""
+"""A length in voxels, above 0 and within reason: a frame has 64 a side."""
 
 PositiveInt = Annotated[int, Gt(0)]
 """A whole number above 0."""
@@ -26,14 +26,14 @@ MAX_VOXEL_CHUNK, MAX_VOXEL_SHARD, MAX_GRID_SHARD = 2**20, 2**28, 2**16
 what a store may have to be read, and so what it may be told to be built with."""
 
 MAX_ALSO = 15
-"""Further sources of one dataset."""
+"""Most further sources of a dataset."""
 
 MAX_SHARD_CHUNKS = 2**20
-"""Chunks of one shard, whose index a reader holds in memory."""
+"""Chunks per shard; a reader keeps their index in memory."""
 
 
 NAMED_SPLITS, CATEGORY = ("hash", "pixie"), "category:"
-"""What `NormalizeParameters.split_by` may be, or begin with, besides the path of a file."""
+"""Words that `NormalizeParameters.split_by` may be or begin with, besides a path."""
 
 
 class _Group:
@@ -53,7 +53,7 @@ class _Text:
 PlaceText = Annotated[Place, _Text]
 
 Samples = Literal["one", "first", "all", "merge"]
-"""What becomes of several annotations of one object, see `PixieverseSource`."""
+"""The treatment of several annotations of an object, see `PixieverseSource`."""
 
 
 @dataclass(frozen=True)

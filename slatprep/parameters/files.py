@@ -33,7 +33,7 @@ Overrides = Mapping[str, "Mapping[str, object] | str"]
 """Values that win over the file, nested as the file is: ``{"slat": {"root": ...}}``."""
 
 NAMED_RANGES = ("dataset", "pixie", "percentiles such as p1-p99")
-"""What `normalize.ranges` may be besides the path of a file."""
+"""Values of `normalize.ranges` besides the path of a file."""
 
 _UNKNOWN_KEY = "unexpected_keyword_argument"
 
@@ -111,7 +111,7 @@ def load_parameters(
     try:
         parameters = TypeAdapter(BuildParameters).validate_json(document, strict=True)
     except ValidationError as error:
-        # One line, one repair: a misspelt key first, for it makes another one missing.
+        # One line, one repair: a misspelt key first, because it makes another one missing.
         faults = sorted(error.errors(), key=lambda fault: fault["type"] != _UNKNOWN_KEY)
         raise ConfigError(_explain(faults[0], origin)) from None
     _check_paths(parameters, origin)

@@ -58,7 +58,7 @@ def _invertible() -> InJson:
 
 
 MAX_SHEAR = 1e-6
-"""How far the rotation of a similarity may be from an orthogonal matrix, entry by entry."""
+"""Largest deviation of a similarity's rotation from an orthogonal matrix, by entry."""
 
 _MAX_SIDE = 32
 _FINITE = {"type": "float", "allow_inf_nan": False}
@@ -77,7 +77,7 @@ Share = Annotated[float, Ge(0), Le(1)]
 
 
 Count = Annotated[int, Ge(0)]
-"""How many."""
+"""A count, at least 0."""
 
 
 Number = Annotated[float, InJson({"type": "nullable", "schema": _FINITE}, _null_is_nan)]

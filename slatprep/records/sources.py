@@ -65,7 +65,7 @@ class Place(Protocol):
 
 
 ROLES = ("grid", "mask", "bounds", "description", "transform", "slat")
-"""What a file that is read may be to its asset."""
+"""The roles of a file in its asset."""
 
 
 @dataclass(frozen=True)

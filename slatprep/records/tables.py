@@ -21,10 +21,10 @@ from slatprep.records.words import (
 )
 
 MAX_PROPERTIES, MAX_CHANNELS = 32, 256
-"""Columns of properties, and channels of latents, that one store may have."""
+"""Most columns of properties, and most channels of latents, of a store."""
 
 MAX_LATENT_RESOLUTION = 256
-"""Voxels along each axis of the finest grid of latents: coordinates are bytes."""
+"""Most voxels along each axis of a grid of latents: coordinates are bytes."""
 
 PropertyName = Annotated[str, InJson({"type": "str", "pattern": r"^[a-z][a-z0-9_]{0,63}$"})]
 """Name of a property: lower-case letters, digits and ``_``, a letter first."""

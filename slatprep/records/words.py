@@ -10,7 +10,7 @@ RESOLUTION = 64
 
 
 MAX_NAME_BYTES = 1024
-"""No id, view, category or name of a file is longer, in UTF-8."""
+"""Most bytes of an id, view, category or file name in UTF-8."""
 
 
 MATERIAL_CLASSES = (
@@ -36,15 +36,15 @@ FEATS_STD = (
     2.377650737762451, 2.386378288269043, 2.124418020248413, 2.1748552322387695,
     2.663944721221924, 2.371192216873169, 2.6217446327209473, 2.684523105621338,
 )  # fmt: skip
-"""Of each latent channel, as TRELLIS publishes them for ``slat_flow_img_dit_L_64l8p2_fp16``."""
+"""Mean and deviation per channel that TRELLIS publishes for ``slat_flow_img_dit_L_64l8p2_fp16``."""
 
 
 BACKGROUND = 7
-"""Material id of an empty voxel, unless there are more classes than its number."""
+"""Material id of an empty voxel, unless a store has more classes than this number."""
 
 
 MANY_BACKGROUND = 254
-"""Material id of an empty voxel where there are more, and so the most classes there may be."""
+"""Material id of an empty voxel in a store with more classes; also the most classes."""
 
 
 UNANNOTATED = 255
@@ -76,7 +76,7 @@ UNANNOTATED_COLOUR = "#FFFFFF"
 
 def _colour_beyond(index: int) -> str:
     """Return a colour for a class beyond PhysGaussian's, unlike those before it."""
-    # Steps of the golden ratio leave no hue out and meet none again.
+    # Steps of the golden ratio cover all hues and never repeat one.
     hue, lightness = index * 0.618034 % 1.0, (0.35, 0.5, 0.65)[index % 3]
     return "#" + "".join(f"{round(255 * c):02X}" for c in hls_to_rgb(hue, lightness, 0.6))
 

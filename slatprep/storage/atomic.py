@@ -151,7 +151,7 @@ def append_file(source: Path, target: Path, size: int) -> None:
                 shutil.copyfileobj(more, file)
             os.fsync(descriptor)
         except OSError:
-            os.ftruncate(descriptor, size)  # Only now is nothing left that waits to be written.
+            os.ftruncate(descriptor, size)  # Only now no buffered bytes are left.
             raise
     finally:
         os.close(descriptor)

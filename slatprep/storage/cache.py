@@ -14,7 +14,7 @@ from pathlib import Path
 from slatprep.storage.remote import RemotePlace, connected, multipart_options
 
 VARIABLE = "SLATPREP_CACHE"
-"""Environment variable that says where the folder is."""
+"""Environment variable with the folder's path."""
 
 
 def cache_folder() -> Path:

@@ -25,7 +25,7 @@ _ZSTD_MAGIC = 0xFD2FB528
 _BLOSC_HEADER = 16
 
 MAX_TEXT_BYTES = 64 * 2**20
-"""What one chunk of strings may unpack to; 65,536 ids take 3 MiB."""
+"""Most bytes of an unpacked chunk of strings; 65,536 ids take 3 MiB."""
 
 
 @dataclass(frozen=True)
@@ -131,7 +131,7 @@ def content_size(data: memoryview | bytes, compressor: str) -> int:
     try:
         if compressor == "blosc":
             nbytes, _, nbytes_packed = struct.unpack_from("<III", data, 4)
-            # blosc reads as much as its header says, not as much as there is.
+            # blosc trusts the size in its header, not the size of the data.
             return int(nbytes) if _BLOSC_HEADER <= nbytes_packed <= len(data) else -1
         if compressor == "zstd":
             magic, descriptor = struct.unpack_from("<IB", data)

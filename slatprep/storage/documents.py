@@ -15,7 +15,7 @@ from slatprep.storage.place import storage_of
 _Value = TypeVar("_Value")
 
 MAX_DEPTH = 64
-"""Objects and lists within each other; a store's metadata have a dozen."""
+"""Most levels of nested objects and lists; a store's metadata have a dozen."""
 
 
 def read_bounded(place: Place, limit: int) -> bytes:

@@ -22,14 +22,14 @@ _NO_WAITING = getattr(os, "O_NONBLOCK", 0)  # a pipe's reader would wait for a w
 _NO_LINK = getattr(os, "O_NOFOLLOW", 0)
 
 OWN_FILE = os.O_CREAT | getattr(os, "O_CLOEXEC", 0) | _NO_LINK | _NO_WAITING
-"""How to open a file of our own, made if need be: no link is followed, no pipe waited for."""
+"""Flags to open or create our own file without following links or waiting for pipes."""
 
 
 class LocalFile(FileIO):
     """An unbuffered file of the local disk; threads may share it."""
 
     def __del__(self) -> None:
-        # A reader keeps its files as long as it lives; to close them then is no oversight.
+        # A reader keeps its files open for its whole life, on purpose.
         self.close()
 
     def size(self) -> int:
@@ -155,7 +155,7 @@ def take_file(source: Path, target: Path) -> None:
 
 
 LINK, OTHER = -1, -2
-"""In place of a size: a symbolic link; a pipe, device or socket."""
+"""Stand for a size: a symbolic link; a pipe, device or socket."""
 
 
 def local_files(path: Path) -> dict[str, int]:

@@ -60,7 +60,7 @@ class Listing:
 def _is_folder(entry: os.DirEntry[str]) -> bool:
     try:
         return entry.is_dir()
-    except OSError:  # A link that leads back to itself.
+    except OSError:  # A link loop.
         return False
 
 

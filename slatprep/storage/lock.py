@@ -16,7 +16,7 @@ from slatprep.storage.documents import parse_document
 from slatprep.storage.files import OWN_FILE, is_at, locks_alone
 
 _TRIES = 100
-"""How often a lock is looked for again that its holder has just removed."""
+"""Attempts to lock a file that its holder has just removed."""
 
 
 def take_lock(path: Path, taken: str) -> int:

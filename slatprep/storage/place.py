@@ -40,10 +40,10 @@ _URL = re.compile(r"([a-z][a-z0-9+.-]+):/+(.*)", re.DOTALL)
 _LOCAL = ("file", "local")
 
 RangeFile = LocalFile | RemoteFile
-"""A file that is read by ranges, which threads may share."""
+"""A file for reading ranges; threads may share it."""
 
 Folder = LocalFolder | RemoteFolder
-"""A folder whose files are read by ranges, and stay those of one store."""
+"""A folder for reading ranges of its files, which stay those of one store."""
 
 
 def place_of(text: str | Place, folder: Path | None = None) -> Place:

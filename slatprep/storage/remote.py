@@ -20,10 +20,10 @@ from typing import IO, Any
 from slatprep.errors import ConfigError
 
 PART_BYTES = 2**24
-"""Of large objects, what is uploaded or fetched by one request."""
+"""Bytes per request in the upload or download of a large object."""
 
 BUFFER_BYTES = 8 * 2**20
-"""What one request of a file that is read from its beginning asks for."""
+"""Bytes per request when a file is read from its beginning."""
 
 
 class RemotePlace:
@@ -34,7 +34,7 @@ class RemotePlace:
     library is missing or the protocol is unknown.
     """
 
-    # No dataclass: what writes JSON would take that for a table of its fields.
+    # Not a dataclass: JSON writers would write that as a table of its fields.
     def __init__(self, protocol: str, path: PurePosixPath) -> None:
         self.protocol, self.path = protocol, path
 
@@ -66,7 +66,7 @@ class RemotePlace:
         return RemotePlace(self.protocol, self.path.parent)
 
     def __truediv__(self, key: str) -> RemotePlace:
-        # Not as pathlib has it, for which a key with a slash in front leads elsewhere.
+        # Unlike in pathlib, a key with a leading slash must not replace the path.
         return RemotePlace(self.protocol, PurePosixPath(f"{self.path}/{key}"))
 
     def absolute(self) -> RemotePlace:
@@ -110,7 +110,7 @@ class RemotePlace:
             system.put_file(str(local), name, **multipart_options(system))
 
     def _kind(self) -> str:
-        # Not by isdir, which lists all that is below.
+        # Not isdir, which lists everything below.
         try:
             with connected(self) as (system, name):
                 return str(system.info(name)["type"])
@@ -136,7 +136,7 @@ class RemoteFile(io.RawIOBase):
         begin, data = self._prefetched
         if begin <= offset and offset + length <= begin + len(data):
             return data[offset - begin : offset - begin + length]
-        # Asked for anew: a connection does not survive a fork, and fsspec keeps one a process.
+        # Asked for each time: connections do not survive a fork; fsspec caches one per process.
         try:
             with connected(self.place) as (system, name):
                 return bytes(system.cat_file(name, start=offset, end=offset + length))
@@ -145,7 +145,7 @@ class RemoteFile(io.RawIOBase):
         except OSError:
             if offset < self._size:
                 raise
-            return b""  # Servers refuse a range that begins behind the end.
+            return b""  # Servers refuse a range that begins after the end.
 
     def prefetch(self, length: int, offset: int) -> None:
         """Read a range with one request, and keep it until the next."""

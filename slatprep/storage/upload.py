@@ -52,7 +52,7 @@ from slatprep.storage.versions import (
 _SMALL_BYTES = 8 * 2**20
 
 _MD5 = re.compile(r"[0-9a-f]{32}(-[0-9]+)?")
-"""What S3 tags an object with, of several parts with their number."""
+"""S3's tag of an object; after an upload in parts it has their number."""
 
 
 @dataclass(frozen=True)
@@ -107,7 +107,7 @@ def published_state(target: RemotePlace) -> PublishedState:
     if is_version(target):
         raise StoreError(f"{target} is one version of a store; expected {target.parent.parent}")
     try:
-        # The tag first: of a pointer that moves in between it is the old one, and will not fit.
+        # The tag first: if the pointer moves in between, the tag is the old one and will not match.
         tag = _tag(target / POINTER)
         pointer = read_pointer(target)
         others = [] if pointer else [name for name in list_objects(target) if not _is_ours(name)]
@@ -152,7 +152,7 @@ class Upload:
         if self.pointer == self.before.pointer:
             return
         try:
-            # Before the pointer moves: a build that begins then is not listed here.
+            # Before the pointer moves, so that builds which begin after that are not listed.
             old = self._unneeded()
             self._replace_pointer()
         except OSError as error:
@@ -239,7 +239,7 @@ def upload_store(new: Path, before: PublishedState, staged: Staged | None = None
         put_objects(new, upload.version, small)
         put_objects(new, upload.version, large, at_once=1)
         if staged is not None and staged.before is not None:
-            # One that an upload left is the same: a version's name tells its content.
+            # An upload may have left it already: a version's name implies its content.
             others = [n for n in staged.copied if there.get(n, {}).get("size") != sizes[n]]
             copy_objects(staged.before, upload.version, sorted(others))
         there = list_objects(upload.version)

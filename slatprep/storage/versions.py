@@ -28,11 +28,11 @@ if TYPE_CHECKING:
 POINTER, VERSIONS, MANIFESTS, SPOOL = "current.json", "versions", "manifests", "spool"
 
 BUILDER = "builder"
-"""How the names of objects in the spool begin that say who builds."""
+"""Prefix of the spool's objects that say who builds."""
 
 FORMAT = "slatprep-store-pointer"
 
-# Names come from whoever wrote the pointer, and lead to objects.
+# Whoever wrote the pointer chose the names, and they lead to objects.
 _NAME = re.compile(r"[0-9a-f]{16}")
 _SPOOLED = re.compile(rf"{BUILDER}-[0-9a-f]{{16}}|[0-9a-z]{{2}}/(none-)?[0-9a-f]{{32,64}}\.arrays")
 _MAX_POINTER_BYTES = 2**16

@@ -5,4 +5,4 @@ from __future__ import annotations
 from collections.abc import Callable
 
 Progress = Callable[[int, int], None]
-"""Called with what is done and what there is in all: assets, where nothing else is said."""
+"""Called with the number done and the number of all, of assets unless stated otherwise."""

@@ -42,13 +42,13 @@ except ImportError as error:
 Result = TypeVar("Result")
 
 ANSWER_SECONDS = 15.0
-"""How long a scheduler may take to answer, and three times as long as to be found at all."""
+"""Seconds for a scheduler to answer, of which a third to connect."""
 
 BATCHES_A_CORE = 3
-"""Batches that a cluster has at a time: one under way, and others that wait for a free worker."""
+"""Batches per core of a cluster: one under way, and others that wait."""
 
 BATCHES_A_SECOND = 200.0
-"""How many a scheduler is asked to hand out, where it could hand out some 500."""
+"""Batches per second for a scheduler, which could hand out some 500."""
 
 SHORTEST_BATCH_SECONDS = 0.25
 
@@ -75,7 +75,7 @@ class Cluster:
         self._common = _Common(_software())
 
     def __enter__(self) -> Cluster:
-        # What is logged of lost workers and connections is either mended or raised by us.
+        # Lost workers and connections are either replaced or raised by us.
         for name in ("distributed.client", "tornado.application"):
             logging.getLogger(name).setLevel(logging.CRITICAL)
         try:

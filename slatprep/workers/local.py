@@ -31,10 +31,10 @@ THREAD_VARIABLES = (
     "NUMEXPR_NUM_THREADS",
     "NUMBA_NUM_THREADS",
 )
-"""What the numeric libraries read, once, when they are loaded."""
+"""Environment variables that the numeric libraries read once, when loaded."""
 
 _IDLE_SECONDS = 300
-"""How long a worker process stays without work: longer than a build needs none."""
+"""Seconds that a worker process stays without work: longer than any pause of a build."""
 
 
 class Workers(Protocol):

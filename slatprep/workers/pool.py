@@ -19,10 +19,10 @@ Task = tuple[Any, ...]
 """Positional arguments of one call."""
 
 LARGEST_BATCH = 1000
-"""Tasks in a batch at most, however short they are."""
+"""Most tasks in a batch, however short they are."""
 
 _BATCH_SECONDS = 0.2
-"""Handing over a call takes 1 ms, some 2 % of what an asset takes; progress still looks steady."""
+"""Seconds per batch: a call's hand-over takes 1 ms, 2 % of an asset; progress looks steady."""
 
 _POLL_SECONDS = 1.0
 
@@ -31,7 +31,7 @@ class Pool(ABC):
     """Workers that take calls, as a `concurrent.futures.Executor` does."""
 
     killed: type[BaseException]
-    """What the future of a call raises whose worker was killed."""
+    """Errors of a call whose worker was killed."""
 
     @abstractmethod
     def room(self) -> int:
@@ -120,7 +120,7 @@ def _attempt(
             pool.abandon(under_way)
         raise
     except BaseException:
-        # Also with nothing under way that is known of: a signal may have come while a call was
+        # Even with no known call under way: a signal may have come while a call was
         # handed over, and its worker would write on beside what the caller cleans up.
         pool.abandon(under_way)
         raise

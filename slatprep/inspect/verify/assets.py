@@ -149,7 +149,7 @@ def value_findings(asset: StoredAsset) -> Iterator[Finding]:
         if not fine:
             yield Finding(where, asset.asset_id, what, expected)
     cells = flat_index(coords, 256)
-    if not (cells[1:] > cells[:-1]).all():  # Else they are in order, as usual, and each once.
+    if not (cells[1:] > cells[:-1]).all():  # Otherwise they are in order, as usual, and unique.
         cells.sort()
     if (cells[1:] == cells[:-1]).any():
         yield Finding("voxel/coords", asset.asset_id, "a coordinate occurs twice", "each once")
@@ -208,13 +208,13 @@ def confidence_findings(asset: StoredAsset, record: AssetRecord) -> Iterator[Fin
         return
     field, properties = asset.normalised_field, asset.properties
     clipped = record.counts.clipped
-    if not field.classified:  # Else the confidence comes of classes alone.
+    if not field.classified:  # Otherwise the confidence comes from classes alone.
         if clipped and any(clipped.grid.values()):
-            return  # The confidence came of values that the store does not hold.
+            return  # The confidence came from values that the store does not hold.
         field, properties = asset.field, asset.properties_si
     annotation = Annotation(properties, asset.material, asset.valid, asset.distance, asset.place)
     if not labels_hold(field, annotation, roundings(asset.store.normalization)):
-        return  # It may have come of other labels than the rounded values have.
+        return  # It may have come from other labels than the rounded values have.
     confidence = record.judgement.confidence
     likely = voxel_confidence(field, asset.latents, record.alignment, annotation, confidence)
     wrong = np.count_nonzero(~(np.abs(likely - asset.confidence) <= CONFIDENCE_TOLERANCE))

@@ -19,7 +19,7 @@ from slatprep.store.contract import Finding
 from slatprep.store.reader import StoredAsset
 
 TOLERANCE = 1e-5
-"""By so much shares and normalised spreads may differ: another machine may round otherwise."""
+"""Largest difference of shares and normalised spreads: another machine may round otherwise."""
 
 
 def merged_findings(
