@@ -11,3 +11,5 @@ slatprep check-alignment --store "$work/demo.zarr" --worst 1 --picture "$here/al
 slatprep make-demo "$work/many" --assets 24 --seed 0 --quiet
 slatprep build-store --config "$work/many/dataset.toml" --out "$work/demo24.zarr" --quiet
 slatprep stats "$work/demo24.zarr" --picture "$here/statistics.png" --quiet
+# Draws the diagrams: frames, deformation, verdict, update, arrays.
+python "$here/diagrams.py"
