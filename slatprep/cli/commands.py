@@ -43,7 +43,6 @@ GROUPS = {
     "Maintain": {
         "verify": "slatprep.cli.verify:verify",
         "diff": "slatprep.cli.diff:diff",
-        "upgrade": "slatprep.cli.join:upgrade",
         "bench": "slatprep.cli.bench:bench",
     },
 }

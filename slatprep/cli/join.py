@@ -1,4 +1,4 @@
-"""`slatprep subset`, `concat` and `upgrade`: new stores from existing ones."""
+"""`slatprep subset` and `concat`: new stores from existing ones."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from slatprep.cli.options import (
     Verdicts,
     require_categories,
 )
-from slatprep.cli.output import Output, say
+from slatprep.cli.output import Output
 from slatprep.cli.signature import Click, command
 
 if TYPE_CHECKING:
@@ -95,37 +95,3 @@ def concat(
     with output.progress("concat", "shards") as progress:
         summary = concat_stores(stores, out, manifests=manifests, progress=progress)
     report(output, summary)
-
-
-@command()
-def upgrade(
-    output: Output,
-    store: FolderOrUrl,
-    *,
-    out: Annotated[
-        PathOrUrl | None,
-        "The new store, a path or URL. [default: STORE itself, replaced in one step]",
-        Click(metavar="STORE.zarr"),
-    ] = None,
-    manifests: Annotated[
-        RecordsFolder | None, "Folder for the records. [default: beside the new store]"
-    ] = None,
-) -> None:
-    """Convert a STORE of an older format to today's, without aligning again.
-
-    Its sources are not needed: places, confidences and verdicts are computed
-    from the store, and all other rows are copied unchanged.
-
-    Example
-    -------
-    slatprep upgrade old.zarr
-    slatprep upgrade old.zarr --out new.zarr
-    """
-    from slatprep.pipeline.upgrade import upgrade_store
-
-    with output.progress("upgrade", "shards") as progress:
-        summary = upgrade_store(store, out, manifests=manifests, progress=progress)
-    if summary is None:
-        output.result({"store": store}, lambda: say(f"{store} has today's format already"))
-    else:
-        report(output, summary)

@@ -188,9 +188,8 @@ def check_alignment(store: Store, asset_id: str) -> AlignmentCheck:
             for name, array in (("property", "voxel/properties"), ("distance", "voxel/distance"))
         ),
     ]
-    if store.format_version > 1:
-        figures.append(Figure("confidence", confidence, confidence, 0))
-        figures.append(Figure("expected_accuracy", expected, expected, 0))
+    figures.append(Figure("confidence", confidence, confidence, 0))
+    figures.append(Figure("expected_accuracy", expected, expected, 0))
     if asset.merged:
         means = [("votes for its class", asset.votes[asset.valid])]
         spreads = zip(store.about.property_columns, asset.spread.T, strict=True)

@@ -52,8 +52,7 @@ class Item:
     valid : Tensor of bool, shape (N,)
         Which voxels have targets.
     confidence : Tensor of float32, shape (N,)
-        Probability that the class is right; 0 where not valid. In a store of format 1, which
-        has none, 1 where valid.
+        Probability that the class is right; 0 where not valid.
     """
 
     asset_id: str
@@ -171,8 +170,6 @@ class SlatDataset(Dataset[Item]):
                 "loosen the filter, change the shares, or add objects (at least as many as splits)"
             )
         self.asset_ids = [self.store.ids[index] for index in self.indices]
-        if min_confidence is not None:
-            require_confidence(self.store)
         self.seed, self.min_confidence = seed, min_confidence
         self._symmetries = lattice_symmetries(augmentation)
         self._latents = self.store.contents.latents
@@ -187,8 +184,6 @@ class SlatDataset(Dataset[Item]):
         rows = self.store.read(int(self.indices[draw.number]), _COLUMNS)
         asset_id = self.asset_ids[draw.number]
         valid, confidence = rows["valid"], rows["confidence"]
-        if self.store.format_version == 1:
-            confidence = valid.astype(np.float32)
         if self.min_confidence is not None:
             valid = valid & (confidence >= self.min_confidence)
         material = rows["material"].astype(np.int64)
@@ -209,15 +204,6 @@ class SlatDataset(Dataset[Item]):
         words = np.frombuffer(asset_id.encode("utf-8").ljust(4, b"\0"), np.uint8)
         rng = np.random.default_rng([self.seed, draw.epoch, *words.tolist()])
         return np.asarray(self._symmetries[rng.integers(len(self._symmetries))])
-
-
-def require_confidence(store: Store) -> None:
-    """Raise ConfigError if a store has format 1, which holds no confidence of voxels."""
-    if store.format_version == 1:
-        raise ConfigError(
-            f"{store.path} has format 1, without the confidence of voxels; expected format 2 or "
-            "later: build it again"
-        )
 
 
 def collate(items: Sequence[Item]) -> SparseBatch:

@@ -15,7 +15,7 @@ import torch
 from slatprep.errors import ConfigError
 from slatprep.learn.augment import Augmentation
 from slatprep.learn.baselines import fit_baselines
-from slatprep.learn.dataset import SlatDataset, SlatLoader, SparseBatch, require_confidence
+from slatprep.learn.dataset import SlatDataset, SlatLoader, SparseBatch
 from slatprep.learn.decoder import SIZES, Prediction, make_decoder
 from slatprep.learn.loss import loss_of
 from slatprep.learn.predict import (
@@ -146,8 +146,6 @@ def train(
     train_set, test_set = (
         _dataset(opened, name, parameters, assignment) for name in ("train", "test")
     )
-    if parameters.weigh_by_confidence:
-        require_confidence(train_set.store)
     val_set = None
     if "val" in assignment.splits.values():
         val_set = _dataset(opened, "val", parameters, assignment)

@@ -12,7 +12,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from typing import Any
 
-from slatprep.errors import ConfigError, StoreError
+from slatprep.errors import ConfigError
 from slatprep.pipeline.pack import resolved_contents
 from slatprep.pipeline.rewrite import NO_EXTENT, Source, places_of_sources, write_rows
 from slatprep.pipeline.spool import spooled
@@ -20,7 +20,6 @@ from slatprep.pipeline.summary import BuildSummary
 from slatprep.provenance.stored import StoredRecords
 from slatprep.records import Contents, LatentSpace, Normalization, Place, PropertyRange
 from slatprep.store import open_store
-from slatprep.store.layout import FORMAT_VERSION
 from slatprep.workers import Progress
 
 
@@ -59,8 +58,7 @@ def subset_store(
     ConfigError
         If no asset is named, or `out` is the store itself.
     StoreError
-        If the store lacks an asset, cannot be read, or is of an older format;
-        or the disk does not take the new one.
+        If the store lacks an asset, cannot be read, or the disk does not take the new one.
     """
     source = _source(store)
     chosen = {source.store.match(name) for name in assets}
@@ -104,7 +102,7 @@ def concat_stores(
         of them, parameters of alignment or look-up differ, or ranges differ
         that do not come from the datasets.
     StoreError
-        If one cannot be read or is of an older format, or the disk does not
+        If one cannot be read, or the disk does not
         take the new one.
     """
     sources = [_source(store) for store in stores]
@@ -126,11 +124,6 @@ def concat_stores(
 
 def _source(place: str | Place) -> Source:
     store = open_store(place)
-    if store.format_version != FORMAT_VERSION:
-        raise StoreError(
-            f"{store.path} has format {store.format_version}, and {FORMAT_VERSION} is written; "
-            "build it again"
-        )
     return Source(store, StoredRecords(store), store.attributes["build"], places_of_sources(store))
 
 

@@ -165,8 +165,6 @@ def plan_asset(pair: AssetPair, context: BuildContext) -> PlannedAsset:
     if found is not None:
         other = names if names.changed(found[0]) else None
         return PlannedAsset(asset_id, Action.RESUME, "finished by an earlier build", key, other)
-    if context.previous and (older := context.previous.older_format):
-        return PlannedAsset(asset_id, Action.ALIGN, older, key)
     try:
         record = context.previous.record(asset_id) if context.previous else None
     except StoreError as error:

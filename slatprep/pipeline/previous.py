@@ -15,7 +15,6 @@ from slatprep.provenance.stored import StoredRecords
 from slatprep.records import Finished, Place
 from slatprep.storage.place import storage_of
 from slatprep.store.integrity import file_findings, metadata_findings
-from slatprep.store.layout import FORMAT_VERSION
 from slatprep.store.reader import Store, is_store, open_store
 from slatprep.store.records import RECORD_ARRAY, RECORDS_IN_SHARD
 from slatprep.store.shard_writer import Written
@@ -57,14 +56,6 @@ class PreviousBuild:
     def store(self) -> Store:
         """The store, open."""
         return open_store(self.path)
-
-    @property
-    def older_format(self) -> str:
-        """Why nothing of it can be reused, in words: its format; empty where that is today's."""
-        found = self.store.format_version
-        if found == FORMAT_VERSION:
-            return ""
-        return f"the store has format {found}, and {FORMAT_VERSION} is written"
 
     @cached_property
     def files(self) -> dict[str, Written]:
@@ -168,8 +159,6 @@ def previous_build(target: Place, jobs: Jobs) -> tuple[PreviousBuild | None, tup
     except StoreError as error:
         return None, (str(error),) if is_store(target) else ()
     build_id = str(store.attributes.get("manifest"))
-    if store.format_version != FORMAT_VERSION:  # Nothing of it is taken over.
-        return PreviousBuild(store.path, build_id), ()
     read = "" if storage_of(store.path).local else "asset/"
     findings = sorted({*metadata_findings(store.path), *file_findings(store, jobs, read)[1]})
     damaged = tuple(map(str, findings))

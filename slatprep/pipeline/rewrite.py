@@ -81,7 +81,6 @@ def write_rows(
     manifests: str | Place | None,
     progress: Progress | None,
     contents: Contents,
-    in_place: bool = False,
 ) -> BuildSummary:
     """Write a store of rows of others, with their records.
 
@@ -97,13 +96,11 @@ def write_rows(
         As for `slatprep.pipeline.join.subset_store`.
     contents : Contents
         What it holds.
-    in_place : bool
-        Whether it may replace one of the stores that rows are taken from.
 
     Raises
     ------
     ConfigError
-        If it would replace one of them, and may not.
+        If it would replace one of them.
     StoreError
         If a row cannot be read or brought to the ranges, or the disk does not take the store.
     """
@@ -111,7 +108,7 @@ def write_rows(
     place = Destination(out, manifests)
     sources = list(dict.fromkeys(source for source, _ in rows))
     for source in sources:
-        if not in_place and _same_place(source.store.path, place.store):
+        if _same_place(source.store.path, place.store):
             raise ConfigError(f"{place.out} is a store to take assets from; choose another path")
     parameters = _parameters(sources, build)
     assets, clipped = [], []

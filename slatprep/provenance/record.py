@@ -35,7 +35,7 @@ from slatprep.records import (
 if TYPE_CHECKING:
     pass
 
-RECORD_VERSION: Final = 2
+RECORD_VERSION: Final = 1
 
 MAX_SOURCES = MAX_WARNINGS = 256
 """Files of one asset: several for each of its annotations, of which there are seldom many."""
@@ -128,7 +128,7 @@ class AssetRecord:
     __pydantic_config__: ClassVar[dict[str, object]] = _CHECKED
 
     format: Literal["slatprep-asset-record"] = "slatprep-asset-record"
-    format_version: Literal[2] = RECORD_VERSION
+    format_version: Literal[1] = RECORD_VERSION
     asset_id: Annotated[str, MinLen(1)]
     """Id of the row."""
     object_id: str
@@ -197,7 +197,7 @@ class FailedRecord:
     __pydantic_config__: ClassVar[dict[str, object]] = _CHECKED
 
     format: Literal["slatprep-asset-record"] = "slatprep-asset-record"
-    format_version: Literal[2] = RECORD_VERSION
+    format_version: Literal[1] = RECORD_VERSION
     asset_id: Annotated[str, MinLen(1)]
     """Id that its row would have."""
     object_id: str
@@ -251,7 +251,7 @@ class BuildRecord:
     __pydantic_config__: ClassVar[dict[str, object]] = _CHECKED
 
     format: Literal["slatprep-build-record"] = "slatprep-build-record"
-    format_version: Literal[2] = RECORD_VERSION
+    format_version: Literal[1] = RECORD_VERSION
     id: Digest
     """SHA-256 of the asset records' content; the store's attribute ``manifest``."""
     name: str

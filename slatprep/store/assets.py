@@ -32,14 +32,6 @@ ASSET_COLUMNS = [
 ]
 """Last names of the ``asset/*`` arrays that describe an asset."""
 
-_NEWER = {
-    name: layout.fill_value
-    for layout in ARRAYS
-    for group, _, name in (layout.name.partition("/"),)
-    if group == "asset" and layout.since > 1
-}
-"""What a store of format 1 says by the name of an ``asset/*`` array that it does not have."""
-
 
 class AttributesError(StoreError):
     """A store whose attributes do not say what readers rely on."""
@@ -185,8 +177,6 @@ class AssetTable:
             If there is no such array, or it cannot be read.
         """
         # Offsets are always written: that they are there bounds what the others may claim.
-        if (unknown := _NEWER.get(name)) is not None and self.format_version == 1:
-            return np.full(len(self), unknown)
         rows = self.shape("asset/offset")[0] if name == "offset" else len(self)
         return self.read_rows(f"asset/{name}", 0, rows)
 

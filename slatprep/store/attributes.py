@@ -30,7 +30,7 @@ from slatprep.records import (
     labels_of,
 )
 from slatprep.store.contract import Finding
-from slatprep.store.layout import FORMAT, FORMAT_VERSION, READABLE_VERSIONS
+from slatprep.store.layout import FORMAT, FORMAT_VERSION
 
 if TYPE_CHECKING:
     from pydantic import TypeAdapter
@@ -88,7 +88,7 @@ class RootAttributes:
     __pydantic_config__: ClassVar[dict[str, object]] = {"extra": "ignore", "allow_inf_nan": False}
 
     format: Annotated[str, _one_of(FORMAT)]
-    format_version: Annotated[int, _one_of(*READABLE_VERSIONS)]
+    format_version: Annotated[int, _one_of(FORMAT_VERSION)]
     resolution: Annotated[int, _one_of(RESOLUTION)]
     material_classes: tuple[ClassName, ...]
     property_columns: Annotated[tuple[PropertyName, ...], MinLen(1), MaxLen(MAX_PROPERTIES)]

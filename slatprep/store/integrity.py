@@ -19,7 +19,7 @@ from slatprep.store.contract import (
 )
 from slatprep.store.digests import ATTRIBUTES, attributes_digest, is_own
 from slatprep.store.gate import GROUPS, gate_findings
-from slatprep.store.layout import MERGED, READABLE_VERSIONS, arrays_of
+from slatprep.store.layout import ARRAYS, MERGED
 from slatprep.store.reader import Store
 from slatprep.workers.local import Jobs, run_unordered
 
@@ -40,14 +40,12 @@ def metadata_findings(path: Place) -> Iterator[Finding]:
         copies = {}
     if not isinstance(said, tuple):
         yield from width_findings(said, copies)
-    version = root["attributes"].get("format_version")
-    layouts = arrays_of(version if version in READABLE_VERSIONS else READABLE_VERSIONS[-1])
     arrays: dict[str, Any] = {}
     files = storage_of(path).files()
     present = {name.removesuffix("/zarr.json") for name in files if _is_metadata(name)}
     for name, copy in copies.items():
         yield from gate_findings(name, copy)
-    for name in sorted({*present, *copies, *(layout.name for layout in layouts), *GROUPS}):
+    for name in sorted({*present, *copies, *(layout.name for layout in ARRAYS), *GROUPS}):
         where = f"{name}/zarr.json"
         if name not in present:
             yield Finding(where, "", "is missing", "the metadata of an array or group")
@@ -69,7 +67,7 @@ def metadata_findings(path: Place) -> Iterator[Finding]:
     if len(merged) == 1:
         both = " and ".join(layout.name for layout in MERGED)
         yield Finding("zarr.json", "", f"has {merged[0]} alone", f"{both}, or neither")
-    for layout in (*layouts, *MERGED):
+    for layout in (*ARRAYS, *MERGED):
         if layout.name in arrays:
             yield from array_findings(layout.name, arrays[layout.name], sizes)
 

@@ -15,12 +15,8 @@ from slatprep.parameters import MAX_VOXEL_SHARD, StoreParameters
 from slatprep.records import BACKGROUND, RESOLUTION, UNANNOTATED
 
 FORMAT = "slatprep-store"
-FORMAT_VERSION = 2
-"""The format that is written."""
-
-READABLE_VERSIONS = (1, 2)
-"""The formats that are read. 1 has no ``voxel/place``, as it knew similarities only,
-and no confidences."""
+FORMAT_VERSION = 1
+"""The format that is written and read."""
 
 ASSET_CHUNK = 65_536
 """Assets in one chunk of the ``asset/*`` arrays."""
@@ -34,8 +30,7 @@ class ArrayLayout:
 
     `packing` is ``zstd``, the smallest, or what unpacks fastest: ``repeats``
     for values that recur, ``columns`` for rows of three bytes of which two
-    recur, ``exponents`` for floats of which little else recurs. `since` is the
-    first format version that has it.
+    recur, ``exponents`` for floats of which little else recurs.
     """
 
     name: str
@@ -45,7 +40,6 @@ class ArrayLayout:
     description: str
     unit: str = ""
     packing: str = "zstd"
-    since: int = 1
 
 
 _XYZ = ("x", "y", "z")
@@ -115,7 +109,6 @@ ARRAYS = (
         ("asset",),
         0,
         "PixieVerse voxels left out, as no material has their properties",
-        since=2,
     ),
     ArrayLayout("asset/verdict", "str", ("asset",), "", "good, doubtful or failed"),
     ArrayLayout(
@@ -124,7 +117,6 @@ ARRAYS = (
         ("asset",),
         NAN,
         "calibrated probability that the placement is right",
-        since=2,
     ),
     ArrayLayout(
         "asset/expected_accuracy",
@@ -132,7 +124,6 @@ ARRAYS = (
         ("asset",),
         NAN,
         "share of right classes to be expected among valid voxels",
-        since=2,
     ),
     ArrayLayout(
         "asset/contradicted",
@@ -140,7 +131,6 @@ ARRAYS = (
         ("asset",),
         False,
         "the latents contradict the labels, where latents were compared with them",
-        since=2,
     ),
     ArrayLayout(
         "voxel/coords",
@@ -198,7 +188,6 @@ ARRAYS = (
         NAN,
         "where it was looked up, in the PixieVerse frame's unit cube [-0.5, 0.5]^3",
         packing="exponents",
-        since=2,
     ),
     ArrayLayout(
         "voxel/confidence",
@@ -207,7 +196,6 @@ ARRAYS = (
         NAN,
         "calibrated probability that the class is right, 0 where not valid",
         packing="exponents",
-        since=2,
     ),
     ArrayLayout(
         "grid/properties",
@@ -234,7 +222,6 @@ MERGED = (
         NAN,
         "standard deviation of normalised properties over the annotations, NaN where not several",
         packing="exponents",
-        since=2,
     ),
     ArrayLayout(
         "voxel/votes",
@@ -243,7 +230,6 @@ MERGED = (
         NAN,
         "share of the annotations that give the class, 0 where not valid, NaN where not several",
         packing="repeats",
-        since=2,
     ),
 )
 """Further arrays of a store in which labels of any asset are merged of several annotations."""
@@ -256,11 +242,6 @@ MERGED_COLUMNS = tuple(layout.name.removeprefix("voxel/") for layout in MERGED)
 def arrays_with(merged: bool) -> tuple[ArrayLayout, ...]:
     """Return every array of a store that is written, whether or not it has `MERGED`."""
     return (*ARRAYS, *MERGED) if merged else ARRAYS
-
-
-def arrays_of(version: int) -> tuple[ArrayLayout, ...]:
-    """Return the arrays that every store of a format version has."""
-    return tuple(layout for layout in ARRAYS if layout.since <= version)
 
 
 FIXED_SIZES = {"row": 4, "column": 4, "axis": 3, **dict.fromkeys(_XYZ, RESOLUTION)}

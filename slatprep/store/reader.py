@@ -13,7 +13,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slatprep.errors import ConfigError, StoreError
-from slatprep.geometry.frames import places_of, voxel_centres
 from slatprep.geometry.voxels import shown_in_cells, voxels_at
 from slatprep.normalize import denormalize_properties
 from slatprep.records import MaterialField, Place, StructuredLatents
@@ -21,7 +20,7 @@ from slatprep.storage.place import place_of, storage_of
 from slatprep.store.assets import ASSET_COLUMNS, AssetTable, AttributesError
 from slatprep.store.attributes import width_findings
 from slatprep.store.contract import MAX_VOXELS, read_metadata
-from slatprep.store.layout import FORMAT, MERGED_COLUMNS, READABLE_VERSIONS, arrays_with
+from slatprep.store.layout import FORMAT, FORMAT_VERSION, MERGED_COLUMNS, arrays_with
 
 TRAINING_COLUMNS = ("coords", "feats", "properties")
 """What `Store.read` reads unless told otherwise."""
@@ -62,11 +61,9 @@ class StoredAsset:
     distance : ndarray of float32, shape (N,)
         Voxels to the annotation used.
     confidence : ndarray of float32, shape (N,)
-        How likely the class is right, 0 where not valid; NaN in a store of
-        format 1, which does not tell.
+        How likely the class is right, 0 where not valid.
     place : ndarray of float32, shape (N, 3)
-        Where each voxel was looked up, in the PixieVerse frame. A store of
-        format 1 does not hold it: there the inverse of the transform leads to it.
+        Where each voxel was looked up, in the PixieVerse frame.
     spread : ndarray of float32, shape (N, P)
         Standard deviation of each normalised property over the annotations that the labels
         are merged of, NaN where fewer than two are valid.
@@ -199,11 +196,11 @@ class Store(AssetTable):
         """
         start, stop = self.rows(index)
         if storage_of(self.path).local is not None:
-            return {name: self._voxel_rows(name, index, start, stop) for name in columns}
+            return {name: self._voxel_rows(name, start, stop) for name in columns}
         # Each array is an object of its own, and an answer takes long to come. Threads that were
         # kept for the next call would not be there in a forked process.
         with ThreadPoolExecutor(max(len(columns), 1)) as pool:
-            read = pool.map(lambda name: self._voxel_rows(name, index, start, stop), columns)
+            read = pool.map(lambda name: self._voxel_rows(name, start, stop), columns)
             return dict(zip(columns, read, strict=True))
 
     def latents_of(
@@ -253,15 +250,7 @@ class Store(AssetTable):
             **self.read(index, VOXEL_COLUMNS),
         )
 
-    def _voxel_rows(self, name: str, index: int, start: int, stop: int) -> NDArray[Any]:
-        if name == "place" and self.format_version == 1:
-            centres = voxel_centres(self.read_rows("voxel/coords", start, stop))
-            try:
-                return places_of(centres, self._column("transform")[index]).astype(np.float32)
-            except ValueError as error:
-                raise StoreError(f"{self.path}/asset/transform: row {index}: {error}") from None
-        if name == "confidence" and self.format_version == 1:
-            return np.full(stop - start, np.nan, dtype=np.float32)
+    def _voxel_rows(self, name: str, start: int, stop: int) -> NDArray[Any]:
         if name in MERGED_COLUMNS and not self.merges:
             columns = [len(self.about.property_columns)] if name == "spread" else []
             return np.full([stop - start, *columns], np.nan, dtype=np.float32)
@@ -304,10 +293,9 @@ def open_store(path: str | Place, *, copy: bool = False) -> Store:
             "`slatprep build-store` wrote"
         )
     version = attributes.get("format_version")
-    if type(version) is not int or version not in READABLE_VERSIONS:
-        readable = " and ".join(map(str, READABLE_VERSIONS))
+    if type(version) is not int or version != FORMAT_VERSION:
         raise StoreError(
-            f"{path} has format version {version!r}; this slatprep reads {readable}. "
+            f"{path} has format version {version!r}; this slatprep reads {FORMAT_VERSION}. "
             "Use the slatprep that wrote it, or a newer one"
         )
     store = Store(path, document)

@@ -95,7 +95,7 @@ def place(document: dict, path: str, value: object) -> dict:
         ("status", "fine"),
         ("status", "failed"),
         ("status", None),
-        ("format_version", 1),
+        ("format_version", 2),
         ("asset_id", ""),
         ("alignment", None),
         ("alignment/engine", "magic"),

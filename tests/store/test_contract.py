@@ -80,7 +80,7 @@ def test_grid_is_the_normalised_field(root: zarr.Group, mixed: Dataset) -> None:
 def test_attributes_explain_the_store(root: zarr.Group, mixed_build: BuildSummary) -> None:
     attributes = dict(root.attrs)
     assert attributes["format"] == "slatprep-store"
-    assert attributes["format_version"] == 2
+    assert attributes["format_version"] == 1
     assert attributes["resolution"] == 64
     assert attributes["material_classes"][6:] == ["stationary", "background"]
     assert attributes["property_columns"] == ["youngs_modulus", "density", "poissons_ratio"]

@@ -7,9 +7,7 @@ from hypothesis import strategies as st
 
 from slatprep.parameters import MAX_VOXEL_SHARD, StoreParameters
 from slatprep.store.layout import (
-    ARRAYS,
     MOST_SHARDS,
-    arrays_of,
     overlaps,
     row_ranges,
     rows_per_shard,
@@ -73,14 +71,3 @@ def test_shards_are_few_and_small_beside_the_store(chunk: int) -> None:
 )
 def test_a_shard_holds_the_least_power_of_two_of_chunks(rows: int, chunks: int) -> None:
     assert rows_per_shard(StoreParameters(), rows) == 4096 * chunks
-
-
-def test_a_format_has_the_arrays_that_came_with_it_and_before() -> None:
-    newer = {
-        "voxel/place", "voxel/confidence", "asset/confidence", "asset/expected_accuracy",
-        "asset/unphysical", "asset/contradicted",
-    }  # fmt: skip
-    names = {layout.name for layout in ARRAYS}
-    assert newer < names
-    assert {layout.name for layout in arrays_of(1)} == names - newer
-    assert {layout.name for layout in arrays_of(2)} == names

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import warnings
 from dataclasses import asdict
 from itertools import accumulate
 from pathlib import Path
@@ -22,7 +21,7 @@ BUILD_ID = "0123456789abcdef" * 4
 
 
 def make_store(
-    path: Path, contents: Contents = PIXIEVERSE, *, merged: bool = False, version: int = 2
+    path: Path, contents: Contents = PIXIEVERSE, *, merged: bool = False
 ) -> dict[str, np.ndarray]:
     """Write a store of four assets, one of them without voxels, and return its arrays by name."""
     rng = np.random.default_rng(0)
@@ -64,8 +63,6 @@ def make_store(
     parameters = {"align": {"radius": 1.5}, "sample": asdict(SampleParameters())}
     build = {"parameters": parameters, "versions": {"slatprep": "0"}, "name": "drawn"}
     finish_store(path, Normalization(ranges, "p1-p99"), BUILD_ID, build, contents)
-    if version == 1:
-        _make_old(path)
     return arrays
 
 
@@ -75,18 +72,6 @@ def _drawn(rng: np.random.Generator, array: zarr.Array) -> np.ndarray:
     if array.dtype.kind == "f":
         return rng.uniform(-1, 1, array.shape).astype(array.dtype)
     return rng.integers(0, 2 if array.dtype.kind == "b" else 7, array.shape).astype(array.dtype)
-
-
-def _make_old(path: Path) -> None:
-    """Take what format 1 lacked."""
-    root = zarr.open_group(path, mode="r+", use_consolidated=False)
-    for name in ("voxel/place", "voxel/confidence", "asset/confidence", "asset/expected_accuracy",
-                 "asset/unphysical", "asset/contradicted"):  # fmt: skip
-        del root[name]
-    root.attrs["format_version"] = 1
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        zarr.consolidate_metadata(str(path), zarr_format=3)
 
 
 def edit_attributes(path: Path, **changes: Any) -> None:

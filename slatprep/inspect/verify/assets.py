@@ -119,8 +119,7 @@ def value_findings(asset: StoredAsset) -> Iterator[Finding]:
         ),
         "voxel/place": (np.isfinite(asset.place).all(), "NaN or infinite", "finite points"),
         "voxel/confidence": (
-            asset.store.format_version == 1
-            or ((asset.confidence >= 0) & (asset.confidence <= valid)).all(),
+            ((asset.confidence >= 0) & (asset.confidence <= valid)).all(),
             "no probability, or one where there is no class",
             "0 to 1 where valid, 0 elsewhere",
         ),
@@ -204,7 +203,7 @@ def record_findings(asset: StoredAsset, record: AssetRecord, store: Store) -> It
 
 def confidence_findings(asset: StoredAsset, record: AssetRecord) -> Iterator[Finding]:
     """Yield a finding where ``voxel/confidence`` differs from what grid and record give."""
-    if asset.store.format_version == 1 or asset.merged:
+    if asset.merged:
         return
     field, properties = asset.normalised_field, asset.properties
     clipped = record.counts.clipped

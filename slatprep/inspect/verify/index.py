@@ -16,7 +16,7 @@ SHARES = ("fitness", "fitness_backward", "overlap", "ambiguity", "valid_share")
 """Columns of shares, 0 to 1."""
 
 PROBABILITIES = ("confidence", "expected_accuracy")
-"""Columns of probabilities, 0 to 1, or NaN in a store of format 1, which has none."""
+"""Columns of probabilities, 0 to 1."""
 
 DISTANCES = ("inlier_rmse", "inlier_rmse_backward", "margin")
 """Columns of numbers of at least 0, or NaN where they are not defined."""
@@ -60,7 +60,7 @@ def index_findings(store: Store) -> Iterator[Finding]:
     for name in SHARES:
         yield from _outside(store, name, 0.0, 1.0)
     for name in PROBABILITIES:
-        yield from _outside(store, name, 0.0, 1.0, nan=store.format_version == 1)
+        yield from _outside(store, name, 0.0, 1.0)
     for name in DISTANCES:
         yield from _outside(store, name, 0.0, np.inf, nan=True)
     yield from _outside(store, "unphysical", 0, RESOLUTION**3)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 from collections import Counter
 from collections.abc import Collection, Iterator, Mapping
 from dataclasses import replace
@@ -105,7 +104,7 @@ def manifest_findings(
     faults: list[Finding] = []
     try:
         found: object = build_id_of(list(_checked(store, folder, seen, faults, only)))
-        if only is not None or (found != manifest and _older_id(folder) == manifest):
+        if only is not None:
             found = manifest
     except StoreError as error:
         yield Finding(assets_file, "", str(error), "a JSON record a line")
@@ -129,18 +128,6 @@ def _stated_id(text: bytes) -> object:
     except ValueError:
         return None
     return document.get("id") if isinstance(document, dict) else None
-
-
-def _older_id(folder: Place) -> str:
-    """Return the id as older versions made it: from the texts themselves, in the order of ids."""
-    digest = hashlib.sha256()
-    for _, line in lines_in(folder):
-        try:
-            record = parse_document(line)
-        except ValueError:
-            continue  # Found by `_checked`.
-        digest.update(counting(record))
-    return digest.hexdigest()
 
 
 def _checked(
