@@ -1,4 +1,3 @@
-import json
 import shutil
 import subprocess
 import sys
@@ -43,13 +42,6 @@ def test_what_is_no_store_is_refused_in_words(tmp_path: Path) -> None:
         (tmp_path / "zarr.json").write_text(content)
         with pytest.raises(StoreError, match="is not a slatprep store"):
             open_store(tmp_path)
-
-
-def test_a_newer_format_is_refused_in_words(tmp_path: Path) -> None:
-    attributes = {"format": "slatprep-store", "format_version": 3}
-    (tmp_path / "zarr.json").write_text(json.dumps({"attributes": attributes}))
-    with pytest.raises(StoreError, match=r"format version 3; this slatprep reads 1 and 2"):
-        open_store(tmp_path)
 
 
 def test_a_reader_that_is_let_go_of_closes_its_files_quietly(mixed_build: BuildSummary) -> None:
