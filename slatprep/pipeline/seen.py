@@ -26,6 +26,7 @@ from numpy.typing import NDArray
 
 from slatprep.records import AssetPair, LatentMoments, Place
 from slatprep.storage.files import open_regular, private_file
+from slatprep.storage.place import storage_of
 
 NAME = "sources.seen"
 """Of the file, in the folder of the records, or on this machine's disk where those are not."""
@@ -214,7 +215,7 @@ def _state_of(pair: AssetPair) -> bytes:
 def _file_state(file: Place) -> tuple[object, ...]:
     """Return what tells whether a file was changed since; nothing where that cannot be told."""
     if not isinstance(file, Path):
-        return ()
+        return storage_of(file).state()
     try:
         state = os.stat(file)  # noqa: PTH116 - half a million times
     except (OSError, ValueError):

@@ -16,8 +16,10 @@ from slatprep.readers.adapters import FoundField, patterns_of, source_adapter
 from slatprep.readers.contents import contents_of
 from slatprep.readers.joins import read_categories, read_map
 from slatprep.readers.patterns import NAME, fill, find_files, list_below, tried_names
+from slatprep.readers.published import category_of, locate_grids
 from slatprep.readers.slat_files import NamedSlat, encoded, find_slats, ordered
 from slatprep.records import AssetPair, Place, SourceRoots
+from slatprep.storage.archives import is_archive
 from slatprep.storage.listing import Listing
 
 
@@ -75,7 +77,7 @@ def discover(parameters: BuildParameters) -> list[AssetPair]:
             raise ConfigError(f"{root}: is no UTF-8, so that no record can hold it; rename it")
     try:
         for source in sources:
-            if not source.root.is_dir():
+            if not source.root.is_dir() and not is_archive(source.root.name):
                 raise ConfigError(f"{source.root}: no such folder; expected the PixieVerse root")
         if not slat.root.exists():
             raise ConfigError(
@@ -84,7 +86,8 @@ def discover(parameters: BuildParameters) -> list[AssetPair]:
         one_file = slat.root.is_file()
     except OSError as error:
         raise ConfigError(f"{error.filename}: cannot be looked at ({error.strerror})") from None
-    listings = [list_below(source.root) for source in sources]
+    places = [locate_grids(source) for source in sources]
+    listings = [list_below(place) for place in places]
     grids, *further = [
         _grids_of(*both, slat, one_file) for both in zip(sources, listings, strict=True)
     ]
@@ -97,13 +100,13 @@ def discover(parameters: BuildParameters) -> list[AssetPair]:
     rows.sort(key=lambda row: (row.asset_id, row.object_id))
     folder = slat.root.parent if one_file else slat.root
     contents = contents_of(parameters)
-    roots = SourceRoots(pixieverse.root, folder, contents, pixieverse.adapter)
+    roots = SourceRoots(places[0], folder, contents, pixieverse.adapter)
     there = _Found(parameters, roots, listings[0], one_file, grids, categories)
     also = tuple(
         replace(
             there,
             parameters=replace(parameters, pixieverse=source, also=()),
-            roots=SourceRoots(source.root, folder, contents, source.adapter, number),
+            roots=SourceRoots(places[number], folder, contents, source.adapter, number),
             listing=listings[number],
             grids=further[number - 1],
         )
@@ -274,7 +277,7 @@ def _pair_of(row: _Row, there: _Found, shared: str, grids: Sequence[FoundField])
         problems += [side.problem, _unrecordable(side.path)]
     grid = mask = bounds = transform = beside = None
     if grids:
-        grid = source.root / grids[0].path
+        grid = there.roots.pixieverse / grids[0].path
         if len(grids) > 1:
             problems.append(_several_grids(row.object_id, grids))
         if NAME.fullmatch(row.object_id):
@@ -283,7 +286,7 @@ def _pair_of(row: _Row, there: _Found, shared: str, grids: Sequence[FoundField])
                 mask = _find_one(there, source.mask, known, "mask", problems)
                 bounds = _find_one(there, source.bounds, known, "bounds", problems)
             if grids[0].beside:
-                beside = source.root / grids[0].beside
+                beside = there.roots.pixieverse / grids[0].beside
             if source.transform:
                 # A name without an id stands for one file, of all assets.
                 transform = _find_one(there, (source.transform,), known, "transform", problems)
@@ -294,7 +297,7 @@ def _pair_of(row: _Row, there: _Found, shared: str, grids: Sequence[FoundField])
         tried = tried_names(source.grid, _known(id=row.object_id, sample=source.sample))
         problems.append(f"no grid for id {row.object_id!r}; looked for {tried} below {source.root}")
     found = [slat for slat in row.slats if slat.path]
-    if not found:
+    if not found and not any(grid.problem for grid in grids):
         problems.append(_no_slat(row, slat_source, there.one_file))
     elif len(found) > 1:
         files = ", ".join(slat.path + (f" [{slat.group}]" if slat.group else "") for slat in found)
@@ -306,7 +309,7 @@ def _pair_of(row: _Row, there: _Found, shared: str, grids: Sequence[FoundField])
         asset_id=row.asset_id,
         object_id=encoded(row.object_id),
         view=encoded(row.view),
-        category=there.categories.get(row.object_id, ""),
+        category=there.categories.get(row.object_id) or category_of(grid),
         roots=there.roots,
         grid=grid,
         mask=mask,
@@ -385,7 +388,7 @@ def _find_one(
             named = ", ".join(paths)
             problems.append(f"{len(paths)} {role} files for one id ({named}); expected one")
         if paths:
-            return there.parameters.pixieverse.root / paths[0]
+            return there.roots.pixieverse / paths[0]
     return None
 
 

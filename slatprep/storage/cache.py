@@ -27,7 +27,7 @@ def cache_folder() -> Path:
 
 def folder_for(place: RemotePlace) -> Path:
     """Return the subfolder for a place, whose name identifies the place."""
-    return cache_folder() / f"{place.name}-{_short(str(place))}"
+    return cache_folder() / f"{place.name}-{short(str(place))}"
 
 
 def cached_file(place: RemotePlace) -> Path:
@@ -40,7 +40,7 @@ def cached_file(place: RemotePlace) -> Path:
         entry = system.info(name)
     state = [str(entry.get(key)) for key in ("size", "ETag", "etag", "LastModified", "mtime")]
     folder = folder_for(place)
-    copy = folder / _short(" ".join(state))
+    copy = folder / short(" ".join(state))
     if copy.exists():
         return copy
     folder.mkdir(parents=True, exist_ok=True)
@@ -55,5 +55,6 @@ def cached_file(place: RemotePlace) -> Path:
     return copy
 
 
-def _short(text: str) -> str:
+def short(text: str) -> str:
+    """Return a short digest of a text, for names."""
     return hashlib.sha256(text.encode()).hexdigest()[:16]

@@ -17,16 +17,20 @@ from pathlib import Path, PurePosixPath
 from typing import IO, TYPE_CHECKING, TypeGuard
 
 from slatprep.errors import InputError, StoreError
+from slatprep.storage.archives import Archive
 from slatprep.storage.atomic import staged
 from slatprep.storage.cache import cached_file, folder_for
 from slatprep.storage.copies import copied_version
 from slatprep.storage.files import LocalFile, LocalFolder, local_files, open_regular
 from slatprep.storage.listing import Listing, RemoteListing
+from slatprep.storage.members import ArchivePlace
 from slatprep.storage.remote import (
     RemoteFile,
     RemoteFolder,
     RemotePlace,
+    list_folder,
     list_objects,
+    pinned,
     remove_objects,
 )
 from slatprep.storage.versions import current_version
@@ -64,15 +68,17 @@ def place_of(text: str | Place, folder: Path | None = None) -> Place:
     return path if folder is None else (folder / path.expanduser()).resolve()
 
 
-def is_place(value: object) -> TypeGuard[Path | RemotePlace]:
-    """Whether a value is a path, or a URL from `place_of`."""
-    return isinstance(value, Path | RemotePlace)
+def is_place(value: object) -> TypeGuard[Path | RemotePlace | ArchivePlace]:
+    """Whether a value is a path, a URL from `place_of`, or lies in archives."""
+    return isinstance(value, Path | RemotePlace | ArchivePlace)
 
 
 def storage_of(place: Place) -> Storage:
     """Return the storage of a place."""
     if not is_place(place):
         raise TypeError(f"{place!r} is no place; expected what `place_of` returns")
+    if isinstance(place, ArchivePlace):
+        return _Archives(place)
     return Storage(place) if isinstance(place, Path) else _ObjectStore(place)
 
 
@@ -105,6 +111,29 @@ class Storage:
     def listing(self) -> Listing:
         """Return the names below the place, for looking them up one by one."""
         return Listing(self._path)
+
+    def names(self) -> tuple[list[str], list[str]]:
+        """Return the names of files and of folders that lie directly in the place.
+
+        Raises
+        ------
+        OSError
+            If it cannot be listed.
+        """
+        listing = Listing(self._path)
+        return list(listing.of_folder("", folders=False)), list(listing.of_folder("", folders=True))
+
+    def archives(self, names: Iterable[str], wanted: tuple[str, ...]) -> list[Archive]:
+        """Look at archives that lie in the place, of whose members those like `wanted` matter.
+
+        Raises
+        ------
+        OSError
+            If one cannot be read.
+        InputError
+            If one is a link that leads out of the place.
+        """
+        return [Archive.on_disk(self._path / name, wanted) for name in names]
 
     def folder(self) -> Folder:
         """Return the place as a folder for reading ranges of its files."""
@@ -156,6 +185,10 @@ class Storage:
         """Return a path of the local disk with the file's content."""
         return self._path
 
+    def state(self) -> tuple[object, ...]:
+        """Return what tells whether what is no file of the disk was changed; nothing if unknown."""
+        return ()
+
     def current_version(self) -> Place:
         """Return the current place of the store's files; StoreError if it cannot be reached."""
         return self._path
@@ -189,6 +222,16 @@ class _ObjectStore(Storage):
 
     def listing(self) -> Listing:
         return RemoteListing(list_objects(self.place))
+
+    def names(self) -> tuple[list[str], list[str]]:
+        found = list_folder(self.place)
+        files = [name for name, entry in found.items() if entry["type"] == "file"]
+        return files, [name for name in found if name not in files]
+
+    def archives(self, names: Iterable[str], wanted: tuple[str, ...]) -> list[Archive]:
+        place = pinned(self.place)
+        found = list_folder(place)
+        return [Archive.of_object(place / name, found[name], wanted) for name in names]
 
     def folder(self) -> Folder:
         return RemoteFolder(self.place)
@@ -233,3 +276,42 @@ class _ObjectStore(Storage):
 
     def work_folder(self) -> Path:
         return folder_for(self.place) / "work"
+
+
+class _Archives(Storage):
+    """See `Storage`; nothing can be written there."""
+
+    def __init__(self, place: ArchivePlace) -> None:
+        self.local, self.remote, self.place = None, None, place
+
+    def _sizes(self) -> dict[str, int]:
+        members = self.place.tree.members
+        return {name: members[name][1].size for name in sorted(members)}
+
+    def names(self) -> tuple[list[str], list[str]]:
+        listing = self.listing()
+        return list(listing.of_folder("", folders=False)), list(listing.of_folder("", folders=True))
+
+    def listing(self) -> Listing:
+        return self.place.tree.listing()
+
+    def locate(self, file: Place) -> tuple[Place, str]:
+        if not isinstance(file, ArchivePlace) or file.entry is None:
+            raise InputError(file, "does not exist", "a readable file")
+        return file, file.path
+
+    def open(self) -> IO[bytes]:
+        return self.place.open("rb")
+
+    def open_scattered(self) -> IO[bytes]:
+        return self.open()
+
+    def read(self, limit: int) -> bytes:
+        # One that is larger is not read, whatever its header claims.
+        return bytes(limit + 1) if self.place.size > limit else self.place.read_bytes()
+
+    def size(self) -> int:
+        return self.place.size
+
+    def state(self) -> tuple[object, ...]:
+        return self.place.state()

@@ -119,11 +119,16 @@ class RemotePlace:
 
 
 class RemoteFile(io.RawIOBase):
-    """An object open for reading; threads may share it if they use only `pread`."""
+    """An object open for reading; threads may share it if they use only `pread`.
 
-    def __init__(self, place: RemotePlace) -> None:
+    Its `size` is asked for where it is not given.
+    """
+
+    def __init__(self, place: RemotePlace, size: int | None = None) -> None:
         super().__init__()
         self.place = place
+        if size is not None:
+            self.__dict__["_size"] = size
         self._position, self._ended = 0, False
         self._prefetched = (0, b"")
 
@@ -139,7 +144,8 @@ class RemoteFile(io.RawIOBase):
         # Asked for each time: connections do not survive a fork; fsspec caches one per process.
         try:
             with connected(self.place) as (system, name):
-                return bytes(system.cat_file(name, start=offset, end=offset + length))
+                options = self._exact if "hf" in system.protocol else {}
+                return bytes(system.cat_file(name, start=offset, end=offset + length, **options))
         except (FileNotFoundError, PermissionError):
             raise
         except OSError:
@@ -168,6 +174,11 @@ class RemoteFile(io.RawIOBase):
         self._position += len(data)
         self._ended = len(data) < len(buffer)
         return len(data)
+
+    @property
+    def _exact(self) -> dict[str, object]:
+        """What keeps the hub's file system from reading ahead, and from asking for the size."""
+        return {"cache_type": "none", "size": self._size}
 
     @cached_property
     def _size(self) -> int:
@@ -207,6 +218,34 @@ def list_objects(place: RemotePlace) -> dict[str, dict[str, Any]]:
         if key.startswith(base) and entry["type"] == "file"
     }
     return {key: entry for key, entry in sorted(below.items()) if _is_plain(key)}
+
+
+def list_folder(place: RemotePlace) -> dict[str, dict[str, Any]]:
+    """Return what fsspec says of what lies directly below a place, by name; nothing if nothing."""
+    with connected(place) as (system, name):
+        try:
+            found = system.ls(name, detail=True)
+        except (FileNotFoundError, NotADirectoryError):
+            return {}
+    entries = {str(entry["name"]).rstrip("/").rpartition("/")[2]: entry for entry in found}
+    return {key: entry for key, entry in entries.items() if _is_plain(key)}
+
+
+def pinned(place: RemotePlace) -> RemotePlace:
+    """Return a place of the hub at the commit that is there now, so that nothing can replace it.
+
+    Places elsewhere have no commits, and are returned as they are.
+    """
+    if place.protocol != "hf":
+        return place
+    with connected(place) as (system, name):
+        from huggingface_hub import HfApi
+
+        at = system.resolve_path(name)
+        api = HfApi(endpoint=system.endpoint, token=system.token)
+        sha = api.repo_info(at.repo_id, repo_type=at.repo_type, revision=at.revision).sha
+        base = f"{at.repo_type}s/{at.repo_id}@{sha}"
+        return RemotePlace("hf", PurePosixPath(base, at.path_in_repo))
 
 
 def put_objects(folder: Path, place: RemotePlace, names: Iterable[str], at_once: int = 16) -> None:

@@ -24,6 +24,7 @@ from slatprep.provenance.record_json import (
     to_json,
 )
 from slatprep.provenance.stored import StoredRecords
+from slatprep.readers.published import locate_grids
 from slatprep.records import Place, SourceRoots, Status
 from slatprep.storage.documents import parse_document
 from slatprep.store.contract import Finding
@@ -49,7 +50,7 @@ def source_roots(manifests: Place | None) -> SourceRoots:
         raise StoreError(f"{manifests / BUILD}: names no sources ({error}); {advice}") from None
     if not gone:
         first, *also = [
-            SourceRoots(source.root, slat, adapter=source.adapter, number=number)
+            SourceRoots(locate_grids(source), slat, adapter=source.adapter, number=number)
             for number, source in enumerate(sources)
         ]
         return replace(first, also=tuple(also))
@@ -73,7 +74,14 @@ def moved(roots: SourceRoots, manifests: Place | None) -> SourceRoots:
     if build is None:
         return roots
     sources = zip((roots, *roots.also), (build.pixieverse, *build.also), strict=False)
-    first, *also = [replace(one, adapter=source.adapter) for one, source in sources]
+    first, *also = [
+        replace(
+            one,
+            adapter=source.adapter,
+            pixieverse=locate_grids(replace(source, root=one.pixieverse)),
+        )
+        for one, source in sources
+    ]
     return replace(first, also=tuple(also))
 
 

@@ -1,0 +1,82 @@
+"""A file that is read here and there, with as few requests and as few bytes as may be."""
+
+from __future__ import annotations
+
+import io
+from typing import Protocol
+
+
+class Ranges(Protocol):
+    """What is read by ranges: `slatprep.storage.place.RangeFile` is one."""
+
+    def pread(self, length: int, offset: int) -> bytes:
+        """Read up to `length` bytes from an offset on."""
+
+
+MAX_READ = 2**20
+"""Most that one read may ask for: what a header claims is not believed."""
+
+_LEAST, _MOST, _NEAR = 2**13, 2**22, 2**21
+"""Bytes: a request after a jump; the largest request; a gap that costs less than a request."""
+
+_SHARE, _SLACK = 0.015, 2**22
+"""Requests grow as long as no more than this share of what lies before was read, and so much."""
+
+
+class ReadAhead(io.RawIOBase):
+    """A file object over ranges, for reading headers that lie between members of any size.
+
+    After a jump it asks for little. As long as the next headers are near, each request is twice
+    the last one: many small members come with one request, and large ones are passed over.
+
+    Parameters
+    ----------
+    file : Ranges
+        What to read.
+    remote : bool
+        Whether a request is dear; otherwise all are small.
+    """
+
+    def __init__(self, file: Ranges, remote: bool) -> None:
+        super().__init__()
+        self._file, self._most = file, _MOST if remote else _LEAST
+        self._begin, self._data, self._at = 0, b"", 0
+        self._window, self._spent = _LEAST, 0
+
+    def tell(self) -> int:
+        """Return the position."""
+        return self._at
+
+    def seek(self, offset: int, whence: int = io.SEEK_SET) -> int:
+        """Set the position, counted from the beginning."""
+        if whence != io.SEEK_SET:
+            raise io.UnsupportedOperation("seek from elsewhere than the beginning")
+        self._at = offset
+        return offset
+
+    def read(self, length: int = -1) -> bytes:
+        """Read on; fewer bytes than asked for mean the end.
+
+        Raises
+        ------
+        ValueError
+            If more than `MAX_READ` bytes are asked for.
+        """
+        if not 0 <= length <= MAX_READ:
+            raise ValueError(f"a header claims {length} bytes")
+        data = self.held(length, self._at)
+        self._at += len(data)
+        return data
+
+    def held(self, length: int, offset: int) -> bytes:
+        """Return a range, from what was read already if it can be."""
+        end = self._begin + len(self._data)
+        if not self._begin <= offset <= offset + length <= end:
+            near = 0 <= offset - end <= _NEAR or self._begin <= offset < end
+            self._window = min(2 * self._window, self._most) if near else _LEAST
+            allowed = max(_LEAST, int(_SHARE * offset) + _SLACK - self._spent)
+            asked = max(length, min(self._window, allowed))
+            self._begin, self._data = offset, self._file.pread(asked, offset)
+            self._spent += len(self._data)
+        start = offset - self._begin
+        return self._data[start : start + length]

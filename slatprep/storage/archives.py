@@ -1,0 +1,351 @@
+"""Archives read as the folders that they were made of, without unpacking them.
+
+Of an uncompressed archive only headers are read, and the members that are asked for; where
+they lie is kept in the cache for as long as the archive is the same. Of one with gzip, and of
+any on an object store, members are kept as well: they come from there but once.
+"""
+
+from __future__ import annotations
+
+import io
+import os
+import re
+import shutil
+import time
+import zlib
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from functools import lru_cache
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import orjson
+
+from slatprep.errors import InputError
+from slatprep.storage.ahead import ReadAhead
+from slatprep.storage.atomic import staged_apart
+from slatprep.storage.cache import cache_folder, short
+from slatprep.storage.files import LocalFile, open_regular
+from slatprep.storage.remote import RemoteFile, RemotePlace
+from slatprep.storage.tar import ArchiveError, Entry, entries, unpack
+
+if TYPE_CHECKING:
+    from slatprep.records import Place
+
+SUFFIXES = (".tar", ".tar.gz", ".tgz")
+"""How the names of archives end."""
+
+_FORMAT, _INDEX, _BLOCK = 1, "index.z", 512
+
+_KEPT = ("next", "complete", "fault", "strange", "twice")
+"""What is kept of an index besides its members."""
+
+_STREAMED = 2**23
+"""Bytes that an archive with gzip is read by."""
+
+_TAGS = ("ETag", "etag", "LastModified", "mtime", "blob_id", "lfs", "xet_hash")
+"""What object stores tell of an object's content."""
+
+_COMMIT = re.compile(r"(?<=[^/])@[0-9a-f]{40}(?=/|$)")
+_SAVE_S = 20.0
+"""How often an index that is being made is written down, so that a killed build loses little."""
+
+_TRUSTED_NS = 2_000_000_000
+"""How long ago an archive must have been written for its times to tell it from a later one."""
+
+
+def is_archive(name: str) -> bool:
+    """Whether a file is an archive by its name."""
+    return name.lower().endswith(SUFFIXES)
+
+
+@dataclass(frozen=True)
+class Archive:
+    """An archive as it was when it was looked at.
+
+    Attributes
+    ----------
+    place : Place
+        Where it lies; on the hub, at one commit.
+    stamp : str
+        What tells it from one that lay there before, or will later.
+    size : int
+        Its bytes.
+    trusted : bool
+        Whether a later change is sure to change the stamp.
+    wanted : tuple of str
+        Patterns of the members that may be asked for, see `is_wanted`.
+    """
+
+    place: Place
+    stamp: str
+    size: int
+    trusted: bool = True
+    wanted: tuple[str, ...] = ()
+
+    @classmethod
+    def on_disk(cls, path: Path, wanted: tuple[str, ...]) -> Archive:
+        """Look at an archive on the disk; OSError if that cannot be."""
+        with open_regular(path) as file:
+            state = os.fstat(file.fileno())
+        newest = max(state.st_mtime_ns, state.st_ctime_ns)
+        trusted = newest + _TRUSTED_NS < time.time_ns()
+        return cls(path, _stamp_of(state), state.st_size, trusted, wanted)
+
+    @classmethod
+    def of_object(
+        cls, place: RemotePlace, entry: Mapping[str, Any], wanted: tuple[str, ...]
+    ) -> Archive:
+        """Take an archive as the listing of an object store has it."""
+        tags = (entry.get(key) for key in _TAGS)
+        stamp = " ".join([str(entry["size"]), *(str(tag) for tag in tags if tag)])
+        return cls(place, stamp, int(entry["size"]), True, wanted)
+
+    @property
+    def category(self) -> str:
+        """Its name without the extension, which in PixieVerse is that of a class."""
+        return self.place.name.partition(".")[0]
+
+    @property
+    def packed(self) -> bool:
+        """Whether it is compressed, so that it can only be read from its beginning."""
+        return not self.place.name.lower().endswith(".tar")
+
+    @property
+    def keeps(self) -> bool:
+        """Whether its members are kept in the cache."""
+        return self.packed or isinstance(self.place, RemotePlace)
+
+    @property
+    def folder(self) -> Path:
+        """The folder of the cache that belongs to it as it is."""
+        state = [self.stamp, *(self.wanted if self.packed else ())]
+        return self.home / short(" ".join(state))
+
+    @property
+    def home(self) -> Path:
+        """The folder of the cache for whatever lies at its place."""
+        return cache_folder() / f"{self.place.name}-{short(shown(self.place))}"
+
+    def is_wanted(self, name: str) -> bool:
+        """Whether a member may be asked for, by its name."""
+        return any(_like(pattern).fullmatch(name) for pattern in self.wanted)
+
+    def read(self, entry: Entry) -> bytes:
+        """Read a member.
+
+        Raises
+        ------
+        OSError
+            If the archive cannot be read.
+        InputError
+            If it is not the archive that was looked at.
+        """
+        if not self.keeps:
+            return self.fetch(entry)
+        data = self._kept(entry)
+        if data is None and self.packed:
+            _extend(self, Index())
+            data = self._kept(entry)
+        if data is None:
+            data = self.fetch(entry)
+            self.keep(entry, data)
+        return data
+
+    def fetch(self, entry: Entry) -> bytes:
+        """Read a member from the archive itself, which is not compressed."""
+        if self.packed:
+            raise self.replaced()
+        return self.checked(entry, self.range(entry.size + _BLOCK, entry.offset - _BLOCK))
+
+    def checked(self, entry: Entry, data: bytes) -> bytes:
+        """Return the data of a member, given with the header in front of it."""
+        if zlib.crc32(data[:_BLOCK]) != entry.check:
+            raise self.replaced()
+        return data[_BLOCK:]
+
+    def range(self, length: int, offset: int) -> bytes:
+        """Read a range; see `read`."""
+        with self.open_ranges() as file:
+            data = file.pread(length, offset)
+        if len(data) != length:
+            raise self.replaced()
+        return data
+
+    def open_ranges(self) -> LocalFile | RemoteFile:
+        """Open it for reading by ranges; see `read`."""
+        if isinstance(self.place, RemotePlace):
+            return RemoteFile(self.place, self.size)
+        file = open_regular(Path(str(self.place)))
+        if _stamp_of(os.fstat(file.fileno())) != self.stamp:
+            file.close()
+            raise self.replaced()
+        return file
+
+    def replaced(self) -> InputError:
+        """Return the error that says that it is another archive by now."""
+        return InputError(
+            shown(self.place), "was replaced after it was looked at", "the same archive; run again"
+        )
+
+    def keep(self, entry: Entry, data: bytes) -> None:
+        """Keep a member in the cache."""
+        self.folder.mkdir(parents=True, exist_ok=True)
+        with staged_apart(self._file(entry), self.folder) as partial:
+            partial.write_bytes(zlib.compress(data, 1))
+
+    def holds(self, entry: Entry) -> bool:
+        """Whether a member need not be fetched."""
+        return not self.keeps or self._file(entry).exists()
+
+    def _kept(self, entry: Entry) -> bytes | None:
+        try:
+            data = zlib.decompress(self._file(entry).read_bytes())
+        except (FileNotFoundError, zlib.error):
+            return None
+        return data if len(data) == entry.size else None
+
+    def _file(self, entry: Entry) -> Path:
+        return self.folder / f"{short(entry.link or entry.name)}.z"
+
+    def index(self, progress: Callable[[int], None] = lambda _: None) -> Index:
+        """Return where its members lie, from the cache or by reading its headers.
+
+        Parameters
+        ----------
+        progress : callable
+            Called with the bytes of the archive that were passed.
+
+        Raises
+        ------
+        OSError
+            If it cannot be read. What was found by then is kept.
+        """
+        index = _read_index(self)
+        if not index.complete:
+            _extend(self, index, progress)
+        return index
+
+
+@dataclass
+class Index:
+    """The members of an archive by name, as far as it was read.
+
+    Attributes
+    ----------
+    members : dict of str to Entry
+        A name that occurs twice stands for the last, as in unpacking.
+    next : int
+        Where the next header begins.
+    complete : bool
+        Whether there are no more.
+    fault : str
+        Why no more can be read; empty where all is well.
+    strange : list of str
+        Names of members that lead out of the archive.
+    twice : int
+        Members that a later one of the same name replaces.
+    """
+
+    members: dict[str, Entry] = field(default_factory=dict)
+    next: int = 0
+    complete: bool = False
+    fault: str = ""
+    strange: list[str] = field(default_factory=list)
+    twice: int = 0
+
+    def told(self) -> str:
+        """Return what a user should know of it; empty if nothing."""
+        lines = []
+        if self.twice:
+            names = "names occur" if self.twice > 1 else "name occurs"
+            lines.append(f"{self.twice:,} {names} twice; the last one counts, as in unpacking")
+        if self.strange:
+            more = f" and {len(self.strange) - 1:,} more" if len(self.strange) > 1 else ""
+            lines.append(f"left out, as no folder could hold them: {self.strange[0]}{more}")
+        return "; ".join(lines)
+
+    def add(self, entry: Entry) -> None:
+        """Add a member."""
+        if not entry.name:
+            self.strange.append(entry.problem)
+            return
+        if entry.link:
+            target = self.members.get(entry.link)
+            problem = "" if target else f"is a link to {entry.link!r}, which is not before it"
+            target = target or entry
+            link = target.link or entry.link
+            problem = problem or target.problem
+            entry = target._replace(name=entry.name, link=link, problem=problem)
+        self.twice += entry.name in self.members
+        self.members[entry.name] = entry
+
+
+def _extend(
+    archive: Archive, index: Index, progress: Callable[[int], None] = lambda _: None
+) -> None:
+    """Read the rest of an archive's headers; what was found is kept, however that ends."""
+    archive.folder.mkdir(parents=True, exist_ok=True)
+    saved = time.monotonic()
+    try:
+        if archive.packed:
+            with io.BufferedReader(archive.open_ranges(), _STREAMED) as stream:
+                for entry in unpack(stream, archive.is_wanted, archive.keep):
+                    index.add(entry)
+                    progress(stream.tell())
+        else:
+            with archive.open_ranges() as file:
+                ahead = ReadAhead(file, isinstance(archive.place, RemotePlace))
+                for member, following in entries(ahead, archive.size, index.next):
+                    if member is not None:
+                        index.add(member)
+                    index.next = following
+                    progress(following)
+                    if time.monotonic() - saved > _SAVE_S:
+                        _write_index(archive, index)
+                        saved = time.monotonic()
+        index.complete = True
+    except ArchiveError as error:
+        index.complete, index.fault = True, str(error)
+    finally:
+        if index.complete or not archive.packed:
+            _write_index(archive, index)
+    for older in archive.home.iterdir():
+        if older != archive.folder:
+            shutil.rmtree(older, ignore_errors=True)
+
+
+def _write_index(archive: Archive, index: Index) -> None:
+    document = {"format": _FORMAT} | {name: getattr(index, name) for name in _KEPT}
+    document["members"] = [tuple(entry) for entry in index.members.values()]
+    text = orjson.dumps(document, default=str)
+    with staged_apart(archive.folder / _INDEX, archive.folder) as partial:
+        partial.write_bytes(zlib.compress(text, 1))
+
+
+def _read_index(archive: Archive) -> Index:
+    """Return what is known of an archive's members."""
+    try:
+        document = orjson.loads(zlib.decompress((archive.folder / _INDEX).read_bytes()))
+        if document["format"] != _FORMAT:
+            return Index()
+        members = [Entry(*entry) for entry in document["members"]]
+        kept = {name: document[name] for name in _KEPT}
+    except (OSError, ValueError, TypeError, LookupError, zlib.error):
+        return Index()  # It is made anew.
+    return Index({entry.name: entry for entry in members}, **kept)
+
+
+def shown(place: Place) -> str:
+    """Return what to call a place: of the hub without the commit."""
+    return _COMMIT.sub("", str(place))
+
+
+@lru_cache(maxsize=64)
+def _like(pattern: str) -> re.Pattern[str]:
+    """Return the expression of a pattern, whose ``*`` stands for anything within a component."""
+    return re.compile("[^/]*".join(re.escape(part) for part in pattern.split("*")), re.DOTALL)
+
+
+def _stamp_of(state: os.stat_result) -> str:
+    return f"{state.st_size} {state.st_mtime_ns} {state.st_ctime_ns} {state.st_ino}"

@@ -1,0 +1,309 @@
+"""A store of PixieVerse as it is published is that of the unpacked folders."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import shutil
+import tarfile
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from support.published import CLASSES, add, pack, publish, write_object
+from support.synthetic import Dataset, make_asset
+
+from slatprep.errors import InputError
+from slatprep.inspect.verify import verify_store
+from slatprep.parameters import BuildParameters
+from slatprep.pipeline.dataset import build_store
+from slatprep.storage import archives
+from slatprep.storage.files import LocalFile
+from slatprep.store import open_store
+
+IDS = [f"{number:032x}" for number in range(5)]
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Five objects unpacked, in archives, and in archives with gzip; four have a SLAT."""
+    folder = tmp_path_factory.mktemp("published")
+    dataset = Dataset(folder)
+    for number, name in enumerate(IDS):
+        asset = make_asset(number)
+        write_object(folder / "pixieverse" / "render_outputs" / name, asset.grid, number)
+        if number < 4:
+            dataset.write_slat(f"{name}.npz", asset.coords, asset.feats)
+    publish(folder / "pixieverse" / "render_outputs", folder / "tar")
+    publish(folder / "pixieverse" / "render_outputs", folder / "gz", ".tar.gz")
+    entries = {
+        name: {"obj_class": CLASSES[number % 3], "vlm_filtering": {"is_appropriate": True}}
+        for number, name in enumerate(IDS)
+    }
+    (folder / "classes.json").write_text(json.dumps(entries))
+    return folder
+
+
+@pytest.fixture(autouse=True)
+def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.setenv("SLATPREP_CACHE", str(tmp_path / "cache"))
+    return tmp_path / "cache"
+
+
+def parameters(made: Path, root: str | Path, categories: bool = False) -> BuildParameters:
+    base = Dataset(made).parameters("pixie")
+    pairing = replace(base.pairing, categories=made / "classes.json" if categories else None)
+    source = replace(base.pixieverse, root=made / root)
+    return replace(base, pixieverse=source, pairing=pairing)
+
+
+def files(store: Path) -> dict[str, bytes]:
+    return {
+        path.relative_to(store).as_posix(): path.read_bytes()
+        for path in sorted(store.rglob("*"))
+        if path.is_file()
+    }
+
+
+@pytest.fixture(scope="module")
+def unpacked(made: Path) -> dict[str, bytes]:
+    """Return the files of the store of the unpacked folder."""
+    wanted = parameters(made, "pixieverse/render_outputs", categories=True)
+    build_store(wanted, made / "unpacked.zarr")
+    return files(made / "unpacked.zarr")
+
+
+ROOTS = [
+    "tar", "tar/archives", "tar/archives/render_outputs", "gz", "gz/archives/render_outputs",
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("root", ROOTS)
+def test_store_of_archives_is_that_of_the_unpacked_folder(
+    made: Path, tmp_path: Path, unpacked: dict[str, bytes], root: str
+) -> None:
+    summary = build_store(parameters(made, root), tmp_path / "s.zarr")
+    assert summary.statuses == {"ok": 4, "failed": 0, "skipped": 1}
+    assert files(tmp_path / "s.zarr") == unpacked
+    assert verify_store(tmp_path / "s.zarr", sources=True).ok
+
+
+def test_unpacked_root_is_read_where_its_grids_lie(
+    made: Path, tmp_path: Path, unpacked: dict[str, bytes]
+) -> None:
+    for other in ("data", "outputs"):
+        (made / "pixieverse" / other / IDS[0]).mkdir(parents=True, exist_ok=True)
+    build_store(parameters(made, "pixieverse", categories=True), tmp_path / "s.zarr")
+    assert files(tmp_path / "s.zarr") == unpacked
+
+
+@pytest.mark.parametrize("root", ["tar", "gz"])
+def test_one_archive_holds_its_class(made: Path, tmp_path: Path, root: str) -> None:
+    name = "tree.tar" if root == "tar" else "tree.tar.gz"
+    chosen = parameters(made, f"{root}/archives/render_outputs/{name}")
+    build_store(chosen, tmp_path / "s.zarr")
+    store = open_store(tmp_path / "s.zarr")
+    assert list(store.ids) == [IDS[0], IDS[3]]
+    assert set(store.column("category")) == {"tree"}
+
+
+class Reads:
+    """Counts what is read of local files by ranges."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        own, self.bytes = LocalFile.pread, dict[str, int]()
+
+        def pread(file: LocalFile, length: int, offset: int) -> bytes:
+            data = own(file, length, offset)
+            name = str(Path(f"/proc/self/fd/{file.fileno()}").readlink())
+            self.bytes[name] = self.bytes.get(name, 0) + len(data)
+            return data
+
+        monkeypatch.setattr(LocalFile, "pread", pread)
+
+    def of_archives(self) -> int:
+        return sum(count for name, count in self.bytes.items() if ".tar" in name)
+
+
+def test_headers_and_needed_members_alone_are_read_and_an_index_but_once(
+    made: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    reads = Reads(monkeypatch)
+    build_store(parameters(made, "tar"), tmp_path / "s.zarr")
+    needed = sum(
+        path.stat().st_size
+        for name in IDS[:4]
+        for path in (made / "pixieverse" / "render_outputs" / name).rglob("*")
+        if path.name in ("material_grid.npy", "clip_features_mask.npy", "clip_features.npz")
+    )
+    whole = sum(path.stat().st_size for path in (made / "tar").rglob("*.tar"))
+    headers = reads.of_archives() - needed
+    assert 0 < headers < 0.1 * whole
+    reads.bytes.clear()
+    again = build_store(parameters(made, "tar"), tmp_path / "s.zarr")
+    assert again.statuses["ok"] == 4
+    assert reads.of_archives() == 0
+
+
+def test_index_goes_on_where_it_was_stopped(
+    made: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = made / "tar" / "archives" / "render_outputs" / "tree.tar"
+    archive = archives.Archive.on_disk(path, ("*/sample_*/material_grid.npy",))
+    whole, passed = archive.index(), []
+    shutil.rmtree(archive.home)
+
+    def stop(at: int) -> None:
+        if at > path.stat().st_size // 2:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        archive.index(stop)
+    assert archive.index(passed.append) == whole
+    assert min(passed) > path.stat().st_size // 2
+    passed.clear()
+    assert archive.index(passed.append) == whole
+    assert not passed
+
+
+def test_what_changed_in_an_archive_is_built_again_alone(made: Path, tmp_path: Path) -> None:
+    folder = shutil.copytree(made / "tar", tmp_path / "tar")
+    build_store(parameters(made, folder), tmp_path / "s.zarr")
+    shutil.copytree(made / "pixieverse" / "render_outputs" / IDS[0], tmp_path / "new" / IDS[0])
+    shutil.copytree(made / "pixieverse" / "render_outputs" / IDS[3], tmp_path / "new" / IDS[3])
+    write_grid = tmp_path / "new" / IDS[3] / "sample_0" / "material_grid.npy"
+    shutil.rmtree(tmp_path / "new" / IDS[3])
+    write_object(tmp_path / "new" / IDS[3], make_asset(3).grid * [1, 2, 1, 1], 3)
+    assert write_grid.exists()
+    pack(folder / "archives/render_outputs/tree.tar", sorted((tmp_path / "new").iterdir()))
+    build_store(parameters(made, folder), tmp_path / "s.zarr")
+    build_store(parameters(made, folder), tmp_path / "fresh.zarr")
+    records = json.loads((tmp_path / "s.manifests" / "build.json").read_text())
+    assert records["statuses"]["ok"] == 4
+    assert files(tmp_path / "s.zarr") == files(tmp_path / "fresh.zarr")
+
+
+@pytest.fixture
+def strange(made: Path, tmp_path: Path) -> Iterator[Path]:
+    """Return a folder with one archive that tests write."""
+    folder = tmp_path / "strange"
+    folder.mkdir()
+    yield folder
+
+
+def grid_of(made: Path, number: int) -> Path:
+    return made / "pixieverse" / "render_outputs" / IDS[number] / "sample_0" / "material_grid.npy"
+
+
+def test_last_of_two_members_counts_and_links_lead_within_the_archive(
+    made: Path, strange: Path, tmp_path: Path
+) -> None:
+    name = f"{IDS[0]}/sample_0/material_grid.npy"
+    with tarfile.open(strange / "tree.tar", "w") as archive:
+        archive.add(grid_of(made, 1), arcname=f"./{name}")
+        archive.add(grid_of(made, 0), arcname=name)
+        link = tarfile.TarInfo(f"{IDS[1]}/sample_0/material_grid.npy")
+        link.type, link.linkname = tarfile.LNKTYPE, name
+        archive.addfile(link)
+        link = tarfile.TarInfo(f"{IDS[2]}/sample_0/material_grid.npy")
+        link.type, link.linkname = tarfile.SYMTYPE, f"../../{name}"
+        archive.addfile(link)
+        pipe = tarfile.TarInfo(f"{IDS[3]}/sample_0/material_grid.npy")
+        pipe.type = tarfile.CHRTYPE
+        archive.addfile(pipe)
+        for other in ("/etc/passwd", f"../{IDS[4]}/sample_0/material_grid.npy"):
+            archive.addfile(tarfile.TarInfo(other))
+    with pytest.warns(UserWarning) as told:
+        summary = build_store(parameters(made, strange), tmp_path / "s.zarr")
+    problems = dict(summary.problems)
+    records = [json.loads(line) for line in (tmp_path / "s.manifests" / "assets.jsonl").open()]
+    digest = hashlib.sha256(grid_of(made, 0).read_bytes()).hexdigest()
+    grids = {r["asset_id"]: r["sources"][0]["sha256"] for r in records if r["status"] == "ok"}
+    assert grids == {IDS[0]: digest, IDS[1]: digest}
+    (line,) = {str(one.message) for one in told}
+    assert "tree.tar: 1 name" in line and "'/etc/passwd' and 1 more" in line
+    assert "is a symbolic link" in problems[IDS[2]]
+    assert "is a device or a pipe" in problems[IDS[3]]
+
+
+def test_object_in_two_archives_is_not_taken_from_either(
+    made: Path, strange: Path, tmp_path: Path
+) -> None:
+    objects = made / "pixieverse" / "render_outputs"
+    pack(strange / "sand.tar", [objects / IDS[0], objects / IDS[1]])
+    pack(strange / "tree.tar", [objects / IDS[0]])
+    summary = build_store(parameters(made, strange), tmp_path / "s.zarr")
+    assert f"lies in {strange / 'sand.tar'} as well" in dict(summary.problems)[IDS[0]]
+    assert list(open_store(tmp_path / "s.zarr").ids) == [IDS[1]]
+
+
+def truncated(data: bytes) -> bytes:
+    return data[: len(data) * 2 // 3]
+
+
+def damaged(data: bytes) -> bytes:
+    at = data.index(IDS[1].encode(), len(data) // 4)
+    return data[:at] + b"x" + data[at + 1 :]
+
+
+@pytest.mark.parametrize("suffix", [".tar", ".tar.gz"])
+def test_truncated_archive_is_named_and_the_rest_of_it_built(
+    made: Path, strange: Path, tmp_path: Path, suffix: str
+) -> None:
+    objects = made / "pixieverse" / "render_outputs"
+    path = strange / f"tree{suffix}"
+    pack(path, [objects / IDS[0], objects / IDS[1]])
+    path.write_bytes(truncated(path.read_bytes()))
+    summary = build_store(parameters(made, strange), tmp_path / "s.zarr")
+    (line,) = [text for name, text in summary.problems if name.startswith("tree")]
+    assert path.name in line and "download it again" in line
+    assert list(open_store(tmp_path / "s.zarr").ids) == [IDS[0]]
+
+
+def test_damaged_header_is_named_and_what_lies_before_it_built(
+    made: Path, strange: Path, tmp_path: Path
+) -> None:
+    objects = made / "pixieverse" / "render_outputs"
+    path = strange / "tree.tar"
+    pack(path, [objects / IDS[0], objects / IDS[1]])
+    path.write_bytes(damaged(path.read_bytes()))
+    summary = build_store(parameters(made, strange), tmp_path / "s.zarr")
+    (line,) = [text for name, text in summary.problems if name.startswith("tree")]
+    assert "is damaged at byte" in line
+    assert list(open_store(tmp_path / "s.zarr").ids) == [IDS[0]]
+
+
+def test_archive_replaced_during_a_build_is_noticed(made: Path, strange: Path) -> None:
+    objects = made / "pixieverse" / "render_outputs"
+    path = strange / "tree.tar"
+    pack(path, [objects / IDS[0]])
+    archive = archives.Archive.on_disk(path, ("*/sample_*/material_grid.npy",))
+    (entry,) = [one for name, one in archive.index().members.items() if "material" in name]
+    assert archive.read(entry) == grid_of(made, 0).read_bytes()
+    pack(path, [objects / IDS[1]])
+    with pytest.raises(InputError, match="was replaced after it was looked at"):
+        archive.read(entry)
+
+
+def test_header_that_claims_much_is_not_believed(strange: Path) -> None:
+    path = strange / "tree.tar"
+    header = tarfile.TarInfo("long")
+    header.type, header.size = tarfile.GNUTYPE_LONGNAME, 2**40
+    path.write_bytes(header.tobuf(tarfile.GNU_FORMAT) + bytes(4096))
+    index = archives.Archive.on_disk(path, ("*",)).index()
+    assert "is no intact tar archive (a header claims" in index.fault
+
+
+def test_long_names_are_read_in_both_forms(strange: Path) -> None:
+    name = "/".join(["a" * 90] * 4) + "/material_grid.npy"
+    for number, form in enumerate([tarfile.GNU_FORMAT, tarfile.PAX_FORMAT]):
+        path = strange / f"{number}.tar"
+        with tarfile.open(path, "w", format=form) as archive:
+            add(archive, name, b"grid")
+            add(archive, "b.npy", b"other")
+        made = archives.Archive.on_disk(path, ("*",))
+        members = made.index().members
+        assert {key: made.read(entry) for key, entry in members.items()} == {
+            name: b"grid", "b.npy": b"other",
+        }  # fmt: skip

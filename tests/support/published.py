@@ -1,0 +1,58 @@
+"""PixieVerse as it is published: archives by class, each object's files as Pixie writes them."""
+
+from __future__ import annotations
+
+import io
+import tarfile
+from collections.abc import Iterable
+from pathlib import Path
+
+import numpy as np
+
+CLASSES = ("tree", "soda_cans", "sand")
+
+
+def add(archive: tarfile.TarFile, name: str, data: bytes) -> None:
+    """Add a file to an archive."""
+    member = tarfile.TarInfo(name)
+    member.size = len(data)
+    archive.addfile(member, io.BytesIO(data))
+
+
+def npy(array: np.ndarray) -> bytes:
+    """Return an array as `numpy.save` writes it."""
+    file = io.BytesIO()
+    np.save(file, array)
+    return file.getvalue()
+
+
+def write_object(folder: Path, grid: np.ndarray, seed: int = 0) -> None:
+    """Write the files of an object that lie beside its grid, small ones in place of large."""
+    rng = np.random.default_rng(seed)
+    frames = folder / "sample_0" / "gs_sim_gridsize_64_output"
+    frames.mkdir(parents=True)
+    np.save(folder / "sample_0" / "material_grid.npy", grid)
+    occupied = grid[..., 3] != 7
+    np.save(folder / "clip_features_mask.npy", occupied.astype(np.float32))
+    np.savez(folder / "clip_features.npz", min_bounds=(-0.5,) * 3, voxel_size=1 / 64)
+    np.save(folder / "clip_features_features.npy", rng.random((8, 8, 8, 768)).astype(np.float16))
+    for number in range(6):
+        (frames / f"{number:04d}.png").write_bytes(rng.bytes(3000))
+    (frames / "output.mp4").write_bytes(rng.bytes(50_000))
+
+
+def publish(objects: Path, root: Path, suffix: str = ".tar") -> Path:
+    """Put a folder of objects into archives by class; return the folder that has them."""
+    folder = root / "archives" / "render_outputs"
+    folder.mkdir(parents=True)
+    names = sorted(path.name for path in objects.iterdir())
+    for number, name in enumerate(CLASSES):
+        pack(folder / f"{name}{suffix}", (objects / one for one in names[number :: len(CLASSES)]))
+    return folder
+
+
+def pack(path: Path, objects: Iterable[Path]) -> None:
+    """Write an archive of objects."""
+    with tarfile.open(path, "w:gz" if path.suffix == ".gz" else "w") as archive:
+        for one in objects:
+            archive.add(one, arcname=one.name)
