@@ -23,6 +23,8 @@ from slatprep.learn.runs import read_state
 from slatprep.normalize import denormalize_properties, normalization_of
 from slatprep.readers.files import refusing
 from slatprep.records import (
+    MANY_BACKGROUND,
+    MAX_PROPERTIES,
     PIXIEVERSE,
     Contents,
     Normalization,
@@ -113,23 +115,46 @@ def load_checkpoint(path: Path, device: str = "cpu") -> Checkpoint:
     state = read_state(path)
     wanted = "best.pt of a run of `slatprep train`; one without ranges is trained anew"
     with refusing(path, "holds no decoder with its ranges", wanted):
-        size = str(state["size"])
-        if not isinstance(state["ranges"], list):
-            raise TypeError(f"ranges are {type(state['ranges']).__name__}")
+        size, source = _text_in(state, "size"), _text_in(state, "ranges_source")
         contents = _contents_in(state)
-        shape = len(contents.properties), 2
-        ranges = np.array(state["ranges"], dtype=np.float64).reshape(shape)
-        if not (np.isfinite(ranges).all() and (ranges[:, 0] < ranges[:, 1]).all()):
-            raise ValueError(f"ranges are {ranges.tolist()}")
+        ranges = _ranges_in(state, len(contents.properties))
+        normalization = normalization_of(ranges, source, contents.properties)
+        ends = np.array([[-1.0] * len(ranges), [1.0] * len(ranges)], dtype=np.float32)
+        with np.errstate(over="ignore"):
+            values = denormalize_properties(ends, normalization)
+        if not np.isfinite(values).all():
+            raise ValueError(f"ranges {ranges.tolist()} lead to values that are not finite")
         model = make_decoder(size, contents)
+        for name, weight in state["model"].items():
+            if not weight.is_floating_point():
+                raise TypeError(f"weights {name} are {weight.dtype}, not real numbers")
         model.load_state_dict(state["model"])
         if not all(bool(torch.isfinite(weight).all()) for weight in model.parameters()):
             raise ValueError("weights are not all finite")
-        source = str(state["ranges_source"])
-    normalization = normalization_of(ranges, source, contents.properties)
     return Checkpoint(
         model.to(device).eval(), size, normalization, contents, file_digest(path), device
     )
+
+
+def _text_in(state: dict[str, Any], name: str) -> str:
+    """Return a text of a checkpoint; anything else could be without end once it is printed."""
+    text = state[name]
+    if not isinstance(text, str):
+        raise TypeError(f"{name} is {type(text).__name__}, not a text")
+    return text
+
+
+def _ranges_in(state: dict[str, Any], count: int) -> NDArray[np.float64]:
+    """Return the ranges (count, 2); lists may hold the same list again and again."""
+    rows = state["ranges"]
+    if not (isinstance(rows, list) and len(rows) == count):
+        raise TypeError(f"ranges are not a list of {count}")
+    if not all(isinstance(row, list) and list(map(type, row)) == [float] * 2 for row in rows):
+        raise TypeError("ranges are not two numbers each")
+    ranges = np.array(rows, dtype=np.float64)
+    if not (np.isfinite(ranges).all() and (ranges[:, 0] < ranges[:, 1]).all()):
+        raise ValueError(f"ranges are {rows}")
+    return ranges
 
 
 def _contents_in(state: dict[str, Any]) -> Contents:
@@ -138,12 +163,18 @@ def _contents_in(state: dict[str, Any]) -> Contents:
 
     if "contents" not in state:
         return PIXIEVERSE
-    document = orjson.loads(str(state["contents"]))
+    document = orjson.loads(_text_in(state, "contents"))
     document["properties"] = [
         dict(zip(("name", "unit", "log10"), row, strict=True)) for row in document["properties"]
     ]
     # Without the bounds of values, since JSON has no infinity.
     contents: Contents = TypeAdapter(Contents).validate_json(orjson.dumps(document), strict=True)
+    if not 0 < len(contents.properties) <= MAX_PROPERTIES:
+        raise ValueError(f"it has {len(contents.properties)} properties, not 1 to {MAX_PROPERTIES}")
+    if len(contents.classes) > MANY_BACKGROUND:
+        raise ValueError(f"it has {len(contents.classes)} classes, not at most {MANY_BACKGROUND}")
+    if len(set(contents.classes)) < len(contents.classes):
+        raise ValueError("two of its classes have one name")
     return contents
 
 
@@ -207,7 +238,8 @@ def write_prediction(
     properties, ``checkpoint`` (the SHA-256 of its file) and ``seconds``. InputError, and no file,
     if the prediction is not finite.
     """
-    if not (np.isfinite(field.properties).all() and np.isfinite(field.probabilities).all()):
+    values = (field.properties, field.properties_si, field.probabilities)
+    if not all(np.isfinite(array).all() for array in values):
         encoder = checkpoint.contents.latents.encoder
         raise InputError(
             asset_id, "what is predicted of its latents is not finite", f"latents of {encoder}"

@@ -35,6 +35,9 @@ _LOCK, _PARTIAL = ".lock", f".{RUN_FILE}.partial"
 _GLOBALS = ("torch", "collections OrderedDict")
 """Prefixes of the names that a checkpoint's pickle may contain."""
 
+_MAX_PICKLE = 2**20
+"""Bytes of a checkpoint's structure without its tensors; the large decoder's takes 60,000."""
+
 
 @dataclasses.dataclass(frozen=True)
 class EpochRecord:
@@ -66,6 +69,8 @@ def read_state(path: Path) -> dict[str, Any]:
                 raise ValueError("it is compressed")
             for info in archive.infolist():
                 if info.filename.endswith("/data.pkl"):
+                    if info.file_size > _MAX_PICKLE:
+                        raise ValueError(f"its structure takes {info.file_size:,} bytes")
                     _check_globals(archive.read(info))
         file.seek(0)
         try:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import struct
+import tracemalloc
 from pathlib import Path
 
 import pytest
@@ -42,6 +43,60 @@ def test_more_rows_than_bytes_are_refused_before_anything_is_set_aside(
     elements = f"element {element} {rows}\n{XYZ}property list uchar double w\n"
     with pytest.raises(InputError, match="announces more rows than it has"):
         read_particles(_ply(tmp_path / "p.ply", elements, b"0 0 0 0\n", form))
+
+
+@pytest.mark.parametrize(
+    "elements",
+    [
+        "element junk 300_000_000\nproperty list uchar int q\n",
+        "element junk +1000000000\nproperty uchar q\n",
+        "element vertex 1\nproperty float x\ncomment " + "c" * 70_000 + "\n"
+        "element junk 1000000000\nproperty list uchar int q\n",
+        "comment " + "c" * 70_000 + "\nelement junk 1000000000\nproperty uchar q\n",
+        "element junk 40\nproperty double q\n",
+        "element junk -1\nproperty double q\n",
+    ],
+    ids=["underscores", "a sign", "behind the vertices", "long comments", "wide rows", "below 0"],
+)
+def test_a_small_file_takes_little_memory_whatever_it_announces(
+    elements: str, tmp_path: Path
+) -> None:
+    file = _ply(tmp_path / "p.ply", elements + f"element vertex 1\n{XYZ}", b"\0" * 100)
+    tracemalloc.start()
+    try:
+        with pytest.raises(
+            InputError, match=r"p\.ply: .*(more rows than it has|fields x, y and z)"
+        ):
+            read_particles(file)
+        assert tracemalloc.get_traced_memory()[1] < 20e6
+    finally:
+        tracemalloc.stop()
+
+
+@pytest.mark.parametrize("form", ["ascii", "binary_little_endian"])
+def test_millions_of_short_rows_are_refused_before_they_are_read(form: str, tmp_path: Path) -> None:
+    rows = 3_000_000
+    body = b"0\n" * rows if form == "ascii" else b"\0" * rows
+    elements = f"element junk {rows}\nproperty list uchar int q\nelement vertex 0\n{XYZ}"
+    file = _ply(tmp_path / "p.ply", elements, body, form)
+    tracemalloc.start()
+    try:
+        with pytest.raises(InputError, match="rows of text or lists, and at most 200,000"):
+            read_particles(file)
+        assert tracemalloc.get_traced_memory()[1] < 50e6
+    finally:
+        tracemalloc.stop()
+
+
+def test_faces_behind_the_vertices_are_counted_and_left_unread(tmp_path: Path) -> None:
+    faces = "element face 300000\nproperty list uchar int vertex_indices\n"
+    row = struct.pack("<3f", 0.1, 0.2, 0.3)
+    body = row + struct.pack("<B3i", 3, 0, 0, 0) * 300_000
+    file = _ply(tmp_path / "p.ply", f"element vertex 1\n{XYZ}{faces}", body)
+    assert read_particles(file).positions.shape == (1, 3)
+    torn = _ply(tmp_path / "torn.ply", f"element vertex 1\n{XYZ}{faces}", row + b"torn")
+    with pytest.raises(InputError, match="announces more rows than it has"):
+        read_particles(torn)
 
 
 @pytest.mark.parametrize("content", [b"", b"ply\n", b"\0" * 2**21])

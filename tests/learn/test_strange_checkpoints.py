@@ -1,0 +1,108 @@
+"""Checkpoints from strangers: each is refused in words, within little memory."""
+
+from __future__ import annotations
+
+import io
+import json
+import pickle
+import tracemalloc
+import zipfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+
+from slatprep.errors import InputError
+from slatprep.learn.decoder import make_decoder
+from slatprep.learn.predict import checkpoint_state, load_checkpoint
+from slatprep.normalize import PIXIE_RANGES
+
+MOST_BYTES = 100e6
+
+
+def shared(depth: int = 9, width: int = 10) -> list[Any]:
+    """Return a list of width ** depth leaves that takes no memory: one list holds another."""
+    inner: list[Any] = [0.0] * width
+    for _ in range(depth - 1):
+        inner = [inner] * width
+    return inner
+
+
+def with_contents(state: dict[str, Any], **change: object) -> None:
+    state["contents"] = json.dumps(json.loads(state["contents"]) | change)
+
+
+CHANGES: dict[str, tuple[Callable[[dict[str, Any]], object], str]] = {
+    "ranges that hold themselves": (lambda s: s.update(ranges=shared()), "ranges are not a list"),
+    "rows that hold themselves": (lambda s: s.update(ranges=[shared()] * 3), "two numbers each"),
+    "a size without end": (lambda s: s.update(size=shared()), "size is list, not a text"),
+    "contents without end": (lambda s: s.update(contents=shared()), "contents is list"),
+    "a source without end": (lambda s: s.update(ranges_source=shared()), "ranges_source is list"),
+    "whole numbers": (lambda s: s.update(ranges=[[0, 1]] * 3), "two numbers each"),
+    "ranges beyond floats": (lambda s: s.update(ranges=[[0.0, 1e308]] * 3), "not finite"),
+    "ranges beyond float32": (lambda s: s.update(ranges=[[0.0, 300.0]] * 3), "not finite"),
+    "one name for two classes": (lambda s: with_contents(s, classes=["a", "a"]), "one name"),
+    "too many classes": (
+        lambda s: with_contents(s, classes=[f"c{k}" for k in range(300)]),
+        "300 classes, not at most 254",
+    ),
+    "no property": (lambda s: with_contents(s, properties=[]), "0 properties"),
+    "whole weights": (
+        lambda s: s["model"].update({k: v.to(torch.int8) for k, v in s["model"].items()}),
+        "torch.int8, not real numbers",
+    ),
+    "complex weights": (
+        lambda s: s["model"].update({k: v.to(torch.complex64) for k, v in s["model"].items()}),
+        "torch.complex64, not real numbers",
+    ),
+    "weights that are none": (lambda s: s.update(model=shared()), "holds no decoder"),
+}
+
+
+def refused(path: Path, said: str) -> None:
+    tracemalloc.start()
+    try:
+        with pytest.raises(InputError, match=said) as caught:
+            load_checkpoint(path)
+        peak = tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+    assert peak < MOST_BYTES
+    assert "\n" not in str(caught.value) and len(str(caught.value)) < 700
+
+
+@pytest.mark.parametrize(("change", "said"), CHANGES.values(), ids=CHANGES)
+def test_a_checkpoint_is_refused_in_words(
+    change: Callable[[dict[str, Any]], object], said: str, tmp_path: Path
+) -> None:
+    state = checkpoint_state(make_decoder("small"), "small", PIXIE_RANGES)
+    change(state)
+    torch.save(state, tmp_path / "best.pt")
+    refused(tmp_path / "best.pt", said)
+
+
+def test_a_structure_of_millions_of_lists_is_not_unpickled(tmp_path: Path) -> None:
+    path = tmp_path / "best.pt"
+    torch.save({"size": "small"}, path)
+    with zipfile.ZipFile(path) as archive:
+        members = {info.filename: archive.read(info) for info in archive.infolist()}
+    stream = io.BytesIO()
+    pickler = pickle.Pickler(stream, protocol=2)
+    pickler.fast = True
+    pickler.dump([[] for _ in range(2_000_000)])
+    with zipfile.ZipFile(path, "w") as archive:
+        for name, data in members.items():
+            archive.writestr(name, stream.getvalue() if name.endswith("data.pkl") else data)
+    refused(path, "its structure takes 2,004,004 bytes")
+
+
+def test_the_largest_decoder_with_its_optimiser_is_no_stranger(tmp_path: Path) -> None:
+    model = make_decoder("large")
+    optimizer = torch.optim.AdamW(model.parameters())
+    sum(weight.sum() for weight in model.parameters()).backward()
+    optimizer.step()
+    state = checkpoint_state(model, "large", PIXIE_RANGES) | {"optimizer": optimizer.state_dict()}
+    torch.save(state, tmp_path / "best.pt")
+    assert load_checkpoint(tmp_path / "best.pt").size == "large"
