@@ -126,7 +126,7 @@ MEASUREMENTS = (
     ),
     Measurement(
         "read", "Reading a store beside other formats",
-        "reading", "slatprep bench read {folder}/demo.zarr",
+        "reading", "python benchmarks/reading.py {folder}/demo.zarr",
         (60, 0, 600), (6, 0, 180), (DEMO, STORE),
     ),
     Measurement(

@@ -40,9 +40,9 @@ from numpy.typing import NDArray
 
 from slatprep.align import field as engine
 from slatprep.align.deformation import map_of
-from slatprep.bench.truth import SUCCESS_DISPLACEMENT, Truth, compare_with_truth, read_truth
 from slatprep.demo import make_demo
 from slatprep.geometry.frames import VOXEL_SIZE, nearest_similarity, split_transform, voxel_centres
+from slatprep.inspect.score import SUCCESS_DISPLACEMENT, Truth, compare_with_truth, read_truth
 from slatprep.judge import measure_ambiguity
 from slatprep.judge.evidence import HARMLESS, evidence_of, surroundings_of
 from slatprep.parameters import (

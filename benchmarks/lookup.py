@@ -19,10 +19,10 @@ from collections import defaultdict
 from pathlib import Path
 
 import numpy as np
+from engines import pairs_with_truth
 from scipy.spatial import cKDTree
 
 from slatprep.align import align
-from slatprep.bench.align import pairs_with_truth
 from slatprep.geometry.frames import RESOLUTION, apply_transform, invert_transform, voxel_centres
 from slatprep.normalize import to_mapped
 from slatprep.parameters import AlignParameters

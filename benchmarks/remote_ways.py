@@ -31,10 +31,10 @@ from typing import Any
 
 import checkout
 import numpy as np
+import reading as local
+from reading import write_forms
 from support import object_store
 
-from slatprep.bench import read as local
-from slatprep.bench.read import write_forms
 from slatprep.store import open_store
 from slatprep.store.reader import TRAINING_COLUMNS
 

@@ -23,8 +23,8 @@ from pathlib import Path
 
 import numpy as np
 
-from slatprep.bench.truth import read_truth
 from slatprep.geometry.frames import places_of
+from slatprep.inspect.score import read_truth
 from slatprep.judge.evidence import HARMLESS
 from slatprep.parameters import WitnessParameters
 from slatprep.parameters.files import load_parameters

@@ -43,7 +43,6 @@ GROUPS = {
     "Maintain": {
         "verify": "slatprep.cli.verify:verify",
         "diff": "slatprep.cli.diff:diff",
-        "bench": "slatprep.cli.bench:bench",
     },
 }
 """Commands by what people do; to add a command, add its name and function here.

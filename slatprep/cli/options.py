@@ -213,18 +213,20 @@ class WorkersOptions:
         Click(metavar="ADDRESS"),
     ] = None
 
+    def __post_init__(self) -> None:
+        given = click.get_current_context().get_parameter_source("jobs")
+        if self.scheduler is not None and given is not click.core.ParameterSource.DEFAULT:
+            raise click.UsageError(
+                "--jobs is for this machine, and --scheduler uses all workers that the cluster "
+                "has; give one of them"
+            )
+
     @contextmanager
     def started(self, output: Output) -> Iterator[int | Workers]:
         """Give what `slatprep.workers` takes as `jobs`."""
         if self.scheduler is None:
             yield self.jobs
             return
-        given = click.get_current_context().get_parameter_source("jobs")
-        if given is not click.core.ParameterSource.DEFAULT:
-            raise click.UsageError(
-                "--jobs is for this machine, and --scheduler uses all workers that the cluster "
-                "has; give one of them"
-            )
         from slatprep.workers.dask import Cluster
 
         with Cluster(self.scheduler, output.note) as cluster:

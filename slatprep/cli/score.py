@@ -34,7 +34,7 @@ def score(
     -------
     slatprep score demo.zarr demo/truth
     """
-    from slatprep.bench.truth import score_against_truth
+    from slatprep.inspect.score import score_against_truth
 
     with output.progress("score") as progress:
         report = score_against_truth(store, truth_dir, progress)

@@ -69,7 +69,7 @@ def _runner(function: _Function) -> Callable[..., object]:
         given = {name: local_path(value) for name, value in options.items()}
         # Without the program: "info".
         context = click.get_current_context()
-        name = context.command_path.partition(" ")[2]
+        name = context.command_path.partition(" ")[2] or context.info_name or ""
         output = Output(as_json, int(verbose) - int(quiet), name)
         with output.failing():
             require_apart(context.command, given)

@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 from support.shapes import Case
 
-from slatprep.bench.truth import read_truth
 from slatprep.demo import make_demo
+from slatprep.inspect.score import read_truth
 from slatprep.parameters import BuildParameters, PixieverseSource, SlatSource
 from slatprep.readers import discover, read_field, read_latents
 

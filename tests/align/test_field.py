@@ -73,7 +73,7 @@ ACCURACY = {
 
 @pytest.mark.parametrize("level", ACCURACY)
 def test_accuracy_on_demo_data(level: int, demo_cases: Callable[[int], list[Case]]) -> None:
-    from slatprep.bench.truth import compare_with_truth
+    from slatprep.inspect.score import compare_with_truth
 
     scores = []
     for field, latents, truth in demo_cases(level):

@@ -11,9 +11,9 @@ import pytest
 import zarr
 from support.trees import records_of, tree
 
-from slatprep.bench.truth import score_against_truth
 from slatprep.demo import make_demo
 from slatprep.inspect.check import check_alignment
+from slatprep.inspect.score import score_against_truth
 from slatprep.judge import THRESHOLDS
 from slatprep.parameters import BuildParameters, ConsensusParameters
 from slatprep.parameters.files import load_parameters

@@ -18,7 +18,6 @@ from slatprep import (
     open_store,
     subset_store,
 )
-from slatprep.bench.truth import score_against_truth
 from slatprep.cli.commands import slatprep as command
 from slatprep.demo import make_demo
 from slatprep.demo.latents import Encoder
@@ -27,6 +26,7 @@ from slatprep.inspect.check import check_alignment
 from slatprep.inspect.pictures.scene import scene_of
 from slatprep.inspect.report.thumbnails import SIDE, thumbnail
 from slatprep.inspect.report.voxels import COARSE, FULL, encode_asset
+from slatprep.inspect.score import score_against_truth
 from slatprep.inspect.verify import verify_store
 from slatprep.learn.augment import lattice_symmetries, move
 from slatprep.learn.train import TrainParameters, train

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from slatprep.bench.truth import Truth
 from slatprep.geometry.voxels import boundary, occupancy_of, voxels_of
+from slatprep.inspect.score import Truth
 from slatprep.records import MaterialField, StructuredLatents
 
 Case = tuple[MaterialField, StructuredLatents, Truth]

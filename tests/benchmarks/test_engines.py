@@ -6,15 +6,14 @@ import importlib.util
 from importlib.machinery import ModuleSpec
 from pathlib import Path
 
+import engines as bench
 import numpy as np
 import pytest
 from click.testing import CliRunner
+from cpd import cpd_places
 from support.deformed import MOVES, occupancy
 from support.shapes import chair, field_of, surface_latents
 
-from slatprep.bench import align as bench
-from slatprep.bench.cpd import cpd_places
-from slatprep.cli.commands import slatprep
 from slatprep.demo import make_demo
 from slatprep.errors import SlatprepError
 from slatprep.geometry.frames import VOXEL_SIZE, voxel_centres
@@ -41,8 +40,8 @@ def test_engines_that_are_not_installed_are_left_out_and_named(
 ) -> None:
     without(monkeypatch, "pycpd", "small_gicp", "open3d")
     assert bench.installed_engines() == ("field",)
-    arguments = ["bench", "align", "--data", str(demo), "--repeats", "1"]
-    result = CliRunner().invoke(slatprep, arguments)
+    arguments = ["--data", str(demo), "--repeats", "1"]
+    result = CliRunner().invoke(bench.main, arguments)
     assert result.exit_code == 0, result.output
     assert "field" in result.stdout
     for engine in bench.ENGINES[1:]:

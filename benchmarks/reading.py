@@ -1,5 +1,7 @@
 """Reading for training: random whole assets, by slatprep and by what one would do without it.
 
+    python benchmarks/reading.py STORE.zarr
+
 Every way reads the same arrays of the same assets, in the same shuffled
 order, and takes its turn in every repeat, so that a machine that slows down
 slows all of them.
@@ -9,18 +11,24 @@ from __future__ import annotations
 
 import multiprocessing
 import os
+import tempfile
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from importlib import util
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
+import click
 import numpy as np
 from numpy.typing import NDArray
 
+from slatprep.cli.options import LastStore, Positive
+from slatprep.cli.output import Output
+from slatprep.cli.signature import command
 from slatprep.errors import StoreError
+from slatprep.storage.place import storage_of
 from slatprep.store import open_store
 from slatprep.store.reader import TRAINING_COLUMNS
 from slatprep.workers import Progress
@@ -344,3 +352,63 @@ def _size(directory: Path, way: Way) -> tuple[int, int]:
         path = path / "voxel"
     files = [path] if path.is_file() else [file for file in path.rglob("*") if file.is_file()]
     return sum(file.stat().st_size for file in files), len(files)
+
+
+@command("reading")
+def main(
+    output: Output,
+    store: LastStore,
+    *,
+    assets: Annotated[Positive | None, "Most assets to read. [default: all]"] = None,
+    repeats: Annotated[Positive, "Number of measurements."] = 5,
+    seed: Annotated[int, "Seed of the order of reading."] = 0,
+) -> None:
+    """Read shuffled whole assets (coords, feats, properties) as training does.
+
+    Compares slatprep's reader with npz (one file an asset, plain and
+    compressed), one HDF5 file, zarr-python, and zarrs and tensorstore where
+    they are installed. 'cold' is after asking the system to drop the files from its cache.
+
+    Example
+    -------
+    python benchmarks/reading.py data/demo.zarr
+    python benchmarks/reading.py data/demo.zarr --assets 400 --repeats 9
+    """
+    path = storage_of(store).local
+    if path is None:
+        raise click.UsageError(f"{store}: expected a store on the local disk")
+    with (
+        tempfile.TemporaryDirectory(dir=path.resolve().parent) as temporary,
+        output.progress("passes") as progress,
+    ):
+        result = bench_read(
+            path, Path(temporary), limit=assets, repeats=repeats, seed=seed, progress=progress
+        )
+    output.result(result, lambda: _show_read(output, result))
+
+
+def _show_read(output: Output, result: ReadBench) -> None:
+    output.table(
+        f"Assets a second, {result.assets} assets of {result.voxels // result.assets} voxels, "
+        f"best of {result.repeats} (processor ms an asset and its ratio to npz: medians)",
+        ("way", "MB", "files", "warm", "warm, two", "cold", "ms", "ratio"),
+        [
+            (
+                way.name,
+                round(way.size / 1e6, 1),
+                way.files,
+                round(way.warm),
+                round(way.warm_two),
+                None if way.cold is None else round(way.cold),
+                round(way.seconds * 1e3, 3),
+                round(way.ratio, 2),
+            )
+            for way in result.ways
+        ],
+    )
+    for name in result.left_out:
+        output.note(f"{name}: not installed")
+
+
+if __name__ == "__main__":
+    main()

@@ -11,10 +11,10 @@ import zarr
 from click.testing import CliRunner
 
 import slatprep
-from slatprep.bench.truth import TruthScore, score_against_truth, summarise
 from slatprep.cli.commands import slatprep as slatprep_command
 from slatprep.errors import InputError
 from slatprep.geometry.frames import make_transform
+from slatprep.inspect.score import TruthScore, score_against_truth, summarise
 from slatprep.parameters import BuildParameters, PixieverseSource, SlatSource
 from slatprep.store.layout import ARRAYS
 

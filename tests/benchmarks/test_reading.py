@@ -5,10 +5,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import reading as read
 from click.testing import CliRunner
 
-from slatprep.bench import read
-from slatprep.cli.commands import slatprep
 from slatprep.errors import StoreError
 from slatprep.pipeline.dataset import BuildSummary
 from slatprep.store import open_store
@@ -42,8 +41,8 @@ def test_a_way_that_reads_something_else_is_not_measured(
 
 
 def test_the_command_gives_a_figure_for_every_way(mixed_build: BuildSummary) -> None:
-    call = ["bench", "read", str(mixed_build.store), "--assets", "2", "--repeats", "1", "--json"]
-    result = CliRunner().invoke(slatprep, [*call, "-q"], catch_exceptions=False)
+    call = [str(mixed_build.store), "--assets", "2", "--repeats", "1", "--json"]
+    result = CliRunner().invoke(read.main, [*call, "-q"], catch_exceptions=False)
     ways = {way["name"]: way for way in json.loads(result.stdout)["ways"]}
     assert set(ways) >= {"slatprep", "npz", "npz compressed", "one HDF5 file", "zarr-python"}
     assert all(way["warm"] > 0 and way["warm_two"] > 0 for way in ways.values())
