@@ -7,7 +7,7 @@ difference of shapes continues from block to block; a field's roughness does not
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -15,9 +15,10 @@ from numpy.typing import NDArray
 
 from slatprep.align.deformation import deform
 from slatprep.align.figures import CHECK_SAMPLES, FIT_SAMPLES, fit_figures
+from slatprep.align.pose import Similarity
 from slatprep.align.residuals import Residuals
 from slatprep.align.surface import Surface
-from slatprep.align.warp import Similarity, Warp, from_nearest, halved
+from slatprep.align.warp import Warp, from_nearest, halved
 from slatprep.geometry.frames import VOXEL_SIZE
 from slatprep.parameters import AlignParameters
 from slatprep.records import Deformation, FitFigures, Model
@@ -132,7 +133,7 @@ def deform_if_earned(
                 nearest, warp = from_nearest(pose, warp, points, parameters.scale_bounds)
                 kept = warp.record(slat.points, parameters.max_displacement)
             if kept is not None:
-                model, warp = Model(tried), replace(warp, **_in_voxels(kept))
+                model, warp = Model(tried), warp._replace(**_in_voxels(kept))
                 if nearest is not pose:
                     pose = nearest
                     residuals = Residuals(slat, pixie, pose, CHECK_SAMPLES, first=FIT_SAMPLES)

@@ -14,36 +14,73 @@ sample, always in the same order.
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
+from numpy.typing import NDArray
 
 from slatprep.align.bspline import bend, gather, locate, scatter, strides_of
+from slatprep.align.equations import invert
 from slatprep.align.interpolation import interpolate
-from slatprep.align.solver import solve_linear
+from slatprep.align.warp import NO_SPACING
 from slatprep.geometry.kernel import kernel
 
-OFFSET_PRIOR, RIDGE = 0.01, 1e-4
+OFFSET_PRIOR = 0.01
 PIXIEVERSE_WEIGHT = 0.5
 """Weight of a PixieVerse sample in a fit: floaters and ground are surface that only they have."""
 
 _INVERSE_STEPS = 2
 
 
+class Lines(NamedTuple):
+    """What the equations of a lattice know of each of M samples; kernels write it."""
+
+    places: NDArray[np.float64]  # (M, 3), where it lies in the SLAT frame
+    bases: NDArray[np.uint64]  # (M,), its first control point
+    weights: NDArray[np.float64]  # (M, 12), of its control points along each axis
+    vectors: NDArray[np.float64]  # (M, 4), weighted derivatives by displacement and offset
+    residuals: NDArray[np.float64]  # (M,), weighted
+
+    @classmethod
+    def at(cls, places: NDArray[np.float64]) -> Lines:
+        """Return empty lines of samples at these places."""
+        n = len(places)
+        return cls(places, np.zeros(n, np.uint64), np.zeros((n, 12)), np.zeros((n, 4)), np.zeros(n))
+
+    def rows(self, chosen: slice | NDArray[np.intp]) -> Lines:
+        """Return some rows; a slice shares memory."""
+        return Lines(
+            self.places[chosen],
+            self.bases[chosen],
+            self.weights[chosen],
+            self.vectors[chosen],
+            self.residuals[chosen],
+        )
+
+
 @kernel()
-def linearise(  # type: ignore[no-untyped-def]
-    points, values, field, field_origin, places, forward, bent,
-    rotation, shift, scale, offset, affine, inverse, coefficients, origin, spacing,
-    tau, bases, weights, vectors, residuals,
-):  # fmt: skip
+def linearise(here, there, pose, warp, lines, forward, tau):  # type: ignore[no-untyped-def]
     """Linearise one side's residuals at the current deformation.
 
-    `places` holds, a row a sample, its point in the SLAT frame; where not
-    `forward` it is improved first (a few steps of a fixed-point iteration from
-    the last known place). Where not `bent` the lattice is not looked at. Writes
-    control points, weights, and the weighted residuals with their derivatives
-    by the sample's displacement; returns the mean kernel.
+    `here` and `there` are `Samples`, `pose` is a `Similarity` and `warp` a `Warp`. Where not
+    `forward` the `lines`' places are improved first: a few steps of a fixed-point iteration
+    from the last known place. Where the warp has no lattice it is not looked at.
     """
+    points, values, field, field_origin = here.points, here.values, there.distance, there.origin
+    places, bases, weights = lines.places, lines.bases, lines.weights
+    vectors, residuals = lines.vectors, lines.residuals
+    rotation, shift, scale, offset = pose.rotation, pose.shift, pose.scale, warp.offset
+    affine, origin, spacing, coefficients = (
+        warp.affine,
+        warp.origin,
+        warp.spacing,
+        warp.coefficients,
+    )
+    bent = spacing < NO_SPACING
+    inverse = np.zeros((3, 3))
+    invert(affine, inverse)
     steps = 0 if forward else (_INVERSE_STEPS if bent else 1)
-    moved, kernels = np.zeros(3), 0.0
+    moved = np.zeros(3)
     flat, strides = coefficients.reshape(-1), strides_of(coefficients.shape)
     for m in range(points.shape[0]):
         if not forward:
@@ -97,40 +134,9 @@ def linearise(  # type: ignore[no-untyped-def]
         bases[m] = first
         # The kernel is the root of the weight of Geman and McClure.
         kernel = 1.0 / (1.0 + residual * residual / (tau * tau))
-        kernels += kernel
         vectors[m, 0], vectors[m, 1], vectors[m, 2] = kernel * gx, kernel * gy, kernel * gz
         vectors[m, 3] = -kernel if forward else kernel
         residuals[m] = kernel * residual
-    return kernels / points.shape[0]
-
-
-@kernel()
-def affine_step(  # type: ignore[no-untyped-def]
-    places, vectors, residuals, centre, ridge, offset, offset_prior, step
-):
-    """Solve for 12 affine unknowns about `centre` and the offset; write them to `step` (13,)."""
-    n = 13
-    normal, rhs, row = np.zeros((n, n)), np.zeros(n), np.zeros(n)
-    for m in range(places.shape[0]):
-        for i in range(3):
-            v = vectors[m, i]
-            row[4 * i] = v * (places[m, 0] - centre[0])
-            row[4 * i + 1] = v * (places[m, 1] - centre[1])
-            row[4 * i + 2] = v * (places[m, 2] - centre[2])
-            row[4 * i + 3] = v
-        row[12] = vectors[m, 3]
-        for i in range(n):
-            rhs[i] -= row[i] * residuals[m]
-            for j in range(i, n):
-                normal[i, j] += row[i] * row[j]
-    normal[12, 12] += offset_prior
-    rhs[12] -= offset_prior * offset
-    for i in range(n):
-        normal[i, i] += ridge * normal[i, i] + 1e-9 * places.shape[0]
-    for i in range(n):
-        for j in range(i):
-            normal[i, j] = normal[j, i]
-    solve_linear(normal, rhs, step)
 
 
 @kernel()
@@ -152,15 +158,13 @@ def _apply(bases, weights, vectors, delta, delta_offset, strength, damping, out)
 
 
 @kernel()
-def lattice_step(  # type: ignore[no-untyped-def]
-    bases, weights, vectors, residuals, coefficients, strength, damping,
-    offset, offset_prior, iterations,
-):  # fmt: skip
+def lattice_step(lines, coefficients, offset, strength, damping, offset_prior, iterations):  # type: ignore[no-untyped-def]
     """One Gauss-Newton step of all coefficients and the offset, by conjugate gradients.
 
     Adds the step to `coefficients` and returns the new offset. The
     preconditioner is the matrix's diagonal.
     """
+    bases, weights, vectors, residuals = lines.bases, lines.weights, lines.vectors, lines.residuals
     shape = coefficients.shape
     size = coefficients.size
     gradient, diagonal, strides = np.zeros(shape), np.zeros(shape), strides_of(shape)

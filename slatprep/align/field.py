@@ -22,13 +22,14 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 from slatprep.align.deform import CLEAN
+from slatprep.align.finish import finish
 from slatprep.align.ground import find_ground, is_ground
 from slatprep.align.pair import COARSE_SAMPLES, COARSE_TAUS, MOST_SURVIVORS, TIE, Pair
-from slatprep.align.pose import Pose
+from slatprep.align.pose import Pose, Similarity
 from slatprep.align.quality import compare
+from slatprep.align.search import ranked, search_all
 from slatprep.align.starts import candidates_of, distinct_starts
 from slatprep.align.surface import surface_of
-from slatprep.geometry.frames import VOXEL_SIZE, split_transform
 from slatprep.geometry.voxels import above, occupancy_of
 from slatprep.parameters import AlignParameters
 from slatprep.records import (
@@ -73,29 +74,32 @@ def _search(pair: Pair) -> Alignment:
     parameters = pair.parameters
     starts = distinct_starts()
     fits = pair.refine(
-        pair.poses((s.rotation for s in starts), pair.size_ratio), COARSE_SAMPLES, COARSE_TAUS, 0.02
+        pair.starts((s.rotation for s in starts), pair.size_ratio),
+        COARSE_SAMPLES,
+        COARSE_TAUS,
+        0.02,
     )
     poses = pair.polish(fits)
     search = Search.EULER64
     if _is_poor(poses):
         search = Search.SO3
-        refined, halfway = pair.search_all()
+        refined, halfway = search_all(pair)
         wide = pair.polish(refined)
         if wide[0].score > poses[0].score + WIDER_GAIN:
             poses = pair.distinct([*poses, *wide])
         if pair.may_deform and HOPELESS < poses[0].score < POOR:
-            poses = pair.ranked(pair.distinct([*poses, *wide]), halfway)
+            poses = ranked(pair, pair.distinct([*poses, *wide]), halfway)
 
     may_contest = pair.may_deform and poses[0].score < POOR
     reach = 2 * TIE if may_contest else TIE
     near = [pose for pose in poses if pose.merit > poses[0].merit - reach]
-    tied, deformed = pair.finish(near, rough=poses[0].score < CLEAN)
+    tied, deformed = finish(pair, near, rough=poses[0].score < CLEAN)
     best = tied[0]
     # A contest said more of them than the scores that they had before.
     others = pair.others(best, [*tied[1:], *poses[len(near) if may_contest else 0 :]])
 
     fitted = {s.index: (fit.fitness, fit.rmse) for s, fit in zip(starts, fits, strict=True)}
-    transform = best.transform
+    transform = best.similarity.transform
     return Alignment(
         transform=transform,
         engine=Engine.FIELD,
@@ -106,7 +110,7 @@ def _search(pair: Pair) -> Alignment:
         # The next one's score may come from fewer samples, and then be the higher one.
         margin=max(best.merit - others[0].merit, 0.0) if others else 1.0,
         placements=tuple(
-            Placement(pose.transform, pose.score, float(pair.apart([pose], best)[0]))
+            Placement(pose.similarity.transform, pose.score, float(pair.apart([pose], best)[0]))
             for pose in others[:MOST_SURVIVORS]
             if pose.merit > best.merit - (CLOSE if may_contest else TIE)
         ),
@@ -124,12 +128,11 @@ def refined_at(
 ) -> Alignment:
     """Finish an alignment's placement as `align` finishes the best one; see `settle.refit`."""
     pair = _pair_of(field, latents, parameters, alignment.ground)
-    rotation, shift, scale = split_transform(alignment.transform)
-    start = Pose(rotation, shift / VOXEL_SIZE, scale)
-    (best,), deformed = pair.finish([start], rough=alignment.score < CLEAN)
+    start = Pose(Similarity.of(alignment.transform))
+    (best,), deformed = finish(pair, [start], rough=alignment.score < CLEAN)
     return replace(
         alignment,
-        transform=best.transform,
+        transform=best.similarity.transform,
         model=deformed.model,
         score=best.score,
         deformation=deformed.deformation,

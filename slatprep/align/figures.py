@@ -8,10 +8,11 @@ from dataclasses import replace
 import numpy as np
 
 from slatprep.align.deformation import bending_of, deform
+from slatprep.align.pose import Similarity
 from slatprep.align.residuals import Residuals
 from slatprep.align.surface import surface_of
-from slatprep.align.warp import Similarity, Warp
-from slatprep.geometry.frames import VOXEL_SIZE, split_transform
+from slatprep.align.warp import Warp
+from slatprep.geometry.frames import VOXEL_SIZE
 from slatprep.geometry.voxels import above, occupancy_of
 from slatprep.records import Alignment, Deformation, FitFigures, MaterialField, StructuredLatents
 
@@ -31,16 +32,15 @@ def measure_figures(
 
     The alignment has no deformation. The offset is the one that suits the residuals best.
     """
-    rotation, shift, scale = split_transform(alignment.transform)
     slat = surface_of(occupancy_of(latents.coords, latents.resolution))
     pixie = surface_of(above(field.occupancy, alignment.ground))
-    pose = Similarity(rotation, shift / VOXEL_SIZE, scale, 0.0)
+    pose = Similarity.of(alignment.transform)
     residuals = Residuals(slat, pixie, pose, CHECK_SAMPLES, first=FIT_SAMPLES)
     warp = residuals.start()
     here, back = residuals.at(warp)
     # The two sides' residuals have the offset with opposite signs.
     offset = float(np.median(np.concatenate([here, -back])))
-    warp = replace(warp, offset=float(np.clip(offset, -_MOST_OFFSET, _MOST_OFFSET)))
+    warp = warp._replace(offset=float(np.clip(offset, -_MOST_OFFSET, _MOST_OFFSET)))
     return fit_figures(residuals, warp)
 
 

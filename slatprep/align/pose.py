@@ -2,30 +2,78 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from slatprep.align.warp import Similarity
-from slatprep.geometry.frames import VOXEL_SIZE, make_transform
+from slatprep.geometry.frames import VOXEL_SIZE, make_transform, split_transform
+
+Array = NDArray[np.float64]
+
+
+class Similarity(NamedTuple):
+    """A similarity from the PixieVerse frame to the SLAT frame, in voxels from the cube's centre.
+
+    ``offset`` is how far the PixieVerse surface stands inside the SLAT's.
+    """
+
+    rotation: Array
+    shift: Array
+    scale: float
+    offset: float = 0.0
+
+    @classmethod
+    def of(cls, transform: Array) -> Similarity:
+        """Return that of a 4x4 matrix between the unit cubes."""
+        rotation, shift, scale = split_transform(transform)
+        return cls(rotation, shift / VOXEL_SIZE, scale)
+
+    @property
+    def transform(self) -> Array:
+        """The 4x4 matrix between the unit cubes."""
+        u, _, v = np.linalg.svd(self.rotation)
+        return make_transform(u @ v, self.shift * VOXEL_SIZE, self.scale)
+
+    def inverse(self, points: Array) -> Array:
+        """Return where points (N, 3) of the SLAT frame lie in the PixieVerse frame, in voxels."""
+        places: Array = (points - self.shift) @ self.rotation / self.scale
+        return places
+
+
+class Poses(NamedTuple):
+    """Many similarities as kernels take them, and change them."""
+
+    rotations: Array  # (n, 3, 3)
+    shifts: Array  # (n, 3)
+    scales: Array  # (n,)
+    offsets: Array  # (n,)
+
+    @classmethod
+    def of(cls, similarities: Sequence[Similarity]) -> Poses:
+        """Return copies of all."""
+        return cls(*(np.array(each) for each in zip(*similarities, strict=True)))
+
+    def similarities(self) -> list[Similarity]:
+        """Return them one by one."""
+        numbers = zip(self.scales.tolist(), self.offsets.tolist(), strict=True)
+        arrays = zip(self.rotations, self.shifts, strict=True)
+        return [Similarity(*pair, *rest) for pair, rest in zip(arrays, numbers, strict=True)]
 
 
 @dataclass(frozen=True, eq=False)
 class Pose:
-    """A similarity from the PixieVerse frame to the SLAT frame, and how well it fits.
+    """A similarity and how well it fits.
 
-    ``shift`` and ``offset`` are in voxels, positions relative to the cube's
-    centre; ``score`` is the mean robust kernel over the samples of both sides,
-    1 for a perfect fit; ``fitness`` the share of samples within one voxel.
+    ``score`` is the mean robust kernel over the samples of both sides, 1 for a
+    perfect fit; ``fitness`` the share of samples within one voxel.
     ``bonus`` is what a trial deformation added to the score, where one was made;
     ``standing`` counts in the order of placements, and not in how far they are apart.
     """
 
-    rotation: NDArray[np.float64]
-    shift: NDArray[np.float64]
-    scale: float
-    offset: float = 0.0
+    similarity: Similarity
     score: float = 0.0
     fitness: float = 0.0
     rmse: float = 0.0
@@ -41,14 +89,3 @@ class Pose:
     def rank(self) -> float:
         """What placements are ordered by."""
         return self.merit + self.standing
-
-    @property
-    def similarity(self) -> Similarity:
-        """The pose without its marks."""
-        return Similarity(self.rotation, self.shift, self.scale, self.offset)
-
-    @property
-    def transform(self) -> NDArray[np.float64]:
-        """The pose as a 4x4 matrix between the unit cubes."""
-        u, _, v = np.linalg.svd(self.rotation)
-        return make_transform(u @ v, self.shift * VOXEL_SIZE, self.scale)

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,6 +36,15 @@ BAND = 1.0
 _MARGIN = 4
 
 
+class Samples(NamedTuple):
+    """A surface as kernels take it: samples, and the field that other samples look up."""
+
+    points: NDArray[np.float64]  # (M, 3), voxels from the cube's centre
+    values: NDArray[np.float64]  # (M,), signed distance [voxel]
+    distance: NDArray[np.float32]  # (a, b, c), signed distance [voxel]
+    origin: NDArray[np.float64]  # (3,), where distance[0, 0, 0] lies
+
+
 @dataclass(frozen=True)
 class Surface:
     """Signed distance to the surface of a voxel set, and samples of it near the surface.
@@ -58,6 +68,11 @@ class Surface:
     points: NDArray[np.float64]
     values: NDArray[np.float64]
     boundary: NDArray[np.uint8]
+
+    @property
+    def samples(self) -> Samples:
+        """What kernels need of it."""
+        return Samples(self.points, self.values, self.distance, self.origin)
 
     @cached_property
     def centroid(self) -> NDArray[np.float64]:

@@ -2,48 +2,36 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from slatprep.align.bspline import displacements, refined
 from slatprep.align.deformation import make_deformation
+from slatprep.align.pose import Similarity
 from slatprep.geometry.frames import VOXEL_SIZE, nearest_similarity, split_transform
 from slatprep.records import Deformation
 
 Array = NDArray[np.float64]
 
 
-@dataclass(frozen=True)
-class Similarity:
-    """The similarity that is deformed: as `slatprep.align.pose.Pose`, in voxels."""
-
-    rotation: Array
-    shift: Array
-    scale: float
-    offset: float
-
-    def inverse(self, points: Array) -> Array:
-        """Return where points (N, 3) of the SLAT frame lie in the PixieVerse frame, in voxels."""
-        places: Array = (points - self.shift) @ self.rotation / self.scale
-        return places
+NO_SPACING = 1e6
 
 
-@dataclass(frozen=True)
-class Warp:
+class Warp(NamedTuple):
     """A deformation while it is fitted; lengths in voxels, positions from the cube's centre."""
 
     affine: Array
     offset: float
-    origin: Array = field(default_factory=lambda: np.zeros(3))
-    spacing: float = 1e6
-    coefficients: Array = field(default_factory=lambda: np.zeros((4, 4, 4, 3)))
+    origin: Array = np.zeros(3)
+    spacing: float = NO_SPACING
+    coefficients: Array = np.zeros((4, 4, 4, 3))
 
     @property
     def has_lattice(self) -> bool:
         """Whether there is a lattice, be it all zeros."""
-        return self.spacing < 1e6
+        return self.spacing < NO_SPACING
 
     @property
     def is_bent(self) -> bool:
@@ -76,7 +64,7 @@ class Warp:
 
 def halved(warp: Warp) -> Warp:
     """Return the same warp on a lattice of half the spacing."""
-    return replace(warp, spacing=0.5 * warp.spacing, coefficients=refined(warp.coefficients))
+    return warp._replace(spacing=0.5 * warp.spacing, coefficients=refined(warp.coefficients))
 
 
 def places_of(pose: Similarity, warp: Warp, points: Array) -> Array:
@@ -90,21 +78,8 @@ def from_nearest(
     """Return the same map as a warp of the similarity that is nearest to it.
 
     Where shapes differ much, the search comes to a similarity of another size or
-    heading, and what corrects that is no deformation.
-
-    Parameters
-    ----------
-    pose, warp
-        The map: from the SLAT frame through the warp and back through the pose.
-    points : ndarray of float64, shape (N, 3)
-        Of the SLAT; nearest is meant over them.
-    scale_bounds : tuple of float
-        Within these the pose's scale stays.
-
-    Returns
-    -------
-    pose : Similarity
-    warp : Warp
+    heading, and what corrects that is no deformation. Nearest is meant over `points`
+    (N, 3) of the SLAT; the new similarity's scale stays within the bounds.
     """
     moved = warp.moved(points)
     transform = nearest_similarity(points, moved)
@@ -122,4 +97,4 @@ def from_nearest(
         pose.scale / grown,
         pose.offset,
     )
-    return nearest, replace(warp, affine=affine, coefficients=warp.coefficients @ back.T)
+    return nearest, warp._replace(affine=affine, coefficients=warp.coefficients @ back.T)

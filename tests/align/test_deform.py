@@ -11,7 +11,8 @@ from support.shapes import chair, field_of, latents_of, surface_latents
 
 from slatprep.align import align
 from slatprep.align.deformation import is_proper, map_of
-from slatprep.align.warp import Similarity, Warp, from_nearest, halved, places_of
+from slatprep.align.pose import Similarity
+from slatprep.align.warp import Warp, from_nearest, halved, places_of
 from slatprep.geometry.frames import voxel_centres
 from slatprep.geometry.voxels import boundary, voxels_of
 from slatprep.parameters import AlignParameters

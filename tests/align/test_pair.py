@@ -15,23 +15,28 @@ from support.residuals import mean_kernel, residuals
 from support.shapes import GRID, chair, crate
 
 from slatprep.align.consensus import degrees_between
+from slatprep.align.finish import MOST_CONTESTED, finish
 from slatprep.align.pair import (
     DISTINCT,
     FINE_SAMPLES,
     FINE_TAUS,
-    MOST_CONTESTED,
-    MOST_RANKED,
     MOST_SURVIVORS,
     RANK_STANDING,
-    RANK_WITHIN,
-    SO3_KEPT,
-    SO3_STARTS,
     SURVIVORS,
     TIE,
     Pair,
-    _apart_from_all,
+    far_from_all,
 )
-from slatprep.align.pose import Pose
+from slatprep.align.pose import Pose, Similarity
+from slatprep.align.search import (
+    MOST_RANKED,
+    RANK_WITHIN,
+    SO3_KEPT,
+    SO3_STARTS,
+    ranked,
+    search_all,
+    stretched,
+)
 from slatprep.align.starts import distinct_starts
 from slatprep.align.surface import Surface, surface_of
 from slatprep.parameters import AlignParameters
@@ -68,13 +73,14 @@ def pair_of(
 
 
 def moved_by(*shift: float, score: float = 0.0) -> Pose:
-    return Pose(np.eye(3), np.array(shift), 1.0, score=score)
+    return Pose(Similarity(np.eye(3), np.array(shift), 1.0), score=score)
 
 
 def looked_up(pose: Pose, points: Array) -> Array:
     """Return where the points of the SLAT lie on the other side, by the inverse of a 4x4 matrix."""
     matrix = np.eye(4)
-    matrix[:3, :3], matrix[:3, 3] = pose.scale * pose.rotation, pose.shift
+    rotation, shift, scale, _ = pose.similarity
+    matrix[:3, :3], matrix[:3, 3] = scale * rotation, shift
     return (np.column_stack([points, np.ones(len(points))]) @ np.linalg.inv(matrix).T)[:, :3]
 
 
@@ -90,7 +96,7 @@ def off(pair: Pair, pose: Pose, true: Pose) -> float:
 def any_poses(seed: int, count: int) -> list[Pose]:
     rng = np.random.default_rng(seed)
     return [
-        Pose(turn, rng.normal(size=3, scale=6.0), float(rng.uniform(0.7, 1.4)))
+        Pose(Similarity(turn, rng.normal(size=3, scale=6.0), float(rng.uniform(0.7, 1.4))))
         for turn in Rotation.random(count, random_state=seed).as_matrix()
     ]
 
@@ -110,7 +116,7 @@ def test_stretched_poses_are_apart_by_the_rms_distance_of_their_places() -> None
     poses = any_poses(1, 6)
     rng = np.random.default_rng(1)
     affines = np.eye(3, 4) + rng.normal(size=(6, 3, 4), scale=[0.1, 0.1, 0.1, 3.0])
-    places = pair._places(poses, affines)
+    places = pair.places(poses, affines)
     points = pair.slat.points
     there = [
         looked_up(pose, points @ affine[:, :3].T + affine[:, 3])
@@ -148,9 +154,9 @@ def test_a_start_lays_centroid_on_centroid() -> None:
     aside = np.roll(ball(9.0), (12, -8, 5), axis=(0, 1, 2))
     pair = pair_of(np.roll(ball(12.0), (-6, 10, 3), axis=(0, 1, 2)), aside)
     rotations = Rotation.random(5, random_state=2).as_matrix()
-    for rotation, pose in zip(rotations, pair.poses(rotations, 1.3), strict=True):
-        np.testing.assert_array_equal(pose.rotation, rotation)
-        assert pose.scale == 1.3
+    for rotation, pose in zip(rotations, pair.starts(rotations, 1.3), strict=True):
+        np.testing.assert_array_equal(pose.similarity.rotation, rotation)
+        assert pose.similarity.scale == 1.3
         np.testing.assert_allclose(looked_up(pose, np.array([[-6.0, 10, 3]])), [[12, -8, 5]])
 
 
@@ -166,13 +172,16 @@ def test_the_size_of_a_start_is_that_of_the_sides_within_its_bounds() -> None:
 
 
 def test_scale_is_refined_only_where_it_is_free() -> None:
-    start = Pose(Rotation.from_euler("x", 4, degrees=True).as_matrix(), np.ones(3), 1.06)
+    turn = Rotation.from_euler("x", 4, degrees=True).as_matrix()
+    start = Pose(Similarity(turn, np.ones(3), 1.06))
     for model, free, held in (
         ("auto", None, False), ("auto", False, True), ("rigid", None, True), ("rigid", True, False),
     ):  # fmt: skip
         pair = pair_of(parameters=AlignParameters(model=model))
         (found,) = pair.refine([start], 400, (4.0,) * 8, 1e-4, free_scale=free)
-        assert found.scale == pytest.approx(1.06 if held else 1.0, abs=0.0 if held else 0.01)
+        assert found.similarity.scale == pytest.approx(
+            1.06 if held else 1.0, abs=0.0 if held else 0.01
+        )
         if not held:
             assert off(pair, found, moved_by(0, 0, 0)) < 0.1
             assert found.score == pytest.approx(1.0, abs=0.02)
@@ -181,9 +190,9 @@ def test_scale_is_refined_only_where_it_is_free() -> None:
 
 def test_the_score_is_the_mean_kernel_of_both_sides() -> None:
     pair = pair_of(placed(0.8), placed(0.7))
-    poses = [replace(pose, offset=0.2) for pose in any_poses(5, 4)]
+    poses = [Pose(p.similarity._replace(offset=0.2)) for p in any_poses(5, 4)]
     for pose, scored in zip(poses, pair.refine(poses, 10**6, (), 0.01), strict=True):
-        forward, backward = residuals(pair.slat, pair.pixie, pose, np.eye(3, 4))
+        forward, backward = residuals(pair.slat, pair.pixie, pose.similarity, np.eye(3, 4))
         expected = 0.5 * (mean_kernel(forward) + mean_kernel(backward))
         assert scored.score == pytest.approx(expected, rel=1e-5)
         within = np.abs(np.concatenate([forward, backward])) <= 1.0
@@ -201,13 +210,13 @@ def test_a_pose_beside_the_truth_is_brought_to_it(step: str) -> None:
     """Not only by as much as brings the next step below a voxel."""
     pair = pair_of()
     turn = Rotation.from_euler("xyz", [5, -4, 6], degrees=True).as_matrix()
-    start = Pose(turn, np.array([1.5, -1.0, 0.5]), 1.03, score=0.5)
+    start = Pose(Similarity(turn, np.array([1.5, -1.0, 0.5]), 1.03), score=0.5)
     if step == "polish":
         (found,) = pair.polish([start])
     else:
-        (found,), deformed = pair.finish([start], rough=False)
+        (found,), deformed = finish(pair, [start], rough=False)
         assert deformed.deformation is None
-        assert found.scale == 1.0
+        assert found.similarity.scale == 1.0
     assert off(pair, found, moved_by(0, 0, 0)) < 0.02
 
 
@@ -215,24 +224,23 @@ def test_a_scale_that_is_not_one_is_kept_and_one_that_is_nearly_one_is_not() -> 
     """Off the cube's centre, so that a scale of one means another shift."""
     aside = (8, -6, 8)
     solid, larger = placed(0.9, at=aside), placed(0.9 * 1.03, at=aside)
-    start = Pose(np.eye(3), -0.03 * np.array(aside), 1.03)
-    (found,), deformed = pair_of(larger, solid).finish([start], rough=False)
-    assert found.scale == pytest.approx(1.03, abs=0.005)
+    start = Pose(Similarity(np.eye(3), -0.03 * np.array(aside), 1.03))
+    (found,), deformed = finish(pair_of(larger, solid), [start], rough=False)
+    assert found.similarity.scale == pytest.approx(1.03, abs=0.005)
     assert deformed.model == "similarity"
-    (same,), deformed = pair_of(solid, solid).finish([start], rough=False)
-    assert same.scale == 1.0
+    (same,), deformed = finish(pair_of(solid, solid), [start], rough=False)
+    assert same.similarity.scale == 1.0
     assert deformed.model == "rigid"
-    np.testing.assert_allclose(same.shift, 0.0, atol=0.02)
+    np.testing.assert_allclose(same.similarity.shift, 0.0, atol=0.02)
 
 
 def test_a_pose_whose_scale_is_set_to_one_looks_the_middle_up_where_it_did() -> None:
     pair = pair_of(np.roll(chair(), (10, -9, 4), axis=(0, 1, 2)))
     for pose in any_poses(3, 4):
-        shift = pair._rescaled_shift(pose)
+        same = Pose(pair.at_scale_one(pose.similarity))
+        assert same.similarity.scale == 1.0
         middle = pair.slat.points.mean(axis=0)[None]
-        np.testing.assert_allclose(
-            looked_up(replace(pose, shift=shift, scale=1.0), middle), looked_up(pose, middle)
-        )
+        np.testing.assert_allclose(looked_up(same, middle), looked_up(pose, middle))
 
 
 class _Watched(Pair):
@@ -243,7 +251,7 @@ class _Watched(Pair):
 
     def refine(self, poses: Sequence[Pose], *given: object, **named: object) -> list[Pose]:
         self.refined.append(len(poses))
-        self.scales.append({pose.scale for pose in poses})
+        self.scales.append({pose.similarity.scale for pose in poses})
         return super().refine(poses, *given, **named)  # type: ignore[arg-type]
 
 
@@ -279,13 +287,13 @@ def test_what_is_polished_is_likely_or_among_the_first(scores: list[float], surv
 def test_all_orientations_are_searched_and_the_likely_half_of_them_to_the_end() -> None:
     turn = Rotation.from_euler("xyz", [40, 25, -70], degrees=True).as_matrix()
     pair = watched(pair_of(placed(0.8, turn), placed(0.8)))
-    refined, halfway = pair.search_all()
+    refined, halfway = search_all(pair)
     assert pair.refined == [SO3_STARTS, SO3_KEPT]
     assert (len(refined), len(halfway)) == (SO3_KEPT, SO3_STARTS)
     scores = [pose.score for pose in halfway]
     assert scores == sorted(scores, reverse=True)
     best = max(refined, key=lambda pose: pose.score)
-    assert off(pair, best, Pose(turn, np.zeros(3), 1.0)) < 0.5
+    assert off(pair, best, Pose(Similarity(turn, np.zeros(3), 1.0))) < 0.5
 
 
 def test_a_stray_part_that_makes_a_side_larger_does_not_hide_the_placement() -> None:
@@ -296,20 +304,20 @@ def test_a_stray_part_that_makes_a_side_larger_does_not_hide_the_placement() -> 
     pair = watched(pair_of(placed(0.6, turn), stray))
     ratio = pair.size_ratio
     assert ratio < 0.85
-    refined, halfway = pair.search_all()
+    refined, halfway = search_all(pair)
     assert pair.scales[:2] == [{ratio}, {1.0}]
     assert pair.refined == [SO3_STARTS, SO3_STARTS // 2, SO3_KEPT]
     assert len(halfway) == SO3_STARTS
     best = max(refined, key=lambda pose: pose.score)
-    assert off(pair, best, Pose(turn, np.zeros(3), 1.0)) < 1.0
+    assert off(pair, best, Pose(Similarity(turn, np.zeros(3), 1.0))) < 1.0
     # The supplement's scale was held, that of the poses by size was not.
-    assert not {1.0} & {pose.scale for pose in halfway}
+    assert not {1.0} & {pose.similarity.scale for pose in halfway}
 
 
 def test_of_rigid_poses_none_gets_a_scale() -> None:
     pair = pair_of(placed(0.8), placed(1.0), parameters=AlignParameters(model="rigid"))
-    refined, halfway = pair.search_all()
-    assert {pose.scale for pose in [*refined, *halfway]} == {1.0}
+    refined, halfway = search_all(pair)
+    assert {pose.similarity.scale for pose in [*refined, *halfway]} == {1.0}
 
 
 def test_deformed_places_are_apart_from_twice_the_usual_distance_on() -> None:
@@ -320,10 +328,10 @@ def test_deformed_places_are_apart_from_twice_the_usual_distance_on() -> None:
         ((-2 * DISTINCT, 0, 0), True), ((0, 2.9, 0), False), ((1.6, 1.8, -1.9), True),
         ((-1.6, 1.6, 1.6), False),
     ):  # fmt: skip
-        assert _apart_from_all(points, [points + shift]) == apart
-        assert _apart_from_all(points, [points + 99, points - shift]) == apart
-        assert _apart_from_all(points, [points + 2**0.5 * half * shift]) == apart
-    assert _apart_from_all(points, [])
+        assert far_from_all(points, [points + shift]) == apart
+        assert far_from_all(points, [points + 99, points - shift]) == apart
+        assert far_from_all(points, [points + 2**0.5 * half * shift]) == apart
+    assert far_from_all(points, [])
 
 
 class _Squashed:
@@ -332,14 +340,14 @@ class _Squashed:
     def __init__(self) -> None:
         centres = GRID.reshape(-1, 3) - 31.5
         self.pair = pair_of(crate(centres / [1.1, 1.1, 0.7]), crate(centres))
-        starts = self.pair.poses([s.rotation for s in distinct_starts()], 1.0)
+        starts = self.pair.starts([s.rotation for s in distinct_starts()], 1.0)
         fits = self.pair.refine(starts, 400, (8.0, 4.0, 2.0, 2.0, 2.0), 0.02)
         self.poses = self.pair.distinct(fits)
         self.upright = min(self.poses, key=upright)
 
 
 def upright(pose: Pose) -> float:
-    return degrees_between(pose.rotation, np.eye(3))
+    return degrees_between(pose.similarity.rotation, np.eye(3))
 
 
 @pytest.fixture
@@ -352,31 +360,31 @@ def test_where_shapes_differ_the_order_is_by_what_a_trial_deformation_leaves(
 ) -> None:
     pair, poses = squashed.pair, squashed.poses
     assert upright(poses[0]) > 60.0
-    _, halfway = pair.search_all()
-    ranked = pair.ranked(poses, halfway)
-    assert upright(ranked[0]) < 10.0
-    assert ranked[0].score < poses[0].score - 0.1
-    ranks = [pose.rank for pose in ranked]
+    _, halfway = search_all(pair)
+    found = ranked(pair, poses, halfway)
+    assert upright(found[0]) < 10.0
+    assert found[0].score < poses[0].score - 0.1
+    ranks = [pose.rank for pose in found]
     assert ranks == sorted(ranks, reverse=True)
     # The one that fitted best as it was has a standing, and no other.
-    (standing,) = (pose for pose in ranked if pose.standing)
+    (standing,) = (pose for pose in found if pose.standing)
     assert standing.standing == RANK_STANDING
     assert off(pair, standing, poses[0]) == 0.0
     # What was not tried keeps its score; it was no more than six, within a bound.
     near = [pose for pose in poses if pose.score > poses[0].score - RANK_WITHIN][:MOST_RANKED]
     beyond = poses[len(near) :]
-    assert {id(pose) for pose in ranked if pose.bonus == 0.0} <= set(map(id, beyond))
+    assert {id(pose) for pose in found if pose.bonus == 0.0} <= set(map(id, beyond))
     for pose in beyond:
-        assert pair.apart(ranked, pose).min() < DISTINCT
+        assert pair.apart(found, pose).min() < DISTINCT
 
 
 def test_what_is_far_below_the_best_fit_is_not_tried(squashed: _Squashed) -> None:
     pair = squashed.pair
     scores = (0.65, 0.56, 0.65 - RANK_WITHIN - 0.01)
     poses = [replace(p, score=s) for p, s in zip(squashed.poses[::2], scores, strict=False)]
-    ranked = pair.ranked(poses, poses[:1])
-    assert ranked[-1] is poses[2]
-    assert all(pose.bonus > 0.0 for pose in ranked[:-1])
+    found = ranked(pair, poses, poses[:1])
+    assert found[-1] is poses[2]
+    assert all(pose.bonus > 0.0 for pose in found[:-1])
 
 
 def test_what_fits_best_as_it_is_takes_part_if_stretching_finds_it_no_more(
@@ -384,14 +392,14 @@ def test_what_fits_best_as_it_is_takes_part_if_stretching_finds_it_no_more(
 ) -> None:
     """Stretched, a neighbour of it fits better and stands for both."""
     pair, best = squashed.pair, squashed.poses[0]
-    turns = Rotation.random(20, random_state=6).as_rotvec() * 0.04
+    turns = Rotation.from_rotvec(0.04 * Rotation.random(20, random_state=6).as_rotvec()).as_matrix()
     beside = [
-        replace(best, rotation=Rotation.from_rotvec(turn).as_matrix() @ best.rotation)
+        replace(best, similarity=best.similarity._replace(rotation=turn @ best.similarity.rotation))
         for turn in turns
     ]
-    better = next(b for b in beside if pair.stretched([best, b], [best]) == [b])
-    ranked = pair.ranked([best, better], [best])
-    assert any(off(pair, pose, best) == 0.0 for pose in ranked)
+    better = next(b for b in beside if stretched(pair, [best, b], [best]) == [b])
+    found = ranked(pair, [best, better], [best])
+    assert any(off(pair, pose, best) == 0.0 for pose in found)
 
 
 def test_of_contested_placements_the_one_that_fits_once_deformed_is_the_best(
@@ -399,7 +407,7 @@ def test_of_contested_placements_the_one_that_fits_once_deformed_is_the_best(
 ) -> None:
     pair, poses = squashed.pair, squashed.poses
     chosen = [squashed.upright, *poses[:2]]
-    (best, *others), deformed = pair.finish(chosen, rough=True)
+    (best, *others), deformed = finish(pair, chosen, rough=True)
     assert deformed.deformation is not None
     assert upright(best) < 10.0
     fine = pair.refine(chosen, FINE_SAMPLES, FINE_TAUS, 0.002, size_by_slat=True)
@@ -417,7 +425,7 @@ def test_of_many_placements_none_is_lost_or_doubled_where_few_are_contested(
     fine = pair.refine(squashed.poses, FINE_SAMPLES, FINE_TAUS, 0.002, size_by_slat=True)
     many = pair.distinct(fine)
     assert len(many) > MOST_CONTESTED + 2
-    found, _ = pair.finish(squashed.poses, rough=True)
+    found, _ = finish(pair, squashed.poses, rough=True)
     for pose in many[MOST_CONTESTED:]:
         assert sum(off(pair, one, pose) == 0.0 for one in found) == 1
     assert len(found) <= len(many)

@@ -13,9 +13,9 @@ from support.shapes import chair, crate
 
 from slatprep import align_voxels
 from slatprep.align.consensus import degrees_between
-from slatprep.align.deform_solver import OFFSET_PRIOR, PIXIEVERSE_WEIGHT, RIDGE
-from slatprep.align.pose import Pose
-from slatprep.align.stretch import stretch
+from slatprep.align.deform_solver import OFFSET_PRIOR, PIXIEVERSE_WEIGHT
+from slatprep.align.pose import Poses, Similarity
+from slatprep.align.stretch import RIDGE, stretch
 from slatprep.align.surface import Surface, surface_of
 from slatprep.geometry.frames import split_transform
 from slatprep.parameters import AlignParameters
@@ -24,21 +24,16 @@ CENTRES = np.indices((64, 64, 64)).reshape(3, -1).T - 31.5
 
 
 def stretched(
-    slat: Surface, pixie: Surface, pose: Pose, affine: NDArray[np.float64], *taus: float
+    slat: Surface, pixie: Surface, pose: Similarity, affine: NDArray[np.float64], *taus: float
 ) -> tuple[NDArray[np.float64], float, float]:
     """Return the affine map and the offset after steps of these widths, and the score."""
-    affines, offsets = affine[None].copy(), np.array([pose.offset])
-    (score,) = stretch(
-        slat.points, slat.values, slat.distance, slat.origin,
-        pixie.points, pixie.values, pixie.distance, pixie.origin,
-        pose.rotation[None], pose.shift[None], np.array([pose.scale]), affines, offsets,
-        np.array(taus),
-    )  # fmt: skip
-    return affines[0], float(offsets[0]), float(score)
+    affines, poses = affine[None].copy(), Poses.of([pose])
+    (score,) = stretch(slat.samples, pixie.samples, poses, affines, np.array(taus))
+    return affines[0], float(poses.offsets[0]), float(score)
 
 
 @pytest.fixture(scope="module")
-def beside() -> tuple[Surface, Surface, Pose, NDArray[np.float64]]:
+def beside() -> tuple[Surface, Surface, Similarity, NDArray[np.float64]]:
     """Two sides beside each other, of other sizes, and a map that is nowhere along an axis.
 
     The samples fill no whole number of blocks, and some lie outside the other's box.
@@ -47,10 +42,10 @@ def beside() -> tuple[Surface, Surface, Pose, NDArray[np.float64]]:
     pixie = surface_of(crate((CENTRES - [-2, -5, 1]) / 0.8)).subset(200)
     turn = Rotation.from_euler("xyz", [25, -40, 70], degrees=True).as_matrix()
     affine = np.array([[1.1, 0.07, -0.05, 1.3], [-0.04, 0.9, 0.06, -0.7], [0.03, -0.08, 1.05, 0.4]])
-    return slat, pixie, Pose(turn, np.array([4.0, -3.0, 6.0]), 1.2, offset=0.3), affine
+    return slat, pixie, Similarity(turn, np.array([4.0, -3.0, 6.0]), 1.2, offset=0.3), affine
 
 
-Beside = tuple[Surface, Surface, Pose, NDArray[np.float64]]
+Beside = tuple[Surface, Surface, Similarity, NDArray[np.float64]]
 
 
 def test_without_a_step_the_score_is_the_mean_kernel_of_both_sides(beside: Beside) -> None:
@@ -87,7 +82,7 @@ def test_a_step_is_that_of_least_squares_on_numerical_derivatives(
 
     def at(step: NDArray[np.float64]) -> NDArray[np.float64]:
         moved, offset = after(step)
-        return np.concatenate(residuals(slat, pixie, replace(pose, offset=offset), moved))
+        return np.concatenate(residuals(slat, pixie, pose._replace(offset=offset), moved))
 
     tiny = 1e-6 * np.eye(13)
     jacobian = np.stack([(at(one) - at(-one)) / 2e-6 for one in tiny], axis=1)
@@ -107,14 +102,9 @@ def test_a_step_is_that_of_least_squares_on_numerical_derivatives(
 
 def test_poses_are_stretched_each_by_itself(beside: Beside) -> None:
     slat, pixie, pose, affine = beside
-    other = replace(pose, shift=pose.shift + 2.0, scale=1.1, offset=-0.1)
-    affines, offsets = np.stack([np.eye(3, 4), affine]), np.array([other.offset, pose.offset])
-    scores = stretch(
-        slat.points, slat.values, slat.distance, slat.origin,
-        pixie.points, pixie.values, pixie.distance, pixie.origin,
-        np.stack([pose.rotation] * 2), np.stack([other.shift, pose.shift]),
-        np.array([other.scale, pose.scale]), affines, offsets, np.array([4.0, 2.0]),
-    )  # fmt: skip
+    other = pose._replace(shift=pose.shift + 2.0, scale=1.1, offset=-0.1)
+    affines, poses = np.stack([np.eye(3, 4), affine]), Poses.of([other, pose])
+    scores = stretch(slat.samples, pixie.samples, poses, affines, np.array([4.0, 2.0]))
     for k, alone in enumerate(
         [
             stretched(slat, pixie, other, np.eye(3, 4), 4.0, 2.0),
@@ -122,7 +112,7 @@ def test_poses_are_stretched_each_by_itself(beside: Beside) -> None:
         ]
     ):
         np.testing.assert_array_equal(affines[k], alone[0])
-        assert (offsets[k], scores[k]) == alone[1:]
+        assert (poses.offsets[k], scores[k]) == alone[1:]
 
 
 @pytest.mark.parametrize("factors", [(1.1, 1.1, 0.7), (1.15, 1.05, 0.75)])
@@ -152,15 +142,13 @@ def test_a_known_affine_map_is_found_from_a_pose_beside_it() -> None:
     moved[within] = shape[tuple(at[within].T)]
     slat, pixie = surface_of(moved.reshape(64, 64, 64)), surface_of(shape)
     few, many = slat.subset(300), pixie.subset(300)
-    affines, offsets = np.eye(3, 4)[None].copy(), np.zeros(1)
+    affines = np.eye(3, 4)[None].copy()
     centre = inside.mean(axis=0)
     start = centre - np.linalg.inv(linear) @ centre
     turn = Rotation.from_euler("xyz", [8, -6, 5], degrees=True).as_matrix()
-    scores = stretch(
-        few.points, few.values, few.distance, few.origin,
-        many.points, many.values, many.distance, many.origin,
-        turn[None], -start[None], np.ones(1), affines, offsets, np.array([5.0, 4, 3, 2, 2, 1.5]),
-    )  # fmt: skip
+    poses = Poses.of([Similarity(turn, -start, 1.0)])
+    taus = np.array([5.0, 4, 3, 2, 2, 1.5])
+    scores = stretch(few.samples, many.samples, poses, affines, taus)
     found = (few.points @ affines[0, :, :3].T + affines[0, :, 3] + start) @ turn
     apart = np.linalg.norm(found - few.points @ linear.T, axis=1)
     assert np.median(apart) < 0.25
@@ -172,11 +160,7 @@ def test_a_pose_that_would_be_squashed_flat_scores_nothing() -> None:
     block = np.zeros((64, 64, 64), dtype=bool)
     block[20:44, 20:44, 20:44] = True
     flat = surface_of(block).subset(60)
-    affines, offsets = np.eye(3, 4)[None].copy(), np.zeros(1)
+    affines, poses = np.eye(3, 4)[None].copy(), Poses.of([Similarity(np.eye(3), np.zeros(3), 1.0)])
     affines[0, :, :3] *= 0.5
-    scores = stretch(
-        flat.points, flat.values, flat.distance, flat.origin,
-        flat.points, flat.values, flat.distance, flat.origin,
-        np.eye(3)[None], np.zeros((1, 3)), np.ones(1), affines, offsets, np.array([5.0]),
-    )  # fmt: skip
+    scores = stretch(flat.samples, flat.samples, poses, affines, np.array([5.0]))
     assert scores[0] == 0.0

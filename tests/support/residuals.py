@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates
 
-from slatprep.align.pose import Pose
+from slatprep.align.pose import Similarity
 from slatprep.align.surface import Surface
 
 Array = NDArray[np.float64]
@@ -22,7 +22,7 @@ def distance_at(surface: Surface, points: Array) -> Array:
     )
 
 
-def carried(slat: Surface, pixie: Surface, pose: Pose, affine: Array) -> tuple[Array, Array]:
+def carried(slat: Surface, pixie: Surface, pose: Similarity, affine: Array) -> tuple[Array, Array]:
     """Return where the SLAT's samples are looked up, and where the PixieVerse ones are.
 
     The `affine` (3, 4) map is applied to the SLAT's side before the pose.
@@ -33,7 +33,9 @@ def carried(slat: Surface, pixie: Surface, pose: Pose, affine: Array) -> tuple[A
     return there, np.linalg.solve(matrix, (placed - shift).T).T
 
 
-def residuals(slat: Surface, pixie: Surface, pose: Pose, affine: Array) -> tuple[Array, Array]:
+def residuals(
+    slat: Surface, pixie: Surface, pose: Similarity, affine: Array
+) -> tuple[Array, Array]:
     """Return the residuals at the SLAT's and at the PixieVerse samples."""
     there, here = carried(slat, pixie, pose, affine)
     forward = pose.scale * distance_at(pixie, there) - slat.values - pose.offset

@@ -1,0 +1,377 @@
+"""Normal equations of a fit between two distance fields; the compiled inner loop.
+
+A SLAT sample looks the PixieVerse distance up, and the other way round; `Link` says where.
+With the residuals r and their derivatives J, the rows A = (J, r), and W the squared kernels
+1 / (1 + r^2 / tau^2) of Geman and McClure, the equations are A^T W A: the normal matrix, and
+beside it, as the last column, the right-hand side.
+
+With g the derivative of a residual by where the deformed SLAT point lies, and q the sample's
+place from the centre, J is g q^T and g for an affine map of the SLAT's side, twelve unknowns row
+by row, and -(q x g), -g, -(q . g) for a turn, shift and growth of the PixieVerse side; behind
+them the offset.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from slatprep.align.interpolation import trilinear
+from slatprep.geometry.kernel import kernel
+
+SIMILARITY = 8  # unknowns: turn 3, shift 3, log scale, offset
+AFFINE = 13  # unknowns: nine of the matrix and three of the shift, row by row, and the offset
+
+_BLOCK = 64  # samples a step at a time: what is kept of them stays in the processor's first cache
+_LANES = 8  # sums of each product, of every eighth sample each: as many on any processor
+_FEW = ((0, 0), (0, 3), (0, 6), (3, 3), (3, 6), (6, 6))
+_MANY = (*_FEW, (0, 9), (0, 12), (3, 9), (3, 12), (6, 9), (6, 12), (9, 9), (9, 12), (12, 12))
+# First row and column of each block of three by three products in the upper triangle.
+_SIZE = 15  # rows of A, the unknowns and the residual, in whole blocks
+_VALUE, _GX, _GY, _GZ, _U, _V, _W, _X, _Y, _Z, _OX, _OY, _OZ, _BEYOND, _ROWS = range(
+    0, 15 * _BLOCK, _BLOCK
+)
+_WEIGHTED = _ROWS + _SIZE * _BLOCK
+_SUMS = _WEIGHTED + _SIZE * _BLOCK
+_NUMBERS = _SUMS + 9 * len(_MANY) * _LANES
+"""How many numbers a block has, and before it where those of each kind begin: in one array, which
+is no other's memory, so that the compiler makes vector instructions of the loops over them."""
+
+
+class Link(NamedTuple):
+    """Where one side's samples look the other side's distance up.
+
+    The map (3, 3), (3,) leads a SLAT sample (`forward`) to the PixieVerse frame, a PixieVerse
+    sample to the SLAT frame; `turn` (3, 3) makes g of the gradient found there.
+    """
+
+    matrix: NDArray[np.float64]
+    shift: NDArray[np.float64]
+    turn: NDArray[np.float64]
+    scale: float
+    offset: float
+    forward: bool
+
+
+@kernel(error_model="numpy")
+def accumulate(here, there, link, centre, tau, weight, unknowns, equations):  # type: ignore[no-untyped-def]
+    """Add one side's residuals, times `weight`, to the upper triangle of the equations."""
+    block, cells = np.empty(_NUMBERS), np.empty(_BLOCK, np.int64)
+    corners = np.empty(8 * _BLOCK, np.float32)
+    blocks = len(_FEW) if unknowns == SIMILARITY else len(_MANY)
+    block[_SUMS : _SUMS + 9 * blocks * _LANES] = 0.0
+    for first in range(0, here.points.shape[0], _BLOCK):
+        points, values = here.points[first : first + _BLOCK], here.values[first : first + _BLOCK]
+        _carry(points, link, there.origin, there.distance.shape, block, cells)
+        _look_up(there.distance, cells, len(points), corners, block)
+        _weigh(values, link, tau, block)
+        _linearise(len(points), link, centre, block)
+        if unknowns == SIMILARITY:
+            _rows_of_similarity(len(points), link.forward, weight, block)
+            _add_products(len(points), block)
+        else:
+            _rows_of_affine(len(points), link.forward, weight, block)
+            _add_products(len(points), block)
+            _add_more_products(len(points), block)
+    _add_sums(blocks, block, equations)
+
+
+@kernel(error_model="numpy")
+def fit_of(here, there, link):  # type: ignore[no-untyped-def]
+    """Of one side at tau = 1, the summed kernel, and the number and squares of the inliers."""
+    block, cells = np.empty(_ROWS), np.empty(_BLOCK, np.int64)
+    corners = np.empty(8 * _BLOCK, np.float32)
+    kernels, inliers, sum_of_squares = 0.0, 0, 0.0
+    for first in range(0, here.points.shape[0], _BLOCK):
+        points, values = here.points[first : first + _BLOCK], here.values[first : first + _BLOCK]
+        _carry(points, link, there.origin, there.distance.shape, block, cells)
+        _look_up(there.distance, cells, len(points), corners, block)
+        _weigh(values, link, 1.0, block)
+        for m in range(len(points)):
+            square = block[_V + m]
+            near = square <= 1.0
+            kernels += block[_U + m]
+            inliers += near
+            sum_of_squares += square if near else 0.0
+    return kernels, inliers, sum_of_squares
+
+
+@kernel(error_model="numpy")
+def _carry(points, link, origin, shape, block, cells):  # type: ignore[no-untyped-def]
+    """Find the points in the SLAT frame, and their cells and places in the other side's field."""
+    # Out of the loop, as the compiler cannot know that what it writes is not one of these.
+    matrix, shift = link.matrix, link.shift
+    m00, m01, m02, s0 = matrix[0, 0], matrix[0, 1], matrix[0, 2], shift[0]
+    m10, m11, m12, s1 = matrix[1, 0], matrix[1, 1], matrix[1, 2], shift[1]
+    m20, m21, m22, s2 = matrix[2, 0], matrix[2, 1], matrix[2, 2], shift[2]
+    o0, o1, o2 = origin[0], origin[1], origin[2]
+    n0, n1, n2 = shape
+    forward = link.forward
+    for m in range(len(points)):
+        x, y, z = points[m, 0], points[m, 1], points[m, 2]
+        a = m00 * x + m01 * y + m02 * z + s0
+        b = m10 * x + m11 * y + m12 * z + s1
+        c = m20 * x + m21 * y + m22 * z + s2
+        block[_X + m], block[_Y + m], block[_Z + m] = (x, y, z) if forward else (a, b, c)
+        block[_OX + m], block[_OY + m], block[_OZ + m] = a - o0, b - o1, c - o2
+    for m in range(len(points)):
+        x, y, z = block[_OX + m], block[_OY + m], block[_OZ + m]
+        cx = min(max(x, 0.0), n0 - 1.000001)
+        cy = min(max(y, 0.0), n1 - 1.000001)
+        cz = min(max(z, 0.0), n2 - 1.000001)
+        i, j, k = np.int64(cx), np.int64(cy), np.int64(cz)
+        cells[m] = (i * n1 + j) * n2 + k
+        block[_U + m] = cx - np.float64(i)
+        block[_V + m] = cy - np.float64(j)
+        block[_W + m] = cz - np.float64(k)
+        x, y, z = x - cx, y - cy, z - cz
+        block[_OX + m], block[_OY + m], block[_OZ + m] = x, y, z
+        block[_BEYOND + m] = x * x + y * y + z * z
+
+
+@kernel(error_model="numpy")
+def _look_up(field, cells, count, corners, block):  # type: ignore[no-untyped-def]
+    """Do what `interpolate` does for a block; as vectors but for the reading of the corners."""
+    values, row = field.reshape(-1), field.shape[2]
+    plane = field.shape[1] * row
+    for m in range(count):
+        # Unsigned, so that no negative index has to be provided for.
+        for corner in range(8):
+            step = (corner >> 2) * plane + (corner >> 1 & 1) * row + (corner & 1)
+            corners[corner * _BLOCK + m] = values[np.uint64(cells[m] + step)]
+    for m in range(count):
+        value, gx, gy, gz = trilinear(
+            corners[m], corners[_BLOCK + m], corners[2 * _BLOCK + m], corners[3 * _BLOCK + m],
+            corners[4 * _BLOCK + m], corners[5 * _BLOCK + m], corners[6 * _BLOCK + m],
+            corners[7 * _BLOCK + m], block[_U + m], block[_V + m], block[_W + m],
+        )  # fmt: skip
+        block[_VALUE + m], block[_GX + m], block[_GY + m], block[_GZ + m] = value, gx, gy, gz
+    for m in range(count):
+        outside = block[_BEYOND + m]
+        if outside > 1e-8:
+            outside = math.sqrt(outside)
+            block[_VALUE + m] += outside
+            block[_GX + m] = block[_OX + m] / outside
+            block[_GY + m] = block[_OY + m] / outside
+            block[_GZ + m] = block[_OZ + m] / outside
+
+
+@kernel(error_model="numpy")
+def _weigh(values, link, tau, block):  # type: ignore[no-untyped-def]
+    """Set a block's residuals, their kernels (U) and their squares (V)."""
+    scale, offset = link.scale, link.offset
+    if link.forward:
+        for m in range(len(values)):
+            block[_VALUE + m] = scale * block[_VALUE + m] - values[m] - offset
+    else:
+        for m in range(len(values)):
+            block[_VALUE + m] = block[_VALUE + m] - scale * values[m] + offset
+    for m in range(len(values)):
+        square = block[_VALUE + m] * block[_VALUE + m]
+        block[_U + m], block[_V + m] = 1.0 / (1.0 + square / (tau * tau)), square
+
+
+@kernel(error_model="numpy")
+def _linearise(count, link, centre, block):  # type: ignore[no-untyped-def]
+    """Set a block's g and q."""
+    turn = link.turn
+    r00, r01, r02 = turn[0, 0], turn[0, 1], turn[0, 2]
+    r10, r11, r12 = turn[1, 0], turn[1, 1], turn[1, 2]
+    r20, r21, r22 = turn[2, 0], turn[2, 1], turn[2, 2]
+    c0, c1, c2 = centre[0], centre[1], centre[2]
+    for m in range(count):
+        a, b, c = block[_GX + m], block[_GY + m], block[_GZ + m]
+        block[_GX + m] = r00 * a + r01 * b + r02 * c
+        block[_GY + m] = r10 * a + r11 * b + r12 * c
+        block[_GZ + m] = r20 * a + r21 * b + r22 * c
+        block[_X + m] -= c0
+        block[_Y + m] -= c1
+        block[_Z + m] -= c2
+
+
+@kernel(error_model="numpy")
+def _rows_of_similarity(count, forward, weight, block):  # type: ignore[no-untyped-def]
+    """Set a block's rows of A and of W A; rows of zeros make it as long as all lanes."""
+    sign = -1.0 if forward else 1.0
+    for m in range(count):
+        gx, gy, gz = block[_GX + m], block[_GY + m], block[_GZ + m]
+        qx, qy, qz = block[_X + m], block[_Y + m], block[_Z + m]
+        kernel = block[_U + m]
+        block[_ROWS + m] = qz * gy - qy * gz
+        block[_ROWS + _BLOCK + m] = qx * gz - qz * gx
+        block[_ROWS + 2 * _BLOCK + m] = qy * gx - qx * gy
+        block[_ROWS + 3 * _BLOCK + m] = -gx
+        block[_ROWS + 4 * _BLOCK + m] = -gy
+        block[_ROWS + 5 * _BLOCK + m] = -gz
+        block[_ROWS + 6 * _BLOCK + m] = -(gx * qx + gy * qy + gz * qz)
+        block[_ROWS + 7 * _BLOCK + m] = sign
+        block[_ROWS + 8 * _BLOCK + m] = block[_VALUE + m]
+        for i in range(9):
+            block[_WEIGHTED + i * _BLOCK + m] = (
+                weight * kernel * kernel * block[_ROWS + i * _BLOCK + m]
+            )
+    for m in range(count, -(-count // _LANES) * _LANES):
+        for i in range(9):
+            block[_ROWS + i * _BLOCK + m] = block[_WEIGHTED + i * _BLOCK + m] = 0.0
+
+
+@kernel(error_model="numpy")
+def _rows_of_affine(count, forward, weight, block):  # type: ignore[no-untyped-def]
+    """Do the same for an affine map; its last row is of zeros."""
+    sign = -1.0 if forward else 1.0
+    for m in range(count):
+        gx, gy, gz = block[_GX + m], block[_GY + m], block[_GZ + m]
+        qx, qy, qz = block[_X + m], block[_Y + m], block[_Z + m]
+        kernel = block[_U + m]
+        block[_ROWS + m] = gx * qx
+        block[_ROWS + _BLOCK + m] = gx * qy
+        block[_ROWS + 2 * _BLOCK + m] = gx * qz
+        block[_ROWS + 3 * _BLOCK + m] = gx
+        block[_ROWS + 4 * _BLOCK + m] = gy * qx
+        block[_ROWS + 5 * _BLOCK + m] = gy * qy
+        block[_ROWS + 6 * _BLOCK + m] = gy * qz
+        block[_ROWS + 7 * _BLOCK + m] = gy
+        block[_ROWS + 8 * _BLOCK + m] = gz * qx
+        block[_ROWS + 9 * _BLOCK + m] = gz * qy
+        block[_ROWS + 10 * _BLOCK + m] = gz * qz
+        block[_ROWS + 11 * _BLOCK + m] = gz
+        block[_ROWS + 12 * _BLOCK + m] = sign
+        block[_ROWS + 13 * _BLOCK + m] = block[_VALUE + m]
+        block[_ROWS + 14 * _BLOCK + m] = 0.0
+        for i in range(_SIZE):
+            block[_WEIGHTED + i * _BLOCK + m] = (
+                weight * kernel * kernel * block[_ROWS + i * _BLOCK + m]
+            )
+    for m in range(count, -(-count // _LANES) * _LANES):
+        for i in range(_SIZE):
+            block[_ROWS + i * _BLOCK + m] = block[_WEIGHTED + i * _BLOCK + m] = 0.0
+
+
+@kernel()
+def _add_products(count, block):  # type: ignore[no-untyped-def]
+    """Add a block's products to their sums; of the symmetric matrix the upper triangle alone."""
+    for first in range(0, _BLOCK, _LANES):
+        # Not the end of the range: the compiler would have to expect a negative `first`, and
+        # a check of each index keeps it from vector instructions.
+        if first >= count:
+            break
+        _add_nine_products(block, first, 0, 0, 0)
+        _add_nine_products(block, first, 0, 3, 1)
+        _add_nine_products(block, first, 0, 6, 2)
+        _add_nine_products(block, first, 3, 3, 3)
+        _add_nine_products(block, first, 3, 6, 4)
+        _add_nine_products(block, first, 6, 6, 5)
+
+
+@kernel()
+def _add_more_products(count, block):  # type: ignore[no-untyped-def]
+    """Add those that only an affine map has."""
+    for first in range(0, _BLOCK, _LANES):
+        if first >= count:
+            break
+        _add_nine_products(block, first, 0, 9, 6)
+        _add_nine_products(block, first, 0, 12, 7)
+        _add_nine_products(block, first, 3, 9, 8)
+        _add_nine_products(block, first, 3, 12, 9)
+        _add_nine_products(block, first, 6, 9, 10)
+        _add_nine_products(block, first, 6, 12, 11)
+        _add_nine_products(block, first, 9, 9, 12)
+        _add_nine_products(block, first, 9, 12, 13)
+        _add_nine_products(block, first, 12, 12, 14)
+
+
+@kernel(inline="always")
+def _add_nine_products(block, first, row, column, number):  # type: ignore[no-untyped-def]
+    """Add those of three rows of W A and three of A, `row` and `column` the first of them.
+
+    Written out, and the numbers constants, so that the compiler makes vectors of the lanes.
+    """
+    left, right = _WEIGHTED + row * _BLOCK + first, _ROWS + column * _BLOCK + first
+    for m in range(_LANES):
+        p, q, r = block[left + m], block[left + _BLOCK + m], block[left + 2 * _BLOCK + m]
+        x, y, z = block[right + m], block[right + _BLOCK + m], block[right + 2 * _BLOCK + m]
+        at = _SUMS + 9 * number * _LANES + m
+        block[at] += p * x
+        block[at + _LANES] += p * y
+        block[at + 2 * _LANES] += p * z
+        block[at + 3 * _LANES] += q * x
+        block[at + 4 * _LANES] += q * y
+        block[at + 5 * _LANES] += q * z
+        block[at + 6 * _LANES] += r * x
+        block[at + 7 * _LANES] += r * y
+        block[at + 8 * _LANES] += r * z
+
+
+@kernel()
+def _add_sums(blocks, block, equations):  # type: ignore[no-untyped-def]
+    """Add up the lanes, and add the sums to the upper triangle of the equations."""
+    for number in range(9 * blocks):
+        at = _SUMS + number * _LANES
+        even = (block[at] + block[at + 4]) + (block[at + 2] + block[at + 6])
+        odd = (block[at + 1] + block[at + 5]) + (block[at + 3] + block[at + 7])
+        block[number] = even + odd
+    number = 0
+    for k in range(blocks):
+        row, column = _MANY[k]
+        for i in range(row, row + 3):
+            for j in range(column, column + 3):
+                equations[i, j] += block[number]
+                number += 1
+
+
+@kernel()
+def new_equations():  # type: ignore[no-untyped-def]
+    """Return equations of nothing."""
+    return np.zeros((_SIZE, _SIZE))
+
+
+@kernel()
+def matrix_and_rhs(equations, unknowns, normal, rhs):  # type: ignore[no-untyped-def]
+    """Take the equations apart into the whole normal matrix and the right-hand side."""
+    for i in range(unknowns):
+        rhs[i] = -equations[i, unknowns]
+        for j in range(unknowns):
+            normal[i, j] = equations[min(i, j), max(i, j)]
+
+
+@kernel()
+def solve_linear(matrix, rhs, step):  # type: ignore[no-untyped-def]
+    """Solve ``matrix @ step = rhs`` by elimination with partial pivoting, in place.
+
+    A dozen unknowns take less time here than calling LAPACK does, and the bits
+    do not depend on which kernels a BLAS picks for the processor.
+    """
+    n = len(rhs)
+    for i in range(n):
+        pivot = i + np.argmax(np.abs(matrix[i:, i]))
+        if pivot != i:
+            for j in range(i, n):
+                matrix[i, j], matrix[pivot, j] = matrix[pivot, j], matrix[i, j]
+            rhs[i], rhs[pivot] = rhs[pivot], rhs[i]
+        for k in range(i + 1, n):
+            factor = matrix[k, i] / matrix[i, i]
+            for j in range(i + 1, n):
+                matrix[k, j] -= factor * matrix[i, j]
+            rhs[k] -= factor * rhs[i]
+    for i in range(n - 1, -1, -1):
+        total = rhs[i]
+        for j in range(i + 1, n):
+            total -= matrix[i, j] * step[j]
+        step[i] = total / matrix[i, i]
+
+
+@kernel()
+def invert(affine, inverse):  # type: ignore[no-untyped-def]
+    """Write the inverse of the 3x3 part; return the determinant."""
+    for i in range(3):
+        for j in range(3):
+            k, n, u, v = (j + 1) % 3, (j + 2) % 3, (i + 1) % 3, (i + 2) % 3
+            inverse[i, j] = affine[k, u] * affine[n, v] - affine[k, v] * affine[n, u]
+    determinant = 0.0
+    for i in range(3):
+        determinant += affine[0, i] * inverse[i, 0]
+    inverse /= determinant
+    return determinant

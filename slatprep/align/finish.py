@@ -1,0 +1,86 @@
+"""What is left of a search: refined, deformed where that is earned, and compared once more.
+
+Steps 4 and 6 of docs/method.md.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from slatprep.align.deform import Deformed, deform_if_earned
+from slatprep.align.pair import (
+    FINE_SAMPLES,
+    FINE_TAUS,
+    RANK_SAMPLES,
+    RANK_STANDING,
+    Array,
+    Pair,
+    far_from_all,
+    scale_penalty,
+)
+from slatprep.align.pose import Pose
+from slatprep.records import Model
+
+MOST_CONTESTED = 4
+"""Where the best placement is deformed, so many, of those within twice `TIE`, are deformed too."""
+
+RIGID_IF_SCALE_WITHIN = 0.04
+RIGID_LOSS = 0.004
+"""A scale this near to one is kept only if it raises the score by more than this."""
+
+
+def finish(pair: Pair, poses: Sequence[Pose], rough: bool) -> tuple[list[Pose], Deformed]:
+    """Refine poses on all samples, best first, and deform the best one if that is earned.
+
+    Then those that fit about as well are deformed too: the order is by what that leaves.
+    """
+    fine = pair.refine(poses, FINE_SAMPLES, FINE_TAUS, 0.002, size_by_slat=rough)
+    first, *others = pair.distinct(fine)
+    best, deformed = _deformed(pair, first, rough)
+    if deformed.deformation is None:
+        return [best, *others], deformed
+    few, rest = others[: MOST_CONTESTED - 1], others[MOST_CONTESTED - 1 :]
+    contested = [(best, deformed), *(_deformed(pair, pose, rough) for pose in few)]
+    ranks = np.array([_rank(*entry) for entry in contested])
+    standing = RANK_STANDING * (np.arange(len(ranks)) == 0)
+    order = np.argsort(-(ranks + standing), kind="stable")
+    highest = max(pose.merit for pose, _ in contested)
+    points = pair.slat.subset(RANK_SAMPLES).points
+    kept: list[tuple[Pose, Deformed, Array]] = []
+    for k in order:
+        pose, bent = contested[k]
+        places = pose.similarity.inverse(bent.moved(points))
+        if far_from_all(places, (there for _, _, there in kept)):
+            below = max(float(ranks[order[0]] - ranks[k]), 0.0)
+            bonus = highest - below - pose.score
+            kept.append((replace(pose, bonus=bonus, standing=0.0), bent, places))
+    return [*(pose for pose, _, _ in kept), *rest], kept[0][1]
+
+
+def _rank(pose: Pose, deformed: Deformed) -> float:
+    figures = deformed.figures
+    return 0.5 * (figures.score_slat + figures.score_pixieverse) - scale_penalty(pose)
+
+
+def _deformed(pair: Pair, pose: Pose, rough: bool) -> tuple[Pose, Deformed]:
+    best, model = _simplest(pair, pose, rough)
+    found = deform_if_earned(pair.slat, pair.pixie, best.similarity, model, pair.parameters)
+    return replace(best, similarity=found.pose), found
+
+
+def _simplest(pair: Pair, pose: Pose, rough: bool) -> tuple[Pose, Model]:
+    """Return the pose with its scale set to one where that fits as well, and the model."""
+    model = pair.parameters.model
+    if model in ("rigid", "similarity"):
+        return pose, Model(model)
+    if abs(pose.similarity.scale - 1.0) < RIGID_IF_SCALE_WITHIN:
+        start = replace(pose, similarity=pair.at_scale_one(pose.similarity))
+        (rigid,) = pair.refine(
+            [start], FINE_SAMPLES, FINE_TAUS, 0.002, free_scale=False, size_by_slat=rough
+        )
+        if rigid.score >= pose.score - RIGID_LOSS:
+            return rigid, Model.RIGID
+    return pose, Model.SIMILARITY
