@@ -161,6 +161,13 @@ def test_patterns_are_lists(folder: Path) -> None:
         ('[normalize]\nranges = "pixi"\n', ("normalize.ranges", "pixi", "dataset, pixie")),
         ('pattern = "{id}.npz"\n', ("slat.pattern", "'{id}.npz'", "array")),
         ('"group" = 3\n', ("slat.group", "3", "string")),
+        ('[normalize]\nranges = "\\u0000"\n', ("normalize.ranges", "without NUL")),
+        ('[normalize]\nsplit_by = "\\u0000.json"\n', ("normalize.split_by", "without NUL")),
+        ('[[also]]\nroot = "\\u0000"\n', ("also.[].root", "without NUL")),
+        ("[align]\nicp_iterations = " + "9" * 23 + "\n", ("align.icp_iterations", "23 digits")),
+        ("[align]\nicp_iterations = " + "9" * 5000 + "\n", ("cannot be read", "4300 digits")),
+        (".".join(["a"] * 3000) + " = 1\n", ("nested too deeply",)),
+        ('[pairing]\nmap = "~nobody-here/x"\n', ("pairing.map", "~nobody-here/x")),
     ],
 )
 def test_fault_is_reported_with_file_key_value_and_what_is_allowed(

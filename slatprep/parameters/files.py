@@ -35,6 +35,9 @@ Overrides = Mapping[str, "Mapping[str, object] | str"]
 NAMED_RANGES = ("dataset", "pixie", "percentiles such as p1-p99")
 """Values of `normalize.ranges` besides the path of a file."""
 
+_MOST, _MOST_KEYS = 2**53, 5
+"""The largest whole number that every reader of JSON keeps, and the deepest nesting."""
+
 _UNKNOWN_KEY = "unexpected_keyword_argument"
 
 OPTIONS = {
@@ -137,19 +140,43 @@ def _read(path: Path) -> dict[str, Any]:
     """Return the content of a file, its paths resolved against its folder."""
     try:
         data = tomllib.loads(path.read_text(encoding="utf-8"))
+        fault = next(_faults_in(data), None)
     except tomllib.TOMLDecodeError as error:
         # tomllib's own message ends with the line and column.
         raise ConfigError(f"{path}: not valid TOML: {error}") from error
     except RecursionError:
         raise ConfigError(f"{path}: not valid TOML: nested too deeply") from None
-    except (OSError, UnicodeDecodeError) as error:
-        raise ConfigError(f"{path}: cannot be read as a dataset definition: {error}") from error
+    except (OSError, ValueError) as error:
+        reason = str(error).partition(";")[0]
+        raise ConfigError(f"{path}: cannot be read as a dataset definition: {reason}") from error
+    if fault:
+        raise ConfigError(f"{path}: {fault}")
     folder = path.resolve().parent
-    for _, table, key in _paths_of(data):
+    for name, table, key in _paths_of(data):
         value = table[key]
         if isinstance(value, str) and value and _is_path(key, value):
-            table[key] = str(place_of(value, folder))
+            try:
+                table[key] = str(place_of(value, folder))
+            except RuntimeError as error:  # ~user, where there is no such user.
+                raise ConfigError(f"{path}: {name}: {value}: {error}") from None
     return data
+
+
+def _faults_in(value: object, keys: tuple[str, ...] = ()) -> Iterator[str]:
+    """Yield what no key may hold: TOML allows more than files, JSON and processors do."""
+    name = ".".join(keys)
+    if len(keys) > _MOST_KEYS:
+        yield f"{name} ...: nested too deeply; expected a table and its keys"
+    elif isinstance(value, dict):
+        for key, inner in value.items():
+            yield from _faults_in(inner, (*keys, key))
+    elif isinstance(value, list):
+        for inner in value:
+            yield from _faults_in(inner, (*keys, "[]"))
+    elif isinstance(value, str) and "\0" in value:
+        yield f"{name}: got {value[:80]!r}; expected a text without NUL"
+    elif isinstance(value, int) and abs(value) > _MOST:
+        yield f"{name}: got a number of {len(str(value))} digits; expected at most {_MOST}"
 
 
 def _paths_of(data: Mapping[str, Any]) -> Iterator[tuple[str, dict[str, Any], str]]:
