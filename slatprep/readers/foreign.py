@@ -32,6 +32,20 @@ from slatprep.records import (
 from slatprep.records.tables import CLASS_NAME, MAX_PROPERTIES
 from slatprep.storage.listing import Listing
 
+_MOST_LETTERS, _MOST_COUNT = 4096, 2**53
+"""What a record takes of a text, and the largest number that every reader of JSON keeps."""
+
+
+def _is_text(value: object) -> bool:
+    """Whether a record can hold a value as a text: UTF-8 has no surrogates."""
+    if not (isinstance(value, str) and len(value) <= _MOST_LETTERS):
+        return False
+    return not any("\ud800" <= letter <= "\udfff" for letter in value)
+
+
+def _is_count(value: object) -> bool:
+    return type(value) is int and 0 <= value <= _MOST_COUNT
+
 
 @dataclass(frozen=True)
 class _Foreign:
@@ -48,7 +62,7 @@ class _Foreign:
             yield
         except (SlatprepError, MemoryError):
             raise
-        except (Exception, SystemExit) as error:  # It is not ours, and may raise anything.
+        except (Exception, SystemExit, GeneratorExit) as error:  # It may raise anything.
             raise self._fault(f"raises {type(error).__name__}: {error}") from error
 
     def _fault(self, what: str) -> InputError:
@@ -71,7 +85,10 @@ class _Foreign:
         """Require that files and notes have types that a record can hold."""
         known = all(isinstance(one, SourceFile) for one in of.sources)
         self._require(known and of.sources, "no `sources`, the files that it read")
-        self._require(all(isinstance(one, str) for one in of.warnings), "warnings that are no text")
+        for one in of.sources:
+            self._require(_is_text(one.path), f"{one.path!r} as the path of a file")
+            self._require(_is_count(one.size), f"{one.size!r} as the size of a file")
+        self._require(all(map(_is_text, of.warnings)), "warnings that are no text")
 
 
 class ForeignSource(_Foreign):
@@ -102,11 +119,17 @@ class ForeignSource(_Foreign):
     def find(self, source: PixieverseSource, listing: Listing) -> Iterator[Any]:
         """Yield its fields."""
         with self._blamed():
-            for found in self.adapter.find(source, listing):
+            every = iter(self.adapter.find(source, listing))
+        while True:
+            # Not around the yield: whoever stops asking is no fault of the adapter.
+            with self._blamed():
+                found = next(every, None)
+                if found is None:
+                    return
                 texts = found.object_id, found.path, found.sample, found.problem, found.beside
                 named = all(isinstance(one, str) for one in texts)
                 self._require(named, f"{found!r} as a field that it found")
-                yield found
+            yield found
 
     def read(self, pair: AssetPair, max_unphysical: float) -> MaterialField:
         """Read a field and check it."""
@@ -139,6 +162,7 @@ class ForeignSource(_Foreign):
                 self._require(one.physical(values).all(), f"values that are not {one.allowed}")
             frame = np.eye(4) if field.frame is None else np.asarray(field.frame, np.float64)
             self._require(frame.shape == (4, 4) and np.isfinite(frame).all(), "a frame of NaN")
+            self._require(_is_count(field.unphysical), f"{field.unphysical!r} unphysical voxels")
             orjson.dumps(field.bounds)
             self._require_told(field)
             return field

@@ -47,6 +47,16 @@ FIELDS: dict[str, Callable[[Any], Any]] = {
     "no files": lambda field: replace(field, sources=()),
     "warnings of objects": lambda field: replace(field, warnings=(object(),)),
     "bounds of objects": lambda field: replace(field, bounds={"a": object()}),
+    "a path of surrogates": lambda field: replace(
+        field, sources=(replace(field.sources[0], path="a\udcff"),)
+    ),
+    "a size beyond numbers": lambda field: replace(
+        field, sources=(replace(field.sources[0], size=2**70),)
+    ),
+    "warnings of surrogates": lambda field: replace(field, warnings=("a\udcff",)),
+    "a warning without end": lambda field: replace(field, warnings=("a" * 10_000_000,)),
+    "more unphysical voxels than numbers": lambda field: replace(field, unphysical=2**70),
+    "unphysical voxels below 0": lambda field: replace(field, unphysical=-1),
     "a frame of NaN": lambda field: replace(field, frame=np.full((4, 4), np.nan)),
 }
 
@@ -76,6 +86,7 @@ SLATS: dict[str, Callable[[Any], Any]] = {
     "twice": lambda slat: replace(slat, coords=np.zeros_like(slat.coords)),
     "another type": lambda slat: replace(slat, coords=slat.coords.astype(np.int64)),
     "no files": lambda slat: replace(slat, sources=()),
+    "warnings of surrogates": lambda slat: replace(slat, warnings=("\udc80",)),
 }
 
 
@@ -101,7 +112,11 @@ def _half_found(*_: object) -> Iterator[FoundField]:
     raise KeyError("boom")
 
 
-@pytest.mark.parametrize("raising", [_raising, _leaving, None])
+def _closing(*_: object) -> Any:
+    raise GeneratorExit
+
+
+@pytest.mark.parametrize("raising", [_raising, _leaving, _closing, None])
 def test_whatever_is_raised_is_theirs(make_pair: MakePair, raising: Any) -> None:
     told = SimpleNamespace(describe=raising, read=raising, find=raising)
     adapter: Any = guarded("slatprep.sources", told, "mine", "theirs 1.0")
