@@ -12,7 +12,7 @@ from typing import Annotated, Any, ClassVar, Literal
 
 from annotated_types import Ge, Gt, Le, MaxLen
 
-from slatprep.records import Engine, Place, Share
+from slatprep.records import Engine, Place, Plausibility, Share, Units
 from slatprep.storage.place import place_of
 
 Length = Annotated[float, Gt(1e-4), Le(1e3)]
@@ -68,6 +68,10 @@ class PixieverseSource(_Group):
     `adapter` reads the source; it is one of `slatprep.readers.adapters.SOURCES` or another
     package's. `transform` is for the engine ``known``: the file with the transform to the SLAT
     frame, or a pattern that names ``{id}``.
+
+    `units` says what the files hold, where it is not SI units. `plausibility` decides what becomes
+    of values that no material has: the asset is refused (``refuse``), or they are taken as they
+    are, with a warning (``warn``) or without (``off``).
     """
 
     root: PlaceText
@@ -81,6 +85,8 @@ class PixieverseSource(_Group):
     samples: Samples = "one"
     adapter: str = "pixieverse"
     transform: str = ""
+    units: Units = field(default_factory=Units)
+    plausibility: Plausibility = "refuse"
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "root", place_of(self.root))

@@ -157,7 +157,8 @@ class Update:
         scratch: Path = Path(),
     ) -> Update:
         """Look at the sources, and read what the last build saw; with `rehash` trust none of it."""
-        asked = (wanted.declared, context.parameters.slat, context.parameters.also)
+        own, parameters = context.parameters.pixieverse, context.parameters
+        asked = (wanted.declared, parameters.slat, parameters.also, own.units, own.plausibility)
         recipe = context.recipe.key("", {"": str(asked)})
         states, seen = look(pairs), Seen()
         if context.previous is not None:

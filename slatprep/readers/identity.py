@@ -17,6 +17,7 @@ from slatprep.records import (
     SourceFile,
     SourceRoots,
     StructuredLatents,
+    Units,
 )
 
 
@@ -90,6 +91,10 @@ def reading_of(roots: SourceRoots) -> dict[str, str]:
     if (space.channels, space.resolution) != (TRELLIS.channels, TRELLIS.resolution):
         own = made_by("slatprep.latents", space.encoder)
         reading["encoder"] = f"{space.encoder} {space.channels} {space.resolution} {own}"
+    if roots.units != Units():
+        reading["units"] = f"{roots.units.youngs_modulus}, {roots.units.density}"
+    if roots.plausibility != SourceRoots.plausibility:
+        reading["plausibility"] = roots.plausibility
     return reading
 
 

@@ -18,7 +18,7 @@ from slatprep.readers.joins import read_categories, read_map
 from slatprep.readers.patterns import NAME, fill, find_files, list_below, tried_names
 from slatprep.readers.published import category_of, locate_grids
 from slatprep.readers.slat_files import NamedSlat, encoded, find_slats, ordered
-from slatprep.records import AssetPair, Place, SourceRoots
+from slatprep.records import AssetPair, Contents, Place, SourceRoots
 from slatprep.storage.archives import is_archive
 from slatprep.storage.listing import Listing
 
@@ -100,19 +100,34 @@ def discover(parameters: BuildParameters) -> list[AssetPair]:
     rows.sort(key=lambda row: (row.asset_id, row.object_id))
     folder = slat.root.parent if one_file else slat.root
     contents = contents_of(parameters)
-    roots = SourceRoots(places[0], folder, contents, pixieverse.adapter)
+    roots = _roots_of(pixieverse, places[0], folder, contents)
     there = _Found(parameters, roots, listings[0], one_file, grids, categories)
     also = tuple(
         replace(
             there,
             parameters=replace(parameters, pixieverse=source, also=()),
-            roots=SourceRoots(places[number], folder, contents, source.adapter, number),
+            roots=_roots_of(source, places[number], folder, contents, number),
             listing=listings[number],
             grids=further[number - 1],
         )
         for number, source in enumerate(parameters.also, 1)
     )
     return list(_pairs(rows, replace(there, also=also)))
+
+
+def _roots_of(
+    source: PixieverseSource, place: Place, slat: Place, contents: Contents, number: int = 0
+) -> SourceRoots:
+    """Return where a source and the latents lie, and how the source is read."""
+    return SourceRoots(
+        place,
+        slat,
+        contents,
+        source.adapter,
+        number,
+        units=source.units,
+        plausibility=source.plausibility,
+    )
 
 
 def _grids_of(

@@ -62,7 +62,7 @@ class PhysXNet:
     def read(self, pair: AssetPair, max_unphysical: float) -> MaterialField:
         """Read a field; see `slatprep.readers.adapters.SourceAdapter`."""
         path, _ = require_complete(pair)
-        root = pair.roots.pixieverse
+        root, units = pair.roots.pixieverse, pair.roots.units
         beside = root / f"voxels/{path.name.removesuffix('2.npy')}.ply"
         data, file = load_source(path, root, "grid")
         rows = npy_array(data, path, _ROWS)
@@ -75,9 +75,11 @@ class PhysXNet:
         return field_of_voxels(
             path,
             np.stack([vertices[axis].astype(np.float64) for axis in "xyz"], axis=1),
-            1000.0 * rows[:, _DENSITY : _DENSITY + 1],
+            # The file's unit, unless the dataset definition states another.
+            (1.0 if units.density else 1000.0) * rows[:, _DENSITY : _DENSITY + 1],
             table=_TABLE,
             max_unphysical=max_unphysical,
             sources=(file, points),
             frame=np.eye(4),
+            roots=pair.roots,
         )

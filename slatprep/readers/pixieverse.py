@@ -32,10 +32,12 @@ from slatprep.readers.files import (
     npz_small_arrays,
     require_complete,
 )
-from slatprep.readers.voxel_sets import physical_rows
+from slatprep.readers.values import in_si, require_plausible, require_prediction
+from slatprep.readers.voxel_sets import half_overflow, physical_rows
 from slatprep.records import (
     BACKGROUND,
     MATERIAL_CLASSES,
+    PROPERTIES,
     PROPERTY_COLUMNS,
     RESOLUTION,
     AssetPair,
@@ -128,13 +130,19 @@ def read_grid(
     annotated = _annotated(occupancy, material, path, warnings)
 
     voxels = voxels_of(annotated)
-    properties = _gather(channels, annotated)
+    properties, classes = _gather(channels, annotated), material[annotated]
+    if raw:
+        in_si(properties, PROPERTIES, pair.roots.units)
+        told_of = properties, classes, PROPERTIES, MATERIAL_CLASSES
+        warnings += require_plausible(path, *told_of, pair.roots)
+    else:
+        warnings += require_prediction(path, properties, classes, pair.roots)
 
     def told(row: int, column: int) -> tuple[str, str]:
         at = tuple(map(int, voxels[row]))
         name, expected = _PHYSICAL[column]
         value = channels[_CHANNEL_ORDER[column]][at]
-        return f"{name} {value:g} at annotated voxel {at}", expected
+        return f"{name} {value:g} at annotated voxel {at}{half_overflow(value)}", expected
 
     keep = physical_rows(path, _physical(properties, raw), told, max_unphysical, warnings)
     unphysical = int(np.count_nonzero(~keep))
@@ -149,7 +157,7 @@ def read_grid(
     return MaterialField(
         occupancy=occupancy,
         voxels=voxels,
-        material=material[annotated][keep].astype(np.uint8),
+        material=classes[keep].astype(np.uint8),
         properties=np.ascontiguousarray(properties),
         unphysical=unphysical,
         bounds=bounds,

@@ -55,4 +55,5 @@ class VoMP:
             max_unphysical=max_unphysical,
             sources=(file,),
             frame=np.eye(4),
+            roots=pair.roots,
         )

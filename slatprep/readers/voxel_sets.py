@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from slatprep.errors import InputError
 from slatprep.geometry.voxels import voxels_of
 from slatprep.normalize import from_mapped, to_mapped
+from slatprep.readers.values import in_si, require_plausible
 from slatprep.records import (
     BACKGROUND,
     PROPERTIES,
@@ -19,6 +20,7 @@ from slatprep.records import (
     Place,
     Property,
     SourceFile,
+    SourceRoots,
 )
 
 MAX_RESOLUTION = 512
@@ -36,6 +38,8 @@ def field_of_voxels(
     max_unphysical: float = 0.0,
     sources: Sequence[SourceFile] = (),
     frame: NDArray[np.float64] | None = None,
+    names: Sequence[str] = (),
+    roots: SourceRoots | None = None,
 ) -> MaterialField:
     """Make a field of annotated voxels (K, 3): integers in 0..resolution - 1, or float points.
 
@@ -46,7 +50,8 @@ def field_of_voxels(
     Cells of a grid coarser than 64^3 stay whole. From a finer grid or points, each cell takes its
     voxels' most frequent class (the lowest at a tie) and mean properties, in log10 where the
     normalisation is. InputError if there is no voxel, one is out of range, or too many are
-    unphysical.
+    unphysical. `names` are those of the classes; `roots` say which units the values have, and
+    what becomes of implausible ones.
     """
     cells, resolution = _cells_of(where, np.asarray(voxels), resolution)
     count = len(cells)
@@ -60,11 +65,16 @@ def field_of_voxels(
         values = np.asarray(properties).astype(np.float32)
     if values.shape != (count, len(table)):
         raise InputError(where, f"has properties {values.shape}", f"({count}, {len(table)})")
+    if roots is not None:
+        in_si(values, table, roots.units)
+        labels = None if material is None else own
+        notes += require_plausible(where, values, labels, table, names, roots)
     fine = np.stack([one.physical(values[:, k]) for k, one in enumerate(table)], axis=1)
 
     def told(row: int, column: int) -> tuple[str, str]:
         one = table[column]
-        return f"{one.name} {values[row, column]:g} in row {row}", one.allowed
+        value = np.asarray(properties)[row, column]
+        return f"{one.name} {value:g} in row {row}{half_overflow(value)}", one.allowed
 
     keep = physical_rows(where, fine, told, max_unphysical, notes)
 
@@ -113,6 +123,13 @@ def _cells_of(
         row = int(np.argmin(inside))
         raise InputError(where, f"voxel {voxels[row].tolist()} in row {row} is outside", expected)
     return index.astype(np.int64), resolution
+
+
+def half_overflow(value: Any) -> str:
+    """Say that float16 overflowed, where a value is infinite for that; empty otherwise."""
+    if getattr(value, "dtype", None) == np.float16 and np.isinf(value):
+        return ", as float16 holds nothing above 65,504: save it as float32"
+    return ""
 
 
 def physical_rows(

@@ -137,6 +137,8 @@ class PlainVoxels:
             max_unphysical=max_unphysical,
             sources=(file, about),
             frame=np.eye(4) if said.aligned else None,
+            names=said.names,
+            roots=pair.roots,
         )
 
 

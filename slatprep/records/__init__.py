@@ -66,6 +66,7 @@ from slatprep.records.tables import (
     PropertyName,
     labels_of,
 )
+from slatprep.records.units import FACTORS, LOG10, Plausibility, Units
 from slatprep.records.words import (
     BACKGROUND,
     CLASS_COLOURS,

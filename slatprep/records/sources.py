@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import IO, Annotated, Any, Protocol, Self
 
@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from slatprep.records.json_types import Count, Digest, _one_of
 from slatprep.records.tables import PIXIEVERSE, PROPERTIES, Contents, LatentMoments, Property
+from slatprep.records.units import Plausibility, Units
 from slatprep.records.words import RESOLUTION
 
 
@@ -88,6 +89,7 @@ class SourceRoots:
     """The root folders of a source and of the latents, and what they hold.
 
     ``number`` is the source's index from 0; the first one names the others in ``also``.
+    ``units`` are those of its files; ``plausibility`` decides about values that no material has.
     """
 
     pixieverse: Place
@@ -96,6 +98,8 @@ class SourceRoots:
     adapter: str = "pixieverse"
     number: int = 0
     also: tuple[SourceRoots, ...] = ()
+    units: Units = field(default_factory=Units)
+    plausibility: Plausibility = "refuse"
 
     def numbered(self, files: Iterable[SourceFile]) -> tuple[SourceFile, ...]:
         """Return files with the number of the source that they lie in."""

@@ -84,6 +84,9 @@ def test_configuration_lists_every_key_with_its_default() -> None:
 
 
 def default_of(field: dataclasses.Field[object]) -> str:
+    if field.default_factory is not dataclasses.MISSING:
+        keys = dataclasses.asdict(field.default_factory())
+        return f"`{json.dumps({name: value for name, value in keys.items() if value})}`"
     if field.default is dataclasses.MISSING:
         return "required"
     return "none" if field.default is None else f"`{json.dumps(field.default)}`"

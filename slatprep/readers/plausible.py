@@ -1,0 +1,156 @@
+"""What materials can have: their extents, which combinations there are, and who says so."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import NamedTuple
+
+from slatprep.records import Units
+
+
+@dataclass(frozen=True)
+class Extent:
+    """What a property of any material lies within, and who says so."""
+
+    name: str
+    least: float
+    most: float
+    source: str
+
+
+EXTENTS = (
+    Extent(
+        "youngs_modulus",
+        1.0,
+        2e12,
+        "the softest gels have some Pa; diamond has 1.05 to 1.22 TPa (CRC Handbook of Chemistry "
+        "and Physics)",
+    ),
+    Extent(
+        "density",
+        1.0,
+        25_000.0,
+        "silica aerogels have 3 kg/m^3 and more (Soleimani Dorcheh and Abbasi, Journal of "
+        "Materials Processing Technology 199, 2008); osmium has 22,590 (CRC Handbook)",
+    ),
+    Extent("poissons_ratio", 0.0, 0.5, "isotropic and not auxetic (Greaves et al., Nature "
+           "Materials 10, 2011)"),
+)  # fmt: skip
+"""What the properties of all materials lie within."""
+
+# Carbon is the stiffest for its weight: diamond has 3.5e8 Pa m^3/kg times its density, fibres have
+# 4.4e8, nanotubes 8e8. E in GPa leaves below 0.1 times the density of any material; Pixie asks its
+# labeller for 13 and more.
+_STIFFEST, _SOFTEST = 1e9, 0.1
+
+# Below this density [kg/m^3] only aerogels lie. A foam of relative density r has r^2 times the
+# modulus of what it is made of (Gibson and Ashby, Cellular Solids, 1997): 1e10 Pa at 1,000 kg/m^3
+# is 1e4 times the density squared, and 100 times that is beyond all woods and foams.
+_LIGHT, _FOAM = 10.0, 1e6
+
+# Above this density are metals alone. Pixie gives those of its crates 1e8 Pa, as its solver is
+# explicit; rubber has 1e6 to 1e7.
+_HEAVY, _RUBBER, _SOFT_METAL = 5_000.0, 1e7, 1e6
+
+# Stone, glass and ceramics are as dense, and mud is not called stationary; but labels that a
+# simulation is to bear may be as soft.
+_STONE, _SOFT_STONE, _SOFT_BASE = 2_200.0, 2e5, 3e3
+
+# The lightest liquid at room temperature, isopentane, has 620 kg/m^3 (CRC Handbook); no paste or
+# mud is as light as a foam.
+LIGHTEST = {"fluid": 600.0, "visplas": 300.0}
+
+# What PixieVerse's classes have, from the ranges that Pixie asks its labeller for.
+_USUAL = {
+    "jelly": (3e2, 3e8),
+    "metal": (1e7, 3e11),
+    "sand": (1e4, 1e9),
+    "visplas": (1e3, 1e8),
+    "fluid": (1e2, 1e10),
+    "snow": (1e3, 1e8),
+}
+_USUAL_MODULUS, _USUAL_DENSITY = (3e2, 3e11), (15.0, 9_000.0)
+
+_UNSTATED = Units()
+
+_SYMBOLS = {"youngs_modulus": " Pa", "density": " kg/m^3"}
+
+
+class Part(NamedTuple):
+    """The medians of a class: of the modulus, the density and the ratio; NaN where it lacks one."""
+
+    name: str
+    share: float
+    modulus: float
+    density: float
+    ratio: float
+
+    @property
+    def values(self) -> tuple[float, float, float]:
+        """The medians alone."""
+        return self.modulus, self.density, self.ratio
+
+
+def fault_of(part: Part, units: Units = _UNSTATED) -> str:
+    """Say what a part has that no material has; empty where there is nothing."""
+    modulus, density = part.modulus, part.density
+    for extent, value in zip(EXTENTS, part.values, strict=True):
+        if value < extent.least or value > extent.most:
+            bounds = f"{extent.least:g} to {extent.most:g}{_SYMBOLS.get(extent.name, '')}"
+            return f"{title_of(extent.name)} {value:.3g}, and all materials have {bounds}"
+    asked = not units.density, not units.youngs_modulus
+    if asked[0] and density < _LIGHT:
+        return f"density {density:.3g} kg/m^3, as aerogels alone have"
+    if asked[0] and density < LIGHTEST.get(part.name, 0):
+        return (
+            f"density {density:.3g} kg/m^3, and no {part.name} is lighter than "
+            f"{LIGHTEST[part.name]:g}"
+        )
+    if not all(asked):
+        return ""
+    both = f"Young's modulus {modulus:.3g} Pa with density {density:.3g} kg/m^3"
+    if modulus > min(_STIFFEST, _FOAM * density) * density:
+        return f"{both}: no material is so stiff and so light"
+    if modulus < _SOFTEST * density:
+        return f"{both}: no material is so soft and so heavy"
+    if density > _HEAVY and modulus < _RUBBER:
+        return f"{both}: a metal's density, and not its stiffness"
+    if part.name == "metal" and modulus < _SOFT_METAL:
+        return f"Young's modulus {modulus:.3g} Pa, and no metal is so soft"
+    return ""
+
+
+def oddity_of(part: Part, units: Units) -> str:
+    """Say what is unusual of a part, though a material may have it; empty where nothing is."""
+    if units.youngs_modulus or part.name not in ("stationary", ""):
+        return ""
+    if part.density > _STONE and part.modulus < _SOFT_STONE:
+        return (
+            f"Young's modulus {part.modulus:.3g} Pa with density {part.density:.3g} kg/m^3: "
+            "is it in MPa?"
+        )
+    if part.name and part.modulus < _SOFT_BASE:
+        return f"Young's modulus {part.modulus:.3g} Pa, softer than rubber: is it in MPa?"
+    return ""
+
+
+def is_usual(part: Part) -> bool:
+    """Whether PixieVerse has such values in a class."""
+    least, most = _USUAL.get(part.name, _USUAL_MODULUS)
+    stiff = math.isnan(part.modulus) or least <= part.modulus <= most
+    lo, hi = _USUAL_DENSITY
+    return stiff and (math.isnan(part.density) or lo <= part.density <= hi)
+
+
+def is_physical(part: Part) -> bool:
+    """Whether the reader takes such values at all; see `slatprep.records.Property.physical`."""
+    above = all(math.isnan(one) or 0 < one < math.inf for one in (part.modulus, part.density))
+    return above and not (part.ratio < 0 or part.ratio > 0.5)
+
+
+def title_of(name: str) -> str:
+    """Return the name of a property in plain English."""
+    return {"youngs_modulus": "Young's modulus", "poissons_ratio": "Poisson's ratio"}.get(
+        name, name
+    )

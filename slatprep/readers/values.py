@@ -1,0 +1,175 @@
+"""A source's values, held against what materials have before anything is made of them.
+
+Most voxels decide: the medians of each class are looked at, so that stray voxels cost nothing.
+Where no material has them, the likeliest mistake is named.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from slatprep.errors import InputError
+from slatprep.readers.mistakes import mistakes_of, raw_grid
+from slatprep.readers.plausible import (
+    EXTENTS,
+    Part,
+    fault_of,
+    is_physical,
+    oddity_of,
+    title_of,
+)
+from slatprep.records import (
+    FACTORS,
+    LOG10,
+    MATERIAL_CLASSES,
+    PROPERTIES,
+    Place,
+    Property,
+    SourceRoots,
+    Units,
+)
+
+TOLD = "plausibility: "
+"""What a warning of this module begins with."""
+
+_PREDICTED = 1.5
+"""Half the values of a prediction lie within this; log10 of most densities is above it."""
+
+_SAMPLE = 1024
+"""Voxels that are looked at: enough for medians, and a tenth of a millisecond."""
+
+_SHARE = 0.5
+"""The share of an asset's voxels that must be implausible for the asset to be."""
+
+_FEW = 0.05
+"""A class with a smaller share of the voxels does not count."""
+
+
+def in_si(
+    values: NDArray[np.float32], table: Sequence[Property], units: Units
+) -> NDArray[np.float32]:
+    """Return values (K, P) in SI units where a unit is stated for a column of SI units."""
+    for column, one in enumerate(table):
+        unit = units.of(one.name)
+        if not unit or FACTORS.get(one.unit) != 1.0:
+            continue
+        with np.errstate(over="ignore", invalid="ignore"):
+            own = values[:, column].astype(np.float64)
+            own = 10.0**own if unit.startswith(LOG10) else own * FACTORS[unit]
+            values[:, column] = own.astype(np.float32)
+    return values
+
+
+def require_plausible(
+    where: str | Place,
+    values: NDArray[np.float32],
+    material: NDArray[Any] | None,
+    table: Sequence[Property],
+    classes: Sequence[str],
+    roots: SourceRoots,
+) -> list[str]:
+    """Hold values (K, P) in SI units and classes (K,) against what materials have.
+
+    Returns what a person should know; raises `InputError` where most voxels cannot be and
+    `roots.plausibility` is ``refuse``. Values that are none, such as NaN, are left to the reader.
+    """
+    if roots.plausibility == "off" or len(values) == 0:
+        return []
+    parts = _parts(values, material, table, classes)
+    faults = [(part, fault) for part in parts if (fault := fault_of(part, roots.units))]
+    if not faults:
+        odd = [(part, told) for part in parts if (told := oddity_of(part, roots.units))]
+        return [f"{TOLD}{_named(part)} has {told}" for part, told in odd]
+    share = sum(part.share for part, _ in faults)
+    (part, fault), *_ = sorted(faults, key=lambda one: -one[0].share)
+    if share < _SHARE:
+        return [f"{TOLD}{_named(part)} ({share:.0%} of the voxels) has {fault}"]
+    likely = mistakes_of(parts, roots.units)
+    if not likely and not is_physical(part):
+        return []  # The reader refuses it, and says which voxel.
+    what = f"{_named(part)} has {fault}"
+    advice = "values that a material has, in SI units"
+    if likely:
+        others = [one.words for one in likely[1:4]]
+        guess = likely[0].words + (f" (or {', or '.join(others)})" if others else "")
+        what = f"the values look like {guess}: {what}"
+        advice = f"SI units, a channel each as documented; {likely[0].setting}"
+    if roots.plausibility == "warn":
+        return [f'{TOLD}{what}; taken as they are (plausibility = "warn")']
+    raise InputError(where, what, f'{advice}. plausibility = "warn" takes them as they are')
+
+
+def require_prediction(
+    where: str | Place, values: NDArray[np.float32], material: NDArray[Any], roots: SourceRoots
+) -> list[str]:
+    """Hold normalised values (K, 3) and classes (K,) against what a network predicts.
+
+    It may leave [-1, 1], but not in most voxels; see `require_plausible`, which this is alike.
+    """
+    if roots.plausibility == "off" or len(values) == 0:
+        return []
+    step = max(1, len(values) // _SAMPLE)
+    sample = values[::step].astype(np.float64)
+    medians = np.median(np.abs(sample), axis=0)
+    if not (medians > _PREDICTED).any():
+        return []
+    parts = _parts(values, material, PROPERTIES, MATERIAL_CLASSES)
+    found = [raw_grid(parts), *mistakes_of(parts, Units())] if all(map(_is_positive, parts)) else []
+    guess = next((one.words for one in found if one), "")
+    low, high = np.percentile(sample, (5, 95), axis=0).T[int(np.argmax(medians))].tolist()
+    name = title_of(PROPERTIES[int(np.argmax(medians))].name)
+    what = (
+        f"has {name} from {low:.4g} to {high:.4g}, and a prediction, channels first, is "
+        f"normalised to [-1, 1]"
+    )
+    if guess:
+        what = f"{what}; the values look like {guess}"
+    if roots.plausibility == "warn":
+        return [f'{TOLD}{what}; clipped (plausibility = "warn")']
+    raise InputError(
+        where,
+        what,
+        "a grid in SI units, channels last (numpy.moveaxis(grid, 0, -1)), or a prediction. "
+        'plausibility = "warn" clips them',
+    )
+
+
+def _is_positive(part: Part) -> bool:
+    return part.modulus > 0 and part.density > 0
+
+
+def _parts(
+    values: NDArray[np.float32],
+    material: NDArray[Any] | None,
+    table: Sequence[Property],
+    classes: Sequence[str],
+) -> list[Part]:
+    """Return the medians of the classes that have a share that counts, of a sample of voxels."""
+    step = max(1, len(values) // _SAMPLE)
+    sample = values[::step].astype(np.float64)
+    columns = {one.name: (k, one.unit) for k, one in enumerate(table)}
+    own = np.full((len(sample), len(EXTENTS)), np.nan)
+    for k, extent in enumerate(EXTENTS):
+        column, unit = columns.get(extent.name, (-1, ""))
+        if column >= 0 and unit in ("1", *FACTORS):
+            own[:, k] = sample[:, column] * FACTORS.get(unit, 1.0)
+    ids = np.zeros(len(own), int) if material is None else material[::step].astype(int)
+    parts = []
+    for k in np.unique(ids):
+        rows = own[ids == k]
+        share = len(rows) / len(own)
+        if share < _FEW:
+            continue
+        middle = len(rows) // 2
+        medians = np.partition(rows, middle, axis=0)[middle].tolist()
+        name = classes[k] if material is not None and 0 <= k < len(classes) else ""
+        parts.append(Part(name, share, *medians))
+    return parts
+
+
+def _named(part: Part) -> str:
+    return f"its {part.name}" if part.name else "it"

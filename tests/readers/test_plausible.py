@@ -1,0 +1,214 @@
+"""Values that no material has: each mistake is named, and nothing that exists is refused."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from itertools import product
+
+import numpy as np
+import pytest
+
+from slatprep.demo.materials import MATERIALS
+from slatprep.errors import InputError
+from slatprep.readers import read_field
+from slatprep.readers.identity import hash_sources
+from slatprep.records import MATERIAL_CLASSES, Units
+
+JELLY, METAL, SAND, VISPLAS, FLUID, SNOW, STATIONARY = range(7)
+
+# Young's modulus [Pa], density [kg/m^3], Poisson's ratio: textbook values, rounded.
+KNOWN = {
+    "steel": (2.0e11, 7850, 0.29), "aluminium": (7.0e10, 2700, 0.33), "lead": (1.6e10, 11340, 0.44),
+    "gold": (7.8e10, 19300, 0.42), "tungsten": (4.1e11, 19250, 0.28),
+    "osmium": (5.5e11, 22590, 0.25), "magnesium": (4.5e10, 1740, 0.29),
+    "beryllium": (2.87e11, 1850, 0.03), "diamond": (1.22e12, 3515, 0.1),
+    "carbon fibre": (9.0e11, 2150, 0.2), "glass": (7.0e10, 2500, 0.22),
+    "concrete": (3.0e10, 2400, 0.2), "granite": (5.0e10, 2700, 0.25), "ice": (9.0e9, 917, 0.33),
+    "oak": (1.1e10, 700, 0.35), "balsa": (3.5e9, 130, 0.3), "cork": (2.0e7, 180, 0.05),
+    "polystyrene": (3.0e9, 1050, 0.34), "foam of polystyrene": (5.0e6, 20, 0.1),
+    "foam of melamine": (1.0e5, 10, 0.3), "natural rubber": (2.0e6, 930, 0.499),
+    "silicone": (1.0e6, 1100, 0.48), "tyre": (1.0e8, 1200, 0.49), "gelatin": (3.0e3, 1010, 0.48),
+    "brain": (1.0e3, 1040, 0.49), "skin": (5.0e5, 1100, 0.48), "leather": (1.0e8, 860, 0.4),
+    "dry sand": (5.0e7, 1600, 0.3), "clay": (5.0e6, 1900, 0.4), "fresh snow": (2.0e5, 100, 0.2),
+    "bone": (1.8e10, 1900, 0.3), "cotton": (8.0e9, 1540, 0.3), "paper": (3.0e9, 800, 0.3),
+}  # fmt: skip
+
+# What Pixie asks its labeller for (vlm_seg_class_instruction.py): class, E, density, ratio.
+PIXIE = {
+    "tree pot": (STATIONARY, (2e8, 2e8), (400, 400), (0.4, 0.4)),
+    "trunk": (JELLY, (2e6, 2e6), (400, 400), (0.4, 0.4)),
+    "leaves": (JELLY, (2e4, 2e4), (200, 200), (0.4, 0.4)),
+    "flowers": (JELLY, (1e4, 1e6), (100, 100), (0.4, 0.4)),
+    "blades": (JELLY, (1e4, 1e6), (80, 80), (0.45, 0.45)),
+    "soil": (STATIONARY, (5e5, 5e5), (1200, 1200), (0.3, 0.3)),
+    "toy": (JELLY, (1e3, 5e4), (80, 150), (0.35, 0.45)),
+    "can": (METAL, (1e8, 8e10), (2600, 2800), (0.25, 0.35)),
+    "crate": (METAL, (8e7, 2.1e11), (2500, 7920), (0.25, 0.35)),
+    "sand": (SAND, (4e7, 6e7), (1800, 2200), (0.25, 0.35)),
+    "jello": (JELLY, (800, 1200), (40, 60), (0.25, 0.35)),
+    "snow and mud": (SNOW, (8e4, 1.2e5), (2000, 3000), (0.15, 0.25)),
+}
+
+
+def grid_of(*parts: tuple[int, float, float, float], dtype: type = np.float32) -> np.ndarray:
+    """Return a raw grid with a slab for each class, modulus, density and ratio."""
+    grid = np.zeros((64, 64, 64, 4), dtype=np.float64)
+    grid[..., 3] = 7
+    for k, (material, modulus, density, ratio) in enumerate(parts):
+        grid[10 + k, 10:50, 10:50] = density, modulus, ratio, material
+    return grid.astype(dtype)
+
+
+def told(field) -> list[str]:
+    return [text for text in field.warnings if text.startswith("plausibility: ")]
+
+
+@pytest.mark.parametrize("name", KNOWN)
+def test_materials_that_exist_are_plausible(make_pair, name):
+    assert told(read_field(make_pair(grid_of((JELLY, *KNOWN[name]))))) == []
+
+
+@pytest.mark.parametrize("name", PIXIE)
+def test_what_pixie_asks_for_is_plausible(make_pair, name):
+    material, *spans = PIXIE[name]
+    parts = [(material, *values) for values in product(*spans)]
+    for part in parts:
+        assert told(read_field(make_pair(grid_of(part)))) == []
+
+
+def test_the_materials_of_the_demo_are_plausible(make_pair):
+    for material, *spans in MATERIALS.values():
+        for values in (*zip(*spans, strict=True), [sum(span) / 2 for span in spans]):
+            assert told(read_field(make_pair(grid_of((material, *values))))) == []
+
+
+def test_stray_voxels_decide_nothing(make_pair):
+    grid = grid_of((JELLY, 2e6, 1000, 0.4))
+    grid[10, 10:18, 10:26, :3] = 0.0, 0.0, 0.546  # 8 %, as the published statistics tell of
+    grid[10, 20, 10:50, 1] = 1e-3
+    field = read_field(make_pair(grid))
+    assert field.unphysical == 128
+    assert told(field) == []
+
+
+def mistaken(change) -> np.ndarray:
+    """Return a grid of rubber, oak and steel as it lies in a file after a mistake."""
+    parts = [(JELLY, 2e6, 930, 0.49), (STATIONARY, 1.1e10, 700, 0.35), (METAL, 2e11, 7850, 0.29)]
+    return grid_of(*(change(*part) for part in parts))
+
+
+UNITS = {
+    "GPa": lambda m, e, d, r: (m, e / 1e9, d, r),
+    "MPa": lambda m, e, d, r: (m, e / 1e6, d, r),
+    "g/cm^3": lambda m, e, d, r: (m, e, d / 1e3, r),
+    "log10 Pa": lambda m, e, d, r: (m, np.log10(e), d, r),
+    "log10 kg/m^3": lambda m, e, d, r: (m, e, np.log10(d), r),
+    "GPa and g/cm^3": lambda m, e, d, r: (m, e / 1e9, d / 1e3, r),
+    "log10 Pa and log10 kg/m^3": lambda m, e, d, r: (m, np.log10(e), np.log10(d), r),
+}
+COLUMNS = {
+    "density where Young's modulus belongs": lambda m, e, d, r: (m, d, e, r),
+    "Poisson's ratio where density belongs": lambda m, e, d, r: (m, e, r, d),
+    "Poisson's ratio where Young's modulus belongs": lambda m, e, d, r: (m, r, d, e),
+}
+
+
+@pytest.mark.parametrize("unit", UNITS)
+def test_a_unit_is_named_and_what_states_it_mends_it(make_pair, unit):
+    pair = make_pair(mistaken(UNITS[unit]))
+    with pytest.raises(InputError) as error:
+        read_field(pair)
+    assert "the values look like " in str(error.value)
+    assert unit in str(error.value)
+    stated = {
+        ("youngs_modulus" if one.endswith("Pa") else "density"): one for one in unit.split(" and ")
+    }
+    for name, one in stated.items():
+        assert f'{name} = "{one}"' in str(error.value) or unit not in str(error.value).split("(")[0]
+    right = read_field(make_pair(mistaken(lambda *part: part)))
+    roots = replace(pair.roots, units=Units(**stated))
+    field = read_field(replace(make_pair(mistaken(UNITS[unit])), roots=roots))
+    np.testing.assert_allclose(field.properties, right.properties, rtol=2e-5)
+    assert told(field) == []
+
+
+@pytest.mark.parametrize("what", COLUMNS)
+def test_swapped_columns_are_named(make_pair, what):
+    with pytest.raises(InputError) as error:
+        read_field(make_pair(mistaken(COLUMNS[what])))
+    assert "the values look like swapped columns" in str(error.value)
+    assert what in str(error.value)
+
+
+def test_normalised_values_for_raw_ones_are_named(make_pair):
+    grid = grid_of((JELLY, 0.2, -0.3, 0.6), (METAL, 0.9, 0.95, -0.2))
+    with pytest.raises(InputError, match="the values look like normalised ones"):
+        read_field(make_pair(grid))
+
+
+def test_classes_of_physgaussians_own_table_are_named(make_pair):
+    snow = grid_of((4, 1e5, 200, 0.2))  # there 4 is snow; here it is fluid
+    with pytest.raises(InputError, match="PhysGaussian's table, where 3 is foam, 4 is snow"):
+        read_field(make_pair(snow))
+    with pytest.raises(InputError, match="PhysGaussian's table"):
+        read_field(make_pair(grid_of((3, 1e5, 40, 0.3))))
+
+
+def test_a_modulus_of_rubber_with_the_density_of_steel(make_pair):
+    with pytest.raises(InputError, match=r"2e\+06 Pa with density 7.85e\+03 kg/m\^3: a metal's"):
+        read_field(make_pair(grid_of((JELLY, 2e6, 7850, 0.3))))
+
+
+def test_a_setting_says_what_becomes_of_it(make_pair):
+    pair = make_pair(grid_of((JELLY, 2e-3, 930, 0.49)))
+    taken = {
+        word: read_field(replace(pair, roots=replace(pair.roots, plausibility=word)))
+        for word in ("warn", "off")
+    }
+    assert "GPa" in told(taken["warn"])[0]
+    assert told(taken["off"]) == []
+    for field in taken.values():
+        assert np.unique(field.properties[:, 0]).tolist() == [np.float32(2e-3)]
+
+
+def test_what_is_stated_is_not_asked_about(make_pair):
+    aerogel = make_pair(grid_of((JELLY, 1e4, 5, 0.2)))
+    with pytest.raises(InputError, match="aerogels"):
+        read_field(aerogel)
+    stated = replace(aerogel.roots, units=Units(density="kg/m^3"))
+    assert told(read_field(replace(aerogel, roots=stated))) == []
+    beyond = replace(aerogel.roots, units=Units(youngs_modulus="GPa"))
+    with pytest.raises(InputError, match=r"1e\+13, and all materials have 1 to 2e\+12 Pa"):
+        read_field(replace(aerogel, roots=beyond))
+
+
+def test_what_is_unusual_or_of_few_voxels_is_told_and_taken(make_pair):
+    stone = read_field(make_pair(grid_of((STATIONARY, 5e4, 2700, 0.25))))
+    assert "is it in MPa?" in told(stone)[0]
+    grid = grid_of(*[(JELLY, 2e6, 930, 0.49)] * 4, (METAL, 200, 7850, 0.3))
+    field = read_field(make_pair(grid))
+    assert "its metal (20% of the voxels) has" in told(field)[0]
+    assert len(field.voxels) == 5 * 1600
+
+
+def test_float16_that_overflowed_is_named(make_pair):
+    with np.errstate(over="ignore"):
+        grid = grid_of((JELLY, 2e6, 930, 0.49), dtype=np.float16)
+    with pytest.raises(InputError, match="float16 holds nothing above 65,504"):
+        read_field(make_pair(grid))
+
+
+def test_units_and_the_setting_are_part_of_what_an_asset_is_made_from(make_pair):
+    pair = make_pair()
+    before = hash_sources(pair)[1]
+    units = replace(pair, roots=replace(pair.roots, units=Units(youngs_modulus="GPa")))
+    warn = replace(pair, roots=replace(pair.roots, plausibility="warn"))
+    digests = [before, hash_sources(units)[1], hash_sources(warn)[1]]
+    assert len({json.dumps(one, sort_keys=True) for one in digests}) == 3
+
+
+def test_classes_of_the_table_are_those_of_the_records():
+    assert MATERIAL_CLASSES[:7] == (
+        "jelly", "metal", "sand", "visplas", "fluid", "snow", "stationary"
+    )  # fmt: skip
