@@ -120,8 +120,8 @@ sdist: $(VENV)/.installed-dev
 
 # Not a part of `make test`: the engine compiles its kernels for a minute or two on a new machine.
 simulate: $(VENV)/.installed-dev
-	$(BIN)/python -m pip install --quiet --editable '.[simulate]'
-	$(BIN)/python -m pytest tests/particles
+	$(BIN)/python -m pip install --quiet --editable '.[simulate,usd]'
+	$(BIN)/python -m pytest tests/particles tests/export/test_usd.py
 
 # Not a part of `make test` either: pyarrow would bring the tests' environment above 2.5 GB.
 hub: $(VENV)/.installed-dev

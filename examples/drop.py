@@ -25,10 +25,11 @@ from slatprep.geometry.voxels import boundary, filled, occupancy_of
 from slatprep.parameters import BuildParameters, PixieverseSource, SlatSource
 from slatprep.particles.fields import stored_field
 from slatprep.particles.read import read_particles
-from slatprep.particles.simulate import ELASTIC, rigid_deviation, simulate, strain
+from slatprep.particles.simulate import rigid_deviation, simulate, strain
 from slatprep.particles.transfer import transfer, write_transferred
 from slatprep.pipeline.dataset import build_store
 from slatprep.records import BACKGROUND, MATERIAL_CLASSES, RESOLUTION
+from slatprep.records.yielding import ELASTIC
 from slatprep.store import Store, open_store
 
 try:

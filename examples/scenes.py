@@ -7,7 +7,7 @@
 Each SLAT is filled with particles, which take the material of the nearest voxel
 by `slatprep.particles.transfer`: of the PixieVerse field of a stored asset, or of
 a prediction of `slatprep predict`. What each class does beyond its elastic limit
-is `slatprep.particles.simulate.YIELDING`. Without wind the objects fall; in the
+is `slatprep.records.yielding.YIELDING`. Without wind the objects fall; in the
 wind, along x, they stand, held at the foot and where they are stationary or soil,
 in the shape in which they bear their weight already, so without gravity.
 """

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 from slatprep.cli.options import (
     AssetIds,
     ChoiceOf,
+    FiniteRange,
     FolderOrUrl,
     Jobs,
     NewFileOrFolder,
@@ -26,10 +27,12 @@ if TYPE_CHECKING:
 
 # The formats of each option; giving it with another format is an error.
 _ONLY_FOR = {
-    "points": ("ply", "voxel_data"),
+    "points": ("ply", "voxel_data", "usd"),
     "frame": ("ply",),
     "shard_size": ("webdataset",),
     "latent_model": ("npz",),
+    "size": ("usd",),
+    "materials": ("usd",),
 }
 
 
@@ -42,7 +45,8 @@ def export(
         Any,
         ChoiceOf("slatprep.export:FORMATS"),
         "Point clouds with Pixie's fields, one HDF5 file, tar shards, the files of TRELLIS's "
-        "dataset (npz and metadata.csv) with the targets added, or the npz of VoMP's scripts.",
+        "dataset (npz and metadata.csv) with the targets added, the npz of VoMP's scripts, or USD "
+        "for Newton and Isaac Lab.",
         Click("--format"),
     ],
     out: Annotated[
@@ -62,7 +66,8 @@ def export(
     points: Annotated[
         Any | None,
         ChoiceOf("slatprep.export.formats:Points"),
-        "ply, voxel_data: SLAT voxels, or the voxels of the PixieVerse field. [default: slat]",
+        "ply, voxel_data, usd: SLAT voxels, or the voxels of the PixieVerse field. [default: grid "
+        "for usd, else slat]",
     ] = None,
     frame: Annotated[
         Any | None,
@@ -76,11 +81,21 @@ def export(
         "TRELLIS's published configurations]",
         Click(metavar="NAME"),
     ] = None,
+    size: Annotated[
+        float | None,
+        FiniteRange(min=0, min_open=True),
+        "usd: width of the unit cube. [default: 1]",
+        Click(metavar="METRES"),
+    ] = None,
+    materials: Annotated[
+        Positive | None,
+        "usd: the most materials that E and nu of an asset are binned into. [default: 64]",
+    ] = None,
     jobs: Jobs = 1,
 ) -> None:
     """Write assets of STORE in a format of other tools.
 
-    Properties are in SI units in PLY and voxel_data, normalised in WebDataset
+    Properties are in SI units in PLY, voxel_data and USD, normalised in WebDataset
     and npz, and both in HDF5. Every folder gets an index.json of its contents.
 
     Example
@@ -91,6 +106,7 @@ def export(
     slatprep export data/demo.zarr --format webdataset --out shards --shard-size 128 --jobs 2
     slatprep export data/demo.zarr --format npz --out trellis
     slatprep export data/demo.zarr --format voxel_data --out vomp --points grid
+    slatprep export data/demo.zarr --format usd --out usd --size 0.3 --asset 5f61cc
     slatprep export data/demo.zarr --format webdataset --out train --split train --split-by pixie
     """
     given: dict[str, Any] = {
@@ -98,6 +114,8 @@ def export(
         "frame": frame,
         "shard_size": shard_size,
         "latent_model": latent_model,
+        "size": size,
+        "materials": materials,
     }
     options = {name: value for name, value in given.items() if value is not None}
     for name in options:

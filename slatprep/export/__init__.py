@@ -1,4 +1,4 @@
-"""Export a store as PLY, HDF5, WebDataset shards, and npz of TRELLIS and VoMP.
+"""Export a store as PLY, HDF5, WebDataset shards, npz of TRELLIS and VoMP, or USD.
 
 Each format is one module. `export_store` chooses the assets, passes batches of them to the
 format's writer, and moves the result into place when it is complete.
@@ -31,6 +31,7 @@ FORMATS = {
     "webdataset": "slatprep.export.webdataset",
     "npz": "slatprep.export.npz",
     "voxel_data": "slatprep.export.voxel_data",
+    "usd": "slatprep.export.usd",
 }
 """Name of each format and its module; to add a format, add its line here.
 
@@ -79,7 +80,7 @@ def export_store(
     out : str or Path
         The file (``hdf5``) or folder (all others) to write. The new export replaces an old one
         when complete; other files stay.
-    format : {"ply", "hdf5", "webdataset", "npz", "voxel_data"}
+    format : {"ply", "hdf5", "webdataset", "npz", "voxel_data", "usd"}
         The format, see docs/export.md.
     assets : sequence of str
         Ids of the assets; empty takes all.
@@ -119,6 +120,7 @@ def export_store(
     writer: Writer = import_module(FORMATS[format]).writer(opened, ids, options)
     about = _about(opened, format)
     entries: list[_Entry] = []
+    notes = writer.notes
     if writer.is_export is not None:
         with target.file(out, writer.is_export) as file:
             for written in writer.write(file, about, map(opened.asset, ids)):
@@ -135,7 +137,8 @@ def export_store(
                 entries += part
                 tell(len(entries), len(ids))
             entries.sort(key=lambda entry: str(entry["asset_id"]))
-            about |= {"notes": writer.notes}
+            notes = writer.notes + (writer.remarks(entries) if writer.remarks else ())
+            about |= {"notes": notes}
             if writer.finish is not None:
                 about |= {"files": writer.finish(directory, entries)}
             target.write_index(directory, about, entries)
@@ -148,7 +151,7 @@ def export_store(
         files=len(sizes),
         size=sum(sizes),
         seconds=time.perf_counter() - begin,
-        notes=writer.notes,
+        notes=notes,
     )
 
 
@@ -164,7 +167,8 @@ def _write_batch(
 
 
 def _entry(written: Exported) -> _Entry:
-    return {**describe_columns(written.asset), "file": written.file, "points": written.points}
+    here = {"file": written.file, "points": written.points, **written.figures}
+    return {**describe_columns(written.asset), **here}
 
 
 def _about(store: Store, format: str) -> dict[str, Any]:

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -31,11 +32,12 @@ TARGETS = ("properties", "material", "valid")
 
 
 class Exported(NamedTuple):
-    """An asset that was written, the name of its file, and its number of points."""
+    """An asset that was written, its file's name, its number of points, figures for the index."""
 
     asset: StoredAsset
     file: str
     points: int
+    figures: Mapping[str, float] = MappingProxyType({})
 
 
 def with_merged(store: Store, *names: str) -> tuple[str, ...]:

@@ -22,21 +22,27 @@ class ExportOptions:
 
     Attributes
     ----------
-    points : {"slat", "grid"}
-        PLY, voxel_data: the valid voxels of the SLAT, or the annotated voxels of the PixieVerse
-        field.
+    points : {"slat", "grid"}, optional
+        PLY, voxel_data, USD: the valid voxels of the SLAT, or the annotated voxels of the
+        PixieVerse field. By default the field for USD, and the SLAT for others.
     frame : {"slat", "pixieverse"}
         PLY: the unit cube of the SLAT, or PixieVerse's world coordinates.
     shard_size : int
         WebDataset: assets in one shard.
     latent_model : str
         npz: the encoder's name, by which TRELLIS's dataset finds the latents.
+    size : float
+        USD: width of the unit cube [m].
+    materials : int
+        USD: the most materials that E and nu of an asset are binned into.
     """
 
-    points: Points = "slat"
+    points: Points | None = None
     frame: Frame = "slat"
     shard_size: int = 256
     latent_model: str = TRELLIS_ENCODER
+    size: float = 1.0
+    materials: int = 64
 
 
 @dataclass(frozen=True)
@@ -56,6 +62,8 @@ class Writer:
     finish : callable, optional
         Takes the folder and the index's entries, sorted by id; writes the files that cover all
         assets and returns their names.
+    remarks : callable, optional
+        Takes the index's entries; returns further remarks for the user.
     is_export : callable, optional
         Only for an export in a single file, which one process writes: whether an existing
         file is such an export, so that it may be replaced.
@@ -65,4 +73,5 @@ class Writer:
     batch: int = 16
     notes: tuple[str, ...] = ()
     finish: Callable[[Path, Sequence[dict[str, Any]]], Sequence[str]] | None = None
+    remarks: Callable[[Sequence[dict[str, Any]]], tuple[str, ...]] | None = None
     is_export: Callable[[Path], bool] | None = None

@@ -56,7 +56,7 @@ def writer(store: Store, ids: Sequence[str], options: ExportOptions) -> Writer:
     bounds, notes = read_bounds(store, ids) if options.frame == "pixieverse" else ({}, ())
     one = functools.partial(
         write,
-        points=options.points,
+        points=options.points or "slat",
         frame=options.frame,
         bounds=bounds,
         max_distance=store.about.build.parameters.sample.max_distance,

@@ -7,11 +7,12 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from slatprep.errors import StoreError
 from slatprep.export.formats import Points
 from slatprep.geometry.frames import voxel_centres
 from slatprep.provenance.stored import StoredRecords
-from slatprep.records import PROPERTY_COLUMNS
-from slatprep.store import StoredAsset
+from slatprep.records import BACKGROUND, MATERIAL_CLASSES, PROPERTY_COLUMNS
+from slatprep.store import Store, StoredAsset
 
 
 class AnnotatedPoints(NamedTuple):
@@ -26,6 +27,15 @@ class AnnotatedPoints(NamedTuple):
     def solid(self, asset: StoredAsset) -> NDArray[np.float32]:
         """Return Young's modulus [Pa], density [kg/m^3] and Poisson's ratio, (N, 3)."""
         return self.values[:, asset.store.columns_of(PROPERTY_COLUMNS)]
+
+
+def require_solver_classes(store: Store) -> None:
+    """Raise StoreError for a store with other classes than those that a solver knows."""
+    if store.contents.classes not in (MATERIAL_CLASSES, ()):
+        raise StoreError(
+            f"{store.path} has classes of its own ({', '.join(store.contents.classes)}); expected "
+            f"those of PhysGaussian's solver ({', '.join(MATERIAL_CLASSES[:BACKGROUND])}), or none"
+        )
 
 
 def annotated_points(asset: StoredAsset, points: Points) -> AnnotatedPoints:

@@ -33,7 +33,7 @@ FOLDER = "voxels"
 
 def writer(store: Store, ids: Sequence[str], options: ExportOptions) -> Writer:
     """Return the writer of an npz for each asset; see `slatprep.export.FORMATS`."""
-    return Writer(partial(write, points=options.points))
+    return Writer(partial(write, points=options.points or "slat"))
 
 
 def write(

@@ -10,7 +10,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from slatprep.align.deformation import PlaceMap
-from slatprep.errors import ConfigError, InputError, StoreError
+from slatprep.errors import ConfigError, InputError
+from slatprep.export.points import require_solver_classes
 from slatprep.geometry.voxels import shown_in_cells
 from slatprep.normalize import denormalize_properties
 from slatprep.provenance.stored import StoredRecords
@@ -18,7 +19,6 @@ from slatprep.readers.files import ArraySpec, load_source, npz_arrays, npz_small
 from slatprep.readers.slat import check_coords
 from slatprep.records import (
     BACKGROUND,
-    MATERIAL_CLASSES,
     MAX_LATENT_RESOLUTION,
     PROPERTY_COLUMNS,
     RESOLUTION,
@@ -93,11 +93,7 @@ def stored_field(store: Store, asset_id: str, points: Points = "slat") -> VoxelF
         If no voxel of the asset has a material.
     """
     asset, columns = store.asset(asset_id), store.columns_of(PROPERTY_COLUMNS)
-    if store.contents.classes not in (MATERIAL_CLASSES, ()):
-        raise StoreError(
-            f"{store.path} has classes of its own ({', '.join(store.contents.classes)}); expected "
-            f"those of PhysGaussian's solver ({', '.join(MATERIAL_CLASSES[:BACKGROUND])}), or none"
-        )
+    require_solver_classes(store)
     if points == "grid":
         grid = asset.field
         place_map = StoredRecords(store).place_map(asset)

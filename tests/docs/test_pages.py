@@ -221,7 +221,7 @@ def test_wrong_asset_is_answered_with_the_one_it_might_be(
     [
         (
             ("--format", "npz", "--points", "grid"),
-            "--points is for --format ply or voxel_data, not npz",
+            "--points is for --format ply or voxel_data or usd, not npz",
         ),
         (("--format", "ply", "--shard-size", "3"), "--shard-size is for --format webdataset"),
     ],

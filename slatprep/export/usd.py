@@ -1,0 +1,264 @@
+"""USD of particles for Newton and Isaac Lab: a file for each asset, and a scene of all.
+
+The schemas are those of newton-usd-schemas 0.6, which Newton 1.8 reads with
+``ModelBuilder.add_usd``: ``NewtonPointsDeformableSimAPI`` on the points, ``NewtonMPMMaterialAPI``
+on the materials, ``NewtonMPMSceneAPI`` on the scene. They are written by name, so that only
+usd-core is needed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Sequence
+from functools import partial
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from slatprep.errors import ConfigError, SlatprepError
+from slatprep.export.assets import Exported
+from slatprep.export.bins import Binned, bin_materials
+from slatprep.export.formats import ExportOptions, Points, Writer
+from slatprep.export.points import annotated_points, require_solver_classes
+from slatprep.records import MATERIAL_CLASSES, MATERIAL_COLOURS, RESOLUTION
+from slatprep.records.yielding import MAX_POISSON, YIELDING
+from slatprep.storage.names import file_name
+from slatprep.store import Store, StoredAsset
+
+SCENE = "scene.usda"
+
+YIELDING_ATTRIBUTES = {
+    "friction": "internalFriction",
+    "pressure": "yieldPressure",
+    "tension": "tensileYieldRatio",
+    "stress": "yieldStress",
+    "hardening": "hardening",
+    "dilatancy": "dilatancy",
+    "viscosity": "viscosity",
+}
+"""The ``newton:mpm`` attribute of each field of `Yielding`."""
+
+_PITCH = 1.25
+"""Distance between neighbours in the scene, in sizes of the unit cube."""
+
+
+def writer(store: Store, ids: Sequence[str], options: ExportOptions) -> Writer:
+    """Return the writer of a USD file for each asset; see `slatprep.export.FORMATS`.
+
+    Raises
+    ------
+    ConfigError
+        If `options.materials` is less than the number of classes.
+    SlatprepError
+        If usd-core is not installed.
+    """
+    least = len(YIELDING)
+    if options.materials < least:
+        raise ConfigError(f"materials is {options.materials}; expected {least} or more")
+    if not options.size > 0:
+        raise ConfigError(f"size is {options.size}; expected a length above 0 m")
+    require_solver_classes(store)
+    _pxr("Usd")
+    one = partial(
+        write, points=options.points or "grid", size=options.size, materials=options.materials
+    )
+    return Writer(one, finish=partial(write_scene, options.size), remarks=_remarks)
+
+
+def write(
+    directory: Path,
+    number: int,
+    assets: Iterable[StoredAsset],
+    *,
+    points: Points,
+    size: float,
+    materials: int,
+) -> Iterator[Exported]:
+    """Write ``<id>.usdc`` of each asset, its unit cube `size` metres wide."""
+    for asset in assets:
+        there = annotated_points(asset, points)
+        solid = there.solid(asset).astype(np.float64)
+        clipped = int(np.count_nonzero(solid[:, 2] > MAX_POISSON))
+        solid[:, 2] = np.minimum(solid[:, 2], MAX_POISSON)
+        name = f"{file_name(asset.asset_id)}.usdc"
+        binned = bin_materials(there.material, solid, materials)
+        width = size * _edge(asset, points)
+        _write_asset(directory / name, asset.asset_id, there.in_slat * size, width, solid, binned)
+        figures = {
+            "spacing": width,
+            "materials": len(binned.material),
+            "kilograms": float(solid[:, 1].sum() * width**3),
+            "E_error": binned.modulus_error,
+            "nu_error": binned.ratio_error,
+            "nu_clipped": clipped,
+        }
+        yield Exported(asset, name, len(there.material), figures)
+
+
+def write_scene(size: float, directory: Path, entries: Sequence[dict[str, Any]]) -> list[str]:
+    """Write the scene: gravity, ground, and a reference to each asset; return its name."""
+    geom, tf = _pxr("UsdGeom"), _pxr("Tf")
+    stage = _stage(directory / SCENE)
+    world = geom.Xform.Define(stage, "/World")
+    stage.SetDefaultPrim(world.GetPrim())
+    # The grid of the solver is one for all: as fine as the finest asset needs.
+    _simulation(stage, "/World", min(entry["spacing"] for entry in entries))
+    columns = int(np.ceil(np.sqrt(len(entries))))
+    for number, entry in enumerate(entries):
+        row, column = divmod(number, columns)
+        label = tf.MakeValidIdentifier(f"a{number:04d}_{entry['asset_id']}")
+        one = geom.Xform.Define(stage, f"/World/{label}")
+        one.GetPrim().GetReferences().AddReference(f"./{entry['file']}")
+        one.GetPrim().SetCustomDataByKey("slatprep:asset_id", entry["asset_id"])
+        # Beside the operation of the asset's file, which lifts it onto the ground.
+        place = one.AddTranslateOp(opSuffix="place")
+        place.Set(tuple(float(_PITCH * size * step) for step in (column, row, 0)))
+    stage.GetRootLayer().Save()
+    return [SCENE]
+
+
+def _write_asset(
+    path: Path,
+    asset_id: str,
+    positions: NDArray[np.float64],
+    width: float,
+    solid: NDArray[np.float64],
+    binned: Binned,
+) -> None:
+    """Write an asset: points (N, 3) [m] of cubes `width` [m] wide, E, density, nu (N, 3)."""
+    geom, sdf, vt, shade = _pxr("UsdGeom"), _pxr("Sdf"), _pxr("Vt"), _pxr("UsdShade")
+    stage = _stage(path)
+    root = geom.Xform.Define(stage, "/Asset")
+    stage.SetDefaultPrim(root.GetPrim())
+    root.GetPrim().SetCustomDataByKey("slatprep:asset_id", asset_id)
+    _simulation(stage, "", width)
+    lowest = float(positions[:, 2].min()) if len(positions) else 0.0
+    root.AddTranslateOp(opSuffix="lift").Set((0.0, 0.0, width / 2 - lowest))
+    if len(positions):
+        points = geom.Points.Define(stage, "/Asset/Points")
+        prim = points.GetPrim()
+        prim.AddAppliedSchema("NewtonPointsDeformableSimAPI")
+        prim.AddAppliedSchema("PhysicsDeformableBodyAPI")
+        points.CreatePointsAttr(vt.Vec3fArray.FromNumpy(positions.astype(np.float32)))
+        points.CreateWidthsAttr([width])
+        points.SetWidthsInterpolation(geom.Tokens.constant)
+        half = np.full(3, width / 2)
+        extent = np.array([positions.min(axis=0) - half, positions.max(axis=0) + half])
+        points.CreateExtentAttr(vt.Vec3fArray.FromNumpy(extent.astype(np.float32)))
+        masses = vt.FloatArray.FromNumpy((solid[:, 1] * width**3).astype(np.float32))
+        prim.CreateAttribute("physics:masses", sdf.ValueTypeNames.FloatArray, custom=False).Set(
+            masses
+        )
+        colours = np.array([_colour(number) for number in binned.material], np.float32)
+        points.CreateDisplayColorPrimvar(geom.Tokens.vertex).Set(
+            vt.Vec3fArray.FromNumpy(colours[binned.rows])
+        )
+        binding = shade.MaterialBindingAPI.Apply(prim)
+        for number, material in enumerate(binned.material):
+            _add_material(stage, binding, number, int(material), solid, binned)
+        binding.SetMaterialBindSubsetsFamilyType(geom.Tokens.nonOverlapping)
+    stage.GetRootLayer().Save()
+
+
+def _add_material(
+    stage: Any,
+    binding: Any,
+    number: int,
+    material: int,
+    solid: NDArray[np.float64],
+    binned: Binned,
+) -> None:
+    """Add a material, and the subset of the points that it is bound to."""
+    geom, sdf, vt, shade = _pxr("UsdGeom"), _pxr("Sdf"), _pxr("Vt"), _pxr("UsdShade")
+    name = f"{MATERIAL_CLASSES[material]}_{number:03d}"
+    made = shade.Material.Define(stage, f"/Asset/Materials/{name}")
+    prim = made.GetPrim()
+    prim.AddAppliedSchema("PhysicsMaterialAPI")
+    prim.AddAppliedSchema("NewtonMPMMaterialAPI")
+    rows = np.flatnonzero(binned.rows == number)
+    figures = {
+        "physics:density": float(solid[rows, 1].mean()),
+        "newton:mpm:youngsModulus": binned.modulus[number],
+        "newton:mpm:poissonsRatio": binned.ratio[number],
+    }
+    for field, value in YIELDING[material]._asdict().items():
+        figures[f"newton:mpm:{YIELDING_ATTRIBUTES[field]}"] = value
+    for attribute, value in figures.items():
+        prim.CreateAttribute(attribute, sdf.ValueTypeNames.Float, custom=False).Set(float(value))
+    indices = vt.IntArray.FromNumpy(rows.astype(np.int32))
+    subset = binding.CreateMaterialBindSubset(name, indices, geom.Tokens.point)
+    shade.MaterialBindingAPI.Apply(subset.GetPrim()).Bind(made, materialPurpose="physics")
+
+
+def _simulation(stage: Any, parent: str, width: float) -> None:
+    """Add what a simulation needs beside particles `width` [m] wide: solver, gravity, ground."""
+    geom, physics, sdf = _pxr("UsdGeom"), _pxr("UsdPhysics"), _pxr("Sdf")
+    scene = physics.Scene.Define(stage, f"{parent}/PhysicsScene")
+    scene.CreateGravityDirectionAttr((0.0, 0.0, -1.0))
+    scene.CreateGravityMagnitudeAttr(9.81)
+    prim = scene.GetPrim()
+    prim.AddAppliedSchema("NewtonSceneAPI")
+    prim.AddAppliedSchema("NewtonMPMSceneAPI")
+    types = sdf.ValueTypeNames
+    for name, kind, value in (
+        ("newton:maxSolverIterations", types.Int, 100),
+        ("newton:mpm:voxelSize", types.Float, 2 * width),
+        ("newton:mpm:tolerance", types.Float, 1e-6),
+        # With one strain per cell, Newton's default, stiff solids creep.
+        ("newton:mpm:strainBasisType", types.Token, "linear"),
+        ("newton:mpm:strainBasisOrder", types.Int, 1),
+        ("newton:mpm:strainDiscontinuousBasis", types.Bool, True),
+    ):
+        variability = sdf.VariabilityUniform
+        prim.CreateAttribute(name, kind, custom=False, variability=variability).Set(value)
+    ground = geom.Plane.Define(stage, f"{parent}/Ground")
+    ground.CreateAxisAttr("Z")
+    physics.CollisionAPI.Apply(ground.GetPrim())
+
+
+def _stage(path: Path) -> Any:
+    """Return a new stage in metres and kilograms, z up."""
+    geom, physics = _pxr("UsdGeom"), _pxr("UsdPhysics")
+    stage = _pxr("Usd").Stage.CreateNew(str(path))
+    geom.SetStageMetersPerUnit(stage, 1.0)
+    physics.SetStageKilogramsPerUnit(stage, 1.0)
+    geom.SetStageUpAxis(stage, geom.Tokens.z)
+    return stage
+
+
+def _edge(asset: StoredAsset, points: Points) -> float:
+    """Return the edge of a voxel in the unit cube of the SLAT, such that its volume is right."""
+    if points == "slat":
+        return 1.0 / asset.store.contents.latents.resolution
+    scale = float(np.cbrt(np.abs(np.linalg.det(asset.transform[:3, :3]))))
+    return scale / RESOLUTION
+
+
+def _colour(material: int) -> tuple[float, ...]:
+    return tuple(byte / 255 for byte in bytes.fromhex(MATERIAL_COLOURS[material][1:]))
+
+
+def _remarks(entries: Sequence[dict[str, Any]]) -> tuple[str, ...]:
+    """Say what binning and clipping changed."""
+    modulus = max(entry["E_error"] for entry in entries)
+    ratio = max(entry["nu_error"] for entry in entries)
+    most = max(entry["materials"] for entry in entries)
+    changed = f"E differs from the store by at most {modulus:.2%}, nu by at most {ratio:.2g}"
+    if modulus < 1e-5 and ratio < 1e-5:
+        changed = "E and nu are those of the store"
+    remarks = [f"up to {most} materials an asset: {changed}; --materials sets how many"]
+    if clipped := sum(entry["nu_clipped"] for entry in entries):
+        remarks.append(f"nu of {clipped:,} points was above {MAX_POISSON} and is written so")
+    return tuple(remarks)
+
+
+def _pxr(name: str) -> Any:
+    """Import a module of OpenUSD."""
+    try:
+        return import_module(f"pxr.{name}")
+    except ImportError as error:
+        raise SlatprepError(
+            "USD needs the package usd-core; install it with `pip install 'slatprep[usd]'`"
+        ) from error

@@ -1,0 +1,245 @@
+"""USD is read back by OpenUSD, and where Newton is, by its importer; then it falls."""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from hypothesis import given
+from hypothesis import strategies as st
+from support.exports import bytes_of, index_of
+from support.synthetic import JELLY, METAL, QUARTER_TURN, Dataset
+
+from slatprep.cli.commands import slatprep
+from slatprep.errors import ConfigError
+from slatprep.export import ExportOptions, export_store
+from slatprep.export.bins import bin_materials
+from slatprep.pipeline.dataset import build_store
+from slatprep.records.yielding import MAX_POISSON, YIELDING
+
+pytest.importorskip("pxr", reason="usd-core has no wheel for this machine")
+SIZE = 0.4
+NEWTON = pytest.mark.skipif(
+    importlib.util.find_spec("newton") is None, reason="Newton is not installed: make simulate"
+)
+
+
+@pytest.fixture(scope="module")
+def exported(mixed_build: Any, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Export all assets of the store of `mixed`; nobody may change the files."""
+    out = tmp_path_factory.mktemp("usd") / "usd"
+    words = ("--format", "usd", "--size", SIZE, "--out", out)
+    done = CliRunner().invoke(slatprep, list(map(str, ("export", mixed_build.store, *words))))
+    assert done.exit_code == 0, done.output
+    assert "up to 2 materials an asset: E and nu are those of the store" in done.output
+    return out
+
+
+def solid_of(mixed: Dataset, asset_id: str) -> tuple[np.ndarray, np.ndarray]:
+    """Return the centres (N, 3) of the solid in the SLAT frame, and density, E, nu, class."""
+    grid = mixed.assets[asset_id].grid
+    voxels = np.argwhere(grid[..., 3] != 7)
+    centres = ((voxels + 0.5) / 64 - 0.5) @ QUARTER_TURN[:3, :3].T
+    return centres, grid[tuple(voxels.T)]
+
+
+def materials_of(stage: Any, path: str) -> dict[str, np.ndarray]:
+    """Return the attributes of each point's material, by name, as a reader of subsets does."""
+    from pxr import UsdShade
+
+    prim = stage.GetPrimAtPath(path)
+    count = len(prim.GetAttribute("points").Get())
+    read: dict[str, np.ndarray] = {}
+    seen = np.zeros(count, int)
+    for subset in UsdShade.MaterialBindingAPI(prim).GetMaterialBindSubsets():
+        assert subset.GetElementTypeAttr().Get() == "point"
+        rows = np.array(subset.GetIndicesAttr().Get())
+        seen[rows] += 1
+        bound = UsdShade.MaterialBindingAPI(subset.GetPrim()).GetDirectBinding("physics")
+        material = bound.GetMaterial().GetPrim()
+        assert "NewtonMPMMaterialAPI" in material.GetMetadata("apiSchemas").GetAppliedItems()
+        for attribute in material.GetAuthoredAttributes():
+            read.setdefault(attribute.GetName(), np.zeros(count))[rows] = attribute.Get()
+    assert (seen == 1).all()
+    return read
+
+
+def test_openusd_reads_back_places_masses_and_materials(exported: Path, mixed: Dataset) -> None:
+    from pxr import Usd, UsdGeom, UsdPhysics
+
+    for entry in index_of(exported):
+        stage = Usd.Stage.Open(str(exported / entry["file"]))
+        assert UsdGeom.GetStageMetersPerUnit(stage) == UsdPhysics.GetStageKilogramsPerUnit(stage)
+        assert UsdGeom.GetStageMetersPerUnit(stage) == 1 and UsdGeom.GetStageUpAxis(stage) == "Z"
+        centres, truth = solid_of(mixed, entry["asset_id"])
+        points = UsdGeom.Points(stage.GetPrimAtPath("/Asset/Points"))
+        positions = np.array(points.GetPointsAttr().Get())
+        np.testing.assert_allclose(positions, centres * SIZE, atol=1e-3)
+        width = SIZE / 64
+        np.testing.assert_allclose(points.GetWidthsAttr().Get(), [width], rtol=1e-3)
+        mass = np.array(points.GetPrim().GetAttribute("physics:masses").Get())
+        np.testing.assert_allclose(mass, truth[:, 0] * width**3, rtol=2e-3)
+        read = materials_of(stage, "/Asset/Points")
+        np.testing.assert_allclose(read["newton:mpm:youngsModulus"], truth[:, 1], rtol=1e-4)
+        np.testing.assert_allclose(read["newton:mpm:poissonsRatio"], truth[:, 2], atol=1e-5)
+        np.testing.assert_allclose(read["physics:density"], truth[:, 0], rtol=1e-4)
+        expected = np.array([YIELDING[int(number)].stress for number in truth[:, 3]])
+        np.testing.assert_allclose(read["newton:mpm:yieldStress"], expected, rtol=1e-6)
+        # It stands on the ground, also where another file refers to it.
+        box = UsdGeom.BBoxCache(Usd.TimeCode.Default(), ["default"]).ComputeWorldBound(
+            stage.GetPrimAtPath("/Asset")
+        )
+        assert abs(box.ComputeAlignedRange().GetMin()[2]) < 1e-6
+
+
+def test_the_scene_has_every_asset_apart_from_the_others(exported: Path) -> None:
+    from pxr import Usd, UsdGeom
+
+    stage = Usd.Stage.Open(str(exported / "scene.usda"))
+    found = [prim for prim in stage.Traverse() if prim.IsA(UsdGeom.Points)]
+    assert len(found) == len(index_of(exported))
+    cache = UsdGeom.BBoxCache(Usd.TimeCode.Default(), ["default"])
+    boxes = [cache.ComputeWorldBound(prim).ComputeAlignedRange() for prim in found]
+    for number, box in enumerate(boxes):
+        assert abs(box.GetMin()[2]) < 1e-6
+        for other in boxes[:number]:
+            apart = np.maximum(
+                np.array(box.GetMin()) - other.GetMax(), np.array(other.GetMin()) - box.GetMax()
+            )
+            assert apart.max() > 0
+    # The physics scenes of the assets' files stay there: a scene has one.
+    assert sum(prim.GetTypeName() == "PhysicsScene" for prim in stage.Traverse()) == 1
+    assert json.loads((exported / "index.json").read_text())["files"] == ["scene.usda"]
+
+
+def test_bytes_do_not_depend_on_the_number_of_workers(
+    exported: Path, store: Path, tmp_path: Path
+) -> None:
+    export_store(store, tmp_path / "usd", "usd", options=ExportOptions(size=SIZE), jobs=2)
+    again, before = bytes_of(tmp_path / "usd"), bytes_of(exported)
+    assert again == before
+
+
+@given(st.integers(0, 2**32 - 1), st.integers(7, 60))
+def test_bins_are_at_most_as_many_as_asked_and_say_their_error(seed: int, most: int) -> None:
+    rng = np.random.default_rng(seed)
+    material = rng.integers(0, 7, 400).astype(np.uint8)
+    solid = np.column_stack(
+        [10 ** rng.uniform(3, 11, 400), rng.uniform(100, 8000, 400), rng.uniform(0.0, 0.499, 400)]
+    )
+    binned = bin_materials(material, solid, most)
+    assert len(binned.material) <= most
+    np.testing.assert_array_equal(binned.material[binned.rows], material)
+    errors = np.abs(binned.modulus[binned.rows] / solid[:, 0] - 1)
+    np.testing.assert_allclose(binned.modulus_error, errors.max())
+    errors = np.abs(binned.ratio[binned.rows] - solid[:, 2])
+    np.testing.assert_allclose(binned.ratio_error, errors.max())
+
+
+def test_more_materials_are_closer_and_few_values_are_exact() -> None:
+    rng = np.random.default_rng(0)
+    material = np.zeros(3000, np.uint8)
+    solid = np.column_stack([10 ** rng.uniform(4, 6, 3000), np.ones(3000), np.full(3000, 0.3)])
+    errors = [bin_materials(material, solid, most).modulus_error for most in (8, 32, 128)]
+    assert errors[0] > 3 * errors[1] > 9 * errors[2]
+    # 2 decades in 128 bins: half a bin is 1.8 %.
+    assert errors[2] < 0.03
+    solid[:, 0] = rng.choice([1e4, 1.01e4, 5e9], 3000)
+    binned = bin_materials(material, solid, 7)
+    assert len(binned.material) == 3 and binned.modulus_error < 1e-6
+
+
+def test_a_ratio_of_one_half_is_clipped_and_said(
+    make_dataset: Callable[..., Dataset], tmp_path: Path
+) -> None:
+    dataset = make_dataset("a")
+    grid = dataset.assets["a"].grid
+    soft = grid[..., 3] == JELLY[0]
+    grid[soft, 2] = 0.5
+    dataset.write_grid("a", grid)
+    built = build_store(dataset.parameters(), tmp_path / "s.zarr")
+    done = export_store(str(built.store), tmp_path / "usd", "usd")
+    said = f"nu of {soft.sum():,} points was above {MAX_POISSON} and is written so"
+    assert said in done.notes
+    from pxr import Usd
+
+    stage = Usd.Stage.Open(str(tmp_path / "usd" / "a.usdc"))
+    ratio = materials_of(stage, "/Asset/Points")["newton:mpm:poissonsRatio"]
+    assert ratio.max() == pytest.approx(MAX_POISSON)
+
+
+def test_too_few_materials_are_refused(store: Path, tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="materials is 3; expected 7 or more"):
+        export_store(store, tmp_path / "usd", "usd", options=ExportOptions(materials=3))
+
+
+# -- Newton ------------------------------------------------------------
+
+
+@NEWTON
+def test_newton_s_importer_gives_back_stiffness_ratio_and_mass(
+    exported: Path, mixed: Dataset
+) -> None:
+    import newton
+
+    builder = newton.ModelBuilder()
+    read = builder.add_usd(str(exported / "scene.usda"))
+    model = builder.finalize(device="cpu")
+    entries = index_of(exported)
+    parts = read["path_particle_map"]
+    assert len(parts) == len(entries)
+    np.testing.assert_allclose(model.gravity.numpy()[0], [0, 0, -9.81], rtol=1e-6)
+    for (path, (start, stop)), entry in zip(sorted(parts.items()), entries, strict=True):
+        assert entry["asset_id"].replace(".", "_") in path
+        _, truth = solid_of(mixed, entry["asset_id"])
+        here = slice(start, stop)
+        modulus, ratio = (
+            getattr(model.mpm, name).numpy()[here] for name in ("young_modulus", "poisson_ratio")
+        )
+        np.testing.assert_allclose(modulus, truth[:, 1], rtol=1e-4)
+        np.testing.assert_allclose(ratio, truth[:, 2], atol=1e-5)
+        mass = truth[:, 0] * (SIZE / 64) ** 3
+        np.testing.assert_allclose(model.particle_mass.numpy()[here], mass, rtol=2e-3)
+        stuff = {JELLY[1]: JELLY[0], METAL[1]: METAL[0]}
+        assert {stuff[min(stuff, key=lambda k: abs(k / e - 1))] for e in np.unique(modulus)} == {
+            0,
+            1,
+        }
+
+
+@NEWTON
+def test_a_drop_runs_from_the_file(exported: Path) -> None:
+    import newton
+    import warp
+    from pxr import Usd
+
+    path, raised, step = str(exported / "cup.usdc"), 0.1, 1 / 240
+    builder = newton.ModelBuilder()
+    read = builder.add_usd(path, xform=warp.transform((0.0, 0.0, raised), warp.quat_identity()))
+    builder.add_ground_plane()
+    model = builder.finalize(device="cpu")
+    stage = Usd.Stage.Open(path)  # The prim lives as long as its stage.
+    scene = stage.GetPrimAtPath(read["particle_scene_path"])
+    config = newton.solvers.SolverImplicitMPM.Config.create_from_usd(scene)
+    np.testing.assert_allclose(config.voxel_size, 2 * SIZE / 64, rtol=1e-3)
+    assert config.strain_basis == "P1d"
+    solver = newton.solvers.SolverImplicitMPM(model, config=config)
+    now, after = model.state(), model.state()
+    heights = []
+    for _ in range(48):
+        solver.step(now, after, None, None, step)
+        solver.project_outside(after, after, step)
+        now, after = after, now
+        heights.append(now.particle_q.numpy()[:, 2])
+    fallen = heights[0].mean() - heights[29].mean()
+    # Free fall between two steps: half g (t^2 - t0^2), and a step's error of g t dt / 2.
+    assert fallen == pytest.approx(9.81 / 2 * (0.125**2 - step**2), rel=0.05)
+    # It hits the ground after 0.143 s and stays above it.
+    assert heights[-1].min() > -SIZE / 64
+    assert heights[-1].mean() > heights[0].mean() - raised - 0.01
