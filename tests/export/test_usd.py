@@ -216,15 +216,16 @@ def test_newton_s_importer_gives_back_stiffness_ratio_and_mass(
 @NEWTON
 def test_a_drop_runs_from_the_file(exported: Path) -> None:
     import newton
-    import warp
-    from pxr import Usd
+    from pxr import Usd, UsdGeom
 
-    path, raised, step = str(exported / "cup.usdc"), 0.1, 1 / 240
+    raised, step = 0.1, 1 / 240
+    stage = Usd.Stage.Open(str(exported / "cup.usdc"))
+    stage.SetEditTarget(stage.GetSessionLayer())
+    up = UsdGeom.Xformable(stage.GetPrimAtPath("/Asset")).AddTranslateOp(opSuffix="raise")
+    up.Set((0.0, 0.0, raised))
     builder = newton.ModelBuilder()
-    read = builder.add_usd(path, xform=warp.transform((0.0, 0.0, raised), warp.quat_identity()))
-    builder.add_ground_plane()
+    read = builder.add_usd(stage)
     model = builder.finalize(device="cpu")
-    stage = Usd.Stage.Open(path)  # The prim lives as long as its stage.
     scene = stage.GetPrimAtPath(read["particle_scene_path"])
     config = newton.solvers.SolverImplicitMPM.Config.create_from_usd(scene)
     np.testing.assert_allclose(config.voxel_size, 2 * SIZE / 64, rtol=1e-3)
