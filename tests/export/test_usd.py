@@ -237,7 +237,7 @@ def test_a_drop_runs_from_the_file(exported: Path) -> None:
         solver.step(now, after, None, None, step)
         solver.project_outside(after, after, step)
         now, after = after, now
-        heights.append(now.particle_q.numpy()[:, 2])
+        heights.append(now.particle_q.numpy()[:, 2].copy())
     fallen = heights[0].mean() - heights[29].mean()
     # Free fall between two steps: half g (t^2 - t0^2), and a step's error of g t dt / 2.
     assert fallen == pytest.approx(9.81 / 2 * (0.125**2 - step**2), rel=0.05)
