@@ -21,9 +21,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 
-from slatprep.align.deform import CLEAN
+from slatprep.align.deform import CLEAN, Deformed
 from slatprep.align.finish import finish
 from slatprep.align.ground import find_ground, is_ground
+from slatprep.align.mirror import mirror_gain
 from slatprep.align.pair import COARSE_SAMPLES, COARSE_TAUS, MOST_SURVIVORS, TIE, Pair
 from slatprep.align.pose import Pose, Similarity
 from slatprep.align.quality import compare
@@ -35,6 +36,7 @@ from slatprep.parameters import AlignParameters
 from slatprep.records import (
     Alignment,
     Engine,
+    FitFigures,
     Ground,
     MaterialField,
     Placement,
@@ -116,7 +118,7 @@ def _search(pair: Pair) -> Alignment:
         ),
         score=best.score,
         deformation=deformed.deformation,
-        figures=deformed.figures,
+        figures=_figures(pair, best, deformed),
     )
 
 
@@ -136,8 +138,13 @@ def refined_at(
         model=deformed.model,
         score=best.score,
         deformation=deformed.deformation,
-        figures=deformed.figures,
+        figures=_figures(pair, best, deformed),
     )
+
+
+def _figures(pair: Pair, best: Pose, deformed: Deformed) -> FitFigures:
+    poor = best.score < POOR
+    return replace(deformed.figures, mirrored=mirror_gain(pair, best.similarity, poor))
 
 
 def _is_poor(poses: Sequence[Pose]) -> bool:

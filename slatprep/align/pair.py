@@ -8,6 +8,7 @@ order, and when it is enough; `slatprep.align.search` looks through all orientat
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -77,11 +78,22 @@ class Pair:
         self._cache: dict[int, tuple[Surface, Surface]] = {}
         self.free_scale = parameters.model != "rigid"
         self.may_deform = parameters.model in ("auto", "affine", "deformable")
-        points = slat.points
-        self._mean: Array = points.mean(axis=0)
+
+    @cached_property
+    def axes(self) -> Array:
+        """The principal axes of the SLAT's samples, the columns of a matrix (3, 3)."""
+        return self._principal[0]
+
+    @cached_property
+    def _principal(self) -> tuple[Array, Array]:
+        points = self.slat.points
         covariance = np.cov(points.T, bias=True) if len(points) > 1 else np.zeros((3, 3))
         variances, axes = np.linalg.eigh(covariance)
-        self._spread: Array = axes * np.sqrt(np.maximum(variances, 0.0))
+        return axes, axes * np.sqrt(np.maximum(variances, 0.0))
+
+    def mirrored(self) -> Pair:
+        """Return the same pair with the SLAT mirrored in its first axis."""
+        return Pair(self.slat.mirrored(), self.pixie, self.parameters)
 
     @property
     def size_ratio(self) -> float:
@@ -158,8 +170,8 @@ class Pair:
         matrices = inverse
         if affines is not None:
             matrices, moved = inverse @ affines[:, :, :3], moved + affines[:, :, 3]
-        centre = matrices @ self._mean + np.einsum("nij,nj->ni", inverse, moved)
-        return np.concatenate([(matrices @ self._spread).reshape(-1, 9), centre], axis=1)
+        centre = matrices @ self.slat.centroid + np.einsum("nij,nj->ni", inverse, moved)
+        return np.concatenate([(matrices @ self._principal[1]).reshape(-1, 9), centre], axis=1)
 
     def distinct(self, poses: Sequence[Pose]) -> list[Pose]:
         """Return the poses best first, without those that repeat a better one."""
@@ -168,6 +180,6 @@ class Pair:
 
     def at_scale_one(self, similarity: Similarity) -> Similarity:
         """Return a similarity of scale one that looks the middle of the SLAT up where this does."""
-        centre = self._mean
+        centre = self.slat.centroid
         shift = centre + (similarity.shift - centre) / similarity.scale
         return similarity._replace(shift=shift, scale=1.0)

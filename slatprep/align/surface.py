@@ -85,6 +85,17 @@ class Surface:
         """Root mean square distance of the surface's samples from their centroid, in voxels."""
         return float(np.sqrt(((self.points - self.centroid) ** 2).sum(axis=1).mean()))
 
+    def mirrored(self) -> Surface:
+        """Return the surface of the set that is mirrored in its first axis."""
+        flip = np.array([-1.0, 1.0, 1.0])
+        origin = self.origin * flip
+        origin[0] -= self.distance.shape[0] - 1
+        boundary = self.boundary.copy()
+        boundary[:, 0] = RESOLUTION - 1 - boundary[:, 0]
+        distance = np.ascontiguousarray(self.distance[::-1])
+        points = self.points * flip
+        return replace(self, distance=distance, origin=origin, points=points, boundary=boundary)
+
     def subset(self, count: int, first: int = 0) -> Surface:
         """Return the same surface with at most `count` evenly chosen samples.
 

@@ -220,6 +220,10 @@ class FitFigures:
     bending : float
         Root mean square second derivative of the displacement over the
         lattice [1 / voxel]; 0 without one.
+    mirrored : float
+        Rise of the score once one side is mirrored: above 0.025 the annotation is a
+        mirror image of its object. NaN where the fit is too good for that, or where
+        another engine placed it.
     """
 
     score_slat: float
@@ -234,6 +238,7 @@ class FitFigures:
     moved_most: float = 0.0
     stretch: tuple[float, float] = (1.0, 1.0)
     bending: float = 0.0
+    mirrored: Number = float("nan")
 
 
 @dataclass(frozen=True, eq=False)
