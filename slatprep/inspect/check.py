@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slatprep.align.quality import measure_quality
-from slatprep.judge import THRESHOLDS, verdict_of
+from slatprep.judge import THRESHOLDS, mirror_gain_of, verdict_of
 from slatprep.provenance.stored import StoredRecords
 from slatprep.records import Place, Verdict
 from slatprep.sample import sample
@@ -167,6 +167,7 @@ def check_alignment(store: Store, asset_id: str) -> AlignmentCheck:
         confidence=confidence if same_fit else math.nan,
         expected_accuracy=expected,
         contradicted=bool(columns["contradicted"]),
+        mirrored=mirror_gain_of(alignment),
     )
     figures = [
         Figure(name, getattr(quality, name), float(columns[name]), QUALITY_TOLERANCE)

@@ -9,6 +9,7 @@ from slatprep.judge.verdict import (
     contradicted,
     judge,
     merged,
+    mirror_gain_of,
     verdict_of,
     voxel_confidence,
 )
@@ -20,6 +21,7 @@ __all__ = [
     "judge",
     "measure_ambiguity",
     "merged",
+    "mirror_gain_of",
     "verdict_of",
     "voxel_confidence",
 ]

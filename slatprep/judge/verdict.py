@@ -37,6 +37,9 @@ class Thresholds:
     good_ambiguity : float
         Share of SLAT voxels whose class depends on the choice among placements
         that fit equally well; above it the asset is doubtful.
+    good_mirrored : float
+        Rise of the score once one side is mirrored; above it the asset is doubtful, as the
+        annotation is a mirror image of its object.
     good_fitness, failed_fitness : float
         The lower one of the two fitnesses, where no confidence is known, as in
         stores of format 1: as the confidences.
@@ -47,6 +50,7 @@ class Thresholds:
     good_accuracy: float = 0.75
     good_valid_share: float = 0.9
     good_ambiguity: float = 0.05
+    good_mirrored: float = 0.025
     good_fitness: float = 0.8
     failed_fitness: float = 0.65
 
@@ -109,8 +113,14 @@ def judge(
         confidence,
         expected,
         next(iter(causes_of_doubt(evidence))),
+        mirrored=mirror_gain_of(alignment),
     )
     return Judgement(ambiguity, verdict, reasons, confidence, expected), likely
+
+
+def mirror_gain_of(alignment: Alignment) -> float:
+    """Return how much better the sides fit once one is mirrored; NaN where that is not known."""
+    return math.nan if alignment.figures is None else alignment.figures.mirrored
 
 
 def contradicted(judgement: Judgement) -> Judgement:
@@ -188,6 +198,7 @@ def verdict_of(
     expected_accuracy: float = math.nan,
     cause: str = "",
     contradicted: bool = False,
+    mirrored: float = math.nan,
 ) -> tuple[Verdict, tuple[str, ...]]:
     """Say what an alignment is worth, and why.
 
@@ -210,6 +221,8 @@ def verdict_of(
         ``roughness``; empty where that is not known.
     contradicted : bool
         Whether the latents of the asset contradict its labels.
+    mirrored : float
+        How much better the two sides fit once one is mirrored; NaN where that is not known.
 
     Returns
     -------
@@ -249,6 +262,11 @@ def verdict_of(
         reasons.append(
             f"{others.lstrip()} about as well and would change the class of {ambiguity:.1%} of the "
             f"voxels (good: {limits.good_ambiguity:.0%})"
+        )
+    if mirrored > limits.good_mirrored:
+        reasons.append(
+            "the annotation is a mirror image of its object, left for right: mirrored, it fits "
+            f"better by {mirrored:.3f} in score (good: at most {limits.good_mirrored:g})"
         )
     if contradicted:
         reasons.append(_CONTRADICTED)

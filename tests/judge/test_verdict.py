@@ -79,6 +79,15 @@ def test_every_reason_is_named_once() -> None:
     )
 
 
+@pytest.mark.parametrize(("gain", "good"), [(math.nan, True), (0.025, True), (0.026, False)])
+def test_a_mirrored_annotation_is_doubtful_however_sure_its_placement_is(
+    gain: float, good: bool
+) -> None:
+    verdict, reasons = verdict_of(FINE, 1.0, confidence=0.99, mirrored=gain)
+    assert verdict is (Verdict.GOOD if good else Verdict.DOUBTFUL)
+    assert len(reasons) == (0 if good else 1)
+
+
 @pytest.mark.parametrize(
     ("ties", "start"),
     [
