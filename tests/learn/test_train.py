@@ -69,9 +69,13 @@ def weights_of(path: Path) -> dict[str, torch.Tensor]:
 
 
 def test_resumed_run_has_the_same_bits(learn_store: Path, tmp_path: Path) -> None:
+    seen: list[tuple[int, int]] = []
     whole = train(learn_store, tmp_path / "whole", SHORT)
-    train(learn_store, tmp_path / "parts", SHORT, stop_after=1)
-    resumed = train(learn_store, tmp_path / "parts", SHORT)
+    for stop_after in (1, None):
+        resumed = train(
+            learn_store, tmp_path / "parts", SHORT, stop_after=stop_after,
+            steps=lambda *done: seen.append(done),
+        )  # fmt: skip
     assert resumed.history == whole.history
     for name in (LAST, BEST):
         ours, theirs = (weights_of(tmp_path / run / name) for run in ("whole", "parts"))
@@ -88,18 +92,16 @@ def test_resumed_run_has_the_same_bits(learn_store: Path, tmp_path: Path) -> Non
         asset_id for asset_id in ["a", "b", "c", "d", "e", "f", "g", "h.front", "h.side"]
         if split_of(asset_id[0], SHARES) == "test"
     }  # fmt: skip
-
-
-def test_tensorboard_reads_what_was_logged(learn_store: Path, tmp_path: Path) -> None:
+    # Steps are counted from where the run goes on, and TensorBoard has those of both parts.
+    batches = len(SlatLoader(SlatDataset(learn_store, "train", shares=SHARES), SHORT.batch_size))
+    first = [(k, 3 * batches) for k in range(batches + 1)]
+    assert seen == [*first, *((k, 2 * batches) for k in range(2 * batches + 1))]
     accumulator = pytest.importorskip("tensorboard.backend.event_processing.event_accumulator")
-    two = dataclasses.replace(SHORT, epochs=2)
-    train(learn_store, tmp_path / "run", two, stop_after=1)
-    history = train(learn_store, tmp_path / "run", two).history
-    events = accumulator.EventAccumulator(str(tmp_path / "run" / "tensorboard"))
+    events = accumulator.EventAccumulator(str(tmp_path / "parts" / "tensorboard"))
     events.Reload()
     for name in ("learning_rate", "train_loss", "val_loss", "val_mse", "val_accuracy"):
         read = [(event.step, event.value) for event in events.Scalars(name)]
-        logged = [(record.epoch, pytest.approx(getattr(record, name))) for record in history]
+        logged = [(one.epoch, pytest.approx(getattr(one, name))) for one in resumed.history]
         assert read == logged, name
 
 
@@ -265,18 +267,6 @@ def test_a_run_on_a_full_disk_leaves_no_half_of_its_parameters(
         run.begin({"seed": 7})
     with Run(tmp_path / "run") as run:
         assert run.parameters == {"seed": 7}
-
-
-def test_steps_are_counted_from_where_a_run_goes_on(learn_store: Path, tmp_path: Path) -> None:
-    seen: list[tuple[int, int]] = []
-    batches = len(SlatLoader(SlatDataset(learn_store, "train", shares=SHARES), SHORT.batch_size))
-    for stop_after in (1, None):
-        train(
-            learn_store, tmp_path / "run", SHORT, stop_after=stop_after,
-            steps=lambda *done: seen.append(done),
-        )  # fmt: skip
-    first = [(k, 3 * batches) for k in range(batches + 1)]
-    assert seen == [*first, *((k, 2 * batches) for k in range(2 * batches + 1))]
 
 
 @pytest.mark.parametrize(
