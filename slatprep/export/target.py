@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import errno
+import glob
 import json
 import os
 import shutil
+import sys
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path, PurePosixPath
 from typing import Any
 
@@ -15,11 +18,15 @@ import orjson
 
 from slatprep.errors import ConfigError, SlatprepError
 from slatprep.storage.atomic import flush, flush_tree, replace_directory, staged
+from slatprep.storage.files import locks_alone
 
 FORMAT = "slatprep-export"
 FORMAT_VERSION = 1
 INDEX = "index.json"
 """Name of the file that lists the contents of an exported folder."""
+
+_NEW, _RANDOM_LETTERS = "export", 8
+"""Name of the new folder in an export's work folder, and how many letters `mkdtemp` adds."""
 
 
 @contextmanager
@@ -37,9 +44,11 @@ def directory(out: Path) -> Iterator[Path]:
         raise _not_an_export(out)
     with _writable(out):
         out.parent.mkdir(parents=True, exist_ok=True)
+        _remove_killed(out)
         work = Path(tempfile.mkdtemp(prefix=f".{out.name}.", dir=out.parent))
     try:
-        new = work / "export"
+        held = _locked(work)
+        new = work / _NEW
         new.mkdir()
         with _writable(out):
             yield new
@@ -49,6 +58,37 @@ def directory(out: Path) -> Iterator[Path]:
                 replace_directory(new, out)
     finally:
         shutil.rmtree(work, ignore_errors=True)
+        os.close(held)
+
+
+def _locked(work: Path) -> int:
+    """Return a descriptor that locks a work folder until this process ends, however it ends.
+
+    OSError if another process holds it, or it is a link or no folder.
+    """
+    if sys.platform == "win32":
+        return os.open(os.devnull, os.O_RDONLY)
+    held = os.open(work, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW)
+    if not locks_alone(held):
+        os.close(held)
+        raise BlockingIOError(errno.EAGAIN, "another export is at work there", str(work))
+    return held
+
+
+def _remove_killed(out: Path) -> None:
+    """Remove the work folders of exports to `out` that were killed."""
+    if sys.platform == "win32":
+        return
+    for work in out.parent.glob(f"{glob.escape(f'.{out.name}.')}{'?' * _RANDOM_LETTERS}"):
+        with suppress(OSError):
+            held = _locked(work)
+            try:
+                # A folder that is still empty may get a lock in a moment.
+                ours = os.fstat(held).st_uid == os.getuid()
+                if ours and [path.name for path in work.iterdir()] == [_NEW]:
+                    shutil.rmtree(work, ignore_errors=True)
+            finally:
+                os.close(held)
 
 
 @contextmanager

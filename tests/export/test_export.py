@@ -23,6 +23,7 @@ from support.trees import tree
 from slatprep.cli.commands import slatprep
 from slatprep.errors import ConfigError, SlatprepError
 from slatprep.export import FORMATS, ExportOptions, export_store
+from slatprep.export.target import directory
 from slatprep.parameters import PixieverseSource, SlatSource
 from slatprep.readers import discover, read_latents
 from slatprep.readers.splits import Shares, split_objects
@@ -310,3 +311,29 @@ def test_hostile_ids_stay_inside_every_export(format: Any, store: Path, tmp_path
         shards = [str(path) for path in out.glob("*.tar")]
         samples = webdataset.WebDataset(shards, shardshuffle=False).decode()
         assert {sample["json"]["asset_id"] for sample in samples} == set(names)
+
+
+# -- killed exports --------------------------------------------------------
+
+
+def test_an_export_removes_what_killed_ones_left_and_nothing_else(tmp_path: Path) -> None:
+    out = tmp_path / "o.npz"
+    killed = (
+        "import os, pathlib\nfrom slatprep.export.target import directory\n"
+        f"with directory(pathlib.Path({str(out)!r})) as new:\n"
+        "    (new / 'half').write_text('done')\n    os.kill(os.getpid(), 9)\n"
+    )
+    for _ in range(2):
+        assert subprocess.run([sys.executable, "-c", killed]).returncode == -9
+    assert len(list(tmp_path.glob(".o.npz.*"))) == 1  # The second removed the first one's.
+    others = [tmp_path / ".o.npz.12345678", tmp_path / ".o.npz.abc", tmp_path / ".p.npz.12345678"]
+    for folder in others:
+        (folder / "mine").mkdir(parents=True)
+    (tmp_path / ".o.npz.87654321").symlink_to(others[2])
+    with directory(out) as running, directory(out) as new:
+        (new / "a").write_text("a")
+        assert running.is_dir()  # Another export to the same place is left to end.
+        (running / "b").write_text("b")
+    assert all((folder / "mine").is_dir() for folder in others)
+    left = {path.name for path in tmp_path.iterdir()} - {"o.npz", ".o.npz.87654321"}
+    assert left == {folder.name for folder in others}
