@@ -9,6 +9,7 @@ import os
 import shutil
 import sys
 import tempfile
+import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path, PurePosixPath
@@ -83,9 +84,10 @@ def _remove_killed(out: Path) -> None:
         with suppress(OSError):
             held = _locked(work)
             try:
+                state, names = os.fstat(held), [path.name for path in work.iterdir()]
                 # A folder that is still empty may get a lock in a moment.
-                ours = os.fstat(held).st_uid == os.getuid()
-                if ours and [path.name for path in work.iterdir()] == [_NEW]:
+                killed = names == [_NEW] or (not names and time.time() - state.st_mtime > 60)
+                if killed and state.st_uid == os.getuid():
                     shutil.rmtree(work, ignore_errors=True)
             finally:
                 os.close(held)

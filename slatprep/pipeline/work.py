@@ -249,8 +249,9 @@ def _claim(directory: Path) -> None:
     with suppress(FileExistsError):
         directory.mkdir(mode=0o700)
     # Not by our user id: on a network file system our files may have another owner.
-    with tempfile.TemporaryDirectory(dir=directory.parent) as ours:
-        owner = Path(ours).stat().st_uid
+    # A file without a name, where the system can: a signal leaves nothing behind.
+    with tempfile.TemporaryFile(dir=directory.parent) as ours:
+        owner = os.fstat(ours.fileno()).st_uid
     try:
         state = directory.lstat()
         if not stat.S_ISDIR(state.st_mode):

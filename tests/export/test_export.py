@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import re
 import shutil
 import subprocess
@@ -326,6 +327,9 @@ def test_an_export_removes_what_killed_ones_left_and_nothing_else(tmp_path: Path
     for _ in range(2):
         assert subprocess.run([sys.executable, "-c", killed]).returncode == -9
     assert len(list(tmp_path.glob(".o.npz.*"))) == 1  # The second removed the first one's.
+    empty = tmp_path / ".o.npz.00000000"
+    empty.mkdir()
+    os.utime(empty, (0, 0))  # Killed before it had a lock.
     others = [tmp_path / ".o.npz.12345678", tmp_path / ".o.npz.abc", tmp_path / ".p.npz.12345678"]
     for folder in others:
         (folder / "mine").mkdir(parents=True)
