@@ -24,7 +24,7 @@ from slatprep.parameters import (
     is_split_file,
     percentiles_of,
 )
-from slatprep.storage.place import place_of
+from slatprep.storage.place import place_of, storage_of
 
 if TYPE_CHECKING:
     from pydantic_core import ErrorDetails
@@ -242,7 +242,7 @@ def _check_paths(parameters: BuildParameters, origin: _Origin) -> None:
         try:
             if place_of(value).exists():
                 continue
-            fault = "does not exist; expected a path"
+            fault = f"{storage_of(place_of(value)).absent}; expected a path"
         except OSError as error:
             fault = f"cannot be looked at ({error.strerror}); expected a path"
         words = {"ranges": NAMED_RANGES, "split_by": (*NAMED_SPLITS, f"{CATEGORY}NAME")}.get(key)

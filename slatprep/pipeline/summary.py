@@ -11,7 +11,7 @@ import numpy as np
 
 from slatprep.parameters import BuildParameters
 from slatprep.pipeline.spool import FailedAsset, SpooledAsset
-from slatprep.readers.pairing import explain_unmatched
+from slatprep.readers.unmatched import explain_unmatched
 from slatprep.records import AssetPair, Normalization, Place, Status
 from slatprep.store import Store
 

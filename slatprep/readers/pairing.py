@@ -6,7 +6,7 @@ Memory holds only names: an entry per object and per SLAT, never an array.
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import groupby
 
@@ -16,11 +16,13 @@ from slatprep.readers.adapters import FoundField, patterns_of, source_adapter
 from slatprep.readers.contents import contents_of
 from slatprep.readers.joins import read_categories, read_map
 from slatprep.readers.patterns import NAME, fill, find_files, list_below, tried_names
-from slatprep.readers.published import category_of, locate_grids
+from slatprep.readers.published import category_of, hint_of, locate_grids
 from slatprep.readers.slat_files import NamedSlat, encoded, find_slats, ordered
+from slatprep.readers.unmatched import by_case
 from slatprep.records import AssetPair, Contents, Place, SourceRoots
 from slatprep.storage.archives import is_archive
 from slatprep.storage.listing import Listing
+from slatprep.storage.place import storage_of
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,6 +50,8 @@ class _Found:
     one_file: bool
     grids: Mapping[str, list[FoundField]]
     categories: Mapping[str, str]
+    cases: Mapping[str, str]
+    """What the other side calls an id that it has in other letters' case."""
     also: tuple[_Found, ...] = ()
 
 
@@ -78,7 +82,10 @@ def discover(parameters: BuildParameters) -> list[AssetPair]:
     try:
         for source in sources:
             if not source.root.is_dir() and not is_archive(source.root.name):
-                raise ConfigError(f"{source.root}: no such folder; expected the PixieVerse root")
+                absent = storage_of(source.root).absent
+                raise ConfigError(
+                    f"{source.root}: {absent}; expected PixieVerse's folder or an archive of it"
+                )
         if not slat.root.exists():
             raise ConfigError(
                 f"{slat.root}: does not exist; expected a folder of SLATs or an HDF5 file"
@@ -101,7 +108,9 @@ def discover(parameters: BuildParameters) -> list[AssetPair]:
     folder = slat.root.parent if one_file else slat.root
     contents = contents_of(parameters)
     roots = _roots_of(pixieverse, places[0], folder, contents)
-    there = _Found(parameters, roots, listings[0], one_file, grids, categories)
+    there = _Found(
+        parameters, roots, listings[0], one_file, grids, categories, by_case(grids, slats)
+    )
     also = tuple(
         replace(
             there,
@@ -142,30 +151,9 @@ def _grids_of(
     # Plain voxels have the names that SLATs have.
     ours = source.adapter == PixieverseSource.adapter and not one_file
     swapped = ours and find_grids(source, list_below(slat.root))
-    hint = f"; the roots are swapped: grids lie below {slat.root}" if swapped else ""
-    raise ConfigError(f"{source.root}: no grid found; looked for {tried}{hint}")
-
-
-def explain_unmatched(pairs: Collection[AssetPair], parameters: BuildParameters) -> str:
-    """Say in a line that the names of the two sides have nothing in common, or return "".
-
-    `pairs` is what `discover` returned for `parameters`.
-    """
-    grids = [pair.object_id for pair in pairs if pair.slat is None and pair.grid is not None]
-    slats = [pair.object_id for pair in pairs if pair.grid is None and pair.slat is not None]
-    if not grids or not slats or any(pair.grid and pair.slat for pair in pairs):
-        return ""
-    table, root = parameters.pairing.map, parameters.slat.root
-    if table is not None:
-        hint = f"the table {table} joins none of them"
-    else:
-        own = root / "metadata.csv"
-        example = own if own.is_file() else "FILE.csv"
-        hint = f"name a table that joins them: --map {example} (docs/configuration.md, [pairing])"
-    return (
-        f"no id occurs on both sides: {len(grids):,} grids such as {grids[0][:40]!r}, "
-        f"{len(slats):,} SLATs such as {slats[0][:40]!r}; {hint}"
-    )
+    hint = f"the roots are swapped: grids lie below {slat.root}" if swapped else hint_of(source)
+    more = f"; {hint}" if hint else ""
+    raise ConfigError(f"{source.root}: no grid found; looked for {tried}{more}")
 
 
 def find_grids(
@@ -311,9 +299,11 @@ def _pair_of(row: _Row, there: _Found, shared: str, grids: Sequence[FoundField])
     else:
         tried = tried_names(source.grid, _known(id=row.object_id, sample=source.sample))
         problems.append(f"no grid for id {row.object_id!r}; looked for {tried} below {source.root}")
+        problems.append(_case(row, there, "grid"))
     found = [slat for slat in row.slats if slat.path]
     if not found and not any(grid.problem for grid in grids):
         problems.append(_no_slat(row, slat_source, there.one_file))
+        problems.append(_case(row, there, "SLAT"))
     elif len(found) > 1:
         files = ", ".join(slat.path + (f" [{slat.group}]" if slat.group else "") for slat in found)
         problems.append(
@@ -336,6 +326,12 @@ def _pair_of(row: _Row, there: _Found, shared: str, grids: Sequence[FoundField])
         beside=beside,
         sample=_label(there.roots.number, in_unicode(grids[0].sample) if grids else ""),
     )
+
+
+def _case(row: _Row, there: _Found, side: str) -> str:
+    """Say that the other side has an id in other letters' case; empty where it has not."""
+    other = there.cases.get(row.object_id, "")
+    return f"a {side} is called {other!r}: rename one, or join them with --map" if other else ""
 
 
 def _name_problems(row: _Row) -> Iterator[str]:

@@ -47,7 +47,7 @@ def list_below(root: Place) -> Listing:
     try:
         return storage_of(root).listing()
     except OSError as error:
-        raise ConfigError(f"{root}: cannot be listed ({error.strerror})") from None
+        raise ConfigError(f"{root}: cannot be listed ({error.strerror or error})") from None
 
 
 def find_files(

@@ -6,8 +6,11 @@ into ``DIRECTORY/``. Grids are in the directory ``render_outputs``.
 
 from __future__ import annotations
 
-from slatprep.errors import ConfigError
+from dataclasses import replace
+
+from slatprep.errors import ConfigError, SlatprepError
 from slatprep.parameters import PixieverseSource
+from slatprep.readers.adapters import source_adapter
 from slatprep.readers.patterns import fill
 from slatprep.records import Place
 from slatprep.storage.archives import is_archive
@@ -15,6 +18,9 @@ from slatprep.storage.members import ArchivePlace, ArchiveTree
 from slatprep.storage.place import storage_of
 
 GRIDS, ARCHIVES = "render_outputs", "archives"
+
+_LOOKED_AT = 20
+"""Folders that are looked into for a hint."""
 
 OTHERS = {
     "data": "rendered views",
@@ -65,6 +71,51 @@ def locate_grids(source: PixieverseSource) -> Place:
     except OSError as error:
         raise ConfigError(f"{error.filename}: cannot be looked at ({error.strerror})") from None
     return root
+
+
+def hint_of(source: PixieverseSource) -> str:
+    """Say what lies where no grid was found, and what to point at; empty where nothing helps."""
+    root, adapter = source.root, source_adapter(source.adapter)
+    named = _other_directory(root)
+    try:
+        place = locate_grids(source)
+        if named:
+            beside = next((p for p in _beside(root, named) if p.is_dir()), GRIDS)
+            return f"it holds Pixie's {OTHERS[named]}; grids are in {beside}"
+        if isinstance(place, ArchivePlace):
+            return _held_in_archives(place)
+        files, folders = storage_of(place).names()
+        if any(name == "material_grid.npy" for name in files):
+            return f"it is a sample of one object; point at {place.parent.parent}"
+        if any(name.startswith("sample_") for name in folders):
+            return f"it is the folder of one object; point at {place.parent}"
+        for name in sorted(folders)[:_LOOKED_AT]:
+            below = replace(source, root=place / name)
+            if any(adapter.find(below, storage_of(locate_grids(below)).listing())):
+                return f"grids lie in {place / name}; point at that"
+    except (OSError, SlatprepError):
+        return ""
+    held = ", ".join(sorted([*folders, *files])[:3]) or "nothing"
+    return f"it holds {held}{' and more' if len(files) + len(folders) > 3 else ''}"
+
+
+def _other_directory(root: Place) -> str:
+    """Return which of Pixie's other directories a path leads into; empty if none."""
+    return next((place.name for place in (root, root.parent) if place.name in OTHERS), "")
+
+
+def _beside(root: Place, named: str) -> tuple[Place, ...]:
+    """Return where the grids' directory may lie, beside one of the others."""
+    folder = root if root.name == named else root.parent
+    return (folder.parent / GRIDS, folder.parent / ARCHIVES / GRIDS)
+
+
+def _held_in_archives(place: ArchivePlace) -> str:
+    indexes = place.tree.indexes
+    names = [name for index in indexes.values() for name in list(index.members)[:1]]
+    if not names:
+        return f"its {len(indexes)} archives hold no file"
+    return f"its archives hold files such as {names[0]}; grids are in archives/{GRIDS}"
 
 
 def category_of(grid: Place | None) -> str:

@@ -292,7 +292,6 @@ def _extend(
             with io.BufferedReader(archive.open_ranges(), _STREAMED) as stream:
                 for entry in unpack(stream, archive.is_wanted, archive.keep):
                     index.add(entry)
-                    progress(stream.tell())
         else:
             with archive.open_ranges() as file:
                 ahead = ReadAhead(file, isinstance(archive.place, RemotePlace))

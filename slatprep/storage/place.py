@@ -8,6 +8,7 @@ only this module asks which kind it is.
 from __future__ import annotations
 
 import io
+import os
 import re
 import stat
 import tempfile
@@ -123,6 +124,11 @@ class Storage:
         listing = Listing(self._path)
         return list(listing.of_folder("", folders=False)), list(listing.of_folder("", folders=True))
 
+    @property
+    def absent(self) -> str:
+        """What to say where there is nothing at the place."""
+        return "does not exist"
+
     def archives(self, names: Iterable[str], wanted: tuple[str, ...]) -> list[Archive]:
         """Look at archives that lie in the place, of whose members those like `wanted` matter.
 
@@ -133,7 +139,11 @@ class Storage:
         InputError
             If one is a link that leads out of the place.
         """
-        return [Archive.on_disk(self._path / name, wanted) for name in names]
+        found = []
+        for name in names:
+            self.locate(self._path / name)
+            found.append(Archive.on_disk(self._path / name, wanted))
+        return found
 
     def folder(self) -> Folder:
         """Return the place as a folder for reading ranges of its files."""
@@ -148,7 +158,7 @@ class Storage:
         try:
             relative = path.relative_to(root)
             resolved = path.resolve(strict=True)
-            inside = ".." not in relative.parts and resolved.is_relative_to(root.resolve())
+            inside = ".." not in relative.parts and _may_lead_to(root.resolve(), resolved)
             regular = stat.S_ISREG(resolved.stat().st_mode)
         except FileNotFoundError:
             fault = "is a link that leads nowhere" if path.is_symlink() else "does not exist"
@@ -157,7 +167,10 @@ class Storage:
             raise InputError(path, f"cannot be opened ({error})", f"a file below {root}") from None
         if not inside:
             raise InputError(
-                path, f"leads to {resolved}, out of its root", f"a file below {root.resolve()}"
+                path,
+                f"leads to {resolved}, out of its root",
+                f"a file below {root.resolve()}; copy it there, or give a root that holds both, "
+                f"{os.path.commonpath([root.resolve(), resolved])}, and patterns from there",
             )
         if not regular:
             raise InputError(path, "is not a regular file", "a readable file")
@@ -211,6 +224,15 @@ class Storage:
         return self._path.with_name(f".{self._path.name}.work")
 
 
+def _may_lead_to(root: Path, file: Path) -> bool:
+    """Whether a link below a root may lead to a file: below it, or in the hub's cache of it."""
+    if file.is_relative_to(root):
+        return True
+    # The hub's cache has snapshots/COMMIT/..., whose files are links into blobs.
+    homes = (folder.parent for folder in (root, *root.parents) if folder.name == "snapshots")
+    return any(file.is_relative_to(home / "blobs") for home in homes)
+
+
 class _ObjectStore(Storage):
     """See `Storage`."""
 
@@ -222,6 +244,12 @@ class _ObjectStore(Storage):
 
     def listing(self) -> Listing:
         return RemoteListing(list_objects(self.place))
+
+    @property
+    def absent(self) -> str:
+        if self.place.protocol != "hf":
+            return super().absent
+        return "is not on the hub, or not for everybody: check its name, and set HF_TOKEN"
 
     def names(self) -> tuple[list[str], list[str]]:
         found = list_folder(self.place)

@@ -312,6 +312,8 @@ def connected(place: RemotePlace) -> Iterator[tuple[Any, str]]:
             f"{place}: cannot be reached ({error}); pip install 'slatprep[remote]' brings s3://, "
             "'slatprep[hub]' hf://, and gcsfs gs://"
         ) from None
+    if "hf" in system.protocol:
+        system.dircache.clear()  # The hub's keeps listings whatever it is told.
     try:
         yield system, str(name)
     except OSError as error:

@@ -7,63 +7,29 @@ import json
 import shutil
 import tarfile
 from collections.abc import Iterator
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from support.published import CLASSES, add, pack, publish, write_object
-from support.synthetic import Dataset, make_asset
+from support.published import IDS, add, files, make_published, pack, parameters, write_object
+from support.synthetic import make_asset
 
 from slatprep.errors import InputError
 from slatprep.inspect.verify import verify_store
-from slatprep.parameters import BuildParameters
 from slatprep.pipeline.dataset import build_store
 from slatprep.storage import archives
 from slatprep.storage.files import LocalFile
 from slatprep.store import open_store
 
-IDS = [f"{number:032x}" for number in range(5)]
-
 
 @pytest.fixture(scope="module")
 def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Five objects unpacked, in archives, and in archives with gzip; four have a SLAT."""
-    folder = tmp_path_factory.mktemp("published")
-    dataset = Dataset(folder)
-    for number, name in enumerate(IDS):
-        asset = make_asset(number)
-        write_object(folder / "pixieverse" / "render_outputs" / name, asset.grid, number)
-        if number < 4:
-            dataset.write_slat(f"{name}.npz", asset.coords, asset.feats)
-    publish(folder / "pixieverse" / "render_outputs", folder / "tar")
-    publish(folder / "pixieverse" / "render_outputs", folder / "gz", ".tar.gz")
-    entries = {
-        name: {"obj_class": CLASSES[number % 3], "vlm_filtering": {"is_appropriate": True}}
-        for number, name in enumerate(IDS)
-    }
-    (folder / "classes.json").write_text(json.dumps(entries))
-    return folder
+    return make_published(tmp_path_factory.mktemp("published"))
 
 
 @pytest.fixture(autouse=True)
 def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.setenv("SLATPREP_CACHE", str(tmp_path / "cache"))
     return tmp_path / "cache"
-
-
-def parameters(made: Path, root: str | Path, categories: bool = False) -> BuildParameters:
-    base = Dataset(made).parameters("pixie")
-    pairing = replace(base.pairing, categories=made / "classes.json" if categories else None)
-    source = replace(base.pixieverse, root=made / root)
-    return replace(base, pixieverse=source, pairing=pairing)
-
-
-def files(store: Path) -> dict[str, bytes]:
-    return {
-        path.relative_to(store).as_posix(): path.read_bytes()
-        for path in sorted(store.rglob("*"))
-        if path.is_file()
-    }
 
 
 @pytest.fixture(scope="module")

@@ -264,7 +264,7 @@ def test_missing_roots_and_empty_roots(find, tmp_path):
     assert "*/sample_*/material_grid.npy" in str(caught.value)
     with pytest.raises(ConfigError, match=r"slat: no SLAT found; looked for \*\.npz"):
         find([grid("a")])
-    with pytest.raises(ConfigError, match="nowhere: no such folder"):
+    with pytest.raises(ConfigError, match="nowhere: does not exist"):
         find(pixieverse={"root": tmp_path / "nowhere"})
     with pytest.raises(ConfigError, match="nowhere: does not exist"):
         find(slat={"root": tmp_path / "nowhere"})

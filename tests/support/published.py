@@ -3,13 +3,20 @@
 from __future__ import annotations
 
 import io
+import json
 import tarfile
 from collections.abc import Iterable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
+from slatprep.parameters import BuildParameters
+from slatprep.storage.place import place_of
+from support.synthetic import Dataset, make_asset
+
 CLASSES = ("tree", "soda_cans", "sand")
+IDS = [f"{number:032x}" for number in range(5)]
 
 
 def add(archive: tarfile.TarFile, name: str, data: bytes) -> None:
@@ -56,3 +63,38 @@ def pack(path: Path, objects: Iterable[Path]) -> None:
     with tarfile.open(path, "w:gz" if path.suffix == ".gz" else "w") as archive:
         for one in objects:
             archive.add(one, arcname=one.name)
+
+
+def make_published(folder: Path) -> Path:
+    """Make five objects unpacked, in archives, and in archives with gzip; four have a SLAT."""
+    dataset = Dataset(folder)
+    for number, name in enumerate(IDS):
+        asset = make_asset(number)
+        write_object(folder / "pixieverse" / "render_outputs" / name, asset.grid, number)
+        if number < 4:
+            dataset.write_slat(f"{name}.npz", asset.coords, asset.feats)
+    publish(folder / "pixieverse" / "render_outputs", folder / "tar")
+    publish(folder / "pixieverse" / "render_outputs", folder / "gz", ".tar.gz")
+    entries = {
+        name: {"obj_class": CLASSES[number % 3], "vlm_filtering": {"is_appropriate": True}}
+        for number, name in enumerate(IDS)
+    }
+    (folder / "classes.json").write_text(json.dumps(entries))
+    return folder
+
+
+def parameters(made: Path, root: str | Path, categories: bool = False) -> BuildParameters:
+    """Return the parameters of a build from a root, below the folder or a URL."""
+    base = Dataset(made).parameters("pixie")
+    pairing = replace(base.pairing, categories=made / "classes.json" if categories else None)
+    place = place_of(root) if "://" in str(root) else made / root
+    return replace(base, pixieverse=replace(base.pixieverse, root=place), pairing=pairing)
+
+
+def files(store: Path) -> dict[str, bytes]:
+    """Return the content of all files of a store."""
+    return {
+        path.relative_to(store).as_posix(): path.read_bytes()
+        for path in sorted(store.rglob("*"))
+        if path.is_file()
+    }

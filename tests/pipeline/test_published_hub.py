@@ -1,0 +1,175 @@
+"""A store of PixieVerse from the hub, which refuses, redirects, breaks off and changes."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from huggingface_hub import HfFileSystem, constants
+from support.published import IDS, files, make_published, pack, parameters
+from support.published_hub import PublishedHub
+
+from slatprep.errors import ConfigError, InputError
+from slatprep.inspect.verify import verify_store
+from slatprep.pipeline.dataset import build_store
+from slatprep.readers import discover
+from slatprep.store import open_store
+
+NAME = "vlongle/pixieverse"
+URL = f"hf://datasets/{NAME}"
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return make_published(tmp_path_factory.mktemp("published"))
+
+
+@pytest.fixture(scope="module")
+def unpacked(made: Path) -> dict[str, bytes]:
+    """Return the files of the store of the unpacked folder."""
+    wanted = parameters(made, "pixieverse/render_outputs", categories=True)
+    build_store(wanted, made / "unpacked.zarr")
+    return files(made / "unpacked.zarr")
+
+
+@pytest.fixture
+def hub(made: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[PublishedHub]:
+    """Serve the archives; nobody's own settings or token get in."""
+    with PublishedHub() as server:
+        server.publish(NAME, made / "tar")
+        monkeypatch.setenv("HF_ENDPOINT", server.address)
+        own = constants.HUGGINGFACE_CO_URL_TEMPLATE.removeprefix(constants.ENDPOINT)
+        monkeypatch.setattr(constants, "HUGGINGFACE_CO_URL_TEMPLATE", server.address + own)
+        monkeypatch.setattr(constants, "ENDPOINT", server.address)
+        monkeypatch.setattr(constants, "HF_TOKEN_PATH", str(tmp_path / "token"))
+        monkeypatch.delenv("HF_TOKEN", raising=False)
+        monkeypatch.setenv("SLATPREP_CACHE", str(tmp_path / "cache"))
+        HfFileSystem.clear_instance_cache()
+        yield server
+        server.shutdown()
+    HfFileSystem.clear_instance_cache()
+
+
+@pytest.mark.parametrize("root", ["", "/archives", "/archives/render_outputs", "@main"])
+def test_store_of_the_hub_is_that_of_the_unpacked_folder(
+    hub: PublishedHub, made: Path, tmp_path: Path, unpacked: dict[str, bytes], root: str
+) -> None:
+    build_store(parameters(made, URL + root), tmp_path / "s.zarr")
+    assert files(tmp_path / "s.zarr") == unpacked
+    assert verify_store(tmp_path / "s.zarr", sources=True).ok
+
+
+def test_one_archive_of_the_hub_and_one_with_gzip(
+    hub: PublishedHub, made: Path, tmp_path: Path
+) -> None:
+    for number, root in enumerate(("tar", "gz")):
+        hub.publish(NAME, made / root)
+        name = f"tree.{root}".replace("gz", "tar.gz")
+        chosen = parameters(made, f"{URL}/archives/render_outputs/{name}")
+        build_store(chosen, tmp_path / f"{number}.zarr")
+        assert list(open_store(tmp_path / f"{number}.zarr").ids) == [IDS[0], IDS[3]]
+
+
+def test_second_look_reads_nothing_of_the_archives_and_another_commit_what_changed(
+    hub: PublishedHub, made: Path, tmp_path: Path
+) -> None:
+    build_store(parameters(made, URL), tmp_path / "s.zarr")
+    hub.requests.clear()
+    assert build_store(parameters(made, URL), tmp_path / "s.zarr").statuses["ok"] == 4
+    assert hub.ranges() == 0
+    root = shutil.copytree(made / "tar", tmp_path / "next")
+    objects = made / "pixieverse" / "render_outputs"
+    pack(root / "archives/render_outputs/tree.tar", [objects / IDS[0]])
+    hub.publish(NAME, root)
+    hub.requests.clear()
+    build_store(parameters(made, URL), tmp_path / "s.zarr")
+    assert {path.rpartition("/")[2] for _, path in hub.requests if "/resolve/" in path} == {
+        "tree.tar"
+    }
+    assert IDS[3] not in open_store(tmp_path / "s.zarr").ids
+
+
+def test_members_without_slat_are_not_fetched(
+    hub: PublishedHub, made: Path, tmp_path: Path
+) -> None:
+    build_store(parameters(made, URL), tmp_path / "s.zarr")
+    kept = list((tmp_path / "cache").rglob("*.z"))
+    assert len([path for path in kept if path.name != "index.z"]) == 4 * 3
+
+
+def test_token_is_sent_to_the_hub_alone(
+    hub: PublishedHub, made: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    hub.token = "hf_secret"
+    with pytest.raises(ConfigError, match="HF_TOKEN"):
+        discover(parameters(made, URL))
+    monkeypatch.setenv("HF_TOKEN", "hf_secret")
+    HfFileSystem.clear_instance_cache()
+    with PublishedHub() as elsewhere:
+        elsewhere.commits = hub.commits
+        hub.elsewhere = elsewhere
+        build_store(parameters(made, URL), tmp_path / "s.zarr")
+        elsewhere.shutdown()
+    assert elsewhere.ranges() > 0
+    assert set(elsewhere.tokens) == {""}
+
+
+def test_too_many_requests_are_waited_for_as_told(
+    hub: PublishedHub, made: Path, tmp_path: Path, unpacked: dict[str, bytes]
+) -> None:
+    pairs = discover(parameters(made, URL))
+    hub.refused, hub.wait = 1, 2
+    assert pairs[0].grid is not None
+    pairs[0].grid.read_bytes()
+    (when,) = hub.refusals
+    assert hub.served() - when >= 2
+
+
+def test_connection_that_ends_in_the_middle_is_made_again(
+    hub: PublishedHub, made: Path, tmp_path: Path, unpacked: dict[str, bytes]
+) -> None:
+    hub.cut = 2
+    build_store(parameters(made, URL), tmp_path / "s.zarr")
+    assert hub.cut == 0
+    assert files(tmp_path / "s.zarr") == unpacked
+
+
+def test_build_stays_with_the_commit_that_it_began_with(hub: PublishedHub, made: Path) -> None:
+    pairs = discover(parameters(made, URL))
+    hub.publish(NAME, made / "gz")
+    grid = pairs[0].grid
+    assert grid is not None
+    own = made / "pixieverse" / "render_outputs" / IDS[0] / "sample_0" / "material_grid.npy"
+    assert grid.read_bytes() == own.read_bytes()
+
+
+def test_archive_that_changes_within_a_commit_is_named(
+    hub: PublishedHub, made: Path, tmp_path: Path
+) -> None:
+    root = shutil.copytree(made / "tar", tmp_path / "own")
+    hub.publish(NAME, root)
+    pairs = discover(parameters(made, URL))
+    objects = made / "pixieverse" / "render_outputs"
+    pack(root / "archives/render_outputs/tree.tar", [objects / IDS[1], objects / IDS[2]])
+    assert pairs[0].grid is not None
+    with pytest.raises(InputError, match=r"tree\.tar: was replaced after it was looked at"):
+        pairs[0].grid.read_bytes()
+
+
+def test_truncated_archive_of_the_hub_is_named(
+    hub: PublishedHub, made: Path, tmp_path: Path
+) -> None:
+    root = shutil.copytree(made / "tar", tmp_path / "own")
+    path = root / "archives/render_outputs/tree.tar"
+    path.write_bytes(path.read_bytes()[: path.stat().st_size * 2 // 3])
+    hub.publish(NAME, root)
+    summary = build_store(parameters(made, URL), tmp_path / "s.zarr")
+    assert "download it again" in dict(summary.problems)["tree.tar"]
+    assert IDS[0] in open_store(tmp_path / "s.zarr").ids
+
+
+def test_dataset_that_is_not_there_is_named(hub: PublishedHub, made: Path) -> None:
+    with pytest.raises(ConfigError, match="nobody/nothing"):
+        discover(parameters(made, "hf://datasets/nobody/nothing"))
