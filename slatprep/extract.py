@@ -9,9 +9,10 @@ from __future__ import annotations
 import hashlib
 import io
 import json
+import sys
 import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, redirect_stdout
 from dataclasses import dataclass, field, replace
 from importlib import metadata
 from pathlib import Path
@@ -78,11 +79,12 @@ class Pipeline(Protocol):
 
 @dataclass(frozen=True)
 class Session:
-    """A loaded pipeline, its torch module, and the description of both for the records."""
+    """A loaded pipeline, its torch module, the description of both for the records, its device."""
 
     pipeline: Pipeline
     torch: Any
     model: dict[str, str]
+    device: str = ""
 
 
 @dataclass(frozen=True)
@@ -111,31 +113,20 @@ class Extracted:
     seconds: Mapping[str, float] = field(default_factory=dict)
 
 
-def load_session(model: str = MODEL, revision: str | None = None, device: str = "cuda") -> Session:
-    """Load TRELLIS's image pipeline.
+def load_session(
+    model: str = MODEL, revision: str | None = None, device: str | None = None
+) -> Session:
+    """Load TRELLIS's image pipeline; by default on the GPU if there is one.
 
-    Parameters
-    ----------
-    model : str
-        Name of the model's repository, or a folder that holds its files.
-    revision : str, optional
-        Commit, tag or branch of the repository; by default its main branch.
-        The commit is recorded.
-    device : str
-        The torch device to run on.
-
-    Returns
-    -------
-    Session
-        The pipeline on its device.
-
-    Raises
-    ------
-    SlatprepError
-        If TRELLIS is not installed; the message says what to do.
-    ConfigError
-        If a folder is given a revision.
+    `model` is a repository or a folder of its files, `revision` a commit, tag or branch of the
+    repository. SlatprepError if TRELLIS is not installed, ConfigError if a folder is given a
+    revision.
     """
+    with redirect_stdout(sys.stderr):  # TRELLIS prints which kernels it takes when imported.
+        return _load_session(model, revision, device)
+
+
+def _load_session(model: str, revision: str | None, device: str | None) -> Session:
     try:
         import torch
         from trellis.pipelines import TrellisImageTo3DPipeline
@@ -157,40 +148,23 @@ def load_session(model: str = MODEL, revision: str | None = None, device: str = 
         folder = Path(snapshot_download(model, revision=revision))
         taken = folder.name
     pipeline = TrellisImageTo3DPipeline.from_pretrained(str(folder))
+    if device is None:
+        device = "cuda" if torch.cuda.is_available() else "cpu"
     pipeline.to(torch.device(device))
     about = {"name": model, "revision": taken, "torch": str(torch.__version__)}
     description = folder / "pipeline.json"
     if description.is_file():
         about["pipeline_sha256"] = file_digest(description)
-    return Session(pipeline, torch, about)
+    return Session(pipeline, torch, about, device)
 
 
 def list_extractions(
     images: Sequence[Path], out: Path, seeds: Sequence[int], by_folder: bool
 ) -> list[Extraction]:
-    """Name the files for each image and seed.
+    """Name the files for each image and seed, below the root `out` that `build-store` takes.
 
-    Parameters
-    ----------
-    images : sequence of Path
-        The images.
-    out : Path
-        Folder of the latents, the root that `build-store` takes.
-    seeds : sequence of int
-        Seeds; each image gets a SLAT for each seed.
-    by_folder : bool
-        Whether images are named ``<id>/<view>`` instead of ``<id>``.
-
-    Returns
-    -------
-    list of Extraction
-        To ``<id>.npz``, or to ``<id>/<view>.npz`` where there are views: folders,
-        several seeds, or both (``<view>-seed-<seed>``).
-
-    Raises
-    ------
-    ConfigError
-        If a name cannot be an id, or two images or seeds have one name.
+    They are ``<id>.npz``, or ``<id>/<view>.npz`` where there are views: folders, several seeds,
+    or both (``<view>-seed-<seed>``). ConfigError if a name cannot be an id, or is there twice.
     """
     listed: dict[Path, Extraction] = {}
     for image in images:
@@ -218,23 +192,11 @@ def list_extractions(
 def extract(
     session: Session, extractions: Iterable[Extraction], *, preprocess: bool = True
 ) -> Iterator[Extracted | InputError]:
-    """Run the pipeline and save latents with their provenance, one image and seed at a time.
+    """Run the pipeline, and save latents with their provenance, one image and seed at a time.
 
-    Parameters
-    ----------
-    session : Session
-        The loaded pipeline.
-    extractions : iterable of Extraction
-        From `list_extractions`.
-    preprocess : bool
-        Whether the pipeline removes the background and crops; not needed for images
-        prepared in this way.
-
-    Yields
-    ------
-    Extracted or InputError
-        The result of each, or why it failed, which does not stop the others. An existing
-        SLAT whose record has the same image, seed and model is kept.
+    Without `preprocess` the images have no background and are cropped already. Yields the result
+    of each, or why it failed, which does not stop the others. An existing SLAT whose record has
+    the same image, seed and model is kept.
     """
     for extraction in extractions:
         try:
@@ -244,22 +206,10 @@ def extract(
 
 
 def decode_gaussians(session: Session, latents: StructuredLatents, path: Path) -> None:
-    """Decode latents to Gaussians and save them as TRELLIS does.
+    """Decode latents to Gaussians and save them as TRELLIS does; replace an existing file.
 
-    Parameters
-    ----------
-    session : Session
-        The loaded pipeline.
-    latents : StructuredLatents
-        Latents of TRELLIS. Standardised ones are converted back, since the decoder takes
-        latents as the pipeline samples them.
-    path : Path
-        A PLY; an existing file is replaced.
-
-    Raises
-    ------
-    InputError
-        If TRELLIS cannot decode them.
+    Standardised latents are converted back, since the decoder takes them as the pipeline samples
+    them. InputError if TRELLIS cannot decode them.
     """
     from trellis.modules.sparse import SparseTensor
 
@@ -278,14 +228,18 @@ def decode_gaussians(session: Session, latents: StructuredLatents, path: Path) -
 
 @contextmanager
 def _named(path: Path, what: str) -> Iterator[None]:
-    """Name the file for which TRELLIS or torch raises an error, such as no memory left."""
+    """Name the file for which TRELLIS or torch raises an error; keep their prints off stdout.
+
+    RuntimeError: no memory left. ValueError: `preprocess_image` finds no foreground.
+    """
     try:
-        yield
-    except RuntimeError as error:
+        with redirect_stdout(sys.stderr):
+            yield
+    except (RuntimeError, ValueError, IndexError) as error:
         raise InputError(
             path,
             f"TRELLIS could not {what} ({type(error).__name__}: {' '.join(str(error).split())})",
-            "a GPU with enough free memory, and what TRELLIS takes",
+            "an image with a foreground, or latents of TRELLIS, and enough memory on the GPU",
         ) from error
 
 

@@ -50,6 +50,8 @@ class Torch(ModuleType):
         super().__init__("torch")
         self.__version__ = "2.0"
         self.rng, self.gradients = np.random.default_rng(), True
+        self.cuda = SimpleNamespace(is_available=lambda: self.gpu, synchronize=lambda: None)
+        self.gpu = True
 
     def manual_seed(self, seed: int) -> None:
         self.rng = np.random.default_rng(seed)
@@ -238,6 +240,29 @@ def test_an_image_that_trellis_cannot_process_does_not_stop_the_others(
     assert [path.name for path in (tmp_path / "slat").glob("*.npz")] == ["bear.npz"]
 
 
+def test_an_image_without_foreground_is_named_and_the_rest_are_done(
+    images: list[Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    class Strict(Pipeline):
+        """Prints, and finds the box of the foreground as TRELLIS's `preprocess_image` does."""
+
+        def preprocess_image(self, input: Image.Image) -> Image.Image:
+            print("[ATTENTION] Using backend: flash_attn")
+            foreground = np.argwhere(np.array(input)[..., 0] > 20)
+            _ = np.min(foreground[:, 1]), np.max(foreground[:, 1])
+            return super().preprocess_image(input)
+
+    torch = Torch()
+    session = work.Session(Strict(torch), torch, {})
+    bad, good = run(session, work.list_extractions(images, tmp_path / "slat", [0], False))
+    assert isinstance(bad, InputError) and good.voxels > 0
+    assert "cup.png: TRELLIS could not make latents of it (ValueError: zero-size" in str(bad)
+    assert "an image with a foreground" in str(bad)
+    assert [path.name for path in (tmp_path / "slat").glob("*.npz")] == ["bear.npz"]
+    printed = capsys.readouterr()
+    assert printed.out == "" and "[ATTENTION]" in printed.err
+
+
 @pytest.mark.parametrize("command", ["extract-slat", "decode-slat"])
 def test_without_trellis_the_command_says_what_to_install(
     command: str, images: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -253,10 +278,12 @@ def test_without_trellis_the_command_says_what_to_install(
     assert not (tmp_path / "slat").exists()
 
 
+@pytest.mark.parametrize("gpu", [True, False])
 def test_command_loads_one_commit_of_the_model(
-    images: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    gpu: bool, images: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     torch, commit = Torch(), "0123abcd"
+    torch.gpu = gpu
     pipeline, asked = Pipeline(torch), []
 
     def snapshot_download(name: str, revision: str | None) -> str:
@@ -264,6 +291,7 @@ def test_command_loads_one_commit_of_the_model(
         return str(tmp_path / commit)
 
     def from_pretrained(path: str) -> Pipeline:
+        print("[SPARSE] Backend: spconv, Attention: flash_attn")
         asked.append(path)
         return pipeline
 
@@ -277,11 +305,15 @@ def test_command_loads_one_commit_of_the_model(
     }
     for name, module in fakes.items():
         monkeypatch.setitem(sys.modules, name, module)
-    words = ["extract-slat", *map(str, images), "--out", str(tmp_path / "slat"), "--json", "-q",
+    words = ["extract-slat", *map(str, images), "--out", str(tmp_path / "slat"), "--json",
              "--revision", "v1", "--no-preprocess"]  # fmt: skip
     result = CliRunner().invoke(slatprep, words)
     assert result.exit_code == 0, result.output
     document = json.loads(result.stdout)
     assert document["model"]["revision"] == commit and document["extracted"] == 2
     assert asked == [("microsoft/TRELLIS-image-large", "v1"), str(tmp_path / commit)]
-    assert pipeline.device == "device cuda" and "cropped" not in pipeline.seen
+    # What TRELLIS prints never comes between the lines of the document.
+    assert "[SPARSE]" in result.stderr
+    device = "cuda" if gpu else "cpu"
+    assert f"TRELLIS runs on {device}" in result.stderr
+    assert pipeline.device == f"device {device}" and "cropped" not in pipeline.seen

@@ -16,7 +16,7 @@ from slatprep.cli.signature import Click, command
 from slatprep.errors import InputError
 
 if TYPE_CHECKING:
-    pass
+    from slatprep.extract import Session
 
 _Command = TypeVar("_Command", bound=Callable[..., object])
 
@@ -31,7 +31,16 @@ class ModelOptions:
     revision: Annotated[
         str | None, "Revision of the model. [default: newest]", Click(metavar="COMMIT")
     ] = None
-    device: Annotated[str, "Where to run it."] = "cuda"
+    device: Annotated[str | None, "Where to run it. [default: the GPU if there is one]"] = None
+
+    def load(self, output: Output) -> Session:
+        """Load the model, and say on which device if none was asked for."""
+        from slatprep.extract import load_session
+
+        session = load_session(self.model, self.revision, self.device)
+        if self.device is None:
+            output.note(f"TRELLIS runs on {session.device}")
+        return session
 
 
 @command("extract-slat")
@@ -67,7 +76,7 @@ def extract_slat(
     from slatprep import extract as work
 
     extractions = work.list_extractions(images, out, seeds, by_folder)
-    session = work.load_session(model.model, model.revision, model.device)
+    session = model.load(output)
     done, problems = [], []
     with output.progress("extract-slat") as progress:
         results = work.extract(session, extractions, preprocess=not no_preprocess)
@@ -115,7 +124,7 @@ def decode_slat(
     from slatprep.storage.names import file_name
 
     read = LatentsReader(output, source, assets, TRELLIS, standardised)
-    session = work.load_session(model.model, model.revision, model.device)
+    session = model.load(output)
     begin, decoded = time.perf_counter(), 0
     with output.progress("decode-slat") as progress:
         for latents in read:

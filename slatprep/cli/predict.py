@@ -6,11 +6,12 @@ import time
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from slatprep.cli.latents import LatentsReader, Standardised
 from slatprep.cli.options import (
     AssetIds,
+    ChoiceOf,
     FileOrFolder,
     FileOrUrl,
     NewFile,
@@ -45,7 +46,16 @@ def predict(
         Click(metavar="FILE.ply"),
     ] = None,
     seed: Annotated[Seed, "Seed of an image's latents."] = 42,
-    device: Annotated[Literal["cpu", "cuda"], "Where to compute."] = "cpu",
+    far: Annotated[
+        Any,
+        ChoiceOf("slatprep.particles.transfer:Far"),
+        "With --gaussians: give far Gaussians class 7 and properties 0, leave them out, or give "
+        "them the nearest material.",
+    ] = "background",
+    device: Annotated[
+        Literal["cpu", "cuda"] | None,
+        "Where to compute. [default: cpu; for an image the GPU if there is one]",
+    ] = None,
     batch_voxels: Annotated[
         Positive, "Number of voxels up to which assets are decoded together."
     ] = 65536,
@@ -69,10 +79,12 @@ def predict(
     """
     from slatprep.learn import require_torch
 
-    require_torch(device)
+    is_image = source.suffix.lower() in _IMAGES
+    require_torch(device or "cpu")
+    if device is None:
+        device = _default_device(output, is_image)
     from slatprep.learn import predict as work
 
-    is_image = source.suffix.lower() in _IMAGES
     if gaussians is not None and not is_image:
         raise ConfigError(
             "--gaussians goes with an image; `slatprep decode-slat` makes Gaussians of latents, "
@@ -105,7 +117,7 @@ def predict(
         seconds = {**image.seconds, **seconds}
     if image and gaussians is not None and predicted:
         begin = time.perf_counter()
-        _write_gaussians(output, image, out, gaussians)
+        _write_gaussians(output, image, out, gaussians, far)
         seconds["gaussians"] = time.perf_counter() - begin
     document = {
         "path": out,
@@ -153,7 +165,18 @@ def _draw(output: Output, source: Place, out: Path, seed: int, device: str) -> _
     return _Image(extractions[0].slat, session, result.seconds)
 
 
-def _write_gaussians(output: Output, image: _Image, out: Path, path: Path) -> None:
+def _default_device(output: Output, is_image: bool) -> Literal["cpu", "cuda"]:
+    """Return the GPU for an image if there is one, since TRELLIS needs it, and say so."""
+    import torch
+
+    if not is_image:
+        return "cpu"
+    device: Literal["cpu", "cuda"] = "cuda" if torch.cuda.is_available() else "cpu"
+    output.note(f"TRELLIS and the decoder run on {device}")
+    return device
+
+
+def _write_gaussians(output: Output, image: _Image, out: Path, path: Path, far: Any) -> None:
     """Decode an image's latents to Gaussians, and give each the material of its voxel."""
     from slatprep.extract import decode_gaussians
     from slatprep.particles import transfer as work
@@ -166,7 +189,8 @@ def _write_gaussians(output: Output, image: _Image, out: Path, path: Path) -> No
     decode_gaussians(image.session, read_slat(image.latents, image.latents.parent), plain)
     field = predicted_field(out / f"{file_name(image.latents.stem)}.npz", None)
     particles = read_particles(plain, "trellis")
-    result = work.transfer(particles.in_slat(), field)
+    result = work.transfer(particles.in_slat(), field, far=far)
     if result.far:
-        output.note(f"{result.far:,} of {len(result.rows):,} Gaussians have no voxel: background")
+        count = len(particles.positions)
+        output.note(f"{result.far:,} of {count:,} Gaussians have no voxel: {far}")
     work.write_transferred(path, particles, result, max_distance=2.0, in_slat=False)

@@ -46,8 +46,8 @@ def transfer(
         Any | None,
         ChoiceOf("slatprep.particles.read:Axes"),
         "Axes of the particles: those of TRELLIS's Gaussians, of its meshes, or of the SLAT "
-        "frame. [default: as a PLY of slatprep states; trellis for TRELLIS's Gaussians; else "
-        "slat]",
+        "frame. [default: as a PLY of slatprep states; for Gaussians of TRELLIS and SAM 3D those "
+        "that fit; else slat]",
     ] = None,
     frame: Annotated[
         Literal["file", "slat"], "Write positions as in the particles' file, or in the SLAT frame."
@@ -81,7 +81,9 @@ def transfer(
     from slatprep.particles.read import read_particles
 
     field = _field(store, asset, prediction, ranges, points)
-    read = read_particles(particles, axes)
+    read, recognised = work.recognise_axes(read_particles(particles, axes), field, max_distance)
+    if recognised:
+        output.note(f"{particles}: {recognised}")
     result = work.transfer(read.in_slat(), field, max_distance=max_distance, far=far)
     if read.foreign and axes is None:
         output.note(

@@ -127,7 +127,7 @@ def write_points(
     vertices["conf"] = conf
     for (name, _), column in more.items():
         vertices[name] = column
-    units = ", ".join((UNITS, *(f"{name} {unit}" for name, unit in more)))
+    units = ", ".join((UNITS, *(f"{name} {unit}" for name, unit in more if unit)))
     _write(path, vertices, (frame, units))
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,7 +24,7 @@ SAVED_AXES: dict[Axes, NDArray[np.float64]] = {
 """The matrix from the SLAT frame to the axes of each kind of file.
 
 TRELLIS saves Gaussians as (x, -z, y) (``Gaussian.save_ply``), and meshes as
-(x, z, -y) (``to_glb``).
+(x, z, -y) (``to_glb``). SAM 3D Objects saves Gaussians as they are, ``slat``.
 """
 
 FRAMES: dict[Axes, str] = {
@@ -54,11 +54,17 @@ class Particles:
     foreign : str
         Why the Gaussians are not from TRELLIS, so that their axes and scale are not known;
         empty if nothing indicates that.
+    guessed : bool
+        Whether only the fields of Gaussians speak for `axes`, which SAM 3D Objects writes too.
+    vertices : ndarray, optional
+        The rows of a PLY of Gaussians, with all attributes.
     """
 
     positions: NDArray[np.float64]
     axes: Axes
     foreign: str = ""
+    guessed: bool = False
+    vertices: NDArray[Any] | None = None
 
     def in_slat(self) -> NDArray[np.float64]:
         """Return the positions (N, 3) in the SLAT frame."""
@@ -67,36 +73,19 @@ class Particles:
 
 
 def read_particles(path: Path, axes: Axes | None = None) -> Particles:
-    """Read particles from a file.
+    """Read particles: a PLY with ``x y z``, an npy (N, 3), or an npz with one such array.
 
-    Parameters
-    ----------
-    path : Path
-        A PLY with ``x y z``; an npy of shape (N, 3); or an npz that holds such
-        an array as ``positions``, ``points`` or ``xyz``.
-    axes : {"trellis", "glb", "slat"}, optional
-        The axes of the file. By default those that a PLY of slatprep states; ``trellis`` for
-        a PLY with the fields of Gaussians (``f_dc_0``, ``opacity``, ``scale_0``, ``rot_0``),
-        unless it has ``f_rest_*``, no normals, or positions outside the unit cube, unlike
-        TRELLIS's; and ``slat`` for all others.
-
-    Returns
-    -------
-    Particles
-        At least one, all finite.
-
-    Raises
-    ------
-    InputError
-        If the file cannot be used.
-    SlatprepError
-        If a PLY is to be read and plyfile is not installed.
+    By default a PLY of slatprep states its axes; one with the fields of TRELLIS's Gaussians, its
+    normals, no ``f_rest_*`` and positions in the unit cube is taken for ``trellis``; all others
+    for ``slat``. InputError if the file cannot be used or holds no finite particle.
     """
     path = Path(path)
     if path.suffix.lower() == ".ply":
-        positions, names, comments = _read_ply(path)
+        vertices, comments = ply_points(_bytes_of(path), path)
+        columns = [np.asarray(vertices[axis], dtype=np.float64) for axis in "xyz"]
+        positions, names = np.column_stack(columns), frozenset(vertices.dtype.names or ())
     else:
-        positions, names, comments = _read_numpy(path), frozenset(), ()
+        positions, vertices, names, comments = _read_numpy(path), None, frozenset(), ()
     if len(positions) == 0:
         raise InputError(path, "holds no particles", "at least one")
     finite = np.isfinite(positions).all(axis=1)
@@ -115,7 +104,13 @@ def read_particles(path: Path, axes: Axes | None = None) -> Particles:
     gaussian = names.issuperset(_GAUSSIAN)
     foreign = _by_another_tool(positions, names) if gaussian else ""
     guessed: Axes = "trellis" if gaussian and not foreign else "slat"
-    return Particles(positions, axes or stated or guessed, foreign)
+    return Particles(
+        positions,
+        axes or stated or guessed,
+        foreign,
+        guessed=guessed == "trellis" and not axes and not stated,
+        vertices=vertices if gaussian else None,
+    )
 
 
 def _by_another_tool(positions: NDArray[np.float64], names: frozenset[str]) -> str:
@@ -128,13 +123,6 @@ def _by_another_tool(positions: NDArray[np.float64], names: frozenset[str]) -> s
     if (reach := float(np.abs(positions).max())) > _REACH:
         signs.append(f"it reaches {reach:.3g} from the centre, out of the unit cube")
     return " and ".join(signs)
-
-
-def _read_ply(path: Path) -> tuple[NDArray[np.float64], frozenset[str], tuple[str, ...]]:
-    data = _bytes_of(path)
-    vertices, comments = ply_points(data, path)
-    positions = np.column_stack([np.asarray(vertices[axis], dtype=np.float64) for axis in "xyz"])
-    return positions, frozenset(vertices.dtype.names or ()), comments
 
 
 def _read_numpy(path: Path) -> NDArray[np.float64]:

@@ -7,6 +7,7 @@ suits jelly and steel in the same object.
 
 from __future__ import annotations
 
+import warnings
 from typing import Any
 
 import numpy as np
@@ -14,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from slatprep.errors import SlatprepError
 from slatprep.records import MATERIAL_CLASSES
-from slatprep.records.yielding import YIELDING
+from slatprep.records.yielding import MAX_POISSON, YIELDING
 
 AIR, DRAG = 1.2, 1.0
 """Density of air [kg/m^3], and the drag coefficient of a face."""
@@ -76,6 +77,9 @@ def simulate(
     """
     rest, stuff = np.array(positions, dtype=np.float64), np.asarray(properties, dtype=np.float64)
     _check(rest, np.asarray(material), stuff)
+    if clipped := int(np.count_nonzero(stuff[:, 2] > MAX_POISSON)):
+        warnings.warn(f"nu of {clipped:,} particles is taken as {MAX_POISSON}", stacklevel=2)
+        stuff = np.minimum(stuff, [np.inf, np.inf, MAX_POISSON])
     newton, warp = _engine()
     rest[:, 2] += height + spacing / 2 - rest[:, 2].min()
     modulus, density, ratio = stuff.T
@@ -246,12 +250,12 @@ def _check(
             f"{', '.join(f'{index} ({MATERIAL_CLASSES[index]})' for index in sorted(YIELDING))}"
         )
     modulus, density, ratio = properties.T
-    wrong = ~((modulus > 0) & (density > 0) & (ratio > -1) & (ratio < 0.5))
+    wrong = ~((modulus > 0) & (density > 0) & (ratio > -1) & (ratio <= 0.5))
     if wrong.any():
         row = int(np.argmax(wrong))
         raise SlatprepError(
             f"particle {row} has E = {modulus[row]:g} Pa, density = {density[row]:g} kg/m^3, "
-            f"nu = {ratio[row]:g}; expected E and density above 0, nu above -1 and below 0.5"
+            f"nu = {ratio[row]:g}; expected E and density above 0, nu above -1 and at most 0.5"
         )
 
 

@@ -6,7 +6,7 @@ values of its nearest voxel.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal, get_args
 
@@ -22,6 +22,14 @@ Far = Literal["background", "drop", "nearest"]
 
 MANY_FAR, MOST_FAR = 0.2, 0.5
 """Shares of far particles above which other axes are tried, and above which it is an error."""
+
+
+_GAUSSIAN_AXES: tuple[Axes, Axes] = ("trellis", "slat")
+"""How TRELLIS and SAM 3D Objects save Gaussians."""
+
+_ALIKE, _SLACK, _SAME = 1.2, 0.1, 0.99
+"""Axes fit alike if mean distances [voxel] differ by less than this factor and sum; materials are
+the same if this share of particles has the same."""
 
 
 @dataclass(frozen=True)
@@ -52,29 +60,10 @@ class Transferred:
 def transfer(
     points: ArrayLike, field: VoxelField, *, max_distance: float = 2.0, far: Far = "background"
 ) -> Transferred:
-    """Give each particle the material of the nearest voxel.
+    """Give each particle (N, 3) of the SLAT frame the material of the nearest voxel.
 
-    Parameters
-    ----------
-    points : array_like, shape (N, 3)
-        Particles in the SLAT frame, the unit cube [-0.5, 0.5]^3, z up.
-    field : VoxelField
-        The materials.
-    max_distance : float
-        Distance [voxel] to the nearest voxel above which a particle is far.
-    far : {"background", "drop", "nearest"}
-        What far particles get: class 7 and properties 0, like empty voxels of PixieVerse; no
-        row; or the nearest voxel's material.
-
-    Returns
-    -------
-    Transferred
-        Materials in the order of the particles.
-
-    Raises
-    ------
-    ConfigError
-        If `far` or `max_distance` is not an allowed value.
+    Without a voxel within `max_distance` voxels a particle is far: it gets class 7 and properties
+    0 (background), no row (drop), or the nearest voxel's material (nearest).
     """
     from slatprep.geometry.nearest import Lattice
 
@@ -94,32 +83,57 @@ def transfer(
     )
 
 
+def recognise_axes(
+    particles: Particles, field: VoxelField, max_distance: float = 2.0
+) -> tuple[Particles, str]:
+    """Tell TRELLIS's Gaussians from those of SAM 3D Objects, which have the same fields.
+
+    Returns the particles in the axes that fit, and a remark if these are not TRELLIS's.
+    ConfigError if both fit alike and give other materials, as of a ball or a crate.
+    """
+    if not particles.guessed:
+        return particles, ""
+    some = particles.positions[:: max(1, len(particles.positions) // 20_000)]
+    tried = {
+        axes: transfer(
+            Particles(some, axes).in_slat(), field, max_distance=max_distance, far="nearest"
+        )
+        for axes in _GAUSSIAN_AXES
+    }
+    apart = {
+        axes: float(np.minimum(result.distance, 2 * max_distance).mean())
+        for axes, result in tried.items()
+    }
+    best, other = sorted(_GAUSSIAN_AXES, key=lambda axes: apart[axes])
+    if apart[other] <= _ALIKE * apart[best] + _SLACK:
+        one, two = tried[best], tried[other]
+        alike = (one.material == two.material) & np.isclose(
+            one.properties, two.properties, rtol=1e-3
+        ).all(axis=1)
+        if alike.mean() < _SAME:
+            raise ConfigError(
+                "TRELLIS and SAM 3D Objects save the same fields in other axes, and this object "
+                f"fits either ({apart['trellis']:.2f} and {apart['slat']:.2f} voxels from the "
+                f"nearest voxel), with other materials for {1 - alike.mean():.0%}; give --axes "
+                "trellis for Gaussians of TRELLIS, --axes slat for those of SAM 3D Objects"
+            )
+        best = "trellis"
+    if best == "trellis":
+        return particles, ""
+    return replace(particles, axes=best), (
+        f"the Gaussians are not turned as TRELLIS turns them ({apart['trellis']:.2f} voxels from "
+        f"the nearest voxel, {apart['slat']:.2f} as they are), so they are read as SAM 3D Objects "
+        "saves them: --axes slat"
+    )
+
+
 def doubt_axes(
     particles: Particles, field: VoxelField, result: Transferred, max_distance: float
 ) -> str:
     """Explain why many particles are far: wrong axes, another scale, or a surface of voxels.
 
-    Parameters
-    ----------
-    particles : Particles
-        The particles.
-    field : VoxelField
-        The materials.
-    result : Transferred
-        From `transfer`.
-    max_distance : float
-        As for `transfer` [voxel].
-
-    Returns
-    -------
-    str
-        One line; empty if at most `MANY_FAR` of the particles are far.
-
-    Raises
-    ------
-    ConfigError
-        With the same line, if more than `MOST_FAR` of them are far, or with other axes less
-        than a tenth as many.
+    Returns one line, empty if at most `MANY_FAR` of them are. ConfigError with the same line if
+    more than `MOST_FAR` are far, or with other axes less than a tenth as many.
     """
     count = len(particles.positions)
     if result.far <= MANY_FAR * count:
@@ -174,25 +188,8 @@ def write_transferred(
 ) -> None:
     """Write the materials of particles as Pixie's PLY for PhysGaussian.
 
-    Parameters
-    ----------
-    path : Path
-        The file; an existing material PLY is replaced.
-    particles : Particles
-        The particles.
-    result : Transferred
-        From `transfer`.
-    max_distance : float
-        Distance [voxel] at which ``conf`` is 0.
-    in_slat : bool
-        Whether to write positions in the SLAT frame instead of the file's.
-
-    Raises
-    ------
-    ConfigError
-        If another file is at `path`.
-    SlatprepError
-        If it cannot be written.
+    Gaussians keep their attributes, behind Pixie's fields. ``conf`` falls to 0 at `max_distance`
+    voxels. ConfigError if another file is at `path`.
     """
     from slatprep.export import target
     from slatprep.export.ply import write_points
@@ -207,7 +204,21 @@ def write_transferred(
             result.properties,
             np.clip(1.0 - result.distance / max_distance, 0.0, 1.0),
             frame,
+            attributes_of(particles, result.rows),
         )
+
+
+def attributes_of(
+    particles: Particles, rows: NDArray[np.intp]
+) -> dict[tuple[str, str], NDArray[np.float32]]:
+    """Return the attributes of Gaussians' rows that Pixie's fields lack, by name and unit."""
+    from slatprep.export.ply import VERTEX
+
+    if particles.vertices is None:
+        return {}
+    held = particles.vertices
+    names = [name for name in held.dtype.names or () if name not in (VERTEX.names or ())]
+    return {(name, ""): held[name][rows] for name in names if held.dtype[name].kind in "fiu"}
 
 
 def _is_material_ply(path: Path) -> bool:

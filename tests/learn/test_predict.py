@@ -231,6 +231,7 @@ class Pipeline:
     """What is used of TRELLIS's image pipeline; its Gaussians lie at the voxels' centres."""
 
     device = "cpu"
+    shift = np.zeros(3)
 
     def __init__(self) -> None:
         self.sparse_structure_sampler_params: dict[str, object] = {}
@@ -257,6 +258,7 @@ class Pipeline:
         assert formats == ["gaussian"]
         x, y, z = ((slat.coords[:, 1:].numpy() + 0.5) / 64 - 0.5).T
         self.feats = slat.feats.numpy()
+        x[0] += self.shift[0]
         names = ("x", "y", "z", "nx", "ny", "nz", "f_dc_0", "opacity", "scale_0", "rot_0")
         rows = np.zeros(len(x), [(name, "f4") for name in names])
         rows["x"], rows["y"], rows["z"] = x, -z, y  # as TRELLIS's save_ply turns them
@@ -308,6 +310,31 @@ def test_an_image_becomes_gaussians_with_materials(
     with np.load(out / "cup.npz") as held:
         assert np.array_equal(rows["material_id"], held["material"])
         np.testing.assert_allclose(rows["E"], held["properties_si"][:, 0], rtol=1e-6)
+    # The attributes of the splats come along.
+    plain = PlyData.read(str(out / "gaussians.ply"))["vertex"].data
+    for name in plain.dtype.names:
+        np.testing.assert_array_equal(rows[name], plain[name])
+
+
+@pytest.mark.parametrize(("far", "kept"), [("drop", 299), ("nearest", 300)])
+def test_far_gaussians_of_an_image_are_what_far_says(
+    far: str,
+    kept: int,
+    checkpoint: Path,
+    tmp_path: Path,
+    trellis: Pipeline,
+    image: Path,
+) -> None:
+    from plyfile import PlyData
+
+    trellis.shift = np.array([9.0, 0.0, 0.0])
+    ply = tmp_path / "cup.ply"
+    words = (image, "--checkpoint", checkpoint, "--out", tmp_path / "out", "--gaussians", ply)
+    result = step("predict", *words, "--far", far)
+    assert f"1 of 300 Gaussians have no voxel: {far}" in result
+    assert "TRELLIS and the decoder run on" in result
+    rows = PlyData.read(str(ply))["vertex"].data
+    assert len(rows) == kept and (rows["density"] > 0).all()
 
 
 def step(*words: object, code: int = 0) -> str:

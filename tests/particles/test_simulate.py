@@ -60,12 +60,21 @@ def test_lone_particles_have_no_strain() -> None:
     assert np.isnan(strain(line, line, np.zeros(3, dtype=int), SPACING)).all()
 
 
+def test_a_ratio_of_one_half_is_taken_and_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    stuff = STUFF.copy()
+    stuff[:7, 2] = 0.5
+    monkeypatch.setitem(sys.modules, "newton", None)  # It is told before the engine is loaded.
+    told = pytest.warns(UserWarning, match="nu of 7 particles is taken as 0.499")
+    with told, pytest.raises(SlatprepError, match="simulation needs the package"):
+        simulate(CUBE, ONE_PART, stuff, SPACING)
+
+
 @pytest.mark.parametrize(
     ("material", "change", "said"),
     [
         (7, None, r"material 7 \(background\) is not simulated"),
         (0, (3, 1, 0.0), "particle 3 has E = 100000 Pa, density = 0"),
-        (0, (5, 2, 0.5), "nu = 0.5; expected"),
+        (0, (5, 2, 0.51), "nu = 0.51; expected"),
         (0, (2, 0, np.nan), "particle 2 has E = nan"),
     ],
 )

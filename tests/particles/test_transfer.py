@@ -115,6 +115,66 @@ def test_wrong_axes_are_an_error_that_names_the_right_ones(
         assert not (tmp_path / "m.ply").exists()
 
 
+# -- axes of TRELLIS and of SAM 3D Objects -----------------------------
+
+
+def write_prediction(path: Path, coords: np.ndarray, material: np.ndarray) -> None:
+    values = np.tile([1e5, 1e3, 0.3], (len(coords), 1)) * (1 + material[:, None] * [1, 1, 0])
+    np.savez(path, coords=coords, material=material, properties_si=values)
+
+
+def as_sam3d(path: Path, slat_positions: np.ndarray) -> None:
+    """Write Gaussians as SAM 3D Objects does: TRELLIS's fields, positions as they are."""
+    x, y, z = slat_positions.T
+    write_gaussians(path, np.column_stack([x, z, -y]))
+    vertex = plyfile.PlyData.read(path)["vertex"]
+    np.testing.assert_allclose(np.column_stack([vertex[a] for a in "xyz"]), slat_positions)
+
+
+@pytest.mark.parametrize("tool", ["trellis", "sam3d"])
+def test_axes_of_sam3d_are_recognised(
+    tool: str, store: Path, true_parts: tuple[np.ndarray, np.ndarray], tmp_path: Path
+) -> None:
+    positions = particles_near(true_parts[0], 3000, 0.45).astype(np.float32)
+    (write_gaussians if tool == "trellis" else as_sam3d)(tmp_path / "g.ply", positions)
+    words = (tmp_path / "g.ply", "--store", store, "--asset", "cup", "--out", tmp_path / "m.ply")
+    result = CliRunner().invoke(slatprep, ["transfer", *map(str, words)])
+    assert result.exit_code == 0, result.output
+    assert ("read as SAM 3D Objects saves them" in result.stderr) == (tool == "sam3d")
+    vertex = plyfile.PlyData.read(tmp_path / "m.ply")["vertex"]
+    coords, material = true_parts
+    voxel = {tuple(c): m for c, m in zip(coords.tolist(), material.tolist(), strict=True)}
+    cells = np.floor((positions.astype(float) + 0.5) * 64).astype(int).tolist()
+    np.testing.assert_array_equal(vertex["material_id"], [voxel[tuple(cell)] for cell in cells])
+
+
+@pytest.mark.parametrize("shape", ["ball", "crate"])
+def test_axes_that_fit_alike_are_asked_for(shape: str, tmp_path: Path) -> None:
+    there = np.indices((64, 64, 64)).reshape(3, -1).T
+    centred = there - 31.5
+    reach = np.linalg.norm(centred, axis=1) if shape == "ball" else np.abs(centred).max(axis=1)
+    coords = there[(reach < 20) & (reach > 18)]
+    positions = particles_near(coords, 3000, 0.45)
+    upper = (coords[:, 2] > 31).astype(int)
+    write_prediction(tmp_path / "two.npz", coords, upper)
+    write_prediction(tmp_path / "one.npz", coords, np.zeros(len(coords), int))
+    for write in (write_gaussians, as_sam3d):
+        write(tmp_path / "g.ply", positions)
+        out = tmp_path / "m.ply"
+        said = run_wrong(tmp_path / "g.ply", "--prediction", tmp_path / "two.npz", "--out", out)
+        assert "this object fits either" in said and "--axes slat for those of SAM 3D" in said
+        assert not out.exists()
+        # Of one material alone it does not matter.
+        run("transfer", tmp_path / "g.ply", "--prediction", tmp_path / "one.npz", "--out", out)
+        out.unlink()
+        axes = "trellis" if write is write_gaussians else "slat"
+        words = ("--prediction", tmp_path / "two.npz", "--out", out, "--axes", axes)
+        run("transfer", tmp_path / "g.ply", *words)
+        vertex = plyfile.PlyData.read(out)["vertex"]
+        np.testing.assert_array_equal(vertex["material_id"], positions[:, 2] > 0)
+        out.unlink()
+
+
 def test_particles_of_another_object_are_an_error_that_says_where_they_lie(
     store: Path, tmp_path: Path
 ) -> None:
