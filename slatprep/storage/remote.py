@@ -18,6 +18,7 @@ from pathlib import Path, PurePosixPath
 from typing import IO, Any
 
 from slatprep.errors import ConfigError
+from slatprep.storage.ranges import range_reader
 
 PART_BYTES = 2**24
 """Bytes per request in the upload or download of a large object."""
@@ -144,6 +145,10 @@ class RemoteFile(io.RawIOBase):
         # Asked for each time: connections do not survive a fork; fsspec caches one per process.
         try:
             with connected(self.place) as (system, name):
+                if "s3" in system.protocol:
+                    bucket, _, key = name.partition("/")
+                    if read := range_reader(bucket):
+                        return read(key, offset, offset + length)
                 options = self._exact if "hf" in system.protocol else {}
                 return bytes(system.cat_file(name, start=offset, end=offset + length, **options))
         except (FileNotFoundError, PermissionError):

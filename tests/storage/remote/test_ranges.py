@@ -1,0 +1,80 @@
+"""Reading by obstore gives what reading by s3fs gives, and leaves to s3fs what it cannot do."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+from typing import Any
+
+import numpy as np
+import pytest
+
+from slatprep.storage.place import place_of
+from slatprep.storage.ranges import range_reader
+from slatprep.storage.remote import RemoteFile
+from slatprep.store import open_store
+
+pytest.importorskip("obstore")
+
+
+@pytest.fixture
+def obstore(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("SLATPREP_OBSTORE", "yes")
+
+
+@pytest.mark.usefixtures("obstore")
+def test_a_store_reads_as_by_s3fs(
+    url: str, s3: Any, undisturbed: Any, requests: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    s3.put(str(undisturbed[1]), url, recursive=True)
+    requests.made.clear()
+    by_obstore = [asset.feats for asset in open_store(url)]
+    assert requests.of("get_object") == []  # s3fs was asked for no bytes.
+    monkeypatch.setenv("SLATPREP_OBSTORE", "no")
+    for here, there in zip(by_obstore, open_store(url), strict=True):
+        np.testing.assert_array_equal(here, there.feats)
+    assert requests.of("get_object")
+
+
+@pytest.mark.usefixtures("obstore")
+def test_ranges_and_faults_are_those_of_a_file(bucket: str, s3: Any) -> None:
+    s3.pipe_file(f"{bucket}/a", b"0123456789")
+    file = RemoteFile(place_of(f"s3://{bucket}/a"))  # type: ignore[arg-type]
+    assert file.pread(4, 3) == b"3456"
+    assert file.pread(100, 8) == b"89"
+    assert file.pread(5, 10) == b""
+    with pytest.raises(FileNotFoundError, match=f"s3://{bucket}/b"):
+        RemoteFile(place_of(f"s3://{bucket}/b")).pread(1, 0)  # type: ignore[arg-type]
+
+
+def _read_in_child(bucket: str, answers: Any) -> None:
+    answers.put((range_reader(bucket) is None, RemoteFile(_a(bucket)).pread(4, 3)))
+
+
+def _a(bucket: str) -> Any:
+    return place_of(f"s3://{bucket}/a")
+
+
+@pytest.mark.usefixtures("obstore")
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="needs a fork")
+def test_a_forked_process_reads_by_s3fs(bucket: str, s3: Any) -> None:
+    s3.pipe_file(f"{bucket}/a", b"0123456789")
+    assert RemoteFile(_a(bucket)).pread(4, 3) == b"3456"
+    forked = multiprocessing.get_context("fork")
+    answers = forked.Queue()
+    child = forked.Process(target=_read_in_child, args=(bucket, answers))
+    child.start()
+    assert answers.get(timeout=60) == (True, b"3456")
+    child.join()
+
+
+@pytest.mark.usefixtures("obstore")
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [("AWS_SECRET_ACCESS_KEY", ""), ("AWS_PROFILE", "mine"), ("SLATPREP_OBSTORE", "no")],
+)
+def test_without_known_credentials_s3fs_reads(
+    name: str, value: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv(name, value)
+    assert range_reader("bucket") is None
