@@ -18,6 +18,8 @@ from slatprep.storage.files import LINK, LocalFolder, local_files
 from slatprep.store.contract import MAX_METADATA_BYTES
 from slatprep.store.shard_reader import BAD_METADATA, RowReader
 
+_WHOLE = 'all chunks, as zarr writes them with config={"write_empty_chunks": True}'
+
 
 def read_array(path: Path, root: Path, spec: ArraySpec) -> NDArray[Any]:
     """Read a whole array of Zarr format 3 from the folder `path`; no link may lead out of `root`.
@@ -41,7 +43,9 @@ def read_array(path: Path, root: Path, spec: ArraySpec) -> NDArray[Any]:
             try:
                 file = folder.open(name)
             except FileNotFoundError:
-                return None
+                # zarr leaves out chunks of fill values, and what was lost must not pass as one.
+                what = f"its chunk {name} is missing"
+                raise InputError(path, what, _WHOLE) from None
             with file:
                 if file.size() > most:
                     raise ValueError(f"a chunk of {file.size()} bytes")

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
-from functools import lru_cache
+from functools import lru_cache, partial
 from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
@@ -73,6 +73,7 @@ class _Description:
     classes: bool | tuple[str, ...] = True
     resolution: Annotated[int, Ge(2), Le(MAX_RESOLUTION)] = 64
     aligned: bool = False
+    empty_chunks: tuple[str, ...] = ()
 
     @property
     def table(self) -> tuple[Property, ...]:
@@ -119,7 +120,8 @@ class PlainVoxels:
             arrays, file = load_datasets(path, root, "", specs, role="grid")
         else:
             data, file = load_source(path, root, "grid")
-            read = {".zarr": group_arrays, ".ply": _ply_arrays}.get(path.suffix.lower(), npz_arrays)
+            group = partial(group_arrays, empty=said.empty_chunks)
+            read = {".zarr": group, ".ply": _ply_arrays}.get(path.suffix.lower(), npz_arrays)
             arrays = read(data, path, specs)
         _, about = load_source(root / DESCRIPTION, root, "description")
         columns: list[Any] = [arrays[one.name] for one in said.properties]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import io
 import json
 import zipfile
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from typing import Any
 
 from numpy.typing import NDArray
@@ -21,31 +21,44 @@ _EXPECTED = (
     "blosc or nothing; or npz, HDF5 or PLY"
 )
 
+_WHOLE = (
+    'all chunks, as zarr writes them with config={{"write_empty_chunks": True}}; where those left '
+    'out hold the fill value, say "empty_chunks": ["{}"] in source.json'
+)
+
 
 def group_arrays(
-    data: bytes, where: str | Place, specs: Mapping[str, ArraySpec]
+    data: bytes,
+    where: str | Place,
+    specs: Mapping[str, ArraySpec],
+    empty: Collection[str] = (),
 ) -> dict[str, NDArray[Any]]:
     """Read the named arrays of a group from the archive of `slatprep.readers.files.load_source`.
 
-    Errors call it `where`. InputError if an array is missing, not as specified, or uses another
+    Errors call it `where`. Of the arrays in `empty` chunks may be missing, which then hold the fill
+    value. InputError if an array is missing, not as specified, lacks a chunk, or uses another
     compression.
     """
     expected = _EXPECTED.format(", ".join(specs))
     with zipfile.ZipFile(io.BytesIO(data)) as files:
         return {
-            name: _array(files, f"{where} [{name}]", name, spec, expected)
+            name: _array(files, f"{where} [{name}]", name, spec, expected, name in empty)
             for name, spec in specs.items()
         }
 
 
 def _array(
-    files: zipfile.ZipFile, where: str, name: str, spec: ArraySpec, expected: str
+    files: zipfile.ZipFile, where: str, name: str, spec: ArraySpec, expected: str, empty: bool
 ) -> NDArray[Any]:
     def fetch(key: str, most: int) -> bytes | None:
         try:
             chunk = files.getinfo(f"{name}/{key}")
         except KeyError:
-            return None
+            if empty or key == "zarr.json":
+                return None
+            raise InputError(
+                where, f"its chunk {name}/{key} is missing", _WHOLE.format(name)
+            ) from None
         if chunk.file_size > most:
             raise ValueError(f"{key} has {chunk.file_size} bytes")
         return files.read(chunk)

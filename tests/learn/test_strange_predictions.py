@@ -106,7 +106,7 @@ def test_values_that_are_no_prediction_are_named(
         root = zarr.open_group(path, mode="w").create_group("a")
         for name, values in whole.items():
             text = values.astype("U4") if values.dtype.kind == "U" else values
-            root.create_array(name, data=text)
+            root.create_array(name, data=text, config={"write_empty_chunks": True})
         message = rf"{message}|data_type is"
     with pytest.raises(InputError, match=message):
         evaluate_store(path, learn_store, None)
@@ -195,6 +195,14 @@ def test_metadata_of_arrays_are_taken_at_their_word(
     file.write_text(json.dumps(json.loads(file.read_text()) | change))
     with pytest.raises(StoreError, match=message):
         read_array(file.parent, file.parents[1], spec)
+
+
+def test_a_lost_chunk_of_a_prediction_is_refused(tmp_path: Path) -> None:
+    root, spec = zarr.open_group(tmp_path / "p.zarr", mode="w"), ArraySpec(((None, 3),), "u")
+    root.create_array("a", shape=(8, 3), dtype="uint8", chunks=(4, 3))[:] = 1
+    (tmp_path / "p.zarr/a/c/1/0").unlink()
+    with pytest.raises(InputError, match=r"p\.zarr/a: its chunk c/1/0 is missing"):
+        read_array(tmp_path / "p.zarr/a", tmp_path / "p.zarr", spec)
 
 
 @pytest.mark.parametrize("sharded", [True, False])

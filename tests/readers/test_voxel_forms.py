@@ -218,6 +218,25 @@ def test_zarr_that_cannot_be_read_is_said(root: Path, how: str, said: str) -> No
         field_at(root)
 
 
+@pytest.mark.parametrize("name", ["voxels", "material", "density", "damping"])
+def test_a_lost_chunk_of_zarr_is_refused_unless_it_may_be_empty(root: Path, name: str) -> None:
+    rows = rows_of(3000) | {"material": np.zeros(3000, np.uint8)}
+    write_voxels(root, "a", "zarr", rows)
+    assert len(field_at(root).voxels) == 3000
+    chunk = next(file for file in (root / "a.zarr" / name / "c").rglob("*") if file.is_file())
+    chunk.unlink()
+    key = chunk.relative_to(root / "a.zarr").as_posix()
+    with pytest.raises(
+        InputError, match=rf"a\.zarr \[{name}\]: its chunk {key} is missing.*empty_c"
+    ):
+        field_at(root)
+    if name != "material":
+        return
+    about = json.loads((root / "source.json").read_text()) | {"empty_chunks": ["material"]}
+    (root / "source.json").write_text(json.dumps(about))
+    assert np.unique(field_at(root).material).tolist() == [0]
+
+
 def test_any_file_of_a_zarr_group_decides_what_it_is(root: Path) -> None:
     rows = rows_of(100)
     write_voxels(root, "a", "zarr", rows)
