@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
-from functools import lru_cache, partial
+from functools import lru_cache
 from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
@@ -20,7 +20,13 @@ from numpy.typing import NDArray
 from slatprep.errors import ConfigError, InputError
 from slatprep.parameters import PixieverseSource
 from slatprep.readers.adapters import FoundField, Holding, find_by_pattern, patterns_of
-from slatprep.readers.files import ArraySpec, load_source, npz_arrays, require_complete
+from slatprep.readers.files import (
+    ArraySpec,
+    is_hierarchy,
+    load_source,
+    npz_arrays,
+    require_complete,
+)
 from slatprep.readers.hdf5 import SUFFIXES, load_datasets
 from slatprep.readers.points import ply_points
 from slatprep.readers.voxel_sets import MAX_RESOLUTION, field_of_voxels
@@ -120,9 +126,11 @@ class PlainVoxels:
             arrays, file = load_datasets(path, root, "", specs, role="grid")
         else:
             data, file = load_source(path, root, "grid")
-            group = partial(group_arrays, empty=said.empty_chunks)
-            read = {".zarr": group, ".ply": _ply_arrays}.get(path.suffix.lower(), npz_arrays)
-            arrays = read(data, path, specs)
+            if is_hierarchy(path):
+                arrays = group_arrays(data, path, specs, said.empty_chunks)
+            else:
+                read = _ply_arrays if path.suffix.lower() == ".ply" else npz_arrays
+                arrays = read(data, path, specs)
         _, about = load_source(root / DESCRIPTION, root, "description")
         columns: list[Any] = [arrays[one.name] for one in said.properties]
         lengths = {len(column) for column in arrays.values()}
