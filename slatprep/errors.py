@@ -17,6 +17,17 @@ def in_unicode(text: str) -> str:
     return text.encode(errors="backslashreplace").decode()
 
 
+def amount(count: int, noun: str, plural: str = "") -> str:
+    """Return a count and its noun, in the singular or the plural.
+
+    Examples
+    --------
+    >>> amount(1, "voxel"), amount(2000, "voxel"), amount(0, "category", "categories")
+    ('1 voxel', '2,000 voxels', '0 categories')
+    """
+    return f"{count:,} {noun if count == 1 else plural or noun + 's'}"
+
+
 class SlatprepError(Exception):
     """Base of every error that slatprep raises on purpose."""
 

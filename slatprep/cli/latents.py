@@ -103,8 +103,10 @@ class LatentsReader:
 
 
 def _match(source: Place, name: str, ids: list[str]) -> str:
-    """Return the id that is `name`, or the only id with this prefix, like `Store.match`."""
+    """Return the id that `name` means, as `Store.match` does: itself, a beginning, or a number."""
     alike = [name] if name in ids else [known for known in ids if known.startswith(name)]
+    if not alike and name.isascii() and name.isdigit() and int(name) < len(ids):
+        return ids[int(name)]
     if len(alike) != 1:
         there = ", ".join(alike[:5]) if alike else f"it has {len(ids):,}"
         raise ConfigError(f"{source}: expected one SLAT with the id {name!r}; {there}")

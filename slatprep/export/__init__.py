@@ -65,7 +65,7 @@ def export_store(
     out: str | Path,
     format: str,
     *,
-    assets: Sequence[str] = (),
+    assets: Sequence[str | int] = (),
     verdicts: Sequence[str] | None = None,
     options: ExportOptions | None = None,
     jobs: int = 1,
@@ -82,8 +82,8 @@ def export_store(
         when complete; other files stay.
     format : {"ply", "hdf5", "webdataset", "npz", "voxel_data", "usd"}
         The format, see docs/export.md.
-    assets : sequence of str
-        Ids of the assets; empty takes all.
+    assets : sequence of str or int
+        Ids, beginnings of ids, or numbers; empty takes all.
     verdicts : sequence of str, optional
         Only assets with one of these verdicts; empty takes all. By default `assets` with any
         verdict, or without them all good and doubtful assets.

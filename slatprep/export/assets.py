@@ -45,7 +45,7 @@ def with_merged(store: Store, *names: str) -> tuple[str, ...]:
     return (*names, *MERGED_COLUMNS) if store.merges else names
 
 
-def choose_ids(store: Store, assets: Sequence[str], verdicts: Sequence[str]) -> list[str]:
+def choose_ids(store: Store, assets: Sequence[str | int], verdicts: Sequence[str]) -> list[str]:
     """Return the sorted ids of `assets` with one of `verdicts`; an empty sequence takes all.
 
     Raises ConfigError if an id or a verdict is unknown, or no asset is left.
@@ -53,7 +53,7 @@ def choose_ids(store: Store, assets: Sequence[str], verdicts: Sequence[str]) -> 
     unknown = sorted(set(verdicts) - set(Verdict))
     if unknown:
         raise ConfigError(f"verdict is {unknown[0]!r}; expected one of {', '.join(Verdict)}")
-    rows = sorted({store.match(asset_id) for asset_id in assets}) or range(len(store))
+    rows = sorted({store.match(name) for name in assets}) or range(len(store))
     verdict = store.column("verdict")
     ids = (store.ids[row] for row in rows if not verdicts or verdict[row] in verdicts)
     chosen = sorted(ids)

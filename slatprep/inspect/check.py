@@ -142,15 +142,15 @@ class AlignmentCheck:
         return self.verdict is Verdict.GOOD and self.consistent
 
 
-def check_alignment(store: Store, asset_id: str) -> AlignmentCheck:
+def check_alignment(store: Store, name: str | int) -> AlignmentCheck:
     """Recompute an alignment's quality, and the annotation it gives, from the store alone.
 
     Raises StoreError if the store has no such asset, or lacks its build parameters.
     """
-    asset = store.asset(asset_id)
+    asset = store.asset(name)
     radius = store.about.build.parameters.align.radius
     valid_share, differs = recompute_annotation(asset)
-    alignment = StoredRecords(store).of(asset_id).alignment
+    alignment = StoredRecords(store).read(asset.index).alignment
     quality = measure_quality(asset.field, asset.latents, asset.transform, radius, alignment.ground)
     columns = asset.columns
     ambiguity, margin = float(columns["ambiguity"]), float(columns["margin"])
@@ -199,7 +199,13 @@ def check_alignment(store: Store, asset_id: str) -> AlignmentCheck:
             mean = float(values.mean(dtype=np.float64)) if len(values) else math.nan
             figures.append(Figure(f"mean {name}", mean, mean, 0))
     return AlignmentCheck(
-        asset_id, verdict, reasons, str(columns["verdict"]), tuple(figures), asset.transform, radius
+        asset.asset_id,
+        verdict,
+        reasons,
+        str(columns["verdict"]),
+        tuple(figures),
+        asset.transform,
+        radius,
     )
 
 

@@ -66,15 +66,15 @@ class VoxelField:
         return self.place_map.to_pixieverse(points)
 
 
-def stored_field(store: Store, asset_id: str, points: Points = "slat") -> VoxelField:
+def stored_field(store: Store, name: str | int, points: Points = "slat") -> VoxelField:
     """Return the materials of an asset in a store.
 
     Parameters
     ----------
     store : Store
         The store.
-    asset_id : str
-        The asset.
+    name : str or int
+        The asset, as in `Store.match`.
     points : {"slat", "grid"}
         The valid SLAT voxels, a surface, or the annotated voxels of the PixieVerse field, a
         solid.
@@ -92,7 +92,7 @@ def stored_field(store: Store, asset_id: str, points: Points = "slat") -> VoxelF
     ConfigError
         If no voxel of the asset has a material.
     """
-    asset, columns = store.asset(asset_id), store.columns_of(PROPERTY_COLUMNS)
+    asset, columns = store.asset(name), store.columns_of(PROPERTY_COLUMNS)
     require_solver_classes(store)
     if points == "grid":
         grid = asset.field
@@ -105,7 +105,7 @@ def stored_field(store: Store, asset_id: str, points: Points = "slat") -> VoxelF
         field = _on_cells(asset.coords[valid], asset.material[valid], values, side)
     if len(field.voxels) == 0:
         raise ConfigError(
-            f"{store.path}: no voxel of {asset_id} has a material; expected an asset whose "
+            f"{store.path}: no voxel of {asset.asset_id} has a material; expected an asset whose "
             "valid_share is above 0"
         )
     return field

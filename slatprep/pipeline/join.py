@@ -26,7 +26,7 @@ from slatprep.workers import Progress
 def subset_store(
     store: str | Place,
     out: str | Place,
-    assets: Iterable[str],
+    assets: Iterable[str | int],
     *,
     manifests: str | Place | None = None,
     progress: Progress | None = None,
@@ -41,8 +41,8 @@ def subset_store(
         The store to choose from; it stays as it is.
     out : str or Place
         The new store, a path or URL; an existing one is replaced in one step.
-    assets : iterable of str
-        Ids, or beginnings of ids that no other has.
+    assets : iterable of str or int
+        Ids, beginnings of ids that no other has, or numbers; see `Store.match`.
     manifests : str or Path, optional
         Folder of its records; by default beside it.
     progress : callable, optional

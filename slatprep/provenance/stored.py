@@ -34,15 +34,15 @@ class StoredRecords:
     def __iter__(self) -> Iterator[AssetRecord]:
         return (self.read(row) for row in range(len(self.store)))
 
-    def of(self, asset_id: str) -> AssetRecord:
-        """Return an asset's record.
+    def of(self, name: str | int) -> AssetRecord:
+        """Return the record of an asset, named as in `Store.match`.
 
         Raises
         ------
         StoreError
             If the store has no such asset, or its record cannot be read.
         """
-        return self.read(self.store.find(asset_id))
+        return self.read(self.store.match(name))
 
     def place_map(self, asset: StoredAsset) -> PlaceMap:
         """Return the map between the frames by which an asset was looked up.

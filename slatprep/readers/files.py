@@ -238,7 +238,9 @@ def npz_arrays(
         wanted = [name for name in specs if not partial or name in present]
         for name in wanted:
             if present.count(name) != 1:
-                found = ", ".join(sorted(present)[:8]) or "nothing"
+                names = sorted(present)
+                more = f" and {len(names) - 8} more" if len(names) > 8 else ""
+                found = (", ".join(names[:8]) or "nothing") + more
                 raise InputError(
                     where,
                     f"has {present.count(name)} arrays named {name!r} (it holds {found})",

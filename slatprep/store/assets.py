@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import operator
 from collections import Counter
 from collections.abc import Sequence
 from functools import cached_property
@@ -12,11 +13,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from slatprep.errors import StoreError, UnknownAssetError
+from slatprep.errors import StoreError, UnknownAssetError, amount
 from slatprep.records import Contents, Normalization, Place
 from slatprep.storage.versions import store_name
 from slatprep.store.arrays import Arrays
 from slatprep.store.attributes import RootAttributes, read_attributes
+from slatprep.store.gate import NAMES
 from slatprep.store.layout import ARRAYS, MERGED
 from slatprep.store.shard_reader import RowReader
 
@@ -176,51 +178,74 @@ class AssetTable:
         StoreError
             If there is no such array, or it cannot be read.
         """
+        if f"asset/{name}" not in NAMES:
+            columns = ("id", "offset", "transform", *ASSET_COLUMNS)
+            close = difflib.get_close_matches(name, columns, n=1)
+            hint = f"did you mean {close[0]}?" if close else f"expected one of {', '.join(columns)}"
+            raise StoreError(f"{self.path} has no column {name!r}; {hint}")
         # Offsets are always written: that they are there bounds what the others may claim.
         rows = self.shape("asset/offset")[0] if name == "offset" else len(self)
         return self.read_rows(f"asset/{name}", 0, rows)
 
     def find(self, asset_id: str) -> int:
-        """Return the index of an asset.
+        """Return the index of the asset with this id, and no other.
 
         Raises
         ------
         UnknownAssetError
             If the store has no such asset; the message names those it might be.
         """
-        index = self._index.get(asset_id)
-        if index is None:
-            views = [known for known in self.ids if known.startswith(f"{asset_id}.")]
-            alike = asset_id.casefold()
-            begun = [known for known in self.ids if alike and known.casefold().startswith(alike)]
-            close = views or begun or difflib.get_close_matches(asset_id, self.ids)
-            hint = (
-                f"did you mean {' or '.join(close[:5])}?" if close else f"it has {len(self)} assets"
-            )
-            raise UnknownAssetError(f"{self.path} has no asset {asset_id!r}; {hint}")
-        return index
+        if asset_id not in self._index:
+            raise self._unknown(asset_id)
+        return self._index[asset_id]
 
-    def match(self, name: str) -> int:
-        """Return the index of the asset with this id, or else of the one that begins so.
+    def match(self, name: str | int) -> int:
+        """Return the index of an asset: named by its id, by a beginning of it, or by a number.
+
+        Numbers count from 0, negative ones from the end. A text of digits is a number where no
+        id begins so.
 
         Raises
         ------
         UnknownAssetError
             If there is none, or several begin so; the message names them.
         """
+        if not isinstance(name, str):
+            return self._numbered(operator.index(name))
         if name in self._index:
             return self._index[name]  # A loop over all assets must not search all ids each time.
         alike = [known for known in self.ids if known.startswith(name)] if name else []
-        if not alike:
-            return self.find(name)
         if len(alike) == 1:
-            return self.find(alike[0])
-        if all(known.startswith(f"{name}.") for known in alike):
-            return self.find(name)  # Views of one object: the message offers them.
-        raise UnknownAssetError(
-            f"{self.path}: {len(alike)} ids begin with {name!r}, such as {', '.join(alike[:3])}; "
-            "give more of it"
+            return self._index[alike[0]]
+        views = all(known.startswith(f"{name}.") for known in alike)
+        if alike and not views:
+            raise UnknownAssetError(
+                f"{self.path}: {len(alike)} ids begin with {name!r}, such as "
+                f"{', '.join(alike[:3])}; give more of it"
+            )
+        if not alike and name.isascii() and name.isdigit():
+            return self._numbered(int(name))
+        raise self._unknown(name)
+
+    def _numbered(self, number: int) -> int:
+        if not -len(self) <= number < len(self):
+            raise UnknownAssetError(
+                f"{self.path} has no asset {number}; it has {amount(len(self), 'asset')}, "
+                "numbered from 0"
+            )
+        return number % len(self)
+
+    def _unknown(self, name: str) -> UnknownAssetError:
+        """Return the error that offers ids which `name` might mean."""
+        alike = name.casefold()
+        begun = [known for known in self.ids if alike and known.casefold().startswith(alike)]
+        close = begun or difflib.get_close_matches(name, self.ids)
+        hint = (
+            f"did you mean {' or '.join(close[:5])}?"
+            if close
+            else f"it has {amount(len(self), 'asset')}; `slatprep list` shows their ids"
         )
+        return UnknownAssetError(f"{self.path} has no asset {name!r}; {hint}")
 
     def table(self) -> dict[str, NDArray[Any]]:
         """Return what is known of every asset, as columns of A values.

@@ -7,7 +7,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, overload
 
 import numpy as np
 from numpy.typing import NDArray
@@ -168,7 +168,18 @@ class Store(AssetTable):
         return (open_store, (self.path,))
 
     def __iter__(self) -> Iterator[StoredAsset]:
-        return (self.asset(asset_id) for asset_id in self.ids)
+        return (self.asset(index) for index in range(len(self)))
+
+    @overload
+    def __getitem__(self, name: str | int) -> StoredAsset: ...
+
+    @overload
+    def __getitem__(self, name: slice) -> list[StoredAsset]: ...
+
+    def __getitem__(self, name: str | int | slice) -> StoredAsset | list[StoredAsset]:
+        if isinstance(name, slice):
+            return [self.asset(index) for index in range(*name.indices(len(self)))]
+        return self.asset(name)
 
     def read(
         self, index: int, columns: Sequence[str] = TRAINING_COLUMNS
@@ -230,17 +241,17 @@ class Store(AssetTable):
             )
         return start, stop
 
-    def asset(self, asset_id: str) -> StoredAsset:
-        """Return one asset, by its id or a beginning that no other has; see `match`.
+    def asset(self, name: str | int) -> StoredAsset:
+        """Return one asset, by its id, a beginning that no other id has, or its number.
 
-        Its grid is read when it is first asked for.
+        ``store[name]`` does the same; see `match`. The grid is read when it is first asked for.
 
         Raises
         ------
         StoreError
             If the store has no such asset, or a file is missing or damaged.
         """
-        index = self.match(asset_id)
+        index = self.match(name)
         return StoredAsset(
             store=self,
             index=index,

@@ -107,7 +107,7 @@ def test_columns_are_those_of_the_arrays(made: Made) -> None:
         change = arrays["asset/property_ambiguity"][:, column]
         assert same(table[f"property_ambiguity_{name}"], change)
     assert "property_ambiguity" not in table
-    with pytest.raises(StoreError, match="lacks the array asset/colour"):
+    with pytest.raises(StoreError, match="has no column 'colour'; expected one of id, offset"):
         store.column("colour")
 
 
@@ -140,12 +140,35 @@ def test_an_asset_is_found_by_a_beginning_that_no_other_has(made: Made) -> None:
         ("cupp", r"did you mean cup\?"),
         ("", "has no asset ''; it has 4 assets"),
         ("zebra", "it has 4 assets"),
+        ("4", "has no asset 4; it has 4 assets, numbered from 0"),
+        (4, "has no asset 4; it has 4 assets, numbered from 0"),
+        (-5, "has no asset -5"),
     ],
 )
-def test_a_name_that_none_or_several_have_is_answered(made: Made, name: str, hint: str) -> None:
+def test_a_name_that_none_or_several_have_is_answered(
+    made: Made, name: str | int, hint: str
+) -> None:
     store, _ = made
     with pytest.raises(UnknownAssetError, match=hint):
         store.match(name)
+
+
+def test_assets_are_taken_by_number_id_beginning_and_slice(made: Made) -> None:
+    store, _ = made
+    names = (0, "0", np.int64(-4), "a", IDS[0])
+    assert {store[name].asset_id for name in names} == {IDS[0]}
+    assert store[-1].asset_id == store.asset("3").asset_id == IDS[3]
+    assert [asset.asset_id for asset in store[1:3]] == list(IDS[1:3])
+    assert [asset.asset_id for asset in store[::-1]] == list(IDS[::-1])
+    assert [asset.asset_id for asset in store] == list(IDS)
+
+
+def test_a_column_that_is_not_there_is_answered_by_those_that_are(made: Made) -> None:
+    store, _ = made
+    with pytest.raises(StoreError, match=r"has no column 'verdikt'; did you mean verdict\?"):
+        store.column("verdikt")
+    with pytest.raises(StoreError, match=r"has no column 'nope'; expected one of .*category, "):
+        store.column("nope")
 
 
 def test_a_notebook_shows_the_store_as_a_table(made: Made) -> None:
