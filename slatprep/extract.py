@@ -22,7 +22,7 @@ import numpy as np
 import orjson
 from numpy.typing import NDArray
 
-from slatprep.errors import ConfigError, InputError, SlatprepError
+from slatprep.errors import ConfigError, InputError
 from slatprep.readers.patterns import NAME
 from slatprep.readers.slat import check_coords
 from slatprep.records import TRELLIS, StructuredLatents
@@ -131,7 +131,7 @@ def _load_session(model: str, revision: str | None, device: str | None) -> Sessi
         import torch
         from trellis.pipelines import TrellisImageTo3DPipeline
     except ImportError as error:
-        raise SlatprepError(
+        raise ConfigError(
             f"TRELLIS draws and decodes latents, and {error.name or 'a part of it'} is not "
             "installed; "
             "install TRELLIS as https://github.com/microsoft/TRELLIS says, on a machine with an "

@@ -5,7 +5,7 @@ from __future__ import annotations
 from importlib import metadata
 from importlib.util import find_spec
 
-from slatprep.errors import SlatprepError
+from slatprep.errors import ConfigError
 from slatprep.parameters import AlignParameters
 from slatprep.records import Alignment, Engine, MaterialField, StructuredLatents
 
@@ -71,12 +71,12 @@ def require_engine(parameters: AlignParameters) -> None:
 
     Raises
     ------
-    SlatprepError
+    ConfigError
         If it is not; the message says what to install.
     """
     extra = _EXTRAS.get(parameters.engine)
     if extra is not None and find_spec(parameters.engine) is None:
-        raise SlatprepError(
+        raise ConfigError(
             f"the engine {parameters.engine} needs the package of that name, which is not "
             f"installed: pip install 'slatprep[{extra}]'"
         )
@@ -101,7 +101,7 @@ def engine_versions(parameters: AlignParameters) -> dict[str, str]:
 
     Raises
     ------
-    SlatprepError
+    ConfigError
         If the engine is not installed.
     """
     require_engine(parameters)

@@ -17,6 +17,9 @@ def main() -> None:
         os.environ[variable] = "1"
     # A batch system stops jobs with SIGTERM: clean up and exit as after Ctrl-C.
     signal.signal(signal.SIGTERM, signal.default_int_handler)
+    from slatprep.cli.streams import prepare_streams
+
+    prepare_streams()
     from slatprep.cli.commands import slatprep
 
     slatprep(prog_name="slatprep")

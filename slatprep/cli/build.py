@@ -15,6 +15,8 @@ from slatprep.cli.options import (
 )
 from slatprep.cli.output import Output, say
 from slatprep.cli.signature import Click, command
+from slatprep.errors import amount
+from slatprep.workers import Progress
 
 if TYPE_CHECKING:
     from slatprep.parameters import BuildParameters
@@ -100,7 +102,7 @@ def build_store(
                 rehash=rehash,
                 compact=compact,
                 keep_work=keep_work,
-                progress=progress,
+                progress=_counting(output, progress),
                 **_by_work(output, parameters),
             )
     report(output, summary)
@@ -137,6 +139,20 @@ def align(
             **_by_work(output, parameters),
         )
     report(output, summary)
+
+
+def _counting(output: Output, progress: Progress) -> Progress:
+    """Return `progress` that also notes what a stopped build keeps."""
+
+    def update(done: int, total: int) -> None:
+        if done:
+            output.keeps(
+                f"{done:,} of {amount(total, 'asset')} are done and kept; the same command goes on "
+                "from there"
+            )
+        progress(done, total)
+
+    return update
 
 
 def _by_work(output: Output, parameters: BuildParameters) -> dict[str, Any]:

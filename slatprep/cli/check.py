@@ -64,13 +64,8 @@ def check_alignment(
     Its quality is recomputed from the stored arrays, and compared with the
     stored figures. A picture shows both sides before and after from three
     directions, the error of every voxel, the scores of the candidates and the
-    verdict. --asset, --worst and --ambiguous may be combined.
-
-    Exit codes
-    ----------
-    0  all assets are good and the store is consistent
-    1  one is not, or a picture cannot be written
-    2  wrong use: an option, or an unknown asset
+    verdict. --asset, --worst and --ambiguous may be combined. The exit code is 1
+    unless all are good and the store agrees with itself.
 
     Example
     -------

@@ -4,11 +4,20 @@ from __future__ import annotations
 
 import difflib
 import importlib
-from typing import Any
+import sys
+from typing import Any, NoReturn
 
 import click
 
-from slatprep.cli.output import EXIT_INCOMPLETE, EXIT_INTERRUPTED, EXIT_USAGE, say
+from slatprep.cli.output import (
+    EXIT_CODES,
+    EXIT_INCOMPLETE,
+    EXIT_INTERRUPTED,
+    EXIT_UNPRINTED,
+    EXIT_USAGE,
+    say,
+)
+from slatprep.cli.streams import OutputLostError, lost
 from slatprep.errors import ConfigError, SlatprepError
 
 GROUPS = {
@@ -97,7 +106,9 @@ class LazyGroup(click.Group):
     def invoke(self, ctx: click.Context) -> Any:
         """Run the command; print an expected error in one line and set the exit code."""
         try:
-            return super().invoke(ctx)
+            done = super().invoke(ctx)
+        except OutputLostError:
+            self._fail_unprinted(ctx)
         except SlatprepError as error:
             say(f"slatprep: error: {error}", err=True)
             ctx.exit(EXIT_USAGE if isinstance(error, ConfigError) else EXIT_INCOMPLETE)
@@ -108,8 +119,19 @@ class LazyGroup(click.Group):
             say(f"slatprep: error: {error.filename}: {error.strerror}; run again", err=True)
             ctx.exit(EXIT_INCOMPLETE)
         except KeyboardInterrupt:
-            say("\nslatprep: stopped; nothing was replaced", err=True)
+            kept = getattr(ctx.obj, "if_stopped", "") or "run it again to start anew"
+            say(f"\nslatprep: stopped; nothing was replaced; {kept}", err=True)
             ctx.exit(EXIT_INTERRUPTED)
+        if lost():
+            self._fail_unprinted(ctx)
+        return done
+
+    def _fail_unprinted(self, ctx: click.Context) -> NoReturn:
+        """Say, on what is left to write to, that the result could not be printed."""
+        if not lost().startswith("standard error") or "--json" not in sys.argv:
+            told = f"slatprep: error: {lost()}; the work is done, run it again to see the result"
+            say(told, err="standard output" in lost())
+        ctx.exit(EXIT_UNPRINTED)
 
 
 @click.command(
@@ -119,13 +141,9 @@ class LazyGroup(click.Group):
         "max_content_width": 100,
         "show_default": True,
     },
-    epilog="""\b
-Exit codes:
-  0    all went in, or the check passed
-  1    something did not go in, or a check failed
-  2    wrong use: an option, a dataset definition or a name
-  130  stopped with Ctrl-C; nothing was replaced
-
+    epilog="\b\nExit codes:\n"
+    + "".join(f"  {code:<4} {words}\n" for code, words in EXIT_CODES.items())
+    + """
 \b
 Example:
   slatprep make-demo demo --assets 12 --seed 0

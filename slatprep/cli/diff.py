@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING, Annotated
 from slatprep.cli.options import FolderOrUrl, Jobs, Positive
 from slatprep.cli.output import Cell, Output, say
 from slatprep.cli.signature import Click, command
-from slatprep.errors import ConfigError, StoreError
 
 if TYPE_CHECKING:
     from slatprep.inspect.difference import AssetChange, PropertyChange, StoreDifference
@@ -38,13 +37,7 @@ def diff(
 
     Lists assets in only one of the stores; changed sources, verdicts, placements, labels,
     properties in SI units and latents of assets in both; and different ranges, parameters
-    and versions.
-
-    Exit codes
-    ----------
-    0  the same
-    1  different
-    2  a store cannot be read, or wrong use
+    and versions. The exit code is 1 where the stores differ.
 
     Example
     -------
@@ -56,13 +49,10 @@ def diff(
 
     if worst is None and not output.as_json:
         worst = _SHOWN
-    try:
-        with output.progress("diff") as progress:
-            found = compare_stores(
-                open_store(a), open_store(b), worst=worst, jobs=jobs, progress=progress
-            )
-    except StoreError as error:
-        raise ConfigError(str(error)) from error  # Exit code 1 means different, as for diff.
+    with output.progress("diff") as progress:
+        found = compare_stores(
+            open_store(a), open_store(b), worst=worst, jobs=jobs, progress=progress
+        )
     output.result(found, lambda: _show(output, found), complete=found.same)
 
 

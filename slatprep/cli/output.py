@@ -21,13 +21,21 @@ from typing import Any
 
 import click
 
+from slatprep.cli.streams import emit
 from slatprep.errors import SlatprepError, in_unicode
 from slatprep.storage.place import is_place, place_of, storage_of
 from slatprep.workers import Progress
 
-EXIT_INCOMPLETE = 1
-EXIT_USAGE = 2
-EXIT_INTERRUPTED = 130
+EXIT_INCOMPLETE, EXIT_USAGE, EXIT_UNPRINTED, EXIT_INTERRUPTED = 1, 2, 3, 130
+
+EXIT_CODES = {
+    0: "all went in, or the check passed",
+    EXIT_INCOMPLETE: "something did not go in, a check failed, or a file cannot be read or written",
+    EXIT_USAGE: "wrong use: an option, a dataset definition, a name, or an extra that is missing",
+    EXIT_UNPRINTED: "the work is done, but its result could not be printed",
+    EXIT_INTERRUPTED: "stopped with Ctrl-C or SIGTERM; nothing was replaced",
+}
+"""What the exit code of every command says."""
 
 Cell = str | int | float | bool | None
 
@@ -59,6 +67,7 @@ class Output:
         self.as_json = as_json
         self.verbosity = verbosity
         self.command = command
+        self.if_stopped = ""
 
     def result(self, document: object, show: Callable[[], None], complete: bool = True) -> None:
         """Print a result: the document as JSON, or else what `show` prints.
@@ -92,6 +101,10 @@ class Output:
     def made(self, document: object, show: Callable[[], None], complete: bool = True) -> None:
         """Print a summary of what was written, as `result` does; if quiet, only as JSON."""
         self.result(document, show if self.verbosity >= 0 else lambda: None, complete)
+
+    def keeps(self, words: str) -> None:
+        """Set what is printed if the command is stopped from now on: what is kept, how to go on."""
+        self.if_stopped = words
 
     def note(self, message: str) -> None:
         """Print a line on standard error, unless quiet."""
@@ -172,7 +185,7 @@ def _for_spreadsheet(value: object) -> object:
 
 def say(text: object = "", *, err: bool = False, nl: bool = True) -> None:
     """Print text through `printable`; all commands print with this function."""
-    click.echo(printable(str(text)), err=err, nl=nl)
+    emit(printable(str(text)), err=err, nl=nl)
 
 
 def printable(text: str) -> str:
@@ -289,7 +302,9 @@ def _rich_table(
     console = Console(file=sys.stdout, highlight=False)
     # On a narrow terminal a line may wrap, but an id or a number is never cut.
     console.width = max(console.width, needed - _GAP)
-    console.print(Text(title, style="bold"), table, "", sep="\n")
+    with console.capture() as drawn:
+        console.print(Text(title, style="bold"), table, "", sep="\n")
+    emit(drawn.get(), err=False, nl=False)
 
 
 def _plain_table(

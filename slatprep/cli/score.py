@@ -27,8 +27,8 @@ def score(
     (0 where the shapes are the same); displacement is the median, p90 the 90th
     percentile; labels is the share of right classes (of a store without
     classes, of voxels with the right properties), beside what the best
-    similarity and the true places themselves would give. Exit code 1 says that
-    an asset with a truth is not in the store.
+    similarity and the true places themselves would give. The exit code
+    is 1 where an asset with a truth is not in the store.
 
     Example
     -------

@@ -66,12 +66,13 @@ def _runner(function: _Function) -> Callable[..., object]:
 
     @functools.wraps(function)
     def run(*, as_json: bool, quiet: bool, verbose: bool, **options: Any) -> object:
-        given = {name: local_path(value) for name, value in options.items()}
         # Without the program: "info".
         context = click.get_current_context()
         name = context.command_path.partition(" ")[2] or context.info_name or ""
         output = Output(as_json, int(verbose) - int(quiet), name)
+        context.find_root().obj = output
         with output.failing():
+            given = {name: local_path(value) for name, value in options.items()}
             require_apart(context.command, given)
             _group(_hints(function), given)
             return function(output, **given)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import math
 import os
 from dataclasses import dataclass
@@ -133,6 +134,7 @@ def train(
     runs = {name: out / name for name in _SIZES} if all_sizes else {size: out}
     summaries = {}
     for name, directory in runs.items():
+        output.keeps("the same command goes on after the last epoch that was finished")
         with (
             writing(str(directory), directory.parent),
             output.progress(f"train {name}", "steps") as steps,
@@ -144,12 +146,19 @@ def train(
                 device=device,
                 workers=workers,
                 steps=steps,
-                progress=lambda r, name=name: output.note(f"{name}, {_line(r)}"),  # type: ignore[misc]
+                progress=functools.partial(_tell_epoch, output, name),
             )
     output.made({"runs": summaries}, lambda: _show_training(output, summaries))
     output.note(f"runs:    {', '.join(str(directory) for directory in runs.values())}")
     first = next(iter(summaries.values()))
     output.note(f"next:    slatprep evaluate {first.predictions} --store {store}")
+
+
+def _tell_epoch(output: Output, name: str, record: EpochRecord) -> None:
+    output.note(f"{name}, {_line(record)}")
+    output.keeps(
+        f"epochs to {record.epoch} are kept; the same command goes on at {record.epoch + 1}"
+    )
 
 
 def _line(record: EpochRecord) -> str:

@@ -50,7 +50,7 @@ def verify(
     Compares metadata with the contract, every file with its digest, every chunk
     with its checksum, values with their ranges, annotations with the stored grid
     and transform, and records with their schema and the rows. Every fault is
-    named. Exit code 0: no faults; 1: at least one.
+    named; the exit code is 1 where there is one.
 
     Example
     -------

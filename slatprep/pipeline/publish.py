@@ -129,9 +129,9 @@ def _replaceable(out: Path) -> Path:
         ) from error
     around = next((str(path) for path in target.parents if is_store(path)), "")
     if around:
-        raise StoreError(f"{out} lies inside the store {around}; choose a path outside of it")
+        raise ConfigError(f"{out} lies inside the store {around}; choose a path outside of it")
     if taken:
-        raise StoreError(
+        raise ConfigError(
             f"{out} exists and is not a slatprep store; expected a store to replace, or a new path"
         )
     return target

@@ -70,7 +70,7 @@ def test_numbers_are_finite(
     ("words", "said"),
     [
         (("evaluate", "--store", "nothing-here", "--json"), "nothing-here"),
-        (("bench", "align", "--json", "--assets", "0"), "0 is not in the range"),
+        (("make-demo", "--json", "d", "--assets", "0"), "0 is not in the range"),
         (("info", "--json", "--colour"), "--colour"),
     ],
 )
@@ -78,7 +78,7 @@ def test_wrong_use_is_told_as_json(words: tuple[str, ...], said: str) -> None:
     result = run(*words)
     document = json.loads(result.stdout)
     assert result.exit_code == 2 and said in document["error"] and said in result.stderr
-    command = " ".join(word for word in words[:2] if word in ("evaluate", "bench", "align", "info"))
+    command = " ".join(word for word in words[:2] if word in ("evaluate", "make-demo", "info"))
     assert (document["command"], document["ok"]) == (command, False)
 
 
@@ -205,10 +205,14 @@ def test_what_ends_a_command_is_json_too(store: Path, tmp_path: Path) -> None:
         (("info", tmp_path, "--json"), 1, "is not a slatprep store"),
         (("check-alignment", "--asset", "cuo", "--store", store, "--json"), 2, "did you mean cup?"),
         (("check-alignment", "--store", store, "--json"), 2, "say which assets"),
-        (("bench", "read", "s3://nowhere/s.zarr", "--json"), 2, "expected a store on the local"),
+        (
+            ("report", store, "--out", "s3://nowhere/p.html", "--json"),
+            2,
+            "expected a path of the local",
+        ),
     ):
         result = run(*words)
         assert result.exit_code == code
         document = json.loads(result.stdout)
         assert said in document["error"] and said in result.stderr and document["ok"] is False
-    assert document["command"] == "bench read"
+    assert document["command"] == "report"

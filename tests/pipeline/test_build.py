@@ -320,7 +320,7 @@ def test_no_store_is_built_inside_another(make_dataset: MakeDataset, tmp_path: P
     build_store(data.parameters(), outer)
     before = tree(outer)
     for inner in (outer / "inner.zarr", outer / "asset" / "deep" / "inner.zarr"):
-        with pytest.raises(StoreError, match=r"lies inside the store .*outer\.zarr"):
+        with pytest.raises(ConfigError, match=r"lies inside the store .*outer\.zarr"):
             build_store(data.parameters(), inner)
     assert tree(outer) == before
 

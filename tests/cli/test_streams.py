@@ -1,0 +1,63 @@
+"""Commands whose standard output or standard error is closed, or full."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from slatprep.pipeline.dataset import BuildSummary
+from slatprep.store import open_store
+
+DEVICE = Path("/dev/full")
+
+
+def shell(words: str, redirected: str) -> subprocess.CompletedProcess[str]:
+    line = f"{sys.executable} -m slatprep {words} {redirected}"
+    return subprocess.run(["sh", "-c", line], capture_output=True, text=True, timeout=120)
+
+
+@pytest.mark.parametrize("redirected", [">&-", pytest.param("> /dev/full", marks=pytest.mark.skipif(
+    not DEVICE.exists(), reason="no /dev/full"))])  # fmt: skip
+@pytest.mark.parametrize("words", ["info {}", "list {}", "verify {} --json"])
+def test_lost_output_is_told_on_standard_error(
+    mixed_build: BuildSummary, words: str, redirected: str
+) -> None:
+    done = shell(words.format(mixed_build.store), redirected)
+    assert done.returncode == 3
+    told = [line for line in done.stderr.splitlines() if line.startswith("slatprep: error:")]
+    assert len(told) == 1 and "standard output cannot be written to" in told[0]
+    assert "Traceback" not in done.stderr and "Exception" not in done.stderr
+
+
+@pytest.mark.parametrize("redirected", ["2>&-", "2> /dev/full", ">&- 2>&-"])
+def test_a_subset_is_whole_whatever_happens_to_what_it_prints(
+    mixed_build: BuildSummary, tmp_path: Path, redirected: str
+) -> None:
+    out = tmp_path / "s.zarr"
+    done = shell(f"subset {mixed_build.store} --verdict good --out {out}", redirected)
+    assert "Traceback" not in done.stdout + done.stderr
+    assert done.returncode in (0, 3)
+    store = open_store(out)
+    assert len(store) and all(asset.columns["verdict"] == "good" for asset in store)
+    assert shell(f"verify {out}", "").returncode == 0
+
+
+def test_lost_notes_are_told_on_standard_output_and_never_within_json(
+    mixed_build: BuildSummary,
+) -> None:
+    store = mixed_build.store
+    done = shell(f"verify {store}", "2>&-")  # It notes how many files it read.
+    assert done.returncode == 3
+    assert "standard error cannot be written to" in done.stdout
+    done = shell(f"stats {store} --json", "2>&-")
+    assert json.loads(done.stdout)["command"] == "stats"
+
+
+def test_a_reader_that_has_read_enough_is_no_fault(mixed_build: BuildSummary) -> None:
+    done = shell(f"list {mixed_build.store} --ids", "| head -1")
+    assert done.stdout.count(os.linesep) == 1 and "rror" not in done.stderr
