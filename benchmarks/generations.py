@@ -103,7 +103,7 @@ def make_pair(seed: int, index: int, bend: float, torn: bool) -> Pair | None:
     if asset.symmetric:
         return None
     first, second = asset.views
-    occupancy, shell = filled_view(first), filled_view(second)
+    occupancy, shell = _filled(first), _filled(second)
     if torn:
         rng = np.random.default_rng([seed, index])
         occupancy, shell = _torn(rng, occupancy), _torn(rng, shell)
@@ -119,8 +119,7 @@ def make_pair(seed: int, index: int, bend: float, torn: bool) -> Pair | None:
     return Pair(asset.name, asset.category, field, latents, second.material[own], places)
 
 
-def filled_view(view: DemoView) -> NDArray[np.bool_]:
-    """Return the solid that a view of a demo object shows."""
+def _filled(view: DemoView) -> NDArray[np.bool_]:
     shell = occupancy_of(view.coords)
     return shell | ~outside_of(shell)
 

@@ -1,98 +1,121 @@
 """Pairs of shapes of one object that differ by lumps: near-perfect here, quite another there.
 
 Two generations of one object, or a scan and a generation of it, differ like that: a chimney
-more, other cushions, a thicker leg. Both sides are shapes of level 5 of the demo, hardly bent
-and of nearly the same proportions; then pieces of either are added, left out, grown, thinned or
-moved. The annotation is turned by a quarter turn and a tilt of up to 15 degrees.
+more, other cushions, a thicker leg. Both sides are a solid of the demo, the SLAT's bent a
+little; then pieces of either are added, left out, grown, thinned or moved. The annotation is
+turned by a quarter turn and a tilt of up to 15 degrees, and half of them are rough.
 """
 
 from __future__ import annotations
 
-from dataclasses import replace
-from unittest.mock import patch
-
 import numpy as np
-from generations import Pair, filled_view
+from generations import Pair
 from numpy.typing import NDArray
 from scipy import ndimage
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from slatprep.demo.asset import make_asset
-from slatprep.demo.difficulty import LEVELS
 from slatprep.geometry.frames import VOXEL_SIZE, cube_symmetries, voxel_centres
 from slatprep.geometry.voxels import boundary
-from slatprep.records import RESOLUTION, MaterialField, StructuredLatents
+from slatprep.records import BACKGROUND, RESOLUTION, MaterialField, StructuredLatents
 
-BENDS, PROPORTIONS = (0.1, 1.2), (0.0, 0.06)
-"""Of the shapes apart from lumps: bend [voxel, rms], and how far their proportions differ."""
+MOST_BEND, ROUGHNESS = 1.5, 0.8
+"""How far the SLAT's shape is bent, and a rough field's surface lies off it [voxel, rms]."""
 
 MOST_LUMPS = 6
 TILT = 15.0
 
+_PIECES = ("box", "ball", "hole", "grown", "thinned", "moved")
+
 Mask = NDArray[np.bool_]
+Array = NDArray[np.float64]
 
 
-def make_lumpy_pair(seed: int, index: int) -> Pair | None:
-    """Make a pair; None of a symmetric object, or where hardly anything is left of one."""
-    rng = np.random.default_rng([seed, index, 77])
-    level = replace(
-        LEVELS[5], bend=float(rng.uniform(*BENDS)), proportions=PROPORTIONS, damaged=False
-    )
-    with patch.dict(LEVELS, {5: level}):
-        asset = make_asset(seed, index, levels=(5,), views=2)
+def make_lumpy_pairs(seed: int, index: int, variants: int) -> list[Pair]:
+    """Make some pairs of one object; none of a symmetric one."""
+    asset = make_asset(seed, index, levels=(0,))
     if asset.symmetric:
-        return None
-    first, second = asset.views
-    solid, shell = filled_view(first), filled_view(second)
-    for _ in range(rng.integers(1, MOST_LUMPS + 1)):
+        return []
+    labels = asset.grid[..., 3].astype(np.int16)
+    voxels = np.argwhere(asset.occupancy & (labels >= 0) & (labels != BACKGROUND))
+    own = labels[tuple(voxels.T)].astype(np.uint8)
+    tree, solid = cKDTree(voxel_centres(voxels)), ndimage.binary_fill_holes(asset.occupancy)
+    pairs = []
+    for variant in range(variants):
+        rng = np.random.default_rng([seed, index, variant])
+        pair = _make(rng, solid, tree, own, asset.name, asset.category)
+        pairs += [] if pair is None else [pair]
+    return pairs
+
+
+def _make(
+    rng: np.random.Generator, solid: Mask, tree: cKDTree, labels: NDArray[np.uint8],
+    name: str, category: str,
+) -> Pair | None:  # fmt: skip
+    bend = _bend(rng, rng.uniform(0.0, MOST_BEND))
+    cells = voxel_centres(np.argwhere(np.ones(solid.shape, dtype=bool)))
+    shell = _at(solid, cells + bend.reshape(-1, 3)).reshape(solid.shape)
+    for _ in range(rng.integers(0, MOST_LUMPS + 1)):
         if rng.uniform() < 0.5:
-            solid = changed(rng, solid)
+            solid = _changed(rng, solid)
         else:
-            shell = changed(rng, shell)
-    coords = np.argwhere(boundary(shell)).astype(np.uint8)
-    turns = cube_symmetries()
-    quarter = turns[rng.integers(len(turns))].astype(float)
-    if np.linalg.det(quarter) < 0:
-        quarter = -quarter
-    axis = rng.normal(size=3)
-    angle = np.radians(rng.uniform(0.0, TILT))
-    turn = Rotation.from_rotvec(angle * axis / np.linalg.norm(axis)).as_matrix() @ quarter
+            shell = _changed(rng, shell)
+    turns = [turn for turn in cube_symmetries().astype(float) if np.linalg.det(turn) > 0]
+    axis, angle = rng.normal(size=3), np.radians(rng.uniform(0.0, TILT))
+    tilt = Rotation.from_rotvec(angle * axis / np.linalg.norm(axis)).as_matrix()
+    turn = tilt @ turns[rng.integers(len(turns))]
     shift = rng.uniform(-1.0, 1.0, 3) * VOXEL_SIZE
-    occupancy = turned(solid, turn, shift)
-    if min(len(coords), np.count_nonzero(occupancy)) < 200:
+    occupancy = _at(solid, cells @ turn.T + shift).reshape(solid.shape)
+    if rng.uniform() < 0.5:
+        occupancy = _roughened(rng, occupancy)
+    coords, voxels = np.argwhere(boundary(shell)), np.argwhere(occupancy)
+    if min(len(coords), len(voxels)) < 200:
         return None
-    voxels = np.argwhere(occupancy).astype(np.uint8)
-    there = voxel_centres(voxels) @ turn.T + shift
-    nearest = cKDTree(voxel_centres(first.coords)).query(there)[1]
-    field = MaterialField(occupancy, voxels, first.material[nearest], first.properties[nearest])
-    own = cKDTree(second.coords.astype(float)).query(coords)[1]
-    shown = cKDTree(first.places).query(second.places[own])[1]
-    places = (voxel_centres(first.coords)[shown] - shift) @ turn
-    latents = StructuredLatents(coords, second.feats[own])
-    return Pair(asset.name, asset.category, field, latents, second.material[own], places)
+    material = labels[tree.query(voxel_centres(voxels) @ turn.T + shift)[1]]
+    properties = np.ones((len(voxels), 3), dtype=np.float32)
+    field = MaterialField(occupancy, voxels.astype(np.uint8), material, properties)
+    there = voxel_centres(coords) + bend[tuple(coords.T)]
+    latents = StructuredLatents(coords.astype(np.uint8), np.zeros((len(coords), 8), np.float32))
+    own = labels[tree.query(there)[1]]
+    return Pair(name, category, field, latents, own, (there - shift) @ turn)
 
 
-def turned(solid: Mask, turn: NDArray[np.float64], shift: NDArray[np.float64]) -> Mask:
-    """Return a solid in a frame whose points x lie at ``turn @ x + shift`` of its own."""
-    cells = np.argwhere(np.ones(solid.shape, dtype=bool))
-    own = np.floor((voxel_centres(cells) @ turn.T + shift + 0.5) * RESOLUTION).astype(int)
-    inside = ((own >= 0) & (own < RESOLUTION)).all(axis=1)
-    occupied = np.zeros(len(cells), dtype=bool)
-    occupied[inside] = solid[tuple(own[inside].T)]
-    return occupied.reshape(solid.shape)
+def _bend(rng: np.random.Generator, voxels: float) -> Array:
+    """Return a smooth displacement (64, 64, 64, 3) of so many voxels, rms."""
+    waves = [
+        ndimage.gaussian_filter(rng.normal(size=(RESOLUTION,) * 3), 10.0, mode="nearest")
+        for _ in range(3)
+    ]
+    bend = np.stack(waves, axis=-1)
+    found: Array = bend * (voxels * VOXEL_SIZE / np.sqrt((bend**2).sum(axis=-1).mean()))
+    return found
 
 
-def changed(rng: np.random.Generator, solid: Mask) -> Mask:
+def _roughened(rng: np.random.Generator, solid: Mask) -> Mask:
+    noise = ndimage.gaussian_filter(rng.normal(size=solid.shape), 1.2)
+    depth = ndimage.distance_transform_edt(solid) - ndimage.distance_transform_edt(~solid)
+    rough: Mask = depth + ROUGHNESS * noise / noise.std() > 0.0
+    return rough
+
+
+def _at(solid: Mask, points: Array) -> Mask:
+    """Look a solid up at points (N, 3) of its frame."""
+    cells = np.floor((points + 0.5) * RESOLUTION).astype(int)
+    inside = ((cells >= 0) & (cells < RESOLUTION)).all(axis=1)
+    found: Mask = np.zeros(len(points), dtype=bool)
+    found[inside] = solid[tuple(cells[inside].T)]
+    return found
+
+
+def _changed(rng: np.random.Generator, solid: Mask) -> Mask:
     """Add, leave out, grow, thin or move a piece of a shape, at its skin."""
     skin = np.argwhere(boundary(solid))
-    centre = skin[rng.integers(len(skin))]
-    kind = rng.choice(["box", "ball", "hole", "grown", "thinned", "moved"])
-    away = np.abs(np.indices(solid.shape) - centre[:, None, None, None])
-    reach = rng.uniform(2.0, 7.0, 3) if kind in ("box", "ball", "hole") else rng.uniform(6, 16, 3)
-    piece = (away <= reach[:, None, None, None]).all(axis=0)
-    if kind == "ball":
-        piece = ((away / reach[:, None, None, None]) ** 2).sum(axis=0) <= 1.0
+    centre, kind = skin[rng.integers(len(skin))], rng.choice(_PIECES)
+    small = kind in ("box", "ball", "hole")
+    reach = rng.uniform(*((2.0, 7.0) if small else (6.0, 16.0)), 3)[:, None, None, None]
+    away = np.abs(np.indices(solid.shape) - centre[:, None, None, None]) / reach
+    piece = (away**2).sum(axis=0) <= 1.0 if kind == "ball" else (away <= 1.0).all(axis=0)
     by = int(rng.integers(1, 4))
     if kind in ("box", "ball"):
         found = solid | piece
@@ -103,7 +126,6 @@ def changed(rng: np.random.Generator, solid: Mask) -> Mask:
     elif kind == "thinned":
         found = np.where(piece, ndimage.binary_erosion(solid, iterations=by), solid)
     else:
-        step = rng.integers(-4, 5, 3)
-        there = ndimage.shift((solid & piece).astype(np.uint8), step, order=0).astype(bool)
-        found = (solid & ~piece) | there
-    return found if np.count_nonzero(found) > 0.4 * np.count_nonzero(solid) else solid
+        moved = ndimage.shift((solid & piece).astype(np.uint8), rng.integers(-4, 5, 3), order=0)
+        found = (solid & ~piece) | moved.astype(bool)
+    return found if found.sum() > 0.4 * solid.sum() else solid
