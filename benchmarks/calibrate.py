@@ -3,9 +3,11 @@
     python benchmarks/calibrate.py demo.npz ... [--fit [--module slatprep/judge/calibration.py]]
                                    [--picture docs/images/confidence.svg]
 
-Logistic regressions whose weights may only have the sign that makes sense (a better fit
-never lowers a confidence); then a curve, from isotonic regression on the same rows, that
-sets their probabilities right. Alignments are weighed to the mix `PRIOR`.
+Two questions of an alignment: do both sides show the same object, and if they do, is its
+placement right? And one of a voxel: is its class right? Logistic regressions answer them, whose
+weights may only have the sign that makes sense (a better fit never lowers a confidence); of
+voxels then a curve, from isotonic regression on the same rows, that sets their
+probabilities right. Alignments are weighed to the mix `PRIOR`.
 
 With --fit the module gets what is fitted to all tables, and all that is printed and drawn is
 of objects that had no part in the fit: their seeds are divided into `PARTS`, and each part is
@@ -19,31 +21,44 @@ import argparse
 import subprocess
 import sys
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from confidence import GROUND
+from confidence import GROUND, LUMPS, REAL
 from numpy.typing import NDArray
 from scipy.optimize import isotonic_regression, minimize
 from scipy.special import expit
 
+from slatprep.align.pair import TIE
 from slatprep.judge import calibration
 from slatprep.judge.confidence import VOXEL_FIGURES, voxel_figures
 from slatprep.judge.evidence import FIGURES, HARMLESS, Surroundings
 from slatprep.judge.model import Figure, Logistic
 from slatprep.judge.verdict import THRESHOLDS
 
-PRIOR = {"own": 0.9, "heading": 0.05, "other": 0.05}
-"""Of a hundred alignments: ninety as the engine makes them, on all levels alike; five whose
-right placement it was not allowed to see; five of other objects."""
+PRIOR = {"own": 0.93, "heading": 0.02, "other": 0.05}
+"""Of a hundred alignments: 93 as the engine makes them; two whose right placement it was
+not allowed to see; five of other objects."""
+
+EMPHASIS = {GROUND: 1.5, LUMPS: 2.0, REAL: 3.0}
+"""Levels that count for more than one: the made-up ones from 0 to 8 are much alike."""
+
+PLACEMENT_FIGURES = ("margin", "ties", "alike")
+"""What the second question rests on: how far the next placement lies below, and what ties."""
+
+SAME_FIGURES = tuple(name for name in FIGURES if name not in PLACEMENT_FIGURES)
+"""What the first question rests on."""
 
 VOXEL_PRIOR = {"own": 0.95, "heading": 0.05}
 """The same for voxels: what is right at one of another object has no meaning."""
 
 GROWS = {"score_slat", "score_pixieverse", "score_similarity", "within_1", "within_2", "within_3",
-         "margin", "fitness", "fitness_backward", "valid_share"}  # fmt: skip
+         "margin", "fitness", "fitness_backward", "valid_share", "blocks_near", "blocks_middle",
+         "blocks_far", "slat_within_half", "slat_within_1", "slat_within_15",
+         "pixieverse_within_half", "pixieverse_within_1", "pixieverse_within_15"}  # fmt: skip
 """Figures that speak for a placement; all others speak against, where they are large."""
 
 RIGHT_LABELS = 0.9
@@ -51,6 +66,9 @@ RIGHT_LABELS = 0.9
 
 KNEE = 0.02
 """Share of the right placements beyond a figure's knee, where another weight begins."""
+
+KNOWN_KNEES = {"margin": TIE, "ties": 0.0}
+"""Knees that are not taken from right placements: nearer ones are ties, which are counted."""
 
 PARTS = 4
 """Into so many parts the seeds are divided, where each is judged by a fit to the others."""
@@ -66,6 +84,19 @@ Array = NDArray[np.float64]
 Table = dict[str, NDArray[Any]]
 
 
+@dataclass(frozen=True)
+class Models:
+    """The three models."""
+
+    same: Logistic
+    placement: Logistic
+    voxel: Logistic
+
+    def confidence(self, figures: Array) -> Array:
+        """Return the product of both answers, of alignments (A, F)."""
+        return self.same.probability(figures) * self.placement.probability(figures)
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("tables", type=Path, nargs="+", help="what is fitted to, and tested")
@@ -75,11 +106,11 @@ def main() -> None:
     options = parser.parse_args()
     table = read_tables(options.tables)
     if not options.fit:
-        report(table, *judged(table, calibration.PLACEMENT, calibration.VOXEL), options.picture)
+        shipped = Models(calibration.SAME_OBJECT, calibration.PLACEMENT, calibration.VOXEL)
+        report(table, *judged(table, shipped), options.picture)
         return
     if options.module:
-        placement = fit_placement(table)
-        write_module(options.module, placement, fit_voxel(table, placement))
+        write_module(options.module, fit_all(table))
     report(table, *judged_by_others(table), options.picture)
 
 
@@ -96,6 +127,7 @@ def read_tables(paths: Sequence[Path]) -> Table:
     alike = table["harmless"] & (table["kind"] != "other")
     table["placed"] |= alike & (table["labels"] >= RIGHT_LABELS)
     table["known"] = ~(table["symmetric"] & (table["kind"] != "other")) | alike
+    table["same"] = (table["kind"] == "own") & (table["placed"] | table["symmetric"])
     sums = np.bincount(table["voxel_row"], table["voxel_voxels"][:, 10], len(table["kind"]))
     counts = np.bincount(table["voxel_row"], minlength=len(table["kind"]))
     table["torn"] = sums / np.maximum(counts, 1) > HARMLESS
@@ -103,21 +135,29 @@ def read_tables(paths: Sequence[Path]) -> Table:
 
 
 def weights_of(table: Table, rows: NDArray[np.bool_], prior: Mapping[str, float] = PRIOR) -> Array:
-    """Weigh rows to the mix `prior`, levels alike; 0 where not in `rows`."""
+    """Weigh rows to the mix `prior`, levels by `EMPHASIS`, objects of a level of real ones alike.
+
+    0 where not in `rows`.
+    """
     weights = np.zeros(len(rows))
     for kind, share in prior.items():
-        levels = np.unique(table["level"][rows])
+        of_kind = rows & (table["kind"] == kind)
+        levels = np.unique(table["level"][of_kind])
+        whole = sum(EMPHASIS.get(int(level), 1.0) for level in levels)
         for level in levels:
-            chosen = rows & (table["kind"] == kind) & (table["level"] == level)
-            weights[chosen] = share / len(levels) / max(chosen.sum(), 1)
+            there = of_kind & (table["level"] == level)
+            names = table["family"][there] if level == REAL else np.zeros(there.sum())
+            _, which, counts = np.unique(names, return_inverse=True, return_counts=True)
+            each = 1.0 / (len(counts) * counts[which])
+            weights[there] = share * EMPHASIS.get(int(level), 1.0) / whole * each
     return weights / weights.sum()
 
 
 def fit(
     names: tuple[str, ...], values: Array, right: NDArray[np.bool_], weights: Array,
-    knees: bool = False,
+    knees: bool = False, use: tuple[str, ...] = (),
 ) -> Logistic:  # fmt: skip
-    """Fit a `Logistic` with weights of the signs that `GROWS` says."""
+    """Fit a `Logistic` with weights of the signs that `GROWS` says, of the figures `use` or all."""
     low, high = np.nanquantile(values, (0.005, 0.995), axis=0)
     usual = np.nanmean(np.where(right[:, None], np.clip(values, low, high), np.nan), axis=0)
     if knees:
@@ -136,8 +176,9 @@ def fit(
         value = float((weights * np.logaddexp(0.0, -odds)).sum() + 0.5 * RIDGE * (w @ w) / len(w))
         return value, np.append(x.T @ slope + RIDGE * w / len(w), slope.sum())
 
-    bounds = [(0, None) if s > 0 else (None, 0) for s in sign] + [(None, None)]
-    start = np.append(0.1 * sign, 1.0)
+    free = np.array([not use or name in use for name in names])
+    bounds = [_bounds(s, f) for s, f in zip(sign, free, strict=True)] + [(None, None)]
+    start = np.append(0.1 * sign * free, 1.0)
     options = {"maxiter": 5_000, "maxfun": 20_000, "ftol": 1e-13, "gtol": 1e-9}
     found = minimize(loss, start, jac=True, bounds=bounds, method="L-BFGS-B", options=options).x
     figures = tuple(
@@ -147,13 +188,21 @@ def fit(
     return Logistic(figures, float(f"{found[-1]:.6g}"), ())
 
 
+def _bounds(sign: float, free: bool) -> tuple[float | None, float | None]:
+    if not free:
+        return 0.0, 0.0
+    return (0.0, None) if sign > 0 else (None, 0.0)
+
+
 def with_knees(
     names: tuple[str, ...], values: Array, right: NDArray[np.bool_], low: Array, high: Array
 ) -> tuple[tuple[str, ...], Array, Array, Array]:
     """Part each figure's bounds at the value beyond which few right ones lie."""
     parts: list[tuple[int, float, float]] = []
     for k, name in enumerate(names):
-        knee = float(np.nanquantile(values[right, k], KNEE if name in GROWS else 1.0 - KNEE))
+        knee = KNOWN_KNEES.get(name, np.nan)
+        if np.isnan(knee):
+            knee = float(np.nanquantile(values[right, k], KNEE if name in GROWS else 1.0 - KNEE))
         ends = [low[k], float(f"{knee:.6g}"), high[k]] if low[k] < knee < high[k] else None
         parts += [(k, a, b) for a, b in pairwise(ends or [low[k], high[k]])]
     which = [k for k, _, _ in parts]
@@ -179,25 +228,31 @@ def with_curve(
     return Logistic(model.figures, model.intercept, curve)
 
 
-def fit_placement(table: Table) -> Logistic:
-    rows = table["known"]
-    weights = weights_of(table, rows)
-    return fit(FIGURES, table["figures"][rows], table["placed"][rows], weights[rows], knees=True)
-
-
-def fit_voxel(table: Table, placement: Logistic) -> Logistic:
+def fit_all(table: Table) -> Models:
+    """Fit the three models to a table."""
+    same = table["same"] | (table["kind"] == "other")
+    placed = table["known"] & (table["kind"] != "other")
+    first = _fit_rows(table, same, table["same"], SAME_FIGURES)
+    second = _fit_rows(table, placed, table["placed"], PLACEMENT_FIGURES)
     # What ties do is known by counting, and not fitted.
     rows = ~table["torn"]
-    values, right, weights = voxels_of(table, rows, placement)
-    model = fit(VOXEL_FIGURES, values, right, weights)
-    return with_curve(model, values, right, weights)
+    confidence = first.probability(table["figures"]) * second.probability(table["figures"])
+    values, right, weights = voxels_of(table, rows, confidence)
+    voxel = fit(VOXEL_FIGURES, values, right, weights)
+    return Models(first, second, with_curve(voxel, values, right, weights))
+
+
+def _fit_rows(
+    table: Table, rows: NDArray[np.bool_], right: NDArray[np.bool_], use: tuple[str, ...]
+) -> Logistic:
+    weights = weights_of(table, rows)[rows]
+    return fit(FIGURES, table["figures"][rows], right[rows], weights, knees=True, use=use)
 
 
 def voxels_of(
-    table: Table, rows: NDArray[np.bool_], placement: Logistic
+    table: Table, rows: NDArray[np.bool_], confidence: Array
 ) -> tuple[Array, NDArray[np.bool_], Array]:
     """Return figures, truth and weights of the voxels of some rows."""
-    confidence = placement.probability(table["figures"])
     values = []
     for row in np.flatnonzero(rows):
         own = table["voxel_voxels"][table["voxel_row"] == row]
@@ -221,22 +276,22 @@ def voxel_weights(table: Table, rows: NDArray[np.bool_]) -> Array:
     return of_voxels / of_voxels.sum()
 
 
-def judged(table: Table, placement: Logistic, voxel: Logistic) -> tuple[Array, Array]:
-    """Return the confidence of each row, and of each voxel whatever ties it has."""
-    values, _, _ = voxels_of(table, np.ones(len(table["kind"]), dtype=bool), placement)
-    return placement.probability(table["figures"]), voxel.probability(values)
+def judged(table: Table, models: Models) -> tuple[Array, Array]:
+    """Return both answers (A, 2), and the confidence of each voxel whatever ties it has."""
+    figures = table["figures"]
+    both = np.stack([models.same.probability(figures), models.placement.probability(figures)], 1)
+    values, _, _ = voxels_of(table, np.ones(len(both), dtype=bool), both.prod(axis=1))
+    return both, models.voxel.probability(values)
 
 
 def judged_by_others(table: Table) -> tuple[Array, Array]:
     """Return what `judged` does of each part of the seeds, by a fit to the other parts."""
     part = np.unique(table["seed"], return_inverse=True)[1] % PARTS
-    confidence, likely = np.zeros(len(part)), np.zeros(len(table["voxel_row"]))
+    both, likely = np.zeros((len(part), 2)), np.zeros(len(table["voxel_row"]))
     for own in range(PARTS):
         others, mine = rows_of(table, part != own), rows_of(table, part == own)
-        placement = fit_placement(others)
-        found = judged(mine, placement, fit_voxel(others, placement))
-        confidence[part == own], likely[(part == own)[table["voxel_row"]]] = found
-    return confidence, likely
+        both[part == own], likely[(part == own)[table["voxel_row"]]] = judged(mine, fit_all(others))
+    return both, likely
 
 
 def rows_of(table: Table, rows: NDArray[np.bool_]) -> Table:
@@ -266,11 +321,19 @@ def reliability(
     return found
 
 
-def report(table: Table, confidence: Array, likely: Array, picture: Path | None) -> None:
+def report(table: Table, both: Array, likely: Array, picture: Path | None) -> None:
     clear, every = table["known"], np.ones(len(table["known"]), dtype=bool)
-    likely = likely * (1.0 - table["voxel_voxels"][:, 10])
+    likely, confidence = likely * (1.0 - table["voxel_voxels"][:, 10]), both.prod(axis=1)
     assets = reliability(confidence[clear], table["placed"][clear], weights_of(table, clear)[clear])
-    diagrams = {"placements": assets}
+    diagrams = {"alignments": assets}
+    of_same = table["same"] | (table["kind"] == "other")
+    of_placed = clear & (table["kind"] != "other")
+    for name, rows, said, right in (
+        ("same object", of_same, both[:, 0], table["same"]),
+        ("right placement", of_placed, both[:, 1], table["placed"]),
+    ):
+        weights = weights_of(table, rows)[rows]
+        diagrams[name] = reliability(said[rows], right[rows], weights)
     for name, rows in (("voxels", ~table["torn"]), ("voxels, with ties", every)):
         weights = voxel_weights(table, rows)
         there = weights > 0
@@ -286,6 +349,15 @@ def report(table: Table, confidence: Array, likely: Array, picture: Path | None)
     own = clear & (table["kind"] == "own") & ~table["symmetric"]
     groups = {f"own, right, L{k}": own & table["placed"] & (table["level"] == k)
               for k in np.unique(table["level"])}  # fmt: skip
+    groups |= {
+        f"real, {name}": own
+        & table["placed"]
+        & (table["level"] == REAL)
+        & (table["family"] == name)
+        for name in np.unique(table["family"][own & (table["level"] == REAL)])
+    }
+    groups["other, real"] = (table["kind"] == "other") & (table["level"] == REAL)
+    groups["own, wrong, real"] = own & ~table["placed"] & (table["level"] == REAL)
     ground = table["level"] == GROUND
     for where, there in (("", ~ground), (" on ground", ground)):
         groups |= {
@@ -304,7 +376,8 @@ def report(table: Table, confidence: Array, likely: Array, picture: Path | None)
     expected = sums / np.maximum(np.bincount(table["voxel_row"], minlength=len(every)), 1)
     good = (confidence >= THRESHOLDS.good_confidence) & (tied == 0)
     good &= (valid >= THRESHOLDS.good_valid_share) & (expected >= THRESHOLDS.good_accuracy)
-    failed = confidence * np.exp(tied) < THRESHOLDS.failed_confidence
+    failed = both[:, 0] < THRESHOLDS.failed_confidence
+    failed |= (both[:, 1] < THRESHOLDS.failed_confidence) & (tied == 0)
     for name, rows in groups.items():
         c = confidence[rows]
         if len(c):
@@ -323,7 +396,7 @@ def draw(path: Path, assets: list[Any], voxels: list[Any]) -> None:
     from matplotlib import pyplot
 
     figure, axes = pyplot.subplots(1, 2, figsize=(7, 3.4), layout="constrained")
-    both = (("placements", assets), ("voxels' classes", voxels))
+    both = (("alignments", assets), ("voxels' classes", voxels))
     for ax, (name, bins) in zip(axes, both, strict=True):
         said, found, weight, _ = np.array([one for one in bins if one[2] >= DRAWN]).T
         ax.plot([0, 1], [0, 1], color="0.7", lw=1)
@@ -335,14 +408,16 @@ def draw(path: Path, assets: list[Any], voxels: list[Any]) -> None:
     figure.savefig(path, metadata={"Date": None})
 
 
-def write_module(path: Path, placement: Logistic, voxel: Logistic) -> None:
+def write_module(path: Path, models: Models) -> None:
     """Write the numbers as a module, so that they are part of the code that makes a store."""
     lines = [
         '"""The weights of the confidences; written by benchmarks/calibrate.py, not by hand."""',
         "", "from slatprep.judge.model import Figure, Logistic", "",
-        f"PLACEMENT = {placement!r}",
-        '"""Whether a placement is right."""', "",
-        f"VOXEL = {voxel!r}",
+        f"SAME_OBJECT = {models.same!r}",
+        '"""Whether both sides show the same object."""', "",
+        f"PLACEMENT = {models.placement!r}",
+        '"""Whether a placement is right, of the same object."""', "",
+        f"VOXEL = {models.voxel!r}",
         '"""Whether the class of a voxel is right."""',
     ]  # fmt: skip
     path.write_text("\n".join(lines) + "\n", encoding="utf-8")

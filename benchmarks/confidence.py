@@ -4,20 +4,22 @@
                                     [--seeds 101 102] [--jobs 2]
     python benchmarks/confidence.py table.npz --generations [--assets 33] [--seeds 911 912]
     python benchmarks/confidence.py table.npz --ground [--seeds 521]
-    python benchmarks/confidence.py table.npz --dataset DIR ...
+    python benchmarks/confidence.py table.npz --lumps [--assets 28] [--seeds 1011]
+    python benchmarks/confidence.py table.npz --dataset DIR ... [--real]
 
 Demo assets of each level, pairs of generated shapes of one object (`generations.py`), objects on
-slabs of ground (`ground.py`), or the assets of datasets with a truth, are aligned by the default
-engine. Each row of the table is one alignment:
+slabs of ground (`ground.py`), pairs that differ by lumps (`lumps.py`), or the assets of
+datasets with a truth, are aligned by the default engine. Each row of the table is one alignment:
 
 own      an asset's field on its own SLAT, as the engine places it;
 heading  the same, with all placements hidden from the engine that lie within 3 voxels of
          the right one: what it would say if it had missed that;
 other    an asset's field on the SLAT of another object.
 
-Each row has the truth (``placed``, within 1.5 voxels of the best similarity; never for
-another object), the share of right labels, and `slatprep.judge.evidence.FIGURES`. Of its
-valid voxels an even choice has ``voxel_*``: figures, whether the class is right, and the row.
+Each row has the truth (``placed``, within 1.5 voxels of the best similarity, of real pairs, whose
+differences blur it, within 30 degrees and 4 voxels; never for another object), the share of
+right labels, and `slatprep.judge.evidence.FIGURES`. Of its valid voxels an even choice has
+``voxel_*``: figures, whether the class is right, and the row.
 
 `benchmarks/calibrate.py` fits to some tables and tests on others. Objects are other ones
 if their seeds are.
@@ -26,6 +28,7 @@ if their seeds are.
 from __future__ import annotations
 
 import argparse
+import hashlib
 import tempfile
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
@@ -36,13 +39,21 @@ from unittest.mock import patch
 import numpy as np
 from generations import make_pair
 from ground import GROUNDS, make_all, on_ground
+from lumps import make_lumpy_pairs
 from numpy.typing import NDArray
 
 from slatprep.align import field as engine
+from slatprep.align.consensus import degrees_between
 from slatprep.align.deformation import map_of
 from slatprep.demo import make_demo
 from slatprep.geometry.frames import VOXEL_SIZE, nearest_similarity, split_transform, voxel_centres
-from slatprep.inspect.score import SUCCESS_DISPLACEMENT, Truth, compare_with_truth, read_truth
+from slatprep.inspect.score import (
+    SUCCESS_DISPLACEMENT,
+    Truth,
+    TruthScore,
+    compare_with_truth,
+    read_truth,
+)
 from slatprep.judge import measure_ambiguity
 from slatprep.judge.evidence import HARMLESS, evidence_of, surroundings_of
 from slatprep.parameters import (
@@ -68,6 +79,12 @@ GENERATIONS, BENDS = 8, (1.5, 3.5)
 GROUND = 9
 """The number that stands for objects on ground."""
 
+LUMPS, VARIANTS = 10, 3
+"""The number that stands for pairs that differ by lumps, and pairs of one object."""
+
+REAL, REAL_TURN, REAL_APART = 11, 30.0, 4.0
+"""The number that stands for real pairs; where their placement is right [degrees, voxel]."""
+
 Asset = tuple[str, MaterialField, StructuredLatents, Truth]
 Row = dict[str, Any]
 
@@ -78,6 +95,8 @@ def main() -> None:
     parser.add_argument("--dataset", type=Path, nargs="+", help="instead of demo data")
     parser.add_argument("--generations", action="store_true", help="instead of levels")
     parser.add_argument("--ground", action="store_true", help="instead of levels")
+    parser.add_argument("--lumps", action="store_true", help="instead of levels")
+    parser.add_argument("--real", action="store_true", help="the datasets are of real pairs")
     parser.add_argument("--assets", type=int, default=14, help="of each level and seed")
     parser.add_argument("--levels", type=int, nargs="+", default=list(range(8)))
     parser.add_argument("--seeds", type=int, nargs="+", default=[101, 102])
@@ -86,18 +105,30 @@ def main() -> None:
     rows: list[Row] = []
     if options.dataset:
         for folder in options.dataset:
-            made = _rows_of_all(_read(folder), options.jobs)
-            rows += [{"seed": 0} | row for row in made]
+            assets = _read(folder)
+            if options.real:
+                # Symmetric, or too far apart for anyone to say what is right.
+                assets = [_as_real(asset) for asset in assets if not asset[3].symmetric]
+            made = _rows_of_all(assets, options.jobs)
+            # Objects are left out together with all that are of their family.
+            rows += [{"seed": _number_of(row["family"]) if options.real else 0} | row
+                     for row in made]  # fmt: skip
             write(options.table, rows)
         return
-    if options.generations or options.ground:
-        options.levels = [GENERATIONS] * options.generations + [GROUND] * options.ground
+    if options.generations or options.ground or options.lumps:
+        options.levels = [
+            *([GENERATIONS] * options.generations),
+            *([GROUND] * options.ground),
+            *([LUMPS] * options.lumps),
+        ]
     for level in options.levels:
         for seed in options.seeds:
             if level == GENERATIONS:
                 assets = _generations(seed, options.assets, options.jobs)
             elif level == GROUND:
                 assets = _on_ground(seed, options.jobs)
+            elif level == LUMPS:
+                assets = _lumpy(seed, options.assets, options.jobs)
             else:
                 assets = _made(seed * 10 + level, options.assets, level, options.jobs)
             rows += [{"seed": seed} | row for row in _rows_of_all(assets, options.jobs)]
@@ -126,6 +157,35 @@ def _generations(seed: int, count: int, jobs: int) -> list[Asset]:
             )  # fmt: skip
             assets.append((f"{seed}-{number}", pair.field, pair.latents, truth))
     return assets
+
+
+def _lumpy(seed: int, count: int, jobs: int) -> list[Asset]:
+    """Make some pairs of each object that differ by lumps."""
+    with ProcessPoolExecutor(jobs) as pool:
+        tasks = [(seed, index, VARIANTS) for index in range(count)]
+        made = list(pool.map(make_lumpy_pairs, *zip(*tasks, strict=True)))
+    assets = []
+    for number, pair in enumerate(pair for pairs in made for pair in pairs):
+        best = nearest_similarity(pair.places, voxel_centres(pair.latents.coords))
+        truth = Truth(
+            Path(), best, pair.material, pair.name, LUMPS, symmetric=False, places=pair.places
+        )
+        assets.append((f"{seed}-{number}", pair.field, pair.latents, truth))
+    return assets
+
+
+def _as_real(asset: Asset) -> Asset:
+    asset_id, field, latents, truth = asset
+    return asset_id, field, latents, replace(truth, level=REAL)
+
+
+def family_of(name: str) -> str:
+    """Return what an object is one of: ``house`` of ``house_chimney:1>3``."""
+    return name.partition(":")[0].partition("_")[0]
+
+
+def _number_of(name: str) -> int:
+    return int(hashlib.sha256(name.encode()).hexdigest()[:7], 16)
 
 
 def _on_ground(seed: int, jobs: int) -> list[Asset]:
@@ -172,7 +232,8 @@ def _rows_of_all(assets: list[Asset], jobs: int) -> list[Row]:
 
 def _other(assets: list[Asset], k: int) -> Asset:
     """Choose another kind of object for an asset, the same whatever the number of jobs."""
-    differ = [asset for asset in assets if asset[3].name != assets[k][3].name]
+    own = family_of(assets[k][3].name)
+    differ = [asset for asset in assets if family_of(asset[3].name) != own]
     return differ[np.random.default_rng([len(assets), k]).integers(len(differ))]
 
 
@@ -236,8 +297,8 @@ def _row(kind: str, asset: Asset, owner: Asset, alignment: Alignment) -> Row:
         "level": truth.level,
         "kind": kind,
         "symmetric": truth.symmetric,
-        "placed": kind != "other"
-        and score.displacement < score.similarity_displacement + SUCCESS_DISPLACEMENT,
+        "family": family_of(truth.name),
+        "placed": kind != "other" and _placed(alignment, truth, score),
         "displacement": score.displacement,
         "labels": float(right[valid].mean()) if len(valid) else np.nan,
         "model": str(alignment.model),
@@ -249,6 +310,13 @@ def _row(kind: str, asset: Asset, owner: Asset, alignment: Alignment) -> Row:
         "right": right[chosen],
         "apart": apart[chosen],
     }
+
+
+def _placed(alignment: Alignment, truth: Truth, score: TruthScore) -> bool:
+    if truth.level != REAL:
+        return score.displacement < score.similarity_displacement + SUCCESS_DISPLACEMENT
+    rotations = [split_transform(one.transform)[0] for one in (alignment, truth)]
+    return degrees_between(*rotations) < REAL_TURN and score.displacement < REAL_APART
 
 
 def _displacement(

@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from slatprep.align.agreement import agreement_of
 from slatprep.align.deformation import bending_of, deform
 from slatprep.align.pose import Similarity
 from slatprep.align.residuals import Residuals
@@ -69,6 +70,7 @@ def fit_figures(
         within=(within[0], within[1], within[2]),
         offset=warp.offset,
         roughness=float(np.median(both)),
+        agreement=agreement_of(here, back, residuals.normals(), residuals.places),
     )
     if kept is None:
         return figures

@@ -16,7 +16,7 @@ from slatprep.align.deform_solver import (
 )
 from slatprep.align.pose import Poses, Similarity
 from slatprep.align.stretch import stretch
-from slatprep.align.surface import Samples, Surface
+from slatprep.align.surface import Samples, Surface, normals_of
 from slatprep.align.warp import Warp
 
 Array = NDArray[np.float64]
@@ -77,6 +77,16 @@ class Residuals:
         self.linearise(warp, 1e6)
         n = self._pixie_rows
         return self._lines.residuals[:n].copy(), self._lines.residuals[n:].copy()
+
+    @property
+    def places(self) -> Array:
+        """Where the samples of both sides lie in the SLAT frame (N, 3), as last measured."""
+        return self._lines.places
+
+    def normals(self) -> Array:
+        """Return the samples' unit normals (N, 3) on their own surfaces, in the SLAT frame."""
+        there = normals_of(self._pixie) @ self._pose.rotation.T
+        return np.concatenate([normals_of(self._slat), there])
 
     def kernels(self, warp: Warp) -> Array:
         """Return 1 / (1 + r^2) of each sample."""

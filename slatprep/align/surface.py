@@ -164,3 +164,16 @@ def surface_of(occupancy: NDArray[np.bool_]) -> Surface:
         values=values.astype(np.float64) + DILATION,
         boundary=boundary.astype(np.uint8),
     )
+
+
+def normals_of(surface: Samples) -> NDArray[np.float64]:
+    """Return unit normals (M, 3) at a surface's samples, by differences of the distance."""
+    distance = surface.distance
+    flat = distance.reshape(-1)
+    strides = np.array(distance.strides) // distance.itemsize
+    # Samples are lattice points, and the box has a margin around all of them.
+    at = np.rint(surface.points - surface.origin).astype(np.intp) @ strides
+    normals = np.stack([flat[at + step] - flat[at - step] for step in strides], axis=1)
+    length = np.linalg.norm(normals, axis=1, keepdims=True)
+    found: NDArray[np.float64] = normals / np.maximum(length, 1e-6)
+    return found

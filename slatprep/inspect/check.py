@@ -163,8 +163,9 @@ def check_alignment(store: Store, name: str | int) -> AlignmentCheck:
         valid_share,
         ambiguity,
         len(alignment.open_placements),
-        # The confidence was computed for the stored fit and holds for no other.
-        confidence=confidence if same_fit else math.nan,
+        # The probabilities were computed for the stored fit and hold for no other.
+        same_object=float(columns["same_object"]) if same_fit else math.nan,
+        right_placement=float(columns["right_placement"]) if same_fit else math.nan,
         expected_accuracy=expected,
         contradicted=bool(columns["contradicted"]),
         mirrored=mirror_gain_of(alignment),
@@ -190,6 +191,8 @@ def check_alignment(store: Store, name: str | int) -> AlignmentCheck:
         ),
     ]
     figures.append(Figure("confidence", confidence, confidence, 0))
+    for name in ("same_object", "right_placement"):
+        figures.append(Figure(name, float(columns[name]), float(columns[name]), 0))
     figures.append(Figure("expected_accuracy", expected, expected, 0))
     if asset.merged:
         means = [("votes for its class", asset.votes[asset.valid])]

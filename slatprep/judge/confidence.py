@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import logit
 
-from slatprep.judge.calibration import PLACEMENT, VOXEL
+from slatprep.judge.calibration import PLACEMENT, SAME_OBJECT, VOXEL
 from slatprep.judge.evidence import FIGURES, RADII, Surroundings
 from slatprep.judge.model import FLOOR
 
@@ -25,44 +25,36 @@ VOXEL_FIGURES = (
 """The figures of a voxel, in the order of `voxel_figures`."""
 
 _CAUSES = {
-    "placement": ("margin", "ties", "alike"),
-    "shape": ("moved", "moved_most", "bending", "stretch", "scale", "within_3", "score_similarity",
-              "ground"),
-    "roughness": ("score_slat", "score_pixieverse", "within_1", "within_2", "offset", "distance",
-                  "depth", "fitness", "fitness_backward", "valid_share"),
+    "shape": ("moved", "moved_most", "bending", "stretch", "scale", "within_2", "within_3",
+              "score_similarity", "ground", "directions_worst", "blocks_far"),
+    "roughness": ("score_slat", "score_pixieverse", "within_1", "offset", "distance", "depth",
+                  "fitness", "fitness_backward", "valid_share", "directions_near",
+                  "directions_middle", "blocks_near", "blocks_middle", "slat_within_half",
+                  "slat_within_1", "slat_within_15", "pixieverse_within_half",
+                  "pixieverse_within_1", "pixieverse_within_15"),
 }  # fmt: skip
-"""Which figures speak for a wrong placement, for another shape and for a rough field."""
+"""Which figures speak for another object by its shape, and which by a rough fit."""
 
 
-def placement_confidence(evidence: NDArray[np.float64]) -> float:
-    """Return the probability that a placement is right.
+def same_object(evidence: NDArray[np.float64]) -> float:
+    """Return the probability that both sides show the same object, by the `FIGURES` (F,)."""
+    return float(SAME_OBJECT.probability(evidence))
 
-    Parameters
-    ----------
-    evidence : ndarray of float64, shape (len(FIGURES),)
-        From `slatprep.judge.evidence.evidence_of`.
 
-    Returns
-    -------
-    float
-        That the mean displacement is less than 1.5 voxels above the least that
-        a similarity can have; docs/quality.md says for which mix of data.
-    """
+def right_placement(evidence: NDArray[np.float64]) -> float:
+    """Return the probability that the placement is right if the object is the same."""
     return float(PLACEMENT.probability(evidence))
 
 
 def causes_of_doubt(evidence: NDArray[np.float64]) -> dict[str, float]:
-    """Return what takes confidence away, compared with a usual right placement.
+    """Return what speaks against the same object, compared with a usual right placement.
 
-    Returns
-    -------
-    dict of str to float
-        For ``placement``, ``shape`` and ``roughness`` the sum of what their
-        figures take from the logarithm of the odds; largest first.
+    For ``shape`` and ``roughness`` the sum of what their figures take from the
+    logarithm of the odds; largest first.
     """
-    added = dict(zip(FIGURES, PLACEMENT.contributions(evidence), strict=True))
+    added = dict(zip(FIGURES, SAME_OBJECT.contributions(evidence), strict=True))
     taken = {
-        cause: float(-sum(min(added[name], 0.0) for name in names))
+        cause: float(-sum(min(added.get(name, 0.0), 0.0) for name in names))
         for cause, names in _CAUSES.items()
     }
     return dict(sorted(taken.items(), key=lambda item: -item[1]))
@@ -104,7 +96,7 @@ def class_confidence(
     around : Surroundings
         Of the voxels.
     confidence : float
-        The asset's, from `placement_confidence`.
+        The asset's: `same_object` times `right_placement`.
     valid : ndarray of bool, shape (N,)
         Which voxels have a class.
 

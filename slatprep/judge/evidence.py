@@ -15,6 +15,7 @@ from slatprep.normalize import property_extent, to_mapped
 from slatprep.records import (
     RESOLUTION,
     UNANNOTATED,
+    Agreement,
     Alignment,
     Annotation,
     MaterialField,
@@ -43,6 +44,18 @@ FIGURES = (
     "depth",
     "alike",
     "ground",
+    "directions_near",
+    "directions_middle",
+    "directions_worst",
+    "blocks_near",
+    "blocks_middle",
+    "blocks_far",
+    "slat_within_half",
+    "slat_within_1",
+    "slat_within_15",
+    "pixieverse_within_half",
+    "pixieverse_within_1",
+    "pixieverse_within_15",
 )
 """The figures of an alignment, in the order of `evidence_of`."""
 
@@ -219,7 +232,8 @@ def evidence_of(
     Returns
     -------
     ndarray of float64, shape (len(FIGURES),)
-        All finite but for the margin, which is NaN where it says nothing.
+        All finite but for the margin, which is NaN where it says nothing, and for those of
+        the agreement where that was not measured.
     """
     count, margin = len(alignment.open_placements), min(alignment.margin, MARGIN_CAP)
     if (count and ambiguity <= HARMLESS) or alignment.settled_by is not None:
@@ -251,6 +265,22 @@ def evidence_of(
             around.depth.std(),
             float(math.isnan(margin)),
             float(alignment.ground is not None),
+            *_agreement(fit.agreement),
         ],
         dtype=np.float64,
+    )
+
+
+def _agreement(agreement: Agreement | None) -> tuple[float, ...]:
+    if agreement is None:
+        return (math.nan,) * (6 + 3 + 3)
+    return (
+        agreement.directions_near,
+        agreement.directions_middle,
+        agreement.directions_worst,
+        agreement.blocks_near,
+        agreement.blocks_middle,
+        agreement.blocks_far,
+        *agreement.within_slat,
+        *agreement.within_pixieverse,
     )

@@ -27,9 +27,11 @@ class Thresholds:
 
     Attributes
     ----------
-    good_confidence, failed_confidence : float
-        Probability that the placement is right, from which on it is good; and that one
-        of the tied placements is, below which it is failed.
+    good_confidence : float
+        Probability that object and placement are right, from which on they are good.
+    failed_confidence : float
+        Probability that the object is the same, or that the placement is right and no other
+        ties with it, below which either is failed.
     good_accuracy : float
         Expected share of right labels; below it the asset is doubtful.
     good_valid_share : float
@@ -59,7 +61,6 @@ THRESHOLDS = Thresholds()
 """The thresholds of `verdict_of`."""
 
 _WORDS = {
-    "placement": "another placement fits about as well",
     "shape": "the two sides show different shapes",
     "roughness": "the surfaces lie on each other roughly only",
 }
@@ -95,27 +96,43 @@ def judge(
     likely : ndarray of float32, shape (N,)
         How likely the class of each SLAT voxel is right, as `voxel_confidence` says.
     """
-    from slatprep.judge.confidence import causes_of_doubt, class_confidence, placement_confidence
+    from slatprep.judge.confidence import (
+        causes_of_doubt,
+        class_confidence,
+        right_placement,
+        same_object,
+    )
     from slatprep.judge.evidence import evidence_of, surroundings_of
 
     ambiguity = measure_ambiguity(field, latents, alignment, annotation, parameters)
     around = surroundings_of(field, latents, alignment, annotation)
     evidence = evidence_of(field, latents, alignment, annotation, around, ambiguity.material_share)
-    confidence = placement_confidence(evidence)
+    same, placed = same_object(evidence), right_placement(evidence)
     valid = annotation.valid
-    likely = class_confidence(around, confidence, valid)
+    likely = class_confidence(around, same * placed, valid)
     expected = float(likely[valid].mean(dtype=np.float64)) if valid.any() else 0.0
     verdict, reasons = verdict_of(
         alignment.quality,
         float(valid.mean()),
         ambiguity.material_share,
         len(alignment.open_placements),
-        confidence,
+        same,
+        placed,
         expected,
         next(iter(causes_of_doubt(evidence))),
         mirrored=mirror_gain_of(alignment),
     )
-    return Judgement(ambiguity, verdict, reasons, confidence, expected), likely
+    judgement = Judgement(
+        ambiguity,
+        verdict,
+        reasons,
+        confidence=same * placed,
+        expected_accuracy=expected,
+        same_object=same,
+        right_placement=placed,
+        evidence=tuple(evidence.tolist()),
+    )
+    return judgement, likely
 
 
 def mirror_gain_of(alignment: Alignment) -> float:
@@ -194,7 +211,8 @@ def verdict_of(
     valid_share: float,
     ambiguity: float = 0.0,
     ties: int = 0,
-    confidence: float = math.nan,
+    same_object: float = math.nan,
+    right_placement: float = math.nan,
     expected_accuracy: float = math.nan,
     cause: str = "",
     contradicted: bool = False,
@@ -205,20 +223,22 @@ def verdict_of(
     Parameters
     ----------
     quality : Quality
-        How well the two surfaces lie on each other; it decides where `confidence` is NaN.
+        How well the two surfaces lie on each other; it decides where no probability is known.
     valid_share : float
         Share of SLAT voxels that got an annotation, 0..1.
     ambiguity : float
         Share of SLAT voxels whose class depends on the choice among ties, 0..1.
     ties : int
         How many placements tie with the one chosen, and nothing chose among them.
-    confidence : float
-        Probability that the placement is right; NaN where it is not known.
+    same_object : float
+        Probability that both sides show the same object; NaN where it is not known.
+    right_placement : float
+        Probability that the placement is right if they do; NaN where it is not known.
     expected_accuracy : float
         Expected share of right labels among the valid ones; NaN where it is not known.
     cause : str
-        What most lowers the confidence in the placement: ``placement``, ``shape`` or
-        ``roughness``; empty where that is not known.
+        What speaks most against the same object: ``shape`` or ``roughness``; empty where
+        that is not known.
     contradicted : bool
         Whether the latents of the asset contradict its labels.
     mirrored : float
@@ -233,20 +253,15 @@ def verdict_of(
     """
     limits = THRESHOLDS
     reasons: list[str] = []
-    failed = False
-    if math.isnan(confidence):
+    if math.isnan(same_object * right_placement):
         failed = _judge_by_fitness(quality, reasons)
-    elif confidence < limits.good_confidence:
-        # As the chosen one is the likeliest, that any of the tied ones is right is no likelier.
-        possible = confidence * (1 + ties if ambiguity > limits.good_ambiguity else 1)
-        failed = possible < limits.failed_confidence
-        because = f": {_WORDS[cause]}" if cause else ""
-        reasons.append(
-            f"the placement is right with a probability of {confidence:.1%} only "
-            f"(good: {limits.good_confidence:.0%}){because}"
-        )
-        if cause != "placement":
-            _judge_by_fitness(quality, reasons)
+    else:
+        # Among placements that tie nobody has chosen yet: any of them may be right.
+        tied = ties > 0 and ambiguity > limits.good_ambiguity
+        wrong = right_placement < limits.failed_confidence and not tied
+        failed = same_object < limits.failed_confidence or wrong
+        if same_object * right_placement < limits.good_confidence:
+            reasons += _doubts(quality, same_object, right_placement, wrong, cause)
     if expected_accuracy < limits.good_accuracy:
         reasons.append(
             f"only {expected_accuracy:.1%} of the labels can be expected to be right "
@@ -273,6 +288,36 @@ def verdict_of(
     if failed:
         return Verdict.FAILED, tuple(reasons)
     return (Verdict.DOUBTFUL if reasons else Verdict.GOOD), tuple(reasons)
+
+
+def _doubts(
+    quality: Quality, same_object: float, right_placement: float, wrong: bool, cause: str
+) -> list[str]:
+    """Say which of the two questions takes the confidence away, the worse one first."""
+    limits, sure = THRESHOLDS, ("perhaps", "probably")
+    good = f"(good: {limits.good_confidence:.0%} for object and placement together)"
+    because = f": {_WORDS[cause]}" if cause else ""
+    another = sure[same_object < limits.failed_confidence]
+    doubts = sorted(
+        [
+            (
+                same_object,
+                f"{another} another object: the two sides show the same one with a probability of "
+                f"{same_object:.1%} {good}{because}",
+            ),
+            (
+                right_placement,
+                f"{sure[wrong]} a wrong placement: it is right with a probability of "
+                f"{right_placement:.1%} {good}",
+            ),
+        ]
+    )
+    # Either that alone would take half of what may be taken is told.
+    told = [text for likely, text in doubts if likely < limits.good_confidence**0.5]
+    reasons = told or [doubts[0][1]]
+    if same_object <= right_placement:
+        _judge_by_fitness(quality, reasons)
+    return reasons
 
 
 def _judge_by_fitness(quality: Quality, reasons: list[str]) -> bool:

@@ -38,6 +38,8 @@ def columns_of(record: AssetRecord) -> dict[str, Column]:
         "unphysical": counts.unphysical,
         "verdict": judgement.verdict,
         "confidence": judgement.confidence,
+        "same_object": judgement.same_object,
+        "right_placement": judgement.right_placement,
         "expected_accuracy": judgement.expected_accuracy,
         "contradicted": judgement.contradicted,
     }

@@ -9,6 +9,7 @@ Frames: the *PixieVerse frame* and the *SLAT frame* are both the unit cube [-0.5
 """
 
 from slatprep.records.alignment import (
+    Agreement,
     Alignment,
     Ambiguity,
     Candidate,

@@ -87,9 +87,12 @@ class Ambiguity:
 class Judgement:
     """The quality of an alignment in words and figures; ``reasons`` say why it is not good.
 
-    ``confidence`` is the calibrated probability that the placement is right, ``expected_accuracy``
-    the expected share of right labels among the valid ones; NaN in records of builds without them.
-    ``contradicted`` says that the asset's latents contradict its labels, if the two were compared.
+    ``same_object`` is the calibrated probability that both sides show the same object,
+    ``right_placement`` that the placement is right if they do, and ``confidence`` the
+    product; ``evidence`` are the figures that they rest on, `slatprep.judge.evidence.FIGURES`.
+    ``expected_accuracy`` is the share of right labels to be expected among the
+    valid ones. All are NaN in records of builds that did not tell. ``contradicted`` says
+    that the latents of the asset contradict its labels, where the two were compared.
     """
 
     ambiguity: Ambiguity
@@ -98,6 +101,9 @@ class Judgement:
     confidence: Number = float("nan")
     expected_accuracy: Number = float("nan")
     contradicted: bool = False
+    same_object: Number = float("nan")
+    right_placement: Number = float("nan")
+    evidence: Annotated[tuple[Number, ...], MaxLen(256)] = ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -188,6 +194,33 @@ class Deformation:
 
 
 @dataclass(frozen=True)
+class Agreement:
+    """How evenly the two surfaces lie on each other, under the final map; lengths in voxels.
+
+    Attributes
+    ----------
+    directions_near, directions_middle : float
+        How far apart the nearest 30 % and the nearer half of the samples lie, by direction
+        of their normals (26 of a cube): mean over directions.
+    directions_worst : float
+        The 30 % of the direction that is worst but one.
+    blocks_near, blocks_middle, blocks_far : float
+        Share of the samples in blocks of 8 voxels whose median is within 0.5, 1 and 1.5 voxels.
+    within_slat, within_pixieverse : tuple of float
+        Shares of either side's samples within 0.5, 1 and 1.5 voxels.
+    """
+
+    directions_near: float
+    directions_middle: float
+    directions_worst: float
+    blocks_near: Share
+    blocks_middle: Share
+    blocks_far: Share
+    within_slat: tuple[Share, Share, Share]
+    within_pixieverse: tuple[Share, Share, Share]
+
+
+@dataclass(frozen=True)
 class FitFigures:
     """What the default engine measured of its own fit; the verdict uses it.
 
@@ -224,6 +257,8 @@ class FitFigures:
         Rise of the score once one side is mirrored: above 0.025 the annotation is a
         mirror image of its object. NaN where the fit is too good for that, or where
         another engine placed it.
+    agreement : Agreement or None
+        How evenly the surfaces lie on each other; None where it was not measured.
     """
 
     score_slat: float
@@ -239,6 +274,7 @@ class FitFigures:
     stretch: tuple[float, float] = (1.0, 1.0)
     bending: float = 0.0
     mirrored: Number = float("nan")
+    agreement: Agreement | None = None
 
 
 @dataclass(frozen=True, eq=False)

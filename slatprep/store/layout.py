@@ -116,7 +116,21 @@ ARRAYS = (
         "float64",
         ("asset",),
         NAN,
-        "calibrated probability that the placement is right",
+        "same_object times right_placement",
+    ),
+    ArrayLayout(
+        "asset/same_object",
+        "float64",
+        ("asset",),
+        NAN,
+        "calibrated probability that both sides show the same object",
+    ),
+    ArrayLayout(
+        "asset/right_placement",
+        "float64",
+        ("asset",),
+        NAN,
+        "calibrated probability that the placement is right if the object is the same",
     ),
     ArrayLayout(
         "asset/expected_accuracy",

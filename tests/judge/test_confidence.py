@@ -18,7 +18,7 @@ from slatprep.demo import make_demo
 from slatprep.inspect.score import Truth, read_truth
 from slatprep.inspect.verify.assets import roundings
 from slatprep.judge import THRESHOLDS, judge, verdict_of, voxel_confidence
-from slatprep.judge.calibration import PLACEMENT, VOXEL
+from slatprep.judge.calibration import PLACEMENT, SAME_OBJECT, VOXEL
 from slatprep.judge.confidence import VOXEL_FIGURES, causes_of_doubt
 from slatprep.judge.evidence import (
     FIGURES,
@@ -27,6 +27,7 @@ from slatprep.judge.evidence import (
     labels_hold,
     surroundings_of,
 )
+from slatprep.judge.model import Logistic
 from slatprep.normalize import (
     PIXIE_RANGES,
     denormalize_properties,
@@ -56,12 +57,17 @@ Case = tuple[MaterialField, StructuredLatents, Truth]
 Judged = tuple[Judgement, np.ndarray, Annotation]
 
 SPEAK_FOR = {"score_slat", "score_pixieverse", "score_similarity", "within_1", "within_2",
-             "within_3", "margin", "fitness", "fitness_backward", "valid_share"}  # fmt: skip
+             "within_3", "margin", "fitness", "fitness_backward", "valid_share", "blocks_near",
+             "blocks_middle", "blocks_far", "slat_within_half", "slat_within_1", "slat_within_15",
+             "pixieverse_within_half", "pixieverse_within_1",
+             "pixieverse_within_15"}  # fmt: skip
+
+MODELS = {"same object": SAME_OBJECT, "right placement": PLACEMENT}
 
 
 def _usual(name: str) -> float:
     """Return a figure's mean over right placements, which only one of its parts holds."""
-    own = [figure for figure in PLACEMENT.figures if figure.name == name]
+    own = [figure for figure in SAME_OBJECT.figures if figure.name == name]
     inside = [figure.usual for figure in own if figure.low < figure.usual < figure.high]
     return inside[0] if inside else own[0].usual
 
@@ -212,16 +218,27 @@ def test_the_same_input_gives_the_same_bytes(cases: list[Case], judged: list[Jud
 
 
 @pytest.mark.parametrize("name", FIGURES)
-def test_a_better_figure_never_lowers_confidence(name: str) -> None:
-    assert PLACEMENT.names == FIGURES
-    own = [figure for figure in PLACEMENT.figures if figure.name == name]
+@pytest.mark.parametrize("model", MODELS.values(), ids=MODELS)
+def test_a_better_figure_never_lowers_confidence(model: Logistic, name: str) -> None:
+    assert model.names == FIGURES
+    own = [figure for figure in model.figures if figure.name == name]
     assert all(first.high == then.low for first, then in pairwise(own))
     values = np.repeat(USUAL[None], 40, axis=0)
     values[:, FIGURES.index(name)] = np.linspace(own[0].low - 0.1, own[-1].high + 0.1, 40)
-    confidences = PLACEMENT.probability(values)
+    confidences = model.probability(values)
     if name not in SPEAK_FOR:
         confidences = confidences[::-1]
     assert all(before <= after for before, after in pairwise(confidences))
+
+
+def test_each_question_has_figures_of_its_own() -> None:
+    looked_at = {
+        name: {figure.name for figure in model.figures if figure.weight}
+        for name, model in MODELS.items()
+    }
+    assert looked_at["right placement"] <= {"margin", "ties", "alike"}
+    assert not looked_at["same object"] & {"margin", "ties", "alike"}
+    assert all(looked_at.values())
 
 
 def test_the_voxels_curve_rises() -> None:
@@ -283,11 +300,11 @@ def test_a_turned_placement_is_no_longer_sure(
 
 
 def test_what_takes_confidence_away_is_named() -> None:
-    assert set(causes_of_doubt(USUAL)) == {"placement", "shape", "roughness"}
+    assert set(causes_of_doubt(USUAL)) == {"shape", "roughness"}
     assert all(taken == 0 for taken in causes_of_doubt(USUAL).values())
-    tied = USUAL.copy()
-    tied[FIGURES.index("margin")] = 0.0
-    assert next(iter(causes_of_doubt(tied))) == "placement"
+    bent = USUAL.copy()
+    bent[FIGURES.index("bending")] = 1.0
+    assert next(iter(causes_of_doubt(bent))) == "shape"
 
 
 @pytest.mark.parametrize(
@@ -307,24 +324,13 @@ def test_verdicts_follow_from_confidence(
     # Where the shapes differ a similarity fits badly however right it is.
     poor = Quality(0.5, 0.5, 0.5, 0.5, 0.5, 1.0)
     given, reasons = verdict_of(
-        poor, 1.0, confidence=confidence, expected_accuracy=accuracy, cause="shape"
+        poor,
+        1.0,
+        same_object=confidence,
+        right_placement=1.0,
+        expected_accuracy=accuracy,
+        cause="shape",
     )
     assert given is verdict
     assert word in " ".join(reasons)
     assert bool(reasons) == (verdict is not Verdict.GOOD)
-
-
-@pytest.mark.parametrize(
-    ("ties", "ambiguity", "verdict"),
-    [
-        (0, 0.4, Verdict.FAILED),
-        (1, 0.4, Verdict.DOUBTFUL),  # One of the two is right with 0.6 at most.
-        (3, THRESHOLDS.good_ambiguity, Verdict.FAILED),  # They differ in nothing: they are one.
-    ],
-)
-def test_only_what_is_wrong_with_all_that_ties_is_failed(
-    ties: int, ambiguity: float, verdict: Verdict
-) -> None:
-    fits = Quality(1.0, 0.5, 1.0, 0.5, 1.0, 1.0)
-    given, _ = verdict_of(fits, 1.0, ambiguity, ties, confidence=0.3, cause="placement")
-    assert given is verdict

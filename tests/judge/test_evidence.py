@@ -22,6 +22,7 @@ from slatprep.judge.evidence import (
     surroundings_of,
 )
 from slatprep.records import (
+    Agreement,
     Alignment,
     Annotation,
     Consensus,
@@ -54,6 +55,7 @@ FIT = FitFigures(
     moved_most=4.0,
     stretch=(0.7, 1.2),
     bending=0.01,
+    agreement=Agreement(0.2, 0.3, 0.4, 0.5, 0.6, 0.7, (0.1, 0.2, 0.3), (0.4, 0.5, 0.6)),
 )
 
 
@@ -135,8 +137,26 @@ def test_each_figure_by_hand() -> None:
             "depth": math.sqrt((0.3**2 + 0.1**2) / 2),  # -0.3, -0.1, 0.1 and 0.3
             "alike": 0.0,
             "ground": 0.0,
+            "directions_near": 0.2,
+            "directions_middle": 0.3,
+            "directions_worst": 0.4,
+            "blocks_near": 0.5,
+            "blocks_middle": 0.6,
+            "blocks_far": 0.7,
+            "slat_within_half": 0.1,
+            "slat_within_1": 0.2,
+            "slat_within_15": 0.3,
+            "pixieverse_within_half": 0.4,
+            "pixieverse_within_1": 0.5,
+            "pixieverse_within_15": 0.6,
         }
     )
+
+
+def test_what_was_not_measured_of_the_agreement_is_not_known() -> None:
+    older = replace(aligned(), figures=replace(FIT, agreement=None))
+    unknown = [name for name, value in figures(older, 0.0).items() if math.isnan(value)]
+    assert unknown == list(FIGURES[-12:])
 
 
 def test_margin_and_ties_count_unless_ties_change_no_class_or_something_chose() -> None:

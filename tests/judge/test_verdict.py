@@ -10,7 +10,7 @@ import pytest
 from support.shapes import field_of, latents_of
 
 from slatprep.judge import THRESHOLDS, judge, verdict_of
-from slatprep.judge.calibration import PLACEMENT
+from slatprep.judge.calibration import SAME_OBJECT
 from slatprep.judge.confidence import causes_of_doubt
 from slatprep.judge.evidence import FIGURES
 from slatprep.judge.verdict import contradicted, merged
@@ -57,18 +57,22 @@ def test_an_asset_on_every_limit_is_good_for_no_reason() -> None:
         limits.good_ambiguity,
         3,
         limits.good_confidence,
+        1.0,
         limits.good_accuracy,
     ) == (Verdict.GOOD, ())
-    # Where the placement is sure, the fitness does not matter.
-    assert verdict_of(ROUGH, 1.0, confidence=0.95) == (Verdict.GOOD, ())
+    # Where object and placement are sure, the fitness does not matter.
+    assert verdict_of(ROUGH, 1.0, same_object=0.96, right_placement=0.95) == (Verdict.GOOD, ())
 
 
 def test_every_reason_is_named_once() -> None:
-    verdict, reasons = verdict_of(ROUGH, 0.8, 0.4, 2, 0.6, 0.7, "roughness", contradicted=True)
+    verdict, reasons = verdict_of(ROUGH, 0.8, 0.4, 2, 0.6, 0.8, 0.7, "roughness", contradicted=True)
     assert verdict is Verdict.DOUBTFUL
     assert reasons == (
-        "the placement is right with a probability of 60.0% only (good: 90%): the surfaces lie on "
-        "each other roughly only",
+        "perhaps another object: the two sides show the same one with a probability of 60.0% "
+        "(good: 90% for object and placement together): the surfaces lie on each other roughly "
+        "only",
+        "perhaps a wrong placement: it is right with a probability of 80.0% (good: 90% for object "
+        "and placement together)",
         "only 70.0% of the PixieVerse boundary lies within 1.5 voxel of the other side (good: 80%)",
         "only 60.0% of the SLAT boundary lies within 1.5 voxel of the other side (good: 80%)",
         "only 70.0% of the labels can be expected to be right (good: 75%)",
@@ -83,7 +87,7 @@ def test_every_reason_is_named_once() -> None:
 def test_a_mirrored_annotation_is_doubtful_however_sure_its_placement_is(
     gain: float, good: bool
 ) -> None:
-    verdict, reasons = verdict_of(FINE, 1.0, confidence=0.99, mirrored=gain)
+    verdict, reasons = verdict_of(FINE, 1.0, same_object=0.99, right_placement=1.0, mirrored=gain)
     assert verdict is (Verdict.GOOD if good else Verdict.DOUBTFUL)
     assert len(reasons) == (0 if good else 1)
 
@@ -104,29 +108,47 @@ def test_ties_are_counted(ties: int, start: str) -> None:
 
 
 def test_without_a_cause_none_is_named_and_the_fitness_is() -> None:
-    _, (first, *fitnesses) = verdict_of(ROUGH, 1.0, confidence=0.6)
-    assert first.endswith("(good: 90%)")
+    _, (first, *fitnesses) = verdict_of(ROUGH, 1.0, same_object=0.6, right_placement=1.0)
+    assert first.endswith("together)")
     assert len(fitnesses) == 2
     # Of placements the fitness says nothing, as another one fits as well.
-    _, reasons = verdict_of(ROUGH, 1.0, confidence=0.6, cause="placement")
+    _, reasons = verdict_of(ROUGH, 1.0, same_object=1.0, right_placement=0.6, cause="shape")
     assert len(reasons) == 1
-    assert reasons[0].endswith("(good: 90%): another placement fits about as well")
+    assert reasons[0].startswith("perhaps a wrong placement")
 
 
 @pytest.mark.parametrize(
-    ("confidence", "ties", "ambiguity", "verdict"),
+    ("same", "placed", "verdict", "first"),
     [
-        (0.25, 1, 0.06, Verdict.DOUBTFUL),  # one of both is right with 0.5: just not failed
-        (0.24, 1, 0.06, Verdict.FAILED),
-        (0.17, 2, 0.06, Verdict.DOUBTFUL),
-        (0.16, 2, 0.06, Verdict.FAILED),
-        (0.49, 3, THRESHOLDS.good_ambiguity, Verdict.FAILED),  # as labels they are one
+        (0.49, 1.0, Verdict.FAILED, "probably another object"),
+        (0.5, 1.0, Verdict.DOUBTFUL, "perhaps another object"),
+        (1.0, 0.49, Verdict.FAILED, "probably a wrong placement"),
+        (1.0, 0.5, Verdict.DOUBTFUL, "perhaps a wrong placement"),
+        # Neither is improbable, though both together are.
+        (0.6, 0.7, Verdict.DOUBTFUL, "perhaps another object"),
     ],
 )
-def test_the_confidence_of_all_that_ties_decides_what_is_failed(
-    confidence: float, ties: int, ambiguity: float, verdict: Verdict
+def test_failed_says_which_of_the_two_questions_failed(
+    same: float, placed: float, verdict: Verdict, first: str
 ) -> None:
-    assert verdict_of(FINE, 1.0, ambiguity, ties, confidence)[0] is verdict
+    given, reasons = verdict_of(FINE, 1.0, same_object=same, right_placement=placed)
+    assert given is verdict
+    assert reasons[0].startswith(first)
+
+
+@pytest.mark.parametrize(
+    ("ties", "ambiguity", "verdict"),
+    [
+        (1, 0.06, Verdict.DOUBTFUL),  # Nothing has chosen among them yet.
+        (5, 0.06, Verdict.DOUBTFUL),
+        (0, 0.06, Verdict.FAILED),
+        (3, THRESHOLDS.good_ambiguity, Verdict.FAILED),  # As labels they are one.
+    ],
+)
+def test_a_placement_that_ties_is_not_failed(ties: int, ambiguity: float, verdict: Verdict) -> None:
+    given, _ = verdict_of(FINE, 1.0, ambiguity, ties, same_object=1.0, right_placement=0.2)
+    assert given is verdict
+    assert verdict_of(FINE, 1.0, ambiguity, ties, 0.2, 1.0)[0] is Verdict.FAILED
 
 
 @pytest.mark.parametrize(
@@ -179,17 +201,16 @@ def test_samples_without_any_label_are_right_nowhere(confidence: list[float] | N
 
 
 def test_what_takes_confidence_away_is_summed_by_cause_largest_first() -> None:
-    usual = np.array([[f.usual for f in PLACEMENT.figures if f.name == n][-1] for n in FIGURES])
+    usual = np.array([[f.usual for f in SAME_OBJECT.figures if f.name == n][-1] for n in FIGURES])
     rng = np.random.default_rng(1)
     for _ in range(20):
         figures = usual * rng.uniform(0.3, 1.7, len(FIGURES))
-        added = dict(zip(FIGURES, PLACEMENT.contributions(figures).tolist(), strict=True))
+        added = dict(zip(FIGURES, SAME_OBJECT.contributions(figures).tolist(), strict=True))
         taken = causes_of_doubt(figures)
         # Every figure belongs to one cause, and what adds confidence makes up for nothing.
         lost = [-value for value in added.values() if value < 0]
         assert sum(taken.values()) == pytest.approx(sum(lost))
-        of_placement = sum(max(-added[name], 0.0) for name in ("margin", "ties", "alike"))
-        assert taken["placement"] == pytest.approx(of_placement)
+        assert set(taken) == {"shape", "roughness"}
         assert list(taken.values()) == sorted(taken.values(), reverse=True)
 
 

@@ -1,0 +1,88 @@
+"""How evenly two surfaces lie on each other: by direction, by block of space, on either side.
+
+Real shapes of one object differ by a lump here and hardly at all elsewhere. Of another object
+nothing fits in most directions. Means over all samples hardly tell the two apart.
+"""
+
+from __future__ import annotations
+
+from itertools import product
+
+import numpy as np
+from numpy.typing import NDArray
+
+from slatprep.records import Agreement
+
+Array = NDArray[np.float64]
+
+BLOCK = 8.0
+"""Edge of a block of space, in voxels."""
+
+_LEAST = 12
+"""Samples that a direction must have to be counted."""
+
+_MOST = 4.0
+"""Voxels; by more no direction differs."""
+
+_AXES = np.array([axes for axes in product((-1.0, 0.0, 1.0), repeat=3) if any(axes)])
+DIRECTIONS: Array = _AXES / np.linalg.norm(_AXES, axis=1, keepdims=True)
+"""The 26 directions of a cube's faces, edges and corners."""
+
+
+def agreement_of(slat: Array, pixieverse: Array, normals: Array, places: Array) -> Agreement:
+    """Measure the agreement of two surfaces.
+
+    `slat` (N,) and `pixieverse` (M,) are residuals in voxels; of their samples together, in this
+    order, `normals` (N+M, 3) are unit vectors and `places` (N+M, 3) in voxels.
+    """
+    apart = np.abs(np.concatenate([slat, pixieverse]))
+    near, middle, counts = _by_direction(apart, normals)
+    median, samples = _by_block(apart, places)
+    total = samples.sum()
+    sides = [
+        tuple(float((np.abs(side) <= limit).mean()) for limit in (0.5, 1.0, 1.5))
+        for side in (slat, pixieverse)
+    ]
+    weights = counts / counts.sum()
+    return Agreement(
+        directions_near=float(weights @ np.minimum(near, _MOST)),
+        directions_middle=float(weights @ np.minimum(middle, _MOST)),
+        directions_worst=float(min(np.sort(near)[-2:][0], _MOST)),
+        blocks_near=float(samples[median <= 0.5].sum() / total),
+        blocks_middle=float(samples[median <= 1.0].sum() / total),
+        blocks_far=float(samples[median <= 1.5].sum() / total),
+        within_slat=(sides[0][0], sides[0][1], sides[0][2]),
+        within_pixieverse=(sides[1][0], sides[1][1], sides[1][2]),
+    )
+
+
+def _by_direction(apart: Array, normals: Array) -> tuple[Array, Array, NDArray[np.intp]]:
+    """Return the 0.3 quantile and the median of what lies apart, and the samples, by direction."""
+    groups = np.argmax(normals @ DIRECTIONS.T, axis=1)
+    counts = np.bincount(groups, minlength=len(DIRECTIONS))
+    if counts.max() < _LEAST:
+        groups, counts = np.zeros_like(groups), np.array([len(apart)])
+    order, first = _sorted_by(groups, apart, counts)
+    use = counts >= min(_LEAST, counts.max())
+    last = counts[use] - 1
+    near, middle = (apart[order[first[use] + (p * last).astype(np.intp)]] for p in (0.3, 0.5))
+    return near, middle, counts[use]
+
+
+def _by_block(apart: Array, places: Array) -> tuple[Array, NDArray[np.intp]]:
+    """Return the median of what lies apart in each block of space, and its samples."""
+    cells = np.floor(places / BLOCK).astype(np.intp)
+    cells -= cells.min(axis=0)
+    # Far more than blocks a side, so that no two blocks have one number.
+    numbers = cells @ np.array([1 << 32, 1 << 16, 1])
+    _, groups, counts = np.unique(numbers, return_inverse=True, return_counts=True)
+    order, first = _sorted_by(groups.reshape(-1), apart, counts)
+    median: Array = apart[order[first + (counts - 1) // 2]]
+    return median, counts
+
+
+def _sorted_by(
+    groups: NDArray[np.intp], values: Array, counts: NDArray[np.intp]
+) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Return the order of `values` by group and in each by size, and where groups begin."""
+    return np.lexsort((values, groups)), np.cumsum(counts) - counts
