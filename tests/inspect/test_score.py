@@ -241,8 +241,8 @@ def test_places_of_the_store_are_what_counts_where_it_has_them(tmp_path: Path) -
     stored = np.concatenate([LONG_PLACES + aside, rod_places]).astype(np.float32)
     root = zarr.open_group(tmp_path / "s.zarr")
     add_array(root, "voxel/place", stored)
-    for name in ("asset/confidence", "asset/expected_accuracy"):
-        add_array(root, name, np.ones(2))
+    for name in ("confidence", "same_object", "right_placement", "expected_accuracy"):
+        add_array(root, f"asset/{name}", np.ones(2))
     add_array(root, "asset/unphysical", np.zeros(2, np.int64))
     add_array(root, "asset/contradicted", np.zeros(2, bool))
     add_array(root, "voxel/confidence", np.ones(len(stored), np.float32))
