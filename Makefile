@@ -51,12 +51,14 @@ help:
 # -- what it is for ---------------------------------------------------------
 
 INSTALLED := $(VENV)/.installed$(if $(filter paper,$(PRESET)),-paper)
+# A definition that names the hub needs its library.
+HUB := $(if $(wildcard $(DATA)),$(shell grep -l '^root *= *"hf://' $(DATA)))
 
 # A file that could not be used fails `make` in the end, but not before the page is drawn.
 ifeq ($(DATA),manifests/demo.toml)
 align: $(INSTALLED) $(DEMO)/.assets-$(ASSETS)-seed-$(SEED)
 else
-align: $(INSTALLED)
+align: $(INSTALLED) $(if $(HUB),$(VENV)/.installed-hub)
 endif
 	@status=0; \
 	$(BIN)/slatprep build-store --config $(DATA) --out $(STORE) --manifests $(MANIFESTS) \
@@ -159,6 +161,10 @@ $(VENV)/.installed: pyproject.toml requirements/run.txt tools/install.sh | $(VEN
 $(VENV)/.installed-paper: pyproject.toml requirements/test.txt tools/install.sh | $(VENV)/.made
 	@LOCKED=$(LOCKED) sh tools/install.sh $(VENV) paper
 	@touch $@ $(VENV)/.installed
+
+$(VENV)/.installed-hub: pyproject.toml requirements/test.txt tools/install.sh | $(INSTALLED)
+	@LOCKED=$(LOCKED) sh tools/install.sh $(VENV) hub
+	@touch $@
 
 $(VENV)/.installed-dev: pyproject.toml $(wildcard requirements/*.txt) tools/install.sh | $(VENV)/.made
 	@LOCKED=$(LOCKED) sh tools/install.sh $(VENV) test

@@ -1,7 +1,8 @@
 #!/bin/sh
-# Install slatprep into an environment: install.sh VENV run|paper|test|WHEEL
+# Install slatprep into an environment: install.sh VENV run|hub|paper|test|WHEEL
 #
 #   run     this checkout, editable, and what building and reading a store needs
+#   hub     also what reads hf:// URLs
 #   paper   also Open3D, the engine of --preset paper
 #   test    all of that, the linters, the tests' and the documentation's tools
 #   WHEEL   that file and what it needs
@@ -74,11 +75,12 @@ for name, package in (('X11.so.6', 'libx11-6'), ('GL.so.1', 'libgl1'), ('gomp.so
 
 case $what in
 run) lock=run from='--editable .' ;;
+hub) lock=test from='--editable .[hub]' ;;
 paper) lock=test from='--editable .[paper]' ;;
 test) lock=test from='--editable .[dev]' ;;
 *.whl) lock=run from=$what ;;
 *)
-    say "nothing is called '$what' here; use run, paper, test or a wheel"
+    say "nothing is called '$what' here; use run, hub, paper, test or a wheel"
     exit 2
     ;;
 esac
@@ -109,7 +111,7 @@ else
     install="$pip install --quiet" # a platform that uv has no wheel for
 fi
 case $what in
-paper) $install --constraint "requirements/$lock.txt" $from ;;
+hub | paper) $install --constraint "requirements/$lock.txt" $from ;;
 *)
     $install --no-deps --requirement "requirements/$lock.txt"
     $install --no-deps $from

@@ -78,9 +78,15 @@ def show_quality(output: Output, overview: StoreOverview) -> None:
     )
     unknown = sum(group.assets for group in overview.categories if group.name == UNKNOWN)
     if unknown:
+        table = _categories_of(overview)
         say(
-            f'unknown: the category of {unknown:,}; categories = "obj_ids_metadata.json" under '
-            "[pairing] of a --config FILE gives it"
+            f"unknown: the category of {unknown:,}; "
+            + (
+                f"{table} does not have their ids"
+                if table
+                else 'categories = "obj_ids_metadata.json" under [pairing] of a --config FILE '
+                "gives it"
+            )
         )
     doubted = [name for name, count in total.verdicts.items() if count and name != "good"]
     if doubted:
@@ -92,3 +98,18 @@ def show_quality(output: Output, overview: StoreOverview) -> None:
             f"well, and change more than {THRESHOLDS.good_ambiguity:.0%} of the classes"
         )
         say(f"look:    slatprep check-alignment --ambiguous --store {overview.store}")
+
+
+def _categories_of(overview: StoreOverview) -> str:
+    """Return the table of categories that a store was built with; empty if none is known."""
+    from slatprep.errors import StoreError
+    from slatprep.provenance.files import build_in
+    from slatprep.provenance.places import manifests_beside
+    from slatprep.storage.place import place_of
+
+    try:
+        folder = manifests_beside(place_of(overview.store))
+        table = None if folder is None else build_in(folder).parameters.pairing.categories
+    except StoreError:
+        return ""
+    return "" if table is None else str(table)

@@ -114,7 +114,7 @@ def build_store(
     with work_beside(
         place.store, fresh=fresh, keep=keep_work, look=place.look, private_disks=elsewhere
     ) as work:
-        pairs = _discover(parameters, jobs, work.shared())
+        pairs = _discover(parameters, jobs, work.shared(), note=note)
         check_objects(pairs, parameters.normalize)
         there = None if fresh else store_there(place.store)
         context = BuildContext(parameters, recipe_of(parameters), work.spool, there, strict)
@@ -215,7 +215,7 @@ def align_pairs(
     out, crew = Path(out), Crew(jobs, assets_per_job, progress, note)
     with work_beside(out.absolute(), arrays=False) as work:
         context = BuildContext(parameters, recipe_of(parameters), work.spool, None, strict)
-        pairs = _discover(parameters, jobs, work.scratch)
+        pairs = _discover(parameters, jobs, work.scratch, note=note)
         plan = _plan(pairs, context, crew)
         assets = sorted(finish(pairs, plan, context, crew), key=lambda asset: asset.asset_id)
         with writing(str(out), out.parent), staged(out) as file:
@@ -227,9 +227,11 @@ def align_pairs(
     return summarise_build(counts, failed, records=out, build_id=build_id, seconds=seconds)
 
 
-def _discover(parameters: BuildParameters, jobs: Jobs, *shared: Place) -> list[AssetPair]:
+def _discover(
+    parameters: BuildParameters, jobs: Jobs, *shared: Place, note: Note | None = None
+) -> list[AssetPair]:
     """Return the pairs; see that the workers find the first one's files, and `shared`."""
-    pairs = discover(parameters)
+    pairs = discover(parameters, note)
     sources = next(([pair.grid, pair.slat] for pair in pairs if pair.grid and pair.slat), [])
     require_shared(jobs, [*shared, *sources])
     return pairs

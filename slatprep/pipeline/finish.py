@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from slatprep.pipeline.context import BuildContext
 from slatprep.pipeline.plan import Action, PlannedAsset
 from slatprep.pipeline.spool import FailedAsset, SpooledAsset
+from slatprep.readers.published import fetch_members
 from slatprep.records import AssetPair
 from slatprep.workers.local import Jobs, at_most, run_unordered, start_early
 
@@ -73,6 +74,7 @@ def finish(
     actions = {planned.action if (planned := plan.get(p.asset_id)) else Action.ALIGN for p in pairs}
     if isinstance(jobs, int) and Action.ALIGN in actions:
         start_early(finish_asset, jobs)
+        fetch_members((pair for pair in pairs if _is_new(pair, plan)), crew.note)
         compile_kernels(crew.note)  # Before workers of this machine work, each to compile all.
     tasks = ((pair, plan.get(pair.asset_id), context) for pair in pairs)
     assets: list[SpooledAsset | FailedAsset] = []
@@ -83,3 +85,9 @@ def finish(
         if crew.progress:
             crew.progress(len(assets), len(pairs))
     return assets
+
+
+def _is_new(pair: AssetPair, plan: Mapping[str, PlannedAsset]) -> bool:
+    """Whether the sources of an asset will be read."""
+    planned = plan.get(pair.asset_id)
+    return planned is None or planned.action is Action.ALIGN

@@ -6,14 +6,15 @@ Memory holds only names: an entry per object and per SLAT, never an array.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import groupby
 
-from slatprep.errors import ConfigError, InputError, in_unicode
+from slatprep.errors import ConfigError, in_unicode
 from slatprep.parameters import BuildParameters, PixieverseSource, SlatSource
 from slatprep.readers.adapters import FoundField, patterns_of, source_adapter
 from slatprep.readers.contents import contents_of
+from slatprep.readers.grids import find_grids, several_grids
 from slatprep.readers.joins import read_categories, read_map
 from slatprep.readers.patterns import NAME, fill, find_files, list_below, tried_names
 from slatprep.readers.published import category_of, hint_of, locate_grids
@@ -55,13 +56,17 @@ class _Found:
     also: tuple[_Found, ...] = ()
 
 
-def discover(parameters: BuildParameters) -> list[AssetPair]:
+def discover(
+    parameters: BuildParameters, note: Callable[[str], None] | None = None
+) -> list[AssetPair]:
     """Find the pairs of a dataset.
 
     Parameters
     ----------
     parameters : BuildParameters
         Its roots, patterns and maps decide.
+    note : callable, optional
+        Gets lines for the user while archives are looked through.
 
     Returns
     -------
@@ -93,7 +98,7 @@ def discover(parameters: BuildParameters) -> list[AssetPair]:
         one_file = slat.root.is_file()
     except OSError as error:
         raise ConfigError(f"{error.filename}: cannot be looked at ({error.strerror})") from None
-    places = [locate_grids(source) for source in sources]
+    places = [locate_grids(source, note) for source in sources]
     listings = [list_below(place) for place in places]
     grids, *further = [
         _grids_of(*both, slat, one_file) for both in zip(sources, listings, strict=True)
@@ -154,20 +159,6 @@ def _grids_of(
     hint = f"the roots are swapped: grids lie below {slat.root}" if swapped else hint_of(source)
     more = f"; {hint}" if hint else ""
     raise ConfigError(f"{source.root}: no grid found; looked for {tried}{more}")
-
-
-def find_grids(
-    source: PixieverseSource, listing: Listing | None = None
-) -> dict[str, list[FoundField]]:
-    """Return the grids of each object, as the source's adapter finds them.
-
-    Raises ConfigError if the folder cannot be listed or a pattern makes no sense.
-    """
-    grids: dict[str, list[FoundField]] = {}
-    found = source_adapter(source.adapter).find(source, listing or list_below(source.root))
-    for grid in found:
-        grids.setdefault(grid.object_id, []).append(grid)
-    return grids
 
 
 def _rows(
@@ -282,7 +273,7 @@ def _pair_of(row: _Row, there: _Found, shared: str, grids: Sequence[FoundField])
     if grids:
         grid = there.roots.pixieverse / grids[0].path
         if len(grids) > 1:
-            problems.append(_several_grids(row.object_id, grids))
+            problems.append(several_grids(row.object_id, grids))
         if NAME.fullmatch(row.object_id):
             known = _known(id=row.object_id, sample=grids[0].sample or source.sample)
             if source.adapter == "pixieverse":
@@ -347,31 +338,6 @@ def _unrecordable(path: str) -> str:
     if path == in_unicode(path):
         return ""
     return f"{path}: its name is no UTF-8, so that no record can hold it; rename it"
-
-
-def one_grid(
-    root: Place, found: Sequence[FoundField], object_id: str, tried: Iterable[str]
-) -> Place:
-    """Return the only grid of an object from `find_grids`; InputError if it has none or several."""
-    if not found:
-        looked = tried_names(tried, {"id": object_id})
-        raise InputError(root, f"no grid for id {object_id!r}", f"one of {looked}")
-    if len(found) > 1:
-        raise InputError(root, _several_grids(object_id, list(found)), "one grid of every object")
-    if found[0].problem:
-        raise InputError(root, found[0].problem, "a grid")
-    return root / found[0].path
-
-
-def _several_grids(object_id: str, grids: Sequence[FoundField]) -> str:
-    files = ", ".join(grid.path for grid in grids)
-    if len({grid.sample for grid in grids}) > 1:
-        return (
-            f"id {object_id!r} has {len(grids)} samples ({files}); choose one with `sample` in the "
-            "table [pixieverse] of the dataset definition, or say with --samples what becomes of "
-            "them: first, all or merge"
-        )
-    return f"{len(grids)} grids for one id {object_id!r} ({files}); expected one"
 
 
 def _no_slat(row: _Row, source: SlatSource, one_file: bool) -> str:

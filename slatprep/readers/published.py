@@ -6,18 +6,24 @@ into ``DIRECTORY/``. Grids are in the directory ``render_outputs``.
 
 from __future__ import annotations
 
+import time
+from collections.abc import Callable, Iterable
 from dataclasses import replace
 
 from slatprep.errors import ConfigError, SlatprepError
 from slatprep.parameters import PixieverseSource
 from slatprep.readers.adapters import source_adapter
 from slatprep.readers.patterns import fill
-from slatprep.records import Place
+from slatprep.records import AssetPair, Place
 from slatprep.storage.archives import is_archive
+from slatprep.storage.fetch import fetch
 from slatprep.storage.members import ArchivePlace, ArchiveTree
 from slatprep.storage.place import storage_of
 
 GRIDS, ARCHIVES = "render_outputs", "archives"
+
+_EVERY_S = 10.0
+"""How often it is told how far reading is."""
 
 _LOOKED_AT = 20
 """Folders that are looked into for a hint."""
@@ -32,7 +38,7 @@ OTHERS = {
 """What the other directories hold."""
 
 
-def locate_grids(source: PixieverseSource) -> Place:
+def locate_grids(source: PixieverseSource, note: Callable[[str], None] | None = None) -> Place:
     """Return the folder of the objects below what a source names, which archives may hold.
 
     Parameters
@@ -58,12 +64,12 @@ def locate_grids(source: PixieverseSource) -> Place:
         return root  # The user's own patterns begin at the root.
     try:
         if is_archive(root.name) and root.is_file():
-            return _tree(root.parent, [root.name], wanted, str(root))
+            return _tree(root.parent, [root.name], wanted, str(root), note)
         for _ in range(3):
             files, folders = storage_of(root).names()
             archives = sorted(name for name in files if is_archive(name))
             if archives:
-                return _tree(root, archives, wanted, str(root))
+                return _tree(root, archives, wanted, str(root), note)
             inner = next((name for name in (GRIDS, ARCHIVES) if name in folders), "")
             if not inner:
                 break
@@ -71,6 +77,35 @@ def locate_grids(source: PixieverseSource) -> Place:
     except OSError as error:
         raise ConfigError(f"{error.filename}: cannot be looked at ({error.strerror})") from None
     return root
+
+
+def fetch_members(pairs: Iterable[AssetPair], note: Callable[[str], None] | None) -> None:
+    """Bring what pairs need of archives elsewhere into the cache, and tell how far that is.
+
+    ConfigError if an archive cannot be read.
+    """
+    wanted = [
+        (place.archive, place.entry)
+        for pair in pairs
+        if not pair.problem
+        for one in pair.annotations
+        for place in (one.grid, one.mask, one.bounds, one.transform)
+        if isinstance(place, ArchivePlace) and place.archive and place.entry
+    ]
+    fetch(wanted, _telling("fetched", note))
+
+
+def _telling(what: str, note: Callable[[str], None] | None) -> Callable[[int, int], None]:
+    """Return what is told bytes, those done and all, and gives a line now and then."""
+    told = time.monotonic()
+
+    def tell(done: int, total: int) -> None:
+        nonlocal told
+        if note and (time.monotonic() - told > _EVERY_S or done == total):
+            told = time.monotonic()
+            note(f"{what} {done / 1e6:,.0f} of {total / 1e6:,.0f} MB")
+
+    return tell
 
 
 def hint_of(source: PixieverseSource) -> str:
@@ -126,8 +161,15 @@ def category_of(grid: Place | None) -> str:
     return "" if name in (GRIDS, ARCHIVES, "pixieverse") else name
 
 
-def _tree(folder: Place, names: list[str], wanted: tuple[str, ...], text: str) -> ArchivePlace:
-    return ArchivePlace(ArchiveTree(text, storage_of(folder).archives(names, wanted)))
+def _tree(
+    folder: Place,
+    names: list[str],
+    wanted: tuple[str, ...],
+    text: str,
+    note: Callable[[str], None] | None,
+) -> ArchivePlace:
+    archives = storage_of(folder).archives(names, wanted)
+    return ArchivePlace(ArchiveTree(text, archives, _telling("archives: looked through", note)))
 
 
 def _wanted(source: PixieverseSource) -> tuple[str, ...]:

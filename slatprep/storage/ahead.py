@@ -19,7 +19,7 @@ MAX_READ = 2**20
 _LEAST, _MOST, _NEAR = 2**13, 2**22, 2**21
 """Bytes: a request after a jump; the largest request; a gap that costs less than a request."""
 
-_SHARE, _SLACK = 0.015, 2**22
+_SHARE, _SLACK = 0.01, 2**21
 """Requests grow as long as no more than this share of what lies before was read, and so much."""
 
 

@@ -27,7 +27,7 @@ from slatprep.storage.atomic import staged_apart
 from slatprep.storage.cache import cache_folder, short
 from slatprep.storage.files import LocalFile, open_regular
 from slatprep.storage.remote import RemoteFile, RemotePlace
-from slatprep.storage.tar import ArchiveError, Entry, entries, unpack
+from slatprep.storage.tar import BLOCK, ArchiveError, Entry, entries, unpack
 
 if TYPE_CHECKING:
     from slatprep.records import Place
@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 SUFFIXES = (".tar", ".tar.gz", ".tgz")
 """How the names of archives end."""
 
-_FORMAT, _INDEX, _BLOCK = 1, "index.z", 512
+_FORMAT, _INDEX = 1, "index.z"
 
 _KEPT = ("next", "complete", "fault", "strange", "twice")
 """What is kept of an index besides its members."""
@@ -156,13 +156,13 @@ class Archive:
         """Read a member from the archive itself, which is not compressed."""
         if self.packed:
             raise self.replaced()
-        return self.checked(entry, self.range(entry.size + _BLOCK, entry.offset - _BLOCK))
+        return self.checked(entry, self.range(entry.size + BLOCK, entry.offset - BLOCK))
 
     def checked(self, entry: Entry, data: bytes) -> bytes:
         """Return the data of a member, given with the header in front of it."""
-        if zlib.crc32(data[:_BLOCK]) != entry.check:
+        if zlib.crc32(data[:BLOCK]) != entry.check:
             raise self.replaced()
-        return data[_BLOCK:]
+        return data[BLOCK:]
 
     def range(self, length: int, offset: int) -> bytes:
         """Read a range; see `read`."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import errno
 import io
 import warnings
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import cached_property
 from pathlib import PurePosixPath
@@ -30,10 +30,17 @@ class ArchiveTree:
         What it is called: the folder that holds the archives, or the only one.
     archives : sequence of Archive
         In the order of their names.
+    progress : callable
+        Called with the bytes of archives that were looked through, and those of all.
     """
 
-    def __init__(self, text: str, archives: Sequence[Archive]) -> None:
-        self.text, self.archives = text, tuple(archives)
+    def __init__(
+        self,
+        text: str,
+        archives: Sequence[Archive],
+        progress: Callable[[int, int], None] = lambda *_: None,
+    ) -> None:
+        self.text, self.archives, self._progress = text, tuple(archives), progress
 
     def __reduce__(self) -> tuple[type, tuple[str, tuple[Archive, ...]]]:
         return ArchiveTree, (self.text, self.archives)  # Indexes stay in the cache.
@@ -47,11 +54,20 @@ class ArchiveTree:
         OSError
             If one cannot be read. What was found by then is kept.
         """
+        passed, total = dict[Archive, int](), sum(archive.size for archive in self.archives)
+
+        def index(archive: Archive) -> Index:
+            def tell(at: int) -> None:
+                passed[archive] = at
+                self._progress(sum(list(passed.values())), total)
+
+            return archive.index(tell)
+
         remote = [archive for archive in self.archives if isinstance(archive.place, RemotePlace)]
         with ThreadPoolExecutor(max(1, min(len(remote), _AT_ONCE))) as pool:
-            coming = {archive: pool.submit(archive.index) for archive in remote}
+            coming = {archive: pool.submit(index, archive) for archive in remote}
             return {
-                archive: coming[archive].result() if archive in coming else archive.index()
+                archive: coming[archive].result() if archive in coming else index(archive)
                 for archive in self.archives
             }
 

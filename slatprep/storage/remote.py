@@ -144,7 +144,7 @@ class RemoteFile(io.RawIOBase):
             return data[offset - begin : offset - begin + length]
         # Asked for each time: connections do not survive a fork; fsspec caches one per process.
         try:
-            with connected(self.place) as (system, name):
+            with connected(self.place, fresh=False) as (system, name):
                 if "s3" in system.protocol:
                     bucket, _, key = name.partition("/")
                     if read := range_reader(bucket):
@@ -300,8 +300,10 @@ def multipart_options(system: Any, files_at_once: int | None = None) -> dict[str
 
 
 @contextmanager
-def connected(place: RemotePlace) -> Iterator[tuple[Any, str]]:
+def connected(place: RemotePlace, *, fresh: bool = True) -> Iterator[tuple[Any, str]]:
     """Yield the fsspec file system of a place, and the place's name in it.
+
+    With `fresh`, what it knows of folders is asked for again.
 
     Errors of the file system become OSErrors of the same kind (`FileNotFoundError`,
     `PermissionError`) that name the place. ConfigError if a library is missing or the protocol is
@@ -317,7 +319,7 @@ def connected(place: RemotePlace) -> Iterator[tuple[Any, str]]:
             f"{place}: cannot be reached ({error}); pip install 'slatprep[remote]' brings s3://, "
             "'slatprep[hub]' hf://, and gcsfs gs://"
         ) from None
-    if "hf" in system.protocol:
+    if fresh and "hf" in system.protocol:
         system.dircache.clear()  # The hub's keeps listings whatever it is told.
     try:
         yield system, str(name)

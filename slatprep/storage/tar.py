@@ -11,7 +11,8 @@ from typing import IO, NamedTuple
 
 from slatprep.storage.ahead import ReadAhead
 
-_BLOCK = tarfile.BLOCKSIZE
+BLOCK = tarfile.BLOCKSIZE
+"""Bytes of a header, to a multiple of which members are filled up."""
 
 INCOMPLETE = "download it again"
 
@@ -66,9 +67,9 @@ def entries(file: ReadAhead, size: int, begin: int = 0) -> Iterator[tuple[Entry 
         archive.members.clear()  # type: ignore[attr-defined]
         if member.offset_data + member.size > size and member.isreg():
             raise ArchiveError(f"ends within {member.name!r}; {INCOMPLETE}")
-        check = zlib.crc32(file.held(_BLOCK, member.offset_data - _BLOCK))
+        check = zlib.crc32(file.held(BLOCK, member.offset_data - BLOCK))
         yield _entry(member, check), archive.offset
-    end = file.held(_BLOCK, archive.offset) if archive.offset < size else b""
+    end = file.held(BLOCK, archive.offset) if archive.offset < size else b""
     if not end:
         raise ArchiveError(f"has no end: it was cut off at byte {size:,}; {INCOMPLETE}")
     if any(end):

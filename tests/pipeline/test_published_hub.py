@@ -15,6 +15,7 @@ from slatprep.errors import ConfigError, InputError
 from slatprep.inspect.verify import verify_store
 from slatprep.pipeline.dataset import build_store
 from slatprep.readers import discover
+from slatprep.readers.published import fetch_members
 from slatprep.store import open_store
 
 NAME = "vlongle/pixieverse"
@@ -97,6 +98,44 @@ def test_members_without_slat_are_not_fetched(
     build_store(parameters(made, URL), tmp_path / "s.zarr")
     kept = list((tmp_path / "cache").rglob("*.z"))
     assert len([path for path in kept if path.name != "index.z"]) == 4 * 3
+
+
+def test_bytes_are_told_and_what_was_fetched_is_kept_when_a_build_stops(
+    hub: PublishedHub, made: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    lines: list[str] = []
+    monkeypatch.setattr("slatprep.readers.published._EVERY_S", 0.0)
+    monkeypatch.setattr("slatprep.storage.fetch._AT_ONCE", 1)
+    hub.delay = 0.05
+
+    def stop(line: str) -> None:
+        lines.append(line)
+        if line.startswith("fetched") and not line.startswith("fetched 0 "):
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        build_store(parameters(made, URL), tmp_path / "s.zarr", note=stop)
+    assert lines[0].startswith("archives: looked through")
+    first = hub.ranges()
+    hub.requests.clear()
+    lines.clear()
+    build_store(parameters(made, URL), tmp_path / "s.zarr", note=lines.append)
+    assert 0 < hub.ranges() < first
+    assert not any(line.startswith("archives") for line in lines)
+
+
+def test_neighbours_come_with_one_request(hub: PublishedHub, made: Path, tmp_path: Path) -> None:
+    pairs = [pair for pair in discover(parameters(made, URL)) if not pair.problem]
+    hub.requests.clear()
+    fetch_members(pairs, None)
+    assert 4 <= hub.ranges() <= 8  # Four objects of three members each.
+    hub.requests.clear()
+    for pair in pairs:
+        for place in (pair.grid, pair.mask, pair.bounds):
+            assert place is not None
+            own = made / "pixieverse" / "render_outputs" / str(place).partition(".tar/")[2]
+            assert place.read_bytes() == own.read_bytes()
+    assert hub.ranges() == 0
 
 
 def test_token_is_sent_to_the_hub_alone(
