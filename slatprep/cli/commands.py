@@ -40,6 +40,7 @@ GROUPS = {
     "Take elsewhere": {
         "export": "slatprep.cli.export:export",
         "transfer": "slatprep.cli.transfer:transfer",
+        "simulate": "slatprep.cli.simulate:simulate",
         "decode-slat": "slatprep.cli.extract:decode_slat",
         "describe": "slatprep.cli.describe:describe",
         "publish": "slatprep.cli.publish:publish",

@@ -80,7 +80,7 @@ def transfer(
     from slatprep.particles import transfer as work
     from slatprep.particles.read import read_particles
 
-    field = _field(store, asset, prediction, ranges, points)
+    field = field_of(store, asset, prediction, ranges, points)
     read, recognised = work.recognise_axes(read_particles(particles, axes), field, max_distance)
     if recognised:
         output.note(f"{particles}: {recognised}")
@@ -108,9 +108,10 @@ def transfer(
     output.made({"path": out, **counts}, lambda: output.record(f"Transferred to {out}", counts))
 
 
-def _field(
+def field_of(
     store: Place | None, asset: str | None, prediction: Path | None, ranges: str | None, points: Any
 ) -> VoxelField:
+    """Return the materials of a stored asset or of a prediction, one of which is given."""
     from slatprep.normalize import PIXIE_RANGES
     from slatprep.particles.fields import predicted_field, stored_field
     from slatprep.readers.ranges import read_ranges

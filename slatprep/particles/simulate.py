@@ -8,7 +8,7 @@ suits jelly and steel in the same object.
 from __future__ import annotations
 
 import warnings
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -21,7 +21,17 @@ AIR, DRAG = 1.2, 1.0
 """Density of air [kg/m^3], and the drag coefficient of a face."""
 
 
-def simulate(
+class Motion(NamedTuple):
+    """Positions (F, N, 3) [m] and deformation gradients (F, N, 3, 3) of particles by frame.
+
+    The engine keeps the principal stretches of a gradient between 0.25 and 2.
+    """
+
+    positions: NDArray[np.float64]
+    gradients: NDArray[np.float32]
+
+
+def simulate_motion(
     positions: ArrayLike,
     material: ArrayLike,
     properties: ArrayLike,
@@ -34,51 +44,25 @@ def simulate(
     seconds: float = 0.5,
     rate: int = 60,
     substeps: int = 2,
-) -> NDArray[np.float64]:
+    device: str = "cpu",
+) -> Motion:
     """Simulate an object that falls to the ground from rest, in still air or in the wind.
 
-    Parameters
-    ----------
-    positions : array_like, shape (N, 3)
-        Particles on a cubic lattice that fills the object [m], z up.
-    material : array_like of int, shape (N,)
-        Class of each, one of `YIELDING`.
-    properties : array_like, shape (N, 3)
-        Young's modulus [Pa], density [kg/m^3] and Poisson's ratio of each.
-    spacing : float
-        Spacing of the lattice [m]; the cells of the engine's grid are twice as wide.
-    height : float
-        Height of the lowest particle above the ground at the start [m].
-    gravity : float
-        Downward acceleration [m/s^2]. The initial shape is taken to be without stress, so an
-        object whose shape already includes the sag under its weight sags further.
-    wind : array_like, shape (3,)
-        Velocity of the air [m/s]. On each free face of a particle's cell that faces the wind
-        the pressure is ``AIR * DRAG / 2`` times the square of the velocity relative to the
-        particle; parts do not shelter each other.
-    fixed : array_like of bool, shape (N,), optional
-        Particles that do not move, such as the roots of a plant.
-    seconds : float
-        Simulated time.
-    rate : int
-        Frames a second.
-    substeps : int
-        Time steps a frame.
-
-    Returns
-    -------
-    ndarray of float64, shape (F, N, 3)
-        Positions in every frame [m], first those at the start; the ground is at z = 0.
-
-    Raises
-    ------
-    SlatprepError
-        If the engine is not installed, or a particle cannot be simulated.
+    `positions` (N, 3) [m], z up, are on a cubic lattice, `spacing` [m] apart, that fills the
+    object; `material` (N,) is one of `YIELDING`; `properties` (N, 3) are Young's modulus [Pa],
+    density [kg/m^3] and Poisson's ratio. The lowest particle starts `height` [m] above the
+    ground, z = 0. The initial shape is taken to be without stress, so an object whose shape
+    already includes the sag under its weight sags further. `wind` [m/s] presses with
+    ``AIR * DRAG / 2`` times the square of the velocity relative to the particle on each free
+    face that meets it; parts do not shelter each other. Particles of `fixed` (N,) do not move.
+    Each of `rate` frames a second has `substeps` time steps; the first frame is the start. The
+    cells of the engine's grid are two spacings wide. SlatprepError if the engine is not
+    installed, or a particle cannot be simulated.
     """
     rest, stuff = np.array(positions, dtype=np.float64), np.asarray(properties, dtype=np.float64)
     _check(rest, np.asarray(material), stuff)
     if clipped := int(np.count_nonzero(stuff[:, 2] > MAX_POISSON)):
-        warnings.warn(f"nu of {clipped:,} particles is taken as {MAX_POISSON}", stacklevel=2)
+        warnings.warn(f"nu of {clipped:,} particles is taken as {MAX_POISSON}", stacklevel=3)
         stuff = np.minimum(stuff, [np.inf, np.inf, MAX_POISSON])
     newton, warp = _engine()
     rest[:, 2] += height + spacing / 2 - rest[:, 2].min()
@@ -94,7 +78,7 @@ def simulate(
         radius=[spacing / 2] * len(rest),
     )
     builder.add_ground_plane()
-    model = builder.finalize(device="cpu")
+    model = builder.finalize(device=device)
     model.mpm.young_modulus.assign(modulus.astype(np.float32))
     model.mpm.poisson_ratio.assign(ratio.astype(np.float32))
     limits = np.array([YIELDING[number] for number in np.asarray(material).tolist()], np.float32)
@@ -113,7 +97,7 @@ def simulate(
     now, after = model.state(), model.state()
     air = np.asarray(wind, dtype=np.float64)
     area = windward(rest, air, spacing)
-    frames = [rest]
+    frames, gradients = [rest], [np.tile(np.eye(3, dtype=np.float32), (len(rest), 1, 1))]
     for _ in range(round(seconds * rate)):
         for _ in range(substeps):
             if area.any():
@@ -122,9 +106,18 @@ def simulate(
                 now.particle_f.assign((AIR * DRAG / 2 * area * speed)[:, None] * past)
             solver.step(now, after, None, None, 1.0 / (rate * substeps))
             solver.project_outside(after, after, 1.0 / (rate * substeps))
+            solver.update_particle_frames(now, after, 1.0 / (rate * substeps))
             now, after = after, now
         frames.append(now.particle_q.numpy().astype(np.float64))
-    return np.stack(frames)
+        gradients.append(now.mpm.particle_transform.numpy().copy())
+    return Motion(np.stack(frames), np.stack(gradients))
+
+
+def simulate(
+    positions: ArrayLike, material: ArrayLike, properties: ArrayLike, spacing: float, **how: Any
+) -> NDArray[np.float64]:
+    """Return the positions (F, N, 3) of `simulate_motion`, which takes the same."""
+    return simulate_motion(positions, material, properties, spacing, **how).positions
 
 
 def _limits(mpm: Any) -> tuple[Any, ...]:
@@ -259,6 +252,11 @@ def _check(
         )
 
 
+def preferred_device() -> str:
+    """Return the engine's name of the GPU if there is one, else ``cpu``."""
+    return str(_engine()[1].get_preferred_device())
+
+
 def _engine() -> tuple[Any, Any]:
     try:
         import newton
@@ -268,5 +266,5 @@ def _engine() -> tuple[Any, Any]:
             f"simulation needs the package {error.name}; install it with "
             "`pip install 'slatprep[simulate]'`"
         ) from error
-    warp.config.quiet = True
+    warp.config.log_level = warp.LOG_WARNING  # Or each kernel that it loads is a line on stdout.
     return newton, warp

@@ -1,0 +1,159 @@
+"""`slatprep simulate`: move an object, and write its Gaussians frame by frame."""
+
+from __future__ import annotations
+
+import time
+import warnings
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import click
+
+from slatprep.cli.options import (
+    ChoiceOf,
+    File,
+    FiniteRange,
+    NewFile,
+    NewFolder,
+    Positive,
+    StoreOption,
+    complete_asset,
+)
+from slatprep.cli.output import Output
+from slatprep.cli.signature import Click, command
+from slatprep.cli.transfer import field_of
+
+if TYPE_CHECKING:
+    from slatprep.particles.motion import Scene
+
+
+@command()
+def simulate(
+    output: Output,
+    *,
+    gaussians: Annotated[
+        File | None,
+        "PLY of Gaussians of the object, as TRELLIS, SAM 3D Objects or PhysGaussian save them. "
+        "[default: a Gaussian for each particle, in the colour of its class]",
+        Click(metavar="FILE.ply"),
+    ] = None,
+    store: StoreOption | None = None,
+    asset: Annotated[
+        str | None, "The asset of the store.", Click(metavar="ID", shell_complete=complete_asset)
+    ] = None,
+    prediction: Annotated[
+        File | None, "Predicted materials instead of an asset.", Click(metavar="FILE.npz")
+    ] = None,
+    ranges: Annotated[
+        str | None, "Ranges of a prediction's properties.", Click(metavar="pixie|FILE")
+    ] = None,
+    material: Annotated[
+        Any | None,
+        ChoiceOf("slatprep.particles.motion:CLASSES"),
+        "Take this class for the whole object.",
+    ] = None,
+    young: Annotated[
+        float | None,
+        FiniteRange(min=0, min_open=True),
+        "Take this Young's modulus for the whole object.",
+        Click(metavar="PA"),
+    ] = None,
+    density: Annotated[
+        float | None,
+        FiniteRange(min=0, min_open=True),
+        "Take this density for the whole object.",
+        Click(metavar="KG/M3"),
+    ] = None,
+    out: Annotated[NewFolder, "Folder of the frames, frame-0000.ply and so on."],
+    picture: Annotated[
+        NewFile | None,
+        "Also draw the frames: an animation (gif, webp) or a strip of five (png).",
+        Click(metavar="FILE"),
+    ] = None,
+    axes: Annotated[
+        Any | None,
+        ChoiceOf("slatprep.particles.read:Axes"),
+        "Axes of the Gaussians. [default: those that fit]",
+    ] = None,
+    stretch: Annotated[bool, "Let the scales of Gaussians follow the deformation too."] = False,
+    size: Annotated[
+        float,
+        FiniteRange(min=0, min_open=True),
+        "Width of the unit cube.",
+        Click(metavar="METRES"),
+    ] = 0.4,
+    height: Annotated[
+        float, FiniteRange(min=0), "Height of the fall.", Click(metavar="METRES")
+    ] = 0.1,
+    wind: Annotated[
+        float,
+        "Wind along x. The object then stands, held at its foot and where it is stationary or "
+        "sand, without gravity.",
+        Click(metavar="M/S"),
+    ] = 0.0,
+    seconds: Annotated[float, FiniteRange(min=0, min_open=True), "Length of the motion."] = 0.6,
+    rate: Annotated[Positive, "Frames a second."] = 30,
+    substeps: Annotated[Positive, "Time steps a frame."] = 4,
+    particles: Annotated[
+        int, click.IntRange(min=4, max=256), "Particles along each axis of the cube."
+    ] = 32,
+    device: Annotated[
+        str | None, "Where to compute: cpu, cuda:0. [default: the GPU if there is one]"
+    ] = None,
+) -> None:
+    """Simulate an object of a store, or a predicted one, and move its Gaussians.
+
+    Particles fill the object and take the materials of its voxels; Newton's
+    material point method moves them on a CPU or a GPU. Gaussians are carried by
+    the particles around them: positions and rotations follow, all other
+    attributes stay. Needs Newton: pip install 'slatprep[simulate]'.
+
+    Example
+    -------
+    slatprep simulate --store data/demo.zarr --asset 5f61cc --out frames --picture fall.gif
+    slatprep simulate --gaussians cup.ply --prediction out/cup.npz --ranges pixie --out frames
+    slatprep simulate --store data/demo.zarr --asset 5f61cc --out frames --wind 8
+    """
+    from slatprep.particles import motion as work
+    from slatprep.particles.picture import require_picture
+
+    if picture is not None:
+        require_picture(picture)
+    points: Any = "grid" if asset is not None else "slat"
+    scene: Scene = work.prepare(
+        field_of(store, asset, prediction, ranges, points),
+        work.cells_of(store, asset),
+        gaussians,
+        axes,
+        particles,
+        work.Override(material, young, density),
+    )
+    for note in scene.notes:
+        output.note(note)
+    begin = time.perf_counter()
+    with warnings.catch_warnings(record=True) as told:
+        warnings.simplefilter("always", UserWarning)
+        moved = work.run(
+            scene,
+            size=size,
+            height=height,
+            wind=wind,
+            seconds=seconds,
+            rate=rate,
+            substeps=substeps,
+            device=device,
+        )
+    for warning in told:
+        output.note(str(warning.message))
+    computed = time.perf_counter() - begin
+    with output.progress("simulate") as progress:
+        count = work.write_frames(
+            Path(out), scene, moved, size, picture, rate, stretch, progress=progress
+        )
+    counts = {
+        "particles": len(scene.positions),
+        "gaussians": len(scene.vertices),
+        "frames": count,
+        "seconds": computed,
+    }
+    output.made({"path": out, **counts}, lambda: output.record(f"Frames in {out}", counts))

@@ -1,0 +1,166 @@
+"""Gaussians in motion: carried by simulated particles, and written with all their attributes."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from slatprep.errors import InputError
+from slatprep.particles.read import SAVED_AXES, Axes
+from slatprep.records import MATERIAL_COLOURS
+
+_NEAREST = 8
+"""Particles that carry a Gaussian; a particle of a cubic lattice has eight around each cell."""
+
+_SH = 0.28209479177387814
+"""The constant spherical harmonic, 1 / (2 sqrt(pi)): colour is 0.5 + _SH * f_dc."""
+
+_ROTATION = tuple(f"rot_{index}" for index in range(4))
+_SCALE = tuple(f"scale_{index}" for index in range(3))
+_COLOUR = tuple(f"f_dc_{index}" for index in range(3))
+_FIELDS = ("x", "y", "z", "nx", "ny", "nz", *_COLOUR, "opacity", *_SCALE, *_ROTATION)
+
+
+class Carrier(NamedTuple):
+    """The particles (G, K) that carry each Gaussian, their weights, and the offsets at rest."""
+
+    particles: NDArray[np.intp]
+    weights: NDArray[np.float64]
+    offsets: NDArray[np.float64]
+
+
+def bind(points: NDArray[np.float64], rest: NDArray[np.float64], spacing: float) -> Carrier:
+    """Bind points (G, 3) to the nearest particles at rest (N, 3), `spacing` apart."""
+    from scipy.spatial import cKDTree
+
+    count = min(_NEAREST, len(rest))
+    distance, particles = cKDTree(rest).query(points, k=count)
+    distance, particles = distance.reshape(-1, count), particles.reshape(-1, count)
+    # Relative to the nearest, so that a Gaussian far from all particles still has a carrier.
+    falloff = np.exp((distance[:, :1] ** 2 - distance**2) / (0.7 * spacing) ** 2)
+    weights = falloff / falloff.sum(axis=1, keepdims=True)
+    return Carrier(particles, weights, points[:, None] - rest[particles])
+
+
+def carry(
+    carrier: Carrier, positions: NDArray[np.floating], gradients: NDArray[np.floating]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return places (G, 3) and gradients (G, 3, 3) of Gaussians by those of the particles.
+
+    Each particle moves its surroundings by its position and its deformation gradient; the
+    Gaussian takes the weighted mean.
+    """
+    local = gradients[carrier.particles]
+    moved = positions[carrier.particles] + np.einsum("gkij,gkj->gki", local, carrier.offsets)
+    places = np.einsum("gk,gki->gi", carrier.weights, moved)
+    return places, np.einsum("gk,gkij->gij", carrier.weights, local)
+
+
+def rotations(gradients: NDArray[np.floating]) -> NDArray[np.float64]:
+    """Return the rotation nearest to each gradient (G, 3, 3): the polar decomposition."""
+    left, _, right = np.linalg.svd(gradients)
+    mirrored = np.linalg.det(left @ right) < 0
+    left[mirrored, :, 2] *= -1
+    turned: NDArray[np.float64] = left @ right
+    return turned
+
+
+def deform(
+    vertices: NDArray[Any],
+    places: NDArray[np.floating],
+    gradients: NDArray[np.floating],
+    axes: Axes,
+    *,
+    stretch: bool = False,
+) -> NDArray[Any]:
+    """Return Gaussians (G,) at places of the SLAT frame, turned by the gradients, else the same.
+
+    Positions and rotations are those of the file's `axes`. With `stretch` the scales follow
+    too: the covariance becomes F C F^T.
+    """
+    turn = SAVED_AXES[axes]
+    moved = vertices.copy()
+    for axis, values in zip("xyz", (places @ turn.T).T, strict=True):
+        moved[axis] = values
+    local = turn @ gradients @ turn.T
+    before = _matrices(vertices)
+    if not stretch:
+        _set_rotations(moved, rotations(local) @ before)
+        return moved
+    scales = np.exp(np.stack([vertices[name] for name in _SCALE], axis=1).astype(np.float64))
+    left, lengths, _ = np.linalg.svd(local @ before * scales[:, None, :])
+    left[np.linalg.det(left) < 0, :, 2] *= -1
+    _set_rotations(moved, left)
+    for name, values in zip(_SCALE, np.log(np.maximum(lengths, 1e-12)).T, strict=True):
+        moved[name] = values
+    return moved
+
+
+def gaussians_of(
+    positions: NDArray[np.floating], material: NDArray[np.uint8], spacing: float
+) -> NDArray[Any]:
+    """Make a Gaussian at each position (N, 3) of the SLAT frame, in the colour of its class."""
+    made = np.zeros(len(positions), dtype=[(name, "<f4") for name in _FIELDS])
+    for axis, values in zip("xyz", positions.T, strict=True):
+        made[axis] = values
+    colours = np.array(
+        [list(bytes.fromhex(MATERIAL_COLOURS[number][1:])) for number in range(8)], np.float64
+    )
+    for name, values in zip(_COLOUR, colours[material].T / 255, strict=True):
+        made[name] = (values - 0.5) / _SH
+    made["opacity"], made["rot_0"] = 6.0, 1.0
+    for name in _SCALE:
+        made[name] = np.log(0.5 * spacing)
+    return made
+
+
+def colours_of(vertices: NDArray[Any]) -> NDArray[np.float64]:
+    """Return the red, green and blue (G, 3) of Gaussians, 0 to 1, from their first harmonic."""
+    harmonics = np.stack([vertices[name] for name in _COLOUR], axis=1).astype(np.float64)
+    return np.clip(0.5 + _SH * harmonics, 0.0, 1.0)
+
+
+def require_gaussians(vertices: NDArray[Any] | None, path: Path) -> NDArray[Any]:
+    """Raise InputError for rows without the fields that are moved, turned and drawn."""
+    needed = {"x", "y", "z", "opacity", *_COLOUR, *_SCALE, *_ROTATION}
+    missing = needed - set(vertices.dtype.names or ()) if vertices is not None else needed
+    if vertices is None or missing:
+        raise InputError(path, f"has no {', '.join(sorted(missing))}", "a PLY of Gaussians")
+    return vertices
+
+
+def write_gaussians(path: Path, vertices: NDArray[Any], comment: str) -> None:
+    """Write Gaussians (G,) with all their fields, binary little-endian."""
+    names = vertices.dtype.names or ()
+    kinds = {name: "float" if vertices.dtype[name].kind == "f" else "int" for name in names}
+    layout = np.dtype([(name, "<f4" if kinds[name] == "float" else "<i4") for name in names])
+    lines = [
+        "ply",
+        "format binary_little_endian 1.0",
+        f"comment {comment}",
+        f"element vertex {len(vertices)}",
+        *(f"property {kinds[name]} {name}" for name in names),
+        "end_header",
+    ]
+    rows = vertices.astype(layout)
+    path.write_bytes("\n".join(lines).encode("ascii") + b"\n" + rows.tobytes())
+
+
+def _matrices(vertices: NDArray[Any]) -> NDArray[np.float64]:
+    """Return the rotations (G, 3, 3) of Gaussians, whose quaternions begin with the scalar."""
+    from scipy.spatial.transform import Rotation
+
+    w, x, y, z = (np.asarray(vertices[name], dtype=np.float64) for name in _ROTATION)
+    matrices: NDArray[np.float64] = Rotation.from_quat(np.stack([x, y, z, w], 1)).as_matrix()
+    return matrices
+
+
+def _set_rotations(vertices: NDArray[Any], matrices: NDArray[np.float64]) -> None:
+    from scipy.spatial.transform import Rotation
+
+    x, y, z, w = Rotation.from_matrix(matrices).as_quat().T
+    for name, values in zip(_ROTATION, (w, x, y, z), strict=True):
+        vertices[name] = values

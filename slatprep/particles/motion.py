@@ -1,0 +1,182 @@
+"""From voxels with materials and Gaussians to frames of moved Gaussians."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from slatprep.geometry.voxels import filled, occupancy_of, shown_in_cells
+from slatprep.particles.fields import VoxelField
+from slatprep.particles.gaussians import (
+    bind,
+    carry,
+    deform,
+    gaussians_of,
+    require_gaussians,
+    write_gaussians,
+)
+from slatprep.particles.read import FRAMES, Axes, Particles, read_particles
+from slatprep.particles.transfer import doubt_axes, recognise_axes, transfer
+from slatprep.records import BACKGROUND, MATERIAL_CLASSES, RESOLUTION, Place
+from slatprep.store import open_store
+
+CLASSES = MATERIAL_CLASSES[:BACKGROUND]
+
+_HELD = tuple(MATERIAL_CLASSES.index(name) for name in ("stationary", "sand"))
+"""Pots and soil, which hold in the wind what grows in them."""
+
+
+class Override(NamedTuple):
+    """Class, Young's modulus [Pa] and density [kg/m^3] for a whole object; None keeps them."""
+
+    material: str | None = None
+    young: float | None = None
+    density: float | None = None
+
+
+class Scene(NamedTuple):
+    """Particles (N, 3) in the SLAT frame, their materials, and the Gaussians that they carry.
+
+    Gaussians are the rows of a PLY and their places (G, 3) in the SLAT frame.
+    """
+
+    positions: NDArray[np.float64]
+    spacing: float
+    material: NDArray[np.uint8]
+    properties: NDArray[np.float32]
+    vertices: NDArray[Any]
+    places: NDArray[np.float64]
+    axes: Axes
+    notes: tuple[str, ...]
+
+
+def cells_of(store: Place | None, asset: str | None) -> NDArray[np.uint8] | None:
+    """Return the SLAT voxels (K, 3) of a stored asset, on the 64^3 grid; None without one."""
+    if store is None or asset is None:
+        return None
+    held = open_store(store).asset(asset)
+    return shown_in_cells(held.coords, held.latents.resolution)[0]
+
+
+def prepare(
+    field: VoxelField,
+    cells: NDArray[np.uint8] | None,
+    gaussians: Path | None,
+    axes: Axes | None,
+    count: int,
+    override: Override,
+) -> Scene:
+    """Fill the object with a lattice of `count` particles a side, and bring its Gaussians along.
+
+    The SLAT's voxels `cells`, by default those of the field, are the surface of the object.
+    """
+    solid = filled(occupancy_of(field.voxels if cells is None else cells))
+    lattice = (np.indices((count,) * 3).reshape(3, -1).T + 0.5) / count - 0.5
+    inside = np.floor((lattice + 0.5) * RESOLUTION).astype(int)
+    positions = lattice[solid[tuple(inside.T)]]
+    given = transfer(positions, field, far="nearest")
+    material, properties = given.material.copy(), given.properties.copy()
+    if override.material is not None:
+        material[:] = MATERIAL_CLASSES.index(override.material)
+    for column, value in ((0, override.young), (1, override.density)):
+        if value is not None:
+            properties[:, column] = value
+    if gaussians is None:
+        vertices = gaussians_of(positions, material, 1 / count)
+        return Scene(positions, 1 / count, material, properties, vertices, positions, "slat", ())
+    surface = (
+        field
+        if cells is None
+        else VoxelField(cells, np.zeros(len(cells), np.uint8), np.ones((len(cells), 3), np.float32))
+    )
+    read, notes = _read(gaussians, axes, field, surface)
+    vertices = require_gaussians(read.vertices, gaussians)
+    return Scene(
+        positions, 1 / count, material, properties, vertices, read.in_slat(), read.axes, notes
+    )
+
+
+def _read(
+    path: Path, axes: Axes | None, field: VoxelField, surface: VoxelField
+) -> tuple[Particles, tuple[str, ...]]:
+    """Read Gaussians, and look whether they lie where the object does."""
+    read, recognised = recognise_axes(read_particles(path, axes), field)
+    doubt = doubt_axes(read, surface, transfer(read.in_slat(), surface), 2.0)
+    notes = [f"{path}: {text}" for text in (recognised, doubt) if text]
+    names = read.vertices.dtype.names if read.vertices is not None else None
+    if "f_rest_0" in (names or ()):
+        notes.append(f"{path}: colours that depend on the view (f_rest_*) do not turn along")
+    return read, tuple(notes)
+
+
+def run(
+    scene: Scene,
+    *,
+    size: float,
+    height: float,
+    wind: float,
+    seconds: float,
+    rate: int,
+    substeps: int,
+    device: str | None,
+) -> tuple[NDArray[np.float64], NDArray[np.float32]]:
+    """Simulate the particles, the unit cube `size` metres wide.
+
+    Returns positions (F, N, 3) in the SLAT frame, and gradients (F, N, 3, 3).
+    """
+    from slatprep.particles.simulate import preferred_device, simulate_motion
+
+    windy = wind != 0
+    foot = scene.positions[:, 2] < scene.positions[:, 2].min() + 1.5 * scene.spacing
+    moved = simulate_motion(
+        scene.positions * size,
+        scene.material,
+        scene.properties,
+        scene.spacing * size,
+        height=0.0 if windy else height,
+        gravity=0.0 if windy else 9.81,
+        wind=(wind, 0.0, 0.0),
+        fixed=(foot | np.isin(scene.material, _HELD)) if windy else None,
+        seconds=seconds,
+        rate=rate,
+        substeps=substeps,
+        device=device or preferred_device(),
+    )
+    # The first frame is where the SLAT has the object.
+    shift = moved.positions[0] - scene.positions * size
+    return (moved.positions - shift) / size, moved.gradients
+
+
+def write_frames(
+    out: Path,
+    scene: Scene,
+    moved: tuple[NDArray[np.float64], NDArray[np.float32]],
+    size: float,
+    picture: Path | None,
+    rate: int,
+    stretch: bool,
+    progress: Callable[[int, int], None],
+) -> int:
+    """Write ``frame-0000.ply`` and so on, and the picture; return the number of frames."""
+    from slatprep.particles.picture import draw, write_picture
+
+    out.mkdir(parents=True, exist_ok=True)
+    carrier = bind(scene.places, scene.positions, scene.spacing)
+    low = moved[0].min(axis=(0, 1)) - scene.spacing
+    high = moved[0].max(axis=(0, 1)) + scene.spacing
+    pictures = []
+    frames = len(moved[0])
+    for number, (positions, gradients) in enumerate(zip(*moved, strict=True)):
+        places, local = carry(carrier, positions, gradients)
+        rows = deform(scene.vertices, places, local, scene.axes, stretch=stretch)
+        write_gaussians(out / f"frame-{number:04d}.ply", rows, FRAMES[scene.axes])
+        if picture is not None:
+            pictures.append(draw(rows, places, low, high))
+        progress(number + 1, frames)
+    if picture is not None:
+        write_picture(picture, pictures, rate)
+    return frames
