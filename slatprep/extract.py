@@ -10,7 +10,6 @@ import hashlib
 import io
 import json
 import sys
-import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, redirect_stdout
 from dataclasses import dataclass, field, replace
@@ -20,7 +19,6 @@ from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 import orjson
-from numpy.typing import NDArray
 
 from slatprep.errors import ConfigError, InputError
 from slatprep.readers.patterns import NAME
@@ -28,17 +26,13 @@ from slatprep.readers.slat import check_coords
 from slatprep.records import TRELLIS, StructuredLatents
 from slatprep.storage.atomic import staged
 from slatprep.storage.files import file_digest
+from slatprep.trellis_latents import FORMAT, sample_trellis
 
 if TYPE_CHECKING:
     from PIL.Image import Image
 
 MODEL = "microsoft/TRELLIS-image-large"
 """The model of TRELLIS that turns images into structured latents."""
-
-FORMAT = "slatprep-extraction"
-
-STAGES = ("image", "sparse structure", "SLAT")
-"""Timed stages of an extraction: background removal and DINO; occupied voxels; their latents."""
 
 _LATENTS = (
     "as TRELLIS's pipeline returns them: multiplied with the model's std and moved by its mean, "
@@ -265,7 +259,9 @@ def _extract(session: Session, extraction: Extraction, preprocess: bool) -> Extr
     if extraction.slat.exists():
         return _kept(extraction, record)
     with _named(extraction.image, "make latents of it"):
-        coords, feats, seconds = _run(session, image, extraction.seed, preprocess)
+        coords, feats, seconds = sample_trellis(
+            pipeline, session.torch, image, extraction.seed, preprocess
+        )
     check_coords(coords, extraction.image)
     if len(coords) == 0 or feats.shape != (len(coords), TRELLIS.channels):
         raise InputError(
@@ -283,36 +279,6 @@ def _extract(session: Session, extraction: Extraction, preprocess: bool) -> Extr
     with staged(extraction.record) as path:
         path.write_text(json.dumps(record, indent=1) + "\n", encoding="utf-8")
     return Extracted(len(coords), kept=False, seconds=seconds)
-
-
-def _run(
-    session: Session, image: Image, seed: int, preprocess: bool
-) -> tuple[NDArray[np.int32], NDArray[np.float32], dict[str, float]]:
-    pipeline = session.pipeline
-    ends = [time.perf_counter()]
-
-    def end_stage() -> None:
-        if str(pipeline.device).startswith("cuda"):
-            session.torch.cuda.synchronize()  # Kernels run asynchronously.
-        ends.append(time.perf_counter())
-
-    # The calls and their order are those of the pipeline's `run`, so that a seed gives the same
-    # numbers; `run` itself does not return the latents.
-    with session.torch.no_grad():
-        if preprocess:
-            image = pipeline.preprocess_image(image)
-        cond = pipeline.get_cond([image])
-        end_stage()
-        session.torch.manual_seed(seed)
-        voxels = pipeline.sample_sparse_structure(cond, 1)
-        end_stage()
-        slat = pipeline.sample_slat(cond, voxels)
-        end_stage()
-    return (
-        np.ascontiguousarray(slat.coords.detach().cpu().numpy(), dtype=np.int32),
-        np.ascontiguousarray(slat.feats.detach().cpu().float().numpy(), dtype=np.float32),
-        dict(zip(STAGES, np.diff(ends).tolist(), strict=True)),
-    )
 
 
 def _kept(extraction: Extraction, record: dict[str, Any]) -> Extracted:

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from slatprep.errors import ConfigError, SlatprepError
+from slatprep.errors import ConfigError
 from slatprep.export.assets import Exported
 from slatprep.export.bins import Binned, bin_materials
 from slatprep.export.formats import ExportOptions, Points, Writer
@@ -50,9 +50,7 @@ def writer(store: Store, ids: Sequence[str], options: ExportOptions) -> Writer:
     Raises
     ------
     ConfigError
-        If `options.materials` is less than the number of classes.
-    SlatprepError
-        If usd-core is not installed.
+        If `options.materials` is less than the number of classes, or usd-core is not installed.
     """
     least = len(YIELDING)
     if options.materials < least:
@@ -259,6 +257,6 @@ def _pxr(name: str) -> Any:
     try:
         return import_module(f"pxr.{name}")
     except ImportError as error:
-        raise SlatprepError(
+        raise ConfigError(
             "USD needs the package usd-core; install it with `pip install 'slatprep[usd]'`"
         ) from error

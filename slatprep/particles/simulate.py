@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from slatprep.errors import SlatprepError
+from slatprep.errors import ConfigError, SlatprepError
 from slatprep.records import MATERIAL_CLASSES
 from slatprep.records.yielding import MAX_POISSON, YIELDING
 
@@ -262,7 +262,7 @@ def _engine() -> tuple[Any, Any]:
         import newton
         import warp
     except ImportError as error:
-        raise SlatprepError(
+        raise ConfigError(
             f"simulation needs the package {error.name}; install it with "
             "`pip install 'slatprep[simulate]'`"
         ) from error
