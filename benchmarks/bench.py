@@ -136,7 +136,7 @@ MEASUREMENTS = (
     ),
     Measurement(
         "generations", "Whether two generated shapes of one object are aligned and judged right",
-        "quality", "python benchmarks/generations.py --objects {size} --seeds 901 902",
+        "design/confidence", "python benchmarks/generations.py --objects {size} --seeds 901 902",
         (0, 44, 1800), (0, 5, 240),
     ),
     Measurement(
