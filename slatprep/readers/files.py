@@ -148,7 +148,9 @@ def require_complete(pair: AssetPair) -> tuple[Place, Place]:
         )
     if pair.problem:
         # Not by a file's name: which side is at fault, the problem says.
-        raise InputError(f"asset {pair.asset_id!r}", pair.problem, "one grid and one SLAT per id")
+        fault, _, expected = pair.problem.rpartition("; expected ")
+        expected = expected if fault else "one grid and one SLAT per id"
+        raise InputError(f"asset {pair.asset_id!r}", fault or pair.problem, expected)
     return pair.grid, pair.slat
 
 

@@ -42,9 +42,11 @@ def read_map(
             elif {"sha256", "file_identifier"} <= columns:
                 form = ("file_identifier", "sha256")
             else:
+                parted = len(columns) == 1 and any(sign in min(columns) for sign in ";\t")
+                hint = "; save it with commas between the columns" if parted else ""
                 raise ConfigError(
                     f"{path}: columns {', '.join(sorted(columns)) or 'none'}; expected object_id "
-                    "and slat_id, or TRELLIS's sha256 and file_identifier"
+                    f"and slat_id, or TRELLIS's sha256 and file_identifier{hint}"
                 )
             own = form[0] == "object_id"
             for row in reader:
@@ -56,7 +58,11 @@ def read_map(
                 if own or (object_id and (object_id in objects or slat_id in slats)):
                     view = (row.get("view") or "") if own else ""
                     claims.setdefault(object_id, {})[slat_id, view] = None
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
+    except UnicodeDecodeError:
+        raise ConfigError(
+            f"{path}: cannot be read as a map of ids: save it as CSV in UTF-8"
+        ) from None
+    except (OSError, csv.Error) as error:
         raise ConfigError(f"{path}: cannot be read as a map of ids ({error})") from None
     return {object_id: list(named) for object_id, named in claims.items()}
 

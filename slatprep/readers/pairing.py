@@ -6,6 +6,7 @@ Memory holds only names: an entry per object and per SLAT, never an array.
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import groupby
@@ -328,9 +329,11 @@ def _case(row: _Row, there: _Found, side: str) -> str:
 def _name_problems(row: _Row) -> Iterator[str]:
     for kind, name in (("id", row.object_id), ("view", row.view)):
         if name and not NAME.fullmatch(name):
+            plain = re.sub(r"[^A-Za-z0-9._-]+", "-", name).lstrip(".")[:40] or "a"
             yield (
-                f"{kind} {name[:300]!r} is not allowed; expected at most 255 letters, digits, "
-                "'.', '_' and '-', not beginning with '.'"
+                f"{kind} {name[:300]!r} is not allowed: rename its files, to {plain!r} for "
+                "instance; expected at most 255 letters a to z, digits, '.', '_' and '-', not "
+                "beginning with '.'"
             )
 
 

@@ -179,6 +179,8 @@ def _walk(
         return
     texts, variables = _split(component, known)
     for name in listed:
+        if name.startswith("._"):
+            continue  # What macOS writes beside a file on other systems' disks.
         fields = _fields(texts, variables, name)
         if fields is None or fields.get("id") in skip:
             continue

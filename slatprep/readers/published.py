@@ -15,7 +15,7 @@ from slatprep.parameters import PixieverseSource
 from slatprep.readers.adapters import source_adapter
 from slatprep.readers.patterns import fill
 from slatprep.records import AssetPair, Place
-from slatprep.storage.archives import is_archive
+from slatprep.storage.archives import is_archive, shown
 from slatprep.storage.fetch import fetch
 from slatprep.storage.members import ArchivePlace, ArchiveTree
 from slatprep.storage.place import storage_of
@@ -169,7 +169,11 @@ def _tree(
     note: Callable[[str], None] | None,
 ) -> ArchivePlace:
     archives = storage_of(folder).archives(names, wanted)
-    return ArchivePlace(ArchiveTree(text, archives, _telling("archives: looked through", note)))
+    tree = ArchiveTree(text, archives, _telling("archives: looked through", note))
+    for archive, index in tree.indexes.items() if note else ():
+        if note and (told := index.told()):
+            note(f"{shown(archive.place)}: {told}")
+    return ArchivePlace(tree)
 
 
 def _wanted(source: PixieverseSource) -> tuple[str, ...]:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import errno
 import io
-import warnings
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import cached_property
@@ -93,9 +92,6 @@ class ArchiveTree:
         OSError
             If an archive cannot be read.
         """
-        for archive, index in self.indexes.items():
-            if told := index.told():
-                warnings.warn(f"{shown(archive.place)}: {told}", stacklevel=2)
         faults = {a.place.name: index.fault for a, index in self.indexes.items() if index.fault}
         return MemberListing(self.members, faults)
 

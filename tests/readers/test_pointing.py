@@ -11,6 +11,8 @@ from support.raw_sources import touch
 from slatprep.errors import ConfigError, InputError
 from slatprep.parameters import BuildParameters, PixieverseSource, SlatSource
 from slatprep.readers import discover
+from slatprep.readers.files import require_complete
+from slatprep.readers.joins import read_map
 from slatprep.readers.unmatched import explain_unmatched
 from slatprep.storage.place import storage_of
 
@@ -118,3 +120,34 @@ def test_archives_in_the_cache_of_the_hub_are_read(root: Path) -> None:
     (folder / "tree.tar").symlink_to("../../../../blobs/1234.tar")
     pairs = discover(parameters(home / "snapshots", "0" * 40, str(root / "slat")))
     assert [pair.category for pair in pairs if pair.grid] == ["tree"]
+
+
+def test_what_macos_writes_beside_files_is_no_asset(root: Path) -> None:
+    touch(root / "slat", "._a.npz", "._c.npz")
+    touch(root / "pixie" / "render_outputs", "._a/sample_0/material_grid.npy")
+    assert [pair.asset_id for pair in discover(parameters(root, "pixie"))] == ["a", "b"]
+
+
+def test_name_that_is_not_allowed_comes_with_another(root: Path) -> None:
+    touch(root / "pixie" / "render_outputs", GRID.format("Täpf mit Blüten 12"))
+    touch(root / "slat", "Täpf mit Blüten 12.npz")
+    (pair,) = [pair for pair in discover(parameters(root, "pixie")) if "%20" in pair.asset_id]
+    with pytest.raises(InputError) as caught:
+        require_complete(pair)
+    assert "rename its files, to 'T-pf-mit-Bl-ten-12' for instance" in str(caught.value)
+    assert str(caught.value).count("expected") == 1
+
+
+@pytest.mark.parametrize(
+    ("data", "advice"),
+    [
+        (b"object_id;slat_id\na;1\n", "save it with commas between the columns"),
+        ("object_id,slat_id\na,1\n".encode("utf-16"), "save it as CSV in UTF-8"),
+    ],
+)
+def test_table_in_another_form_is_told_how_to_save_it(
+    tmp_path: Path, data: bytes, advice: str
+) -> None:
+    (tmp_path / "map.csv").write_bytes(data)
+    with pytest.raises(ConfigError, match=advice):
+        read_map(tmp_path / "map.csv", {"a"}, {"1"})
