@@ -39,22 +39,10 @@ OTHERS = {
 
 
 def locate_grids(source: PixieverseSource, note: Callable[[str], None] | None = None) -> Place:
-    """Return the folder of the objects below what a source names, which archives may hold.
+    """Return the folder of the objects below a source's root, which archives may hold.
 
-    Parameters
-    ----------
-    source : PixieverseSource
-        Its root is the dataset's, its folder of archives, one archive, or the objects' folder.
-
-    Returns
-    -------
-    Place
-        The root itself where nothing says otherwise.
-
-    Raises
-    ------
-    ConfigError
-        If an archive or its folder cannot be looked at.
+    The root is the dataset's, its folder of archives, one archive, or the objects' folder.
+    ConfigError if an archive or its folder cannot be looked at.
     """
     root = source.root
     if source.adapter != PixieverseSource.adapter:
@@ -75,7 +63,8 @@ def locate_grids(source: PixieverseSource, note: Callable[[str], None] | None = 
                 break
             root = root / inner
     except OSError as error:
-        raise ConfigError(f"{error.filename}: cannot be looked at ({error.strerror})") from None
+        what = error.strerror or error
+        raise ConfigError(f"{error.filename or root}: cannot be looked at ({what})") from None
     return root
 
 

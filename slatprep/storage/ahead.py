@@ -19,7 +19,7 @@ MAX_READ = 2**20
 _LEAST, _MOST, _NEAR = 2**13, 2**22, 2**21
 """Bytes: a request after a jump; the largest request; a gap that costs less than a request."""
 
-_SHARE, _SLACK = 0.01, 2**21
+_SHARE, _SLACK = 0.015, 2**20
 """Requests grow as long as no more than this share of what lies before was read, and so much."""
 
 
@@ -28,13 +28,7 @@ class ReadAhead(io.RawIOBase):
 
     After a jump it asks for little. As long as the next headers are near, each request is twice
     the last one: many small members come with one request, and large ones are passed over.
-
-    Parameters
-    ----------
-    file : Ranges
-        What to read.
-    remote : bool
-        Whether a request is dear; otherwise all are small.
+    Of a file that is not `remote` all requests are small.
     """
 
     def __init__(self, file: Ranges, remote: bool) -> None:
@@ -55,13 +49,7 @@ class ReadAhead(io.RawIOBase):
         return offset
 
     def read(self, length: int = -1) -> bytes:
-        """Read on; fewer bytes than asked for mean the end.
-
-        Raises
-        ------
-        ValueError
-            If more than `MAX_READ` bytes are asked for.
-        """
+        """Read on; fewer bytes than asked for mean the end. ValueError above `MAX_READ`."""
         if not 0 <= length <= MAX_READ:
             raise ValueError(f"a header claims {length} bytes")
         data = self.held(length, self._at)

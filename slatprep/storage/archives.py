@@ -132,15 +132,7 @@ class Archive:
         return any(_like(pattern).fullmatch(name) for pattern in self.wanted)
 
     def read(self, entry: Entry) -> bytes:
-        """Read a member.
-
-        Raises
-        ------
-        OSError
-            If the archive cannot be read.
-        InputError
-            If it is not the archive that was looked at.
-        """
+        """Read a member; InputError if the archive is not the one that was looked at."""
         if not self.keeps:
             return self.fetch(entry)
         data = self._kept(entry)
@@ -211,15 +203,8 @@ class Archive:
     def index(self, progress: Callable[[int], None] = lambda _: None) -> Index:
         """Return where its members lie, from the cache or by reading its headers.
 
-        Parameters
-        ----------
-        progress : callable
-            Called with the bytes of the archive that were passed.
-
-        Raises
-        ------
-        OSError
-            If it cannot be read. What was found by then is kept.
+        `progress` is called with the bytes that were passed. OSError if it cannot be read: what
+        was found by then is kept.
         """
         index = _read_index(self)
         if not index.complete:

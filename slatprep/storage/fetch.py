@@ -7,7 +7,7 @@ from concurrent.futures import ThreadPoolExecutor, as_completed
 
 from slatprep.errors import ConfigError, InputError
 from slatprep.storage.archives import Archive, shown
-from slatprep.storage.tar import BLOCK, Entry
+from slatprep.storage.tar import BLOCK, MAX_KEPT, Entry
 
 _GAP, _MOST = 2**18, 2**24
 """Bytes between members that are read with them; bytes of one request with several members."""
@@ -53,7 +53,8 @@ def _requests(wanted: Iterable[tuple[Archive, Entry]]) -> Iterator[tuple[Archive
     """Yield members that one request brings: of one archive, and near each other."""
     missing: dict[Archive, Members] = {}
     for archive, entry in wanted:
-        if not (archive.packed or entry.problem or archive.holds(entry)):
+        unusable = archive.packed or entry.problem or entry.size > MAX_KEPT
+        if not (unusable or archive.holds(entry)):
             missing.setdefault(archive, []).append(entry)
     for archive, entries in missing.items():
         near: Members = []

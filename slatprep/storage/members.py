@@ -23,14 +23,8 @@ _AT_ONCE = 8
 class ArchiveTree:
     """The folder that archives were made of.
 
-    Parameters
-    ----------
-    text : str
-        What it is called: the folder that holds the archives, or the only one.
-    archives : sequence of Archive
-        In the order of their names.
-    progress : callable
-        Called with the bytes of archives that were looked through, and those of all.
+    `text` is what it is called: the folder that holds the archives, or the only one. `progress`
+    is called with the bytes of archives that were looked through, and those of all.
     """
 
     def __init__(
@@ -48,10 +42,7 @@ class ArchiveTree:
     def indexes(self) -> dict[Archive, Index]:
         """What each archive holds; those of an object store are read at the same time.
 
-        Raises
-        ------
-        OSError
-            If one cannot be read. What was found by then is kept.
+        OSError if one cannot be read. What was found by then is kept.
         """
         passed, total = dict[Archive, int](), sum(archive.size for archive in self.archives)
 
@@ -85,30 +76,15 @@ class ArchiveTree:
         return members
 
     def listing(self) -> MemberListing:
-        """Return the names that may be asked for, and what is damaged.
-
-        Raises
-        ------
-        OSError
-            If an archive cannot be read.
-        """
+        """Return the names that may be asked for, and what is damaged."""
         faults = {a.place.name: index.fault for a, index in self.indexes.items() if index.fault}
         return MemberListing(self.members, faults)
 
 
 class ArchivePlace:
-    """The tree of archives, or a file in it.
+    """The tree of archives, with an empty `path`, or a file in it.
 
-    Parameters
-    ----------
-    tree : ArchiveTree
-        The archives.
-    path : str
-        Name below them, with forward slashes; empty for the tree itself.
-    archive : Archive, optional
-        Where it lies; without it there is no such file.
-    entry : Entry, optional
-        And as what.
+    `archive` and `entry` tell where it lies; without them there is no such file.
     """
 
     # No dataclass, as `slatprep.storage.remote.RemotePlace` is none.
@@ -187,14 +163,8 @@ class ArchivePlace:
     def read_bytes(self) -> bytes:
         """Read a file whole.
 
-        Raises
-        ------
-        FileNotFoundError
-            If there is none.
-        InputError
-            If it is no plain file, or the archive is another one by now.
-        OSError
-            If the archive cannot be read.
+        FileNotFoundError if there is none, InputError if it is no plain file or the archive is
+        another one by now.
         """
         if self.archive is None or self.entry is None:
             raise FileNotFoundError(errno.ENOENT, "is in no archive", str(self))

@@ -114,13 +114,7 @@ class Storage:
         return Listing(self._path)
 
     def names(self) -> tuple[list[str], list[str]]:
-        """Return the names of files and of folders that lie directly in the place.
-
-        Raises
-        ------
-        OSError
-            If it cannot be listed.
-        """
+        """Return the names of files and of folders that lie directly in the place."""
         listing = Listing(self._path)
         return list(listing.of_folder("", folders=False)), list(listing.of_folder("", folders=True))
 
@@ -132,12 +126,7 @@ class Storage:
     def archives(self, names: Iterable[str], wanted: tuple[str, ...]) -> list[Archive]:
         """Look at archives that lie in the place, of whose members those like `wanted` matter.
 
-        Raises
-        ------
-        OSError
-            If one cannot be read.
-        InputError
-            If one is a link that leads out of the place.
+        OSError if one cannot be read, InputError if one is a link that leads out of the place.
         """
         found = []
         for name in names:

@@ -14,6 +14,9 @@ from slatprep.storage.ahead import ReadAhead
 BLOCK = tarfile.BLOCKSIZE
 """Bytes of a header, to a multiple of which members are filled up."""
 
+MAX_KEPT = 2**27
+"""Bytes of a member that is kept; no reader takes a larger file."""
+
 INCOMPLETE = "download it again"
 
 
@@ -38,23 +41,9 @@ class ArchiveError(Exception):
 def entries(file: ReadAhead, size: int, begin: int = 0) -> Iterator[tuple[Entry | None, int]]:
     """Yield the members of an archive from a header on, each with where the next one begins.
 
-    Folders are None. Members that no folder could take, by their names, have an empty one.
-
-    Parameters
-    ----------
-    file : ReadAhead
-        The archive, uncompressed.
-    size : int
-        Its bytes.
-    begin : int
-        Where to begin: 0, or what was yielded with a member.
-
-    Raises
-    ------
-    ArchiveError
-        Where it is damaged or ends too early.
-    OSError
-        If it cannot be read.
+    Folders are None; a name that leads out of the archive is empty. `begin` is 0, or where a
+    member said that the next one begins. ArchiveError where the archive, of `size` bytes, is
+    damaged or ends too early.
     """
     file.seek(begin)
     with _told():
@@ -81,19 +70,8 @@ def unpack(
 ) -> Iterator[Entry]:
     """Yield the members of an archive with gzip, read once from its beginning.
 
-    Parameters
-    ----------
-    stream : file
-        The archive.
-    wanted : callable
-        Whether the data of a name is wanted.
-    keep : callable
-        Gets it.
-
-    Raises
-    ------
-    ArchiveError
-        Where it is damaged or ends too early.
+    `keep` gets the data of names that are `wanted`, but for those larger than `MAX_KEPT`.
+    ArchiveError where the archive is damaged or ends too early.
     """
     with _told(), tarfile.open(fileobj=stream, mode="r|gz", errors="surrogateescape") as archive:
         for member in archive:
@@ -101,7 +79,8 @@ def unpack(
             archive.members.clear()  # type: ignore[attr-defined]
             if entry is None:
                 continue
-            if member.isreg() and not entry.problem and wanted(entry.name):
+            small = member.isreg() and member.size <= MAX_KEPT
+            if small and not entry.problem and wanted(entry.name):
                 data = archive.extractfile(member)
                 assert data is not None
                 content = data.read()

@@ -6,6 +6,7 @@ import hashlib
 import json
 import shutil
 import tarfile
+import zlib
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -16,6 +17,7 @@ from support.synthetic import make_asset
 from slatprep.errors import InputError
 from slatprep.inspect.verify import verify_store
 from slatprep.pipeline.dataset import build_store
+from slatprep.readers import discover, read_field
 from slatprep.storage import archives
 from slatprep.storage.files import LocalFile
 from slatprep.store import open_store
@@ -274,3 +276,18 @@ def test_long_names_are_read_in_both_forms(strange: Path) -> None:
         assert {key: made.read(entry) for key, entry in members.items()} == {
             name: b"grid", "b.npy": b"other",
         }  # fmt: skip
+
+
+@pytest.mark.parametrize("suffix", [".tar", ".tar.gz"])
+def test_member_that_no_reader_takes_is_not_read(
+    made: Path, strange: Path, tmp_path: Path, suffix: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("slatprep.storage.tar.MAX_KEPT", 2**20)
+    monkeypatch.setattr("slatprep.readers.files.MAX_FILE_BYTES", 2**20)
+    objects = made / "pixieverse" / "render_outputs"
+    pack(strange / f"tree{suffix}", [objects / IDS[0]])
+    (pair,) = [one for one in discover(parameters(made, strange)) if one.grid]
+    with pytest.raises(InputError, match="is larger than 1 MiB"):
+        read_field(pair)
+    kept = (tmp_path / "cache").rglob("*.z")
+    assert all(len(zlib.decompress(one.read_bytes())) < 2**20 for one in kept)
