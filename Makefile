@@ -92,7 +92,7 @@ TESTS = OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 \
         $(BIN)/python -m pytest -n $(JOBS) --dist worksteal
 # Once, or each process of the tests would compile the same.
 KERNELS = $(BIN)/python -c \
-          'from slatprep.pipeline.kernels import compile_kernels; compile_kernels()'
+          'from slatprep.pipeline.asset import compile_kernels; compile_kernels()'
 
 # Whatever one of them finds, the others run, and the tests' closing line comes last.
 # Not by a make within make: such a line would run even under --dry-run.

@@ -11,7 +11,7 @@ from hypothesis import HealthCheck, settings
 from support.deformed import add_deformed
 from support.synthetic import Dataset, make_asset
 
-from slatprep.pipeline import carry, seen
+from slatprep.pipeline import before, rows
 from slatprep.pipeline.dataset import BuildSummary, build_store
 
 # Tests must pass however busy the machine is.
@@ -35,14 +35,14 @@ def make_dataset(tmp_path: Path) -> Callable[..., Dataset]:
 @pytest.fixture
 def files_are_old(monkeypatch: pytest.MonkeyPatch) -> None:
     """Trust the states of files however shortly ago they were written."""
-    monkeypatch.setattr(seen, "_FINE_NS", 0)
-    monkeypatch.setattr(seen, "_COARSE_NS", 0)
+    monkeypatch.setattr(before, "FINE_NS", 0)
+    monkeypatch.setattr(before, "COARSE_NS", 0)
 
 
 @pytest.fixture
 def few_are_new(monkeypatch: pytest.MonkeyPatch) -> None:
     """Let two new assets of six be few."""
-    monkeypatch.setattr(carry, "MOST_BEHIND", 1.0)
+    monkeypatch.setattr(rows, "MOST_BEHIND", 1.0)
 
 
 @pytest.fixture(scope="session")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import click
 
@@ -11,6 +11,7 @@ from slatprep.cli.options import (
     AssetIds,
     Categories,
     FolderOrUrl,
+    Jobs,
     PathOrUrl,
     RecordsFolder,
     Verdicts,
@@ -18,9 +19,6 @@ from slatprep.cli.options import (
 )
 from slatprep.cli.output import Output
 from slatprep.cli.signature import Click, command
-
-if TYPE_CHECKING:
-    pass
 
 
 @command()
@@ -39,6 +37,7 @@ def subset(
     manifests: Annotated[
         RecordsFolder | None, "Folder for the records. [default: beside the new store]"
     ] = None,
+    jobs: Jobs = 1,
 ) -> None:
     """Make a store of some assets of STORE, without aligning them again.
 
@@ -62,7 +61,9 @@ def subset(
         require_categories(opened, categories)
         chosen += [asset.asset_id for asset in list_assets(opened, verdicts, categories)]
     with output.progress("subset", "shards") as progress:
-        summary = subset_store(store, out, chosen, manifests=manifests, progress=progress)
+        summary = subset_store(
+            store, out, chosen, manifests=manifests, jobs=jobs, progress=progress
+        )
     report(output, summary)
 
 
@@ -79,6 +80,7 @@ def concat(
     manifests: Annotated[
         RecordsFolder | None, "Folder for the records. [default: beside the new store]"
     ] = None,
+    jobs: Jobs = 1,
 ) -> None:
     """Make one store of the assets of all STORES, without aligning them again.
 
@@ -93,5 +95,5 @@ def concat(
     from slatprep.pipeline.join import concat_stores
 
     with output.progress("concat", "shards") as progress:
-        summary = concat_stores(stores, out, manifests=manifests, progress=progress)
+        summary = concat_stores(stores, out, manifests=manifests, jobs=jobs, progress=progress)
     report(output, summary)

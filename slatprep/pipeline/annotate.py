@@ -1,23 +1,36 @@
-"""One annotation of an object: aligned to the SLAT, looked up at its voxels, judged."""
+"""An object's annotations: aligned to the SLAT, looked up at its voxels, judged, and merged.
+
+Where there are several, each is aligned by itself.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
+
+import numpy as np
 
 from slatprep.align import align
 from slatprep.align.deformation import map_of
-from slatprep.judge import judge, voxel_confidence
+from slatprep.errors import InputError
+from slatprep.judge import judge, merged, voxel_confidence
 from slatprep.parameters import BuildParameters
-from slatprep.provenance.record import StageParameters
+from slatprep.provenance.record import MAX_SOURCES, StageParameters
+from slatprep.readers import read_field, read_latents
+from slatprep.readers.identity import hash_sources, source_digests
 from slatprep.records import (
     Alignment,
     Annotation,
     AssetPair,
+    Contribution,
+    Finished,
     Judgement,
     MaterialField,
+    SourceFile,
     StructuredLatents,
+    Verdict,
 )
-from slatprep.sample import sample
+from slatprep.sample import in_table, lacking, merge, sample
 from slatprep.storage.faults import reached
 
 
@@ -66,3 +79,165 @@ def annotate(
         confidence = judgement.confidence
         likely = voxel_confidence(field, latents, alignment, annotation, confidence)
     return Annotated(pair, field, alignment, judgement, replace(annotation, confidence=likely))
+
+
+def process_several(
+    pair: AssetPair, parameters: BuildParameters, known: tuple[Contribution, ...] = ()
+) -> Finished:
+    """Take an asset from several annotations of its object to one, merged.
+
+    Left out are those that cannot be used, and those whose alignment failed where that
+    of another did not. Of fields that occupy the same voxels one alignment serves all.
+    Annotations that have a part of the properties alone, or no classes, add to the others.
+
+    Parameters
+    ----------
+    pair : AssetPair
+        With others beside it.
+    parameters : BuildParameters
+        How to align and to look up.
+    known : tuple of Contribution
+        What an earlier build found of the same annotations.
+
+    Returns
+    -------
+    Finished
+        Its field, alignment, places and distances are those of the first that is merged and
+        has all that the store holds.
+
+    Raises
+    ------
+    InputError
+        If the SLAT cannot be used, or no annotation that has all that the store holds, or a
+        file was replaced between its hashing, which gives the asset its key, and its reading.
+    """
+    sources, digests = hash_sources(pair)
+    if len(sources) > MAX_SOURCES:
+        what = f"has {len(pair.annotations):,} annotations in {len(sources):,} files to be merged"
+        raise InputError(f"asset {pair.asset_id!r}", what, f"at most {MAX_SOURCES} files")
+    latents, annotated, faults = _annotations(pair, parameters, known, sources, digests)
+    contents = pair.roots.contents
+    good = [one for one in annotated if one.judgement.verdict is not Verdict.FAILED] or annotated
+    lacks = {one.pair.sample: lacking(one.field, contents) for one in good}
+    first = next((one for one in good if not lacks[one.pair.sample]), None)
+    if first is None:
+        raise _incomplete(pair, lacks, faults)
+    good = [first, *(one for one in good if one is not first)]
+    parts = [in_table(one.annotation, one.field, contents) for one in good]
+    annotation = merge(parts, contents.properties)
+    told = {one.pair.sample: one for one in annotated}
+    contributions = tuple(
+        _contribution(one, told.get(one.sample), faults.get(one.sample), good, sources)
+        for one in pair.annotations
+    )
+    return Finished(
+        pair,
+        replace(first.field, warnings=_warnings(good, lacks, contributions)),
+        latents,
+        first.alignment,
+        annotation,
+        merged(first.judgement, annotation),
+        contributions,
+        sources,
+        digests,
+        tuple(one.field for one in good[1:]),
+    )
+
+
+def _annotations(
+    pair: AssetPair,
+    parameters: BuildParameters,
+    known: tuple[Contribution, ...],
+    sources: tuple[SourceFile, ...],
+    digests: Mapping[str, str],
+) -> tuple[StructuredLatents, list[Annotated], dict[str, InputError]]:
+    """Return the latents, each annotation that can be used, and why the others cannot."""
+    before = {one.sample: one for one in known}
+    latents: StructuredLatents | None = None
+    annotated: list[Annotated] = []
+    faults: dict[str, InputError] = {}
+    for one in pair.annotations:
+        try:
+            field = read_field(one, parameters.sample.max_unphysical)
+        except InputError as error:
+            faults[one.sample] = error
+            continue
+        if not set(field.sources) <= set(sources):
+            raise _replaced(one)
+        if latents is None:
+            latents = read_latents(one)
+            shared = latents if pair.slat_group else None
+            if source_digests(latents.sources, shared)["slat"] != digests["slat"]:
+                raise _replaced(one)
+        found = before.get(one.sample)
+        alignment = found.alignment if found else _same_alignment(field, annotated)
+        judgement = found.judgement if found else None
+        annotated.append(annotate(one, field, latents, parameters, alignment, judgement))
+    if latents is None:
+        raise _refused(pair, faults)
+    return latents, annotated, faults
+
+
+def _warnings(
+    good: list[Annotated],
+    lacks: Mapping[str, tuple[str, ...]],
+    contributions: tuple[Contribution, ...],
+) -> tuple[str, ...]:
+    left_out = ((one.sample, one.left_out) for one in contributions if one.left_out)
+    return (
+        *(f"sample {one.pair.sample}: {text}" for one in good for text in one.field.warnings),
+        *(f"sample {sample} has no {', '.join(names)}" for sample, names in lacks.items() if names),
+        *(f"sample {sample} is left out: {why}" for sample, why in left_out),
+    )
+
+
+def _incomplete(
+    pair: AssetPair, lacks: Mapping[str, tuple[str, ...]], faults: Mapping[str, InputError]
+) -> InputError:
+    reasons = [f"sample {sample} has no {', '.join(names)}" for sample, names in lacks.items()]
+    reasons += [f"sample {sample}: {error}" for sample, error in faults.items()]
+    return InputError(
+        f"asset {pair.asset_id!r}",
+        f"no annotation with all that the store holds can be used ({'; '.join(reasons)})",
+        "one that can be, to which others add",
+    )
+
+
+def _replaced(one: AssetPair) -> InputError:
+    what = f"a file of sample {one.sample} was replaced while the build read it"
+    return InputError(f"asset {one.asset_id!r}", what, "files that stay; build again")
+
+
+def _same_alignment(field: MaterialField, annotated: list[Annotated]) -> Alignment | None:
+    """Return the alignment of a field with the same geometry, which is all that engines use."""
+    for one in annotated:
+        frames = [own.frame is None or own.frame.tobytes() for own in (field, one.field)]
+        if frames[0] == frames[1] and np.array_equal(field.occupancy, one.field.occupancy):
+            return one.alignment
+    return None
+
+
+def _contribution(
+    pair: AssetPair,
+    annotated: Annotated | None,
+    fault: InputError | None,
+    good: list[Annotated],
+    sources: tuple[SourceFile, ...],
+) -> Contribution:
+    if annotated is None:
+        return Contribution(pair.sample, (), " ".join(str(fault).split()))
+    left_out = (
+        "" if annotated in good else f"its alignment failed: {annotated.judgement.reasons[0]}"
+    )
+    files = tuple(k for k, file in enumerate(sources) if file in annotated.field.sources)
+    return Contribution(pair.sample, files, left_out, annotated.alignment, annotated.judgement)
+
+
+def _refused(pair: AssetPair, faults: dict[str, InputError]) -> InputError:
+    """Return why none of the annotations can be used; one reason where all have the same."""
+    first, *others = faults.values()
+    if all(str(other) == str(first) for other in others):
+        return first
+    reasons = "; ".join(f"sample {sample}: {error}" for sample, error in faults.items())
+    what = f"none of its {len(faults)} annotations can be used ({reasons})"
+    return InputError(f"asset {pair.asset_id!r}", what, "one that can be")

@@ -2,30 +2,49 @@
 
 `process_asset` is the method, stage by stage. `finish_asset` is the task a
 worker gets: it does that, or uses what was done before, leaves the result in
-the spool and turns an asset's faults into its status.
+the spool and turns an asset's faults into its status. `compile_kernels` does all of it
+once before workers start: numba compiles a kernel when it is first called and keeps it on
+disk, and workers that start without it would each compile all of them, at the same time.
 """
 
 from __future__ import annotations
 
 import time
 import traceback
+from collections.abc import Callable
 from dataclasses import replace
+from typing import Any
 
+import numpy as np
+
+from slatprep.align import align
+from slatprep.align.deformation import map_of
 from slatprep.errors import InputError, MissingPartnerError, SlatprepError, StoreError
-from slatprep.parameters import BuildParameters
-from slatprep.pipeline.annotate import annotate
-from slatprep.pipeline.context import BuildContext
-from slatprep.pipeline.plan import Action, PlannedAsset
-from slatprep.pipeline.previous import PreviousBuild
+from slatprep.geometry.kernel import KEPT
+from slatprep.geometry.voxels import voxels_of
+from slatprep.judge import judge
+from slatprep.parameters import AlignParameters, BuildParameters, SampleParameters
+from slatprep.pipeline.annotate import annotate, process_several
+from slatprep.pipeline.plan import Action, BuildContext, PlannedAsset
+from slatprep.pipeline.previous import SourceStore
 from slatprep.pipeline.recipe import Recipe
-from slatprep.pipeline.several import process_several
-from slatprep.pipeline.spool import FailedAsset, Spool, SpooledAsset
+from slatprep.pipeline.rows import FailedAsset, Row
+from slatprep.pipeline.spool import Spool
 from slatprep.provenance.make import record_of, record_of_failed
 from slatprep.provenance.record import AssetRecord
 from slatprep.provenance.record_json import faults_of
 from slatprep.readers import read_field, read_latents
 from slatprep.readers.identity import reading_of, source_digests
-from slatprep.records import AssetPair, Failed, Finished, Status
+from slatprep.records import (
+    RESOLUTION,
+    AssetPair,
+    Failed,
+    Finished,
+    MaterialField,
+    Status,
+    StructuredLatents,
+)
+from slatprep.sample import sample
 from slatprep.storage.faults import reached
 
 _REASON, _TRACEBACK = 4_000, 100_000
@@ -69,7 +88,7 @@ def process_asset(
 
 def finish_asset(
     pair: AssetPair, planned: PlannedAsset | None, context: BuildContext
-) -> SpooledAsset | FailedAsset:
+) -> Row | FailedAsset:
     """Bring one asset into the spool, with no more work than it needs.
 
     Parameters
@@ -83,7 +102,7 @@ def finish_asset(
 
     Returns
     -------
-    SpooledAsset or FailedAsset
+    Row or FailedAsset
         What the parent keeps of it.
 
     Raises
@@ -93,7 +112,6 @@ def finish_asset(
     SlatprepError
         With `strict`, the asset's own fault.
     """
-    begin = time.perf_counter()
     reached("asset begun", pair.asset_id)
     if planned is not None and planned.action is Action.RESUME:
         resumed = _resumed(planned, context.spool)
@@ -109,8 +127,7 @@ def finish_asset(
         # A fault in one asset, even of slatprep's own, must not cost the others.
         if context.strict:
             raise
-        return _failed(_failure(pair, error), context, time.perf_counter() - begin)
-    record = replace(record, duration_s=round(time.perf_counter() - begin, 4))
+        return _failed(_failure(pair, error), context)
     kept = context.spool.put(record, asset.field, asset.latents, asset.annotation, asset.others)
     return replace(kept, damaged=damaged)
 
@@ -140,7 +157,7 @@ def _processed(
 
 
 def _repeated(
-    pair: AssetPair, key: str, context: BuildContext, previous: PreviousBuild
+    pair: AssetPair, key: str, context: BuildContext, previous: SourceStore
 ) -> Finished | None:
     """Return an asset as its record tells of it; None where that does not hold any more."""
     try:
@@ -161,7 +178,7 @@ def _key(asset: Finished, recipe: Recipe) -> str:
     return recipe.key(asset.pair.asset_id, digests)
 
 
-def _resumed(planned: PlannedAsset, spool: Spool) -> SpooledAsset | None:
+def _resumed(planned: PlannedAsset, spool: Spool) -> Row | None:
     """Return what an interrupted build finished, under the names things have now."""
     if planned.names is not None:
         found = spool.find(planned.key)
@@ -172,8 +189,8 @@ def _resumed(planned: PlannedAsset, spool: Spool) -> SpooledAsset | None:
     return again and again[1]
 
 
-def _failed(asset: Failed, context: BuildContext, seconds: float = 0.0) -> FailedAsset:
-    record = record_of_failed(asset, context.parameters, context.recipe.code, seconds)
+def _failed(asset: Failed, context: BuildContext) -> FailedAsset:
+    record = record_of_failed(asset, context.parameters, context.recipe.code)
     return context.spool.put_failed(record)
 
 
@@ -191,3 +208,59 @@ def _failure(pair: AssetPair, error: Exception) -> Failed:
         return Failed(pair, Status.FAILED, line)
     line = f"internal error, please report: {type(error).__name__}: {line}"
     return Failed(pair, Status.FAILED, line, traceback.format_exc()[-_TRACEBACK:])
+
+
+WHEN = (
+    "once after installing"
+    if KEPT
+    else "in each process, as no cache folder can be written to (NUMBA_CACHE_DIR names one)"
+)
+"""When kernels are compiled, for the user."""
+
+
+def compile_kernels(note: Callable[[str], None] | None = None) -> None:
+    """Compile all kernels of alignment, sampling and judgement, and keep them on disk.
+
+    Parameters
+    ----------
+    note : callable, optional
+        Gets a line to show when something has to be compiled, which takes
+        20 to 40 s in all, and one when that is done; otherwise this takes 1 s.
+    """
+    from numba.core import event
+
+    class Told(event.Listener):
+        told = False
+
+        def on_start(self, event: Any) -> None:
+            if note and not self.told:
+                note(f"compiling the numerical kernels, {WHEN}: 20 to 40 s")
+            self.told = True
+
+        def on_end(self, event: Any) -> None:
+            pass
+
+    start, told = time.monotonic(), Told()
+    with event.install_listener("numba:compile", told):
+        _process_a_bent_shape()
+    if note and told.told:
+        note(f"compiled in {time.monotonic() - start:.0f} s")
+
+
+def _process_a_bent_shape() -> None:
+    """Align, sample and judge an L whose SLAT is bent so far that it is stretched, with a stray."""
+    occupied = np.zeros((RESOLUTION,) * 3, dtype=bool)
+    occupied[20:44, 22:36, 26:34] = occupied[20:26, 22:36, 34:50] = True
+    voxels = voxels_of(occupied)
+    count = len(voxels)
+    field = MaterialField(
+        occupied, voxels, np.zeros(count, np.uint8), np.ones((count, 3), np.float32)
+    )
+    bent = voxels.copy()
+    bent[:, 2] += ((bent[:, 0] - 20) ** 2 // 25).astype(np.uint8)
+    bent = np.append(bent, np.zeros((1, 3), np.uint8), axis=0)  # far from all that is annotated
+    latents = StructuredLatents(bent, np.zeros((len(bent), 8), np.float32))
+    alignment = align(field, latents, AlignParameters(model="deformable"))
+    places = map_of(alignment).places(latents.coords)
+    annotation = sample(field, places, SampleParameters())
+    judge(field, latents, alignment, annotation, SampleParameters())

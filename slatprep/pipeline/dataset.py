@@ -12,27 +12,25 @@ from pathlib import Path
 from types import MappingProxyType
 
 from slatprep.parameters import BuildParameters
-from slatprep.pipeline.assemble import Assembled, assemble
 from slatprep.pipeline.asset import process_asset
-from slatprep.pipeline.context import BuildContext
+from slatprep.pipeline.before import Before, look_back
 from slatprep.pipeline.finish import Crew, Note, Progress, finish
-from slatprep.pipeline.pack import latent_warnings
-from slatprep.pipeline.plan import Action, BuildPlan, PlannedAsset, plan_assets
-from slatprep.pipeline.previous import store_there
+from slatprep.pipeline.pack import Packed, pack_store
+from slatprep.pipeline.plan import Action, BuildContext, BuildPlan, PlannedAsset, plan_assets
 from slatprep.pipeline.publish import Destination, publish_manifests, require_records_file
 from slatprep.pipeline.ranges import check_objects
 from slatprep.pipeline.recipe import recipe_of
-from slatprep.pipeline.rows import Rows, settle_rows
-from slatprep.pipeline.seen import Found
-from slatprep.pipeline.spool import FailedAsset, Spool, SpooledAsset
-from slatprep.pipeline.standing import standing_lines
-from slatprep.pipeline.summary import BuildSummary, counts_of, summarise_build
-from slatprep.pipeline.update import Update, Wanted
+from slatprep.pipeline.rows import FailedAsset, NextStore, Row
+from slatprep.pipeline.settle import Wanted, latent_warnings, settle_rows
+from slatprep.pipeline.spool import Spool
+from slatprep.pipeline.summary import BuildSummary, counts_of, summarise, summarise_store
 from slatprep.pipeline.work import spool_of, work_beside, work_directory
-from slatprep.provenance.record_json import build_id_of, write_records
+from slatprep.provenance.record import Record
+from slatprep.provenance.record_json import build_id_of, digest_of
 from slatprep.readers import discover
 from slatprep.records import AssetPair, Place
 from slatprep.storage.atomic import staged, writing
+from slatprep.store import open_store
 from slatprep.workers.local import Jobs, require_shared
 
 __all__ = [
@@ -115,28 +113,28 @@ def build_store(
         place.store, fresh=fresh, keep=keep_work, look=place.look, private_disks=elsewhere
     ) as work:
         pairs = _discover(parameters, jobs, work.shared(), note=note)
-        check_objects(pairs, parameters.normalize)
-        there = None if fresh else store_there(place.store)
-        context = BuildContext(parameters, recipe_of(parameters), work.spool, there, strict)
-        update = Update.begun(pairs, context, place, wanted, rehash, begin, work.scratch)
-        if summary := update.untouched():
-            return summary
-        if not fresh:
-            update = update.compared(crew.of(len(pairs)))
-        plan = _plan(pairs, update.context, crew, update.known)
+        recipe = recipe_of(parameters)
+        before = look_back(place, pairs, parameters, recipe, wanted.declared, fresh, rehash)
+        if before.previous and before.untouched and wanted.allows(before.previous.store):
+            return _publish(before, parameters, begin)
+        before = before.checked(crew.of(len(pairs)))
+        context = BuildContext(parameters, recipe, work.spool, before.previous, strict)
+        plan = _plan(pairs, context, crew, before.known)
         new, unchanged = _split(pairs, plan)
-        finished = finish(new, plan, update.context, crew)
-        if summary := update.current(plan, finished):
-            return summary
-        rows = settle_rows(update, finished, unchanged, plan, crew, keep_work)
-        with writing(str(place.out), work_directory(place.store).parent):
-            packing, standing = crew.of(len(rows.made)), standing_lines(update, rows)
-            lines = standing.digests
-            assembled = assemble(rows, wanted.given, work, parameters, packing, lines)
-            place.replace(assembled.store, assembled.staged)
-        summary = _publish(update, rows, assembled, standing.size)
+        finished = finish(new, plan, context, crew)
+        following, failed = settle_rows(
+            finished, unchanged, plan, before, context, wanted, crew, keep_work
+        )
+        packed = None
+        if not before.holds(following):
+            with writing(str(place.out), work_directory(place.store).parent):
+                jobs = crew.of(sum(row.spooled for row in following.rows))
+                packed = pack_store(work.scratch, following, work.spool, jobs, work.shards)
+                place.replace(packed.store, packed.staged)
+        records = [work.spool.record(asset.key) for asset in failed]
+        summary = _publish(before, parameters, begin, following, packed, failed, records)
         if keep_work:
-            work.keep_only({asset.key for asset in rows.usable})
+            work.keep_only({row.key for row in following.rows if row.spooled})
     return summary
 
 
@@ -161,19 +159,15 @@ def plan_build(
     BuildPlan
         An entry an asset.
     """
-    place = Destination(out)
+    place, declared = Destination(out), Wanted.of(parameters).declared
     spool = spool_of(place.store, private_disks=not isinstance(jobs, int))
     if fresh:
         spool = Spool(work_directory(place.store) / "nothing")
-    pairs = _discover(parameters, jobs)
-    check_objects(pairs, parameters.normalize)
-    there = None if fresh else store_there(place.store)
-    context = BuildContext(parameters, recipe_of(parameters), spool, there, strict=False)
-    update = Update.begun(pairs, context, place, Wanted.of(parameters), rehash)
-    if not fresh:
-        update = update.compared(jobs)
-    plan = plan_assets(pairs, update.context, jobs, progress, update.known)
-    return BuildPlan(place.out, tuple(plan), update.damaged)
+    pairs, recipe = _discover(parameters, jobs), recipe_of(parameters)
+    before = look_back(place, pairs, parameters, recipe, declared, fresh, rehash).checked(jobs)
+    context = BuildContext(parameters, recipe, spool, before.previous, strict=False)
+    plan = plan_assets(pairs, context, jobs, progress, before.known)
+    return BuildPlan(place.out, tuple(plan), before.damaged)
 
 
 def align_pairs(
@@ -194,7 +188,7 @@ def align_pairs(
         Sources and methods.
     out : str or Path
         JSON Lines file of asset records, sorted by asset id, in the form of a
-        build's ``assets.jsonl``; ``normalization`` is null.
+        build's ``assets.jsonl``; of assets that cannot be used too.
     jobs, strict, assets_per_job, progress, note
         As for `build_store`.
 
@@ -218,13 +212,16 @@ def align_pairs(
         pairs = _discover(parameters, jobs, work.scratch, note=note)
         plan = _plan(pairs, context, crew)
         assets = sorted(finish(pairs, plan, context, crew), key=lambda asset: asset.asset_id)
-        with writing(str(out), out.parent), staged(out) as file:
-            digests = write_records(file, (work.spool.record(asset.key) for asset in assets))
-            build_id = build_id_of(digests.items())
-    seconds = time.perf_counter() - begin
+        texts = ((asset.asset_id, work.spool.record_text(asset.key)) for asset in assets)
+        digests = []
+        with writing(str(out), out.parent), staged(out) as partial, partial.open("wb") as file:
+            for asset_id, text in texts:
+                file.write(text + b"\n")
+                digests.append((asset_id, digest_of(text)))
     failed = [asset for asset in assets if isinstance(asset, FailedAsset)]
-    counts = counts_of(asset for asset in assets if isinstance(asset, SpooledAsset))
-    return summarise_build(counts, failed, records=out, build_id=build_id, seconds=seconds)
+    counts = counts_of(asset for asset in assets if isinstance(asset, Row))
+    build_id = build_id_of(parameters.name, digests)
+    return summarise(counts, failed, out, build_id, time.perf_counter() - begin)
 
 
 def _discover(
@@ -232,6 +229,7 @@ def _discover(
 ) -> list[AssetPair]:
     """Return the pairs; see that the workers find the first one's files, and `shared`."""
     pairs = discover(parameters, note)
+    check_objects(pairs, parameters.normalize)
     sources = next(([pair.grid, pair.slat] for pair in pairs if pair.grid and pair.slat), [])
     require_shared(jobs, [*shared, *sources])
     return pairs
@@ -262,30 +260,29 @@ def _split(
     return split
 
 
-def _publish(update: Update, rows: Rows, assembled: Assembled, behind: int) -> BuildSummary:
-    """Publish the records of a store that is in place, and the store where that is a step more."""
-    place, context = update.place, update.context
-    standardised = context.parameters.slat.standardised
-    told = (f"{asset.asset_id}: {asset.damaged}" for asset in rows.made if asset.damaged)
-    summary = summarise_build(
-        assembled.counts,
-        rows.failed,
-        store=place.out,
-        records=place.records(),
-        build_id=assembled.build_id,
-        seconds=update.seconds,
-        normalization=assembled.normalization,
-        clipped=assembled.clipped.sum(axis=0),
-        warnings=latent_warnings(rows.usable, rows.contents.latents, standardised),
-        damaged=(*update.damaged, *told),
-    )
-    publish_manifests(assembled.records, summary, context.parameters, behind=behind)
+def _publish(
+    before: Before,
+    parameters: BuildParameters,
+    begin: float,
+    following: NextStore | None = None,
+    packed: Packed | None = None,
+    failed: Sequence[FailedAsset] = (),
+    records: Iterable[Record] = (),
+) -> BuildSummary:
+    """Publish the store that is in place, or was there, with its manifests; note what was seen."""
+    place, previous = before.place, before.previous
+    store = open_store(place.in_place(previous.path if previous and not packed else None))
+    manifests = place.manifests(store.path)
+    damaged, warnings = list(before.damaged), list[str]()
+    if following is not None:
+        damaged += [f"{row.asset_id}: {row.damaged}" for row in following.rows if row.damaged]
+    if following is not None and packed is not None:
+        warnings += latent_warnings(following, parameters.slat.standardised)
+    seconds = time.perf_counter() - begin
+    summary = summarise_store(store, failed, place.out, manifests, seconds, warnings, damaged)
+    standing = before.standing_files(len(store), packed.records if packed else None)
+    publish_manifests(store, summary, parameters, records, standing=standing)
     place.publish()
-    clips = zip(rows.usable, assembled.clipped, strict=True)
-    keys, digests = rows.keys, assembled.digests
-    found = {
-        a.asset_id: Found(keys[a.asset_id], a.extent, c, a.latents, digests[a.asset_id])
-        for a, c in clips
-    }
-    update.note(summary, found)
+    if following is not None:
+        before.note(store, manifests)
     return summary

@@ -25,7 +25,6 @@ STAGES = (
     "slatprep.sample",
     "slatprep.judge",
     "slatprep.pipeline.annotate",
-    "slatprep.pipeline.several",
 )
 """Where an asset's numbers are made; a package stands for all of its modules."""
 

@@ -5,9 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
-from slatprep.pipeline.context import BuildContext
-from slatprep.pipeline.plan import Action, PlannedAsset
-from slatprep.pipeline.spool import FailedAsset, SpooledAsset
+from slatprep.pipeline.plan import Action, BuildContext, PlannedAsset
+from slatprep.pipeline.rows import FailedAsset, Row
 from slatprep.readers.published import fetch_members
 from slatprep.records import AssetPair
 from slatprep.workers.local import Jobs, at_most, run_unordered, start_early
@@ -50,7 +49,7 @@ def finish(
     plan: Mapping[str, PlannedAsset],
     context: BuildContext,
     crew: Crew,
-) -> list[SpooledAsset | FailedAsset]:
+) -> list[Row | FailedAsset]:
     """Bring assets into the spool; return what is kept of each, in no order.
 
     Parameters
@@ -67,8 +66,7 @@ def finish(
     if not pairs:
         return []
     # Late: a run that finds nothing changed needs neither numba nor scipy.
-    from slatprep.pipeline.asset import fail_asset, finish_asset
-    from slatprep.pipeline.kernels import compile_kernels
+    from slatprep.pipeline.asset import compile_kernels, fail_asset, finish_asset
 
     jobs = crew.of(len(pairs))
     actions = {planned.action if (planned := plan.get(p.asset_id)) else Action.ALIGN for p in pairs}
@@ -77,7 +75,7 @@ def finish(
         fetch_members((pair for pair in pairs if _is_new(pair, plan)), crew.note)
         compile_kernels(crew.note)  # Before workers of this machine work, each to compile all.
     tasks = ((pair, plan.get(pair.asset_id), context) for pair in pairs)
-    assets: list[SpooledAsset | FailedAsset] = []
+    assets: list[Row | FailedAsset] = []
     if crew.progress:
         crew.progress(0, len(pairs))
     for asset in run_unordered(finish_asset, tasks, jobs, fail_asset):

@@ -7,20 +7,40 @@ ranges of their own dataset are brought to the ranges of all of them.
 
 from __future__ import annotations
 
+import time
 from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from typing import Any
 
-from slatprep.errors import ConfigError
-from slatprep.pipeline.pack import resolved_contents
-from slatprep.pipeline.rewrite import NO_EXTENT, Source, places_of_sources, write_rows
-from slatprep.pipeline.spool import spooled
-from slatprep.pipeline.summary import BuildSummary
-from slatprep.provenance.stored import StoredRecords
+import numpy as np
+import orjson
+
+from slatprep.errors import ConfigError, StoreError
+from slatprep.parameters import BuildParameters
+from slatprep.pipeline.pack import pack_store
+from slatprep.pipeline.previous import SourceStore
+from slatprep.pipeline.publish import Destination, publish_manifests
+from slatprep.pipeline.rows import NextStore, Row
+from slatprep.pipeline.settle import resolved_contents
+from slatprep.pipeline.summary import BuildSummary, summarise_store
+from slatprep.pipeline.work import work_beside, work_directory
+from slatprep.provenance.files import build_in
+from slatprep.provenance.places import manifests_beside
+from slatprep.provenance.record_json import adapter_of
 from slatprep.records import Contents, LatentSpace, Normalization, Place, PropertyRange
+from slatprep.storage.atomic import writing
+from slatprep.storage.place import storage_of
 from slatprep.store import open_store
 from slatprep.workers import Progress
+from slatprep.workers.local import Jobs, at_most
+
+NO_ROOT, APART = "unknown", " | "
+"""The root that a build's record gives for unknown sources, and what separates several roots."""
+
+
+_ROWS_A_JOB = 256
+"""No more processes are started than there are so many rows for."""
 
 
 def subset_store(
@@ -29,6 +49,7 @@ def subset_store(
     assets: Iterable[str | int],
     *,
     manifests: str | Place | None = None,
+    jobs: Jobs = 1,
     progress: Progress | None = None,
 ) -> BuildSummary:
     """Make a store of some assets of another.
@@ -45,6 +66,8 @@ def subset_store(
         Ids, beginnings of ids that no other has, or numbers; see `Store.match`.
     manifests : str or Path, optional
         Folder of its records; by default beside it.
+    jobs : int or Workers
+        Worker processes, or a `slatprep.workers.dask.Cluster`.
     progress : callable, optional
         Called with the shards written and those there are.
 
@@ -58,16 +81,16 @@ def subset_store(
     ConfigError
         If no asset is named, or `out` is the store itself.
     StoreError
-        If the store lacks an asset, cannot be read, or the disk does not take the new one.
+        If the store lacks an asset, or cannot be read, or the disk does not take the new one.
     """
     source = _source(store)
-    chosen = {source.store.match(name) for name in assets}
-    rows = [(source, row) for row in sorted(chosen, key=source.store.ids.__getitem__)]
-    if not rows:
-        raise ConfigError(f"no asset of {source.store.path} is chosen; expected one at least")
-    contents = source.store.contents
-    ranges = source.store.normalization
-    return write_rows(rows, ranges, source.build, out, manifests, progress, contents)
+    held = source.store
+    chosen = sorted({held.match(name) for name in assets}, key=held.ids.__getitem__)
+    if not chosen:
+        raise ConfigError(f"no asset of {held.path} is chosen; expected one at least")
+    rows = [(0, row) for row in chosen]
+    ranges, contents = source.normalization, held.contents
+    return _write([source], rows, ranges, contents, source.build, out, manifests, jobs, progress)
 
 
 def concat_stores(
@@ -75,6 +98,7 @@ def concat_stores(
     out: str | Place,
     *,
     manifests: str | Place | None = None,
+    jobs: Jobs = 1,
     progress: Progress | None = None,
 ) -> BuildSummary:
     """Make one store of the assets of several.
@@ -87,7 +111,7 @@ def concat_stores(
     ----------
     stores : iterable of str or Place
         Two or more; they stay as they are.
-    out, manifests, progress
+    out, manifests, jobs, progress
         As for `subset_store`.
 
     Returns
@@ -102,14 +126,13 @@ def concat_stores(
         of them, parameters of alignment or look-up differ, or ranges differ
         that do not come from the datasets.
     StoreError
-        If one cannot be read, or the disk does not
-        take the new one.
+        If one cannot be read, or the disk does not take the new one.
     """
     sources = [_source(store) for store in stores]
     if len(sources) < 2:
         raise ConfigError(f"{len(sources)} stores to join; expected two or more")
-    rows = [(source, row) for source in sources for row in range(len(source.store))]
-    times = Counter(source.store.ids[row] for source, row in rows)
+    everything = [(n, row) for n, source in enumerate(sources) for row in range(len(source.store))]
+    times = Counter(sources[n].store.ids[row] for n, row in everything)
     twice = sorted(asset_id for asset_id, count in times.items() if count > 1)
     if twice:
         raise ConfigError(
@@ -117,17 +140,113 @@ def concat_stores(
             "expected each once: leave them out of one with `slatprep subset`"
         )
     build, contents = _common_build(sources), _common_contents(sources)
-    normalization = _common_ranges(sources)
-    rows.sort(key=lambda row: row[0].store.ids[row[1]])
-    return write_rows(rows, normalization, build, out, manifests, progress, contents)
+    ranges = _common_ranges(sources)
+    rows = sorted(everything, key=lambda row: sources[row[0]].store.ids[row[1]])
+    return _write(sources, rows, ranges, contents, build, out, manifests, jobs, progress)
 
 
-def _source(place: str | Place) -> Source:
-    store = open_store(place)
-    return Source(store, StoredRecords(store), store.attributes["build"], places_of_sources(store))
+def _source(place: str | Place) -> SourceStore:
+    return SourceStore(open_store(place).path.absolute())
 
 
-def _common_build(sources: Sequence[Source]) -> dict[str, Any]:
+def _write(
+    sources: Sequence[SourceStore],
+    chosen: Sequence[tuple[int, int]],
+    normalization: Normalization,
+    contents: Contents,
+    build: dict[str, Any],
+    out: str | Place,
+    manifests: str | Place | None,
+    jobs: Jobs,
+    progress: Progress | None,
+) -> BuildSummary:
+    """Write a store of rows of others, each named by the number of its store and its row there."""
+    begin = time.perf_counter()
+    place = Destination(out, manifests)
+    for source in sources:
+        if _same_place(source.path, place.store):
+            raise ConfigError(f"{place.out} is a store to take assets from; choose another path")
+    parameters = _parameters(sources, build)
+    sizes = [np.diff(source.store.offsets).tolist() for source in sources]
+    rows = [Row(sources[n].store.ids[row], sizes[n][row], store=n, row=row) for n, row in chosen]
+    _require_unclipped(sources, rows, normalization)
+    new = NextStore(rows, tuple(sources), normalization, contents, build, parameters.store)
+    with work_beside(place.store, look=place.look) as work:
+        with writing(str(place.out), work_directory(place.store).parent):
+            jobs = at_most(len(rows) // _ROWS_A_JOB, jobs)
+            packed = pack_store(work.scratch, new, work.spool, jobs, progress=progress)
+            place.replace(packed.store, packed.staged)
+        store = open_store(place.in_place())
+        folder, seconds = place.manifests(store.path), time.perf_counter() - begin
+        summary = summarise_store(store, (), place.out, folder, seconds)
+        publish_manifests(store, summary, parameters, versions=build["versions"])
+        place.publish()
+    return summary
+
+
+def _require_unclipped(
+    sources: Sequence[SourceStore], rows: Sequence[Row], normalization: Normalization
+) -> None:
+    """Raise StoreError where a row is to be brought to ranges, and lost values to its own."""
+    for number, source in enumerate(sources):
+        if source.normalization == normalization:
+            continue
+        clipped = source.store.column("clipped") + source.store.column("clipped_grid")
+        for row in rows:
+            if row.store == number and clipped[row.row].any():
+                raise StoreError(
+                    f"{source.path}: values of {row.asset_id} were clipped to its ranges, "
+                    "so it cannot be brought to others; build it again"
+                )
+
+
+def _same_place(one: Place, other: Place) -> bool:
+    """Whether two places are one, whatever leads there."""
+    a, b = storage_of(one).local, storage_of(other).local
+    return one == other if a is None or b is None else a.resolve() == b.resolve()
+
+
+def _places_of_sources(store: SourceStore) -> dict[str, Any]:
+    """Return where a store's sources lay; nothing where no record beside it is of its build."""
+    folder = manifests_beside(store.path)
+    if folder is None:
+        return {}
+    try:
+        record = build_in(folder)
+    except StoreError:
+        return {}  # The store does not need it, and `slatprep verify` names it.
+    if record.id != store.build_id:
+        return {}
+    names = ("pixieverse", "also", "slat", "pairing")
+    named = {name: getattr(record.parameters, name) for name in names}
+    places: dict[str, Any] = orjson.loads(orjson.dumps(named, default=str))
+    return places
+
+
+def _parameters(sources: Sequence[SourceStore], build: dict[str, Any]) -> BuildParameters:
+    """Return what the build's record says: the parameters, and where all sources lay."""
+    places: dict[str, Any] = {"pixieverse": {"root": NO_ROOT}, "slat": {"root": NO_ROOT}}
+    named = [_places_of_sources(source) for source in sources]
+    if all(own == named[0] for own in named):
+        places |= named[0]
+    else:
+        for side in ("pixieverse", "slat"):
+            roots = (own.get(side, {}).get("root", NO_ROOT) for own in named)
+            places[side] = {"root": APART.join(dict.fromkeys(roots))}
+    document = {"name": build["name"], **places, **build["parameters"]}
+    try:
+        parameters: BuildParameters = adapter_of(BuildParameters).validate_json(
+            orjson.dumps(document), strict=True
+        )
+    except ValueError as error:
+        path = sources[0].store.path
+        raise StoreError(
+            f"{path}: its attribute build does not say how it was built ({error}); build it again"
+        ) from None
+    return parameters
+
+
+def _common_build(sources: Sequence[SourceStore]) -> dict[str, Any]:
     """Return the attribute ``build`` of the joined store; versions that differ are all named."""
     first = sources[0]
     for other in sources[1:]:
@@ -150,7 +269,7 @@ def _common_build(sources: Sequence[Source]) -> dict[str, Any]:
     }
 
 
-def _common_ranges(sources: Sequence[Source]) -> Normalization:
+def _common_ranges(sources: Sequence[SourceStore]) -> Normalization:
     """Return the ranges that all have, or those that span all datasets'."""
     ranges = [source.store.normalization for source in sources]
     if all(one == ranges[0] for one in ranges):
@@ -173,7 +292,7 @@ def _in_words(space: LatentSpace) -> str:
     return f"{space.encoder!r} ({grid}, standardised: {space.standardised})"
 
 
-def _common_contents(sources: Sequence[Source]) -> Contents:
+def _common_contents(sources: Sequence[SourceStore]) -> Contents:
     """Return what all stores hold; moments of latents that a build measured are pooled."""
     first = sources[0].store.contents
     for source in sources[1:]:
@@ -192,5 +311,11 @@ def _common_contents(sources: Sequence[Source]) -> Contents:
     if all(source.store.contents == first for source in sources):
         return first
     unknown = replace(first, latents=replace(first.latents, mean=(), std=()))
-    rows = (spooled(record, NO_EXTENT) for source in sources for record in source.records)
-    return resolved_contents(rows, unknown, "as said")
+    rows = [
+        Row(asset_id, size, store=number, row=row)
+        for number, source in enumerate(sources)
+        for row, (asset_id, size) in enumerate(
+            zip(source.store.ids, np.diff(source.store.offsets).tolist(), strict=True)
+        )
+    ]
+    return resolved_contents(rows, sources, unknown, "as said")

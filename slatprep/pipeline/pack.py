@@ -1,12 +1,11 @@
-"""Pack finished assets into the arrays of a store, a shard a task."""
+"""Pack rows into the arrays of a store, a shard a task."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass, replace
-from functools import partial
-from itertools import accumulate, groupby
+from dataclasses import dataclass
+from itertools import groupby
 from pathlib import Path
 from typing import Any
 
@@ -14,134 +13,167 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slatprep.geometry.voxels import flat_index
-from slatprep.normalize import normalize_and_count, normalize_change
-from slatprep.parameters import StoreParameters
-from slatprep.pipeline.carry import Carried, KeptAsset, Row
-from slatprep.pipeline.previous import PreviousBuild
-from slatprep.pipeline.spool import Spool, SpooledAsset
-from slatprep.readers.encoders import ENOUGH, in_words, look_standardised, resolve_latents
-from slatprep.records import (
-    BACKGROUND,
-    UNANNOTATED,
-    Contents,
-    LatentSpace,
-    Normalization,
-    Place,
+from slatprep.normalize import (
+    denormalize_properties,
+    normalize_and_count,
+    normalize_change,
+    normalize_properties,
 )
+from slatprep.pipeline.previous import SourceStore
+from slatprep.pipeline.rows import NextStore, Where, record_text
+from slatprep.pipeline.spool import Spool
+from slatprep.records import UNANNOTATED, Normalization, Place
 from slatprep.storage.faults import reached
+from slatprep.storage.files import take_file
 from slatprep.storage.place import storage_of
 from slatprep.storage.remote import put_objects
-from slatprep.store import Store
+from slatprep.storage.upload import Staged
 from slatprep.store.layout import ARRAYS, ArrayLayout, arrays_with, overlaps
+from slatprep.store.records import RECORD_ARRAY
+from slatprep.store.runs import Run, Runs, runs_of
 from slatprep.store.shard_writer import ShardWriter, Written
-from slatprep.store.writer import Shard, create_store, merges, open_for_writing, shards
+from slatprep.store.writer import (
+    GROUPS,
+    Shard,
+    create_store,
+    finish_store,
+    merges,
+    open_for_writing,
+    packing_of,
+    shard_rows,
+    shards,
+)
 from slatprep.workers.local import Jobs, run_unordered
 
 Arrays = dict[str, NDArray[Any]]
 """Rows of arrays, by their full names."""
 
 _ROWS_MOVED = 65_536
-"""Rows of the existing store that are unpacked at a time, 4 MB in all arrays."""
+"""Rows of an older store that are unpacked at a time, 4 MB in all arrays."""
+
+
+@dataclass(frozen=True)
+class Packed:
+    """A store that is made and not in place yet.
+
+    Attributes
+    ----------
+    store : Path
+        Where it was made.
+    staged : Staged
+        What of it is not there, as an object store has it already.
+    records : frozenset of int
+        Shards of records that are files of the store it replaces.
+    """
+
+    store: Path
+    staged: Staged
+    records: frozenset[int]
+
+
+def pack_store(
+    folder: Path,
+    new: NextStore,
+    spool: Spool,
+    jobs: Jobs,
+    at: Place | None = None,
+    progress: Callable[[int, int], None] | None = None,
+) -> Packed:
+    """Write a store into a folder; shards go to `at`, where that is on an object store.
+
+    What an older store has in the same bytes is taken over: whole shards as files, if the new
+    store replaces it, and chunks as they are packed.
+    """
+    path = folder / "store.zarr"
+    create_store(path, len(new.rows), new.offsets[-1], new.parameters, new.contents, new.merged)
+    reached("store created", path.name)
+    remote = None if at is None else storage_of(at).remote
+    if remote is not None:
+        names = [name for group in GROUPS for name in arrays_in(group, new.merged)]
+        put_objects(path, remote, [f"{name}/zarr.json" for name in names])
+    runs = {group: _runs(path, group, new) for group in GROUPS}
+    taken, records = _taken(path, new, runs)
+    todo = list(shards([row.where for row in new.rows], new.offsets, new.parameters, runs, taken))
+    clipped = {group: _clipped_before(name, new) for group, name in _CLIPPED.items()}
+    here, written = remote or path, dict[str, Written]()
+    # Those of grids, which take longest, first: so the last shards keep all workers at work.
+    todo.sort(key=lambda shard: shard.group != "grid")
+    how = new.normalization, new.contents.background
+    tasks = ((here, spool, new.stores, shard, *how) for shard in todo)
+    for done, (shard, counts, files) in enumerate(run_unordered(write_shard, tasks, jobs), 1):
+        if shard.group in clipped:
+            clipped[shard.group][shard.first : shard.first + len(shard.rows)] += counts
+        written |= files
+        if progress:
+            progress(done, len(todo))
+    reached("records written", path.name)
+    _write_columns(path, new, {_CLIPPED[group]: counts for group, counts in clipped.items()})
+    files = _take(path, new, taken)
+    before = storage_of(new.stores[0].path).remote if files else None
+    copied = files if before else {}
+    afar = copied | written if remote else copied
+    sizes = {name: file.size for name, file in afar.items()}
+    digests = {name: file.sha256 for name, file in (written | files).items()}
+    finish_store(path, new.normalization, new.build_id, new.build, new.contents, digests, sizes)
+    return Packed(path, Staged(sizes, digests, remote, before, frozenset(copied)), records)
+
+
+_CLIPPED = {"voxel": "clipped", "grid": "clipped_grid"}
+"""Columns of what packing a group clips."""
 
 
 def write_shard(
     path: Place,
     spool: Spool,
+    stores: Sequence[SourceStore],
     shard: Shard,
     normalization: Normalization,
-    previous: PreviousBuild | None = None,
-    background: int = BACKGROUND,
+    background: int,
 ) -> tuple[Shard, NDArray[np.int64], dict[str, Written]]:
-    """Normalise and write one shard of every array of its group.
-
-    Parameters
-    ----------
-    path : Place
-        Where the store is made; `create_store` wrote the metadata of its arrays.
-    spool : Spool
-        Where the assets lie.
-    shard : Shard
-        What to write; no other task may have it.
-    normalization : Normalization
-        Ranges of the properties.
-    previous : PreviousBuild, optional
-        Where assets lie that are not in the spool.
-    background : int
-        Material id of an empty cell.
+    """Write one shard of every array of its group into the store that is made at `path`.
 
     Returns
     -------
     shard : Shard
-        The same.
-    clipped : ndarray of int64, shape (len(shard.keys), P)
+        The same; no other task may have it.
+    clipped : ndarray of int64, shape (len(shard.rows), P)
         How many of the values of the spool's assets lay outside the range, by property.
     files : dict of str to Written
         What was written, by name.
     """
-    name = f"{shard.group} {shard.rows[0]}"
+    name = f"{shard.group} {shard.start}"
     reached("shard begun", name)
-    clipped = np.zeros((len(shard.keys), len(normalization.ranges)), dtype=np.int64)
-    held = None if previous is None else previous.store
-    arrays_of = _grid_rows if shard.group == "grid" else _voxel_rows
+    clipped = np.zeros((len(shard.rows), len(normalization.ranges)), dtype=np.int64)
     with ExitStack() as stack:
         writers = {
-            name: stack.enter_context(ShardWriter(path, name, shard.rows[0]))
-            for name in arrays_in(shard.group, merges(path))
+            array: stack.enter_context(ShardWriter(path, array, shard.start))
+            for array in arrays_in(shard.group, merges(path))
         }
-        for same, *rows in shard.pieces or ((False, *shard.rows),):
-            if same and held is not None:
-                for array, writer in writers.items():
-                    reader = held.reader(array)
-                    first, last = (-(-row // reader.chunk_rows) for row in rows)
-                    for data, lengths in reader.packed(first, last):
-                        writer.append_packed(data, lengths)
+        for run, start, stop in shard.pieces:
+            if run is not None:
+                _copy_chunks(writers, stores[run.store], start + run.shift, stop + run.shift)
                 continue
-            for there, assets in groupby(owners(shard, *rows), partial(_row_there, shard.keys)):
-                if there is not None and held is not None:
-                    _move_rows(writers, held, there, list(assets))
+            assets = list(owners(shard, start, stop))
+            for there, own in groupby(assets, lambda one: _follows(shard.rows[one[0]], one[0])):
+                if there is not None:
+                    _move_rows(writers, stores[there[0]], shard, list(own), normalization)
                     continue
-                for asset, own in assets:
-                    key = str(shard.keys[asset])
-                    arrays, counts = arrays_of(spool, key, own, normalization, background)
+                for asset, rows in own:
+                    key = str(shard.rows[asset])
+                    arrays, counts = _spooled(
+                        spool, key, shard.group, rows, normalization, background
+                    )
                     clipped[asset] += counts
-                    append_rows(writers, arrays, own.stop - own.start)
+                    _append(writers, arrays, rows.stop - rows.start)
         reached("shard filled", name)
     reached("shard written", name)
     return shard, clipped, {writer.file: writer.written() for writer in writers.values()}
 
 
-def _row_there(keys: Sequence[str | int], one: tuple[int, slice]) -> int | None:
-    """Return what assets have in common whose rows follow one another in the existing store."""
-    key = keys[one[0]]
-    return key - one[0] if isinstance(key, int) else None
-
-
-def _move_rows(
-    writers: Mapping[str, ShardWriter],
-    held: Store,
-    there: int,
-    assets: Sequence[tuple[int, slice]],
-) -> None:
-    """Write rows of voxels that follow one another in a store; `there` is the row of asset 0."""
-    (first, begin), (last, end) = assets[0], assets[-1]
-    start = int(held.offsets[there + first]) + begin.start
-    stop = int(held.offsets[there + last]) + end.stop
-    for at in range(start, stop, _ROWS_MOVED):
-        rows = min(_ROWS_MOVED, stop - at)
-        append_rows(writers, {name: held.read_rows(name, at, at + rows) for name in writers}, rows)
-
-
-def append_rows(writers: Mapping[str, ShardWriter], arrays: Arrays, rows: int) -> None:
-    """Give each writer the rows of its array; fill values where there is no such array."""
-    for name, writer in writers.items():
-        if name in arrays:
-            writer.append(arrays[name])
-        else:
-            writer.append_fill(rows)
-
-
 def arrays_in(group: str, merged: bool) -> list[str]:
-    """Return the full names of a group's arrays; those of merged labels where there are any."""
+    """Return the full names of a group's arrays that are cut into shards."""
+    if group == "record":
+        return [RECORD_ARRAY]
     layouts = arrays_with(merged)
     return [layout.name for layout in layouts if layout.name.startswith(f"{group}/")]
 
@@ -151,25 +183,27 @@ def owners(shard: Shard, start: int, stop: int) -> Iterator[tuple[int, slice]]:
     if shard.group == "voxel":
         yield from overlaps(shard.offsets, start, stop)
     else:
-        first = shard.rows[0]
+        first = shard.start
         yield from ((asset, slice(0, 1)) for asset in range(start - first, stop - first))
 
 
-def _voxel_rows(
-    spool: Spool, key: str, own: slice, normalization: Normalization, background: int
-) -> tuple[Arrays, NDArray[np.int64]]:
-    del background  # no voxel of a SLAT is empty
-    arrays = {name: array[own] for name, array in spool.voxels(key).items()}
-    arrays["properties"], clipped = normalize_and_count(arrays["properties"], normalization)
-    if "spread" in arrays:
-        arrays["spread"] = normalize_change(arrays["spread"], normalization).astype(np.float32)
-    return {f"voxel/{name}": array for name, array in arrays.items()}, clipped
+def _follows(where: Where, asset: int) -> tuple[int, int] | None:
+    """Return what assets have in common whose rows follow one another in an older store."""
+    return None if isinstance(where, str) else (where[0], where[1] - asset)
 
 
-def _grid_rows(
-    spool: Spool, key: str, own: slice, normalization: Normalization, background: int
-) -> tuple[Arrays, NDArray[np.int64]]:
-    del own  # a grid is one row
+def _spooled(
+    spool: Spool, key: str, group: str, own: slice, normalization: Normalization, background: int
+) -> tuple[Arrays, NDArray[np.int64] | int]:
+    """Return rows of an asset of the spool in a group's arrays, and what was clipped (P,)."""
+    if group == "record":
+        return {RECORD_ARRAY: np.array([spool.record_text(key).decode()], object)}, 0
+    if group == "voxel":
+        arrays = {name: array[own] for name, array in spool.voxels(key).items()}
+        arrays["properties"], clipped = normalize_and_count(arrays["properties"], normalization)
+        if "spread" in arrays:
+            arrays["spread"] = normalize_change(arrays["spread"], normalization).astype(np.float32)
+        return {f"voxel/{name}": array for name, array in arrays.items()}, clipped
     field = spool.field(key)
     cells = flat_index(field.voxels)
     material = np.where(field.occupancy, np.uint8(UNANNOTATED), np.uint8(background))
@@ -182,139 +216,159 @@ def _grid_rows(
     return {"grid/material": material[None], "grid/properties": properties}, clipped
 
 
-def write_assets(
-    path: Path,
-    assets: Sequence[Row],
-    offsets: Sequence[int],
-    normalization: Normalization,
-    store: Store | None = None,
+def _copy_chunks(
+    writers: Mapping[str, ShardWriter], source: SourceStore, start: int, stop: int
 ) -> None:
-    """Write every ``asset/*`` array; `store` is the one that has the kept assets."""
-    made = [(row, asset) for row, asset in enumerate(assets) if isinstance(asset, SpooledAsset)]
-    kept = [(row, asset) for row, asset in enumerate(assets) if isinstance(asset, KeptAsset)]
-    ids = [asset.asset_id for asset in assets]
+    """Write whole chunks, rows ``start`` to ``stop - 1`` of an older store, as they are packed."""
+    for array, writer in writers.items():
+        if not source.store.holds(array):
+            writer.append_fill(stop - start)
+            continue
+        reader = source.store.reader(array)
+        first, last = (-(-row // reader.chunk_rows) for row in (start, stop))
+        for data, lengths in reader.packed(first, last):
+            writer.append_packed(data, lengths)
+
+
+def _move_rows(
+    writers: Mapping[str, ShardWriter],
+    source: SourceStore,
+    shard: Shard,
+    assets: Sequence[tuple[int, slice]],
+    normalization: Normalization,
+) -> None:
+    """Write rows of assets that follow one another in an older store, brought to the ranges."""
+    if shard.group == "record":
+        for asset, _ in assets:
+            _, row, names = shard.rows[asset]
+            text = record_text(source, int(row), names).decode()
+            _append(writers, {RECORD_ARRAY: np.array([text], object)}, 1)
+        return
+    held = source.store
+    (first, begin), (last, end) = assets[0], assets[-1]
+    rows = [int(shard.rows[asset][1]) for asset in (first, last)]
+    start, stop = rows[0], rows[1] + 1
+    if shard.group == "voxel":
+        start, stop = (
+            int(held.offsets[rows[0]]) + begin.start,
+            int(held.offsets[rows[1]]) + end.stop,
+        )
+    change = _renormaliser(source.normalization, normalization)
+    names = [name for name in writers if held.holds(name)]
+    at_a_time = _ROWS_MOVED if shard.group == "voxel" else 1
+    for at in range(start, stop, at_a_time):
+        end_row = min(at + at_a_time, stop)
+        arrays = {name: change(held.read_rows(name, at, end_row), name) for name in names}
+        _append(writers, arrays, end_row - at)
+
+
+def _append(writers: Mapping[str, ShardWriter], arrays: Arrays, rows: int) -> None:
+    """Give each writer the rows of its array; fill values where there is no such array."""
+    for name, writer in writers.items():
+        if name in arrays:
+            writer.append(arrays[name])
+        else:
+            writer.append_fill(rows)
+
+
+def _renormaliser(
+    old: Normalization, new: Normalization
+) -> Callable[[NDArray[Any], str], NDArray[Any]]:
+    """Return what brings the rows of an array, by its name, from one set of ranges to another."""
+    before, after = ([span.hi - span.lo for span in ranges.ranges] for ranges in (old, new))
+    scale = np.divide(before, after)
+
+    def change(values: NDArray[Any], name: str) -> NDArray[Any]:
+        if old != new and name == "voxel/spread":
+            return (values * scale).astype(np.float32)
+        if old == new or not name.endswith("/properties"):
+            return values
+        last = np.moveaxis(values, 1, -1)  # (N, P), or of a grid (1, x, y, z, P)
+        changed = normalize_properties(denormalize_properties(last, old), new)
+        return np.ascontiguousarray(np.moveaxis(changed, -1, 1))
+
+    return change
+
+
+def _runs(path: Path, group: str, new: NextStore) -> Runs:
+    """Return which rows of a group's arrays older stores have in chunks of the same bytes."""
+    alike = [_packs_alike(path, group, new, source) for source in new.stores]
+    if not any(alike):
+        return Runs()
+    voxel = group == "voxel"
+    before = [s.store.offsets.tolist() if voxel else range(len(s.store) + 1) for s in new.stores]
+    ends = new.offsets if voxel else range(len(new.rows) + 1)
+    spans = (
+        Run(ends[k], ends[k + 1], row.store, before[row.store][row.row] - ends[k])
+        for k, row in enumerate(new.rows)
+        if not row.spooled and alike[row.store] and (row.names is None or group != "record")
+    )
+    return runs_of(spans, ends[-1], tuple(rows[-1] for rows in before))
+
+
+def _packs_alike(path: Path, group: str, new: NextStore, source: SourceStore) -> bool:
+    """Whether a store has a group's values as the new one, in chunks cut and packed alike."""
+    if group != "record" and source.normalization != new.normalization:
+        return False
+    held = (name for name in arrays_in(group, new.merged) if source.store.holds(name))
+    return all(packing_of(path / name) == packing_of(source.path / name) for name in held)
+
+
+def _taken(
+    path: Path, new: NextStore, runs: Mapping[str, Runs]
+) -> tuple[frozenset[tuple[str, int]], frozenset[int]]:
+    """Return the shards, by group and number, that are files of the store that is replaced."""
+    if not (new.replaces and new.stores):
+        return frozenset(), frozenset()
+    held, taken = new.stores[0].store, set()
+    rows = shard_rows(new.parameters, new.offsets[-1])
+    for group in GROUPS:
+        names = arrays_in(group, new.merged)
+        if not all(held.holds(n) and held.reader(n).shard_rows == rows[group] for n in names):
+            continue
+        for number in range(-(-runs[group].new // rows[group])):
+            run = runs[group].holds(number * rows[group], (number + 1) * rows[group])
+            if run is not None and run.shift == 0:
+                taken.add((group, number))
+    return frozenset(taken), frozenset(number for group, number in taken if group == "record")
+
+
+def _take(path: Path, new: NextStore, taken: frozenset[tuple[str, int]]) -> dict[str, Written]:
+    """Give the new store those shards; on an object store they are named alone.
+
+    There the server copies them when the others are uploaded.
+    """
+    files: dict[str, Written] = {}
+    for group, number in sorted(taken):
+        source = new.stores[0]
+        local = storage_of(source.path).local
+        for name in arrays_in(group, new.merged):
+            file = source.store.reader(name).key(number)
+            if local is not None:
+                take_file(local / file, path / file)
+            files[file] = source.files[file]
+    return files
+
+
+def _clipped_before(name: str, new: NextStore) -> NDArray[np.int64]:
+    """Return what older stores clipped, (A, P) by row and property."""
+    counts = np.zeros((len(new.rows), len(new.contents.properties)), np.int64)
+    held = [source.store.column(name) for source in new.stores]
+    for k, row in enumerate(new.rows):
+        if not row.spooled:
+            counts[k] = held[row.store][row.row]
+    return counts
+
+
+def _write_columns(path: Path, new: NextStore, found: Mapping[str, NDArray[np.int64]]) -> None:
+    """Write every ``asset/*`` array; `found` are those that packing fills, by last name."""
     group = open_for_writing(path)["asset"]
     for layout in ARRAYS:
         where, _, name = layout.name.partition("/")
-        if where != "asset":
-            continue
-        if name in ("id", "offset"):
-            values: Any = ids if name == "id" else offsets
-        else:
-            own: Any = [asset.columns[name] for _, asset in made]
-            if name == "property_ambiguity" and made:
-                own = normalize_change(own, normalization)
-            values = np.empty((len(assets), *group[name].shape[1:]), _dtype(layout))
-            if made:
-                values[[row for row, _ in made]] = own
-            if kept and store is not None:
-                held = store.column(name)
-                values[[row for row, _ in kept]] = held[[asset.row for _, asset in kept]]
-                for row, asset in kept:
-                    if asset.names is not None and hasattr(asset.names, name):
-                        values[row] = getattr(asset.names, name)
-        group[name][:] = np.array(values, _dtype(layout))
+        if where == "asset":
+            values = found[name] if name in found else new.column(name)
+            group[name][:] = np.array(values, _dtype(layout))
 
 
 def _dtype(layout: ArrayLayout) -> Any:
     return object if layout.dtype == "str" else layout.dtype
-
-
-def resolved_contents(assets: Iterable[Row], declared: Contents, standardised: str) -> Contents:
-    """Return what a store holds, its latents as `resolve_latents` finds them to be."""
-    moments = [(asset.n_voxels, asset.latents) for asset in assets]
-    return replace(declared, latents=resolve_latents(declared.latents, standardised, moments))
-
-
-def latent_warnings(
-    assets: Sequence[Row], latents: LatentSpace, standardised: str
-) -> Iterator[str]:
-    """Yield what a person should know about whether the latents of a store are standardised."""
-    known = [(a.asset_id, a.latents) for a in assets if a.latents and a.n_voxels >= ENOUGH]
-    looks = {name: look_standardised(moments, latents) for name, moments in known}
-    if latents.standardised and standardised == "auto":
-        yield (
-            f"the latents look standardised already ({in_words(known[0][1])} in {known[0][0]}) and "
-            'are marked so; say slat.standardised = "yes" if they are, "no" if they are not'
-        )
-    others = [name for name, look in looks.items() if look != latents.standardised]
-    if others and standardised != "no":
-        how = "as the encoder gives them" if latents.standardised else "standardised already"
-        yield (
-            f"the latents of {len(others)} of {len(looks)} assets look {how}, unlike the others "
-            f"({', '.join(others[:3])}): look where they come from"
-        )
-
-
-@dataclass(frozen=True)
-class Packed:
-    """What became of packing.
-
-    Attributes
-    ----------
-    clipped : dict of str to ndarray of int64, shape (A, P)
-        Values outside the ranges, by group.
-    digests : dict of str to str
-        Of the shards, by file.
-    records : frozenset of int
-        Shards of records that were taken over.
-    elsewhere : dict of str to int
-        Bytes of the files that do not lie where the store is made, but on an object store.
-    copied : frozenset of str
-        Names of those that lie in the version that is there.
-    """
-
-    clipped: Mapping[str, NDArray[np.int64]]
-    digests: Mapping[str, str]
-    records: frozenset[int]
-    elsewhere: Mapping[str, int]
-    copied: frozenset[str]
-
-
-def pack_store(
-    path: Path,
-    spool: Spool,
-    assets: Sequence[Row],
-    normalization: Normalization,
-    parameters: StoreParameters,
-    jobs: Jobs,
-    contents: Contents,
-    carried: Carried | None = None,
-    at: Place | None = None,
-) -> Packed:
-    """Write the store's arrays, a task a shard; take over what `carried` has.
-
-    Shards go to `at`, if given, a place on an object store that all workers reach.
-    """
-    keys = [asset.row if isinstance(asset, KeptAsset) else asset.key for asset in assets]
-    offsets = [0, *accumulate(asset.n_voxels for asset in assets)]
-    merged = any(asset.merged for asset in assets)
-    create_store(path, len(keys), offsets[-1], parameters, contents, merged)
-    reached("store created", path.name)
-    previous = carried.previous if carried else None
-    write_assets(path, assets, offsets, normalization, previous.store if previous else None)
-    shape = len(keys), len(contents.properties)
-    clipped = {group: np.zeros(shape, dtype=np.int64) for group in ("voxel", "grid")}
-    same = carried.rows if carried else None
-    if (remote := None if at is None else storage_of(at).remote) is not None:
-        arrays = [*arrays_in("voxel", merged), *arrays_in("grid", merged)]
-        put_objects(path, remote, [f"{name}/zarr.json" for name in arrays])
-    # Those of grids, which take longest, first: so the last shards keep all workers at work.
-    todo = sorted(shards(keys, offsets, parameters, same), key=lambda shard: shard.group != "grid")
-    tasks = (
-        (remote or path, spool, shard, normalization, previous, contents.background)
-        for shard in todo
-    )
-    written: dict[str, Written] = {}
-    for shard, counts, files in run_unordered(write_shard, tasks, jobs):
-        clipped[shard.group][shard.first : shard.first + len(shard.keys)] += counts
-        written |= files
-    for row, asset in enumerate(assets):
-        if isinstance(asset, KeptAsset):
-            clipped["voxel"][row] = asset.clipped
-    taken, records = carried.take_shards(path) if carried else ({}, frozenset())
-    copied = taken if previous and storage_of(previous.path).remote else {}
-    afar = copied | written if remote else copied
-    elsewhere = {name: file.size for name, file in afar.items()}
-    digests = {name: file.sha256 for name, file in (written | taken).items()}
-    return Packed(clipped, digests, records, elsewhere, frozenset(copied))

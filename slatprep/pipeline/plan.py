@@ -8,18 +8,46 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass
 from enum import StrEnum
 from types import MappingProxyType
 
 from slatprep.errors import SlatprepError, StoreError
-from slatprep.pipeline.context import BuildContext
-from slatprep.provenance.record import AssetRecord
+from slatprep.parameters import BuildParameters
+from slatprep.pipeline.previous import SourceStore
+from slatprep.pipeline.recipe import Recipe
+from slatprep.pipeline.rows import Names
+from slatprep.pipeline.spool import Spool
 from slatprep.provenance.record_json import RecordError
 from slatprep.readers.identity import hash_sources
-from slatprep.records import AssetPair, Place, SourceFile
+from slatprep.records import AssetPair, Place
 from slatprep.storage.faults import reached
 from slatprep.workers.local import Jobs, run_unordered
+
+
+@dataclass(frozen=True)
+class BuildContext:
+    """A build, as its tasks see it.
+
+    Attributes
+    ----------
+    parameters : BuildParameters
+        The build's.
+    recipe : Recipe
+        What they and the code come to.
+    spool : Spool
+        Where finished assets go.
+    previous : SourceStore or None
+        The store that is there.
+    strict : bool
+        Raise an asset's fault instead of noting it.
+    """
+
+    parameters: BuildParameters
+    recipe: Recipe
+    spool: Spool
+    previous: SourceStore | None
+    strict: bool
 
 
 class Action(StrEnum):
@@ -30,25 +58,6 @@ class Action(StrEnum):
     RESUME = "resume"
     REFUSE = "refuse"
     REMOVE = "remove"
-
-
-@dataclass(frozen=True, slots=True)
-class Names:
-    """What an asset and its files are called now: no part of the work."""
-
-    object_id: str
-    view: str
-    category: str
-    sources: tuple[SourceFile, ...]
-
-    def changed(self, record: AssetRecord) -> list[str]:
-        """Return the names of the fields in which a record differs."""
-        names = (field.name for field in fields(self))
-        return [name for name in names if getattr(record, name) != getattr(self, name)]
-
-    def applied(self, record: AssetRecord) -> AssetRecord:
-        """Return a record with these names."""
-        return replace(record, **{field.name: getattr(self, field.name) for field in fields(self)})
 
 
 @dataclass(frozen=True, slots=True)

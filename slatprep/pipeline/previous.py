@@ -1,10 +1,11 @@
-"""The store that a build brings up to date."""
+"""The stores that a new one takes assets from: the one that is there, or those that are joined."""
 
 from __future__ import annotations
 
 import uuid
 from collections.abc import Callable
 from functools import cached_property, lru_cache
+from typing import Any
 
 import numpy as np
 
@@ -12,8 +13,7 @@ from slatprep.align.deformation import map_of
 from slatprep.errors import StoreError
 from slatprep.provenance.record import AssetRecord
 from slatprep.provenance.stored import StoredRecords
-from slatprep.records import Finished, Place
-from slatprep.storage.place import storage_of
+from slatprep.records import Finished, Normalization, Place
 from slatprep.store.integrity import file_findings, metadata_findings
 from slatprep.store.reader import Store, is_store, open_store
 from slatprep.store.records import RECORD_ARRAY, RECORDS_IN_SHARD
@@ -28,34 +28,46 @@ machine may round the map otherwise."""
 _NEEDED = ("asset/id/", "asset/offset/", f"{RECORD_ARRAY}/zarr.json", "file")
 
 
-class PreviousBuild:
-    """A store that was built before; each process that gets one opens it once.
+class SourceStore:
+    """A store that assets are taken from; each process that gets one opens it once.
 
     Parameters
     ----------
     path : Place
         The store.
-    build_id : str
-        Id of its build.
     damaged : frozenset of str
-        Files of records that are not as they were written.
+        Files of its records and columns that are not as they were written.
     """
 
-    def __init__(self, path: Place, build_id: str, damaged: frozenset[str] = frozenset()) -> None:
+    def __init__(self, path: Place, damaged: frozenset[str] = frozenset()) -> None:
         self.path = path
-        self.build_id = build_id
         self.damaged = damaged
         # A process that lives on must not answer with what it read of an older store at the same
         # path, whose rows may have been in another order under the same id.
         self._run = uuid.uuid4().hex
 
-    def __reduce__(self) -> tuple[Callable[..., PreviousBuild], tuple[object, ...]]:
-        return _in_this_process, (self.path, self.build_id, self.damaged, self._run)
+    def __reduce__(self) -> tuple[Callable[..., SourceStore], tuple[object, ...]]:
+        return _in_this_process, (self.path, self.damaged, self._run)
 
     @cached_property
     def store(self) -> Store:
         """The store, open."""
         return open_store(self.path)
+
+    @property
+    def build_id(self) -> str:
+        """Id of its build."""
+        return str(self.store.attributes.get("manifest"))
+
+    @cached_property
+    def normalization(self) -> Normalization:
+        """The ranges of its properties."""
+        return self.store.normalization
+
+    @property
+    def build(self) -> dict[str, Any]:
+        """Its attribute ``build``."""
+        return dict(self.store.attributes["build"])
 
     @cached_property
     def files(self) -> dict[str, Written]:
@@ -80,10 +92,7 @@ class PreviousBuild:
     def record(self, asset_id: str) -> AssetRecord | None:
         """Return the record of an asset as its first pass left it, None where it is not there.
 
-        Raises
-        ------
-        StoreError
-            If its file is damaged, or another version of slatprep wrote it.
+        Raises StoreError if its file is damaged, or another version of slatprep wrote it.
         """
         if asset_id not in self.ids:
             return None
@@ -118,52 +127,36 @@ class PreviousBuild:
         return same_rows and bool((np.abs(held["place"] - places) <= PLACE_TOLERANCE).all())
 
 
-@lru_cache(maxsize=1)
-def _in_this_process(
-    path: Place, build_id: str, damaged: frozenset[str], run: str
-) -> PreviousBuild:
-    return PreviousBuild(path, build_id, damaged)
+@lru_cache(maxsize=16)
+def _in_this_process(path: Place, damaged: frozenset[str], run: str) -> SourceStore:
+    return SourceStore(path, damaged)
 
 
-def store_there(target: Place) -> PreviousBuild | None:
+def store_there(target: Place) -> SourceStore | None:
     """Return the store at a path, none of its files compared; None where none can be opened."""
     try:
-        store = open_store(target)
+        return SourceStore(open_store(target).path)
     except StoreError:
         return None
-    return PreviousBuild(store.path, str(store.attributes.get("manifest")))
 
 
-def previous_build(target: Place, jobs: Jobs) -> tuple[PreviousBuild | None, tuple[str, ...]]:
-    """Return the store at a path, and what of it is not as it was written.
+def checked_store(
+    target: Place, jobs: Jobs, below: str = ""
+) -> tuple[SourceStore | None, tuple[str, ...]]:
+    """Return the store at a path, None where no build can go on from it, and what is wrong.
 
-    Every file is compared with its digest. On an object store, where each is a download and
-    the server keeps sums of its own, these are the files that a build reads.
-
-    Parameters
-    ----------
-    target : Place
-        Where a store may lie.
-    jobs : int or Workers
-        Worker processes, or a cluster's.
-
-    Returns
-    -------
-    previous : PreviousBuild or None
-        None where there is none that a build can go on from.
-    damaged : tuple of str
-        What is wrong with it, in words, sorted by file.
+    Its metadata are held against the contract, and the files whose names begin with `below`
+    against their digests; of the others the sizes are compared. What is wrong is in words,
+    sorted by file.
     """
     try:
         store = open_store(target)
     except StoreError as error:
         return None, (str(error),) if is_store(target) else ()
-    build_id = str(store.attributes.get("manifest"))
-    read = "" if storage_of(store.path).local else "asset/"
-    findings = sorted({*metadata_findings(store.path), *file_findings(store, jobs, read)[1]})
+    findings = sorted({*metadata_findings(store.path), *file_findings(store, jobs, below)[1]})
     damaged = tuple(map(str, findings))
     files = frozenset(finding.file for finding in findings)
     if any(file.startswith(_NEEDED) for file in files):
         return None, damaged
     records = frozenset(file for file in files if file.startswith(RECORD_ARRAY))
-    return PreviousBuild(store.path, build_id, records), damaged
+    return SourceStore(store.path, records), damaged

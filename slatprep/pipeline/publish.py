@@ -1,7 +1,7 @@
-"""Publish a build: put its store in place, with its records within it and beside it.
+"""Publish a build: put its store in place, and its manifests beside it.
 
 The store and its records are replaced in one step, because the records are an
-array of it. The files beside it are copies; a build that was killed before it
+array of it. The files beside it are made from them; a build that was killed before it
 could write them is noticed by the next one, which writes them then.
 """
 
@@ -9,36 +9,42 @@ from __future__ import annotations
 
 import os
 import platform
-import shutil
-from collections.abc import Iterable, Iterator, Mapping
-from contextlib import ExitStack
+from collections.abc import Collection, Iterable, Iterator
+from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
-from types import MappingProxyType
 
 from slatprep.errors import ConfigError, StoreError, in_unicode
 from slatprep.parameters import BuildParameters
 from slatprep.pipeline.summary import BuildSummary
-from slatprep.provenance.files import build_in
+from slatprep.provenance.files import (
+    ASSETS,
+    BUILD,
+    MAX_BUILD_BYTES,
+    build_in,
+    file_names,
+    lines_of,
+    stale_files,
+)
 from slatprep.provenance.make import build_versions
 from slatprep.provenance.places import manifests_of
 from slatprep.provenance.record import (
+    AssetRecord,
     BuildCounts,
     BuildRecord,
+    FailedRecord,
     Record,
     Versions,
 )
-from slatprep.provenance.record_json import RecordText, content_of, to_json, write_records
+from slatprep.provenance.record_json import to_json
 from slatprep.records import Place
-from slatprep.storage.atomic import append_file, replace_directory
+from slatprep.storage.atomic import replace_directory
 from slatprep.storage.faults import reached
 from slatprep.storage.place import place_of, storage_of
 from slatprep.storage.upload import PublishedState, Staged, Upload, published_state, upload_store
-from slatprep.store.reader import is_store, require_outside
-from slatprep.store.records import RecordWriter
-from slatprep.store.writer import open_for_writing
+from slatprep.store.reader import Store, is_store, require_outside
 
-_MARKS = {"build.json": b'"slatprep-build-record"', "assets.jsonl": b'"slatprep-asset-record"'}
+_MARKS = {BUILD: b'"slatprep-build-record"', ASSETS: b'"slatprep-asset-record"'}
 """Files beside a store, and what each says at its beginning."""
 
 _HEAD_BYTES = 4096
@@ -110,12 +116,16 @@ class Destination:
         if self._upload is not None:
             self._upload.publish()
 
-    def records(self, version: Place | None = None) -> Place:
-        """Return the file of asset records, of the new store or of the existing version."""
+    def in_place(self, there: Place | None = None) -> Place:
+        """Return where the new store lies, once it is in place; else `there`, the existing one."""
         if self._upload is not None:
-            version = self._upload.version
-        beside = self.out if self._remote is None or version is None else version
-        return (self._manifests or manifests_of(beside)) / "assets.jsonl"
+            return self._upload.version
+        return self.store if there is None else there
+
+    def manifests(self, store: Place | None = None) -> Place:
+        """Return the folder of the records of a store that lies here; by default of a new one."""
+        version = None if self._remote is None else store
+        return self._manifests or manifests_of(self.out if version is None else version)
 
 
 def _replaceable(out: Path) -> Path:
@@ -154,7 +164,7 @@ def _require_records(folder: Path, store: Path | None) -> None:
 def require_records_file(file: Path) -> None:
     """Raise ConfigError if a file to write lies in a store, or holds what is no record."""
     require_outside(file)
-    if os.path.lexists(file) and not _is_marked(file, _MARKS["assets.jsonl"]):
+    if os.path.lexists(file) and not _is_marked(file, _MARKS[ASSETS]):
         raise ConfigError(
             f"{file} exists and holds no records of slatprep; expected such records to replace, "
             "or a new path"
@@ -189,86 +199,50 @@ def _is_marked(file: Path, mark: bytes) -> bool:
         return False
 
 
-def write_all_records(
-    store: Path,
-    path: Path,
-    records: Iterable[tuple[int, Record | RecordText]],
-    taken: frozenset[int] = frozenset(),
-    standing: Mapping[str, bytes] = MappingProxyType({}),
-) -> dict[str, bytes]:
-    """Write records to a file, and those of rows into the new store; return all digests by id.
-
-    Parameters
-    ----------
-    store : Path
-        The new store.
-    path : Path
-        The file.
-    records : iterable of (int, Record or RecordText)
-        Rows and records, by asset id; rows of assets that do not go in are negative.
-    taken : frozenset of int
-        Shards of records that the new store has already.
-    standing : mapping of str to bytes
-        Digests of records by id that have a line already, so that they are not written to the
-        file.
-    """
-    writer = RecordWriter(open_for_writing(store), taken)
-
-    def lines() -> Iterator[Record | RecordText]:
-        for row, record in records:
-            if row >= 0:
-                writer.add(row, content_of(record))
-            if record.asset_id not in standing:
-                yield record
-
-    digests = {**standing, **write_records(path, lines())}
-    reached("records written", str(path))
-    return digests
-
-
 def publish_manifests(
-    records: Path,
+    store: Store,
     summary: BuildSummary,
     parameters: BuildParameters,
+    failed: Iterable[Record] = (),
     versions: Versions | None = None,
-    behind: int = 0,
+    standing: Collection[str] = (),
 ) -> None:
-    """Move the records of a finished build to where people look for them.
+    """Write the manifests of a store that is in place: lines of its records, and `build.json`.
+
+    What says so already stays as it is.
 
     Parameters
     ----------
-    records : Path
-        Those of the assets.
+    store : Store
+        The store.
     summary : BuildSummary
-        What the build did.
+        What the build did, and where its records go.
     parameters : BuildParameters
         What it was asked for.
+    failed : iterable of FailedRecord
+        The assets that could not go in, by id.
     versions : dict of str to str, optional
         Of the libraries that made the numbers, where they are not those of today.
-    behind : int
-        Put the records behind what is there, a file of so many bytes. Above 0 it must be
-        on a disk; what of it a reader has read stays where it is.
+    standing : collection of str
+        Files of lines that need not be looked at.
 
     Raises
     ------
     StoreError
         If the disk does not take them.
     """
-    folder = summary.records.parent
+    folder, names = summary.records.parent, file_names(len(store))
     try:
-        with ExitStack() as stack:
-            build_file = stack.enter_context(storage_of(folder / "build.json").staged())
-            if behind and (there := storage_of(summary.records).local) is not None:
-                append_file(records, there, behind)
-            else:
-                place = stack.enter_context(storage_of(summary.records).staged())
-                try:
-                    records.replace(place)
-                except OSError:  # on another disk
-                    shutil.copyfile(records, place)
-            reached("manifests written", str(folder))
-            document = to_json(build_record(summary, parameters, versions), indent=True)
-            build_file.write_bytes(document + b"\n")
+        for shard, name in enumerate(names):
+            if name not in standing:
+                _write(folder / name, lines_of(store, shard))
+        reached("manifests written", str(folder))
+        record = build_record(summary, parameters, versions, failed)
+        if not _is_there(folder, record):
+            _write(folder / BUILD, to_json(record, indent=True) + b"\n")
+        if (local := storage_of(folder).local) is not None:
+            for file in stale_files(local, names):
+                file.unlink()
         reached("manifests published", str(folder))
     except OSError as error:
         raise StoreError(
@@ -277,8 +251,32 @@ def publish_manifests(
         ) from error
 
 
+def _write(file: Place, content: bytes) -> None:
+    """Write a file in one step, unless it is there with this content."""
+    try:
+        if storage_of(file).read(len(content)) == content:
+            return
+    except OSError:
+        pass
+    with storage_of(file).staged() as partial:
+        partial.write_bytes(content)
+
+
+def _is_there(folder: Place, wanted: BuildRecord) -> bool:
+    """Whether the record of a build says what it should, but for when and where it ran."""
+    try:
+        found = build_in(folder)
+    except StoreError:
+        return False
+    run = {name: getattr(found, name) for name in ("created", "duration_s", "platform")}
+    return to_json(found) == to_json(replace(wanted, **run))
+
+
 def build_record(
-    summary: BuildSummary, parameters: BuildParameters, versions: Versions | None = None
+    summary: BuildSummary,
+    parameters: BuildParameters,
+    versions: Versions | None = None,
+    failed: Iterable[Record] = (),
 ) -> BuildRecord:
     """Return the record of a build that made a store; ValueError where it made none."""
     if summary.store is None or summary.normalization is None:
@@ -302,4 +300,14 @@ def build_record(
             dict(summary.clipped),
             summary.n_unphysical,
         ),
+        failed=tuple(_as_many_as_fit(failed)),
     )
+
+
+def _as_many_as_fit(failed: Iterable[Record]) -> Iterator[FailedRecord]:
+    left = MAX_BUILD_BYTES // 4  # Indented, with escapes, they take more.
+    for record in failed:
+        left -= len(to_json(record))
+        if left < 0 or isinstance(record, AssetRecord):
+            return
+        yield record

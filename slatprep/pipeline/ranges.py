@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 from slatprep.errors import ConfigError
 from slatprep.normalize import ranges_from_bounds, ranges_from_extents, to_mapped
 from slatprep.parameters import NormalizeParameters, is_split_file, percentiles_of
-from slatprep.pipeline.spool import Spool, SpooledAsset
+from slatprep.pipeline.rows import Row
+from slatprep.pipeline.spool import Spool
 from slatprep.readers.ranges import pixie_ranges, read_ranges
 from slatprep.readers.splits import Shares, assign_splits, read_id_file
 from slatprep.records import PROPERTIES, AssetPair, Normalization, Property
@@ -61,7 +62,7 @@ def check_objects(pairs: Sequence[AssetPair], parameters: NormalizeParameters) -
 
 
 def dataset_ranges(
-    usable: Sequence[SpooledAsset],
+    usable: Sequence[Row],
     spool: Spool,
     parameters: NormalizeParameters,
     jobs: Jobs,
@@ -75,7 +76,7 @@ def dataset_ranges(
 
     Parameters
     ----------
-    usable : sequence of SpooledAsset
+    usable : sequence of Row
         One asset at least.
     spool : Spool
         Where their fields lie.
@@ -96,7 +97,7 @@ def dataset_ranges(
     chosen, source = _chosen(usable, parameters), source_of(parameters)
     percentiles = percentiles_of(parameters.ranges)
     if percentiles is None:
-        return ranges_from_extents([asset.extent for asset in chosen], source, table)
+        return ranges_from_extents([asset.columns["extent"] for asset in chosen], source, table)
     keys = list({_field_of(asset): asset.key for asset in reversed(chosen)}.values())
     coarse = _counted(spool, keys, jobs, len(table))
     place = (sum(coarse[0].values()) - 1) * np.array(percentiles) / 100
@@ -115,13 +116,11 @@ def dataset_ranges(
     return ranges_from_bounds(lo, hi, source, table)
 
 
-def _chosen(
-    usable: Sequence[SpooledAsset], parameters: NormalizeParameters
-) -> Sequence[SpooledAsset]:
+def _chosen(usable: Sequence[Row], parameters: NormalizeParameters) -> Sequence[Row]:
     """Return the assets of the objects that count."""
     if parameters.objects != "train":
         return usable
-    valid = [asset for asset in usable if asset.n_valid]
+    valid = [asset for asset in usable if asset.columns["n_valid"]]
     trained = _trained(
         {str(asset.columns["object_id"]): str(asset.columns["category"]) for asset in valid},
         parameters,
@@ -130,7 +129,7 @@ def _chosen(
     return [asset for asset in usable if str(asset.columns["object_id"]) in trained]
 
 
-def _field_of(asset: SpooledAsset) -> tuple[str, str]:
+def _field_of(asset: Row) -> tuple[str, str]:
     """Return what tells an asset's field from others: views of an object have it in common."""
     object_id, view = str(asset.columns["object_id"]), str(asset.columns["view"])
     return object_id, asset.asset_id.removeprefix(object_id).removeprefix(f".{view}")

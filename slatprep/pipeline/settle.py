@@ -1,73 +1,209 @@
-"""What the passes over a whole dataset share: an asset of the spool, placed or judged anew.
-
-They work on what the first pass left in the spool and change nothing there: an
-asset that comes out otherwise is written again under a key of its own. Its
-record keeps what the first pass found, so the next build does not align it
-again, with these passes or without.
-"""
+"""Settle the next store: which rows it has, in which order, and the ranges of its properties."""
 
 from __future__ import annotations
 
-import hashlib
-from dataclasses import replace
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 
-from slatprep.align.deformation import map_of
-from slatprep.align.settle import refit
-from slatprep.judge import judge
-from slatprep.parameters import BuildParameters
-from slatprep.pipeline.spool import Spool, SpooledAsset
-from slatprep.provenance.record import AssetRecord, FailedRecord, FirstPass
-from slatprep.provenance.record_json import to_json
-from slatprep.records import Alignment, Annotation, Judgement, MaterialField, StructuredLatents
-from slatprep.sample import sample
+import numpy as np
+
+from slatprep.errors import StoreError
+from slatprep.normalize import ranges_from_extents
+from slatprep.parameters import BuildParameters, percentiles_of
+from slatprep.pipeline.before import Before
+from slatprep.pipeline.finish import Crew, finish
+from slatprep.pipeline.plan import BuildContext, PlannedAsset
+from slatprep.pipeline.previous import SourceStore
+from slatprep.pipeline.ranges import dataset_ranges, given_ranges, source_of
+from slatprep.pipeline.rows import FailedAsset, NextStore, Row, column, in_order, moments_of
+from slatprep.pipeline.summary import nothing_usable
+from slatprep.provenance.make import origin
+from slatprep.readers import contents_of
+from slatprep.readers.encoders import ENOUGH, in_words, look_standardised, resolve_latents
+from slatprep.records import AssetPair, Contents, Normalization
+from slatprep.store import Store
 
 
-class Reopened:
-    """A finished asset, read back from the spool.
+@dataclass(frozen=True)
+class Wanted:
+    """What a build is asked for.
+
+    Attributes
+    ----------
+    build : mapping
+        Parameters and versions, as the store's attribute ``build`` says them.
+    ranges : Normalization or str
+        Ranges that do not depend on the dataset, or where those of the dataset come from.
+    compact : bool
+        Rows by id, whatever the order of the existing store.
+    declared : Contents
+        What the sources hold.
+    """
+
+    build: Mapping[str, object]
+    ranges: Normalization | str
+    compact: bool
+    declared: Contents
+
+    @classmethod
+    def of(cls, parameters: BuildParameters, compact: bool = False) -> Wanted:
+        """Return what parameters ask for; raise `SlatprepError` if their files cannot be used."""
+        declared = contents_of(parameters)
+        given = given_ranges(parameters.normalize, declared.properties)
+        return cls(origin(parameters), given or source_of(parameters.normalize), compact, declared)
+
+    @property
+    def given(self) -> Normalization | None:
+        """Ranges that do not depend on the dataset."""
+        return self.ranges if isinstance(self.ranges, Normalization) else None
+
+    def allows(self, store: Store) -> bool:
+        """Whether a store of the right assets is the one that is asked for."""
+        return (
+            store.attributes["build"] == self.build
+            and self.ranges in (store.normalization, store.normalization.source)
+            and not (self.compact and len(store.attributes["segments"]) > 1)
+        )
+
+
+def settle_rows(
+    finished: Sequence[Row | FailedAsset],
+    unchanged: Sequence[AssetPair],
+    plan: Mapping[str, PlannedAsset],
+    before: Before,
+    context: BuildContext,
+    wanted: Wanted,
+    crew: Crew,
+    keep_work: bool = False,
+) -> tuple[NextStore, list[FailedAsset]]:
+    """Return the next store, and the assets that cannot go in by id.
 
     Parameters
     ----------
-    asset : SpooledAsset
-        Which.
-    spool : Spool
-        Where it lies.
+    finished : sequence of Row or FailedAsset
+        The assets that are new or changed.
+    unchanged : sequence of AssetPair
+        Those whose alignment is in the existing store: their rows are taken over, or they are
+        finished too where that cannot be.
+    plan : mapping of str to PlannedAsset
+        What is to be done by id.
+    before : Before
+        What is there.
+    context : BuildContext
+        The build.
+    wanted : Wanted
+        What it is asked for.
+    crew : Crew
+        Who works.
+    keep_work : bool
+        Have all assets in the spool.
+
+    Raises
+    ------
+    StoreError
+        If no asset can be used.
     """
+    parameters, spool, previous = context.parameters, context.spool, before.previous
+    kept: list[Row] = []
+    if not (before.damaged or keep_work):
+        made = [asset for asset in finished if isinstance(asset, Row)]
+        kept = _kept_rows(made, unchanged, plan, before, parameters, wanted)
+    if not kept:
+        finished = [*finished, *finish(unchanged, plan, context, crew)]
+    rows = sorted((a for a in finished if isinstance(a, Row)), key=lambda row: row.asset_id)
+    failed = [asset for asset in finished if isinstance(asset, FailedAsset)]
+    failed.sort(key=lambda asset: asset.asset_id)
+    if not (rows or kept):
+        raise StoreError(nothing_usable(failed, parameters, before.pairs))
+    if kept and previous:
+        rows, normalization = [*rows, *kept], previous.normalization
+    else:
+        jobs = crew.of(len(rows))
+        if parameters.consensus.settle or parameters.witness.settle:
+            from slatprep.pipeline.passes import apply_passes  # They need scipy.
 
-    def __init__(self, asset: SpooledAsset, spool: Spool) -> None:
-        record = spool.record(asset.key)
-        if isinstance(record, FailedRecord):
-            raise TypeError(f"{record.asset_id}: an asset that failed is not judged anew")
-        self._asset, self._spool = asset, spool
-        self.record: AssetRecord = record
-        self.latents: StructuredLatents = spool.latents(asset.key)
-        self.annotation: Annotation = spool.annotation(asset.key)
-        self.field: MaterialField = spool.field(asset.key)
-
-    def placed(
-        self, alignment: Alignment, parameters: BuildParameters
-    ) -> tuple[Alignment, Annotation, Judgement]:
-        """Look up and judge under another alignment; fit it first if its placement is another."""
-        if alignment.transform is not self.record.alignment.transform:
-            alignment = refit(alignment, self.field, self.latents, parameters.align)
-        places = map_of(alignment).to_pixieverse(self.latents.centres)
-        annotation = sample(self.field, places, parameters.sample)
-        judgement, likely = judge(
-            self.field, self.latents, alignment, annotation, parameters.sample
+            rows = apply_passes(rows, spool, parameters, jobs, crew.note, wanted.declared.n_labels)
+        normalization = wanted.given or dataset_ranges(
+            rows, spool, parameters.normalize, jobs, wanted.declared.properties
         )
-        return alignment, replace(annotation, confidence=likely), judgement
+    stores = (previous,) if kept and previous else ()
+    rows = in_order(rows, previous, wanted.compact)
+    contents = resolved_contents(rows, stores, wanted.declared, parameters.slat.standardised)
+    how = (wanted.build, parameters.store, bool(stores))
+    return NextStore(rows, stores, normalization, contents, *how), failed
 
-    def put(
-        self, alignment: Alignment, annotation: Annotation, judgement: Judgement
-    ) -> SpooledAsset:
-        """Write the asset with these beside itself; return what the parent keeps."""
-        first = self.record
-        record = replace(
-            first,
-            alignment=alignment,
-            judgement=judgement,
-            first_pass=first.first_pass or FirstPass(first.key, first.alignment, first.judgement),
-            counts=replace(first.counts, valid=int(annotation.valid.sum())),
+
+def _kept_rows(
+    made: Sequence[Row],
+    unchanged: Sequence[AssetPair],
+    plan: Mapping[str, PlannedAsset],
+    before: Before,
+    parameters: BuildParameters,
+    wanted: Wanted,
+) -> list[Row]:
+    """Return the rows of unchanged assets, if they can be taken over; else none.
+
+    They can where the ranges stay as they are, no pass over the whole dataset may
+    change them, and the rest of what decides a store's bytes is the same.
+    """
+    previous, normalize = before.previous, parameters.normalize
+    if previous is None:
+        return []
+    store, declared = previous.store, wanted.declared
+    tables = [(one.properties, one.classes) for one in (store.contents, declared)]
+    if tables[0] != tables[1] or {**previous.build, "name": ""} != {**wanted.build, "name": ""}:
+        return []
+    sizes, rows = np.diff(store.offsets).tolist(), []
+    for pair in unchanged:
+        row = store.find(pair.asset_id)
+        names = plan[pair.asset_id].names
+        rows.append(Row(pair.asset_id, sizes[row], store=0, row=row, names=names))
+    everything, alone = [*rows, *made], not made and len(rows) == len(store)
+    if alone and not any(row.names for row in rows):
+        # Whatever made ranges and placements of these assets would make the same again.
+        return rows if wanted.ranges in (store.normalization, store.normalization.source) else []
+    if parameters.consensus.settle or parameters.witness.settle or not rows:
+        return []
+    ranges = wanted.given
+    if ranges is None:
+        if normalize.objects != "all" or percentiles_of(normalize.ranges):
+            return []  # Such ranges are of the values of all fields.
+        extents = column("extent", everything, (previous,))
+        ranges = ranges_from_extents(extents, normalize.ranges, declared.properties)
+    return rows if ranges == store.normalization else []
+
+
+def resolved_contents(
+    rows: Sequence[Row], stores: Sequence[SourceStore], declared: Contents, standardised: str
+) -> Contents:
+    """Return what a store holds, its latents as `resolve_latents` finds them to be."""
+    means, stds = (column(name, rows, stores) for name in ("latent_mean", "latent_std"))
+    moments = [
+        (row.n_voxels, moments_of(mean, std))
+        for row, mean, std in zip(rows, means, stds, strict=True)
+    ]
+    return replace(declared, latents=resolve_latents(declared.latents, standardised, moments))
+
+
+def latent_warnings(new: NextStore, standardised: str) -> Iterator[str]:
+    """Yield what a person should know about whether the latents of a store are standardised."""
+    latents = new.contents.latents
+    means, stds = (new.column(name) for name in ("latent_mean", "latent_std"))
+    known = [
+        (row.asset_id, moments)
+        for row, mean, std in zip(new.rows, means, stds, strict=True)
+        if row.n_voxels >= ENOUGH and (moments := moments_of(mean, std))
+    ]
+    looks = {name: look_standardised(moments, latents) for name, moments in known}
+    if latents.standardised and standardised == "auto":
+        yield (
+            f"the latents look standardised already ({in_words(known[0][1])} in {known[0][0]}) and "
+            'are marked so; say slat.standardised = "yes" if they are, "no" if they are not'
         )
-        key = hashlib.sha256(to_json(record.without_duration())).hexdigest()
-        put = self._spool.put(replace(record, key=key), self.field, self.latents, annotation)
-        return replace(put, damaged=self._asset.damaged)
+    others = [name for name, look in looks.items() if look != latents.standardised]
+    if others and standardised != "no":
+        how = "as the encoder gives them" if latents.standardised else "standardised already"
+        yield (
+            f"the latents of {len(others)} of {len(looks)} assets look {how}, unlike the others "
+            f"({', '.join(others[:3])}): look where they come from"
+        )

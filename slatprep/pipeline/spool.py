@@ -1,7 +1,7 @@
 """Finished assets as files, between the pass that aligns and the pass that packs.
 
 A worker leaves an asset's arrays here, in SI units, and hands the parent only
-a `SpooledAsset`, so the parent's memory does not grow with voxels. A file is
+a `slatprep.pipeline.rows.Row`, so the parent's memory does not grow with voxels. A file is
 named by its asset's key (see `slatprep.pipeline.recipe`), so what an interrupted build
 finished is found again by the next one, and only by one that would write the
 same. It appears under its name when it is whole, and holds a checksum of
@@ -13,7 +13,6 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -22,17 +21,16 @@ from numpy.typing import NDArray
 
 from slatprep.errors import StoreError
 from slatprep.normalize import property_extent
-from slatprep.provenance.columns import Column, columns_of
+from slatprep.pipeline.rows import FailedAsset, Row
+from slatprep.provenance.columns import columns_of
 from slatprep.provenance.record import AssetRecord, FailedRecord, Record
-from slatprep.provenance.record_json import read_record, to_json
+from slatprep.provenance.record_json import digest_of, read_record, to_json
 from slatprep.records import (
     RESOLUTION,
     Annotation,
-    LatentMoments,
     MaterialField,
     Place,
     Property,
-    Status,
     StructuredLatents,
 )
 from slatprep.storage.arrays import ArrayFile, write_arrays
@@ -47,54 +45,6 @@ Arrays = dict[str, NDArray[Any]]
 _VOXEL_ARRAYS = ("coords", "feats", "properties", "material", "valid", "distance", "place",
                  "confidence")  # fmt: skip
 _TORN = (OSError, ValueError, KeyError, StoreError)
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class SpooledAsset:
-    """What the parent keeps of an asset that is finished.
-
-    Attributes
-    ----------
-    asset_id : str
-        Id of the row.
-    key : str
-        Names its file in the spool.
-    n_voxels, n_valid : int
-        SLAT voxels, and those that found an annotation.
-    n_placements : int
-        Distinct placements that fit about as well as the one chosen.
-    extent : ndarray of float64, shape (P, 2)
-        What `slatprep.normalize.property_extent` gives.
-    columns : dict
-        See `slatprep.provenance.columns.columns_of`.
-    latents : LatentMoments or None
-        Of its latents; None where its record does not tell.
-    damaged : str
-        Why, in words, what an older store holds of it was not taken over.
-    merged : bool
-        Whether its labels are merged of several annotations.
-    """
-
-    asset_id: str
-    key: str
-    n_voxels: int
-    n_valid: int
-    n_placements: int
-    extent: NDArray[np.float64]
-    columns: dict[str, Column]
-    latents: LatentMoments | None = None
-    damaged: str = ""
-    merged: bool = False
-
-
-@dataclass(frozen=True, slots=True)
-class FailedAsset:
-    """What the parent keeps of an asset that cannot go in; its record is in the spool."""
-
-    asset_id: str
-    key: str
-    status: Status
-    reason: str
 
 
 class Spool:
@@ -119,7 +69,7 @@ class Spool:
         latents: StructuredLatents,
         annotation: Annotation,
         others: Sequence[MaterialField] = (),
-    ) -> SpooledAsset:
+    ) -> Row:
         """Write an asset's record and arrays; return what the parent keeps.
 
         Of `others`, the further fields whose annotations are merged, the extent alone is kept.
@@ -147,28 +97,31 @@ class Spool:
                 "grid_log10": np.array([one.log10 for one in field.table]),
                 "grid_classified": np.array(field.classified),
             }
-        self._write(record.key, record, arrays)
-        return spooled(record, extent)
+        text = to_json(record)
+        self._write(record.key, record.asset_id, text, arrays)
+        return row_of(record, text, extent)
 
     def put_failed(self, record: FailedRecord) -> FailedAsset:
         """Write the record of an asset that cannot go in; return what the parent keeps."""
         # It is tried again in every build. By its content, as builds may share the spool.
-        key = f"none-{hashlib.sha256(to_json(record)).hexdigest()[:32]}"
-        self._write(key, record, {})
+        text = to_json(record)
+        key = f"none-{hashlib.sha256(text).hexdigest()[:32]}"
+        self._write(key, record.asset_id, text, {})
         return FailedAsset(record.asset_id, key, record.status, record.reason)
 
-    def find(self, key: str) -> tuple[AssetRecord, SpooledAsset] | None:
+    def find(self, key: str) -> tuple[AssetRecord, Row] | None:
         """Return a finished asset, or None if there is none under this key that is whole."""
         try:
             with self._open(key) as file:
                 arrays = dict(file)  # Reads, so checks, them all.
-            record = read_record(arrays["record"].tobytes(), str(self._path(key)))
+            text = arrays["record"].tobytes()
+            record = read_record(text, str(self._path(key)))
             extent = arrays["extent"]
         except _TORN:
             return None
         if isinstance(record, FailedRecord) or (self.arrays and "coords" not in arrays):
             return None  # Finished by an alignment without a store.
-        return record, spooled(record, extent)
+        return record, row_of(record, text, extent)
 
     def holds_any(self) -> bool:
         """Whether anything at all is finished."""
@@ -181,7 +134,7 @@ class Spool:
         """Replace the record of a finished asset."""
         with self._open(record.key) as file:
             arrays = {name: file[name] for name in file if name != "record"}
-        self._write(record.key, record, arrays)
+        self._write(record.key, record.asset_id, to_json(record), arrays)
 
     def keep_only(self, keys: set[str], mark: str = "") -> list[str]:
         """Remove everything but these assets' files, if no other build is at work there.
@@ -266,15 +219,15 @@ class Spool:
         with storage_of(self._path(key)).open_scattered() as file:
             yield ArrayFile(file)
 
-    def _write(self, key: str, record: Record, arrays: Arrays) -> None:
-        everything: Arrays = {**arrays, "record": np.frombuffer(to_json(record), np.uint8)}
+    def _write(self, key: str, asset_id: str, record: bytes, arrays: Arrays) -> None:
+        everything: Arrays = {**arrays, "record": np.frombuffer(record, np.uint8)}
         with (
-            writing(record.asset_id, self.directory),
+            writing(asset_id, self.directory),
             self._staged(self._path(key)) as partial,
             partial.open("wb") as file,
         ):
             write_arrays(file, everything)
-        reached("asset spooled", record.asset_id)
+        reached("asset spooled", asset_id)
 
     def _staged(self, place: Place) -> AbstractContextManager[Path]:
         path = storage_of(place).local
@@ -284,16 +237,13 @@ class Spool:
         return staged_apart(path, path.parent)
 
 
-def spooled(record: AssetRecord, extent: NDArray[np.float64]) -> SpooledAsset:
-    """Return what the parent keeps of an asset with this record."""
-    return SpooledAsset(
-        record.asset_id,
-        record.key,
-        n_voxels=record.counts.slat_voxels,
-        n_valid=record.counts.valid,
-        n_placements=len(record.alignment.placements),
-        latents=record.latents,
-        extent=extent,
-        columns=columns_of(record),
-        merged=bool(record.merged),
-    )
+def row_of(record: AssetRecord, text: bytes, extent: NDArray[np.float64]) -> Row:
+    """Return the row of a finished asset with this record, extent (P, 2) of its properties."""
+    columns: dict[str, Any] = {
+        **columns_of(record),
+        "record_sha256": np.frombuffer(digest_of(text), np.uint8),
+        "extent": extent,
+        "n_valid": record.counts.valid,
+        "n_placements": len(record.alignment.placements),
+    }
+    return Row(record.asset_id, record.counts.slat_voxels, record.key, columns)

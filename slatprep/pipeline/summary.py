@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Collection, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import islice
 
 import numpy as np
 
 from slatprep.parameters import BuildParameters
-from slatprep.pipeline.spool import FailedAsset, SpooledAsset
+from slatprep.pipeline.rows import FailedAsset, Row
+from slatprep.provenance.files import SEVERAL, file_names
 from slatprep.readers.unmatched import explain_unmatched
 from slatprep.records import AssetPair, Normalization, Place, Status
 from slatprep.store import Store
@@ -26,7 +27,8 @@ class BuildSummary:
     Attributes
     ----------
     records : Place
-        The JSON Lines file of asset records.
+        The JSON Lines file of asset records; of more than 1,024 assets, what their files are
+        called, with a ``*``.
     build_id : str
         Id of the build, a hash of the records' content.
     seconds : float
@@ -89,13 +91,13 @@ class Counts:
     contradicted: tuple[str, ...]
 
 
-def counts_of(assets: Iterable[SpooledAsset]) -> Counts:
+def counts_of(assets: Iterable[Row]) -> Counts:
     """Count what became of finished assets."""
     usable = list(assets)
     return Counts(
         verdicts=dict(sorted(Counter(str(asset.columns["verdict"]) for asset in usable).items())),
         n_voxels=sum(asset.n_voxels for asset in usable),
-        n_valid=sum(asset.n_valid for asset in usable),
+        n_valid=sum(asset.columns["n_valid"] for asset in usable),
         n_unphysical=int(np.sum([asset.columns["unphysical"] for asset in usable])),
         contradicted=tuple(
             islice((a.asset_id for a in usable if a.columns["contradicted"]), PROBLEMS_LISTED)
@@ -117,23 +119,12 @@ def counts_in(store: Store) -> Counts:
     )
 
 
-def summarise_build(
-    counts: Counts,
-    failed: Sequence[FailedAsset],
-    *,
-    records: Place,
-    build_id: str,
-    seconds: float,
-    store: Place | None = None,
-    normalization: Normalization | None = None,
-    clipped: Iterable[int] = (),
-    damaged: Sequence[str] = (),
-    warnings: Iterable[str] = (),
+def summarise(
+    counts: Counts, failed: Sequence[FailedAsset], records: Place, build_id: str, seconds: float
 ) -> BuildSummary:
-    """Say what became of the assets; `clipped` are values of ``voxel/properties`` by property."""
+    """Say what became of the assets, by counts of those that went in."""
     statuses = Counter(str(asset.status) for asset in failed)
     statuses[str(Status.OK)] = sum(counts.verdicts.values())
-    names = [one.name for one in normalization.ranges] if normalization else []
     return BuildSummary(
         records=records,
         build_id=build_id,
@@ -145,9 +136,27 @@ def summarise_build(
         n_unphysical=counts.n_unphysical,
         problems=tuple((asset.asset_id, asset.reason) for asset in failed[:PROBLEMS_LISTED]),
         contradicted=counts.contradicted,
-        store=store,
-        normalization=normalization,
-        clipped=dict(zip(names, map(int, clipped), strict=False)),
+    )
+
+
+def summarise_store(
+    store: Store,
+    failed: Sequence[FailedAsset],
+    place: Place,
+    manifests: Place,
+    seconds: float,
+    warnings: Iterable[str] = (),
+    damaged: Iterable[str] = (),
+) -> BuildSummary:
+    """Say what a build's store holds, which its user calls `place`, and what did not go in."""
+    names = file_names(len(store))
+    records = manifests / (names[0] if len(names) == 1 else SEVERAL)
+    clipped = zip(store.about.property_columns, store.column("clipped").sum(axis=0), strict=True)
+    return replace(
+        summarise(counts_in(store), failed, records, store.about.manifest, seconds),
+        store=place,
+        normalization=store.normalization,
+        clipped={name: int(count) for name, count in clipped},
         warnings=tuple(warnings),
         damaged=tuple(damaged),
     )

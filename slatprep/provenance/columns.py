@@ -7,17 +7,17 @@ from numpy.typing import NDArray
 
 from slatprep.provenance.record import AssetRecord
 
-Column = str | float | tuple[float, ...] | NDArray[np.float64]
+Column = str | float | tuple[float, ...] | NDArray[np.generic]
 
 
 def columns_of(record: AssetRecord) -> dict[str, Column]:
-    """Return an asset's row of each ``asset/*`` array, by the array's last name.
+    """Return an asset's row of each ``asset/*`` array that its record tells, by its last name.
 
     A new array is named here and in `slatprep.store.layout.ARRAYS`.
     ``property_ambiguity`` is in mapped units: ranges come from the dataset.
     """
     alignment, judgement, counts = record.alignment, record.judgement, record.counts
-    quality = alignment.quality
+    quality, moments = alignment.quality, record.latents
     return {
         "object_id": record.object_id,
         "view": record.view,
@@ -42,4 +42,12 @@ def columns_of(record: AssetRecord) -> dict[str, Column]:
         "right_placement": judgement.right_placement,
         "expected_accuracy": judgement.expected_accuracy,
         "contradicted": judgement.contradicted,
+        "merged": bool(record.merged),
+        "key": _bytes(record.of_first_pass().key),
+        "latent_mean": np.nan if moments is None else moments.mean,
+        "latent_std": np.nan if moments is None else moments.std,
     }
+
+
+def _bytes(digest: str) -> NDArray[np.generic]:
+    return np.frombuffer(bytes.fromhex(digest), np.uint8)

@@ -1,18 +1,59 @@
-"""The records beside a store, read from their files with bounds."""
+"""The manifests beside a store: its records as lines, and `build.json`, read with bounds.
+
+A file of lines is derived from one shard of ``asset/record`` by `lines_of`, and by nothing else.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import re
+from collections.abc import Sequence
+from pathlib import Path
 
 from slatprep.errors import StoreError
 from slatprep.provenance.record import BuildRecord
 from slatprep.provenance.record_json import read_build_record
 from slatprep.records import Place
 from slatprep.storage.documents import read_bounded
-from slatprep.storage.place import storage_of
-from slatprep.store.records import MAX_RECORD_BYTES
+from slatprep.store.reader import Store
+from slatprep.store.records import RECORD_ARRAY, RECORDS_IN_SHARD
 
-BUILD, ASSETS = "build.json", "assets.jsonl"
+BUILD, ASSETS, SEVERAL = "build.json", "assets.jsonl", "assets-*.jsonl"
+
+MAX_BUILD_BYTES = 32 * 2**20
+"""No `build.json` is larger: it lists as many of the assets that could not go in as fit."""
+
+_LINES = re.compile(r"assets(-\d{5,})?\.jsonl")
+
+
+def file_names(assets: int) -> list[str]:
+    """Return the names of the files of lines, one for each shard of the records of so many assets.
+
+    Examples
+    --------
+    >>> file_names(5), file_names(1025)
+    (['assets.jsonl'], ['assets-00000.jsonl', 'assets-00001.jsonl'])
+    """
+    shards = -(-assets // RECORDS_IN_SHARD)
+    return [ASSETS] if shards == 1 else [f"assets-{shard:05d}.jsonl" for shard in range(shards)]
+
+
+def lines_of(store: Store, shard: int) -> bytes:
+    """Return the records of a shard's rows, a line each.
+
+    Raises
+    ------
+    StoreError
+        If they cannot be read.
+    """
+    start = shard * RECORDS_IN_SHARD
+    texts = store.read_rows(RECORD_ARRAY, start, min(start + RECORDS_IN_SHARD, len(store)))
+    return "".join(f"{text}\n" for text in texts).encode()
+
+
+def stale_files(folder: Path, names: Sequence[str]) -> list[Path]:
+    """Return the files of lines in a folder that have none of these names."""
+    there = (file for file in folder.iterdir() if _LINES.fullmatch(file.name))
+    return sorted(file for file in there if file.name not in names)
 
 
 def build_text(folder: Place) -> bytes:
@@ -24,7 +65,7 @@ def build_text(folder: Place) -> bytes:
         If it cannot be read, or is larger than any record.
     """
     try:
-        return read_bounded(folder / BUILD, MAX_RECORD_BYTES)
+        return read_bounded(folder / BUILD, MAX_BUILD_BYTES)
     except (OSError, ValueError) as error:
         raise StoreError(f"{folder / BUILD}: cannot be read ({error})") from None
 
@@ -32,22 +73,3 @@ def build_text(folder: Place) -> bytes:
 def build_in(folder: Place) -> BuildRecord:
     """Read the record of a build; StoreError where it cannot be."""
     return read_build_record(build_text(folder), str(folder / BUILD))
-
-
-def lines_in(folder: Place) -> Iterator[tuple[str, bytes]]:
-    """Yield the records of a build's assets one by one: where each is, and its text.
-
-    A line that is longer than any record comes in pieces, none of which is a record.
-
-    Raises
-    ------
-    StoreError
-        If the file cannot be read.
-    """
-    path = folder / ASSETS
-    try:
-        with storage_of(path).open() as file:
-            lines = iter(lambda: file.readline(MAX_RECORD_BYTES), b"")
-            yield from ((f"{path}, line {number}", line) for number, line in enumerate(lines, 1))
-    except OSError as error:
-        raise StoreError(f"{path}: cannot be read ({error})") from None

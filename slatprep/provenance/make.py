@@ -37,8 +37,7 @@ def record_of(asset: Finished, parameters: BuildParameters, code: str, key: str)
     Returns
     -------
     AssetRecord
-        Without the seconds spent; `slatprep.provenance.record_json.completed` adds what only the
-        whole dataset can tell.
+        What the store will hold of it.
     """
     pair, field, latents = asset.pair, asset.field, asset.latents
     return AssetRecord(
@@ -70,9 +69,7 @@ def _first(warnings: tuple[str, ...]) -> tuple[str, ...]:
     return (*kept, f"{len(warnings) - len(kept):,} more warnings")
 
 
-def record_of_failed(
-    asset: Failed, parameters: BuildParameters, code: str, seconds: float = 0.0
-) -> FailedRecord:
+def record_of_failed(asset: Failed, parameters: BuildParameters, code: str) -> FailedRecord:
     """Return the record of an asset that cannot go in."""
     pair = asset.pair
     return FailedRecord(
@@ -86,7 +83,6 @@ def record_of_failed(
         parameters=StageParameters(parameters.align, parameters.sample),
         versions=library_versions(parameters.align),
         code=code,
-        duration_s=round(seconds, 4),
     )
 
 

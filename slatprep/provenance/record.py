@@ -80,14 +80,6 @@ PropertyCounts = Annotated[dict[PropertyName, Count], MaxLen(MAX_PROPERTIES)]
 
 
 @dataclass(frozen=True)
-class Clipped:
-    """Values outside the ranges in ``voxel/properties`` and in ``grid/properties``."""
-
-    voxel: PropertyCounts
-    grid: PropertyCounts
-
-
-@dataclass(frozen=True)
 class VoxelCounts:
     """Voxels of an asset."""
 
@@ -105,8 +97,6 @@ class VoxelCounts:
     """SLAT voxels with an annotation near enough."""
     unphysical: Count = 0
     """Of the unannotated those with a class, but properties that no material has."""
-    clipped: Clipped | None = None
-    """Values outside the ranges; null where no store was built."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -157,8 +147,6 @@ class AssetRecord:
     """What ties would change in the labels, the verdict and its reasons."""
     first_pass: FirstPass | None = None
     """What was found for the asset alone, where a pass over the whole dataset changed that."""
-    normalization: Normalization | None = None
-    """The ranges of the properties; null where no store was built."""
     counts: VoxelCounts
     """Voxels of the asset."""
     merged: Annotated[tuple[Contribution, ...], MaxLen(MAX_SOURCES)] = ()
@@ -169,12 +157,6 @@ class AssetRecord:
     """Mean and standard deviation of each channel of its latents, as they lie in the file."""
     warnings: Annotated[tuple[str, ...], MaxLen(MAX_WARNINGS)]
     """What a person should know about the sources."""
-    duration_s: Seconds = 0.0
-    """Seconds spent on the asset; 0 inside a store, where equal builds are equal bytes."""
-
-    def without_duration(self) -> AssetRecord:
-        """Return the record as a store holds it, the same in two builds of the same."""
-        return replace(self, duration_s=0.0)
 
     def of_first_pass(self) -> AssetRecord:
         """Return the record as it was before the passes over the whole dataset."""
@@ -218,8 +200,6 @@ class FailedRecord:
     """Versions of slatprep and of the libraries that were used."""
     code: Digest
     """Fingerprint of the code."""
-    duration_s: Seconds = 0.0
-    """Seconds spent on the asset."""
 
 
 Record = AssetRecord | FailedRecord
@@ -253,7 +233,7 @@ class BuildRecord:
     format: Literal["slatprep-build-record"] = "slatprep-build-record"
     format_version: Literal[1] = RECORD_VERSION
     id: Digest
-    """SHA-256 of the asset records' content; the store's attribute ``manifest``."""
+    """SHA-256 of what decides the store, the asset records among it; its attribute ``manifest``."""
     name: str
     """Name of the dataset."""
     created: datetime
@@ -265,7 +245,7 @@ class BuildRecord:
     store: str
     """Name of the store's directory."""
     records: str
-    """Name of the file of asset records, beside this one."""
+    """Name of the file of asset records, beside this one; of several with a ``*``."""
     parameters: BuildParameters
     """All parameters, with where the sources lay."""
     versions: Versions
@@ -278,6 +258,8 @@ class BuildRecord:
     """Assets in the store by verdict."""
     counts: BuildCounts
     """Voxels of the store."""
+    failed: tuple[FailedRecord, ...] = ()
+    """The assets that could not go in, by id; the first of them where they are very many."""
 
 
 def property_counts(counts: Iterable[int], normalization: Normalization) -> PropertyCounts:

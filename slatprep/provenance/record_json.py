@@ -3,18 +3,17 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterable, Iterator
-from dataclasses import fields, replace
+from collections.abc import Iterable
+from dataclasses import fields
 from functools import lru_cache
-from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
+from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 import orjson
 
 from slatprep.errors import StoreError
-from slatprep.provenance.record import AssetRecord, BuildRecord, Clipped, Record
-from slatprep.records import Normalization, SourceFile, Status
+from slatprep.provenance.record import AssetRecord, BuildRecord, Record
+from slatprep.records import SourceFile, Status
 from slatprep.storage.place import is_place
 from slatprep.store.records import MAX_RECORD_BYTES
 
@@ -41,14 +40,6 @@ class RecordError(StoreError):
             "build again to have it written anew"
         )
         self.faults = faults
-
-
-class RecordText(NamedTuple):
-    """A record as a line of ``assets.jsonl``, and as what of it counts in `records_id`."""
-
-    asset_id: str
-    line: bytes
-    content: bytes
 
 
 def to_json(record: Record | BuildRecord, *, indent: bool = False) -> bytes:
@@ -106,78 +97,24 @@ def faults_of(record: AssetRecord) -> tuple[str, ...]:
     return ()
 
 
-def completed(text: bytes, normalization: Normalization, clipped: Clipped | None) -> RecordText:
-    """Add to a record what only the whole dataset can tell.
-
-    Parameters
-    ----------
-    text : bytes
-        What `to_json` gave for it. It is not checked again, which takes ten times as long.
-    normalization : Normalization
-        The ranges.
-    clipped : Clipped or None
-        Values outside of them; None for an asset that is not in the store, whose record stays.
-    """
-    document = orjson.loads(text)
-    if clipped is not None:
-        document["normalization"] = normalization
-        document["counts"]["clipped"] = clipped
-    return RecordText(document["asset_id"], orjson.dumps(document), counting(document))
-
-
-def counting(document: dict[str, Any]) -> bytes:
-    """Return what of a record's JSON counts in `records_id`, whatever format it is of."""
-    left_out = {"duration_s": 0.0, "reason": "", "traceback": ""}
-    kept = {name: empty for name, empty in left_out.items() if name in document}
-    return orjson.dumps(document | kept)
-
-
 def read_build_record(text: bytes | str, where: str) -> BuildRecord:
     """Read ``build.json``; see `read_record`."""
     record: BuildRecord = _read(BuildRecord, text, where)
     return record
 
 
-def records_id(records: Iterable[Record | RecordText]) -> str:
-    """Return the id of the build that has these records, in any order; see `build_id_of`.
+def build_id_of(head: object, digests: Iterable[tuple[str, bytes]]) -> str:
+    """Return the id of a build: SHA-256, in hex, of what decides its store.
 
-    How long things took and in what words they failed are left out: they
-    differ between runs, machines and folders without the content differing.
+    That is `head`, and `digest_of` each record by asset id, whatever the order of the rows.
     """
-    return build_id_of((record.asset_id, digest_of(record)) for record in records)
+    first = orjson.dumps(head, option=orjson.OPT_SORT_KEYS)
+    return hashlib.sha256(first + b"".join(digest for _, digest in sorted(digests))).hexdigest()
 
 
-def build_id_of(digests: Iterable[tuple[str, bytes]]) -> str:
-    """Return the id of a build: SHA-256, in hex, of its records' in the order of asset ids.
-
-    So that an update need not read the records of assets that did not change.
-    """
-    return hashlib.sha256(b"".join(digest for _, digest in sorted(digests))).hexdigest()
-
-
-def digest_of(record: Record | RecordText) -> bytes:
-    """Return the SHA-256 of what of a record counts in a build's id."""
-    return hashlib.sha256(content_of(record)).digest()
-
-
-def content_of(record: Record | RecordText) -> bytes:
-    """Return what of a record counts in `records_id`; of a row's it is what its store holds."""
-    if isinstance(record, RecordText):
-        return record.content
-    if isinstance(record, AssetRecord):
-        return to_json(record.without_duration())
-    return to_json(replace(record, duration_s=0.0, reason="", traceback=""))
-
-
-def write_records(path: Path, records: Iterable[Record | RecordText]) -> dict[str, bytes]:
-    """Write records, in their order, as JSON Lines; return `digest_of` each by asset id."""
-    digests = {}
-    with path.open("wb") as file:
-        for record in records:
-            line = record.line if isinstance(record, RecordText) else to_json(record)
-            file.write(line + b"\n")
-            digests[record.asset_id] = digest_of(record)
-    return digests
+def digest_of(text: bytes) -> bytes:
+    """Return the SHA-256 of a record's text, by which builds and stores tell it from others."""
+    return hashlib.sha256(text).digest()
 
 
 @lru_cache(maxsize=4)
@@ -198,26 +135,7 @@ def _read(kind: Any, text: bytes | str, where: str) -> Any:
         read = adapter_of(kind).validate_json(text, strict=True)
     except ValidationError as error:
         raise RecordError(where, _faults(error)) from None
-    if isinstance(read, AssetRecord) and (faults := tuple(_table_faults(read))):
-        raise RecordError(where, faults)
     return read
-
-
-def _table_faults(record: AssetRecord) -> Iterator[str]:
-    """Yield where a record does not have the properties that its ranges name."""
-    if record.normalization is None:
-        return
-    names = [one.name for one in record.normalization.ranges]
-    for at, of in (
-        ("judgement", record.judgement),
-        ("first_pass/judgement", record.first_pass and record.first_pass.judgement),
-    ):
-        if of and len(of.ambiguity.property_change) != len(names):
-            yield f"{at}/ambiguity/property_change: should have a number for each of {names}"
-    if clipped := record.counts.clipped:
-        for group in ("voxel", "grid"):
-            if list(getattr(clipped, group)) != names:
-                yield f"counts/clipped/{group}: should have the properties {names}"
 
 
 def _faults(error: ValidationError) -> tuple[str, ...]:

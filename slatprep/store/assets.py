@@ -30,7 +30,7 @@ ASSET_COLUMNS = [
     name
     for layout in ARRAYS
     for group, _, name in (layout.name.partition("/"),)
-    if group == "asset" and name not in ("id", "offset", "transform")
+    if group == "asset" and not layout.internal and name not in ("id", "offset", "transform")
 ]
 """Last names of the ``asset/*`` arrays that describe an asset."""
 
@@ -64,7 +64,7 @@ class AssetTable:
 
     def __repr__(self) -> str:
         try:
-            verdicts = Counter(str(verdict) for verdict in self._column("verdict"))
+            verdicts = Counter(str(verdict) for verdict in self.cached_column("verdict"))
             counts = ", ".join(f"{count:,} {verdict}" for verdict, count in verdicts.most_common())
             what = f"{len(self):,} assets ({counts}), {self.offsets[-1]:,} voxels"
         except StoreError as error:
@@ -74,12 +74,12 @@ class AssetTable:
     def _repr_html_(self) -> str:
         """Return the store as a notebook shows it: a table of what it holds."""
         try:
-            verdicts = Counter(str(verdict) for verdict in self._column("verdict"))
+            verdicts = Counter(str(verdict) for verdict in self.cached_column("verdict"))
             rows = {
                 "path": self.path,
                 "assets": f"{len(self):,}",
                 **{f"assets {verdict}": f"{n:,}" for verdict, n in verdicts.most_common()},
-                "categories": f"{len(set(map(str, self._column('category'))) - {''}):,}",
+                "categories": f"{len(set(map(str, self.cached_column('category'))) - {''}):,}",
                 "voxels": f"{self.offsets[-1]:,}",
                 "ranges": self.normalization.source,
                 "build": self.about.manifest[:12],
@@ -154,6 +154,10 @@ class AssetTable:
     def normalization(self) -> Normalization:
         """The ranges that properties were normalised with."""
         return self.about.ranges
+
+    def holds(self, name: str) -> bool:
+        """Whether the store has an array, by its full name."""
+        return self._arrays.holds(name)
 
     @property
     def merges(self) -> bool:
@@ -258,7 +262,7 @@ class AssetTable:
         """
         columns = {"id": np.array(self.ids, dtype=object), "voxels": np.diff(self.offsets)}
         for name in ASSET_COLUMNS:
-            values = self._column(name)
+            values = self.cached_column(name)
             if values.ndim == 1:
                 columns[name] = values
             else:
@@ -286,7 +290,8 @@ class AssetTable:
     def _index(self) -> dict[str, int]:
         return {asset_id: index for index, asset_id in enumerate(self.ids)}
 
-    def _column(self, name: str) -> NDArray[Any]:
+    def cached_column(self, name: str) -> NDArray[Any]:
+        """Return an ``asset/*`` array as `column` does, read once."""
         if name not in self._columns:
             self._columns[name] = self.column(name)
         return self._columns[name]

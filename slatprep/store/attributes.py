@@ -175,10 +175,21 @@ def root_attributes(
     contents: Contents,
     ids: Sequence[str],
 ) -> dict[str, Any]:
-    """Return the attributes of the store's root.
+    """Return the attributes of the store's root: `store_attributes`, and what its rows tell."""
+    return {
+        **store_attributes(normalization, build, contents),
+        "manifest": manifest,
+        "segments": segments_of(ids),
+    }
+
+
+def store_attributes(
+    normalization: Normalization, build: Mapping[str, object], contents: Contents
+) -> dict[str, Any]:
+    """Return the attributes of a store's root that decide its bytes, whatever its rows.
 
     `build` holds the parameters and versions that made the content, so that
-    a store is understood without its manifests; `ids` are those of its rows.
+    a store is understood without its manifests.
     """
     return {
         "format": FORMAT,
@@ -193,9 +204,7 @@ def root_attributes(
             r.name: {"log10": r.log10, "lo": r.lo, "hi": r.hi, "source": normalization.source}
             for r in normalization.ranges
         },
-        "manifest": manifest,
         "build": dict(build),
-        "segments": segments_of(ids),
     }
 
 

@@ -30,7 +30,8 @@ class ArrayLayout:
 
     `packing` is ``zstd``, the smallest, or what unpacks fastest: ``repeats``
     for values that recur, ``columns`` for rows of three bytes of which two
-    recur, ``exponents`` for floats of which little else recurs.
+    recur, ``exponents`` for floats of which little else recurs. An `internal` array
+    is kept for the next build, and describes no asset to a reader.
     """
 
     name: str
@@ -40,6 +41,7 @@ class ArrayLayout:
     description: str
     unit: str = ""
     packing: str = "zstd"
+    internal: bool = False
 
 
 _XYZ = ("x", "y", "z")
@@ -145,6 +147,70 @@ ARRAYS = (
         ("asset",),
         False,
         "the latents contradict the labels, where latents were compared with them",
+    ),
+    ArrayLayout(
+        "asset/merged",
+        "bool",
+        ("asset",),
+        False,
+        "labels are merged of several annotations",
+        internal=True,
+    ),
+    ArrayLayout(
+        "asset/key",
+        "uint8",
+        ("asset", "byte"),
+        0,
+        "what decides the row, as one hash: sources, parameters, libraries and code",
+        internal=True,
+    ),
+    ArrayLayout(
+        "asset/record_sha256",
+        "uint8",
+        ("asset", "byte"),
+        0,
+        "SHA-256 of asset/record",
+        internal=True,
+    ),
+    ArrayLayout(
+        "asset/extent",
+        "float64",
+        ("asset", "property", "bound"),
+        NAN,
+        "least and most of each property of its fields, log10 where the property is mapped so",
+        internal=True,
+    ),
+    ArrayLayout(
+        "asset/clipped",
+        "int64",
+        ("asset", "property"),
+        0,
+        "values of voxel/properties outside the range",
+        internal=True,
+    ),
+    ArrayLayout(
+        "asset/clipped_grid",
+        "int64",
+        ("asset", "property"),
+        0,
+        "values of grid/properties outside the range",
+        internal=True,
+    ),
+    ArrayLayout(
+        "asset/latent_mean",
+        "float64",
+        ("asset", "latent"),
+        NAN,
+        "mean of each channel of its latents",
+        internal=True,
+    ),
+    ArrayLayout(
+        "asset/latent_std",
+        "float64",
+        ("asset", "latent"),
+        NAN,
+        "standard deviation of each channel of its latents",
+        internal=True,
     ),
     ArrayLayout(
         "voxel/coords",
@@ -258,7 +324,14 @@ def arrays_with(merged: bool) -> tuple[ArrayLayout, ...]:
     return (*ARRAYS, *MERGED) if merged else ARRAYS
 
 
-FIXED_SIZES = {"row": 4, "column": 4, "axis": 3, **dict.fromkeys(_XYZ, RESOLUTION)}
+FIXED_SIZES = {
+    "row": 4,
+    "column": 4,
+    "axis": 3,
+    "byte": 32,
+    "bound": 2,
+    **dict.fromkeys(_XYZ, RESOLUTION),
+}
 """Dimensions that are the same in every store."""
 
 

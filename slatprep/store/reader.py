@@ -256,8 +256,8 @@ class Store(AssetTable):
             store=self,
             index=index,
             asset_id=self.ids[index],
-            transform=np.asarray(self._column("transform")[index]),
-            columns={name: self._column(name)[index] for name in ASSET_COLUMNS},
+            transform=np.asarray(self.cached_column("transform")[index]),
+            columns={name: self.cached_column(name)[index] for name in ASSET_COLUMNS},
             **self.read(index, VOXEL_COLUMNS),
         )
 

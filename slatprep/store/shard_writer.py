@@ -158,12 +158,14 @@ def _staged(store: Place, file: str) -> Iterator[Path]:
 
 def _encoder(codecs: list[Mapping[str, Any]]) -> Callable[[NDArray[Any]], bytes]:
     """Return what packs a chunk as the codecs of a ``zarr.json`` say."""
-    from numcodecs import Blosc, Zstd
+    from numcodecs import Blosc, VLenUTF8, Zstd
 
-    _, packer, _ = codecs  # RowReader takes no others than these, with a checksum last.
+    first, packer, _ = codecs  # RowReader takes no others than these, with a checksum last.
     settings = packer["configuration"]
     if packer["name"] == "zstd":
         zstd = Zstd(settings["level"], settings["checksum"])
+        if first["name"] == "vlen-utf8":
+            return lambda chunk: _with_checksum(zstd.encode(VLenUTF8().encode(chunk)))
         return lambda chunk: _with_checksum(zstd.encode(chunk))
     single_threaded_blosc()
     blosc = Blosc(

@@ -8,9 +8,8 @@ So `shards` cuts the store into tasks that share none, which
 from __future__ import annotations
 
 import warnings
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Container, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from itertools import groupby
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
@@ -18,6 +17,7 @@ from typing import Any
 from slatprep.parameters import StoreParameters
 from slatprep.records import PIXIEVERSE, Contents, Normalization, Place
 from slatprep.store.attributes import root_attributes
+from slatprep.store.contract import read_metadata
 from slatprep.store.coordinates import write_coordinates
 from slatprep.store.digests import write_digests
 from slatprep.store.layout import (
@@ -30,8 +30,11 @@ from slatprep.store.layout import (
     row_ranges,
     rows_per_shard,
 )
-from slatprep.store.records import create_record_array
-from slatprep.store.unmoved import Piece, Unmoved
+from slatprep.store.records import RECORDS_IN_CHUNK, RECORDS_IN_SHARD, create_record_array
+from slatprep.store.runs import Piece, Runs
+
+GROUPS = ("voxel", "grid", "record")
+"""What is cut into shards: arrays below ``voxel`` and ``grid``, and the records."""
 
 
 @dataclass(frozen=True)
@@ -41,28 +44,27 @@ class Shard:
     Attributes
     ----------
     group : str
-        ``voxel`` or ``grid``.
-    rows : (int, int)
+        One of `GROUPS`.
+    start, stop : int
         First row and end in the store.
     first : int
         Index of the first asset that has rows in it.
-    keys : sequence of str or int
-        Of the assets that have rows in it: keys in the spool, or rows in the
-        existing store.
+    rows : sequence
+        Where the arrays of the assets lie that have rows in it, in a form that the writer knows.
     offsets : sequence of int
         ``voxel`` alone: first row of each of them in the store, and the last
         one's end.
     pieces : sequence of Piece
-        Its rows, and which of them the existing store has as chunks, rows of voxels at the same
-        place; empty where none may be.
+        Its rows, and which of them an older store has in whole chunks.
     """
 
     group: str
-    rows: tuple[int, int]
+    start: int
+    stop: int
     first: int
-    keys: Sequence[str | int]
-    offsets: Sequence[int] = ()
-    pieces: Sequence[Piece] = ()
+    rows: Sequence[Any]
+    offsets: Sequence[int]
+    pieces: Sequence[Piece]
 
 
 def create_store(
@@ -144,50 +146,61 @@ def merges(path: Place) -> bool:
     return all((path / layout.name).is_dir() for layout in MERGED)
 
 
+def packing_of(array: Place) -> object:
+    """Return how an array is cut into chunks, and how those are packed."""
+    document = read_metadata(array / "zarr.json")
+    names = ("data_type", "fill_value", "codecs")
+    data_type, fill_value, codecs = (document.get(name) for name in names)
+    inner = codecs[0]["configuration"] if codecs else {}
+    return data_type, fill_value, inner.get("chunk_shape"), inner.get("codecs")
+
+
+def shard_rows(parameters: StoreParameters, n_voxels: int) -> dict[str, int]:
+    """Return how many rows one shard of each group holds."""
+    grids = parameters.grid_assets_per_shard
+    return {
+        "voxel": rows_per_shard(parameters, n_voxels),
+        "grid": grids,
+        "record": RECORDS_IN_SHARD,
+    }
+
+
 def shards(
-    keys: Sequence[str | int],
+    rows: Sequence[Any],
     offsets: Sequence[int],
     parameters: StoreParameters,
-    same: Mapping[str, Unmoved] | None = None,
+    runs: Mapping[str, Runs] = MappingProxyType({}),
+    taken: Container[tuple[str, int]] = (),
 ) -> Iterator[Shard]:
-    """Yield every shard of a store whose assets, by key, begin at rows `offsets`.
+    """Yield the shards of a store whose assets begin at rows `offsets`, but those that are taken.
 
-    `same` has, by group, the rows that are the same in the existing store;
-    shards that are the same as a whole are left out.
+    Parameters
+    ----------
+    rows : sequence
+        Where the arrays of each asset lie.
+    offsets : sequence of int
+        First row of each asset in ``voxel/*``, and the last one's end.
+    parameters : StoreParameters
+        Sizes of chunks and shards.
+    runs : mapping of str to Runs
+        By group, the rows that older stores have in chunks of the same bytes.
+    taken : container of (str, int)
+        Groups and numbers of shards that are left out.
     """
-    of_voxels, of_grids = (
-        same[group] if same else Unmoved((), 0, 0) for group in ("voxel", "grid")
-    )
-    per_shard = rows_per_shard(parameters, offsets[-1])
-    for start, stop in row_ranges(offsets[-1], per_shard):
-        if of_voxels.holds_shard(start, start + per_shard):
-            continue
-        owners = [asset for asset, _ in overlaps(offsets, start, stop)]
-        first, last = owners[0], owners[-1] + 1
-        pieces = tuple(of_voxels.pieces(start, stop, parameters.voxel_chunk)) if same else ()
-        own, at = keys[first:last], offsets[first : last + 1]
-        yield Shard("voxel", (start, stop), first, own, at, pieces)
-    per_shard = parameters.grid_assets_per_shard
-    for start, stop in row_ranges(len(keys), per_shard):
-        if not of_grids.holds_shard(start, start + per_shard):
-            own = keys[start:stop]
-            pieces = tuple(_grid_pieces(own, start)) if same else ()
-            yield Shard("grid", (start, stop), start, own, pieces=pieces)
-
-
-def _grid_pieces(keys: Sequence[str | int], start: int) -> Iterator[Piece]:
-    """Yield the grids that follow one another in the existing store, which are chunks, and others.
-
-    Of the first the rows are those of the existing store.
-    """
-
-    def place(one: tuple[int, str | int]) -> tuple[bool, int]:
-        row, key = one
-        return (True, key - row) if isinstance(key, int) else (False, 0)
-
-    for (held, moved), own in groupby(enumerate(keys, start), place):
-        rows = [row for row, _ in own]
-        yield held, rows[0] + moved, rows[-1] + moved + 1
+    chunks = {"voxel": parameters.voxel_chunk, "grid": 1, "record": RECORDS_IN_CHUNK}
+    for group, per_shard in shard_rows(parameters, offsets[-1]).items():
+        own, total = runs.get(group, Runs()), offsets[-1] if group == "voxel" else len(rows)
+        for number, (start, stop) in enumerate(row_ranges(total, per_shard)):
+            if (group, number) in taken:
+                continue
+            pieces = tuple(own.pieces(start, stop, chunks[group]))
+            first, last = start, stop
+            begins: Sequence[int] = ()
+            if group == "voxel":
+                owners = [asset for asset, _ in overlaps(offsets, start, stop)]
+                first, last = owners[0], owners[-1] + 1
+                begins = tuple(offsets[first : last + 1])
+            yield Shard(group, start, stop, first, rows[first:last], begins, pieces)
 
 
 def finish_store(

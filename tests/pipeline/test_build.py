@@ -29,7 +29,8 @@ def test_bad_assets_are_told_and_the_others_go_in(mixed_build: BuildSummary) -> 
     assert "torn.npz" in problems["torn"]
     assert "expected" in problems["torn"]
     assert all("\n" not in reason for reason in problems.values())
-    assert list(records_of(mixed_build.records)) == sorted(records_of(mixed_build.records))
+    lines = [json.loads(line) for line in mixed_build.records.read_text().splitlines()]
+    assert [line["asset_id"] for line in lines] == open_store(mixed_build.store).ids
 
 
 def test_two_jobs_write_the_same_bytes_as_one(
@@ -38,10 +39,7 @@ def test_two_jobs_write_the_same_bytes_as_one(
     again = build_store(mixed.parameters(), tmp_path / "two.zarr", jobs=2)
     assert again.build_id == mixed_build.build_id
     assert tree(again.store) == tree(mixed_build.store)
-    one, two = records_of(mixed_build.records), records_of(again.records)
-    for record in (*one.values(), *two.values()):
-        del record["duration_s"]
-    assert one == two
+    assert records_of(mixed_build.records) == records_of(again.records)
 
 
 def test_the_dataset_can_lie_elsewhere(make_dataset: MakeDataset, tmp_path: Path) -> None:
@@ -160,9 +158,9 @@ def test_ranges_by_name_clip_and_count(make_dataset: MakeDataset, tmp_path: Path
         "density": in_voxels,
         "poissons_ratio": 0,
     }
-    clipped = records_of(summary.records)["a"]["counts"]["clipped"]
-    assert clipped["voxel"] == summary.clipped
-    assert clipped["grid"] == {"youngs_modulus": in_grid, "density": in_grid, "poissons_ratio": 0}
+    store = open_store(summary.store)
+    assert store.column("clipped").tolist() == [[in_voxels, in_voxels, 0]]
+    assert store.column("clipped_grid").tolist() == [[in_grid, in_grid, 0]]
 
 
 def test_ranges_from_a_file(make_dataset: MakeDataset, tmp_path: Path) -> None:

@@ -30,7 +30,7 @@ from slatprep.geometry.fill import _flood
 from slatprep.parameters import BuildParameters, PixieverseSource, SlatSource
 from slatprep.parameters.files import load_parameters
 from slatprep.pipeline.dataset import build_store
-from slatprep.pipeline.kernels import compile_kernels
+from slatprep.pipeline.asset import compile_kernels
 
 compiled = []
 
@@ -90,7 +90,7 @@ UNKEPT = """
 import numpy as np
 import slatprep.align.deform_solver, slatprep.align.solver
 from slatprep.geometry.fill import outside_of
-from slatprep.pipeline import kernels
+from slatprep.pipeline import asset as kernels
 
 shell = np.ones((3, 3, 3), dtype=bool)
 shell[1, 1, 1] = False

@@ -30,7 +30,7 @@ from slatprep.parameters import (
     SlatSource,
 )
 from slatprep.particles.fields import stored_field
-from slatprep.pipeline import seen
+from slatprep.pipeline import before
 from slatprep.records import Engine
 
 TABLE = [
@@ -329,7 +329,7 @@ def test_every_file_that_decides_an_asset_is_looked_at_again(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     # States of files are trusted however shortly ago they were written.
-    monkeypatch.setattr(seen, "_FINE_NS", 0)
+    monkeypatch.setattr(before, "FINE_NS", 0)
     write(tmp_path, "ab")
     frame = tmp_path / "voxels" / "frame.json"
     frame.write_text(json.dumps(QUARTER_TURN.tolist()))

@@ -4,11 +4,9 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import numpy as np
-
 from slatprep.parameters import BuildParameters, PixieverseSource, SlatSource
-from slatprep.pipeline.spool import FailedAsset, SpooledAsset
-from slatprep.pipeline.summary import counts_of, nothing_usable, summarise_build
+from slatprep.pipeline.rows import FailedAsset, Row
+from slatprep.pipeline.summary import counts_of, nothing_usable, summarise
 from slatprep.records import Status
 
 PARAMETERS = BuildParameters(PixieverseSource(Path("/grids")), SlatSource(Path("/slats")))
@@ -18,16 +16,15 @@ def failed(number: int, status: Status = Status.FAILED) -> FailedAsset:
     return FailedAsset(f"a{number:03d}", "", status, f"reason {number}")
 
 
-def finished(name: str, verdict: str) -> SpooledAsset:
-    columns = {"verdict": verdict, "unphysical": 4, "contradicted": name == "y"}
-    return SpooledAsset(name, "", 10, 7, 1, np.zeros((3, 2)), columns)
+def finished(name: str, verdict: str) -> Row:
+    columns = {"verdict": verdict, "unphysical": 4, "contradicted": name == "y", "n_valid": 7}
+    return Row(name, 10, columns=columns)
 
 
 def test_assets_are_counted_and_the_first_hundred_problems_listed() -> None:
     usable = [finished("x", "good"), finished("y", "doubtful"), finished("z", "good")]
     without = [*map(failed, range(120)), failed(120, Status.SKIPPED)]
-    about = {"records": Path("r"), "build_id": "id", "seconds": 1.0}
-    summary = summarise_build(counts_of(usable), without, **about)
+    summary = summarise(counts_of(usable), without, Path("r"), "id", 1.0)
     assert summary.statuses == {"ok": 3, "failed": 120, "skipped": 1}
     assert summary.verdicts == {"doubtful": 1, "good": 2}
     assert (summary.n_voxels, summary.n_valid) == (30, 21)
@@ -36,7 +33,7 @@ def test_assets_are_counted_and_the_first_hundred_problems_listed() -> None:
     assert summary.problems[0] == ("a000", "reason 0")
     assert len(summary.problems) == 100
     assert not summary.complete
-    clean = summarise_build(counts_of(usable[-1:]), [], **about)
+    clean = summarise(counts_of(usable[-1:]), [], Path("r"), "id", 1.0)
     assert clean.complete
 
 

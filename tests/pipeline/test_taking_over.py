@@ -19,12 +19,12 @@ from support.trees import records_of, tree
 
 from slatprep.inspect.verify import verify_store
 from slatprep.parameters import BuildParameters, StoreParameters
-from slatprep.pipeline import carry, seen
+from slatprep.pipeline import before as looks
+from slatprep.pipeline import rows
 from slatprep.pipeline.dataset import build_store, plan_build
-from slatprep.pipeline.previous import previous_build
+from slatprep.pipeline.previous import checked_store
 from slatprep.store import layout, open_store
 from slatprep.store.shard_reader import RowReader
-from slatprep.store.unmoved import Unmoved
 
 MakeDataset = Callable[..., Dataset]
 
@@ -135,7 +135,7 @@ def test_where_much_is_new_all_rows_are_ordered_by_id(
     built: tuple[Dataset, Path], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     dataset, out = built
-    monkeypatch.setattr(carry, "MOST_BEHIND", 0.2)
+    monkeypatch.setattr(rows, "MOST_BEHIND", 0.2)
     dataset.add("b", seed=2)
     build_store(dataset.parameters(), out)
     assert tree(out) == from_nothing(dataset.parameters(), tmp_path)
@@ -378,8 +378,8 @@ def test_what_was_seen_is_not_trusted_without_reason(
     elif how == "machine":
         monkeypatch.setattr("platform.node", lambda: "another")
     elif how == "young":
-        monkeypatch.setattr(seen, "_FINE_NS", 10**15)
-        monkeypatch.setattr(seen, "_COARSE_NS", 10**15)
+        monkeypatch.setattr(looks, "FINE_NS", 10**15)
+        monkeypatch.setattr(looks, "COARSE_NS", 10**15)
         monkeypatch.setattr("time.sleep", lambda seconds: None)
     else:
         path.unlink()
@@ -428,25 +428,6 @@ def test_a_file_that_changed_under_an_unchanged_dataset_is_found(
     assert verify_store(out).ok
 
 
-def test_rows_of_chunks_that_are_the_same() -> None:
-    """Against the definition: every row of the chunk, at the same place in both arrays."""
-    rng = random.Random(0)
-    for _ in range(300):
-        old, new, chunk = rng.randrange(1, 12), rng.randrange(1, 12), rng.randrange(1, 5)
-        same = [rng.random() < 0.8 and row < old for row in range(new)]
-        runs = []
-        for row, is_same in enumerate(same):
-            if is_same and runs and runs[-1][1] == row:
-                runs[-1] = (runs[-1][0], row + 1)
-            elif is_same:
-                runs.append((row, row + 1))
-        rows = Unmoved(tuple(runs), old, new)
-        for start in range(0, new, chunk):
-            ends = [min(start + chunk, length) for length in (old, new)]
-            expected = ends[0] == ends[1] and all(same[start : ends[1]])
-            assert rows.holds(start, start + chunk) is expected, (runs, old, new, start, chunk)
-
-
 def test_a_worker_that_lives_on_reads_the_store_of_today(built: tuple[Dataset, Path]) -> None:
     """A cluster's workers outlive builds, and rows in another order have the same build id."""
     dataset, out = built
@@ -454,7 +435,7 @@ def test_a_worker_that_lives_on_reads_the_store_of_today(built: tuple[Dataset, P
     build_store(dataset.parameters(), out)
 
     def in_the_worker() -> list[str]:
-        there = previous_build(out, 1)[0]
+        there = checked_store(out, 1)[0]
         worker = pickle.loads(pickle.dumps(there))
         ids = worker.store.ids
         assert [worker.store.asset(one).asset_id for one in ids] == list(ids)

@@ -28,6 +28,9 @@ def contents(s3: Any, place: str) -> dict[str, str]:
 
 
 def records_of(lines: Path) -> dict[str, dict[str, Any]]:
-    """Return the records of a build's ``assets.jsonl`` by their asset's id, in its order."""
-    records = map(json.loads, lines.read_text("utf-8").splitlines())
+    """Return the records of a build by their asset's id: lines, in their order, and the failed."""
+    records = list(map(json.loads, lines.read_text("utf-8").splitlines()))
+    build = lines.with_name("build.json")
+    if lines.name == "assets.jsonl" and build.exists():
+        records += json.loads(build.read_text("utf-8"))["failed"]
     return {record["asset_id"]: record for record in records}

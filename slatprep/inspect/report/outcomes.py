@@ -4,16 +4,16 @@ from __future__ import annotations
 
 import re
 from collections import Counter
-from collections.abc import Collection, Iterable, Iterator
+from collections.abc import Collection, Iterable
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from slatprep.errors import StoreError
-from slatprep.provenance.files import build_in, lines_in
-from slatprep.provenance.record import FailedRecord, Record
-from slatprep.provenance.record_json import read_record
+from slatprep.provenance.files import build_in
+from slatprep.provenance.record import AssetRecord, FailedRecord
+from slatprep.provenance.stored import StoredRecords
 from slatprep.records import Place, Status
 from slatprep.store.reader import Store
 
@@ -39,8 +39,6 @@ class Outcome:
         Distinct placements that fit about as well as the best.
     displacement : float or None
         Largest distance [voxel] between the best placement and a tied one; None without ties.
-    clipped : tuple of int
-        Values of ``voxel/properties`` outside the range, by property.
     ties : tuple of tuple of float
         Transforms of the first `MOST_TIES` tied placements, each as three rows of four numbers.
     annotations : tuple of int
@@ -53,7 +51,6 @@ class Outcome:
     reasons: tuple[str, ...]
     tied: int
     displacement: float | None
-    clipped: tuple[int, ...]
     ties: tuple[tuple[float, ...], ...] = ()
     annotations: tuple[int, ...] = ()
 
@@ -88,42 +85,22 @@ def gather_outcomes(
     It keeps the assets `listed` and at most `most_absent` that are not in the store. StoreError if
     the records cannot be read, belong to another build, or lack an asset of the store.
     """
-    known: dict[str, Outcome] = {}
-    missing, absent, tied = set(store.ids), Counter[Status](), 0
-    clipped = np.zeros(len(store.normalization.ranges), dtype=np.int64)
-    for outcome in read_outcomes(manifests, store.about.manifest):
-        missing.discard(outcome.asset_id)
-        tied += outcome.tied > 0
-        if outcome.clipped:
-            clipped += outcome.clipped
-        if outcome.status is not Status.OK:
-            absent[outcome.status] += 1
-            if absent.total() > most_absent:
-                continue
-        elif outcome.asset_id not in listed:
-            continue
-        known[outcome.asset_id] = outcome
-    if missing:
+    build = build_in(manifests)
+    if build.id != store.about.manifest:
         raise StoreError(
-            f"{manifests} has no record of {len(missing)} assets of {store.path}, such as "
-            f"{min(missing)!r}; name the folder of its own records with --manifests"
+            f"{manifests} holds the records of build {build.id[:12]!r}, the store was written by "
+            f"{store.about.manifest[:12]!r}; name the folder of its own records with --manifests"
         )
-    return Outcomes(dict(sorted(known.items())), clipped, tied, absent)
-
-
-def read_outcomes(manifests: Place, build_id: str) -> Iterator[Outcome]:
-    """Yield the outcome of every asset of a build, in the order of its records.
-
-    Raises StoreError if the records cannot be read or belong to another build.
-    """
-    found = build_in(manifests).id
-    if found != build_id:
-        raise StoreError(
-            f"{manifests} holds the records of build {found[:12]!r}, the store was written by "
-            f"{build_id[:12]!r}; name the folder of its own records with --manifests"
-        )
-    for where, line in lines_in(manifests):
-        yield _outcome(read_record(line, where))
+    known = {record.asset_id: _failed(record) for record in build.failed[:most_absent]}
+    tied = 0
+    for record in StoredRecords(store):
+        tied += len(record.alignment.placements) > 0
+        if record.asset_id in listed:
+            known[record.asset_id] = _outcome(record)
+    absent = Counter({status: build.statuses.get(str(status), 0) for status in Status})
+    del absent[Status.OK]
+    clipped = store.column("clipped").sum(axis=0)
+    return Outcomes(dict(sorted(known.items())), clipped, tied, +absent)
 
 
 def kind_of(reason: str) -> str:
@@ -157,17 +134,20 @@ def _fault_of(reason: str) -> str:
     return re.sub(r"^\S*[/\\.]\S*: ", "", reason.partition("; expected")[0])
 
 
-def _outcome(record: Record) -> Outcome:
-    names = record.asset_id, record.category, record.status
-    if isinstance(record, FailedRecord):
-        return Outcome(*names, reasons=(record.reason,), tied=0, displacement=None, clipped=())
-    placements, clipped = record.alignment.placements, record.counts.clipped
+def _failed(record: FailedRecord) -> Outcome:
+    reasons = (record.reason,)
+    return Outcome(record.asset_id, record.category, record.status, reasons, 0, None)
+
+
+def _outcome(record: AssetRecord) -> Outcome:
+    placements = record.alignment.placements
     return Outcome(
-        *names,
+        record.asset_id,
+        record.category,
+        record.status,
         reasons=record.judgement.reasons,
         tied=len(placements),
         displacement=max((placement.displacement for placement in placements), default=None),
-        clipped=tuple(clipped.voxel.values()) if clipped else (),
         ties=tuple(
             tuple(placement.transform[:3].ravel().tolist()) for placement in placements[:MOST_TIES]
         ),

@@ -138,8 +138,7 @@ def verify_store(
             progress(min(done * ASSETS_IN_TASK, total), total)
     if folder is not None:
         try:
-            only = None if sample is None else {store.ids[row] for row in rows}
-            findings |= set(manifest_findings(store, folder, only))
+            findings |= set(manifest_findings(store, folder, None if sample is None else rows))
         except StoreError as error:
             findings.add(Finding(str(folder), "", str(error), "records of a readable store"))
     return Verification(path, total, files, hashed, folder, tuple(sorted(findings)))

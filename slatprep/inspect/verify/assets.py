@@ -23,7 +23,7 @@ from slatprep.pipeline.fingerprint import code_fingerprint
 from slatprep.pipeline.previous import PLACE_TOLERANCE
 from slatprep.provenance.columns import columns_of
 from slatprep.provenance.record import AssetRecord
-from slatprep.provenance.record_json import RecordError
+from slatprep.provenance.record_json import RecordError, digest_of
 from slatprep.provenance.stored import StoredRecords
 from slatprep.readers.files import is_hierarchy, load_source
 from slatprep.records import (
@@ -76,6 +76,11 @@ def asset_findings(
         except StoreError as error:
             findings.append(Finding(RECORD_ARRAY, asset_id, f"no record ({error})", "one a row"))
             continue
+        if digest_of(records.text(row).encode()) != bytes(
+            store.cached_column("record_sha256")[row]
+        ):
+            what = "is not the text of asset/record_sha256"
+            findings.append(Finding(RECORD_ARRAY, asset_id, what, "the record of the build"))
         findings += record_findings(asset, record, store)
         if not own:  # From invalid values no confidence can be computed.
             findings += confidence_findings(asset, record)
@@ -206,9 +211,8 @@ def confidence_findings(asset: StoredAsset, record: AssetRecord) -> Iterator[Fin
     if asset.merged:
         return
     field, properties = asset.normalised_field, asset.properties
-    clipped = record.counts.clipped
     if not field.classified:  # Otherwise the confidence comes from classes alone.
-        if clipped and any(clipped.grid.values()):
+        if asset.store.cached_column("clipped_grid")[asset.index].any():
             return  # The confidence came from values that the store does not hold.
         field, properties = asset.field, asset.properties_si
     annotation = Annotation(properties, asset.material, asset.valid, asset.distance, asset.place)
@@ -298,7 +302,7 @@ def _claims(
         said = normalize_change([change], store.normalization)[0]
     yield "property_ambiguity", said, asset.columns["property_ambiguity"]
     for name, column in columns.items():
-        yield name, column, asset.transform if name == "transform" else asset.columns[name]
+        yield name, column, store.cached_column(name)[asset.index]
     grid, background = asset.grid_material, asset.store.contents.background
     for name, count in (
         ("slat_voxels", len(asset.coords)),
@@ -308,7 +312,6 @@ def _claims(
         ("occupied", (grid != background).sum()),
     ):
         yield f"counts/{name}", getattr(record.counts, name), int(count)
-    yield "normalization", record.normalization, store.normalization
     parameters = store.attributes["build"]["parameters"]
     for name in ("align", "sample"):
         said_parameters = getattr(record.parameters, name)
@@ -325,7 +328,10 @@ def _in_json(parameters: object) -> Any:
 
 def _equal(said: object, held: object) -> bool:
     if isinstance(said, np.ndarray | float | tuple):
-        return np.array_equal(np.asarray(said), np.asarray(held), equal_nan=True)
+        if isinstance(said, float) and np.isnan(said):  # Of all channels.
+            return bool(np.isnan(np.asarray(held)).all())
+        numbers = not isinstance(said, np.ndarray) or said.dtype.kind == "f"
+        return np.array_equal(np.asarray(said), np.asarray(held), equal_nan=numbers)
     return bool(said == held)
 
 

@@ -2,33 +2,28 @@
 
 from __future__ import annotations
 
-from collections import Counter
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from itertools import zip_longest
 
 import orjson
 
 from slatprep.errors import StoreError
 from slatprep.inspect.verify.assets import fault_findings
-from slatprep.pipeline.rewrite import APART, NO_ROOT
-from slatprep.provenance.files import ASSETS, BUILD, build_in, build_text, lines_in
-from slatprep.provenance.record import AssetRecord
-from slatprep.provenance.record_json import (
-    RecordError,
-    RecordText,
-    build_id_of,
-    counting,
-    digest_of,
-    read_build_record,
-    read_record,
-    to_json,
-)
-from slatprep.provenance.stored import StoredRecords
+from slatprep.pipeline.join import APART, NO_ROOT
+from slatprep.pipeline.summary import counts_in
+from slatprep.provenance.files import BUILD, build_in, build_text, file_names, lines_of
+from slatprep.provenance.make import origin
+from slatprep.provenance.record import BuildRecord
+from slatprep.provenance.record_json import RecordError, read_build_record
 from slatprep.readers.published import locate_grids
 from slatprep.records import Place, SourceRoots, Status
-from slatprep.storage.documents import parse_document
+from slatprep.storage.place import storage_of
 from slatprep.store.contract import Finding
 from slatprep.store.reader import Store
+from slatprep.store.records import RECORDS_IN_SHARD
+
+_MOST_LINES = 8
 
 
 def source_roots(manifests: Place | None) -> SourceRoots:
@@ -86,47 +81,76 @@ def moved(roots: SourceRoots, manifests: Place | None) -> SourceRoots:
 
 
 def manifest_findings(
-    store: Store, folder: Place, only: Collection[str] | None = None
+    store: Store, folder: Place, rows: Sequence[int] | None = None
 ) -> Iterator[Finding]:
-    """Yield findings where the records break their schemas or disagree with the store.
+    """Yield findings where the manifests are not what the store's records give.
 
-    With a sample of ids, `only`, records of other assets are not read, and the records' id and
-    statuses are not compared.
+    With a sample of rows, files of lines that hold none of them are not read.
     """
-    build_file, assets_file = str(folder / BUILD), str(folder / ASSETS)
-    manifest, build = store.attributes.get("manifest"), None
+    names = file_names(len(store))
+    if rows is not None:
+        names = sorted({names[row // RECORDS_IN_SHARD] for row in rows})
+    file, manifest = str(folder / BUILD), store.attributes.get("manifest")
     try:
         text = build_text(folder)
-        build = read_build_record(text, build_file)
-        build_id: object = build.id
+        build = read_build_record(text, file)
     except RecordError as error:
-        yield from fault_findings(build_file, "", error)
+        yield from fault_findings(file, "", error)
         build_id = _stated_id(text)
+        if build_id != manifest:
+            yield Finding(file, "", f"id is {build_id!r}", f"{manifest!r}, the store's")
+            return
     except StoreError as error:
-        yield Finding(build_file, "", str(error), "the record of the build")
-        build_id = manifest
-    if build_id != manifest:
-        yield Finding(build_file, "", f"id is {build_id!r}", f"{manifest!r}, the store's")
-        return
-    seen: Counter[str] = Counter({str(status): 0 for status in Status})
-    faults: list[Finding] = []
+        yield Finding(file, "", str(error), "the record of the build")
+    else:
+        if build.id != manifest:
+            yield Finding(file, "", f"id is {build.id!r}", f"{manifest!r}, the store's")
+            return
+        for name, said, held in _claims(build, store):
+            if said != held:
+                yield Finding(file, "", f"{name} is {said!r}", f"{held!r}, as the store has")
+    for name in names:
+        yield from _line_findings(store, folder / name, file_names(len(store)).index(name))
+
+
+def _claims(build: BuildRecord, store: Store) -> Iterator[tuple[str, object, object]]:
+    """Yield the name of each entry that the store tells too, its value here and there."""
+    counts = counts_in(store)
+    yield "verdicts", build.verdicts, counts.verdicts
+    ok = build.statuses.get(str(Status.OK))
+    yield "statuses/ok", ok, len(store)
+    yield "counts/voxels", build.counts.voxels, store.shape("voxel/coords")[0]
+    yield "counts/valid", build.counts.valid, counts.n_valid
+    yield "counts/unphysical", build.counts.unphysical, counts.n_unphysical
+    clipped = store.column("clipped").sum(axis=0).tolist()
+    held = dict(zip(store.about.property_columns, clipped, strict=True))
+    yield "counts/clipped", build.counts.clipped, held
+    yield "normalization", build.normalization, store.normalization
+    said = {**origin(build.parameters), "versions": build.versions}
+    for name, value in store.attributes["build"].items():
+        yield name, said.get(name), value
+
+
+def _line_findings(store: Store, file: Place, shard: int) -> Iterator[Finding]:
+    """Yield the first lines of a file that are not those of its shard of records."""
     try:
-        found: object = build_id_of(list(_checked(store, folder, seen, faults, only)))
-        if only is not None:
-            found = manifest
-    except StoreError as error:
-        yield Finding(assets_file, "", str(error), "a JSON record a line")
+        expected = lines_of(store, shard)
+        found = storage_of(file).read(len(expected))
+    except StoreError:
+        return  # The shard of records is damaged, which is told of its file.
+    except OSError as error:
+        yield Finding(str(file), "", f"cannot be read ({error.strerror})", "records, a line each")
         return
-    yield from faults
-    if found != manifest:
-        yield Finding(assets_file, "", f"its content has the id {found}", f"{manifest}")
-    if only is not None and not faults and seen[Status.OK] != len(only):
-        what = f"has {seen[Status.OK]} records of {len(only)} assets"
-        yield Finding(assets_file, "", what, "one of each")
-    if only is None and build and build.statuses != dict(seen):
-        yield Finding(build_file, "", f"statuses are {build.statuses}", f"{dict(seen)}")
-    if build and build.counts.voxels != store.shape("voxel/coords")[0]:
-        yield Finding(build_file, "", "counts other voxels", f"{store.shape('voxel/coords')[0]}")
+    if found == expected:
+        return
+    lines = zip_longest(found.split(b"\n"), expected.split(b"\n")[:-1])
+    wrong = [number for number, (one, other) in enumerate(lines, 1) if other not in (one, None)]
+    for number in wrong[:_MOST_LINES]:
+        row = shard * RECORDS_IN_SHARD + number - 1
+        what = f"line {number} differs from asset/record"
+        yield Finding(str(file), store.ids[row], what, "the same record")
+    if not wrong:
+        yield Finding(str(file), "", "goes on behind the last record", f"{len(expected)} bytes")
 
 
 def _stated_id(text: bytes) -> object:
@@ -136,64 +160,3 @@ def _stated_id(text: bytes) -> object:
     except ValueError:
         return None
     return document.get("id") if isinstance(document, dict) else None
-
-
-def _checked(
-    store: Store,
-    folder: Place,
-    seen: Counter[str],
-    faults: list[Finding],
-    only: Collection[str] | None,
-) -> Iterator[tuple[str, bytes]]:
-    """Yield the ids and digests of ``assets.jsonl``; count statuses and collect faults.
-
-    A record that agrees with the store's copy in its row is skipped: verifying the row covers it.
-    """
-    rows = {asset_id: row for row, asset_id in enumerate(store.ids)}
-    stored = StoredRecords(store)
-    file = str(folder / ASSETS)
-    for where, line in lines_in(folder):
-        if only is not None and _id_in(line) not in only:
-            continue
-        if (text := _as_stored(line, rows, stored)) is not None:
-            seen[str(Status.OK)] += 1
-            yield text.asset_id, digest_of(text)
-            continue
-        try:
-            record = read_record(line, where)
-        except RecordError as error:
-            faults += fault_findings(file, where.removeprefix(f"{file}, "), error)
-            continue
-        seen[str(record.status)] += 1
-        if isinstance(record, AssetRecord):
-            row = rows.get(record.asset_id)
-            if row is None or not _same(record, stored, row):
-                what = "differs from asset/record"
-                faults.append(Finding(file, record.asset_id, what, "the same record"))
-        yield record.asset_id, digest_of(record)
-
-
-def _as_stored(line: bytes, rows: Mapping[str, int], stored: StoredRecords) -> RecordText | None:
-    """Return a line if it equals the store's record of its row, else None."""
-    try:
-        document = orjson.loads(line)
-        content, asset_id = counting(document), str(document.get("asset_id"))
-        row = rows.get(asset_id)
-        same = row is not None and stored.text(row).encode() == content
-        return RecordText(asset_id, line, content) if same else None
-    except (TypeError, ValueError, StoreError):  # No JSON object, or no text that can be read.
-        return None
-
-
-def _id_in(line: bytes | str) -> object:
-    try:
-        return parse_document(line).get("asset_id")
-    except ValueError:
-        return None
-
-
-def _same(record: AssetRecord, stored: StoredRecords, row: int) -> bool:
-    try:
-        return to_json(record.without_duration()) == to_json(stored.read(row))
-    except StoreError:
-        return False

@@ -1,0 +1,296 @@
+"""The passes over a whole dataset: the consensus and the witness settle ties, and judge labels.
+
+They work on what the first pass left in the spool and change nothing there: an
+asset that comes out otherwise is written again under a key of its own. Its
+record keeps what the first pass found, so the next build does not align it
+again, with these passes or without.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import replace
+
+from slatprep.align.consensus import find_consensus, settle
+from slatprep.align.deformation import map_of
+from slatprep.align.settle import refit, take
+from slatprep.judge import contradicted, judge
+from slatprep.judge.witness import (
+    LatentEvidence,
+    LatentModel,
+    Moments,
+    Reliability,
+    choice_of,
+    fit_models,
+    fold_of,
+    moments_of,
+    reliability_of,
+    weigh,
+)
+from slatprep.parameters import BuildParameters
+from slatprep.pipeline.rows import Row
+from slatprep.pipeline.spool import Spool
+from slatprep.provenance.record import AssetRecord, FailedRecord, FirstPass
+from slatprep.provenance.record_json import to_json
+from slatprep.records import (
+    BACKGROUND,
+    Alignment,
+    Annotation,
+    Consensus,
+    Judgement,
+    LatentChoice,
+    MaterialField,
+    StructuredLatents,
+    Verdict,
+)
+from slatprep.sample import sample
+from slatprep.workers.local import Jobs, run_unordered
+
+
+def apply_passes(
+    rows: Sequence[Row],
+    spool: Spool,
+    parameters: BuildParameters,
+    jobs: Jobs,
+    note: Callable[[str], None] | None = None,
+    labels: int = BACKGROUND,
+) -> list[Row]:
+    """Settle ties by the consensus, then by the latents, as far as parameters ask for it."""
+    settled = apply_consensus(rows, spool, parameters, jobs, note)
+    return apply_witness(settled, spool, parameters, jobs, note, labels)
+
+
+class Reopened:
+    """A finished asset, read back from the spool.
+
+    Parameters
+    ----------
+    asset : Row
+        Which.
+    spool : Spool
+        Where it lies.
+    """
+
+    def __init__(self, asset: Row, spool: Spool) -> None:
+        record = spool.record(asset.key)
+        if isinstance(record, FailedRecord):
+            raise TypeError(f"{record.asset_id}: an asset that failed is not judged anew")
+        self._asset, self._spool = asset, spool
+        self.record: AssetRecord = record
+        self.latents: StructuredLatents = spool.latents(asset.key)
+        self.annotation: Annotation = spool.annotation(asset.key)
+        self.field: MaterialField = spool.field(asset.key)
+
+    def placed(
+        self, alignment: Alignment, parameters: BuildParameters
+    ) -> tuple[Alignment, Annotation, Judgement]:
+        """Look up and judge under another alignment; fit it first if its placement is another."""
+        if alignment.transform is not self.record.alignment.transform:
+            alignment = refit(alignment, self.field, self.latents, parameters.align)
+        places = map_of(alignment).to_pixieverse(self.latents.centres)
+        annotation = sample(self.field, places, parameters.sample)
+        judgement, likely = judge(
+            self.field, self.latents, alignment, annotation, parameters.sample
+        )
+        return alignment, replace(annotation, confidence=likely), judgement
+
+    def put(self, alignment: Alignment, annotation: Annotation, judgement: Judgement) -> Row:
+        """Write the asset with these beside itself; return what the parent keeps."""
+        first = self.record
+        record = replace(
+            first,
+            alignment=alignment,
+            judgement=judgement,
+            first_pass=first.first_pass or FirstPass(first.key, first.alignment, first.judgement),
+            counts=replace(first.counts, valid=int(annotation.valid.sum())),
+        )
+        key = hashlib.sha256(to_json(record)).hexdigest()
+        put = self._spool.put(replace(record, key=key), self.field, self.latents, annotation)
+        return replace(put, damaged=self._asset.damaged)
+
+
+def apply_consensus(
+    assets: Sequence[Row],
+    spool: Spool,
+    parameters: BuildParameters,
+    jobs: Jobs,
+    note: Callable[[str], None] | None = None,
+) -> list[Row]:
+    """Give ambiguous assets the placement nearest to the dataset's common rotation, if asked to.
+
+    Parameters
+    ----------
+    assets : sequence of Row
+        The assets of the build.
+    spool : Spool
+        Where they lie.
+    parameters : BuildParameters
+        Whether to do it, and how to align and to look up.
+    jobs : int or Workers
+        Worker processes, or a cluster's.
+    note : callable, optional
+        Gets a line that says what came of it.
+
+    Returns
+    -------
+    list of Row
+        In the same order; those without a tie are the same objects.
+    """
+    if not parameters.consensus.settle:
+        return list(assets)
+    consensus = find_consensus(
+        asset.columns["transform"]
+        for asset in assets
+        if not asset.columns["n_placements"] and asset.columns["verdict"] != Verdict.FAILED
+    )
+    tied = [asset for asset in assets if asset.columns["n_placements"]]
+    tell = note or (lambda line: None)
+    if consensus is None:
+        tell(f"consensus: too few assets share a rotation; all {len(tied):,} ties stay")
+        return list(assets)
+    tasks = ((asset, spool, consensus, parameters) for asset in tied)
+    changed = {asset.asset_id: asset for asset in run_unordered(settle_asset, tasks, jobs)}
+    moved = sum(changed[asset.asset_id] is not asset for asset in tied)
+    tell(
+        f"consensus: {consensus.agreeing:,} of {consensus.winners:,} assets without a tie share a "
+        f"rotation; {moved:,} of {len(tied):,} ties were given another placement by it"
+    )
+    return [changed.get(asset.asset_id, asset) for asset in assets]
+
+
+def settle_asset(
+    asset: Row, spool: Spool, consensus: Consensus, parameters: BuildParameters
+) -> Row:
+    """Settle one asset's tie; return it as it was where the choice stands."""
+    first = Reopened(asset, spool)
+    alignment = settle(first.record.alignment, first.latents, consensus)
+    if alignment is first.record.alignment:
+        return asset
+    return first.put(*first.placed(alignment, parameters))
+
+
+def apply_witness(
+    assets: Sequence[Row],
+    spool: Spool,
+    parameters: BuildParameters,
+    jobs: Jobs,
+    note: Callable[[str], None] | None = None,
+    labels: int = BACKGROUND,
+) -> list[Row]:
+    """Settle ties by the latents and mark labels that they contradict, if asked to.
+
+    Parameters
+    ----------
+    assets : sequence of Row
+        The assets of the build, by id. Those whose verdict is good say what
+        latents are like in each class, and whether they can be trusted.
+    spool : Spool
+        Where they lie.
+    parameters : BuildParameters
+        Whether to do it, and how to align and to look up.
+    jobs : int or Workers
+        Worker processes, or a cluster's.
+    note : callable, optional
+        Gets a line that says what came of it.
+    labels : int
+        How many classes voxels may have.
+
+    Returns
+    -------
+    list of Row
+        In the same order; those of which latents say nothing are the same
+        objects. An asset without a tie is never placed anew.
+    """
+    if not parameters.witness.settle:
+        return list(assets)
+    sure = [asset for asset in assets if asset.columns["verdict"] == Verdict.GOOD]
+    moments = dict(run_unordered(read_moments, ((asset, spool, labels) for asset in sure), jobs))
+    models = fit_models((_object_of(asset), moments[asset.asset_id]) for asset in sure)
+    tell = note or (lambda line: None)
+    if models is None:
+        tell(f"witness: {len(sure):,} good assets have too few classes; latents are not used")
+        return list(assets)
+    model_of = {asset.asset_id: models[fold_of(_object_of(asset))] for asset in assets}
+    tasks = ((asset, spool, model_of[asset.asset_id], parameters) for asset in assets)
+    evidence = dict(run_unordered(weigh_asset, tasks, jobs))
+    reliability = reliability_of([evidence[asset.asset_id] for asset in sure])
+    choices = {asset.asset_id: choice_of(evidence[asset.asset_id], reliability) for asset in assets}
+    tasks_of_changed = (
+        (asset, spool, choices[asset.asset_id], reliability, model_of[asset.asset_id], parameters)
+        for asset in assets
+        if choices[asset.asset_id] or evidence[asset.asset_id].gain < reliability.least_gain
+    )
+    changed = {
+        asset.asset_id: asset for asset in run_unordered(apply_latents, tasks_of_changed, jobs)
+    }
+    contradictions = sum(bool(asset.columns["contradicted"]) for asset in changed.values())
+    tell(_told(reliability, choices.values(), contradictions))
+    return [changed.get(asset.asset_id, asset) for asset in assets]
+
+
+def read_moments(asset: Row, spool: Spool, labels: int) -> tuple[str, Moments]:
+    """Return an asset's id and the moments of its latents."""
+    arrays = spool.voxels(asset.key)
+    return asset.asset_id, moments_of(arrays["feats"], arrays["material"], labels)
+
+
+def weigh_asset(
+    asset: Row, spool: Spool, model: LatentModel, parameters: BuildParameters
+) -> tuple[str, LatentEvidence]:
+    """Return an asset's id and what its latents say of its labels."""
+    first = Reopened(asset, spool)
+    return asset.asset_id, weigh(
+        first.field,
+        first.latents,
+        first.record.alignment,
+        first.annotation.material,
+        model,
+        parameters.sample,
+    )
+
+
+def apply_latents(
+    asset: Row,
+    spool: Spool,
+    choice: tuple[int, LatentChoice] | None,
+    reliability: Reliability,
+    model: LatentModel,
+    parameters: BuildParameters,
+) -> Row:
+    """Place one asset anew as its latents ask, or mark its labels as contradicted."""
+    first = Reopened(asset, spool)
+    alignment, annotation = first.record.alignment, first.annotation
+    judgement = first.record.judgement
+    if choice is not None:
+        number, by = choice
+        # Placement 0 is the one that the asset has: it stands, and is settled now.
+        chosen = (
+            take(alignment, number - 1, first.latents, by)
+            if number
+            else replace(alignment, settled_by=by)
+        )
+        alignment, annotation, judgement = first.placed(chosen, parameters)
+    if model.gain(first.latents.feats, annotation.material) < reliability.least_gain:
+        judgement = contradicted(judgement)
+    return first.put(alignment, annotation, judgement)
+
+
+def _told(
+    reliability: Reliability, choices: Iterable[tuple[int, LatentChoice] | None], contradicted: int
+) -> str:
+    """Say how reliable latents are, and what they decided."""
+    agreeing, good = reliability.agreeing, reliability.witnesses
+    fit = f"the latents of {agreeing:,} of {good:,} good assets fit their own labels best"
+    if not reliability.factor:
+        return f"witness: {fit}; too few, so latents are not used"
+    decided = [choice[0] for choice in choices if choice]
+    moved = sum(number > 0 for number in decided)
+    return (
+        f"witness: {fit}; of {len(decided):,} ties that latents decide {moved:,} were given "
+        f"another placement; they contradict the labels of {contradicted:,} assets"
+    )
+
+
+def _object_of(asset: Row) -> str:
+    return str(asset.columns["object_id"])

@@ -1,0 +1,87 @@
+"""Which rows of a new array follow one another in an older one, so that bytes can be taken over."""
+
+from __future__ import annotations
+
+from bisect import bisect_right
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from itertools import groupby
+from typing import NamedTuple
+
+
+class Run(NamedTuple):
+    """Rows ``start`` to ``stop - 1`` of a new array; an older store has them `shift` rows on."""
+
+    start: int
+    stop: int
+    store: int
+    shift: int
+
+
+Piece = tuple[Run | None, int, int]
+"""Some rows, the first and the end: whole chunks that a run holds, or None and any rows."""
+
+
+@dataclass(frozen=True)
+class Runs:
+    """The runs of a new array.
+
+    Attributes
+    ----------
+    runs : tuple of Run
+        Ascending, without overlap.
+    new : int
+        Rows of the new array.
+    old : tuple of int
+        Rows of the array of each older store.
+    """
+
+    runs: tuple[Run, ...] = ()
+    new: int = 0
+    old: tuple[int, ...] = ()
+
+    def holds(self, start: int, end: int) -> Run | None:
+        """Return the run of a store whose chunk has the bytes of this one, `start` to ``end - 1``.
+
+        Its last rows may lie beyond the arrays: then both must end at the same row. Shards are
+        looked up likewise.
+        """
+        stop = min(end, self.new)
+        position = bisect_right(self.runs, start, key=lambda run: run.start) - 1
+        run = self.runs[position] if position >= 0 else None
+        if run is None or run.stop < stop or run.shift % (end - start):
+            return None
+        old = self.old[run.store]
+        whole = end <= self.new and end + run.shift <= old
+        return run if whole or (stop == self.new and stop + run.shift == old) else None
+
+    def pieces(self, start: int, stop: int, chunk: int) -> Iterator[Piece]:
+        """Cut the rows of a shard into pieces of whole chunks that a run holds, and others.
+
+        Examples
+        --------
+        >>> list(Runs((Run(0, 5, 0, 0),), new=9, old=(5,)).pieces(0, 9, 2))
+        [(Run(start=0, stop=5, store=0, shift=0), 0, 4), (None, 4, 9)]
+        """
+        begins = range(start, stop, chunk)
+        for run, own in groupby(begins, lambda begin: self.holds(begin, begin + chunk)):
+            chunks = list(own)
+            yield run, chunks[0], min(chunks[-1] + chunk, stop)
+
+
+def runs_of(spans: Iterable[Run], new: int, old: tuple[int, ...]) -> Runs:
+    """Return the runs that spans make; those that continue one another become one.
+
+    Examples
+    --------
+    >>> runs_of([Run(0, 2, 0, 5), Run(2, 5, 0, 5), Run(7, 9, 0, 5)], 12, (20,)).runs
+    (Run(start=0, stop=5, store=0, shift=5), Run(start=7, stop=9, store=0, shift=5))
+    """
+    runs: list[Run] = []
+    for span in spans:
+        last = runs[-1] if runs else None
+        if last and (last.stop, *last[2:]) == (span.start, *span[2:]):
+            runs[-1] = Run(last.start, *span[1:])
+        elif span.start < span.stop:
+            runs.append(span)
+    return Runs(tuple(runs), new, old)

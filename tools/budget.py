@@ -1,0 +1,68 @@
+"""Hold each room of the package to its budget of code lines, as CONTRIBUTING.md lists them.
+
+    python tools/budget.py
+
+A code line is one that is neither blank, comment nor docstring. A room over its budget fails;
+raising the number is a line in the change that needs it.
+"""
+
+from __future__ import annotations
+
+import ast
+import io
+import re
+import sys
+import tokenize
+from pathlib import Path
+
+TOP = Path(__file__).parents[1]
+_ENTRY = re.compile(r"^\| `slatprep/([\w.]*)/?` \| ([\d,]+) \|", re.MULTILINE)
+_NO_CODE = {tokenize.COMMENT, tokenize.NL, tokenize.NEWLINE, tokenize.INDENT, tokenize.DEDENT,
+            tokenize.ENCODING, tokenize.ENDMARKER}  # fmt: skip
+
+
+def code_lines(text: str) -> int:
+    """Return how many lines of a module hold code."""
+    docstrings: set[int] = set()
+    for node in ast.walk(ast.parse(text)):
+        body = getattr(node, "body", None)
+        for entry in body if isinstance(body, list) else []:
+            # Also the strings that describe a field or a constant.
+            if isinstance(entry, ast.Expr) and isinstance(entry.value, ast.Constant):
+                docstrings |= set(range(entry.lineno, (entry.end_lineno or 0) + 1))
+    lines: set[int] = set()
+    for token in tokenize.generate_tokens(io.StringIO(text).readline):
+        if token.type not in _NO_CODE:
+            lines |= set(range(token.start[0], token.end[0] + 1))
+    return len(lines - docstrings)
+
+
+def rooms() -> dict[str, int]:
+    """Return the code lines of each room; what lies at the top of the package is one of them."""
+    counts: dict[str, int] = {}
+    for file in sorted((TOP / "slatprep").rglob("*.py")):
+        folders = file.relative_to(TOP / "slatprep").parts
+        room = folders[0] if len(folders) > 1 else ""
+        counts[room] = counts.get(room, 0) + code_lines(file.read_text())
+    return counts
+
+
+def main() -> int:
+    """Compare; print what is over its budget or lacks one."""
+    told = (TOP / "CONTRIBUTING.md").read_text()
+    budgets = {room: int(number.replace(",", "")) for room, number in _ENTRY.findall(told)}
+    counts, wrong = rooms(), 0
+    for room in sorted({*counts, *budgets}):
+        count, budget = counts.get(room, 0), budgets.get(room)
+        if budget is None or count > budget or count == 0:
+            wrong += 1
+            allowed = (
+                "no budget in CONTRIBUTING.md" if budget is None else f"{budget:,} are allowed"
+            )
+            print(f"slatprep/{room}: {count:,} code lines, {allowed}")
+    print(f"{sum(counts.values()):,} code lines in {len(counts)} rooms")
+    return 1 if wrong else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
