@@ -36,7 +36,7 @@ import zarr
 from slatprep.inspect.verify import verify_store
 from slatprep.parameters import BuildParameters, PairingParameters, PixieverseSource, SlatSource
 from slatprep.parameters.files import load_parameters
-from slatprep.pipeline import annotate, assemble, publish
+from slatprep.pipeline import annotate, publish
 from slatprep.pipeline import asset as process
 from slatprep.pipeline import dataset as build
 from slatprep.readers import discover
@@ -81,7 +81,7 @@ def measure(parameters: BuildParameters, folder: Path, jobs: bool) -> dict[str, 
         process.process_asset(pair, parameters)
     steps: dict[str, float] = defaultdict(float)
     rooms = {
-        **STEPS, "finish_asset": process, "pack_store": assemble, "replace_directory": publish
+        **STEPS, "finish_asset": process, "pack_store": build, "replace_directory": publish
     }  # fmt: skip
     for name, room in rooms.items():
         setattr(room, name, timed(getattr(room, name), steps, name))

@@ -101,7 +101,9 @@ def measure(folder: Path, count: int, new: int, like: Path | None) -> dict[str, 
         "written [MB]": first["written [MB]"],
         "files": len(files),
         "store [MB]": round(sum(files) / 1e6, 2),
-        "records [MB]": round((folder / "s.manifests" / "assets.jsonl").stat().st_size / 1e6, 2),
+        "records [MB]": round(
+            sum(f.stat().st_size for f in (folder / "s.manifests").glob("*.jsonl")) / 1e6, 2
+        ),
         "open, with start of Python [s]": round(time.perf_counter() - begin, 2),
     }
     row["CPU, nothing changed [s]"], again = build(dataset.root, out)

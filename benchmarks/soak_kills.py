@@ -333,9 +333,8 @@ def read_whole(path: Path) -> None:
 
 
 def records_beside(store: Path) -> dict[str, dict[str, object]]:
-    """Return the records beside a store by asset id, but for how long they took."""
-    records = records_of(manifests_of(store) / "assets.jsonl")
-    return {asset_id: {**one, "duration_s": 0.0} for asset_id, one in records.items()}
+    """Return the records beside a store by asset id."""
+    return records_of(manifests_of(store) / "assets.jsonl")
 
 
 def file_of(path: Path) -> tuple[int, int]:

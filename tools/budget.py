@@ -56,9 +56,7 @@ def main() -> int:
         count, budget = counts.get(room, 0), budgets.get(room)
         if budget is None or count > budget or count == 0:
             wrong += 1
-            allowed = (
-                "no budget in CONTRIBUTING.md" if budget is None else f"{budget:,} are allowed"
-            )
+            allowed = "no budget in CONTRIBUTING.md" if budget is None else f"{budget:,} allowed"
             print(f"slatprep/{room}: {count:,} code lines, {allowed}")
     print(f"{sum(counts.values()):,} code lines in {len(counts)} rooms")
     return 1 if wrong else 0

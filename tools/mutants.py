@@ -69,8 +69,8 @@ TESTS = {
     "store/layout": ["store/test_layout.py"],
     "store/shard_reader": ["store/test_row_reader.py", "store/test_packing.py"],
     "store/shard_writer": ["store/test_packing.py"],
-    "store/unmoved": ["store/test_unmoved.py"],
-    "store/writer": ["store/test_unmoved.py", "store/test_writer.py", "store/test_layout.py"],
+    "store/runs": ["store/test_runs.py"],
+    "store/writer": ["store/test_runs.py", "store/test_writer.py", "store/test_layout.py"],
 }
 """Modules of the package, and the tests that are to catch what is wrong in them."""
 

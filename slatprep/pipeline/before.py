@@ -22,6 +22,7 @@ from pathlib import Path
 import numpy as np
 import orjson
 
+from slatprep.errors import StoreError
 from slatprep.parameters import BuildParameters
 from slatprep.pipeline.previous import SourceStore, checked_store, store_there
 from slatprep.pipeline.publish import Destination
@@ -165,7 +166,10 @@ def _is_as_left(previous: SourceStore, place: Destination, state: bytes) -> bool
     folder, path = storage_of(place.manifests()).local, storage_of(place.store).local
     if folder is None or path is None or state in (b"", bytes(32)):
         return False
-    return store_state(path, _files_beside(folder, len(previous.store))) == state
+    try:
+        return store_state(path, _files_beside(folder, len(previous.store))) == state
+    except StoreError:  # Damaged: how many rows there are is not known.
+        return False
 
 
 def _files_beside(folder: Path, assets: int) -> list[Path]:

@@ -76,12 +76,11 @@ def asset_findings(
         except StoreError as error:
             findings.append(Finding(RECORD_ARRAY, asset_id, f"no record ({error})", "one a row"))
             continue
-        if digest_of(records.text(row).encode()) != bytes(
-            store.cached_column("record_sha256")[row]
-        ):
-            what = "is not the text of asset/record_sha256"
-            findings.append(Finding(RECORD_ARRAY, asset_id, what, "the record of the build"))
-        findings += record_findings(asset, record, store)
+        try:
+            findings += record_findings(asset, record, records.text(row).encode())
+        except DamagedFileError as error:
+            findings.append(Finding(error.file, asset_id, error.fault, error.expected))
+            continue
         if not own:  # From invalid values no confidence can be computed.
             findings += confidence_findings(asset, record)
         if roots is not None:
@@ -183,8 +182,12 @@ def fault_findings(where: str, asset_id: str, error: RecordError) -> list[Findin
     return [Finding(where, asset_id, fault, "the published schema") for fault in error.faults[:3]]
 
 
-def record_findings(asset: StoredAsset, record: AssetRecord, store: Store) -> Iterator[Finding]:
+def record_findings(asset: StoredAsset, record: AssetRecord, text: bytes) -> Iterator[Finding]:
     """Yield findings where an asset's record disagrees with its row or its stored places."""
+    store = asset.store
+    if digest_of(text) != bytes(store.cached_column("record_sha256")[asset.index]):
+        what = "is not what asset/record_sha256 is of"
+        yield Finding(RECORD_ARRAY, asset.asset_id, what, "the record of the build")
     for name, said, held in _claims(asset, record, store):
         if not _equal(said, held):
             yield Finding(

@@ -106,9 +106,12 @@ def manifest_findings(
         if build.id != manifest:
             yield Finding(file, "", f"id is {build.id!r}", f"{manifest!r}, the store's")
             return
-        for name, said, held in _claims(build, store):
-            if said != held:
-                yield Finding(file, "", f"{name} is {said!r}", f"{held!r}, as the store has")
+        try:
+            claims = [claim for claim in _claims(build, store) if claim[1] != claim[2]]
+        except StoreError:
+            claims = []  # A column is damaged, which is told of its file.
+        for name, said, held in claims:
+            yield Finding(file, "", f"{name} is {said!r}", f"{held!r}, as the store has")
     for name in names:
         yield from _line_findings(store, folder / name, file_names(len(store)).index(name))
 
@@ -126,7 +129,7 @@ def _claims(build: BuildRecord, store: Store) -> Iterator[tuple[str, object, obj
     held = dict(zip(store.about.property_columns, clipped, strict=True))
     yield "counts/clipped", build.counts.clipped, held
     yield "normalization", build.normalization, store.normalization
-    said = {**origin(build.parameters), "versions": build.versions}
+    said = {**origin(build.parameters), "name": build.name, "versions": build.versions}
     for name, value in store.attributes["build"].items():
         yield name, said.get(name), value
 

@@ -32,14 +32,18 @@ def hostile(mixed_build: BuildSummary, tmp_path_factory: pytest.TempPathFactory)
     categories = group["asset/category"][:]
     categories[:] = ["animal", "animal", "animal", HOSTILE, "vessel"]
     group["asset/category"][:] = categories
-    records = [json.loads(line) for line in (manifests / "assets.jsonl").open(encoding="utf-8")]
-    for record in records:
-        if record["status"] == "failed":
-            record["reason"] = HOSTILE
+    texts = group["asset/record"][:]
+    for row, text in enumerate(texts):
+        record = json.loads(str(text))
         if record["asset_id"] == "ant":
             record["judgement"]["reasons"] = [HOSTILE]
-    lines = "".join(json.dumps(record) + "\n" for record in records)
-    (manifests / "assets.jsonl").write_text(lines, "utf-8")
+            texts[row] = json.dumps(record)
+    group["asset/record"][:] = texts
+    build = json.loads((manifests / "build.json").read_text("utf-8"))
+    for record in build["failed"]:
+        if record["status"] == "failed":
+            record["reason"] = HOSTILE
+    (manifests / "build.json").write_text(json.dumps(build), "utf-8")
     path = folder / "page.html"
     write_report(open_store(store), path, manifests=manifests)
     return Report(store, manifests, path)

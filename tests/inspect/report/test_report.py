@@ -271,9 +271,6 @@ def test_records_of_another_build_are_refused(hostile: Report, tmp_path: Path) -
     [
         ("build.json", '{"id": "0123"}', "build.json: not a record"),
         ("build.json", "[]", "build.json: not a record"),
-        ("assets.jsonl", "", "no record of 5 assets"),
-        ("assets.jsonl", '{"asset_id": "ant"}\n', "line 1: not a record"),
-        ("assets.jsonl", "{", "line 1: not a record"),
     ],
 )
 def test_other_records_are_refused(

@@ -7,6 +7,7 @@ import os
 import shutil
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -19,6 +20,7 @@ from support.synthetic import Dataset
 from slatprep.cli.commands import slatprep
 from slatprep.errors import StoreError
 from slatprep.inspect.verify import Finding, SourceRoots, verify_store
+from slatprep.inspect.verify.manifests import manifest_findings
 from slatprep.pipeline.dataset import BuildSummary
 from slatprep.storage.files import local_files
 from slatprep.store import open_store
@@ -72,21 +74,6 @@ def test_a_sample_is_looked_at_and_nothing_else(store: Path) -> None:
         named = {finding.asset for finding in found(store, sample=2)}
         assert (ids[row] in named) is known
     assert ids[0] in {finding.asset for finding in found(store)}
-
-
-def test_of_a_sample_the_records_beside_the_store_are_compared(store: Path) -> None:
-    file = store.with_suffix(".manifests") / "assets.jsonl"
-    lines = file.read_bytes().splitlines(keepends=True)
-    ids = open_store(store).ids
-    for name, known in ((ids[1], True), (ids[0], False)):
-        other = [
-            line.replace(b'"annotated":', b'"annotated":1') if name.encode() in line else line
-            for line in lines
-        ]
-        file.write_bytes(b"".join(other))
-        assert (name in {one.asset for one in found(store, sample=2)}) is known
-    file.write_bytes(b"".join(line for line in lines if ids[1].encode() not in line))
-    assert "has 1 records of 2 assets" in {one.what for one in found(store, sample=2)}
 
 
 SHARDS = [
@@ -302,12 +289,43 @@ def test_edited_manifests_are_found(store: Path) -> None:
     lines = records.read_text().splitlines()
     records.write_text("\n".join(line.replace('"cup"', '"cop"') for line in lines) + "\n")
     findings = of_file(found(store), str(records))
-    assert any(finding.asset == "cop" for finding in findings)
-    assert any("its content has the id" in finding.what for finding in findings)
+    assert [(one.asset, one.what) for one in findings] == [
+        ("cup", f"line {open_store(store).ids.index('cup') + 1} differs from asset/record")
+    ]
 
+
+@pytest.mark.parametrize(
+    ("entry", "value"),
+    [
+        ("id", "0" * 64),
+        ("name", "another"),
+        ("verdicts/good", 9),
+        ("statuses/ok", 1),
+        ("counts/voxels", 1),
+        ("counts/valid", 1),
+        ("counts/unphysical", 1),
+        ("counts/clipped/density", 1),
+        ("normalization/ranges/0/lo", 1.0),
+        ("versions/numpy", "0"),
+        ("parameters/align/radius", 2.0),
+        ("parameters/store/voxel_chunk", 1),
+    ],
+)
+def test_what_build_json_says_of_the_store_is_compared(
+    store: Path, entry: str, value: object
+) -> None:
     build = store.with_suffix(".manifests") / "build.json"
-    edit_json(build, lambda document: document.update(id="0" * 64))
-    assert any(finding.what.startswith("id is") for finding in of_file(found(store), str(build)))
+
+    def change(document: Any) -> None:
+        *steps, last = (int(step) if step.isdigit() else step for step in entry.split("/"))
+        for step in steps:
+            document = document[step]
+        assert document[last] != value
+        document[last] = value
+
+    edit_json(build, change)
+    (one,) = manifest_findings(open_store(store), build.parent)
+    assert one.file == str(build)
 
 
 def test_changed_and_missing_sources_are_found(store: Path, mixed: Dataset, tmp_path: Path) -> None:

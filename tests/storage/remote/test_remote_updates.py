@@ -103,7 +103,7 @@ def test_where_the_server_does_not_copy_the_old_store_stays(
     assert current(s3, url) == tree(beside)
 
 
-def test_without_what_was_seen_all_is_packed_again_and_nothing_aligned(
+def test_another_machine_takes_over_what_did_not_change(
     s3: Any, url: str, built: tuple[Dataset, Path], tmp_path: Path, requests: Any
 ) -> None:
     dataset, beside = built
@@ -111,6 +111,6 @@ def test_without_what_was_seen_all_is_packed_again_and_nothing_aligned(
     dataset.add("h", seed=1)
     requests.made.clear()
     build_store(dataset.parameters(), url)
-    assert requests.of("copy_object") == []
+    assert len(requests.of("copy_object")) > 3
     build_store(dataset.parameters(), beside)
     assert current(s3, url) == tree(beside)
