@@ -10,6 +10,7 @@ from __future__ import annotations
 import os
 import platform
 from collections.abc import Collection, Iterable, Iterator
+from contextlib import suppress
 from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
@@ -233,17 +234,16 @@ def publish_manifests(
     """
     folder, names = summary.records.parent, file_names(len(store))
     try:
-        for shard, name in enumerate(names):
-            if name not in standing:
-                _write(folder / name, lines_of(store, shard))
-        reached("manifests written", str(folder))
+        looked = [(n, name) for n, name in enumerate(names) if name not in standing]
+        written = [_write(folder / name, lines_of(store, n)) for n, name in looked]
         record = build_record(summary, parameters, versions, failed)
-        if not _is_there(folder, record):
+        if any(written) or not _is_there(folder, record):
+            reached("manifests written", str(folder))
             _write(folder / BUILD, to_json(record, indent=True) + b"\n")
+            reached("manifests published", str(folder))
         if (local := storage_of(folder).local) is not None:
             for file in stale_files(local, names):
                 file.unlink()
-        reached("manifests published", str(folder))
     except OSError as error:
         raise StoreError(
             f"{folder}: the records cannot be written there ({error.strerror or error}); the store "
@@ -251,15 +251,14 @@ def publish_manifests(
         ) from error
 
 
-def _write(file: Place, content: bytes) -> None:
-    """Write a file in one step, unless it is there with this content."""
-    try:
+def _write(file: Place, content: bytes) -> bool:
+    """Write a file in one step, unless it is there with this content; whether it was written."""
+    with suppress(OSError):
         if storage_of(file).read(len(content)) == content:
-            return
-    except OSError:
-        pass
+            return False
     with storage_of(file).staged() as partial:
         partial.write_bytes(content)
+    return True
 
 
 def _is_there(folder: Place, wanted: BuildRecord) -> bool:
