@@ -55,18 +55,7 @@ def annotate(
 ) -> Annotated:
     """Align a field, look it up at the SLAT's voxels, and judge both.
 
-    Parameters
-    ----------
-    pair : AssetPair
-        Where the files of both sides lie.
-    field : MaterialField
-        The annotation, in the PixieVerse frame.
-    latents : StructuredLatents
-        The SLAT.
-    parameters : BuildParameters or StageParameters
-        How to align and to look up.
-    alignment, judgement : Alignment and Judgement, optional
-        What is known of the same field and SLAT; it stands.
+    An alignment or judgement that is known of the same field and SLAT stands.
     """
     reused = alignment is not None
     if alignment is None:
@@ -86,30 +75,12 @@ def process_several(
 ) -> Finished:
     """Take an asset from several annotations of its object to one, merged.
 
-    Left out are those that cannot be used, and those whose alignment failed where that
-    of another did not. Of fields that occupy the same voxels one alignment serves all.
-    Annotations that have a part of the properties alone, or no classes, add to the others.
-
-    Parameters
-    ----------
-    pair : AssetPair
-        With others beside it.
-    parameters : BuildParameters
-        How to align and to look up.
-    known : tuple of Contribution
-        What an earlier build found of the same annotations.
-
-    Returns
-    -------
-    Finished
-        Its field, alignment, places and distances are those of the first that is merged and
-        has all that the store holds.
-
-    Raises
-    ------
-    InputError
-        If the SLAT cannot be used, or no annotation that has all that the store holds, or a
-        file was replaced between its hashing, which gives the asset its key, and its reading.
+    Left out are those that cannot be used, and those whose alignment failed where that of another
+    did not. Of fields that occupy the same voxels one alignment serves all; what an earlier build
+    found, `known`, stands. Annotations that have a part of the properties alone, or no classes, add
+    to the others. Field, alignment, places and distances are those of the first that is merged and
+    has all that the store holds. InputError if there is none, or if the SLAT cannot be used, or if
+    a file was replaced between its hashing, which gives the asset its key, and its reading.
     """
     sources, digests = hash_sources(pair)
     if len(sources) > MAX_SOURCES:

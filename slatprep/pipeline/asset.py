@@ -89,28 +89,10 @@ def process_asset(
 def finish_asset(
     pair: AssetPair, planned: PlannedAsset | None, context: BuildContext
 ) -> Row | FailedAsset:
-    """Bring one asset into the spool, with no more work than it needs.
+    """Bring one asset into the spool, with no more work than it needs; return its row.
 
-    Parameters
-    ----------
-    pair : AssetPair
-        Where its files lie.
-    planned : PlannedAsset or None
-        What was found of earlier work; None where there is none.
-    context : BuildContext
-        The rest.
-
-    Returns
-    -------
-    Row or FailedAsset
-        What the parent keeps of it.
-
-    Raises
-    ------
-    StoreError
-        If the disk does not take it.
-    SlatprepError
-        With `strict`, the asset's own fault.
+    `planned` is what was found of earlier work. StoreError if the disk does not take it; with
+    `strict`, the asset's own fault.
     """
     reached("asset begun", pair.asset_id)
     if planned is not None and planned.action is Action.RESUME:
@@ -221,11 +203,8 @@ WHEN = (
 def compile_kernels(note: Callable[[str], None] | None = None) -> None:
     """Compile all kernels of alignment, sampling and judgement, and keep them on disk.
 
-    Parameters
-    ----------
-    note : callable, optional
-        Gets a line to show when something has to be compiled, which takes
-        20 to 40 s in all, and one when that is done; otherwise this takes 1 s.
+    `note` gets a line when something has to be compiled, which takes 20 to 40 s in all, and one
+    when that is done; otherwise this takes 1 s.
     """
     from numba.core import event
 

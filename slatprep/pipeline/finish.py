@@ -52,16 +52,7 @@ def finish(
 ) -> list[Row | FailedAsset]:
     """Bring assets into the spool; return what is kept of each, in no order.
 
-    Parameters
-    ----------
-    pairs : sequence of AssetPair
-        The assets.
-    plan : mapping of str to PlannedAsset
-        What is to be done by id; of those that it does not have, everything.
-    context : BuildContext
-        The build.
-    crew : Crew
-        Who does it.
+    `plan` says what is to be done by id; of those that it does not have, everything.
     """
     if not pairs:
         return []

@@ -132,14 +132,8 @@ def write_shard(
 ) -> tuple[Shard, NDArray[np.int64], dict[str, Written]]:
     """Write one shard of every array of its group into the store that is made at `path`.
 
-    Returns
-    -------
-    shard : Shard
-        The same; no other task may have it.
-    clipped : ndarray of int64, shape (len(shard.rows), P)
-        How many of the values of the spool's assets lay outside the range, by property.
-    files : dict of str to Written
-        What was written, by name.
+    Returns the shard, how many values of the spool's assets lay outside the range, (A, P) by asset
+    of the shard and property, and what was written by file. No other task may have the shard.
     """
     name = f"{shard.group} {shard.start}"
     reached("shard begun", name)

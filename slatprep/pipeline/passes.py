@@ -62,15 +62,7 @@ def apply_passes(
 
 
 class Reopened:
-    """A finished asset, read back from the spool.
-
-    Parameters
-    ----------
-    asset : Row
-        Which.
-    spool : Spool
-        Where it lies.
-    """
+    """A finished asset, read back from the spool."""
 
     def __init__(self, asset: Row, spool: Spool) -> None:
         record = spool.record(asset.key)
@@ -119,23 +111,7 @@ def apply_consensus(
 ) -> list[Row]:
     """Give ambiguous assets the placement nearest to the dataset's common rotation, if asked to.
 
-    Parameters
-    ----------
-    assets : sequence of Row
-        The assets of the build.
-    spool : Spool
-        Where they lie.
-    parameters : BuildParameters
-        Whether to do it, and how to align and to look up.
-    jobs : int or Workers
-        Worker processes, or a cluster's.
-    note : callable, optional
-        Gets a line that says what came of it.
-
-    Returns
-    -------
-    list of Row
-        In the same order; those without a tie are the same objects.
+    The order stays; rows without a tie are the same objects. `note` gets what came of it.
     """
     if not parameters.consensus.settle:
         return list(assets)
@@ -180,27 +156,9 @@ def apply_witness(
 ) -> list[Row]:
     """Settle ties by the latents and mark labels that they contradict, if asked to.
 
-    Parameters
-    ----------
-    assets : sequence of Row
-        The assets of the build, by id. Those whose verdict is good say what
-        latents are like in each class, and whether they can be trusted.
-    spool : Spool
-        Where they lie.
-    parameters : BuildParameters
-        Whether to do it, and how to align and to look up.
-    jobs : int or Workers
-        Worker processes, or a cluster's.
-    note : callable, optional
-        Gets a line that says what came of it.
-    labels : int
-        How many classes voxels may have.
-
-    Returns
-    -------
-    list of Row
-        In the same order; those of which latents say nothing are the same
-        objects. An asset without a tie is never placed anew.
+    Assets whose verdict is good say what latents are like in each of so many `labels`, and whether
+    they can be trusted. The order stays; rows of which latents say nothing are the same objects. An
+    asset without a tie is never placed anew. `note` gets what came of it.
     """
     if not parameters.witness.settle:
         return list(assets)

@@ -120,25 +120,10 @@ def plan_assets(
     progress: Callable[[int, int], None] | None = None,
     known: Mapping[str, str] = MappingProxyType({}),
 ) -> list[PlannedAsset]:
-    """Say what will be done with each asset, and why.
+    """Say what will be done with each asset, and why, by id; those to be removed as well.
 
-    Parameters
-    ----------
-    pairs : sequence of AssetPair
-        The dataset.
-    context : BuildContext
-        The build.
-    jobs : int or Workers
-        Worker processes, or a cluster's.
-    progress : callable, optional
-        Called with the assets done and the assets in all.
-    known : mapping of str to str
-        Keys of assets whose sources need not be hashed again, by id.
-
-    Returns
-    -------
-    list of PlannedAsset
-        Sorted by asset id; those to be removed as well.
+    `known` has the keys of assets whose sources need not be hashed again, by id. `progress` gets
+    the assets done and the assets in all.
     """
     plan = []
     other = []

@@ -31,12 +31,7 @@ _NEEDED = ("asset/id/", "asset/offset/", f"{RECORD_ARRAY}/zarr.json", "file")
 class SourceStore:
     """A store that assets are taken from; each process that gets one opens it once.
 
-    Parameters
-    ----------
-    path : Place
-        The store.
-    damaged : frozenset of str
-        Files of its records and columns that are not as they were written.
+    `damaged` are files of its records that are not as they were written.
     """
 
     def __init__(self, path: Place, damaged: frozenset[str] = frozenset()) -> None:

@@ -99,12 +99,7 @@ class Destination:
     def replace(self, new: Path, staged: Staged | None = None) -> None:
         """Put a finished store in place; on an object store it is not published yet.
 
-        Parameters
-        ----------
-        new : Path
-            The store.
-        staged : Staged, optional
-            What of it is on the object store already.
+        `staged` is what of it is on the object store already.
         """
         if self._before is not None:
             self._upload = upload_store(new, self._before, staged)
@@ -210,27 +205,9 @@ def publish_manifests(
 ) -> None:
     """Write the manifests of a store that is in place: lines of its records, and `build.json`.
 
-    What says so already stays as it is.
-
-    Parameters
-    ----------
-    store : Store
-        The store.
-    summary : BuildSummary
-        What the build did, and where its records go.
-    parameters : BuildParameters
-        What it was asked for.
-    failed : iterable of FailedRecord
-        The assets that could not go in, by id.
-    versions : dict of str to str, optional
-        Of the libraries that made the numbers, where they are not those of today.
-    standing : collection of str
-        Files of lines that need not be looked at.
-
-    Raises
-    ------
-    StoreError
-        If the disk does not take them.
+    What says so already stays as it is; files named in `standing` are not looked at. `failed` are
+    the records of assets that could not go in, `versions` those that made the numbers where they
+    are not today's. StoreError if the disk does not take them.
     """
     folder, names = summary.records.parent, file_names(len(store))
     try:

@@ -40,10 +40,7 @@ def given_ranges(
 def source_of(parameters: NormalizeParameters) -> str:
     """Return where ranges of the dataset come from, in a word that changes when they would.
 
-    Raises
-    ------
-    InputError
-        If a file of ids cannot be used.
+    InputError if a file of ids cannot be used.
     """
     if parameters.objects == "all":
         return parameters.ranges
@@ -70,29 +67,10 @@ def dataset_ranges(
 ) -> Normalization:
     """Return the ranges of the usable assets' fields: their extent, or percentiles.
 
-    Percentiles are over the annotated voxels of all fields together, each alike and each
-    field once, and interpolated in mapped units, as numpy and Pixie (``inspect_ranges.py``,
-    which draws 2,000,000 of them) do; of annotations that are merged, the first counts.
-
-    Parameters
-    ----------
-    usable : sequence of Row
-        One asset at least.
-    spool : Spool
-        Where their fields lie.
-    parameters : NormalizeParameters
-        Ranges that are of the dataset.
-    jobs : int or Workers
-        As for a build.
-    table : sequence of Property
-        The properties.
-
-    Raises
-    ------
-    ConfigError
-        If there is no training object, or a split cannot be made.
-    InputError
-        If a file of ids cannot be used.
+    Percentiles are over the annotated voxels of all fields together, each alike and each field
+    once, and interpolated in mapped units, as numpy and Pixie (``inspect_ranges.py``, which draws
+    2,000,000 of them) do; of annotations that are merged, the first counts. ConfigError if no
+    object is trained on or a split cannot be made, InputError if a file of ids cannot be used.
     """
     chosen, source = _chosen(usable, parameters), source_of(parameters)
     percentiles = percentiles_of(parameters.ranges)
@@ -168,21 +146,9 @@ def count_bits(
 ) -> list[tuple[NDArray[np.uint32], NDArray[np.int64]]]:
     """Count a field's values by their bits, brought to an order that is that of the values.
 
-    Parameters
-    ----------
-    spool : Spool
-        Where the field lies.
-    key : str
-        Names it.
-    halves : sequence of set of int, optional
-        For each property the upper 16 bits whose values are counted, by all 32; by default
-        all values are, by their upper 16 bits. So two passes find any value by its rank,
-        whatever their number, in a memory that does not grow with it.
-
-    Returns
-    -------
-    list of tuple of ndarray
-        Of each property the bits, sorted, and how often they occur.
+    Returns of each property the bits, sorted, and how often they occur: the upper 16 bits of all
+    values, or, with `halves`, all 32 bits of the values whose upper 16 are among a property's. So
+    two passes find any value by its rank in a memory that does not grow with their number.
     """
     bits = _in_order(spool.field(key).properties)
     if halves is None:

@@ -78,30 +78,9 @@ def settle_rows(
 ) -> tuple[NextStore, list[FailedAsset]]:
     """Return the next store, and the assets that cannot go in by id.
 
-    Parameters
-    ----------
-    finished : sequence of Row or FailedAsset
-        The assets that are new or changed.
-    unchanged : sequence of AssetPair
-        Those whose alignment is in the existing store: their rows are taken over, or they are
-        finished too where that cannot be.
-    plan : mapping of str to PlannedAsset
-        What is to be done by id.
-    before : Before
-        What is there.
-    context : BuildContext
-        The build.
-    wanted : Wanted
-        What it is asked for.
-    crew : Crew
-        Who works.
-    keep_work : bool
-        Have all assets in the spool.
-
-    Raises
-    ------
-    StoreError
-        If no asset can be used.
+    `finished` are the assets that are new or changed. Rows of the `unchanged` are taken over from
+    the existing store, or finished too where that cannot be, or with `keep_work`. StoreError if no
+    asset can be used.
     """
     parameters, spool, previous = context.parameters, context.spool, before.previous
     kept: list[Row] = []

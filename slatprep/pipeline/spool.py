@@ -48,14 +48,9 @@ _TORN = (OSError, ValueError, KeyError, StoreError)
 
 
 class Spool:
-    """A directory of finished assets.
+    """A directory of finished assets, which on a disk must exist.
 
-    Parameters
-    ----------
-    directory : Place
-        Where; on a disk it must exist.
-    arrays : bool
-        Whether arrays are kept, or records alone.
+    It keeps arrays, or records alone.
     """
 
     def __init__(self, directory: Place, arrays: bool = True) -> None:
@@ -70,14 +65,9 @@ class Spool:
         annotation: Annotation,
         others: Sequence[MaterialField] = (),
     ) -> Row:
-        """Write an asset's record and arrays; return what the parent keeps.
+        """Write an asset's record and arrays; return its row. StoreError if the disk refuses.
 
         Of `others`, the further fields whose annotations are merged, the extent alone is kept.
-
-        Raises
-        ------
-        StoreError
-            If the disk does not take it; names the asset.
         """
         least, most = np.array([property_extent(own, field.table) for own in (field, *others)]).T
         extent = np.stack([np.nanmin(least, axis=1), np.nanmax(most, axis=1)], axis=1)
@@ -139,22 +129,9 @@ class Spool:
     def keep_only(self, keys: set[str], mark: str = "") -> list[str]:
         """Remove everything but these assets' files, if no other build is at work there.
 
-        Parameters
-        ----------
-        keys : set of str
-            Of the assets.
-        mark : str
-            Object that says that this build is at work; is removed in any case.
-
-        Returns
-        -------
-        list of str
-            Marks of other builds; where there are any, no asset was removed.
-
-        Raises
-        ------
-        StoreError, OSError
-            If the place cannot be listed, or the files not be removed.
+        `mark` is the object that says that this build is at work; it is removed in any case.
+        Returns the marks of other builds; where there are any, no asset was removed. StoreError or
+        OSError if the place cannot be listed, or the files not be removed.
         """
         storage = storage_of(self.directory)
         kept = {f"{key[:2]}/{key}.arrays" for key in keys}

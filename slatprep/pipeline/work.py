@@ -63,13 +63,7 @@ class Work:
     mark: str = ""
 
     def shared(self) -> Place:
-        """Return a place that all workers must see, after making it.
-
-        Raises
-        ------
-        StoreError
-            If it cannot be written.
-        """
+        """Make a place that all workers must see, and return it; StoreError if that cannot be."""
         if not self.mark:
             return self.scratch
         place = self.spool.directory / self.mark
@@ -121,26 +115,11 @@ def work_beside(
 ) -> Iterator[Work]:
     """Make the work folder of a target, hold its lock, and clean up.
 
-    Parameters
-    ----------
-    target : Place
-        What is to be made or replaced.
-    arrays : bool
-        Whether the spool keeps arrays, or records alone.
-    fresh : bool
-        Begin with an empty spool.
-    keep : bool
-        Keep the spool after success as well.
-    look : callable
-        Called with the lock held, before anything is written: raises what `target` is refused for.
-    private_disks : bool
-        Whether workers have no disk in common, so that a spool belongs where `target` is.
-
-    Raises
-    ------
-    StoreError
-        If the folder cannot be written or is not a build's, or another build has
-        the lock; the message names that build. With `fresh`, if another build uses the spool.
+    The spool keeps `arrays`, or records alone; it begins empty with `fresh`, and stays after
+    success with `keep`. `look` is called with the lock held, before anything is written, and raises
+    what the target is refused for. With `private_disks` workers have no disk in common, so the
+    spool lies where the target is. StoreError if the folder cannot be written or is not a build's,
+    or another build has the lock or, with `fresh`, uses the spool; it names that build.
     """
     directory = work_directory(target)
     folder, remote = directory / SPOOL, storage_of(target).remote if private_disks else None

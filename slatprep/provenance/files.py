@@ -28,8 +28,6 @@ _LINES = re.compile(r"assets(-\d{5,})?\.jsonl")
 def file_names(assets: int) -> list[str]:
     """Return the names of the files of lines, one for each shard of the records of so many assets.
 
-    Examples
-    --------
     >>> file_names(5), file_names(1025)
     (['assets.jsonl'], ['assets-00000.jsonl', 'assets-00001.jsonl'])
     """
@@ -38,13 +36,7 @@ def file_names(assets: int) -> list[str]:
 
 
 def lines_of(store: Store, shard: int) -> bytes:
-    """Return the records of a shard's rows, a line each.
-
-    Raises
-    ------
-    StoreError
-        If they cannot be read.
-    """
+    """Return the records of a shard's rows, a line each; StoreError if they are damaged."""
     start = shard * RECORDS_IN_SHARD
     texts = store.read_rows(RECORD_ARRAY, start, min(start + RECORDS_IN_SHARD, len(store)))
     return "".join(f"{text}\n" for text in texts).encode()
@@ -57,13 +49,7 @@ def stale_files(folder: Path, names: Sequence[str]) -> list[Path]:
 
 
 def build_text(folder: Place) -> bytes:
-    """Return the record of a build as it is in its file.
-
-    Raises
-    ------
-    StoreError
-        If it cannot be read, or is larger than any record.
-    """
+    """Return the record of a build as it is in its file; StoreError if it cannot be read."""
     try:
         return read_bounded(folder / BUILD, MAX_BUILD_BYTES)
     except (OSError, ValueError) as error:

@@ -21,23 +21,10 @@ from slatprep.records import Failed, Finished, Status
 
 
 def record_of(asset: Finished, parameters: BuildParameters, code: str, key: str) -> AssetRecord:
-    """Return the record of an asset that went through all stages.
+    """Return the record of an asset that went through all stages, as the store will hold it.
 
-    Parameters
-    ----------
-    asset : Finished
-        The asset.
-    parameters : BuildParameters
-        The build's parameters.
-    code : str
-        Fingerprint of the code that made the numbers.
-    key : str
-        What the asset was made from and how, see `slatprep.pipeline.recipe`.
-
-    Returns
-    -------
-    AssetRecord
-        What the store will hold of it.
+    `code` is the fingerprint of the code that made the numbers, `key` what the asset was made from
+    and how.
     """
     pair, field, latents = asset.pair, asset.field, asset.latents
     return AssetRecord(

@@ -18,13 +18,7 @@ def manifests_of(store: Place) -> Place:
 
 
 def manifests_beside(store: Place) -> Place | None:
-    """Return the folder of a store's records if there is one.
-
-    Raises
-    ------
-    StoreError
-        If the object store does not say.
-    """
+    """Return the folder of a store's records if there is one; StoreError if nobody can tell."""
     folder = manifests_of(store)
     files = (folder / "build.json", folder / "assets.jsonl")
     try:

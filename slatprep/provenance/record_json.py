@@ -58,19 +58,9 @@ def _without(entry: AssetRecord | SourceFile, name: str) -> dict[str, object]:
 
 
 def read_record(text: bytes | str, where: str) -> Record:
-    """Read a line of ``assets.jsonl``.
+    """Read a line of ``assets.jsonl``, which errors call `where`.
 
-    Parameters
-    ----------
-    text : bytes or str
-        JSON.
-    where : str
-        What errors call it.
-
-    Raises
-    ------
-    RecordError
-        If it is no record of this version, or breaks its schema.
+    RecordError if it is no record of this version, or breaks its schema.
     """
     record: Record = _read(Record, text, where)
     return record

@@ -19,13 +19,7 @@ _CHUNKS_KEPT = 8
 
 
 class StoredRecords:
-    """The records of a store, by row or in order.
-
-    Parameters
-    ----------
-    store : Store
-        The store.
-    """
+    """The records of a store, by row or in order."""
 
     def __init__(self, store: Store) -> None:
         self.store = store
@@ -35,22 +29,13 @@ class StoredRecords:
         return (self.read(row) for row in range(len(self.store)))
 
     def of(self, name: str | int) -> AssetRecord:
-        """Return the record of an asset, named as in `Store.match`.
-
-        Raises
-        ------
-        StoreError
-            If the store has no such asset, or its record cannot be read.
-        """
+        """Return the record of an asset, named as in `Store.match`; StoreError if there is none."""
         return self.read(self.store.match(name))
 
     def place_map(self, asset: StoredAsset) -> PlaceMap:
         """Return the map between the frames by which an asset was looked up.
 
-        Raises
-        ------
-        StoreError
-            If the asset is deformed, and its record, which holds how, cannot be read.
+        StoreError if the asset is deformed, and its record, which holds how, cannot be read.
         """
         if asset.columns["model"] in (Model.RIGID, Model.SIMILARITY):
             return PlaceMap(asset.transform)
@@ -61,13 +46,7 @@ class StoredRecords:
         return self.store.read_rows(name, start, stop)
 
     def read(self, row: int) -> AssetRecord:
-        """Return the record of a row.
-
-        Raises
-        ------
-        StoreError
-            If it cannot be read.
-        """
+        """Return the record of a row; StoreError if it cannot be read."""
         where = f"{self.store.path}: {RECORD_ARRAY}, row {row}"
         return read_asset_record(self.text(row), where)
 

@@ -29,15 +29,7 @@ if TYPE_CHECKING:
 
 
 class Arrays:
-    """What is below the root of a store.
-
-    Parameters
-    ----------
-    path : Place
-        The store.
-    document : mapping
-        The root's ``zarr.json``.
-    """
+    """What is below the root of a store, by the root's ``zarr.json``."""
 
     def __init__(self, path: Place, document: Mapping[str, Any]) -> None:
         self.path = path
@@ -70,11 +62,8 @@ class Arrays:
     def reader(self, name: str) -> RowReader:
         """Return the reader of an array, by its full name.
 
-        Raises
-        ------
-        StoreError
-            If there is no such array, or its metadata claim another size than
-            the contract has, unreasonably large chunks, or codecs that slatprep does not use.
+        StoreError if there is no such array, or its metadata claim another size than the contract
+        has, unreasonably large chunks, or codecs that slatprep does not use.
         """
         if name not in self._readers:
             self._readers[name] = self._checked(name)

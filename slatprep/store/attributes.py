@@ -160,8 +160,6 @@ def width_findings(said: RootAttributes, metadata: Mapping[str, Any]) -> Iterato
 def segments_of(ids: Sequence[str]) -> list[int]:
     """Return the rows at which ids begin to ascend anew: 0, and those that updates added.
 
-    Examples
-    --------
     >>> segments_of(["a", "d", "b", "c"])
     [0, 2]
     """

@@ -76,13 +76,7 @@ class Finding:
 
 
 def read_metadata(path: Place) -> dict[str, Any]:
-    """Read a ``zarr.json``.
-
-    Raises
-    ------
-    StoreError
-        If it is missing, too large, nested too deeply, or no JSON object.
-    """
+    """Read a ``zarr.json``; StoreError if it is missing, or no JSON object within bounds."""
     try:
         return read_document(path, MAX_METADATA_BYTES)
     except (OSError, ValueError) as error:
@@ -90,16 +84,9 @@ def read_metadata(path: Place) -> dict[str, Any]:
 
 
 def array_findings(name: str, metadata: object, sizes: Mapping[str, int]) -> Iterator[Finding]:
-    """Yield what is wrong with the metadata of one array.
+    """Yield what is wrong with the ``zarr.json`` of an array of the contract, by its name.
 
-    Parameters
-    ----------
-    name : str
-        One of the contract's arrays; of others nothing is asked.
-    metadata : object
-        Its ``zarr.json``.
-    sizes : mapping of str to int
-        What `dimension_sizes` gave.
+    `sizes` are what `dimension_sizes` gave. Of other arrays nothing is asked.
     """
     layout = _LAYOUTS.get(name)
     if layout is None:
@@ -133,13 +120,7 @@ def size_findings(name: str, metadata: object, sizes: Mapping[str, int]) -> Iter
 
 
 def dimension_sizes(metadata: Mapping[str, Any]) -> dict[str, int]:
-    """Return the size of every dimension, from the arrays that define it.
-
-    Raises
-    ------
-    StoreError
-        If an array that defines one says no size.
-    """
+    """Return the size of every dimension from the arrays that define it, else StoreError."""
     sizes = dict(FIXED_SIZES)
     for name, dimension, limit in (
         ("asset/id", "asset", MAX_ASSETS),

@@ -25,13 +25,7 @@ ASSET_COORDINATES = "id object_id view category"
 def write_coordinates(path: Path, properties: Sequence[str]) -> None:
     """Write the coordinates of every group into a store that is being made.
 
-    Parameters
-    ----------
-    path : Path
-        The store, with its groups in place; to be called before its metadata
-        are consolidated.
-    properties : sequence of str
-        Names of the properties.
+    Its groups are in place, and its metadata not yet consolidated.
     """
     import zarr
     from zarr.codecs import Crc32cCodec, ZstdCodec

@@ -34,21 +34,10 @@ def write_digests(
 ) -> None:
     """Add the digests of all files to a store that is otherwise complete.
 
-    What no array accounts for is removed first.
-
-    Parameters
-    ----------
-    path : Path
-        The store; its root attributes are written, metadata not yet consolidated.
-    known : mapping of str to str
-        Digests, by name, of files that need not be read again.
-    elsewhere : mapping of str to int
-        Bytes, by name, of files that are not here, but where the store will lie.
-
-    Raises
-    ------
-    StoreError
-        If a file of an array is not there.
+    What no array accounts for is removed first. Root attributes are written, metadata not yet
+    consolidated. `known` has digests of files that need not be read again, `elsewhere` the bytes of
+    files that are not here, but where the store will lie. StoreError if a file of an array is
+    missing.
     """
     import zarr
 

@@ -42,15 +42,7 @@ CODECS = ("bytes", "vlen-utf8", "blosc", "zstd", "crc32c", "sharding_indexed")
 
 
 def gate_findings(name: str, metadata: object) -> Iterator[Finding]:
-    """Yield what is not allowed in the metadata of an array or a group.
-
-    Parameters
-    ----------
-    name : str
-        Where it lies below the store.
-    metadata : object
-        Its ``zarr.json``, or the copy of it in the root's.
-    """
+    """Yield what is not allowed in the ``zarr.json`` of an array or group, or the root's copy."""
     where = f"{name}/zarr.json"
     kinds = {"array": NAMES, "group": GROUPS}
     if not isinstance(metadata, Mapping) or name not in kinds.get(

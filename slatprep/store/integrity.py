@@ -75,14 +75,8 @@ def metadata_findings(path: Place) -> Iterator[Finding]:
 def file_findings(store: Store, jobs: Jobs, below: str = "") -> tuple[int, set[Finding]]:
     """Compare every file of a store, or those whose names begin with `below`, with its digest.
 
-    Of the others the sizes are compared.
-
-    Returns
-    -------
-    files : int
-        How many files the store has, those of the digests themselves included.
-    findings : set of Finding
-        Missing, additional and changed files.
+    Of the others the sizes are compared. Returns how many files the store has, those of the digests
+    themselves included, and what is missing, additional or changed.
     """
     try:
         names, sizes, digests = (

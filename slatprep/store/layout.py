@@ -361,8 +361,6 @@ def rows_per_shard(parameters: StoreParameters, n_voxels: int) -> int:
 def row_ranges(total: int, per_shard: int) -> Iterator[tuple[int, int]]:
     """Yield the rows ``(start, stop)`` of each shard, in order.
 
-    Examples
-    --------
     >>> list(row_ranges(5, 2))
     [(0, 2), (2, 4), (4, 5)]
     """
@@ -371,24 +369,10 @@ def row_ranges(total: int, per_shard: int) -> Iterator[tuple[int, int]]:
 
 
 def overlaps(offsets: Sequence[int], start: int, stop: int) -> Iterator[tuple[int, slice]]:
-    """Yield which assets own the rows ``start:stop``, in order.
+    """Yield which assets own the rows ``start:stop``, and which of their own rows those are.
 
-    Parameters
-    ----------
-    offsets : sequence of int, length A+1
-        Asset a owns rows ``offsets[a]:offsets[a+1]``.
-    start, stop : int
-        The rows asked for.
+    Asset a owns rows ``offsets[a]:offsets[a+1]``.
 
-    Yields
-    ------
-    asset : int
-        Index of the asset.
-    rows : slice
-        Its rows that fall into the range, counted from its own first row.
-
-    Examples
-    --------
     >>> list(overlaps([0, 3, 5], 2, 4))
     [(0, slice(2, 3, None)), (1, slice(0, 1, None))]
     """

@@ -327,10 +327,7 @@ def is_store(path: Place) -> bool:
 def require_outside(out: Path) -> None:
     """Raise unless a path that something is to be written to lies outside of every store.
 
-    Raises
-    ------
-    ConfigError
-        If it is a store, lies inside one, or cannot be looked at.
+    ConfigError if it is a store, lies inside one, or cannot be looked at.
     """
     try:
         target = out.resolve()

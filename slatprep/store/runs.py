@@ -58,8 +58,6 @@ class Runs:
     def pieces(self, start: int, stop: int, chunk: int) -> Iterator[Piece]:
         """Cut the rows of a shard into pieces of whole chunks that a run holds, and others.
 
-        Examples
-        --------
         >>> list(Runs((Run(0, 5, 0, 0),), new=9, old=(5,)).pieces(0, 9, 2))
         [(Run(start=0, stop=5, store=0, shift=0), 0, 4), (None, 4, 9)]
         """
@@ -72,8 +70,6 @@ class Runs:
 def runs_of(spans: Iterable[Run], new: int, old: tuple[int, ...]) -> Runs:
     """Return the runs that spans make; those that continue one another become one.
 
-    Examples
-    --------
     >>> runs_of([Run(0, 2, 0, 5), Run(2, 5, 0, 5), Run(7, 9, 0, 5)], 12, (20,)).runs
     (Run(start=0, stop=5, store=0, shift=5), Run(start=7, stop=9, store=0, shift=5))
     """

@@ -57,19 +57,7 @@ MAX_TEXT = {RECORD_ARRAY: MAX_RECORD_BYTES}
 
 
 class DamagedFileError(StoreError):
-    """A file of a store that is missing, cut short or damaged.
-
-    Parameters
-    ----------
-    folder : str
-        The store.
-    file : str
-        The file, below the store.
-    fault : str
-        What is wrong with it.
-    expected : str
-        What should be there.
-    """
+    """A file of a store, in a folder, that is missing, cut short or damaged."""
 
     def __init__(self, folder: str, file: str, fault: str, expected: str) -> None:
         super().__init__(
@@ -132,10 +120,7 @@ class RowReader:
     def of(cls, folder: Folder, name: str, metadata: Mapping[str, Any]) -> RowReader:
         """Return a reader for an array with this ``zarr.json``.
 
-        Raises
-        ------
-        StoreError
-            If the metadata make no sense, or the array is not cut and packed as slatprep does it.
+        StoreError if that makes no sense, or the array is not cut and packed as slatprep does it.
         """
         try:
             return cls._of(folder, name, metadata)
@@ -171,22 +156,9 @@ class RowReader:
         return f"{self.name}/c/{shard}" + "/0" * (len(self.shape) - 1)
 
     def read(self, start: int, stop: int) -> NDArray[Any]:
-        """Read rows.
+        """Read rows ``start:stop`` into fresh memory (stop - start, ...) in native byte order.
 
-        Parameters
-        ----------
-        start, stop : int
-            First row, and the one after the last; ``0 <= start <= stop <= len``.
-
-        Returns
-        -------
-        ndarray, shape (stop - start, ...)
-            Fresh memory in native byte order.
-
-        Raises
-        ------
-        StoreError
-            If a file is missing, cut short or damaged; the message names it.
+        StoreError if a file is missing, cut short or damaged; the message names it.
         """
         if not 0 <= start <= stop <= self.shape[0]:
             raise StoreError(f"{self.name} has {self.shape[0]} rows, not {start} to {stop}")
@@ -207,19 +179,10 @@ class RowReader:
         return out
 
     def packed(self, first: int, last: int) -> Iterator[tuple[bytes, list[int]]]:
-        """Yield the bytes of chunks ``first`` to ``last - 1``, as they are packed.
+        """Yield the bytes of chunks ``first`` to ``last - 1`` packed, with their lengths.
 
-        Yields
-        ------
-        data : bytes
-            Of several chunks, one after the other; the checksum of each holds.
-        lengths : list of int
-            Of each of them.
-
-        Raises
-        ------
-        StoreError
-            If a chunk is damaged, or they do not lie as slatprep writes them.
+        They come several at a time; the checksum of each holds. StoreError if one is damaged, or
+        they do not lie as slatprep writes them.
         """
         for _, own in groupby(range(first, last), lambda chunk: chunk // self.chunks_per_shard):
             chunks = list(own)

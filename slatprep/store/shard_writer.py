@@ -90,10 +90,7 @@ class ShardWriter:
     def append_packed(self, data: bytes, lengths: Iterable[int]) -> None:
         """Write the next chunks, packed, as `RowReader.packed` gives them.
 
-        Raises
-        ------
-        ValueError
-            If the rows before them do not end with a chunk.
+        ValueError if the rows before them do not end with a chunk.
         """
         if self._rows:
             raise ValueError(f"{self._rows} rows of a chunk are waiting; expected none")

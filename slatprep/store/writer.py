@@ -75,20 +75,10 @@ def create_store(
     contents: Contents = PIXIEVERSE,
     merged: bool = False,
 ) -> None:
-    """Create a store with every array in place, empty.
+    """Create a store at a new path with every array in place, empty.
 
-    Parameters
-    ----------
-    path : Path
-        The new store.
-    n_assets, n_voxels : int
-        A and N.
-    parameters : StoreParameters
-        Sizes of chunks and shards, and the compression level.
-    contents : Contents
-        How many properties and channels there are.
-    merged : bool
-        Whether labels are merged of several annotations.
+    It has `n_assets` rows, `n_voxels` voxels, and the arrays of `merged` labels if there are any;
+    `contents` says how many properties and channels there are.
     """
     import zarr
 
@@ -174,18 +164,8 @@ def shards(
 ) -> Iterator[Shard]:
     """Yield the shards of a store whose assets begin at rows `offsets`, but those that are taken.
 
-    Parameters
-    ----------
-    rows : sequence
-        Where the arrays of each asset lie.
-    offsets : sequence of int
-        First row of each asset in ``voxel/*``, and the last one's end.
-    parameters : StoreParameters
-        Sizes of chunks and shards.
-    runs : mapping of str to Runs
-        By group, the rows that older stores have in chunks of the same bytes.
-    taken : container of (str, int)
-        Groups and numbers of shards that are left out.
+    `rows` say where the arrays of each asset lie, `runs` by group which rows older stores have in
+    chunks of the same bytes, and `taken` which shards, by group and number, are left out.
     """
     chunks = {"voxel": parameters.voxel_chunk, "grid": 1, "record": RECORDS_IN_CHUNK}
     for group, per_shard in shard_rows(parameters, offsets[-1]).items():
@@ -214,22 +194,8 @@ def finish_store(
 ) -> None:
     """Write the root's attributes and all files' digests; gather all metadata in one file.
 
-    Parameters
-    ----------
-    path : Path
-        The store.
-    normalization : Normalization
-        Ranges of the properties.
-    build_id : str
-        Id of the build.
-    build : mapping
-        Parameters and versions that made the content.
-    contents : Contents
-        What it holds.
-    known : mapping of str to str
-        Digests of files, as they were written or have been seen to be true.
-    elsewhere : mapping of str to int
-        Bytes of files that are not at `path`; see `write_digests`.
+    `build` are parameters and versions that made the content, `known` digests of files as they were
+    written or have been seen to be true, `elsewhere` bytes of files that are not at `path`.
     """
     import zarr
 
