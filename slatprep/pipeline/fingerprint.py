@@ -45,6 +45,36 @@ _NOT_NUMBERS = (
 _DECODING = ("slatprep.storage.chunks", "slatprep.storage.codecs")
 
 
+PACKING = (
+    "slatprep.normalize",
+    "slatprep.pipeline.pack",
+    "slatprep.pipeline.rows",
+    "slatprep.pipeline.spool",
+    "slatprep.provenance.columns",
+    "slatprep.provenance.make",
+    "slatprep.provenance.record_json",
+    "slatprep.store.layout",
+    "slatprep.store.shard_writer",
+    "slatprep.store.writer",
+)
+"""What makes rows, columns and records of an asset's numbers; these modules alone."""
+
+
+@lru_cache(maxsize=1)
+def packing_fingerprint() -> str:
+    """Return the beginning of the SHA-256, in hex, of the statements of `PACKING`.
+
+    Rows that other code packed are packed anew, but their assets are not aligned again.
+    """
+    digest = hashlib.sha256()
+    for name in PACKING:
+        path = _source(name)
+        if path is None:
+            raise ValueError(f"{name} is no module of slatprep")
+        digest.update(f"{_dump(_parsed(path.read_bytes()))}\n".encode())
+    return digest.hexdigest()[:16]
+
+
 @lru_cache(maxsize=1)
 def code_fingerprint() -> str:
     """Return the SHA-256, in hex, of the statements of `numeric_modules`."""

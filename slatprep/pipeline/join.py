@@ -179,7 +179,7 @@ def _write(
         store = open_store(place.in_place())
         folder, seconds = place.manifests(store.path), time.perf_counter() - begin
         summary = summarise_store(store, (), place.out, folder, seconds)
-        publish_manifests(store, summary, parameters, versions=build["versions"])
+        publish_manifests(store, summary, parameters)
         place.publish()
     return summary
 

@@ -27,7 +27,6 @@ from slatprep.provenance.files import (
     lines_of,
     stale_files,
 )
-from slatprep.provenance.make import build_versions
 from slatprep.provenance.places import manifests_of
 from slatprep.provenance.record import (
     AssetRecord,
@@ -200,20 +199,18 @@ def publish_manifests(
     summary: BuildSummary,
     parameters: BuildParameters,
     failed: Iterable[Record] = (),
-    versions: Versions | None = None,
     standing: Collection[str] = (),
 ) -> None:
     """Write the manifests of a store that is in place: lines of its records, and `build.json`.
 
     What says so already stays as it is; files named in `standing` are not looked at. `failed` are
-    the records of assets that could not go in, `versions` those that made the numbers where they
-    are not today's. StoreError if the disk does not take them.
+    the records of assets that could not go in. StoreError if the disk does not take them.
     """
     folder, names = summary.records.parent, file_names(len(store))
     try:
         looked = [(n, name) for n, name in enumerate(names) if name not in standing]
         written = [_write(folder / name, lines_of(store, n)) for n, name in looked]
-        record = build_record(summary, parameters, versions, failed)
+        record = build_record(summary, parameters, store.about.build.versions, failed)
         if any(written) or not _is_there(folder, record):
             reached("manifests written", str(folder))
             _write(folder / BUILD, to_json(record, indent=True) + b"\n")
@@ -251,7 +248,7 @@ def _is_there(folder: Place, wanted: BuildRecord) -> bool:
 def build_record(
     summary: BuildSummary,
     parameters: BuildParameters,
-    versions: Versions | None = None,
+    versions: Versions,
     failed: Iterable[Record] = (),
 ) -> BuildRecord:
     """Return the record of a build that made a store; ValueError where it made none."""
@@ -266,7 +263,7 @@ def build_record(
         store=summary.store.name,
         records=summary.records.name,
         parameters=parameters,
-        versions=versions or build_versions(parameters),
+        versions=versions,
         normalization=summary.normalization,
         statuses=summary.statuses,
         verdicts=summary.verdicts,

@@ -12,11 +12,13 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass
+from typing import Any
 
 import orjson
 
 from slatprep.parameters import BuildParameters
-from slatprep.pipeline.fingerprint import code_fingerprint
+from slatprep.pipeline.fingerprint import code_fingerprint, packing_fingerprint
+from slatprep.provenance.make import origin
 from slatprep.provenance.record import AssetRecord, StageParameters
 from slatprep.provenance.versions import numeric_versions
 from slatprep.records import SourceFile
@@ -71,3 +73,9 @@ def recipe_of(parameters: BuildParameters) -> Recipe:
         versions=numeric_versions(parameters.align),
         code=code_fingerprint(),
     )
+
+
+def build_of(parameters: BuildParameters) -> dict[str, Any]:
+    """Return a store's attribute ``build``: its parameters, and what else decides its bytes."""
+    build: dict[str, Any] = origin(parameters)
+    return {**build, "versions": {**build["versions"], "packing": packing_fingerprint()}}

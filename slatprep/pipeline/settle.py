@@ -15,9 +15,9 @@ from slatprep.pipeline.finish import Crew, finish
 from slatprep.pipeline.plan import BuildContext, PlannedAsset
 from slatprep.pipeline.previous import SourceStore
 from slatprep.pipeline.ranges import dataset_ranges, given_ranges, source_of
+from slatprep.pipeline.recipe import build_of
 from slatprep.pipeline.rows import FailedAsset, NextStore, Row, column, in_order, moments_of
 from slatprep.pipeline.summary import nothing_usable
-from slatprep.provenance.make import origin
 from slatprep.readers import contents_of
 from slatprep.readers.encoders import ENOUGH, in_words, look_standardised, resolve_latents
 from slatprep.records import AssetPair, Contents, Normalization
@@ -50,7 +50,9 @@ class Wanted:
         """Return what parameters ask for; raise `SlatprepError` if their files cannot be used."""
         declared = contents_of(parameters)
         given = given_ranges(parameters.normalize, declared.properties)
-        return cls(origin(parameters), given or source_of(parameters.normalize), compact, declared)
+        return cls(
+            build_of(parameters), given or source_of(parameters.normalize), compact, declared
+        )
 
     @property
     def given(self) -> Normalization | None:

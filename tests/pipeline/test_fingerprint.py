@@ -101,3 +101,23 @@ def test_what_makes_no_numbers_is_not_in_it() -> None:
     assert "slatprep.pipeline.dataset" not in names
     for path in numeric_modules().values():
         ast.parse(path.read_text())
+
+
+def test_what_packs_rows_makes_columns_and_records_is_in_the_other(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """Code that is in no key, and still decides bytes."""
+    wanted = {"normalize", "pipeline.pack", "provenance.columns", "provenance.make",
+              "store.shard_writer", "store.layout"}  # fmt: skip
+    assert {f"slatprep.{name}" for name in wanted} <= set(fingerprint.PACKING)
+    before = fingerprint.packing_fingerprint.__wrapped__()
+    source = fingerprint._source
+    for name in fingerprint.PACKING:
+        changed = tmp_path / f"{name}.py"
+        changed.write_bytes(source(name).read_bytes() + b"\nCHANGED = 1\n")
+        monkeypatch.setattr(
+            fingerprint, "_source", lambda one, n=name, c=changed: c if one == n else source(one)
+        )
+        assert fingerprint.packing_fingerprint.__wrapped__() != before
+    monkeypatch.setattr(fingerprint, "_source", source)
+    assert fingerprint.packing_fingerprint.__wrapped__() == before

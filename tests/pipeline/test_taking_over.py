@@ -20,7 +20,7 @@ from support.trees import records_of, tree
 from slatprep.inspect.verify import verify_store
 from slatprep.parameters import BuildParameters, StoreParameters
 from slatprep.pipeline import before as looks
-from slatprep.pipeline import rows
+from slatprep.pipeline import recipe, rows
 from slatprep.pipeline.dataset import build_store, plan_build
 from slatprep.pipeline.previous import checked_store
 from slatprep.store import layout, open_store
@@ -426,6 +426,27 @@ def test_a_file_that_changed_under_an_unchanged_dataset_is_found(
     assert not verify_store(out).ok
     build_store(dataset.parameters(), out)
     assert verify_store(out).ok
+
+
+def test_rows_that_other_code_packed_are_packed_anew_and_not_aligned(
+    built: tuple[Dataset, Path],
+    steps: list[tuple[str, str]],
+    monkeypatch: pytest.MonkeyPatch,
+    tmp_path: Path,
+) -> None:
+    dataset, out = built
+    dataset.add("h", seed=1)
+    with monkeypatch.context() as context:
+        context.setattr(recipe, "packing_fingerprint", lambda: "0" * 16)
+        assert plan_build(dataset.parameters(), out).actions["reuse"] == 4
+        build_store(dataset.parameters(), out)
+        assert names(steps, "asset aligned") == ["h"]
+        assert sorted(names(steps, "asset reused")) == ["a", "c", "e", "g"]
+        assert tree(out) == from_nothing(dataset.parameters(), tmp_path)
+    steps.clear()
+    build_store(dataset.parameters(), out)
+    assert names(steps, "asset aligned") == []
+    assert tree(out) == from_nothing(dataset.parameters(), tmp_path)
 
 
 def test_a_worker_that_lives_on_reads_the_store_of_today(built: tuple[Dataset, Path]) -> None:
