@@ -87,9 +87,7 @@ def test_it_covers_every_module_that_an_asset_runs_through() -> None:
     assert loaded - set(numeric_modules()) <= uncounted | finding | carrying
 
 
-@pytest.mark.parametrize(
-    "name", ["pipeline.annotate", "pipeline.annotate", "storage.chunks", "storage.codecs"]
-)
+@pytest.mark.parametrize("name", ["pipeline.annotate", "storage.chunks", "storage.codecs"])
 def test_what_merges_annotations_and_unpacks_values_is_in_it(name: str) -> None:
     assert f"slatprep.{name}" in numeric_modules()
 
