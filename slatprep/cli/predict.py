@@ -84,6 +84,7 @@ def predict(
     if device is None:
         device = _default_device(output, is_image)
     from slatprep.learn import predict as work
+    from slatprep.learn.published import SECONDS, SECONDS_OF_OTHERS
 
     if gaussians is not None and not is_image:
         raise ConfigError(
@@ -131,14 +132,20 @@ def predict(
     def show() -> None:
         output.record(f"Predictions in {out}", counts)
         each = 1e3 / max(predicted, 1)
+        printed = SECONDS if image else {}
         output.table(
             "Time",
-            ("stage", "seconds", "ms an asset"),
+            ("stage", "seconds", "ms an asset", *(["SLAT-Phys, s"] if image else [])),
             [
-                (stage, spent, spent * each)
+                (stage, spent, spent * each, *([printed.get(stage, "")] if image else []))
                 for stage, spent in {**seconds, "in all": sum(seconds.values())}.items()
             ],
         )
+        if image:
+            others = ", ".join(
+                f"{name} {spent:,.0f} s" for name, spent in SECONDS_OF_OTHERS.items()
+            )
+            output.note(f"SLAT-Phys's times are of an A5000; it prints beside them: {others}")
 
     output.made(document, show, complete=not read.problems)
 

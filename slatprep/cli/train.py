@@ -31,6 +31,9 @@ if TYPE_CHECKING:
 
 _SIZES = ("small", "medium", "large")
 
+_PAPER: dict[str, Any] = {"steps": 2000, "accumulate": 4}
+"""What `--preset paper` sets; the other parameters of the paper are the defaults."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class TrainingOptions:
@@ -84,6 +87,11 @@ def train(
         Literal["small", "medium", "large"], "0.20, 1.19 or 6.32 million weights."
     ] = "large",
     all_sizes: Annotated[bool, "Train all three, each in a folder of its own."] = False,
+    preset: Annotated[
+        Literal["default", "paper"],
+        "paper: 2,000 steps, and 4 accumulated batches a step, whose number the paper does not "
+        "give. Options that are given count more.",
+    ] = "default",
     training: TrainingOptions,
     verdicts: UsableVerdicts = None,
     splits: SplitOptions,
@@ -101,7 +109,7 @@ def train(
     -------
     slatprep train data/demo.zarr --out runs/small --size small --epochs 8 --learning-rate 0.003
     slatprep train data/demo.zarr --out runs/sizes --all-sizes
-    slatprep train data/demo.zarr --out runs/large --steps 2000 --keep last --split-by test_set.json
+    slatprep train data/demo.zarr --out runs/large --preset paper --split-by test_set.json
     """
     from slatprep.learn import require_torch
 
@@ -115,9 +123,21 @@ def train(
     from slatprep.storage.atomic import writing
     from slatprep.store import open_store
 
-    given = click.get_current_context().get_parameter_source("epochs")
-    if training.steps and given is not click.core.ParameterSource.DEFAULT:
+    source = click.get_current_context().get_parameter_source
+    given = {
+        name: source(name) is not click.core.ParameterSource.DEFAULT for name in ("epochs", *_PAPER)
+    }
+    if training.steps and given["epochs"]:
         raise click.UsageError("--epochs and --steps both say when to end; give one of them")
+    if preset == "paper":
+        training = dataclasses.replace(
+            training,
+            **{
+                name: value
+                for name, value in _PAPER.items()
+                if not given[name] and not (name == "steps" and given["epochs"])
+            },
+        )
     torch.set_num_threads(threads or os.cpu_count() or 1)
     opened, rule = open_store(store), splits.rule
     note_split(output, assign_store(opened, **rule), f"by {rule['by']}")

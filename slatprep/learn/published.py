@@ -79,6 +79,13 @@ TABLES = {
 """Published tables with their titles, by their names in `slatprep evaluate --beside`."""
 
 
+SECONDS = {"image": 0.138, "sparse structure": 4.69, "SLAT": 5.03, "decode": 0.004, "in all": 9.9}
+"""SLAT-Phys's seconds an object on an NVIDIA A5000, by the stages of `slatprep predict`."""
+
+SECONDS_OF_OTHERS = {"NeRF2Physics": 1196.0, "Pixie": 1261.0}
+"""Seconds an object of other methods, as SLAT-Phys prints them: 121 and 128 times its own."""
+
+
 def read_scores(path: Path) -> tuple[PublishedScore, ...]:
     """Read a table of scores without spreads, such as from ``slatprep evaluate --csv``.
 

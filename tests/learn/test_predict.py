@@ -26,6 +26,7 @@ from slatprep.learn.decoder import make_decoder
 from slatprep.learn.metrics import evaluate_store
 from slatprep.learn.predict import checkpoint_state, load_checkpoint, predict
 from slatprep.learn.predictions import check_prediction
+from slatprep.learn.published import SECONDS, SECONDS_OF_OTHERS
 from slatprep.normalize import PIXIE_RANGES, normalization_of, normalize_properties
 from slatprep.particles.fields import predicted_field
 from slatprep.records import FEATS_MEAN, FEATS_STD, StructuredLatents
@@ -333,6 +334,10 @@ def test_far_gaussians_of_an_image_are_what_far_says(
     result = step("predict", *words, "--far", far)
     assert f"1 of 300 Gaussians have no voxel: {far}" in result
     assert "TRELLIS and the decoder run on" in result
+    # SLAT-Phys's times stand beside; its speed-ups follow from the sum of its stages.
+    assert "SLAT-Phys, s" in result and "4.69" in result and "NeRF2Physics 1,196 s" in result
+    whole = sum(spent for stage, spent in SECONDS.items() if stage != "in all")
+    assert [round(spent / whole) for spent in SECONDS_OF_OTHERS.values()] == [121, 128]
     rows = PlyData.read(str(ply))["vertex"].data
     assert len(rows) == kept and (rows["density"] > 0).all()
 

@@ -151,3 +151,30 @@ def test_the_last_weights_need_no_validation(learn_store: Path, tmp_path: Path) 
 def test_epochs_and_steps_are_not_given_together(learn_store: Path, tmp_path: Path) -> None:
     both = run("train", learn_store, "--out", tmp_path / "run", "--epochs", "2", "--steps", "3")
     assert both.exit_code == 2 and "give one of them" in both.stderr
+
+
+@pytest.mark.parametrize(
+    ("words", "steps", "accumulate"),
+    [(("--steps", "1"), 1, 4), (("--steps", "1", "--accumulate", "2"), 1, 2), ((), 2000, 4)],
+)
+def test_the_paper_s_preset_is_what_is_not_given(
+    words: tuple[str, ...],
+    steps: int,
+    accumulate: int,
+    learn_store: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    asked: list[TrainParameters] = []
+
+    def stop(store: Path, out: Path, parameters: TrainParameters, **_: object) -> None:
+        asked.append(parameters)
+        raise ConfigError("far enough")
+
+    monkeypatch.setattr("slatprep.learn.train.train", stop)
+    done = run("train", learn_store, "--out", tmp_path / "run", "--preset", "paper", *words)
+    assert done.exit_code == 2 and "far enough" in done.stderr
+    (chosen,) = asked
+    assert (chosen.steps, chosen.accumulate) == (steps, accumulate)
+    # As the paper prints them.
+    assert (chosen.size, chosen.learning_rate, chosen.keep) == ("large", 1e-4, "best")
