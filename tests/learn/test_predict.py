@@ -138,7 +138,7 @@ def test_a_device_that_is_not_there_is_named(
     source.mkdir()
     options = [str(source), *weights, "--out", str(tmp_path / "out"), "--device", "cuda"]
     result = CliRunner().invoke(slatprep, [command, *options])
-    assert result.exit_code == 1 and "finds no CUDA device" in result.stderr
+    assert result.exit_code == 2 and "finds no CUDA device" in result.stderr
     assert not (tmp_path / "out").exists()
 
 
