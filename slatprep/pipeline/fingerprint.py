@@ -19,6 +19,7 @@ STAGES = (
     "slatprep.readers.voxels",
     "slatprep.readers.vomp",
     "slatprep.readers.physxnet",
+    "slatprep.readers.parts",
     "slatprep.readers.transforms",
     "slatprep.readers.slat",
     "slatprep.align",

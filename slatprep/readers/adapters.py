@@ -90,6 +90,7 @@ SOURCES = {
     "voxels": "slatprep.readers.voxels:PlainVoxels",
     "vomp": "slatprep.readers.vomp:VoMP",
     "physxnet": "slatprep.readers.physxnet:PhysXNet",
+    "parts": "slatprep.readers.parts:Parts",
 }
 """slatprep's own source adapters."""
 

@@ -1,0 +1,166 @@
+"""Objects of parts: a JSON with the materials of each, and a mesh of each, without voxels.
+
+PhysXNet and its kin (PhysX-Mobility, PhysXVerse) are published so: ``finaljson/<id>.json`` and
+``partseg/<id>/objs/<label>.obj``. PhysX-Anything's ``4_simready_gen.py`` reads of each part
+``density``, ``"Young's Modulus (GPa)"`` and ``"Poisson's Ratio"``, and its mesh at
+``objs/<label>/<label>.obj``.
+"""
+
+from __future__ import annotations
+
+import io
+import re
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+import orjson
+from numpy.typing import NDArray
+
+from slatprep.errors import ConfigError, InputError
+from slatprep.parameters import PixieverseSource
+from slatprep.readers.adapters import FoundField, Holding, find_by_pattern, patterns_of
+from slatprep.readers.files import load_source, require_complete
+from slatprep.readers.voxel_sets import field_of_voxels
+from slatprep.records import PROPERTIES, RESOLUTION, AssetPair, MaterialField, Place, SourceFile
+from slatprep.storage.listing import Listing
+
+_KEYS = {
+    "youngs_modulus": "Young's Modulus (GPa)",
+    "density": "density",
+    "poissons_ratio": "Poisson's Ratio",
+}
+_SI = {"youngs_modulus": 1e9, "density": 1e3, "poissons_ratio": 1.0}
+"""What a number of each key is in SI units: GPa, g/cm^3 and 1."""
+
+_NUMBER = re.compile(r"\s*([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*(.*)", re.S)
+_UNITS = {
+    "youngs_modulus": {"gpa": 1e9},
+    "density": {"g/cm^3": 1e3, "g/cm³": 1e3, "kg/m^3": 1.0, "kg/m³": 1.0},
+    "poissons_ratio": {},
+}
+"""What units that stand behind a number are in SI units."""
+_MAX_PARTS = 1000
+
+
+class Parts:
+    """``finaljson/<id>.json`` and the meshes of its parts, voxelised solid on 64^3."""
+
+    patterns = ("finaljson/{id}.json",)
+
+    def describe(self, source: PixieverseSource) -> Holding:
+        """Say that there are PixieVerse's three properties, and no classes."""
+        _trimesh()
+        return Holding(PROPERTIES, ())
+
+    def find(self, source: PixieverseSource, listing: Listing) -> Iterator[FoundField]:
+        """Find the fields by the names of their JSON files."""
+        return find_by_pattern(patterns_of(self, source), listing, {})
+
+    def read(self, pair: AssetPair, max_unphysical: float) -> MaterialField:
+        """Read a field; see `slatprep.readers.adapters.SourceAdapter`."""
+        path, _ = require_complete(pair)
+        root, units = pair.roots.pixieverse, pair.roots.units
+        data, file = load_source(path, root, "grid")
+        rows = _parts_of(data, path)
+        stated = {name for name in _SI if units.of(name)}
+        values = [[_number(part, name, name in stated, path) for name in _SI] for part in rows]
+        meshes, files = [], [file]
+        for part in rows:
+            mesh, source = _mesh(root, path.name.removesuffix(".json"), part["label"], path)
+            meshes.append(mesh)
+            files.append(source)
+        voxels, owner = _voxels(meshes, path)
+        return field_of_voxels(
+            path,
+            voxels,
+            np.array(values)[owner],
+            max_unphysical=max_unphysical,
+            sources=files,
+            roots=pair.roots,
+        )
+
+
+def _parts_of(data: bytes, path: Place) -> list[dict[str, Any]]:
+    """Return the parts of a JSON, each with a label."""
+    try:
+        parts = orjson.loads(data)["parts"]
+        if not all(isinstance(part["label"], int) for part in parts):
+            raise TypeError
+    except (ValueError, KeyError, TypeError) as error:
+        raise InputError(
+            path,
+            f"is no annotation of parts ({error})",
+            'an object with "parts", each with "label"',
+        ) from None
+    if not 0 < len(parts) <= _MAX_PARTS:
+        raise InputError(path, f"has {len(parts)} parts", f"1 to {_MAX_PARTS}")
+    return list(parts)
+
+
+def _number(part: dict[str, Any], name: str, stated: bool, path: Place) -> float:
+    """Return a property of a part in SI units, or as it is where the definition states a unit."""
+    key = _KEYS[name]
+    given = part.get(key)
+    match = _NUMBER.fullmatch(str(given))
+    unit = match[2].strip().lower() if match else "?"
+    known = {"": _SI[name], **_UNITS[name]}
+    if match is None or unit not in known:
+        expected = " or ".join(["a number", *_UNITS[name]])
+        raise InputError(path, f"part {part['label']} has {key} {given!r}", expected)
+    return float(match[1]) * (1.0 if stated else known[unit])
+
+
+def _mesh(root: Place, name: str, label: int, path: Place) -> tuple[Any, SourceFile]:
+    """Return the mesh of a part, and its file."""
+    tried = [f"partseg/{name}/objs/{label}.obj", f"partseg/{name}/objs/{label}/{label}.obj"]
+    there = next((one for one in tried if (root / one).exists()), None)
+    if there is None:
+        raise InputError(path, f"part {label} has no mesh", " or ".join(tried))
+    data, file = load_source(root / there, root, "description")
+    try:
+        mesh = _trimesh().load(
+            io.BytesIO(data), file_type="obj", force="mesh", process=False, skip_materials=True
+        )
+        if len(mesh.faces) == 0 or not np.isfinite(mesh.vertices).all():
+            raise ValueError("it has no faces, or vertices that are not finite")
+    except (ValueError, TypeError, KeyError, IndexError, AttributeError) as error:
+        raise InputError(root / there, f"is no mesh ({error})", "an OBJ with faces") from None
+    return mesh, file
+
+
+def _voxels(meshes: list[Any], path: Place) -> tuple[NDArray[np.int64], NDArray[np.intp]]:
+    """Voxelise the parts, filled: voxels (K, 3) of 64^3, each once, and the part of each.
+
+    The object's longest side spans the cube, as in TRELLIS's toolkit. Where parts overlap the
+    smaller one counts, such as what lies inside a shell.
+    """
+    low = np.min([mesh.vertices.min(axis=0) for mesh in meshes], axis=0)
+    high = np.max([mesh.vertices.max(axis=0) for mesh in meshes], axis=0)
+    side = float((high - low).max())
+    if not side > 0:
+        raise InputError(path, "has parts without any size", "meshes of a solid")
+    owner = np.full((RESOLUTION,) * 3, -1, dtype=np.intp)
+    filled = []
+    for mesh in meshes:
+        moved = mesh.copy()
+        # Cell i spans i - 0.5 to i + 0.5 in the library's grid of pitch 1.
+        scaled = (mesh.vertices - (low + high) / 2) / side * (RESOLUTION - 1e-6)
+        moved.vertices = scaled + (RESOLUTION - 1) / 2
+        cells = np.rint(moved.voxelized(pitch=1.0).fill().points).astype(np.int64)
+        filled.append(np.unique(np.clip(cells, 0, RESOLUTION - 1), axis=0))
+    for number in sorted(range(len(meshes)), key=lambda number: -len(filled[number])):
+        owner[tuple(filled[number].T)] = number
+    voxels = np.argwhere(owner >= 0)
+    return voxels, owner[tuple(voxels.T)]
+
+
+def _trimesh() -> Any:
+    try:
+        import trimesh
+    except ImportError as error:
+        raise ConfigError(
+            "meshes of parts need the package trimesh; install it with "
+            "`pip install 'slatprep[parts]'`"
+        ) from error
+    return trimesh
