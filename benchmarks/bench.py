@@ -115,6 +115,11 @@ MEASUREMENTS = (
         (60, 50, 600), (6, 5, 180), (DEMO, STORE),
     ),
     Measurement(
+        "published", "What of the published PixieVerse is asked for on the way to a store",
+        "pixieverse", "python benchmarks/published.py {folder} --objects {assets}",
+        (12, 0, 900), (3, 0, 240),
+    ),
+    Measurement(
         "remote-ways", "Reading whole assets from an object store, by several ways",
         "remote", "python benchmarks/remote_ways.py {folder}/demo.zarr --assets {size}",
         (60, 60, 900), (6, 5, 240), (DEMO, STORE),

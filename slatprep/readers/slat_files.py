@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from urllib.parse import quote
 
 from slatprep.errors import ConfigError, InputError
@@ -12,6 +12,10 @@ from slatprep.readers.adapters import latent_adapter
 from slatprep.readers.hdf5 import SUFFIXES
 from slatprep.readers.patterns import find_files, list_below, tried_names
 from slatprep.records import Place
+from slatprep.storage.place import storage_of
+
+_LOOKED_AT = 20
+"""Folders that are looked into for a hint."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -90,11 +94,27 @@ def find_slats(source: SlatSource, one_file: bool) -> dict[str, list[NamedSlat]]
         slats.setdefault(slat.slat_id, []).append(slat)
     if not slats:
         tried = f"groups {source.group}" if one_file else tried_names(_patterns_of(source), {})
-        raise ConfigError(f"{source.root}: no SLAT found; looked for {tried}")
+        hint = "" if one_file else _hint(source)
+        raise ConfigError(f"{source.root}: no SLAT found; looked for {tried}{hint}")
     problems = [slat.problem for found in slats.values() for slat in found if slat.problem]
     if one_file and problems:
         raise ConfigError(problems[0])
     return slats
+
+
+def _hint(source: SlatSource) -> str:
+    """Say in which folder below the root SLATs lie, or what it holds; empty if neither is known."""
+    try:
+        files, folders = storage_of(source.root).names()
+        for name in sorted(folders)[:_LOOKED_AT]:
+            below = replace(source, root=source.root / name)
+            if any(_each_slat(below, False)):
+                return f"; SLATs lie in {below.root}: point at that"
+    except (OSError, ConfigError):
+        return ""
+    held = sorted([*files, *folders])
+    more = " and more" if len(held) > 3 else ""
+    return f"; it holds {', '.join(held[:3]) or 'nothing'}{more}"
 
 
 def _patterns_of(source: SlatSource) -> tuple[str, ...]:

@@ -151,3 +151,13 @@ def test_table_in_another_form_is_told_how_to_save_it(
     (tmp_path / "map.csv").write_bytes(data)
     with pytest.raises(ConfigError, match=advice):
         read_map(tmp_path / "map.csv", {"a"}, {"1"})
+
+
+@pytest.mark.parametrize(
+    ("where", "what"), [("deep", "SLATs lie in {}/deep/trellis"), ("pixie", "it holds data, ")]
+)
+def test_folder_without_slats_is_told_apart(root: Path, where: str, what: str) -> None:
+    touch(root, "deep/trellis/latents/model/a.npz")
+    with pytest.raises(ConfigError, match="no SLAT found") as caught:
+        discover(parameters(root, "pixie", where))
+    assert what.format(root) in str(caught.value)
