@@ -3,14 +3,17 @@
 Both pipelines have a habitual frame, so most assets of a dataset are turned the
 same way. Where an asset's geometry cannot tell placements apart, the clear
 winners of its dataset can: among its tied placements the one nearest to their
-common rotation is taken. An asset without a tie is never touched, and the
-placement that was left is kept among the placements, so that the choice can be
-undone.
+common rotation is taken. An asset that is turned otherwise without a tie is fitted
+in the common rotation as well, and what the shapes say is weighed against how rare
+other rotations are. The placement that was left is kept among the placements, so
+that the choice can be undone.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -18,11 +21,18 @@ from numpy.typing import ArrayLike, NDArray
 from slatprep.align.settle import take
 from slatprep.align.starts import distinct_starts
 from slatprep.geometry.frames import split_transform
-from slatprep.records import Alignment, Consensus, StructuredLatents
+from slatprep.parameters import AlignParameters
+from slatprep.records import Alignment, Consensus, Engine, MaterialField, StructuredLatents
 
 LEAST_WINNERS = 5
 LEAST_SHARE = 0.5
 """A rotation is common if so many clear winners, and this share of them, have it."""
+
+TEMPERATURE = 0.02
+"""A placement that scores so much higher, once deformed, is e times as likely the right one."""
+
+SURE = 0.95
+"""From this probability on an asset without a tie is turned as the dataset is."""
 
 NEAR_DEGREES = 30.0
 """Rotations this near to a quarter turn count as that quarter turn."""
@@ -87,6 +97,51 @@ def settle(alignment: Alignment, latents: StructuredLatents, consensus: Consensu
     if chosen == 0:
         return alignment
     return take(alignment, chosen - 1, latents, consensus)
+
+
+def turn_if_likelier(
+    alignment: Alignment,
+    field: MaterialField,
+    latents: StructuredLatents,
+    consensus: Consensus,
+    parameters: AlignParameters,
+) -> Alignment:
+    """Choose the common rotation for an asset that is turned otherwise, if that is likelier.
+
+    The odds are those of the shapes, by how much better the asset fits once deformed
+    (`TEMPERATURE`), times those of the dataset: how frequent the common rotation is, and any
+    other quarter turn. It takes `SURE` to change a placement.
+
+    Returns the same object where the choice stands.
+    """
+    if alignment.engine is not Engine.FIELD or is_common(alignment.transform, consensus):
+        return alignment
+    from slatprep.align.field import fitted_near
+
+    placement, gain = fitted_near(alignment, consensus.rotation, field, latents, parameters)
+    if not is_common(placement.transform, consensus):
+        return alignment
+    probability = probability_of_common(consensus, gain)
+    if probability < SURE:
+        return alignment
+    left = replace(alignment, placements=(placement, *alignment.placements))
+    return take(left, 0, latents, replace(consensus, probability=probability))
+
+
+def is_common(transform: ArrayLike, consensus: Consensus) -> bool:
+    """Whether a transform (4, 4) turns as the dataset does."""
+    return degrees_between(split_transform(transform)[0], consensus.rotation) <= NEAR_DEGREES
+
+
+def probability_of_common(consensus: Consensus, gain: float) -> float:
+    """Return how likely the common rotation is for an asset, of it and one other quarter turn.
+
+    `gain` is how much higher the asset scores in the common rotation, once deformed.
+    """
+    # One more that disagrees, so that no other rotation is impossible.
+    common = consensus.agreeing / (consensus.winners + 1)
+    other = (1.0 - common) / (len(distinct_starts()) - 1)
+    return 1.0 / (1.0 + other / common * math.exp(min(-gain / TEMPERATURE, 700.0)))
 
 
 def degrees_between(rotation: ArrayLike, other: ArrayLike) -> float:

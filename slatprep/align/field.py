@@ -21,8 +21,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 
+import numpy as np
+from numpy.typing import NDArray
+
 from slatprep.align.deform import CLEAN, Deformed
-from slatprep.align.finish import finish
+from slatprep.align.figures import measure_figures
+from slatprep.align.finish import finish, rank_of
 from slatprep.align.ground import find_ground, is_ground
 from slatprep.align.mirror import mirror_gain
 from slatprep.align.pair import COARSE_SAMPLES, COARSE_TAUS, MOST_SURVIVORS, TIE, Pair
@@ -140,6 +144,29 @@ def refined_at(
         deformation=deformed.deformation,
         figures=_figures(pair, best, deformed),
     )
+
+
+def fitted_near(
+    alignment: Alignment,
+    rotation: NDArray[np.float64],
+    field: MaterialField,
+    latents: StructuredLatents,
+    parameters: AlignParameters,
+) -> tuple[Placement, float]:
+    """Fit a placement from a rotation (3, 3), without the alignment's ground.
+
+    Returns it, and how much higher than the alignment it ranks once both are deformed.
+    """
+    pair = _pair_of(field, latents, parameters, alignment.ground)
+    starts = [
+        pose for scale in sorted({pair.size_ratio, 1.0}) for pose in pair.starts([rotation], scale)
+    ]
+    poses = pair.polish(pair.refine(starts, COARSE_SAMPLES, COARSE_TAUS, 0.02))
+    (best, *_), deformed = finish(pair, poses[:1], rough=poses[0].score < CLEAN)
+    figures = alignment.figures or measure_figures(field, latents, alignment)
+    before = rank_of(Similarity.of(alignment.transform), figures)
+    placement = Placement(best.similarity.transform, best.score, 0.0)
+    return placement, rank_of(best.similarity, deformed.figures) - before
 
 
 def _figures(pair: Pair, best: Pose, deformed: Deformed) -> FitFigures:

@@ -21,8 +21,8 @@ from slatprep.align.pair import (
     far_from_all,
     scale_penalty,
 )
-from slatprep.align.pose import Pose
-from slatprep.records import Model
+from slatprep.align.pose import Pose, Similarity
+from slatprep.records import FitFigures, Model
 
 MOST_CONTESTED = 4
 """Where the best placement is deformed, so many, of those within twice `TIE`, are deformed too."""
@@ -44,7 +44,7 @@ def finish(pair: Pair, poses: Sequence[Pose], rough: bool) -> tuple[list[Pose], 
         return [best, *others], deformed
     few, rest = others[: MOST_CONTESTED - 1], others[MOST_CONTESTED - 1 :]
     contested = [(best, deformed), *(_deformed(pair, pose, rough) for pose in few)]
-    ranks = np.array([_rank(*entry) for entry in contested])
+    ranks = np.array([rank_of(pose.similarity, bent.figures) for pose, bent in contested])
     standing = RANK_STANDING * (np.arange(len(ranks)) == 0)
     order = np.argsort(-(ranks + standing), kind="stable")
     highest = max(pose.merit for pose, _ in contested)
@@ -60,9 +60,10 @@ def finish(pair: Pair, poses: Sequence[Pose], rough: bool) -> tuple[list[Pose], 
     return [*(pose for pose, _, _ in kept), *rest], kept[0][1]
 
 
-def _rank(pose: Pose, deformed: Deformed) -> float:
-    figures = deformed.figures
-    return 0.5 * (figures.score_slat + figures.score_pixieverse) - scale_penalty(pose)
+def rank_of(similarity: Similarity, figures: FitFigures) -> float:
+    """Return what placements are compared by once deformed: the score of unseen samples."""
+    score = 0.5 * (figures.score_slat + figures.score_pixieverse)
+    return score - scale_penalty(similarity)
 
 
 def _deformed(pair: Pair, pose: Pose, rough: bool) -> tuple[Pose, Deformed]:

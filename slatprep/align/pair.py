@@ -47,9 +47,9 @@ RANK_SAMPLES = 250
 """Samples at which deformed placements are told apart."""
 
 
-def scale_penalty(pose: Pose) -> float:
-    """By how much the scale of a pose lowers its rank once it is deformed."""
-    return float(SCALE_PRIOR * (np.log(pose.similarity.scale) / 0.25) ** 2)
+def scale_penalty(similarity: Similarity) -> float:
+    """By how much the scale of a placement lowers its rank once it is deformed."""
+    return float(SCALE_PRIOR * (np.log(similarity.scale) / 0.25) ** 2)
 
 
 def far_from_all(places: Array, others: Iterable[Array]) -> bool:

@@ -99,7 +99,7 @@ def ranked(pair: Pair, poses: Sequence[Pose], halfway: Sequence[Pose]) -> list[P
     ranked = []
     for pose in likely:
         trial = try_out(pair.slat, pair.pixie, pose.similarity, RANK_SAMPLES)
-        bonus = float(trial.whole) - scale_penalty(pose) - pose.score
+        bonus = float(trial.whole) - scale_penalty(pose.similarity) - pose.score
         standing = RANK_STANDING if pose is poses[0] else 0.0
         places = places_of(pose.similarity, trial.bent, points)
         ranked.append((replace(pose, bonus=bonus, standing=standing), places))

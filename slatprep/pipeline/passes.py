@@ -12,7 +12,7 @@ import hashlib
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 
-from slatprep.align.consensus import find_consensus, settle
+from slatprep.align.consensus import find_consensus, is_common, settle, turn_if_likelier
 from slatprep.align.deformation import map_of
 from slatprep.align.settle import refit, take
 from slatprep.judge import contradicted, judge
@@ -125,12 +125,21 @@ def apply_consensus(
     if consensus is None:
         tell(f"consensus: too few assets share a rotation; all {len(tied):,} ties stay")
         return list(assets)
-    tasks = ((asset, spool, consensus, parameters) for asset in tied)
+    turned = [
+        asset
+        for asset in assets
+        if not asset.columns["n_placements"]
+        and not is_common(asset.columns["transform"], consensus)
+    ]
+    tasks = ((asset, spool, consensus, parameters) for asset in (*tied, *turned))
     changed = {asset.asset_id: asset for asset in run_unordered(settle_asset, tasks, jobs)}
-    moved = sum(changed[asset.asset_id] is not asset for asset in tied)
+    moved, righted = (
+        sum(changed[asset.asset_id] is not asset for asset in some) for some in (tied, turned)
+    )
     tell(
         f"consensus: {consensus.agreeing:,} of {consensus.winners:,} assets without a tie share a "
-        f"rotation; {moved:,} of {len(tied):,} ties were given another placement by it"
+        f"rotation; {moved:,} of {len(tied):,} ties were given another placement by it, and "
+        f"{righted:,} of {len(turned):,} assets that were turned otherwise without a tie"
     )
     return [changed.get(asset.asset_id, asset) for asset in assets]
 
@@ -138,10 +147,15 @@ def apply_consensus(
 def settle_asset(
     asset: Row, spool: Spool, consensus: Consensus, parameters: BuildParameters
 ) -> Row:
-    """Settle one asset's tie; return it as it was where the choice stands."""
+    """Settle one asset's tie, or weigh its heading; return it as it was where the choice stands."""
     first = Reopened(asset, spool)
-    alignment = settle(first.record.alignment, first.latents, consensus)
-    if alignment is first.record.alignment:
+    before = first.record.alignment
+    alignment = settle(before, first.latents, consensus)
+    if alignment is before:
+        alignment = turn_if_likelier(
+            before, first.field, first.latents, consensus, parameters.align
+        )
+    if alignment is before:
         return asset
     return first.put(*first.placed(alignment, parameters))
 

@@ -108,11 +108,16 @@ class Judgement:
 
 @dataclass(frozen=True, eq=False)
 class Consensus:
-    """The rotation (3, 3) that `agreeing` of `winners` assets without a tie have in common."""
+    """The rotation (3, 3) that `agreeing` of `winners` assets without a tie have in common.
+
+    `probability` is that of this rotation where an asset that was turned otherwise, without a tie,
+    took it; NaN where it chose among ties.
+    """
 
     rotation: Rotation
     winners: Annotated[int, Ge(1)]
     agreeing: Annotated[int, Ge(1)]
+    probability: Number = float("nan")
 
 
 @dataclass(frozen=True)

@@ -10,10 +10,19 @@ from scipy.spatial.transform import Rotation
 from support.shapes import GRID, chair, field_of, surface_latents, turned
 
 from slatprep.align import align
-from slatprep.align.consensus import degrees_between, find_consensus, settle
+from slatprep.align.consensus import (
+    SURE,
+    TEMPERATURE,
+    degrees_between,
+    find_consensus,
+    probability_of_common,
+    settle,
+    turn_if_likelier,
+)
 from slatprep.align.starts import distinct_starts
 from slatprep.geometry.frames import displacement, make_transform, split_transform
 from slatprep.parameters import AlignParameters
+from slatprep.records import Consensus
 
 COMMON = distinct_starts()[14].rotation
 
@@ -160,3 +169,54 @@ def test_degrees_between_is_the_angle_of_the_turn() -> None:
     turn = Rotation.from_rotvec([0, np.radians(33), 0]).as_matrix()
     assert degrees_between(COMMON, turn @ COMMON) == pytest.approx(33)
     assert GRID.shape == (64, 64, 64, 3)
+
+
+def _agreeing(count: int, others: int = 0) -> Consensus:
+    away = [s.rotation for s in distinct_starts() if degrees_between(s.rotation, COMMON) > 1]
+    transforms = [make_transform(turn) for turn in [COMMON] * count + away[:others]]
+    found = find_consensus(transforms)
+    assert found is not None
+    return found
+
+
+@pytest.mark.parametrize("gain", [-0.1, -0.02, 0.0, 0.03])
+@pytest.mark.parametrize(("agree", "others"), [(5, 5), (19, 1), (400, 0)])
+def test_the_odds_of_the_shapes_are_weighed_by_those_of_the_dataset(
+    agree: int, others: int, gain: float
+) -> None:
+    """By Bayes' rule, counted over a dataset of the common rotation and of 23 other ones."""
+    seen = agree + others + 1
+    prior = np.array([agree / seen] + [(others + 1) / seen / 23] * 23)
+    likelihood = np.exp(np.array([gain, 0.0]) / TEMPERATURE)
+    joint = prior[:2] * likelihood
+    expected = joint[0] / joint.sum()
+    assert probability_of_common(_agreeing(agree, others), gain) == pytest.approx(expected)
+
+
+def test_an_asset_that_is_clearly_turned_otherwise_stays() -> None:
+    """However many assets agree: the shapes say more than that."""
+    turn = distinct_starts()[3].rotation
+    assert degrees_between(turn, COMMON) > 60
+    field, latents = field_of(chair()), surface_latents(turned(chair(), turn))
+    found = align(field, latents, AlignParameters())
+    assert turn_if_likelier(found, field, latents, _agreeing(500), AlignParameters()) is found
+
+
+def test_an_asset_that_fits_as_well_is_turned_as_the_dataset_is() -> None:
+    """A box has four placements; here only a wrong one was found."""
+    field, latents = field_of(_box()), surface_latents(turned(_box(), COMMON))
+    found = align(field, latents, AlignParameters())
+    choices = [found.transform, *(p.transform for p in found.placements)]
+    wrong = next(c for c in choices if degrees_between(split_transform(c)[0], COMMON) > 60)
+    alone = replace(found, transform=wrong, placements=())
+    after = turn_if_likelier(alone, field, latents, _agreeing(19, 1), AlignParameters())
+    assert displacement(after.transform, make_transform(COMMON), latents.centres) < 0.1
+    assert isinstance(after.settled_by, Consensus)
+    assert after.settled_by.probability > SURE
+    assert after.placements[0].transform.tobytes() == wrong.tobytes()
+
+
+def test_an_asset_that_is_turned_as_the_dataset_is_keeps_its_placement() -> None:
+    field, latents = field_of(chair()), surface_latents(turned(chair(), COMMON))
+    found = align(field, latents, AlignParameters())
+    assert turn_if_likelier(found, field, latents, _agreeing(5), AlignParameters()) is found
