@@ -52,7 +52,7 @@ POOR, FAIR, CLEAR = 0.8, 0.9, 0.1
 """All orientations are searched if the best score from the 24 starts is poor, or if it is
 no better than fair and not clearly above that of the next distinct placement."""
 
-HOPELESS = 0.2
+HOPELESS = 0.1
 """Sides whose best score is lower have no shape in common, deformed or without ground."""
 
 WIDER_GAIN = 0.02

@@ -36,6 +36,9 @@ HALF_LAYER = 3.5
 LEAST_FACE = 0.08
 """A layer is looked at whose face is this share of the annotation's surface, both sides counted."""
 
+LEAST_ABOVE = 0.05
+"""This share of the voxels lies above ground at least: less is a board's lid, and not an object."""
+
 LEAST_GAIN, MOST_LOST = 0.05, 0.08
 """A layer is ground if without it the scores of search and fit rise by so much together, and
 that of the SLAT's samples falls by less than so much, as it would were the layer the object's."""
@@ -70,8 +73,7 @@ def find_ground(surface: Surface) -> Ground | None:
     inside = np.stack(np.unravel_index(solid, surface.distance.shape), axis=1) + surface.origin
     found = [_layer(points, inside, end) for end in _ends(points)]
     normal, top, face = max(found, key=lambda layer: layer[2])
-    share = 2.0 * face * (total / len(solid)) / len(surface.points)
-    if share < LEAST_FACE or not (inside @ normal > top + 1.0).any():
+    if 2.0 * face * (total / len(solid)) < LEAST_FACE * len(surface.points):
         return None
     rounded = np.rint(np.append(normal, top * VOXEL_SIZE) / GRAIN) * GRAIN
     return Ground(rounded[:3], float(rounded[3]))
@@ -118,8 +120,12 @@ def _layer(points: Array, inside: Array, normal: Array) -> tuple[Array, float, f
         middle, reach = float(np.median(layer @ normal)), HALF_LAYER
     # Voxels of a height, every half a voxel, and how much fewer there are one above than below.
     edges = middle + np.arange(-8.0, 9.0, 0.5)
-    halves = np.histogram(inside @ normal, edges)[0].astype(np.float64)
+    inside_heights = inside @ normal
+    halves = np.histogram(inside_heights, edges)[0].astype(np.float64)
     slices = halves[:-1] + halves[1:]
     fewer = 0.5 * (slices[:-4] + slices[1:-3] - slices[3:-1] - slices[4:])
+    tops = edges[3 : 3 + len(fewer)]
+    above = len(inside) - np.searchsorted(np.sort(inside_heights), tops + 1.0, side="right")
+    fewer[above < LEAST_ABOVE * len(inside)] = 0.0
     at = int(np.argmax(fewer))
-    return normal, float(edges[at + 3]), float(fewer[at])
+    return normal, float(tops[at]), float(fewer[at])

@@ -73,6 +73,27 @@ def test_the_top_of_a_slab_is_found() -> None:
     assert ground.height * 64 + 31.5 == pytest.approx(FOOT - 0.5, abs=0.75)
 
 
+def board() -> np.ndarray:
+    """A board on wheels with a tail: nearly all of it is one flat layer above the ground."""
+    x, y, z = np.moveaxis(GRID, -1, 0)
+    deck = (x >= 10) & (x < 54) & (y >= 25) & (y < 38) & (z >= FOOT + 5) & (z < FOOT + 8)
+    tail = (x >= 50) & (x < 58) & (y >= 26) & (y < 37) & (z >= FOOT + 7) & (z < FOOT + 10)
+    wheels = (abs(abs(y - 31.5) - 5) < 2) & ((abs(x - 18) < 3) | (abs(x - 44) < 3))
+    return deck | tail | (wheels & (z >= FOOT) & (z < FOOT + 6))
+
+
+@pytest.mark.parametrize("radius", [np.inf, 30.0])
+def test_the_lid_of_a_low_object_is_not_taken_for_its_ground(radius: float) -> None:
+    """More voxels go away at the lid than at the slab's top, but nothing lies above it."""
+    latents = surface_latents(larger(board(), 1.1))
+    field = field_of(board() | slab(2.0, radius=radius))
+    found = align(field, latents, DEFAULT)
+    assert found.ground is not None
+    assert found.ground.height * 64 + 31.5 == pytest.approx(FOOT - 0.5, abs=1.5)
+    true = make_transform(np.eye(3), scale=1.1)
+    assert displacement(found.transform, true, latents.centres) < 1.5
+
+
 def test_a_flat_part_that_both_sides_have_is_no_ground() -> None:
     """Where the SLAT shows the layer too, it is the object's, however badly the rest fits."""
     solid = chair() | slab(3.0)
