@@ -39,19 +39,10 @@ NEAR_DEGREES = 30.0
 
 
 def find_consensus(transforms: Iterable[ArrayLike]) -> Consensus | None:
-    """Find the rotation that a dataset's clear winners have in common.
+    """Find the rotation that clear winners have in common, from their transforms (4, 4).
 
-    Parameters
-    ----------
-    transforms : iterable of array_like, shape (4, 4)
-        PixieVerse frame to SLAT frame, of the assets without a tie.
-
-    Returns
-    -------
-    Consensus or None
-        The mean of the rotations near the most frequent quarter turn; None
-        where fewer than `LEAST_WINNERS` assets or less than `LEAST_SHARE` of
-        them agree.
+    It is the mean of the rotations near the most frequent quarter turn. None where fewer than
+    `LEAST_WINNERS` assets or less than `LEAST_SHARE` of them agree.
     """
     rotations = [split_transform(transform)[0] for transform in transforms]
     near: dict[int, list[NDArray[np.float64]]] = {}
@@ -74,20 +65,7 @@ def find_consensus(transforms: Iterable[ArrayLike]) -> Consensus | None:
 def settle(alignment: Alignment, latents: StructuredLatents, consensus: Consensus) -> Alignment:
     """Choose, among tied placements, the one nearest to the common rotation.
 
-    Parameters
-    ----------
-    alignment : Alignment
-        As an engine found it.
-    latents : StructuredLatents
-        The SLAT, over whose voxels displacements are measured.
-    consensus : Consensus
-        What `find_consensus` found.
-
-    Returns
-    -------
-    Alignment
-        The same object where nothing is tied or the choice stands; otherwise
-        what `slatprep.align.settle.take` makes of it.
+    Returns the same object where nothing is tied or the choice stands.
     """
     if not alignment.placements:
         return alignment

@@ -96,22 +96,8 @@ def deform_if_earned(
 ) -> Deformed:
     """Deform a similarity as far as the parameters allow and the evidence asks.
 
-    Parameters
-    ----------
-    slat, pixie : Surface
-        The two sides.
-    pose : Similarity
-        The placement.
-    model : str
-        ``rigid`` or ``similarity``, as the placement is.
-    parameters : AlignParameters
-        `model` ``auto`` lets the evidence decide, ``affine`` and ``deformable``
-        fit that without asking, the others nothing; `max_displacement` bounds it.
-
-    Returns
-    -------
-    Deformed
-        The model kept, the deformation, and the figures of the fit.
+    `model` says whether its scale is one. Of the parameters, the model ``auto`` lets the evidence
+    decide, ``affine`` and ``deformable`` fit that without asking, the others nothing.
     """
     residuals = Residuals(slat, pixie, pose, CHECK_SAMPLES, first=FIT_SAMPLES)
     start = residuals.start()

@@ -60,18 +60,7 @@ class PlaceMap:
 
 
 def map_of(alignment: Alignment) -> PlaceMap:
-    """Return the map between the frames that an alignment stands for.
-
-    Parameters
-    ----------
-    alignment : Alignment
-        What `slatprep.align_voxels` found, or a record holds.
-
-    Returns
-    -------
-    PlaceMap
-        Its transform, and its deformation where there is one.
-    """
+    """Return the map between the frames that an alignment stands for."""
     return PlaceMap(alignment.transform, alignment.deformation)
 
 
@@ -108,21 +97,10 @@ def jacobian(deformation: Deformation, points: ArrayLike) -> NDArray[np.float64]
 
 
 def undeform(deformation: Deformation, points: ArrayLike) -> NDArray[np.float64]:
-    """Invert a deformation.
+    """Return the points (N, 3) that `deform` takes to these, of a deformation that does not fold.
 
-    Parameters
-    ----------
-    deformation : Deformation
-        One that does not fold; see `is_proper`.
-    points : array_like, shape (N, 3)
-        Deformed points, in the SLAT frame.
-
-    Returns
-    -------
-    ndarray of float64, shape (N, 3)
-        The points that `deform` takes there, to 1e-9 of the cube's edge; where
-        Newton's method does not settle within 30 steps (possible only beyond
-        the splines' domain, where the derivative jumps), the nearest it came.
+    To 1e-9 of the cube's edge. Where Newton's method does not settle within 30 steps, which is
+    possible only beyond the splines' domain, where the derivative jumps, the nearest it came.
     """
     target = np.asarray(points, dtype=np.float64)
     affine = deformation.affine
@@ -155,24 +133,13 @@ def make_deformation(
     points: ArrayLike,
     max_displacement: float,
 ) -> Deformation | None:
-    """Make a deformation that is bounded and does not fold.
+    """Make a deformation that is bounded and does not fold, rounded to `GRAIN`.
 
-    Parameters
-    ----------
-    affine, origin, spacing, coefficients
-        As `Deformation` describes them, in edges of the unit cube.
-    points : array_like, shape (N, 3)
-        Of the SLAT, in the SLAT frame.
-    max_displacement : float
-        Voxels. Neither the affine part nor the bending moves one of the points
-        farther: coefficients are shortened to it, and a spline lies in the
-        convex hull of its coefficients.
-
-    Returns
-    -------
-    Deformation or None
-        Rounded to `GRAIN`, its bending shrunk until `is_proper` holds; None where
-        the affine part stretches or moves too far, or no shrinking helps.
+    Arguments are as `Deformation` has them; `points` (N, 3) are the SLAT's. Neither the affine part
+    nor the bending moves one of them farther than `max_displacement` (voxels): coefficients are
+    shortened to it, and a spline lies in the convex hull of its coefficients. Bending is shrunk
+    until `is_proper` holds. None where the affine part stretches or moves too far, or no shrinking
+    helps.
     """
     made = Deformation(
         _rounded(affine), _rounded(origin), float(_rounded(spacing)), _rounded(coefficients)

@@ -45,25 +45,12 @@ that of the SLAT's samples falls by less than so much, as it would were the laye
 
 
 def find_ground(surface: Surface) -> Ground | None:
-    """Find the widest flat layer at an end of an annotation; it may be part of the object.
+    """Find the widest flat layer at an end of the PixieVerse side; it may be part of the object.
 
-    Parameters
-    ----------
-    surface : Surface
-        Of the PixieVerse side.
-
-    Returns
-    -------
-    Ground or None
-        Up to the layer's top; None where no layer has a face of `LEAST_FACE`, or nothing
-        lies above it.
-
-    Notes
-    -----
-    The ends with most samples of the surface are looked at. There a plane is
-    fitted, by least squares, to the samples near it, again and again. The
-    layer's top is where most voxels go away from one height to the next, and
-    the face is as large as these are many.
+    The ends with most samples of the surface are looked at. There a plane is fitted to the samples
+    near it, again and again. The layer's top is where most voxels go away from one height to the
+    next, and the face is as large as these are many. None where no layer has a face of
+    `LEAST_FACE`.
     """
     points = surface.subset(SAMPLES).points
     solid = np.flatnonzero(surface.distance < DILATION)

@@ -61,15 +61,10 @@ def align(
 
 
 def load_open3d() -> Any:
-    """Import Open3D, from wheels alone.
+    """Import Open3D, from wheels alone; a SlatprepError says why it cannot be loaded.
 
-    Since 0.20 Open3D needs the system's libusb, though nothing here uses it; a
-    copy that a wheel carries, loaded first, satisfies the dynamic linker.
-
-    Raises
-    ------
-    SlatprepError
-        If it cannot be loaded; small systems lack libraries that it links.
+    Since 0.20 Open3D needs the system's libusb, though nothing here uses it; a copy that a wheel
+    carries, loaded first, satisfies the dynamic linker.
     """
     if sys.platform == "linux" and sys.version_info >= (3, 13):
         import ctypes

@@ -22,23 +22,9 @@ def measure_quality(
     radius: float,
     ground: Ground | None = None,
 ) -> Quality:
-    """Measure how well the outer surfaces of the two sides lie on each other.
+    """Measure how well the outer surfaces of the two sides lie on each other; see `compare`.
 
-    Parameters
-    ----------
-    field, latents : MaterialField, StructuredLatents
-        The two sides; only their geometry is used.
-    transform : array_like, shape (4, 4)
-        PixieVerse frame to SLAT frame.
-    radius : float
-        Voxels of the SLAT frame; partners farther apart are no inliers.
-    ground : Ground, optional
-        What of the PixieVerse side does not count.
-
-    Returns
-    -------
-    Quality
-        See `compare`.
+    The transform (4, 4) leads to the SLAT frame; ground does not count.
     """
     return compare(
         outer_boundary(above(field.occupancy, ground)),
@@ -51,25 +37,11 @@ def measure_quality(
 def compare(
     pixieverse: NDArray[np.uint8], slat: NDArray[np.uint8], transform: ArrayLike, radius: float
 ) -> Quality:
-    """Compare two boundaries under a transform.
+    """Compare boundary voxels (K, 3) and (N, 3), each in its own frame, under a transform (4, 4).
 
-    Both are boundaries of filled sets: a SLAT has voxels inside the object
-    wherever its parts meet, which a solid's boundary cannot have.
-
-    Parameters
-    ----------
-    pixieverse, slat : ndarray of uint8, shapes (K, 3) and (N, 3)
-        Boundary voxels, each in its own frame.
-    transform : array_like, shape (4, 4)
-        PixieVerse frame to SLAT frame.
-    radius : float
-        Voxels of the SLAT frame; partners farther apart are no inliers.
-
-    Returns
-    -------
-    Quality
-        Fitness and inlier rmse both ways; overlap is the share of both
-        boundaries' voxels together that have a partner.
+    Both are boundaries of filled sets: a SLAT has voxels inside the object wherever its parts meet,
+    which a solid's boundary cannot have. Partners farther apart than `radius` (voxels of the SLAT
+    frame) are no inliers.
     """
     from slatprep.geometry.nearest import Lattice
 

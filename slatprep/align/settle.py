@@ -22,25 +22,10 @@ from slatprep.records import (
 def take(
     alignment: Alignment, chosen: int, latents: StructuredLatents, by: Consensus | LatentChoice
 ) -> Alignment:
-    """Exchange an alignment's placement for a tied one.
+    """Exchange an alignment's placement for number `chosen` of its `placements`.
 
-    Parameters
-    ----------
-    alignment : Alignment
-        As an engine found it.
-    chosen : int
-        Number of the placement in ``placements``, from 0.
-    latents : StructuredLatents
-        The SLAT, over whose voxels displacements are measured.
-    by : Consensus or LatentChoice
-        What chose it.
-
-    Returns
-    -------
-    Alignment
-        With the transform of the chosen placement, `settled_by` set, and the
-        placement that was left first among the placements. It has no
-        deformation, and the old one's quality: `refit` gives it its own.
+    The placement that was left comes first among the placements. The result has no deformation, and
+    the old placement's quality: `refit` gives it its own.
     """
     placement = alignment.placements[chosen]
     # Scores are relative to the best fit; the one that was left had it.
@@ -65,22 +50,10 @@ def refit(
     latents: StructuredLatents,
     parameters: AlignParameters,
 ) -> Alignment:
-    """Fit at an alignment's placement what its engine fits at the one it chooses.
+    """Fit at the placement that `take` chose what the engine fits at the one it chooses.
 
-    Parameters
-    ----------
-    alignment : Alignment
-        What `take` returned.
-    field, latents : MaterialField, StructuredLatents
-        The two sides; only their geometry is used.
-    parameters : AlignParameters
-        What the asset was aligned with.
-
-    Returns
-    -------
-    Alignment
-        With the quality measured there. Of the default engine also refined,
-        its scale set to one if that fits as well, and deformed if that is earned.
+    The quality is measured there. The default engine also refines the placement, sets its scale to
+    one if that fits as well, and deforms it if that is earned.
     """
     if alignment.engine is Engine.FIELD:
         from slatprep.align.field import refined_at

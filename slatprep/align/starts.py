@@ -65,13 +65,7 @@ def distinct_starts() -> tuple[Start, ...]:
 
 
 def candidates_of(fits: Mapping[int, tuple[float, float]]) -> tuple[Candidate, ...]:
-    """Return all 64 candidates from the fits of the distinct ones.
-
-    Parameters
-    ----------
-    fits : mapping of int to (float, float)
-        Fitness and inlier rmse (voxels) by the index of a distinct start.
-    """
+    """Return all 64 candidates from the fitness and inlier rmse (voxels) of the distinct ones."""
     return tuple(
         Candidate(
             start.index,
@@ -93,22 +87,8 @@ def search_starts(
 ) -> Alignment:
     """Register from every start, and once more from the best result.
 
-    Parameters
-    ----------
-    field, latents, parameters
-        See `slatprep.align.align`.
-    first : callable
-        Registers from a start (4, 4) and returns fitness, inlier rmse [voxel] and
-        the transform (4, 4). The highest fitness wins, then the lowest rmse.
-    last : callable
-        Registers from the winner; returns the transform in the unit cubes.
-    starts : sequence of Start, optional
-        The 24 distinct ones if not given.
-
-    Returns
-    -------
-    Alignment
-        With all 64 candidates.
+    `first` registers from a start (4, 4) and returns fitness, inlier rmse [voxel] and the
+    transform; the highest fitness wins, then the lowest rmse. `last` registers from the winner.
     """
     fits = {
         start.index: first(make_transform(start.rotation))

@@ -128,23 +128,10 @@ def _fractions(count: int, first: int) -> NDArray[np.float64]:
 
 
 def surface_of(occupancy: NDArray[np.bool_]) -> Surface:
-    """Fill a voxel set and measure the signed distance to its surface.
+    """Fill a voxel set (64, 64, 64), a solid or a shell, and measure the distance to its surface.
 
-    Parameters
-    ----------
-    occupancy : ndarray of bool, shape (64, 64, 64)
-        A solid or a shell; at least one voxel.
-
-    Returns
-    -------
-    Surface
-        Of the solid: the set and all empty voxels that no path over faces
-        joins with the outside.
-
-    Notes
-    -----
-    The distance transform is exact and Euclidean, taken to the nearest voxel
-    centre of the other kind, less half a voxel to the face between the two.
+    The distance is exact and Euclidean, to the nearest voxel centre of the other kind, less half a
+    voxel to the face between the two.
     """
     from slatprep.geometry.distance import near_surface, signed_distance
 

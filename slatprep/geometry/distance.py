@@ -30,24 +30,11 @@ _VECTOR = 16
 
 
 def signed_distance(solid: NDArray[np.bool_]) -> NDArray[np.float32]:
-    """Measure the distance of each voxel's centre to the faces of a solid.
+    """Return the distance (a, b, c), in voxels, of each voxel's centre to the faces of a solid.
 
-    Parameters
-    ----------
-    solid : ndarray of bool, shape (a, b, c)
-        At most `LARGEST_SIDE` a side; voxels of both kinds. What lies outside
-        the box is not looked at.
-
-    Returns
-    -------
-    ndarray of float32, shape (a, b, c)
-        Euclidean distance, in voxels, to the nearest voxel centre of the other
-        kind, less half a voxel; negative inside.
-
-    Raises
-    ------
-    ValueError
-        If the box is too large.
+    It is Euclidean, to the nearest voxel centre of the other kind, less half a voxel; negative
+    inside. What lies outside the box is not looked at. ValueError if a side is beyond
+    `LARGEST_SIDE`.
     """
     if max(solid.shape) > LARGEST_SIDE:
         raise ValueError(f"a side is at most {LARGEST_SIDE} voxels, got shape {solid.shape}")
@@ -169,21 +156,9 @@ def _signed(solid, inside, outside, distance):  # type: ignore[no-untyped-def]
 def near_surface(
     distance: NDArray[np.float32], band: float
 ) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
-    """Find the points of a lattice that are near a surface.
+    """Return the lattice points (M, 3) within `band` voxels of a surface, and their distances (M,).
 
-    Parameters
-    ----------
-    distance : ndarray of float32, shape (a, b, c)
-        From `signed_distance`.
-    band : float
-        Voxels.
-
-    Returns
-    -------
-    points : ndarray of uint8, shape (M, 3)
-        Indices of those that are no farther off, in C order; a column after the other in memory.
-    values : ndarray of float32, shape (M,)
-        Their distances.
+    In C order; of the points a column lies after the other in memory.
     """
     points = np.empty((3, np.count_nonzero(np.abs(distance) <= band)), dtype=np.uint8)
     values = np.empty(points.shape[1], dtype=np.float32)

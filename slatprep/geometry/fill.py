@@ -16,22 +16,9 @@ WORD = 64
 
 
 def outside_of(occupancy: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Return the empty voxels that a path over faces joins with the outside of the grid.
+    """Return the empty voxels that a path over faces joins with the outside of a grid (a, b, c).
 
-    Parameters
-    ----------
-    occupancy : ndarray of bool, shape (a, b, c), c <= 64
-        Occupied voxels.
-
-    Returns
-    -------
-    ndarray of bool, shape (a, b, c)
-        The outside.
-
-    Raises
-    ------
-    ValueError
-        If a line is too long for a word.
+    ValueError if c is above 64, as a line is a word.
     """
     a, b, c = occupancy.shape
     if c > WORD:

@@ -21,19 +21,7 @@ VOXEL_SIZE = 1.0 / RESOLUTION
 
 
 def voxel_centres(voxels: ArrayLike, resolution: int = RESOLUTION) -> NDArray[np.float64]:
-    """Return the centres of voxels in the unit cube.
-
-    Parameters
-    ----------
-    voxels : array_like of int, shape (N, 3)
-        Voxel indices in 0..resolution - 1.
-    resolution : int
-        Voxels along each axis of the cube.
-
-    Returns
-    -------
-    ndarray of float64, shape (N, 3)
-        Points in [-0.5, 0.5]^3 of the same frame.
+    """Return the centres (N, 3) of voxels (N, 3) in the unit cube.
 
     Examples
     --------
@@ -44,19 +32,7 @@ def voxel_centres(voxels: ArrayLike, resolution: int = RESOLUTION) -> NDArray[np
 
 
 def apply_transform(transform: ArrayLike, points: ArrayLike) -> NDArray[np.float64]:
-    """Map points by a homogeneous transform.
-
-    Parameters
-    ----------
-    transform : array_like, shape (4, 4)
-        Homogeneous transform; the last row is taken to be 0, 0, 0, 1.
-    points : array_like, shape (N, 3)
-        Points of the transform's source frame.
-
-    Returns
-    -------
-    ndarray of float64, shape (N, 3)
-        Points of its target frame.
+    """Map points (N, 3) by a homogeneous transform (4, 4) whose last row is 0, 0, 0, 1.
 
     Examples
     --------
@@ -86,10 +62,7 @@ def split_transform(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], float]:
     """Split a similarity transform into rotation (3, 3), translation (3,) and scale.
 
-    Raises
-    ------
-    ValueError
-        If the matrix is not 4x4, not finite, mirrors, or is no similarity.
+    ValueError if the matrix is not 4x4, not finite, mirrors, or is no similarity.
     """
     matrix = np.asarray(transform, dtype=np.float64)
     if matrix.shape != (4, 4) or not np.isfinite(matrix).all():
@@ -107,13 +80,7 @@ def split_transform(
 
 
 def invert_transform(transform: ArrayLike) -> NDArray[np.float64]:
-    """Return the inverse (4, 4) of a similarity transform (4, 4): SLAT frame to PixieVerse frame.
-
-    Raises
-    ------
-    ValueError
-        As `split_transform` does.
-    """
+    """Return the inverse of a similarity transform (4, 4); ValueError as `split_transform`."""
     rotation, translation, scale = split_transform(transform)
     inverse = np.eye(4)
     inverse[:3, :3] = rotation.T / scale
@@ -127,17 +94,10 @@ def places_of(points: ArrayLike, transform: ArrayLike) -> NDArray[np.float64]:
 
 
 def displacement(transform: ArrayLike, reference: ArrayLike, points: ArrayLike) -> float:
-    """Mean distance, in voxels, between where two transforms look SLAT voxels up.
+    """Mean distance, in voxels, between where two transforms (4, 4) look points (N, 3) up.
 
-    Both transforms are inverted and applied to the voxels' centres, so the
-    distance is measured in the PixieVerse frame, where the annotation lies.
-
-    Parameters
-    ----------
-    transform, reference : array_like, shape (4, 4)
-        PixieVerse frame to SLAT frame.
-    points : array_like, shape (N, 3)
-        Centres of the SLAT's voxels, in the SLAT frame.
+    Both are inverted, so the distance is measured in the PixieVerse frame, where the annotation
+    lies.
     """
     here, there = places_of(points, transform), places_of(points, reference)
     return float(np.linalg.norm(here - there, axis=1).mean() * RESOLUTION)
@@ -146,22 +106,10 @@ def displacement(transform: ArrayLike, reference: ArrayLike, points: ArrayLike) 
 def nearest_similarity(
     source: NDArray[np.floating[Any]], target: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Return the similarity that maps points onto others with least squares.
+    """Return the similarity (4, 4) that maps points (P, 3) onto others with least squares.
 
-    Parameters
-    ----------
-    source, target : ndarray of float64, shape (P, 3)
-        The points, at least three that are not on a line, and their targets.
-
-    Returns
-    -------
-    ndarray of float64, shape (4, 4)
-        With a rotation, a positive scale and a shift.
-
-    References
-    ----------
-    S. Umeyama, "Least-squares estimation of transformation parameters between
-    two point patterns", IEEE TPAMI 13(4), 1991.
+    At least three of them are not on a line. S. Umeyama, "Least-squares estimation of
+    transformation parameters between two point patterns", IEEE TPAMI 13(4), 1991.
     """
     a, b = source - source.mean(axis=0), target - target.mean(axis=0)
     u, values, v = np.linalg.svd(b.T @ a)

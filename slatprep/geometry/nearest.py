@@ -28,18 +28,7 @@ _ROUNDING = 1e-6  # voxels by which a bound is loosened, so that no rounding pas
 
 
 class Lattice:
-    """A set of voxels that knows which row each cell of the grid belongs to.
-
-    Parameters
-    ----------
-    voxels : ndarray of uint8, shape (K, 3)
-        The set, K >= 1; no voxel occurs twice.
-
-    Raises
-    ------
-    ValueError
-        If the set is empty.
-    """
+    """A set of voxels (K, 3), K >= 1, that knows which row each cell of the grid belongs to."""
 
     def __init__(self, voxels: NDArray[np.uint8]) -> None:
         if len(voxels) == 0:
@@ -54,22 +43,10 @@ class Lattice:
     def nearest(
         self, points: NDArray[np.float64], limit: float = np.inf
     ) -> tuple[NDArray[np.float64], NDArray[np.intp]]:
-        """Find the nearest voxel for each point.
+        """Return distance (N,) [voxel] and row (N,) of the nearest voxel of points (N, 3).
 
-        Parameters
-        ----------
-        points : ndarray of float64, shape (N, 3)
-            Points of the unit cube's frame; they may lie outside the cube.
-        limit : float
-            Voxels; a point without a voxel this near needs no exact answer.
-
-        Returns
-        -------
-        distance : ndarray of float64, shape (N,)
-            Euclidean distance in voxels; infinite where it exceeds `limit`.
-        index : ndarray of intp, shape (N,)
-            Row of the nearest voxel in the set, the first of several equally
-            near ones; -1 where the distance exceeds `limit`.
+        Points may lie outside the cube. The first of several equally near voxels counts. The
+        distance is infinite, and the row -1, where it exceeds `limit` (voxels).
         """
         position = _in_voxels(points)
         near = self._blocks_near(min(limit, _SURE))
@@ -105,27 +82,12 @@ class Lattice:
         width: float,
         found: tuple[NDArray[np.float64], NDArray[np.intp]] | None = None,
     ) -> NDArray[np.intp]:
-        """Find for each point the voxel that a vote of those around it chooses.
+        """Return for each point (N, 3) the row (N,) of the voxel that a vote around it chooses.
 
-        The voxels in the 27 cells around the point vote for their label with the
-        weight exp(-d^2 / 2 width^2), d their distance from the point.
-
-        Parameters
-        ----------
-        points : ndarray of float64, shape (N, 3)
-            Points of the unit cube's frame.
-        labels : ndarray of uint8, shape (K,)
-            Label of each voxel.
-        width : float
-            Voxels.
-        found : tuple of ndarray, optional
-            What `nearest` gives for the points, where that is known.
-
-        Returns
-        -------
-        ndarray of intp, shape (N,)
-            Row of the nearest voxel that has the winning label (the lower label
-            wins a draw), or -1 where none of the 27 cells is in the set.
+        The voxels in the 27 cells around the point vote for their label (K,) with the weight
+        exp(-d^2 / 2 width^2), d their distance in voxels; the lower label wins a draw. The nearest
+        voxel of the winning label is chosen; -1 where none is there. `found` is what `nearest` gave
+        for the points.
         """
         position, parties = _in_voxels(points), int(labels.max()) + 1
         found = found or self.nearest(points, limit=_BEYOND)

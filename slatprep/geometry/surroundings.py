@@ -21,28 +21,11 @@ def shares_around(
     radii: tuple[int, ...],
     empty: int,
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Look at the cells at some distances of points, and say how they are labelled.
+    """Look at the cells at some distances of points (N, 3), and say how they are labelled.
 
-    Parameters
-    ----------
-    grid : ndarray of uint8, shape (64, 64, 64)
-        The label of each cell.
-    points : ndarray of float, shape (N, 3)
-        Points of the unit cube's frame; they may lie outside the cube.
-    labels : ndarray of uint8, shape (N,)
-        What to compare with.
-    radii : tuple of int
-        Distances in voxels; each shell has `DIRECTIONS` cells.
-    empty : int
-        The label of an empty cell; it lies also outside the grid.
-
-    Returns
-    -------
-    others : ndarray of float32, shape (N, len(radii))
-        Share of the shell's cells that are not empty whose label differs from
-        the point's own; 0 where all are empty.
-    solid : ndarray of float32, shape (N, len(radii))
-        Share of the shell's cells that are not empty.
+    Each of the `radii` (voxels) is a shell of `DIRECTIONS` cells; outside the grid all are `empty`.
+    Returns shares (N, len(radii)): of the cells that are not empty those whose label differs from
+    the point's own, 0 where all are empty; and of all cells those that are not empty.
     """
     # Beyond twice the largest radius no cell of a shell lies in the grid.
     margin = 2 * max(radii)

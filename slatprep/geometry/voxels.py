@@ -10,25 +10,10 @@ from slatprep.records import RESOLUTION, Ground
 
 
 def boundary(occupancy: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Return the occupied voxels that touch an empty one by a face.
+    """Return the occupied voxels of a grid (n, n, n) that touch an empty one by a face.
 
-    The outside of the grid counts as empty, so a full grid's boundary is its
-    outermost layer.
-
-    Parameters
-    ----------
-    occupancy : ndarray of bool, shape (n, n, n)
-        Occupied voxels.
-
-    Returns
-    -------
-    ndarray of bool, shape (n, n, n)
-        The boundary voxels, a subset of `occupancy`.
-
-    Notes
-    -----
-    The source points of the alignment in SLAT-Phys, "Physics-to-SLAT
-    Annotation Alignment".
+    The outside of the grid counts as empty. They are the source points of the alignment in
+    SLAT-Phys, "Physics-to-SLAT Annotation Alignment".
     """
     padded = np.pad(np.asarray(occupancy, dtype=bool), 1)
     inner = padded[1:-1, 1:-1, 1:-1]
@@ -44,10 +29,7 @@ def boundary(occupancy: NDArray[np.bool_]) -> NDArray[np.bool_]:
 def bounding_box(occupancy: NDArray[np.bool_]) -> tuple[slice, slice, slice]:
     """Return the slices of the smallest box that holds all occupied voxels of a grid (a, b, c).
 
-    Raises
-    ------
-    ValueError
-        If no voxel is occupied.
+    ValueError if no voxel is occupied.
     """
     slices = []
     for axis in range(3):
@@ -60,40 +42,16 @@ def bounding_box(occupancy: NDArray[np.bool_]) -> tuple[slice, slice, slice]:
 
 
 def filled(occupancy: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Return a voxel set with its inside filled.
-
-    Parameters
-    ----------
-    occupancy : ndarray of bool, shape (n, n, n)
-        A shell or a solid; n <= 64.
-
-    Returns
-    -------
-    ndarray of bool, shape (n, n, n)
-        The set and every empty voxel that no path over faces joins with the
-        outside of the grid.
-    """
+    """Return a voxel set (n, n, n), n <= 64, and all that no path over faces joins outside."""
     from slatprep.geometry.fill import outside_of
 
     return ~outside_of(occupancy)
 
 
 def above(occupancy: NDArray[np.bool_], ground: Ground | None) -> NDArray[np.bool_]:
-    """Return a voxel set without the ground.
+    """Return the filled set's voxels above the ground; `occupancy` itself where there is none.
 
     It is filled first, as what is hollow would be open where it stood on the ground.
-
-    Parameters
-    ----------
-    occupancy : ndarray of bool, shape (64, 64, 64)
-        Occupied voxels of the PixieVerse frame.
-    ground : Ground or None
-        From an alignment.
-
-    Returns
-    -------
-    ndarray of bool, shape (64, 64, 64)
-        The filled set's voxels whose centres are above the ground; `occupancy` where there is none.
     """
     if ground is None:
         return occupancy
@@ -138,24 +96,11 @@ def flat_index(voxels: ArrayLike, side: int = RESOLUTION) -> NDArray[np.intp]:
 def shown_in_cells(
     voxels: NDArray[np.uint8], resolution: int
 ) -> tuple[NDArray[np.uint8], NDArray[np.intp]]:
-    """Return the cells of the frames' 64^3 grid that voxels of any grid occupy.
+    """Return cells (M, 3) of the frames' 64^3 grid that voxels of any grid occupy, and whose (M,).
 
-    A cell is occupied if its centre lies in a voxel, or a voxel's centre in it: of a coarser
-    grid a voxel has several cells, of a finer one a cell may have several voxels.
-
-    Parameters
-    ----------
-    voxels : ndarray of uint8, shape (N, 3)
-        Voxels in 0..resolution - 1, each once.
-    resolution : int
-        Voxels along each axis of their grid, 2 to 256.
-
-    Returns
-    -------
-    cells : ndarray of uint8, shape (M, 3)
-        Those of a 64^3 grid as they are; of others in C order.
-    row : ndarray of intp, shape (M,)
-        The voxel that each cell shows, the first of several.
+    A cell is occupied if its centre lies in a voxel, or a voxel's centre in it: of a coarser grid a
+    voxel has several cells, of a finer one a cell may have several voxels, the first of which
+    counts. Cells of a 64^3 grid stay as they are; others are in C order.
     """
     if resolution == RESOLUTION:
         return voxels, np.arange(len(voxels))

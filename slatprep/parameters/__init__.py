@@ -169,7 +169,8 @@ class ConsensusParameters(_Group):
     """Whether the dataset's common rotation settles ties.
 
     With `settle`, a second pass treats assets whose geometry cannot decide between placements. Each
-    gets the placement nearest to the rotation that most assets without a tie share.
+    gets the placement nearest to the rotation that most assets without a tie share. An asset
+    without a tie that is turned otherwise gets it where shape and dataset together say so.
     """
 
     settle: bool = False
