@@ -23,10 +23,10 @@ MIRRORED = 0.025
 Of objects that are not mirrored, on real meshes of all levels, the largest was 0.015.
 """
 
-REFLECTED_SAMPLES, REFLECTED_TAUS = 100, (3.0, 2.0, 1.0, 1.0)
+REFLECTED_SAMPLES, REFLECTED_TAUS = 60, (3.0, 2.0, 1.0, 1.0)
 WIDE_SAMPLES, WIDE_TAUS, WIDE_STARTS, WIDE_KEPT = 60, (8.0, 5.0, 3.0, 2.0), 240, 6
 NEXT_SAMPLES, NEXT_TAUS, NEXT_KEPT = 200, (2.0, 1.0, 1.0, 1.0), 2
-LAST_TAUS = (1.0, 1.0)
+LAST_TAUS = (1.0, 1.0, 1.0)
 TRIAL_SAMPLES = 300
 """Samples a side and widths of the kernel, step by step, and how many placements go on."""
 
@@ -44,14 +44,16 @@ def mirror_gain(pair: Pair, found: Similarity, poor: bool) -> float:
     tried = mirrored.refine(
         _reflected(pair, best.similarity), REFLECTED_SAMPLES, REFLECTED_TAUS, 0.02
     )
+    if not poor:
+        (other,) = mirrored.refine(_best(tried, 1), POLISH_SAMPLES, LAST_TAUS, 0.01)
+        return other.score - best.score
     kept = _best(tried, NEXT_KEPT)
-    if poor:
-        # Every second one: a mirrored side that fits better has more than one way to it.
-        rotations = [s.rotation for s in distinct_starts()] + list(so3_starts(WIDE_STARTS)[::2])
-        starts = mirrored.starts(rotations, pair.size_ratio)
-        kept += _best(mirrored.refine(starts, WIDE_SAMPLES, WIDE_TAUS, 0.02), WIDE_KEPT)
+    # Every second one: a mirrored side that fits better has more than one way to it.
+    rotations = [s.rotation for s in distinct_starts()] + list(so3_starts(WIDE_STARTS)[::2])
+    starts = mirrored.starts(rotations, pair.size_ratio)
+    kept += _best(mirrored.refine(starts, WIDE_SAMPLES, WIDE_TAUS, 0.02), WIDE_KEPT)
     kept = _best(mirrored.refine(kept, NEXT_SAMPLES, NEXT_TAUS, 0.01), NEXT_KEPT)
-    if poor and pair.may_deform:
+    if pair.may_deform:
         there = try_out(mirrored.slat, pair.pixie, kept[0].similarity, TRIAL_SAMPLES)
         here = try_out(pair.slat, pair.pixie, best.similarity, TRIAL_SAMPLES)
         return there.whole - here.whole
