@@ -54,6 +54,10 @@ class PlaceType(click.Path):
     ) -> Any:
         """Return a place."""
         place = place_of(value)
+        if str(place).startswith("memory://"):
+            self.fail(
+                f"{place} is gone when the command ends; expected a path, or a URL that lasts"
+            )
         if storage_of(place).local is None:
             return place
         return super().convert(str(place), parameter, context)

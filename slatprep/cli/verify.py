@@ -10,7 +10,7 @@ import click
 from slatprep.cli.options import FolderOrUrl, LastStore, Positive, WorkersOptions
 from slatprep.cli.output import Output, say
 from slatprep.cli.signature import Click, command
-from slatprep.errors import StoreError
+from slatprep.errors import StoreError, amount
 
 if TYPE_CHECKING:
     from slatprep.records import Place
@@ -82,12 +82,13 @@ def verify(
     def show() -> None:
         for finding in result.findings:
             say(finding)
+        read = amount(result.sources, "source") if result.sources else "sources not asked for"
         records = result.manifests or "none beside the store"
         output.note(
-            f"{result.assets:,} assets, {result.files:,} files, {result.sources:,} sources; "
+            f"{amount(result.assets, 'asset')}, {amount(result.files, 'file')}, {read}; "
             f"records: {records}"
         )
-        found = f"{len(result.findings):,} findings" if result.findings else "nothing is wrong"
+        found = amount(len(result.findings), "finding") if result.findings else "nothing is wrong"
         say(f"{store}: {found}")
 
     output.result(result, show, complete=result.ok)

@@ -173,7 +173,7 @@ def merged(judgement: Judgement, annotation: Annotation) -> Judgement:
     verdict = Verdict.DOUBTFUL if judgement.verdict is Verdict.GOOD else judgement.verdict
     reason = (
         f"its annotations differ: only {expected:.1%} of the labels can be expected to be right "
-        f"(good: {least:.0%})"
+        f"(good needs {least:.0%})"
     )
     return replace(together, verdict=verdict, reasons=(*judgement.reasons, reason))
 
@@ -265,23 +265,23 @@ def verdict_of(
     if expected_accuracy < limits.good_accuracy:
         reasons.append(
             f"only {expected_accuracy:.1%} of the labels can be expected to be right "
-            f"(good: {limits.good_accuracy:.0%})"
+            f"(good needs {limits.good_accuracy:.0%})"
         )
     if valid_share < limits.good_valid_share:
         reasons.append(
             f"only {valid_share:.1%} of the SLAT voxels found an annotation "
-            f"(good: {limits.good_valid_share:.0%})"
+            f"(good needs {limits.good_valid_share:.0%})"
         )
     if ambiguity > limits.good_ambiguity:
         others = "another placement fits" if ties == 1 else f"{ties or ''} other placements fit"
         reasons.append(
             f"{others.lstrip()} about as well and would change the class of {ambiguity:.1%} of the "
-            f"voxels (good: {limits.good_ambiguity:.0%})"
+            f"voxels (good needs {limits.good_ambiguity:.0%})"
         )
     if mirrored > limits.good_mirrored:
         reasons.append(
             "the annotation is a mirror image of its object, left for right: mirrored, it fits "
-            f"better by {mirrored:.3f} in score (good: at most {limits.good_mirrored:g})"
+            f"better by {mirrored:.3f} in score (good needs at most {limits.good_mirrored:g})"
         )
     if contradicted:
         reasons.append(_CONTRADICTED)
@@ -295,7 +295,7 @@ def _doubts(
 ) -> list[str]:
     """Say which of the two questions takes the confidence away, the worse one first."""
     limits, sure = THRESHOLDS, ("perhaps", "probably")
-    good = f"(good: {limits.good_confidence:.0%} for object and placement together)"
+    good = f"(good needs {limits.good_confidence:.0%} for object and placement together)"
     because = f": {_WORDS[cause]}" if cause else ""
     another = sure[same_object < limits.failed_confidence]
     doubts = sorted(
@@ -331,6 +331,6 @@ def _judge_by_fitness(quality: Quality, reasons: list[str]) -> bool:
         if fitness < limits.good_fitness:
             reasons.append(
                 f"only {fitness:.1%} of the {name} lies within {quality.radius:g} voxel of the "
-                f"other side (good: {limits.good_fitness:.0%})"
+                f"other side (good needs {limits.good_fitness:.0%})"
             )
     return any(fitness < limits.failed_fitness for _, fitness in sides)

@@ -66,7 +66,8 @@ class AssetTable:
         try:
             verdicts = Counter(str(verdict) for verdict in self.cached_column("verdict"))
             counts = ", ".join(f"{count:,} {verdict}" for verdict, count in verdicts.most_common())
-            what = f"{len(self):,} assets ({counts}), {self.offsets[-1]:,} voxels"
+            total = f"{amount(len(self), 'asset')} ({counts})"
+            what = f"{total}, {amount(int(self.offsets[-1]), 'voxel')}"
         except StoreError as error:
             what = f"cannot be read ({error})"
         return f"<Store {self.path}: {what}>"

@@ -12,7 +12,7 @@ from typing import Any, overload
 import numpy as np
 from numpy.typing import NDArray
 
-from slatprep.errors import ConfigError, StoreError
+from slatprep.errors import ConfigError, StoreError, amount
 from slatprep.geometry.voxels import shown_in_cells, voxels_at
 from slatprep.normalize import denormalize_properties
 from slatprep.records import MaterialField, Place, StructuredLatents
@@ -96,7 +96,7 @@ class StoredAsset:
 
     def __repr__(self) -> str:
         what = f"{self.columns['category'] or 'category unknown'}, {self.columns['verdict']}"
-        return f"<StoredAsset {self.asset_id}: {what}, {len(self.coords):,} voxels>"
+        return f"<StoredAsset {self.asset_id}: {what}, {amount(len(self.coords), 'voxel')}>"
 
     @property
     def merged(self) -> bool:
@@ -296,7 +296,7 @@ def open_store(path: str | Place, *, copy: bool = False) -> Store:
         path = storage_of(path).copied_version()
     document = _root_document(path)
     if not document:
-        _require_there(path)
+        _require_readable(path)
     attributes = document.get("attributes", {})
     if attributes.get("format") != FORMAT:
         raise StoreError(
@@ -341,11 +341,18 @@ def require_outside(out: Path) -> None:
         raise ConfigError(f"{out} {where}; expected a path outside of any store")
 
 
-def _require_there(path: Place) -> None:
-    """Raise StoreError if there is nothing at all, or nobody can tell."""
+def _require_readable(path: Place) -> None:
+    """Raise StoreError if there is nothing at all, or it may not be read."""
     needed = path / "zarr.json"
     try:
         there = needed.exists()
+        if there:
+            needed.read_bytes()
+    except PermissionError as error:
+        raise StoreError(
+            f"{needed}: may not be read ({error.strerror}); expected a store that these "
+            "credentials may read"
+        ) from None
     except OSError as error:
         raise StoreError(f"{path}: cannot be reached ({error.strerror})") from None
     if not there:

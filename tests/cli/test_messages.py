@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import json
+import shutil
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
 import zarr
 from click.testing import CliRunner, Result
+from support.rights import BOUND_BY_PERMISSIONS
 from support.synthetic import Dataset
 
 from slatprep import open_store
@@ -216,3 +220,29 @@ def test_what_ends_a_command_is_json_too(store: Path, tmp_path: Path) -> None:
         document = json.loads(result.stdout)
         assert said in document["error"] and said in result.stderr and document["ok"] is False
     assert document["command"] == "report"
+
+
+def test_a_store_that_may_not_be_read_is_no_other_kind_of_folder(
+    store: Path, tmp_path: Path
+) -> None:
+    own = tmp_path / "s.zarr"
+    shutil.copytree(store, own)
+    (own / "zarr.json").chmod(0)
+    script = f"{BOUND_BY_PERMISSIONS}\nfrom slatprep.cli import main; main()"
+    command = [sys.executable, "-c", script, "info", str(own)]
+    done = subprocess.run(command, capture_output=True, text=True)
+    assert done.returncode == 1
+    assert "zarr.json: may not be read (Permission denied)" in done.stderr
+    assert "is not a slatprep store" not in done.stderr
+
+
+def test_nothing_is_written_to_memory_that_goes_with_the_command(store: Path) -> None:
+    result = run("subset", store, "--verdict", "good", "--out", "memory://s.zarr")
+    assert result.exit_code == 2 and "gone when the command ends" in result.stderr
+
+
+def test_a_single_asset_is_counted_in_the_singular(store: Path, tmp_path: Path) -> None:
+    out = tmp_path / "one.zarr"
+    assert run("subset", store, "--asset", "0", "--out", out, "-q").exit_code == 0
+    told = run("verify", out)
+    assert told.exit_code == 0 and "1 asset," in told.stderr and "0 sources" not in told.stderr

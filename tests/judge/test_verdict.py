@@ -69,16 +69,19 @@ def test_every_reason_is_named_once() -> None:
     assert verdict is Verdict.DOUBTFUL
     assert reasons == (
         "perhaps another object: the two sides show the same one with a probability of 60.0% "
-        "(good: 90% for object and placement together): the surfaces lie on each other roughly "
+        "(good needs 90% for object and placement together): the surfaces lie on each "
+        "other roughly "
         "only",
-        "perhaps a wrong placement: it is right with a probability of 80.0% (good: 90% for object "
+        "perhaps a wrong placement: it is right with a probability of 80.0% (good needs "
+        "90% for object "
         "and placement together)",
-        "only 70.0% of the PixieVerse boundary lies within 1.5 voxel of the other side (good: 80%)",
-        "only 60.0% of the SLAT boundary lies within 1.5 voxel of the other side (good: 80%)",
-        "only 70.0% of the labels can be expected to be right (good: 75%)",
-        "only 80.0% of the SLAT voxels found an annotation (good: 90%)",
+        "only 70.0% of the PixieVerse boundary lies within 1.5 voxel of the other side "
+        "(good needs 80%)",
+        "only 60.0% of the SLAT boundary lies within 1.5 voxel of the other side (good needs 80%)",
+        "only 70.0% of the labels can be expected to be right (good needs 75%)",
+        "only 80.0% of the SLAT voxels found an annotation (good needs 90%)",
         "2 other placements fit about as well and would change the class of 40.0% of the voxels "
-        "(good: 5%)",
+        "(good needs 5%)",
         "its latents contradict its labels: labels drawn at random would be likelier",
     )
 
@@ -170,7 +173,8 @@ def test_contradiction_and_samples_that_differ_make_good_ones_doubtful(
     assert (several.verdict, several.expected_accuracy) == (after, 0.5)
     assert several.reasons == (
         "what it had",
-        "its annotations differ: only 50.0% of the labels can be expected to be right (good: 75%)",
+        "its annotations differ: only 50.0% of the labels can be expected to be right "
+        "(good needs 75%)",
     )
 
 

@@ -18,7 +18,7 @@ from slatprep.workers.local import at_most
 # Numba says of every kernel that it compiles; what it finds on disk it does not name. But a
 # kernel knows what types it has been called with, wherever its code came from: those of a build
 # must be those from before it. So one kernel alone needs to be compiled here.
-SCRIPT = """
+SCRIPT = r"""
 import gc, re, sys
 from pathlib import Path
 import numba

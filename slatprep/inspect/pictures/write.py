@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from slatprep.errors import StoreError
+from slatprep.errors import StoreError, amount
 from slatprep.inspect.check import AlignmentCheck, check_alignment
 from slatprep.inspect.pictures.alignment import draw_alignment
 from slatprep.inspect.pictures.canvas import FORMATS, STYLE, in_format
@@ -82,15 +82,16 @@ def _drawn(path: Place, check: AlignmentCheck, kind: str) -> tuple[str, bytes, S
 
 
 def title_of(asset: StoredAsset) -> str:
-    """Return the title of an asset's picture: its category."""
-    return str(asset.columns["category"]).replace("_", " ") or "category unknown"
+    """Return the title of an asset's picture: its category where it is known, and its id."""
+    category = str(asset.columns["category"]).replace("_", " ")
+    return f"{category}: {asset.asset_id}" if category else asset.asset_id
 
 
 def subtitle_of(asset: StoredAsset) -> str:
-    """Return an asset's id, its number of voxels and how it was aligned, in one line."""
+    """Return an asset's number of voxels and how it was aligned, in one line."""
     columns = asset.columns
     how = f"engine {columns['engine']}, {columns['model']}, starts {columns['search']}"
-    return f"{asset.asset_id}   {len(asset.coords):,} SLAT voxels   {how}"
+    return f"{amount(len(asset.coords), 'SLAT voxel')}   {how}"
 
 
 def _write(path: Path, content: bytes) -> None:

@@ -145,6 +145,26 @@ def test_it_opens_an_asset_that_turns(opened: Chrome) -> None:
     assert_quiet(opened)
 
 
+def test_an_address_may_name_an_asset_in_short(browser: Chrome, hostile: Report) -> None:
+    def opened_by(name: str) -> str:
+        browser.get("about:blank")
+        browser.get(f"{hostile.path.as_uri()}#asset={name}")
+        wait(
+            lambda: browser.execute_script(
+                "return performance.getEntriesByName('slatprep-ready').length"
+            )
+        )
+        shown = browser.execute_script("return document.getElementById('asset').open")
+        return browser.current_url.partition("#asset=")[2] if shown else ""
+
+    assert opened_by("bear.s") == opened_by("bear.side") == "bear.side"
+    assert opened_by("0") == "ant"
+    for name in ("bear.", "nonsense", "400"):
+        assert opened_by(name) == ""
+        told = browser.find_element("id", "nowhere")
+        assert told.is_displayed() and name in told.text
+
+
 def test_an_address_opens_an_asset_before_the_page_has_been_read(
     browser: Chrome, hostile: Report, tmp_path: Path
 ) -> None:

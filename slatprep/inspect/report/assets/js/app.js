@@ -194,14 +194,27 @@ const Detail = (() => {
     if (next !== null) open(next);
   }
 
+  /** Return the row that a name means: an id, a beginning that no other id has, or a number. */
+  function named(name) {
+    const whole = ASSETS.id.indexOf(name);
+    if (whole >= 0 || !name) return whole < 0 ? undefined : whole;
+    const begun = ASSETS.id.flatMap((id, row) => (id.startsWith(name) ? [row] : []));
+    if (begun.length || !/^\d+$/.test(name)) return begun.length === 1 ? begun[0] : undefined;
+    return Number(name) < ASSETS.id.length ? Number(name) : undefined;
+  }
+
   /** Open the asset that the address names. */
   function fromAddress() {
     const [, id] = location.hash.match(/^#asset=(.*)$/) ?? [];
+    byId("nowhere").hidden = true;
     if (id === undefined) return;
     let name = id;
     try { name = decodeURIComponent(id); } catch { /* taken as it stands */ }
-    const found = ASSETS.id.indexOf(name);
-    if (found >= 0 && found !== index) open(found);
+    const found = named(name);
+    if (found === undefined) {
+      byId("nowhere").textContent = `No asset of this page, or more than one, is named “${name}”.`;
+      byId("nowhere").hidden = false;
+    } else if (found !== index) open(found);
   }
 
   function create() {
