@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import textwrap
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -33,11 +34,10 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 WIDTH, HEIGHT = 1800, 1140
-"""Pixels of a picture; with a deformation it is `WIDER` pixels wider."""
+"""Pixels of a picture of four columns."""
 
 PANEL = 300
 _LEFT, _TOP, _GAP = 48, 142, 14
-WIDER = 2 * (PANEL + _GAP)
 _MOST_LINES = 10
 """Most lines of reasons in the column at the right."""
 
@@ -58,6 +58,16 @@ DEFORMED_COLUMNS = (
 )
 """The same for an alignment with a deformation."""
 
+TIED_COLUMN = ("another", "placement that fits about as well")
+"""Stands before the last two columns where placements are tied."""
+
+
+def columns_of(scene: Scene) -> tuple[tuple[str, str], ...]:
+    """Return the columns of an asset's picture."""
+    columns = COLUMNS if scene.deformed is None else DEFORMED_COLUMNS
+    tied = () if scene.tied is None else (TIED_COLUMN,)
+    return (*columns[:-2], *tied, *columns[-2:])
+
 
 def draw_alignment(
     scene: Scene,
@@ -67,12 +77,17 @@ def draw_alignment(
     alignment: Alignment,
     finer: int = 1,
 ) -> Figure:
-    """Draw an alignment as a figure of `WIDTH` x `HEIGHT` pixels, `WIDER` pixels more if deformed.
+    """Draw an alignment as a figure of `WIDTH` x `HEIGHT` pixels, wider by its further columns.
 
-    A pixel of the figure has `finer` pixels of a panel along each edge. The figure must be drawn
-    and saved within `slatprep.inspect.pictures.canvas.STYLE`.
+    If other placements are tied, the best of them is shown as well. A pixel of the figure has
+    `finer` pixels of a panel along each edge. The figure must be drawn and saved within
+    `slatprep.inspect.pictures.canvas.STYLE`.
     """
-    figure = new_figure(WIDTH + (WIDER if scene.deformed else 0), HEIGHT)
+    if alignment.open_placements:
+        best = max(alignment.open_placements, key=lambda placement: placement.score)
+        scene = replace(scene, tied=best.transform)
+    further = len(columns_of(scene)) - len(COLUMNS)
+    figure = new_figure(WIDTH + further * (PANEL + _GAP), HEIGHT)
     reasons = _head(figure, check, title, subtitle)
     _panels(figure, scene, finer)
     _legend(figure, scene)
@@ -110,7 +125,7 @@ def error_picture(scene: Scene, view: View) -> NDArray[np.float64]:
 
 
 def panels(scene: Scene, view: View) -> tuple[NDArray[np.float64], ...]:
-    """Draw one row of a picture: `COLUMNS` or `DEFORMED_COLUMNS`, each (n, n, 3) in 0..1."""
+    """Draw one row of a picture: `columns_of` it, each (n, n, 3) in 0..1."""
     field = scene.pixieverse, scene.pixieverse_material
     sets: list[Placed] = [(*field, np.eye(4)), (*field, scene.transform)]
     moved = []
@@ -120,7 +135,9 @@ def panels(scene: Scene, view: View) -> tuple[NDArray[np.float64], ...]:
         colours = distance_colours(shares, displacement_scale(scene.deformed))
         moved.append(draw_voxels(scene.slat, colours, np.eye(4), view, contrast=0.35).rgb)
     result = draw_voxels(scene.slat, class_colours(scene.slat_material), np.eye(4), view)
-    return (*outlined(scene, view, *sets), *moved, result.rgb, error_picture(scene, view))
+    tied = [] if scene.tied is None else outlined(scene, view, (*field, scene.tied))
+    shown = *outlined(scene, view, *sets), *moved, *tied
+    return (*shown, result.rgb, error_picture(scene, view))
 
 
 def displacement_scale(deformed: Deformed) -> float:
@@ -139,8 +156,7 @@ def _outline(drawing: Drawing) -> NDArray[np.float64]:
 
 
 def _panels(figure: Figure, scene: Scene, finer: int) -> None:
-    columns = COLUMNS if scene.deformed is None else DEFORMED_COLUMNS
-    for column, (name, meaning) in enumerate(columns):
+    for column, (name, meaning) in enumerate(columns_of(scene)):
         x = _LEFT + column * (PANEL + _GAP)
         write(figure, x, _TOP - 30, name, weight="bold", size=9)
         write(figure, x, _TOP - 10, meaning, color=palette.MUTED, size=6.8)

@@ -62,6 +62,8 @@ class Scene:
         The deformation, if the asset has one.
     labels : tuple of str
         Names of the classes.
+    tied : ndarray of float64, shape (4, 4), or None
+        The best of the other placements that fit about as well, if there are such.
     """
 
     pixieverse: NDArray[np.uint8]
@@ -74,6 +76,7 @@ class Scene:
     error_before: NDArray[np.float64]
     deformed: Deformed | None = None
     labels: tuple[str, ...] = MATERIAL_CLASSES
+    tied: NDArray[np.float64] | None = None
 
     @property
     def placed(self) -> Placed:

@@ -29,8 +29,9 @@ from slatprep.geometry.frames import apply_transform, invert_transform, voxel_ce
 from slatprep.inspect.check import check_alignment, choose_assets
 from slatprep.inspect.pictures.alignment import (
     HEIGHT,
-    WIDER,
+    PANEL,
     WIDTH,
+    columns_of,
     displacement_scale,
     draw_alignment,
     panels,
@@ -41,7 +42,7 @@ from slatprep.inspect.pictures.viewer import cube_mesh, has_screen, meshes
 from slatprep.inspect.pictures.write import write_pictures
 from slatprep.pipeline.dataset import BuildSummary
 from slatprep.provenance.stored import StoredRecords
-from slatprep.records import Search
+from slatprep.records import Placement, Search
 from slatprep.store import open_store
 
 
@@ -99,6 +100,27 @@ def test_on_a_full_disk_the_picture_that_is_there_stays(copy: Path, tmp_path: Pa
     assert told.returncode == 1
     assert f"the picture: cannot be written to {picture} (File too large)" in told.stderr
     assert [file.read_bytes() for file in picture.parent.iterdir()] == [b"a good one"]
+
+
+def test_the_next_of_tied_placements_stands_beside_the_chosen_one(copy: Path) -> None:
+    store = open_store(copy)
+    asset, check = store.asset("ant"), check_alignment(store, "ant")
+    alignment = StoredRecords(store).of("ant").alignment
+    turned = asset.transform @ QUARTER_TURN
+    ties = tuple(Placement(at, score, 9.0) for at, score in ((asset.transform, 0.5), (turned, 0.7)))
+    tied = replace(alignment, placements=ties, settled_by=None)
+    with matplotlib.style.context(["default", STYLE]):
+        figure = draw_alignment(scene_of(asset), check, "t", "s", tied)
+        words = [text.get_text() for text in figure.findobj(Text)]
+    assert "placement that fits about as well" in words
+    assert figure.bbox.width == WIDTH + PANEL + 14
+    scene = replace(scene_of(asset), tied=turned)
+    assert len(columns_of(scene)) == 5
+    before, after, another, result, error = panels(scene, views(scene, 90)[0])
+    assert np.abs(another - after).sum() > 9
+    alone = panels(scene_of(asset), views(scene, 90)[0])
+    for one, other in zip((before, after, result, error), alone, strict=True):
+        assert np.array_equal(one, other)
 
 
 def test_no_words_are_cut_or_written_over_others(copy: Path) -> None:
@@ -216,7 +238,7 @@ def test_a_deformation_is_shown_before_and_after_and_as_displacement(
         result = run("--asset", asset.asset_id, "--store", store.path, "--picture", file)
         assert "picture:" in result.stdout, result.output
         image = imread(file)
-        assert image.shape[:2] == (HEIGHT, WIDTH + WIDER)
+        assert image.shape[:2] == (HEIGHT, WIDTH + 2 * (PANEL + 14))
         for top in (142, 456, 770):
             for left in (48, 362, 676, 990, 1304, 1618, 1978):
                 assert image[top : top + 300, left : left + 300, :3].std() > 0.05, (top, left)
