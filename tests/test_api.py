@@ -5,9 +5,12 @@ from __future__ import annotations
 import doctest
 import importlib.metadata
 import inspect
+import os
 import pkgutil
+import re
 import subprocess
 import sys
+from pathlib import Path
 from types import ModuleType
 
 import numpy as np
@@ -187,3 +190,20 @@ def test_normalised_and_back() -> None:
         assert values.dtype == np.float32 and (np.abs(values) <= 1).all()
         back = slatprep.denormalize_properties(values, ranges)
         np.testing.assert_allclose(back, properties, rtol=1e-4)
+
+
+def test_type_checkers_see_the_package_from_outside_the_checkout(tmp_path: Path) -> None:
+    script = tmp_path / "script.py"
+    script.write_text(
+        "import slatprep\n"
+        "store = slatprep.open_store('x')\n"
+        "reveal_type(store)\n"
+        "reveal_type(store[0])\n"
+        "reveal_type(store[1:])\n"
+    )
+    environment = {name: value for name, value in os.environ.items() if "PYTHONPATH" not in name}
+    command = [sys.executable, "-m", "mypy", "--follow-imports=silent", str(script)]
+    done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True)
+    seen = re.findall(r'Revealed type is "([\w.\[\]]+)"', done.stdout)
+    asset = "slatprep.store.reader.StoredAsset"
+    assert seen == ["slatprep.store.reader.Store", asset, f"list[{asset}]"], done.stdout
