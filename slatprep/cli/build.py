@@ -224,7 +224,9 @@ def report(output: Output, summary: BuildSummary) -> None:
             from slatprep.inspect.overview import overview_of
             from slatprep.store import open_store
 
-            show_quality(output, overview_of(open_store(summary.store)))
+            overview = overview_of(open_store(summary.store))
+            # What a dataset definition may say is of no use to `subset` and `concat`.
+            show_quality(output, overview, advise=output.command == "build-store")
         others = ", ".join(f"{count:,} {status}" for status, count in summary.statuses.items())
         say(f"assets:  {total:,} ({others}) in {summary.seconds:,.1f} s")
         if summary.store is not None:

@@ -57,7 +57,7 @@ def info(
     output.result(overview, show)
 
 
-def show_quality(output: Output, overview: StoreOverview) -> None:
+def show_quality(output: Output, overview: StoreOverview, *, advise: bool = True) -> None:
     """Print how good the alignments of a store are, by category and in all.
 
     ``labels`` is the expected share of right classes. Lines below the table say which
@@ -77,7 +77,7 @@ def show_quality(output: Output, overview: StoreOverview) -> None:
         ],
     )
     unknown = sum(group.assets for group in overview.categories if group.name == UNKNOWN)
-    if unknown:
+    if unknown and advise:
         table = _categories_of(overview)
         say(
             f"unknown: the category of {unknown:,}; "

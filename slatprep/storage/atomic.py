@@ -180,7 +180,7 @@ def writing(what: str, where: Place) -> Iterator[None]:
         yield
     except OSError as error:
         full = error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
-        advice = "Make room there" if full else "See that both may be written"
+        advice = "Make room there" if full else "Name a place that may be written"
         raise StoreError(
             f"{what}: cannot be written to {where} ({error.strerror or error}); nothing was "
             f"replaced. {advice} and run again: what is finished is kept"

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import pkgutil
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any, overload
+from typing import TYPE_CHECKING, Any, cast, overload
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,6 +22,9 @@ from slatprep.store.assets import ASSET_COLUMNS, AssetTable, AttributesError
 from slatprep.store.attributes import width_findings
 from slatprep.store.contract import MAX_VOXELS, read_metadata
 from slatprep.store.layout import FORMAT, FORMAT_VERSION, MERGED_COLUMNS, arrays_with
+
+if TYPE_CHECKING:
+    from PIL.Image import Image
 
 TRAINING_COLUMNS = ("coords", "feats", "properties")
 """What `Store.read` reads unless told otherwise."""
@@ -97,6 +101,15 @@ class StoredAsset:
     def __repr__(self) -> str:
         what = f"{self.columns['category'] or 'category unknown'}, {self.columns['verdict']}"
         return f"<StoredAsset {self.asset_id}: {what}, {amount(len(self.coords), 'voxel')}>"
+
+    def plot(self) -> Image:
+        """Draw it as ``slatprep check-alignment`` does; a notebook shows the picture.
+
+        StoreError if its record cannot be read.
+        """
+        # Pictures stand floors above the store, whose face is where people look for them.
+        picture = pkgutil.resolve_name("slatprep.inspect.pictures.write:picture_of")
+        return cast("Image", picture(self))
 
     @property
     def merged(self) -> bool:

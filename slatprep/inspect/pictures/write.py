@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import io
 from collections.abc import Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from slatprep.errors import StoreError, amount
 from slatprep.inspect.check import AlignmentCheck, check_alignment
@@ -18,6 +20,9 @@ from slatprep.storage.names import file_name
 from slatprep.store.reader import Store, StoredAsset, open_store
 from slatprep.workers import Progress
 from slatprep.workers.local import run_unordered
+
+if TYPE_CHECKING:
+    from PIL.Image import Image
 
 SHEET = "sheet.png"
 """Name of the contact sheet in a folder of pictures."""
@@ -64,6 +69,14 @@ def sheet_of(store: Store, asset_ids: Sequence[str]) -> bytes:
     shown = [store.asset(asset_id) for asset_id in asset_ids[:MOST]]
     checks = [check_alignment(store, asset.asset_id) for asset in shown]
     return draw_sheet([scene_of(one) for one in shown], checks, [title_of(one) for one in shown])
+
+
+def picture_of(asset: StoredAsset) -> Image:
+    """Return an asset's picture, as `write_pictures` draws it."""
+    import PIL.Image
+
+    check = check_alignment(asset.store, asset.index)
+    return PIL.Image.open(io.BytesIO(_drawn(asset.store.path, check, "png")[1]))
 
 
 def _drawn(path: Place, check: AlignmentCheck, kind: str) -> tuple[str, bytes, Scene, str]:

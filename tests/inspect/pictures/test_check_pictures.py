@@ -123,6 +123,15 @@ def test_the_next_of_tied_placements_stands_beside_the_chosen_one(copy: Path) ->
         assert np.array_equal(one, other)
 
 
+def test_an_asset_plots_itself_as_the_command_draws_it(copy: Path, tmp_path: Path) -> None:
+    asset = open_store(copy)["ant"]
+    picture = asset.plot()
+    assert picture.format == "PNG"  # A notebook shows it.
+    run("--asset", "ant", "--store", copy, "--picture", tmp_path / "ant.png")
+    drawn = imread(tmp_path / "ant.png")
+    assert np.array_equal(np.asarray(picture)[..., :3], np.rint(drawn[..., :3] * 255))
+
+
 def test_no_words_are_cut_or_written_over_others(copy: Path) -> None:
     group = zarr.open_group(copy, mode="r+")
     for name, value in (("confidence", 0.4), ("expected_accuracy", 0.5), ("ambiguity", 0.9)):
