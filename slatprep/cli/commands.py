@@ -36,6 +36,7 @@ GROUPS = {
         "report": "slatprep.cli.report:report",
         "check-alignment": "slatprep.cli.check:check_alignment",
         "score": "slatprep.cli.score:score",
+        "measure-errors": "slatprep.cli.errors:measure_errors",
     },
     "Take elsewhere": {
         "export": "slatprep.cli.export:export",

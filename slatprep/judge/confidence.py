@@ -46,6 +46,16 @@ def right_placement(evidence: NDArray[np.float64]) -> float:
     return float(PLACEMENT.probability(evidence))
 
 
+def same_objects(evidence: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return what `same_object` says of many alignments (A, F)."""
+    return SAME_OBJECT.probability(evidence)
+
+
+def right_placements(evidence: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return what `right_placement` says of many alignments (A, F)."""
+    return PLACEMENT.probability(evidence)
+
+
 def causes_of_doubt(evidence: NDArray[np.float64]) -> dict[str, float]:
     """Return what speaks against the same object, compared with a usual right placement.
 

@@ -50,7 +50,7 @@ class Thresholds:
     good_confidence: float = 0.9
     failed_confidence: float = 0.5
     good_accuracy: float = 0.75
-    good_valid_share: float = 0.9
+    good_valid_share: float = 0.8
     good_ambiguity: float = 0.05
     good_mirrored: float = 0.025
     good_fitness: float = 0.8

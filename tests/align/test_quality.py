@@ -83,7 +83,7 @@ def _quality(fitness: float, backward: float = 1.0) -> Quality:
         (_quality(1.0, 0.64), 1.0, 0.0, Verdict.FAILED, "SLAT boundary"),
         (_quality(THRESHOLDS.failed_fitness), 1.0, 0.0, Verdict.DOUBTFUL, ""),
         (_quality(0.64), 1.0, 0.0, Verdict.FAILED, "64.0%"),
-        (_quality(1.0), 0.89, 0.0, Verdict.DOUBTFUL, "annotation"),
+        (_quality(1.0), 0.79, 0.0, Verdict.DOUBTFUL, "annotation"),
         (_quality(1.0), 1.0, 0.05, Verdict.GOOD, ""),
         (_quality(1.0), 1.0, 0.3, Verdict.DOUBTFUL, "30.0%"),
     ],

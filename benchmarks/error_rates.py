@@ -1,0 +1,102 @@
+"""Compare the error rates that decoys state with the true ones, on tables of confidence.py.
+
+    python benchmarks/error_rates.py table.npz ... [--wrong 0 0.05 0.2 0.35 1] [--draws 12]
+
+A dataset is drawn from right alignments, with a share of alignments to SLATs of other objects
+mixed in as if files were paired wrongly; other such alignments are its decoys. Printed by that
+share, mean and worst of the draws: the share that is stated and whether its interval holds the
+truth; of those called good, how many are stated to be wrong and how many are; at a stated rate of
+0.01 the true rate, and the share of the right ones that is kept, beside the share called good.
+
+Tables of objects that had no part in the fit of the shipped model tell most.
+"""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+import numpy as np
+from calibrate import Table, read_tables
+from numpy.typing import NDArray
+
+from slatprep.judge.confidence import right_placements, same_objects
+from slatprep.judge.decoys import FOLDS, ErrorRates, error_rates
+from slatprep.judge.verdict import THRESHOLDS
+
+RATE = 0.01
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("tables", type=Path, nargs="+")
+    parser.add_argument("--wrong", type=float, nargs="+", default=[0.0, 0.05, 0.2, 0.35, 1.0])
+    parser.add_argument("--draws", type=int, default=12)
+    parser.add_argument("--decoys", type=int, default=200, help="at most")
+    options = parser.parse_args()
+    table = read_tables(options.tables)
+    print("| wrong | targets | decoys | stated | holds | good: wrong, stated | range holds "
+          "| rate at 0.01, mean | worst | right kept | right called good |")  # fmt: skip
+    print("| --- " * 11 + "|")
+    for share in options.wrong:
+        rows = [_draw(table, share, options.decoys, seed) for seed in range(options.draws)]
+        print(_line(share, rows), flush=True)
+
+
+def _draw(table: Table, share: float, most: int, seed: int) -> dict[str, float]:
+    rng = np.random.default_rng(seed)
+    right = np.flatnonzero(table["same"] & ~((table["kind"] == "own") & ~table["known"]))
+    others = rng.permutation(np.flatnonzero(table["kind"] == "other"))
+    decoys, spare = np.array_split(others, 2)
+    decoys = decoys[:most]
+    count = len(spare) if share == 1 else round(share / (1 - share) * len(right))
+    if count > len(spare):
+        right = rng.permutation(right)[: round(len(spare) * (1 - share) / share)]
+        count = len(spare)
+    targets = spare[:count] if share == 1 else np.concatenate([right, spare[:count]])
+    figures, wrong = table["figures"], table["kind"][targets] == "other"
+    folds = _folds(table)
+    found = error_rates(figures[targets], figures[decoys], folds[targets], folds[decoys])
+    return _told(found, figures[targets], wrong)
+
+
+def _told(
+    found: ErrorRates, figures: NDArray[np.float64], wrong: NDArray[np.bool_]
+) -> dict[str, float]:
+    good = same_objects(figures) * right_placements(figures) >= THRESHOLDS.good_confidence
+    kept = found.rates <= RATE
+    low, high = found.wrong_share_range
+    least, most = found.good_wrong_range
+    truly = int((good & wrong).sum())
+    return {
+        "targets": found.targets,
+        "decoys": found.decoys,
+        "stated": found.wrong_share,
+        "holds": low <= wrong.mean() <= high,
+        "good wrong": truly,
+        "good stated": found.good_wrong,
+        "good holds": np.floor(least) <= truly <= np.ceil(most),
+        "rate": (kept & wrong).sum() / max(kept.sum(), 1),
+        "kept": (kept & ~wrong).sum() / max((~wrong).sum(), 1),
+        "good": (good & ~wrong).sum() / max((~wrong).sum(), 1),
+    }
+
+
+def _folds(table: Table) -> NDArray[np.intp]:
+    names = [f"{name} {seed}" for name, seed in zip(table["family"], table["seed"], strict=True)]
+    return np.unique(names, return_inverse=True)[1] % FOLDS
+
+
+def _line(share: float, rows: list[dict[str, float]]) -> str:
+    mean = {name: float(np.mean([row[name] for row in rows])) for name in rows[0]}
+    worst = max(row["rate"] for row in rows)
+    return (
+        f"| {share:g} | {mean['targets']:.0f} | {mean['decoys']:.0f} | {mean['stated']:.3f} "
+        f"| {mean['holds']:.2f} | {mean['good wrong']:.1f}, {mean['good stated']:.1f} "
+        f"| {mean['good holds']:.2f} | {mean['rate']:.4f} | {worst:.4f} | {mean['kept']:.3f} "
+        f"| {mean['good']:.3f} |"
+    )
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,46 @@
+"""Targets and decoys as two histograms, with the threshold between good and doubtful."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.special import logit
+
+from slatprep.inspect.errors import MeasuredErrors, histogram_of
+from slatprep.inspect.pictures import palette
+from slatprep.inspect.pictures.canvas import STYLE, in_format, new_figure, write
+
+_WIDTH, _HEIGHT = 1200, 640
+_TARGETS, _DECOYS = palette.ACCENT, palette.VERDICT_COLOURS["failed"]
+
+
+def draw_errors(errors: MeasuredErrors, name: str, rate: float = 0.01, kind: str = "png") -> bytes:
+    """Draw the scores of a store's alignments and of its decoys as a ``png``, ``svg`` or ``pdf``.
+
+    The line is the least score that keeps the share of wrong ones at `rate`.
+    """
+    import matplotlib.style
+
+    rates = errors.rates
+    edges, targets, decoys = histogram_of(errors)
+    with matplotlib.style.context(["default", STYLE]):
+        figure = new_figure(_WIDTH, _HEIGHT)
+        write(figure, 40, 48, f"Same object? {name}", weight="bold", size=12)
+        for row, sentence in enumerate(errors.sentences()):
+            write(figure, 40, 76 + 22 * row, sentence, size=7, color=palette.MUTED)
+        axes = figure.add_axes((0.07, 0.13, 0.9, 0.6))
+        width = np.diff(edges)
+        axes.bar(edges[:-1], targets, width, align="edge", color=_TARGETS, alpha=0.7,
+                 label=f"{rates.targets:,} alignments of the dataset")  # fmt: skip
+        axes.step(edges, np.append(decoys, decoys[-1]), where="post", color=_DECOYS, lw=1.6,
+                  label=f"{rates.decoys:,} decoys: grids with SLATs of other objects")  # fmt: skip
+        kept = rates.rates <= rate
+        if kept.any():
+            axes.axvline(rates.scores[kept].min(), color=palette.INK, lw=1, ls="--",
+                         label=f"{kept.sum():,} kept at {rate:.0%} wrong")  # fmt: skip
+        ticks = np.array([1e-4, 0.01, 0.5, 0.99, 0.9999])
+        inside = (logit(ticks) >= edges[0]) & (logit(ticks) <= edges[-1])
+        axes.set_xticks(logit(ticks)[inside], [f"{tick:.4g}" for tick in ticks[inside]])
+        axes.set_xlabel("score, as a probability that the object is the same")
+        axes.set_ylabel("count")
+        axes.legend(frameon=False, loc="upper center")
+        return in_format(figure, kind)

@@ -1,0 +1,271 @@
+"""How many verdicts are wrong, from decoys: grids aligned with SLATs of other objects.
+
+Of a decoy it is known that it is wrong, so decoys show what wrong pairs of this very dataset look
+like. Mass spectrometry counts its errors so: target-decoy competition (Elias and Gygi, Nature
+Methods 2007), a score learned on the decoys and cross-validated (Percolator: Kaell et al.,
+Nature Methods 2007), a probability of an error for each match (PeptideProphet: Keller et al.,
+Analytical Chemistry 2002), and the share of wrong matches from those that score like any decoy
+(Storey, Journal of the Royal Statistical Society B, 2002).
+
+Decoys tell nothing of a wrong placement of the right object.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import isotonic_regression, minimize
+from scipy.special import expit, logit
+
+from slatprep.judge.calibration import SAME_OBJECT
+from slatprep.judge.confidence import right_placements, same_objects
+from slatprep.judge.evidence import FIGURES
+from slatprep.judge.verdict import THRESHOLDS
+
+Array = NDArray[np.float64]
+Range = tuple[float, float]
+
+LEAST_TARGETS, LEAST_DECOYS = 50, 40
+"""With fewer, chance would decide: the shipped model stands."""
+
+FOLDS, ROUNDS = 3, 3
+"""Parts of the objects, each scored by a fit to the others; rounds of choosing what is right."""
+
+SURE = 0.01
+"""Targets up to this rate of errors are taken as right in a fit."""
+
+RIDGE = 3.0
+"""How strongly a fit is held to the shipped model, against one target of each side."""
+
+LIKE_DECOYS = 0.3
+"""Targets that this share of the decoys surpasses are counted as wrong ones."""
+
+DRAWS, LIKELY = 4_000, (0.025, 0.975)
+"""Draws and ends of an interval."""
+
+LEARNED = ("directions_near", "directions_middle", "directions_worst", "blocks_near",
+           "blocks_middle", "blocks_far", "slat_within_1", "pixieverse_within_1", "moved",
+           "bending", "stretch", "valid_share")  # fmt: skip
+"""Figures whose weight a dataset may change."""
+
+
+@dataclass(frozen=True, eq=False)
+class ErrorRates:
+    """What decoys say of the verdicts of a dataset.
+
+    Attributes
+    ----------
+    targets, decoys : int
+        Alignments of the dataset, and of decoys.
+    refitted : bool
+        Whether the score was learned on them; else the shipped model's stands.
+    wrong_share : float
+        Share of the targets that show another object.
+    wrong_share_range : tuple of float
+        Where it lies with a probability of 0.95.
+    good : int
+        Targets whose object and placement are sure enough to be called good.
+    good_wrong : float
+        How many of those show another object.
+    good_wrong_range : tuple of float
+        Where that number lies with a probability of 0.95.
+    scores, decoy_scores : ndarray of float64, shape (T,) and (D,)
+        Logarithms of the odds that the object is the same.
+    errors : ndarray of float64, shape (T,)
+        Posterior probability that a target shows another object.
+    rates : ndarray of float64, shape (T,)
+        Least share of wrong ones among all targets up to a score that includes this one.
+    """
+
+    targets: int
+    decoys: int
+    refitted: bool
+    wrong_share: float
+    wrong_share_range: Range
+    good: int
+    good_wrong: float
+    good_wrong_range: Range
+    scores: Array
+    decoy_scores: Array
+    errors: Array
+    rates: Array
+
+    def kept(self, rate: float) -> int:
+        """Return how many targets may be kept at a share of wrong ones of at most `rate`."""
+        return int(np.count_nonzero(self.rates <= rate))
+
+
+def error_rates(
+    targets: Array,
+    decoys: Array,
+    target_folds: NDArray[np.intp],
+    decoy_folds: NDArray[np.intp],
+    seed: int = 0,
+) -> ErrorRates:
+    """Count the errors of a dataset by its decoys.
+
+    Parameters
+    ----------
+    targets, decoys : ndarray of float64, shape (T, F) and (D, F)
+        `slatprep.judge.evidence.FIGURES` of each.
+    target_folds, decoy_folds : ndarray of int, shape (T,) and (D,)
+        Which of `FOLDS` parts each belongs to; all of one object, and its decoys, to one.
+    seed : int
+        Of the draws that intervals are taken from.
+    """
+    refitted = len(targets) >= LEAST_TARGETS and len(decoys) >= LEAST_DECOYS
+    scores, decoy_scores = (logit(same_objects(values)) for values in (targets, decoys))
+    if refitted:
+        scores, decoy_scores = _refitted(targets, decoys, target_folds, decoy_folds)
+    rng = np.random.default_rng(seed)
+    share, shares = _wrong_share(scores, decoy_scores, rng)
+    low, high = _ends(shares)
+    good, decoy_good = (_called_good(values) for values in (targets, decoys))
+    count, passed = len(targets), int(decoy_good.sum())
+    passing = rng.beta(passed + 0.5, len(decoys) - passed + 0.5, DRAWS)
+    most = int(good.sum())
+    wrong = np.minimum(count * shares * passing, most)
+    return ErrorRates(
+        targets=count,
+        decoys=len(decoys),
+        refitted=refitted,
+        wrong_share=share,
+        wrong_share_range=(min(low, share) if share else 0.0, high),
+        good=most,
+        good_wrong=float(min(count * share * (passed + 0.5) / (len(decoys) + 1.0), most)),
+        good_wrong_range=_ends(wrong),
+        scores=scores,
+        decoy_scores=decoy_scores,
+        errors=_posterior_errors(scores, decoy_scores, share),
+        rates=_rates(scores, decoy_scores, share),
+    )
+
+
+def _ends(draws: Array) -> Range:
+    low, high = np.quantile(draws, LIKELY)
+    return float(low), float(high)
+
+
+def _called_good(evidence: Array) -> NDArray[np.bool_]:
+    sure = same_objects(evidence) * right_placements(evidence)
+    good: NDArray[np.bool_] = sure >= THRESHOLDS.good_confidence
+    return good
+
+
+def _wrong_share(
+    scores: Array, decoy_scores: Array, rng: np.random.Generator
+) -> tuple[float, Array]:
+    """Estimate the share of targets that score as decoys do; return also draws of it."""
+    limit = np.quantile(decoy_scores, 1.0 - LIKE_DECOYS, method="higher")
+    below = int(np.count_nonzero(scores < limit))
+    of_decoys = float(np.mean(decoy_scores < limit)) or 1.0
+    # Half of one, and half of none, as nobody has seen all of them.
+    drawn = rng.beta(below + 0.5, len(scores) - below + 0.5, DRAWS)
+    of_drawn = rng.beta(
+        of_decoys * len(decoy_scores) + 0.5, (1 - of_decoys) * len(decoy_scores) + 0.5, DRAWS
+    )
+    share = min(below / len(scores) / of_decoys, 1.0)
+    return share, np.minimum(drawn / of_drawn, 1.0)
+
+
+def _surpassed(scores: Array, by: Array) -> NDArray[np.intp]:
+    """Return how many of `by` reach each score."""
+    found: NDArray[np.intp] = len(by) - np.searchsorted(np.sort(by), scores, side="left")
+    return found
+
+
+def _rates(scores: Array, decoy_scores: Array, share: float) -> Array:
+    """Return the least rate of wrong ones at which each target is kept."""
+    # One decoy more than were seen, so that no rate is stated that so few cannot show.
+    wrong = (_surpassed(scores, decoy_scores) + 1.0) / (len(decoy_scores) + 1.0)
+    kept = _surpassed(scores, scores)
+    order = np.argsort(scores, kind="stable")
+    rates = np.minimum(share * len(scores) * wrong / kept, 1.0)
+    rates[order] = np.minimum.accumulate(rates[order])
+    return rates
+
+
+def _posterior_errors(scores: Array, decoy_scores: Array, share: float) -> Array:
+    """Return the probability that each target is wrong; it never rises with the score."""
+    # A decoy that scores as high as the best target stands for those that were not drawn.
+    decoys = np.append(decoy_scores, max(scores.max(), decoy_scores.max()))
+    values = np.concatenate([scores, decoys])
+    each = share * len(scores) / len(decoys)
+    weights = np.concatenate([np.ones(len(scores)), np.full(len(decoys), max(each, 1e-12))])
+    wrong = np.concatenate([np.zeros(len(scores)), np.ones(len(decoys))])
+    which = np.unique(values, return_inverse=True)[1]
+    mass = np.bincount(which, weights)
+    ratio = np.bincount(which, weights * wrong) / mass
+    part = isotonic_regression(ratio, weights=mass, increasing=False).x[which][: len(scores)]
+    errors: Array = np.minimum(part / np.maximum(1.0 - part, 1e-12), 1.0)
+    return errors
+
+
+def _refitted(
+    targets: Array, decoys: Array, target_folds: NDArray[np.intp], decoy_folds: NDArray[np.intp]
+) -> tuple[Array, Array]:
+    """Score targets and decoys by fits to the other folds, which start from the shipped model."""
+    both = np.concatenate([targets, decoys])
+    folds = np.concatenate([target_folds, decoy_folds])
+    decoy = np.arange(len(both)) >= len(targets)
+    features = _features(both, decoy)
+    scores = features[:, 0].copy()
+    for _ in range(ROUNDS):
+        rated = _rates(scores[~decoy], scores[decoy], 1.0)
+        sure = np.zeros(len(both), dtype=bool)
+        sure[: len(targets)] = rated <= SURE
+        found = scores.copy()
+        for fold in np.unique(folds):
+            seen = folds != fold
+            right, wrong = seen & sure, seen & decoy
+            if min(right.sum(), wrong.sum()) < LEAST_DECOYS // 2:
+                return features[: len(targets), 0], features[len(targets) :, 0]
+            weights = _fit(features[right], features[wrong])
+            found[folds == fold] = features[folds == fold] @ weights[:-1] + weights[-1]
+        scores = found
+    return scores[: len(targets)], scores[len(targets) :]
+
+
+def _features(evidence: Array, decoy: NDArray[np.bool_]) -> Array:
+    """Return the shipped model's score and `LEARNED`, better where larger, in decoys' spreads."""
+    contributions = SAME_OBJECT.contributions(evidence)
+    score = contributions.sum(axis=1) + SAME_OBJECT.intercept
+    columns = [FIGURES.index(name) for name in LEARNED]
+    signs = np.array([_sign(name) for name in LEARNED])
+    chosen = np.nan_to_num(evidence[:, columns] * signs)
+    centre, spread = chosen[decoy].mean(axis=0), chosen[decoy].std(axis=0)
+    others = np.clip((chosen - centre) / np.maximum(spread, 1e-9), -4.0, 4.0)
+    return np.column_stack([np.clip(score, -15.0, 15.0), others])
+
+
+def _sign(name: str) -> float:
+    grows = name.startswith(("blocks", "slat_within", "pixieverse_within", "valid"))
+    return 1.0 if grows else -1.0
+
+
+def _fit(right: Array, wrong: Array) -> Array:
+    """Fit weights and a constant to right and wrong ones, each side with the weight of one half.
+
+    The shipped score's weight is held to 1 and the others to 0; none is negative.
+    """
+    x = np.concatenate([right, wrong])
+    y = np.concatenate([np.ones(len(right)), -np.ones(len(wrong))])
+    weights = np.concatenate(
+        [np.full(len(right), 0.5 / len(right)), np.full(len(wrong), 0.5 / len(wrong))]
+    )
+    prior = np.append(np.eye(1, x.shape[1])[0], 0.0)
+    ridge = RIDGE / min(len(right), len(wrong)) * np.append(np.ones(x.shape[1]), 0.1)
+
+    def loss(parameters: Array) -> tuple[float, Array]:
+        odds = y * (x @ parameters[:-1] + parameters[-1])
+        slope = -y * expit(-odds) * weights
+        off = parameters - prior
+        value = float((weights * np.logaddexp(0.0, -odds)).sum() + 0.5 * (ridge * off) @ off)
+        return value, np.append(x.T @ slope, slope.sum()) + ridge * off
+
+    bounds = [(0.0, None)] * x.shape[1] + [(None, None)]
+    found = minimize(loss, prior, jac=True, bounds=bounds, method="L-BFGS-B")
+    fitted: Array = found.x
+    return fitted

@@ -1,0 +1,65 @@
+"""Decoys of a real store: drawn by ids and size, aligned once, and told in words."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from slatprep.inspect.errors import FILE, draw_decoys, measure_errors, read_decoys
+from slatprep.inspect.pictures.errors import draw_errors
+from slatprep.pipeline.dataset import BuildSummary
+from slatprep.provenance.places import manifests_of
+from slatprep.store import Store, open_store
+
+
+@pytest.fixture(scope="module")
+def store(mixed_build: BuildSummary, tmp_path_factory: pytest.TempPathFactory) -> Store:
+    """Copy a store with its records, beside which decoys are kept."""
+    path = tmp_path_factory.mktemp("errors") / "s.zarr"
+    shutil.copytree(mixed_build.store, path)
+    shutil.copytree(mixed_build.manifests, Path(str(manifests_of(path))))
+    return open_store(path)
+
+
+def test_decoys_are_of_other_objects_and_are_aligned_once(store: Store) -> None:
+    first = measure_errors(store, decoys=3, seed=1)
+    decoys = read_decoys(store)
+    objects = dict(zip(store.ids, map(str, store.column("object_id")), strict=True))
+    assert len(decoys) == first.aligned == 3
+    assert all(objects[one.grid] != objects[one.slat] for one in decoys)
+    assert (manifests_of(store.path) / FILE).exists()
+    again = measure_errors(store, decoys=3, seed=1)
+    assert again.aligned == 0
+    np.testing.assert_array_equal(again.rates.errors, first.rates.errors)
+    assert again.rates.good_wrong == first.rates.good_wrong
+
+
+def test_more_decoys_take_over_those_there_are_and_another_seed_draws_others(store: Store) -> None:
+    keys = {asset_id: asset_id for asset_id in store.ids}
+    few, more = (draw_decoys(store, keys, count, 1) for count in (2, 4))
+    assert more[:2] == few
+    assert [one.grid for one in draw_decoys(store, keys, 9, 2)] != [
+        one.grid for one in draw_decoys(store, keys, 9, 1)
+    ]
+
+
+def test_the_slat_is_of_the_size_that_is_nearest(store: Store) -> None:
+    sizes = dict(zip(store.ids, np.diff(store.offsets).tolist(), strict=True))
+    objects = dict(zip(store.ids, map(str, store.column("object_id")), strict=True))
+    for one in draw_decoys(store, {asset_id: "" for asset_id in store.ids}, 100, 0):
+        others = [other for other in store.ids if objects[other] != objects[one.grid]]
+        nearest = min(abs(sizes[other] - sizes[one.grid]) for other in others)
+        assert abs(sizes[one.slat] - sizes[one.grid]) == nearest
+
+
+def test_few_assets_are_said_to_be_few_and_the_picture_is_drawn(store: Store) -> None:
+    found = measure_errors(store, decoys=3, seed=1)
+    told = found.sentences()
+    assert "decoys of this dataset" in told[0]
+    assert told[-1].startswith("too few assets")
+    picture = draw_errors(found, store.name)
+    assert picture.startswith(b"\x89PNG")
+    assert picture == draw_errors(found, store.name)
