@@ -27,6 +27,7 @@ from slatprep.workers.local import Jobs, run_unordered
 
 if TYPE_CHECKING:
     from slatprep.judge.decoys import ErrorRates
+    from slatprep.provenance.record import StageParameters
 
 DECOYS = 200
 """Decoys of a dataset, at most one for each asset."""
@@ -139,7 +140,8 @@ def measure_errors(
     known = {(one.grid, one.slat, one.keys): one.evidence for one in read_decoys(store)}
     found = [known.get((one.grid, one.slat, one.keys), ()) for one in wanted]
     missing = [k for k, figures in enumerate(found) if not figures]
-    tasks = ((store.path, k, wanted[k].grid, wanted[k].slat) for k in missing)
+    how = {record.asset_id: record.parameters for record in records}
+    tasks = ((store.path, k, wanted[k], how[wanted[k].grid]) for k in missing)
     for done, (k, figures) in enumerate(run_unordered(align_decoy, tasks, jobs), 1):
         found[k] = figures
         if progress:
@@ -192,16 +194,17 @@ def fold_of(object_id: str) -> int:
     return hashlib.sha256(f"fold {object_id}".encode()).digest()[0] % FOLDS
 
 
-def align_decoy(path: Place, number: int, grid: str, slat: str) -> tuple[int, tuple[float, ...]]:
-    """Align a grid with the SLAT of another asset; return the decoy's number and its evidence."""
+def align_decoy(
+    path: Place, number: int, decoy: Decoy, parameters: StageParameters
+) -> tuple[int, tuple[float, ...]]:
+    """Align a decoy as its grid was; return the decoy's number and its evidence."""
     from slatprep.align import align
     from slatprep.align.deformation import map_of
     from slatprep.judge import judge
     from slatprep.sample import sample
 
     store = open_store(path)
-    parameters = store.about.build.parameters
-    field, latents = store.asset(grid).field, store.asset(slat).latents
+    field, latents = store.asset(decoy.grid).field, store.asset(decoy.slat).latents
     alignment = align(field, latents, parameters.align)
     places = map_of(alignment).to_pixieverse(latents.centres)
     annotation = sample(field, places, parameters.sample)

@@ -19,8 +19,8 @@ from slatprep.store import Store, open_store
 def store(mixed_build: BuildSummary, tmp_path_factory: pytest.TempPathFactory) -> Store:
     """Copy a store with its records, beside which decoys are kept."""
     path = tmp_path_factory.mktemp("errors") / "s.zarr"
-    shutil.copytree(mixed_build.store, path)
-    shutil.copytree(mixed_build.manifests, Path(str(manifests_of(path))))
+    shutil.copytree(Path(str(mixed_build.store)), path)
+    shutil.copytree(Path(str(mixed_build.records)).parent, Path(str(manifests_of(path))))
     return open_store(path)
 
 
@@ -49,7 +49,7 @@ def test_more_decoys_take_over_those_there_are_and_another_seed_draws_others(sto
 def test_the_slat_is_of_the_size_that_is_nearest(store: Store) -> None:
     sizes = dict(zip(store.ids, np.diff(store.offsets).tolist(), strict=True))
     objects = dict(zip(store.ids, map(str, store.column("object_id")), strict=True))
-    for one in draw_decoys(store, {asset_id: "" for asset_id in store.ids}, 100, 0):
+    for one in draw_decoys(store, dict.fromkeys(store.ids, ""), 100, 0):
         others = [other for other in store.ids if objects[other] != objects[one.grid]]
         nearest = min(abs(sizes[other] - sizes[one.grid]) for other in others)
         assert abs(sizes[one.slat] - sizes[one.grid]) == nearest

@@ -65,7 +65,7 @@ def test_an_asset_on_every_limit_is_good_for_no_reason() -> None:
 
 
 def test_every_reason_is_named_once() -> None:
-    verdict, reasons = verdict_of(ROUGH, 0.8, 0.4, 2, 0.6, 0.8, 0.7, "roughness", contradicted=True)
+    verdict, reasons = verdict_of(ROUGH, 0.7, 0.4, 2, 0.6, 0.8, 0.7, "roughness", contradicted=True)
     assert verdict is Verdict.DOUBTFUL
     assert reasons == (
         "perhaps another object: the two sides show the same one with a probability of 60.0% "
@@ -79,7 +79,7 @@ def test_every_reason_is_named_once() -> None:
         "(good needs 80%)",
         "only 60.0% of the SLAT boundary lies within 1.5 voxel of the other side (good needs 80%)",
         "only 70.0% of the labels can be expected to be right (good needs 75%)",
-        "only 80.0% of the SLAT voxels found an annotation (good needs 90%)",
+        "only 70.0% of the SLAT voxels found an annotation (good needs 80%)",
         "2 other placements fit about as well and would change the class of 40.0% of the voxels "
         "(good needs 5%)",
         "its latents contradict its labels: labels drawn at random would be likelier",
