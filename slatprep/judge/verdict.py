@@ -298,23 +298,21 @@ def _doubts(
     good = f"(good needs {limits.good_confidence:.0%} for object and placement together)"
     because = f": {_WORDS[cause]}" if cause else ""
     another = sure[same_object < limits.failed_confidence]
-    doubts = sorted(
-        [
-            (
-                same_object,
-                f"{another} another object: the two sides show the same one with a probability of "
-                f"{same_object:.1%} {good}{because}",
-            ),
-            (
-                right_placement,
-                f"{sure[wrong]} a wrong placement: it is right with a probability of "
-                f"{right_placement:.1%} {good}",
-            ),
-        ]
+    of_object = (
+        f"{another} another object: the two sides show the same one with a probability of "
+        f"{same_object:.1%} {good}{because}"
     )
-    # Either that alone would take half of what may be taken is told.
-    told = [text for likely, text in doubts if likely < limits.good_confidence**0.5]
-    reasons = told or [doubts[0][1]]
+    of_placement = (
+        f"{sure[wrong]} a wrong placement: it is right with a probability of "
+        f"{right_placement:.1%} {good}"
+    )
+    doubts = sorted([(same_object, of_object), (right_placement, of_placement)])
+    if same_object < limits.failed_confidence:
+        reasons = [of_object]  # On another object no placement is right.
+    else:
+        # Either that alone would take half of what may be taken is told.
+        told = [text for likely, text in doubts if likely < limits.good_confidence**0.5]
+        reasons = told or [doubts[0][1]]
     if same_object <= right_placement:
         _judge_by_fitness(quality, reasons)
     return reasons

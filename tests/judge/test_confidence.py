@@ -67,7 +67,8 @@ MODELS = {"same object": SAME_OBJECT, "right placement": PLACEMENT}
 
 def _usual(name: str) -> float:
     """Return a figure's mean over right placements, which only one of its parts holds."""
-    own = [figure for figure in SAME_OBJECT.figures if figure.name == name]
+    model = PLACEMENT if name in ("margin", "ties", "alike") else SAME_OBJECT
+    own = [figure for figure in model.figures if figure.name == name]
     inside = [figure.usual for figure in own if figure.low < figure.usual < figure.high]
     return inside[0] if inside else own[0].usual
 

@@ -9,14 +9,17 @@ from slatprep.inspect.errors import MeasuredErrors, histogram_of
 from slatprep.inspect.pictures import palette
 from slatprep.inspect.pictures.canvas import STYLE, in_format, new_figure, write
 
+RATES = {0.01: "-", 0.05: "--"}
+"""Shares of wrong ones with a line, and how it is drawn."""
+
 _WIDTH, _HEIGHT = 1200, 640
 _TARGETS, _DECOYS = palette.ACCENT, palette.VERDICT_COLOURS["failed"]
 
 
-def draw_errors(errors: MeasuredErrors, name: str, rate: float = 0.01, kind: str = "png") -> bytes:
+def draw_errors(errors: MeasuredErrors, name: str, kind: str = "png") -> bytes:
     """Draw the scores of a store's alignments and of its decoys as a ``png``, ``svg`` or ``pdf``.
 
-    The line is the least score that keeps the share of wrong ones at `rate`.
+    Lines are the least scores that keep the share of wrong ones at `RATES`.
     """
     import matplotlib.style
 
@@ -33,9 +36,11 @@ def draw_errors(errors: MeasuredErrors, name: str, rate: float = 0.01, kind: str
                  label=f"{rates.targets:,} alignments of the dataset")  # fmt: skip
         axes.step(edges, np.append(decoys, decoys[-1]), where="post", color=_DECOYS, lw=1.6,
                   label=f"{rates.decoys:,} decoys: grids with SLATs of other objects")  # fmt: skip
-        kept = rates.rates <= rate
-        if kept.any():
-            axes.axvline(rates.scores[kept].min(), color=palette.INK, lw=1, ls="--",
+        for rate, style in RATES.items():
+            kept = rates.rates <= rate
+            if not kept.any():
+                continue
+            axes.axvline(rates.scores[kept].min(), color=palette.INK, lw=1, ls=style,
                          label=f"{kept.sum():,} kept at {rate:.0%} wrong")  # fmt: skip
         ticks = np.array([1e-4, 0.01, 0.5, 0.99, 0.9999])
         inside = (logit(ticks) >= edges[0]) & (logit(ticks) <= edges[-1])
