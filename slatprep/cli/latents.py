@@ -11,12 +11,15 @@ from slatprep.cli.output import Output
 from slatprep.errors import ConfigError, InputError, StoreError
 
 if TYPE_CHECKING:
-    from slatprep.records import LatentSpace, Place, StructuredLatents
+    from slatprep.records import LatentMoments, LatentSpace, Place, StructuredLatents
 
 Standardised = Annotated[
     Literal["auto", "yes", "no"],
     "Whether the latents of files are standardised already; auto: judged by their values.",
 ]
+
+_ASKED = 8
+"""Files that are read to tell whether latents have been standardised, where one does not."""
 
 
 class LatentsReader:
@@ -76,17 +79,51 @@ class LatentsReader:
 
     def _of_file(self, latents: StructuredLatents) -> StructuredLatents:
         """Return the latents of a file with `standardised` set."""
-        from slatprep.readers.encoders import in_words, look_standardised
+        from slatprep.readers.encoders import in_words
 
         if self.standardised != "auto":
             return replace(latents, standardised=self.standardised == "yes")
-        if not look_standardised(latents.moments, self.space):
+        if not self._look_standardised(latents):
             return latents
         self.output.note(
             f"{latents.sources[0].path}: its latents look standardised already "
             f"({in_words(latents.moments)}) and are taken so; --standardised says otherwise"
         )
         return replace(latents, standardised=True)
+
+    def _look_standardised(self, latents: StructuredLatents) -> bool:
+        """Whether latents look standardised; asks the other files where they alone do not tell."""
+        from slatprep.readers.encoders import (
+            ENOUGH,
+            in_words,
+            look_standardised,
+            pooled_moments,
+            tell_alone,
+        )
+
+        moments = latents.moments
+        if len(latents.coords) < ENOUGH or tell_alone(moments, self.space):
+            return look_standardised(moments, self.space)
+        known = list(self._moments_of_files())
+        if len(known) < 2:
+            raise InputError(
+                latents.sources[0].path,
+                "one file alone does not tell whether its latents have been standardised "
+                f"({in_words(moments)})",
+                "--standardised yes or no",
+            )
+        return look_standardised(pooled_moments(known), self.space)
+
+    def _moments_of_files(self) -> Iterator[tuple[int, LatentMoments]]:
+        """Yield voxels and moments of the first files that can be read."""
+        from slatprep.readers.slat import read_slat
+
+        for file in [one for one in self.files.values() if not one.problem][:_ASKED]:
+            try:
+                latents = read_slat(file.path, file.root, file.group, self.space)
+            except (InputError, StoreError):
+                continue
+            yield len(latents.coords), latents.moments
 
     def _latents(self, asset_id: str) -> StructuredLatents:
         from slatprep.readers.slat import checked_latents, read_slat

@@ -15,13 +15,14 @@ from slatprep.parameters import BuildParameters
 from slatprep.pipeline.asset import process_asset
 from slatprep.pipeline.before import Before, look_back
 from slatprep.pipeline.finish import Crew, Note, Progress, finish
+from slatprep.pipeline.notices import dataset_notices
 from slatprep.pipeline.pack import Packed, pack_store
 from slatprep.pipeline.plan import Action, BuildContext, BuildPlan, PlannedAsset, plan_assets
 from slatprep.pipeline.publish import Destination, publish_manifests, require_records_file
 from slatprep.pipeline.ranges import check_objects
 from slatprep.pipeline.recipe import recipe_of
 from slatprep.pipeline.rows import FailedAsset, NextStore, Row
-from slatprep.pipeline.settle import Wanted, latent_warnings, settle_rows
+from slatprep.pipeline.settle import Wanted, settle_rows
 from slatprep.pipeline.spool import Spool
 from slatprep.pipeline.summary import BuildSummary, counts_of, summarise, summarise_store
 from slatprep.pipeline.work import spool_of, work_beside, work_directory
@@ -277,7 +278,7 @@ def _publish(
     if following is not None:
         damaged += [f"{row.asset_id}: {row.damaged}" for row in following.rows if row.damaged]
     if following is not None and packed is not None:
-        warnings += latent_warnings(following, parameters.slat.standardised)
+        warnings += dataset_notices(following, parameters.slat.standardised)
     seconds = time.perf_counter() - begin
     summary = summarise_store(store, failed, place.out, manifests, seconds, warnings, damaged)
     standing = before.standing_files(len(store), packed.records if packed else None)

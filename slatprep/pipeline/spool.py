@@ -25,6 +25,7 @@ from slatprep.pipeline.rows import FailedAsset, Row
 from slatprep.provenance.columns import columns_of
 from slatprep.provenance.record import AssetRecord, FailedRecord, Record
 from slatprep.provenance.record_json import digest_of, read_record, to_json
+from slatprep.readers.plausible import TOLD
 from slatprep.records import (
     RESOLUTION,
     Annotation,
@@ -222,5 +223,7 @@ def row_of(record: AssetRecord, text: bytes, extent: NDArray[np.float64]) -> Row
         "extent": extent,
         "n_valid": record.counts.valid,
         "n_placements": len(record.alignment.placements),
+        "unusual": next((one for one in record.warnings if TOLD in one), "").partition(TOLD)[2],
+        "grid": next((file.sha256 for file in record.sources if file.role == "grid"), ""),
     }
     return Row(record.asset_id, record.counts.slat_voxels, record.key, columns)

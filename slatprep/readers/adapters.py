@@ -99,6 +99,8 @@ LATENTS = {
     "sam3d": "slatprep.readers.slat:sam3d",
     "trellis2": "slatprep.readers.slat:trellis2",
     "trellis2-512": "slatprep.readers.slat:trellis2_512",
+    "trellis2-pbr": "slatprep.readers.slat:trellis2_pbr",
+    "trellis2-pbr-512": "slatprep.readers.slat:trellis2_pbr_512",
 }
 """slatprep's own latent adapters."""
 

@@ -67,8 +67,14 @@ def resolve_latents(
     known = [(count, one) for count, one in moments if one is not None and count]
     if not known:
         return declared
-    pooled = _pool(known)
-    if standardised == "auto" and sum(count for count, _ in known) >= ENOUGH:
+    pooled = pooled_moments(known)
+    auto = standardised == "auto" and sum(count for count, _ in known) >= ENOUGH
+    if auto and len(known) == 1 and not tell_alone(pooled, declared):
+        raise ConfigError(
+            "slat.standardised: one asset alone does not tell whether its latents have been "
+            f'standardised ({in_words(pooled)}); say "yes" or "no"'
+        )
+    if auto:
         declared = replace(declared, standardised=look_standardised(pooled, declared))
     if not declared.mean and not declared.standardised:
         # A channel that never changes is left as wide as it is.
@@ -95,13 +101,24 @@ def look_standardised(moments: LatentMoments, space: LatentSpace) -> bool:
     return bool((standard - as_encoded).sum() > 0)
 
 
+def tell_alone(moments: LatentMoments, space: LatentSpace) -> bool:
+    """Whether the moments of one asset tell if its latents have been standardised.
+
+    An asset's channels spread less than the dataset's, so standardised latents of one may look as
+    if they were not. Those of a wide spread are as encoded, and those that look standardised are.
+    """
+    spread = float(np.median(moments.std))
+    return spread > 1.5 or (bool(space.mean) and look_standardised(moments, space))
+
+
 def in_words(moments: LatentMoments) -> str:
     """Return the spread and the mean of channels in a few words."""
     mean, std = np.abs(moments.mean).max(), moments.std
     return f"means within {mean:.2g} of 0, standard deviations {min(std):.2g} to {max(std):.2g}"
 
 
-def _pool(known: Sequence[tuple[int, LatentMoments]]) -> LatentMoments:
+def pooled_moments(known: Sequence[tuple[int, LatentMoments]]) -> LatentMoments:
+    """Return the moments of several assets together, each with its number of voxels."""
     counts = np.array([count for count, _ in known], dtype=np.float64)
     share: NDArray[np.float64] = (counts / counts.sum())[:, None]
     means, stds = (np.array([getattr(one, n) for _, one in known]) for n in ("mean", "std"))

@@ -39,6 +39,9 @@ EXTENTS = (
 )  # fmt: skip
 """What the properties of all materials lie within."""
 
+TOLD = "plausibility: "
+"""What a warning about values begins with."""
+
 # Carbon is the stiffest for its weight: diamond has 3.5e8 Pa m^3/kg times its density, fibres have
 # 4.4e8, nanotubes 8e8. E in GPa leaves below 0.1 times the density of any material; Pixie asks its
 # labeller for 13 and more.

@@ -14,6 +14,7 @@ from slatprep.parameters import SlatSource
 from slatprep.readers.encoders import ENOUGH, in_words, look_standardised
 from slatprep.readers.files import ArraySpec, load_source, npz_arrays
 from slatprep.readers.hdf5 import SUFFIXES, load_datasets
+from slatprep.readers.trellis2 import PBR_MEAN, PBR_STD, SHAPE_MEAN, SHAPE_STD
 from slatprep.records import (
     RESOLUTION,
     TRELLIS,
@@ -47,14 +48,32 @@ def sam3d() -> _Slat:
 
 
 def trellis2() -> _Slat:
-    """Return the reader of TRELLIS.2's shape latents of resolution 1024; no moments are known."""
-    return _Slat(LatentSpace("trellis2", 32, RESOLUTION))
+    """Return what reads TRELLIS.2's shape latents of resolution 1024."""
+    return _Slat(LatentSpace("trellis2", 32, RESOLUTION, SHAPE_MEAN, SHAPE_STD))
 
 
 def trellis2_512() -> _Slat:
-    """Return the reader of TRELLIS.2's latents of resolution 512, which lie beside the others."""
-    patterns = tuple(one.replace("_1024/", "_512/") for one in SlatSource.pattern)
-    return _Slat(LatentSpace("trellis2-512", 32, RESOLUTION // 2), patterns)
+    """Return the reader of resolution 512, which TRELLIS.2's toolkit puts beside the others."""
+    space = LatentSpace("trellis2-512", 32, RESOLUTION // 2, SHAPE_MEAN, SHAPE_STD)
+    return _Slat(space, _below("shape_latents", 512))
+
+
+def trellis2_pbr() -> _Slat:
+    """Return the reader of TRELLIS.2's texture latents, which lie beside those of the shape."""
+    space = LatentSpace("trellis2-pbr", 32, RESOLUTION, PBR_MEAN, PBR_STD)
+    return _Slat(space, _below("pbr_latents", 1024))
+
+
+def trellis2_pbr_512() -> _Slat:
+    """Return the reader of texture latents of resolution 512."""
+    space = LatentSpace("trellis2-pbr-512", 32, RESOLUTION // 2, PBR_MEAN, PBR_STD)
+    return _Slat(space, _below("pbr_latents", 512))
+
+
+def _below(folder: str, resolution: int) -> tuple[str, ...]:
+    """Return patterns of a folder of TRELLIS.2's toolkit instead of the default's."""
+    default = "shape_latents/*_1024/"
+    return tuple(one.replace(default, f"{folder}/*_{resolution}/") for one in SlatSource.pattern)
 
 
 _COORDS = ArraySpec(shapes=((None, 3), (None, 4)), kinds="iu")

@@ -16,6 +16,7 @@ from slatprep.errors import InputError
 from slatprep.readers.mistakes import mistakes_of, raw_grid
 from slatprep.readers.plausible import (
     EXTENTS,
+    TOLD,
     Part,
     fault_of,
     is_physical,
@@ -32,9 +33,6 @@ from slatprep.records import (
     SourceRoots,
     Units,
 )
-
-TOLD = "plausibility: "
-"""What a warning of this module begins with."""
 
 _PREDICTED = 1.5
 """Half the values of a prediction lie within this; log10 of most densities is above it."""

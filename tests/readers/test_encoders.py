@@ -12,7 +12,8 @@ import pytest
 from slatprep.errors import ConfigError, InputError
 from slatprep.parameters import SlatSource
 from slatprep.readers import read_latents, read_slat
-from slatprep.readers.encoders import latent_space, look_standardised, resolve_latents
+from slatprep.readers.adapters import latent_adapter
+from slatprep.readers.encoders import latent_space, look_standardised, resolve_latents, tell_alone
 from slatprep.records import FEATS_MEAN, FEATS_STD, TRELLIS, LatentMoments, LatentSpace
 
 
@@ -29,6 +30,33 @@ def test_raw_and_standardised_latents_are_told_apart(seed: int, narrow: float) -
     raw = z * np.array(FEATS_STD) + np.array(FEATS_MEAN)
     assert look_standardised(moments_of(z), TRELLIS)
     assert not look_standardised(moments_of(raw), TRELLIS)
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_one_asset_is_asked_about_and_never_mistaken(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    spread, shift = rng.uniform(0.3, 1.1), rng.normal(scale=0.6, size=8)
+    z = rng.normal(size=(500, 8)) * spread + shift
+    raw = z * np.array(FEATS_STD) + np.array(FEATS_MEAN)
+    for feats, right in ((z, True), (raw, False)):
+        moments = moments_of(feats)
+        assert not tell_alone(moments, TRELLIS) or look_standardised(moments, TRELLIS) is right
+
+
+def test_trellis_2_has_the_moments_that_microsoft_publishes() -> None:
+    for name, mean, std in (
+        ("trellis2", 0.781296, 5.972266),
+        ("trellis2-512", 0.781296, 5.972266),
+        ("trellis2-pbr", 3.501659, 2.665652),
+        ("trellis2-pbr-512", 3.501659, 2.665652),
+    ):
+        adapter = latent_adapter(name)
+        assert adapter is not None
+        space = adapter.space
+        assert (space.encoder, space.channels, len(space.std)) == (name, 32, 32)
+        assert (space.mean[0], space.std[0]) == (mean, std)
+        folder = f"{'pbr' if 'pbr' in name else 'shape'}_latents/*_{space.resolution * 16}/"
+        assert f"{folder}{{id}}.npz" in (getattr(adapter, "patterns", ()) or SlatSource.pattern)
 
 
 def test_unpublished_moments_are_those_of_all_voxels_of_the_dataset() -> None:

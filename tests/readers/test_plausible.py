@@ -192,6 +192,30 @@ def test_what_is_unusual_or_of_few_voxels_is_told_and_taken(make_pair):
     assert len(field.voxels) == 5 * 1600
 
 
+def test_a_raw_grid_saved_channels_first_is_no_prediction(make_pair):
+    grid = np.ascontiguousarray(np.moveaxis(grid_of((JELLY, 1.85e6, 998, 0.45)), -1, 0))
+    with pytest.raises(InputError, match="look like a raw grid in SI units, channels first"):
+        read_field(make_pair(grid))
+    logs = grid.copy()
+    logs[:2] = np.log10(np.maximum(logs[:2], 1e-9))
+    with pytest.raises(InputError, match=r"log10 Pa and log10 kg/m\^3"):
+        read_field(make_pair(logs))
+
+
+def test_a_prediction_may_leave_its_range_in_some_voxels(make_pair):
+    rng = np.random.default_rng(0)
+    grid = rng.normal(size=(4, 64, 64, 64)) * 0.8
+    grid[3] = JELLY
+    field = read_field(make_pair(grid.astype(np.float32)))
+    assert told(field) == []
+    grid[:2] *= 5
+    pair = make_pair(grid.astype(np.float32))
+    with pytest.raises(InputError, match=r"a prediction, channels first, is normalised to \[-1, 1"):
+        read_field(pair)
+    roots = replace(pair.roots, plausibility="warn")
+    assert "clipped" in told(read_field(replace(pair, roots=roots)))[0]
+
+
 def test_float16_that_overflowed_is_named(make_pair):
     with np.errstate(over="ignore"):
         grid = grid_of((JELLY, 2e6, 930, 0.49), dtype=np.float16)
