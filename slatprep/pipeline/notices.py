@@ -67,7 +67,7 @@ def shared_sources(new: NextStore) -> Iterator[str]:
 def wild_ranges(
     ids: Sequence[str], extents: NDArray[np.float64], normalization: Normalization
 ) -> Iterator[str]:
-    """Yield which asset alone makes a property's range, of mapped extents (A, P, 2), 10 times wider.
+    """Yield which asset alone makes a range, of mapped extents (A, P, 2), 10 times wider.
 
     Of two assets nobody can tell which is wild.
     """
