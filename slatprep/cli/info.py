@@ -26,10 +26,12 @@ def info(
     -------
     slatprep info data/demo.zarr
     """
+    from slatprep.inspect.errors import told_of
     from slatprep.inspect.overview import overview_of
     from slatprep.store import open_store
 
-    overview = overview_of(open_store(store))
+    opened = open_store(store)
+    overview, errors = overview_of(opened), told_of(opened)
 
     def show() -> None:
         contents: dict[str, Cell] = {
@@ -45,6 +47,8 @@ def info(
         }
         output.record(f"Store {overview.store}", contents)
         show_quality(output, overview)
+        for sentence in errors:
+            say(f"errors:  {sentence}")
         output.table(
             f"Normalisation to [-1, 1] (ranges: {overview.normalization.source})",
             ("property", "scale", "lo", "hi"),

@@ -150,7 +150,6 @@ def measure_errors(
         Decoy(one.grid, one.slat, one.keys, tuple(figures))
         for one, figures in zip(wanted, found, strict=True)
     ]
-    write_decoys(store, made, seed)
     objects = dict(zip(store.ids, map(str, store.column("object_id")), strict=True))
     folds = {asset_id: fold_of(objects[asset_id]) for asset_id in store.ids}
     rates = error_rates(
@@ -160,7 +159,9 @@ def measure_errors(
         np.array([folds[one.grid] for one in made]),
         seed,
     )
-    return MeasuredErrors(rates, [record.asset_id for record in records], seed, len(missing))
+    measured = MeasuredErrors(rates, [record.asset_id for record in records], seed, len(missing))
+    write_decoys(store, made, seed, measured.sentences())
+    return measured
 
 
 def draw_decoys(store: Store, keys: dict[str, str], count: int, seed: int) -> list[Decoy]:
@@ -214,12 +215,10 @@ def align_decoy(
 
 def read_decoys(store: Store) -> list[Decoy]:
     """Return the decoys that were measured of a store, or of what it was before an update."""
-    folder = manifests_beside(store.path)
-    file = None if folder is None else folder / FILE
-    if file is None or not file.exists():
+    document = _document(store)
+    if document is None:
         return []
     try:
-        document = json.loads(file.read_bytes())
         return [
             Decoy(one["grid"], one["slat"], (one["keys"][0], one["keys"][1]), _numbers(one))
             for one in document["decoys"]
@@ -232,8 +231,36 @@ def _numbers(one: dict[str, Any]) -> tuple[float, ...]:
     return tuple(np.nan if value is None else float(value) for value in one["evidence"])
 
 
-def write_decoys(store: Store, decoys: Sequence[Decoy], seed: int) -> None:
-    """Write decoys beside the records of the build, if those lie on a disk."""
+def told_of(store: Store) -> list[str]:
+    """Return what was said of a store when its errors were measured; empty if they were not.
+
+    Of a store that was updated since, that it was.
+    """
+    document = _document(store)
+    told = document.get("told") if document else None
+    if not isinstance(told, list) or document is None:
+        return []
+    if document.get("build") != store.about.manifest:
+        return ["measured before the last update; run `slatprep measure-errors` again"]
+    return [str(sentence) for sentence in told]
+
+
+def _document(store: Store) -> dict[str, Any] | None:
+    folder = manifests_beside(store.path)
+    file = None if folder is None else folder / FILE
+    if file is None or not file.exists():
+        return None
+    try:
+        document = json.loads(file.read_bytes())
+    except ValueError:
+        return None
+    return document if isinstance(document, dict) else None
+
+
+def write_decoys(
+    store: Store, decoys: Sequence[Decoy], seed: int, told: Sequence[str] = ()
+) -> None:
+    """Write decoys and what they say beside the records of the build, if those lie on a disk."""
     folder = manifests_beside(store.path)
     if not isinstance(folder, Path):
         return
@@ -246,7 +273,7 @@ def write_decoys(store: Store, decoys: Sequence[Decoy], seed: int) -> None:
         }
         for one in decoys
     ]
-    document = {"build": store.about.manifest, "seed": seed, "decoys": rows}
+    document = {"build": store.about.manifest, "seed": seed, "told": [*told], "decoys": rows}
     file = folder / FILE
     with writing(str(file), folder), staged(file) as path:
         path.write_text(json.dumps(document, indent=1) + "\n", encoding="utf-8")

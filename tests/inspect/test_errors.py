@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import json
 import shutil
 from pathlib import Path
 
 import numpy as np
 import pytest
+from click.testing import CliRunner
 
-from slatprep.inspect.errors import FILE, draw_decoys, measure_errors, read_decoys
+from slatprep.cli.commands import slatprep
+from slatprep.inspect.errors import FILE, draw_decoys, measure_errors, read_decoys, told_of
 from slatprep.inspect.pictures.errors import draw_errors
 from slatprep.pipeline.dataset import BuildSummary
 from slatprep.provenance.places import manifests_of
@@ -63,3 +66,29 @@ def test_few_assets_are_said_to_be_few_and_the_picture_is_drawn(store: Store) ->
     picture = draw_errors(found, store.name)
     assert picture.startswith(b"\x89PNG")
     assert picture == draw_errors(found, store.name)
+
+
+def test_info_repeats_what_was_measured_and_says_where_that_is_of_before(store: Store) -> None:
+    measured = measure_errors(store, decoys=3, seed=1)
+    shown = CliRunner().invoke(slatprep, ["info", str(store.path)])
+    assert shown.exit_code == 0
+    assert all(sentence in shown.output for sentence in measured.sentences())
+    file = manifests_of(store.path) / FILE
+    document = json.loads(file.read_bytes())
+    file.write_text(json.dumps(document | {"build": "another"}))
+    assert told_of(store) == [
+        "measured before the last update; run `slatprep measure-errors` again"
+    ]
+    file.write_text("{")
+    assert told_of(store) == [] and read_decoys(store) == []
+
+
+def test_the_command_says_how_many_are_wrong(store: Store, tmp_path: Path) -> None:
+    picture = tmp_path / "errors.svg"
+    options = ["--decoys", "3", "--seed", "1", "--picture", str(picture)]
+    shown = CliRunner().invoke(slatprep, ["measure-errors", str(store.path), *options, "--json"])
+    assert shown.exit_code == 0, shown.output
+    found = json.loads(shown.stdout)
+    assert found["decoys"] == 3 and found["assets"] == len(store)
+    assert set(found["errors"]) == set(store.ids)
+    assert picture.read_text().startswith("<?xml")
