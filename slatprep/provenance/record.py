@@ -260,9 +260,3 @@ class BuildRecord:
     """Voxels of the store."""
     failed: tuple[FailedRecord, ...] = ()
     """The assets that could not go in, by id; the first of them where they are very many."""
-
-
-def property_counts(counts: Iterable[int], normalization: Normalization) -> PropertyCounts:
-    """Return counts in the order of the ranges by name."""
-    names = (one.name for one in normalization.ranges)
-    return dict(zip(names, map(int, counts), strict=True))

@@ -134,29 +134,6 @@ def _claimed(path: Path) -> tuple[Path, int]:
     return temporary, os.open(temporary, os.O_WRONLY | os.O_EXCL | OWN_FILE, 0o666)
 
 
-def append_file(source: Path, target: Path, size: int) -> None:
-    """Append a file to `target`, our own file of `size` bytes, and flush it to the disk.
-
-    Unlike `staged` this is not one step: a kill leaves a part. OSError if the file has changed
-    meanwhile or the disk refuses; the file then keeps its former content.
-    """
-    flags = os.O_WRONLY | os.O_APPEND | OWN_FILE & ~os.O_CREAT
-    descriptor = os.open(target, flags)
-    try:
-        state = os.fstat(descriptor)
-        if not is_only_ours(state) or state.st_size != size:
-            raise OSError(errno.EBUSY, "it was changed meanwhile")
-        try:
-            with source.open("rb") as more, os.fdopen(os.dup(descriptor), "ab") as file:
-                shutil.copyfileobj(more, file)
-            os.fsync(descriptor)
-        except OSError:
-            os.ftruncate(descriptor, size)  # Only now no buffered bytes are left.
-            raise
-    finally:
-        os.close(descriptor)
-
-
 @contextmanager
 def staged_apart(path: Path, folder: Path) -> Iterator[Path]:
     """Yield a file in `folder` that replaces `path`, complete, unless an error occurs.

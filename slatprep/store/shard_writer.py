@@ -55,7 +55,7 @@ class ShardWriter:
     def __init__(self, store: Place, name: str, start: int) -> None:
         metadata = read_metadata(store / name / "zarr.json")
         layout = RowReader.of(storage_of(store).folder(), name, metadata)
-        if layout is None or not layout.sharded:
+        if not layout.sharded:
             raise ValueError(f"{name} is not laid out as slatprep lays arrays out")
         self._encode = _encoder(metadata["codecs"][0]["configuration"]["codecs"])
         self._index = np.full((layout.chunks_per_shard, 2), MISSING, "<u8")

@@ -22,7 +22,7 @@ from slatprep.errors import StoreError
 from slatprep.inspect.verify import verify_store
 from slatprep.pipeline.dataset import build_store
 from slatprep.pipeline.work import work_beside
-from slatprep.storage import atomic as replace
+from slatprep.storage import atomic
 from slatprep.store import open_store
 
 
@@ -124,7 +124,7 @@ def test_a_kill_between_two_renames_is_mended(
     work = tmp_path / ".s.zarr.work"
     (work / "build-x").mkdir(parents=True)
     (work / "lock").touch()
-    out.rename(replace._aside(work / "build-x"))
+    out.rename(atomic._aside(work / "build-x"))
     with work_beside(out):
         assert tree(out) == expected
     assert not work.exists()

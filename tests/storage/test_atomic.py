@@ -2,7 +2,7 @@ from pathlib import Path
 
 import pytest
 
-from slatprep.storage import atomic as replace
+from slatprep.storage import atomic
 
 
 def directory(path: Path, content: str) -> Path:
@@ -16,20 +16,20 @@ def test_the_new_takes_the_olds_place(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, exchange: bool
 ) -> None:
     if not exchange:
-        monkeypatch.setattr(replace, "_exchange", lambda new, target: False)
+        monkeypatch.setattr(atomic, "_exchange", lambda new, target: False)
     target = directory(tmp_path / "store", "old")
-    replace.replace_directory(directory(tmp_path / "new", "new"), target)
+    atomic.replace_directory(directory(tmp_path / "new", "new"), target)
     assert (target / "file").read_text() == "new"
     assert [path.name for path in tmp_path.iterdir()] == ["store"]
 
 
 def test_nothing_there_before(tmp_path: Path) -> None:
-    replace.replace_directory(directory(tmp_path / "new", "new"), tmp_path / "store")
+    atomic.replace_directory(directory(tmp_path / "new", "new"), tmp_path / "store")
     assert (tmp_path / "store" / "file").read_text() == "new"
 
 
 def test_a_new_that_does_not_exist_leaves_the_old(tmp_path: Path) -> None:
     target = directory(tmp_path / "store", "old")
     with pytest.raises(OSError):
-        replace.replace_directory(tmp_path / "absent", target)
+        atomic.replace_directory(tmp_path / "absent", target)
     assert (target / "file").read_text() == "old"
