@@ -244,7 +244,7 @@ def test_labels_that_the_sources_do_not_give_are_found(
     several: Dataset, merged: BuildSummary, name: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The file is written with its digest, as a faulty build would have done."""
-    from slatprep.pipeline import several as stage
+    from slatprep.pipeline import annotate as stage
 
     right = stage.merge
 
