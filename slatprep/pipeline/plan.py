@@ -1,6 +1,6 @@
 """What a build will do with each asset, and why, before it does it.
 
-Sources are compared by content, but for those that `slatprep.pipeline.seen` has
+Sources are compared by content, but for those that the last build (`slatprep.pipeline.before`) has
 seen as they are.
 """
 
