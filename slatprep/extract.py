@@ -127,9 +127,8 @@ def _load_session(model: str, revision: str | None, device: str | None) -> Sessi
     except ImportError as error:
         raise ConfigError(
             f"TRELLIS draws and decodes latents, and {error.name or 'a part of it'} is not "
-            "installed; "
-            "install TRELLIS as https://github.com/microsoft/TRELLIS says, on a machine with an "
-            "NVIDIA GPU of at least 16 GB, and slatprep into the same environment"
+            "installed. Install TRELLIS as https://github.com/microsoft/TRELLIS says, and slatprep "
+            "into the same environment. It needs an NVIDIA GPU of at least 16 GB"
         ) from error
     if Path(model).is_dir():
         if revision is not None:

@@ -17,7 +17,7 @@ from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
 LONGEST = 30
-BUDGET = 22_000
+BUDGET = 26_000
 """Words of README and docs, with their tables; without design notes and made pages."""
 
 MADE = {"benchmarks.md"}
@@ -46,8 +46,9 @@ def messages() -> Iterator[tuple[str, str]]:
         tree = ast.parse(path.read_text("utf-8"))
         for node in ast.walk(tree):
             if isinstance(node, ast.FunctionDef) and place.startswith("slatprep/cli/"):
-                lines = (ast.get_docstring(node) or "").splitlines()
-                yield f"{place}:{node.lineno}", "\n".join(x for x in lines if not x.startswith(" "))
+                # The sections behind it, such as the example, are no sentences.
+                text = re.split(r"\n\w[\w ]*\n-+\n", ast.get_docstring(node) or "")[0]
+                yield f"{place}:{node.lineno}", text
             if isinstance(node, ast.JoinedStr):
                 parts = [p.value if isinstance(p, ast.Constant) else "X" for p in node.values]
                 yield f"{place}:{node.lineno}", "".join(map(str, parts))

@@ -63,9 +63,9 @@ def check_alignment(
 
     Its quality is recomputed from the stored arrays, and compared with the
     stored figures. A picture shows both sides before and after from three
-    directions, the error of every voxel, the scores of the candidates and the
-    verdict. --asset, --worst and --ambiguous may be combined. The exit code is 1
-    unless all are good and the store agrees with itself.
+    directions, the error of every voxel, the candidates and the verdict.
+    --asset, --worst and --ambiguous may be combined. The exit code is 1 unless
+    all are good and the store agrees with itself.
 
     Example
     -------

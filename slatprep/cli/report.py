@@ -29,10 +29,10 @@ def report(
 ) -> None:
     """Write a page about STORE that opens in a browser.
 
-    A single HTML file, which needs no network: the number of assets by state
-    with reasons, histograms of quality, orientations, classes and properties,
-    and a table of all assets that shows each in 3D. Without STORE, the one
-    that `make align` built last under data/ is taken.
+    The page is a single HTML file and needs no network. It has the assets by
+    state with reasons, histograms, orientations, classes and properties, and a
+    table that shows each asset in 3D. Without STORE, it takes the one that
+    `make align` built last under data/.
 
     Example
     -------

@@ -21,14 +21,13 @@ def score(
 ) -> None:
     """Score STORE against known truth.
 
-    TRUTH_DIR holds an npz for each asset, as make-demo writes it. Each level's
-    figures are over assets that have one right placement only: success is a
-    mean displacement less than 1.5 voxels above that of the best similarity
-    (0 where the shapes are the same); displacement is the median, p90 the 90th
-    percentile; labels is the share of right classes (of a store without
-    classes, of voxels with the right properties), beside what the best
-    similarity and the true places themselves would give. The exit code
-    is 1 where an asset with a truth is not in the store.
+    TRUTH_DIR holds an npz for each asset, as make-demo writes it. Figures of a
+    level leave out symmetric assets. Success is a mean displacement less than
+    1.5 voxels above that of the best similarity. Displacement is the median,
+    p90 the 90th percentile. Labels is the share of right classes; without
+    classes, of right properties. Beside it stands what the best similarity and
+    the true places would give. The exit code is 1 if an asset with a truth is
+    not in the store.
 
     Example
     -------

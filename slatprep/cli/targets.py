@@ -19,8 +19,8 @@ class NewPath(click.Path):
 def require_apart(command: click.Command, given: Mapping[str, Any]) -> None:
     """Refuse a file or folder to write that is part of a store or of what a command reads.
 
-    A new file or folder below a folder that is read is nobody's loss, so it may be written; so may
-    a folder below that of a run, which holds predictions.
+    A new file or folder below a folder that is read may be written. So may a folder below that of
+    a run, which holds predictions.
 
     Parameters
     ----------

@@ -47,10 +47,10 @@ def verify(
 ) -> None:
     """Check that STORE is whole, unchanged and consistent.
 
-    Compares metadata with the contract, every file with its digest, every chunk
-    with its checksum, values with their ranges, annotations with the stored grid
-    and transform, and records with their schema and the rows. Every fault is
-    named; the exit code is 1 where there is one.
+    Compares metadata with the contract, files with their digests, and chunks with
+    their checksums. Compares values with their ranges, annotations with the
+    stored grid and transform, and records with their schema and the rows. Every
+    fault is named, and the exit code is then 1.
 
     Example
     -------

@@ -176,8 +176,8 @@ def _properties(store: Store) -> dict[str, Any]:
     ranges = zip(store.normalization.ranges, store.contents.properties, strict=True)
     return _record_set(
         "properties",
-        "The columns of voxel/properties and the channels of grid/properties: a normalised value "
-        "v is m = lo + (v + 1) / 2 * (hi - lo), and 10**m where log10 is true, in SI units.",
+        "The columns of voxel/properties and the channels of grid/properties. A normalised value "
+        "v is m = lo + (v + 1) / 2 * (hi - lo) in SI units, or 10**m where log10 is true.",
         {
             "name": ("sc:Text", "name of the property"),
             "unit": ("sc:Text", "SI unit"),

@@ -166,8 +166,8 @@ class SlatDataset(Dataset[Item]):
         if len(self.indices) == 0:
             raise ConfigError(
                 f"{self.store.path} has no asset of split {split or 'all'} that passes the "
-                f"filter, of {len(self.store)} in all; expected at least one: "
-                "loosen the filter, change the shares, or add objects (at least as many as splits)"
+                f"filter, of {len(self.store)} in all; expected at least one. Loosen the filter, "
+                "change the shares, or add objects (at least as many as splits)"
             )
         self.asset_ids = [self.store.ids[index] for index in self.indices]
         self.seed, self.min_confidence = seed, min_confidence

@@ -112,17 +112,17 @@ def recognise_axes(
         ).all(axis=1)
         if alike.mean() < _SAME:
             raise ConfigError(
-                "TRELLIS and SAM 3D Objects save the same fields in other axes, and this object "
-                f"fits either ({apart['trellis']:.2f} and {apart['slat']:.2f} voxels from the "
-                f"nearest voxel), with other materials for {1 - alike.mean():.0%}; give --axes "
-                "trellis for Gaussians of TRELLIS, --axes slat for those of SAM 3D Objects"
+                "TRELLIS and SAM 3D Objects save the same fields in other axes. This object fits "
+                f"either, {apart['trellis']:.2f} and {apart['slat']:.2f} voxels from the nearest "
+                f"voxel, with other materials for {1 - alike.mean():.0%}. Give --axes trellis for "
+                "Gaussians of TRELLIS, --axes slat for those of SAM 3D Objects"
             )
         best = "trellis"
     if best == "trellis":
         return particles, ""
     return replace(particles, axes=best), (
-        f"the Gaussians are not turned as TRELLIS turns them ({apart['trellis']:.2f} voxels from "
-        f"the nearest voxel, {apart['slat']:.2f} as they are), so they are read as SAM 3D Objects "
+        f"the Gaussians are not turned as TRELLIS turns them: {apart['trellis']:.2f} voxels from "
+        f"the nearest voxel, {apart['slat']:.2f} as they are. So they are read as SAM 3D Objects "
         "saves them: --axes slat"
     )
 

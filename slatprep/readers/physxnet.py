@@ -44,8 +44,8 @@ class PhysXNet:
         if "finaljson" in listing.of_folder("", folders=True):
             raise ConfigError(
                 f"{source.root}: is PhysXNet as it is downloaded, annotations of the parts of "
-                "meshes, which have no voxels; the adapter `parts` voxelises them, or expected is "
-                "what PhysX-3D's toolkit makes of it, with property/ and voxels/"
+                "meshes, which have no voxels. Use the adapter `parts`, which voxelises them. "
+                "Expected is what PhysX-3D's toolkit makes of it, with property/ and voxels/"
             )
         for found in find_by_pattern(patterns_of(self, source), listing, {}):
             beside = f"voxels/{found.object_id}.ply"

@@ -191,8 +191,8 @@ class Deformation:
             or not self.spacing > 0
         ):
             raise ValueError(
-                "a deformation has finite numbers: affine (3, 4), origin (3,), spacing above 0 "
-                "and coefficients (n0, n1, n2, 3) with at least 4 a side or none; got affine "
+                "a deformation has finite numbers: affine (3, 4), origin (3,), spacing above 0, "
+                "and coefficients (n0, n1, n2, 3), at least 4 a side or none. Got affine "
                 f"{self.affine.shape}, origin {self.origin.shape}, spacing {self.spacing}, "
                 f"coefficients {shape}"
             )
