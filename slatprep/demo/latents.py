@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slatprep.records import FEATS_MEAN, FEATS_STD
+from slatprep.records.trellis2 import SHAPE_MEAN, SHAPE_STD
 
 LatentKind = Literal["placeholder", "material"]
 
@@ -57,6 +58,8 @@ def make_latents(
         z *= NOISE
         z[:, :8] += clean_latents(centres, material, properties)
     mean, std = np.resize(MEAN, channels), np.resize(STD, channels)
+    if channels == len(SHAPE_MEAN):
+        mean, std = np.array(SHAPE_MEAN), np.array(SHAPE_STD)
     feats: NDArray[np.float32] = (mean + std * z).astype(np.float32)
     return feats
 

@@ -100,9 +100,11 @@ def build_store(
 
     Raises
     ------
+    ConfigError
+        If `out` is something other than a store.
     StoreError
-        If `out` is something other than a store, another build is writing it,
-        no asset can be used, or the disk does not take what is written.
+        If another build is writing it, no asset can be used, or the disk does not take what is
+        written.
     InputError
         With `strict`, for the first asset that cannot be used.
     """

@@ -19,6 +19,12 @@ from slatprep.storage.place import place_of
 ENOUGH = 64
 """Voxels below which the moments of latents say nothing of whether they are standardised."""
 
+_WIDE_ALONE = 1.2
+"""Spread of the median channel above which one asset alone shows raw latents.
+
+Standardised, a dataset's channels have a spread of 1, and three real SLATs alone 0.66 to 0.79.
+"""
+
 _MAX_BYTES = 2**20
 
 
@@ -108,7 +114,7 @@ def tell_alone(moments: LatentMoments, space: LatentSpace) -> bool:
     if they were not. Those of a wide spread are as encoded, and those that look standardised are.
     """
     spread = float(np.median(moments.std))
-    return spread > 1.5 or (bool(space.mean) and look_standardised(moments, space))
+    return spread > _WIDE_ALONE or (bool(space.mean) and look_standardised(moments, space))
 
 
 def in_words(moments: LatentMoments) -> str:

@@ -14,7 +14,6 @@ from slatprep.parameters import SlatSource
 from slatprep.readers.encoders import ENOUGH, in_words, look_standardised
 from slatprep.readers.files import ArraySpec, load_source, npz_arrays
 from slatprep.readers.hdf5 import SUFFIXES, load_datasets
-from slatprep.readers.trellis2 import PBR_MEAN, PBR_STD, SHAPE_MEAN, SHAPE_STD
 from slatprep.records import (
     RESOLUTION,
     TRELLIS,
@@ -23,6 +22,7 @@ from slatprep.records import (
     SourceFile,
     StructuredLatents,
 )
+from slatprep.records.trellis2 import PBR_MEAN, PBR_STD, SHAPE_MEAN, SHAPE_STD
 
 
 @dataclass(frozen=True)

@@ -170,7 +170,8 @@ def test_the_search_looks_at_no_more_of_a_grid_full_of_voxels(
         work.append(0)
         align(field_of(chair()), latents_of(np.argwhere(occupancy)), DEFAULT)
     usual, *full = work
-    assert max(full) < 8 * usual
+    # Twice what one search takes: where a fit is poor, another one looks for ground.
+    assert max(full) < 2 * 10 * usual
 
 
 BALL = ((GRID - 31.5) ** 2).sum(axis=-1) < 22**2

@@ -187,5 +187,9 @@ def test_commands_print_through_one_function() -> None:
     """Which escapes what a terminal would obey."""
     folder = Path(str(module.__file__)).parent
     printing = [p.name for p in folder.glob("*.py") if "click.echo(" in p.read_text("utf-8")]
-    assert printing == ["output.py"]
-    assert Path(str(module.__file__)).read_text("utf-8").count("click.echo(") == 1
+    assert printing == ["streams.py"]
+    assert (folder / "streams.py").read_text("utf-8").count("click.echo(") == 1
+    emitting = [p.name for p in folder.glob("*.py") if " emit(" in p.read_text("utf-8")]
+    assert sorted(emitting) == ["output.py", "streams.py"]
+    # `say`, and a table that rich has drawn of escaped cells.
+    assert Path(str(module.__file__)).read_text("utf-8").count(" emit(") == 2

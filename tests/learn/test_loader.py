@@ -44,7 +44,7 @@ def test_without_pytorch_scores_work_and_the_loader_says_what_to_install() -> No
         "except Exception as error: print(type(error).__name__, error)"
     )
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
-    assert done.stdout.startswith("SlatprepError"), done.stderr
+    assert done.stdout.startswith("ConfigError"), done.stderr
     assert "pip install 'slatprep[train]'" in done.stdout
 
 

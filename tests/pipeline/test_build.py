@@ -116,7 +116,7 @@ def test_a_build_that_is_stopped_midway_leaves_the_old_store(
 def test_what_is_not_a_store_is_never_replaced(make_dataset: MakeDataset, tmp_path: Path) -> None:
     (tmp_path / "thesis").mkdir()
     (tmp_path / "thesis" / "chapter.tex").write_text("years of work")
-    with pytest.raises(StoreError, match="is not a slatprep store"):
+    with pytest.raises(ConfigError, match="is not a slatprep store"):
         build_store(make_dataset("a").parameters(), tmp_path / "thesis")
     assert (tmp_path / "thesis" / "chapter.tex").exists()
     (tmp_path / "empty").mkdir()
@@ -271,7 +271,7 @@ def test_voxels_too_far_from_an_annotation_are_not_valid(
     made = dataset.assets["a"]
     far = np.array([[1, 1, 1], [2, 1, 1]], np.uint8)
     coords = np.concatenate([far, made.coords])
-    dataset.write_slat("a.npz", coords, np.zeros((len(coords), 8), np.float32))
+    dataset.write_slat("a.npz", coords, np.resize(made.feats, (len(coords), 8)))
     summary = build_store(dataset.parameters(), tmp_path / "s.zarr")
     asset = open_store(summary.store).asset("a")
     assert asset.valid.tolist() == [False, False] + [True] * len(made.coords)

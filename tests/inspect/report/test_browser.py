@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
+import zarr
 from PIL import Image
 from support.pages import HOSTILE, Report
 
@@ -235,19 +236,20 @@ def test_a_deformed_asset_is_found_by_its_model_and_shown_through_its_map(
 def test_tied_placements_are_stepped_through(
     browser: Chrome, mixed_build: BuildSummary, tmp_path: Path
 ) -> None:
-    records = tmp_path / "records"
-    shutil.copytree(mixed_build.records.parent, records)
-    lines = [json.loads(line) for line in mixed_build.records.read_text().splitlines()]
+    store = Path(shutil.copytree(mixed_build.store, tmp_path / "mixed.zarr"))
+    texts = (group := zarr.open_group(store, mode="r+"))["asset/record"][:]
     turned = np.eye(4)
     turned[:2, :2] = [[-1, 0], [0, -1]]
-    for line in lines:
-        if line["asset_id"] == "cup":
-            line["alignment"]["placements"] = [
+    for row, text in enumerate(texts):
+        record = json.loads(str(text))
+        if record["asset_id"] == "cup":
+            record["alignment"]["placements"] = [
                 {"transform": turned.tolist(), "score": 1.0, "displacement": 40.0}
             ]
-    (records / "assets.jsonl").write_text("".join(f"{json.dumps(line)}\n" for line in lines))
+            texts[row] = json.dumps(record)
+    group["asset/record"][:] = texts
     path = tmp_path / "page.html"
-    write_report(open_store(mixed_build.store), path, manifests=records)
+    write_report(open_store(store), path, manifests=mixed_build.records.parent)
     browser.get("about:blank")
     browser.get(f"{path.as_uri()}#asset=cup")
     canvas = browser.find_element("id", "canvas")
