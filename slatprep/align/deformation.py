@@ -60,7 +60,18 @@ class PlaceMap:
 
 
 def map_of(alignment: Alignment) -> PlaceMap:
-    """Return the map between the frames that an alignment stands for."""
+    """Return the map between the frames that an alignment stands for.
+
+    Parameters
+    ----------
+    alignment : Alignment
+        What `slatprep.align_voxels` found, or a record holds.
+
+    Returns
+    -------
+    PlaceMap
+        Its transform, and its deformation where there is one.
+    """
     return PlaceMap(alignment.transform, alignment.deformation)
 
 

@@ -21,7 +21,19 @@ VOXEL_SIZE = 1.0 / RESOLUTION
 
 
 def voxel_centres(voxels: ArrayLike, resolution: int = RESOLUTION) -> NDArray[np.float64]:
-    """Return the centres (N, 3) of voxels (N, 3) in the unit cube.
+    """Return the centres of voxels in the unit cube.
+
+    Parameters
+    ----------
+    voxels : array_like of int, shape (N, 3)
+        Voxel indices in 0..resolution - 1.
+    resolution : int
+        Voxels along each axis of the cube.
+
+    Returns
+    -------
+    ndarray of float64, shape (N, 3)
+        Points in [-0.5, 0.5]^3 of the same frame.
 
     Examples
     --------
@@ -32,7 +44,19 @@ def voxel_centres(voxels: ArrayLike, resolution: int = RESOLUTION) -> NDArray[np
 
 
 def apply_transform(transform: ArrayLike, points: ArrayLike) -> NDArray[np.float64]:
-    """Map points (N, 3) by a homogeneous transform (4, 4) whose last row is 0, 0, 0, 1.
+    """Map points by a homogeneous transform.
+
+    Parameters
+    ----------
+    transform : array_like, shape (4, 4)
+        Homogeneous transform; the last row is taken to be 0, 0, 0, 1.
+    points : array_like, shape (N, 3)
+        Points of the transform's source frame.
+
+    Returns
+    -------
+    ndarray of float64, shape (N, 3)
+        Points of its target frame.
 
     Examples
     --------
