@@ -359,15 +359,16 @@ def _require_readable(path: Place) -> None:
     needed = path / "zarr.json"
     try:
         there = needed.exists()
-        if there:
-            needed.read_bytes()
     except PermissionError as error:
-        raise StoreError(
-            f"{needed}: may not be read ({error.strerror}); expected a store that these "
-            "credentials may read"
-        ) from None
+        raise _unreadable(needed, error) from None
     except OSError as error:
         raise StoreError(f"{path}: cannot be reached ({error.strerror})") from None
+    try:
+        storage_of(needed).read(0)
+    except PermissionError as error:
+        raise _unreadable(needed, error) from None
+    except OSError:
+        pass  # A pipe or a folder of that name is no store.
     if not there:
         raise StoreError(
             f"{path} is not a slatprep store: {needed} does not exist; build a store with "
@@ -381,3 +382,10 @@ def _root_document(path: Place) -> dict[str, Any]:
     except StoreError:
         return {}
     return document if isinstance(document.get("attributes"), dict) else {}
+
+
+def _unreadable(needed: Place, error: PermissionError) -> StoreError:
+    return StoreError(
+        f"{needed}: may not be read ({error.strerror}); expected a store that these credentials "
+        "may read"
+    )
