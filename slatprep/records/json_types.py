@@ -76,8 +76,8 @@ Share = Annotated[float, Ge(0), Le(1)]
 """A share, 0 to 1."""
 
 
-Count = Annotated[int, Ge(0)]
-"""A count, at least 0."""
+Count = Annotated[int, Ge(0), Le(2**53)]
+"""A count, 0 to the largest whole number that every reader of JSON keeps."""
 
 
 Number = Annotated[float, InJson({"type": "nullable", "schema": _FINITE}, _null_is_nan)]

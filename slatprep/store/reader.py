@@ -22,6 +22,7 @@ from slatprep.store.assets import ASSET_COLUMNS, AssetTable, AttributesError
 from slatprep.store.attributes import width_findings
 from slatprep.store.contract import MAX_VOXELS, read_metadata
 from slatprep.store.layout import FORMAT, FORMAT_VERSION, MERGED_COLUMNS, arrays_with
+from slatprep.store.shard_reader import DamagedFileError
 
 if TYPE_CHECKING:
     from PIL.Image import Image
@@ -265,13 +266,19 @@ class Store(AssetTable):
             If the store has no such asset, or a file is missing or damaged.
         """
         index = self.match(name)
+        arrays = self.read(index, VOXEL_COLUMNS)
+        side = self.contents.latents.resolution
+        if arrays["coords"].max(initial=0) >= side:
+            raise DamagedFileError(
+                str(self.path), "voxel/coords", f"a coordinate above {side - 1}", f"0 to {side - 1}"
+            )
         return StoredAsset(
             store=self,
             index=index,
             asset_id=self.ids[index],
             transform=np.asarray(self.cached_column("transform")[index]),
             columns={name: self.cached_column(name)[index] for name in ASSET_COLUMNS},
-            **self.read(index, VOXEL_COLUMNS),
+            **arrays,
         )
 
     def _voxel_rows(self, name: str, start: int, stop: int) -> NDArray[Any]:

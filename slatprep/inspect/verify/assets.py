@@ -96,15 +96,9 @@ def value_findings(asset: StoredAsset) -> Iterator[Finding]:
     """Yield findings on values that the contract does not allow."""
     coords, valid, material = asset.coords, asset.valid, asset.material
     contents = asset.store.contents
-    side = contents.latents.resolution
     classes = (*range(contents.n_labels), contents.background, UNANNOTATED)
     labelled = material < contents.n_labels
     checks = {
-        "voxel/coords": (
-            coords.max(initial=0) < side,
-            f"a coordinate above {side - 1}",
-            f"0 to {side - 1}",
-        ),
         "voxel/feats": (np.isfinite(asset.feats).all(), "NaN or infinite", "finite latents"),
         "voxel/material": (
             (labelled == valid).all() and (material[~valid] == UNANNOTATED).all(),

@@ -233,6 +233,30 @@ def test_a_record_that_breaks_its_schema_is_found(store: Path) -> None:
     assert "found 'beef'" in findings[0].what
 
 
+@pytest.mark.parametrize(
+    ("group", "key"), [("sources", "size"), ("candidates", "index"), ("counts", "valid")]
+)
+def test_a_number_beyond_counting_is_a_finding(store: Path, group: str, key: str) -> None:
+    record = json.loads(str(open_store(store).read_rows("asset/record", 0, 1)[0]))
+    place = record["alignment"][group] if group == "candidates" else record[group]
+    (place[0] if isinstance(place, list) else place)[key] = 10**30
+    rewrite(store, "asset/record", 0, json.dumps(record))
+    assert any(key in f.what for f in of_file(found(store), "asset/record"))
+
+
+def test_a_coordinate_beyond_the_grid_is_refused_wherever_an_asset_is_read(
+    store: Path, tmp_path: Path
+) -> None:
+    rewrite(store, "voxel/coords", 3, 70)
+    with pytest.raises(StoreError, match=r"voxel/coords: a coordinate above 63; expected 0 to 63"):
+        open_store(store).asset("ant")
+    check = ["check-alignment", "--store", str(store), "--asset", "ant", "--picture", "none"]
+    export = ["export", str(store), "--format", "ply", "--out", str(tmp_path / "x")]
+    for words in (check, export):
+        done = CliRunner().invoke(slatprep, words)
+        assert done.exit_code == 1 and "a coordinate above 63" in done.stderr, done.output
+
+
 def edit_json(path: Path, edit: Callable[[dict], object]) -> None:
     document = json.loads(path.read_text())
     edit(document)
