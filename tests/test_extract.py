@@ -274,7 +274,7 @@ def test_without_trellis_the_command_says_what_to_install(
     words = [command, str(source), "--out", str(tmp_path / "slat")]
     result = CliRunner().invoke(slatprep, words)
     assert result.exit_code == 2 and len(result.stderr.splitlines()) == 1
-    assert "install TRELLIS as https://github.com/microsoft/TRELLIS says" in result.stderr
+    assert "Install TRELLIS as https://github.com/microsoft/TRELLIS says" in result.stderr
     assert not (tmp_path / "slat").exists()
 
 

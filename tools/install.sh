@@ -74,10 +74,10 @@ for name, package in (('X11.so.6', 'libx11-6'), ('GL.so.1', 'libgl1'), ('gomp.so
 }
 
 case $what in
-run) lock=run from='--editable .' ;;
-hub) lock=test from='--editable .[hub]' ;;
-paper) lock=test from='--editable .[paper]' ;;
-test) lock=test from='--editable .[dev]' ;;
+run) lock=run from='-C editable_mode=compat --editable .' ;;
+hub) lock=test from='-C editable_mode=compat --editable .[hub]' ;;
+paper) lock=test from='-C editable_mode=compat --editable .[paper]' ;;
+test) lock=test from='-C editable_mode=compat --editable .[dev]' ;;
 *.whl) lock=run from=$what ;;
 *)
     say "nothing is called '$what' here; use run, hub, paper, test or a wheel"

@@ -162,7 +162,7 @@ def test_axes_that_fit_alike_are_asked_for(shape: str, tmp_path: Path) -> None:
         write(tmp_path / "g.ply", positions)
         out = tmp_path / "m.ply"
         said = run_wrong(tmp_path / "g.ply", "--prediction", tmp_path / "two.npz", "--out", out)
-        assert "this object fits either" in said and "--axes slat for those of SAM 3D" in said
+        assert "This object fits either" in said and "--axes slat for those of SAM 3D" in said
         assert not out.exists()
         # Of one material alone it does not matter.
         run("transfer", tmp_path / "g.ply", "--prediction", tmp_path / "one.npz", "--out", out)
