@@ -43,8 +43,8 @@ class Thresholds:
         Rise of the score once one side is mirrored; above it the asset is doubtful, as the
         annotation is a mirror image of its object.
     good_fitness, failed_fitness : float
-        The lower one of the two fitnesses, where no confidence is known, as in
-        stores of format 1: as the confidences.
+        The lower one of the two fitnesses, as the confidences, where no probability is known:
+        where a check finds another fit than the stored one.
     """
 
     good_confidence: float = 0.9
