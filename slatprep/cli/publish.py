@@ -13,8 +13,6 @@ from slatprep.cli.signature import Click, command
 if TYPE_CHECKING:
     from slatprep.store import Store
 
-_PICTURES = click.IntRange(min=0, max=60)
-
 
 @command()
 def publish(
