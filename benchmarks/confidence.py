@@ -44,8 +44,8 @@ from numpy.typing import NDArray
 
 from slatprep.align import field as engine
 from slatprep.align.consensus import degrees_between
-from slatprep.align.deformation import map_of
 from slatprep.demo import make_demo
+from slatprep.geometry.deformation import map_of
 from slatprep.geometry.frames import VOXEL_SIZE, nearest_similarity, split_transform, voxel_centres
 from slatprep.inspect.score import (
     SUCCESS_DISPLACEMENT,

@@ -27,7 +27,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slatprep.align import align
-from slatprep.align.deformation import map_of
 from slatprep.align.starts import euler_starts
 from slatprep.align.surface import surface_of
 from slatprep.cli.options import Folder, Positive
@@ -35,6 +34,7 @@ from slatprep.cli.output import Output
 from slatprep.cli.signature import Click, command
 from slatprep.demo import make_demo
 from slatprep.errors import ConfigError, SlatprepError
+from slatprep.geometry.deformation import map_of
 from slatprep.geometry.frames import nearest_similarity
 from slatprep.geometry.voxels import occupancy_of
 from slatprep.inspect.score import LevelScore, TruthScore, compare_with_truth, read_truth, summarise

@@ -32,9 +32,9 @@ from scipy.spatial import cKDTree
 
 from slatprep.align import align
 from slatprep.align.consensus import degrees_between
-from slatprep.align.deformation import map_of
 from slatprep.demo.asset import DemoView, make_asset
 from slatprep.demo.difficulty import LEVELS
+from slatprep.geometry.deformation import map_of
 from slatprep.geometry.fill import outside_of
 from slatprep.geometry.frames import (
     VOXEL_SIZE,

@@ -39,7 +39,6 @@ from scipy import ndimage
 
 from slatprep.align import align
 from slatprep.align import field as engine
-from slatprep.align.deformation import map_of
 from slatprep.demo import nerf
 from slatprep.demo.asset import make_asset
 from slatprep.demo.catalogue import CATALOGUE
@@ -47,6 +46,7 @@ from slatprep.demo.difficulty import LEVELS
 from slatprep.demo.materials import draw
 from slatprep.demo.model import Model, Parts, Rng, orient
 from slatprep.demo.shapes import Shape, box, capsule, cone, cylinder, ellipsoid
+from slatprep.geometry.deformation import map_of
 from slatprep.geometry.frames import VOXEL_SIZE, places_of, split_transform, voxel_centres
 from slatprep.inspect.score import Truth, TruthScore, compare_with_truth
 from slatprep.judge import judge

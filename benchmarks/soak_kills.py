@@ -47,9 +47,9 @@ from support.trees import records_of, tree
 
 from slatprep.inspect.verify.manifests import manifest_findings
 from slatprep.pipeline.dataset import build_store
-from slatprep.provenance.places import manifests_of
 from slatprep.storage.faults import VARIABLE
 from slatprep.store import open_store
+from slatprep.store.manifests import manifests_of
 from slatprep.workers.dask import Cluster
 from slatprep.workers.local import Jobs
 

@@ -29,10 +29,10 @@ from slatprep.judge.evidence import HARMLESS
 from slatprep.parameters import WitnessParameters
 from slatprep.parameters.files import load_parameters
 from slatprep.pipeline.dataset import build_store
-from slatprep.provenance.stored import StoredRecords
 from slatprep.records import UNANNOTATED
 from slatprep.sample import sample
 from slatprep.store import open_store
+from slatprep.store.records import StoredRecords
 
 LEEWAY = 0.02
 

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from slatprep.align import align
-from slatprep.align.deformation import PlaceMap, map_of
+from slatprep.geometry.deformation import PlaceMap, map_of
 from slatprep.geometry.voxels import occupancy_of, voxels_of
 from slatprep.parameters import AlignParameters, SampleParameters
 from slatprep.records import (

@@ -13,12 +13,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from slatprep.align.deformation import deform
 from slatprep.align.figures import CHECK_SAMPLES, FIT_SAMPLES, fit_figures
 from slatprep.align.pose import Similarity
 from slatprep.align.residuals import Residuals
 from slatprep.align.surface import Surface
 from slatprep.align.warp import Warp, from_nearest, halved
+from slatprep.geometry.deformation import deform
 from slatprep.geometry.frames import VOXEL_SIZE
 from slatprep.parameters import AlignParameters
 from slatprep.records import Deformation, FitFigures, Model

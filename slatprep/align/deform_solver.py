@@ -19,10 +19,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from slatprep.align.bspline import bend, gather, locate, scatter, strides_of
 from slatprep.align.equations import invert
 from slatprep.align.interpolation import interpolate
 from slatprep.align.warp import NO_SPACING
+from slatprep.geometry.bspline import bend, gather, locate, scatter, strides_of
 from slatprep.geometry.kernel import kernel
 
 OFFSET_PRIOR = 0.01

@@ -8,11 +8,11 @@ from dataclasses import replace
 import numpy as np
 
 from slatprep.align.agreement import agreement_of
-from slatprep.align.deformation import bending_of, deform
 from slatprep.align.pose import Similarity
 from slatprep.align.residuals import Residuals
 from slatprep.align.surface import surface_of
 from slatprep.align.warp import Warp
+from slatprep.geometry.deformation import bending_of, deform
 from slatprep.geometry.frames import VOXEL_SIZE
 from slatprep.geometry.voxels import above, occupancy_of
 from slatprep.records import Alignment, Deformation, FitFigures, MaterialField, StructuredLatents

@@ -10,8 +10,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from slatprep.align.deformation import GRAIN
 from slatprep.align.surface import DILATION, Surface, even_choice
+from slatprep.geometry.deformation import GRAIN
 from slatprep.geometry.frames import VOXEL_SIZE, even_directions
 from slatprep.records import Alignment, Ground
 

@@ -7,9 +7,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from slatprep.align.bspline import displacements, refined
-from slatprep.align.deformation import make_deformation
 from slatprep.align.pose import Similarity
+from slatprep.geometry.bspline import displacements, refined
+from slatprep.geometry.deformation import make_deformation
 from slatprep.geometry.frames import VOXEL_SIZE, nearest_similarity, split_transform
 from slatprep.records import Deformation
 

@@ -107,9 +107,8 @@ def show_quality(output: Output, overview: StoreOverview, *, advise: bool = True
 def _categories_of(overview: StoreOverview) -> str:
     """Return the table of categories that a store was built with; empty if none is known."""
     from slatprep.errors import StoreError
-    from slatprep.provenance.files import build_in
-    from slatprep.provenance.places import manifests_beside
     from slatprep.storage.place import place_of
+    from slatprep.store.manifests import build_in, manifests_beside
 
     try:
         folder = manifests_beside(place_of(overview.store))

@@ -40,8 +40,8 @@ def report(
     slatprep report data/demo.zarr --out demo.html --manifests manifests/build/demo
     """
     from slatprep.inspect.report import write_report
-    from slatprep.provenance.places import manifests_of
     from slatprep.store import open_store
+    from slatprep.store.manifests import manifests_of
 
     opened = open_store(store)
     name = store.name.removesuffix(".zarr")

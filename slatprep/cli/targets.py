@@ -65,7 +65,7 @@ def require_apart(command: click.Command, given: Mapping[str, Any]) -> None:
 
 def _inputs(given: Mapping[str, Any]) -> Iterator[tuple[str, Path]]:
     """Yield files and folders among options, by name, and the records of stores."""
-    from slatprep.provenance.places import manifests_of
+    from slatprep.store.manifests import manifests_of
     from slatprep.store.reader import is_store
 
     for name, value in given.items():

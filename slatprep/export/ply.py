@@ -18,10 +18,10 @@ from slatprep.errors import StoreError
 from slatprep.export.assets import Exported
 from slatprep.export.formats import ExportOptions, Frame, Points, Writer
 from slatprep.export.points import annotated_points
-from slatprep.provenance.stored import StoredRecords
 from slatprep.records import MATERIAL_COLOURS, PROPERTY_COLUMNS, RESOLUTION
 from slatprep.storage.names import file_name
 from slatprep.store import Store, StoredAsset
+from slatprep.store.records import StoredRecords
 
 VERTEX = np.dtype(
     [

@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 from slatprep.errors import StoreError
 from slatprep.export.formats import Points
 from slatprep.geometry.frames import voxel_centres
-from slatprep.provenance.stored import StoredRecords
 from slatprep.records import BACKGROUND, MATERIAL_CLASSES, PROPERTY_COLUMNS
 from slatprep.store import Store, StoredAsset
+from slatprep.store.records import StoredRecords
 
 
 class AnnotatedPoints(NamedTuple):

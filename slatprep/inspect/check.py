@@ -12,10 +12,10 @@ from numpy.typing import NDArray
 
 from slatprep.align.quality import measure_quality
 from slatprep.judge import THRESHOLDS, mirror_gain_of, verdict_of
-from slatprep.provenance.stored import StoredRecords
 from slatprep.records import Place, Verdict
 from slatprep.sample import sample
 from slatprep.store.reader import Store, StoredAsset, open_store
+from slatprep.store.records import StoredRecords
 
 QUALITY_TOLERANCE = 1e-3
 """Largest difference of a recomputed figure: a voxel at the radius may round either way."""

@@ -15,11 +15,11 @@ from slatprep.errors import StoreError
 from slatprep.geometry.frames import displacement, voxel_centres
 from slatprep.inspect.difference import AssetChange, PropertyChange, Setting, StoreDifference
 from slatprep.normalize import denormalize_properties
-from slatprep.provenance.stored import StoredRecords
 from slatprep.records import RESOLUTION, Place
 from slatprep.store import Store, open_store
 from slatprep.store.assets import ASSET_COLUMNS
 from slatprep.store.reader import VOXEL_COLUMNS
+from slatprep.store.records import StoredRecords
 from slatprep.workers import Progress
 from slatprep.workers.local import run_in_order
 

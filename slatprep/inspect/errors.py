@@ -18,16 +18,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slatprep.errors import StoreError
-from slatprep.provenance.places import manifests_beside
-from slatprep.provenance.stored import StoredRecords
 from slatprep.records import Place
 from slatprep.storage.atomic import staged, writing
 from slatprep.store import Store, open_store
+from slatprep.store.manifests import manifests_beside
+from slatprep.store.records import StoredRecords
 from slatprep.workers.local import Jobs, run_unordered
 
 if TYPE_CHECKING:
     from slatprep.judge.decoys import ErrorRates
-    from slatprep.provenance.record import StageParameters
+    from slatprep.store.record import StageParameters
 
 DECOYS = 200
 """Decoys of a dataset, at most one for each asset."""
@@ -200,7 +200,7 @@ def align_decoy(
 ) -> tuple[int, tuple[float, ...]]:
     """Align a decoy as its grid was; return the decoy's number and its evidence."""
     from slatprep.align import align
-    from slatprep.align.deformation import map_of
+    from slatprep.geometry.deformation import map_of
     from slatprep.judge import judge
     from slatprep.sample import sample
 

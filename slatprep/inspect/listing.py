@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Collection, Iterator
 from dataclasses import dataclass
 
-from slatprep.provenance.stored import StoredRecords
 from slatprep.records import Verdict
 from slatprep.store import Store
+from slatprep.store.records import StoredRecords
 
 
 @dataclass(frozen=True)

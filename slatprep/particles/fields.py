@@ -9,12 +9,11 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from slatprep.align.deformation import PlaceMap
 from slatprep.errors import ConfigError, InputError
 from slatprep.export.points import require_solver_classes
+from slatprep.geometry.deformation import PlaceMap
 from slatprep.geometry.voxels import shown_in_cells
 from slatprep.normalize import denormalize_properties
-from slatprep.provenance.stored import StoredRecords
 from slatprep.readers.files import ArraySpec, load_source, npz_arrays, npz_small_arrays
 from slatprep.readers.slat import check_coords
 from slatprep.records import (
@@ -25,6 +24,7 @@ from slatprep.records import (
     Normalization,
 )
 from slatprep.store import Store
+from slatprep.store.records import StoredRecords
 
 Points = Literal["slat", "grid"]
 

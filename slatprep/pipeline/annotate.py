@@ -11,11 +11,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from slatprep.align import align
-from slatprep.align.deformation import map_of
 from slatprep.errors import InputError
+from slatprep.geometry.deformation import map_of
 from slatprep.judge import judge, merged, voxel_confidence
 from slatprep.parameters import BuildParameters
-from slatprep.provenance.record import MAX_SOURCES, StageParameters
 from slatprep.readers import read_field, read_latents
 from slatprep.readers.identity import hash_sources, source_digests
 from slatprep.records import (
@@ -32,6 +31,7 @@ from slatprep.records import (
 )
 from slatprep.sample import in_table, lacking, merge, sample
 from slatprep.storage.faults import reached
+from slatprep.store.record import MAX_SOURCES, StageParameters
 
 
 @dataclass(frozen=True, eq=False)

@@ -24,10 +24,10 @@ from numba.core import event
 
 from slatprep.align import align
 from slatprep.align.deform import deform_if_earned
-from slatprep.align.deformation import map_of
 from slatprep.align.pose import Similarity
 from slatprep.align.surface import surface_of
 from slatprep.errors import InputError, MissingPartnerError, SlatprepError, StoreError
+from slatprep.geometry.deformation import map_of
 from slatprep.geometry.frames import voxel_centres
 from slatprep.geometry.kernel import KEPT
 from slatprep.geometry.voxels import occupancy_of, voxels_of
@@ -36,12 +36,9 @@ from slatprep.parameters import AlignParameters, BuildParameters, SampleParamete
 from slatprep.pipeline.annotate import annotate, process_several
 from slatprep.pipeline.plan import Action, BuildContext, PlannedAsset
 from slatprep.pipeline.previous import SourceStore
-from slatprep.pipeline.recipe import Recipe
+from slatprep.pipeline.recipe import Recipe, record_of, record_of_failed
 from slatprep.pipeline.rows import FailedAsset, Row
 from slatprep.pipeline.spool import Spool
-from slatprep.provenance.make import record_of, record_of_failed
-from slatprep.provenance.record import AssetRecord
-from slatprep.provenance.record_json import faults_of
 from slatprep.readers import read_field, read_latents
 from slatprep.readers.identity import reading_of, source_digests
 from slatprep.records import (
@@ -56,6 +53,8 @@ from slatprep.records import (
 )
 from slatprep.sample import sample
 from slatprep.storage.faults import reached
+from slatprep.store.record import AssetRecord
+from slatprep.store.record_json import faults_of
 
 _REASON, _TRACEBACK = 4_000, 100_000
 """Most letters of why an asset failed, and of where, which a stranger's names may be part of."""
@@ -111,7 +110,7 @@ def finish_asset(
             return resumed
     try:
         asset, key, damaged = _processed(pair, planned, context)
-        record = record_of(asset, context.parameters, context.recipe.code, key)
+        record = record_of(asset, context.recipe, key)
         if faults := faults_of(record):
             what = f"what was found is more than a record may hold ({'; '.join(faults[:3])})"
             raise InputError(f"asset {pair.asset_id!r}", what, "sources of a usual kind")
@@ -182,7 +181,7 @@ def _resumed(planned: PlannedAsset, spool: Spool) -> Row | None:
 
 
 def _failed(asset: Failed, context: BuildContext) -> FailedAsset:
-    record = record_of_failed(asset, context.parameters, context.recipe.code)
+    record = record_of_failed(asset, context.recipe)
     return context.spool.put_failed(record)
 
 

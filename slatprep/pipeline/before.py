@@ -28,11 +28,11 @@ from slatprep.pipeline.previous import SourceStore, checked_store, store_there
 from slatprep.pipeline.publish import Destination
 from slatprep.pipeline.recipe import Recipe
 from slatprep.pipeline.rows import NextStore
-from slatprep.provenance.files import BUILD, file_names
 from slatprep.records import AssetPair, Contents, Place
 from slatprep.storage.files import open_regular, private_file
 from slatprep.storage.place import storage_of
 from slatprep.store import Store
+from slatprep.store.manifests import BUILD, file_names
 from slatprep.workers.local import Jobs
 
 NAME = "sources.seen"

@@ -26,12 +26,12 @@ from slatprep.pipeline.settle import Wanted, settle_rows
 from slatprep.pipeline.spool import Spool
 from slatprep.pipeline.summary import BuildSummary, counts_of, summarise, summarise_store
 from slatprep.pipeline.work import spool_of, work_beside, work_directory
-from slatprep.provenance.record import Record
-from slatprep.provenance.record_json import build_id_of, digest_of
 from slatprep.readers import discover
 from slatprep.records import AssetPair, Place
 from slatprep.storage.atomic import staged, writing
 from slatprep.store import open_store
+from slatprep.store.record import Record
+from slatprep.store.record_json import build_id_of, digest_of
 from slatprep.workers.local import Jobs, require_shared
 
 __all__ = [
@@ -71,7 +71,7 @@ def build_store(
         one is finished; assets that did not change are not aligned again.
     manifests : str or Path, optional
         Directory of ``assets.jsonl`` and ``build.json``; by default beside the
-        store, see `slatprep.provenance.places.manifests_of`.
+        store, see `slatprep.store.manifests.manifests_of`.
     jobs : int or Workers
         Worker processes, or a `slatprep.workers.dask.Cluster`. The store's bytes do
         not depend on it.

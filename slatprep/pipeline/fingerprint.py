@@ -36,7 +36,7 @@ _NOT_NUMBERS = (
     "slatprep",
     "slatprep.errors",
     "slatprep.parameters",
-    "slatprep.provenance.record",
+    "slatprep.store.record",
     "slatprep.workers",
     "slatprep.workers.local",
 )
@@ -49,12 +49,12 @@ _DECODING = ("slatprep.storage.chunks", "slatprep.storage.codecs")
 PACKING = (
     "slatprep.normalize",
     "slatprep.pipeline.pack",
+    "slatprep.pipeline.recipe",
     "slatprep.pipeline.rows",
     "slatprep.pipeline.spool",
-    "slatprep.provenance.columns",
-    "slatprep.provenance.make",
-    "slatprep.provenance.record_json",
+    "slatprep.store.columns",
     "slatprep.store.layout",
+    "slatprep.store.record_json",
     "slatprep.store.shard_writer",
     "slatprep.store.writer",
 )

@@ -25,13 +25,12 @@ from slatprep.pipeline.rows import NextStore, Row
 from slatprep.pipeline.settle import resolved_contents
 from slatprep.pipeline.summary import BuildSummary, summarise_store
 from slatprep.pipeline.work import work_beside, work_directory
-from slatprep.provenance.files import build_in
-from slatprep.provenance.places import manifests_beside
-from slatprep.provenance.record_json import adapter_of
 from slatprep.records import Contents, LatentSpace, Normalization, Place, PropertyRange
 from slatprep.storage.atomic import writing
 from slatprep.storage.place import storage_of
 from slatprep.store import open_store
+from slatprep.store.manifests import build_in, manifests_beside
+from slatprep.store.record_json import adapter_of
 from slatprep.workers import Progress
 from slatprep.workers.local import Jobs, at_most
 

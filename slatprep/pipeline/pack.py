@@ -28,8 +28,7 @@ from slatprep.storage.files import take_file
 from slatprep.storage.place import storage_of
 from slatprep.storage.remote import put_objects
 from slatprep.storage.upload import Staged
-from slatprep.store.layout import ARRAYS, ArrayLayout, arrays_with, overlaps
-from slatprep.store.records import RECORD_ARRAY
+from slatprep.store.layout import ARRAYS, RECORD_ARRAY, ArrayLayout, arrays_with, overlaps
 from slatprep.store.runs import Run, Runs, runs_of
 from slatprep.store.shard_writer import ShardWriter, Written
 from slatprep.store.writer import (

@@ -13,8 +13,8 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 
 from slatprep.align.consensus import find_consensus, is_common, settle, turn_if_likelier
-from slatprep.align.deformation import map_of
 from slatprep.align.settle import refit, take
+from slatprep.geometry.deformation import map_of
 from slatprep.judge import contradicted, judge
 from slatprep.judge.witness import (
     LatentEvidence,
@@ -31,8 +31,6 @@ from slatprep.judge.witness import (
 from slatprep.parameters import BuildParameters
 from slatprep.pipeline.rows import Row
 from slatprep.pipeline.spool import Spool
-from slatprep.provenance.record import AssetRecord, FailedRecord, FirstPass
-from slatprep.provenance.record_json import to_json
 from slatprep.records import (
     BACKGROUND,
     Alignment,
@@ -45,6 +43,8 @@ from slatprep.records import (
     Verdict,
 )
 from slatprep.sample import sample
+from slatprep.store.record import AssetRecord, FailedRecord, FirstPass
+from slatprep.store.record_json import to_json
 from slatprep.workers.local import Jobs, run_unordered
 
 

@@ -18,10 +18,10 @@ from slatprep.pipeline.previous import SourceStore
 from slatprep.pipeline.recipe import Recipe
 from slatprep.pipeline.rows import Names
 from slatprep.pipeline.spool import Spool
-from slatprep.provenance.record_json import RecordError
 from slatprep.readers.identity import hash_sources
 from slatprep.records import AssetPair, Place
 from slatprep.storage.faults import reached
+from slatprep.store.record_json import RecordError
 from slatprep.workers.local import Jobs, run_unordered
 
 

@@ -9,14 +9,14 @@ from typing import Any
 
 import numpy as np
 
-from slatprep.align.deformation import map_of
 from slatprep.errors import StoreError
-from slatprep.provenance.record import AssetRecord
-from slatprep.provenance.stored import StoredRecords
+from slatprep.geometry.deformation import map_of
 from slatprep.records import Finished, Normalization, Place
 from slatprep.store.integrity import file_findings, metadata_findings
+from slatprep.store.layout import RECORD_ARRAY, RECORDS_IN_SHARD
 from slatprep.store.reader import Store, is_store, open_store
-from slatprep.store.records import RECORD_ARRAY, RECORDS_IN_SHARD
+from slatprep.store.record import AssetRecord
+from slatprep.store.records import StoredRecords
 from slatprep.store.shard_writer import Written
 from slatprep.workers.local import Jobs
 

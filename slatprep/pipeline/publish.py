@@ -18,17 +18,23 @@ from pathlib import Path
 from slatprep.errors import ConfigError, StoreError, in_unicode
 from slatprep.parameters import BuildParameters
 from slatprep.pipeline.summary import BuildSummary
-from slatprep.provenance.files import (
+from slatprep.records import Place
+from slatprep.storage.atomic import replace_directory
+from slatprep.storage.faults import reached
+from slatprep.storage.place import place_of, storage_of
+from slatprep.storage.upload import PublishedState, Staged, Upload, published_state, upload_store
+from slatprep.store.manifests import (
     ASSETS,
     BUILD,
     MAX_BUILD_BYTES,
     build_in,
     file_names,
     lines_of,
+    manifests_of,
     stale_files,
 )
-from slatprep.provenance.places import manifests_of
-from slatprep.provenance.record import (
+from slatprep.store.reader import Store, is_store, require_outside
+from slatprep.store.record import (
     AssetRecord,
     BuildCounts,
     BuildRecord,
@@ -36,13 +42,7 @@ from slatprep.provenance.record import (
     Record,
     Versions,
 )
-from slatprep.provenance.record_json import to_json
-from slatprep.records import Place
-from slatprep.storage.atomic import replace_directory
-from slatprep.storage.faults import reached
-from slatprep.storage.place import place_of, storage_of
-from slatprep.storage.upload import PublishedState, Staged, Upload, published_state, upload_store
-from slatprep.store.reader import Store, is_store, require_outside
+from slatprep.store.record_json import to_json
 
 _MARKS = {BUILD: b'"slatprep-build-record"', ASSETS: b'"slatprep-asset-record"'}
 """Files beside a store, and what each says at its beginning."""

@@ -1,4 +1,4 @@
-"""When an asset that was done before need not be done again.
+"""What decides an asset's row: when it need not be done again, and what its record says.
 
 Three things decide an asset's row: what its sources hold, the parameters that
 touch it, and the code with the libraries it computes with. A `Recipe` is the
@@ -10,18 +10,28 @@ of files are no part of it.
 from __future__ import annotations
 
 import hashlib
+import platform
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass
+from functools import lru_cache
+from importlib import metadata
 from typing import Any
 
+import numpy as np
 import orjson
 
+from slatprep.align import engine_versions
+from slatprep.geometry.voxels import boundary
 from slatprep.parameters import BuildParameters
 from slatprep.pipeline.fingerprint import code_fingerprint, packing_fingerprint
-from slatprep.provenance.make import origin
-from slatprep.provenance.record import AssetRecord, StageParameters
-from slatprep.provenance.versions import numeric_versions
-from slatprep.records import SourceFile
+from slatprep.records import Failed, Finished, SourceFile, Status
+from slatprep.store.record import (
+    MAX_WARNINGS,
+    AssetRecord,
+    FailedRecord,
+    StageParameters,
+    VoxelCounts,
+)
 
 
 @dataclass(frozen=True)
@@ -70,12 +80,102 @@ def recipe_of(parameters: BuildParameters) -> Recipe:
     """Return the recipe of a build."""
     return Recipe(
         parameters=StageParameters(parameters.align, parameters.sample),
-        versions=numeric_versions(parameters.align),
+        versions=numeric_versions(parameters),
         code=code_fingerprint(),
     )
 
 
 def build_of(parameters: BuildParameters) -> dict[str, Any]:
     """Return a store's attribute ``build``: its parameters, and what else decides its bytes."""
-    build: dict[str, Any] = origin(parameters)
-    return {**build, "versions": {**build["versions"], "packing": packing_fingerprint()}}
+    versions = {
+        **_environment(),
+        **numeric_versions(parameters),
+        "zarr": metadata.version("zarr"),
+        "joblib": metadata.version("joblib"),
+        "packing": packing_fingerprint(),
+    }
+    return origin(parameters, versions)
+
+
+def origin(parameters: BuildParameters, versions: Mapping[str, str]) -> dict[str, Any]:
+    """Return what decides a store's bytes, without where files lie, as its metadata hold it."""
+    groups = ("align", "sample", "consensus", "witness", "normalize", "store")
+    said = {group: getattr(parameters, group) for group in groups}
+    document = {"name": parameters.name, "parameters": said, "versions": versions}
+    return dict(orjson.loads(orjson.dumps(document)))
+
+
+def numeric_versions(parameters: BuildParameters) -> dict[str, str]:
+    """Return the versions of the libraries that make an asset's numbers."""
+    return {
+        "numpy": metadata.version("numpy"),
+        "scipy": metadata.version("scipy"),
+        **engine_versions(parameters.align),
+    }
+
+
+@lru_cache(maxsize=1)  # It takes longer than to read an asset.
+def _environment() -> dict[str, str]:
+    return {"slatprep": metadata.version("slatprep"), "python": platform.python_version()}
+
+
+def record_of(asset: Finished, recipe: Recipe, key: str) -> AssetRecord:
+    """Return the record of an asset that went through all stages, as the store will hold it."""
+    pair, field, latents = asset.pair, asset.field, asset.latents
+    return AssetRecord(
+        asset_id=pair.asset_id,
+        object_id=pair.object_id,
+        view=pair.view,
+        category=pair.category,
+        status=Status.OK,
+        sources=asset.sources or field.sources + latents.sources,
+        bounds=field.bounds,
+        parameters=recipe.parameters,
+        versions={**_environment(), **recipe.versions},
+        code=recipe.code,
+        key=key,
+        alignment=asset.alignment,
+        judgement=asset.judgement,
+        counts=_counts_of(asset),
+        merged=asset.contributions,
+        latents=latents.moments,
+        warnings=_first(field.warnings + latents.warnings),
+    )
+
+
+def _first(warnings: tuple[str, ...]) -> tuple[str, ...]:
+    """Return as many warnings as a record may hold, the last of them about the others."""
+    if len(warnings) <= MAX_WARNINGS:
+        return warnings
+    kept = warnings[: MAX_WARNINGS - 1]
+    return (*kept, f"{len(warnings) - len(kept):,} more warnings")
+
+
+def record_of_failed(asset: Failed, recipe: Recipe) -> FailedRecord:
+    """Return the record of an asset that cannot go in."""
+    pair = asset.pair
+    return FailedRecord(
+        asset_id=pair.asset_id,
+        object_id=pair.object_id,
+        view=pair.view,
+        category=pair.category,
+        status=asset.status,
+        reason=asset.reason,
+        traceback=asset.traceback,
+        parameters=recipe.parameters,
+        versions={**_environment(), **recipe.versions},
+        code=recipe.code,
+    )
+
+
+def _counts_of(asset: Finished) -> VoxelCounts:
+    occupied = int(np.count_nonzero(asset.field.occupancy))
+    return VoxelCounts(
+        occupied=occupied,
+        annotated=len(asset.field.voxels),
+        unannotated=occupied - len(asset.field.voxels),
+        boundary=int(np.count_nonzero(boundary(asset.field.occupancy))),
+        slat_voxels=len(asset.latents.coords),
+        valid=int(np.count_nonzero(asset.annotation.valid)),
+        unphysical=asset.field.unphysical,
+    )

@@ -15,10 +15,10 @@ from numpy.typing import NDArray
 from slatprep.normalize import normalize_change
 from slatprep.parameters import StoreParameters
 from slatprep.pipeline.previous import SourceStore
-from slatprep.provenance.record import AssetRecord
-from slatprep.provenance.record_json import build_id_of, digest_of, read_asset_record, to_json
 from slatprep.records import Contents, LatentMoments, Normalization, SourceFile, Status
 from slatprep.store.attributes import store_attributes
+from slatprep.store.record import AssetRecord
+from slatprep.store.record_json import build_id_of, digest_of, read_asset_record, to_json
 
 IN_SPOOL = -1
 """In place of the number of a store."""

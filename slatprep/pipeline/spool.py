@@ -22,9 +22,6 @@ from numpy.typing import NDArray
 from slatprep.errors import StoreError
 from slatprep.normalize import property_extent
 from slatprep.pipeline.rows import FailedAsset, Row
-from slatprep.provenance.columns import columns_of
-from slatprep.provenance.record import AssetRecord, FailedRecord, Record
-from slatprep.provenance.record_json import digest_of, read_record, to_json
 from slatprep.readers.plausible import TOLD
 from slatprep.records import (
     RESOLUTION,
@@ -39,7 +36,10 @@ from slatprep.storage.atomic import staged_apart, writing
 from slatprep.storage.faults import reached
 from slatprep.storage.place import storage_of
 from slatprep.storage.versions import BUILDER, is_spooled
+from slatprep.store.columns import columns_of
 from slatprep.store.layout import MERGED_COLUMNS
+from slatprep.store.record import AssetRecord, FailedRecord, Record
+from slatprep.store.record_json import digest_of, read_record, to_json
 
 Arrays = dict[str, NDArray[Any]]
 

@@ -11,10 +11,10 @@ import numpy as np
 
 from slatprep.parameters import BuildParameters
 from slatprep.pipeline.rows import FailedAsset, Row
-from slatprep.provenance.files import SEVERAL, file_names
 from slatprep.readers.unmatched import explain_unmatched
 from slatprep.records import AssetPair, Normalization, Place, Status
 from slatprep.store import Store
+from slatprep.store.manifests import SEVERAL, file_names
 
 PROBLEMS_LISTED = 100
 """How many problems a summary lists; the records hold all."""

@@ -20,9 +20,9 @@ from slatprep.store.layout import (
     ASSET_CHUNK,
     FIXED_SIZES,
     MERGED,
+    RECORD_ARRAY,
     ArrayLayout,
 )
-from slatprep.store.records import RECORD_ARRAY
 
 MAX_METADATA_BYTES = 16 * 2**20
 """No zarr.json is larger: all metadata of a store take about 50 kB."""

@@ -12,8 +12,7 @@ from typing import Any
 
 from slatprep.store.contract import Finding
 from slatprep.store.digests import GROUP
-from slatprep.store.layout import arrays_with
-from slatprep.store.records import RECORD_ARRAY
+from slatprep.store.layout import RECORD_ARRAY, arrays_with
 
 GROUPS = ("asset", "voxel", "grid", GROUP)
 

@@ -21,6 +21,17 @@ FORMAT_VERSION = 1
 ASSET_CHUNK = 65_536
 """Assets in one chunk of the ``asset/*`` arrays."""
 
+RECORD_ARRAY = "asset/record"
+"""The record of each row, as JSON. It is replaced in one step with the arrays it belongs to, the
+lines of ``assets.jsonl`` are made from it, and it is what the next build compares with."""
+
+MAX_RECORD_BYTES = 2**20
+"""No record is larger; most take some 10 kB."""
+
+RECORDS_IN_CHUNK = 64
+RECORDS_IN_SHARD = 1024
+"""About 10 MB of text: what the parent holds at a time."""
+
 NAN = float("nan")
 
 

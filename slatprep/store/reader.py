@@ -77,7 +77,7 @@ class StoredAsset:
         the asset has one annotation.
     transform : ndarray of float64, shape (4, 4)
         PixieVerse frame to SLAT frame, a similarity; a deformation that follows
-        it is in the record, see `slatprep.provenance.stored.StoredRecords.place_map`.
+        it is in the record, see `slatprep.store.records.StoredRecords.place_map`.
     columns : dict
         The asset's row of every other ``asset/*`` array, by the array's last
         name: ``fitness``, ``verdict``, ``category``, ...

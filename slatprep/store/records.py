@@ -1,36 +1,64 @@
-"""The records inside the store: the provenance of each row is stored with it.
-
-``asset/record`` holds them as JSON. It is replaced in one step with the arrays it
-belongs to, the lines of ``assets.jsonl`` are made from it, and it is what the next
-build compares with. What a record says is `slatprep.provenance`'s matter.
-"""
+"""Read the records that a store holds of its rows."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import Any
 
-RECORD_ARRAY = "asset/record"
+from numpy.typing import NDArray
 
-MAX_RECORD_BYTES = 2**20
-"""No record is larger; most take some 10 kB."""
+from slatprep.geometry.deformation import PlaceMap
+from slatprep.records import Model
+from slatprep.store.layout import RECORD_ARRAY, RECORDS_IN_CHUNK
+from slatprep.store.reader import Store, StoredAsset
+from slatprep.store.record import AssetRecord
+from slatprep.store.record_json import read_asset_record
 
-RECORDS_IN_CHUNK = 64
-RECORDS_IN_SHARD = 1024
-"""About 10 MB of text: what the parent holds at a time."""
+_CHUNKS_KEPT = 8
+"""Chunks of texts in memory, 0.6 MB each."""
 
 
-def create_record_array(root: Any, n_assets: int, level: int) -> None:
-    """Create the array in a new store."""
-    from zarr.codecs import Crc32cCodec, ZstdCodec
+class StoredRecords:
+    """The records of a store, by row or in order."""
 
-    root.create_array(
-        RECORD_ARRAY,
-        shape=(n_assets,),
-        dtype=str,
-        chunks=(RECORDS_IN_CHUNK,),
-        shards=(RECORDS_IN_SHARD,),
-        compressors=(ZstdCodec(level=level), Crc32cCodec()),
-        fill_value="",
-        dimension_names=("asset",),
-        attributes={"description": "provenance of the row, as JSON"},
-    )
+    def __init__(self, store: Store) -> None:
+        self.store = store
+        self._chunks: dict[int, list[str]] = {}
+
+    def __iter__(self) -> Iterator[AssetRecord]:
+        return (self.read(row) for row in range(len(self.store)))
+
+    def of(self, name: str | int) -> AssetRecord:
+        """Return the record of an asset, named as in `Store.match`; StoreError if there is none."""
+        return self.read(self.store.match(name))
+
+    def place_map(self, asset: StoredAsset) -> PlaceMap:
+        """Return the map between the frames by which an asset was looked up.
+
+        StoreError if the asset is deformed, and its record, which holds how, cannot be read.
+        """
+        if asset.columns["model"] in (Model.RIGID, Model.SIMILARITY):
+            return PlaceMap(asset.transform)
+        return PlaceMap(asset.transform, self.read(asset.index).alignment.deformation)
+
+    def rows(self, name: str, start: int, stop: int) -> NDArray[Any]:
+        """Return rows ``start:stop`` of an array of the store; see `Store.read_rows`."""
+        return self.store.read_rows(name, start, stop)
+
+    def read(self, row: int) -> AssetRecord:
+        """Return the record of a row; StoreError if it cannot be read."""
+        where = f"{self.store.path}: {RECORD_ARRAY}, row {row}"
+        return read_asset_record(self.text(row), where)
+
+    def text(self, row: int) -> str:
+        """Return the record of a row as its JSON, unchecked; StoreError where it cannot be read."""
+        chunk, position = divmod(row, RECORDS_IN_CHUNK)
+        # Assets are asked for nearly in order, of each segment.
+        if chunk not in self._chunks:
+            start = chunk * RECORDS_IN_CHUNK
+            stop = min(start + RECORDS_IN_CHUNK, len(self.store))
+            texts = self.store.read_rows(RECORD_ARRAY, start, stop)
+            if len(self._chunks) == _CHUNKS_KEPT:
+                del self._chunks[next(iter(self._chunks))]
+            self._chunks[chunk] = [str(text) for text in texts]
+        return self._chunks[chunk][position]

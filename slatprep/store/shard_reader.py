@@ -24,7 +24,7 @@ from slatprep.records import MAX_NAME_BYTES
 from slatprep.storage.chunks import whole_sizes
 from slatprep.storage.codecs import MAX_TEXT_BYTES, ChunkDecoder, crc32c_holds
 from slatprep.storage.place import Folder, RangeFile
-from slatprep.store.records import MAX_RECORD_BYTES, RECORD_ARRAY
+from slatprep.store.layout import MAX_RECORD_BYTES, RECORD_ARRAY
 
 MISSING = 2**64 - 1
 """Offset and length of a chunk that was never written: it holds the fill value."""

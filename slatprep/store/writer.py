@@ -24,13 +24,15 @@ from slatprep.store.layout import (
     ASSET_CHUNK,
     FIXED_SIZES,
     MERGED,
+    RECORD_ARRAY,
+    RECORDS_IN_CHUNK,
+    RECORDS_IN_SHARD,
     ArrayLayout,
     arrays_with,
     overlaps,
     row_ranges,
     rows_per_shard,
 )
-from slatprep.store.records import RECORDS_IN_CHUNK, RECORDS_IN_SHARD, create_record_array
 from slatprep.store.runs import Piece, Runs
 
 GROUPS = ("voxel", "grid", "record")
@@ -115,7 +117,23 @@ def create_store(
             dimension_names=layout.dimensions,
             attributes=attributes,
         )
-    create_record_array(root, n_assets, parameters.compression_level)
+    _create_record_array(root, n_assets, parameters.compression_level)
+
+
+def _create_record_array(root: Any, n_assets: int, level: int) -> None:
+    from zarr.codecs import Crc32cCodec, ZstdCodec
+
+    root.create_array(
+        RECORD_ARRAY,
+        shape=(n_assets,),
+        dtype=str,
+        chunks=(RECORDS_IN_CHUNK,),
+        shards=(RECORDS_IN_SHARD,),
+        compressors=(ZstdCodec(level=level), Crc32cCodec()),
+        fill_value="",
+        dimension_names=("asset",),
+        attributes={"description": "provenance of the row, as JSON"},
+    )
 
 
 def _codecs(layout: ArrayLayout, level: int) -> dict[str, Any]:

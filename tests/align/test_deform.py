@@ -10,9 +10,9 @@ from support.deformed import Move, bend, occupancy, stretch
 from support.shapes import chair, field_of, latents_of, surface_latents
 
 from slatprep.align import align
-from slatprep.align.deformation import is_proper, map_of
 from slatprep.align.pose import Similarity
 from slatprep.align.warp import Warp, from_nearest, halved, places_of
+from slatprep.geometry.deformation import is_proper, map_of
 from slatprep.geometry.frames import voxel_centres
 from slatprep.geometry.voxels import boundary, voxels_of
 from slatprep.parameters import AlignParameters

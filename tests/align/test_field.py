@@ -16,9 +16,9 @@ from hypothesis import strategies as st
 from support.shapes import GRID, Case, chair, field_of, latents_of, surface_latents, turned
 
 from slatprep.align import align, engine_versions, solver
-from slatprep.align.deformation import map_of
 from slatprep.align.pair import FINE_SAMPLES
 from slatprep.align.starts import distinct_starts
+from slatprep.geometry.deformation import map_of
 from slatprep.geometry.frames import displacement, make_transform, split_transform
 from slatprep.geometry.voxels import boundary, voxels_of
 from slatprep.judge import judge

@@ -12,11 +12,11 @@ from support.shapes import GRID, chair, field_of, surface_latents
 
 from slatprep.align import align
 from slatprep.align import field as engine
-from slatprep.align.deformation import map_of
 from slatprep.align.ground import find_ground
 from slatprep.align.quality import measure_quality
 from slatprep.align.settle import refit, take
 from slatprep.align.surface import surface_of
+from slatprep.geometry.deformation import map_of
 from slatprep.geometry.frames import displacement, make_transform
 from slatprep.geometry.voxels import above
 from slatprep.judge import judge

@@ -10,8 +10,8 @@ from scipy.spatial.transform import Rotation
 from support.shapes import GRID, chair, field_of, surface_latents
 
 from slatprep.align import align
-from slatprep.align.deformation import map_of
 from slatprep.align.surface import surface_of
+from slatprep.geometry.deformation import map_of
 from slatprep.judge import THRESHOLDS, judge
 from slatprep.parameters import AlignParameters, SampleParameters
 from slatprep.records import Verdict

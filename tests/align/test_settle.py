@@ -11,9 +11,9 @@ from support.deformed import MOVES, occupancy
 from support.shapes import chair, field_of, surface_latents
 
 from slatprep.align import align
-from slatprep.align.deformation import map_of
 from slatprep.align.quality import measure_quality
 from slatprep.align.settle import refit, take
+from slatprep.geometry.deformation import map_of
 from slatprep.geometry.frames import VOXEL_SIZE, apply_transform, make_transform, voxel_centres
 from slatprep.parameters import AlignParameters
 from slatprep.records import (

@@ -13,7 +13,7 @@ from slatprep.cli import output as module
 from slatprep.cli.commands import slatprep
 from slatprep.inspect.listing import list_assets
 from slatprep.pipeline.dataset import BuildSummary
-from slatprep.provenance.stored import StoredRecords
+from slatprep.store.records import StoredRecords
 
 
 def listed(build: BuildSummary, *options: str) -> str:

@@ -9,9 +9,9 @@ from support.synthetic import QUARTER_TURN, Dataset
 from slatprep.errors import StoreError
 from slatprep.inspect.check import AlignmentCheck, check_alignment
 from slatprep.pipeline.dataset import BuildSummary, build_store
-from slatprep.provenance.stored import StoredRecords
 from slatprep.records import Verdict
 from slatprep.store import open_store
+from slatprep.store.records import StoredRecords
 
 
 @pytest.fixture

@@ -14,8 +14,8 @@ from slatprep.cli.commands import slatprep
 from slatprep.inspect.errors import FILE, draw_decoys, measure_errors, read_decoys, told_of
 from slatprep.inspect.pictures.errors import draw_errors
 from slatprep.pipeline.dataset import BuildSummary
-from slatprep.provenance.places import manifests_of
 from slatprep.store import Store, open_store
+from slatprep.store.manifests import manifests_of
 
 
 @pytest.fixture(scope="module")

@@ -10,7 +10,7 @@ import pytest
 from support.shapes import GRID, chair, field_of, surface_latents
 
 from slatprep.align import align
-from slatprep.align.deformation import map_of
+from slatprep.geometry.deformation import map_of
 from slatprep.judge import measure_ambiguity
 from slatprep.judge.ambiguity import FEWER, MOST_VOXELS, thinning
 from slatprep.judge.evidence import surroundings_of

@@ -12,9 +12,9 @@ import pytest
 from support.shapes import GRID, chair, field_of, surface_latents
 
 from slatprep.align import align
-from slatprep.align.deformation import map_of
 from slatprep.align.figures import measure_figures
 from slatprep.demo import make_demo
+from slatprep.geometry.deformation import map_of
 from slatprep.inspect.score import Truth, read_truth
 from slatprep.inspect.verify.assets import roundings
 from slatprep.judge import THRESHOLDS, judge, verdict_of, voxel_confidence

@@ -21,8 +21,8 @@ from slatprep.inspect.verify import verify_store
 from slatprep.parameters import PairingParameters
 from slatprep.parameters.files import load_parameters
 from slatprep.pipeline.dataset import build_store
-from slatprep.provenance.stored import StoredRecords
 from slatprep.store import open_store
+from slatprep.store.records import StoredRecords
 
 MakeDataset = Callable[..., Dataset]
 

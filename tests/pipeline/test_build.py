@@ -13,8 +13,8 @@ from slatprep.errors import ConfigError, InputError, MissingPartnerError, StoreE
 from slatprep.inspect.verify import verify_store
 from slatprep.parameters import PairingParameters, SampleParameters
 from slatprep.pipeline.dataset import BuildSummary, align_pairs, build_store
-from slatprep.provenance.places import manifests_of
 from slatprep.store import open_store
+from slatprep.store.manifests import manifests_of
 
 MakeDataset = Callable[..., Dataset]
 

@@ -16,9 +16,9 @@ from support.trees import tree
 
 from slatprep.inspect.verify import verify_store
 from slatprep.pipeline.dataset import BuildSummary, build_store, plan_build
-from slatprep.provenance.stored import StoredRecords
 from slatprep.store import open_store
 from slatprep.store.digests import GROUP, write_digests
+from slatprep.store.records import StoredRecords
 
 RECORDS = "asset/record/c/0"
 

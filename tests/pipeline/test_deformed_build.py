@@ -21,11 +21,11 @@ from slatprep.inspect.verify import verify_store
 from slatprep.particles.fields import stored_field
 from slatprep.particles.transfer import transfer
 from slatprep.pipeline.dataset import BuildSummary
-from slatprep.provenance.record_json import read_asset_record, to_json
-from slatprep.provenance.schemas import FOLDER
-from slatprep.provenance.stored import StoredRecords
 from slatprep.store import open_store
 from slatprep.store.reader import Store
+from slatprep.store.record_json import read_asset_record, to_json
+from slatprep.store.records import StoredRecords
+from slatprep.store.schemas import FOLDER
 
 
 @pytest.fixture

@@ -94,7 +94,7 @@ def test_what_merges_annotations_and_unpacks_values_is_in_it(name: str) -> None:
 
 def test_what_makes_no_numbers_is_not_in_it() -> None:
     names = set(numeric_modules())
-    assert not {n for n in names if n.startswith(("slatprep.provenance", "slatprep.storage.pl"))}
+    assert not {n for n in names if n.startswith("slatprep.storage.pl")}
     assert not {n for n in names if n.startswith(("slatprep.cli", "slatprep.store"))}
     assert "slatprep.pipeline.dataset" not in names
     for path in numeric_modules().values():
@@ -105,7 +105,7 @@ def test_what_packs_rows_makes_columns_and_records_is_in_the_other(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     """Code that is in no key, and still decides bytes."""
-    wanted = {"normalize", "pipeline.pack", "provenance.columns", "provenance.make",
+    wanted = {"normalize", "pipeline.pack", "pipeline.recipe", "store.columns",
               "store.shard_writer", "store.layout"}  # fmt: skip
     assert {f"slatprep.{name}" for name in wanted} <= set(fingerprint.PACKING)
     before = fingerprint.packing_fingerprint.__wrapped__()

@@ -33,9 +33,9 @@ from slatprep.learn.train import TrainParameters, train
 from slatprep.parameters import WitnessParameters
 from slatprep.parameters.files import load_parameters
 from slatprep.particles.fields import predicted_field, stored_field
-from slatprep.provenance.stored import StoredRecords
 from slatprep.readers.splits import Shares
 from slatprep.records import BACKGROUND
+from slatprep.store.records import StoredRecords
 
 FILES = ("shape_latents/*/{id}.npz", "{id}.npz")
 ENCODERS: tuple[Encoder, ...] = ("trellis2-512", "plain-128")

@@ -14,8 +14,7 @@ from support.trees import records_of, tree
 from slatprep.inspect.verify import verify_store
 from slatprep.pipeline import previous
 from slatprep.pipeline.dataset import build_store
-from slatprep.provenance import files, stored
-from slatprep.store import open_store, records, writer
+from slatprep.store import manifests, open_store, records, writer
 from slatprep.store.layout import ARRAYS
 
 MakeDataset = Callable[..., Dataset]
@@ -73,9 +72,9 @@ def test_an_update_writes_what_is_new_and_the_last_shards(built: tuple[Dataset, 
 @pytest.fixture
 def two_a_shard(monkeypatch: pytest.MonkeyPatch) -> None:
     """Cut records into shards of two rows."""
-    for module in (files, previous, records, writer):
+    for module in (manifests, previous, writer):
         monkeypatch.setattr(module, "RECORDS_IN_SHARD", 2)
-    for module in (records, writer, stored):
+    for module in (records, writer):
         monkeypatch.setattr(module, "RECORDS_IN_CHUNK", 2)
 
 

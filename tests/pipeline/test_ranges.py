@@ -16,8 +16,8 @@ from support.trees import tree
 from slatprep import ConfigError, InputError
 from slatprep.parameters import BuildParameters, NormalizeParameters
 from slatprep.pipeline.dataset import build_store
-from slatprep.provenance.record_json import read_build_record
 from slatprep.store import open_store
+from slatprep.store.record_json import read_build_record
 
 MakeDataset = Callable[..., Dataset]
 

@@ -10,8 +10,8 @@ import pytest
 from slatprep.parameters import AlignParameters, SampleParameters
 from slatprep.pipeline.dataset import BuildSummary
 from slatprep.pipeline.recipe import Recipe
-from slatprep.provenance.record import AssetRecord, StageParameters
-from slatprep.provenance.record_json import read_asset_record
+from slatprep.store.record import AssetRecord, StageParameters
+from slatprep.store.record_json import read_asset_record
 
 RECIPE = Recipe(
     StageParameters(AlignParameters(), SampleParameters()),

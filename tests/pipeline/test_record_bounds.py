@@ -14,9 +14,9 @@ from support.trees import tree
 
 from slatprep.inspect.verify import verify_store
 from slatprep.pipeline.dataset import build_store
-from slatprep.provenance.record import MAX_WARNINGS
-from slatprep.provenance.stored import StoredRecords
 from slatprep.store import open_store
+from slatprep.store.record import MAX_WARNINGS
+from slatprep.store.records import StoredRecords
 
 MakeDataset = Callable[..., Dataset]
 
@@ -65,7 +65,7 @@ def test_a_record_that_nobody_could_read_costs_its_asset_alone(
     dataset = make_dataset("a", "b")
     beside = dataset.root / "pixieverse/a/clip_features.npz"
     np.savez(beside, **{f"names_{k}": np.array(["x" * 60] * 60) for k in range(40)})
-    monkeypatch.setattr("slatprep.provenance.record_json.MAX_RECORD_BYTES", 2 * 100_000)
+    monkeypatch.setattr("slatprep.store.record_json.MAX_RECORD_BYTES", 2 * 100_000)
     out = tmp_path / "s.zarr"
     summary = build_store(dataset.parameters("pixie"), out)
     assert (summary.statuses["ok"], summary.statuses["failed"]) == (1, 1)

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from slatprep.align.deformation import PlaceMap
+from slatprep.geometry.deformation import PlaceMap
 from slatprep.geometry.frames import (
     VOXEL_SIZE,
     apply_transform,
@@ -23,9 +23,9 @@ from slatprep.geometry.voxels import (
 )
 from slatprep.inspect.pictures.palette import DISTANCE_COLOURS
 from slatprep.inspect.pictures.voxels import View, view_rotation
-from slatprep.provenance.stored import StoredRecords
 from slatprep.records import MATERIAL_CLASSES, MATERIAL_COLOURS, RESOLUTION
 from slatprep.store.reader import StoredAsset
+from slatprep.store.records import StoredRecords
 
 FARTHEST = 3.0
 """End of the scale of distances [voxel]."""

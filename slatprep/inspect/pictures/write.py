@@ -13,11 +13,11 @@ from slatprep.inspect.pictures.alignment import draw_alignment
 from slatprep.inspect.pictures.canvas import FORMATS, STYLE, in_format
 from slatprep.inspect.pictures.scene import Scene, scene_of
 from slatprep.inspect.pictures.sheet import MOST, draw_sheet
-from slatprep.provenance.stored import StoredRecords
 from slatprep.records import Place
 from slatprep.storage.atomic import staged
 from slatprep.storage.names import file_name
 from slatprep.store.reader import Store, StoredAsset, open_store
+from slatprep.store.records import StoredRecords
 from slatprep.workers import Progress
 from slatprep.workers.local import run_unordered
 

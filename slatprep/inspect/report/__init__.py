@@ -19,12 +19,12 @@ from slatprep.inspect.report.thumbnails import PER_SHEET, sheet, thumbnail
 from slatprep.inspect.report.voxels import COARSE, FULL, encode_asset
 from slatprep.inspect.tallies import Tally, tally
 from slatprep.inspect.verify.index import WORDS
-from slatprep.provenance.files import build_in
-from slatprep.provenance.stored import StoredRecords
 from slatprep.records import Place, Verdict
 from slatprep.storage.atomic import staged, writing
 from slatprep.store import open_store
+from slatprep.store.manifests import build_in
 from slatprep.store.reader import Store, StoredAsset
+from slatprep.store.records import StoredRecords
 from slatprep.workers import Progress
 from slatprep.workers.local import run_unordered
 

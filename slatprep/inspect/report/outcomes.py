@@ -11,11 +11,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slatprep.errors import StoreError
-from slatprep.provenance.files import build_in
-from slatprep.provenance.record import AssetRecord, FailedRecord
-from slatprep.provenance.stored import StoredRecords
 from slatprep.records import Place, Status
+from slatprep.store.manifests import build_in
 from slatprep.store.reader import Store
+from slatprep.store.record import AssetRecord, FailedRecord
+from slatprep.store.records import StoredRecords
 
 MOST_TIES = 8
 """Most tied placements of an asset on the page."""

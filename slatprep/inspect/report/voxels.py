@@ -25,7 +25,7 @@ import zlib
 import numpy as np
 from numpy.typing import NDArray
 
-from slatprep.align.deformation import PlaceMap
+from slatprep.geometry.deformation import PlaceMap
 from slatprep.geometry.frames import apply_transform, invert_transform, voxel_centres
 from slatprep.geometry.voxels import boundary, filled
 from slatprep.records import RESOLUTION, UNANNOTATED

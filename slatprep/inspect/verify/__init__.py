@@ -14,12 +14,12 @@ from slatprep.errors import StoreError
 from slatprep.inspect.verify.assets import asset_findings
 from slatprep.inspect.verify.index import index_findings
 from slatprep.inspect.verify.manifests import manifest_findings, moved, source_roots
-from slatprep.provenance.places import manifests_beside
 from slatprep.records import Place, SourceRoots
 from slatprep.storage.place import place_of, storage_of
 from slatprep.store.assets import AttributesError
 from slatprep.store.contract import Finding, read_metadata
 from slatprep.store.integrity import file_findings, metadata_findings
+from slatprep.store.manifests import manifests_beside
 from slatprep.store.reader import Store, open_store
 from slatprep.workers import Progress
 from slatprep.workers.local import Jobs, require_shared, run_unordered

@@ -11,8 +11,8 @@ import numpy as np
 import orjson
 from numpy.typing import NDArray
 
-from slatprep.align.deformation import map_of
 from slatprep.errors import InputError, StoreError
+from slatprep.geometry.deformation import map_of
 from slatprep.geometry.voxels import flat_index
 from slatprep.inspect.check import TOLERANCES, recompute_annotation
 from slatprep.inspect.verify.merged import merged_findings
@@ -21,10 +21,6 @@ from slatprep.judge.evidence import labels_hold
 from slatprep.normalize import normalize_change
 from slatprep.pipeline.fingerprint import code_fingerprint
 from slatprep.pipeline.previous import PLACE_TOLERANCE
-from slatprep.provenance.columns import columns_of
-from slatprep.provenance.record import AssetRecord
-from slatprep.provenance.record_json import RecordError, digest_of
-from slatprep.provenance.stored import StoredRecords
 from slatprep.readers.files import is_hierarchy, load_source
 from slatprep.records import (
     UNANNOTATED,
@@ -36,9 +32,13 @@ from slatprep.records import (
 )
 from slatprep.storage.files import file_digest
 from slatprep.storage.place import storage_of
+from slatprep.store.columns import columns_of
 from slatprep.store.contract import Finding
+from slatprep.store.layout import RECORD_ARRAY
 from slatprep.store.reader import Store, StoredAsset, open_store
-from slatprep.store.records import RECORD_ARRAY
+from slatprep.store.record import AssetRecord
+from slatprep.store.record_json import RecordError, digest_of
+from slatprep.store.records import StoredRecords
 from slatprep.store.shard_reader import DamagedFileError
 
 CONFIDENCE_TOLERANCE = 1e-5

@@ -11,17 +11,17 @@ import orjson
 from slatprep.errors import StoreError
 from slatprep.inspect.verify.assets import fault_findings
 from slatprep.pipeline.join import APART, NO_ROOT
+from slatprep.pipeline.recipe import origin
 from slatprep.pipeline.summary import counts_in
-from slatprep.provenance.files import BUILD, build_in, build_text, file_names, lines_of
-from slatprep.provenance.make import origin
-from slatprep.provenance.record import BuildRecord
-from slatprep.provenance.record_json import RecordError, read_build_record
 from slatprep.readers.published import locate_grids
 from slatprep.records import Place, SourceRoots, Status
 from slatprep.storage.place import storage_of
 from slatprep.store.contract import Finding
+from slatprep.store.layout import RECORDS_IN_SHARD
+from slatprep.store.manifests import BUILD, build_in, build_text, file_names, lines_of
 from slatprep.store.reader import Store
-from slatprep.store.records import RECORDS_IN_SHARD
+from slatprep.store.record import BuildRecord
+from slatprep.store.record_json import RecordError, read_build_record
 
 _MOST_LINES = 8
 
@@ -129,7 +129,7 @@ def _claims(build: BuildRecord, store: Store) -> Iterator[tuple[str, object, obj
     held = dict(zip(store.about.property_columns, clipped, strict=True))
     yield "counts/clipped", build.counts.clipped, held
     yield "normalization", build.normalization, store.normalization
-    said = {**origin(build.parameters), "name": build.name, "versions": build.versions}
+    said = {**origin(build.parameters, build.versions), "name": build.name}
     for name, value in store.attributes["build"].items():
         yield name, said.get(name), value
 

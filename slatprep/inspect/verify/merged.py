@@ -11,12 +11,12 @@ from slatprep.errors import SlatprepError
 from slatprep.inspect.check import TOLERANCES
 from slatprep.normalize import normalize_change, normalize_properties
 from slatprep.pipeline.annotate import annotate
-from slatprep.provenance.record import AssetRecord
 from slatprep.readers import read_field
 from slatprep.records import AssetPair, Contribution, SourceRoots
 from slatprep.sample import in_table, merge
 from slatprep.store.contract import Finding
 from slatprep.store.reader import StoredAsset
+from slatprep.store.record import AssetRecord
 
 TOLERANCE = 1e-5
 """Largest difference of shares and normalised spreads: another machine may round otherwise."""

@@ -41,9 +41,9 @@ from slatprep.inspect.pictures.scene import FARTHEST, distance_colours, scene_of
 from slatprep.inspect.pictures.viewer import cube_mesh, has_screen, meshes
 from slatprep.inspect.pictures.write import write_pictures
 from slatprep.pipeline.dataset import BuildSummary
-from slatprep.provenance.stored import StoredRecords
 from slatprep.records import Placement, Search
 from slatprep.store import open_store
+from slatprep.store.records import StoredRecords
 
 
 def run(*arguments: str | Path) -> Result:

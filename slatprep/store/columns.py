@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from slatprep.provenance.record import AssetRecord
+from slatprep.store.record import AssetRecord
 
 Column = str | float | tuple[float, ...] | NDArray[np.generic]
 

@@ -1,9 +1,9 @@
 """The records of an asset and of a build: what was made from what, by what, and how well.
 
-They are written and read by `slatprep.provenance.record_json`, and nowhere
+They are written and read by `slatprep.store.record_json`, and nowhere
 else. A record that is read is checked: unknown keys, types, ranges and
-digests. ``slatprep/provenance/schema`` holds the JSON Schemas, which
-`slatprep.provenance.schemas` makes from these classes.
+digests. ``slatprep/store/schema`` holds the JSON Schemas, which
+`slatprep.store.schemas` makes from these classes.
 """
 
 from __future__ import annotations

@@ -11,8 +11,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from support.shapes import chair, field_of, surface_latents
 
-from slatprep.align.bspline import refined
-from slatprep.align.deformation import (
+from slatprep.geometry.bspline import refined
+from slatprep.geometry.deformation import (
     GRAIN,
     LEAST_STRETCH,
     MOST_STRETCH,
@@ -26,9 +26,9 @@ from slatprep.align.deformation import (
 )
 from slatprep.geometry.frames import make_transform, places_of
 from slatprep.parameters import SampleParameters
-from slatprep.provenance.record_json import adapter_of
 from slatprep.records import Deformation
 from slatprep.sample import sample
+from slatprep.store.record_json import adapter_of
 
 BOX = np.array([[-0.5] * 3, [0.5] * 3])
 AFFINE = np.array([[1.1, 0.03, 0.0, 0.01], [-0.02, 0.95, 0.04, 0.0], [0.01, 0.0, 1.02, -0.02]])

@@ -10,12 +10,13 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from slatprep.errors import StoreError
-from slatprep.provenance.record import BuildRecord
-from slatprep.provenance.record_json import read_build_record
 from slatprep.records import Place
 from slatprep.storage.documents import read_bounded
+from slatprep.storage.versions import MANIFESTS, is_version
+from slatprep.store.layout import RECORD_ARRAY, RECORDS_IN_SHARD
 from slatprep.store.reader import Store
-from slatprep.store.records import RECORD_ARRAY, RECORDS_IN_SHARD
+from slatprep.store.record import BuildRecord
+from slatprep.store.record_json import read_build_record
 
 BUILD, ASSETS, SEVERAL = "build.json", "assets.jsonl", "assets-*.jsonl"
 
@@ -59,3 +60,23 @@ def build_text(folder: Place) -> bytes:
 def build_in(folder: Place) -> BuildRecord:
     """Read the record of a build; StoreError where it cannot be."""
     return read_build_record(build_text(folder), str(folder / BUILD))
+
+
+def manifests_of(store: Place) -> Place:
+    """Return the folder of a store's records: ``demo.manifests`` beside ``demo.zarr``.
+
+    Those of a version on an object store lie beside all versions.
+    """
+    if is_version(store):
+        return store.parent.parent / MANIFESTS / store.name
+    return store.parent / f"{store.name.removesuffix('.zarr')}.manifests"
+
+
+def manifests_beside(store: Place) -> Place | None:
+    """Return the folder of a store's records if there is one; StoreError if nobody can tell."""
+    folder = manifests_of(store)
+    files = (folder / "build.json", folder / "assets.jsonl")
+    try:
+        return folder if any(file.exists() for file in files) else None
+    except OSError as error:
+        raise StoreError(f"{folder}: cannot be reached ({error.strerror})") from None

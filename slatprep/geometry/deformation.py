@@ -85,7 +85,7 @@ def deform(deformation: Deformation, points: ArrayLike) -> NDArray[np.float64]:
     affine = deformation.affine
     moved: NDArray[np.float64] = points @ affine[:, :3].T + affine[:, 3]
     if deformation.coefficients.size:
-        from slatprep.align.bspline import displacements
+        from slatprep.geometry.bspline import displacements
 
         added = np.empty_like(points)
         displacements(
@@ -100,7 +100,7 @@ def jacobian(deformation: Deformation, points: ArrayLike) -> NDArray[np.float64]
     points = np.ascontiguousarray(points, dtype=np.float64)
     slopes = np.zeros((len(points), 3, 3))
     if deformation.coefficients.size:
-        from slatprep.align.bspline import jacobians
+        from slatprep.geometry.bspline import jacobians
 
         jacobians(points, deformation.origin, deformation.spacing, deformation.coefficients, slopes)
     slopes += deformation.affine[:, :3]
@@ -190,7 +190,7 @@ def is_proper(deformation: Deformation) -> bool:
     c, spacing = deformation.coefficients, deformation.spacing
     if not c.size:
         return bool(np.linalg.det(deformation.affine[:, :3]) > 0)
-    from slatprep.align.bspline import least_stretch
+    from slatprep.geometry.bspline import least_stretch
 
     fall = _largest_second_derivative(c) / spacing**2 * np.sqrt(3.0) / 2.0 * spacing
     return any(

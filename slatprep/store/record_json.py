@@ -12,10 +12,10 @@ import numpy as np
 import orjson
 
 from slatprep.errors import StoreError
-from slatprep.provenance.record import AssetRecord, BuildRecord, Record
 from slatprep.records import SourceFile, Status
 from slatprep.storage.place import is_place
-from slatprep.store.records import MAX_RECORD_BYTES
+from slatprep.store.layout import MAX_RECORD_BYTES
+from slatprep.store.record import AssetRecord, BuildRecord, Record
 
 if TYPE_CHECKING:
     from pydantic import TypeAdapter, ValidationError

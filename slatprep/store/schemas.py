@@ -1,8 +1,8 @@
 """The JSON Schemas of the records, made from their classes.
 
-    python -m slatprep.provenance.schemas
+    python -m slatprep.store.schemas
 
-writes them into ``slatprep/provenance/schema``, where they are published.
+writes them into ``slatprep/store/schema``, where they are published.
 """
 
 from __future__ import annotations
@@ -11,8 +11,8 @@ import json
 from pathlib import Path
 from typing import Any
 
-from slatprep.provenance.record import BuildRecord, Record
-from slatprep.provenance.record_json import adapter_of
+from slatprep.store.record import BuildRecord, Record
+from slatprep.store.record_json import adapter_of
 
 FOLDER = Path(__file__).with_name("schema")
 

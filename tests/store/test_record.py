@@ -8,16 +8,16 @@ import pytest
 from support.synthetic import Dataset
 
 from slatprep.pipeline.dataset import BuildSummary
-from slatprep.provenance.record import AssetRecord, FailedRecord
-from slatprep.provenance.record_json import (
+from slatprep.store import open_store
+from slatprep.store.record import AssetRecord, FailedRecord
+from slatprep.store.record_json import (
     RecordError,
     read_asset_record,
     read_build_record,
     read_record,
     to_json,
 )
-from slatprep.provenance.schemas import FOLDER, json_schemas
-from slatprep.store import open_store
+from slatprep.store.schemas import FOLDER, json_schemas
 
 
 def lines_of(build: BuildSummary) -> list[bytes]:
@@ -51,7 +51,7 @@ def test_every_record_follows_the_published_schema(mixed_build: BuildSummary) ->
 
 
 def test_the_published_schemas_are_those_of_the_classes() -> None:
-    """Made anew by ``python -m slatprep.provenance.schemas``."""
+    """Made anew by ``python -m slatprep.store.schemas``."""
     assert json_schemas() == {path.name: json.loads(path.read_text()) for path in FOLDER.iterdir()}
 
 
