@@ -43,7 +43,7 @@ TESTS = {
     "align/consensus": ["align/test_consensus.py"],
     "align/surface": ["align/test_surface.py"],
     "align/settle": ["align/test_settle.py", "align/test_consensus.py"],
-    "align/deformation": ["align/test_deformation.py"],
+    "geometry/deformation": ["geometry/test_deformation.py"],
     "align/stretch": ["align/test_stretch.py"],
     "align/pair": [
         "align/test_pair.py",
