@@ -1,5 +1,5 @@
 # ruff: noqa: I001 (one import a module)
-from .align.deformation import (
+from .geometry.deformation import (
     PlaceMap as PlaceMap,
     map_of as map_of,
 )
