@@ -38,6 +38,9 @@ _GLOBALS = ("torch", "collections OrderedDict")
 _MAX_PICKLE = 2**20
 """Bytes of a checkpoint's structure without its tensors; the large decoder's takes 60,000."""
 
+_MAX_ENTRIES = 10_000
+"""Members of a checkpoint's archive."""
+
 
 @dataclasses.dataclass(frozen=True)
 class EpochRecord:
@@ -63,7 +66,17 @@ def read_state(path: Path) -> dict[str, Any]:
         refusing(path, "cannot be read", "a checkpoint of `slatprep train`"),
         storage_of(path).open() as file,
     ):
+        # zipfile and torch make an object for every entry before one can ask how many there are.
+        entries = sum(part.count(b"PK\x01\x02") for part in iter(lambda: file.read(2**20), b""))
+        if entries > _MAX_ENTRIES:
+            raise ValueError(f"it has {entries:,} members, and at most {_MAX_ENTRIES:,} are read")
+        size = file.tell()
+        file.seek(0)
         with zipfile.ZipFile(file) as archive:
+            if sum(info.file_size for info in archive.infolist()) > size:
+                raise ValueError("its members overlap")
+            if any(info.filename.endswith("/constants.pkl") for info in archive.infolist()):
+                raise ValueError("it holds a program of TorchScript")
             # torch.save does not compress; a compressed file could unpack to any size.
             if any(info.compress_type != zipfile.ZIP_STORED for info in archive.infolist()):
                 raise ValueError("it is compressed")

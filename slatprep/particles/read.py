@@ -80,26 +80,28 @@ def read_particles(path: Path, axes: Axes | None = None) -> Particles:
     for ``slat``. InputError if the file cannot be used or holds no finite particle.
     """
     path = Path(path)
+    comments: tuple[str, ...] = ()
+    vertices: NDArray[Any] | None = None
     if path.suffix.lower() == ".ply":
         vertices, comments = ply_points(_bytes_of(path), path)
-        columns = [np.asarray(vertices[axis], dtype=np.float64) for axis in "xyz"]
-        positions, names = np.column_stack(columns), frozenset(vertices.dtype.names or ())
+        columns = [vertices[axis] for axis in "xyz"]
     else:
-        positions, vertices, names, comments = _read_numpy(path), None, frozenset(), ()
-    if len(positions) == 0:
+        columns = list(_read_numpy(path).T)
+    if len(columns[0]) == 0:
         raise InputError(path, "holds no particles", "at least one")
-    finite = np.isfinite(positions).all(axis=1)
-    if not finite.all():
-        row = int(np.argmin(finite))
-        raise InputError(
-            path, f"particle {row} lies at {positions[row].tolist()}", "finite x, y, z"
-        )
+    # Column by column: a large file that is refused is not copied first.
+    faults = [int(np.argmin(fine)) for fine in map(np.isfinite, columns) if not fine.all()]
+    if faults:
+        where = [float(column[min(faults)]) for column in columns]
+        raise InputError(path, f"particle {min(faults)} lies at {where}", "finite x, y, z")
     if axes is None and any(comment.startswith("frame PixieVerse") for comment in comments):
         raise InputError(
             path,
             "is an export of points in the PixieVerse frame",
             "the SLAT frame: slatprep export --frame slat; or say with --axes how they lie",
         )
+    positions = np.stack(columns, axis=1, dtype=np.float64)
+    names = frozenset(vertices.dtype.names or ()) if vertices is not None else frozenset()
     stated = next((key for key, words in FRAMES.items() if words in comments), None)
     gaussian = names.issuperset(_GAUSSIAN)
     foreign = _by_another_tool(positions, names) if gaussian else ""
@@ -125,10 +127,10 @@ def _by_another_tool(positions: NDArray[np.float64], names: frozenset[str]) -> s
     return " and ".join(signs)
 
 
-def _read_numpy(path: Path) -> NDArray[np.float64]:
+def _read_numpy(path: Path) -> NDArray[Any]:
     data = _bytes_of(path)
     if not data.startswith(b"PK"):
-        return npy_array(data, path, _POINTS).astype(np.float64)
+        return npy_array(data, path, _POINTS)
     arrays = npz_arrays(data, path, dict.fromkeys(_KEYS, _POINTS), partial=True)
     if len(arrays) != 1:
         raise InputError(
@@ -136,7 +138,7 @@ def _read_numpy(path: Path) -> NDArray[np.float64]:
             f"has {' and '.join(arrays) or 'no particles'}",
             f"one array named {' or '.join(_KEYS)}",
         )
-    return next(iter(arrays.values())).astype(np.float64)
+    return next(iter(arrays.values()))
 
 
 def _bytes_of(path: Path) -> bytes:

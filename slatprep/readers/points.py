@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import re
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -16,15 +17,10 @@ from slatprep.records import Place
 _HEADER_BYTES = 2**18
 """Bytes that a header may have; one of Gaussians has some 2,000."""
 
-_SLOW_ROWS = 200_000
-"""Rows of text, or with lists, that a PLY may have."""
+_SLOW_VALUES, _SLOW_BYTES, _LINE_BYTES = 1_000_000, 48 * 2**20, 2**16
+"""What a PLY of text or with lists may have: plyfile reads it value by value, 1 µs each."""
 
-_SIZES = {
-    "char": 1, "uchar": 1, "int8": 1, "uint8": 1, "short": 2, "ushort": 2, "int16": 2,
-    "uint16": 2, "int": 4, "uint": 4, "int32": 4, "uint32": 4, "float": 4, "float32": 4,
-    "double": 8, "float64": 8,
-}  # fmt: skip
-"""Bytes of a number by the name of its type."""
+_AXES = ("x", "y", "z")
 
 
 def ply_points(data: bytes, where: str | Place) -> tuple[NDArray[Any], tuple[str, ...]]:
@@ -40,56 +36,89 @@ def ply_points(data: bytes, where: str | Place) -> tuple[NDArray[Any], tuple[str
             "reading a PLY needs the package plyfile; install it with "
             "`pip install 'slatprep[simulate]'`"
         ) from error
-    expected = "a PLY of Gaussians or points"
-    with refusing(where, "is no readable PLY with vertices", expected):
+    with refusing(where, "is no readable PLY with vertices", "a PLY of Gaussians or points"):
+        header, start, counts = _header(data)
+        if max(counts, default=0) > len(data) - start:
+            raise ValueError("announces more rows than it has")
         try:
-            read = plyfile.PlyData.read(io.BytesIO(_up_to_vertices(data)))
+            # Without rows: plyfile reserves memory for what a header claims.
+            described = plyfile.PlyData.read(io.BytesIO(_with_counts(header, [0] * len(counts))))
         except plyfile.PlyParseError as error:
             raise ValueError(str(error)) from None
-        vertices: NDArray[Any] = np.asarray(read["vertex"].data)
-    names = vertices.dtype.names or ()
-    if not {"x", "y", "z"} <= set(names):
-        raise InputError(where, f"has vertices of {', '.join(names)}", "fields x, y and z")
-    if any(vertices.dtype[axis].kind not in "fiu" for axis in "xyz"):
+        names = [element.name for element in described.elements]
+        if "vertex" not in names:
+            raise ValueError(f"its elements are {', '.join(names) or 'none'}")
+        last = names.index("vertex")
+        fields = described.elements[last].dtype(described.byte_order)
+    if not set(_AXES) <= set(fields.names or ()):
+        raise InputError(where, f"has vertices of {', '.join(fields.names)}", "fields x, y and z")
+    if any(fields[axis].kind not in "fiu" for axis in _AXES):
         raise InputError(where, "has x, y, z that are lists", "a number each")
-    return vertices, tuple(read.comments)
+    with refusing(where, "is no readable PLY with vertices", "a PLY of Gaussians or points"):
+        if len(names) != len(counts):
+            raise ValueError("its elements cannot be counted")
+        least = slow = 0
+        for number, (element, rows) in enumerate(zip(described.elements, counts, strict=True)):
+            sizes, lists = _sizes(element.properties)
+            least += rows * (2 * len(sizes) if described.text else sum(sizes))
+            slow += rows * len(sizes) * (number <= last and (described.text or lists))
+        if least - 1 > len(data) - start:  # the end of the last line may be missing
+            raise ValueError("announces more rows than it has")
+        if not slow:
+            for element, rows in zip(described.elements[:last], counts, strict=False):
+                start += rows * element.dtype(described.byte_order).itemsize
+            return np.frombuffer(data, fields, counts[last], start), tuple(described.comments)
+        _require_small(data, start, slow, described.text)
+        kept = _with_counts(header, counts[: last + 1])
+        try:
+            read = plyfile.PlyData.read(io.BytesIO(kept + data[start:]))
+        except plyfile.PlyParseError as error:
+            raise ValueError(str(error)) from None
+        return np.asarray(read["vertex"].data), tuple(read.comments)
 
 
-def _up_to_vertices(data: bytes) -> bytes:
-    """Return a PLY without the elements behind its vertices; ValueError if it claims too much.
-
-    plyfile reserves memory for what a header claims. It reads texts and lists row by row, 10 µs
-    each. So counts are compared with the bytes of the file, and such rows are limited.
-    """
-    head = data[:_HEADER_BYTES]
-    match = re.match(rb"(ply(\r\n|\n|\r).*?)(end_header\2)", head, re.DOTALL)
+def _header(data: bytes) -> tuple[list[bytes], int, list[int]]:
+    """Return the lines of a header, where it ends, and the rows of each element."""
+    match = re.match(rb"ply(\r\n|\n|\r)(?s:.*?)\1end_header\1", data[:_HEADER_BYTES])
     if match is None:
         raise ValueError(f"its header does not end in the first {_HEADER_BYTES:,} bytes")
-    body = data[match.end() :]
+    lines = [line + match[1] for line in match[0].split(match[1])[:-1]]
+    # int, as plyfile: a sign and underscores count.
+    counts = [int(line.split()[2]) for line in lines if line.startswith(b"element ")]
+    if min(counts, default=0) < 0:
+        raise ValueError("announces rows below 0")
+    return lines, match.end(), counts
+
+
+def _with_counts(lines: list[bytes], counts: list[int]) -> bytes:
+    """Return a header with as many elements as there are counts, of so many rows."""
     kept: list[bytes] = []
-    name, rows, least, slow, is_text, behind = "", 0, 0, 0, False, False
-    for line in match[1].splitlines(keepends=True):
-        words = line.decode("ascii", "replace").split()
-        if words[:1] == ["element"] and len(words) == 3:
-            behind = behind or name == "vertex"
-            # int, as plyfile: a sign and underscores count.
-            name, rows = words[1], int(words[2])
-            if not 0 <= rows <= len(body):
-                raise ValueError("announces more rows than it has")
-            slow += rows * (is_text and not behind)
-        elif words[:1] == ["property"]:
-            is_list = words[1:2] == ["list"]
-            slow += rows * (is_list and not (is_text or behind))
-            least += rows * (2 if is_text else _SIZES[words[2 if is_list else 1]])
-        elif words[:1] == ["format"]:
-            is_text = words[1] == "ascii"
-        if not behind:
-            kept.append(line)
-    if least > len(body) + 1:
-        raise ValueError("announces more rows than it has")
-    if slow > _SLOW_ROWS:
+    left = iter(counts)
+    for line in lines[:-1]:
+        if line.startswith(b"element "):
+            rows = next(left, None)
+            if rows is None:
+                break
+            line = b" ".join([*line.split()[:2], b"%d" % rows, *line.split()[3:]])
+            line += lines[0].removeprefix(b"ply")
+        kept.append(line)
+    return b"".join([*kept, lines[-1]])
+
+
+def _sizes(properties: Sequence[Any]) -> tuple[list[int], bool]:
+    """Return the least bytes of a row's values in a binary PLY, and whether any is a list."""
+    lists = [hasattr(one, "len_dtype") for one in properties]
+    kinds = [getattr(one, "len_dtype", one.val_dtype) for one in properties]
+    return [np.dtype(kind).itemsize for kind in kinds], any(lists)
+
+
+def _require_small(data: bytes, start: int, values: int, text: bool) -> None:
+    """Raise ValueError if what plyfile would read value by value takes too long or too much."""
+    if values > _SLOW_VALUES or len(data) - start > _SLOW_BYTES:
         raise ValueError(
-            f"it has {slow:,} rows of text or lists, and at most {_SLOW_ROWS:,} are read; write "
-            "it in binary, without lists"
+            f"it has {values:,} values of text or with lists in {len(data) - start:,} bytes, and "
+            f"at most {_SLOW_VALUES:,} in {_SLOW_BYTES:,} are read; write it in binary, without "
+            "lists"
         )
-    return b"".join(kept) + match[3] + body
+    if text and re.compile(rb"[^\r\n]{%d}" % _LINE_BYTES).search(data, start):
+        raise ValueError(f"it has a line of {_LINE_BYTES:,} bytes and more")

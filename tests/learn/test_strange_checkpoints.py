@@ -98,6 +98,41 @@ def test_a_structure_of_millions_of_lists_is_not_unpickled(tmp_path: Path) -> No
     refused(path, "its structure takes 2,004,004 bytes")
 
 
+def _add(path: Path, name: str, content: bytes, times: int = 1) -> None:
+    with zipfile.ZipFile(path, "a") as archive:
+        for number in range(times):
+            archive.writestr(name.format(number), content)
+
+
+def test_more_members_than_tensors_are_not_looked_at(tmp_path: Path) -> None:
+    torch.save({"size": "small"}, tmp_path / "best.pt")
+    _add(tmp_path / "best.pt", "best/data/x{}", b"", times=20_000)
+    refused(tmp_path / "best.pt", "20,0.. members, and at most 10,000")
+
+
+def test_members_that_overlap_are_not_read(tmp_path: Path) -> None:
+    """A directory may name one member again and again, each time with all its bytes."""
+    path = tmp_path / "best.pt"
+    torch.save({"size": "small", "other": torch.zeros(1000)}, path)
+    with zipfile.ZipFile(path) as archive:
+        largest = max(archive.infolist(), key=lambda info: info.file_size)
+        largest.filename = largest.orig_filename = largest.filename[:-1] + "9"
+    with zipfile.ZipFile(path, "a") as archive:
+        archive.filelist.append(largest)
+        archive.NameToInfo[largest.filename] = largest
+        archive.writestr("best/last", b"")
+    refused(path, "its members overlap")
+
+
+def test_a_program_of_torchscript_is_refused_without_a_word_of_torch(
+    tmp_path: Path, recwarn: pytest.WarningsRecorder
+) -> None:
+    torch.save({"size": "small"}, tmp_path / "best.pt")
+    _add(tmp_path / "best.pt", "best/constants.pkl", b"\x80\x02N.")
+    refused(tmp_path / "best.pt", "it holds a program of TorchScript")
+    assert not recwarn.list
+
+
 def test_the_largest_decoder_with_its_optimiser_is_no_stranger(tmp_path: Path) -> None:
     model = make_decoder("large")
     optimizer = torch.optim.AdamW(model.parameters())

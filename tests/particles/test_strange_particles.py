@@ -7,6 +7,7 @@ import struct
 import tracemalloc
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from slatprep.errors import InputError
@@ -65,7 +66,7 @@ def test_a_small_file_takes_little_memory_whatever_it_announces(
     tracemalloc.start()
     try:
         with pytest.raises(
-            InputError, match=r"p\.ply: .*(more rows than it has|fields x, y and z)"
+            InputError, match=r"p\.ply: .*(more rows than it has|rows below 0|fields x, y and z)"
         ):
             read_particles(file)
         assert tracemalloc.get_traced_memory()[1] < 20e6
@@ -81,11 +82,58 @@ def test_millions_of_short_rows_are_refused_before_they_are_read(form: str, tmp_
     file = _ply(tmp_path / "p.ply", elements, body, form)
     tracemalloc.start()
     try:
-        with pytest.raises(InputError, match="rows of text or lists, and at most 200,000"):
+        with pytest.raises(InputError, match=r"values of text or with lists .* at most 1,000,000"):
             read_particles(file)
         assert tracemalloc.get_traced_memory()[1] < 50e6
     finally:
         tracemalloc.stop()
+
+
+@pytest.mark.parametrize(
+    ("elements", "body", "said"),
+    [
+        ("comment end_header\nelement junk 1000000000\nproperty list uchar int q\n", b"0 0 0\n",
+         "more rows than it has"),
+        ("element vertex 1\nproperty list uint float w\n", b"1 " * 5_000_000, "a line of 65,536"),
+        (f"element vertex 300000\n{XYZ}property float a\n", b"0\n" * 1_200_000, "1,000,000"),
+    ],
+    ids=["a header behind a comment", "a line without end", "many short values"],
+)  # fmt: skip
+def test_text_costs_no_more_than_its_size(
+    elements: str, body: bytes, said: str, tmp_path: Path
+) -> None:
+    file = _ply(
+        tmp_path / "p.ply", elements.replace("vertex 1\n", f"vertex 1\n{XYZ}"), body, "ascii"
+    )
+    tracemalloc.start()
+    try:
+        with pytest.raises(InputError, match=said):
+            read_particles(file)
+        assert tracemalloc.get_traced_memory()[1] < 30e6
+    finally:
+        tracemalloc.stop()
+
+
+def test_a_large_file_is_refused_without_a_copy(tmp_path: Path) -> None:
+    rows = np.zeros((2_000_000, 3), dtype="<f4")
+    rows[-1, 1] = np.nan
+    file = _ply(tmp_path / "p.ply", f"element vertex {len(rows)}\n{XYZ}", rows.tobytes())
+    tracemalloc.start()
+    try:
+        with pytest.raises(InputError, match=r"particle 1999999 lies at \[0.0, nan, 0.0\]"):
+            read_particles(file)
+        assert tracemalloc.get_traced_memory()[1] < 1.5 * rows.nbytes
+    finally:
+        tracemalloc.stop()
+
+
+@pytest.mark.parametrize("form", ["binary_little_endian", "binary_big_endian"])
+def test_elements_before_the_vertices_are_stepped_over(form: str, tmp_path: Path) -> None:
+    order = "<" if form == "binary_little_endian" else ">"
+    body = struct.pack(f"{order}3h", 7, 8, 9) + struct.pack(f"{order}6f", *range(6))
+    elements = f"element junk 3\nproperty short q\nelement vertex 2\n{XYZ}"
+    read = read_particles(_ply(tmp_path / "p.ply", elements, body, form))
+    np.testing.assert_array_equal(read.positions, np.arange(6.0).reshape(2, 3))
 
 
 def test_faces_behind_the_vertices_are_counted_and_left_unread(tmp_path: Path) -> None:
