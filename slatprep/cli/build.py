@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 from slatprep.cli.info import show_quality
 from slatprep.cli.options import (
     NewFile,
-    PathOrUrl,
+    NewStore,
     RecordsFolder,
     SourceOptions,
     WorkersOptions,
@@ -34,14 +34,8 @@ def build_store(
     output: Output,
     *,
     sources: SourceOptions,
-    out: Annotated[
-        PathOrUrl,
-        "The store, a path or URL; an existing store is updated, and replaced in one step.",
-        Click(metavar="STORE.zarr"),
-    ],
-    manifests: Annotated[
-        RecordsFolder | None, "Folder for the records. [default: beside the store]"
-    ] = None,
+    out: NewStore,
+    manifests: RecordsFolder | None = None,
     strict: Annotated[bool, "Stop at the first asset that cannot be built."] = False,
     consensus: Annotated[bool, "Settle ties by the rotation that most assets share."] = False,
     witness: Annotated[

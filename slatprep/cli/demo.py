@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Annotated, Any
 
 import click
@@ -11,13 +12,12 @@ from slatprep.cli.output import Output
 from slatprep.cli.signature import Click, command
 
 
-@command("make-demo")
-def make_demo(
-    output: Output,
-    directory: NewFolder,
-    *,
-    assets: Annotated[Positive, "Number of objects; fourteen have every category once."] = 25,
-    seed: Annotated[Seed, "The same seed gives the same bytes."] = 0,
+@dataclass(frozen=True, kw_only=True)
+class DemoOptions:
+    """What `slatprep.demo.make_demo` makes."""
+
+    assets: Annotated[Positive, "Number of objects; fourteen have every category once."] = 25
+    seed: Annotated[Seed, "The same seed gives the same bytes."] = 0
     levels: Annotated[
         tuple[int, ...],
         click.IntRange(0, 7),
@@ -25,48 +25,56 @@ def make_demo(
         "7 (both); may be repeated: assets take the levels in turn. [default: 0 to 4, or 0 where "
         "both sides share a frame]",
         Click("--level"),
-    ] = (),
-    views: Annotated[Positive, "SLATs per object."] = 1,
+    ] = ()
+    views: Annotated[Positive, "SLATs per object."] = 1
     habitual_share: Annotated[
         float, FiniteRange(0, 1), "Share of the objects that have one quarter turn in common."
-    ] = 0.0,
+    ] = 0.0
     latents: Annotated[
         Any,
         ChoiceOf("slatprep.demo.latents:LatentKind"),
         "Noise with TRELLIS's statistics (placeholder), or latents that depend on the material.",
-    ] = "placeholder",
+    ] = "placeholder"
     source: Annotated[
         Any,
         ChoiceOf("slatprep.demo.sources:Source"),
         "PixieVerse's grids, predictions of 11 or 4 channels, VoMP's or PhysXNet's voxels, or "
         "plain voxels with ten properties (in HDF5 without classes).",
-    ] = "pixieverse",
+    ] = "pixieverse"
     encoder: Annotated[
         Any,
         ChoiceOf("slatprep.demo.latents:Encoder"),
         "Latents of TRELLIS, SAM 3D Objects, TRELLIS.2 (-512: on a grid of 32^3), or others with "
         "16 channels (-128: on a grid of 128^3).",
-    ] = "trellis",
+    ] = "trellis"
     slat_form: Annotated[
         Any,
         ChoiceOf("slatprep.demo.write:SlatForm"),
         "Files of (N,3) or (N,4) coordinates, HDF5, or one HDF5 for all.",
-    ] = "npz",
+    ] = "npz"
     slat_names: Annotated[
         Any,
         ChoiceOf("slatprep.demo.write:SlatNames"),
         "Name SLATs by object, or by sha256 with a metadata.csv.",
-    ] = "id",
+    ] = "id"
     results: Annotated[
         bool,
         "Also write results/: grids as predicted by a method with errors, 12 MB each, for "
         "`slatprep evaluate --grids`.",
-    ] = False,
+    ] = False
     samples: Annotated[
         Positive,
         "Annotations of each object; several have errors, part by part, and dataset.toml asks for "
         "a merge.",
-    ] = 1,
+    ] = 1
+
+
+@command("make-demo")
+def make_demo(
+    output: Output,
+    directory: NewFolder,
+    *,
+    demo: DemoOptions,
     jobs: Jobs = 1,
 ) -> None:
     """Make procedural assets with known truth in DIRECTORY.
@@ -84,28 +92,12 @@ def make_demo(
     slatprep make-demo other --assets 4 --seed 2 --source pixie-predictions --slat-form hdf5
     slatprep make-demo vomp --assets 4 --source vomp --encoder trellis2
     """
-    from slatprep import demo
+    from slatprep.demo import make_demo as make
     from slatprep.storage.atomic import writing
 
-    chosen = {"levels": tuple(sorted(set(levels)))} if levels else {}
+    chosen = vars(demo) | {"levels": tuple(sorted(set(demo.levels))) or None}
     with writing(str(directory), directory.parent), output.progress("demo") as progress:
-        summary = demo.make_demo(
-            directory,
-            assets=assets,
-            seed=seed,
-            views=views,
-            habitual_share=habitual_share,
-            latents=latents,
-            source=source,
-            encoder=encoder,
-            slat_form=slat_form,
-            slat_names=slat_names,
-            results=results,
-            samples=samples,
-            jobs=jobs,
-            progress=progress,
-            **chosen,
-        )
+        summary = make(directory, **chosen, jobs=jobs, progress=progress)
 
     def show() -> None:
         title = f"Demo data in {summary.directory}"

@@ -4,16 +4,12 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 from slatprep.cli.options import FolderOrUrl, NewFile, StatedOptions
 from slatprep.cli.output import Output, say
 from slatprep.cli.signature import Click, command
 from slatprep.storage.place import storage_of
-
-if TYPE_CHECKING:
-    pass
-
 
 _ASKED_FOR = ("license", "cite_as", "date_published")
 """Optional metadata whose absence Croissant's validator warns of."""

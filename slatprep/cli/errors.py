@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import TYPE_CHECKING, Annotated
 
-import click
-
-from slatprep.cli.options import Jobs, LastStore, NewFile, Positive
+from slatprep.cli.options import DrawnFile, Jobs, LastStore, Positive, draw_to
 from slatprep.cli.output import Output
 from slatprep.cli.signature import Click, command
 
@@ -26,9 +25,7 @@ def measure_errors(
     ] = 200,
     seed: Annotated[int, "Seed of the draw of decoys."] = 0,
     picture: Annotated[
-        NewFile | None,
-        "Also draw alignments and decoys as two histograms.",
-        Click(metavar="FILE.png|svg|pdf"),
+        DrawnFile | None, "Also draw alignments and decoys as two histograms."
     ] = None,
     jobs: Jobs = 1,
 ) -> None:
@@ -44,24 +41,15 @@ def measure_errors(
     slatprep measure-errors data/demo.zarr --jobs 2 --picture errors.png
     """
     from slatprep.inspect.errors import measure_errors as measure
-    from slatprep.inspect.pictures.canvas import FORMATS
     from slatprep.store import open_store
 
-    kind = "png" if picture is None else picture.suffix[1:].lower()
-    if kind not in FORMATS:
-        raise click.BadParameter(
-            f"{picture} ends in none of .{', .'.join(FORMATS)}", param_hint="--picture"
-        )
     opened = open_store(store)
     with output.progress("decoys") as progress:
         found = measure(opened, decoys, seed, jobs, progress)
     if picture is not None:
         from slatprep.inspect.pictures.errors import draw_errors
-        from slatprep.storage.atomic import staged, writing
 
-        with writing(str(picture), picture.parent), staged(picture) as path:
-            path.write_bytes(draw_errors(found, opened.name, kind=kind))
-        output.note(f"picture: {picture}")
+        draw_to(output, picture, partial(draw_errors, found, opened.name))
     output.result(_summary(found), lambda: _show(output, found))
 
 

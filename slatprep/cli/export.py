@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated, Any
 
 from slatprep.cli.options import (
@@ -18,7 +19,7 @@ from slatprep.cli.options import (
     note_left_out,
     note_split,
 )
-from slatprep.cli.output import Cell, Output
+from slatprep.cli.output import Output
 from slatprep.cli.signature import Click, command
 from slatprep.errors import ConfigError
 
@@ -34,6 +35,50 @@ _ONLY_FOR = {
     "size": ("usd",),
     "materials": ("usd",),
 }
+
+
+@dataclass(frozen=True, kw_only=True)
+class FormatOptions:
+    """Options of some formats; None where the format's own default counts."""
+
+    points: Annotated[
+        Any | None,
+        ChoiceOf("slatprep.export.formats:Points"),
+        "ply, voxel_data, usd: SLAT voxels, or the voxels of the PixieVerse field. [default: grid "
+        "for usd, else slat]",
+    ] = None
+    frame: Annotated[
+        Any | None,
+        ChoiceOf("slatprep.export.formats:Frame"),
+        "ply: the SLAT's unit cube, or PixieVerse's world coordinates. [default: slat]",
+    ] = None
+    shard_size: Annotated[Positive | None, "webdataset: assets a shard. [default: 256]"] = None
+    latent_model: Annotated[
+        str | None,
+        "npz: the encoder's name, latent_model in TRELLIS's configurations. [default: that of "
+        "TRELLIS's published configurations]",
+        Click(metavar="NAME"),
+    ] = None
+    size: Annotated[
+        float | None,
+        FiniteRange(min=0, min_open=True),
+        "usd: width of the unit cube. [default: 1]",
+        Click(metavar="METRES"),
+    ] = None
+    materials: Annotated[
+        Positive | None,
+        "usd: the most materials that E and nu of an asset are binned into. [default: 64]",
+    ] = None
+
+    def of(self, kind: str) -> dict[str, Any]:
+        """Return those that were given; refuse one of another format."""
+        given = {name: value for name, value in vars(self).items() if value is not None}
+        for name in given:
+            if kind not in _ONLY_FOR[name]:
+                flag = f"--{name.replace('_', '-')}"
+                formats = " or ".join(_ONLY_FOR[name])
+                raise ConfigError(f"{flag} is for --format {formats}, not {kind}")
+        return given
 
 
 @command()
@@ -63,34 +108,7 @@ def export(
         "Only objects of this split, as `slatprep train` splits them.",
     ] = "all",
     splits: SplitOptions,
-    points: Annotated[
-        Any | None,
-        ChoiceOf("slatprep.export.formats:Points"),
-        "ply, voxel_data, usd: SLAT voxels, or the voxels of the PixieVerse field. [default: grid "
-        "for usd, else slat]",
-    ] = None,
-    frame: Annotated[
-        Any | None,
-        ChoiceOf("slatprep.export.formats:Frame"),
-        "ply: the SLAT's unit cube, or PixieVerse's world coordinates. [default: slat]",
-    ] = None,
-    shard_size: Annotated[Positive | None, "webdataset: assets a shard. [default: 256]"] = None,
-    latent_model: Annotated[
-        str | None,
-        "npz: the encoder's name, latent_model in TRELLIS's configurations. [default: that of "
-        "TRELLIS's published configurations]",
-        Click(metavar="NAME"),
-    ] = None,
-    size: Annotated[
-        float | None,
-        FiniteRange(min=0, min_open=True),
-        "usd: width of the unit cube. [default: 1]",
-        Click(metavar="METRES"),
-    ] = None,
-    materials: Annotated[
-        Positive | None,
-        "usd: the most materials that E and nu of an asset are binned into. [default: 64]",
-    ] = None,
+    format_options: FormatOptions,
     jobs: Jobs = 1,
 ) -> None:
     """Write assets of STORE in a format of other tools.
@@ -109,19 +127,7 @@ def export(
     slatprep export data/demo.zarr --format usd --out usd --size 0.3 --asset 5f61cc
     slatprep export data/demo.zarr --format webdataset --out train --split train --split-by pixie
     """
-    given: dict[str, Any] = {
-        "points": points,
-        "frame": frame,
-        "shard_size": shard_size,
-        "latent_model": latent_model,
-        "size": size,
-        "materials": materials,
-    }
-    options = {name: value for name, value in given.items() if value is not None}
-    for name in options:
-        if kind not in _ONLY_FOR[name]:
-            flag = f"--{name.replace('_', '-')}"
-            raise ConfigError(f"{flag} is for --format {' or '.join(_ONLY_FOR[name])}, not {kind}")
+    options = format_options.of(kind)
     from slatprep.export import ExportOptions, export_store
     from slatprep.store import open_store
 
@@ -144,16 +150,10 @@ def export(
             progress=progress,
         )
 
-    cells: dict[str, Cell] = {
-        "format": summary.format,
-        "assets": summary.assets,
-        "points": summary.points,
-        "files": summary.files,
-        "MB": summary.size / 1e6,
-        "seconds": summary.seconds,
-    }
     for note in summary.notes:
         output.note(note)
+    cells = {name: getattr(summary, name) for name in ("format", "assets", "points", "files")}
+    cells |= {"MB": summary.size / 1e6, "seconds": summary.seconds}
     output.made(summary, lambda: output.record(f"Exported to {summary.path}", cells))
 
 

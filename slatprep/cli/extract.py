@@ -93,9 +93,8 @@ def extract_slat(
         "failed": len(problems),
         "voxels": sum(result.voxels for result in done),
     }
-
-    document = {"path": out, "model": session.model, **counts, "problems": problems}
-    output.made(document, lambda: output.record(f"Latents in {out}", counts), complete=not problems)
+    told = {"path": out, "model": session.model, "problems": problems}
+    output.counted(f"Latents in {out}", counts, complete=not problems, **told)
 
 
 @command("decode-slat")
@@ -136,8 +135,8 @@ def decode_slat(
                 read.leave_out(error)
             progress(decoded + len(read.problems), len(read.ids))
     counts = {"decoded": decoded, "failed": len(read.problems)}
-    document = {"path": out, "model": session.model, **counts, "problems": read.problems,
-                "seconds": time.perf_counter() - begin}  # fmt: skip
-    output.made(
-        document, lambda: output.record(f"Gaussians in {out}", counts), complete=not read.problems
+    told = {"path": out, "model": session.model, "problems": read.problems}
+    seconds = time.perf_counter() - begin
+    output.counted(
+        f"Gaussians in {out}", counts, complete=not read.problems, seconds=seconds, **told
     )

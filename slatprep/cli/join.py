@@ -9,16 +9,14 @@ import click
 from slatprep.cli.build import report
 from slatprep.cli.options import (
     AssetIds,
-    Categories,
+    ChosenOptions,
     FolderOrUrl,
     Jobs,
-    PathOrUrl,
+    NewStore,
     RecordsFolder,
-    Verdicts,
-    require_categories,
 )
 from slatprep.cli.output import Output
-from slatprep.cli.signature import Click, command
+from slatprep.cli.signature import command
 
 
 @command()
@@ -26,17 +24,10 @@ def subset(
     output: Output,
     store: FolderOrUrl,
     *,
-    out: Annotated[
-        PathOrUrl,
-        "The new store, a path or URL; an existing store is replaced in one step.",
-        Click(metavar="STORE.zarr"),
-    ],
+    out: NewStore,
     assets: Annotated[AssetIds, "An asset; may be repeated."] = (),
-    verdicts: Annotated[Verdicts, "Assets with this verdict; may be repeated."] = (),
-    categories: Annotated[Categories, "Assets of this category; may be repeated."] = (),
-    manifests: Annotated[
-        RecordsFolder | None, "Folder for the records. [default: beside the new store]"
-    ] = None,
+    chosen: ChosenOptions,
+    manifests: RecordsFolder | None = None,
     jobs: Jobs = 1,
 ) -> None:
     """Make a store of some assets of STORE, without aligning them again.
@@ -49,20 +40,19 @@ def subset(
     slatprep subset data/demo.zarr --verdict good --out good.zarr
     slatprep subset data/demo.zarr --asset 5f61cc --asset 803c1a --out two.zarr
     """
-    if not (assets or verdicts or categories):
+    if not (assets or chosen.verdicts or chosen.categories):
         raise click.UsageError("say which assets: --asset ID, --verdict or --category")
     from slatprep.inspect.listing import list_assets
     from slatprep.pipeline.join import subset_store
     from slatprep.store import open_store
 
-    chosen = list(assets)
-    if verdicts or categories:
+    wanted = list(assets)
+    if chosen.verdicts or chosen.categories:
         opened = open_store(store)
-        require_categories(opened, categories)
-        chosen += [asset.asset_id for asset in list_assets(opened, verdicts, categories)]
+        wanted += [asset.asset_id for asset in list_assets(opened, *chosen.of(opened))]
     with output.progress("subset", "shards") as progress:
         summary = subset_store(
-            store, out, chosen, manifests=manifests, jobs=jobs, progress=progress
+            store, out, wanted, manifests=manifests, jobs=jobs, progress=progress
         )
     report(output, summary)
 
@@ -72,14 +62,8 @@ def concat(
     output: Output,
     stores: tuple[FolderOrUrl, ...],
     *,
-    out: Annotated[
-        PathOrUrl,
-        "The new store, a path or URL; an existing store is replaced in one step.",
-        Click(metavar="STORE.zarr"),
-    ],
-    manifests: Annotated[
-        RecordsFolder | None, "Folder for the records. [default: beside the new store]"
-    ] = None,
+    out: NewStore,
+    manifests: RecordsFolder | None = None,
     jobs: Jobs = 1,
 ) -> None:
     """Make one store of the assets of all STORES, without aligning them again.

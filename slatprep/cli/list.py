@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
-from slatprep.cli.options import Categories, LastStore, Verdicts, require_categories
+from slatprep.cli.options import ChosenOptions, LastStore
 from slatprep.cli.output import Output, say
 from slatprep.cli.signature import command
-
-if TYPE_CHECKING:
-    pass
 
 
 @command("list")
@@ -17,12 +14,7 @@ def list_assets(
     output: Output,
     store: LastStore,
     *,
-    verdicts: Annotated[
-        Verdicts, "Only assets with this verdict; may be repeated. [default: all]"
-    ] = (),
-    categories: Annotated[
-        Categories, "Only assets of this category; may be repeated. [default: all]"
-    ] = (),
+    chosen: ChosenOptions,
     max_confidence: Annotated[float | None, "Only assets with at most this confidence."] = None,
     ids: Annotated[bool, "Print only the full ids, one on each line."] = False,
 ) -> None:
@@ -40,8 +32,7 @@ def list_assets(
     from slatprep.store import open_store
 
     opened = open_store(store)
-    require_categories(opened, categories)
-    listed = list(listed_of(opened, verdicts, categories, max_confidence))
+    listed = list(listed_of(opened, *chosen.of(opened), max_confidence))
 
     def show() -> None:
         if ids:

@@ -7,7 +7,7 @@ import difflib
 import math
 import pkgutil
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -97,7 +97,11 @@ FileOrFolder = Annotated[Path, click.Path(path_type=Path, exists=True)]
 NewFile = Annotated[Path, NewPath(path_type=Path, dir_okay=False)]
 NewFolder = Annotated[Path, NewPath(path_type=Path, file_okay=False)]
 NewFileOrFolder = Annotated[Path, NewPath(path_type=Path)]
-RecordsFolder = Annotated[Path, click.Path(path_type=Path, file_okay=False)]
+RecordsFolder = Annotated[
+    Path,
+    click.Path(path_type=Path, file_okay=False),
+    "Folder for the records. [default: beside the store]",
+]
 """Of a build, which looks itself at what lies there."""
 PathOrUrl = Annotated[Place, PlaceType(path_type=Path)]
 """Need not exist."""
@@ -129,6 +133,29 @@ StoreOption = Annotated[
 ]
 
 
+def _drawable(
+    _context: click.Context, _parameter: click.Parameter, picture: Path | None
+) -> Path | None:
+    if picture is not None:
+        from slatprep.inspect.pictures.canvas import FORMATS
+
+        if picture.suffix[1:].lower() not in FORMATS:
+            raise click.BadParameter(f"{picture} ends in none of .{', .'.join(FORMATS)}")
+    return picture
+
+
+DrawnFile = Annotated[NewFile, Click(metavar="FILE.png|svg|pdf", callback=_drawable)]
+
+
+def draw_to(output: Output, picture: Path, draw: Callable[[str], bytes]) -> None:
+    """Write the picture that `draw` gives in the format that the file's name has."""
+    from slatprep.storage.atomic import staged, writing
+
+    with writing(str(picture), picture.parent), staged(picture) as path:
+        path.write_bytes(draw(picture.suffix[1:].lower()))
+    output.note(f"picture: {picture}")
+
+
 def beside(store: Place, suffix: str) -> Path:
     """Return NAME`suffix` beside NAME.zarr, or in the working folder for an object store."""
     name = f"{store.name.removesuffix('.zarr')}{suffix}"
@@ -152,9 +179,15 @@ def complete_asset(
 
 AssetIds = Annotated[tuple[str, ...], Click("--asset", metavar="ID", shell_complete=complete_asset)]
 
-Verdicts = Annotated[tuple[str, ...], ChoiceOf("slatprep.records:Verdict"), Click("--verdict")]
+AssetOption = Annotated[
+    str, "The asset of the store.", Click(metavar="ID", shell_complete=complete_asset)
+]
 
-Categories = Annotated[tuple[str, ...], Click("--category")]
+NewStore = Annotated[
+    PathOrUrl,
+    "The store, a path or URL; an existing store is replaced in one step.",
+    Click(metavar="STORE.zarr"),
+]
 
 UsableVerdicts = Annotated[
     tuple[str, ...] | None,
@@ -169,16 +202,31 @@ UsableVerdicts = Annotated[
 """Empty for all, None if the option was not given."""
 
 
-def require_categories(store: Store, categories: Sequence[str]) -> None:
-    """Refuse a category that no asset of a store has, and suggest a similar one."""
-    known = sorted(set(map(str, store.column("category"))))
-    for category in categories:
-        if category not in known:
-            close = difflib.get_close_matches(category, known, n=1) or list(filter(None, known))
-            expected = f"expected {', '.join(close)}" if close else "no category is known"
-            raise click.BadParameter(
-                f"no asset has {category!r}; {expected}", param_hint="--category"
-            )
+@dataclass(frozen=True, kw_only=True)
+class ChosenOptions:
+    """Which assets of a store are wanted."""
+
+    verdicts: Annotated[
+        tuple[str, ...],
+        ChoiceOf("slatprep.records:Verdict"),
+        "Only assets with this verdict; may be repeated.",
+        Click("--verdict"),
+    ] = ()
+    categories: Annotated[
+        tuple[str, ...], "Only assets of this category; may be repeated.", Click("--category")
+    ] = ()
+
+    def of(self, store: Store) -> tuple[tuple[str, ...], tuple[str, ...]]:
+        """Return both; refuse a category that no asset has, and suggest a similar one."""
+        known = sorted(set(map(str, store.column("category"))))
+        for category in self.categories:
+            if category not in known:
+                close = difflib.get_close_matches(category, known, n=1) or list(filter(None, known))
+                expected = f"expected {', '.join(close)}" if close else "no category is known"
+                raise click.BadParameter(
+                    f"no asset has {category!r}; {expected}", param_hint="--category"
+                )
+        return self.verdicts, self.categories
 
 
 def note_left_out(output: Output, store: Store) -> None:

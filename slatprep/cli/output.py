@@ -102,6 +102,12 @@ class Output:
         """Print a summary of what was written, as `result` does; if quiet, only as JSON."""
         self.result(document, show if self.verbosity >= 0 else lambda: None, complete)
 
+    def counted(
+        self, title: str, counts: Mapping[str, Cell], *, complete: bool = True, **more: object
+    ) -> None:
+        """Print counts of what was written as a table of one row; JSON has `more` beside them."""
+        self.made({**more, **counts}, lambda: self.record(title, counts), complete)
+
     def keeps(self, words: str) -> None:
         """Set what is printed if the command is stopped from now on: what is kept, how to go on."""
         self.if_stopped = words

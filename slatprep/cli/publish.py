@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import click
 
 from slatprep.cli.options import ChoiceOf, FolderOrUrl, NewFolder, StatedOptions, UsableVerdicts
-from slatprep.cli.output import Cell, Output
+from slatprep.cli.output import Output
 from slatprep.cli.signature import Click, command
 
 if TYPE_CHECKING:
@@ -68,12 +68,8 @@ def publish(
         )
     if summary.missing:
         output.note(f"the card and catalogues also ask for {', '.join(summary.missing)}")
-    cells: dict[str, Cell] = {
-        "data": summary.data,
-        "assets": summary.assets,
-        "files": summary.files,
-        "MB": summary.size / 1e6,
-    }
+    cells = {name: getattr(summary, name) for name in ("data", "assets", "files")}
+    cells |= {"MB": summary.size / 1e6}
     output.made(summary, lambda: output.record(f"Dataset in {out}", cells))
     output.note(f"next: hf upload OWNER/NAME {out} --repo-type dataset")
 

@@ -3,14 +3,10 @@
 from __future__ import annotations
 
 from operator import attrgetter
-from typing import TYPE_CHECKING
 
 from slatprep.cli.options import Folder, FolderOrUrl
 from slatprep.cli.output import Output
 from slatprep.cli.signature import command
-
-if TYPE_CHECKING:
-    pass
 
 
 @command()

@@ -16,12 +16,10 @@ from slatprep.cli.options import (
     NewFile,
     NewFolder,
     Positive,
-    StoreOption,
-    complete_asset,
 )
 from slatprep.cli.output import Output
 from slatprep.cli.signature import Click, command
-from slatprep.cli.transfer import field_of
+from slatprep.cli.transfer import MaterialOptions
 
 if TYPE_CHECKING:
     from slatprep.particles.motion import Scene
@@ -37,16 +35,7 @@ def simulate(
         "[default: a Gaussian for each particle, in the colour of its class]",
         Click(metavar="FILE.ply"),
     ] = None,
-    store: StoreOption | None = None,
-    asset: Annotated[
-        str | None, "The asset of the store.", Click(metavar="ID", shell_complete=complete_asset)
-    ] = None,
-    prediction: Annotated[
-        File | None, "Predicted materials instead of an asset.", Click(metavar="FILE.npz")
-    ] = None,
-    ranges: Annotated[
-        str | None, "Ranges of a prediction's properties.", Click(metavar="pixie|FILE")
-    ] = None,
+    source: MaterialOptions,
     material: Annotated[
         Any | None,
         ChoiceOf("slatprep.particles.motion:CLASSES"),
@@ -119,10 +108,9 @@ def simulate(
 
     if picture is not None:
         require_picture(picture)
-    points: Any = "grid" if asset is not None else "slat"
     scene: Scene = work.prepare(
-        field_of(store, asset, prediction, ranges, points),
-        work.cells_of(store, asset),
+        source.field("grid" if source.asset is not None else "slat"),
+        work.cells_of(source.store, source.asset),
         gaussians,
         axes,
         particles,
@@ -156,4 +144,4 @@ def simulate(
         "frames": count,
         "seconds": computed,
     }
-    output.made({"path": out, **counts}, lambda: output.record(f"Frames in {out}", counts))
+    output.counted(f"Frames in {out}", counts, path=out)

@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import TYPE_CHECKING, Annotated, Any
 
-import click
-
 from slatprep.cli.options import (
-    Categories,
     ChoiceOf,
+    ChosenOptions,
+    DrawnFile,
     Jobs,
     LastStore,
     NewFile,
-    Verdicts,
-    require_categories,
+    draw_to,
 )
 from slatprep.cli.output import Cell, Output, write_csv
 from slatprep.cli.signature import Click, command
@@ -30,12 +29,7 @@ def stats(
     output: Output,
     store: LastStore,
     *,
-    verdicts: Annotated[
-        Verdicts, "Only assets with this verdict; may be repeated. [default: all]"
-    ] = (),
-    categories: Annotated[
-        Categories, "Only assets of this category; may be repeated. [default: all]"
-    ] = (),
+    chosen: ChosenOptions,
     weight: Annotated[
         Any,
         ChoiceOf("slatprep.inspect.distributions:Weight"),
@@ -46,9 +40,7 @@ def stats(
         "Also write a table to this file: a line for each group, side, property and scale.",
         Click("--csv"),
     ] = None,
-    picture: Annotated[
-        NewFile | None, "Also draw them to this file.", Click(metavar="FILE.png|svg|pdf")
-    ] = None,
+    picture: Annotated[DrawnFile | None, "Also draw them to this file."] = None,
     jobs: Jobs = 1,
 ) -> None:
     """Show statistics of the voxels of STORE: classes and properties, by category and in total.
@@ -62,37 +54,21 @@ def stats(
     slatprep stats data/demo.zarr
     slatprep stats data/demo.zarr --verdict good --weight asset --picture demo.png --csv demo.csv
     """
-    from slatprep.inspect.pictures.canvas import FORMATS
-
-    kind = "png" if picture is None else picture.suffix[1:].lower()
-    if kind not in FORMATS:
-        raise click.BadParameter(
-            f"{picture} ends in none of .{', .'.join(FORMATS)}", param_hint="--picture"
-        )
     from slatprep.inspect.distributions import COLUMNS, table_of
     from slatprep.inspect.statistics import store_statistics
     from slatprep.store import open_store
 
     opened = open_store(store)
-    require_categories(opened, categories)
     with output.progress("stats") as progress:
         found = store_statistics(
-            opened,
-            verdicts=verdicts,
-            categories=categories,
-            weight=weight,
-            jobs=jobs,
-            progress=progress,
+            opened, *chosen.of(opened), weight=weight, jobs=jobs, progress=progress
         )
     if csv_file is not None:
         write_csv(csv_file, COLUMNS, table_of(found))
     if picture is not None:
         from slatprep.inspect.pictures.statistics import draw_statistics
-        from slatprep.storage.atomic import staged, writing
 
-        with writing(str(picture), picture.parent), staged(picture) as path:
-            path.write_bytes(draw_statistics(opened, found, kind))
-        output.note(f"picture: {picture}")
+        draw_to(output, picture, partial(draw_statistics, opened, found))
     output.result(found, lambda: _show(output, found))
 
 

@@ -2,17 +2,60 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-from slatprep.cli.options import ChoiceOf, File, FiniteRange, NewFile, StoreOption, complete_asset
+from slatprep.cli.options import AssetOption, ChoiceOf, File, FiniteRange, NewFile, StoreOption
 from slatprep.cli.output import Output
 from slatprep.cli.signature import Click, command
 from slatprep.errors import ConfigError
 
 if TYPE_CHECKING:
-    from slatprep.particles.fields import VoxelField
-    from slatprep.records import Place
+    from slatprep.particles.fields import Points, VoxelField
+
+
+@dataclass(frozen=True, kw_only=True)
+class MaterialOptions:
+    """Where materials come from: an asset of a store, or a prediction."""
+
+    store: StoreOption | None = None
+    asset: AssetOption | None = None
+    prediction: Annotated[
+        File | None,
+        "Predicted materials instead of an asset: coords, material, and properties (normalised as "
+        "--store or --ranges says) or properties_si.",
+        Click(metavar="FILE.npz"),
+    ] = None
+    ranges: Annotated[
+        str | None, "Ranges of a prediction's properties.", Click(metavar="pixie|FILE")
+    ] = None
+
+    def field(self, points: Points) -> VoxelField:
+        """Return the materials of a stored asset or of a prediction, one of which is given."""
+        from slatprep.normalize import PIXIE_RANGES
+        from slatprep.particles.fields import predicted_field, stored_field
+        from slatprep.readers.ranges import read_ranges
+        from slatprep.store import open_store
+
+        store, ranges, normalization = self.store, self.ranges, None
+        if (self.asset is None) == (self.prediction is None):
+            raise ConfigError("expected either --asset, with --store, or --prediction")
+        if self.asset is not None:
+            if store is None or ranges is not None:
+                raise ConfigError(
+                    "--asset needs --store, which knows the ranges; --ranges does not go"
+                )
+            return stored_field(open_store(store), self.asset, points)
+        if points != "slat" or (store is not None and ranges is not None):
+            raise ConfigError(
+                "--prediction goes with --store or --ranges, and without --points grid"
+            )
+        if ranges is not None:
+            normalization = PIXIE_RANGES if ranges == "pixie" else read_ranges(Path(ranges))
+        elif store is not None:
+            normalization = open_store(store).normalization
+        return predicted_field(self.prediction, normalization)  # type: ignore[arg-type]
 
 
 @command()
@@ -20,19 +63,7 @@ def transfer(
     output: Output,
     particles: File,
     *,
-    store: StoreOption | None = None,
-    asset: Annotated[
-        str | None, "The asset of the store.", Click(metavar="ID", shell_complete=complete_asset)
-    ] = None,
-    prediction: Annotated[
-        File | None,
-        "Predicted materials instead of an asset: coords, material, and properties (normalised as "
-        "--store or --ranges says) or properties_si.",
-        Click(metavar="FILE.npz"),
-    ] = None,
-    ranges: Annotated[
-        str | None, "Ranges of a prediction's properties.", Click(metavar="pixie|FILE")
-    ] = None,
+    material: MaterialOptions,
     out: Annotated[
         NewFile, "Where to write the particles with their materials.", Click(metavar="FILE.ply")
     ],
@@ -80,7 +111,7 @@ def transfer(
     from slatprep.particles import transfer as work
     from slatprep.particles.read import read_particles
 
-    field = field_of(store, asset, prediction, ranges, points)
+    field = material.field(points)
     read, recognised = work.recognise_axes(read_particles(particles, axes), field, max_distance)
     if recognised:
         output.note(f"{particles}: {recognised}")
@@ -105,29 +136,4 @@ def transfer(
         "written": len(result.rows),
         "far": result.far,
     }
-    output.made({"path": out, **counts}, lambda: output.record(f"Transferred to {out}", counts))
-
-
-def field_of(
-    store: Place | None, asset: str | None, prediction: Path | None, ranges: str | None, points: Any
-) -> VoxelField:
-    """Return the materials of a stored asset or of a prediction, one of which is given."""
-    from slatprep.normalize import PIXIE_RANGES
-    from slatprep.particles.fields import predicted_field, stored_field
-    from slatprep.readers.ranges import read_ranges
-    from slatprep.store import open_store
-
-    if (asset is None) == (prediction is None):
-        raise ConfigError("expected either --asset, with --store, or --prediction")
-    if asset is not None:
-        if store is None or ranges is not None:
-            raise ConfigError("--asset needs --store, which knows the ranges; --ranges does not go")
-        return stored_field(open_store(store), asset, points)
-    if points != "slat" or (store is not None and ranges is not None):
-        raise ConfigError("--prediction goes with --store or --ranges, and without --points grid")
-    normalization = None
-    if ranges is not None:
-        normalization = PIXIE_RANGES if ranges == "pixie" else read_ranges(Path(ranges))
-    elif store is not None:
-        normalization = open_store(store).normalization
-    return predicted_field(prediction, normalization)  # type: ignore[arg-type]
+    output.counted(f"Transferred to {out}", counts, path=out)

@@ -42,9 +42,9 @@ _TASK_ASSETS = 32
 
 def store_statistics(
     store: Store,
-    *,
     verdicts: Collection[str] = (),
     categories: Collection[str] = (),
+    *,
     weight: Weight = "voxel",
     jobs: int = 1,
     progress: Progress | None = None,

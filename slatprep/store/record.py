@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from datetime import datetime
-from typing import TYPE_CHECKING, Annotated, ClassVar, Final, Literal
+from typing import Annotated, ClassVar, Final, Literal
 
 from annotated_types import Ge, MaxLen, MinLen
 
@@ -31,9 +31,6 @@ from slatprep.records import (
     Status,
     Verdict,
 )
-
-if TYPE_CHECKING:
-    pass
 
 RECORD_VERSION: Final = 1
 
