@@ -262,7 +262,7 @@ def _state_of(pair: AssetPair) -> bytes:
     states: list[object] = [names]
     files = [pair.slat]
     for one in pair.annotations:
-        files += [one.grid, one.mask, one.bounds, one.beside, one.transform]
+        files += [one.grid, one.mask, one.bounds, *one.beside, one.transform]
     for file in files:
         state = None if file is None else _file_state(file)
         if state == ():

@@ -24,6 +24,7 @@ from slatprep.align import engine_versions
 from slatprep.geometry.voxels import boundary
 from slatprep.parameters import BuildParameters
 from slatprep.pipeline.fingerprint import code_fingerprint, packing_fingerprint
+from slatprep.readers.identity import source_digests
 from slatprep.records import Failed, Finished, SourceFile, Status
 from slatprep.store.record import (
     MAX_WARNINGS,
@@ -70,8 +71,7 @@ class Recipe:
                 return f"libraries changed: {name} was {record.versions.get(name)}, is {version}"
         if record.code != self.code:
             return "code changed"
-        old = {source.role: source.sha256 for source in record.sources}
-        new = {source.role: source.sha256 for source in sources}
+        old, new = source_digests(record.sources), source_digests(sources)
         roles = sorted(role for role in old | new if old.get(role) != new.get(role))
         return f"sources changed: {', '.join(roles)}"
 

@@ -36,14 +36,14 @@ from slatprep.storage.listing import Listing
 class FoundField:
     """The name of a field and its file, relative to the root.
 
-    The adapter also reads the file `beside`. `problem` says why the field cannot be used.
+    The adapter also reads the files `beside`. `problem` says why the field cannot be used.
     """
 
     object_id: str
     path: str
     sample: str = ""
     problem: str = ""
-    beside: str = ""
+    beside: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -165,7 +165,7 @@ def patterns_of(adapter: SourceAdapter, source: PixieverseSource) -> Sequence[st
 
 
 def find_by_pattern(
-    patterns: Sequence[str], listing: Listing, known: Mapping[str, str], beside: str = ""
+    patterns: Sequence[str], listing: Listing, known: Mapping[str, str]
 ) -> Iterator[FoundField]:
     """Yield the fields whose names match; for an object, only those of its first matching pattern.
 
@@ -176,7 +176,7 @@ def find_by_pattern(
         if "{id}" not in pattern:
             raise ConfigError(f"grid pattern {pattern!r} names no {{id}}")
         found = [
-            FoundField(fields.get("id", path), path, fields.get("sample", ""), problem, beside)
+            FoundField(fields.get("id", path), path, fields.get("sample", ""), problem)
             for fields, path, problem in find_files(listing, pattern, known, skip=done)
         ]
         done |= dict.fromkeys(one.object_id for one in found)

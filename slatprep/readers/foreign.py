@@ -126,8 +126,9 @@ class ForeignSource(_Foreign):
                 found = next(every, None)
                 if found is None:
                     return
-                texts = found.object_id, found.path, found.sample, found.problem, found.beside
-                named = all(isinstance(one, str) for one in texts)
+                texts = found.object_id, found.path, found.sample, found.problem
+                named = all(isinstance(one, str) for one in (*texts, *found.beside))
+                named = named and isinstance(found.beside, tuple)
                 self._require(named, f"{found!r} as a field that it found")
             yield found
 

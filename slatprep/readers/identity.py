@@ -66,9 +66,9 @@ def _hash_annotation(pair: AssetPair, grid: Place) -> list[SourceFile]:
     if pair.bounds:
         with suppress(InputError):  # Not needed: the reader goes on without it, too.
             sources.append(load_source(pair.bounds, root, "bounds")[1])
-    for path, role in ((pair.beside, "description"), (pair.transform, "transform")):
-        if path:
-            sources.append(load_source(path, root, role)[1])
+    sources += [load_source(path, root, "description")[1] for path in pair.beside]
+    if pair.transform:
+        sources.append(load_source(pair.transform, root, "transform")[1])
     return list(pair.roots.numbered(sources))
 
 
@@ -106,7 +106,12 @@ def source_digests(
     `shared` is given where a file holds the latents of many assets. Their digest then replaces
     the file's, which changes with every asset added.
     """
-    digests = {source.role: source.sha256 for source in sources}
+    digests: dict[str, str] = {}
+    for source in sources:
+        before = digests.get(source.role)
+        # Of several files of a role, such as the meshes of parts, every one counts.
+        several = f"{before} {source.sha256}".encode()
+        digests[source.role] = hashlib.sha256(several).hexdigest() if before else source.sha256
     if shared is not None:
         digest = hashlib.sha256(shared.coords.tobytes())
         digest.update(shared.feats.tobytes())

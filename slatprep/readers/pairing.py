@@ -270,7 +270,8 @@ def _pair_of(row: _Row, there: _Found, shared: str, grids: Sequence[FoundField])
     sides: tuple[FoundField | NamedSlat, ...] = (*grids, *row.slats)
     for side in sides:
         problems += [side.problem, _unrecordable(side.path)]
-    grid = mask = bounds = transform = beside = None
+    grid = mask = bounds = transform = None
+    beside: tuple[Place, ...] = ()
     if grids:
         grid = there.roots.pixieverse / grids[0].path
         if len(grids) > 1:
@@ -280,8 +281,7 @@ def _pair_of(row: _Row, there: _Found, shared: str, grids: Sequence[FoundField])
             if source.adapter == "pixieverse":
                 mask = _find_one(there, source.mask, known, "mask", problems)
                 bounds = _find_one(there, source.bounds, known, "bounds", problems)
-            if grids[0].beside:
-                beside = there.roots.pixieverse / grids[0].beside
+            beside = tuple(there.roots.pixieverse / name for name in grids[0].beside)
             if source.transform:
                 # A name without an id stands for one file, of all assets.
                 transform = _find_one(there, (source.transform,), known, "transform", problems)

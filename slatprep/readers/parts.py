@@ -11,6 +11,7 @@ from __future__ import annotations
 import io
 import re
 from collections.abc import Iterator
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -22,7 +23,7 @@ from slatprep.parameters import PixieverseSource
 from slatprep.readers.adapters import FoundField, Holding, find_by_pattern, patterns_of
 from slatprep.readers.files import load_source, require_complete
 from slatprep.readers.voxel_sets import field_of_voxels
-from slatprep.records import PROPERTIES, RESOLUTION, AssetPair, MaterialField, Place, SourceFile
+from slatprep.records import PROPERTIES, RESOLUTION, AssetPair, MaterialField, Place
 from slatprep.storage.listing import Listing
 
 _KEYS = {
@@ -55,7 +56,8 @@ class Parts:
 
     def find(self, source: PixieverseSource, listing: Listing) -> Iterator[FoundField]:
         """Find the fields by the names of their JSON files."""
-        return find_by_pattern(patterns_of(self, source), listing, {})
+        for found in find_by_pattern(patterns_of(self, source), listing, {}):
+            yield replace(found, beside=tuple(_meshes_of(found.object_id, listing).values()))
 
     def read(self, pair: AssetPair, max_unphysical: float) -> MaterialField:
         """Read a field; see `slatprep.readers.adapters.SourceAdapter`."""
@@ -65,18 +67,20 @@ class Parts:
         rows = _parts_of(data, path)
         stated = {name for name in _SI if units.of(name)}
         values = [[_number(part, name, name in stated, path) for name in _SI] for part in rows]
-        meshes, files = [], [file]
-        for part in rows:
-            mesh, source = _mesh(root, path.name.removesuffix(".json"), part["label"], path)
-            meshes.append(mesh)
-            files.append(source)
+        read = {one.name[:-4]: (one, *load_source(one, root, "description")) for one in pair.beside}
+        meshes = []
+        for label in (str(part["label"]) for part in rows):
+            if label not in read:
+                expected = " or ".join(_names(path.name.removesuffix(".json"), label))
+                raise InputError(path, f"part {label} has no mesh", expected)
+            meshes.append(_mesh(*read[label][:2]))
         voxels, owner = _voxels(meshes, path)
         return field_of_voxels(
             path,
             voxels,
             np.array(values)[owner],
             max_unphysical=max_unphysical,
-            sources=files,
+            sources=(file, *(source for _, _, source in read.values())),
             roots=pair.roots,
         )
 
@@ -111,13 +115,25 @@ def _number(part: dict[str, Any], name: str, stated: bool, path: Place) -> float
     return float(match[1]) * (1.0 if stated else known[unit])
 
 
-def _mesh(root: Place, name: str, label: int, path: Place) -> tuple[Any, SourceFile]:
-    """Return the mesh of a part, and its file."""
-    tried = [f"partseg/{name}/objs/{label}.obj", f"partseg/{name}/objs/{label}/{label}.obj"]
-    there = next((one for one in tried if (root / one).exists()), None)
-    if there is None:
-        raise InputError(path, f"part {label} has no mesh", " or ".join(tried))
-    data, file = load_source(root / there, root, "description")
+def _names(name: str, label: str) -> tuple[str, str]:
+    """Return where the mesh of a part of an object may lie."""
+    return f"partseg/{name}/objs/{label}.obj", f"partseg/{name}/objs/{label}/{label}.obj"
+
+
+def _meshes_of(name: str, listing: Listing) -> dict[str, str]:
+    """Return the meshes of an object by label, also those of no part."""
+    folder = f"partseg/{name}/objs/"
+    files = listing.of_folder(folder, folders=False)
+    found = {file[:-4]: folder + file for file in sorted(files) if file.endswith(".obj")}
+    for label in sorted(listing.of_folder(folder, folders=True)):
+        nested = _names(name, label)[1]
+        if label not in found and listing.is_file(nested):
+            found[label] = nested
+    return found
+
+
+def _mesh(path: Place, data: bytes) -> Any:
+    """Return the mesh of a part."""
     try:
         mesh = _trimesh().load(
             io.BytesIO(data), file_type="obj", force="mesh", process=False, skip_materials=True
@@ -125,8 +141,8 @@ def _mesh(root: Place, name: str, label: int, path: Place) -> tuple[Any, SourceF
         if len(mesh.faces) == 0 or not np.isfinite(mesh.vertices).all():
             raise ValueError("it has no faces, or vertices that are not finite")
     except (ValueError, TypeError, KeyError, IndexError, AttributeError) as error:
-        raise InputError(root / there, f"is no mesh ({error})", "an OBJ with faces") from None
-    return mesh, file
+        raise InputError(path, f"is no mesh ({error})", "an OBJ with faces") from None
+    return mesh
 
 
 def _voxels(meshes: list[Any], path: Place) -> tuple[NDArray[np.int64], NDArray[np.intp]]:

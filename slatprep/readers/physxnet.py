@@ -57,16 +57,16 @@ class PhysXNet:
                     f"{beside}, which PhysX-3D's toolkit writes with it"
                 )
             )
-            yield replace(found, beside=beside, problem=found.problem or lacking)
+            yield replace(found, beside=(beside,), problem=found.problem or lacking)
 
     def read(self, pair: AssetPair, max_unphysical: float) -> MaterialField:
         """Read a field; see `slatprep.readers.adapters.SourceAdapter`."""
         path, _ = require_complete(pair)
         root, units = pair.roots.pixieverse, pair.roots.units
-        beside = root / f"voxels/{path.name.removesuffix('2.npy')}.ply"
+        (beside,) = pair.beside or (root / f"voxels/{path.name.removesuffix('2.npy')}.ply",)
         data, file = load_source(path, root, "grid")
         rows = npy_array(data, path, _ROWS)
-        text, points = load_source(pair.beside or beside, root, "description")
+        text, points = load_source(beside, root, "description")
         vertices, _ = ply_points(text, beside)
         if len(rows) != len(vertices):
             raise InputError(

@@ -112,8 +112,9 @@ class PlainVoxels:
 
     def find(self, source: PixieverseSource, listing: Listing) -> Iterator[FoundField]:
         """Find the fields by the names of their files."""
-        for found in find_by_pattern(patterns_of(self, source), listing, {}, DESCRIPTION):
-            yield replace(found, path=found.path.removesuffix(_GROUP))
+        for found in find_by_pattern(patterns_of(self, source), listing, {}):
+            path = found.path.removesuffix(_GROUP)
+            yield replace(found, path=path, beside=(DESCRIPTION,))
 
     def read(self, pair: AssetPair, max_unphysical: float) -> MaterialField:
         """Read a field; see `slatprep.readers.adapters.SourceAdapter`."""

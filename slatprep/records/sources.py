@@ -131,8 +131,8 @@ class AssetPair:
         Group inside an HDF5 file with several assets; otherwise empty.
     problem : str
         Why the pair cannot be used (missing partner, two files for one id); empty if it can.
-    beside : Place or None
-        Another file that the adapter of the source reads for it.
+    beside : tuple of Place
+        Further files that the adapter of the source reads for it.
     sample : str
         Name of this annotation among the object's; may be empty.
     others : tuple of AssetPair
@@ -151,7 +151,7 @@ class AssetPair:
     slat_group: str = ""
     problem: str = ""
     transform: Place | None = None
-    beside: Place | None = None
+    beside: tuple[Place, ...] = ()
     sample: str = ""
     others: tuple[AssetPair, ...] = ()
 

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import time
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +13,8 @@ import pytest
 
 from slatprep.errors import InputError
 from slatprep.parameters import BuildParameters, PixieverseSource, SlatSource
-from slatprep.pipeline.dataset import build_store
+from slatprep.pipeline.dataset import build_store, plan_build
+from slatprep.pipeline.summary import BuildSummary
 from slatprep.readers import discover, read_field
 from slatprep.records import MaterialField
 from slatprep.records.units import Units
@@ -120,7 +123,9 @@ def test_missing_and_broken_meshes_are_named(tmp_path: Path) -> None:
         field_at(tmp_path / "p")
 
 
-def test_a_store_is_built_of_parts_and_knows_every_file(tmp_path: Path) -> None:
+@pytest.fixture
+def built(tmp_path: Path) -> partial[BuildSummary]:
+    """Return what builds a store of a hammer with a hook, over and over, and its result."""
     parts = [
         (HANDLE, box((0, 0, 0), (24, 4, 4))),
         (HEAD, box((20, -6, -2), (32, 10, 6))),
@@ -134,12 +139,37 @@ def test_a_store_is_built_of_parts_and_knows_every_file(tmp_path: Path) -> None:
     shell = (np.argwhere(solid & ~buried) - 1).astype(np.uint8)
     feats = np.random.default_rng(0).normal(size=(len(shell), 8)).astype(np.float32)
     np.savez(tmp_path / "slat" / "a.npz", coords=shell, feats=feats)
-    source = PixieverseSource(tmp_path / "p", adapter="parts")
-    built = build_store(BuildParameters(source, SlatSource(tmp_path / "slat")), tmp_path / "s.zarr")
-    assert built.verdicts == {"good": 1}
+    parameters = BuildParameters(
+        PixieverseSource(tmp_path / "p", adapter="parts"), SlatSource(tmp_path / "slat")
+    )
+    return partial(build_store, parameters, tmp_path / "s.zarr")
+
+
+def test_a_store_is_built_of_parts_and_knows_every_file(
+    built: partial[BuildSummary], tmp_path: Path
+) -> None:
+    assert built().verdicts == {"good": 1}
     asset = open_store(tmp_path / "s.zarr").asset("a")
     heavy = asset.properties_si[:, 1] > 5000
     assert 0.05 < heavy.mean() < 0.9
     record = json.loads((tmp_path / "s.manifests" / "assets.jsonl").read_text().splitlines()[0])
     names = {file["path"] for file in record["sources"]}
     assert {f"partseg/a/objs/{k}.obj" for k in range(3)} <= names
+
+
+@pytest.mark.parametrize("rehash", [False, True])
+@pytest.mark.parametrize("part", [0, 2])
+def test_a_changed_mesh_changes_the_asset(
+    part: int, rehash: bool, built: partial[BuildSummary], tmp_path: Path
+) -> None:
+    plan = partial(plan_build, *built.args, rehash=rehash)
+    built()
+    heavy = (open_store(tmp_path / "s.zarr").asset("a").properties_si[:, 1] > 5000).sum()
+    time.sleep(0.2)  # A file as young as the build that read it is hashed in any case.
+    assert plan().assets[0].reason == "unchanged"
+    half = {0: ((0, 0, 0), (12, 4, 4)), 2: ((2, 1, 0), (5, 3, 7))}[part]
+    box(*half).export(tmp_path / "p" / "partseg" / "a" / "objs" / f"{part}.obj")
+    assert plan().assets[0].reason == "sources changed: description"
+    built(rehash=rehash)
+    now = (open_store(tmp_path / "s.zarr").asset("a").properties_si[:, 1] > 5000).sum()
+    assert now < 0.95 * heavy

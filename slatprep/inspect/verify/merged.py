@@ -85,6 +85,6 @@ def _pair_of(
         files.get("bounds"),
         slat,
         transform=files.get("transform"),
-        beside=files.get("description"),
+        beside=tuple(own.pixieverse / file.path for file in found if file.role == "description"),
         sample=one.sample,
     )
