@@ -5,7 +5,8 @@
 Writes archives by class as Pixie's code writes them, at true size but sparse, and serves them as
 the hub does, each answer late by the latency. Builds a store by one command from the dataset's
 name, verifies it, and builds it again. Prints requests and bytes, and whether the store equals
-that of the unpacked folder and that of the archives on the disk.
+that of the unpacked folder and that of the archives on the disk. Then prints what the index of an
+archive takes, by number and size of an object's frames.
 """
 
 from __future__ import annotations
@@ -23,14 +24,23 @@ from pathlib import Path
 
 import checkout  # noqa: F401 - says where the tests' support lies
 import numpy as np
-from support.published import CLASSES, files, npy
+from support.published import CLASSES, SparseArchive, files, npy
 from support.published_hub import PublishedHub
 from support.synthetic import Dataset, make_asset
 
+from slatprep.parameters import PixieverseSource
+from slatprep.readers.published import wanted_members
+from slatprep.storage.ahead import ReadAhead
+from slatprep.storage.archives import Archive
 from slatprep.storage.files import LocalFile
+from slatprep.storage.tar import entries
 
 NAME = "vlongle/pixieverse"
 CUBE = 64**3
+
+FRAMES = ((0, 0), (25, 20_000), (100, 20_000), (100, 60_000), (125, 120_000), (125, 250_000),
+          (600, 30_000), (125, 600_000), (300, 1_500_000))  # fmt: skip
+"""Numbers of frames of an object, and their bytes, of which the index is measured."""
 
 
 def members(name: str, grid: np.ndarray, frames: int, frame: int) -> list[tuple[str, bytes | int]]:
@@ -39,6 +49,8 @@ def members(name: str, grid: np.ndarray, frames: int, frame: int) -> list[tuple[
     bounds = io.BytesIO()
     np.savez(bounds, min_bounds=(-0.5,) * 3, max_bounds=(0.5,) * 3, voxel_size=1 / 64)
     videos = f"{name}/sample_0/gs_sim_gridsize_64_output"
+    rng = np.random.default_rng(int(name, 16))
+    sizes = (frame * rng.uniform(0.6, 1.4) * rng.uniform(0.6, 1.4, frames)).astype(int).tolist()
     return [
         (f"{name}/clip_features.npz", bounds.getvalue()),
         (f"{name}/clip_features_alphas.npy", 128 + 4 * CUBE),
@@ -46,7 +58,7 @@ def members(name: str, grid: np.ndarray, frames: int, frame: int) -> list[tuple[
         (f"{name}/clip_features_mask.npy", mask),
         (f"{name}/clip_features_pc.ply", 900_000),
         (f"{name}/clip_features_rgb.npy", 128 + 12 * CUBE),
-        *((f"{videos}/{number:04d}.png", frame) for number in range(frames)),
+        *((f"{videos}/{number:04d}.png", size) for number, size in enumerate(sizes)),
         (f"{videos}/output.gif", 1_500_000),
         (f"{videos}/output.mp4", 200_000),
         (f"{name}/sample_0/material_grid.npy", npy(grid)),
@@ -111,6 +123,28 @@ def local_bytes(folder: Path, cache: Path) -> int:
     return count
 
 
+def index_of(objects: int, frames: int, frame: int) -> str:
+    """Read the headers of an archive; return what that took, as a row of a table."""
+    grid = np.full((64, 64, 64, 4), 7, dtype=np.float32)
+    listed = [
+        (name, data if isinstance(data, int) else len(data))
+        for number in range(objects)
+        for name, data in members(f"{number:032x}", grid, frames, frame)
+    ]
+    file = SparseArchive(listed)
+    archive = Archive(Path("tree.tar"), "", file.size, wanted=wanted_members(PixieverseSource(Path())))
+    found = entries(ReadAhead(file, remote=True), file.size, needed=archive.may_hold)
+    known = {entry.name for entry, _ in found if entry}
+    needed = {name: size for name, size in listed if archive.is_wanted(name)}
+    if not needed.keys() <= known:
+        sys.exit("the index lacks members")
+    whole = (file.bytes + sum(needed.values())) / file.size
+    return (
+        f"| {frames} of {frame // 1000} kB | {file.requests / objects:.1f} | "
+        f"{file.bytes / objects / 1e6:.2f} MB | {whole:.2%} |"
+    )
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("folder", type=Path)
@@ -160,6 +194,10 @@ def main() -> None:
         f"{given.frame_bytes:,} bytes an object, {needed:,} bytes needed; equal to the store of "
         f"the unpacked folder: {same[0]}, of the archives on the disk: {same[1]}"
     )
+    print("\n| frames of an object | requests | bytes | share with the members needed |")
+    print("| --- | --- | --- | --- |")
+    for frames, frame in FRAMES:
+        print(index_of(given.objects, frames, frame))
     shutil.rmtree(folder)
     if not all(same):
         sys.exit(1)

@@ -47,7 +47,7 @@ def locate_grids(source: PixieverseSource, note: Callable[[str], None] | None = 
     root = source.root
     if source.adapter != PixieverseSource.adapter:
         return root
-    wanted = _wanted(source)
+    wanted = wanted_members(source)
     if any(pattern.startswith((f"{GRIDS}/", f"{ARCHIVES}/")) for pattern in wanted):
         return root  # The user's own patterns begin at the root.
     try:
@@ -165,7 +165,7 @@ def _tree(
     return ArchivePlace(tree)
 
 
-def _wanted(source: PixieverseSource) -> tuple[str, ...]:
+def wanted_members(source: PixieverseSource) -> tuple[str, ...]:
     """Return patterns of all files of a source that a build may read."""
     patterns = (*source.grid, *source.mask, *source.bounds, source.transform)
     return tuple(fill(pattern, {}) for pattern in patterns if pattern)

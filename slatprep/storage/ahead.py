@@ -19,7 +19,7 @@ MAX_READ = 2**20
 _LEAST, _MOST, _NEAR = 2**13, 2**22, 2**21
 """Bytes: a request after a jump; the largest request; a gap that costs less than a request."""
 
-_SHARE, _SLACK = 0.015, 2**20
+_SHARE, _SLACK = 0.015, 2**22
 """Requests grow as long as no more than this share of what lies before was read, and so much."""
 
 
@@ -35,7 +35,7 @@ class ReadAhead(io.RawIOBase):
         super().__init__()
         self._file, self._most = file, _MOST if remote else _LEAST
         self._begin, self._data, self._at = 0, b"", 0
-        self._window, self._spent = _LEAST, 0
+        self._window, self._spent, self._allowed = _LEAST, 0, 0
 
     def tell(self) -> int:
         """Return the position."""
@@ -56,15 +56,23 @@ class ReadAhead(io.RawIOBase):
         self._at += len(data)
         return data
 
+    def holds(self, length: int, offset: int) -> bool:
+        """Whether a range was read already."""
+        return self._begin <= offset and offset + length <= self._begin + len(self._data)
+
+    def affords(self, length: int) -> bool:
+        """Whether so much may be read at once; growing requests leave half for it."""
+        return self._spent + length <= self._allowed
+
     def held(self, length: int, offset: int) -> bytes:
         """Return a range, from what was read already if it can be."""
         end = self._begin + len(self._data)
-        if not self._begin <= offset <= offset + length <= end:
+        if not self.holds(length, offset):
             near = 0 <= offset - end <= _NEAR or self._begin <= offset < end
             self._window = min(2 * self._window, self._most) if near else _LEAST
-            allowed = max(_LEAST, int(_SHARE * offset) + _SLACK - self._spent)
-            asked = max(length, min(self._window, allowed))
-            self._begin, self._data = offset, self._file.pread(asked, offset)
+            self._allowed = int(_SHARE * offset) + _SLACK
+            window = min(self._window, max(_LEAST, self._allowed // 2 - self._spent))
+            self._begin, self._data = offset, self._file.pread(max(length, window), offset)
             self._spent += len(self._data)
         start = offset - self._begin
         return self._data[start : start + length]

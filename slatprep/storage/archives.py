@@ -35,9 +35,9 @@ if TYPE_CHECKING:
 SUFFIXES = (".tar", ".tar.gz", ".tgz")
 """How the names of archives end."""
 
-_FORMAT, _INDEX = 1, "index.z"
+_FORMAT, _INDEX = 2, "index.z"
 
-_KEPT = ("next", "complete", "fault", "strange", "twice")
+_KEPT = ("next", "complete", "fault", "strange", "twice", "wanted")
 """What is kept of an index besides its members."""
 
 _STREAMED = 2**23
@@ -130,6 +130,13 @@ class Archive:
     def is_wanted(self, name: str) -> bool:
         """Whether a member may be asked for, by its name."""
         return any(_like(pattern).fullmatch(name) for pattern in self.wanted)
+
+    def may_hold(self, folder: str) -> bool:
+        """Whether a member may be asked for that lies in a folder, or below it."""
+        depth = folder.count("/") + 1
+        parts = (pattern.split("/") for pattern in self.wanted)
+        heads = ("/".join(one[:depth]) for one in parts if len(one) > depth)
+        return not folder or any(_like(head).fullmatch(folder) for head in heads)
 
     def read(self, entry: Entry) -> bytes:
         """Read a member; InputError if the archive is not the one that was looked at."""
@@ -230,6 +237,8 @@ class Index:
         Names of members that lead out of the archive.
     twice : int
         Members that a later one of the same name replaces.
+    wanted : list of str
+        Patterns of the members that it has all of; without any, it has all members.
     """
 
     members: dict[str, Entry] = field(default_factory=dict)
@@ -238,6 +247,7 @@ class Index:
     fault: str = ""
     strange: list[str] = field(default_factory=list)
     twice: int = 0
+    wanted: list[str] = field(default_factory=list)
 
     def told(self) -> str:
         """Return what a user should know of it; empty if nothing."""
@@ -271,7 +281,8 @@ def _extend(
 ) -> None:
     """Read the rest of an archive's headers; what was found is kept, however that ends."""
     archive.folder.mkdir(parents=True, exist_ok=True)
-    saved = time.monotonic()
+    saved, remote = time.monotonic(), isinstance(archive.place, RemotePlace)
+    index.wanted = list(archive.wanted) if remote else []
     try:
         if archive.packed:
             with io.BufferedReader(archive.open_ranges(), _STREAMED) as stream:
@@ -279,8 +290,9 @@ def _extend(
                     index.add(entry)
         else:
             with archive.open_ranges() as file:
-                ahead = ReadAhead(file, isinstance(archive.place, RemotePlace))
-                for member, following in entries(ahead, archive.size, index.next):
+                ahead = ReadAhead(file, remote)
+                needed = archive.may_hold if remote else None
+                for member, following in entries(ahead, archive.size, index.next, needed):
                     if member is not None:
                         index.add(member)
                     index.next = following
@@ -315,6 +327,8 @@ def _read_index(archive: Archive) -> Index:
             return Index()
         members = [Entry(*entry) for entry in document["members"]]
         kept = {name: document[name] for name in _KEPT}
+        if kept["wanted"] not in ([], list(archive.wanted)):
+            return Index()
     except (OSError, ValueError, TypeError, LookupError, zlib.error):
         return Index()  # It is made anew.
     return Index({entry.name: entry for entry in members}, **kept)

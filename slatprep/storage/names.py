@@ -1,4 +1,4 @@
-"""File names from ids."""
+"""File names from ids, and paths from the names of an archive's members."""
 
 from __future__ import annotations
 
@@ -29,3 +29,11 @@ def file_name(asset_id: str, *, dots: bool = True) -> str:
         digest = hashlib.sha256(asset_id.encode()).hexdigest()[:32]
         name = f"{name[:_LONGEST_NAME]}~{digest}"
     return name
+
+
+def plain_name(name: str) -> str:
+    """Return the name of a member as a path below a folder; empty if it could be none."""
+    parts = [part for part in name.split("/") if part not in ("", ".")]
+    if name.startswith("/") or ".." in parts or "\\" in name or "\0" in name:
+        return ""
+    return "/".join(parts)

@@ -10,6 +10,8 @@ from contextlib import contextmanager
 from typing import IO, NamedTuple
 
 from slatprep.storage.ahead import ReadAhead
+from slatprep.storage.leaps import Leaps
+from slatprep.storage.names import plain_name
 
 BLOCK = tarfile.BLOCKSIZE
 """Bytes of a header, to a multiple of which members are filled up."""
@@ -38,13 +40,16 @@ class ArchiveError(Exception):
     """An archive that is damaged from some byte on; its text says how."""
 
 
-def entries(file: ReadAhead, size: int, begin: int = 0) -> Iterator[tuple[Entry | None, int]]:
+def entries(
+    file: ReadAhead, size: int, begin: int = 0, needed: Callable[[str], bool] | None = None
+) -> Iterator[tuple[Entry | None, int]]:
     """Yield the members of an archive from a header on, each with where the next one begins.
 
     Folders are None; a name that leads out of the archive is empty. `begin` is 0, or where a
-    member said that the next one begins. ArchiveError where the archive, of `size` bytes, is
-    damaged or ends too early.
+    member said that the next one begins. Files of folders that are not `needed` may be left out
+    by `Leaps`. ArchiveError where the archive, of `size` bytes, is damaged or ends too early.
     """
+    leaps = Leaps(file)
     file.seek(begin)
     with _told():
         archive = tarfile.TarFile(fileobj=file, mode="r", errors="surrogateescape")
@@ -58,6 +63,9 @@ def entries(file: ReadAhead, size: int, begin: int = 0) -> Iterator[tuple[Entry 
             raise ArchiveError(f"ends within {member.name!r}; {INCOMPLETE}")
         check = zlib.crc32(file.held(BLOCK, member.offset_data - BLOCK))
         yield _entry(member, check), archive.offset
+        folder = plain_name(member.name).rpartition("/")[0]
+        if needed and member.isreg() and not needed(folder):
+            archive.offset = leaps.after(folder, member.offset_data, archive.offset)
     end = file.held(BLOCK, archive.offset) if archive.offset < size else b""
     if not end:
         raise ArchiveError(f"has no end: it was cut off at byte {size:,}; {INCOMPLETE}")
@@ -88,14 +96,6 @@ def unpack(
                     raise ArchiveError(f"ends within {member.name!r}; {INCOMPLETE}")
                 keep(entry, content)
             yield entry
-
-
-def plain_name(name: str) -> str:
-    """Return the name of a member as a path below a folder; empty if it could be none."""
-    parts = [part for part in name.split("/") if part not in ("", ".")]
-    if name.startswith("/") or ".." in parts or "\\" in name or "\0" in name:
-        return ""
-    return "/".join(parts)
 
 
 def _entry(member: tarfile.TarInfo, check: int) -> Entry | None:

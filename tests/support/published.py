@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import json
 import tarfile
+from bisect import bisect_left
 from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
@@ -15,6 +16,7 @@ from slatprep.parameters import BuildParameters
 from slatprep.storage.place import place_of
 from support.synthetic import Dataset, make_asset
 
+BLOCK = tarfile.BLOCKSIZE
 CLASSES = ("tree", "soda_cans", "sand")
 IDS = [f"{number:032x}" for number in range(5)]
 
@@ -81,6 +83,32 @@ def make_published(folder: Path) -> Path:
     }
     (folder / "classes.json").write_text(json.dumps(entries))
     return folder
+
+
+class SparseArchive:
+    """An archive of any size with empty files, whose reads are counted; holds headers alone."""
+
+    def __init__(self, files: Iterable[tuple[str, int]]) -> None:
+        self.headers, self.requests, self.bytes, at = dict[int, bytes](), 0, 0, 0
+        for name, size in files:
+            member = tarfile.TarInfo(name)
+            member.size = size
+            self.headers[at] = member.tobuf()
+            at += BLOCK + size + -size % BLOCK
+        self.begins, self.size = list(self.headers), at + 10_240
+
+    def pread(self, length: int, offset: int) -> bytes:
+        data = bytearray(max(0, min(length, self.size - offset)))
+        self.requests, self.bytes = self.requests + 1, self.bytes + len(data)
+        end = offset + len(data)
+        for begin in self.begins[bisect_left(self.begins, offset - BLOCK) :]:
+            if begin >= end:
+                break
+            first, last = max(begin, offset), min(begin + BLOCK, end)
+            if first < last:
+                part = self.headers[begin][first - begin : last - begin]
+                data[first - offset : last - offset] = part
+        return bytes(data)
 
 
 def parameters(made: Path, root: str | Path, categories: bool = False) -> BuildParameters:
