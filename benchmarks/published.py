@@ -132,7 +132,8 @@ def index_of(objects: int, frames: int, frame: int) -> str:
         for name, data in members(f"{number:032x}", grid, frames, frame)
     ]
     file = SparseArchive(listed)
-    archive = Archive(Path("tree.tar"), "", file.size, wanted=wanted_members(PixieverseSource(Path())))
+    wanted = wanted_members(PixieverseSource(Path()))
+    archive = Archive(Path("tree.tar"), "", file.size, wanted=wanted)
     found = entries(ReadAhead(file, remote=True), file.size, needed=archive.may_hold)
     known = {entry.name for entry, _ in found if entry}
     needed = {name: size for name, size in listed if archive.is_wanted(name)}
