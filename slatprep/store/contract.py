@@ -20,7 +20,7 @@ from slatprep.store.layout import (
     ASSET_CHUNK,
     FIXED_SIZES,
     MERGED,
-    RECORD_ARRAY,
+    RECORDS,
     ArrayLayout,
 )
 
@@ -184,7 +184,7 @@ _LAYOUTS = {
     for layout in (
         *ARRAYS,
         *MERGED,
-        ArrayLayout(RECORD_ARRAY, "str", ("asset",), "", ""),
+        RECORDS,
         *(
             ArrayLayout(f"{GROUP}/{name}", dtype, ("file",), "", "")
             for name, dtype in (("name", "str"), ("size", "int64"), ("sha256", "str"))

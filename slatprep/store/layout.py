@@ -10,6 +10,7 @@ from __future__ import annotations
 from bisect import bisect_right
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 from slatprep.parameters import MAX_VOXEL_SHARD, StoreParameters
 from slatprep.records import BACKGROUND, RESOLUTION, UNANNOTATED
@@ -57,11 +58,46 @@ class ArrayLayout:
 
 _XYZ = ("x", "y", "z")
 
+_EMPTY: dict[str, float | bool | str] = {
+    "str": "",
+    "float64": NAN,
+    "float32": NAN,
+    "int64": 0,
+    "uint8": 0,
+    "bool": False,
+}
+"""What an array of a type has where nothing is written, if it does not say otherwise."""
+
+
+def _asset(
+    name: str, description: str, dtype: str = "float64", of: str = "", **more: Any
+) -> ArrayLayout:
+    """Return an array of ``asset/*``; `of` are its dimensions behind the first."""
+    dimensions = ("asset", *of.split())
+    return ArrayLayout(f"asset/{name}", dtype, dimensions, _EMPTY[dtype], description, **more)
+
+
+def _voxel(
+    name: str,
+    packing: str,
+    description: str,
+    dtype: str = "float32",
+    of: str = "",
+    fill_value: float | None = None,
+    unit: str = "",
+) -> ArrayLayout:
+    """Return an array of ``voxel/*``; `of` are its dimensions behind the first."""
+    empty = _EMPTY[dtype] if fill_value is None else fill_value
+    return ArrayLayout(
+        f"voxel/{name}", dtype, ("voxel", *of.split()), empty, description, unit, packing
+    )
+
+
 ARRAYS = (
-    ArrayLayout("asset/id", "str", ("asset",), "", "id of the row, ascending within a segment"),
-    ArrayLayout("asset/object_id", "str", ("asset",), "", "PixieVerse id of the object"),
-    ArrayLayout("asset/view", "str", ("asset",), "", "image or seed the SLAT was made from"),
-    ArrayLayout("asset/category", "str", ("asset",), "", "PixieVerse category, empty if unknown"),
+    _asset("id", "id of the row, ascending within a segment", dtype="str"),
+    _asset("object_id", "PixieVerse id of the object", dtype="str"),
+    _asset("view", "image or seed the SLAT was made from", dtype="str"),
+    _asset("category", "PixieVerse category, empty if unknown", dtype="str"),
     ArrayLayout(
         "asset/offset",
         "int64",
@@ -69,224 +105,110 @@ ARRAYS = (
         0,
         "asset a owns rows offset[a]:offset[a+1] of voxel/*",
     ),
-    ArrayLayout(
-        "asset/transform",
-        "float64",
-        ("asset", "row", "column"),
-        NAN,
+    _asset(
+        "transform",
         "PixieVerse frame to SLAT frame, both the unit cube [-0.5, 0.5]^3",
+        of="row column",
     ),
-    ArrayLayout("asset/engine", "str", ("asset",), "", "alignment engine"),
-    ArrayLayout("asset/model", "str", ("asset",), "", "rigid, similarity, affine or deformable"),
-    ArrayLayout("asset/search", "str", ("asset",), "", "starts that were needed"),
-    ArrayLayout(
-        "asset/fitness",
-        "float64",
-        ("asset",),
-        NAN,
-        "share of PixieVerse boundary voxels with a SLAT voxel within the radius",
-    ),
-    ArrayLayout("asset/inlier_rmse", "float64", ("asset",), NAN, "rms distance of those", "voxel"),
-    ArrayLayout(
-        "asset/fitness_backward",
-        "float64",
-        ("asset",),
-        NAN,
+    _asset("engine", "alignment engine", dtype="str"),
+    _asset("model", "rigid, similarity, affine or deformable", dtype="str"),
+    _asset("search", "starts that were needed", dtype="str"),
+    _asset("fitness", "share of PixieVerse boundary voxels with a SLAT voxel within the radius"),
+    _asset("inlier_rmse", "rms distance of those", unit="voxel"),
+    _asset(
+        "fitness_backward",
         "share of SLAT voxels with a PixieVerse boundary voxel within the radius",
     ),
-    ArrayLayout(
-        "asset/inlier_rmse_backward", "float64", ("asset",), NAN, "rms distance of those", "voxel"
-    ),
-    ArrayLayout("asset/overlap", "float64", ("asset",), NAN, "overlap of the two voxel surfaces"),
-    ArrayLayout(
-        "asset/margin", "float64", ("asset",), NAN, "score above the next distinct placement"
-    ),
-    ArrayLayout(
-        "asset/ambiguity",
-        "float64",
-        ("asset",),
-        NAN,
+    _asset("inlier_rmse_backward", "rms distance of those", unit="voxel"),
+    _asset("overlap", "overlap of the two voxel surfaces"),
+    _asset("margin", "score above the next distinct placement"),
+    _asset(
+        "ambiguity",
         "share of SLAT voxels whose class differs between placements that fit about as well",
     ),
-    ArrayLayout(
-        "asset/property_ambiguity",
-        "float64",
-        ("asset", "property"),
-        NAN,
+    _asset(
+        "property_ambiguity",
         "mean change of each normalised property between placements that fit about as well",
+        of="property",
     ),
-    ArrayLayout("asset/valid_share", "float64", ("asset",), NAN, "share of valid SLAT voxels"),
-    ArrayLayout(
-        "asset/unphysical",
-        "int64",
-        ("asset",),
-        0,
+    _asset("valid_share", "share of valid SLAT voxels"),
+    _asset(
+        "unphysical",
         "PixieVerse voxels left out, as no material has their properties",
+        dtype="int64",
     ),
-    ArrayLayout("asset/verdict", "str", ("asset",), "", "good, doubtful or failed"),
-    ArrayLayout(
-        "asset/confidence",
-        "float64",
-        ("asset",),
-        NAN,
-        "same_object times right_placement",
-    ),
-    ArrayLayout(
-        "asset/same_object",
-        "float64",
-        ("asset",),
-        NAN,
-        "calibrated probability that both sides show the same object",
-    ),
-    ArrayLayout(
-        "asset/right_placement",
-        "float64",
-        ("asset",),
-        NAN,
+    _asset("verdict", "good, doubtful or failed", dtype="str"),
+    _asset("confidence", "same_object times right_placement"),
+    _asset("same_object", "calibrated probability that both sides show the same object"),
+    _asset(
+        "right_placement",
         "calibrated probability that the placement is right if the object is the same",
     ),
-    ArrayLayout(
-        "asset/expected_accuracy",
-        "float64",
-        ("asset",),
-        NAN,
-        "share of right classes to be expected among valid voxels",
-    ),
-    ArrayLayout(
-        "asset/contradicted",
-        "bool",
-        ("asset",),
-        False,
+    _asset("expected_accuracy", "share of right classes to be expected among valid voxels"),
+    _asset(
+        "contradicted",
         "the latents contradict the labels, where latents were compared with them",
+        dtype="bool",
     ),
-    ArrayLayout(
-        "asset/merged",
-        "bool",
-        ("asset",),
-        False,
-        "labels are merged of several annotations",
-        internal=True,
-    ),
-    ArrayLayout(
-        "asset/key",
-        "uint8",
-        ("asset", "byte"),
-        0,
+    _asset("merged", "labels are merged of several annotations", dtype="bool", internal=True),
+    _asset(
+        "key",
         "what decides the row, as one hash: sources, parameters, libraries and code",
+        dtype="uint8",
+        of="byte",
         internal=True,
     ),
-    ArrayLayout(
-        "asset/record_sha256",
-        "uint8",
-        ("asset", "byte"),
-        0,
-        "SHA-256 of asset/record",
-        internal=True,
-    ),
-    ArrayLayout(
-        "asset/extent",
-        "float64",
-        ("asset", "property", "bound"),
-        NAN,
+    _asset("record_sha256", "SHA-256 of asset/record", dtype="uint8", of="byte", internal=True),
+    _asset(
+        "extent",
         "least and most of each property of its fields, log10 where the property is mapped so",
+        of="property bound",
         internal=True,
     ),
-    ArrayLayout(
-        "asset/clipped",
-        "int64",
-        ("asset", "property"),
-        0,
+    _asset(
+        "clipped",
         "values of voxel/properties outside the range",
+        dtype="int64",
+        of="property",
         internal=True,
     ),
-    ArrayLayout(
-        "asset/clipped_grid",
-        "int64",
-        ("asset", "property"),
-        0,
+    _asset(
+        "clipped_grid",
         "values of grid/properties outside the range",
+        dtype="int64",
+        of="property",
         internal=True,
     ),
-    ArrayLayout(
-        "asset/latent_mean",
-        "float64",
-        ("asset", "latent"),
-        NAN,
-        "mean of each channel of its latents",
-        internal=True,
-    ),
-    ArrayLayout(
-        "asset/latent_std",
-        "float64",
-        ("asset", "latent"),
-        NAN,
+    _asset("latent_mean", "mean of each channel of its latents", of="latent", internal=True),
+    _asset(
+        "latent_std",
         "standard deviation of each channel of its latents",
+        of="latent",
         internal=True,
     ),
-    ArrayLayout(
-        "voxel/coords",
-        "uint8",
-        ("voxel", "axis"),
-        0,
-        "SLAT coordinate, source order",
-        packing="columns",
-    ),
-    ArrayLayout(
-        "voxel/feats",
-        "float32",
-        ("voxel", "latent"),
-        0.0,
-        "SLAT latents, unchanged",
-        packing="exponents",
-    ),
-    ArrayLayout(
-        "voxel/properties",
-        "float32",
-        ("voxel", "property"),
-        NAN,
+    _voxel("coords", "columns", "SLAT coordinate, source order", dtype="uint8", of="axis"),
+    _voxel("feats", "exponents", "SLAT latents, unchanged", of="latent", fill_value=0.0),
+    _voxel(
+        "properties",
+        "repeats",
         "normalised properties in [-1, 1], NaN where not valid",
-        packing="repeats",
+        of="property",
     ),
-    ArrayLayout(
-        "voxel/material",
-        "uint8",
-        ("voxel",),
-        UNANNOTATED,
-        "class, 255 where not valid",
-        packing="repeats",
+    _voxel(
+        "material", "repeats", "class, 255 where not valid", dtype="uint8", fill_value=UNANNOTATED
     ),
-    ArrayLayout(
-        "voxel/valid",
-        "bool",
-        ("voxel",),
-        False,
-        "an annotation was found near enough",
-        packing="repeats",
-    ),
-    ArrayLayout(
-        "voxel/distance",
-        "float32",
-        ("voxel",),
-        NAN,
-        "distance to the annotation used",
-        "voxel",
-        packing="exponents",
-    ),
-    ArrayLayout(
-        "voxel/place",
-        "float32",
-        ("voxel", "axis"),
-        NAN,
+    _voxel("valid", "repeats", "an annotation was found near enough", dtype="bool"),
+    _voxel("distance", "exponents", "distance to the annotation used", unit="voxel"),
+    _voxel(
+        "place",
+        "exponents",
         "where it was looked up, in the PixieVerse frame's unit cube [-0.5, 0.5]^3",
-        packing="exponents",
+        of="axis",
     ),
-    ArrayLayout(
-        "voxel/confidence",
-        "float32",
-        ("voxel",),
-        NAN,
+    _voxel(
+        "confidence",
+        "exponents",
         "calibrated probability that the class is right, 0 where not valid",
-        packing="exponents",
     ),
     ArrayLayout(
         "grid/properties",
@@ -306,24 +228,22 @@ ARRAYS = (
 """Every array of any store."""
 
 MERGED = (
-    ArrayLayout(
-        "voxel/spread",
-        "float32",
-        ("voxel", "property"),
-        NAN,
+    _voxel(
+        "spread",
+        "exponents",
         "standard deviation of normalised properties over the annotations, NaN where not several",
-        packing="exponents",
+        of="property",
     ),
-    ArrayLayout(
-        "voxel/votes",
-        "float32",
-        ("voxel",),
-        NAN,
+    _voxel(
+        "votes",
+        "repeats",
         "share of the annotations that give the class, 0 where not valid, NaN where not several",
-        packing="repeats",
     ),
 )
 """Further arrays of a store in which labels of any asset are merged of several annotations."""
+
+
+RECORDS = ArrayLayout(RECORD_ARRAY, "str", ("asset",), "", "provenance of the row, as JSON")
 
 
 MERGED_COLUMNS = tuple(layout.name.removeprefix("voxel/") for layout in MERGED)

@@ -25,6 +25,7 @@ from slatprep.store.layout import (
     FIXED_SIZES,
     MERGED,
     RECORD_ARRAY,
+    RECORDS,
     RECORDS_IN_CHUNK,
     RECORDS_IN_SHARD,
     ArrayLayout,
@@ -97,10 +98,12 @@ def create_store(
         "asset": (ASSET_CHUNK, None),
         "voxel": (parameters.voxel_chunk, rows_per_shard(parameters, n_voxels)),
         "grid": (1, parameters.grid_assets_per_shard),
+        RECORD_ARRAY: (RECORDS_IN_CHUNK, RECORDS_IN_SHARD),
     }
-    for layout in arrays_with(merged):
+    for layout in (*arrays_with(merged), RECORDS):
         shape = tuple(sizes[dimension] for dimension in layout.dimensions)
-        chunk, shard = chunk_and_shard[layout.name.partition("/")[0]]
+        group = layout.name.partition("/")[0]
+        chunk, shard = chunk_and_shard.get(layout.name, chunk_and_shard[group])
         if shard is None:
             chunk = min(chunk, shape[0])
         attributes: dict[str, Any] = {"description": layout.description}
@@ -117,23 +120,6 @@ def create_store(
             dimension_names=layout.dimensions,
             attributes=attributes,
         )
-    _create_record_array(root, n_assets, parameters.compression_level)
-
-
-def _create_record_array(root: Any, n_assets: int, level: int) -> None:
-    from zarr.codecs import Crc32cCodec, ZstdCodec
-
-    root.create_array(
-        RECORD_ARRAY,
-        shape=(n_assets,),
-        dtype=str,
-        chunks=(RECORDS_IN_CHUNK,),
-        shards=(RECORDS_IN_SHARD,),
-        compressors=(ZstdCodec(level=level), Crc32cCodec()),
-        fill_value="",
-        dimension_names=("asset",),
-        attributes={"description": "provenance of the row, as JSON"},
-    )
 
 
 def _codecs(layout: ArrayLayout, level: int) -> dict[str, Any]:
