@@ -6,11 +6,9 @@ from __future__ import annotations
 def in_unicode(text: str) -> str:
     r"""Return a text in which whatever UTF-8 cannot hold is written out.
 
-    Names of files are bytes; those that are no UTF-8 come as lone surrogates,
-    which no record, store or terminal takes.
+    Names of files are bytes; those that are no UTF-8 come as lone surrogates, which no record,
+    store or terminal takes.
 
-    Examples
-    --------
     >>> print(in_unicode("a\udcff.npz"))
     a\udcff.npz
     """
@@ -20,8 +18,6 @@ def in_unicode(text: str) -> str:
 def amount(count: int, noun: str, plural: str = "") -> str:
     """Return a count and its noun, in the singular or the plural.
 
-    Examples
-    --------
     >>> amount(1, "voxel"), amount(2000, "voxel"), amount(0, "category", "categories")
     ('1 voxel', '2,000 voxels', '0 categories')
     """

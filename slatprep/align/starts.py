@@ -32,12 +32,8 @@ class Start:
 def euler_starts() -> tuple[Start, ...]:
     """Return the 64 starts: turns by 0, 90, 180 and 270 degrees about x, then y, then z.
 
-    Only 24 of them are different rotations; the others name, in `same_as`, the
-    first start that has the same one.
-
-    Notes
-    -----
-    SLAT-Phys, "Physics-to-SLAT Annotation Alignment".
+    Only 24 of them are different rotations; the others name, in `same_as`, the first start that has
+    the same one. SLAT-Phys, "Physics-to-SLAT Annotation Alignment".
     """
     cos, sin = (1, 0, -1, 0), (0, 1, 0, -1)
     starts: list[Start] = []
@@ -110,10 +106,8 @@ def search_starts(
 def so3_starts(count: int) -> NDArray[np.float64]:
     """Return `count` rotations (count, 3, 3) spread evenly over all orientations.
 
-    Notes
-    -----
-    Super-Fibonacci spirals on the unit quaternions: M. Alexa, "Super-Fibonacci
-    Spirals: Fast, Low-Discrepancy Sampling of SO(3)", CVPR 2022.
+    Super-Fibonacci spirals on the unit quaternions: M. Alexa, "Super-Fibonacci Spirals: Fast,
+    Low-Discrepancy Sampling of SO(3)", CVPR 2022.
     """
     from scipy.spatial.transform import Rotation
 

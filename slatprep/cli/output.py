@@ -162,13 +162,7 @@ class Output:
 
 
 def write_csv(file: Path, header: Sequence[str], rows: Iterable[Sequence[object]]) -> None:
-    """Write a table as CSV in which no text becomes a formula in a spreadsheet.
-
-    Raises
-    ------
-    StoreError
-        If the file cannot be written.
-    """
+    """Write a table as CSV in which no text becomes a formula in a spreadsheet."""
     import csv
 
     from slatprep.storage.atomic import staged, writing
@@ -199,8 +193,6 @@ def printable(text: str) -> str:
 
     Names and categories are not trusted. Line breaks and tabs are kept.
 
-    Examples
-    --------
     >>> print(printable("cup" + chr(27) + "[2J"))
     cup\u001b[2J
     """

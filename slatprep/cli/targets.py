@@ -19,22 +19,9 @@ class NewPath(click.Path):
 def require_apart(command: click.Command, given: Mapping[str, Any]) -> None:
     """Refuse a file or folder to write that is part of a store or of what a command reads.
 
-    A new file or folder below a folder that is read may be written. So may a folder below that of
-    a run, which holds predictions.
-
-    Parameters
-    ----------
-    command : click.Command
-        The command. What it writes are its parameters of the type `NewPath`.
-    given : mapping of str to object
-        The values of its parameters by name.
-
-    Raises
-    ------
-    ConfigError
-        If a path to write lies inside a store.
-    click.BadParameter
-        If it is one of the inputs, or is there already and lies in one, or is a pipe or device.
+    A command writes the parameters of the type `NewPath`; `given` are all values by name. A new
+    file or folder below a folder that is read may be written. So may a folder below that of a run,
+    which holds predictions.
     """
     written = {
         parameter.name: (parameter, Path(given[parameter.name]))

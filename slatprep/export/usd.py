@@ -47,10 +47,8 @@ _PITCH = 1.25
 def writer(store: Store, ids: Sequence[str], options: ExportOptions) -> Writer:
     """Return the writer of a USD file for each asset; see `slatprep.export.FORMATS`.
 
-    Raises
-    ------
-    ConfigError
-        If `options.materials` is less than the number of classes, or usd-core is not installed.
+    ConfigError if `options.materials` is less than the number of classes, or usd-core is not
+    installed.
     """
     least = len(YIELDING)
     if options.materials < least:

@@ -147,27 +147,9 @@ class TruthReport:
 def score_against_truth(
     store: Place, truth_dir: Path, progress: Progress | None = None
 ) -> TruthReport:
-    """Compare every asset of a store with its truth.
+    """Compare every asset of a store that has a truth in the folder with it.
 
-    Parameters
-    ----------
-    store : Place
-        A store of `slatprep build-store`; only its published layout is read.
-    truth_dir : Path
-        Folder of truth files; assets of the store without one are left out.
-    progress : callable, optional
-        Called with the assets compared and the assets in all.
-
-    Returns
-    -------
-    TruthReport
-
-    Raises
-    ------
-    StoreError
-        If the store cannot be opened.
-    InputError
-        If there is no truth in the folder, or a truth does not fit its asset.
+    InputError if there is no truth in the folder, or a truth does not fit its asset.
     """
     truths = {path.stem: path for path in sorted(truth_dir.glob("*.npz"))}
     if not truths:
@@ -270,29 +252,11 @@ def compare_with_truth(
 ) -> TruthScore:
     """Compare one asset's places and labels with its truth.
 
-    Parameters
-    ----------
-    asset_id : str
-        For the score's name.
-    truth : Truth
-        What `read_truth` gave.
-    centres, transform, material, valid : ndarray
-        Centres of the SLAT voxels (N, 3) in the SLAT frame, the estimated transform (4, 4),
-        and what was looked up at the voxels (N,).
-    annotated, annotated_material : ndarray
-        Annotated voxels (K, 3) of the PixieVerse frame and their classes (K,).
-    places : ndarray, shape (N, 3), optional
-        Where the voxels were looked up, in the PixieVerse frame's unit cube; by default
-        where the inverse of `transform` puts them.
-
-    Returns
-    -------
-    TruthScore
-
-    Raises
-    ------
-    InputError
-        If the truth does not have one class, or not one place, for each SLAT voxel.
+    `centres` (N, 3) of the SLAT voxels, the estimated `transform` (4, 4), and `material` and
+    `valid` (N,) are the asset's; `annotated` (K, 3) are voxels of the PixieVerse frame with their
+    classes (K,). Voxels were looked up at `places` (N, 3) in that frame's unit cube, by default
+    where the inverse of `transform` puts them. InputError if the truth does not have one class and
+    one place for each voxel.
     """
     from scipy.spatial import cKDTree
 
@@ -344,13 +308,7 @@ def _share(flags: NDArray[np.bool_]) -> float:
 
 
 def read_truth(path: Path) -> Truth:
-    """Read one asset's truth.
-
-    Raises
-    ------
-    InputError
-        If the file cannot be read, lacks something, or its numbers are no truth.
-    """
+    """Read one asset's truth; InputError if the file cannot be read, or its numbers are none."""
     try:
         data, _ = load_source(path, path.parent, "truth")
         arrays = npz_arrays(data, path, _TRUTH)

@@ -67,30 +67,11 @@ class VoxelField:
 
 
 def stored_field(store: Store, name: str | int, points: Points = "slat") -> VoxelField:
-    """Return the materials of an asset in a store.
+    """Return the materials of an asset, named as in `Store.match`: at least one voxel.
 
-    Parameters
-    ----------
-    store : Store
-        The store.
-    name : str or int
-        The asset, as in `Store.match`.
-    points : {"slat", "grid"}
-        The valid SLAT voxels, a surface, or the annotated voxels of the PixieVerse field, a
-        solid.
-
-    Returns
-    -------
-    VoxelField
-        At least one voxel.
-
-    Raises
-    ------
-    StoreError
-        If the store cannot be read, has no such asset, lacks one of the properties, or has
-        classes of its own.
-    ConfigError
-        If no voxel of the asset has a material.
+    Points are the valid SLAT voxels, a surface, or the annotated voxels of the PixieVerse field, a
+    solid. StoreError if the store lacks one of the properties, or has classes of its own;
+    ConfigError if no voxel of the asset has a material.
     """
     asset, columns = store.asset(name), store.columns_of(PROPERTY_COLUMNS)
     require_solver_classes(store)
@@ -112,29 +93,13 @@ def stored_field(store: Store, name: str | int, points: Points = "slat") -> Voxe
 
 
 def predicted_field(path: Path, normalization: Normalization | None) -> VoxelField:
-    """Read predicted materials.
+    """Read predicted materials; return the valid voxels, in the SLAT frame.
 
-    Parameters
-    ----------
-    path : Path
-        An npz with integer ``coords`` (N, 3) or (N, 4); integer ``material`` (N,), 0..6;
-        ``properties`` (N, 3) normalised, or ``properties_si`` (N, 3) in Pa, kg/m^3 and 1; and
-        optionally boolean ``valid`` (N,), and ``resolution``, the voxels along each axis where
-        these are not 64. `slatprep export --format npz` writes such files.
-    normalization : Normalization or None
-        The ranges of ``properties``; None if not known.
-
-    Returns
-    -------
-    VoxelField
-        The valid voxels, in the SLAT frame.
-
-    Raises
-    ------
-    InputError
-        If the file cannot be used.
-    ConfigError
-        If properties are normalised and no ranges are given.
+    The npz has integer ``coords`` (N, 3) or (N, 4); integer ``material`` (N,), 0..6; ``properties``
+    (N, 3) normalised by the given ranges, or ``properties_si`` (N, 3) in Pa, kg/m^3 and 1; and
+    optionally boolean ``valid`` (N,), and ``resolution``, the voxels along each axis where these
+    are not 64. `slatprep export --format npz` writes such files. InputError if the file cannot be
+    used, ConfigError if properties are normalised and no ranges are given.
     """
     data, _ = load_source(path, path.parent, "slat")
     arrays = npz_arrays(data, path, _SPECS)

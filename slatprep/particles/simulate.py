@@ -134,22 +134,11 @@ def _limits(mpm: Any) -> tuple[Any, ...]:
 
 
 def windward(positions: ArrayLike, wind: ArrayLike, spacing: float) -> NDArray[np.float64]:
-    """Return the area of each particle's free faces, projected on the plane across the wind.
+    """Return the area (N,) of each particle's free faces, projected on the plane across the wind.
 
-    Parameters
-    ----------
-    positions : array_like, shape (N, 3)
-        Particles on a cubic lattice.
-    wind : array_like, shape (3,)
-        Direction to which it blows; its length does not matter.
-    spacing : float
-        Spacing of the lattice.
-
-    Returns
-    -------
-    ndarray of float64, shape (N,)
-        In the square of the unit of `spacing`; 0 if no free face is on the upwind side, or
-        without wind.
+    Particles (N, 3) stand on a cubic lattice; the length of the wind's direction (3,) does not
+    matter. The area is in the square of the unit of `spacing`; 0 if no free face is on the upwind
+    side, or without wind.
     """
     rest, way = np.asarray(positions, dtype=np.float64), np.asarray(wind, dtype=np.float64)
     area = np.zeros(len(rest))
@@ -168,23 +157,11 @@ def windward(positions: ArrayLike, wind: ArrayLike, spacing: float) -> NDArray[n
 def strain(
     rest: ArrayLike, moved: ArrayLike, part: ArrayLike, spacing: float
 ) -> NDArray[np.float64]:
-    """Measure the strain around each particle; rigid motion does not count.
+    """Measure the strain (N,) around each particle; rigid motion does not count.
 
-    Parameters
-    ----------
-    rest, moved : array_like, shape (N, 3)
-        The particles before and after.
-    part : array_like of int, shape (N,)
-        The part of each particle; only neighbours of the same part count.
-    spacing : float
-        Spacing of the lattice at rest; the neighbours are the 26 particles around each.
-
-    Returns
-    -------
-    ndarray of float64, shape (N,)
-        Largest absolute principal value of the Green-Lagrange strain
-        (F^T F - I) / 2, where F is the least-squares fit to the neighbours' motion.
-        NaN if the neighbours do not span the space.
+    It is the largest absolute principal value of the Green-Lagrange strain (F^T F - I) / 2. F is
+    the least-squares fit to the motion, from positions `rest` to `moved` (N, 3), of the neighbours
+    of the same `part` (N,) among the 26 around. NaN if they do not span the space.
     """
     from scipy.spatial import cKDTree
 
@@ -205,22 +182,10 @@ def strain(
 
 
 def rigid_deviation(rest: ArrayLike, moved: ArrayLike) -> float:
-    """Return the root mean square distance of points from their best rigid motion.
+    """Return the rms distance of points (N, 3), N >= 3, from their best rigid motion.
 
-    Parameters
-    ----------
-    rest, moved : array_like, shape (N, 3)
-        The particles of one part before and after, N >= 3.
-
-    Returns
-    -------
-    float
-        In the unit of the positions; 0 for a rigid motion.
-
-    Notes
-    -----
-    Kabsch, "A solution for the best rotation to relate two sets of vectors",
-    Acta Crystallographica A32 (1976).
+    Kabsch, "A solution for the best rotation to relate two sets of vectors", Acta Crystallographica
+    A32 (1976).
     """
     from scipy.spatial.transform import Rotation
 

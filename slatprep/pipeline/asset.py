@@ -63,27 +63,10 @@ _REASON, _TRACEBACK = 4_000, 100_000
 def process_asset(
     pair: AssetPair, parameters: BuildParameters, known: AssetRecord | None = None
 ) -> Finished:
-    """Take one asset from its two source files to annotated SLAT voxels.
+    """Take one asset from its two source files to annotated SLAT voxels, in SI units.
 
-    Parameters
-    ----------
-    pair : AssetPair
-        Where its files lie.
-    parameters : BuildParameters
-        How to align and to look up.
-    known : AssetRecord, optional
-        What an earlier build found with the same sources, parameters and code;
-        its alignment and judgement are taken over.
-
-    Returns
-    -------
-    Finished
-        With properties in SI units: ranges come from the whole dataset.
-
-    Raises
-    ------
-    InputError
-        If a source cannot be used or a partner is missing.
+    The alignment and judgement of `known` are taken over, an earlier build's record of the same
+    sources, parameters and code. InputError if a source cannot be used or a partner is missing.
     """
     if pair.others:
         return process_several(pair, parameters, known.merged if known else ())

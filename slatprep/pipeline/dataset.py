@@ -150,18 +150,7 @@ def plan_build(
     rehash: bool = False,
     progress: Progress | None = None,
 ) -> BuildPlan:
-    """Say what `build_store` would do with each asset, and why; nothing is written.
-
-    Parameters
-    ----------
-    parameters, out, jobs, fresh, rehash, progress
-        As for `build_store`.
-
-    Returns
-    -------
-    BuildPlan
-        An entry an asset.
-    """
+    """Say what `build_store` would do with each asset, and why; nothing is written."""
     place, declared = Destination(out), Wanted.of(parameters).declared
     spool = spool_of(place.store, private_disks=not isinstance(jobs, int))
     if fresh:
@@ -185,27 +174,10 @@ def align_pairs(
 ) -> BuildSummary:
     """Align all assets of a dataset and write their records, without a store.
 
-    Parameters
-    ----------
-    parameters : BuildParameters
-        Sources and methods.
-    out : str or Path
-        JSON Lines file of asset records, sorted by asset id, in the form of a
-        build's ``assets.jsonl``; of assets that cannot be used too.
-    jobs, strict, assets_per_job, progress, note
-        As for `build_store`.
-
-    Returns
-    -------
-    BuildSummary
-        What went in and what did not.
-
-    Raises
-    ------
-    InputError
-        With `strict`, for the first asset that cannot be used.
-    ConfigError
-        If `out` lies in a store, or is a file of something else than records.
+    `out` is a JSON Lines file in the form of a build's ``assets.jsonl``, sorted by asset id, with
+    the assets that cannot be used too. Other parameters are as for `build_store`. InputError with
+    `strict`, for the first asset that cannot be used; ConfigError if `out` lies in a store, or is a
+    file of something else than records.
     """
     begin = time.perf_counter()
     require_records_file(Path(out))
