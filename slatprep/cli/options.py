@@ -66,15 +66,8 @@ class PlaceType(click.Path):
 class ChoiceOf(_Choice):
     """A choice of words from a module, which is imported when the words are needed.
 
-    ``slatprep --help`` imports every command, and must not import numpy with them.
-
-    Parameters
-    ----------
-    name : str
-        Name of an enum, a Literal, a mapping or a sequence of words, as
-        ``package.module:NAME``.
-    *others : str
-        More words.
+    ``package.module:NAME`` is an enum, a Literal, a mapping or a sequence of words; `others` are
+    more. ``slatprep --help`` imports every command, and must not import numpy with them.
     """
 
     def __init__(self, name: str, *others: str) -> None:

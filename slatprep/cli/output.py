@@ -53,14 +53,8 @@ _LEAST_DONE = 2
 class Output:
     """Prints the results of one command in the form that was asked for.
 
-    Parameters
-    ----------
-    as_json : bool
-        One JSON document on standard output instead of tables.
-    verbosity : int
-        -1 prints only errors and results, 1 prints more details.
-    command : str
-        Name of the command in JSON documents.
+    With `as_json`, that is one JSON document on standard output instead of tables. `verbosity` -1
+    prints only errors and results, 1 prints more details.
     """
 
     def __init__(self, as_json: bool = False, verbosity: int = 0, command: str = "") -> None:

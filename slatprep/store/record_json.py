@@ -24,15 +24,7 @@ _FAULTS = 64
 
 
 class RecordError(StoreError):
-    """A record that cannot be read.
-
-    Parameters
-    ----------
-    where : str
-        The file, and the line or row in it.
-    faults : tuple of str
-        What is wrong, each with its place in the record and the value there.
-    """
+    """A record that cannot be read: `where` it lies, and its `faults`, each with place and value."""
 
     def __init__(self, where: str, faults: tuple[str, ...]) -> None:
         super().__init__(

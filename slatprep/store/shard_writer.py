@@ -35,21 +35,9 @@ class Written(NamedTuple):
 
 
 class ShardWriter:
-    """Writes the rows of one shard of one array, in order.
+    """Writes the rows of one shard of one array, in order, from row `start` of the array on.
 
-    Parameters
-    ----------
-    store : Place
-        The store, with the array created.
-    name : str
-        Name of the array, such as ``voxel/feats``.
-    start : int
-        Its first row.
-
-    Attributes
-    ----------
-    file : str
-        Name of the shard's file below the store.
+    `file` is the name of the shard's file below the store, in which the array has been created.
     """
 
     def __init__(self, store: Place, name: str, start: int) -> None:
