@@ -51,27 +51,11 @@ _HEAD_BYTES = 4096
 
 
 class Destination:
-    """Where a build goes: a folder that is replaced, or a new version on an object store.
+    """Where a store and its records go; `store` is where it really lies, behind a link.
 
-    Parameters
-    ----------
-    out : str or Place
-        The store, as its user names it.
-    manifests : str or Path, optional
-        Folder of its records, if not beside it.
-
-    Attributes
-    ----------
-    store : Place
-        Where the store really lies: what a link points to is replaced, not the link.
-
-    Raises
-    ------
-    StoreError
-        If there is something other than a store, or the folder of records holds
-        files of other origin or the records of another store.
-    ConfigError
-        If the folder of records lies in another store.
+    `out` is the store as its user names it, `manifests` the folder of its records, if not beside
+    it. StoreError if there is something other than a store, or the folder holds files of other
+    origin or the records of another store; ConfigError if it lies in another store.
     """
 
     def __init__(self, out: str | Place, manifests: str | Place | None = None) -> None:

@@ -24,7 +24,7 @@ _FAULTS = 64
 
 
 class RecordError(StoreError):
-    """A record that cannot be read: `where` it lies, and its `faults`, each with place and value."""
+    """A record that cannot be read: where it lies, and its faults, each with place and value."""
 
     def __init__(self, where: str, faults: tuple[str, ...]) -> None:
         super().__init__(
