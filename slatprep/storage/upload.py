@@ -14,11 +14,12 @@ name is then new.
 from __future__ import annotations
 
 import hashlib
+import re
 import warnings
-from collections.abc import Container, Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from datetime import UTC, datetime
-from math import inf
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +27,7 @@ from slatprep.errors import StoreError
 from slatprep.storage.faults import reached
 from slatprep.storage.files import file_digest, local_files
 from slatprep.storage.remote import (
+    PART_BYTES,
     RemotePlace,
     connected,
     copy_objects,
@@ -48,6 +50,9 @@ from slatprep.storage.versions import (
 
 # A small file is held in memory whole while it is uploaded.
 _SMALL_BYTES = 8 * 2**20
+
+_MD5 = re.compile(r"[0-9a-f]{32}(-[0-9]+)?")
+"""S3's tag of an object; after an upload in parts it has their number."""
 
 
 @dataclass(frozen=True)
@@ -228,18 +233,21 @@ def upload_store(new: Path, before: PublishedState, staged: Staged | None = None
     upload = Upload(before, pointer)
     try:
         there = list_objects(upload.version)
-        # An upload may have left some already: a version's name implies its content, and a server
-        # keeps no object that differs from the checksum its client sent.
-        missing = sorted(name for name in sizes if there.get(name, {}).get("size") != sizes[name])
-        put_objects(new, upload.version, [n for n in missing if files.get(n, inf) <= _SMALL_BYTES])
-        large = [name for name in missing if files.get(name, 0) > _SMALL_BYTES]
+        missing = {name for name in files if not _is_same(there.get(name), new / name)}
+        small = [name for name in sorted(missing) if files[name] <= _SMALL_BYTES]
+        large = [name for name in sorted(missing) if files[name] > _SMALL_BYTES]
+        put_objects(new, upload.version, small)
         put_objects(new, upload.version, large, at_once=1)
         if staged is not None and staged.before is not None:
-            others = [name for name in missing if name in staged.copied]
-            copy_objects(staged.before, upload.version, others)
+            # An upload may have left it already: a version's name implies its content.
+            others = [n for n in staged.copied if there.get(n, {}).get("size") != sizes[n]]
+            copy_objects(staged.before, upload.version, sorted(others))
         there = list_objects(upload.version)
         for name, size in sizes.items():
-            if there.get(name, {}).get("size") != size:
+            arrived = there.get(name, {}).get("size") == size
+            if arrived and name in missing and _is_tagged_otherwise(there[name], new / name):
+                arrived = file_digest(upload.version / name) == digests[name]
+            if not arrived:
                 raise StoreError(
                     f"{upload.version / name}: is not there as it was uploaded; nothing was "
                     "replaced. If another build has just replaced the store, run again"
@@ -256,13 +264,40 @@ def _remove_version(version: RemotePlace) -> None:
         raise StoreError(_refused(version.parent.parent, error)) from None
 
 
+def _is_same(entry: Mapping[str, Any] | None, file: Path) -> bool:
+    """Whether an object surely equals a file: S3 tags most objects by their MD5."""
+    if entry is None or entry["size"] != file.stat().st_size:
+        return False
+    return bool(_tag_in(entry)) and not _is_tagged_otherwise(entry, file)
+
+
+def _is_tagged_otherwise(entry: Mapping[str, Any], file: Path) -> bool:
+    """Whether an object's tag looks like an MD5 and is not the file's.
+
+    The object may equal the file even so: where S3 encrypts, a tag is something else.
+    """
+    tag = _tag_in(entry)
+    with file.open("rb") as content:
+        if "-" not in tag:
+            return tag not in ("", hashlib.file_digest(content, "md5").hexdigest())
+        # Of several parts: the MD5 of theirs.
+        parts = [hashlib.md5(part) for part in iter(partial(content.read, PART_BYTES), b"")]
+    whole = hashlib.md5(b"".join(part.digest() for part in parts))
+    return tag != f"{whole.hexdigest()}-{len(parts)}"
+
+
+def _tag_in(entry: Mapping[str, Any]) -> str:
+    tag = str(entry.get("ETag", "")).strip('"')
+    return tag if _MD5.fullmatch(tag) else ""
+
+
 def _is_ours(name: str) -> bool:
     """Whether an object below a store is part of a version, its records or the spool."""
     kind, _, rest = name.partition("/")
     return _is_of_version(name) or (kind == SPOOL and is_spooled(rest))
 
 
-def _is_of_version(name: str, but: Container[str] = ()) -> bool:
+def _is_of_version(name: str, but: Iterable[str] = ()) -> bool:
     """Whether an object below a store is part of a version or its records."""
     kind, _, rest = name.partition("/")
     version = rest.partition("/")[0]
