@@ -96,22 +96,22 @@ MEASUREMENTS = (
     ),
     Measurement(
         "cluster", "What a Dask cluster costs beside local processes",
-        "cluster", "python benchmarks/cluster_cost.py {folder}/demo/dataset.toml --workers 2",
+        "cluster", "python benchmarks/cluster.py cost {folder}/demo/dataset.toml --workers 2",
         (70, 0, 900), (6, 0, 240), (DEMO,),
     ),
     Measurement(
         "cluster-traffic", "What passes through the command's machine when a cluster writes to S3",
-        "cluster", "python benchmarks/cluster_traffic.py {folder}/demo/dataset.toml --workers 2",
+        "cluster", "python benchmarks/cluster.py traffic {folder}/demo/dataset.toml --workers 2",
         (60, 0, 900), (4, 0, 240), (DEMO,),
     ),
     Measurement(
         "empty-tasks", "How many tasks a second one scheduler hands out",
-        "cluster", "python benchmarks/cluster_cost.py --empty {size} --workers 2",
+        "cluster", "python benchmarks/cluster.py cost --empty {size} --workers 2",
         (0, 100_000, 300), (0, 2_000, 120),
     ),
     Measurement(
         "remote", "Reading a store on an object store",
-        "remote", "python benchmarks/remote_read.py {folder}/demo.zarr --assets {size}",
+        "remote", "python benchmarks/remote.py steps {folder}/demo.zarr --assets {size}",
         (60, 50, 600), (6, 5, 180), (DEMO, STORE),
     ),
     Measurement(
@@ -121,7 +121,7 @@ MEASUREMENTS = (
     ),
     Measurement(
         "remote-ways", "Reading whole assets from an object store, by several ways",
-        "remote", "python benchmarks/remote_ways.py {folder}/demo.zarr --assets {size}",
+        "remote", "python benchmarks/remote.py ways {folder}/demo.zarr --assets {size}",
         (60, 60, 900), (6, 5, 240), (DEMO, STORE),
     ),
     Measurement(
@@ -136,7 +136,7 @@ MEASUREMENTS = (
     ),
     Measurement(
         "lookup", "Which way of looking labels up is right most often",
-        "design/alignment", "python benchmarks/lookup.py {folder}/demo",
+        "design/alignment", "python benchmarks/labels.py lookup {folder}/demo",
         (84, 0, 900), (6, 0, 120), (DEMO,),
     ),
     Measurement(
@@ -146,7 +146,7 @@ MEASUREMENTS = (
     ),
     Measurement(
         "witness", "What latents settle",
-        "design/alignment", "python benchmarks/witness.py {folder}/demo",
+        "design/alignment", "python benchmarks/labels.py witness {folder}/demo",
         (96, 0, 1800), (8, 0, 240), (MATERIAL,),
     ),
 )  # fmt: skip

@@ -1,18 +1,25 @@
-"""Reading whole assets in shuffled order, by slatprep and by what one would do without it.
+"""Reading from an object store: in place or from a copy, and by what one would do otherwise.
 
-    python benchmarks/remote_ways.py STORE [--latency 0.02] [--assets 60]
+    python benchmarks/remote.py steps STORE [--latency 0.03] [--assets 50]
+    python benchmarks/remote.py ways STORE [--latency 0.02] [--assets 60]
 
-From this machine's disk, as the system remembers it, and from S3: a server on loopback answers
-requests for objects as S3 does, each after the latency; nothing limits the bandwidth. Every way
-reads coords, feats and properties of the same assets in the same shuffled order, from one, two and
-four processes at a time, each with its part of them; WebDataset, which reads its shards from end
-to end, in the order that it shuffles itself. Prints milliseconds an asset and process, best of the
-repeats, after one asset that opens what has to be opened, and requests an asset.
+``steps`` uploads a local store to moto's server on loopback, which stands in for S3: each request
+is made to wait as long as one to S3 does, and nothing limits the bandwidth. Prints seconds to
+publish, to open, to read an asset's coords, feats and properties in shuffled order, and to copy,
+and the requests each takes.
+
+``ways`` reads from this machine's disk, as the system remembers it, and from S3: a server on
+loopback answers requests for objects as S3 does, each after the latency. Every way reads coords,
+feats and properties of the same assets in the same shuffled order, from one, two and four processes
+at a time, each with its part of them; WebDataset, which reads its shards from end to end, in the
+order that it shuffles itself. Prints milliseconds an asset and process, best of the repeats, after
+one asset that opens what has to be opened, and requests an asset.
 """
 
 from __future__ import annotations
 
 import argparse
+import asyncio
 import hashlib
 import io
 import json
@@ -30,13 +37,72 @@ from pathlib import Path
 from typing import Any
 
 import checkout
+import fsspec
 import numpy as np
 import reading as local
 from reading import write_forms
+from s3fs.core import S3FileSystem
 from support import object_store
 
-from slatprep.store import open_store
+from slatprep.storage.place import place_of
+from slatprep.storage.upload import published_state, upload_store
+from slatprep.store import Store, open_store
 from slatprep.store.reader import TRAINING_COLUMNS
+
+URL = "s3://bench/demo.zarr"
+
+requests: list[str] = []
+
+
+@contextmanager
+def server(latency: float) -> Iterator[None]:
+    with tempfile.TemporaryDirectory() as cache, object_store.running() as address:
+        os.environ |= {**object_store.environment(address), "SLATPREP_CACHE": cache}
+        fsspec.filesystem("s3").mkdir("bench")
+        call = S3FileSystem._call_s3
+
+        async def later(filesystem: Any, method: str, *args: Any, **options: Any) -> Any:
+            requests.append(method)
+            await asyncio.sleep(latency)
+            return await call(filesystem, method, *args, **options)
+
+        S3FileSystem._call_s3 = later
+        yield
+
+
+def report(what: str, step: Callable[[], Any], times: int = 1) -> Any:
+    requests.clear()
+    begin = time.perf_counter()
+    result = step()
+    seconds = (time.perf_counter() - begin) / times
+    print(f"| {what} | {seconds:.4f} | {len(requests) / times:.1f} |")
+    return result
+
+
+def steps(arguments: argparse.Namespace) -> None:
+    local = open_store(arguments.store)
+    order = np.random.default_rng(0).permutation(len(local))[: arguments.assets].tolist()
+    size = sum(path.stat().st_size for path in arguments.store.rglob("*") if path.is_file())
+    print(f"{len(local)} assets, {size / 1e6:.1f} MB; {1e3 * arguments.latency:.0f} ms a request\n")
+    print("| step | s | requests |\n| --- | --- | --- |")
+
+    def read(store: Store) -> None:
+        for index in order:
+            store.read(index)
+
+    def publish() -> None:
+        upload_store(arguments.store, published_state(place_of(URL))).publish()  # type: ignore[arg-type]
+
+    with server(arguments.latency):
+        report("publish", publish)
+        store = report("open", lambda: open_store(URL))
+        report("first asset", lambda: store.read(order[0]))
+        report("an asset, where it lies", lambda: read(store), len(order))
+        copy = report("copy", lambda: open_store(URL, copy=True))
+        report("open the copy", lambda: open_store(URL, copy=True))
+        report("an asset, from the copy", lambda: read(copy), len(order))
+        report("an asset, from the local store", lambda: read(local), len(order))
+
 
 SERVER = """
 import asyncio, pathlib, sys
@@ -192,14 +258,7 @@ def opened(way: str, address: str, assets: int) -> Reader:
     return next(one for one in local.WAYS if one.name == way).open(Path(address))
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("store", type=Path)
-    parser.add_argument("--latency", type=float, default=0.02)
-    parser.add_argument("--assets", type=int, default=60)
-    parser.add_argument("--repeats", type=int, default=3)
-    parser.add_argument("--processes", type=int, nargs="+", default=[1, 2, 4])
-    arguments = parser.parse_args()
+def ways(arguments: argparse.Namespace) -> None:
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         assets = min(arguments.assets, len(open_store(arguments.store)))
@@ -214,9 +273,9 @@ def main() -> None:
             for way in (*WAYS, WEBDATASET):
                 before = asked(address)
                 check(way, address, arguments.store, assets)
-                requests = round((asked(address) - before) / assets, 1)
+                number = round((asked(address) - before) / assets, 1)
                 measured = measure(way, address, arguments, assets)
-                told = {"from": "S3", "way": way, **measured, "requests an asset": requests}
+                told = {"from": "S3", "way": way, **measured, "requests an asset": number}
                 print(json.dumps(told), flush=True)
 
 
@@ -286,6 +345,21 @@ def work(way: str, address: str, order: list[int], assets: int, start: Any) -> N
     for row in order:
         read(row)
     os._exit(0)  # What a way tears down is not reading.
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    questions = parser.add_subparsers(required=True)
+    for run, latency, assets in ((steps, 0.03, 50), (ways, 0.02, 60)):
+        question = questions.add_parser(run.__name__)
+        question.set_defaults(run=run)
+        question.add_argument("store", type=Path)
+        question.add_argument("--latency", type=float, default=latency)
+        question.add_argument("--assets", type=int, default=assets)
+    question.add_argument("--repeats", type=int, default=3)
+    question.add_argument("--processes", type=int, nargs="+", default=[1, 2, 4])
+    arguments = parser.parse_args()
+    arguments.run(arguments)
 
 
 assert checkout.ROOT  # Importing it made the tests' server known.
