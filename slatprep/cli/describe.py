@@ -51,7 +51,8 @@ def describe(
     missing = [f"--{name.replace('_', '-')}" for name in _ASKED_FOR if not getattr(stated, name)]
     if missing:
         output.note(f"catalogues also ask for {', '.join(missing)}")
-    document = croissant.describe(open_store(store), location=location.rstrip("/"), **vars(stated))
+    told = croissant.Stated(**vars(stated))
+    document = croissant.describe(open_store(store), told, location.rstrip("/"))
     text = croissant.to_json(document)
     if out is None:
         say(text, nl=False)

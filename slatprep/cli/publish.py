@@ -46,7 +46,7 @@ def publish(
     slatprep publish data/demo.zarr --out hub --data webdataset --name "My demo"
     """
     from slatprep.errors import ConfigError
-    from slatprep.export.card import Stated
+    from slatprep.export.croissant import Stated
     from slatprep.export.publish import publish_store
     from slatprep.store import open_store
 

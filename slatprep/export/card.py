@@ -6,13 +6,12 @@ import html
 import json
 from collections import Counter
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from slatprep.export.croissant import DESCRIPTION
+from slatprep.export.croissant import DESCRIPTION, Stated
 from slatprep.store import Store
 
 _SIZES = ((1_000, "n<1K"), (10_000, "1K<n<10K"), (100_000, "10K<n<100K"),
@@ -41,35 +40,6 @@ for sample in load_dataset("OWNER/NAME", split="train", streaming=True):
 ```
 
 Each sample is an asset: `json` describes it, `npz` holds its arrays."""
-
-
-@dataclass(frozen=True)
-class Stated:
-    """Metadata of a dataset that its store does not hold; empty if not known.
-
-    Attributes
-    ----------
-    name, url, cite_as, version : str
-        Name, home page, citation, version.
-    license : str
-        An SPDX identifier, such as ``CC-BY-4.0``, or the URL of a licence.
-    date_published : str
-        Year, month and day, as ``2026-01-31``.
-    """
-
-    name: str = ""
-    license: str = ""
-    url: str = ""
-    cite_as: str = ""
-    version: str = "1.0.0"
-    date_published: str = ""
-
-    @property
-    def license_url(self) -> str:
-        """The URL of the licence."""
-        if not self.license or "://" in self.license:
-            return self.license
-        return f"https://spdx.org/licenses/{self.license}"
 
 
 def card_of(

@@ -11,6 +11,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
 from typing import Any
 
 from slatprep.errors import StoreError
@@ -52,38 +53,56 @@ DESCRIPTION = (
 )
 
 
-def describe(
-    store: Store,
-    *,
-    location: str = "",
-    name: str = "",
-    description: str = DESCRIPTION,
-    license: str = "",
-    url: str = "",
-    cite_as: str = "",
-    version: str = "1.0.0",
-    date_published: str = "",
-) -> dict[str, Any]:
+@dataclass(frozen=True)
+class Stated:
+    """Metadata of a dataset that its store does not hold; empty if not known.
+
+    Attributes
+    ----------
+    name, url, cite_as, version : str
+        Name, home page, citation, version.
+    license : str
+        An SPDX identifier, such as ``CC-BY-4.0``, or the URL of a licence.
+    date_published : str
+        Year, month and day, as ``2026-01-31``.
+    """
+
+    name: str = ""
+    license: str = ""
+    url: str = ""
+    cite_as: str = ""
+    version: str = "1.0.0"
+    date_published: str = ""
+
+    @property
+    def license_url(self) -> str:
+        """The URL of the licence."""
+        if not self.license or "://" in self.license:
+            return self.license
+        return f"https://spdx.org/licenses/{self.license}"
+
+
+def describe(store: Store, stated: Stated | None = None, location: str = "") -> dict[str, Any]:
     """Describe a store as a Croissant dataset: JSON-LD, JSON-ready, the same for the same store.
 
-    `location` is the path or URL of the store for readers; by default its name. The others are
-    metadata that the store does not hold; Croissant's validator warns of those left empty.
+    `location` is the path or URL of the store for readers; by default its name. Croissant's
+    validator warns of what `stated` leaves empty.
     """
-    location = location or store.name
-    stated = {
-        "description": description,
-        "license": license,
-        "url": url,
-        "citeAs": cite_as,
-        "version": version,
-        "datePublished": date_published,
+    location, stated = location or store.name, stated or Stated()
+    more = {
+        "description": DESCRIPTION,
+        "license": stated.license,
+        "url": stated.url,
+        "citeAs": stated.cite_as,
+        "version": stated.version,
+        "datePublished": stated.date_published,
     }
     return {
         "@context": _CONTEXT,
         "@type": "sc:Dataset",
         "conformsTo": CONFORMS_TO,
-        "name": name or store.name.removesuffix(".zarr"),
-        **{key: value for key, value in stated.items() if value},
+        "name": stated.name or store.name.removesuffix(".zarr"),
+        **{key: value for key, value in more.items() if value},
         "keywords": ["3D", "physics", "material properties", "structured latents", "Zarr"],
         "distribution": _distribution(store, location),
         "recordSet": [_classes(store), _properties(store), _assets(store)],

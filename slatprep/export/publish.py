@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
 from slatprep.errors import ConfigError, StoreError
 from slatprep.export import croissant, export_store, target
-from slatprep.export.card import Stated, card_of
+from slatprep.export.card import card_of
+from slatprep.export.croissant import Stated
 from slatprep.records import USABLE, Place
 from slatprep.storage.files import file_digest, local_files
 from slatprep.storage.place import place_of, storage_of
@@ -66,16 +67,8 @@ def publish_store(
             where = opened.name
             _copy(opened, local, folder / where)
             # For shards, hubs generate a description themselves.
-            document = croissant.describe(
-                opened,
-                location=where,
-                name=stated.name,
-                license=stated.license_url,
-                url=stated.url,
-                cite_as=stated.cite_as,
-                version=stated.version,
-                date_published=stated.date_published,
-            )
+            described = replace(stated, license=stated.license_url)
+            document = croissant.describe(opened, described, where)
             (folder / DESCRIPTION).write_text(croissant.to_json(document), encoding="utf-8")
         else:
             where = f"{SHARDS}/*.tar"

@@ -153,31 +153,32 @@ def check_alignment(store: Store, name: str | int) -> AlignmentCheck:
     alignment = StoredRecords(store).read(asset.index).alignment
     quality = measure_quality(asset.field, asset.latents, asset.transform, radius, alignment.ground)
     columns = asset.columns
-    ambiguity, margin = float(columns["ambiguity"]), float(columns["margin"])
-    confidence, expected = float(columns["confidence"]), float(columns["expected_accuracy"])
     same_fit = all(
         abs(getattr(quality, name) - float(columns[name])) <= QUALITY_TOLERANCE for name in _QUALITY
     )
     verdict, reasons = verdict_of(
         quality,
         valid_share,
-        ambiguity,
+        float(columns["ambiguity"]),
         len(alignment.open_placements),
         # The probabilities were computed for the stored fit and hold for no other.
         same_object=float(columns["same_object"]) if same_fit else math.nan,
         right_placement=float(columns["right_placement"]) if same_fit else math.nan,
-        expected_accuracy=expected,
+        expected_accuracy=float(columns["expected_accuracy"]),
         contradicted=bool(columns["contradicted"]),
         mirrored=mirror_gain_of(alignment),
     )
+
+    def stored(name: str) -> Figure:
+        return Figure(name, float(columns[name]), float(columns[name]), 0)
+
     figures = [
         Figure(name, getattr(quality, name), float(columns[name]), QUALITY_TOLERANCE)
         for name in _QUALITY
     ]
     figures += [
         Figure("valid_share", valid_share, float(columns["valid_share"]), QUALITY_TOLERANCE),
-        Figure("ambiguity", ambiguity, ambiguity, 0),
-        Figure("margin", margin, margin, 0),
+        *map(stored, ("ambiguity", "margin")),
         Figure("voxels with another valid", differs["voxel/valid"].sum(), 0, 0),
         Figure("voxels with another material", differs["voxel/material"].sum(), 0, 0),
         *(
@@ -190,10 +191,7 @@ def check_alignment(store: Store, name: str | int) -> AlignmentCheck:
             for name, array in (("property", "voxel/properties"), ("distance", "voxel/distance"))
         ),
     ]
-    figures.append(Figure("confidence", confidence, confidence, 0))
-    for name in ("same_object", "right_placement"):
-        figures.append(Figure(name, float(columns[name]), float(columns[name]), 0))
-    figures.append(Figure("expected_accuracy", expected, expected, 0))
+    figures += map(stored, ("confidence", "same_object", "right_placement", "expected_accuracy"))
     if asset.merged:
         means = [("votes for its class", asset.votes[asset.valid])]
         spreads = zip(store.about.property_columns, asset.spread.T, strict=True)

@@ -43,6 +43,11 @@ class Crew:
         """Return who works on so many assets."""
         return at_most(assets // self.assets_per_job, self.jobs)
 
+    def tell(self, line: str) -> None:
+        """Give a line for the user to whoever listens."""
+        if self.note:
+            self.note(line)
+
 
 def finish(
     pairs: Sequence[AssetPair],

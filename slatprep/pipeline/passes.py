@@ -9,7 +9,7 @@ again, with these passes or without.
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import replace
 
 from slatprep.align.consensus import find_consensus, is_common, settle, turn_if_likelier
@@ -29,10 +29,11 @@ from slatprep.judge.witness import (
     weigh,
 )
 from slatprep.parameters import BuildParameters
+from slatprep.pipeline.finish import Crew
+from slatprep.pipeline.plan import BuildContext
 from slatprep.pipeline.rows import Row
 from slatprep.pipeline.spool import Spool
 from slatprep.records import (
-    BACKGROUND,
     Alignment,
     Annotation,
     Consensus,
@@ -45,20 +46,19 @@ from slatprep.records import (
 from slatprep.sample import sample
 from slatprep.store.record import AssetRecord, FailedRecord, FirstPass
 from slatprep.store.record_json import to_json
-from slatprep.workers.local import Jobs, run_unordered
+from slatprep.workers.local import run_unordered
 
 
-def apply_passes(
-    rows: Sequence[Row],
-    spool: Spool,
-    parameters: BuildParameters,
-    jobs: Jobs,
-    note: Callable[[str], None] | None = None,
-    labels: int = BACKGROUND,
-) -> list[Row]:
-    """Settle ties by the consensus, then by the latents, as far as parameters ask for it."""
-    settled = apply_consensus(rows, spool, parameters, jobs, note)
-    return apply_witness(settled, spool, parameters, jobs, note, labels)
+def apply_passes(rows: list[Row], context: BuildContext, crew: Crew, labels: int) -> list[Row]:
+    """Settle ties by the consensus, then by the latents, as far as parameters ask for it.
+
+    `labels` is the number of classes that a voxel may have.
+    """
+    if context.parameters.consensus.settle:
+        rows = apply_consensus(rows, context, crew)
+    if context.parameters.witness.settle:
+        rows = apply_witness(rows, context, crew, labels)
+    return rows
 
 
 class Reopened:
@@ -102,41 +102,33 @@ class Reopened:
         return replace(put, damaged=self._asset.damaged)
 
 
-def apply_consensus(
-    assets: Sequence[Row],
-    spool: Spool,
-    parameters: BuildParameters,
-    jobs: Jobs,
-    note: Callable[[str], None] | None = None,
-) -> list[Row]:
-    """Give ambiguous assets the placement nearest to the dataset's common rotation, if asked to.
+def apply_consensus(assets: list[Row], context: BuildContext, crew: Crew) -> list[Row]:
+    """Give ambiguous assets the placement nearest to the dataset's common rotation.
 
-    The order stays; rows without a tie are the same objects. `note` gets what came of it.
+    The order stays; rows without a tie are the same objects.
     """
-    if not parameters.consensus.settle:
-        return list(assets)
     consensus = find_consensus(
         asset.columns["transform"]
         for asset in assets
         if not asset.columns["n_placements"] and asset.columns["verdict"] != Verdict.FAILED
     )
     tied = [asset for asset in assets if asset.columns["n_placements"]]
-    tell = note or (lambda line: None)
     if consensus is None:
-        tell(f"consensus: too few assets share a rotation; all {len(tied):,} ties stay")
-        return list(assets)
+        crew.tell(f"consensus: too few assets share a rotation; all {len(tied):,} ties stay")
+        return assets
     turned = [
         asset
         for asset in assets
         if not asset.columns["n_placements"]
         and not is_common(asset.columns["transform"], consensus)
     ]
-    tasks = ((asset, spool, consensus, parameters) for asset in (*tied, *turned))
-    changed = {asset.asset_id: asset for asset in run_unordered(settle_asset, tasks, jobs)}
+    tasks = ((asset, context.spool, consensus, context.parameters) for asset in (*tied, *turned))
+    settled = run_unordered(settle_asset, tasks, crew.of(len(assets)))
+    changed = {asset.asset_id: asset for asset in settled}
     moved, righted = (
         sum(changed[asset.asset_id] is not asset for asset in some) for some in (tied, turned)
     )
-    tell(
+    crew.tell(
         f"consensus: {consensus.agreeing:,} of {consensus.winners:,} assets without a tie share a "
         f"rotation; {moved:,} of {len(tied):,} ties were given another placement by it, and "
         f"{righted:,} of {len(turned):,} assets that were turned otherwise without a tie"
@@ -160,29 +152,20 @@ def settle_asset(
     return first.put(*first.placed(alignment, parameters))
 
 
-def apply_witness(
-    assets: Sequence[Row],
-    spool: Spool,
-    parameters: BuildParameters,
-    jobs: Jobs,
-    note: Callable[[str], None] | None = None,
-    labels: int = BACKGROUND,
-) -> list[Row]:
-    """Settle ties by the latents and mark labels that they contradict, if asked to.
+def apply_witness(assets: list[Row], context: BuildContext, crew: Crew, labels: int) -> list[Row]:
+    """Settle ties by the latents and mark labels that they contradict.
 
     Assets whose verdict is good say what latents are like in each of so many `labels`, and whether
     they can be trusted. The order stays; rows of which latents say nothing are the same objects. An
-    asset without a tie is never placed anew. `note` gets what came of it.
+    asset without a tie is never placed anew.
     """
-    if not parameters.witness.settle:
-        return list(assets)
+    spool, parameters, jobs = context.spool, context.parameters, crew.of(len(assets))
     sure = [asset for asset in assets if asset.columns["verdict"] == Verdict.GOOD]
     moments = dict(run_unordered(read_moments, ((asset, spool, labels) for asset in sure), jobs))
     models = fit_models((_object_of(asset), moments[asset.asset_id]) for asset in sure)
-    tell = note or (lambda line: None)
     if models is None:
-        tell(f"witness: {len(sure):,} good assets have too few classes; latents are not used")
-        return list(assets)
+        crew.tell(f"witness: {len(sure):,} good assets have too few classes; latents are not used")
+        return assets
     model_of = {asset.asset_id: models[fold_of(_object_of(asset))] for asset in assets}
     tasks = ((asset, spool, model_of[asset.asset_id], parameters) for asset in assets)
     evidence = dict(run_unordered(weigh_asset, tasks, jobs))
@@ -197,7 +180,7 @@ def apply_witness(
         asset.asset_id: asset for asset in run_unordered(apply_latents, tasks_of_changed, jobs)
     }
     contradictions = sum(bool(asset.columns["contradicted"]) for asset in changed.values())
-    tell(_told(reliability, choices.values(), contradictions))
+    crew.tell(_told(reliability, choices.values(), contradictions))
     return [changed.get(asset.asset_id, asset) for asset in assets]
 
 

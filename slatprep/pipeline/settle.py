@@ -103,7 +103,7 @@ def settle_rows(
         if parameters.consensus.settle or parameters.witness.settle:
             from slatprep.pipeline.passes import apply_passes  # They need scipy.
 
-            rows = apply_passes(rows, spool, parameters, jobs, crew.note, wanted.declared.n_labels)
+            rows = apply_passes(rows, context, crew, wanted.declared.n_labels)
         normalization = wanted.given or dataset_ranges(
             rows, spool, parameters.normalize, jobs, wanted.declared.properties
         )

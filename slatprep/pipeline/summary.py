@@ -130,12 +130,8 @@ def summarise(
         build_id=build_id,
         seconds=seconds,
         statuses={str(status): statuses[str(status)] for status in Status},
-        verdicts=counts.verdicts,
-        n_voxels=counts.n_voxels,
-        n_valid=counts.n_valid,
-        n_unphysical=counts.n_unphysical,
         problems=tuple((asset.asset_id, asset.reason) for asset in failed[:PROBLEMS_LISTED]),
-        contradicted=counts.contradicted,
+        **vars(counts),
     )
 
 

@@ -115,7 +115,7 @@ class Storage:
 
     def names(self) -> tuple[list[str], list[str]]:
         """Return the names of files and of folders that lie directly in the place."""
-        listing = Listing(self._path)
+        listing = self.listing()
         return list(listing.of_folder("", folders=False)), list(listing.of_folder("", folders=True))
 
     @property
@@ -305,10 +305,6 @@ class _Archives(Storage):
         members = self.place.tree.members
         return {name: members[name][1].size for name in sorted(members)}
 
-    def names(self) -> tuple[list[str], list[str]]:
-        listing = self.listing()
-        return list(listing.of_folder("", folders=False)), list(listing.of_folder("", folders=True))
-
     def listing(self) -> Listing:
         return self.place.tree.listing()
 
@@ -319,9 +315,6 @@ class _Archives(Storage):
 
     def open(self) -> IO[bytes]:
         return self.place.open("rb")
-
-    def open_scattered(self) -> IO[bytes]:
-        return self.open()
 
     def read(self, limit: int) -> bytes:
         # One that is larger is not read, whatever its header claims.

@@ -13,7 +13,7 @@ import zarr
 from click.testing import CliRunner
 
 from slatprep.cli.commands import slatprep
-from slatprep.export.croissant import describe, to_json
+from slatprep.export.croissant import Stated, describe, to_json
 from slatprep.pipeline.dataset import BuildSummary
 from slatprep.store import open_store
 from slatprep.store.layout import ARRAYS
@@ -36,7 +36,7 @@ def test_croissant_is_valid_without_a_warning(
     store: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     path = tmp_path / "croissant.json"
-    path.write_text(to_json(describe(open_store(store), **STATED)), encoding="utf-8")
+    path.write_text(to_json(describe(open_store(store), Stated(**STATED))), encoding="utf-8")
     dataset = mlcroissant.Dataset(jsonld=path)  # raises where the description is invalid
     assert dataset.metadata.ctx.issues.report() == ""
     assert caplog.text == ""

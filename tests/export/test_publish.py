@@ -20,7 +20,8 @@ from click.testing import CliRunner, Result
 from support.trees import tree
 
 from slatprep.cli.commands import slatprep
-from slatprep.export.card import Stated, card_of
+from slatprep.export.card import card_of
+from slatprep.export.croissant import Stated
 from slatprep.pipeline.dataset import BuildSummary
 from slatprep.store import open_store
 
