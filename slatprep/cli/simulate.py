@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 import warnings
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -23,6 +24,33 @@ from slatprep.cli.transfer import MaterialOptions
 
 if TYPE_CHECKING:
     from slatprep.particles.motion import Scene
+
+
+@dataclass(frozen=True, kw_only=True)
+class MotionOptions:
+    """What moves the object, for how long, and how finely that is computed."""
+
+    size: Annotated[
+        float,
+        FiniteRange(min=0, min_open=True),
+        "Width of the unit cube.",
+        Click(metavar="METRES"),
+    ] = 0.4
+    height: Annotated[float, FiniteRange(min=0), "Height of the fall.", Click(metavar="METRES")] = (
+        0.1
+    )
+    wind: Annotated[
+        float,
+        "Wind along x. The object then stands, held at its foot and where it is stationary or "
+        "sand, without gravity.",
+        Click(metavar="M/S"),
+    ] = 0.0
+    seconds: Annotated[float, FiniteRange(min=0, min_open=True), "Length of the motion."] = 0.6
+    rate: Annotated[Positive, "Frames a second."] = 30
+    substeps: Annotated[Positive, "Time steps a frame."] = 4
+    device: Annotated[
+        str | None, "Where to compute: cpu, cuda:0. [default: the GPU if there is one]"
+    ] = None
 
 
 @command()
@@ -65,30 +93,10 @@ def simulate(
         "Axes of the Gaussians. [default: those that fit]",
     ] = None,
     stretch: Annotated[bool, "Let the scales of Gaussians follow the deformation too."] = False,
-    size: Annotated[
-        float,
-        FiniteRange(min=0, min_open=True),
-        "Width of the unit cube.",
-        Click(metavar="METRES"),
-    ] = 0.4,
-    height: Annotated[
-        float, FiniteRange(min=0), "Height of the fall.", Click(metavar="METRES")
-    ] = 0.1,
-    wind: Annotated[
-        float,
-        "Wind along x. The object then stands, held at its foot and where it is stationary or "
-        "sand, without gravity.",
-        Click(metavar="M/S"),
-    ] = 0.0,
-    seconds: Annotated[float, FiniteRange(min=0, min_open=True), "Length of the motion."] = 0.6,
-    rate: Annotated[Positive, "Frames a second."] = 30,
-    substeps: Annotated[Positive, "Time steps a frame."] = 4,
     particles: Annotated[
         int, click.IntRange(min=4, max=256), "Particles along each axis of the cube."
     ] = 32,
-    device: Annotated[
-        str | None, "Where to compute: cpu, cuda:0. [default: the GPU if there is one]"
-    ] = None,
+    motion: MotionOptions,
 ) -> None:
     """Simulate an object of a store, or a predicted one, and move its Gaussians.
 
@@ -118,26 +126,15 @@ def simulate(
     )
     for note in scene.notes:
         output.note(note)
-    begin = time.perf_counter()
+    begin, how = time.perf_counter(), work.Motion(**vars(motion))
     with warnings.catch_warnings(record=True) as told:
         warnings.simplefilter("always", UserWarning)
-        moved = work.run(
-            scene,
-            size=size,
-            height=height,
-            wind=wind,
-            seconds=seconds,
-            rate=rate,
-            substeps=substeps,
-            device=device,
-        )
+        moved = work.run(scene, how)
     for warning in told:
         output.note(str(warning.message))
     computed = time.perf_counter() - begin
     with output.progress("simulate") as progress:
-        count = work.write_frames(
-            Path(out), scene, moved, size, picture, rate, stretch, progress=progress
-        )
+        count = work.write_frames(Path(out), scene, moved, how, picture, stretch, progress=progress)
     counts = {
         "particles": len(scene.positions),
         "gaussians": len(scene.vertices),

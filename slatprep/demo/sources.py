@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slatprep.records import BACKGROUND, PROPERTIES
+from slatprep.storage.ply import write_ply
 
 Source = Literal[
     "pixieverse", "pixie-predictions", "pixie-prediction-ids",
@@ -142,12 +143,8 @@ def write_physxnet(
 
 def write_points(path: Path, columns: Mapping[str, NDArray[Any]]) -> None:
     """Write a binary PLY of points with a property for each column (K,)."""
-    kinds = {"f4": "float", "f8": "double", "i4": "int", "u1": "uchar"}
     dtype = np.dtype([(key, array.dtype.newbyteorder("<")) for key, array in columns.items()])
-    rows = np.rec.fromarrays(list(columns.values()), dtype=dtype)
-    lines = [f"property {kinds[rows.dtype[key].str[1:]]} {key}" for key in columns]
-    head = ["ply", "format binary_little_endian 1.0", f"element vertex {len(rows)}", *lines]
-    path.write_bytes("\n".join([*head, "end_header\n"]).encode() + rows.tobytes())
+    write_ply(path, np.rec.fromarrays(list(columns.values()), dtype=dtype))
 
 
 def write_description(

@@ -20,6 +20,7 @@ from slatprep.export.formats import ExportOptions, Frame, Points, Writer
 from slatprep.export.points import annotated_points
 from slatprep.records import MATERIAL_COLOURS, PROPERTY_COLUMNS, RESOLUTION
 from slatprep.storage.names import file_name
+from slatprep.storage.ply import write_ply
 from slatprep.store import Store, StoredAsset
 from slatprep.store.records import StoredRecords
 
@@ -32,8 +33,6 @@ VERTEX = np.dtype(
     ]
 )  # fmt: skip
 """The fields of a point in Pixie's order; density in kg/m^3, E in Pa."""
-
-_TYPE_NAMES = {"<f4": "float", "<i4": "int", "|u1": "uchar"}
 
 UNITS = "density kg/m^3, E Pa, nu 1"
 """The units, a comment in every PLY written here."""
@@ -128,7 +127,7 @@ def write_points(
     for (name, _), column in more.items():
         vertices[name] = column
     units = ", ".join((UNITS, *(f"{name} {unit}" for name, unit in more if unit)))
-    _write(path, vertices, (frame, units))
+    write_ply(path, vertices, frame, units)
 
 
 def read_bounds(store: Store, ids: Sequence[str]) -> tuple[dict[str, Bounds], tuple[str, ...]]:
@@ -180,17 +179,3 @@ def _colours() -> NDArray[np.uint8]:
     for material, colour in MATERIAL_COLOURS.items():
         colours[material] = tuple(bytes.fromhex(colour[1:]))
     return colours
-
-
-def _write(path: Path, vertices: NDArray[np.void], comments: tuple[str, ...]) -> None:
-    # The format is a header followed by the rows as in memory, so no library is needed.
-    fields = vertices.dtype
-    lines = [
-        "ply",
-        "format binary_little_endian 1.0",
-        *(f"comment {comment}" for comment in comments),
-        f"element vertex {len(vertices)}",
-        *(f"property {_TYPE_NAMES[fields[name].str]} {name}" for name in fields.names or ()),
-        "end_header",
-    ]
-    path.write_bytes("\n".join(lines).encode("ascii") + b"\n" + vertices.tobytes())

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from slatprep.errors import InputError
 from slatprep.particles.read import SAVED_AXES, Axes
 from slatprep.records import MATERIAL_COLOURS
+from slatprep.storage.ply import write_ply
 
 _NEAREST = 8
 """Particles that carry a Gaussian; a particle of a cubic lattice has eight around each cell."""
@@ -134,19 +135,9 @@ def require_gaussians(vertices: NDArray[Any] | None, path: Path) -> NDArray[Any]
 
 def write_gaussians(path: Path, vertices: NDArray[Any], comment: str) -> None:
     """Write Gaussians (G,) with all their fields, binary little-endian."""
-    names = vertices.dtype.names or ()
-    kinds = {name: "float" if vertices.dtype[name].kind == "f" else "int" for name in names}
-    layout = np.dtype([(name, "<f4" if kinds[name] == "float" else "<i4") for name in names])
-    lines = [
-        "ply",
-        "format binary_little_endian 1.0",
-        f"comment {comment}",
-        f"element vertex {len(vertices)}",
-        *(f"property {kinds[name]} {name}" for name in names),
-        "end_header",
-    ]
-    rows = vertices.astype(layout)
-    path.write_bytes("\n".join(lines).encode("ascii") + b"\n" + rows.tobytes())
+    kinds = {name: vertices.dtype[name].kind for name in vertices.dtype.names or ()}
+    layout = [(name, "<f4" if kind == "f" else "<i4") for name, kind in kinds.items()]
+    write_ply(path, vertices.astype(layout), comment)
 
 
 def _matrices(vertices: NDArray[Any]) -> NDArray[np.float64]:

@@ -38,6 +38,21 @@ class Override(NamedTuple):
     density: float | None = None
 
 
+class Motion(NamedTuple):
+    """Width of the unit cube [m], height of the fall [m], wind [m/s], length [s], frames a second.
+
+    Each frame has so many `substeps`; without a `device` the GPU computes if there is one.
+    """
+
+    size: float
+    height: float
+    wind: float
+    seconds: float
+    rate: int
+    substeps: int
+    device: str | None
+
+
 class Scene(NamedTuple):
     """Particles (N, 3) in the SLAT frame, their materials, and the Gaussians that they carry.
 
@@ -113,38 +128,25 @@ def _read(
     return read, tuple(notes)
 
 
-def run(
-    scene: Scene,
-    *,
-    size: float,
-    height: float,
-    wind: float,
-    seconds: float,
-    rate: int,
-    substeps: int,
-    device: str | None,
-) -> tuple[NDArray[np.float64], NDArray[np.float32]]:
-    """Simulate the particles, the unit cube `size` metres wide.
-
-    Returns positions (F, N, 3) in the SLAT frame, and gradients (F, N, 3, 3).
-    """
+def run(scene: Scene, how: Motion) -> tuple[NDArray[np.float64], NDArray[np.float32]]:
+    """Simulate the particles; return positions (F, N, 3) in the SLAT frame, and gradients."""
     from slatprep.particles.simulate import preferred_device, simulate_motion
 
-    windy = wind != 0
+    size, windy = how.size, how.wind != 0
     foot = scene.positions[:, 2] < scene.positions[:, 2].min() + 1.5 * scene.spacing
     moved = simulate_motion(
         scene.positions * size,
         scene.material,
         scene.properties,
         scene.spacing * size,
-        height=0.0 if windy else height,
+        height=0.0 if windy else how.height,
         gravity=0.0 if windy else 9.81,
-        wind=(wind, 0.0, 0.0),
+        wind=(how.wind, 0.0, 0.0),
         fixed=(foot | np.isin(scene.material, _HELD)) if windy else None,
-        seconds=seconds,
-        rate=rate,
-        substeps=substeps,
-        device=device or preferred_device(),
+        seconds=how.seconds,
+        rate=how.rate,
+        substeps=how.substeps,
+        device=how.device or preferred_device(),
     )
     # The first frame is where the SLAT has the object.
     shift = moved.positions[0] - scene.positions * size
@@ -155,9 +157,8 @@ def write_frames(
     out: Path,
     scene: Scene,
     moved: tuple[NDArray[np.float64], NDArray[np.float32]],
-    size: float,
+    how: Motion,
     picture: Path | None,
-    rate: int,
     stretch: bool,
     progress: Callable[[int, int], None],
 ) -> int:
@@ -178,5 +179,5 @@ def write_frames(
             pictures.append(draw(rows, places, low, high))
         progress(number + 1, frames)
     if picture is not None:
-        write_picture(picture, pictures, rate)
+        write_picture(picture, pictures, how.rate)
     return frames
