@@ -17,16 +17,17 @@ from typing import Any
 from slatprep.demo.asset import DemoAsset, make_asset
 from slatprep.demo.difficulty import LEVELS, SAME_SHAPE_LEVELS
 from slatprep.demo.latents import GRIDS, Encoder, LatentKind
-from slatprep.demo.samples import sample_grids, write_samples
 from slatprep.demo.sources import ONE_FRAME, TABLE, Source, classes_of, write_description
 from slatprep.demo.write import (
     SlatForm,
     SlatNames,
     row_id,
+    sample_grids,
     slat_name,
     write_annotated,
     write_categories,
     write_results,
+    write_samples,
     write_slat,
     write_trellis_metadata,
     write_truth,
@@ -130,7 +131,7 @@ def make_demo(
     results : bool
         Also write ``results/``: predictions of a method with errors, 12 MB for each asset.
     samples : int
-        Annotations of each object; several have the errors of `slatprep.demo.samples`.
+        Annotations of each object; several have the errors of `slatprep.demo.write`.
     jobs : int
         Processes.
     progress : callable, optional

@@ -15,8 +15,7 @@ from typing import Any
 
 from slatprep.errors import ConfigError
 from slatprep.export import target
-from slatprep.export.assets import Exported, choose_ids, describe_columns
-from slatprep.export.formats import ExportOptions, Writer
+from slatprep.export.formats import Exported, ExportOptions, Writer, choose_ids, describe_columns
 from slatprep.records import USABLE, Place
 from slatprep.storage.place import place_of
 from slatprep.store import Store, open_store

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from slatprep.errors import StoreError
-from slatprep.export.assets import COLUMNS
+from slatprep.export.formats import COLUMNS
 from slatprep.store import Store
 
 CONFORMS_TO = "http://mlcommons.org/croissant/1.0"

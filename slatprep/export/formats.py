@@ -1,19 +1,132 @@
-"""The interface of an export format: the `Writer` that its module's ``writer`` returns."""
+"""What formats of an export share: their interface, their options, and what assets give them."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections import Counter
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from types import MappingProxyType
+from typing import Any, Literal, NamedTuple
 
-from slatprep.export.assets import Exported
+import numpy as np
+from numpy.typing import NDArray
+
+from slatprep.errors import ConfigError, StoreError
+from slatprep.geometry.frames import voxel_centres
+from slatprep.records import BACKGROUND, MATERIAL_CLASSES, PROPERTY_COLUMNS, Verdict
+from slatprep.store import Store, StoredAsset
+from slatprep.store.layout import MERGED_COLUMNS
+from slatprep.store.records import StoredRecords
 
 Points = Literal["slat", "grid"]
 Frame = Literal["slat", "pixieverse"]
 
 TRELLIS_ENCODER = "dinov2_vitl14_reg_slat_enc_swin8_B_64l8_fp16"
 """The encoder that TRELLIS's published configurations name as ``latent_model``."""
+
+COLUMNS = (
+    "object_id",
+    "view",
+    "category",
+    "verdict",
+    "fitness",
+    "fitness_backward",
+    "inlier_rmse",
+    "ambiguity",
+    "valid_share",
+)
+"""The columns of ``asset/*`` in every export."""
+
+TARGETS = ("properties", "material", "valid")
+"""The arrays that a decoder is trained to predict."""
+
+
+class Exported(NamedTuple):
+    """An asset that was written, its file's name, its number of points, figures for the index."""
+
+    asset: StoredAsset
+    file: str
+    points: int
+    figures: Mapping[str, float] = MappingProxyType({})
+
+
+def with_merged(store: Store, *names: str) -> tuple[str, ...]:
+    """Return names of an asset's arrays, and those of merged labels where the store has them."""
+    return (*names, *MERGED_COLUMNS) if store.merges else names
+
+
+def choose_ids(store: Store, assets: Sequence[str | int], verdicts: Sequence[str]) -> list[str]:
+    """Return the sorted ids of `assets` with one of `verdicts`; an empty sequence takes all.
+
+    Raises ConfigError if an id or a verdict is unknown, or no asset is left.
+    """
+    unknown = sorted(set(verdicts) - set(Verdict))
+    if unknown:
+        raise ConfigError(f"verdict is {unknown[0]!r}; expected one of {', '.join(Verdict)}")
+    rows = sorted({store.match(name) for name in assets}) or range(len(store))
+    verdict = store.column("verdict")
+    ids = (store.ids[row] for row in rows if not verdicts or verdict[row] in verdicts)
+    chosen = sorted(ids)
+    if not chosen:
+        there = Counter(str(verdict[row]) for row in rows)
+        counts = ", ".join(f"{count} {name}" for name, count in sorted(there.items()))
+        raise ConfigError(
+            f"{store.path}: no asset has the verdict {' or '.join(verdicts)}; those asked for "
+            f"are {counts}"
+        )
+    return chosen
+
+
+def describe_columns(asset: StoredAsset) -> dict[str, Any]:
+    """Return an asset's id and its `COLUMNS`, as Python objects."""
+    columns = {name: np.asarray(asset.columns[name]).tolist() for name in COLUMNS}
+    return {"asset_id": asset.asset_id, **columns}
+
+
+class AnnotatedPoints(NamedTuple):
+    """Points with materials: positions (N, 3) in either frame's unit cube, SI values (N, P)."""
+
+    in_slat: NDArray[np.float64]
+    in_pixieverse: NDArray[np.float64]
+    material: NDArray[np.uint8]
+    values: NDArray[np.float32]
+    distance: NDArray[np.float32]
+
+    def solid(self, asset: StoredAsset) -> NDArray[np.float32]:
+        """Return Young's modulus [Pa], density [kg/m^3] and Poisson's ratio, (N, 3)."""
+        return self.values[:, asset.store.columns_of(PROPERTY_COLUMNS)]
+
+
+def require_solver_classes(store: Store) -> None:
+    """Raise StoreError for a store with other classes than those that a solver knows."""
+    if store.contents.classes not in (MATERIAL_CLASSES, ()):
+        raise StoreError(
+            f"{store.path} has classes of its own ({', '.join(store.contents.classes)}); expected "
+            f"those of PhysGaussian's solver ({', '.join(MATERIAL_CLASSES[:BACKGROUND])}), or none"
+        )
+
+
+def annotated_points(asset: StoredAsset, points: Points) -> AnnotatedPoints:
+    """Return the valid SLAT voxels, or the annotated voxels of the field at distance 0."""
+    if points == "grid":
+        field = asset.field
+        centres = voxel_centres(field.voxels)
+        return AnnotatedPoints(
+            StoredRecords(asset.store).place_map(asset).to_slat(centres),
+            centres,
+            field.material,
+            field.properties,
+            np.zeros(len(field.material), dtype=np.float32),
+        )
+    valid = asset.valid
+    return AnnotatedPoints(
+        asset.latents.centres[valid],
+        asset.place[valid].astype(np.float64),
+        asset.material[valid],
+        asset.properties_si[valid],
+        asset.distance[valid],
+    )
 
 
 @dataclass(frozen=True)

@@ -8,8 +8,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from slatprep.export.assets import Exported, describe_columns, with_merged
-from slatprep.export.formats import ExportOptions, Writer
+from slatprep.export.formats import Exported, ExportOptions, Writer, describe_columns, with_merged
 from slatprep.export.target import FORMAT
 from slatprep.storage.names import file_name
 from slatprep.store import Store, StoredAsset

@@ -15,8 +15,7 @@ from typing import Any
 import numpy as np
 
 from slatprep.errors import ConfigError
-from slatprep.export.assets import TARGETS, Exported, with_merged
-from slatprep.export.formats import ExportOptions, Writer
+from slatprep.export.formats import TARGETS, Exported, ExportOptions, Writer, with_merged
 from slatprep.storage.names import file_name
 from slatprep.store import Store, StoredAsset
 

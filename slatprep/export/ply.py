@@ -15,9 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from slatprep.errors import StoreError
-from slatprep.export.assets import Exported
-from slatprep.export.formats import ExportOptions, Frame, Points, Writer
-from slatprep.export.points import annotated_points
+from slatprep.export.formats import Exported, ExportOptions, Frame, Points, Writer, annotated_points
 from slatprep.records import MATERIAL_COLOURS, PROPERTY_COLUMNS, RESOLUTION
 from slatprep.storage.names import file_name
 from slatprep.storage.ply import write_ply

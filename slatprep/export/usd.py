@@ -18,10 +18,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slatprep.errors import ConfigError
-from slatprep.export.assets import Exported
 from slatprep.export.bins import Binned, bin_materials
-from slatprep.export.formats import ExportOptions, Points, Writer
-from slatprep.export.points import annotated_points, require_solver_classes
+from slatprep.export.formats import (
+    Exported,
+    ExportOptions,
+    Points,
+    Writer,
+    annotated_points,
+    require_solver_classes,
+)
 from slatprep.records import MATERIAL_CLASSES, MATERIAL_COLOURS, RESOLUTION
 from slatprep.records.yielding import MAX_POISSON, YIELDING
 from slatprep.storage.names import file_name

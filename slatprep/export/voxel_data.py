@@ -13,9 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
-from slatprep.export.assets import Exported
-from slatprep.export.formats import ExportOptions, Points, Writer
-from slatprep.export.points import annotated_points
+from slatprep.export.formats import Exported, ExportOptions, Points, Writer, annotated_points
 from slatprep.storage.names import file_name
 from slatprep.store import Store, StoredAsset
 

@@ -10,8 +10,14 @@ from pathlib import Path
 import numpy as np
 import orjson
 
-from slatprep.export.assets import TARGETS, Exported, describe_columns, with_merged
-from slatprep.export.formats import ExportOptions, Writer
+from slatprep.export.formats import (
+    TARGETS,
+    Exported,
+    ExportOptions,
+    Writer,
+    describe_columns,
+    with_merged,
+)
 from slatprep.storage.names import file_name
 from slatprep.store import Store, StoredAsset
 

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from slatprep.errors import ConfigError, InputError
-from slatprep.export.points import require_solver_classes
+from slatprep.export.formats import require_solver_classes
 from slatprep.geometry.deformation import PlaceMap
 from slatprep.geometry.voxels import shown_in_cells
 from slatprep.normalize import denormalize_properties

@@ -20,8 +20,7 @@ from typing import IO, TYPE_CHECKING, TypeGuard
 from slatprep.errors import InputError, StoreError
 from slatprep.storage.archives import Archive
 from slatprep.storage.atomic import staged
-from slatprep.storage.cache import cached_file, folder_for
-from slatprep.storage.copies import copied_version
+from slatprep.storage.cache import cached_file, copied_version, folder_for
 from slatprep.storage.files import LocalFile, LocalFolder, local_files, open_regular
 from slatprep.storage.listing import Listing, RemoteListing
 from slatprep.storage.members import ArchivePlace

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from slatprep.demo import make_asset, make_demo
-from slatprep.demo.samples import MISTAKEN, SPREAD, sample_grids
+from slatprep.demo.write import MISTAKEN, SPREAD, sample_grids
 from slatprep.errors import ConfigError
 from slatprep.parameters.files import load_parameters
 
