@@ -15,6 +15,7 @@ import numpy as np
 
 from slatprep.geometry.frames import voxel_centres
 from slatprep.records import RESOLUTION
+from slatprep.store.digests import add_array
 
 _AXES = ("x", "y", "z")
 
@@ -28,7 +29,6 @@ def write_coordinates(path: Path, properties: Sequence[str]) -> None:
     Its groups are in place, and its metadata not yet consolidated.
     """
     import zarr
-    from zarr.codecs import Crc32cCodec, ZstdCodec
 
     root: Any = zarr.open_group(path, mode="r+", zarr_format=3, use_consolidated=False)
     centres = voxel_centres(np.repeat(np.arange(RESOLUTION)[:, None], 3, axis=1))[:, 0]
@@ -39,17 +39,7 @@ def write_coordinates(path: Path, properties: Sequence[str]) -> None:
         ("grid", ("property", *_AXES)),
     ):
         for dimension in dimensions:
-            values: Any = centres
-            if dimension in texts:
-                values = np.array(texts[dimension], dtype=object)
-            array = root[group].create_array(
-                dimension,
-                shape=values.shape,
-                dtype=str if dimension in texts else "float64",
-                chunks=values.shape,
-                compressors=(ZstdCodec(), Crc32cCodec()),
-                dimension_names=(dimension,),
-                attributes={"description": f"coordinate of the dimension {dimension}"},
-            )
-            array[:] = values
+            values = np.array(texts[dimension], object) if dimension in texts else centres
+            description = f"coordinate of the dimension {dimension}"
+            add_array(root[group], dimension, values, dimension, description)
     root["asset"].attrs["coordinates"] = ASSET_COORDINATES

@@ -17,6 +17,7 @@ from types import MappingProxyType
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from slatprep.errors import StoreError
 from slatprep.storage.files import file_digest, local_files
@@ -58,21 +59,12 @@ def write_digests(
     sizes.append(len(_canonical(attributes)))
     digests.append(attributes_digest(attributes))
     # Row by row these are small; one chunk holds all of a large store's.
-    for name, values, dtype, description in (
-        ("name", np.array(names, dtype=object), str, "file below the store, with forward slashes"),
-        ("size", np.array(sizes, dtype=np.int64), "int64", "bytes"),
-        ("sha256", np.array(digests, dtype=object), str, "SHA-256 in hex"),
+    for name, values, description in (
+        ("name", np.array(names, dtype=object), "file below the store, with forward slashes"),
+        ("size", np.array(sizes, dtype=np.int64), "bytes"),
+        ("sha256", np.array(digests, dtype=object), "SHA-256 in hex"),
     ):
-        array = root.create_array(
-            f"{GROUP}/{name}",
-            shape=values.shape,
-            dtype=dtype,
-            compressors=_compressors(),
-            chunks=values.shape,
-            dimension_names=("file",),
-            attributes={"description": description},
-        )
-        array[:] = values
+        add_array(root, f"{GROUP}/{name}", values, "file", description, level=1)
 
 
 def attributes_digest(attributes: Mapping[str, Any]) -> str:
@@ -101,7 +93,19 @@ def _canonical(attributes: Mapping[str, Any]) -> bytes:
     return json.dumps(attributes, sort_keys=True, ensure_ascii=False).encode()
 
 
-def _compressors() -> tuple[Any, ...]:
+def add_array(
+    group: Any, name: str, values: NDArray[Any], dimension: str, description: str, level: int = 0
+) -> None:
+    """Add a small array (N,) of numbers, or texts as objects, in one chunk."""
     from zarr.codecs import Crc32cCodec, ZstdCodec
 
-    return (ZstdCodec(level=1), Crc32cCodec())
+    array = group.create_array(
+        name,
+        shape=values.shape,
+        dtype=str if values.dtype == object else values.dtype.name,
+        compressors=(ZstdCodec(level=level), Crc32cCodec()),
+        chunks=values.shape,
+        dimension_names=(dimension,),
+        attributes={"description": description},
+    )
+    array[:] = values
