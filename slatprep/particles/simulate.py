@@ -110,7 +110,15 @@ def simulate_motion(
             now, after = after, now
         frames.append(now.particle_q.numpy().astype(np.float64))
         gradients.append(now.mpm.particle_transform.numpy().copy())
-    return Motion(np.stack(frames), np.stack(gradients))
+    moved = np.stack(frames)
+    way = np.linalg.norm(np.diff(moved, axis=0), axis=2).max(initial=0.0)
+    if (crossed := way / (2 * spacing)) > substeps:
+        warnings.warn(
+            f"particles cross {crossed / substeps:.1f} cells in a time step, which tears or "
+            f"squashes them; take --substeps {int(np.ceil(crossed))} or more",
+            stacklevel=3,
+        )
+    return Motion(moved, np.stack(gradients))
 
 
 def simulate(

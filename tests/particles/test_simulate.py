@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 import sys
+import warnings
 
 import numpy as np
 import pytest
@@ -129,6 +130,18 @@ def test_water_runs_sand_slumps_snow_packs_and_jelly_stands() -> None:
     assert heights == sorted(heights)
     assert heights[0] < 2.5 * SPACING and heights[3] > 6 * SPACING
     assert np.ptp(water[:, 0]) > np.ptp(sand[:, 0]) > 1.5 * np.ptp(jelly[:, 0])
+
+
+@needs_newton
+def test_steps_too_long_for_the_speed_are_said() -> None:
+    """A fall of 1 m ends at 4.4 m/s: 0.29 m in a step of 1/15 s, and cells are 0.2 m wide."""
+    stuff = np.tile([1e5, 1e3, 0.3], (len(CUBE), 1))
+    how = {"height": 1.0, "seconds": 0.6, "rate": 15}
+    with pytest.warns(UserWarning, match=r"cross 1\.[0-9] cells in a time step.*--substeps 2"):
+        simulate(CUBE, ONE_PART, stuff, SPACING, substeps=1, **how)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", UserWarning)
+        simulate(CUBE, ONE_PART, stuff, SPACING, substeps=2, **how)
 
 
 @needs_newton
