@@ -15,7 +15,6 @@ from slatprep.parameters import BuildParameters
 from slatprep.pipeline.asset import process_asset
 from slatprep.pipeline.before import Before, look_back
 from slatprep.pipeline.finish import Crew, Note, Progress, finish
-from slatprep.pipeline.notices import dataset_notices
 from slatprep.pipeline.pack import Packed, pack_store
 from slatprep.pipeline.plan import Action, BuildContext, BuildPlan, PlannedAsset, plan_assets
 from slatprep.pipeline.publish import Destination, publish_manifests, require_records_file
@@ -24,7 +23,13 @@ from slatprep.pipeline.recipe import recipe_of
 from slatprep.pipeline.rows import FailedAsset, NextStore, Row
 from slatprep.pipeline.settle import Wanted, settle_rows
 from slatprep.pipeline.spool import Spool
-from slatprep.pipeline.summary import BuildSummary, counts_of, summarise, summarise_store
+from slatprep.pipeline.summary import (
+    BuildSummary,
+    counts_of,
+    dataset_notices,
+    summarise,
+    summarise_store,
+)
 from slatprep.pipeline.work import spool_of, work_beside, work_directory
 from slatprep.readers import discover
 from slatprep.records import AssetPair, Place

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -19,7 +19,7 @@ from slatprep.pipeline.recipe import build_of
 from slatprep.pipeline.rows import FailedAsset, NextStore, Row, column, in_order, moments_of
 from slatprep.pipeline.summary import nothing_usable
 from slatprep.readers import contents_of
-from slatprep.readers.encoders import ENOUGH, in_words, look_standardised, resolve_latents
+from slatprep.readers.encoders import resolve_latents
 from slatprep.records import AssetPair, Contents, Normalization
 from slatprep.store import Store
 
@@ -164,27 +164,3 @@ def resolved_contents(
         for row, mean, std in zip(rows, means, stds, strict=True)
     ]
     return replace(declared, latents=resolve_latents(declared.latents, standardised, moments))
-
-
-def latent_warnings(new: NextStore, standardised: str) -> Iterator[str]:
-    """Yield what a person should know about whether the latents of a store are standardised."""
-    latents = new.contents.latents
-    means, stds = (new.column(name) for name in ("latent_mean", "latent_std"))
-    known = [
-        (row.asset_id, moments)
-        for row, mean, std in zip(new.rows, means, stds, strict=True)
-        if row.n_voxels >= ENOUGH and (moments := moments_of(mean, std))
-    ]
-    looks = {name: look_standardised(moments, latents) for name, moments in known}
-    if latents.standardised and standardised == "auto":
-        yield (
-            f"the latents look standardised already ({in_words(known[0][1])} in {known[0][0]}) and "
-            'are marked so; say slat.standardised = "yes" if they are, "no" if they are not'
-        )
-    others = [name for name, look in looks.items() if look != latents.standardised]
-    if others and standardised != "no":
-        how = "as the encoder gives them" if latents.standardised else "standardised already"
-        yield (
-            f"the latents of {len(others)} of {len(looks)} assets look {how}, unlike the others "
-            f"({', '.join(others[:3])}): look where they come from"
-        )

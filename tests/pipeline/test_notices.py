@@ -12,7 +12,7 @@ from support.synthetic import Dataset
 from slatprep.errors import ConfigError
 from slatprep.normalize import ranges_from_extents
 from slatprep.pipeline.dataset import build_store
-from slatprep.pipeline.notices import wild_ranges
+from slatprep.pipeline.summary import wild_ranges
 
 USUAL = ((3.2, 10.8), (1.8, 3.8), (0.21, 0.45))
 
