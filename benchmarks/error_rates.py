@@ -56,14 +56,20 @@ def _draw(table: Table, share: float, most: int, seed: int) -> dict[str, float]:
     targets = spare[:count] if share == 1 else np.concatenate([right, spare[:count]])
     figures, wrong = table["figures"], table["kind"][targets] == "other"
     folds = _folds(table)
-    found = error_rates(figures[targets], figures[decoys], folds[targets], folds[decoys])
-    return _told(found, figures[targets], wrong)
+    good, good_decoys = (_good(figures[rows]) for rows in (targets, decoys))
+    found = error_rates(figures[targets], figures[decoys], folds[targets], folds[decoys],
+                        good=good, good_decoys=good_decoys)  # fmt: skip
+    return _told(found, good, wrong)
 
 
-def _told(
-    found: ErrorRates, figures: NDArray[np.float64], wrong: NDArray[np.bool_]
-) -> dict[str, float]:
-    good = same_objects(figures) * right_placements(figures) >= THRESHOLDS.good_confidence
+def _good(figures: NDArray[np.float64]) -> NDArray[np.bool_]:
+    good: NDArray[np.bool_] = (
+        same_objects(figures) * right_placements(figures) >= THRESHOLDS.good_confidence
+    )
+    return good
+
+
+def _told(found: ErrorRates, good: NDArray[np.bool_], wrong: NDArray[np.bool_]) -> dict[str, float]:
     kept = found.rates <= RATE
     low, high = found.wrong_share_range
     least, most = found.good_wrong_range

@@ -5,11 +5,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Annotated, Any
 
-from slatprep.cli.info import show_quality
+from slatprep.cli.info import show_errors, show_quality
 from slatprep.cli.options import (
     NewFile,
     NewStore,
     RecordsFolder,
+    Seed,
     SourceOptions,
     WorkersOptions,
 )
@@ -53,6 +54,12 @@ def build_store(
         "Keep all assets' arrays beside the store, about 1 MB each, so that an update that packs "
         "all assets again does not read their sources.",
     ] = False,
+    decoys: Annotated[
+        Seed,
+        "Measure errors on at most N decoys: grids aligned with SLATs of other objects, one for "
+        "every 20 assets that are aligned. 0: none.",
+        Click(metavar="N"),
+    ] = 200,
     dry_run: Annotated[bool, "Print what would be done, and why; write nothing."] = False,
     workers: WorkersOptions,
 ) -> None:
@@ -96,6 +103,7 @@ def build_store(
                 rehash=rehash,
                 compact=compact,
                 keep_work=keep_work,
+                decoys=decoys,
                 progress=_counting(output, progress),
                 **_by_work(output, parameters),
             )
@@ -218,9 +226,10 @@ def report(output: Output, summary: BuildSummary) -> None:
             from slatprep.inspect.overview import overview_of
             from slatprep.store import open_store
 
-            overview = overview_of(open_store(summary.store))
+            store, built = open_store(summary.store), output.command == "build-store"
             # What a dataset definition may say is of no use to `subset` and `concat`.
-            show_quality(output, overview, advise=output.command == "build-store")
+            show_quality(output, overview_of(store), advise=built)
+            show_errors(store)
         others = ", ".join(f"{count:,} {status}" for status, count in summary.statuses.items())
         say(f"assets:  {total:,} ({others}) in {summary.seconds:,.1f} s")
         if summary.store is not None:

@@ -77,6 +77,7 @@ def check_alignment(
         raise click.UsageError("say which assets: --asset ID, --worst N or --ambiguous")
     path = chosen_store(store)
     from slatprep.inspect import check
+    from slatprep.pipeline.decoys import measured_errors
     from slatprep.store import open_store
     from slatprep.workers.local import run_unordered
 
@@ -94,8 +95,15 @@ def check_alignment(
         with output.progress("pictures") as progress:
             pictures, sheet = write_pictures(opened, checks, target, jobs=jobs, progress=progress)
 
+    measured = measured_errors(opened.path)
+    if measured and measured.build != opened.about.manifest:
+        measured = None  # It is of before an update.
+
     def print_all() -> None:
         _print(output, checks)
+        for one in chosen:
+            if measured and (len(chosen) == 1 or output.verbosity > 0):
+                say(f"{one}: {measured.of_asset(one)}")
         if sheet is not None:
             say(f"pictures: {target} ({len(pictures)}), all in one: {sheet}")
         elif pictures:
@@ -104,7 +112,11 @@ def check_alignment(
 
     if show:
         _show(output, opened, chosen, sheet or (pictures[0] if pictures else None))
-    document = {"store": path, "assets": _documents(checks, pictures), "sheet": sheet}
+    assets = _documents(checks, pictures)
+    if measured:
+        for one in assets:
+            one["another_object"] = measured.errors.get(one["asset_id"], 0.0)
+    document = {"store": path, "assets": assets, "sheet": sheet}
     output.result(document, print_all, complete=all(one.ok for one in checks))
 
 

@@ -10,9 +10,7 @@ from slatprep.cli.output import Output
 from slatprep.cli.signature import Click, command
 
 if TYPE_CHECKING:
-    from slatprep.inspect.errors import MeasuredErrors
-
-_RATES = (0.001, 0.01, 0.05)
+    from slatprep.pipeline.decoys import MeasuredErrors
 
 
 @command()
@@ -33,14 +31,14 @@ def measure_errors(
 
     A decoy is an asset's grid aligned with the SLAT of another object of about its size.
     Decoys show how wrong pairs of this dataset score. No asset of the store is
-    aligned again, and no verdict is changed. What decoys gave is kept beside the records
-    of the build, and taken over after an update.
+    aligned again, and no verdict is changed. What decoys gave is kept in decoys.json beside
+    the store, and taken over after an update. A build does the same with fewer decoys.
 
     Example
     -------
     slatprep measure-errors data/demo.zarr --jobs 2 --picture errors.png
     """
-    from slatprep.inspect.errors import measure_errors as measure
+    from slatprep.pipeline.decoys import measure_errors as measure
     from slatprep.store import open_store
 
     opened = open_store(store)
@@ -54,34 +52,30 @@ def measure_errors(
 
 
 def _summary(found: MeasuredErrors) -> dict[str, object]:
-    rates = found.rates
     return {
-        "assets": rates.targets,
-        "decoys": rates.decoys,
-        "aligned": found.aligned,
+        "assets": found.assets,
+        "decoys": len(found.decoys),
         "seed": found.seed,
-        "refitted": rates.refitted,
-        "wrong_share": rates.wrong_share,
-        "wrong_share_range": list(rates.wrong_share_range),
-        "sure": rates.good,
-        "sure_wrong": rates.good_wrong,
-        "sure_wrong_range": list(rates.good_wrong_range),
-        "kept": {f"{rate:g}": rates.kept(rate) for rate in _RATES},
-        "errors": dict(zip(found.ids, rates.errors.tolist(), strict=True)),
+        "refitted": found.refitted,
+        "wrong_share": found.wrong_share,
+        "wrong_share_range": found.wrong_share_range,
+        "good": found.good,
+        "good_wrong": found.good_wrong,
+        "good_wrong_range": found.good_wrong_range,
+        "kept": {f"{kept.rate:g}": kept.assets for kept in found.kept},
+        "errors": found.errors,
     }
 
 
 def _show(output: Output, found: MeasuredErrors) -> None:
-    rates = found.rates
     for sentence in found.sentences():
         output.note(sentence)
     output.table(
         "Assets that can be kept, by the share of wrong ones among them",
         ("wrong at most", "assets", "of all"),
-        [(f"{rate:.1%}", kept, kept / rates.targets) for rate in _RATES
-         for kept in (rates.kept(rate),)],
-    )  # fmt: skip
-    worst = sorted(zip(rates.errors.tolist(), found.ids, strict=True), reverse=True)[:10]
-    likely = [(asset_id, error) for error, asset_id in worst if error >= 0.5]
+        [(f"{kept.rate:.1%}", kept.assets, kept.assets / found.assets) for kept in found.kept],
+    )
+    worst = sorted(found.errors.items(), key=lambda one: (-one[1], one[0]))[:10]
+    likely = [(asset_id, error) for asset_id, error in worst if error >= 0.5]
     if likely:
         output.table("Most likely another object", ("id", "probability"), likely)

@@ -11,6 +11,7 @@ from slatprep.cli.signature import command
 
 if TYPE_CHECKING:
     from slatprep.inspect.overview import StoreOverview
+    from slatprep.store import Store
 
 
 @command()
@@ -26,12 +27,11 @@ def info(
     -------
     slatprep info data/demo.zarr
     """
-    from slatprep.inspect.errors import told_of
     from slatprep.inspect.overview import overview_of
     from slatprep.store import open_store
 
     opened = open_store(store)
-    overview, errors = overview_of(opened), told_of(opened)
+    overview = overview_of(opened)
 
     def show() -> None:
         contents: dict[str, Cell] = {
@@ -47,8 +47,7 @@ def info(
         }
         output.record(f"Store {overview.store}", contents)
         show_quality(output, overview)
-        for sentence in errors:
-            say(f"errors:  {sentence}")
+        show_errors(opened)
         output.table(
             f"Normalisation to [-1, 1] (ranges: {overview.normalization.source})",
             ("property", "scale", "lo", "hi"),
@@ -102,6 +101,14 @@ def show_quality(output: Output, overview: StoreOverview, *, advise: bool = True
             f"well, and change more than {THRESHOLDS.good_ambiguity:.0%} of the classes"
         )
         say(f"look:    slatprep check-alignment --ambiguous --store {overview.store}")
+
+
+def show_errors(store: Store) -> None:
+    """Print how many of a store's verdicts are wrong, as far as decoys said."""
+    from slatprep.pipeline.decoys import told_of
+
+    for sentence in told_of(store):
+        say(f"errors:  {sentence}")
 
 
 def _categories_of(overview: StoreOverview) -> str:

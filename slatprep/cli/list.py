@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Annotated
 
+from slatprep.cli.info import show_errors
 from slatprep.cli.options import ChosenOptions, LastStore
 from slatprep.cli.output import Output, say
 from slatprep.cli.signature import command
@@ -29,6 +30,7 @@ def list_assets(
     slatprep list data/demo.zarr --category tree --ids
     """
     from slatprep.inspect.listing import list_assets as listed_of
+    from slatprep.pipeline.decoys import measured_errors
     from slatprep.store import open_store
 
     opened = open_store(store)
@@ -55,6 +57,8 @@ def list_assets(
                 for asset in listed
             ],
         )
+        if measured_errors(opened.path):
+            show_errors(opened)
 
     output.result({"store": store, "assets": listed}, show)
 

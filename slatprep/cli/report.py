@@ -41,14 +41,14 @@ def report(
     """
     from slatprep.inspect.report import write_report
     from slatprep.store import open_store
-    from slatprep.store.manifests import manifests_of
+    from slatprep.store.manifests import manifests_beside
 
     opened = open_store(store)
     name = store.name.removesuffix(".zarr")
     records: Place | None = manifests
     if records is None:
-        usual = (manifests_of(opened.path), Path("manifests/build") / name)
-        records = next((folder for folder in usual if folder.is_dir()), None)
+        of_make = Path("manifests/build") / name
+        records = manifests_beside(opened.path) or (of_make if of_make.is_dir() else None)
     if records is None:
         output.problem(
             f"no records of {store} found; the page cannot list assets that are not in the store. "

@@ -20,15 +20,12 @@ from scipy.optimize import isotonic_regression, minimize
 from scipy.special import expit, logit
 
 from slatprep.judge.calibration import SAME_OBJECT
-from slatprep.judge.confidence import right_placements, same_objects
+from slatprep.judge.confidence import same_objects
 from slatprep.judge.evidence import FIGURES
-from slatprep.judge.verdict import THRESHOLDS
+from slatprep.judge.verdict import LEAST_DECOYS, LEAST_TARGETS
 
 Array = NDArray[np.float64]
 Range = tuple[float, float]
-
-LEAST_TARGETS, LEAST_DECOYS = 50, 40
-"""With fewer, chance would decide: the shipped model stands."""
 
 FOLDS, ROUNDS = 3, 3
 """Parts of the objects, each scored by a fit to the others; rounds of choosing what is right."""
@@ -66,7 +63,7 @@ class ErrorRates:
     wrong_share_range : tuple of float
         Where it lies with a probability of 0.95.
     good : int
-        Targets whose object and placement are sure enough to be called good.
+        Targets that are called good.
     good_wrong : float
         How many of those show another object.
     good_wrong_range : tuple of float
@@ -92,9 +89,13 @@ class ErrorRates:
     errors: Array
     rates: Array
 
-    def kept(self, rate: float) -> int:
-        """Return how many targets may be kept at a share of wrong ones of at most `rate`."""
-        return int(np.count_nonzero(self.rates <= rate))
+    def kept(self, rate: float) -> tuple[int, float]:
+        """Return how many targets may be kept at a share of wrong ones of at most `rate`.
+
+        And their least score; NaN where none may be.
+        """
+        kept = self.rates <= rate
+        return int(kept.sum()), float(self.scores[kept].min()) if kept.any() else np.nan
 
 
 def error_rates(
@@ -102,6 +103,9 @@ def error_rates(
     decoys: Array,
     target_folds: NDArray[np.intp],
     decoy_folds: NDArray[np.intp],
+    *,
+    good: NDArray[np.bool_],
+    good_decoys: NDArray[np.bool_],
     seed: int = 0,
 ) -> ErrorRates:
     """Count the errors of a dataset by its decoys.
@@ -112,6 +116,8 @@ def error_rates(
         `slatprep.judge.evidence.FIGURES` of each.
     target_folds, decoy_folds : ndarray of int, shape (T,) and (D,)
         Which of `FOLDS` parts each belongs to; all of one object, and its decoys, to one.
+    good, good_decoys : ndarray of bool, shape (T,) and (D,)
+        Which are called good.
     seed : int
         Of the draws that intervals are taken from.
     """
@@ -122,8 +128,7 @@ def error_rates(
     rng = np.random.default_rng(seed)
     share, shares = _wrong_share(scores, decoy_scores, rng)
     low, high = _ends(shares)
-    good, decoy_good = (_called_good(values) for values in (targets, decoys))
-    count, passed = len(targets), int(decoy_good.sum())
+    count, passed = len(targets), int(good_decoys.sum())
     passing = rng.beta(passed + 0.5, len(decoys) - passed + 0.5, DRAWS)
     most = int(good.sum())
     wrong = np.minimum(count * shares * passing, most)
@@ -146,12 +151,6 @@ def error_rates(
 def _ends(draws: Array) -> Range:
     low, high = np.quantile(draws, LIKELY)
     return float(low), float(high)
-
-
-def _called_good(evidence: Array) -> NDArray[np.bool_]:
-    sure = same_objects(evidence) * right_placements(evidence)
-    good: NDArray[np.bool_] = sure >= THRESHOLDS.good_confidence
-    return good
 
 
 def _wrong_share(

@@ -60,6 +60,9 @@ class Thresholds:
 THRESHOLDS = Thresholds()
 """The thresholds of `verdict_of`."""
 
+LEAST_TARGETS, LEAST_DECOYS = 50, 40
+"""Assets and decoys of a dataset; of fewer chance would decide, and the shipped model stands."""
+
 _WORDS = {
     "shape": "the two sides show different shapes",
     "roughness": "the surfaces lie on each other roughly only",

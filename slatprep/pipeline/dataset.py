@@ -14,6 +14,7 @@ from types import MappingProxyType
 from slatprep.parameters import BuildParameters
 from slatprep.pipeline.asset import process_asset
 from slatprep.pipeline.before import Before, look_back
+from slatprep.pipeline.decoys import DECOYS, EVERY, measure_build
 from slatprep.pipeline.finish import Crew, Note, Progress, finish
 from slatprep.pipeline.pack import Packed, pack_store
 from slatprep.pipeline.plan import Action, BuildContext, BuildPlan, PlannedAsset, plan_assets
@@ -61,6 +62,7 @@ def build_store(
     keep_work: bool = False,
     rehash: bool = False,
     compact: bool = False,
+    decoys: int = DECOYS,
     assets_per_job: int = 1,
     progress: Progress | None = None,
     note: Note | None = None,
@@ -91,6 +93,9 @@ def build_store(
         Hash all sources, also those whose size, times and inode are as they were.
     compact : bool
         Order rows by id, as in a first build, where updates have added some behind.
+    decoys : int
+        Measure errors on at most so many decoys, see `slatprep.pipeline.decoys`; 0: none. What
+        they say lies beside the store, whose bytes do not depend on it.
     assets_per_job : int
         Start no more processes than there are so many assets for.
     progress : callable, optional
@@ -143,7 +148,17 @@ def build_store(
         summary = _publish(before, parameters, begin, following, packed, failed, records)
         if keep_work:
             work.keep_only({row.key for row in following.rows if row.spooled})
+        if packed is not None:
+            aligned = sum(isinstance(asset, Row) for asset in finished)
+            _measure(before, aligned, decoys, crew)
     return summary
+
+
+def _measure(before: Before, aligned: int, most: int, crew: Crew) -> None:
+    """Measure the errors of the store that is in place now on at most so many decoys."""
+    store, there = open_store(before.place.in_place()), before.previous
+    jobs = crew.of(aligned // EVERY)
+    measure_build(store, aligned, most, jobs, there.path if there else None, crew.note)
 
 
 def plan_build(

@@ -99,7 +99,7 @@ def digest_of(text: bytes) -> bytes:
     return hashlib.sha256(text).digest()
 
 
-@lru_cache(maxsize=4)
+@lru_cache(maxsize=8)
 def adapter_of(kind: Any) -> TypeAdapter[Any]:
     """Return what reads a kind of record, and knows its JSON Schema."""
     # Late: pydantic takes a third of a second that a command without records does not have.

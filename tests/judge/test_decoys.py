@@ -7,8 +7,10 @@ import pytest
 from scipy.special import logit
 
 from slatprep.judge.calibration import PLACEMENT, SAME_OBJECT
-from slatprep.judge.decoys import FOLDS, LEAST_TARGETS, ErrorRates, error_rates
+from slatprep.judge.confidence import right_placements, same_objects
+from slatprep.judge.decoys import FOLDS, ErrorRates, error_rates
 from slatprep.judge.evidence import FIGURES
+from slatprep.judge.verdict import LEAST_TARGETS, THRESHOLDS
 
 
 def _ends(name: str) -> tuple[float, float]:
@@ -43,7 +45,14 @@ def wrong(count: int, seed: int = 1) -> np.ndarray:
 
 def rated(targets: np.ndarray, decoys: np.ndarray) -> ErrorRates:
     folds = (np.arange(len(targets)) % FOLDS, np.arange(len(decoys)) % FOLDS)
-    return error_rates(targets, decoys, *folds)
+    return error_rates(targets, decoys, *folds, **called_good(targets, decoys))
+
+
+def called_good(targets: np.ndarray, decoys: np.ndarray) -> dict[str, np.ndarray]:
+    return {
+        name: same_objects(figures) * right_placements(figures) >= THRESHOLDS.good_confidence
+        for name, figures in (("good", targets), ("good_decoys", decoys))
+    }
 
 
 @pytest.mark.parametrize("mixed", [0, 20, 80, 160])
@@ -70,7 +79,7 @@ def test_the_stated_rates_are_the_true_ones(mixed: int) -> None:
 def test_of_shuffled_pairs_hardly_any_is_kept() -> None:
     found = rated(wrong(300, 7), wrong(200))
     assert found.wrong_share > 0.9
-    assert found.kept(0.01) <= 3
+    assert found.kept(0.01)[0] <= 3
     assert found.errors.mean() > 0.9
 
 
@@ -78,7 +87,7 @@ def test_where_decoys_fit_as_well_nothing_can_be_told() -> None:
     """A dataset of balls: any SLAT is as good as the own one."""
     found = rated(right(200), right(100, 9))
     assert found.wrong_share > 0.8
-    assert found.kept(0.01) <= 4
+    assert found.kept(0.01)[0] <= 4
     assert found.good > 0 and found.good_wrong > 0.5 * found.good
 
 
@@ -102,9 +111,13 @@ def test_errors_never_rise_with_the_score() -> None:
 def test_the_order_of_assets_does_not_matter() -> None:
     targets, decoys = np.concatenate([wrong(40, 3), right(160)]), wrong(100)
     folds = np.arange(len(targets)) % FOLDS
-    first = error_rates(targets, decoys, folds, np.arange(100) % FOLDS)
+    rest = (np.arange(100) % FOLDS,)
+    good = called_good(targets, decoys)
+    first = error_rates(targets, decoys, folds, *rest, **good)
     order = np.random.default_rng(0).permutation(len(targets))
-    second = error_rates(targets[order], decoys, folds[order], np.arange(100) % FOLDS)
+    second = error_rates(
+        targets[order], decoys, folds[order], *rest, **good | {"good": good["good"][order]}
+    )
     np.testing.assert_allclose(second.errors, first.errors[order], atol=1e-6)
     assert second.wrong_share == pytest.approx(first.wrong_share)
 
@@ -114,5 +127,5 @@ def test_a_dataset_that_the_shipped_model_finds_rough_is_set_right_by_its_decoys
     targets, decoys = made(200, (0.3, 0.5), 2), made(150, (0.7, 1.0), 3)
     found = rated(targets, decoys)
     assert found.refitted
-    assert found.kept(0.01) > 190
+    assert found.kept(0.01)[0] > 190
     assert found.wrong_share < 0.05

@@ -1,13 +1,13 @@
-"""Targets and decoys as two histograms, with the threshold between good and doubtful."""
+"""Targets and decoys as two histograms, with the scores from which on few are wrong."""
 
 from __future__ import annotations
 
 import numpy as np
 from scipy.special import logit
 
-from slatprep.inspect.errors import MeasuredErrors, histogram_of
 from slatprep.inspect.pictures import palette
 from slatprep.inspect.pictures.canvas import STYLE, in_format, new_figure, write
+from slatprep.pipeline.decoys import MeasuredErrors
 
 RATES = {0.01: "-", 0.05: "--"}
 """Shares of wrong ones with a line, and how it is drawn."""
@@ -23,25 +23,21 @@ def draw_errors(errors: MeasuredErrors, name: str, kind: str = "png") -> bytes:
     """
     import matplotlib.style
 
-    rates = errors.rates
-    edges, targets, decoys = histogram_of(errors)
+    edges, counts = np.array(errors.edges), errors.counts
     with matplotlib.style.context(["default", STYLE]):
         figure = new_figure(_WIDTH, _HEIGHT)
         write(figure, 40, 48, f"Same object? {name}", weight="bold", size=12)
         for row, sentence in enumerate(errors.sentences()):
             write(figure, 40, 76 + 22 * row, sentence, size=7, color=palette.MUTED)
         axes = figure.add_axes((0.07, 0.13, 0.9, 0.6))
-        width = np.diff(edges)
-        axes.bar(edges[:-1], targets, width, align="edge", color=_TARGETS, alpha=0.7,
-                 label=f"{rates.targets:,} alignments of the dataset")  # fmt: skip
-        axes.step(edges, np.append(decoys, decoys[-1]), where="post", color=_DECOYS, lw=1.6,
-                  label=f"{rates.decoys:,} decoys: grids with SLATs of other objects")  # fmt: skip
-        for rate, style in RATES.items():
-            kept = rates.rates <= rate
-            if not kept.any():
-                continue
-            axes.axvline(rates.scores[kept].min(), color=palette.INK, lw=1, ls=style,
-                         label=f"{kept.sum():,} kept at {rate:.0%} wrong")  # fmt: skip
+        axes.bar(edges[:-1], errors.targets, np.diff(edges), align="edge", color=_TARGETS,
+                 alpha=0.7, label=f"{errors.assets:,} alignments of the dataset")  # fmt: skip
+        decoys = f"{len(errors.decoys):,} decoys: grids with SLATs of other objects"
+        axes.step(edges, [*counts, counts[-1]], where="post", color=_DECOYS, lw=1.6, label=decoys)
+        for kept in errors.kept:
+            if kept.rate in RATES and kept.assets:
+                axes.axvline(kept.score, color=palette.INK, lw=1, ls=RATES[kept.rate],
+                             label=f"{kept.assets:,} kept at {kept.rate:.0%} wrong")  # fmt: skip
         ticks = np.array([1e-4, 0.01, 0.5, 0.99, 0.9999])
         inside = (logit(ticks) >= edges[0]) & (logit(ticks) <= edges[-1])
         axes.set_xticks(logit(ticks)[inside], [f"{tick:.4g}" for tick in ticks[inside]])

@@ -17,6 +17,7 @@ from slatprep.inspect.report.voxels import LEVELS
 from slatprep.inspect.tallies import Tally, no_tally
 from slatprep.judge import THRESHOLDS
 from slatprep.normalize import PIXIE_RANGES
+from slatprep.pipeline.decoys import measured_errors, told_of
 from slatprep.records import (
     MATERIAL_COLOURS,
     UNANNOTATED_COLOUR,
@@ -101,6 +102,7 @@ def page_content(
             "columns": COLUMNS,
             "views": VIEWS,
         },
+        "errors": _errors(store),
         "turns": quarter_turns(),
         "properties": _properties(store, outcomes, tallies),
         "balance": _balance(store, tallies),
@@ -111,6 +113,19 @@ def page_content(
             "states": states,
             "tied": outcomes and outcomes.tied,
         },
+    }
+
+
+def _errors(store: Store) -> dict[str, Any]:
+    """Return what decoys say of the verdicts, and the histograms of scores that show it."""
+    measured, told = measured_errors(store.path), {"told": told_of(store)}
+    if measured is None:
+        return told
+    return told | {
+        "edges": [round(edge, _DIGITS) for edge in measured.edges],
+        "assets": measured.targets,
+        "decoys": measured.counts,
+        "kept": [(one.rate, one.assets, _number(one.score)) for one in measured.kept],
     }
 
 

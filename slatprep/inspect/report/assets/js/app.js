@@ -247,6 +247,7 @@ Viewer.create();
 Theme.create();
 Sections.states(Filter);
 Sections.quality(Filter);
+Sections.errors();
 Sections.rotations(Filter);
 Sections.properties();
 Sections.balance(Filter);

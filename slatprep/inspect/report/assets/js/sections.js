@@ -107,6 +107,30 @@ const Sections = (() => {
     filter.onBin((chosen) => figures.forEach((figure) => figure.press(chosen && chosen.key === figure.dataset.key ? chosen.bin : null)));
   }
 
+  /** What decoys say: the scores of the assets, and of grids aligned with other objects' SLATs. */
+  function errors() {
+    const { told, edges, assets, decoys, kept } = CONTENT.errors;
+    const sentence = (text) => `${text[0].toUpperCase()}${text.slice(1).replaceAll("`", "")}.`;
+    byId("errors").textContent = told.map(sentence).join(" ");
+    if (!edges) return;
+    const domain = [edges[0], edges.at(-1)];
+    const share = (odds) => Number((1 / (1 + Math.exp(-odds))).toPrecision(3));
+    const ticks = [-9.21, -4.6, 0, 4.6, 9.21].filter((at) => at >= domain[0] && at <= domain[1]).map((at) => ({ at, text: String(share(at)) }));
+    const [, most, least] = kept.find(([rate]) => rate === 0.01);
+    const marks = least === null ? [] : [{ at: least, text: `1 % wrong: ${Format.count(most)} kept` }];
+    const one = (title, counts, colour) =>
+      Charts.histogram({
+        title, edges, domain, ticks, marks,
+        sub: "Score, as a probability that the object is the same",
+        bins: counts.map((count) => [{ colour, count }]),
+        describe: (k) => `${share(edges[k])} to ${share(edges[k + 1])}: ${Format.count(counts[k])}`,
+      });
+    byId("decoys").replaceChildren(
+      one("Assets", assets, "var(--accent)"),
+      one("Decoys: grids with SLATs of other objects", decoys, "var(--failed)"),
+    );
+  }
+
   function rotations(filter) {
     const turns = CONTENT.turns.map((words, turn) => {
       const own = ASSETS.turn.flatMap((one, index) => (one === turn ? [index] : []));
@@ -225,5 +249,5 @@ const Sections = (() => {
     byId("parameters").replaceChildren(...CONTENT.parameters.map(([name, value]) => el("li", {}, el("code", {}, `${name} = ${value}`))));
   }
 
-  return { states, quality, rotations, properties, balance, colophon };
+  return { states, quality, errors, rotations, properties, balance, colophon };
 })();

@@ -1,0 +1,102 @@
+"""Say what becomes of verdicts and stated errors at the ends of what datasets may be.
+
+    python benchmarks/ends.py [--assets 126] [--seed 61] [--levels 5 6 7] [--jobs 2]
+
+Datasets of demo objects: one asset, ten, all, all with a fifth of the SLATs shuffled among
+themselves, all with all SLATs shuffled, and as many balls. Printed of each: the assets, how many
+pairs are wrong, how many assets are good and failed, how many wrong ones are good, and what the
+decoys say.
+"""
+
+from __future__ import annotations
+
+import argparse
+import tempfile
+from collections.abc import Iterable
+from concurrent.futures import ProcessPoolExecutor
+from pathlib import Path
+
+import numpy as np
+
+from slatprep.demo.asset import make_asset
+from slatprep.demo.catalogue import CATALOGUE
+from slatprep.demo.write import write_annotated, write_slat
+from slatprep.parameters import BuildParameters, PairingParameters, PixieverseSource, SlatSource
+from slatprep.pipeline.dataset import build_store
+from slatprep.pipeline.decoys import measure_errors, told_of
+from slatprep.records import RESOLUTION
+from slatprep.store import open_store
+
+BALL = list(CATALOGUE).index("sport_balls")
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--assets", type=int, default=126)
+    parser.add_argument("--seed", type=int, default=61)
+    parser.add_argument("--levels", type=int, nargs="+", default=[5, 6, 7])
+    parser.add_argument("--jobs", type=int, default=2)
+    options = parser.parse_args()
+    with tempfile.TemporaryDirectory() as scratch:
+        mixed, balls = Path(scratch, "mixed"), Path(scratch, "balls")
+        ids = make(mixed, range(options.assets), options)
+        numbers = range(BALL, BALL + len(CATALOGUE) * options.assets, len(CATALOGUE))
+        ball_ids = make(balls, numbers, options)
+        rng = np.random.default_rng(options.seed)
+        fifth = sorted(rng.choice(ids, len(ids) // 5, replace=False).tolist())
+        print("| dataset | assets | wrong pairs | good | failed | wrong ones good | decoys say |")
+        print("| --- " * 7 + "|")
+        for name, source, chosen, wrong in (
+            ("one asset", mixed, ids[:1], []),
+            ("ten assets", mixed, ids[:10], []),
+            ("all", mixed, ids, []),
+            ("a fifth of the pairs shuffled", mixed, ids, fifth),
+            ("all pairs shuffled", mixed, ids, ids),
+            ("balls alone", balls, ball_ids, []),
+        ):
+            shuffled = dict(zip(wrong, [*wrong[1:], *wrong[:1]], strict=True))
+            out = Path(scratch, name.replace(" ", "-"))
+            print(row(name, source, {one: shuffled.get(one, one) for one in chosen}, out,
+                      options.jobs), flush=True)  # fmt: skip
+
+
+def make(root: Path, numbers: Iterable[int], options: argparse.Namespace) -> list[str]:
+    """Make assets; return their ids in random order."""
+    tasks = [(root, options.seed, number, tuple(options.levels)) for number in numbers]
+    with ProcessPoolExecutor(options.jobs) as pool:
+        ids = list(pool.map(make_one, *zip(*tasks, strict=True)))
+    return [ids[k] for k in np.random.default_rng(options.seed).permutation(len(ids))]
+
+
+def make_one(root: Path, seed: int, number: int, levels: tuple[int, ...]) -> str:
+    asset = make_asset(seed, number, levels=levels)
+    write_annotated(root / "pixieverse", asset, "pixieverse", RESOLUTION)
+    write_slat(root / "slat", asset, "npz", "id", "trellis")
+    return asset.object_id
+
+
+def row(name: str, source: Path, slat_of: dict[str, str], out: Path, jobs: int) -> str:
+    """Pair grids with SLATs as told, build, measure; return a row of the table."""
+    out.mkdir()
+    lines = ["object_id,slat_id", *(f"{one},{slat}" for one, slat in slat_of.items())]
+    (out / "map.csv").write_text("\n".join(lines) + "\n")
+    parameters = BuildParameters(
+        pixieverse=PixieverseSource(root=source / "pixieverse"),
+        slat=SlatSource(root=source / "slat"),
+        pairing=PairingParameters(map=out / "map.csv"),
+    )
+    build_store(parameters, out / "s.zarr", jobs=jobs)
+    store = open_store(out / "s.zarr")
+    if len(store) > 1:
+        measure_errors(store, jobs=jobs)
+    verdicts = dict(zip(store.ids, map(str, store.column("verdict")), strict=True))
+    wrong = [one for one, slat in slat_of.items() if one != slat]
+    count = list(verdicts.values()).count
+    good = sum(verdicts.get(one) == "good" for one in wrong)
+    told = "; ".join(told_of(store))
+    return (f"| {name} | {len(store)} | {len(wrong)} | {count('good')} | {count('failed')} "
+            f"| {good} | {told} |")  # fmt: skip
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,392 @@
+"""How many of a store's alignments show another object, measured on decoys of the dataset itself.
+
+A decoy is an asset's grid aligned with the SLAT of another object, of the size nearest to its
+own. Which grids are drawn depends on a seed and the ids alone, so those of an update are
+mostly those of before, and what was measured of them is taken over.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+import orjson
+from numpy.typing import NDArray
+
+from slatprep.errors import StoreError
+from slatprep.judge.verdict import LEAST_TARGETS
+from slatprep.records import Engine, Number, Place, Share, Verdict
+from slatprep.storage.atomic import writing
+from slatprep.storage.documents import read_bounded
+from slatprep.storage.place import storage_of
+from slatprep.store import Store, open_store
+from slatprep.store.manifests import manifests_of
+from slatprep.store.record import StageParameters
+from slatprep.store.record_json import adapter_of
+from slatprep.store.records import StoredRecords
+from slatprep.workers import Progress
+from slatprep.workers.local import Jobs, run_unordered
+
+DECOYS = 200
+"""Decoys of a dataset, at most one for each asset."""
+
+EVERY = 20
+"""A build aligns one decoy for each so many assets that it aligns: 5 % more."""
+
+ALIKE = 0.2
+"""From this share of decoys called good on, objects are too much alike for decoys to tell."""
+
+RATES = (0.001, 0.01, 0.05)
+"""Shares of wrong assets for which it is said how many assets may be kept."""
+
+FILE = "decoys.json"
+"""In the folder of the store's records, as it is called beside the store."""
+
+LEAST_TOLD = 0.001
+"""Least probability of an error that is kept for an asset."""
+
+BINS = 40
+_MAX_BYTES = 64 * 2**20
+
+
+@dataclass(frozen=True)
+class Decoy:
+    """An asset's grid with another one's SLAT.
+
+    Attributes
+    ----------
+    grid, slat : str
+        Ids of the assets.
+    keys : tuple of str
+        What these two were made from and how.
+    verdict : str
+        What the alignment is called, as that of an asset would be.
+    evidence : tuple of float
+        `slatprep.judge.evidence.FIGURES` of their alignment; empty before it is aligned.
+    """
+
+    grid: str
+    slat: str
+    keys: tuple[str, str]
+    verdict: str = ""
+    evidence: tuple[Number, ...] = ()
+
+
+@dataclass(frozen=True)
+class Kept:
+    """How many assets may be kept at a share of wrong ones, and the least score that they have."""
+
+    rate: float
+    assets: int
+    score: Number
+
+
+@dataclass(frozen=True)
+class MeasuredErrors:
+    """The errors of a store's alignments, as `FILE` keeps them.
+
+    Attributes
+    ----------
+    build : str
+        Id of the build that was measured.
+    seed : int
+        Of the draw of decoys.
+    assets : int
+        How many the store had.
+    refitted : bool
+        Whether the score was learned on the dataset; else it is the shipped model's.
+    wrong_share : float
+        Share of all assets that show another object.
+    good : int
+        Assets called good.
+    good_wrong : float
+        How many of them show another object.
+    wrong_share_range, good_wrong_range : tuple of float
+        Where these two lie with a probability of 0.95.
+    kept : tuple of Kept
+        For each of `RATES`.
+    errors : dict of str to float
+        Posterior probability that an asset shows another object, by id; those of `LEAST_TOLD`
+        and more.
+    edges, targets, counts : tuple
+        Histogram of the scores, logarithms of odds: edges, assets and decoys in between.
+    decoys : tuple of Decoy
+        What it was measured on.
+    """
+
+    build: str
+    seed: int
+    assets: int
+    refitted: bool
+    wrong_share: Share
+    wrong_share_range: tuple[float, float]
+    good: int
+    good_wrong: float
+    good_wrong_range: tuple[float, float]
+    kept: tuple[Kept, ...]
+    errors: dict[str, float]
+    edges: tuple[float, ...]
+    targets: tuple[int, ...]
+    counts: tuple[int, ...]
+    decoys: tuple[Decoy, ...]
+
+    def sentences(self) -> list[str]:
+        """Say in words what was measured."""
+        low, high = self.good_wrong_range
+        shares = self.wrong_share_range
+        passed = sum(one.verdict == Verdict.GOOD for one in self.decoys)
+        if passed >= ALIKE * len(self.decoys):
+            return [
+                f"decoys cannot tell how many of the {self.good:,} called good show another "
+                f"object: {passed:,} of {len(self.decoys):,} decoys are called good, too, as "
+                "objects of this dataset are alike"
+            ]
+        told = [
+            f"of the {self.good:,} called good about {self.good_wrong:.0f} show another object "
+            f"({low:.0f} to {high:.0f}; measured on {len(self.decoys):,} decoys of this dataset)",
+            f"of all {self.assets:,} assets about {self.wrong_share:.1%} show another object "
+            f"({shares[0]:.1%} to {shares[1]:.1%})",
+        ]
+        if not self.refitted:
+            told.append("too few assets or decoys to learn from: the shipped model stands")
+        return told
+
+    def of_asset(self, asset_id: str) -> str:
+        """Say how probable it is that an asset shows another object, where decoys can tell."""
+        error = self.errors.get(asset_id)
+        likely = f"below {LEAST_TOLD:.1%}" if error is None else f"{error:.1%}"
+        return f"by the decoys of its dataset, the probability of another object is {likely}"
+
+
+def measure_errors(
+    store: Store,
+    decoys: int = DECOYS,
+    seed: int = 0,
+    jobs: Jobs = 1,
+    progress: Progress | None = None,
+    *,
+    most_new: int | None = None,
+    before: Place | None = None,
+) -> MeasuredErrors:
+    """Count the errors of a store's alignments on decoys; none of its assets is aligned again.
+
+    Parameters
+    ----------
+    store : Store
+        An aligned dataset.
+    decoys : int
+        How many decoys at most.
+    seed : int
+        Of their draw.
+    jobs : int or Workers
+        Worker processes; the result does not depend on it.
+    progress : callable, optional
+        Called with the decoys done and the decoys to align.
+    most_new : int, optional
+        How many decoys to align at most; the others are those that were aligned before.
+    before : Place, optional
+        The store that this one replaces, if it lies elsewhere; its decoys are taken over.
+
+    Returns
+    -------
+    MeasuredErrors
+        Also written to `FILE`.
+
+    Raises
+    ------
+    StoreError
+        If the store has fewer than two objects, its transforms were given, or its records have
+        no evidence.
+    """
+    from slatprep.judge.decoys import error_rates
+
+    if reason := _no_decoys(store):
+        raise StoreError(f"{store.path}: {reason}")
+    keys, evidence = _evidence_of(store)
+    wanted = draw_decoys(store, keys, decoys, seed)
+    measured = measured_errors(store.path) or (before and measured_errors(before))
+    known = {(one.grid, one.slat, one.keys): one for one in measured.decoys} if measured else {}
+    found = [known.get((one.grid, one.slat, one.keys), one) for one in wanted]
+    missing = [number for number, one in enumerate(found) if not one.evidence][:most_new]
+    records, row_of = StoredRecords(store), {name: row for row, name in enumerate(store.ids)}
+    tasks = (
+        (store.path, k, wanted[k], records.read(row_of[wanted[k].grid]).parameters) for k in missing
+    )
+    for done, (number, decoy) in enumerate(run_unordered(align_decoy, tasks, jobs), 1):
+        found[number] = decoy
+        if progress:
+            progress(done, len(missing))
+    made = tuple(one for one in found if one.evidence)
+    folds = [fold_of(str(one)) for one in store.column("object_id")]
+    rates = error_rates(
+        evidence,
+        np.array([one.evidence for one in made], dtype=np.float64),
+        np.array(folds),
+        np.array([folds[row_of[one.grid]] for one in made]),
+        good=store.column("verdict") == str(Verdict.GOOD),
+        good_decoys=np.array([one.verdict == Verdict.GOOD for one in made]),
+        seed=seed,
+    )
+    both = np.concatenate([rates.scores, rates.decoy_scores])
+    edges = np.linspace(both.min(), max(both.max(), both.min() + 1e-6), BINS + 1)
+    errors = zip(store.ids, rates.errors.tolist(), strict=True)
+    result = MeasuredErrors(
+        build=store.about.manifest,
+        seed=seed,
+        assets=rates.targets,
+        refitted=rates.refitted,
+        wrong_share=rates.wrong_share,
+        wrong_share_range=rates.wrong_share_range,
+        good=rates.good,
+        good_wrong=rates.good_wrong,
+        good_wrong_range=rates.good_wrong_range,
+        kept=tuple(Kept(rate, *rates.kept(rate)) for rate in RATES),
+        errors={one: round(error, 6) for one, error in sorted(errors) if error >= LEAST_TOLD},
+        edges=tuple(edges.tolist()),
+        targets=tuple(np.histogram(rates.scores, edges)[0].tolist()),
+        counts=tuple(np.histogram(rates.decoy_scores, edges)[0].tolist()),
+        decoys=made,
+    )
+    _write(store, result)
+    return result
+
+
+def measure_build(
+    store: Store,
+    aligned: int,
+    most: int,
+    jobs: Jobs,
+    before: Place | None = None,
+    note: Callable[[str], None] | None = None,
+) -> None:
+    """Measure the errors of a store that a build has just written, within `EVERY`.
+
+    `aligned` is how many assets it aligned, `most` how many decoys there may be, and `before` the
+    store that it replaces. Where these allow no decoy, what was measured before stands, and
+    `told_of` says that it is of before.
+    """
+    measured = measured_errors(store.path) or (before and measured_errors(before))
+    new = min(aligned // EVERY, most)
+    if new == 0 or len(store) < LEAST_TARGETS or _no_decoys(store):
+        if measured:
+            _write(store, measured)
+        return
+    if note:
+        note(f"measuring errors on at most {new:,} new decoys")
+    # As many as were asked for by hand are kept.
+    count = max(min(len(store) // EVERY, most), len(measured.decoys) if measured else 0)
+    seed = measured.seed if measured else 0
+    measure_errors(store, count, seed, jobs, most_new=new, before=before)
+
+
+def _no_decoys(store: Store) -> str:
+    """Say why a store can have no decoys; empty where it can."""
+    if len(set(map(str, store.column("object_id")))) < 2:
+        return "decoys need at least two objects, and it has one"
+    if str(Engine.KNOWN) in store.column("engine"):
+        return "its transforms were given, so decoys of it cannot be aligned"
+    return ""
+
+
+def _evidence_of(store: Store) -> tuple[dict[str, str], NDArray[np.float64]]:
+    """Return the key of each asset by its id, and the evidence (A, F), from the records."""
+    records = StoredRecords(store)
+    keys: dict[str, str] = {}
+    evidence: list[NDArray[np.float64]] = []
+    for row, asset_id in enumerate(store.ids):
+        # To check a whole record takes a millisecond, and only these two are needed.
+        try:
+            record = orjson.loads(records.text(row))
+            keys[asset_id] = str(record["key"])
+            evidence.append(np.array(record["judgement"]["evidence"], dtype=np.float64))
+        except (ValueError, KeyError, TypeError):
+            raise StoreError(
+                f"{store.path}: the record of {asset_id} cannot be read; run `slatprep verify`"
+            ) from None
+    if len({one.shape for one in evidence}) != 1 or not evidence[0].size:
+        raise StoreError(f"{store.path}: its records hold no evidence; build it again")
+    return keys, np.array(evidence)
+
+
+def draw_decoys(store: Store, keys: Mapping[str, str], count: int, seed: int) -> list[Decoy]:
+    """Choose grids by a hash of their ids, and for each the SLAT of the size nearest to its own."""
+    ids, objects = store.ids, [str(one) for one in store.column("object_id")]
+    sizes = np.diff(store.offsets).tolist()
+    by_hash = sorted(range(len(ids)), key=lambda row: _hash(seed, ids[row]))
+    # Stable, so that of one size the order is that of the hashes.
+    by_size = sorted(by_hash, key=sizes.__getitem__)
+    place = {row: at for at, row in enumerate(by_size)}
+    drawn = []
+    for row in by_hash[:count]:
+        at, own = place[row], objects[row]
+        larger = next((k for k in by_size[at + 1 :] if objects[k] != own), None)
+        smaller = next((k for k in reversed(by_size[:at]) if objects[k] != own), None)
+        near = [k for k in (smaller, larger) if k is not None]
+        if near:
+            other = min(near, key=lambda k: abs(sizes[k] - sizes[row]))
+            drawn.append(Decoy(ids[row], ids[other], (keys[ids[row]], keys[ids[other]])))
+    return drawn
+
+
+def _hash(seed: int, text: str) -> bytes:
+    return hashlib.sha256(f"decoy {seed} {text}".encode()).digest()
+
+
+def fold_of(object_id: str) -> int:
+    """Return the part of the objects that one belongs to, whatever others there are."""
+    from slatprep.judge.decoys import FOLDS
+
+    return hashlib.sha256(f"fold {object_id}".encode()).digest()[0] % FOLDS
+
+
+def align_decoy(
+    path: Place, number: int, decoy: Decoy, parameters: StageParameters
+) -> tuple[int, Decoy]:
+    """Align a decoy as its grid was; return it, judged, with its number."""
+    from slatprep.align import align
+    from slatprep.geometry.deformation import map_of
+    from slatprep.judge import judge
+    from slatprep.sample import sample
+
+    store = open_store(path)
+    field, latents = store.asset(decoy.grid).field, store.asset(decoy.slat).latents
+    alignment = align(field, latents, parameters.align)
+    places = map_of(alignment).to_pixieverse(latents.centres)
+    annotation = sample(field, places, parameters.sample)
+    judgement, _ = judge(field, latents, alignment, annotation, parameters.sample)
+    return number, replace(decoy, verdict=str(judgement.verdict), evidence=judgement.evidence)
+
+
+def measured_errors(store: Place) -> MeasuredErrors | None:
+    """Return what was measured of a store, or of what it was before an update; None if nothing."""
+    file = manifests_of(store) / FILE
+    try:
+        text = read_bounded(file, _MAX_BYTES)
+        found: MeasuredErrors = adapter_of(MeasuredErrors).validate_json(text, strict=True)
+    except (OSError, ValueError):
+        return None  # They are measured anew.
+    return found
+
+
+def told_of(store: Store) -> list[str]:
+    """Return what is known of a store's errors in sentences, or why nothing is known."""
+    measured = measured_errors(store.path)
+    if measured is None:
+        few = f"; decoys need {LEAST_TARGETS} assets" if len(store) < LEAST_TARGETS else ""
+        return [f"not measured{few or '; run `slatprep measure-errors`'}"]
+    told = measured.sentences()
+    if measured.build != store.about.manifest:
+        told.append(
+            f"measured before the last update, when there were {measured.assets:,} assets; "
+            "`slatprep measure-errors` counts them anew"
+        )
+    return told
+
+
+def _write(store: Store, measured: MeasuredErrors) -> None:
+    """Write what was measured beside the store."""
+    file = manifests_of(store.path) / FILE
+    with writing(str(file), file.parent), storage_of(file).staged() as path:
+        path.write_bytes(orjson.dumps(measured, option=orjson.OPT_INDENT_2) + b"\n")
