@@ -73,3 +73,14 @@ def test_an_engine_that_is_not_installed_names_its_extra(
     ):
         with pytest.raises(SlatprepError, match=rf"{engine}.*slatprep\[{extra}\]"):
             call()
+
+
+def test_a_library_that_open3d_lacks_is_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    lacking = "libusb-1.0.so.0: cannot open shared object file"
+    (tmp_path / "open3d.py").write_text(f"raise ImportError({lacking!r})")
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.delitem(sys.modules, "open3d", raising=False)
+    with pytest.raises(SlatprepError, match=rf"{lacking}.*libusb-1\.0-0"):
+        align(field_of(chair()), surface_latents(chair()), ENGINES["open3d"])
