@@ -23,6 +23,9 @@ from contextlib import redirect_stdout
 from pathlib import Path
 from typing import Any
 
+if __name__ == "__main__" and (Path(__file__).parent / "inspect").is_dir():
+    sys.path[0] = str(Path.cwd())  # Not slatprep's folder, whose `inspect` is not Python's.
+
 import numpy as np
 
 STAGES = ("image", "sparse structure", "SLAT")

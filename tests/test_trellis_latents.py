@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import json
+import subprocess
 import sys
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
@@ -37,6 +38,17 @@ def test_it_is_python_3_10_and_imports_nothing_of_ours() -> None:
     assert modules <= brought | set(sys.stdlib_module_names), modules
     # Names that Python 3.11 added to modules used here.
     assert "tomllib" not in modules and "StrEnum" not in SOURCE.read_text("utf-8")
+
+
+def test_it_runs_where_slatprep_lies_and_with_what_lies_where_it_is_run(tmp_path: Path) -> None:
+    # Beside it is slatprep's `inspect`, and a checkout of TRELLIS is not installed.
+    (tmp_path / "trellis").mkdir()
+    (tmp_path / "trellis" / "__init__.py").write_text("raise RuntimeError('TRELLIS of here')")
+    (tmp_path / "torch.py").touch()
+    Image.new("RGB", (2, 2)).save(tmp_path / "cup.png")
+    words = [sys.executable, str(SOURCE), "cup.png", "--out", "slat"]
+    ran = subprocess.run(words, cwd=tmp_path, capture_output=True, text=True)
+    assert "RuntimeError: TRELLIS of here" in ran.stderr
 
 
 @pytest.fixture

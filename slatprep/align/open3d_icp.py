@@ -79,8 +79,8 @@ def load_open3d() -> Any:
     except ImportError as error:
         raise SlatprepError(
             f"Open3D is installed and cannot be loaded ({error}); it needs libraries of the "
-            "system, on Debian: apt-get install libx11-6 libgl1 libgomp1, and for Open3D 0.20, which "
-            "newton[importers] puts over open3d-cpu 0.19, libusb-1.0-0"
+            "system, on Debian: apt-get install libx11-6 libgl1 libgomp1. Open3D 0.20 also needs "
+            "libusb-1.0-0; newton[importers] puts it over open3d-cpu 0.19"
         ) from None
 
     open3d.utility.set_verbosity_level(open3d.utility.VerbosityLevel.Error)
