@@ -16,6 +16,7 @@ import time
 import traceback
 from collections.abc import Callable
 from dataclasses import replace
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -232,7 +233,7 @@ def compile_kernels(note: Callable[[str], None] | None = None) -> None:
 
     `note` gets a line where something has to be compiled, with the seconds that this machine needs
     by the first kernel, and one when that is done. Half of the kernels are compiled by a second
-    process. Where all are compiled already, this takes 1 s.
+    process. Where all are compiled already, this takes 1 s, once a process.
     """
     start, watch = time.monotonic(), _Watch(note)
     with event.install_listener("numba:compile", watch):
@@ -258,8 +259,9 @@ def _bent_shape() -> tuple[MaterialField, StructuredLatents]:
     return field, StructuredLatents(bent, np.zeros((len(bent), 8), np.float32))
 
 
+@cache
 def _process_a_bent_shape() -> None:
-    """Align, sample and judge."""
+    """Align, sample and judge, once a process."""
     field, latents = _bent_shape()
     alignment = align(field, latents, AlignParameters(model="deformable"))
     places = map_of(alignment).places(latents.coords)
