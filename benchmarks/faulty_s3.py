@@ -42,8 +42,7 @@ import fsspec
 from click.testing import CliRunner
 from support import object_store
 from support.faulty_proxy import KINDS, Faults, faulty
-from support.remote import current, put
-from support.synthetic import Dataset
+from support.remote import Dataset, current, put
 from support.trees import tree
 
 from slatprep.cli.commands import slatprep

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -46,18 +47,29 @@ def sample_grid(seed: int, factor: float, metal: int = 1) -> np.ndarray:
     return grid
 
 
-@pytest.fixture
-def several(make_dataset: MakeDataset) -> Dataset:
+@pytest.fixture(scope="module")
+def several(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
     """Object ``a`` with three samples, of which the last calls the metal sand; ``b`` with one."""
-    dataset = make_dataset("a", "b")
+    dataset = Dataset(tmp_path_factory.mktemp("several"))
+    for seed, object_id in enumerate("ab"):
+        dataset.add(object_id, seed)
     for sample, factor in enumerate(FACTORS):
         write_sample(dataset, "a", sample, sample_grid(0, factor, metal=2 if sample == 2 else 1))
     return dataset
 
 
+@pytest.fixture(scope="module")
+def merged(several: Dataset) -> BuildSummary:
+    """Build it; nobody may change the store."""
+    return build_store(asked(several, "merge"), several.root / "merged.zarr")
+
+
 @pytest.fixture
-def merged(several: Dataset, tmp_path: Path) -> BuildSummary:
-    return build_store(asked(several, "merge"), tmp_path / "merged.zarr")
+def own(several: Dataset, tmp_path: Path) -> Dataset:
+    """Return the dataset of a test that changes it."""
+    for side in ("pixieverse", "slat"):
+        shutil.copytree(several.root / side, tmp_path / "own" / side)
+    return Dataset(tmp_path / "own", several.assets)
 
 
 def test_labels_are_the_mean_and_the_vote_of_all(
@@ -148,10 +160,10 @@ def test_each_sample_may_be_an_asset(several: Dataset, tmp_path: Path) -> None:
     assert not store.merges
 
 
-def test_what_fails_is_left_out_and_named(several: Dataset, tmp_path: Path) -> None:
-    path = several.root / "pixieverse/a/sample_0/material_grid.npy"
+def test_what_fails_is_left_out_and_named(own: Dataset, tmp_path: Path) -> None:
+    path = own.root / "pixieverse/a/sample_0/material_grid.npy"
     path.write_bytes(path.read_bytes()[:1000])
-    summary = build_store(asked(several, "merge"), tmp_path / "s.zarr")
+    summary = build_store(asked(own, "merge"), tmp_path / "s.zarr")
     assert summary.statuses["ok"] == 2
     record = records_of(summary.records)["a"]
     first, *others = record["merged"]
@@ -163,15 +175,15 @@ def test_what_fails_is_left_out_and_named(several: Dataset, tmp_path: Path) -> N
     np.testing.assert_allclose(np.unique(asset.votes), [0.5, 1.0])
     assert verify_store(str(summary.store), sources=True).findings == ()
     # The same again: what cannot be read is no reason to do it anew.
-    assert {str(a.action) for a in plan_build(asked(several, "merge"), summary.store).assets} == {
+    assert {str(a.action) for a in plan_build(asked(own, "merge"), summary.store).assets} == {
         "reuse"
     }
 
 
-def test_an_asset_fails_when_none_is_left(several: Dataset, tmp_path: Path) -> None:
+def test_an_asset_fails_when_none_is_left(own: Dataset, tmp_path: Path) -> None:
     for sample in range(len(FACTORS)):
-        write_sample(several, "a", sample, np.zeros((64, 64, 63, 4), np.float32))
-    summary = build_store(asked(several, "merge"), tmp_path / "s.zarr")
+        write_sample(own, "a", sample, np.zeros((64, 64, 63, 4), np.float32))
+    summary = build_store(asked(own, "merge"), tmp_path / "s.zarr")
     assert summary.statuses == {"ok": 1, "failed": 1, "skipped": 0}
     (problem,) = summary.problems
     assert "none of its 3 annotations can be used" in problem[1]
@@ -179,37 +191,39 @@ def test_an_asset_fails_when_none_is_left(several: Dataset, tmp_path: Path) -> N
 
 
 def test_a_sample_more_redoes_that_object_alone(
-    several: Dataset, merged: BuildSummary, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    own: Dataset, merged: BuildSummary, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    write_sample(several, "b", 1, sample_grid(1, 2.0))
+    out = Path(shutil.copytree(str(merged.store), tmp_path / "s.zarr"))
+    shutil.copytree(merged.records.parent, tmp_path / "s.manifests")
+    write_sample(own, "b", 1, sample_grid(1, 2.0))
     done: list[str] = []
     inject(monkeypatch, lambda step, name: done.append(name) if step == "asset aligned" else None)
-    again = build_store(asked(several, "merge"), str(merged.store))
+    again = build_store(asked(own, "merge"), out)
     assert set(done) == {"b"}
-    fresh = build_store(asked(several, "merge"), tmp_path / "fresh.zarr")
+    fresh = build_store(asked(own, "merge"), tmp_path / "fresh.zarr")
     assert tree(again.store) == tree(fresh.store)
     assert open_store(str(again.store)).asset("b").merged
 
 
 @pytest.mark.parametrize(("sample", "ok"), [(0, 2), (1, 1)])
 def test_a_grid_replaced_during_the_build_never_gets_the_key_of_other_labels(
-    several: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, sample: int, ok: int
+    own: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, sample: int, ok: int
 ) -> None:
     """Sample 0 has been read when it is replaced, sample 1 has been hashed alone."""
     new = sample_grid(0, 20.0)
 
     def replace_grid(step: str, name: str) -> None:
         if (step, name) == ("asset aligned", "a"):
-            write_sample(several, "a", sample, new)
+            write_sample(own, "a", sample, new)
 
     with monkeypatch.context() as during:
         inject(during, replace_grid)
-        first = build_store(asked(several, "merge"), tmp_path / "s.zarr")
+        first = build_store(asked(own, "merge"), tmp_path / "s.zarr")
     assert first.statuses["ok"] == ok
     if ok == 1:
         assert "sample 1 was replaced while the build read it" in first.problems[0][1]
-    again = build_store(asked(several, "merge"), tmp_path / "s.zarr")
-    fresh = build_store(asked(several, "merge"), tmp_path / "fresh.zarr")
+    again = build_store(asked(own, "merge"), tmp_path / "s.zarr")
+    fresh = build_store(asked(own, "merge"), tmp_path / "fresh.zarr")
     assert tree(again.store) == tree(fresh.store)
 
 
@@ -230,18 +244,18 @@ def test_passes_that_place_anew_are_refused(several: Dataset) -> None:
         replace(asked(several, "merge"), consensus=ConsensusParameters(settle=True))
 
 
-def test_by_default_several_are_a_fault(several: Dataset, tmp_path: Path) -> None:
-    summary = build_store(several.parameters(), tmp_path / "s.zarr")
+def test_by_default_several_are_a_fault(own: Dataset, tmp_path: Path) -> None:
+    summary = build_store(own.parameters(), tmp_path / "s.zarr")
     assert dict(summary.problems)["a"].endswith("expected one grid and one SLAT per id")
     assert "--samples" in dict(summary.problems)["a"]
-    (several.root / "slat/b.npz").unlink()
+    (own.root / "slat/b.npz").unlink()
     with pytest.raises(StoreError, match="3 samples"):
-        build_store(several.parameters(), tmp_path / "t.zarr")
+        build_store(own.parameters(), tmp_path / "t.zarr")
 
 
 @pytest.mark.parametrize("name", ["spread", "votes", "confidence", "properties", "material"])
 def test_labels_that_the_sources_do_not_give_are_found(
-    several: Dataset, merged: BuildSummary, name: str, monkeypatch: pytest.MonkeyPatch
+    several: Dataset, tmp_path: Path, name: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The file is written with its digest, as a faulty build would have done."""
     from slatprep.pipeline import annotate as stage
@@ -257,8 +271,8 @@ def test_labels_that_the_sources_do_not_give_are_found(
         return replace(made, **{name: values})
 
     monkeypatch.setattr(stage, "merge", wrong)
-    out = str(merged.store)
-    build_store(asked(several, "merge"), out, fresh=True)
+    out = tmp_path / "s.zarr"
+    build_store(asked(several, "merge"), out)
     assert verify_store(out).findings == ()
     found = verify_store(out, sources=True).findings
     assert {finding.file for finding in found} == {f"voxel/{name}"}

@@ -12,6 +12,7 @@ import h5py
 import numpy as np
 import pytest
 from support.faults import inject
+from support.first_builds import tree_from_nothing
 from support.synthetic import Dataset, make_asset
 from support.trees import tree
 
@@ -42,14 +43,6 @@ def reasons(parameters: BuildParameters, out: Path) -> dict[str, tuple[str, str]
     return {asset.asset_id: (str(asset.action), asset.reason) for asset in plan.assets}
 
 
-def fresh_tree(parameters: BuildParameters, tmp_path: Path) -> dict[str, str]:
-    """Return what a build that knows of no other would write."""
-    summary = build_store(parameters, tmp_path / "reference" / "s.zarr")
-    hashes = tree(summary.store)
-    shutil.rmtree(tmp_path / "reference")
-    return hashes
-
-
 def test_nothing_changed_writes_nothing(built: tuple[Dataset, Path], aligned: list[str]) -> None:
     dataset, out = built
     inodes = {path: path.stat().st_ino for path in out.parent.rglob("*") if path.is_file()}
@@ -68,9 +61,7 @@ def test_nothing_changed_writes_nothing(built: tuple[Dataset, Path], aligned: li
     }
 
 
-def test_new_changed_and_removed(
-    built: tuple[Dataset, Path], aligned: list[str], tmp_path: Path
-) -> None:
+def test_new_changed_and_removed(built: tuple[Dataset, Path], aligned: list[str]) -> None:
     dataset, out = built
     dataset.add("d", seed=3)
     made = make_asset(seed=6)
@@ -90,7 +81,7 @@ def test_new_changed_and_removed(
     build_store(dataset.parameters(), out)
     assert len(aligned) == 2
     assert open_store(out).ids == ["a", "b", "d"]
-    assert tree(out) == fresh_tree(dataset.parameters(), tmp_path)
+    assert tree(out) == tree_from_nothing(dataset.parameters())
 
 
 def test_a_change_that_keeps_size_and_times_is_seen(built: tuple[Dataset, Path]) -> None:
@@ -109,29 +100,27 @@ def test_a_change_that_keeps_size_and_times_is_seen(built: tuple[Dataset, Path])
 
 
 def test_moved_ranges_renormalise_without_aligning(
-    built: tuple[Dataset, Path], aligned: list[str], tmp_path: Path
+    built: tuple[Dataset, Path], aligned: list[str]
 ) -> None:
     dataset, out = built
     pixie = dataset.parameters("pixie")
     assert {action for action, _ in reasons(pixie, out).values()} == {"reuse"}
     build_store(pixie, out)
     assert aligned == []
-    assert tree(out) == fresh_tree(pixie, tmp_path)
+    assert tree(out) == tree_from_nothing(pixie)
 
 
-def test_other_shards_need_no_alignment(
-    built: tuple[Dataset, Path], aligned: list[str], tmp_path: Path
-) -> None:
+def test_other_shards_need_no_alignment(built: tuple[Dataset, Path], aligned: list[str]) -> None:
     dataset, out = built
     parameters = dataset.parameters()
     wider = replace(parameters, store=replace(parameters.store, voxel_chunk=256))
     build_store(wider, out)
     assert aligned == []
-    assert tree(out) == fresh_tree(wider, tmp_path)
+    assert tree(out) == tree_from_nothing(wider)
 
 
 def test_parameters_that_touch_an_asset_redo_it(
-    built: tuple[Dataset, Path], aligned: list[str], tmp_path: Path
+    built: tuple[Dataset, Path], aligned: list[str]
 ) -> None:
     dataset, out = built
     nearer = replace(dataset.parameters(), sample=SampleParameters(max_distance=2.0))
@@ -139,7 +128,7 @@ def test_parameters_that_touch_an_asset_redo_it(
     assert reasons(nearer, out) == dict.fromkeys("abc", ("align", why))
     build_store(nearer, out)
     assert len(aligned) == 3
-    assert tree(out) == fresh_tree(nearer, tmp_path)
+    assert tree(out) == tree_from_nothing(nearer)
     rigid = replace(nearer, align=AlignParameters(model="rigid"))
     assert reasons(rigid, out)["a"][1] == "parameters changed: align.model was auto, is rigid"
 
@@ -191,7 +180,7 @@ def test_one_file_of_all_slats_may_grow(
     assert reasons(parameters, tmp_path / "s.zarr") == {"a": again, "b": again, "c": new}
     build_store(parameters, tmp_path / "s.zarr")
     assert len(aligned) == 3
-    assert tree(tmp_path / "s.zarr") == fresh_tree(parameters, tmp_path)
+    assert tree(tmp_path / "s.zarr") == tree_from_nothing(parameters)
 
 
 def test_an_asset_that_cannot_go_in_does_not_make_the_store_old(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import ClassVar
 
 import numpy as np
 
@@ -72,6 +73,8 @@ def make_asset(seed: int = 0) -> Asset:
 class Dataset:
     """A folder of sources, and the parameters that build it."""
 
+    shards: ClassVar[StoreParameters] = SMALL_SHARDS
+
     root: Path
     assets: dict[str, Asset] = field(default_factory=dict)
 
@@ -104,5 +107,5 @@ class Dataset:
             SlatSource(self.root / "slat"),
             align=AlignParameters(),
             normalize=NormalizeParameters(ranges),
-            store=SMALL_SHARDS,
+            store=self.shards,
         )

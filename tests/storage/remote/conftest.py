@@ -12,9 +12,7 @@ import pytest
 from joblib.externals.loky import get_reusable_executor
 from s3fs.core import S3FileSystem
 from support import object_store
-from support.synthetic import Dataset
-
-from slatprep.pipeline.dataset import build_store
+from support.remote import Dataset, Made, built, made
 
 
 @pytest.fixture(scope="session")
@@ -65,13 +63,20 @@ def bucket(s3: Any) -> str:
 
 
 @pytest.fixture(scope="session")
-def another(tmp_path_factory: pytest.TempPathFactory) -> tuple[Dataset, Path]:
+def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> Made:
+    """Return three assets, and the store of them; nobody may change them."""
+    return built(tmp_path_factory.mktemp("undisturbed"), *"abc")
+
+
+@pytest.fixture(scope="session")
+def another(tmp_path_factory: pytest.TempPathFactory) -> Made:
     """Return one other asset, and the store of it."""
-    folder = tmp_path_factory.mktemp("another")
-    dataset = Dataset(folder / "sources")
-    dataset.add("z", seed=3)
-    build_store(dataset.parameters("pixie"), folder / "s.zarr")
-    return dataset, folder / "s.zarr"
+    return built(tmp_path_factory.mktemp("another"), "z", seed=3)
+
+
+@pytest.fixture
+def make_dataset(tmp_path: Path) -> Callable[..., Dataset]:
+    return lambda *ids: made(tmp_path / "sources", *ids)
 
 
 class Requests:

@@ -12,8 +12,7 @@ from typing import Any
 import pytest
 from s3fs.core import S3FileSystem
 from support.faults import inject, kill_self
-from support.remote import Made, current, put, versions
-from support.synthetic import Dataset
+from support.remote import Dataset, Made, current, put, versions
 from support.trees import contents, tree
 
 from slatprep.errors import StoreError

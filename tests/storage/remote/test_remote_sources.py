@@ -10,7 +10,7 @@ from typing import Any
 import h5py
 import pytest
 from support.faults import inject
-from support.synthetic import Dataset
+from support.remote import Made
 from support.trees import tree
 
 from slatprep.errors import ConfigError
@@ -22,7 +22,7 @@ from slatprep.store import open_store
 
 
 @pytest.fixture
-def uploaded(s3: Any, bucket: str, undisturbed: tuple[Dataset, Path]) -> BuildParameters:
+def uploaded(s3: Any, bucket: str, undisturbed: Made) -> BuildParameters:
     """Put the sources of three assets into the bucket; return the parameters to build them."""
     dataset, _ = undisturbed
     s3.put(f"{dataset.root}/", f"{bucket}/data/", recursive=True)
@@ -34,7 +34,7 @@ def uploaded(s3: Any, bucket: str, undisturbed: tuple[Dataset, Path]) -> BuildPa
 
 
 def test_the_store_is_the_one_that_local_sources_give(
-    uploaded: BuildParameters, undisturbed: tuple[Dataset, Path], tmp_path: Path
+    uploaded: BuildParameters, undisturbed: Made, tmp_path: Path
 ) -> None:
     summary = build_store(uploaded, tmp_path / "s.zarr")
     assert tree(tmp_path / "s.zarr") == tree(undisturbed[1])
@@ -107,7 +107,7 @@ def test_objects_that_are_torn_or_gone_are_named_and_the_others_go_in(
 
 def test_one_hdf5_file_of_many_assets_is_copied_once(
     uploaded: BuildParameters,
-    undisturbed: tuple[Dataset, Path],
+    undisturbed: Made,
     s3: Any,
     bucket: str,
     tmp_path: Path,
@@ -131,7 +131,7 @@ def test_one_hdf5_file_of_many_assets_is_copied_once(
 
 
 def test_a_pairing_may_lie_elsewhere_than_its_sources(
-    undisturbed: tuple[Dataset, Path], s3: Any, bucket: str
+    undisturbed: Made, s3: Any, bucket: str
 ) -> None:
     s3.pipe_file(f"{bucket}/map.csv", b"object_id,slat_id\na,b\n")
     parameters = replace(

@@ -19,8 +19,7 @@ from click.testing import CliRunner
 from s3fs.core import S3FileSystem
 from support.faults import inject
 from support.faulty_proxy import Faults, faulty
-from support.remote import Made, current, put, versions
-from support.synthetic import Dataset
+from support.remote import Dataset, Made, current, put, versions
 from support.trees import contents, tree
 
 from slatprep.cli.commands import slatprep
@@ -170,9 +169,7 @@ def test_older_versions_that_must_not_be_removed_are_told(
     assert current(s3, url) == tree(another[1])
 
 
-def test_each_fault_of_a_store_is_named(
-    s3: Any, url: str, undisturbed: Made, tmp_path: Path
-) -> None:
+def test_each_fault_of_a_store_is_named(s3: Any, url: str, undisturbed: Made) -> None:
     version = put(undisturbed[1], url)
     s3.rm(f"{version}/voxel/coords/c/0/0")
     shard = bytearray(s3.cat_file(f"{version}/voxel/feats/c/0/0"))

@@ -10,8 +10,7 @@ from typing import Any
 import pytest
 from s3fs.core import S3FileSystem
 from support.faults import inject
-from support.remote import current
-from support.synthetic import Dataset
+from support.remote import Dataset, current
 from support.trees import tree
 
 from slatprep.errors import StoreError
