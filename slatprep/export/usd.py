@@ -52,8 +52,7 @@ _PITCH = 1.25
 def writer(store: Store, ids: Sequence[str], options: ExportOptions) -> Writer:
     """Return the writer of a USD file for each asset; see `slatprep.export.FORMATS`.
 
-    ConfigError if `options.materials` is less than the number of classes, or usd-core is not
-    installed.
+    ConfigError if `options.materials` is less than the number of classes, or usd-core is missing.
     """
     least = len(YIELDING)
     if options.materials < least:

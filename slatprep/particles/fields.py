@@ -67,10 +67,9 @@ class VoxelField:
 
 
 def stored_field(store: Store, name: str | int, points: Points = "slat") -> VoxelField:
-    """Return the materials of an asset, named as in `Store.match`: at least one voxel.
+    """Return the materials of an asset: of its valid SLAT voxels, or of its field, ``grid``.
 
-    Points are the valid SLAT voxels, a surface, or the annotated voxels of the PixieVerse field, a
-    solid. StoreError if the store lacks one of the properties, or has classes of its own;
+    StoreError if the store has no such asset, lacks a property or has classes of its own;
     ConfigError if no voxel of the asset has a material.
     """
     asset, columns = store.asset(name), store.columns_of(PROPERTY_COLUMNS)
@@ -93,13 +92,11 @@ def stored_field(store: Store, name: str | int, points: Points = "slat") -> Voxe
 
 
 def predicted_field(path: Path, normalization: Normalization | None) -> VoxelField:
-    """Read predicted materials; return the valid voxels, in the SLAT frame.
+    """Read predicted materials of the SLAT frame, as `slatprep export --format npz` writes them.
 
-    The npz has integer ``coords`` (N, 3) or (N, 4); integer ``material`` (N,), 0..6; ``properties``
-    (N, 3) normalised by the given ranges, or ``properties_si`` (N, 3) in Pa, kg/m^3 and 1; and
-    optionally boolean ``valid`` (N,), and ``resolution``, the voxels along each axis where these
-    are not 64. `slatprep export --format npz` writes such files. InputError if the file cannot be
-    used, ConfigError if properties are normalised and no ranges are given.
+    The npz has ``coords``, ``material``, ``properties`` or ``properties_si``, and may have
+    ``valid`` and ``resolution``. InputError if it cannot be used, ConfigError if its
+    properties are normalised and `normalization` is None.
     """
     data, _ = load_source(path, path.parent, "slat")
     arrays = npz_arrays(data, path, _SPECS)

@@ -142,11 +142,9 @@ def _limits(mpm: Any) -> tuple[Any, ...]:
 
 
 def windward(positions: ArrayLike, wind: ArrayLike, spacing: float) -> NDArray[np.float64]:
-    """Return the area (N,) of each particle's free faces, projected on the plane across the wind.
+    """Return the area (N,) of the free faces of particles on a lattice, as the wind (3,) sees them.
 
-    Particles (N, 3) stand on a cubic lattice; the length of the wind's direction (3,) does not
-    matter. The area is in the square of the unit of `spacing`; 0 if no free face is on the upwind
-    side, or without wind.
+    0 without a free face on the upwind side; in the square of the unit of `spacing`.
     """
     rest, way = np.asarray(positions, dtype=np.float64), np.asarray(wind, dtype=np.float64)
     area = np.zeros(len(rest))
@@ -165,11 +163,10 @@ def windward(positions: ArrayLike, wind: ArrayLike, spacing: float) -> NDArray[n
 def strain(
     rest: ArrayLike, moved: ArrayLike, part: ArrayLike, spacing: float
 ) -> NDArray[np.float64]:
-    """Measure the strain (N,) around each particle; rigid motion does not count.
+    """Return the largest principal Green-Lagrange strain (F^T F - I) / 2 around each particle (N,).
 
-    It is the largest absolute principal value of the Green-Lagrange strain (F^T F - I) / 2. F is
-    the least-squares fit to the motion, from positions `rest` to `moved` (N, 3), of the neighbours
-    of the same `part` (N,) among the 26 around. NaN if they do not span the space.
+    F is the least-squares fit to the motion of those of the 26 neighbours on the lattice at rest
+    that are of the same `part` (N,); NaN if they do not span the space. Rigid motion has none.
     """
     from scipy.spatial import cKDTree
 
@@ -190,10 +187,10 @@ def strain(
 
 
 def rigid_deviation(rest: ArrayLike, moved: ArrayLike) -> float:
-    """Return the rms distance of points (N, 3), N >= 3, from their best rigid motion.
+    """Return the root mean square distance of points (N, 3), N >= 3, from their best rigid motion.
 
-    Kabsch, "A solution for the best rotation to relate two sets of vectors", Acta Crystallographica
-    A32 (1976).
+    Kabsch, "A solution for the best rotation to relate two sets of vectors", Acta
+    Crystallographica A32 (1976).
     """
     from scipy.spatial.transform import Rotation
 

@@ -98,6 +98,17 @@ def test_openusd_reads_back_places_masses_and_materials(exported: Path, mixed: D
         assert abs(box.ComputeAlignedRange().GetMin()[2]) < 1e-6
 
 
+def test_openusd_s_validators_find_nothing(exported: Path) -> None:
+    from pxr import Usd, UsdValidation
+
+    every = UsdValidation.ValidationRegistry().GetOrLoadAllValidators()
+    assert len(every) > 20
+    context = UsdValidation.ValidationContext(every)
+    for name in ("scene.usda", index_of(exported)[0]["file"]):
+        stage = Usd.Stage.Open(str(exported / name))
+        assert [found.GetMessage() for found in context.Validate(stage)] == []
+
+
 def test_the_scene_has_every_asset_apart_from_the_others(exported: Path) -> None:
     from pxr import Usd, UsdGeom
 
