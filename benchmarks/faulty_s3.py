@@ -6,8 +6,8 @@
 moto's S3 answers on loopback, behind a proxy that spoils a share of the answers by the seed:
 errors of the server (500, 503 SlowDown, 403, 404), connections that are reset before or after
 the server did what it was asked, requests that it gets twice, bodies that are cut, shorter,
-longer or flipped in a bit, delays, listings and pointers that are out of date, and 409 or 412
-where a write has a condition.
+longer, flipped in a bit or those of another object, delays, listings and pointers that are out of
+date, and 409 or 412 where a write has a condition.
 
 Each run builds a store there or brings one up to date, builds from sources that lie there, or
 verifies, reads, copies, exports or reports one. It must end in what the same gives
@@ -77,6 +77,7 @@ class Bench:
     faults: Faults
     s3: Any
     chance: random.Random
+    only: tuple[str, ...] = ()
     told: Counter[str] = field(default_factory=Counter)
     harm: list[str] = field(default_factory=list)
 
@@ -99,7 +100,8 @@ class Bench:
     def run(self, number: int) -> None:
         """Do one thing under faults, and look at what came of it."""
         operation = self.chance.choice(list(OPERATIONS))
-        some = self.chance.sample(KINDS, self.chance.choice((1, 2, len(KINDS))))
+        few = self.chance.choice((1, 2, len(KINDS)))
+        some = self.only or self.chance.sample(KINDS, few)
         self.faults.kinds = tuple(k for k in some if operation != "sources" or k in SOUND)
         self.faults.seed = f"{self.chance.random()}"
         self.faults.lasting = self.chance.random() < 0.2
@@ -261,7 +263,7 @@ def _differences(found: Any, expected: Any) -> str:
 
 
 @contextmanager
-def bench_of(seed: int) -> Iterator[Bench]:
+def bench_of(seed: int, only: tuple[str, ...] = ()) -> Iterator[Bench]:
     """Start server and proxy, and make what is asked of them."""
     faults = Faults()
     with (
@@ -276,7 +278,7 @@ def bench_of(seed: int) -> Iterator[Bench]:
             "SLATPREP_CACHE": f"{folder}/cache",
         }
         direct = fsspec.filesystem("s3", endpoint_url=server, use_listings_cache=False)
-        yield Bench(Path(folder, "work"), faults, direct, random.Random(seed))
+        yield Bench(Path(folder, "work"), faults, direct, random.Random(seed), only)
 
 
 def main() -> None:
@@ -284,11 +286,12 @@ def main() -> None:
     parser.add_argument("--minutes", type=float, default=float("inf"), help="stop after these")
     parser.add_argument("--runs", type=int, default=1_000_000)
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--kind", action="append", choices=KINDS, help="only these faults")
     given = parser.parse_args()
     signal.signal(signal.SIGALRM, _time_is_up)
     begin = time.monotonic()
     runs = 0
-    with bench_of(given.seed) as bench, warnings.catch_warnings():
+    with bench_of(given.seed, tuple(given.kind or ())) as bench, warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of older versions that could not be removed
         while runs < given.runs and time.monotonic() < begin + 60 * given.minutes:
             bench.run(runs)

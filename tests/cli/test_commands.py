@@ -302,7 +302,7 @@ def test_stopped_build_leaves_the_older_store_and_nothing_else(
     while len(list(tmp_path.iterdir())) == 1 and build.poll() is None:
         time.sleep(0.05)
     build.send_signal(signal_number)
-    _, said = build.communicate(timeout=60)
+    _, said = build.communicate(timeout=600)
     assert build.returncode == 130, said
     assert "stopped; nothing was replaced" in said and "Traceback" not in said
     assert list(tmp_path.iterdir()) == [store]

@@ -18,7 +18,7 @@ DEVICE = Path("/dev/full")
 
 def shell(words: str, redirected: str) -> subprocess.CompletedProcess[str]:
     line = f"{sys.executable} -m slatprep {words} {redirected}"
-    return subprocess.run(["sh", "-c", line], capture_output=True, text=True, timeout=120)
+    return subprocess.run(["sh", "-c", line], capture_output=True, text=True, timeout=600)
 
 
 @pytest.mark.parametrize("redirected", [">&-", pytest.param("> /dev/full", marks=pytest.mark.skipif(

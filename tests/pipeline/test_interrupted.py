@@ -317,7 +317,7 @@ if step == "asset begun":
     build.kill()
     build.wait()
     workers = [int(path.name) for path in pids.iterdir()]
-    end = time.monotonic() + 60
+    end = time.monotonic() + 600
     while any(Path(f"/proc/{pid}/stat").exists() for pid in workers):
         assert time.monotonic() < end, "a worker is still there"
         time.sleep(0.1)

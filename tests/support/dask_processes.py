@@ -23,12 +23,14 @@ def reached(step, name):
     if step == "asset aligned":
         with (faults / "aligned").open("a") as log:
             log.write(f"{name}\\n")
+    kill = faults / f"kill at {step}"
     try:
-        (faults / f"kill at {step}").unlink()
+        whom = int(kill.read_text() or os.getpid())
+        kill.unlink()
     except FileNotFoundError:
         pass
     else:
-        os.kill(os.getpid(), signal.SIGKILL)
+        os.kill(whom, signal.SIGKILL)
     if step != "asset begun":
         return
     if (faults / f"deadly-{name}").exists():
@@ -66,7 +68,7 @@ sys.addaudithook(refuse)
 def wait_for_workers(address: str, number: int) -> None:
     """Wait until so many workers are there: one may have been killed just now."""
     with Client(address, set_as_default=False) as client:
-        client.wait_for_workers(number, timeout=180)
+        client.wait_for_workers(number, timeout=900)
 
 
 class Processes:
@@ -108,6 +110,11 @@ class Processes:
             ONLY_SEES=os.pathsep.join(map(str, (root, disk, self.folder))), **variables,
         )  # fmt: skip
 
+    @property
+    def pids(self) -> list[int]:
+        """Their numbers, in the order in which they were started."""
+        return [process.pid for process in self._started]
+
     def stop(self) -> None:
         """End all of them."""
         for process in self._started:
@@ -147,7 +154,7 @@ def end(process: subprocess.Popen[bytes]) -> None:
     process.wait()
 
 
-def wait_until(condition: object, seconds: float = 180.0) -> None:
+def wait_until(condition: object, seconds: float = 900.0) -> None:
     deadline = time.monotonic() + seconds
     while not condition():  # type: ignore[operator]
         assert time.monotonic() < deadline, "waited too long"

@@ -40,7 +40,10 @@ BEFORE = ("500", "503", "reset", "delay")
 AFTER = ("lost", "lost 500", "twice")
 """What may happen to any request that the server answers: nobody hears, or it comes twice."""
 
-READING = ("truncated", "short", "long", "flipped", "404", "403")
+ANOTHER = "another's"
+"""The answer is that of another object, as from a cache that mixes them up."""
+
+READING = ("truncated", "short", "long", "flipped", "404", "403", ANOTHER)
 """What may happen to an answer that has content."""
 
 LISTING = ("truncated", "stale")
@@ -70,6 +73,8 @@ class Faults:
         Whether a request that is repeated meets the same again.
     only : str
         A pattern of the addresses that something may happen to.
+    rate : float
+        Bytes a second of every connection; 0 for as many as there may be.
     told : Counter
         What happened, and how often.
     """
@@ -79,6 +84,7 @@ class Faults:
     kinds: tuple[str, ...] = KINDS
     lasting: bool = False
     only: str = ""
+    rate: float = 0.0
     told: Counter[str] = field(default_factory=Counter)
     _asked: Counter[str] = field(default_factory=Counter)
     _lock: threading.Lock = field(default_factory=threading.Lock)
@@ -118,6 +124,8 @@ class _Handler(BaseHTTPRequestHandler):
     def answer(self) -> None:
         """Pass a request on, with or without a fault."""
         body = self._body()
+        if self.server.faults.rate:
+            time.sleep(len(body) / self.server.faults.rate)
         conditional = bool(self.headers.get("If-Match") or self.headers.get("If-None-Match"))
         kind, chance = self.server.faults.draw(self.command, self.path, conditional)
         if kind == "delay":
@@ -127,8 +135,12 @@ class _Handler(BaseHTTPRequestHandler):
         elif kind in ERRORS:
             self._refuse(kind)
         else:
+            asked = self.server.asked
+            if "list-type" not in self.path and self.path not in asked:
+                asked.append(self.path)
+            path = chance.choice(asked) if kind == ANOTHER and asked else ""
             status, headers, content = self._forward(
-                _flipped(body, chance) if body and kind == UPLOAD else body
+                _flipped(body, chance) if body and kind == UPLOAD else body, path
             )
             if kind == "twice":
                 status, headers, content = self._forward(body)
@@ -149,10 +161,12 @@ class _Handler(BaseHTTPRequestHandler):
         self.rfile.readline()
         return b"".join(parts)
 
-    def _forward(self, body: bytes) -> tuple[int, list[tuple[str, str]], bytes]:
+    def _forward(self, body: bytes, path: str = "") -> tuple[int, list[tuple[str, str]], bytes]:
         upstream = http.client.HTTPConnection(self.server.upstream, timeout=60)
         headers = {k: v for k, v in self.headers.items() if k.lower() not in (*HOP, "expect")}
-        upstream.request(self.command, self.path, body, {**headers, "Content-Length": len(body)})
+        upstream.request(
+            self.command, path or self.path, body, {**headers, "Content-Length": len(body)}
+        )
         with upstream.getresponse() as response:
             content = response.read()
             kept = [(k, v) for k, v in response.getheaders() if k.lower() not in HOP]
@@ -202,8 +216,11 @@ class _Handler(BaseHTTPRequestHandler):
             self.send_header(name, value)
         self.send_header("Content-Length", str(length))
         self.end_headers()
-        self.wfile.write(content)
-        self.wfile.flush()
+        rate = int(self.server.faults.rate)
+        for start in range(0, len(content), rate or max(len(content), 1)):
+            self.wfile.write(content[start : start + rate] if rate else content)
+            self.wfile.flush()
+            time.sleep(1.0 if rate else 0.0)
 
     def _refuse(self, status: str) -> None:
         code, message = ERRORS[status]
@@ -239,6 +256,8 @@ class _Server(ThreadingHTTPServer):
         # Earlier answers, of which a stale one is chosen.
         self.known: defaultdict[str, list[tuple[int, list[tuple[str, str]], bytes]]]
         self.known = defaultdict(list)
+        self.asked: list[str] = []
+        """Addresses of objects that were asked for, of which another's is chosen."""
 
     def handle_error(self, *_: object) -> None:
         """Say nothing: clients go away."""

@@ -104,7 +104,7 @@ def test_a_build_whose_worker_is_killed_gives_the_same_bytes(
     os.kill(int((faults / "held").read_text()), signal.SIGKILL)
     (faults / "held").unlink()
 
-    _, errors = build.communicate(timeout=300)
+    _, errors = build.communicate(timeout=900)
     assert build.returncode == 0, errors
     # On a busy machine it takes long enough for a line of progress.
     told = re.sub(r"build: \d of 6 assets, [\w: ]+ left\n", "", errors).splitlines()
@@ -249,10 +249,11 @@ def test_a_scheduler_that_nobody_reaches(monkeypatch: pytest.MonkeyPatch) -> Non
 def test_a_scheduler_that_is_killed_ends_the_run_and_nothing_hangs(
     processes: Processes, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(module, "ANSWER_SECONDS", 3)
     scheduler = processes.scheduler()
     processes.worker(scheduler, "--no-nanny")
     with Cluster(scheduler) as cluster:
+        # Only now: a loaded machine may need longer for the first answer.
+        monkeypatch.setattr(module, "ANSWER_SECONDS", 3)
         results = cluster.run_unordered(time.sleep, ((0.2,) for _ in range(10**6)))
         next(results)
         end(processes._started[0])
@@ -304,7 +305,7 @@ def test_tasks_are_taken_as_workers_come_free() -> None:
         nonlocal taken
         while taken < 100_000:
             taken += 1
-            yield (0.05,)
+            yield (0.5,)
 
     with threads_for_workers(2) as started, Cluster(started.scheduler_address) as cluster:
         results = cluster.run_unordered(time.sleep, tasks())

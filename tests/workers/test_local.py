@@ -24,7 +24,7 @@ def test_tasks_are_taken_as_workers_come_free(jobs: int) -> None:
         nonlocal taken
         while taken < 100_000:
             taken += 1
-            yield (0.05,)  # long enough that a hundred cannot be done before the first is seen
+            yield (0.5,)  # long enough that a hundred cannot be done before the first is seen
 
     results = run_unordered(time.sleep, tasks(), jobs)
     next(results)

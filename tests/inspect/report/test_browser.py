@@ -27,7 +27,7 @@ pytest.importorskip("selenium")
 
 LIBRARY = '<script type="text/plain" id="library">'
 
-PATIENCE = 60  # A loaded machine draws 3D slowly without a graphics card.
+PATIENCE = 600  # A loaded machine draws 3D slowly without a graphics card.
 
 
 def wait(condition: Callable[[], object]) -> None:

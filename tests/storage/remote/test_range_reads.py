@@ -64,7 +64,7 @@ def test_a_forked_process_reads_by_s3fs(bucket: str, s3: Any) -> None:
     answers = forked.Queue()
     child = forked.Process(target=_read_in_child, args=(bucket, answers))
     child.start()
-    assert answers.get(timeout=60) == (True, b"3456")
+    assert answers.get(timeout=300) == (True, b"3456")
     child.join()
 
 

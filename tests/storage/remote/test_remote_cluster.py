@@ -119,10 +119,10 @@ def test_a_command_that_is_killed_again_and_again_goes_on_where_it_was(
     assert current(s3, url) == tree(another[1])
     for step in ("store created", "manifests published"):
         killed = build(f"if step == {step!r}:\n    kill_self()")
-        assert killed.wait(300) == -9, step
+        assert killed.wait(900) == -9, step
         assert current(s3, url) == tree(another[1])
     assert len(spooled(s3, url)) == 3
-    assert build().wait(300) == 0
+    assert build().wait(900) == 0
     assert current(s3, url) == tree(undisturbed[1])
     assert left_behind(s3, url) == set()
     assert len(versions(s3, url)) == 2

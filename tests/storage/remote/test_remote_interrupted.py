@@ -56,7 +56,7 @@ def build_and_be_killed(fault: Callable[[], Fault], dataset: Dataset, url: str) 
 
     child = multiprocessing.get_context("fork").Process(target=run)
     child.start()
-    child.join(120)
+    child.join(600)
     assert child.exitcode == -signal.SIGKILL
 
 

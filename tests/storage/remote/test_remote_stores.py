@@ -335,7 +335,7 @@ def test_a_forked_process_reads_on(url: str, undisturbed: Made) -> None:
     queue = context.Queue()
     child = context.Process(target=lambda: queue.put(store.read(1)["feats"]))
     child.start()
-    feats = queue.get(timeout=30)
+    feats = queue.get(timeout=300)
     child.join()
     np.testing.assert_array_equal(feats, open_store(undisturbed[1]).read(1)["feats"])
 
