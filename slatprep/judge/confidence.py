@@ -96,24 +96,10 @@ def voxel_figures(around: Surroundings, confidence: float) -> NDArray[np.float32
 def class_confidence(
     around: Surroundings, confidence: float, valid: NDArray[np.bool_]
 ) -> NDArray[np.float32]:
-    """Return how likely the class of each voxel is right.
+    """Return how likely the class of each voxel (N,) is right, 0 where not valid.
 
-    Placements that fit equally well are taken as equally likely: the model's probability
-    counts for those with the same class.
-
-    Parameters
-    ----------
-    around : Surroundings
-        Of the voxels.
-    confidence : float
-        The asset's: `same_object` times `right_placement`.
-    valid : ndarray of bool, shape (N,)
-        Which voxels have a class.
-
-    Returns
-    -------
-    ndarray of float32, shape (N,)
-        0 where not valid.
+    `confidence` is the asset's: `same_object` times `right_placement`. Placements that fit equally
+    well are taken as equally likely: the model's probability counts for those with the same class.
     """
     likely = VOXEL.probability(voxel_figures(around, confidence)) * (1.0 - around.tied)
     return np.where(valid, likely, 0.0).astype(np.float32)

@@ -105,17 +105,7 @@ class Surroundings:
 def surroundings_of(
     field: MaterialField, latents: StructuredLatents, alignment: Alignment, annotation: Annotation
 ) -> Surroundings:
-    """Look at what lies around the places where voxels were looked up.
-
-    Parameters
-    ----------
-    field, latents, alignment, annotation
-        As `slatprep.judge.judge` takes them.
-
-    Returns
-    -------
-    Surroundings
-    """
+    """Look at what lies around the places where voxels were looked up."""
     from slatprep.geometry.surroundings import shares_around
 
     cells, labels = _labels_of(field, annotation)
@@ -163,12 +153,7 @@ def _labels_of(
 def labels_hold(field: MaterialField, annotation: Annotation, off: NDArray[np.float64]) -> bool:
     """Whether the labels of voxels, see `surroundings_of`, are the same for rounded properties.
 
-    Parameters
-    ----------
-    field, annotation : MaterialField, Annotation
-        Of an asset; classes are never rounded.
-    off : ndarray of float64, shape (P,)
-        How far each mapped property may be off at most.
+    Each mapped property may be off by `off` (P,) at most; classes are never rounded.
     """
     if field.classified:
         return True
@@ -215,25 +200,11 @@ def evidence_of(
 ) -> NDArray[np.float64]:
     """Return the `FIGURES` of an alignment, whatever engine found it.
 
-    Placements that tie and leave nearly all classes alone count as one: of a
-    ball it does not matter which it is, and neither they nor the margin say
-    anything then but that it is so (``alike``). The same where the consensus of
-    a dataset chose among them.
-
-    Parameters
-    ----------
-    field, latents, alignment, annotation
-        As `slatprep.judge.judge` takes them.
-    around : Surroundings
-        Of its voxels.
-    ambiguity : float
-        Share of the voxels whose class depends on the choice among ties.
-
-    Returns
-    -------
-    ndarray of float64, shape (len(FIGURES),)
-        All finite but for the margin, which is NaN where it says nothing, and for those of
-        the agreement where that was not measured.
+    Placements that tie and leave nearly all classes alone count as one: of a ball it does not
+    matter which it is, and neither they nor the margin say anything then but that it is so
+    (``alike``). The same where the consensus of a dataset chose among them. `ambiguity` is the
+    share of the voxels whose class depends on the choice among ties. The margin is NaN where it
+    says nothing, and so are figures of the agreement that were not measured.
     """
     count, margin = len(alignment.open_placements), min(alignment.margin, MARGIN_CAP)
     if (count and ambiguity <= HARMLESS) or alignment.settled_by is not None:

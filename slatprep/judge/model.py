@@ -61,16 +61,10 @@ class Logistic:
         return np.array([(f.weight, f.usual, f.low, f.high) for f in self.figures]).T
 
     def contributions(self, values: NDArray[np.floating]) -> NDArray[np.float64]:
-        """Return what each figure adds to the logarithm of the odds.
+        """Return what each figure (..., F), in the model's order, adds to the logarithm of the
+        odds.
 
-        Parameters
-        ----------
-        values : ndarray of float, shape (..., F)
-            Figures in the model's order; one that is NaN adds nothing.
-
-        Returns
-        -------
-        ndarray of float64, shape (..., F)
+        One that is NaN adds nothing.
         """
         weight, usual, low, high = self._table
         parts = weight * (np.clip(values[..., self._columns], low, high) - usual)

@@ -180,16 +180,8 @@ def moments_of(
 def fit_models(moments: Iterable[tuple[str, Moments]]) -> list[LatentModel] | None:
     """Estimate for each fold the latents of the classes in all others.
 
-    Parameters
-    ----------
-    moments : iterable of (str, Moments)
-        Object id and moments of each sure asset, in an order that does not
-        depend on the number of jobs.
-
-    Returns
-    -------
-    list of LatentModel or None
-        By fold; None where the assets of all other folds have less than two classes.
+    `moments` has the object id and the moments of each sure asset, in an order that does not depend
+    on the number of jobs. None where the assets of all other folds have less than two classes.
     """
     sums: dict[int, Moments] = {}
     for object_id, some in moments:
@@ -232,16 +224,7 @@ def weigh(
 ) -> LatentEvidence:
     """Compare an asset's latents with its labels, and with those it could have instead.
 
-    Parameters
-    ----------
-    field, latents, alignment
-        The asset.
-    material : ndarray of uint8, shape (N,)
-        Its labels; 255 where there is none.
-    model : LatentModel
-        Of other objects.
-    parameters : SampleParameters
-        How labels are looked up.
+    Its labels `material` (N,) are 255 where there is none; the model is of other objects.
     """
     likely = model.log_likelihood(latents.feats)
     labels = material[None]
@@ -296,16 +279,7 @@ def _against(
 def reliability_of(evidence: Sequence[LatentEvidence]) -> Reliability:
     """Find out from assets whose labels are sure what their latents are worth.
 
-    Parameters
-    ----------
-    evidence : sequence of LatentEvidence
-        Of the sure assets.
-
-    Returns
-    -------
-    Reliability
-        `factor` is 0 where their latents do not prefer their own labels more
-        often than chance would have it.
+    The factor is 0 where these do not prefer their own labels more often than chance would have it.
     """
     compared = [one.against for one in evidence if one.against]
     agreeing = sum(min(float(blocks.sum()) for blocks in against) > 0 for against in compared)
@@ -339,12 +313,9 @@ def _factor(compared: Sequence[Array]) -> float:
 def choice_of(found: LatentEvidence, reliability: Reliability) -> tuple[int, LatentChoice] | None:
     """Choose among an asset's tied placements, if its latents are decisive.
 
-    Returns
-    -------
-    tuple of int and LatentChoice, or None
-        The number of the placement, 0 the one that the asset has, which stands
-        where its labels are those of the likeliest one; None where nothing
-        tied changes labels, or the latents do not say enough.
+    Returns the number of the placement; 0 is the one that the asset has, which stands where its
+    labels are those of the likeliest one. None where nothing tied changes labels, or the latents do
+    not say enough.
     """
     different = found.differing > OTHER_LABELS * max(found.voxels, 1)
     best = int(np.argmax(found.support))
