@@ -61,11 +61,7 @@ class Logistic:
         return np.array([(f.weight, f.usual, f.low, f.high) for f in self.figures]).T
 
     def contributions(self, values: NDArray[np.floating]) -> NDArray[np.float64]:
-        """Return what each figure (..., F), in the model's order, adds to the logarithm of the
-        odds.
-
-        One that is NaN adds nothing.
-        """
+        """Return what each figure (..., F) adds to the logarithm of the odds; NaN adds nothing."""
         weight, usual, low, high = self._table
         parts = weight * (np.clip(values[..., self._columns], low, high) - usual)
         first = [self._columns.index(k) for k in range(len(self.names))]
