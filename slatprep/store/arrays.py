@@ -19,9 +19,8 @@ from slatprep.store.contract import (
     read_metadata,
     size_findings,
 )
-from slatprep.store.digests import GROUP
 from slatprep.store.gate import NAMES, gate_findings
-from slatprep.store.layout import ASSET_CHUNK
+from slatprep.store.layout import ASSET_CHUNK, FILE
 from slatprep.store.shard_reader import BAD_METADATA, RowReader
 
 if TYPE_CHECKING:
@@ -70,7 +69,7 @@ class Arrays:
         return self._readers[name]
 
     def _checked(self, name: str) -> RowReader:
-        of_files = (f"{GROUP}/name",) if name.startswith(f"{GROUP}/") else ()
+        of_files = (f"{FILE}/name",) if name.startswith(f"{FILE}/") else ()
         for needed in (*DEFINING, *of_files, name):
             if needed not in self._metadata:
                 self._metadata[needed] = self._read(needed)

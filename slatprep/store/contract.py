@@ -14,13 +14,11 @@ from slatprep.errors import StoreError
 from slatprep.parameters import MAX_GRID_SHARD, MAX_VOXEL_CHUNK, MAX_VOXEL_SHARD
 from slatprep.records import MAX_CHANNELS, MAX_PROPERTIES, RESOLUTION, Place
 from slatprep.storage.documents import read_document
-from slatprep.store.digests import GROUP
 from slatprep.store.layout import (
-    ARRAYS,
     ASSET_CHUNK,
+    FILE,
     FIXED_SIZES,
-    MERGED,
-    RECORDS,
+    LAYOUTS,
     ArrayLayout,
 )
 
@@ -39,12 +37,12 @@ MIN_ASSET_BYTES = 256
 """No asset takes less of a store's files: its record alone, packed, has more. By this the number
 of assets that a store claims is held against the bytes of its files."""
 
-_MAX_CHUNK_ROWS = {"asset": ASSET_CHUNK, "voxel": MAX_VOXEL_CHUNK, "grid": 16, GROUP: MAX_FILES}
+_MAX_CHUNK_ROWS = {"asset": ASSET_CHUNK, "voxel": MAX_VOXEL_CHUNK, "grid": 16, FILE: MAX_FILES}
 _MAX_SHARD_ROWS = {
     "asset": ASSET_CHUNK,
     "voxel": MAX_VOXEL_SHARD,
     "grid": MAX_GRID_SHARD,
-    GROUP: MAX_FILES,
+    FILE: MAX_FILES,
 }
 _ZARR_NAMES = {"str": "string"}
 
@@ -88,7 +86,7 @@ def array_findings(name: str, metadata: object, sizes: Mapping[str, int]) -> Ite
 
     `sizes` are what `dimension_sizes` gave. Of other arrays nothing is asked.
     """
-    layout = _LAYOUTS.get(name)
+    layout = LAYOUTS.get(name)
     if layout is None:
         return
     yield from size_findings(name, metadata, sizes)
@@ -107,7 +105,7 @@ def size_findings(name: str, metadata: object, sizes: Mapping[str, int]) -> Iter
     Parameters are those of `array_findings`. An array without findings may be
     read: no more memory is set aside than its files account for.
     """
-    layout = _LAYOUTS.get(name)
+    layout = LAYOUTS.get(name)
     if layout is None:
         return
     where = f"{name}/zarr.json"
@@ -125,7 +123,7 @@ def dimension_sizes(metadata: Mapping[str, Any]) -> dict[str, int]:
     for name, dimension, limit in (
         ("asset/id", "asset", MAX_ASSETS),
         ("voxel/coords", "voxel", 2**40),
-        (f"{GROUP}/name", "file", MAX_FILES),
+        (f"{FILE}/name", "file", MAX_FILES),
         ("voxel/feats", "latent", MAX_CHANNELS),
         ("voxel/properties", "property", MAX_PROPERTIES),
     ):
@@ -177,17 +175,3 @@ def _chunk_findings(
         if not fits or min(sizes) < 1 or sizes[0] > limit:
             expected = f"1 to {limit} rows of at most {rows}"
             yield Finding(where, "", f"{kind} shape is {sizes!r}", expected)
-
-
-_LAYOUTS = {
-    layout.name: layout
-    for layout in (
-        *ARRAYS,
-        *MERGED,
-        RECORDS,
-        *(
-            ArrayLayout(f"{GROUP}/{name}", dtype, ("file",), "", "")
-            for name, dtype in (("name", "str"), ("size", "int64"), ("sha256", "str"))
-        ),
-    )
-}

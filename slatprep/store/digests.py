@@ -21,8 +21,7 @@ from numpy.typing import NDArray
 
 from slatprep.errors import StoreError
 from slatprep.storage.files import file_digest, local_files
-
-GROUP = "file"
+from slatprep.store.layout import FILE, FILES
 
 ATTRIBUTES = "zarr.json#attributes"
 """Name under which the digest of the root's attributes is kept."""
@@ -59,12 +58,9 @@ def write_digests(
     sizes.append(len(_canonical(attributes)))
     digests.append(attributes_digest(attributes))
     # Row by row these are small; one chunk holds all of a large store's.
-    for name, values, description in (
-        ("name", np.array(names, dtype=object), "file below the store, with forward slashes"),
-        ("size", np.array(sizes, dtype=np.int64), "bytes"),
-        ("sha256", np.array(digests, dtype=object), "SHA-256 in hex"),
-    ):
-        add_array(root, f"{GROUP}/{name}", values, "file", description, level=1)
+    columns = (np.array(names, object), np.array(sizes, np.int64), np.array(digests, object))
+    for layout, values in zip(FILES, columns, strict=True):
+        add_array(root, layout.name, values, "file", layout.description, level=1)
 
 
 def attributes_digest(attributes: Mapping[str, Any]) -> str:
@@ -74,7 +70,7 @@ def attributes_digest(attributes: Mapping[str, Any]) -> str:
 
 def is_own(name: str) -> bool:
     """Whether a file belongs to the arrays of digests."""
-    return name.startswith(f"{GROUP}/")
+    return name.startswith(f"{FILE}/")
 
 
 def _files_of(root: Any) -> Iterator[tuple[str, bool]]:

@@ -11,10 +11,9 @@ from collections.abc import Iterator, Mapping
 from typing import Any
 
 from slatprep.store.contract import Finding
-from slatprep.store.digests import GROUP
-from slatprep.store.layout import RECORD_ARRAY, arrays_with
+from slatprep.store.layout import FILE, LAYOUTS
 
-GROUPS = ("asset", "voxel", "grid", GROUP)
+GROUPS = ("asset", "voxel", "grid", FILE)
 
 COORDINATES = (
     "asset/property",
@@ -24,14 +23,7 @@ COORDINATES = (
     *(f"grid/{axis}" for axis in "xyz"),
 )
 
-NAMES = frozenset(
-    (
-        *(layout.name for layout in arrays_with(merged=True)),
-        RECORD_ARRAY,
-        *(f"{GROUP}/{name}" for name in ("name", "size", "sha256")),
-        *COORDINATES,
-    )
-)
+NAMES = frozenset((*LAYOUTS, *COORDINATES))
 """Every array that a store may have."""
 
 DATA_TYPES = ("bool", "uint8", "int64", "float32", "float64", "string")

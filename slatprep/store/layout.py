@@ -22,6 +22,9 @@ FORMAT_VERSION = 1
 ASSET_CHUNK = 65_536
 """Assets in one chunk of the ``asset/*`` arrays."""
 
+FILE = "file"
+"""Group of the digests."""
+
 RECORD_ARRAY = "asset/record"
 """The record of each row, as JSON. It is replaced in one step with the arrays it belongs to, the
 lines of ``assets.jsonl`` are made from it, and it is what the next build compares with."""
@@ -245,6 +248,15 @@ MERGED = (
 
 RECORDS = ArrayLayout(RECORD_ARRAY, "str", ("asset",), "", "provenance of the row, as JSON")
 
+FILES = (
+    ArrayLayout(f"{FILE}/name", "str", ("file",), "", "file below the store, with forward slashes"),
+    ArrayLayout(f"{FILE}/size", "int64", ("file",), 0, "bytes"),
+    ArrayLayout(f"{FILE}/sha256", "str", ("file",), "", "SHA-256 in hex"),
+)
+"""Digests of the store's files; see `slatprep.store.digests`."""
+
+LAYOUTS = {layout.name: layout for layout in (*ARRAYS, *MERGED, RECORDS, *FILES)}
+"""Every array that a store may have, by name, but for the coordinates of its dimensions."""
 
 MERGED_COLUMNS = tuple(layout.name.removeprefix("voxel/") for layout in MERGED)
 """Last names of the arrays of `MERGED`."""

@@ -17,7 +17,8 @@ from support.trees import tree
 from slatprep.inspect.verify import verify_store
 from slatprep.pipeline.dataset import BuildSummary, build_store, plan_build
 from slatprep.store import open_store
-from slatprep.store.digests import GROUP, write_digests
+from slatprep.store.digests import write_digests
+from slatprep.store.layout import FILE
 from slatprep.store.records import StoredRecords
 
 RECORDS = "asset/record/c/0"
@@ -127,7 +128,7 @@ def rewritten(out: Path, change: Callable[[zarr.Group], None]) -> None:
     """Change a store's values and make its digests anew, as if they had always been so."""
     root = zarr.open_group(out, mode="r+", use_consolidated=False)
     change(root)
-    shutil.rmtree(out / GROUP)
+    shutil.rmtree(out / FILE)
     write_digests(out)
     zarr.consolidate_metadata(str(out), zarr_format=3)
 
