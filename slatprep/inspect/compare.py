@@ -5,7 +5,7 @@ from __future__ import annotations
 import heapq
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -68,7 +68,7 @@ def compare_stores(
     """
     rows_b = {asset_id: row for row, asset_id in enumerate(b.ids)}
     rows = [(row, rows_b[name]) for row, name in enumerate(a.ids) if name in rows_b]
-    settings = tuple(_settings(_attributes(a), _attributes(b)))
+    settings = tuple(_settings(a.attributes, b.attributes))
     only_a = tuple(name for name in a.ids if name not in rows_b)
     only_b = tuple(sorted(rows_b.keys() - set(a.ids)))
     total = _Sum()
@@ -145,13 +145,6 @@ def _sum_of(one: PropertyChange, other: PropertyChange) -> PropertyChange:
 def _how_much(change: AssetChange) -> tuple[float, ...]:
     share = (change.labels + change.unmatched) / max(change.voxels + change.unmatched, 1)
     return (share, change.moved, sum(own.changed for own in change.properties.values()))
-
-
-def _attributes(store: Store) -> dict[str, Any]:
-    """Return the attributes of a store's root, with what an older format leaves implicit."""
-    about = store.about
-    latents, units = asdict(about.latents), about.property_units
-    return {**store.attributes, "latents": latents, "property_units": units}
 
 
 def _settings(a: Mapping[str, Any], b: Mapping[str, Any], above: str = "") -> Iterator[Setting]:

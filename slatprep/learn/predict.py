@@ -158,11 +158,9 @@ def _ranges_in(state: dict[str, Any], count: int) -> NDArray[np.float64]:
 
 
 def _contents_in(state: dict[str, Any]) -> Contents:
-    """Return what a decoder was trained on; older checkpoints, without it, on PixieVerse."""
+    """Return what a decoder was trained on."""
     from pydantic import TypeAdapter
 
-    if "contents" not in state:
-        return PIXIEVERSE
     document = orjson.loads(_text_in(state, "contents"))
     document["properties"] = [
         dict(zip(("name", "unit", "log10"), row, strict=True)) for row in document["properties"]

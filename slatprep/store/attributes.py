@@ -15,9 +15,7 @@ from slatprep.parameters import Length, SampleParameters
 from slatprep.records import (
     BACKGROUND,
     MAX_PROPERTIES,
-    PROPERTIES,
     RESOLUTION,
-    TRELLIS,
     ClassName,
     Contents,
     Digest,
@@ -95,8 +93,8 @@ class RootAttributes:
     normalization: dict[str, StoredRange]
     manifest: Digest
     build: StoredBuild
-    property_units: tuple[str, ...] = tuple(one.unit for one in PROPERTIES)
-    latents: LatentSpace = TRELLIS
+    property_units: tuple[str, ...]
+    latents: LatentSpace
 
     def __post_init__(self) -> None:
         labels_of(self.material_classes)

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from contextlib import suppress
 from functools import lru_cache
-from typing import Any
 
 import numpy as np
 import orjson
@@ -311,16 +309,8 @@ def _claims(
         yield f"counts/{name}", getattr(record.counts, name), int(count)
     parameters = store.attributes["build"]["parameters"]
     for name in ("align", "sample"):
-        said_parameters = getattr(record.parameters, name)
-        held = parameters.get(name)
-        with suppress(TypeError):  # Not parameters at all, so they differ as they are.
-            # Parameters that an older format lacks get their defaults on both sides.
-            held = _in_json(type(said_parameters)(**held))
-        yield f"parameters/{name}", _in_json(said_parameters), held
-
-
-def _in_json(parameters: object) -> Any:
-    return orjson.loads(orjson.dumps(parameters))
+        given = orjson.loads(orjson.dumps(getattr(record.parameters, name)))
+        yield f"parameters/{name}", given, parameters.get(name)
 
 
 def _equal(said: object, held: object) -> bool:
