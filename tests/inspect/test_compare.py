@@ -60,16 +60,6 @@ def test_a_copy_is_the_same(mixed_build: BuildSummary, copy: Path) -> None:
     assert result.exit_code == 0 and "hold the same" in result.stdout
 
 
-def test_what_an_older_store_does_not_say_is_what_it_has(
-    mixed_build: BuildSummary, copy: Path
-) -> None:
-    document = json.loads((copy / "zarr.json").read_text("utf-8"))
-    for name in ("property_units", "latents"):
-        del document["attributes"][name]
-    (copy / "zarr.json").write_text(json.dumps(document), "utf-8")
-    assert compare(mixed_build, copy).same
-
-
 def test_every_change_is_counted_where_it_was_made(mixed_build: BuildSummary, copy: Path) -> None:
     before = open_store(str(mixed_build.store))
     ant, cup, dog = (rows(copy, asset) for asset in (0, 3, 4))
