@@ -108,7 +108,7 @@ def evaluate(
     else:
         result = evaluate_store(cast("Path", predictions), store, part, **chosen)
         measures = {name or "(none)": m for name, m in result.categories.items()}
-        measures |= {"all": result.overall}
+        measures |= {"all": result.overall} | result.baselines
         ours, what = {"these predictions": result.overall}, "category"
         problems = [f"{predictions}: no prediction of {name}" for name in result.missing]
         if result.converted:

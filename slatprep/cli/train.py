@@ -154,7 +154,7 @@ def train(
     runs = {name: out / name for name in _SIZES} if all_sizes else {size: out}
     summaries = {}
     for name, directory in runs.items():
-        output.keeps("the same command goes on after the last epoch that was finished")
+        output.keeps("the same command goes on with the last step that was kept")
         with (
             writing(str(directory), directory.parent),
             output.progress(f"train {name}", "steps") as steps,
@@ -177,7 +177,8 @@ def train(
 def _tell_epoch(output: Output, name: str, record: EpochRecord) -> None:
     output.note(f"{name}, {_line(record)}")
     output.keeps(
-        f"epochs to {record.epoch} are kept; the same command goes on at {record.epoch + 1}"
+        f"epochs up to {record.epoch} are kept, and the steps of epoch {record.epoch + 1} but for "
+        "the last 30 s; the same command goes on from there"
     )
 
 

@@ -2,13 +2,22 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from slatprep.geometry.frames import voxel_centres
-from slatprep.learn.dataset import Item, SlatDataset
+from slatprep.learn.predictions import VoxelPrediction
+from slatprep.store import Store
+
+COLUMNS = ("coords", "feats", "properties", "material", "valid")
+"""The arrays of an asset that a baseline is fitted to."""
+
+Rows = Mapping[str, NDArray[Any]]
+"""Those arrays by name, as `Store.read` returns them."""
 
 
 @dataclass(frozen=True)
@@ -17,59 +26,57 @@ class VoxelBaseline:
 
     Attributes
     ----------
+    name : str
+        What tables and pictures call it.
     weights : ndarray of float64, shape (channels + 4, P + classes)
         From latents, position and 1 to properties and class indicators.
     properties : int
         Number of properties P.
     """
 
+    name: str
     weights: NDArray[np.float64]
     properties: int
 
-    def predict(self, item: Item) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-        """Return properties (N, P), within [-1, 1], and classes (N,)."""
-        outputs = _inputs(item) @ self.weights
-        split = self.properties
-        return np.clip(outputs[:, :split], -1, 1), outputs[:, split:].argmax(axis=1)
-
-    def error(self, dataset: SlatDataset) -> float:
-        """Return the mean squared error of the properties, a mean over assets."""
-        errors = []
-        for item in (dataset[k] for k in range(len(dataset))):
-            predicted, _ = self.predict(item)
-            valid = item.valid.numpy()
-            errors.append(np.square(predicted - item.properties.numpy())[valid].mean())
-        return float(np.mean(errors))
+    def predict(self, rows: Rows) -> VoxelPrediction:
+        """Return properties (N, P), within [-1, 1], and classes (N,) if there are any."""
+        outputs = _inputs(rows) @ self.weights
+        properties, classes = np.split(outputs, [self.properties], axis=1)
+        material = classes.argmax(axis=1) if classes.size else None
+        return VoxelPrediction(np.clip(properties, -1, 1), material)
 
 
-def fit_baselines(dataset: SlatDataset) -> tuple[VoxelBaseline, VoxelBaseline]:
-    """Fit both reference models to a dataset in one pass; all valid voxels weigh the same.
+def fit_baselines(store: Store, assets: Iterable[int]) -> tuple[VoxelBaseline, VoxelBaseline]:
+    """Fit both reference models to assets in one pass; all valid voxels weigh the same.
 
     The first gives the mean and the most frequent class of all voxels, the second is a
     least-squares fit.
     """
-    contents = dataset.store.contents
+    contents = store.contents
     size, count = contents.latents.channels + 4, len(contents.properties)
     squares = np.zeros((size, size))
     products = np.zeros((size, count + contents.n_classes))
-    for item in (dataset[k] for k in range(len(dataset))):
-        valid = item.valid.numpy()
-        inputs, targets = _inputs(item)[valid], _targets(item, contents.n_classes)[valid]
+    for index in assets:
+        rows = store.read(index, COLUMNS)
+        valid = rows["valid"]
+        inputs, targets = _inputs(rows)[valid], _targets(rows, contents.n_classes)[valid]
         squares += inputs.T @ inputs
         products += inputs.T @ targets
     # The last input is 1, so its products are the sum of the targets and the count.
     mean = np.zeros_like(products)
     mean[-1] = products[-1] / squares[-1, -1]
     linear = np.linalg.lstsq(squares, products, rcond=None)[0]
-    return VoxelBaseline(mean, count), VoxelBaseline(np.asarray(linear, np.float64), count)
+    return (
+        VoxelBaseline("mean of the training voxels", mean, count),
+        VoxelBaseline("linear in each voxel", np.asarray(linear, np.float64), count),
+    )
 
 
-def _inputs(item: Item) -> NDArray[np.float64]:
+def _inputs(rows: Rows) -> NDArray[np.float64]:
     # Of another grid than 64^3 on another scale, which the weights make up for.
-    position = voxel_centres(item.coords.numpy())
-    return np.hstack([item.feats.numpy(), position, np.ones((len(position), 1))])
+    position = voxel_centres(rows["coords"])
+    return np.hstack([rows["feats"], position, np.ones((len(position), 1))])
 
 
-def _targets(item: Item, classes: int) -> NDArray[np.float64]:
-    indicators = item.material.numpy()[:, None] == np.arange(classes)
-    return np.hstack([item.properties.numpy(), indicators])
+def _targets(rows: Rows, classes: int) -> NDArray[np.float64]:
+    return np.hstack([rows["properties"], rows["material"][:, None] == np.arange(classes)])

@@ -242,7 +242,7 @@ class EpochSampler(Sampler[Draw]):
 
     def __init__(self, length: int, *, shuffle: bool, seed: int) -> None:
         self.length, self.shuffle, self.seed = length, shuffle, seed
-        self.epoch = 0
+        self.epoch = self.first = 0
 
     def __len__(self) -> int:
         return self.length
@@ -251,7 +251,7 @@ class EpochSampler(Sampler[Draw]):
         order = np.arange(self.length)
         if self.shuffle:
             order = np.random.default_rng([self.seed, self.epoch]).permutation(self.length)
-        return (Draw(int(index), self.epoch) for index in order)
+        return (Draw(int(index), self.epoch) for index in order[self.first :])
 
 
 class SlatLoader(DataLoader[Item]):
@@ -302,6 +302,6 @@ class SlatLoader(DataLoader[Item]):
             pin_memory=pin_memory,
         )
 
-    def set_epoch(self, epoch: int) -> None:
-        """Set the epoch, which decides order and augmentation."""
-        self.order.epoch = epoch
+    def set_epoch(self, epoch: int, batches: int = 0) -> None:
+        """Set the epoch, which decides order and augmentation; leave out its first batches."""
+        self.order.epoch, self.order.first = epoch, batches * (self.batch_size or 1)

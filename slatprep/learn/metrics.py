@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import Literal
 
@@ -11,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slatprep.errors import InputError
+from slatprep.learn.baselines import COLUMNS, fit_baselines
 from slatprep.learn.predictions import VoxelPrediction, check_prediction, open_predictions
 from slatprep.learn.splits import select_assets
 from slatprep.readers.splits import Shares, Split
@@ -84,6 +86,9 @@ class Evaluation:
     converted : int
         Assets whose prediction was normalised by other ranges and was converted to the
         store's.
+    baselines : dict of str to Measure
+        The reference models on the same assets, see `slatprep.learn.baselines`; empty if the
+        split train has no object.
     """
 
     spread: Spread
@@ -91,6 +96,7 @@ class Evaluation:
     categories: dict[str, Measure]
     missing: list[str]
     converted: int = 0
+    baselines: dict[str, Measure] = field(default_factory=dict)
 
 
 def score_asset(
@@ -171,14 +177,17 @@ def evaluate_store(
     scores: list[NDArray[np.float64]] = []
     missing: list[str] = []
     converted = 0
-    chosen = select_assets(
+    select = partial(
+        select_assets,
         store,
-        split,
         shares=shares,
         verdicts=verdicts,
         max_ambiguity=max_ambiguity,
         splits=splits,
     )
+    chosen, trained = select(split), select("train").tolist()
+    baselines = fit_baselines(store, trained) if trained else ()
+    theirs: list[list[NDArray[np.float64]]] = [[] for _ in baselines]
     with open_predictions(predictions) as read:
         for index in chosen.tolist():
             asset_id = store.ids[index]
@@ -186,26 +195,30 @@ def evaluate_store(
             if arrays is None:
                 missing.append(asset_id)
                 continue
-            rows = store.read(index, ("coords", "properties", "material", "valid"))
-            source, coords = f"{predictions}/{asset_id}", rows.pop("coords")
-            ranges = store.normalization
-            prediction = check_prediction(source, arrays, coords, ranges, store.contents)
+            rows = store.read(index, COLUMNS)
+            truth = rows["properties"], rows["material"], rows["valid"]
+            source, ranges = f"{predictions}/{asset_id}", store.normalization
+            prediction = check_prediction(source, arrays, rows["coords"], ranges, store.contents)
             converted += prediction.converted
             scored.append(index)
             if not store.contents.classes:
                 prediction = replace(prediction, material=None)
-            scores.append(score_asset(prediction, **rows))
+            scores.append(score_asset(prediction, *truth))
+            for one, own in zip(baselines, theirs, strict=True):
+                own.append(score_asset(one.predict(rows), *truth))
     if not scored:
         raise InputError(
             predictions,
             f"has no prediction of an asset of split {split or 'all'}",
             f"asset ids as names, such as {', '.join(missing[:3]) or 'none: the split is empty'}",
         )
-    overall, groups = average_objects(
-        scores,
-        [str(object_ids[k]) for k in scored],
-        [str(categories[k]) for k in scored],
-        spread,
-        metrics_of(store.normalization),
+    average = partial(
+        average_objects,
+        objects=[str(object_ids[k]) for k in scored],
+        categories=[str(categories[k]) for k in scored],
+        spread=spread,
+        names=metrics_of(store.normalization),
     )
-    return Evaluation(spread, overall, groups, missing, converted)
+    overall, groups = average(scores)
+    beside = {one.name: average(own)[0] for one, own in zip(baselines, theirs, strict=True)}
+    return Evaluation(spread, overall, groups, missing, converted, beside)

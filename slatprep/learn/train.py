@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field, replace
 from itertools import islice
@@ -14,10 +15,11 @@ import torch
 
 from slatprep.errors import ConfigError
 from slatprep.learn.augment import Augmentation
-from slatprep.learn.baselines import fit_baselines
+from slatprep.learn.baselines import COLUMNS, VoxelBaseline, fit_baselines
 from slatprep.learn.dataset import SlatDataset, SlatLoader, SparseBatch
 from slatprep.learn.decoder import SIZES, Prediction, make_decoder
 from slatprep.learn.loss import loss_of
+from slatprep.learn.metrics import score_asset
 from slatprep.learn.predict import (
     Checkpoint,
     checkpoint_state,
@@ -34,6 +36,9 @@ from slatprep.workers import Progress
 
 PRECISIONS = ("auto", "fp32", "bf16")
 KEEPS = ("best", "last")
+
+SECONDS_BETWEEN_SAVES = 30.0
+"""How much of an unfinished epoch a stopped training loses at most, beside a step."""
 
 
 @dataclass(frozen=True)
@@ -166,7 +171,7 @@ def train(
             with run.reading(LAST):
                 session.restore(state)
         while not session.finished and session.epoch != stop_after:
-            train_loss, rate = session.run_epoch(steps)
+            train_loss, rate = session.run_epoch(steps, lambda: run.save(LAST, session.state()))
             record = EpochRecord(session.epoch, rate, train_loss, *session.validate(val_set))
             session.history.append(record)
             run.save(LAST, session.state())
@@ -178,13 +183,20 @@ def train(
                 progress(record)
         references = {}
         if val_set is not None:
-            names = "mean of the training voxels", "linear in each voxel"
-            baselines = zip(names, fit_baselines(train_set), strict=True)
-            references = {name: baseline.error(val_set) for name, baseline in baselines}
+            for one in fit_baselines(opened, train_set.indices.tolist()):
+                scores = [_score(one, opened, index) for index in val_set.indices.tolist()]
+                references[one.name] = float(np.mean(scores))
             run.draw(session.history, references)
         predictions = run.path / "predictions"
         _write_predictions(load_checkpoint(run.path / BEST, device), test_set, predictions)
     return TrainSummary(session.history, session.best_epoch, references, predictions)
+
+
+def _score(baseline: VoxelBaseline, store: Store, index: int) -> float:
+    """Return the mean squared error of a baseline for an asset, the mean of its properties."""
+    rows = store.read(index, COLUMNS)
+    truth = rows["properties"], rows["material"], rows["valid"]
+    return float(score_asset(baseline.predict(rows), *truth)[-2])
 
 
 def precision_of(device: str) -> str:
@@ -220,7 +232,8 @@ class _Session:
         self.all_steps = parameters.steps or parameters.epochs * self.steps
         self.epochs = math.ceil(self.all_steps / self.steps)
         self.history: list[EpochRecord] = []
-        self.first_epoch = 0
+        self.losses: list[float] = []  # Of the batches of an unfinished epoch.
+        self.resumed_at = 0
 
     @property
     def epoch(self) -> int:
@@ -239,33 +252,42 @@ class _Session:
             return True
         return bool(self.history) and self.epoch - 1 - self.best_epoch >= self.parameters.patience
 
-    def run_epoch(self, steps: Progress | None) -> tuple[float, float]:
-        """Train for one epoch; return the mean loss and the last learning rate."""
+    def run_epoch(self, steps: Progress | None, save: Callable[[], None]) -> tuple[float, float]:
+        """Train to the end of an epoch; return the mean loss and the last learning rate.
+
+        `save` is called after a step of the optimiser, every `SECONDS_BETWEEN_SAVES`.
+        """
         self.model.train()
-        self.loader.set_epoch(self.epoch)
-        accumulate, losses, rate = self.parameters.accumulate, [], 0.0
-        before = (self.epoch - self.first_epoch) * len(self.loader)
-        batches = min(len(self.loader), (self.all_steps - self.epoch * self.steps) * accumulate)
-        last = min(len(self.loader), (self.all_steps - (self.epochs - 1) * self.steps) * accumulate)
-        total = (self.epochs - 1 - self.first_epoch) * len(self.loader) + last
-        if steps and before == 0:
+        self.loader.set_epoch(self.epoch, len(self.losses))
+        accumulate, length = self.parameters.accumulate, len(self.loader)
+        before = self.epoch * length - self.resumed_at
+        batches = min(length, (self.all_steps - self.epoch * self.steps) * accumulate)
+        last = min(length, (self.all_steps - (self.epochs - 1) * self.steps) * accumulate)
+        total = (self.epochs - 1) * length + last - self.resumed_at
+        if steps and before + len(self.losses) == 0:
             steps(0, total)
-        for number, batch in enumerate(islice(self.loader, batches)):
+        saved = time.monotonic()
+        for batch in islice(self.loader, batches - len(self.losses)):
+            number = len(self.losses)
             moved = batch.to(self.device)
             loss = loss_of(self._predict(moved), moved, self.parameters.weigh_by_confidence)
             # The last step of an epoch may have fewer batches to average.
             first = number - number % accumulate
-            (loss / min(accumulate, len(self.loader) - first)).backward()  # type: ignore[no-untyped-call]
-            losses.append(float(loss.detach()))
-            if (number + 1) % accumulate == 0 or number + 1 == len(self.loader):
-                rate = self._rate(self.epoch * self.steps + number // accumulate)
+            (loss / min(accumulate, length - first)).backward()  # type: ignore[no-untyped-call]
+            self.losses.append(float(loss.detach()))
+            if (number + 1) % accumulate == 0 or number + 1 == length:
                 for group in self.optimizer.param_groups:
-                    group["lr"] = rate
+                    group["lr"] = self._rate(self.epoch * self.steps + number // accumulate)
                 self.optimizer.step()
                 self.optimizer.zero_grad(set_to_none=True)
+                if time.monotonic() - saved >= SECONDS_BETWEEN_SAVES and number + 1 < batches:
+                    save()
+                    saved = time.monotonic()
             if steps:
                 steps(before + number + 1, total)
-        return float(np.mean(losses)), rate
+        rate = self._rate(self.epoch * self.steps + (batches - 1) // accumulate)
+        loss_of_epoch, self.losses = float(np.mean(self.losses)), []
+        return loss_of_epoch, rate
 
     @torch.no_grad()
     def validate(self, dataset: SlatDataset | None) -> tuple[float, float, float]:
@@ -289,6 +311,7 @@ class _Session:
             "model": self.model.state_dict(),
             "optimizer": self.optimizer.state_dict(),
             "history": [asdict(record) for record in self.history],
+            "losses": torch.tensor(self.losses, dtype=torch.float64),
         }
 
     def restore(self, state: dict[str, Any]) -> None:
@@ -303,9 +326,12 @@ class _Session:
                 if moments[name].shape != parameter.shape:
                     raise ValueError(f"{name} has shape {tuple(moments[name].shape)}")
         self.history = TypeAdapter(list[EpochRecord]).validate_python(state["history"])
-        if not self.history:
-            raise ValueError("it has no epoch")
-        self.first_epoch = self.epoch
+        self.losses = state["losses"].tolist()
+        if not (self.history or self.losses):
+            raise ValueError("it has no epoch and no batch")
+        if len(self.losses) >= len(self.loader) or len(self.losses) % self.parameters.accumulate:
+            raise ValueError(f"it ends after batch {len(self.losses)}, within a step")
+        self.resumed_at = self.epoch * len(self.loader) + len(self.losses)
 
     def _rate(self, step: int) -> float:
         cosine = math.cos(math.pi * step / self.all_steps)

@@ -105,6 +105,44 @@ def test_resumed_run_has_the_same_bits(learn_store: Path, tmp_path: Path) -> Non
         assert read == logged, name
 
 
+def test_a_stopped_run_goes_on_within_its_epoch(
+    learn_store: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    single = dataclasses.replace(SHORT, epochs=2, batch_size=1, accumulate=2)
+    whole = train(learn_store, tmp_path / "whole", single)
+    monkeypatch.setattr(module, "SECONDS_BETWEEN_SAVES", 0.0)
+    batches = len(SlatLoader(SlatDataset(learn_store, "train", shares=SHARES)))
+    assert batches >= 4  # Two steps an epoch, so that the first is within it.
+
+    def stopped_at(batch: int) -> list[tuple[int, int]]:
+        seen: list[tuple[int, int]] = []
+
+        def stop(done: int, total: int) -> None:
+            seen.append((done, total))
+            if done == batch:
+                raise KeyboardInterrupt
+
+        with pytest.raises(KeyboardInterrupt):
+            train(learn_store, tmp_path / "parts", single, steps=stop)
+        return seen
+
+    stopped_at(3)  # One step is kept, of two batches; the third is not.
+    assert not (tmp_path / "parts" / "log.csv").exists()
+    # Goes on with the third batch of the first epoch, and stops after the second of the second.
+    seen = stopped_at(batches)
+    assert seen[0] == (0, 2 * batches - 2) and len(seen) == batches + 1
+    resumed = train(learn_store, tmp_path / "parts", single)
+    assert resumed.history == whole.history
+    for name in (LAST, BEST):
+        ours, theirs = (weights_of(tmp_path / run / name) for run in ("whole", "parts"))
+        assert all(torch.equal(ours[key], theirs[key]) for key in ours), name
+    state = torch.load(tmp_path / "parts" / LAST, weights_only=True)
+    state["losses"] = torch.ones(batches)
+    torch.save(state, tmp_path / "parts" / LAST)
+    with pytest.raises(InputError, match=r"last\.pt.*ends after batch"):
+        train(learn_store, tmp_path / "parts", single)
+
+
 def test_wrong_runs_are_named(learn_store: Path, tmp_path: Path) -> None:
     out = tmp_path / "run"
     one = dataclasses.replace(SHORT, epochs=1)
@@ -155,20 +193,21 @@ def test_an_epoch_that_diverged_is_not_the_best(learn_store: Path, tmp_path: Pat
 
 
 def test_baselines_are_what_numpy_finds(learn_store: Path) -> None:
-    dataset = SlatDataset(learn_store)
-    items = [dataset[k] for k in range(len(dataset))]
-    valid = np.concatenate([item.valid.numpy() for item in items])
-    targets = np.concatenate([item.properties.numpy() for item in items])[valid]
-    feats = np.concatenate([item.feats.numpy() for item in items])
-    places = np.concatenate([(item.coords.numpy() + 0.5) / 64 - 0.5 for item in items])
-    inputs = np.hstack([feats, places, np.ones((len(feats), 1))])[valid]
+    store = open_store(learn_store)
+    columns = ("coords", "feats", "properties", "material", "valid")
+    items = [store.read(k, columns) for k in range(len(store))]
+    all_of = {name: np.concatenate([item[name] for item in items]) for name in columns}
+    valid = all_of["valid"]
+    places = (all_of["coords"] + 0.5) / 64 - 0.5
+    inputs = np.hstack([all_of["feats"], places, np.ones((len(places), 1))])[valid]
+    targets = all_of["properties"][valid]
     solution = np.linalg.lstsq(inputs, targets, rcond=None)[0]
-    constant, linear = fit_baselines(dataset)
+    constant, linear = fit_baselines(store, range(len(store)))
     np.testing.assert_allclose(linear.weights[:, :3], solution, atol=1e-6)
-    mean, classes = constant.predict(items[0])
-    np.testing.assert_allclose(mean[0], targets.mean(axis=0), atol=1e-9)
-    material = np.concatenate([item.material.numpy() for item in items])[valid]
-    assert (classes == np.bincount(material).argmax()).all()
+    predicted = constant.predict(items[0])
+    np.testing.assert_allclose(predicted.properties[0], targets.mean(axis=0), atol=1e-9)
+    assert predicted.material is not None
+    assert (predicted.material == np.bincount(all_of["material"][valid]).argmax()).all()
 
 
 def test_commands_train_and_evaluate(learn_store: Path, tmp_path: Path) -> None:
@@ -185,7 +224,24 @@ def test_commands_train_and_evaluate(learn_store: Path, tmp_path: Path) -> None:
     evaluate = ["evaluate", str(predictions), "--store", str(learn_store), "--json"]
     measured = CliRunner().invoke(slatprep, [*evaluate, *shares])
     assert measured.exit_code == 0, measured.output
-    assert json.loads(measured.stdout)["missing"] == []
+    document = json.loads(measured.stdout)
+    assert document["missing"] == []
+    # The mean of the training voxels, by hand on the same test objects.
+    store = open_store(learn_store)
+    columns = ("properties", "material", "valid")
+    sides: dict[str, list[dict[str, np.ndarray]]] = {"train": [], "test": []}
+    for k, object_id in enumerate(store.column("object_id")):
+        if (split := split_of(str(object_id), SHARES)) != "val":
+            sides[split].append(store.read(k, columns) | {"object": object_id})
+    mean = np.concatenate([one["properties"][one["valid"]] for one in sides["train"]]).mean(axis=0)
+    errors: dict[str, list[float]] = {}
+    for one in sides["test"]:
+        error = np.square(one["properties"] - mean)[one["valid"]].mean()
+        errors.setdefault(str(one["object"]), []).append(error)
+    expected = np.mean([np.mean(own) for own in errors.values()])
+    baselines = document["baselines"]
+    assert baselines["mean of the training voxels"]["means"]["mean"] == pytest.approx(expected)
+    assert "linear in each voxel" in baselines
     # Without shares those of the run are taken, whose test objects alone were predicted.
     again = CliRunner().invoke(slatprep, evaluate)
     assert again.stdout == measured.stdout
