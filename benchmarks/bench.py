@@ -283,17 +283,32 @@ def page(found: dict[str, Any]) -> Iterator[str]:
 
 
 def shown(result: Any) -> Iterator[str]:
-    """Yield a result as Markdown: tables of what was JSON, all else as it was printed."""
-    rows = result if isinstance(result, list) and result and isinstance(result[0], dict) else None
-    if isinstance(result, dict) or rows:
-        columns = rows or [result]
-        yield "| | " + " | ".join("value" if len(columns) == 1 else "" for _ in columns) + " |"
-        yield "| --- " * (len(columns) + 1) + "|"
-        for name in dict.fromkeys(name for row in columns for name in row):
-            values = (json.dumps(row.get(name)).strip('"') for row in columns)
-            yield f"| {name} | " + " | ".join(values) + " |"
+    """Yield a result as Markdown: tables of what was JSON, all else as it was printed.
+
+    Of several rows, each gets a line with the figures that it has: no cell is empty, and the table
+    is as wide as a page.
+    """
+    if isinstance(result, dict):
+        yield from ("| figure | value |", "| --- | --- |")
+        yield from (f"| {name} | {cell(value)} |" for name, value in result.items())
+        return
+    if isinstance(result, list) and result and isinstance(result[0], dict):
+        (title, *_), *_ = result
+        yield from (f"| {title} | figures |", "| --- | --- |")
+        for row in result:
+            figures = (f"{name} {cell(row[name])}" for name in row if name != title)
+            yield f"| {cell(row[title])} | {'; '.join(figures)} |"
         return
     yield from ("```text", *(str(line).rstrip() for line in result or []), "```")
+
+
+def cell(value: Any) -> str:
+    """Return a value for a table: the items of lists and objects, none as a dash."""
+    if isinstance(value, dict):
+        return ", ".join(f"{name} {cell(one)}" for name, one in value.items())
+    if isinstance(value, list):
+        return ("; " if value and isinstance(value[0], dict) else ", ").join(map(cell, value))
+    return "-" if value is None else str(value)
 
 
 if __name__ == "__main__":

@@ -89,9 +89,9 @@ def export(
     kind: Annotated[
         Any,
         ChoiceOf("slatprep.export:FORMATS"),
-        "Point clouds with Pixie's fields, one HDF5 file, tar shards, the files of TRELLIS's "
-        "dataset (npz and metadata.csv) with the targets added, the npz of VoMP's scripts, or USD "
-        "for Newton and Isaac Lab.",
+        "ply: point clouds with Pixie's fields. hdf5: one file. webdataset: tar shards. npz: the "
+        "files of TRELLIS's dataset with the targets added. voxel_data: the npz of VoMP's scripts. "
+        "usd: for Newton and Isaac Lab.",
         Click("--format"),
     ],
     out: Annotated[

@@ -388,10 +388,19 @@ class SourceOptions:
         return load_parameters(self.config, given, self.preset)
 
 
+_FEW_OBJECTS = 100
+"""Below this number a hash's shares are far from those asked for."""
+
+
 def note_split(output: Output, assignment: Assignment, how: str) -> None:
     """Print the sizes of the splits, and ids of a file and of the store that are in none."""
     counts = ", ".join(f"{len(ids):,} {split}" for split, ids in assignment.lists().items())
     output.note(f"split:   {how}: {counts}")
+    if how.endswith("by hash") and len(assignment.splits) < _FEW_OBJECTS:
+        output.note(
+            "note:    a hash of its id draws each object's split; of few objects the shares are "
+            "rough. --split-by FILE takes lists of your own"
+        )
     for ids, what in (
         (assignment.unknown, "are of no object of the store that has a valid voxel"),
         (assignment.unlisted, "of the store are in none of its lists, and left out"),

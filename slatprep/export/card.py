@@ -22,7 +22,7 @@ _TAGS = ("3d", "physics", "material-properties", "structured-latents", "zarr", "
 
 _HOW_ZARR = """\
 ```python
-import slatprep  # pip install 'slatprep[hub]'
+import slatprep  # in a checkout of it: pip install '.[hub]'
 
 store = slatprep.open_store("hf://datasets/OWNER/NAME/{data}")
 asset = store.asset(store.ids[0])

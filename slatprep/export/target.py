@@ -42,7 +42,7 @@ def directory(out: Path) -> Iterator[Path]:
     out = out.resolve()
     own = _files_of_export(out) if out.exists() else frozenset()
     if own is None:
-        raise _not_an_export(out)
+        raise _not_an_export(out, "folder")
     with _writable(out):
         out.parent.mkdir(parents=True, exist_ok=True)
         _remove_killed(out)
@@ -101,7 +101,7 @@ def file(out: Path, is_export: Callable[[Path], bool]) -> Iterator[Path]:
     """
     out = out.resolve()
     if out.exists() and not (out.is_file() and is_export(out)):
-        raise _not_an_export(out)
+        raise _not_an_export(out, "file")
     with _writable(out), staged(out) as path:
         yield path
 
@@ -159,7 +159,12 @@ def _replace_files(new: Path, out: Path, own: frozenset[str], others: set[str]) 
     flush(out)
 
 
-def _not_an_export(out: Path) -> ConfigError:
+def _not_an_export(out: Path, wanted: str) -> ConfigError:
+    there = "folder" if out.is_dir() else "file"
+    if there != wanted:
+        return ConfigError(
+            f"{out} exists and is a {there}, but this format writes a {wanted}; expected a new path"
+        )
     return ConfigError(
         f"{out} exists and is not an export of slatprep; expected an export to replace, "
         "or a new path"

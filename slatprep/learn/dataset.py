@@ -302,6 +302,10 @@ class SlatLoader(DataLoader[Item]):
             pin_memory=pin_memory,
         )
 
+    def __iter__(self) -> Iterator[SparseBatch]:  # type: ignore[override]
+        """Iterate over batches: `DataLoader` itself leaves their type open."""
+        return super().__iter__()
+
     def set_epoch(self, epoch: int, batches: int = 0) -> None:
         """Set the epoch, which decides order and augmentation; leave out its first batches."""
         self.order.epoch, self.order.first = epoch, batches * (self.batch_size or 1)

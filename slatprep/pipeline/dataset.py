@@ -11,6 +11,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType
 
+from slatprep.errors import ConfigError
 from slatprep.parameters import BuildParameters
 from slatprep.pipeline.asset import process_asset
 from slatprep.pipeline.before import Before, look_back
@@ -111,7 +112,7 @@ def build_store(
     Raises
     ------
     ConfigError
-        If `out` is something other than a store.
+        If `out` is something other than a store, or `parameters` are of another type.
     StoreError
         If another build is writing it, no asset can be used, or the disk does not take what is
         written.
@@ -119,6 +120,11 @@ def build_store(
         With `strict`, for the first asset that cannot be used.
     """
     begin = time.perf_counter()
+    if not hasattr(parameters, "pixieverse"):
+        raise ConfigError(
+            f"parameters are {parameters!r:.80}; expected those of load_parameters(FILE), or "
+            "BuildParameters(PixieverseSource(DIR), SlatSource(DIR))"
+        )
     crew = Crew(jobs, assets_per_job, progress, note)
     place, wanted = Destination(out, manifests), Wanted.of(parameters, compact)
     elsewhere = not isinstance(jobs, int)

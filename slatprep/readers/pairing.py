@@ -94,7 +94,8 @@ def discover(
                 )
         if not slat.root.exists():
             raise ConfigError(
-                f"{slat.root}: does not exist; expected a folder of SLATs or an HDF5 file"
+                f"{slat.root}: {storage_of(slat.root).absent}; expected a folder of SLATs or an "
+                "HDF5 file"
             )
         one_file = slat.root.is_file()
     except OSError as error:

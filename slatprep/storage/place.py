@@ -14,6 +14,7 @@ import stat
 import tempfile
 from collections.abc import Iterable, Iterator
 from contextlib import AbstractContextManager, contextmanager
+from itertools import islice
 from pathlib import Path, PurePosixPath
 from typing import IO, TYPE_CHECKING, TypeGuard
 
@@ -37,6 +38,9 @@ from slatprep.storage.versions import current_version
 
 if TYPE_CHECKING:
     from slatprep.records import Place
+
+_LOOKED_AT, _NAMED = 1000, 5
+"""Of the folder in which a missing path is: how much is looked at, and how many are named."""
 
 # pathlib makes one slash of two, and one letter is a drive.
 _URL = re.compile(r"([a-z][a-z0-9+.-]+):/+(.*)", re.DOTALL)
@@ -119,8 +123,13 @@ class Storage:
 
     @property
     def absent(self) -> str:
-        """What to say where there is nothing at the place."""
-        return "does not exist"
+        """What to say where there is nothing at the place: how far the path leads."""
+        if self.local is None:
+            return "does not exist"
+        above = next(path for path in self.local.absolute().parents if path.is_dir())
+        names = sorted(path.name for path in islice(above.iterdir(), _LOOKED_AT) if path.is_dir())
+        held = f"the folders {', '.join(names[:_NAMED])}" if names else "no folder"
+        return f"does not exist; {above} does, and holds {held}"
 
     def archives(self, names: Iterable[str], wanted: tuple[str, ...]) -> list[Archive]:
         """Look at archives that lie in the place, of whose members those like `wanted` matter.

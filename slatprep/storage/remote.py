@@ -284,6 +284,12 @@ def remove_objects(place: RemotePlace, names: Iterable[str]) -> None:
         system.rm([f"{root}/{name}" for name in names])
 
 
+_CREDENTIALS = (
+    "set AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY, or AWS_PROFILE to a profile of ~/.aws"
+)
+"""What helps where S3 has no credentials."""
+
+
 def _is_plain(name: str) -> bool:
     return not {"", ".", ".."} & set(name.split("/")) and "\\" not in name and "\0" not in name
 
@@ -338,4 +344,5 @@ def connected(place: RemotePlace, *, fresh: bool = True) -> Iterator[tuple[Any, 
 
 
 def _words(error: object) -> str:
-    return " ".join(str(error).split()).rstrip(".") or type(error).__name__
+    words = " ".join(str(error).split()).rstrip(".") or type(error).__name__
+    return f"{words}; {_CREDENTIALS}" if "locate credentials" in words else words

@@ -248,7 +248,7 @@ class AssetTable:
         hint = (
             f"did you mean {' or '.join(close[:5])}?"
             if close
-            else f"it has {amount(len(self), 'asset')}; `slatprep list` shows their ids"
+            else f"it has {amount(len(self), 'asset')}; `slatprep list {self.path}` shows their ids"
         )
         return UnknownAssetError(f"{self.path} has no asset {name!r}; {hint}")
 

@@ -6,21 +6,38 @@ import ast
 import importlib.util
 import sys
 from pathlib import Path
+from types import ModuleType
 
 import pytest
 
 ROOT = Path(__file__).parents[2]
 
 
-def test_every_measurement_names_a_script_and_a_page_that_are_there(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+@pytest.fixture
+def bench(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
     monkeypatch.syspath_prepend(str(ROOT / "benchmarks"))
     spec = importlib.util.spec_from_file_location("bench", ROOT / "benchmarks" / "bench.py")
     assert spec is not None and spec.loader is not None
     bench = importlib.util.module_from_spec(spec)
     monkeypatch.setitem(sys.modules, "bench", bench)
     spec.loader.exec_module(bench)
+    return bench
+
+
+def test_tables_of_the_page_are_two_cells_wide_and_none_is_empty(bench: ModuleType) -> None:
+    one = {"wall [s]": 1.5, "files": None, "runs": [1, [2, 3]], "at": [{"cpu": 4}, {"cpu": 5}]}
+    assert list(bench.shown(one))[2:] == [
+        "| wall [s] | 1.5 |", "| files | - |", "| runs | 1, 2, 3 |", "| at | cpu 4; cpu 5 |",
+    ]  # fmt: skip
+    rows = list(bench.shown([{"step": "build", "files": 3}, {"step": "read", "CPU [s]": 0.2}]))
+    assert rows == [
+        "| step | figures |", "| --- | --- |", "| build | files 3 |", "| read | CPU [s] 0.2 |",
+    ]  # fmt: skip
+    text = (ROOT / "docs" / "benchmarks.md").read_text("utf-8")
+    assert "null" not in text
+
+
+def test_every_measurement_names_a_script_and_a_page_that_are_there(bench: ModuleType) -> None:
     for one in bench.MEASUREMENTS:
         program, script, *_ = one.command.split()
         assert program == "python" and (ROOT / script).is_file(), one.name

@@ -188,6 +188,7 @@ def test_options_win_over_the_dataset_definition(demo: Path) -> None:
         assert result.exit_code == 2
         assert result.stderr.startswith("slatprep: error: ") and said in result.stderr
         assert len(result.stderr.splitlines()) == 1
+    assert f"{demo} does, and holds the folders " in result.stderr
 
 
 def test_asset_that_cannot_go_in_is_named_and_exit_code_is_one(demo: Path, tmp_path: Path) -> None:

@@ -14,6 +14,8 @@ from typing import get_type_hints
 
 import pytest
 
+from slatprep.cli.export import export
+from slatprep.export import FORMATS
 from slatprep.parameters import BuildParameters
 from slatprep.parameters.files import load_parameters
 from slatprep.store.layout import ARRAYS, MERGED
@@ -90,6 +92,15 @@ def default_of(field: dataclasses.Field[object]) -> str:
     if field.default is dataclasses.MISSING:
         return "required"
     return "none" if field.default is None else f"`{json.dumps(field.default)}`"
+
+
+def test_each_format_of_export_is_told_of_in_help_and_page() -> None:
+    page = (ROOT / "docs" / "export.md").read_text("utf-8")
+    rows = re.findall(r"^\| `(\w+)` \| a f(?:ile|older)", page, re.M)
+    commands = re.findall(r"^slatprep export .*--format (\w+)", page, re.M)
+    assert set(rows) == set(commands) == FORMATS.keys()
+    (kind,) = (one for one in export.params if one.name == "kind")
+    assert set(re.findall(r"(\w+): ", getattr(kind, "help", ""))) == FORMATS.keys()
 
 
 def test_formats_describes_every_array() -> None:

@@ -121,7 +121,11 @@ def test_what_is_no_export_is_never_replaced(format: Any, store: Path, tmp_path:
     (folder / "thesis.txt").write_text("years of work")
     file.write_text("years of work")
     for out in (folder, file):
-        with pytest.raises(ConfigError, match="exists and is not an export"):
+        wanted = "file" if format == "hdf5" else "folder"
+        there = "folder" if out.is_dir() else "file"
+        other = f"is a {there}, but this format writes a {wanted}"
+        said = "is not an export" if there == wanted else other
+        with pytest.raises(ConfigError, match=f"exists and {said}"):
             export_store(store, out, format)
     assert (folder / "thesis.txt").read_text() == file.read_text() == "years of work"
 

@@ -218,6 +218,7 @@ def test_commands_train_and_evaluate(learn_store: Path, tmp_path: Path) -> None:
          "2", "--learning-rate", "0.002", "--threads", "1", *shares, "--json"],
     )  # fmt: skip
     assert trained.exit_code == 0, trained.output
+    assert "of few objects the shares are rough" in trained.stderr
     history = json.loads(trained.stdout)["runs"]["small"]["history"]
     assert history[1]["train_loss"] < history[0]["train_loss"]
     predictions = tmp_path / "run" / "predictions"

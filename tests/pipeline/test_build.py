@@ -113,6 +113,11 @@ def test_a_build_that_is_stopped_midway_leaves_the_old_store(
     assert {name: after[name] for name in before} == before
 
 
+def test_folders_instead_of_parameters_are_answered_with_what_to_give(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="parameters are 'grids'; expected those of load_param"):
+        build_store("grids", tmp_path / "s.zarr")  # type: ignore[arg-type]
+
+
 def test_what_is_not_a_store_is_never_replaced(make_dataset: MakeDataset, tmp_path: Path) -> None:
     (tmp_path / "thesis").mkdir()
     (tmp_path / "thesis" / "chapter.tex").write_text("years of work")
