@@ -121,10 +121,7 @@ def build_store(
     """
     begin = time.perf_counter()
     if not hasattr(parameters, "pixieverse"):
-        raise ConfigError(
-            f"parameters are {parameters!r:.80}; expected those of load_parameters(FILE), or "
-            "BuildParameters(PixieverseSource(DIR), SlatSource(DIR))"
-        )
+        raise ConfigError(f"parameters are {parameters!r:.80}; expected those of load_parameters")
     crew = Crew(jobs, assets_per_job, progress, note)
     place, wanted = Destination(out, manifests), Wanted.of(parameters, compact)
     elsewhere = not isinstance(jobs, int)
