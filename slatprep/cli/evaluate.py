@@ -98,6 +98,7 @@ def evaluate(
     chosen["spread"] = spread
     part = None if split == "all" else split
     result: Evaluation | Comparison
+    baselines: dict[str, Measure] = {}
     if grids:
         from slatprep.learn.compare import compare_methods
 
@@ -108,8 +109,9 @@ def evaluate(
     else:
         result = evaluate_store(cast("Path", predictions), store, part, **chosen)
         measures = {name or "(none)": m for name, m in result.categories.items()}
-        measures |= {"all": result.overall} | result.baselines
+        measures |= {"all": result.overall}
         ours, what = {"these predictions": result.overall}, "category"
+        baselines = result.baselines
         problems = [f"{predictions}: no prediction of {name}" for name in result.missing]
         if result.converted:
             output.note(
@@ -133,7 +135,7 @@ def evaluate(
         document["beside"] = [score for scores in others.values() for score in scores]
     output.result(
         document,
-        lambda: _show(output, SPREADS[spread], what, measures, ours, others),
+        lambda: _show(output, SPREADS[spread], what, measures | baselines, ours, others),
         complete=not problems,
     )
 
