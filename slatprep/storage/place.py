@@ -39,9 +39,6 @@ from slatprep.storage.versions import current_version
 if TYPE_CHECKING:
     from slatprep.records import Place
 
-_LOOKED_AT, _NAMED = 1000, 5
-"""Of the folder in which a missing path is: how much is looked at, and how many are named."""
-
 # pathlib makes one slash of two, and one letter is a drive.
 _URL = re.compile(r"([a-z][a-z0-9+.-]+):/+(.*)", re.DOTALL)
 
@@ -127,9 +124,8 @@ class Storage:
         if self.local is None:
             return "does not exist"
         above = next(path for path in self.local.absolute().parents if path.is_dir())
-        names = sorted(path.name for path in islice(above.iterdir(), _LOOKED_AT) if path.is_dir())
-        held = f"the folders {', '.join(names[:_NAMED])}" if names else "no folder"
-        return f"does not exist; {above} does, and holds {held}"
+        names = sorted(path.name for path in islice(above.iterdir(), 1000) if path.is_dir())[:5]
+        return f"does not exist; {above} does, and holds the folders {', '.join(names) or '(none)'}"
 
     def archives(self, names: Iterable[str], wanted: tuple[str, ...]) -> list[Archive]:
         """Look at archives that lie in the place, of whose members those like `wanted` matter.

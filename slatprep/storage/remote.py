@@ -284,9 +284,7 @@ def remove_objects(place: RemotePlace, names: Iterable[str]) -> None:
         system.rm([f"{root}/{name}" for name in names])
 
 
-_CREDENTIALS = (
-    "set AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY, or AWS_PROFILE to a profile of ~/.aws"
-)
+_CREDENTIALS = "set AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY, or AWS_PROFILE"
 """What helps where S3 has no credentials."""
 
 
