@@ -73,13 +73,13 @@ def read_state(path: Path) -> dict[str, Any]:
         size = file.tell()
         file.seek(0)
         with zipfile.ZipFile(file) as archive:
-            if sum(info.file_size for info in archive.infolist()) > size:
-                raise ValueError("its members overlap")
             if any(info.filename.endswith("/constants.pkl") for info in archive.infolist()):
                 raise ValueError("it holds a program of TorchScript")
             # torch.save does not compress; a compressed file could unpack to any size.
             if any(info.compress_type != zipfile.ZIP_STORED for info in archive.infolist()):
                 raise ValueError("it is compressed")
+            if sum(info.file_size for info in archive.infolist()) > size:
+                raise ValueError("its members overlap")
             for info in archive.infolist():
                 if info.filename.endswith("/data.pkl"):
                     if info.file_size > _MAX_PICKLE:
