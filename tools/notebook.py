@@ -1,17 +1,26 @@
-"""Write the tutorial as a notebook, to standard output: into examples/tutorial.ipynb.
+"""Run the tutorial as a notebook, and write it with its outputs: examples/tutorial.ipynb.
 
 Its text and code are those of docs/tutorial.md, which the tests run, so the two
-cannot say different things; the tests compare them.
+cannot say different things; the tests compare them. Pictures are made small.
 """
 
 from __future__ import annotations
 
+import base64
+import io
 import json
+import os
 import re
 import sys
+import tempfile
 from pathlib import Path
+from typing import Any
 
-PAGE = Path(__file__).parents[1] / "docs" / "tutorial.md"
+ROOT = Path(__file__).parents[1]
+PAGE = ROOT / "docs" / "tutorial.md"
+NOTEBOOK = ROOT / "examples" / "tutorial.ipynb"
+WIDTH = 1000
+"""Pixels of a picture."""
 
 _BLOCK = re.compile(r"^```(\w+)\n(.*?)^```$", re.M | re.S)
 _LINK = re.compile(r"\]\((?!https?:)([\w./#-]+)\)")
@@ -42,5 +51,42 @@ def notebook(page: str) -> str:
     return json.dumps(document, indent=1, ensure_ascii=False) + "\n"
 
 
+def run(text: str, folder: Path) -> str:
+    """Return a notebook after it was run in a folder: what cells print, and their pictures."""
+    import nbformat
+    from nbclient import NotebookClient
+
+    os.environ["PATH"] = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
+    done = nbformat.reads(text, as_version=4)
+    patient = {"timeout": None, "startup_timeout": 600, "iopub_timeout": 600}
+    NotebookClient(done, resources={"metadata": {"path": str(folder)}}, **patient).execute()
+    shown: dict[str, list[Any]] = {}
+    for cell in done.cells:
+        outputs = [one for one in cell.get("outputs", []) if one.get("name") != "stderr"]
+        for one in outputs:
+            if picture := one.get("data", {}).get("image/png"):
+                one["data"] = {"image/png": small(picture)}
+        shown[cell.id] = outputs
+    document = json.loads(text)
+    for number, cell in enumerate(c for c in document["cells"] if c["cell_type"] == "code"):
+        cell |= {"execution_count": number + 1, "outputs": shown[cell["id"]]}
+        for one in cell["outputs"]:
+            if "execution_count" in one:
+                one["execution_count"] = number + 1
+    return json.dumps(document, indent=1, ensure_ascii=False) + "\n"
+
+
+def small(picture: str) -> str:
+    """Return a PNG in base64, at most `WIDTH` wide and of 128 colours."""
+    from PIL import Image
+
+    image = Image.open(io.BytesIO(base64.b64decode(picture))).convert("RGB")
+    image.thumbnail((WIDTH, WIDTH), Image.Resampling.LANCZOS)
+    made = io.BytesIO()
+    image.quantize(128).save(made, "PNG", optimize=True)
+    return base64.b64encode(made.getvalue()).decode()
+
+
 if __name__ == "__main__":
-    sys.stdout.write(notebook(PAGE.read_text("utf-8")))
+    with tempfile.TemporaryDirectory() as scratch:
+        NOTEBOOK.write_text(run(notebook(PAGE.read_text("utf-8")), Path(scratch)), "utf-8")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import contextlib
+import importlib
 import io
 import json
 import os
@@ -62,20 +63,26 @@ def test_the_page_on_security_says_what_each_command_does_with_files() -> None:
     assert set(re.findall(r"`([a-z-]+)`", " ".join(rows))) == COMMANDS.keys()
 
 
-def test_the_notebook_is_the_tutorial() -> None:
-    written = (ROOT / "examples" / "tutorial.ipynb").read_text("utf-8")
-    made = subprocess.run(
-        [sys.executable, ROOT / "tools" / "notebook.py"], capture_output=True, text=True, check=True
-    )
-    assert made.stdout == written, "run: python tools/notebook.py > examples/tutorial.ipynb"
-    cells = json.loads(written)["cells"]
-    code = ["".join(cell["source"]) for cell in cells if cell["cell_type"] == "code"]
-    expected = [
-        (f"%%sh\n{text}" if language == "sh" else text).strip("\n")
-        for language, text in blocks("tutorial.md")
-        if language != "text"
-    ]
-    assert code == expected
+def test_the_notebook_is_the_tutorial_with_its_outputs(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.syspath_prepend(str(ROOT / "tools"))
+    notebook = importlib.import_module("notebook")
+    written = json.loads((ROOT / "examples" / "tutorial.ipynb").read_text("utf-8"))
+    made = json.loads(notebook.notebook((DOCS / "tutorial.md").read_text("utf-8")))
+    sources = [[cell["source"] for cell in one["cells"]] for one in (written, made)]
+    assert sources[0] == sources[1], "run: python tools/notebook.py"
+    cells = iter(cell for cell in written["cells"] if cell["cell_type"] == "code")
+    printed, pictures = "", 0
+    for language, text in blocks("tutorial.md"):
+        if language == "text":
+            assert printed == text, "run: python tools/notebook.py"
+            continue
+        cell = next(cells)
+        expected = f"%%sh\n{text}" if language == "sh" else text
+        assert "".join(cell["source"]) == expected.strip("\n")
+        printed = "".join("".join(out.get("text", "")) for out in cell["outputs"])
+        pictures += sum("image/png" in out.get("data", {}) for out in cell["outputs"])
+    assert pictures == 1
+    assert (ROOT / "examples" / "tutorial.ipynb").stat().st_size < 300_000
 
 
 def test_the_notebook_runs_in_jupyter_and_prints_what_the_tutorial_shows(

@@ -48,6 +48,20 @@ def test_tensorstore_reads_the_same_numbers(store: Path, layout: object) -> None
     np.testing.assert_array_equal(read, ours[...])
 
 
+def test_what_others_cannot_open_is_what_the_page_says(store: Path) -> None:
+    with xarray.open_zarr(store) as root:
+        assert not root.variables
+    with xarray.open_datatree(store, engine="zarr") as tree:
+        assert {"asset", "voxel", "grid"} <= set(tree.children)
+        assert tree["voxel/coords"].shape[1] == 3
+    for layout in ARRAYS:
+        if layout.dtype == "str":
+            path = f"{store / layout.name}/"
+            spec = {"driver": "zarr3", "kvstore": {"driver": "file", "path": path}}
+            with pytest.raises(ValueError, match="data_type"):
+                tensorstore.open(spec, read=True, open=True).result()
+
+
 def test_coordinates_name_rows_columns_and_places(store: Path) -> None:
     group = zarr.open_group(store, mode="r")
     with xarray.open_zarr(store, group="asset") as assets:

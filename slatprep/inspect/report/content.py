@@ -111,7 +111,7 @@ def page_content(
             "stored": len(store),
             "assets": sum(states.values()),
             "states": states,
-            "tied": outcomes and outcomes.tied,
+            "ambiguous": int((store.column("ambiguity") > THRESHOLDS.good_ambiguity).sum()),
         },
     }
 

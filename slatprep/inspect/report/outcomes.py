@@ -65,15 +65,12 @@ class Outcomes:
         By id, assets that the page lists, whether in the store or not.
     clipped : ndarray of int64, shape (P,)
         Values outside the range, by property, of all assets.
-    tied : int
-        Assets with ties.
     absent : Counter
         Assets that are not in the store, by status.
     """
 
     known: dict[str, Outcome]
     clipped: NDArray[np.int64]
-    tied: int
     absent: Counter[Status]
 
 
@@ -92,15 +89,13 @@ def gather_outcomes(
             f"{store.about.manifest[:12]!r}; name the folder of its own records with --manifests"
         )
     known = {record.asset_id: _failed(record) for record in build.failed[:most_absent]}
-    tied = 0
     for record in StoredRecords(store):
-        tied += len(record.alignment.placements) > 0
         if record.asset_id in listed:
             known[record.asset_id] = _outcome(record)
     absent = Counter({status: build.statuses.get(str(status), 0) for status in Status})
     del absent[Status.OK]
     clipped = store.column("clipped").sum(axis=0)
-    return Outcomes(dict(sorted(known.items())), clipped, tied, +absent)
+    return Outcomes(dict(sorted(known.items())), clipped, +absent)
 
 
 def kind_of(reason: str) -> str:

@@ -25,6 +25,7 @@ from slatprep.cli.commands import slatprep as command
 from slatprep.errors import StoreError
 from slatprep.geometry.frames import apply_transform, voxel_centres
 from slatprep.inspect import report
+from slatprep.inspect.overview import overview_of
 from slatprep.inspect.report import write_report
 from slatprep.inspect.report.orientations import nearest_quarter_turn, quarter_turns
 from slatprep.inspect.report.outcomes import kind_of, kinds_of
@@ -197,8 +198,9 @@ def test_of_a_store_too_large_to_list_a_sample_is_listed_and_all_are_counted(
             assert values == [*whole["assets"][name][:5:2], *whole["assets"][name][5:]], name
     assert found["assets"]["picture"] == [0, 1, 2, None, None]
     states = {state: whole["assets"]["state"].count(state) for state in whole["assets"]["state"]}
-    tied = sum(1 for tied in whole["assets"]["tied"] if tied)
-    expected = {"stored": 5, "assets": 7, "states": states, "tied": tied}
+    # The same assets as `slatprep info` and `check-alignment --ambiguous` count.
+    ambiguous = overview_of(store).total.ambiguous
+    expected = {"stored": 5, "assets": 7, "states": states, "ambiguous": ambiguous}
     assert found["all"] == whole["all"] == expected
     clips = [[one["clipped"] for one in content["properties"]] for content in (found, whole)]
     assert clips[0] == clips[1]

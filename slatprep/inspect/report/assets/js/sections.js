@@ -6,7 +6,7 @@ const Sections = (() => {
 
   function states(filter) {
     const counts = STATES.map((state) => ({ ...state, count: CONTENT.all.states[state.name] ?? 0 }));
-    const { stored: inStore, assets: total, tied } = CONTENT.all;
+    const { stored: inStore, assets: total, ambiguous } = CONTENT.all;
     byId("title").textContent = CONTENT.name || CONTENT.title;
     const engine = CONTENT.engine.join(", ");
     byId("lede").textContent =
@@ -23,7 +23,7 @@ const Sections = (() => {
     ];
     const unphysical = sum(known(ASSETS.unphysical));
     if (unphysical) tiles.push(["unphysical voxels left out", Format.count(unphysical)]);
-    if (CONTENT.records) tiles.push(["assets with ties", Format.count(tied)]);
+    tiles.push(["tied, with other labels", Format.count(ambiguous)]);
     const merged = known(ASSETS.spreads).length;
     if (merged) tiles.push(["assets with merged labels", Format.count(merged)]);
     byId("tiles").replaceChildren(...tiles.map(([name, value]) => el("div", {}, el("dt", {}, name), el("dd", {}, value))));
@@ -240,7 +240,7 @@ const Sections = (() => {
     const { side, assets } = CONTENT.detail;
     const { stored: inStore, assets: total } = CONTENT.all;
     const notes = [];
-    if (TOTAL < total) notes.push(`This page shows a sample: ${Format.count(TOTAL)} of ${Format.count(total)} assets are in its table and in its charts and medians; counts of assets by state and with ties, and of SLAT voxels, are of all.`);
+    if (TOTAL < total) notes.push(`This page shows a sample: ${Format.count(TOTAL)} of ${Format.count(total)} assets are in its table and in its charts and medians; counts of assets by state and of ties, and of SLAT voxels, are of all.`);
     if (side < 64) notes.push(`To keep this page small, 3D views show ${side}³ voxels: each stands for 2 × 2 × 2 of the store's.`);
     if (assets < inStore) notes.push(`${Format.count(assets)} of ${Format.count(inStore)} assets have a thumbnail and a 3D view, and make up the distributions: those with a doubtful or failed alignment first, the rest evenly chosen.`);
     byId("detail-hint").textContent = notes.join(" ");
