@@ -14,7 +14,6 @@ from dataclasses import replace
 
 from slatprep.align.consensus import find_consensus, is_common, settle, turn_if_likelier
 from slatprep.align.settle import refit, take
-from slatprep.errors import amount
 from slatprep.geometry.deformation import map_of
 from slatprep.judge import contradicted, judge
 from slatprep.judge.witness import (
@@ -115,10 +114,7 @@ def apply_consensus(assets: list[Row], context: BuildContext, crew: Crew) -> lis
     )
     tied = [asset for asset in assets if asset.columns["n_placements"]]
     if consensus is None:
-        crew.tell(
-            f"consensus: too few assets share a rotation; {amount(len(tied), 'asset')} with other "
-            "placements stay as they are"
-        )
+        crew.tell(f"consensus: too few assets share a rotation; {len(tied):,} tied ones stay")
         return assets
     turned = [
         asset
