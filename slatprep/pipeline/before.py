@@ -22,12 +22,13 @@ from pathlib import Path
 import numpy as np
 import orjson
 
-from slatprep.errors import StoreError
+from slatprep.errors import InputError, StoreError
 from slatprep.parameters import BuildParameters
 from slatprep.pipeline.previous import SourceStore, checked_store, store_there
 from slatprep.pipeline.publish import Destination
 from slatprep.pipeline.recipe import Recipe
 from slatprep.pipeline.rows import NextStore
+from slatprep.readers.slat import texture_of
 from slatprep.records import AssetPair, Contents, Place
 from slatprep.storage.files import open_regular, private_file
 from slatprep.storage.place import storage_of
@@ -260,7 +261,10 @@ def _state_of(pair: AssetPair) -> bytes:
              str(pair.roots.pixieverse), str(pair.roots.slat),
              *(one.problem for one in pair.annotations))  # fmt: skip
     states: list[object] = [names]
-    files = [pair.slat]
+    try:
+        files = [pair.slat, pair.slat and texture_of(pair.slat, pair.roots.contents.latents)]
+    except InputError:
+        return _UNKNOWN
     for one in pair.annotations:
         files += [one.grid, one.mask, one.bounds, *one.beside, one.transform]
     for file in files:

@@ -99,6 +99,8 @@ LATENTS = {
     "sam3d": "slatprep.readers.slat:sam3d",
     "trellis2": "slatprep.readers.slat:trellis2",
     "trellis2-512": "slatprep.readers.slat:trellis2_512",
+    "trellis2-shape-pbr": "slatprep.readers.slat:trellis2_shape_pbr",
+    "trellis2-shape-pbr-512": "slatprep.readers.slat:trellis2_shape_pbr_512",
     "trellis2-pbr": "slatprep.readers.slat:trellis2_pbr",
     "trellis2-pbr-512": "slatprep.readers.slat:trellis2_pbr_512",
 }

@@ -9,7 +9,7 @@ from contextlib import suppress
 from slatprep.errors import InputError
 from slatprep.readers.adapters import made_by
 from slatprep.readers.files import load_source, require_complete
-from slatprep.readers.slat import read_slat
+from slatprep.readers.slat import read_slat, texture_of
 from slatprep.records import (
     TRELLIS,
     AssetPair,
@@ -76,10 +76,11 @@ def _hash_slat(
     pair: AssetPair, slat: Place
 ) -> tuple[StructuredLatents | None, tuple[SourceFile, ...]]:
     """Return the latents, where their file holds those of others as well, and their file."""
+    space, root = pair.roots.contents.latents, pair.roots.slat
     if not pair.slat_group:
-        return None, (load_source(slat, pair.roots.slat, "slat")[1],)
-    space = pair.roots.contents.latents
-    latents = read_slat(slat, pair.roots.slat, pair.slat_group, space)
+        files = [(slat, "slat"), (texture_of(slat, space), "texture")]
+        return None, tuple(load_source(path, root, role)[1] for path, role in files if path)
+    latents = read_slat(slat, root, pair.slat_group, space)
     return latents, latents.sources
 
 

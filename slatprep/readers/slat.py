@@ -23,6 +23,7 @@ from slatprep.records import (
     StructuredLatents,
 )
 from slatprep.records.trellis2 import PBR_MEAN, PBR_STD, SHAPE_MEAN, SHAPE_STD
+from slatprep.storage.place import storage_of
 
 
 @dataclass(frozen=True)
@@ -70,10 +71,44 @@ def trellis2_pbr_512() -> _Slat:
     return _Slat(space, _below("pbr_latents", 512))
 
 
+def trellis2_shape_pbr() -> _Slat:
+    """Return the reader of shape latents with the texture latents of the same voxels behind."""
+    moments = (*SHAPE_MEAN, *PBR_MEAN), (*SHAPE_STD, *PBR_STD)
+    return _Slat(LatentSpace("trellis2-shape-pbr", 64, RESOLUTION, *moments))
+
+
+def trellis2_shape_pbr_512() -> _Slat:
+    """Return the reader of both of resolution 512."""
+    space = trellis2_shape_pbr().space
+    space = replace(space, encoder="trellis2-shape-pbr-512", resolution=RESOLUTION // 2)
+    return _Slat(space, _below("shape_latents", 512))
+
+
 def _below(folder: str, resolution: int) -> tuple[str, ...]:
     """Return patterns of a folder of TRELLIS.2's toolkit instead of the default's."""
     default = "shape_latents/*_1024/"
     return tuple(one.replace(default, f"{folder}/*_{resolution}/") for one in SlatSource.pattern)
+
+
+def texture_of(path: Place, space: LatentSpace) -> Place | None:
+    """Return the file of texture latents that belongs to one of shape latents.
+
+    None where the encoder has none; InputError where the folders are not those of TRELLIS.2.
+    """
+    if not space.encoder.startswith("trellis2-shape-pbr"):
+        return None
+    model, home = path.parent.name, path.parent.parent
+    textures = home.parent / "pbr_latents"
+    like = model[model.rfind("_") :]
+    folders = storage_of(textures).names()[1] if home.name == "shape_latents" else []
+    found = [name for name in folders if name.endswith(like)]
+    if len(found) != 1:
+        raise InputError(
+            path,
+            f"{len(found)} folders of texture latents go with it",
+            f"shape_latents/MODEL{like}/ID.npz and one pbr_latents/MODEL{like}/ below slat.root",
+        )
+    return textures / found[0] / path.name
 
 
 _COORDS = ArraySpec(shapes=((None, 3), (None, 4)), kinds="iu")
@@ -85,7 +120,8 @@ def read_slat(
     """Read one SLAT from npz or HDF5.
 
     It holds integer ``coords``, (N, 3) or (N, 4) with a leading batch column of zeros, and float
-    ``feats``, (N, C) with the encoder's channels C. Other arrays are ignored.
+    ``feats``, (N, C) with the encoder's channels C. Other arrays are ignored. Where the encoder has
+    texture latents behind those of the shape, they come from a file of their own.
 
     Parameters
     ----------
@@ -110,6 +146,8 @@ def read_slat(
     """
     feats = ArraySpec(((None, space.channels),), "f", note=f" (slat.encoder: {space.encoder})")
     specs = {"coords": _COORDS, "feats": feats}
+    if texture := texture_of(path, space):
+        return _with_texture(path, texture, root, space)
     if group or path.suffix.lower() in SUFFIXES:
         arrays, source = load_datasets(path, root, group, specs)
     else:
@@ -117,6 +155,28 @@ def read_slat(
         arrays = npz_arrays(data, path, specs)
     where = f"{path} [{group}]" if group else path
     return checked_latents(arrays["coords"], arrays["feats"], where, (source,), space)
+
+
+def _with_texture(
+    path: Place, texture: Place, root: Place, space: LatentSpace
+) -> StructuredLatents:
+    """Read shape and texture latents of the same voxels as one SLAT."""
+    half = replace(space, encoder="trellis2", channels=space.channels // 2, mean=(), std=())
+    shape, pbr = read_slat(path, root, "", half), read_slat(texture, root, "", half)
+    ours, theirs = (flat_index(one.coords, space.resolution) for one in (shape, pbr))
+    order = np.argsort(theirs)
+    at = order[np.minimum(np.searchsorted(theirs, ours, sorter=order), len(order) - 1)]
+    if len(ours) != len(theirs) or (theirs[at] != ours).any():
+        raise InputError(
+            texture, f"has other voxels than {path.name} of the shape", "latents of the same voxels"
+        )
+    (file,) = pbr.sources
+    return replace(
+        shape,
+        feats=np.concatenate([shape.feats, pbr.feats[at]], axis=1),
+        sources=(*shape.sources, replace(file, role="texture")),
+        warnings=(*shape.warnings, *pbr.warnings),
+    )
 
 
 def checked_latents(

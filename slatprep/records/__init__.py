@@ -43,6 +43,7 @@ from slatprep.records.results import (
     PropertyRange,
 )
 from slatprep.records.sources import (
+    LATENT_ROLES,
     AssetPair,
     MaterialField,
     Place,

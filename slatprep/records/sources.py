@@ -65,8 +65,11 @@ class Place(Protocol):
         """Read a whole file as text."""
 
 
-ROLES = ("grid", "mask", "bounds", "description", "transform", "slat")
+ROLES = ("grid", "mask", "bounds", "description", "transform", "slat", "texture")
 """The roles of a file in its asset."""
+
+LATENT_ROLES = ("slat", "texture")
+"""Those whose root is that of the latents."""
 
 
 @dataclass(frozen=True)

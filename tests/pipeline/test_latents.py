@@ -11,11 +11,13 @@ import pytest
 from support.synthetic import Dataset
 
 from slatprep import build_store, concat_stores, export_store, open_store
-from slatprep.errors import StoreError
+from slatprep.errors import InputError, StoreError
+from slatprep.inspect.verify import verify_store
 from slatprep.learn.dataset import SlatDataset
 from slatprep.learn.predict import load_checkpoint, predict
 from slatprep.learn.train import TrainParameters, train
 from slatprep.parameters import BuildParameters
+from slatprep.readers import discover, read_latents
 from slatprep.records import FEATS_MEAN, FEATS_STD, StructuredLatents
 from slatprep.store.integrity import metadata_findings
 
@@ -163,3 +165,84 @@ def test_attributes_that_do_not_fit_the_arrays_are_refused(
     with pytest.raises(StoreError, match=said):
         open_store(out)
     assert any(said in str(finding) for finding in metadata_findings(out))
+
+
+def write_both(dataset: Dataset, seed: int = 0) -> dict[str, np.ndarray]:
+    """Write shape and texture latents as TRELLIS.2's toolkit does; return both, by asset.
+
+    Those of the texture are in another order of voxels.
+    """
+    rng, both = np.random.default_rng(seed), {}
+    for name, asset in dataset.assets.items():
+        feats = rng.normal(size=(len(asset.coords), 64)).astype(np.float32) * 4
+        order = rng.permutation(len(feats))
+        for folder, rows, part in (
+            ("shape_latents/shape_enc_1024", slice(None), feats[:, :32]),
+            ("pbr_latents/tex_enc_1024", order, feats[:, 32:]),
+        ):
+            path = dataset.root / "trellis2" / folder / f"{name}.npz"
+            path.parent.mkdir(parents=True, exist_ok=True)
+            np.savez(path, coords=asset.coords[rows].astype(np.uint8), feats=part[rows])
+        both[name] = feats
+    return both
+
+
+def of_both(dataset: Dataset) -> BuildParameters:
+    root = dataset.root / "trellis2"
+    return of(dataset, root=root, encoder="trellis2-shape-pbr", standardised="no")
+
+
+def test_texture_latents_stand_behind_those_of_the_shape(dataset: Dataset, tmp_path: Path) -> None:
+    both, out = write_both(dataset), tmp_path / "s.zarr"
+    assert build_store(of_both(dataset), out).statuses["ok"] == 6
+    store = open_store(out)
+    for asset in store:
+        own = dataset.assets[asset.asset_id].coords
+        np.testing.assert_array_equal(asset.coords, own)
+        np.testing.assert_array_equal(asset.feats, both[asset.asset_id])
+    space = store.contents.latents
+    assert (space.encoder, space.channels, len(space.std)) == ("trellis2-shape-pbr", 64, 64)
+    assert (space.mean[0], space.mean[32]) == (0.781296, 3.501659)
+    files = [json.loads(line)["sources"] for line in (tmp_path / "s.manifests/assets.jsonl").open()]
+    paths = {(file["role"], file["path"]) for file in files[0]}
+    assert ("texture", "pbr_latents/tex_enc_1024/a.npz") in paths
+    assert verify_store(out, sources=True).ok
+    write_both(dataset, seed=1)
+    changed = build_store(of_both(dataset), out)
+    build_store(of_both(dataset), tmp_path / "fresh.zarr")
+    np.testing.assert_array_equal(
+        open_store(out).read(0)["feats"], open_store(tmp_path / "fresh.zarr").read(0)["feats"]
+    )
+    assert changed.statuses["ok"] == 6
+
+
+def test_changed_texture_alone_is_noticed(dataset: Dataset, tmp_path: Path) -> None:
+    write_both(dataset)
+    build_store(of_both(dataset), tmp_path / "s.zarr")
+    path = dataset.root / "trellis2/pbr_latents/tex_enc_1024/a.npz"
+    with np.load(path) as held:
+        np.savez(path, coords=held["coords"], feats=held["feats"] + 1)
+    assert not verify_store(tmp_path / "s.zarr", sources=True).ok
+    build_store(of_both(dataset), tmp_path / "s.zarr")
+    assert verify_store(tmp_path / "s.zarr", sources=True).ok
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda path: path.unlink(), "does not exist"),
+        (lambda path: path.parent.rename(path.parents[1] / "tex_512"), "0 folders of texture"),
+        (lambda path: (path.parents[1] / "other_1024").mkdir(), "2 folders of texture"),
+        (
+            lambda path: np.savez(path, coords=[[1, 2, 3]], feats=np.zeros((1, 32), np.float32)),
+            "has other voxels than a.npz of the shape",
+        ),
+    ],
+)
+def test_texture_latents_that_do_not_belong_are_refused(
+    dataset: Dataset, change, words: str
+) -> None:
+    write_both(dataset)
+    change(dataset.root / "trellis2/pbr_latents/tex_enc_1024/a.npz")
+    with pytest.raises(InputError, match=words):
+        read_latents(discover(of_both(dataset))[0])

@@ -21,6 +21,7 @@ from slatprep.pipeline.fingerprint import code_fingerprint
 from slatprep.pipeline.previous import PLACE_TOLERANCE
 from slatprep.readers.files import is_hierarchy, load_source
 from slatprep.records import (
+    LATENT_ROLES,
     UNANNOTATED,
     Annotation,
     Model,
@@ -233,7 +234,7 @@ def source_findings(record: AssetRecord, roots: SourceRoots, run: str) -> Iterat
             what = f"{source.path} is of [[also]] {source.source}, whose root is not known"
             yield Finding("sources", record.asset_id, what, "its root, by --also")
             continue
-        root = roots.slat if source.role == "slat" else own.pixieverse
+        root = roots.slat if source.role in LATENT_ROLES else own.pixieverse
         path = root / source.path
         expected = f"SHA-256 {source.sha256}"
         try:
