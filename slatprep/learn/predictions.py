@@ -49,6 +49,9 @@ RUN_BYTES = 2**20
 _FARTHEST = 100.0
 """No decoder errs by so many ranges; SI values, given by mistake, exceed it."""
 
+_MIDDLE = 2.5
+"""Nor half of an asset's values: log10 of Young's modulus, which is 3 to 12, exceeds it."""
+
 _FORMS = "a directory of <asset id>.npz, a Zarr group or an HDF5 file with a group an asset"
 
 _NUMBERS = "iuf"
@@ -175,6 +178,10 @@ def check_prediction(
     if not np.isfinite(properties).all():
         raise InputError(source, "properties are not all finite", "numbers in normalised space")
     require_normalised(source, properties)
+    middle = np.median(np.abs(properties), axis=0).max() if count else 0.0
+    if middle > _MIDDLE:
+        what = f"half of the values of a property are beyond {middle:.4g}"
+        raise InputError(source, what, "normalised properties, -1 to 1 within the ranges")
     converted = False
     if "ranges" in arrays:
         spans = _checked_ranges(source, arrays, columns).tolist()

@@ -36,6 +36,9 @@ def read_array(path: Path, root: Path, spec: ArraySpec) -> NDArray[Any]:
             reader = RowReader.of(LocalFolder(path.parent), path.name, metadata)
             if reader.decoder.nbytes > MAX_CHUNK_BYTES:
                 raise ValueError(f"chunks of {reader.decoder.shape}")
+            for number in range(-(-shape[0] // reader.shard_rows)):
+                if not (path.parent / (name := reader.key(number))).exists():
+                    raise InputError(path, f"its shard {name} is missing", _WHOLE)
             return reader.read(0, shape[0])
         folder = LocalFolder(path)
 

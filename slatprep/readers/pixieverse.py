@@ -32,7 +32,7 @@ from slatprep.readers.files import (
     npz_small_arrays,
     require_complete,
 )
-from slatprep.readers.values import in_si, require_plausible, require_prediction
+from slatprep.readers.values import in_si, require_plausible, require_possible, require_prediction
 from slatprep.readers.voxel_sets import half_overflow, physical_rows
 from slatprep.records import (
     BACKGROUND,
@@ -136,7 +136,7 @@ def read_grid(
         told_of = properties, classes, PROPERTIES, MATERIAL_CLASSES
         warnings += require_plausible(path, *told_of, pair.roots)
     else:
-        warnings += require_prediction(path, properties, classes, pair.roots)
+        warnings += require_prediction(path, properties, classes, pair.roots.plausibility)
 
     def told(row: int, column: int) -> tuple[str, str]:
         at = tuple(map(int, voxels[row]))
@@ -199,7 +199,9 @@ def read_prediction(
             "finite numbers" + (", none of E and density below 0" if raw else ""),
         )
     if not raw:
+        require_prediction(path, values, material)
         return change_ranges(values, PIXIE_RANGES, normalization), material
+    require_possible(path, values, material)
     values[:, :2] += _NO_LOG_OF_ZERO
     return np.clip(normalize_mapped(to_mapped(values), normalization), -1, 1), material
 

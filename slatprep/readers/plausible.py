@@ -95,13 +95,20 @@ class Part(NamedTuple):
         return self.modulus, self.density, self.ratio
 
 
-def fault_of(part: Part, units: Units = _UNSTATED) -> str:
-    """Say what a part has that no material has; empty where there is nothing."""
-    modulus, density = part.modulus, part.density
+def beyond_all(part: Part) -> str:
+    """Say which value of a part is beyond those of all materials; empty where none is."""
     for extent, value in zip(EXTENTS, part.values, strict=True):
         if value < extent.least or value > extent.most:
             bounds = f"{extent.least:g} to {extent.most:g}{_SYMBOLS.get(extent.name, '')}"
             return f"{title_of(extent.name)} {value:.3g}, and all materials have {bounds}"
+    return ""
+
+
+def fault_of(part: Part, units: Units = _UNSTATED) -> str:
+    """Say what a part has that no material has; empty where there is nothing."""
+    modulus, density = part.modulus, part.density
+    if fault := beyond_all(part):
+        return fault
     asked = not units.density, not units.youngs_modulus
     if asked[0] and density < _LIGHT:
         return f"density {density:.3g} kg/m^3, as aerogels alone have"

@@ -18,12 +18,14 @@ from slatprep.readers.plausible import (
     EXTENTS,
     TOLD,
     Part,
+    beyond_all,
     fault_of,
     is_physical,
     oddity_of,
     title_of,
 )
 from slatprep.records import (
+    BACKGROUND,
     FACTORS,
     LOG10,
     MATERIAL_CLASSES,
@@ -102,13 +104,14 @@ def require_plausible(
 
 
 def require_prediction(
-    where: str | Place, values: NDArray[np.float32], material: NDArray[Any], roots: SourceRoots
+    where: str | Place, values: NDArray[Any], material: NDArray[Any], plausibility: str = ""
 ) -> list[str]:
     """Hold normalised values (K, 3) and classes (K,) against what a network predicts.
 
     It may leave [-1, 1], but not in most voxels; see `require_plausible`, which this is alike.
+    Without a setting for `plausibility`, values that are none are refused.
     """
-    if roots.plausibility == "off" or len(values) == 0:
+    if plausibility == "off" or len(values) == 0:
         return []
     step = max(1, len(values) // _SAMPLE)
     sample = values[::step].astype(np.float64)
@@ -126,14 +129,26 @@ def require_prediction(
     )
     if guess:
         what = f"{what}; the values look like {guess}"
-    if roots.plausibility == "warn":
+    if plausibility == "warn":
         return [f'{TOLD}{what}; clipped (plausibility = "warn")']
-    raise InputError(
-        where,
-        what,
-        "a grid in SI units, channels last (numpy.moveaxis(grid, 0, -1)), or a prediction. "
-        'plausibility = "warn" clips them',
-    )
+    advice = "a grid in SI units, channels last (numpy.moveaxis(grid, 0, -1)), or a prediction"
+    setting = '. plausibility = "warn" clips them' if plausibility else ""
+    raise InputError(where, what, advice + setting)
+
+
+def require_possible(where: str | Place, values: NDArray[Any], material: NDArray[Any]) -> None:
+    """Refuse predicted values (K, 3) in SI units that are mostly beyond those of all materials.
+
+    Else they are measured: that a method predicts what no material has is its own error.
+    """
+    parts = [part for part in _parts(values, material, PROPERTIES, MATERIAL_CLASSES)
+             if part.name != MATERIAL_CLASSES[BACKGROUND]]  # fmt: skip
+    faults = [(part, fault) for part in parts if (fault := beyond_all(part))]
+    if not faults or sum(part.share for part, _ in faults) < _SHARE:
+        return
+    part, fault = faults[0]
+    guess = next((f"the values look like {one.words}: " for one in mistakes_of(parts, Units())), "")
+    raise InputError(where, f"{guess}{_named(part)} has {fault}", "values in SI units")
 
 
 def _is_positive(part: Part) -> bool:

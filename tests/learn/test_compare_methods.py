@@ -204,7 +204,7 @@ BAD: dict[str, tuple[Callable[[Path], None], str]] = {
     "si": (
         lambda path: save(path, np.array([7850.0, 1e6, 0.3, 0.0])[:, None, None, None]
                           + np.zeros((4, 64, 64, 64))),
-        "expected normalised properties",
+        "a prediction, channels first, is normalised to [-1, 1]",
     ),
     "negative": (lambda path: save(path, np.full((64, 64, 64, 4), -1.0)), "youngs_modulus -1"),
     "two": (
@@ -324,3 +324,34 @@ def test_published_spreads_are_those_printed() -> None:
     assert by_name["Pixie"].spreads["log10 density"] == 0.009
     assert by_name["SLAT-Phys, small"].spreads == {}
     assert all(list(score.spreads) in ([], list(METRICS)) for score in SLAT_PHYS_TABLE)
+
+
+def stuffed(case: Case, root: Path, change: Callable[[np.ndarray], np.ndarray]) -> Comparison:
+    """Measure the true grids after a change, in the form of a prediction or of a raw grid."""
+    for name in NAMES:
+        written(root / f"{name}.npy", change(case.grids[name].astype(np.float64)))
+    return compared(case, root)
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda grid: np.moveaxis(grid, -1, 0), "a prediction, channels first, is normalised"),
+        (lambda grid: grid / [1e3, 1e9, 1, 1], "look like GPa and g/cm"),
+        (lambda grid: grid * [1, 1, 100, 1], "Poisson's ratio"),
+    ],
+)
+def test_values_that_are_no_prediction_are_refused(
+    case: Case, tmp_path: Path, change: Callable[[np.ndarray], np.ndarray], words: str
+) -> None:
+    with pytest.raises(InputError, match=words):
+        stuffed(case, tmp_path, change)
+
+
+def test_a_method_that_predicts_what_no_material_has_is_measured(
+    case: Case, tmp_path: Path
+) -> None:
+    wrong = stuffed(
+        case, tmp_path, lambda grid: np.where(grid[..., 3:] == 7, grid, [7850, 2e6, 0.3, 1])
+    )
+    assert not wrong.problems

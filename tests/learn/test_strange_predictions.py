@@ -20,10 +20,11 @@ from click.testing import CliRunner
 from slatprep.cli.commands import slatprep
 from slatprep.errors import InputError, StoreError
 from slatprep.learn.metrics import evaluate_store
-from slatprep.learn.predictions import selection_of_run
+from slatprep.learn.predictions import check_prediction, selection_of_run
 from slatprep.learn.runs import LAST
 from slatprep.learn.train import TrainParameters, train
 from slatprep.learn.zarr_arrays import read_array
+from slatprep.normalize import PIXIE_RANGES
 from slatprep.readers.files import ArraySpec
 from slatprep.readers.splits import Shares
 from slatprep.store import open_store
@@ -203,6 +204,22 @@ def test_a_lost_chunk_of_a_prediction_is_refused(tmp_path: Path) -> None:
     (tmp_path / "p.zarr/a/c/1/0").unlink()
     with pytest.raises(InputError, match=r"p\.zarr/a: its chunk c/1/0 is missing"):
         read_array(tmp_path / "p.zarr/a", tmp_path / "p.zarr", spec)
+
+
+def test_a_lost_shard_of_a_prediction_is_refused(tmp_path: Path) -> None:
+    root, spec = zarr.open_group(tmp_path / "p.zarr", mode="w"), ArraySpec(((None, 3),), "u")
+    root.create_array("a", shape=(8, 3), dtype="uint8", chunks=(2, 3), shards=(4, 3))[:] = 1
+    (tmp_path / "p.zarr/a/c/1/0").unlink()
+    with pytest.raises(InputError, match=r"its shard a/c/1/0 is missing; expected all chunks"):
+        read_array(tmp_path / "p.zarr/a", tmp_path / "p.zarr", spec)
+
+
+def test_log10_is_no_prediction_and_a_bad_one_is() -> None:
+    coords = np.argwhere(np.ones((5, 5, 4))).astype(np.uint8)
+    log10, bad = np.tile([6.3, 3.0, 0.4], (100, 1)), np.random.default_rng(0).normal(size=(100, 3))
+    with pytest.raises(InputError, match=r"half of the values of a property are beyond 6\.3"):
+        check_prediction("a", {"properties": log10}, coords, PIXIE_RANGES)
+    check_prediction("a", {"properties": 2 * bad}, coords, PIXIE_RANGES)
 
 
 @pytest.mark.parametrize("sharded", [True, False])
