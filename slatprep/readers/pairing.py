@@ -88,7 +88,8 @@ def discover(
     try:
         for source in sources:
             if not source.root.is_dir() and not is_archive(source.root.name):
-                absent = storage_of(source.root).absent
+                there = source.root.exists()
+                absent = "is another file" if there else storage_of(source.root).absent
                 raise ConfigError(
                     f"{source.root}: {absent}; expected PixieVerse's folder or an archive of it"
                 )
@@ -157,7 +158,8 @@ def _grids_of(
     tried = tried_names(patterns, _known(sample=source.sample))
     # Plain voxels have the names that SLATs have.
     ours = source.adapter == PixieverseSource.adapter and not one_file
-    swapped = ours and find_grids(source, list_below(slat.root))
+    other = replace(source, root=slat.root)
+    swapped = ours and find_grids(other, list_below(locate_grids(other)))
     hint = f"the roots are swapped: grids lie below {slat.root}" if swapped else hint_of(source)
     more = f"; {hint}" if hint else ""
     raise ConfigError(f"{source.root}: no grid found; looked for {tried}{more}")

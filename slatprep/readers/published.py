@@ -113,10 +113,16 @@ def hint_of(source: PixieverseSource) -> str:
             return f"it is a sample of one object; point at {place.parent.parent}"
         if any(name.startswith("sample_") for name in folders):
             return f"it is the folder of one object; point at {place.parent}"
-        for name in sorted(folders)[:_LOOKED_AT]:
-            below = replace(source, root=place / name)
+        if known := sorted(OTHERS.keys() & {*folders}):
+            return f"it holds Pixie's {', '.join(known)}, and no {GRIDS}, which has the grids"
+        inner = [place / name for name in sorted(folders)]
+        for _ in range(_LOOKED_AT):
+            if not inner:
+                break
+            below = replace(source, root=inner.pop(0))
             if any(adapter.find(below, storage_of(locate_grids(below)).listing())):
-                return f"grids lie in {place / name}; point at that"
+                return f"grids lie in {below.root}; point at that"
+            inner += [below.root / name for name in sorted(storage_of(below.root).names()[1])]
     except (OSError, SlatprepError):
         return ""
     held = ", ".join(sorted([*folders, *files])[:3]) or "nothing"

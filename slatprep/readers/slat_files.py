@@ -12,7 +12,10 @@ from slatprep.readers.adapters import latent_adapter
 from slatprep.readers.hdf5 import SUFFIXES
 from slatprep.readers.patterns import find_files, list_below, tried_names
 from slatprep.records import Place
+from slatprep.storage.archives import is_archive
 from slatprep.storage.place import storage_of
+
+_UNPACKED = "and SLATs are read unpacked: `tar -xf ARCHIVE -C FOLDER`, then point at FOLDER"
 
 _LOOKED_AT = 20
 """Folders that are looked into for a hint."""
@@ -89,7 +92,11 @@ def find_slats(source: SlatSource, one_file: bool) -> dict[str, list[NamedSlat]]
 
     Raises ConfigError if there are none or the file cannot be read.
     """
-    slats: dict[str, list[NamedSlat]] = {}
+    root, slats = source.root, dict[str, list[NamedSlat]]()
+    if one_file and is_archive(root.name):
+        raise ConfigError(f"{root}: is an archive, {_UNPACKED}")
+    if one_file and root.suffix == ".npz":
+        raise ConfigError(f"{root}: is one SLAT; point at its folder, {root.parent}")
     for slat in _each_slat(source, one_file):
         slats.setdefault(slat.slat_id, []).append(slat)
     if not slats:
@@ -112,6 +119,8 @@ def _hint(source: SlatSource) -> str:
                 return f"; SLATs lie in {below.root}: point at that"
     except (OSError, ConfigError):
         return ""
+    if archives := sorted(filter(is_archive, files)):
+        return f"; it holds {archives[0]}, {_UNPACKED}"
     held = sorted([*files, *folders])
     more = " and more" if len(held) > 3 else ""
     return f"; it holds {', '.join(held[:3]) or 'nothing'}{more}"

@@ -134,7 +134,11 @@ class Storage:
         """
         found = []
         for name in names:
-            self.locate(self._path / name)
+            try:
+                self.locate(self._path / name)
+            except InputError as error:
+                way = "an archive in its folder, not a link; or point at the archive itself"
+                raise InputError(error.path, error.fault, way) from None
             found.append(Archive.on_disk(self._path / name, wanted))
         return found
 

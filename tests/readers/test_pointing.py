@@ -75,6 +75,38 @@ def test_archives_of_another_directory_are_told_apart(root: Path) -> None:
         discover(parameters(root, "tree.tar"))
 
 
+def test_root_without_the_folder_of_grids_says_what_is_missing(root: Path) -> None:
+    touch(root, "partly/data/a/train/000.png", "partly/outputs/a/mesh.ply")
+    with pytest.raises(ConfigError, match="holds Pixie's data, outputs, and no render_outputs"):
+        discover(parameters(root, "partly"))
+
+
+def test_both_swapped_roots_are_told(root: Path) -> None:
+    with pytest.raises(ConfigError, match="the roots are swapped: grids lie below"):
+        discover(parameters(root, "slat", "pixie"))
+
+
+def test_file_that_is_no_archive_is_not_called_missing(root: Path) -> None:
+    touch(root, "classes.json")
+    with pytest.raises(ConfigError, match="is another file; expected PixieVerse's folder or an"):
+        discover(parameters(root, "classes.json"))
+
+
+@pytest.mark.parametrize("where", ["slats.tar", "slats.tar.gz", "tars"])
+def test_slats_in_archives_are_to_be_unpacked(root: Path, where: str) -> None:
+    (root / "tars").mkdir()
+    for name in ("slats.tar", "slats.tar.gz", "tars/slats.tar"):
+        pack(root / name, [root / "slat" / "a.npz"])
+    with pytest.raises(ConfigError, match="SLATs are read unpacked: `tar -xf ARCHIVE -C FOLDER`"):
+        discover(parameters(root, "pixie", where))
+
+
+def test_one_slat_is_not_a_folder_of_them(root: Path) -> None:
+    with pytest.raises(ConfigError, match="is one SLAT; point at its folder") as caught:
+        discover(parameters(root, "pixie", "slat/a.npz"))
+    assert str(root / "slat") in str(caught.value)
+
+
 def test_own_patterns_begin_at_the_root(root: Path) -> None:
     own = PixieverseSource(root / "pixie", ("render_outputs/{id}/sample_{sample}/*_grid.npy",))
     pairs = discover(BuildParameters(own, SlatSource(root / "slat")))
@@ -116,10 +148,21 @@ def test_archives_in_the_cache_of_the_hub_are_read(root: Path) -> None:
     folder = home / "snapshots" / ("0" * 40) / "archives" / "render_outputs"
     folder.mkdir(parents=True)
     (home / "blobs").mkdir()
-    pack(home / "blobs" / "1234.tar", [root / "pixie" / "render_outputs" / "a"])
-    (folder / "tree.tar").symlink_to("../../../../blobs/1234.tar")
+    pack(home / "blobs" / "1234", [root / "pixie" / "render_outputs" / "a"])
+    (folder / "tree.tar").symlink_to("../../../../blobs/1234")
     pairs = discover(parameters(home / "snapshots", "0" * 40, str(root / "slat")))
     assert [pair.category for pair in pairs if pair.grid] == ["tree"]
+    for above in (home, home / "snapshots"):
+        with pytest.raises(ConfigError, match=f"grids lie in {home}/snapshots/0{{40}}; point at"):
+            discover(parameters(above, ".", str(root / "slat")))
+
+
+def test_archive_that_is_a_link_out_of_its_folder_names_the_way_out(root: Path) -> None:
+    pack(root / "tree.tar", [root / "pixie" / "render_outputs" / "a"])
+    (root / "links").mkdir()
+    (root / "links" / "tree.tar").symlink_to(root / "tree.tar")
+    with pytest.raises(InputError, match=r"out of its root; .* the archive itself"):
+        discover(parameters(root, "links"))
 
 
 def test_what_macos_writes_beside_files_is_no_asset(root: Path) -> None:
