@@ -88,8 +88,8 @@ def discover(
     try:
         for source in sources:
             if not source.root.is_dir() and not is_archive(source.root.name):
-                there = source.root.exists()
-                absent = "is another file" if there else storage_of(source.root).absent
+                missing = storage_of(source.root).absent
+                absent = "is another file" if source.root.exists() else missing
                 raise ConfigError(
                     f"{source.root}: {absent}; expected PixieVerse's folder or an archive of it"
                 )
