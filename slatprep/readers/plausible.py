@@ -53,8 +53,8 @@ _STIFFEST, _SOFTEST = 1e9, 0.1
 _LIGHT, _FOAM = 10.0, 1e6
 
 # Above this density are metals alone. Pixie gives those of its crates 1e8 Pa, as its solver is
-# explicit; rubber has 1e6 to 1e7.
-_HEAVY, _RUBBER, _SOFT_METAL = 5_000.0, 1e7, 1e6
+# explicit; rubber has 1e6 to 1e7. Of metals, magnesium is the lightest in use, with 1,740.
+_HEAVY, _LIGHT_METAL, _RUBBER, _SOFT_METAL = 5_000.0, 1_500.0, 1e7, 1e6
 
 # Stone, glass and ceramics are as dense, and mud is not called stationary; but labels that a
 # simulation is to bear may be as soft.
@@ -126,7 +126,8 @@ def fault_of(part: Part, units: Units = _UNSTATED) -> str:
         return f"{both}: no material is so soft and so heavy"
     if density > _HEAVY and modulus < _RUBBER:
         return f"{both}: a metal's density, and not its stiffness"
-    if part.name == "metal" and modulus < _SOFT_METAL:
+    # What is lighter than metals is likely of another class: a label's own error.
+    if part.name == "metal" and modulus < _SOFT_METAL and density > _LIGHT_METAL:
         return f"Young's modulus {modulus:.3g} Pa, and no metal is so soft"
     return ""
 

@@ -285,9 +285,11 @@ def _extend(
     index.wanted = list(archive.wanted) if remote else []
     try:
         if archive.packed:
-            with io.BufferedReader(archive.open_ranges(), _STREAMED) as stream:
+            file = archive.open_ranges()
+            with io.BufferedReader(file, _STREAMED) as stream:
                 for entry in unpack(stream, archive.is_wanted, archive.keep):
                     index.add(entry)
+                    progress(file.tell())
         else:
             with archive.open_ranges() as file:
                 ahead = ReadAhead(file, remote)

@@ -166,6 +166,10 @@ class RemoteFile(io.RawIOBase):
         """Read to the end, in blocks of `io.BufferedReader`: Python's own have 8 kB."""
         return b"".join(iter(lambda: self.read(BUFFER_BYTES) or b"", b""))
 
+    def tell(self) -> int:
+        """Return how far it was read from its beginning."""
+        return self._position
+
     def readable(self) -> bool:
         """Return True."""
         return True

@@ -131,6 +131,25 @@ def test_index_goes_on_where_it_was_stopped(
     assert not passed
 
 
+def test_stopped_reading_of_an_archive_with_gzip_begins_again_and_is_told(made: Path) -> None:
+    path = made / "gz" / "archives" / "render_outputs" / "tree.tar.gz"
+    archive = archives.Archive.on_disk(path, ("*/sample_*/material_grid.npy",))
+    whole, passed = archive.index(), list[int]()
+    grid = next(one for name, one in whole.members.items() if "material_grid" in name)
+    shutil.rmtree(archive.home)
+
+    def stop(at: int) -> None:
+        if archive.holds(grid):
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        archive.index(stop)
+    assert archive.holds(grid)
+    assert archive.index(passed.append) == whole
+    assert len(passed) == len(whole.members)
+    assert passed == sorted(passed) and passed[-1] == path.stat().st_size
+
+
 def test_what_changed_in_an_archive_is_built_again_alone(made: Path, tmp_path: Path) -> None:
     folder = shutil.copytree(made / "tar", tmp_path / "tar")
     build_store(parameters(made, folder), tmp_path / "s.zarr")

@@ -28,7 +28,8 @@ def test_sources_of_the_demo_raise_no_alarm(tmp_path: Path, source: Source) -> N
 
 
 def test_every_category_in_samples_that_err_raises_no_alarm(tmp_path: Path) -> None:
-    assert alarms(tmp_path / "demo", 14, 4, levels=(0,), samples=3) == []
+    # Of seed 77, a soft and light part is called metal by mistake.
+    assert alarms(tmp_path / "demo", 14, 77, levels=(0,), samples=4) == []
 
 
 def test_hard_levels_raise_no_alarm(tmp_path: Path) -> None:
