@@ -292,8 +292,8 @@ def _pair_of(row: _Row, there: _Found, shared: str, grids: Sequence[FoundField])
                     tried = fill(source.transform, known)
                     problems.append(f"no transform for id {row.object_id!r}; looked for {tried}")
     else:
-        tried = tried_names(source.grid, _known(id=row.object_id, sample=source.sample))
-        problems.append(f"no grid for id {row.object_id!r}; looked for {tried} below {source.root}")
+        tried = tried_names(source.grid, _known(id="{id}", sample=source.sample))
+        problems.append(f"no grid for id {row.object_id!r}; looked for {tried}")
         problems.append(_case(row, there, "grid"))
     found = [slat for slat in row.slats if slat.path]
     if not found and not any(grid.problem for grid in grids):
@@ -347,12 +347,13 @@ def _unrecordable(path: str) -> str:
 
 
 def _no_slat(row: _Row, source: SlatSource, one_file: bool) -> str:
-    names = {slat.slat_id for slat in row.slats} or {row.object_id}
+    names = {slat.slat_id for slat in row.slats} - {row.object_id} or {"{id}"}
     if one_file:
-        tried = " or ".join(f"group {fill(source.group, {'id': name})}" for name in sorted(names))
-        return f"no SLAT for id {row.object_id!r}; looked for {tried} in {source.root}"
-    tried = "; ".join(tried_names(source.pattern, {"id": name}) for name in sorted(names))
-    return f"no SLAT for id {row.object_id!r}; looked for {tried} below {source.root}"
+        groups = " or ".join(f"group {fill(source.group, {'id': name})}" for name in sorted(names))
+        tried = f"{groups} in {source.root}"
+    else:
+        tried = "; ".join(tried_names(source.pattern, {"id": name}) for name in sorted(names))
+    return f"no SLAT for id {row.object_id!r}; looked for {tried}"
 
 
 def _find_one(

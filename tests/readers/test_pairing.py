@@ -79,7 +79,7 @@ def test_several_samples_need_a_choice(find):
     assert pair.grid.parent.name == "sample_1"
 
     (pair,) = find([grid("b")], ["b.npz"], pixieverse={"sample": "1"})[1:]
-    assert "looked for b/sample_1/material_grid.npy" in pair.problem
+    assert "looked for {id}/sample_1/material_grid.npy" in pair.problem
 
 
 def test_several_samples_by_number(find):
@@ -117,16 +117,19 @@ def test_missing_partners_are_yielded_with_what_was_looked_for(find, tmp_path):
     no_slat, no_grid = find([grid("a")], ["b.npz"])
     assert no_slat.asset_id == "a"
     assert no_slat.slat is None
-    assert "no SLAT for id 'a'; looked for a.npz, a.h5" in no_slat.problem
-    assert str(tmp_path / "slat") in no_slat.problem
+    assert "no SLAT for id 'a'; looked for {id}.npz, {id}.h5" in no_slat.problem
     assert no_grid.asset_id == "b"
     assert no_grid.grid is None
-    assert "no grid for id 'b'; looked for b/sample_*/material_grid.npy" in no_grid.problem
-    assert str(tmp_path / "pixie") in no_grid.problem
-    for pair in (no_slat, no_grid):
+    assert "no grid for id 'b'; looked for {id}/sample_*/material_grid.npy" in no_grid.problem
+    for pair, root in ((no_slat, "slat"), (no_grid, "pixie")):
         for read in (read_field, read_latents):
-            with pytest.raises(MissingPartnerError, match=f"for id '{pair.asset_id}'; looked for"):
+            told = f"for id '{pair.asset_id}'; looked for"
+            with pytest.raises(MissingPartnerError, match=told) as caught:
                 read(pair)
+            # Each is told once: the folder first, the id by itself and not in each pattern.
+            assert str(caught.value).startswith(f"{tmp_path / root}: ")
+            assert str(caught.value).count(str(tmp_path)) == 1
+            assert str(caught.value).count(f"'{pair.asset_id}'") == 1
 
 
 @pytest.mark.parametrize("files", [("a.npz", "a.h5"), ("a/v.npz", "a/v.h5")])
@@ -210,7 +213,7 @@ def test_hdf5_with_a_group_per_asset(find, tmp_path):
     assert found["a"].problem == ""
     assert found["a"].slat == tmp_path / "all.h5"
     assert found["a"].slat_group == "a"
-    assert f"looked for group b in {tmp_path / 'all.h5'}" in found["b"].problem
+    assert f"looked for group {{id}} in {tmp_path / 'all.h5'}" in found["b"].problem
 
     np.save(found["a"].grid, raw_grid())
     np.testing.assert_array_equal(read_latents(found["a"]).coords, COORDS)
