@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Annotated, Any
 
+import click
+
 from slatprep.cli.info import show_errors, show_quality
 from slatprep.cli.options import (
     NewFile,
@@ -44,8 +46,12 @@ def build_store(
     ] = False,
     fresh: Annotated[bool, "Reuse nothing from an earlier build."] = False,
     rehash: Annotated[
-        bool, "Hash all sources, also those whose size, times and inode did not change."
-    ] = False,
+        float,
+        click.FloatRange(0, 1),
+        "Share of the sources whose files look unchanged to hash, drawn at random; without a "
+        "number, all.",
+        Click(is_flag=False, flag_value="1", metavar="[SHARE]", show_default=True),
+    ] = 0.01,
     compact: Annotated[
         bool, "Order rows by id, as a first build does; an update appends new assets."
     ] = False,
@@ -88,7 +94,7 @@ def build_store(
         if dry_run:
             with output.progress("compare") as progress:
                 plan = build.plan_build(
-                    parameters, out, jobs=jobs, fresh=fresh, rehash=rehash, progress=progress
+                    parameters, out, jobs=jobs, fresh=fresh, rehash=rehash == 1, progress=progress
                 )
             _show_plan(output, plan)
             return

@@ -39,6 +39,7 @@ from slatprep.pipeline.plan import Action, BuildContext, PlannedAsset
 from slatprep.pipeline.previous import SourceStore
 from slatprep.pipeline.recipe import Recipe, record_of, record_of_failed
 from slatprep.pipeline.rows import FailedAsset, Row
+from slatprep.pipeline.seen import as_read
 from slatprep.pipeline.spool import Spool
 from slatprep.readers import read_field, read_latents
 from slatprep.readers.identity import reading_of, source_digests
@@ -54,6 +55,7 @@ from slatprep.records import (
 )
 from slatprep.sample import sample
 from slatprep.storage.faults import reached
+from slatprep.storage.states import noting
 from slatprep.store.record import AssetRecord
 from slatprep.store.record_json import faults_of
 
@@ -93,7 +95,8 @@ def finish_asset(
         if resumed is not None:
             return resumed
     try:
-        asset, key, damaged = _processed(pair, planned, context)
+        with noting() as noted:
+            asset, key, damaged = _processed(pair, planned, context)
         record = record_of(asset, context.recipe, key)
         if faults := faults_of(record):
             what = f"what was found is more than a record may hold ({'; '.join(faults[:3])})"
@@ -104,7 +107,7 @@ def finish_asset(
             raise
         return _failed(_failure(pair, error), context)
     kept = context.spool.put(record, asset.field, asset.latents, asset.annotation, asset.others)
-    return replace(kept, damaged=damaged)
+    return replace(kept, damaged=damaged, seen=as_read(pair, noted))
 
 
 def fail_asset(pair: AssetPair, planned: PlannedAsset | None, context: BuildContext) -> FailedAsset:

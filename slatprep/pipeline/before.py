@@ -1,54 +1,35 @@
-"""What is there before a build, by the state of files: a store, and sources that are as they were.
+"""What is there before a build: a store, and sources that are as they were.
 
-A first build finds nothing, and then nothing here matters. For the next ones,
-the state of a file is its size, its times of change, of content and of inode, and its
-inode. A file that was written so shortly before it was looked at that a later
-change could leave the same times is not trusted, as in git. What was seen lies beside the
-records of a build, with a digest of its own; it holds for this machine, this store
-and the same code and parameters. Where anything of that is otherwise, the sources are hashed.
+Sources are as they were by the state of their files, see `slatprep.pipeline.seen`. Of those, each
+build hashes a share all the same, drawn anew. Where one of them is another one, no state is
+trusted.
 """
 
 from __future__ import annotations
 
-import hashlib
-import os
-import platform
-import stat
+import math
+import random
 import time
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-import numpy as np
-import orjson
-
-from slatprep.errors import InputError, StoreError
+from slatprep.errors import StoreError
 from slatprep.parameters import BuildParameters
+from slatprep.pipeline.plan import key_of
 from slatprep.pipeline.previous import SourceStore, checked_store, store_there
 from slatprep.pipeline.publish import Destination
 from slatprep.pipeline.recipe import Recipe
 from slatprep.pipeline.rows import NextStore
-from slatprep.readers.slat import texture_of
+from slatprep.pipeline.seen import bound_to, look, read_seen, store_state, write_seen
 from slatprep.records import AssetPair, Contents, Place
-from slatprep.storage.files import open_regular, private_file
 from slatprep.storage.place import storage_of
 from slatprep.store import Store
 from slatprep.store.manifests import BUILD, file_names
-from slatprep.workers.local import Jobs
+from slatprep.workers.local import Jobs, run_unordered
 
-NAME = "sources.seen"
-"""Of the file, in the folder of the records, or on this machine's disk where those are not."""
-
-_ROW = np.dtype([("state", "V16"), ("key", "V32")])
-_HEAD = 3 * 32
-"""Bytes before the rows: three digests."""
-
-_FORMAT = "slatprep-seen-3"
-_UNKNOWN = bytes(16)
-
-FINE_NS, COARSE_NS = 100_000_000, 2_000_000_000
-"""How long before a look a file must have been written. File systems with times in nanoseconds
-stamp by the clock's tick, 10 ms at most; where times are rounder, the roughest, FAT, has 2 s."""
+SHARE = 0.01
+"""Share of the sources whose state is as it was that a build hashes all the same."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,8 +40,10 @@ class Before:
     ----------
     place : Destination
         Where the store lies, and its records.
-    recipe : str
-        What tells parameters and code.
+    recipe : Recipe
+        Parameters and code.
+    asked : str
+        What tells them, and how sources are read.
     pairs : sequence of AssetPair
         The dataset.
     states : mapping of str to bytes
@@ -73,23 +56,30 @@ class Before:
         Whether the files of store and records are as the last build left them.
     damaged : tuple of str
         What of the store is not as it was written.
+    unnoticed : tuple of str
+        Ids of assets whose sources are other ones, though their states are as they were.
+    seed : int or None
+        What the assets were drawn with whose sources were hashed all the same; None if none was.
     """
 
     place: Destination
-    recipe: str
+    recipe: Recipe
+    asked: str
     pairs: Sequence[AssetPair]
-    states: Mapping[str, bytes]
+    states: Mapping[str, bytes] = field(default_factory=dict)
     previous: SourceStore | None = None
     known: Mapping[str, str] = field(default_factory=dict)
     as_left: bool = False
     damaged: tuple[str, ...] = ()
+    unnoticed: tuple[str, ...] = ()
+    seed: int | None = None
 
     @property
     def untouched(self) -> bool:
         """Whether sources, store and records are as the last build left them, and of one set."""
         if self.previous is None or not self.as_left:
             return False
-        return len(self.known) == len(self.states) == len(self.previous.store)
+        return len(self.known) == len(self.pairs) == len(self.previous.store)
 
     def holds(self, following: NextStore) -> bool:
         """Whether the store that is there is sound, and the one that would be written."""
@@ -123,14 +113,33 @@ class Before:
         known = {} if damaged else self.known
         return replace(self, previous=previous, damaged=damaged, known=known)
 
-    def note(self, store: Store, manifests: Place) -> None:
-        """Write down what was seen of the assets of a store that is in place."""
-        bound, state = bound_to(store.about.manifest, self.recipe), b""
+    def sampled(self, share: float, seed: int | None, jobs: Callable[[int], Jobs]) -> Before:
+        """Return it after a share of the known sources has been hashed, by the clock if not a seed.
+
+        If one is not as it was, no sources are known. `jobs` says who hashes so many.
+        """
+        seed = time.time_ns() if seed is None else seed
+        ids = sorted(self.known)
+        drawn = set(random.Random(seed).sample(ids, math.ceil(share * len(ids))))
+        tasks = [(pair, self.recipe) for pair in self.pairs if pair.asset_id in drawn]
+        keys = run_unordered(key_of, tasks, jobs(len(tasks)))
+        others = tuple(sorted(one for one, key in keys if key != self.known[one]))
+        return replace(
+            self, known={} if others else self.known, unnoticed=others, seed=seed if drawn else None
+        )
+
+    def note(self, store: Store, manifests: Place, read: Mapping[str, bytes]) -> None:
+        """Write down what was seen of the assets of a store that is in place.
+
+        `read` has the states of the sources that were read, as they were then.
+        """
+        bound, state = bound_to(store.about.manifest, self.asked), b""
         folder, path = storage_of(manifests).local, storage_of(self.place.store).local
         if folder is not None and path is not None:
             state = store_state(path, _files_beside(folder, len(store)), wait=True)
         keys = zip(store.ids, (bytes(key).hex() for key in store.column("key")), strict=True)
-        write_seen(_seen_folder(self.place), bound, state, self.states, dict(keys))
+        states = {asset_id: self.states[asset_id] for asset_id in self.known} | dict(read)
+        write_seen(_seen_folder(self.place), bound, state, states, dict(keys))
 
 
 def look_back(
@@ -142,24 +151,27 @@ def look_back(
     fresh: bool = False,
     rehash: bool = False,
 ) -> Before:
-    """Look at the sources, the store and what the last build saw; with `rehash` trust none of it.
+    """Look at the sources, the store and what the last build saw; with `rehash` not at the sources.
 
     With `fresh` it is as if there were no store.
     """
     own = parameters.pixieverse
     asked = (declared, parameters.slat, parameters.also, own.units, own.plausibility)
-    key = recipe.key("", {"": str(asked)})
-    before = Before(place, key, pairs, look(pairs))
+    before = Before(place, recipe, recipe.key("", {"": str(asked)}), pairs)
     previous = None if fresh else store_there(place.store)
     if previous is None:
         # One that cannot be opened is told of when it is checked.
         damaged = () if fresh else checked_store(place.store, 1)[1]
         return replace(before, damaged=damaged)
-    seen = read_seen(_seen_folder(place), bound_to(previous.build_id, key))
-    keys = ((asset_id, seen.keys.get(state)) for asset_id, state in before.states.items())
-    known = {} if rehash else {asset_id: key for asset_id, key in keys if key is not None}
+    seen = read_seen(_seen_folder(place), bound_to(previous.build_id, before.asked))
+    states = {} if rehash or not seen.keys else look(pairs)
+    keys = ((asset_id, seen.keys.get(state)) for asset_id, state in states.items())
     return replace(
-        before, previous=previous, known=known, as_left=_is_as_left(previous, place, seen.store)
+        before,
+        states=states,
+        previous=previous,
+        known={asset_id: key for asset_id, key in keys if key is not None},
+        as_left=_is_as_left(previous, place, seen.store),
     )
 
 
@@ -181,129 +193,3 @@ def _seen_folder(place: Destination) -> Path:
     """Return where it is kept what a build saw: with the records, if those are on the disk."""
     folder = storage_of(place.manifests()).local
     return folder or storage_of(place.store).work_folder().parent
-
-
-@dataclass(frozen=True)
-class Seen:
-    """What the last build saw.
-
-    Attributes
-    ----------
-    keys : dict of bytes to str
-        Keys of the assets of the store by the state of their sources.
-    store : bytes
-        State of the store's files and records when it was finished; empty if unknown.
-    """
-
-    keys: Mapping[bytes, str] = field(default_factory=dict)
-    store: bytes = b""
-
-
-def read_seen(folder: Path, bound: bytes) -> Seen:
-    """Read what the last build saw; nothing where no whole file is bound to the same."""
-    try:
-        with open_regular(folder / NAME) as file:
-            data = file.read()
-    except OSError:
-        return Seen()
-    if len(data) < _HEAD or _digest(data[32:]) != data[:32] or data[32:64] != bound:
-        return Seen()
-    rows = np.frombuffer(data, _ROW, offset=_HEAD)
-    keys = zip(rows["state"].tolist(), rows["key"].tolist(), strict=True)
-    return Seen({state: key.hex() for state, key in keys if state != _UNKNOWN}, data[64:96])
-
-
-def write_seen(
-    folder: Path, bound: bytes, store: bytes, states: Mapping[str, bytes], keys: Mapping[str, str]
-) -> None:
-    """Note the state of the sources of each asset of a store, and its key, by id.
-
-    The file is written in place: half of one is noticed by its digest, and costs
-    the next build some hashing. So does a disk that does not take it.
-    """
-    rows = np.zeros(len(keys), _ROW)
-    for row, (asset_id, key) in zip(rows, keys.items(), strict=True):
-        row["state"], row["key"] = states[asset_id], bytes.fromhex(key)
-    body = bound + (store or bytes(32)) + rows.tobytes()
-    try:
-        with private_file(folder / NAME) as file:
-            file.write(_digest(body) + body)
-    except OSError:
-        return
-
-
-def _digest(body: bytes) -> bytes:
-    """Return the digest of a file, which one of another form does not have."""
-    return hashlib.sha256(_FORMAT.encode() + body).digest()
-
-
-def bound_to(build_id: str, recipe: str) -> bytes:
-    """Return what states hold for: this machine, a build's store, and the recipe of its assets."""
-    machine = Path("/etc/machine-id")
-    try:
-        name = machine.read_text()
-    except (OSError, UnicodeDecodeError):
-        name = ""
-    parts = [_FORMAT, platform.node(), name, build_id, recipe]
-    return hashlib.sha256(orjson.dumps(parts)).digest()
-
-
-def look(pairs: Sequence[AssetPair]) -> dict[str, bytes]:
-    """Return the state of each asset's sources, 16 bytes; zeros where it cannot be trusted.
-
-    To be called before the sources are read: what changes them later changes the state.
-    """
-    return {pair.asset_id: _state_of(pair) for pair in pairs}
-
-
-def _state_of(pair: AssetPair) -> bytes:
-    names = (pair.asset_id, pair.object_id, pair.view, pair.category, pair.slat_group,
-             str(pair.roots.pixieverse), str(pair.roots.slat),
-             *(one.problem for one in pair.annotations))  # fmt: skip
-    states: list[object] = [names]
-    try:
-        files = [pair.slat, pair.slat and texture_of(pair.slat, pair.roots.contents.latents)]
-    except InputError:
-        return _UNKNOWN
-    for one in pair.annotations:
-        files += [one.grid, one.mask, one.bounds, *one.beside, one.transform]
-    for file in files:
-        state = None if file is None else _file_state(file)
-        if state == ():
-            return _UNKNOWN
-        states.append(state)
-    return hashlib.blake2b(repr(states).encode(), digest_size=16).digest()
-
-
-def _file_state(file: Place) -> tuple[object, ...]:
-    """Return what tells whether a file was changed since; nothing where that cannot be told."""
-    if not isinstance(file, Path):
-        return storage_of(file).state()
-    try:
-        state = os.stat(file)  # noqa: PTH116 - half a million times
-    except (OSError, ValueError):
-        return ()
-    newest = max(state.st_mtime_ns, state.st_ctime_ns)
-    fine = newest % 1_000_000
-    if not stat.S_ISREG(state.st_mode) or (
-        newest + (FINE_NS if fine else COARSE_NS) > time.time_ns()
-    ):
-        return ()
-    return (str(file), state.st_size, state.st_mtime_ns, state.st_ctime_ns, state.st_ino)
-
-
-def store_state(store: Path, records: Iterable[Path], *, wait: bool = False) -> bytes:
-    """Return the state of all files of a store and of the records beside it; empty if not trusted.
-
-    With `wait`, for a tenth of a second first, as they have just been written.
-    """
-    if wait:
-        time.sleep(FINE_NS / 1e9)
-    digest = hashlib.sha256()
-    files = [Path(folder, name) for folder, _, names in os.walk(store) for name in names]
-    for file in (*sorted(files), *records):
-        state = _file_state(file)
-        if state == ():
-            return b""
-        digest.update(repr(state).encode())
-    return digest.digest()

@@ -8,13 +8,14 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from types import MappingProxyType
 
 from slatprep.errors import ConfigError
 from slatprep.parameters import BuildParameters
 from slatprep.pipeline.asset import process_asset
-from slatprep.pipeline.before import Before, look_back
+from slatprep.pipeline.before import SHARE, Before, look_back
 from slatprep.pipeline.decoys import DECOYS, EVERY, measure_build
 from slatprep.pipeline.finish import Crew, Note, Progress, finish
 from slatprep.pipeline.pack import Packed, pack_store
@@ -61,7 +62,8 @@ def build_store(
     strict: bool = False,
     fresh: bool = False,
     keep_work: bool = False,
-    rehash: bool = False,
+    rehash: float = SHARE,
+    rehash_seed: int | None = None,
     compact: bool = False,
     decoys: int = DECOYS,
     assets_per_job: int = 1,
@@ -90,8 +92,11 @@ def build_store(
     keep_work : bool
         Keep each asset's arrays beside the store, about a megabyte an asset, so that
         the next build can pack all of them anew without reading their sources.
-    rehash : bool
-        Hash all sources, also those whose size, times and inode are as they were.
+    rehash : float
+        Share of the sources to hash, drawn at random, of those whose files look as they were;
+        True, or 1, for all. Where one of them is another one, all are hashed.
+    rehash_seed : int, optional
+        What that share is drawn with; by default the clock. It stands in the summary.
     compact : bool
         Order rows by id, as in a first build, where updates have added some behind.
     decoys : int
@@ -130,7 +135,9 @@ def build_store(
     ) as work:
         pairs = _discover(parameters, jobs, work.shared(), note=note)
         recipe = recipe_of(parameters)
-        before = look_back(place, pairs, parameters, recipe, wanted.declared, fresh, rehash)
+        every = rehash >= 1
+        before = look_back(place, pairs, parameters, recipe, wanted.declared, fresh, every)
+        before = before.sampled(rehash, rehash_seed, crew.of)
         if before.previous and before.untouched and wanted.allows(before.previous.store):
             return _publish(before, parameters, begin)
         before = before.checked(crew.of(len(pairs)))
@@ -148,7 +155,7 @@ def build_store(
                 packed = pack_store(work.scratch, following, work.spool, jobs, work.shards)
                 place.replace(packed.store, packed.staged)
         records = [work.spool.record(asset.key) for asset in failed]
-        summary = _publish(before, parameters, begin, following, packed, failed, records)
+        summary = _publish(before, parameters, begin, following, packed, failed, records, crew.seen)
         if keep_work:
             work.keep_only({row.key for row in following.rows if row.spooled})
         if packed is not None:
@@ -244,6 +251,7 @@ def _plan(
         return {}
     jobs = crew.of(len(pairs) - len(known))
     plan = plan_assets(pairs, context, jobs, crew.progress, known)
+    crew.seen.update((asset.asset_id, asset.seen) for asset in plan if asset.seen)
     return {asset.asset_id: asset for asset in plan}
 
 
@@ -266,6 +274,7 @@ def _publish(
     packed: Packed | None = None,
     failed: Sequence[FailedAsset] = (),
     records: Iterable[Record] = (),
+    seen: Mapping[str, bytes] = MappingProxyType({}),
 ) -> BuildSummary:
     """Publish the store that is in place, or was there, with its manifests; note what was seen."""
     place, previous = before.place, before.previous
@@ -274,13 +283,19 @@ def _publish(
     damaged, warnings = list(before.damaged), list[str]()
     if following is not None:
         damaged += [f"{row.asset_id}: {row.damaged}" for row in following.rows if row.damaged]
+    if before.unnoticed:
+        warnings.append(
+            f"the sources of {', '.join(before.unnoticed[:3])} changed, though their files look as "
+            "they did; all sources were hashed"
+        )
     if following is not None and packed is not None:
         warnings += dataset_notices(following, parameters.slat.standardised)
     seconds = time.perf_counter() - begin
     summary = summarise_store(store, failed, place.out, manifests, seconds, warnings, damaged)
+    summary = replace(summary, rehash_seed=before.seed)
     standing = before.standing_files(len(store), packed.records if packed else None)
     publish_manifests(store, summary, parameters, records, standing=standing)
     place.publish()
     if following is not None:
-        before.note(store, manifests)
+        before.note(store, manifests, seen)
     return summary

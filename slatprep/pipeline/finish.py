@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 from slatprep.pipeline.plan import Action, BuildContext, PlannedAsset
 from slatprep.pipeline.rows import FailedAsset, Row
@@ -32,12 +32,15 @@ class Crew:
         See `Progress`.
     note : callable or None
         See `Note`.
+    seen : dict of str to bytes
+        States of the sources of assets as they were read, by id.
     """
 
     jobs: Jobs
     assets_per_job: int = 1
     progress: Progress | None = None
     note: Note | None = None
+    seen: dict[str, bytes] = field(default_factory=dict)
 
     def of(self, assets: int) -> Jobs:
         """Return who works on so many assets."""
@@ -76,6 +79,8 @@ def finish(
         crew.progress(0, len(pairs))
     for asset in run_unordered(finish_asset, tasks, jobs, fail_asset):
         assets.append(asset)
+        if isinstance(asset, Row) and asset.seen:
+            crew.seen[asset.asset_id] = asset.seen
         if crew.progress:
             crew.progress(len(assets), len(pairs))
     return assets

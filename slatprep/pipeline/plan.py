@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import StrEnum
 from types import MappingProxyType
 
@@ -17,10 +17,12 @@ from slatprep.parameters import BuildParameters
 from slatprep.pipeline.previous import SourceStore
 from slatprep.pipeline.recipe import Recipe
 from slatprep.pipeline.rows import Names
+from slatprep.pipeline.seen import as_read
 from slatprep.pipeline.spool import Spool
 from slatprep.readers.identity import hash_sources
-from slatprep.records import AssetPair, Place
+from slatprep.records import AssetPair, Place, SourceFile
 from slatprep.storage.faults import reached
+from slatprep.storage.states import noting
 from slatprep.store.record_json import RecordError
 from slatprep.workers.local import Jobs, run_unordered
 
@@ -79,6 +81,8 @@ class PlannedAsset:
         See `slatprep.pipeline.recipe`; empty where the sources cannot be read.
     names : Names or None
         Where its record has other ones: its category, paths of its files.
+    seen : bytes
+        State of its sources as they were hashed; empty where they were not.
     """
 
     asset_id: str
@@ -86,6 +90,7 @@ class PlannedAsset:
     reason: str
     key: str = ""
     names: Names | None = None
+    seen: bytes = b""
 
 
 @dataclass(frozen=True)
@@ -147,12 +152,32 @@ def plan_assets(
 
 def plan_asset(pair: AssetPair, context: BuildContext) -> PlannedAsset:
     """Say what will be done with one asset, and why."""
-    asset_id, recipe = pair.asset_id, context.recipe
-    reached("asset compared", asset_id)
+    reached("asset compared", pair.asset_id)
+    with noting() as noted:
+        try:
+            sources, digests = hash_sources(pair)
+        except SlatprepError as error:
+            return PlannedAsset(pair.asset_id, Action.REFUSE, " ".join(str(error).split()))
+    planned = _planned(pair, sources, digests, context)
+    return replace(planned, seen=as_read(pair, noted))
+
+
+def key_of(pair: AssetPair, recipe: Recipe) -> tuple[str, str]:
+    """Return an asset's id and the key that its sources give; empty if they cannot be read."""
     try:
-        sources, digests = hash_sources(pair)
-    except SlatprepError as error:
-        return PlannedAsset(asset_id, Action.REFUSE, " ".join(str(error).split()))
+        return pair.asset_id, recipe.key(pair.asset_id, hash_sources(pair)[1])
+    except SlatprepError:
+        return pair.asset_id, ""
+
+
+def _planned(
+    pair: AssetPair,
+    sources: tuple[SourceFile, ...],
+    digests: Mapping[str, str],
+    context: BuildContext,
+) -> PlannedAsset:
+    """See `plan_asset`, of an asset whose sources have been hashed."""
+    asset_id, recipe = pair.asset_id, context.recipe
     key = recipe.key(asset_id, digests)
     names = Names(pair.object_id, pair.view, pair.category, sources)
     found = context.spool.find(key)

@@ -71,6 +71,8 @@ class Row:
         Where its record there has other ones.
     damaged : str
         Why, in words, what an older store holds of it was not taken over.
+    seen : bytes
+        State of its sources as they were read; empty where they were not.
     """
 
     asset_id: str
@@ -81,6 +83,7 @@ class Row:
     row: int = 0
     names: Names | None = None
     damaged: str = ""
+    seen: bytes = b""
 
     @property
     def spooled(self) -> bool:

@@ -67,6 +67,8 @@ class BuildSummary:
         What a person should know about the dataset as a whole.
     damaged : tuple of str
         What of the existing store was not as it was written, and was made anew.
+    rehash_seed : int or None
+        What the share of unchanged sources was drawn with that was hashed; None if none was.
     """
 
     records: Place
@@ -84,6 +86,7 @@ class BuildSummary:
     clipped: Mapping[str, int] = field(default_factory=dict)
     damaged: tuple[str, ...] = ()
     warnings: tuple[str, ...] = ()
+    rehash_seed: int | None = None
 
     @property
     def complete(self) -> bool:

@@ -170,7 +170,7 @@ def load_source(path: Place, root: Place, role: str) -> tuple[bytes, SourceFile]
         return _load_hierarchy(path, root, role)
     file, name = storage_of(root).locate(path)
     try:
-        data = storage_of(file).read(MAX_FILE_BYTES)
+        data = storage_of(file).read(MAX_FILE_BYTES, path)
     except FileNotFoundError:
         raise InputError(path, "does not exist", "a readable file") from None
     except OSError as error:

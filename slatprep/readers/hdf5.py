@@ -7,12 +7,13 @@ within a bound.
 
 from __future__ import annotations
 
+import hashlib
 import math
+import os
 import zlib
 from collections.abc import Iterator, Mapping
 from functools import lru_cache
 from itertools import product
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -22,8 +23,8 @@ from slatprep.errors import InputError
 from slatprep.readers.files import ArraySpec, load_source, refusing
 from slatprep.readers.patterns import match
 from slatprep.records import Place, SourceFile
-from slatprep.storage.files import file_digest
 from slatprep.storage.place import storage_of
+from slatprep.storage.states import reading
 
 if TYPE_CHECKING:
     import h5py
@@ -52,14 +53,16 @@ def load_datasets(
     expected = f"an intact HDF5 file with datasets {', '.join(specs)}; copy or make it again"
     with refusing(where, _UNREADABLE, expected):
         if group:
-            source = _hash_shared(path, root)
-            file = h5py.File(storage_of(path).on_disk(), "r", locking=False)
-        else:
-            data, source = load_source(path, root, role)
-            file = h5py.File(h5py.h5f.open_file_image(data))
-        with file:
-            arrays = group_arrays(file, path, group, specs)
-    return arrays, source
+            located, name = storage_of(root).locate(path)
+            with (
+                h5py.File(storage_of(located).on_disk(), "r", locking=False) as file,
+                reading(file.id.get_vfd_handle(), str(path)),
+            ):
+                source = _hash_shared(file.id.get_vfd_handle(), name)
+                return group_arrays(file, path, group, specs), source
+        data, source = load_source(path, root, role)
+        with h5py.File(h5py.h5f.open_file_image(data)) as file:
+            return group_arrays(file, path, group, specs), source
 
 
 def group_arrays(
@@ -242,15 +245,17 @@ def _undo(filters: list[int], data: bytes, chunk_bytes: int, itemsize: int) -> b
     return data
 
 
-def _hash_shared(path: Place, root: Place) -> SourceFile:
-    """Describe a file that many assets share; it is hashed once a process, not once an asset."""
-    file, name = storage_of(root).locate(path)
-    copy = storage_of(file).on_disk()
-    state = copy.stat()
-    known = state.st_size, state.st_mtime_ns, state.st_ctime_ns, state.st_ino
-    return SourceFile("slat", name, state.st_size, _sha256(copy, known))
+def _hash_shared(descriptor: int, name: str) -> SourceFile:
+    """Describe an open file that many assets share, hashed once a process, not once an asset."""
+    state = os.fstat(descriptor)
+    known = state.st_dev, state.st_ino, state.st_mtime_ns, state.st_ctime_ns, state.st_size
+    return SourceFile("slat", name, state.st_size, _sha256(descriptor, known))
 
 
 @lru_cache(maxsize=64)
-def _sha256(path: Path, known: tuple[int, ...]) -> str:
-    return file_digest(path)
+def _sha256(descriptor: int, known: tuple[int, ...]) -> str:
+    digest, at = hashlib.sha256(), 0
+    while block := os.pread(descriptor, 2**20, at):  # HDF5 keeps the place where it reads
+        digest.update(block)
+        at += len(block)
+    return digest.hexdigest()

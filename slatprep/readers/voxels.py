@@ -120,7 +120,8 @@ class PlainVoxels:
         """Read a field; see `slatprep.readers.adapters.SourceAdapter`."""
         path, _ = require_complete(pair)
         root = pair.roots.pixieverse
-        said = _description(root)
+        text, about = load_source(root / DESCRIPTION, root, "description")
+        said = _parsed(text, str(root / DESCRIPTION))
         specs = {"voxels": _VOXELS, **{one.name: _COLUMN for one in said.properties}}
         specs |= {"material": _COLUMN} if said.classes else {}
         if path.suffix.lower() in SUFFIXES:
@@ -132,7 +133,6 @@ class PlainVoxels:
             else:
                 read = _ply_arrays if path.suffix.lower() == ".ply" else npz_arrays
                 arrays = read(data, path, specs)
-        _, about = load_source(root / DESCRIPTION, root, "description")
         columns: list[Any] = [arrays[one.name] for one in said.properties]
         lengths = {len(column) for column in arrays.values()}
         if len(lengths) > 1:

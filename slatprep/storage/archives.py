@@ -25,8 +25,9 @@ from slatprep.errors import InputError
 from slatprep.storage.ahead import ReadAhead
 from slatprep.storage.atomic import staged_apart
 from slatprep.storage.cache import cache_folder, short
-from slatprep.storage.files import LocalFile, open_regular
+from slatprep.storage.files import LocalFile, open_digest, open_regular
 from slatprep.storage.remote import RemoteFile, RemotePlace
+from slatprep.storage.states import boot_id, lasting_state
 from slatprep.storage.tar import BLOCK, ArchiveError, Entry, entries, unpack
 
 if TYPE_CHECKING:
@@ -49,9 +50,6 @@ _TAGS = ("ETag", "etag", "LastModified", "mtime", "blob_id", "lfs", "xet_hash")
 _COMMIT = re.compile(r"(?<=[^/])@[0-9a-f]{40}(?=/|$)")
 _SAVE_S = 20.0
 """How often an index that is being made is written down, so that a killed build loses little."""
-
-_TRUSTED_NS = 2_000_000_000
-"""How long ago an archive must have been written for its times to tell it from a later one."""
 
 
 def is_archive(name: str) -> bool:
@@ -87,10 +85,9 @@ class Archive:
     def on_disk(cls, path: Path, wanted: tuple[str, ...]) -> Archive:
         """Look at an archive on the disk; OSError if that cannot be."""
         with open_regular(path) as file:
-            state = os.fstat(file.fileno())
-        newest = max(state.st_mtime_ns, state.st_ctime_ns)
-        trusted = newest + _TRUSTED_NS < time.time_ns()
-        return cls(path, _stamp_of(state), state.st_size, trusted, wanted)
+            more = lasting_state(file.fileno()) or _digest_of_packed(file, path.name)
+            stamp = f"{_stamp_of(file)};{boot_id()} {more}"
+            return cls(path, stamp, file.size(), bool(more), wanted)
 
     @classmethod
     def of_object(
@@ -109,7 +106,7 @@ class Archive:
     @property
     def packed(self) -> bool:
         """Whether it is compressed, so that it can only be read from its beginning."""
-        return not self.place.name.lower().endswith(".tar")
+        return _is_packed(self.place.name)
 
     @property
     def keeps(self) -> bool:
@@ -160,6 +157,7 @@ class Archive:
     def checked(self, entry: Entry, data: bytes) -> bytes:
         """Return the data of a member, given with the header in front of it."""
         if zlib.crc32(data[:BLOCK]) != entry.check:
+            (self.folder / _INDEX).unlink(missing_ok=True)
             raise self.replaced()
         return data[BLOCK:]
 
@@ -176,7 +174,7 @@ class Archive:
         if isinstance(self.place, RemotePlace):
             return RemoteFile(self.place, self.size)
         file = open_regular(Path(str(self.place)))
-        if _stamp_of(os.fstat(file.fileno())) != self.stamp:
+        if _stamp_of(file) != self.stamp.partition(";")[0]:
             file.close()
             raise self.replaced()
         return file
@@ -347,5 +345,15 @@ def _like(pattern: str) -> re.Pattern[str]:
     return re.compile("[^/]*".join(re.escape(part) for part in pattern.split("*")), re.DOTALL)
 
 
-def _stamp_of(state: os.stat_result) -> str:
+def _stamp_of(file: LocalFile) -> str:
+    state = os.fstat(file.fileno())
     return f"{state.st_size} {state.st_mtime_ns} {state.st_ctime_ns} {state.st_ino}"
+
+
+def _is_packed(name: str) -> bool:
+    return not name.lower().endswith(".tar")
+
+
+def _digest_of_packed(file: LocalFile, name: str) -> str:
+    """Return the digest of an archive with gzip, as its members are kept; else nothing."""
+    return open_digest(file) if _is_packed(name) else ""

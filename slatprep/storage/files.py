@@ -11,7 +11,7 @@ import sys
 from contextlib import suppress
 from io import BufferedWriter, BytesIO, FileIO
 from pathlib import Path
-from typing import TYPE_CHECKING, cast
+from typing import IO, TYPE_CHECKING, cast
 
 if TYPE_CHECKING:
     from slatprep.records import Place
@@ -181,4 +181,9 @@ def local_files(path: Path) -> dict[str, int]:
 def file_digest(place: Place) -> str:
     """Return the SHA-256 of a file, in hex."""
     with open_regular(place) if isinstance(place, Path) else place.open("rb") as file:
-        return hashlib.file_digest(cast(BytesIO, file), "sha256").hexdigest()
+        return open_digest(file)
+
+
+def open_digest(file: IO[bytes] | LocalFile) -> str:
+    """Return the SHA-256 of an open file that has not been read, in hex."""
+    return hashlib.file_digest(cast(BytesIO, file), "sha256").hexdigest()

@@ -14,6 +14,7 @@ from slatprep.errors import InputError
 from slatprep.storage.archives import Archive, Index, shown
 from slatprep.storage.listing import RemoteListing
 from slatprep.storage.remote import RemotePlace
+from slatprep.storage.states import Noted
 from slatprep.storage.tar import Entry
 
 _AT_ONCE = 8
@@ -176,10 +177,10 @@ class ArchivePlace:
         """Read a file whole, as text."""
         return self.read_bytes().decode(encoding or "utf-8")
 
-    def state(self) -> tuple[object, ...]:
-        """Return what tells whether it was changed since; nothing where that cannot be told."""
+    def state(self) -> Noted:
+        """Return what tells whether it was changed since; None where that cannot be told."""
         if self.archive is None or self.entry is None or not self.archive.trusted:
-            return ()
+            return None
         return (str(self), self.archive.stamp, *self.entry)
 
     def _below(self, path: str) -> Self:

@@ -34,6 +34,7 @@ from slatprep.storage.remote import (
     pinned,
     remove_objects,
 )
+from slatprep.storage.states import Noted, States, note, reading
 from slatprep.storage.versions import current_version
 
 if TYPE_CHECKING:
@@ -177,9 +178,15 @@ class Storage:
         """Open a file for reading; OSError if it does not exist, or is a folder, pipe or device."""
         return io.BufferedReader(open_regular(self._path))
 
-    def read(self, limit: int) -> bytes:
-        """Read at most `limit` + 1 bytes of a file; the last shows that it is too large."""
-        with open_regular(self._path) as file:
+    def read(self, limit: int, asked: Place | None = None) -> bytes:
+        """Read at most `limit` + 1 bytes of a file; the last shows that it is too large.
+
+        Its state is noted under what was `asked` for, see `slatprep.storage.states`.
+        """
+        with (
+            open_regular(self._path) as file,
+            reading(file.fileno(), str(asked or self._path)),
+        ):
             # read() would allocate all that it is allowed to return.
             return file.pread(min(file.size(), limit + 1), 0)
 
@@ -195,9 +202,9 @@ class Storage:
         """Return a path of the local disk with the file's content."""
         return self._path
 
-    def state(self) -> tuple[object, ...]:
-        """Return what tells whether what is no file of the disk was changed; nothing if unknown."""
-        return ()
+    def state(self, states: States) -> Noted:
+        """Return what tells whether the file was changed since; None if unknown."""
+        return states.of(str(self._path))
 
     def current_version(self) -> Place:
         """Return the current place of the store's files; StoreError if it cannot be reached."""
@@ -271,8 +278,11 @@ class _ObjectStore(Storage):
     def open(self) -> IO[bytes]:
         return self.place.open("rb")
 
-    def read(self, limit: int) -> bytes:
+    def read(self, limit: int, asked: Place | None = None) -> bytes:
         return RemoteFile(self.place).pread(limit + 1, 0)
+
+    def state(self, states: States) -> Noted:
+        return None
 
     def open_scattered(self) -> IO[bytes]:
         return io.BytesIO(self.place.read_bytes())
@@ -324,12 +334,14 @@ class _Archives(Storage):
     def open(self) -> IO[bytes]:
         return self.place.open("rb")
 
-    def read(self, limit: int) -> bytes:
+    def read(self, limit: int, asked: Place | None = None) -> bytes:
         # One that is larger is not read, whatever its header claims.
-        return bytes(limit + 1) if self.place.size > limit else self.place.read_bytes()
+        data = bytes(limit + 1) if self.place.size > limit else self.place.read_bytes()
+        note(str(asked or self.place), self.place.state())
+        return data
 
     def size(self) -> int:
         return self.place.size
 
-    def state(self) -> tuple[object, ...]:
+    def state(self, states: States) -> Noted:
         return self.place.state()

@@ -20,10 +20,10 @@ from support.trees import records_of, tree
 
 from slatprep.inspect.verify import verify_store
 from slatprep.parameters import StoreParameters
-from slatprep.pipeline import before as looks
 from slatprep.pipeline import recipe, rows
 from slatprep.pipeline.dataset import build_store, plan_build
 from slatprep.pipeline.previous import checked_store
+from slatprep.storage import states
 from slatprep.store import layout, open_store
 from slatprep.store.shard_reader import RowReader
 
@@ -362,9 +362,10 @@ def test_what_was_seen_is_not_trusted_without_reason(
     elif how == "machine":
         monkeypatch.setattr("platform.node", lambda: "another")
     elif how == "young":
-        monkeypatch.setattr(looks, "FINE_NS", 10**15)
-        monkeypatch.setattr(looks, "COARSE_NS", 10**15)
+        monkeypatch.setattr(states, "FINE_NS", 10**15)
+        monkeypatch.setattr(states, "COARSE_NS", 10**15)
         monkeypatch.setattr("time.sleep", lambda seconds: None)
+        build_store(dataset.parameters(), out, rehash=True)  # sees them as they are read
     else:
         path.unlink()
         if how == "link":
