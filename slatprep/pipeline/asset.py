@@ -38,7 +38,7 @@ from slatprep.pipeline.annotate import annotate, process_several
 from slatprep.pipeline.plan import Action, BuildContext, PlannedAsset
 from slatprep.pipeline.previous import SourceStore
 from slatprep.pipeline.recipe import Recipe, record_of, record_of_failed
-from slatprep.pipeline.rows import FailedAsset, Row
+from slatprep.pipeline.rows import Row
 from slatprep.pipeline.seen import as_read
 from slatprep.pipeline.spool import Spool
 from slatprep.readers import read_field, read_latents
@@ -56,7 +56,7 @@ from slatprep.records import (
 from slatprep.sample import sample
 from slatprep.storage.faults import reached
 from slatprep.storage.states import noting
-from slatprep.store.record import AssetRecord
+from slatprep.store.record import AssetRecord, FailedRecord
 from slatprep.store.record_json import faults_of
 
 _REASON, _TRACEBACK = 4_000, 100_000
@@ -83,7 +83,7 @@ def process_asset(
 
 def finish_asset(
     pair: AssetPair, planned: PlannedAsset | None, context: BuildContext
-) -> Row | FailedAsset:
+) -> Row | FailedRecord:
     """Bring one asset into the spool, with no more work than it needs; return its row.
 
     `planned` is what was found of earlier work. StoreError if the disk does not take it; with
@@ -105,17 +105,19 @@ def finish_asset(
         # A fault in one asset, even of slatprep's own, must not cost the others.
         if context.strict:
             raise
-        return _failed(_failure(pair, error), context)
+        return record_of_failed(_failure(pair, error), context.recipe)
     kept = context.spool.put(record, asset.field, asset.latents, asset.annotation, asset.others)
     return replace(kept, damaged=damaged, seen=as_read(pair, noted))
 
 
-def fail_asset(pair: AssetPair, planned: PlannedAsset | None, context: BuildContext) -> FailedAsset:
+def fail_asset(
+    pair: AssetPair, planned: PlannedAsset | None, context: BuildContext
+) -> FailedRecord:
     """Record as failed an asset that killed its worker twice, the second time alone in it."""
     reason = "its worker process was killed twice, probably because memory ran out"
     if context.strict:
         raise SlatprepError(f"{pair.asset_id}: {reason}")
-    return _failed(Failed(pair, Status.FAILED, reason), context)
+    return record_of_failed(Failed(pair, Status.FAILED, reason), context.recipe)
 
 
 def _processed(
@@ -165,11 +167,6 @@ def _resumed(planned: PlannedAsset, spool: Spool) -> Row | None:
         spool.amend(planned.names.applied(found[0]))
     again = spool.find(planned.key)
     return again and again[1]
-
-
-def _failed(asset: Failed, context: BuildContext) -> FailedAsset:
-    record = record_of_failed(asset, context.recipe)
-    return context.spool.put_failed(record)
 
 
 def _failure(pair: AssetPair, error: Exception) -> Failed:

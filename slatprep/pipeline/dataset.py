@@ -23,7 +23,7 @@ from slatprep.pipeline.plan import Action, BuildContext, BuildPlan, PlannedAsset
 from slatprep.pipeline.publish import Destination, publish_manifests, require_records_file
 from slatprep.pipeline.ranges import check_objects
 from slatprep.pipeline.recipe import recipe_of
-from slatprep.pipeline.rows import FailedAsset, NextStore, Row
+from slatprep.pipeline.rows import NextStore, Row
 from slatprep.pipeline.settle import Wanted, settle_rows
 from slatprep.pipeline.spool import Spool
 from slatprep.pipeline.summary import (
@@ -38,8 +38,8 @@ from slatprep.readers import discover
 from slatprep.records import AssetPair, Place
 from slatprep.storage.atomic import staged, writing
 from slatprep.store import open_store
-from slatprep.store.record import Record
-from slatprep.store.record_json import build_id_of, digest_of
+from slatprep.store.record import FailedRecord
+from slatprep.store.record_json import build_id_of, digest_of, to_json
 from slatprep.workers.local import Jobs, require_shared
 
 __all__ = [
@@ -154,8 +154,7 @@ def build_store(
                 jobs = crew.of(sum(row.spooled for row in following.rows))
                 packed = pack_store(work.scratch, following, work.spool, jobs, work.shards)
                 place.replace(packed.store, packed.staged)
-        records = [work.spool.record(asset.key) for asset in failed]
-        summary = _publish(before, parameters, begin, following, packed, failed, records, crew.seen)
+        summary = _publish(before, parameters, begin, following, packed, failed, crew.seen)
         if keep_work:
             work.keep_only({row.key for row in following.rows if row.spooled})
         if packed is not None:
@@ -217,16 +216,20 @@ def align_pairs(
         pairs = _discover(parameters, jobs, work.scratch, note=note)
         plan = _plan(pairs, context, crew)
         assets = sorted(finish(pairs, plan, context, crew), key=lambda asset: asset.asset_id)
-        texts = ((asset.asset_id, work.spool.record_text(asset.key)) for asset in assets)
+        texts = ((asset.asset_id, _text_of(asset, work.spool)) for asset in assets)
         digests = []
         with writing(str(out), out.parent), staged(out) as partial, partial.open("wb") as file:
             for asset_id, text in texts:
                 file.write(text + b"\n")
                 digests.append((asset_id, digest_of(text)))
-    failed = [asset for asset in assets if isinstance(asset, FailedAsset)]
+    failed = [asset for asset in assets if isinstance(asset, FailedRecord)]
     counts = counts_of(asset for asset in assets if isinstance(asset, Row))
     build_id = build_id_of(parameters.name, digests)
     return summarise(counts, failed, out, build_id, time.perf_counter() - begin)
+
+
+def _text_of(asset: Row | FailedRecord, spool: Spool) -> bytes:
+    return to_json(asset) if isinstance(asset, FailedRecord) else spool.record_text(asset.key)
 
 
 def _discover(
@@ -272,8 +275,7 @@ def _publish(
     begin: float,
     following: NextStore | None = None,
     packed: Packed | None = None,
-    failed: Sequence[FailedAsset] = (),
-    records: Iterable[Record] = (),
+    failed: Sequence[FailedRecord] = (),
     seen: Mapping[str, bytes] = MappingProxyType({}),
 ) -> BuildSummary:
     """Publish the store that is in place, or was there, with its manifests; note what was seen."""
@@ -294,7 +296,7 @@ def _publish(
     summary = summarise_store(store, failed, place.out, manifests, seconds, warnings, damaged)
     summary = replace(summary, rehash_seed=before.seed)
     standing = before.standing_files(len(store), packed.records if packed else None)
-    publish_manifests(store, summary, parameters, records, standing=standing)
+    publish_manifests(store, summary, parameters, failed, standing=standing)
     place.publish()
     if following is not None:
         before.note(store, manifests, seen)

@@ -6,9 +6,10 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 from slatprep.pipeline.plan import Action, BuildContext, PlannedAsset
-from slatprep.pipeline.rows import FailedAsset, Row
+from slatprep.pipeline.rows import Row
 from slatprep.readers.published import fetch_members
 from slatprep.records import AssetPair
+from slatprep.store.record import FailedRecord
 from slatprep.workers.local import Jobs, at_most, run_unordered, start_early
 
 Progress = Callable[[int, int], None]
@@ -57,7 +58,7 @@ def finish(
     plan: Mapping[str, PlannedAsset],
     context: BuildContext,
     crew: Crew,
-) -> list[Row | FailedAsset]:
+) -> list[Row | FailedRecord]:
     """Bring assets into the spool; return what is kept of each, in no order.
 
     `plan` says what is to be done by id; of those that it does not have, everything.
@@ -74,7 +75,7 @@ def finish(
         fetch_members((pair for pair in pairs if _is_new(pair, plan)), crew.note)
         compile_kernels(crew.note)  # Before workers of this machine work, each to compile all.
     tasks = ((pair, plan.get(pair.asset_id), context) for pair in pairs)
-    assets: list[Row | FailedAsset] = []
+    assets: list[Row | FailedRecord] = []
     if crew.progress:
         crew.progress(0, len(pairs))
     for asset in run_unordered(finish_asset, tasks, jobs, fail_asset):

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from slatprep.normalize import normalize_change
 from slatprep.parameters import StoreParameters
 from slatprep.pipeline.previous import SourceStore
-from slatprep.records import Contents, LatentMoments, Normalization, SourceFile, Status
+from slatprep.records import Contents, LatentMoments, Normalization, SourceFile
 from slatprep.store.attributes import store_attributes
 from slatprep.store.record import AssetRecord
 from slatprep.store.record_json import build_id_of, digest_of, read_asset_record, to_json
@@ -103,16 +103,6 @@ class Row:
 
 Where = str | tuple[int, int, Names | None]
 """Where a row's arrays lie: its key in the spool, or its store, its row there and its new names."""
-
-
-@dataclass(frozen=True, slots=True)
-class FailedAsset:
-    """What the parent keeps of an asset that cannot go in; its record is in the spool."""
-
-    asset_id: str
-    key: str
-    status: Status
-    reason: str
 
 
 def moments_of(mean: Any, std: Any) -> LatentMoments | None:

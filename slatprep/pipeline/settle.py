@@ -16,12 +16,13 @@ from slatprep.pipeline.plan import BuildContext, PlannedAsset
 from slatprep.pipeline.previous import SourceStore
 from slatprep.pipeline.ranges import dataset_ranges, given_ranges, source_of
 from slatprep.pipeline.recipe import build_of
-from slatprep.pipeline.rows import FailedAsset, NextStore, Row, column, in_order, moments_of
+from slatprep.pipeline.rows import NextStore, Row, column, in_order, moments_of
 from slatprep.pipeline.summary import nothing_usable
 from slatprep.readers import contents_of
 from slatprep.readers.encoders import resolve_latents
 from slatprep.records import AssetPair, Contents, Normalization
 from slatprep.store import Store
+from slatprep.store.record import FailedRecord
 
 
 @dataclass(frozen=True)
@@ -69,7 +70,7 @@ class Wanted:
 
 
 def settle_rows(
-    finished: Sequence[Row | FailedAsset],
+    finished: Sequence[Row | FailedRecord],
     unchanged: Sequence[AssetPair],
     plan: Mapping[str, PlannedAsset],
     before: Before,
@@ -77,7 +78,7 @@ def settle_rows(
     wanted: Wanted,
     crew: Crew,
     keep_work: bool = False,
-) -> tuple[NextStore, list[FailedAsset]]:
+) -> tuple[NextStore, list[FailedRecord]]:
     """Return the next store, and the assets that cannot go in by id.
 
     `finished` are the assets that are new or changed. Rows of the `unchanged` are taken over from
@@ -92,7 +93,7 @@ def settle_rows(
     if not kept:
         finished = [*finished, *finish(unchanged, plan, context, crew)]
     rows = sorted((a for a in finished if isinstance(a, Row)), key=lambda row: row.asset_id)
-    failed = [asset for asset in finished if isinstance(asset, FailedAsset)]
+    failed = [asset for asset in finished if isinstance(asset, FailedRecord)]
     failed.sort(key=lambda asset: asset.asset_id)
     if not (rows or kept):
         raise StoreError(nothing_usable(failed, parameters, before.pairs))

@@ -10,7 +10,6 @@ every array, so one that a power failure tore is known and done again.
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
@@ -21,7 +20,7 @@ from numpy.typing import NDArray
 
 from slatprep.errors import StoreError
 from slatprep.normalize import property_extent
-from slatprep.pipeline.rows import FailedAsset, Row
+from slatprep.pipeline.rows import Row
 from slatprep.readers.plausible import TOLD
 from slatprep.records import (
     RESOLUTION,
@@ -91,14 +90,6 @@ class Spool:
         text = to_json(record)
         self._write(record.key, record.asset_id, text, arrays)
         return row_of(record, text, extent)
-
-    def put_failed(self, record: FailedRecord) -> FailedAsset:
-        """Write the record of an asset that cannot go in; return what the parent keeps."""
-        # It is tried again in every build. By its content, as builds may share the spool.
-        text = to_json(record)
-        key = f"none-{hashlib.sha256(text).hexdigest()[:32]}"
-        self._write(key, record.asset_id, text, {})
-        return FailedAsset(record.asset_id, key, record.status, record.reason)
 
     def find(self, key: str) -> tuple[AssetRecord, Row] | None:
         """Return a finished asset, or None if there is none under this key that is whole."""

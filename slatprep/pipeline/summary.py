@@ -12,12 +12,13 @@ from numpy.typing import NDArray
 
 from slatprep.normalize import PIXIE_RANGES
 from slatprep.parameters import BuildParameters
-from slatprep.pipeline.rows import FailedAsset, NextStore, Row, moments_of
+from slatprep.pipeline.rows import NextStore, Row, moments_of
 from slatprep.readers.encoders import ENOUGH, in_words, look_standardised
 from slatprep.readers.unmatched import explain_unmatched
 from slatprep.records import AssetPair, Normalization, Place, Status
 from slatprep.store import Store
 from slatprep.store.manifests import SEVERAL, file_names
+from slatprep.store.record import FailedRecord
 
 # What the range would be without an asset: narrower by decades, or by its own widths.
 _WILD_DECADES, _WILD_WIDTHS = 1.0, 9.0
@@ -134,7 +135,7 @@ def counts_in(store: Store) -> Counts:
 
 
 def summarise(
-    counts: Counts, failed: Sequence[FailedAsset], records: Place, build_id: str, seconds: float
+    counts: Counts, failed: Sequence[FailedRecord], records: Place, build_id: str, seconds: float
 ) -> BuildSummary:
     """Say what became of the assets, by counts of those that went in."""
     statuses = Counter(str(asset.status) for asset in failed)
@@ -151,7 +152,7 @@ def summarise(
 
 def summarise_store(
     store: Store,
-    failed: Sequence[FailedAsset],
+    failed: Sequence[FailedRecord],
     place: Place,
     manifests: Place,
     seconds: float,
@@ -173,7 +174,7 @@ def summarise_store(
 
 
 def nothing_usable(
-    failed: Sequence[FailedAsset], parameters: BuildParameters, pairs: Collection[AssetPair] = ()
+    failed: Sequence[FailedRecord], parameters: BuildParameters, pairs: Collection[AssetPair] = ()
 ) -> str:
     """Say why there is no store."""
     if unmatched := explain_unmatched(pairs, parameters):

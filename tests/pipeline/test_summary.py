@@ -5,15 +5,18 @@ from __future__ import annotations
 from pathlib import Path
 
 from slatprep.parameters import BuildParameters, PixieverseSource, SlatSource
-from slatprep.pipeline.rows import FailedAsset, Row
+from slatprep.pipeline.recipe import recipe_of, record_of_failed
+from slatprep.pipeline.rows import Row
 from slatprep.pipeline.summary import counts_of, nothing_usable, summarise
-from slatprep.records import Status
+from slatprep.records import AssetPair, Failed, SourceRoots, Status
+from slatprep.store.record import FailedRecord
 
 PARAMETERS = BuildParameters(PixieverseSource(Path("/grids")), SlatSource(Path("/slats")))
 
 
-def failed(number: int, status: Status = Status.FAILED) -> FailedAsset:
-    return FailedAsset(f"a{number:03d}", "", status, f"reason {number}")
+def failed(number: int, status: Status = Status.FAILED) -> FailedRecord:
+    pair = AssetPair(f"a{number:03d}", "", "", "", SourceRoots(Path(), Path()), *[None] * 4)
+    return record_of_failed(Failed(pair, status, f"reason {number}"), recipe_of(PARAMETERS))
 
 
 def finished(name: str, verdict: str) -> Row:
