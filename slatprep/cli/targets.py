@@ -66,4 +66,4 @@ def _inputs(given: Mapping[str, Any]) -> Iterator[tuple[str, Path]]:
             elif is_place(one) and (local := storage_of(one).local) is not None:
                 yield name, local
                 if is_store(local):
-                    yield name, local.parent / manifests_of(local).name
+                    yield name, Path(str(manifests_of(local)))

@@ -40,7 +40,6 @@ from slatprep.store.record import (
     BuildRecord,
     FailedRecord,
     Record,
-    Versions,
 )
 from slatprep.store.record_json import to_json
 
@@ -70,7 +69,7 @@ class Destination:
         if self._manifests is not None:
             _require_records(self._manifests, storage_of(self.store).local)
         if path is not None:
-            _require_own(self._manifests or path.parent / manifests_of(path).name, path)
+            _require_own(self._manifests or Path(str(manifests_of(path))), path)
         self._before: PublishedState | None = None
         self._upload: Upload | None = None
 
@@ -194,7 +193,7 @@ def publish_manifests(
     try:
         looked = [(n, name) for n, name in enumerate(names) if name not in standing]
         written = [_write(folder / name, lines_of(store, n)) for n, name in looked]
-        record = build_record(summary, parameters, store.about.build.versions, failed)
+        record = build_record(store, summary, parameters, failed)
         if any(written) or not _is_there(folder, record):
             reached("manifests written", str(folder))
             _write(folder / BUILD, to_json(record, indent=True) + b"\n")
@@ -230,9 +229,9 @@ def _is_there(folder: Place, wanted: BuildRecord) -> bool:
 
 
 def build_record(
+    store: Store,
     summary: BuildSummary,
     parameters: BuildParameters,
-    versions: Versions,
     failed: Iterable[Record] = (),
 ) -> BuildRecord:
     """Return the record of a build that made a store; ValueError where it made none."""
@@ -244,10 +243,10 @@ def build_record(
         created=datetime.now(UTC).replace(microsecond=0),
         duration_s=round(summary.seconds, 3),
         platform=platform.platform(),
-        store=summary.store.name,
+        store=(storage_of(store.path).local or summary.store).name,
         records=summary.records.name,
         parameters=parameters,
-        versions=versions,
+        versions=store.about.build.versions,
         normalization=summary.normalization,
         statuses=summary.statuses,
         verdicts=summary.verdicts,

@@ -65,8 +65,11 @@ def build_in(folder: Place) -> BuildRecord:
 def manifests_of(store: Place) -> Place:
     """Return the folder of a store's records: ``demo.manifests`` beside ``demo.zarr``.
 
-    Those of a version on an object store lie beside all versions.
+    Those of a version on an object store lie beside all versions; those of a store behind a link
+    lie beside the store.
     """
+    if isinstance(store, Path) and store.is_symlink():
+        store = store.resolve()
     if is_version(store):
         return store.parent.parent / MANIFESTS / store.name
     return store.parent / f"{store.name.removesuffix('.zarr')}.manifests"

@@ -135,7 +135,9 @@ def test_a_link_stays_a_link(make_dataset: MakeDataset, tmp_path: Path) -> None:
     for _ in range(2):
         build_store(parameters, link)
         assert link.is_symlink()
-        assert [path.name for path in (tmp_path / "disk").iterdir()] == ["real.zarr"]
+        there = sorted(path.name for path in (tmp_path / "disk").iterdir())
+        assert there == ["real.manifests", "real.zarr"]
+        assert not (tmp_path / "link.manifests").exists()
         assert open_store(link).ids == ["a"]
 
 
