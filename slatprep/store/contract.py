@@ -95,7 +95,15 @@ def array_findings(name: str, metadata: object, sizes: Mapping[str, int]) -> Ite
         yield from _differences(
             f"{name}/zarr.json",
             metadata,
-            {"data_type": dtype, "dimension_names": list(layout.dimensions), "zarr_format": 3},
+            {
+                "data_type": dtype,
+                "dimension_names": list(layout.dimensions),
+                "zarr_format": 3,
+                # NaN differs from itself, and JSON has no word for it.
+                "fill_value": layout.fill_value
+                if layout.fill_value == layout.fill_value
+                else "NaN",
+            },
         )
 
 

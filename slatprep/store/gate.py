@@ -31,6 +31,33 @@ DATA_TYPES = ("bool", "uint8", "int64", "float32", "float64", "string")
 CODECS = ("bytes", "vlen-utf8", "blosc", "zstd", "crc32c", "sharding_indexed")
 """What a store is packed with; none of these can run code."""
 
+_KEYS = frozenset(
+    ("zarr_format", "node_type", "shape", "data_type", "chunk_grid", "chunk_key_encoding",
+     "fill_value", "codecs", "attributes", "dimension_names", "storage_transformers")
+)  # fmt: skip
+_FORMS = {
+    "chunk_grid": {"name": ("regular",), "configuration": {"chunk_shape": list}},
+    "chunk_key_encoding": {"name": ("default",), "configuration": {"separator": ("/",)}},
+}
+_SETTINGS = {
+    "bytes": {"endian": ("little",)},
+    "zstd": {"level": range(23), "checksum": bool},
+    "blosc": {
+        "typesize": range(1, 256),
+        "cname": ("lz4", "lz4hc", "blosclz", "snappy", "zlib", "zstd"),
+        "clevel": range(10),
+        "shuffle": ("noshuffle", "shuffle", "bitshuffle"),
+        "blocksize": int,
+    },
+    "sharding_indexed": {
+        "chunk_shape": list,
+        "codecs": list,
+        "index_codecs": list,
+        "index_location": ("end",),
+    },
+}
+"""Configurations of codecs, see `_has_form`; those of others are empty."""
+
 
 def gate_findings(name: str, metadata: object) -> Iterator[Finding]:
     """Yield what is not allowed in the ``zarr.json`` of an array or group, or the root's copy."""
@@ -69,6 +96,52 @@ def gate_findings(name: str, metadata: object) -> Iterator[Finding]:
     for codec in _codecs(metadata.get("codecs")):
         if codec not in CODECS:
             yield Finding(where, "", f"has the codec {codec!r}", f"some of {', '.join(CODECS)}")
+
+
+def form_findings(name: str, metadata: Mapping[str, Any]) -> Iterator[Finding]:
+    """Yield what the ``zarr.json`` of an array says otherwise than Zarr writes it."""
+    if metadata.get("node_type") != "array":
+        return
+    where = f"{name}/zarr.json"
+    for key in metadata.keys() - _KEYS:
+        yield Finding(where, "", f"has {key!r}", f"none but {', '.join(sorted(_KEYS))}")
+    for key, form in _FORMS.items():
+        if not _has_form(metadata.get(key), form):
+            yield Finding(where, "", f"{key} is {metadata.get(key)!r}", _in_words(form))
+    for codec in _every_codec(metadata.get("codecs")):
+        form = _SETTINGS.get(codec["name"], {})
+        settings = codec.get("configuration", {})
+        if not (_has_form(settings, form) or (codec["name"] == "bytes" and settings == {})):
+            what = f"the codec {codec['name']} has the configuration {settings!r}"
+            yield Finding(where, "", what, _in_words(form))
+
+
+def _has_form(value: object, form: Any) -> bool:
+    """Whether a value of JSON has a form: a type, one of several values, or an object of forms."""
+    if isinstance(form, dict):
+        whole = isinstance(value, dict) and value.keys() == form.keys()
+        return whole and all(_has_form(value[key], form[key]) for key in form)
+    if isinstance(form, type):
+        return type(value) is form
+    return any(type(value) is type(one) and value == one for one in form)
+
+
+def _in_words(form: Any) -> str:
+    if isinstance(form, dict):
+        return f"{{{', '.join(f'{key}: {_in_words(one)}' for key, one in form.items())}}}"
+    if isinstance(form, range):
+        return f"{form[0]} to {form[-1]}"
+    return form.__name__ if isinstance(form, type) else " or ".join(map(repr, form))
+
+
+def _every_codec(codecs: Any) -> Iterator[dict[str, Any]]:
+    """Yield codecs that have names, and those within them."""
+    for codec in codecs if isinstance(codecs, list) else ():
+        if isinstance(codec, dict) and isinstance(codec.get("name"), str):
+            yield codec
+            inner = codec.get("configuration")
+            for key in ("codecs", "index_codecs"):
+                yield from _every_codec(inner.get(key) if isinstance(inner, dict) else None)
 
 
 def _codecs(codecs: Any) -> Iterator[object]:

@@ -18,7 +18,7 @@ from slatprep.store.contract import (
     read_metadata,
 )
 from slatprep.store.digests import ATTRIBUTES, attributes_digest, is_own
-from slatprep.store.gate import GROUPS, gate_findings
+from slatprep.store.gate import GROUPS, form_findings, gate_findings
 from slatprep.store.layout import ARRAYS, MERGED
 from slatprep.store.reader import Store
 from slatprep.workers.local import Jobs, run_unordered
@@ -56,6 +56,7 @@ def metadata_findings(path: Place) -> Iterator[Finding]:
             yield Finding(where, "", str(error), "readable metadata")
             continue
         yield from gate_findings(name, arrays[name])
+        yield from form_findings(name, arrays[name])
         if not _same(arrays[name], copies.get(name)):
             yield Finding(where, "", "differs from its copy in zarr.json", "the same metadata")
     try:

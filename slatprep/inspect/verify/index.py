@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterator
-from itertools import pairwise
 
 import numpy as np
 
 from slatprep.readers.patterns import ASSET_ID, NAME
 from slatprep.records import RESOLUTION, Engine, Model, Search, Verdict
+from slatprep.store.attributes import segments_of
 from slatprep.store.contract import MAX_VOXELS, Finding
 from slatprep.store.reader import Store
 
@@ -39,13 +40,14 @@ _TOLERANCE = 1e-6
 def index_findings(store: Store) -> Iterator[Finding]:
     """Yield findings on the ``asset/*`` arrays."""
     ids = store.ids
-    begins = store.attributes.get("segments", [0])
-    if not isinstance(begins, list) or begins[:1] != [0]:
-        yield Finding("zarr.json", "", f"attribute segments is {begins!r}", "rows, from 0 on")
-        begins = [0]
+    begins = store.attributes.get("segments")
+    if json.dumps(begins) != json.dumps(segments_of(ids)):  # True is 1, and 4.0 is 4
+        what = f"attribute segments is {begins!r}"
+        yield Finding("zarr.json", "", what, "the rows at which ids begin to ascend")
     known = set(ids[:1])
     for row, (before, after) in enumerate(pairwise(ids), 1):
-        if after in known or (before > after and row not in begins):
+        stated = not isinstance(begins, list) or row in begins
+        if after in known or (before > after and not stated):
             what = "occurs twice" if after in known else f"comes after {before!r}"
             yield Finding("asset/id", after, what, "ids ascending in each segment, each once")
         known.add(after)

@@ -308,6 +308,57 @@ def test_edited_metadata_of_an_array_are_found(store: Path, key: str, value: obj
     assert any("differs from its copy" in finding.what for finding in findings)
 
 
+def forged(store: Path, array: str, edit: Callable[[dict], object]) -> tuple[Finding, ...]:
+    """Edit both copies of an array's metadata, and return what is found."""
+
+    def both(root: dict) -> None:
+        edit(root["consolidated_metadata"]["metadata"][array])
+
+    edit_json(store / "zarr.json", both)
+    edit_json(store / array / "zarr.json", edit)
+    return found(store)
+
+
+def the_codec(metadata: dict, name: str) -> dict:
+    inner = metadata["codecs"][0].get("configuration", {}).get("codecs", metadata["codecs"])
+    return next(codec for codec in inner if codec["name"] == name)
+
+
+@pytest.mark.parametrize(
+    ("array", "edit", "what"),
+    [
+        ("asset/fitness", lambda d: d["chunk_grid"].update(name=1e-320), "chunk_grid is"),
+        ("asset/fitness", lambda d: d["chunk_grid"].update(more=1), "chunk_grid is"),
+        ("asset/fitness", lambda d: d["chunk_key_encoding"].update(name="v2"), "chunk_key_enc"),
+        ("asset/fitness", lambda d: d.pop("chunk_key_encoding"), "chunk_key_encoding is None"),
+        ("asset/fitness", lambda d: d.update(strange={}), "has 'strange'"),
+        ("asset/fitness", lambda d: d.update(fill_value=0.5), "fill_value is 0.5"),
+        ("asset/fitness", lambda d: the_codec(d, "zstd")["configuration"].update(level={}), "zstd"),
+        ("voxel/feats", lambda d: the_codec(d, "blosc")["configuration"].update(clevel=True), "bl"),
+        ("voxel/feats", lambda d: the_codec(d, "blosc")["configuration"].update(cname=7), "blosc"),
+        ("voxel/feats", lambda d: the_codec(d, "blosc").update(configuration=[]), "blosc"),
+        ("voxel/feats", lambda d: the_codec(d, "crc32c").update(configuration={"x": 1}), "crc32c"),
+        ("voxel/feats", lambda d: d["codecs"][0]["configuration"].update(more=0), "sharding"),
+        ("asset/property", lambda d: the_codec(d, "zstd").update(configuration={}), "zstd"),
+    ],
+)
+def test_forged_metadata_of_an_array_are_found(
+    store: Path, array: str, edit: Callable, what: str
+) -> None:
+    findings = of_file(forged(store, array, edit), f"{array}/zarr.json")
+    assert any(what in finding.what for finding in findings), findings
+
+
+@pytest.mark.parametrize("segments", [[0, 4, 4], [0, 1], [], [0.0], [False], None, "0"])
+def test_forged_segments_are_found(store: Path, segments: object) -> None:
+    def edit(document: dict) -> None:
+        document["attributes"]["segments"] = segments
+
+    edit_json(store / "zarr.json", edit)
+    findings = of_file(found(store), "zarr.json")
+    assert any("segments" in finding.what for finding in findings), findings
+
+
 def test_edited_manifests_are_found(store: Path) -> None:
     records = store.with_suffix(".manifests") / "assets.jsonl"
     lines = records.read_text().splitlines()
