@@ -92,6 +92,7 @@ def array_findings(name: str, metadata: object, sizes: Mapping[str, int]) -> Ite
     yield from size_findings(name, metadata, sizes)
     if isinstance(metadata, dict):
         dtype = _ZARR_NAMES.get(layout.dtype, layout.dtype)
+        empty = layout.fill_value
         yield from _differences(
             f"{name}/zarr.json",
             metadata,
@@ -99,10 +100,7 @@ def array_findings(name: str, metadata: object, sizes: Mapping[str, int]) -> Ite
                 "data_type": dtype,
                 "dimension_names": list(layout.dimensions),
                 "zarr_format": 3,
-                # NaN differs from itself, and JSON has no word for it.
-                "fill_value": layout.fill_value
-                if layout.fill_value == layout.fill_value
-                else "NaN",
+                "fill_value": empty if empty == empty else "NaN",  # which differs from itself
             },
         )
 

@@ -35,11 +35,11 @@ _KEYS = frozenset(
     ("zarr_format", "node_type", "shape", "data_type", "chunk_grid", "chunk_key_encoding",
      "fill_value", "codecs", "attributes", "dimension_names", "storage_transformers")
 )  # fmt: skip
-_FORMS = {
+_FORMS: dict[str, Any] = {
     "chunk_grid": {"name": ("regular",), "configuration": {"chunk_shape": list}},
     "chunk_key_encoding": {"name": ("default",), "configuration": {"separator": ("/",)}},
 }
-_SETTINGS = {
+_SETTINGS: dict[str, Any] = {
     "bytes": {"endian": ("little",)},
     "zstd": {"level": range(23), "checksum": bool},
     "blosc": {
@@ -109,14 +109,14 @@ def form_findings(name: str, metadata: Mapping[str, Any]) -> Iterator[Finding]:
         if not _has_form(metadata.get(key), form):
             yield Finding(where, "", f"{key} is {metadata.get(key)!r}", _in_words(form))
     for codec in _every_codec(metadata.get("codecs")):
-        form = _SETTINGS.get(codec["name"], {})
+        wanted = _SETTINGS.get(codec["name"], {})
         settings = codec.get("configuration", {})
-        if not (_has_form(settings, form) or (codec["name"] == "bytes" and settings == {})):
+        if not (_has_form(settings, wanted) or (codec["name"] == "bytes" and settings == {})):
             what = f"the codec {codec['name']} has the configuration {settings!r}"
-            yield Finding(where, "", what, _in_words(form))
+            yield Finding(where, "", what, _in_words(wanted))
 
 
-def _has_form(value: object, form: Any) -> bool:
+def _has_form(value: Any, form: Any) -> bool:
     """Whether a value of JSON has a form: a type, one of several values, or an object of forms."""
     if isinstance(form, dict):
         whole = isinstance(value, dict) and value.keys() == form.keys()
