@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from support.faults import inject
-from support.synthetic import JELLY, METAL, Dataset
+from support.synthetic import JELLY, METAL, Dataset, make_asset
 from support.trees import records_of, tree
 
 from slatprep.errors import ConfigError, InputError, MissingPartnerError, StoreError
@@ -126,6 +126,21 @@ def test_what_is_not_a_store_is_never_replaced(make_dataset: MakeDataset, tmp_pa
     assert (tmp_path / "thesis" / "chapter.tex").exists()
     (tmp_path / "empty").mkdir()
     assert build_store(make_dataset("a").parameters(), tmp_path / "empty").complete
+
+
+def test_an_asset_without_a_partner_costs_no_file(
+    make_dataset: MakeDataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of 200,000 unmatched grids each would take the time of a file that is written and read."""
+    dataset, spooled = make_dataset("a"), list[str]()
+    for k in range(30):
+        dataset.write_grid(f"lone{k}", make_asset(0).grid)
+    inject(monkeypatch, lambda step, name: step == "asset spooled" and spooled.append(name))
+    summary = build_store(dataset.parameters(), tmp_path / "s.zarr")
+    assert summary.statuses == {"ok": 1, "failed": 0, "skipped": 30}
+    assert spooled == ["a"]
+    records = records_of(tmp_path / "s.manifests" / "assets.jsonl")
+    assert list(records) == ["a", *sorted(f"lone{k}" for k in range(30))]
 
 
 def test_a_link_stays_a_link(make_dataset: MakeDataset, tmp_path: Path) -> None:
