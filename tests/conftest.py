@@ -23,7 +23,7 @@ settings.load_profile("untimed")
 # No test takes the power away, so none can see whether bytes have reached the disk: builds in
 # this process need not wait for that. The clock's tick is 10 ms at most.
 os.fsync = lambda descriptor: None
-before.FINE_NS = 20_000_000
+states.FINE_NS = 20_000_000
 
 
 @pytest.fixture
