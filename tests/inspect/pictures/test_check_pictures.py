@@ -37,7 +37,8 @@ from slatprep.inspect.pictures.alignment import (
     panels,
 )
 from slatprep.inspect.pictures.canvas import STYLE
-from slatprep.inspect.pictures.scene import FARTHEST, distance_colours, scene_of, views
+from slatprep.inspect.pictures.scene import FARTHEST, Scene, distance_colours, scene_of, views
+from slatprep.inspect.pictures.voxels import View
 from slatprep.inspect.pictures.viewer import cube_mesh, has_screen, meshes
 from slatprep.inspect.pictures.write import write_pictures
 from slatprep.pipeline.dataset import BuildSummary
@@ -191,11 +192,19 @@ def test_the_names_of_many_classes_stay_on_the_picture(count: int, copy: Path) -
 
 @pytest.mark.parametrize("kind", ["svg", "pdf"])
 def test_a_picture_for_a_paper_is_of_lines_and_letters(
-    kind: str, copy: Path, tmp_path: Path
+    kind: str, copy: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    sides: set[int] = set()
+
+    def few_pixels(scene: Scene, side: int) -> list[View]:
+        sides.add(side)
+        return views(scene, 80)
+
+    monkeypatch.setattr("slatprep.inspect.pictures.alignment.views", few_pixels)
     files = [tmp_path / f"{name}.{kind}" for name in ("one", "two")]
     for file in files:
         assert run("--asset", "ant", "--store", copy, "--picture", file).exit_code == 0
+    assert sides == {2 * PANEL}
     assert files[0].read_bytes() == files[1].read_bytes()
     assert files[0].read_bytes()[:5] in (b"<?xml", b"%PDF-")
     several = run("--worst", "2", "--store", copy, "--picture", files[0])
