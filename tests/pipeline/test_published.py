@@ -11,7 +11,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from support.published import IDS, add, files, make_published, pack, parameters, write_object
+from support.published import IDS, add, files, pack, parameters, write_object
 from support.synthetic import make_asset
 
 from slatprep.errors import InputError
@@ -23,23 +23,10 @@ from slatprep.storage.files import LocalFile
 from slatprep.store import open_store
 
 
-@pytest.fixture(scope="module")
-def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return make_published(tmp_path_factory.mktemp("published"))
-
-
 @pytest.fixture(autouse=True)
 def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.setenv("SLATPREP_CACHE", str(tmp_path / "cache"))
     return tmp_path / "cache"
-
-
-@pytest.fixture(scope="module")
-def unpacked(made: Path) -> dict[str, bytes]:
-    """Return the files of the store of the unpacked folder."""
-    wanted = parameters(made, "pixieverse/render_outputs", categories=True)
-    build_store(wanted, made / "unpacked.zarr")
-    return files(made / "unpacked.zarr")
 
 
 @pytest.mark.parametrize("root", ["tar", "tar/archives", "gz/archives/render_outputs"])

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 from huggingface_hub import HfFileSystem, constants
-from support.published import IDS, files, make_published, pack, parameters
+from support.published import IDS, files, pack, parameters
 from support.published_hub import PublishedHub
 
 from slatprep.errors import ConfigError, InputError
@@ -20,19 +20,6 @@ from slatprep.store import open_store
 
 NAME = "vlongle/pixieverse"
 URL = f"hf://datasets/{NAME}"
-
-
-@pytest.fixture(scope="module")
-def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return make_published(tmp_path_factory.mktemp("published"))
-
-
-@pytest.fixture(scope="module")
-def unpacked(made: Path) -> dict[str, bytes]:
-    """Return the files of the store of the unpacked folder."""
-    wanted = parameters(made, "pixieverse/render_outputs", categories=True)
-    build_store(wanted, made / "unpacked.zarr")
-    return files(made / "unpacked.zarr")
 
 
 @pytest.fixture
@@ -53,7 +40,7 @@ def hub(made: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator
     HfFileSystem.clear_instance_cache()
 
 
-@pytest.mark.parametrize("root", ["", "/archives", "/archives/render_outputs", "@main"])
+@pytest.mark.parametrize("root", ["", "/archives/render_outputs", "@main"])
 def test_store_of_the_hub_is_that_of_the_unpacked_folder(
     hub: PublishedHub, made: Path, tmp_path: Path, unpacked: dict[str, bytes], root: str
 ) -> None:

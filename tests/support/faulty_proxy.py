@@ -267,7 +267,7 @@ class _Server(ThreadingHTTPServer):
 def faulty(upstream: str, faults: Faults) -> Iterator[str]:
     """Run the proxy before a server; yield its address."""
     with _Server(upstream, faults) as server:
-        thread = threading.Thread(target=server.serve_forever, daemon=True)
+        thread = threading.Thread(target=server.serve_forever, args=(0.01,), daemon=True)
         thread.start()
         try:
             yield f"http://127.0.0.1:{server.server_address[1]}"

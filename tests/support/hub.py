@@ -103,6 +103,6 @@ class Hub(BaseHTTPRequestHandler):
 if __name__ == "__main__":
     Hub.root = Path(sys.argv[1])
     server = ThreadingHTTPServer(("127.0.0.1", 0), Hub)
-    threading.Thread(target=server.serve_forever, daemon=True).start()
+    threading.Thread(target=server.serve_forever, args=(0.01,), daemon=True).start()
     print(f"http://127.0.0.1:{server.server_port}", flush=True)
     sys.stdin.read()

@@ -41,7 +41,7 @@ class PublishedHub(ThreadingHTTPServer):
         self.tokens: list[str] = []
         self._last = 0.0
         self.bytes, self._lock = 0, threading.Lock()
-        threading.Thread(target=self.serve_forever, daemon=True).start()
+        threading.Thread(target=self.serve_forever, args=(0.01,), daemon=True).start()
 
     @property
     def address(self) -> str:

@@ -38,8 +38,8 @@ from slatprep.inspect.pictures.alignment import (
 )
 from slatprep.inspect.pictures.canvas import STYLE
 from slatprep.inspect.pictures.scene import FARTHEST, Scene, distance_colours, scene_of, views
-from slatprep.inspect.pictures.voxels import View
 from slatprep.inspect.pictures.viewer import cube_mesh, has_screen, meshes
+from slatprep.inspect.pictures.voxels import View
 from slatprep.inspect.pictures.write import write_pictures
 from slatprep.pipeline.dataset import BuildSummary
 from slatprep.records import Placement, Search
