@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
 from hypothesis import HealthCheck, settings
 from support.deformed import add_deformed
-from support.synthetic import Dataset, make_asset
+from support.synthetic import Dataset, Made, MakeDataset, make_asset
 
 from slatprep.pipeline import rows
 from slatprep.pipeline.dataset import BuildSummary, build_store
@@ -27,7 +26,7 @@ states.FINE_NS = 20_000_000
 
 
 @pytest.fixture
-def make_dataset(tmp_path: Path) -> Callable[..., Dataset]:
+def make_dataset(tmp_path: Path) -> MakeDataset:
     """Make a dataset of good assets: ``make_dataset("a", "b")``."""
 
     def make(*ids: str) -> Dataset:
@@ -75,7 +74,7 @@ def mixed_build(mixed: Dataset, tmp_path_factory: pytest.TempPathFactory) -> Bui
 
 
 @pytest.fixture(scope="session")
-def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> tuple[Dataset, Path]:
+def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> Made:
     """Return three assets and the store of an undisturbed build; nobody may change them."""
     folder = tmp_path_factory.mktemp("undisturbed")
     dataset = Dataset(folder / "sources")

@@ -76,10 +76,7 @@ def test_options_win_over_the_file(folder: Path) -> None:
 def test_options_alone_are_enough(folder: Path) -> None:
     parameters = load_parameters(
         None,
-        {
-            "pixieverse": {"root": str(folder / "grids")},
-            "slat": {"root": str(folder / "latents")},
-        },
+        {"pixieverse": {"root": str(folder / "grids")}, "slat": {"root": str(folder / "latents")}},
     )
     assert parameters.slat.root == folder / "latents"
 

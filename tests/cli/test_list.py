@@ -68,9 +68,7 @@ def test_a_beginning_names_an_asset_where_no_other_has_it(mixed_build: BuildSumm
     assert json.loads(result.stdout)["assets"][0]["asset_id"] == "bear.side"
 
 
-def test_ids_on_a_terminal_are_as_long_as_tells_them_apart(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_ids_on_a_terminal_are_as_long_as_tells_them_apart(monkeypatch: pytest.MonkeyPatch) -> None:
     ids = ["0123456789ab", "0123456789cd", "0123zzzzzzzz"]
     assert module.Output().id_length(ids) is None
     monkeypatch.setattr(sys.stdout, "isatty", lambda: True)

@@ -8,14 +8,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 from click.testing import CliRunner, Result
-from support.synthetic import Dataset
+from support.synthetic import Made
 from support.trees import tree
 
 from slatprep.cli.commands import slatprep
 
 
 @pytest.fixture
-def folder(undisturbed: tuple[Dataset, Path], tmp_path: Path) -> Path:
+def folder(undisturbed: Made, tmp_path: Path) -> Path:
     """Sources, a store of them, its records, and predictions."""
     dataset, store = undisturbed
     shutil.copytree(dataset.root, tmp_path / "sources")

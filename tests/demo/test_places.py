@@ -11,13 +11,7 @@ from scipy.spatial import cKDTree
 from slatprep.demo import make_demo
 from slatprep.demo.asset import make_asset
 from slatprep.demo.catalogue import CATALOGUE
-from slatprep.demo.difficulty import (
-    LEVELS,
-    QUARTER_TURNS,
-    UNLABELLED,
-    draw_frames,
-    generate,
-)
+from slatprep.demo.difficulty import LEVELS, QUARTER_TURNS, UNLABELLED, draw_frames, generate
 from slatprep.demo.generated import draw_distortion
 from slatprep.demo.nerf import nerf_field
 from slatprep.demo.shapes import Solid

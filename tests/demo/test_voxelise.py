@@ -33,10 +33,7 @@ def test_plane_meets_the_cubes_whose_corners_it_parts(normal, offset):
 
 
 @settings(max_examples=10)
-@given(
-    centre=st.tuples(*[st.floats(-0.2, 0.2)] * 3),
-    radius=st.floats(0.03, 0.3),
-)
+@given(centre=st.tuples(*[st.floats(-0.2, 0.2)] * 3), radius=st.floats(0.03, 0.3))
 @example(centre=(0.0, 0.0, 0.1640625), radius=0.0625)
 def test_sphere_meets_the_cubes_between_nearest_and_farthest_point(centre, radius):
     surface, filled = voxelise(lambda p: np.linalg.norm(p - centre, axis=1) - radius)

@@ -159,11 +159,7 @@ def complete(words: str, shell: str = "bash_complete", cwd: Path | None = None) 
         "COMP_CWORD": str(len(words.split()) - 1),
     }
     done = subprocess.run(
-        [sys.executable, "-m", "slatprep"],
-        capture_output=True,
-        text=True,
-        env=environment,
-        cwd=cwd,
+        [sys.executable, "-m", "slatprep"], capture_output=True, text=True, env=environment, cwd=cwd
     )
     assert "Traceback" not in done.stderr, done.stderr
     return done.stdout

@@ -99,9 +99,7 @@ def test_grid_points_are_the_field_itself_in_either_frame(
     )
     centres = (voxels + 0.5) / 64 - 0.5
     np.testing.assert_allclose(
-        np.column_stack([slat[axis] for axis in "xyz"]),
-        centres @ QUARTER_TURN[:3, :3].T,
-        atol=2e-3,
+        np.column_stack([slat[axis] for axis in "xyz"]), centres @ QUARTER_TURN[:3, :3].T, atol=2e-3
     )
     truth = grid[tuple(voxels.T)]
     for vertex in (world, slat):

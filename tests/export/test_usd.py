@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import importlib.util
 import json
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +13,7 @@ from click.testing import CliRunner
 from hypothesis import given
 from hypothesis import strategies as st
 from support.exports import bytes_of, index_of
-from support.synthetic import JELLY, METAL, QUARTER_TURN, Dataset
+from support.synthetic import JELLY, METAL, QUARTER_TURN, Dataset, MakeDataset
 
 from slatprep.cli.commands import slatprep
 from slatprep.errors import ConfigError
@@ -166,9 +165,7 @@ def test_more_materials_are_closer_and_few_values_are_exact() -> None:
     assert len(binned.material) == 3 and binned.modulus_error < 1e-6
 
 
-def test_a_ratio_of_one_half_is_clipped_and_said(
-    make_dataset: Callable[..., Dataset], tmp_path: Path
-) -> None:
+def test_a_ratio_of_one_half_is_clipped_and_said(make_dataset: MakeDataset, tmp_path: Path) -> None:
     dataset = make_dataset("a")
     grid = dataset.assets["a"].grid
     soft = grid[..., 3] == JELLY[0]

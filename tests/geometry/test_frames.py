@@ -21,13 +21,7 @@ from slatprep.geometry.frames import (
     split_transform,
     voxel_centres,
 )
-from slatprep.geometry.voxels import (
-    boundary,
-    bounding_box,
-    occupancy_of,
-    shown_in_cells,
-    voxels_of,
-)
+from slatprep.geometry.voxels import boundary, bounding_box, occupancy_of, shown_in_cells, voxels_of
 
 numbers = st.floats(-2, 2)
 poses = st.tuples(
@@ -41,8 +35,7 @@ def test_the_first_and_last_voxel_lie_half_a_voxel_inside_the_cube() -> None:
     centres = voxel_centres([[0, 0, 0], [63, 63, 63], [31, 32, 0]])
     half = 1 / 128
     np.testing.assert_array_equal(
-        centres,
-        [[-0.5 + half] * 3, [0.5 - half] * 3, [-half, half, -0.5 + half]],
+        centres, [[-0.5 + half] * 3, [0.5 - half] * 3, [-half, half, -0.5 + half]]
     )
 
 

@@ -20,13 +20,7 @@ from slatprep.inspect.verify.assets import roundings
 from slatprep.judge import THRESHOLDS, judge, verdict_of, voxel_confidence
 from slatprep.judge.calibration import PLACEMENT, SAME_OBJECT, VOXEL
 from slatprep.judge.confidence import VOXEL_FIGURES, causes_of_doubt
-from slatprep.judge.evidence import (
-    FIGURES,
-    _labels_of,
-    evidence_of,
-    labels_hold,
-    surroundings_of,
-)
+from slatprep.judge.evidence import FIGURES, _labels_of, evidence_of, labels_hold, surroundings_of
 from slatprep.judge.model import Logistic
 from slatprep.normalize import (
     PIXIE_RANGES,
@@ -127,9 +121,7 @@ def test_labels_are_right_as_often_as_they_are_said_to_be(
         assert judgement.expected_accuracy == pytest.approx(own[annotation.valid].mean(), abs=1e-6)
 
 
-def test_without_classes_it_is_said_how_likely_the_properties_are_right(
-    cases: list[Case],
-) -> None:
+def test_without_classes_it_is_said_how_likely_the_properties_are_right(cases: list[Case]) -> None:
     # Of the same objects, as a source without classes has them: the same values, all of class 0.
     likely, right = [], []
     for field, latents, truth in cases:

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from click.testing import CliRunner, Result
 from scipy.spatial import cKDTree
-from support.synthetic import Dataset
+from support.synthetic import Dataset, MakeDataset
 
 from slatprep import InputError, open_store
 from slatprep.cli.commands import slatprep
@@ -149,7 +149,7 @@ def test_what_labels_are_of_scores_perfectly(case: Case, tmp_path: Path) -> None
 
 
 def test_by_vote_what_labels_are_of_scores_perfectly(
-    make_dataset: Callable[..., Dataset], tmp_path: Path
+    make_dataset: MakeDataset, tmp_path: Path
 ) -> None:
     dataset = make_dataset("a", "b")
     build_store(dataset.parameters(), tmp_path / "s.zarr")
@@ -159,7 +159,7 @@ def test_by_vote_what_labels_are_of_scores_perfectly(
 
 
 def test_other_ranges_are_brought_to_the_store_s(
-    case: Case, make_dataset: Callable[..., Dataset], tmp_path: Path
+    case: Case, make_dataset: MakeDataset, tmp_path: Path
 ) -> None:
     dataset = make_dataset(*NAMES)
     for name, grid in case.grids.items():
@@ -292,7 +292,7 @@ def test_nothing_in_common_is_an_error(case: Case, tmp_path: Path) -> None:
 
 
 def test_occupied_voxels_without_a_class_are_counted(
-    make_dataset: Callable[..., Dataset], tmp_path: Path
+    make_dataset: MakeDataset, tmp_path: Path
 ) -> None:
     dataset = make_dataset("a", "b")
     grid = dataset.assets["a"].grid

@@ -319,12 +319,7 @@ def test_an_image_becomes_gaussians_with_materials(
 
 @pytest.mark.parametrize(("far", "kept"), [("drop", 299), ("nearest", 300)])
 def test_far_gaussians_of_an_image_are_what_far_says(
-    far: str,
-    kept: int,
-    checkpoint: Path,
-    tmp_path: Path,
-    trellis: Pipeline,
-    image: Path,
+    far: str, kept: int, checkpoint: Path, tmp_path: Path, trellis: Pipeline, image: Path
 ) -> None:
     from plyfile import PlyData
 

@@ -348,9 +348,7 @@ def test_a_run_goes_on_in_the_precision_it_began_with(
         assert json.loads((tmp_path / "run" / "run.json").read_text())["precision"] == "fp32"
 
 
-def test_failed_assets_are_neither_trained_on_nor_exported_unless_asked_for(
-    tmp_path: Path,
-) -> None:
+def test_failed_assets_are_neither_trained_on_nor_exported_unless_asked_for(tmp_path: Path) -> None:
     dataset = Dataset(tmp_path / "sources")
     for seed, object_id in enumerate("abc"):
         dataset.add(object_id, seed)

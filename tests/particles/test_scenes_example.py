@@ -92,10 +92,7 @@ def test_a_strip_shows_the_object_fall_and_a_gif_every_frame(
     ],
 )
 def test_what_cannot_be_moved_is_said_in_a_line(
-    words: list[str],
-    said: str,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
+    words: list[str], said: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     with pytest.raises(SystemExit) as caught:
         command(monkeypatch, *words)

@@ -5,14 +5,13 @@ from __future__ import annotations
 import json
 import os
 import shutil
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 from click.testing import CliRunner
-from support.synthetic import Dataset
+from support.synthetic import MakeDataset
 from support.trees import records_of
 
 from slatprep.cli.commands import slatprep
@@ -23,8 +22,6 @@ from slatprep.parameters.files import load_parameters
 from slatprep.pipeline.dataset import build_store
 from slatprep.store import open_store
 from slatprep.store.records import StoredRecords
-
-MakeDataset = Callable[..., Dataset]
 
 BAD = os.fsdecode(b"b\xff")
 

@@ -1,12 +1,11 @@
 import json
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 from support.faults import inject
-from support.synthetic import JELLY, METAL, Dataset, make_asset
+from support.synthetic import JELLY, METAL, Dataset, MakeDataset, make_asset
 from support.trees import records_of, tree
 
 from slatprep.errors import ConfigError, InputError, MissingPartnerError, StoreError
@@ -15,8 +14,6 @@ from slatprep.parameters import PairingParameters, SampleParameters
 from slatprep.pipeline.dataset import BuildSummary, align_pairs, build_store
 from slatprep.store import open_store
 from slatprep.store.manifests import manifests_of
-
-MakeDataset = Callable[..., Dataset]
 
 
 def test_bad_assets_are_told_and_the_others_go_in(mixed_build: BuildSummary) -> None:

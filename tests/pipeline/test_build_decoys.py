@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from support.synthetic import Dataset
+from support.synthetic import Made, MakeDataset
 
 from slatprep.pipeline import decoys
 from slatprep.pipeline.dataset import build_store
@@ -31,7 +30,7 @@ def files_of(folder: Path) -> dict[str, bytes]:
 
 @pytest.mark.usefixtures("few_suffice")
 def test_a_build_measures_errors_the_same_for_any_number_of_jobs(
-    make_dataset: Callable[..., Dataset], tmp_path: Path
+    make_dataset: MakeDataset, tmp_path: Path
 ) -> None:
     parameters = make_dataset(*OBJECTS).parameters()
     one, two, none = (tmp_path / f"{name}.zarr" for name in ("one", "two", "none"))
@@ -49,7 +48,7 @@ def test_a_build_measures_errors_the_same_for_any_number_of_jobs(
 
 @pytest.mark.usefixtures("few_suffice", "few_are_new")
 def test_a_small_update_measures_nothing_and_says_so(
-    make_dataset: Callable[..., Dataset], tmp_path: Path
+    make_dataset: MakeDataset, tmp_path: Path
 ) -> None:
     out = tmp_path / "s.zarr"
     dataset = make_dataset(*OBJECTS)
@@ -68,7 +67,7 @@ def test_a_small_update_measures_nothing_and_says_so(
 
 @pytest.mark.usefixtures("few_suffice", "few_are_new")
 def test_a_larger_update_takes_the_decoys_of_before_over(
-    make_dataset: Callable[..., Dataset], tmp_path: Path
+    make_dataset: MakeDataset, tmp_path: Path
 ) -> None:
     out = tmp_path / "s.zarr"
     dataset = make_dataset(*OBJECTS)
@@ -87,7 +86,7 @@ def test_a_larger_update_takes_the_decoys_of_before_over(
 
 
 def test_of_few_assets_there_are_no_decoys_and_that_is_said(
-    undisturbed: tuple[Dataset, Path],
+    undisturbed: Made,
 ) -> None:
     _, out = undisturbed
     assert measured_errors(out) is None

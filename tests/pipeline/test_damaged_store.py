@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import zarr
 from support.faults import inject
-from support.synthetic import Dataset
+from support.synthetic import Made
 from support.trees import tree
 
 from slatprep.inspect.verify import verify_store
@@ -25,14 +25,14 @@ RECORDS = "asset/record/c/0"
 
 
 @pytest.fixture(scope="module")
-def sound(undisturbed: tuple[Dataset, Path], tmp_path_factory: pytest.TempPathFactory) -> Path:
+def sound(undisturbed: Made, tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("sound")
     build_store(undisturbed[0].parameters(), folder / "s.zarr")
     return folder
 
 
 @pytest.fixture
-def built(undisturbed: tuple[Dataset, Path], sound: Path, tmp_path: Path) -> tuple[Dataset, Path]:
+def built(undisturbed: Made, sound: Path, tmp_path: Path) -> Made:
     """Three assets, and a store of them with the ranges of the dataset, to be damaged."""
     shutil.copytree(sound, tmp_path, dirs_exist_ok=True)
     return undisturbed[0], tmp_path / "s.zarr"
@@ -51,7 +51,7 @@ def flip(path: Path, byte: int, bit: int = 0) -> None:
     path.write_bytes(data)
 
 
-def rebuilt(built: tuple[Dataset, Path], undisturbed: tuple[Dataset, Path]) -> BuildSummary:
+def rebuilt(built: Made, undisturbed: Made) -> BuildSummary:
     """Build with other ranges, which takes over what is sound; compare with one from nothing."""
     dataset, out = built
     summary = build_store(dataset.parameters("pixie"), out)
@@ -61,16 +61,14 @@ def rebuilt(built: tuple[Dataset, Path], undisturbed: tuple[Dataset, Path]) -> B
     return summary
 
 
-def test_a_sound_store_is_taken_over(
-    built: tuple[Dataset, Path], undisturbed: tuple[Dataset, Path], aligned: list[str]
-) -> None:
+def test_a_sound_store_is_taken_over(built: Made, undisturbed: Made, aligned: list[str]) -> None:
     assert rebuilt(built, undisturbed).damaged == ()
     assert aligned == []
 
 
 @pytest.mark.parametrize("share", [0.1, 0.7])
 def test_a_flipped_bit_of_a_record_is_never_inherited(
-    built: tuple[Dataset, Path], undisturbed: tuple[Dataset, Path], aligned: list[str], share: float
+    built: Made, undisturbed: Made, aligned: list[str], share: float
 ) -> None:
     dataset, out = built
     flip(out / RECORDS, int(share * (out / RECORDS).stat().st_size))
@@ -84,9 +82,7 @@ def test_a_flipped_bit_of_a_record_is_never_inherited(
 
 
 @pytest.mark.parametrize("text", ["", "[]", "{}", "[" * 100_000])
-def test_a_record_that_is_none_is_made_anew(
-    built: tuple[Dataset, Path], undisturbed: tuple[Dataset, Path], text: str
-) -> None:
+def test_a_record_that_is_none_is_made_anew(built: Made, undisturbed: Made, text: str) -> None:
     _, out = built
     zarr.open_group(out, mode="r+", use_consolidated=False)["asset/record"][1] = text
     assert rebuilt(built, undisturbed).damaged
@@ -103,7 +99,7 @@ def test_a_record_that_is_none_is_made_anew(
     ],
 )
 def test_a_store_that_is_damaged_is_not_current(
-    built: tuple[Dataset, Path], aligned: list[str], name: str, aligned_again: int
+    built: Made, aligned: list[str], name: str, aligned_again: int
 ) -> None:
     dataset, out = built
     before = tree(out)
@@ -115,7 +111,7 @@ def test_a_store_that_is_damaged_is_not_current(
     assert build_store(dataset.parameters(), out).damaged == ()
 
 
-def test_rows_that_are_gone_are_written_again(built: tuple[Dataset, Path]) -> None:
+def test_rows_that_are_gone_are_written_again(built: Made) -> None:
     dataset, out = built
     before = tree(out)
     (out / "voxel/feats/c/1/0").unlink()
@@ -135,7 +131,7 @@ def rewritten(out: Path, change: Callable[[zarr.Group], None]) -> None:
 
 @pytest.mark.filterwarnings("ignore:Consolidated metadata")
 def test_a_transform_that_does_not_give_the_stored_labels_is_found_anew(
-    built: tuple[Dataset, Path], undisturbed: tuple[Dataset, Path], aligned: list[str]
+    built: Made, undisturbed: Made, aligned: list[str]
 ) -> None:
     """Every checksum and digest is right, and yet the record is not of these rows."""
     _, out = built
@@ -162,7 +158,7 @@ def test_a_transform_that_does_not_give_the_stored_labels_is_found_anew(
     ],
 )
 def test_records_beside_a_store_that_are_damaged_are_written_again(
-    built: tuple[Dataset, Path], file: str, text: bytes
+    built: Made, file: str, text: bytes
 ) -> None:
     dataset, out = built
     path = out.with_name("s.manifests") / file
@@ -173,7 +169,7 @@ def test_records_beside_a_store_that_are_damaged_are_written_again(
 
 
 @pytest.mark.parametrize("file", ["build.json", "assets.jsonl"])
-def test_one_changed_digit_beside_a_store_is_mended(built: tuple[Dataset, Path], file: str) -> None:
+def test_one_changed_digit_beside_a_store_is_mended(built: Made, file: str) -> None:
     dataset, out = built
     path = out.with_name("s.manifests") / file
     sound = path.read_text()

@@ -15,7 +15,7 @@ import pytest
 from support.build_process import kill_at, prepared, run
 from support.faults import environment
 from support.rights import BOUND_BY_PERMISSIONS
-from support.synthetic import Dataset, make_asset
+from support.synthetic import Dataset, Made, make_asset
 from support.trees import tree
 
 from slatprep.errors import StoreError
@@ -33,7 +33,7 @@ def script(tmp_path: Path) -> Path:
 
 
 @pytest.fixture
-def reference(undisturbed: tuple[Dataset, Path], tmp_path: Path) -> tuple[Dataset, dict[str, str]]:
+def reference(undisturbed: Made, tmp_path: Path) -> tuple[Dataset, dict[str, str]]:
     """Three assets that may be changed, and the hashes of what is to come of them."""
     dataset, store = undisturbed
     shutil.copytree(dataset.root, tmp_path / "sources")

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import json
 import shutil
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 from click.testing import CliRunner
-from support.synthetic import Dataset
+from support.synthetic import Dataset, Made, MakeDataset
 from support.trees import records_of, tree
 
 from slatprep.cli.commands import slatprep
@@ -22,11 +21,9 @@ from slatprep.pipeline.dataset import BuildSummary, build_store
 from slatprep.pipeline.join import concat_stores, subset_store
 from slatprep.store import open_store
 
-MakeDataset = Callable[..., Dataset]
-
 
 @pytest.fixture(scope="module")
-def parts(tmp_path_factory: pytest.TempPathFactory) -> tuple[Dataset, Path]:
+def parts(tmp_path_factory: pytest.TempPathFactory) -> Made:
     """Return a dataset of five rows, built with Pixie's ranges: whole, and in two parts."""
     folder = tmp_path_factory.mktemp("parts")
     whole = Dataset(folder / "whole")
@@ -44,7 +41,7 @@ def parts(tmp_path_factory: pytest.TempPathFactory) -> tuple[Dataset, Path]:
     return whole, folder
 
 
-def test_a_subset_is_the_build_of_its_assets(parts: tuple[Dataset, Path], tmp_path: Path) -> None:
+def test_a_subset_is_the_build_of_its_assets(parts: Made, tmp_path: Path) -> None:
     _, folder = parts
     summary = subset_store(folder / "whole.zarr", tmp_path / "s.zarr", ["d", "b.s", "b.front"])
     assert summary.statuses == {"ok": 3, "failed": 0, "skipped": 0}
@@ -54,9 +51,7 @@ def test_a_subset_is_the_build_of_its_assets(parts: tuple[Dataset, Path], tmp_pa
     assert records_of(tmp_path / "s.manifests" / "assets.jsonl") == built
 
 
-def test_joined_stores_are_the_build_of_all_their_assets(
-    parts: tuple[Dataset, Path], tmp_path: Path
-) -> None:
+def test_joined_stores_are_the_build_of_all_their_assets(parts: Made, tmp_path: Path) -> None:
     _, folder = parts
     concat_stores([folder / "bd.zarr", folder / "ac.zarr"], tmp_path / "all.zarr")
     assert tree(tmp_path / "all.zarr") == tree(folder / "whole.zarr")
@@ -93,7 +88,7 @@ def test_stores_with_ranges_of_their_own_get_those_of_all(
 
 
 def test_what_does_not_go_together_is_refused(
-    parts: tuple[Dataset, Path], make_dataset: MakeDataset, tmp_path: Path
+    parts: Made, make_dataset: MakeDataset, tmp_path: Path
 ) -> None:
     _, folder = parts
     out = tmp_path / "out.zarr"
@@ -143,7 +138,7 @@ def test_commands_choose_and_join(mixed_build: BuildSummary, tmp_path: Path) -> 
 
 
 def test_a_source_is_never_replaced_whatever_path_leads_there(
-    parts: tuple[Dataset, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    parts: Made, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     _, folder = parts
     shutil.copytree(folder / "ac.zarr", tmp_path / "own.zarr")
@@ -165,7 +160,7 @@ def test_a_source_is_never_replaced_whatever_path_leads_there(
 
 
 def test_records_beside_a_store_are_taken_only_if_they_are_of_its_build(
-    parts: tuple[Dataset, Path], tmp_path: Path
+    parts: Made, tmp_path: Path
 ) -> None:
     _, folder = parts
     for name, change in (
@@ -182,7 +177,7 @@ def test_records_beside_a_store_are_taken_only_if_they_are_of_its_build(
 
 
 def test_a_store_whose_attributes_do_not_say_how_it_was_built_is_refused(
-    parts: tuple[Dataset, Path], tmp_path: Path
+    parts: Made, tmp_path: Path
 ) -> None:
     _, folder = parts
     shutil.copytree(folder / "ac.zarr", tmp_path / "odd.zarr")

@@ -5,11 +5,10 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from support.synthetic import Dataset
+from support.synthetic import MakeDataset
 
 from slatprep.pipeline.dataset import build_store
 from slatprep.workers import local
@@ -115,7 +114,7 @@ def test_jobs_are_no_more_than_there_is_work_for() -> None:
 
 
 def test_few_assets_start_no_process(
-    make_dataset: Callable[..., Dataset], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    make_dataset: MakeDataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def refuse(number: int) -> None:
         raise AssertionError(f"{number} processes for two assets")

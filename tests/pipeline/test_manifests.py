@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import os
 import shutil
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from support.synthetic import Dataset
+from support.synthetic import Dataset, Made, MakeDataset
 from support.trees import records_of, tree
 
 from slatprep.inspect.verify import verify_store
@@ -17,14 +16,11 @@ from slatprep.pipeline.dataset import build_store
 from slatprep.store import manifests, open_store, records, writer
 from slatprep.store.layout import ARRAYS
 
-MakeDataset = Callable[..., Dataset]
-
-
 pytestmark = pytest.mark.usefixtures("files_are_old", "few_are_new")
 
 
 @pytest.fixture
-def built(make_dataset: MakeDataset, tmp_path: Path) -> tuple[Dataset, Path]:
+def built(make_dataset: MakeDataset, tmp_path: Path) -> Made:
     """Three assets and one without a partner, and the file of their records."""
     dataset = make_dataset("a", "c", "e")
     dataset.add("lone", seed=4)
@@ -34,7 +30,7 @@ def built(make_dataset: MakeDataset, tmp_path: Path) -> tuple[Dataset, Path]:
 
 
 def test_a_build_through_a_link_leaves_the_records_where_the_store_lies(
-    built: tuple[Dataset, Path], tmp_path: Path
+    built: Made, tmp_path: Path
 ) -> None:
     dataset, lines = built
     (tmp_path / "elsewhere").mkdir()
@@ -59,7 +55,7 @@ def update(dataset: Dataset, lines: Path) -> list[str]:
     return list(records_of(lines))
 
 
-def test_an_update_writes_what_is_new_and_the_last_shards(built: tuple[Dataset, Path]) -> None:
+def test_an_update_writes_what_is_new_and_the_last_shards(built: Made) -> None:
     dataset, lines = built
     out = lines.parent.with_name("s.zarr")
     before = {path: path.stat().st_ino for path in out.rglob("*") if path.is_file()}
@@ -134,7 +130,7 @@ def test_lines_are_those_of_shards_and_stay_where_their_shard_does(
 
 @pytest.mark.parametrize("how", ["cut", "longer", "another line", "gone", "named twice"])
 def test_lines_that_are_not_those_of_the_store_are_found_and_mended(
-    built: tuple[Dataset, Path], tmp_path: Path, how: str
+    built: Made, tmp_path: Path, how: str
 ) -> None:
     dataset, lines = built
     sound = lines.read_bytes()
@@ -158,7 +154,7 @@ def test_lines_that_are_not_those_of_the_store_are_found_and_mended(
         assert lines.read_bytes().startswith(sound)
 
 
-def test_an_asset_that_cannot_go_in_costs_build_json_alone(built: tuple[Dataset, Path]) -> None:
+def test_an_asset_that_cannot_go_in_costs_build_json_alone(built: Made) -> None:
     dataset, lines = built
     out = lines.parent.with_name("s.zarr")
     before, inode = tree(out), lines.stat().st_ino
@@ -172,7 +168,7 @@ def test_an_asset_that_cannot_go_in_costs_build_json_alone(built: tuple[Dataset,
 
 
 def test_the_store_and_its_id_do_not_depend_on_the_order_of_lines(
-    built: tuple[Dataset, Path], tmp_path: Path
+    built: Made, tmp_path: Path
 ) -> None:
     dataset, lines = built
     dataset.add("b", seed=1)

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 from support.faults import inject
-from support.synthetic import Dataset
+from support.synthetic import Dataset, MakeDataset
 from support.trees import tree
 
 from slatprep import ConfigError, InputError
@@ -18,8 +17,6 @@ from slatprep.parameters import BuildParameters, NormalizeParameters
 from slatprep.pipeline.dataset import build_store
 from slatprep.store import open_store
 from slatprep.store.record_json import read_build_record
-
-MakeDataset = Callable[..., Dataset]
 
 
 def noisy(dataset: Dataset, *names: str) -> Dataset:

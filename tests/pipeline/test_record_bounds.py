@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
-from support.synthetic import Dataset
+from support.synthetic import MakeDataset
 from support.trees import tree
 
 from slatprep.inspect.verify import verify_store
@@ -17,8 +16,6 @@ from slatprep.pipeline.dataset import build_store
 from slatprep.store import open_store
 from slatprep.store.record import MAX_WARNINGS
 from slatprep.store.records import StoredRecords
-
-MakeDataset = Callable[..., Dataset]
 
 
 def test_more_annotations_than_a_record_holds_cost_their_asset_alone(

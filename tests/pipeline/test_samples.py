@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 from support.faults import inject
-from support.synthetic import Dataset, make_asset
+from support.synthetic import Dataset, MakeDataset, make_asset
 from support.trees import records_of, tree
 
 from slatprep.errors import StoreError
@@ -21,8 +20,6 @@ from slatprep.parameters import BuildParameters, ConsensusParameters, Samples
 from slatprep.pipeline.dataset import BuildSummary, build_store, plan_build
 from slatprep.pipeline.join import concat_stores, subset_store
 from slatprep.store import open_store
-
-MakeDataset = Callable[..., Dataset]
 
 FACTORS = (1.0, 3.0, 0.7)
 """What the samples of object ``a`` make of Young's modulus."""

@@ -7,7 +7,6 @@ import os
 import pickle
 import random
 import shutil
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -15,7 +14,7 @@ import numpy as np
 import pytest
 from support.faults import inject
 from support.first_builds import tree_from_nothing
-from support.synthetic import Dataset, make_asset
+from support.synthetic import Made, MakeDataset, make_asset
 from support.trees import records_of, tree
 
 from slatprep.inspect.verify import verify_store
@@ -26,9 +25,6 @@ from slatprep.pipeline.previous import checked_store
 from slatprep.storage import states
 from slatprep.store import layout, open_store
 from slatprep.store.shard_reader import RowReader
-
-MakeDataset = Callable[..., Dataset]
-
 
 pytestmark = pytest.mark.usefixtures("files_are_old", "few_are_new")
 
@@ -47,7 +43,7 @@ def steps(monkeypatch: pytest.MonkeyPatch) -> list[tuple[str, str]]:
 
 
 @pytest.fixture
-def built(make_dataset: MakeDataset, tmp_path: Path) -> tuple[Dataset, Path]:
+def built(make_dataset: MakeDataset, tmp_path: Path) -> Made:
     """Four assets, and a store of them in some ten shards an array."""
     dataset, out = make_dataset("a", "c", "e", "g"), tmp_path / "s.zarr"
     build_store(dataset.parameters(), out)
@@ -67,7 +63,7 @@ def names(steps: list[tuple[str, str]], step: str) -> list[str]:
 
 
 def test_new_assets_come_behind_and_the_rest_stays_where_it_is(
-    built: tuple[Dataset, Path], steps: list[tuple[str, str]]
+    built: Made, steps: list[tuple[str, str]]
 ) -> None:
     dataset, out = built
     before, files = inodes(out), tree(out)
@@ -98,9 +94,7 @@ def test_new_assets_come_behind_and_the_rest_stays_where_it_is(
     assert files.keys() <= built_anew.keys()
 
 
-def test_what_is_new_and_sorts_last_gives_the_bytes_of_a_first_build(
-    built: tuple[Dataset, Path],
-) -> None:
+def test_what_is_new_and_sorts_last_gives_the_bytes_of_a_first_build(built: Made) -> None:
     dataset, out = built
     dataset.add("h", seed=1)
     build_store(dataset.parameters(), out, jobs=2)
@@ -128,7 +122,7 @@ def test_shards_that_a_larger_store_has_larger_are_made_of_chunks_as_they_are(
 
 
 def test_where_much_is_new_all_rows_are_ordered_by_id(
-    built: tuple[Dataset, Path], monkeypatch: pytest.MonkeyPatch
+    built: Made, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     dataset, out = built
     monkeypatch.setattr(rows, "MOST_BEHIND", 0.2)
@@ -137,9 +131,7 @@ def test_where_much_is_new_all_rows_are_ordered_by_id(
     assert tree(out) == tree_from_nothing(dataset.parameters())
 
 
-def test_every_asset_has_the_rows_of_a_first_build(
-    built: tuple[Dataset, Path], tmp_path: Path
-) -> None:
+def test_every_asset_has_the_rows_of_a_first_build(built: Made, tmp_path: Path) -> None:
     dataset, out = built
     dataset.add("b", seed=2)
     build_store(dataset.parameters(), out)
@@ -156,7 +148,7 @@ def test_every_asset_has_the_rows_of_a_first_build(
 
 
 def test_a_change_of_latents_alone_costs_its_own_chunks(
-    built: tuple[Dataset, Path], steps: list[tuple[str, str]]
+    built: Made, steps: list[tuple[str, str]]
 ) -> None:
     dataset, out = built
     before = inodes(out)
@@ -172,7 +164,7 @@ def test_a_change_of_latents_alone_costs_its_own_chunks(
 
 
 def test_what_is_removed_moves_the_rows_behind_it(
-    built: tuple[Dataset, Path], steps: list[tuple[str, str]]
+    built: Made, steps: list[tuple[str, str]]
 ) -> None:
     dataset, out = built
     before = inodes(out)
@@ -185,9 +177,7 @@ def test_what_is_removed_moves_the_rows_behind_it(
     assert tree(out) == tree_from_nothing(dataset.parameters())
 
 
-def test_grids_that_move_are_not_unpacked(
-    built: tuple[Dataset, Path], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_grids_that_move_are_not_unpacked(built: Made, monkeypatch: pytest.MonkeyPatch) -> None:
     dataset, out = built
     shutil.rmtree(dataset.root / "pixieverse" / "a")
     (dataset.root / "slat" / "a.npz").unlink()
@@ -207,7 +197,7 @@ def test_grids_that_move_are_not_unpacked(
 
 
 def test_another_name_costs_a_record(
-    built: tuple[Dataset, Path], steps: list[tuple[str, str]], tmp_path: Path
+    built: Made, steps: list[tuple[str, str]], tmp_path: Path
 ) -> None:
     dataset, out = built
     before = inodes(out)
@@ -252,7 +242,7 @@ def test_any_sequence_of_updates_comes_to_the_same_when_compacted(
 
 
 def test_ranges_that_change_take_no_rows_over_and_align_nothing(
-    built: tuple[Dataset, Path], steps: list[tuple[str, str]]
+    built: Made, steps: list[tuple[str, str]]
 ) -> None:
     dataset, out = built
     made = make_asset(2)
@@ -269,7 +259,7 @@ def test_ranges_that_change_take_no_rows_over_and_align_nothing(
 @pytest.mark.parametrize(
     "name", ["voxel/feats/c/0/0", "grid/material/c/1/0/0/0", "asset/fitness/c/0"]
 )
-def test_a_flipped_bit_is_not_taken_over(built: tuple[Dataset, Path], name: str) -> None:
+def test_a_flipped_bit_is_not_taken_over(built: Made, name: str) -> None:
     dataset, out = built
     data = bytearray((out / name).read_bytes())
     data[len(data) // 3] ^= 4
@@ -284,7 +274,7 @@ def test_a_flipped_bit_is_not_taken_over(built: tuple[Dataset, Path], name: str)
     "step", ["shard filled", "directory flushed", "store replaced", "manifests written"]
 )
 def test_an_update_that_fails_leaves_one_whole_store(
-    built: tuple[Dataset, Path], monkeypatch: pytest.MonkeyPatch, step: str
+    built: Made, monkeypatch: pytest.MonkeyPatch, step: str
 ) -> None:
     dataset, out = built
     before = tree(out)
@@ -310,9 +300,7 @@ def test_an_update_that_fails_leaves_one_whole_store(
     assert tree(out) == tree_from_nothing(dataset.parameters())
 
 
-def test_a_store_with_other_names_shares_no_file_with_the_next(
-    built: tuple[Dataset, Path], tmp_path: Path
-) -> None:
+def test_a_store_with_other_names_shares_no_file_with_the_next(built: Made, tmp_path: Path) -> None:
     """Whoever writes into a snapshot made of hard links must not change the store."""
     dataset, out = built
     shutil.copytree(out, tmp_path / "snapshot", copy_function=os.link)
@@ -324,7 +312,7 @@ def test_a_store_with_other_names_shares_no_file_with_the_next(
 
 
 def test_sources_that_are_as_they_were_are_not_read(
-    built: tuple[Dataset, Path], steps: list[tuple[str, str]]
+    built: Made, steps: list[tuple[str, str]]
 ) -> None:
     dataset, out = built
     build_store(dataset.parameters(), out)
@@ -346,7 +334,7 @@ def test_sources_that_are_as_they_were_are_not_read(
 
 @pytest.mark.parametrize("how", ["gone", "flipped", "cut", "empty", "link", "machine", "young"])
 def test_what_was_seen_is_not_trusted_without_reason(
-    built: tuple[Dataset, Path],
+    built: Made,
     steps: list[tuple[str, str]],
     monkeypatch: pytest.MonkeyPatch,
     tmp_path: Path,
@@ -382,7 +370,7 @@ def test_what_was_seen_is_not_trusted_without_reason(
 
 
 def test_what_was_seen_of_one_store_is_nothing_to_another(
-    built: tuple[Dataset, Path], tmp_path: Path, steps: list[tuple[str, str]]
+    built: Made, tmp_path: Path, steps: list[tuple[str, str]]
 ) -> None:
     dataset, out = built
     shutil.copytree(out, tmp_path / "kept")
@@ -397,9 +385,7 @@ def test_what_was_seen_of_one_store_is_nothing_to_another(
 
 
 @pytest.mark.parametrize("file", ["s.zarr/voxel/feats/c/0/0", "s.manifests/assets.jsonl"])
-def test_a_file_that_changed_under_an_unchanged_dataset_is_found(
-    built: tuple[Dataset, Path], file: str
-) -> None:
+def test_a_file_that_changed_under_an_unchanged_dataset_is_found(built: Made, file: str) -> None:
     dataset, out = built
     path = out.parent / file
     data = bytearray(path.read_bytes())
@@ -411,9 +397,7 @@ def test_a_file_that_changed_under_an_unchanged_dataset_is_found(
 
 
 def test_rows_that_other_code_packed_are_packed_anew_and_not_aligned(
-    built: tuple[Dataset, Path],
-    steps: list[tuple[str, str]],
-    monkeypatch: pytest.MonkeyPatch,
+    built: Made, steps: list[tuple[str, str]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     dataset, out = built
     dataset.add("h", seed=1)
@@ -430,7 +414,7 @@ def test_rows_that_other_code_packed_are_packed_anew_and_not_aligned(
     assert tree(out) == tree_from_nothing(dataset.parameters())
 
 
-def test_a_worker_that_lives_on_reads_the_store_of_today(built: tuple[Dataset, Path]) -> None:
+def test_a_worker_that_lives_on_reads_the_store_of_today(built: Made) -> None:
     """A cluster's workers outlive builds, and rows in another order have the same build id."""
     dataset, out = built
     dataset.add("b", seed=5)

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 from support.faults import inject
-from support.synthetic import Dataset, make_asset
+from support.synthetic import Dataset, MakeDataset, make_asset
 from support.trees import records_of, tree
 
 from slatprep.errors import ConfigError
@@ -26,8 +25,6 @@ DENSER, STIFFER = 4.0, 3.0
 """What the second source makes of the density, the third of Young's modulus."""
 
 DENSITY = {"name": "density", "unit": "kg/m^3", "scale": "log10"}
-
-MakeDataset = Callable[..., Dataset]
 
 
 def describe(root: Path, **changes: object) -> None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import shutil
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,14 +12,12 @@ import numpy as np
 import pytest
 from support.faults import inject
 from support.first_builds import tree_from_nothing
-from support.synthetic import Dataset, make_asset
+from support.synthetic import Made, MakeDataset, make_asset
 from support.trees import tree
 
 from slatprep.parameters import AlignParameters, BuildParameters, SampleParameters
 from slatprep.pipeline.dataset import build_store, plan_build
 from slatprep.store import open_store
-
-MakeDataset = Callable[..., Dataset]
 
 
 @pytest.fixture
@@ -32,7 +29,7 @@ def aligned(monkeypatch: pytest.MonkeyPatch) -> list[str]:
 
 
 @pytest.fixture
-def built(make_dataset: MakeDataset, tmp_path: Path) -> tuple[Dataset, Path]:
+def built(make_dataset: MakeDataset, tmp_path: Path) -> Made:
     dataset, out = make_dataset("a", "b", "c"), tmp_path / "s.zarr"
     build_store(dataset.parameters(), out)
     return dataset, out
@@ -43,7 +40,7 @@ def reasons(parameters: BuildParameters, out: Path) -> dict[str, tuple[str, str]
     return {asset.asset_id: (str(asset.action), asset.reason) for asset in plan.assets}
 
 
-def test_nothing_changed_writes_nothing(built: tuple[Dataset, Path], aligned: list[str]) -> None:
+def test_nothing_changed_writes_nothing(built: Made, aligned: list[str]) -> None:
     dataset, out = built
     inodes = {path: path.stat().st_ino for path in out.parent.rglob("*") if path.is_file()}
     summary = build_store(dataset.parameters(), out)
@@ -61,7 +58,7 @@ def test_nothing_changed_writes_nothing(built: tuple[Dataset, Path], aligned: li
     }
 
 
-def test_new_changed_and_removed(built: tuple[Dataset, Path], aligned: list[str]) -> None:
+def test_new_changed_and_removed(built: Made, aligned: list[str]) -> None:
     dataset, out = built
     dataset.add("d", seed=3)
     made = make_asset(seed=6)
@@ -84,7 +81,7 @@ def test_new_changed_and_removed(built: tuple[Dataset, Path], aligned: list[str]
     assert tree(out) == tree_from_nothing(dataset.parameters())
 
 
-def test_a_change_that_keeps_size_and_times_is_seen(built: tuple[Dataset, Path]) -> None:
+def test_a_change_that_keeps_size_and_times_is_seen(built: Made) -> None:
     import os
 
     dataset, out = built
@@ -99,9 +96,7 @@ def test_a_change_that_keeps_size_and_times_is_seen(built: tuple[Dataset, Path])
     assert reasons(dataset.parameters(), out)["a"] == ("align", "sources changed: slat")
 
 
-def test_moved_ranges_renormalise_without_aligning(
-    built: tuple[Dataset, Path], aligned: list[str]
-) -> None:
+def test_moved_ranges_renormalise_without_aligning(built: Made, aligned: list[str]) -> None:
     dataset, out = built
     pixie = dataset.parameters("pixie")
     assert {action for action, _ in reasons(pixie, out).values()} == {"reuse"}
@@ -110,7 +105,7 @@ def test_moved_ranges_renormalise_without_aligning(
     assert tree(out) == tree_from_nothing(pixie)
 
 
-def test_other_shards_need_no_alignment(built: tuple[Dataset, Path], aligned: list[str]) -> None:
+def test_other_shards_need_no_alignment(built: Made, aligned: list[str]) -> None:
     dataset, out = built
     parameters = dataset.parameters()
     wider = replace(parameters, store=replace(parameters.store, voxel_chunk=256))
@@ -119,9 +114,7 @@ def test_other_shards_need_no_alignment(built: tuple[Dataset, Path], aligned: li
     assert tree(out) == tree_from_nothing(wider)
 
 
-def test_parameters_that_touch_an_asset_redo_it(
-    built: tuple[Dataset, Path], aligned: list[str]
-) -> None:
+def test_parameters_that_touch_an_asset_redo_it(built: Made, aligned: list[str]) -> None:
     dataset, out = built
     nearer = replace(dataset.parameters(), sample=SampleParameters(max_distance=2.0))
     why = "parameters changed: sample.max_distance was 3.0, is 2.0"
@@ -133,9 +126,7 @@ def test_parameters_that_touch_an_asset_redo_it(
     assert reasons(rigid, out)["a"][1] == "parameters changed: align.model was auto, is rigid"
 
 
-def test_other_code_redoes_an_asset(
-    built: tuple[Dataset, Path], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_other_code_redoes_an_asset(built: Made, monkeypatch: pytest.MonkeyPatch) -> None:
     from slatprep.pipeline import recipe as reuse
 
     dataset, out = built
@@ -143,9 +134,7 @@ def test_other_code_redoes_an_asset(
     assert reasons(dataset.parameters(), out)["a"] == ("align", "code changed")
 
 
-def test_a_category_is_no_part_of_the_work(
-    built: tuple[Dataset, Path], aligned: list[str], tmp_path: Path
-) -> None:
+def test_a_category_is_no_part_of_the_work(built: Made, aligned: list[str], tmp_path: Path) -> None:
     dataset, out = built
     categories = tmp_path / "categories.json"
     categories.write_text(json.dumps({"a": {"obj_class": "tree"}}))
@@ -184,7 +173,7 @@ def test_one_file_of_all_slats_may_grow(
 
 
 def test_an_asset_that_cannot_go_in_does_not_make_the_store_old(
-    built: tuple[Dataset, Path], aligned: list[str]
+    built: Made, aligned: list[str]
 ) -> None:
     dataset, out = built
     dataset.write_grid("lone", make_asset(4).grid)
@@ -198,7 +187,7 @@ def test_an_asset_that_cannot_go_in_does_not_make_the_store_old(
     assert aligned == []
 
 
-def test_missing_or_older_manifests_are_written_again(built: tuple[Dataset, Path]) -> None:
+def test_missing_or_older_manifests_are_written_again(built: Made) -> None:
     dataset, out = built
     manifests = out.with_name("s.manifests")
     before = (manifests / "assets.jsonl").read_text().splitlines()
@@ -211,7 +200,7 @@ def test_missing_or_older_manifests_are_written_again(built: tuple[Dataset, Path
         assert old == new
 
 
-def test_fresh_does_everything(built: tuple[Dataset, Path], aligned: list[str]) -> None:
+def test_fresh_does_everything(built: Made, aligned: list[str]) -> None:
     dataset, out = built
     before = tree(out)
     build_store(dataset.parameters(), out, fresh=True)
@@ -220,7 +209,7 @@ def test_fresh_does_everything(built: tuple[Dataset, Path], aligned: list[str]) 
 
 
 def test_kept_work_is_used_and_holds_no_more_than_the_store(
-    built: tuple[Dataset, Path], aligned: list[str], monkeypatch: pytest.MonkeyPatch
+    built: Made, aligned: list[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     dataset, out = built
     build_store(dataset.parameters("pixie"), out, keep_work=True)
@@ -238,7 +227,7 @@ def test_kept_work_is_used_and_holds_no_more_than_the_store(
     assert aligned == read == []
 
 
-def test_a_dry_run_writes_nothing(built: tuple[Dataset, Path]) -> None:
+def test_a_dry_run_writes_nothing(built: Made) -> None:
     dataset, out = built
     before = tree(out.parent)
     dataset.add("d", seed=3)
@@ -250,7 +239,7 @@ def test_a_dry_run_writes_nothing(built: tuple[Dataset, Path]) -> None:
     assert np.all([not path.name.startswith(".") for path in out.parent.iterdir()])
 
 
-def test_a_dry_run_at_the_shell(built: tuple[Dataset, Path]) -> None:
+def test_a_dry_run_at_the_shell(built: Made) -> None:
     from click.testing import CliRunner
 
     from slatprep.cli.commands import slatprep

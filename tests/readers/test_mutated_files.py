@@ -18,11 +18,7 @@ from slatprep.errors import InputError
 from slatprep.readers import read_field, read_latents
 from slatprep.records import AssetPair, SourceRoots
 
-SETTINGS = settings(
-    max_examples=150,
-    derandomize=True,
-    database=None,
-)
+SETTINGS = settings(max_examples=150, derandomize=True, database=None)
 
 # Where, how many bytes are replaced, and by what: a flip, a cut, an insertion, all of them.
 EDITS = st.lists(

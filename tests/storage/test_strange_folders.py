@@ -10,7 +10,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from support.synthetic import Dataset
+from support.synthetic import Made
 
 from slatprep.errors import StoreError
 from slatprep.pipeline.dataset import build_store
@@ -212,7 +212,7 @@ def test_a_full_disk_before_anything_is_written_is_told(
 
 @pytest.mark.parametrize("file", ["build.json", "assets.jsonl"])
 def test_a_folder_for_records_that_holds_others_is_refused(
-    undisturbed: tuple[Dataset, Path], tmp_path: Path, file: str
+    undisturbed: Made, tmp_path: Path, file: str
 ) -> None:
     (tmp_path / "records").mkdir()
     (tmp_path / "records" / file).write_text('{"mine": 1}\n')
@@ -224,16 +224,14 @@ def test_a_folder_for_records_that_holds_others_is_refused(
 
 
 def test_a_folder_for_records_within_the_store_is_refused(
-    undisturbed: tuple[Dataset, Path], tmp_path: Path
+    undisturbed: Made, tmp_path: Path
 ) -> None:
     out = tmp_path / "s.zarr"
     with pytest.raises(StoreError, match="lies in the store"):
         build_store(undisturbed[0].parameters(), out, manifests=out / "records")
 
 
-def test_two_stores_in_a_folder_do_not_share_records(
-    undisturbed: tuple[Dataset, Path], tmp_path: Path
-) -> None:
+def test_two_stores_in_a_folder_do_not_share_records(undisturbed: Made, tmp_path: Path) -> None:
     """``demo`` and ``demo.zarr`` both have ``demo.manifests`` by default."""
     parameters = undisturbed[0].parameters()
     first, second = tmp_path / "demo.zarr", tmp_path / "demo"
@@ -252,7 +250,7 @@ def test_two_stores_in_a_folder_do_not_share_records(
 
 
 def test_records_of_a_store_that_was_renamed_with_them_stay_its_own(
-    undisturbed: tuple[Dataset, Path], tmp_path: Path
+    undisturbed: Made, tmp_path: Path
 ) -> None:
     build_store(undisturbed[0].parameters(), tmp_path / "demo.zarr")
     for suffix in ("zarr", "manifests"):
@@ -262,7 +260,7 @@ def test_records_of_a_store_that_was_renamed_with_them_stay_its_own(
 
 
 def test_a_renamed_store_is_built_on_beside_a_new_one_of_its_old_name(
-    undisturbed: tuple[Dataset, Path], tmp_path: Path
+    undisturbed: Made, tmp_path: Path
 ) -> None:
     parameters = undisturbed[0].parameters()
     build_store(parameters, tmp_path / "demo.zarr")

@@ -16,17 +16,12 @@ import numpy as np
 import pytest
 import zarr
 from click.testing import CliRunner
-from support.synthetic import Dataset
+from support.synthetic import MakeDataset
 
 from slatprep.cli.commands import slatprep
 from slatprep.errors import StoreError
 from slatprep.inspect.verify import verify_store
-from slatprep.parameters import (
-    MAX_GRID_SHARD,
-    MAX_VOXEL_CHUNK,
-    MAX_VOXEL_SHARD,
-    StoreParameters,
-)
+from slatprep.parameters import MAX_GRID_SHARD, MAX_VOXEL_CHUNK, MAX_VOXEL_SHARD, StoreParameters
 from slatprep.pipeline.dataset import BuildSummary, build_store
 from slatprep.store import open_store
 from slatprep.store.gate import gate_findings
@@ -100,7 +95,7 @@ def test_a_pickle_in_format_two_is_never_read(
 
 
 def test_the_largest_chunks_and_shards_that_may_be_asked_for_are_read(
-    make_dataset: Callable[..., Dataset], tmp_path: Path
+    make_dataset: MakeDataset, tmp_path: Path
 ) -> None:
     largest = StoreParameters(
         voxel_chunk=MAX_VOXEL_CHUNK,

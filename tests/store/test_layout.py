@@ -6,19 +6,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from slatprep.parameters import MAX_VOXEL_SHARD, StoreParameters
-from slatprep.store.layout import (
-    MOST_SHARDS,
-    overlaps,
-    row_ranges,
-    rows_per_shard,
-)
+from slatprep.store.layout import MOST_SHARDS, overlaps, row_ranges, rows_per_shard
 from slatprep.store.shard_reader import OPEN_SHARDS
 
 
-@given(
-    sizes=st.lists(st.integers(0, 40), min_size=1, max_size=30),
-    per_shard=st.integers(1, 50),
-)
+@given(sizes=st.lists(st.integers(0, 40), min_size=1, max_size=30), per_shard=st.integers(1, 50))
 def test_shards_take_every_row_of_every_asset_once_and_in_place(
     sizes: list[int], per_shard: int
 ) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import ClassVar
@@ -109,3 +110,9 @@ class Dataset:
             normalize=NormalizeParameters(ranges),
             store=self.shards,
         )
+
+
+Made = tuple[Dataset, Path]
+"""Sources, and the store of them."""
+
+MakeDataset = Callable[..., Dataset]

@@ -19,7 +19,7 @@ import pytest
 from click.testing import CliRunner
 from distributed import LocalCluster
 from support.dask_processes import Processes, end, wait_for_workers, wait_until
-from support.synthetic import Dataset
+from support.synthetic import Dataset, Made
 from support.trees import tree
 
 import slatprep
@@ -60,7 +60,7 @@ def address(shared: tuple[Processes, str]) -> str:
 
 
 @pytest.fixture(scope="module")
-def local(tmp_path_factory: pytest.TempPathFactory) -> tuple[Dataset, Path]:
+def local(tmp_path_factory: pytest.TempPathFactory) -> Made:
     """Six assets, and the store that one process makes of them."""
     folder = tmp_path_factory.mktemp("local")
     dataset = Dataset(folder / "sources")
@@ -84,7 +84,7 @@ def threads_for_workers(workers: int, threads: int = 1) -> Iterator[LocalCluster
 
 
 def test_a_build_whose_worker_is_killed_gives_the_same_bytes(
-    shared: tuple[Processes, str], address: str, local: tuple[Dataset, Path], tmp_path: Path
+    shared: tuple[Processes, str], address: str, local: Made, tmp_path: Path
 ) -> None:
     dataset, expected = local
     faults = shared[0].folder
@@ -115,7 +115,7 @@ def test_a_build_whose_worker_is_killed_gives_the_same_bytes(
 
 
 def test_a_worker_that_is_killed_with_a_shard_open_leaves_nothing_of_it(
-    shared: tuple[Processes, str], address: str, local: tuple[Dataset, Path], tmp_path: Path
+    shared: tuple[Processes, str], address: str, local: Made, tmp_path: Path
 ) -> None:
     dataset, expected = local
     once = shared[0].folder / "kill at shard filled"
@@ -129,7 +129,7 @@ def test_a_worker_that_is_killed_with_a_shard_open_leaves_nothing_of_it(
 
 
 def test_an_asset_that_kills_every_worker_is_named_and_the_others_go_in(
-    shared: tuple[Processes, str], address: str, local: tuple[Dataset, Path], tmp_path: Path
+    shared: tuple[Processes, str], address: str, local: Made, tmp_path: Path
 ) -> None:
     dataset, expected = local
     deadly = shared[0].folder / "deadly-b"
@@ -146,9 +146,7 @@ def test_an_asset_that_kills_every_worker_is_named_and_the_others_go_in(
     assert tree(tmp_path / "s.zarr") == tree(expected)
 
 
-def test_the_other_commands_find_the_same(
-    address: str, local: tuple[Dataset, Path], tmp_path: Path
-) -> None:
+def test_the_other_commands_find_the_same(address: str, local: Made, tmp_path: Path) -> None:
     dataset, store = local
     parameters = dataset.parameters("pixie")
     damaged = tmp_path / "damaged.zarr"
@@ -172,14 +170,13 @@ def test_the_other_commands_find_the_same(
 
 
 def test_workers_that_do_not_see_the_sources_are_named(
-    address: str, local: tuple[Dataset, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    address: str, local: Made, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The folder of this process is not that of a worker, though both have the same path."""
     dataset, _ = local
     monkeypatch.chdir(dataset.root)
     parameters = BuildParameters(
-        PixieverseSource(Path("/proc/self/cwd/pixieverse")),
-        SlatSource(Path("/proc/self/cwd/slat")),
+        PixieverseSource(Path("/proc/self/cwd/pixieverse")), SlatSource(Path("/proc/self/cwd/slat"))
     )
     message = r"worker tcp://127.0.0.1:\d+ on .*: sees nothing .* at /proc/self/cwd/pixieverse"
     with Cluster(address) as cluster, pytest.raises(SlatprepError, match=message):
@@ -274,10 +271,7 @@ def test_the_first_worker_is_waited_for() -> None:
         with Cluster(started.scheduler_address, note) as cluster:
             assert list(run_unordered(divmod, [(7, 2)], cluster)) == [(3, 1)]
         address = started.scheduler_address
-    assert lines == [
-        f"{address}: has no worker yet; waiting for the first",
-        f"{address}: 1 worker",
-    ]
+    assert lines == [f"{address}: has no worker yet; waiting for the first", f"{address}: 1 worker"]
 
 
 def test_jobs_and_scheduler_exclude_each_other() -> None:

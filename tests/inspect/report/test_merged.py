@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -10,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pytest
 from support.pages import Page
-from support.synthetic import Dataset
+from support.synthetic import MakeDataset
 
 from slatprep.inspect.report import write_report
 from slatprep.pipeline.dataset import BuildSummary, build_store
@@ -24,7 +23,7 @@ FACTORS = {"a": (1.0, 2.0), "b": (1.0, 1.1, 1.0)}
 
 
 @pytest.fixture
-def merged(make_dataset: Callable[..., Dataset], tmp_path: Path) -> BuildSummary:
+def merged(make_dataset: MakeDataset, tmp_path: Path) -> BuildSummary:
     dataset = make_dataset("a", "b", "c")
     for name, factors in FACTORS.items():
         for sample, factor in enumerate(factors):
@@ -74,7 +73,7 @@ def test_assets_say_how_many_annotations_agree(
 
 
 def test_a_page_without_merged_labels_has_no_such_columns(
-    make_dataset: Callable[..., Dataset], browser: Chrome, tmp_path: Path
+    make_dataset: MakeDataset, browser: Chrome, tmp_path: Path
 ) -> None:
     made = build_store(make_dataset("a").parameters(), tmp_path / "s.zarr")
     path = tmp_path / "page.html"

@@ -295,12 +295,7 @@ def test_an_edited_repetition_within_the_consolidated_metadata_is_found(store: P
 
 @pytest.mark.parametrize(
     ("key", "value"),
-    [
-        ("shape", [7]),
-        ("data_type", "float32"),
-        ("dimension_names", ["row"]),
-        ("fill_value", 1.0),
-    ],
+    [("shape", [7]), ("data_type", "float32"), ("dimension_names", ["row"]), ("fill_value", 1.0)],
 )
 def test_edited_metadata_of_an_array_are_found(store: Path, key: str, value: object) -> None:
     edit_json(store / "asset/fitness/zarr.json", lambda document: document.update({key: value}))

@@ -62,11 +62,7 @@ def build_and_be_killed(fault: Callable[[], Fault], dataset: Dataset, url: str) 
 
 @pytest.mark.parametrize(
     ("fault", "shown"),
-    [
-        (kill_midway, False),
-        (kill_before, False),
-        (kill_after, True),
-    ],
+    [(kill_midway, False), (kill_before, False), (kill_after, True)],
     ids=["while it uploads", "before the pointer", "after the pointer"],
 )
 def test_a_build_that_is_killed_leaves_a_whole_store_and_the_next_one_completes(

@@ -135,8 +135,7 @@ def test_a_pairing_may_lie_elsewhere_than_its_sources(
 ) -> None:
     s3.pipe_file(f"{bucket}/map.csv", b"object_id,slat_id\na,b\n")
     parameters = replace(
-        undisturbed[0].parameters(),
-        pairing=PairingParameters(map=f"s3://{bucket}/map.csv"),
+        undisturbed[0].parameters(), pairing=PairingParameters(map=f"s3://{bucket}/map.csv")
     )
     pairs = {pair.asset_id: pair for pair in discover(parameters)}
     assert pairs["a"].slat == undisturbed[0].root / "slat" / "b.npz"

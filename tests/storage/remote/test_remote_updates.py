@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import pytest
 from s3fs.core import S3FileSystem
 from support.faults import inject
-from support.remote import Dataset, current
+from support.remote import current
+from support.synthetic import Made, MakeDataset
 from support.trees import tree
 
 from slatprep.errors import StoreError
@@ -22,7 +22,7 @@ pytestmark = pytest.mark.usefixtures("files_are_old", "few_are_new")
 
 
 @pytest.fixture
-def built(make_dataset: Callable[..., Dataset], url: str, tmp_path: Path) -> tuple[Dataset, Path]:
+def built(make_dataset: MakeDataset, url: str, tmp_path: Path) -> Made:
     """Four assets; a store of them on S3, and the same on the disk."""
     dataset = make_dataset("a", "c", "e", "g")
     for out in (url, tmp_path / "s.zarr"):
@@ -35,11 +35,7 @@ def below(names: list[str], version: str) -> set[str]:
 
 
 def test_shards_that_did_not_change_are_copied_by_the_server(
-    s3: Any,
-    url: str,
-    built: tuple[Dataset, Path],
-    requests: Any,
-    monkeypatch: pytest.MonkeyPatch,
+    s3: Any, url: str, built: Made, requests: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     dataset, beside = built
     before = tree(beside)
@@ -71,9 +67,7 @@ def test_shards_that_did_not_change_are_copied_by_the_server(
     assert verify_store(url, sources=True).ok
 
 
-def test_a_shard_that_is_gone_from_the_server_is_made_again(
-    s3: Any, url: str, built: tuple[Dataset, Path]
-) -> None:
+def test_a_shard_that_is_gone_from_the_server_is_made_again(s3: Any, url: str, built: Made) -> None:
     dataset, beside = built
     s3.rm(f"{open_store(url).path}/voxel/feats/c/0/0")
     dataset.add("b", seed=1)
@@ -83,9 +77,7 @@ def test_a_shard_that_is_gone_from_the_server_is_made_again(
     assert current(s3, url) == tree(beside)
 
 
-def test_where_the_server_does_not_copy_the_old_store_stays(
-    s3: Any, url: str, built: tuple[Dataset, Path]
-) -> None:
+def test_where_the_server_does_not_copy_the_old_store_stays(s3: Any, url: str, built: Made) -> None:
     dataset, beside = built
     dataset.add("b", seed=1)
 
@@ -103,7 +95,7 @@ def test_where_the_server_does_not_copy_the_old_store_stays(
 
 
 def test_another_machine_takes_over_what_did_not_change(
-    s3: Any, url: str, built: tuple[Dataset, Path], tmp_path: Path, requests: Any
+    s3: Any, url: str, built: Made, tmp_path: Path, requests: Any
 ) -> None:
     dataset, beside = built
     shutil.rmtree(tmp_path / "cache")
