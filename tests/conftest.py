@@ -1,7 +1,5 @@
 """Datasets of small made assets, and a build of one."""
 
-from __future__ import annotations
-
 import os
 from pathlib import Path
 

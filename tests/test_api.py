@@ -1,7 +1,5 @@
 """What `import slatprep` gives."""
 
-from __future__ import annotations
-
 import doctest
 import importlib.metadata
 import inspect

@@ -4,8 +4,6 @@ The stand-in draws from a generator that `manual_seed` seeds, as torch's does,
 so that order and number of the calls matter as they do with the real one.
 """
 
-from __future__ import annotations
-
 import contextlib
 import json
 import sys
@@ -34,7 +32,7 @@ class Tensor:
     def __init__(self, values: np.ndarray) -> None:
         self.values = values
 
-    def detach(self) -> Tensor:
+    def detach(self) -> "Tensor":
         return self
 
     cpu = float = detach

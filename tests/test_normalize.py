@@ -1,7 +1,5 @@
 """Normalisation against arithmetic by hand, and its inverse."""
 
-from __future__ import annotations
-
 import json
 import math
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Dataset definitions: what is read from them, and what is said of a wrong one."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

@@ -1,7 +1,5 @@
 """The locked versions are what pyproject.toml allows, and none is forgotten."""
 
-from __future__ import annotations
-
 import re
 import tomllib
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Look-ups at SLAT voxels whose answer is known by construction."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The file that runs alone, in TRELLIS's own Python 3.10: syntax, imports, calls, and output."""
 
-from __future__ import annotations
-
 import ast
 import json
 import subprocess

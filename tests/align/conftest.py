@@ -1,7 +1,5 @@
 """Demo assets of every level, each level made once."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """The rotation that a dataset shares settles ties, and nothing else."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

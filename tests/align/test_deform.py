@@ -1,7 +1,5 @@
 """A deformation is found where there is one, and none where there is none."""
 
-from __future__ import annotations
-
 from itertools import product
 
 import numpy as np

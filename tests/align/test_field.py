@@ -1,7 +1,5 @@
 """The default engine against transforms known by construction."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys

@@ -1,7 +1,5 @@
 """Objects on a slab of ground that the SLAT does not have, under maps known by construction."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """A mirrored annotation is told from its object, unless the object is its own mirror image."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from numpy.typing import NDArray

@@ -1,7 +1,5 @@
 """The steps of the search, on shapes whose placement is known."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import lru_cache

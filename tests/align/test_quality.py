@@ -1,7 +1,5 @@
 """Figures and verdicts on cases worked out by hand."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from support.shapes import chair, field_of, surface_latents

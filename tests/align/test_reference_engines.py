@@ -1,7 +1,5 @@
 """The paper's protocol on Open3D, and GICP."""
 
-from __future__ import annotations
-
 import sys
 from pathlib import Path
 

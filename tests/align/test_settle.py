@@ -1,7 +1,5 @@
 """What is fitted at a placement that a pass over the dataset takes."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The 64 published starts and the even cover of all orientations."""
 
-from __future__ import annotations
-
 import numpy as np
 from scipy.spatial.transform import Rotation
 

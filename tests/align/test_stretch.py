@@ -1,7 +1,5 @@
 """What is squashed or lengthened is placed by its features, not by its proportions."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

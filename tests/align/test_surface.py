@@ -1,7 +1,5 @@
 """Filled sets, their distance fields and samples."""
 
-from __future__ import annotations
-
 import numpy as np
 from scipy.ndimage import binary_fill_holes
 from support.shapes import GRID, chair

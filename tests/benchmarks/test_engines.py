@@ -1,7 +1,5 @@
 """The comparison of engines: same cases, and no more engines than there are packages for."""
 
-from __future__ import annotations
-
 import importlib.util
 from importlib.machinery import ModuleSpec
 from pathlib import Path

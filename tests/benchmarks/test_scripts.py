@@ -1,7 +1,5 @@
 """What `make bench` lists can be run: every script is there, with what others import of it."""
 
-from __future__ import annotations
-
 import ast
 import importlib.util
 import sys

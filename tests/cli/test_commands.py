@@ -1,7 +1,5 @@
 """The commands as a user calls them: help, exit codes, JSON, errors."""
 
-from __future__ import annotations
-
 import json
 import os
 import re

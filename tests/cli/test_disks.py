@@ -1,7 +1,5 @@
 """A disk that takes no more, or nothing, is one line and no traceback."""
 
-from __future__ import annotations
-
 import errno
 import os
 from pathlib import Path

@@ -1,7 +1,5 @@
 """What `slatprep info` advises."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 from pathlib import Path

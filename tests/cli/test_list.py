@@ -1,7 +1,5 @@
 """`slatprep list`, and ids given by their beginning."""
 
-from __future__ import annotations
-
 import json
 import sys
 

@@ -1,7 +1,5 @@
 """What commands say to somebody who meets them for the first time, and with which exit code."""
 
-from __future__ import annotations
-
 import json
 import shutil
 import subprocess

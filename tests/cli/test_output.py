@@ -1,7 +1,5 @@
 """What commands print, and where."""
 
-from __future__ import annotations
-
 import io
 import json
 import sys

@@ -1,7 +1,5 @@
 """Commands made of signatures: what a user may type, and what the function gets."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import dataclass
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Whatever a stranger's store, records or truth hold, no command ends in a traceback."""
 
-from __future__ import annotations
-
 import csv
 import json
 import shutil

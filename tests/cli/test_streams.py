@@ -1,7 +1,5 @@
 """Commands whose standard output or standard error is closed, or full."""
 
-from __future__ import annotations
-
 import json
 import os
 import subprocess

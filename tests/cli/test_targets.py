@@ -1,7 +1,5 @@
 """No command writes into a store, or over what it reads."""
 
-from __future__ import annotations
-
 import shutil
 from pathlib import Path
 

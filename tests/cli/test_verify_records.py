@@ -1,7 +1,5 @@
 """Where `slatprep verify` looks for the records of a store."""
 
-from __future__ import annotations
-
 import shutil
 from pathlib import Path
 

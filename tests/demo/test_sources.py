@@ -1,7 +1,5 @@
 """Demo data of every source and encoder: two commands build it, and a third holds it to truth."""
 
-from __future__ import annotations
-
 import json
 import re
 import shlex

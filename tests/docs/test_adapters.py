@@ -1,7 +1,5 @@
 """The page about other sources: its adapter is run as a package that somebody installed."""
 
-from __future__ import annotations
-
 import json
 import re
 from collections.abc import Iterator

@@ -1,7 +1,5 @@
 """What docs/design/architecture.md and its picture say of the code is so."""
 
-from __future__ import annotations
-
 import importlib
 import importlib.util
 import re

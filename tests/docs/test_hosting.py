@@ -1,7 +1,5 @@
 """What hosts of code read: workflows, citation, source archive."""
 
-from __future__ import annotations
-
 import re
 import tomllib
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The pages of docs/ that show code, messages and habits of the shell."""
 
-from __future__ import annotations
-
 import ast
 import contextlib
 import importlib

@@ -1,7 +1,5 @@
 """The store that exports are made of."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

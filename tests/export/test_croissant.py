@@ -1,7 +1,5 @@
 """What mlcroissant makes of a store's description, and where its files are found."""
 
-from __future__ import annotations
-
 import glob
 import json
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Every export is read back by the library that its users use."""
 
-from __future__ import annotations
-
 import json
 import os
 import re

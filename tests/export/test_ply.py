@@ -1,7 +1,5 @@
 """PLY exports are read back by what simulates and draws, points and frames included."""
 
-from __future__ import annotations
-
 import json
 import shutil
 from pathlib import Path

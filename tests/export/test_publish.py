@@ -1,7 +1,5 @@
 """What `slatprep publish` writes is read by a hub's own libraries, and from a hub."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 import os

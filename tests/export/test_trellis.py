@@ -1,7 +1,5 @@
 """An npz export is a root that TRELLIS's structured-latent data set loads."""
 
-from __future__ import annotations
-
 import json
 import shutil
 from pathlib import Path

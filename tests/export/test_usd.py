@@ -1,7 +1,5 @@
 """USD is read back by OpenUSD, and where Newton is, by its importer; then it falls."""
 
-from __future__ import annotations
-
 import importlib.util
 import json
 from pathlib import Path

@@ -1,7 +1,5 @@
 """VoMP's npz is read back as its simulation scripts read it, and by the adapter for its data."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The map between the frames: both ways, bounded, without folds, the same bytes from JSON."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

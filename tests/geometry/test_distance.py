@@ -1,7 +1,5 @@
 """The signed distance, against scipy's exact Euclidean distance transform."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import given, settings

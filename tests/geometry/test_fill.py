@@ -1,7 +1,5 @@
 """What lies outside a voxel set, against scipy's labelling of connected regions."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import given, settings

@@ -1,7 +1,5 @@
 """Frames, transforms and voxel sets."""
 
-from __future__ import annotations
-
 import itertools
 import math
 from fractions import Fraction

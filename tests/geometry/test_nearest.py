@@ -1,7 +1,5 @@
 """Nearest voxels and votes, against a kd-tree and by hand."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import given, settings

@@ -1,7 +1,5 @@
 """What the cells around points hold, counted by hand and by plain numpy."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from slatprep.geometry.surroundings import DIRECTIONS, shares_around

@@ -1,7 +1,5 @@
 """Sets of voxels, against scipy's morphology and by counting."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import given, settings

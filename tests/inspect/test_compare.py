@@ -1,7 +1,5 @@
 """What `slatprep diff` says, of changes made by hand."""
 
-from __future__ import annotations
-
 import json
 import math
 import shutil

@@ -1,7 +1,5 @@
 """What `slatprep info` counts, against the arrays themselves."""
 
-from __future__ import annotations
-
 import shutil
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Scores against truth, on stores whose figures can be worked out by hand."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """What `slatprep stats` counts, against numpy over the arrays themselves."""
 
-from __future__ import annotations
-
 import csv
 import json
 import math

@@ -1,7 +1,5 @@
 """What ties mean for the supervision, on shapes whose symmetry is known."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Confidence against truth that nothing was fitted to: freshly made demo objects."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from itertools import pairwise

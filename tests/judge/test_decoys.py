@@ -1,7 +1,5 @@
 """Error rates by decoys, on made figures of which it is known what is right."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scipy.special import logit

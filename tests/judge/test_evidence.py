@@ -1,7 +1,5 @@
 """The figures that confidence follows from, by hand and by geometry that can be worked out."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

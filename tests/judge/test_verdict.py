@@ -1,7 +1,5 @@
 """Verdicts, and the sentences that say what kept an asset from being good."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """Latents as witnesses: heard where they know of classes, silent where they do not."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import numpy as np

@@ -1,7 +1,5 @@
 """What witnesses say, in figures: against plain loops, scipy's Gaussians, and by hand."""
 
-from __future__ import annotations
-
 from collections import defaultdict
 from itertools import count
 

@@ -1,7 +1,5 @@
 """A small store for everything that learns."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

@@ -1,7 +1,5 @@
 """Predicted grids by Pixie's protocol and at SLAT voxels, against numpy on the files themselves."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable
 from dataclasses import dataclass, replace

@@ -1,7 +1,5 @@
 """The decoder against what it must not depend on, and a dense reference."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 from torch import Tensor

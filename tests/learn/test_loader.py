@@ -1,7 +1,5 @@
 """The loader: splits, batches, workers, symmetries."""
 
-from __future__ import annotations
-
 import hashlib
 import shutil
 import subprocess

@@ -1,7 +1,5 @@
 """Scores against cases done by hand and a second computation."""
 
-from __future__ import annotations
-
 import json
 import shutil
 from pathlib import Path

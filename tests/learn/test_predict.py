@@ -1,7 +1,5 @@
 """Predictions: what they say, by hand; from files and stores; measured by other ranges."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 import sys

@@ -1,7 +1,5 @@
 """Training and measuring by the protocols of others: their splits, steps and weights."""
 
-from __future__ import annotations
-
 import json
 import math
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Checkpoints from strangers: each is refused in words, within little memory."""
 
-from __future__ import annotations
-
 import io
 import json
 import pickle

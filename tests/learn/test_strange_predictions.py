@@ -1,7 +1,5 @@
 """Stores, predictions and checkpoints of strangers: nothing outside, nothing huge, no traceback."""
 
-from __future__ import annotations
-
 import dataclasses
 import json
 import os

@@ -1,7 +1,5 @@
 """Training: the loss by hand, resuming to the bit, stopping, and learning at all."""
 
-from __future__ import annotations
-
 import csv
 import dataclasses
 import errno

@@ -1,7 +1,5 @@
 """The example's way from a store to particles, and its picture of a motion that is known."""
 
-from __future__ import annotations
-
 import sys
 from pathlib import Path
 

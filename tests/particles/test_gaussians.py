@@ -1,7 +1,5 @@
 """Gaussians follow the particles around them: rigid motions exactly, everything else kept."""
 
-from __future__ import annotations
-
 import importlib.util
 import json
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Particles from numpy files, those of strangers included."""
 
-from __future__ import annotations
-
 import io
 import zipfile
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The example that moves stored and predicted objects: what it moves, and what it draws."""
 
-from __future__ import annotations
-
 import argparse
 import importlib.util
 import sys

@@ -1,7 +1,5 @@
 """What is measured of a simulated object is what was done to it; and a drop, where Newton is."""
 
-from __future__ import annotations
-
 import importlib.util
 import sys
 import warnings

@@ -1,7 +1,5 @@
 """PLYs of strangers: nothing huge is set aside, and what is wrong is said."""
 
-from __future__ import annotations
-
 import os
 import struct
 import tracemalloc

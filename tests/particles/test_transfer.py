@@ -1,7 +1,5 @@
 """Materials reach particles: against brute force, and read back by other programs."""
 
-from __future__ import annotations
-
 import json
 import shutil
 from pathlib import Path

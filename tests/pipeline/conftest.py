@@ -1,7 +1,5 @@
 """The published dataset, in archives and unpacked, and the store of it."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

@@ -1,7 +1,5 @@
 """Names and texts that are not UTF-8 cost their own asset at most, and no traceback."""
 
-from __future__ import annotations
-
 import json
 import os
 import shutil

@@ -1,7 +1,5 @@
 """A build's second pass, on demo data with a planted common rotation."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 from typing import Any

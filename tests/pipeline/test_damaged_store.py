@@ -1,7 +1,5 @@
 """What a build takes over from the store that is there is checked first, and else made anew."""
 
-from __future__ import annotations
-
 import json
 import shutil
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """A deformation goes all the way: into the store, its record, and whatever looks things up."""
 
-from __future__ import annotations
-
 import json
 import shutil
 from pathlib import Path

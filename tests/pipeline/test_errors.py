@@ -1,7 +1,5 @@
 """Decoys of a real store: drawn by ids and size, aligned once, and told in words."""
 
-from __future__ import annotations
-
 import json
 import shutil
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """SLATs on other grids than the frames' 64^3: placed, looked up and used at their own voxels."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Builds that are killed, starved or refused: each by doing it to a real build."""
 
-from __future__ import annotations
-
 import json
 import os
 import random

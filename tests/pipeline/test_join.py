@@ -1,7 +1,5 @@
 """Stores made of stores are those that a build of their assets would have made."""
 
-from __future__ import annotations
-
 import json
 import shutil
 from dataclasses import replace

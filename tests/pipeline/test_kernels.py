@@ -1,7 +1,5 @@
 """Kernels are compiled once, before any worker starts, and the user is told."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys

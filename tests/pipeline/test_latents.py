@@ -1,7 +1,5 @@
 """Latents of any width and encoder, standardised already or not, all the way to a prediction."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """What an update writes: files of what changed, and the lines of their records."""
 
-from __future__ import annotations
-
 import os
 import shutil
 from pathlib import Path

@@ -1,7 +1,5 @@
 """More classes than PhysGaussian has: the background's id is the store's, not 7."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """What a build tells once of a dataset as a whole."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

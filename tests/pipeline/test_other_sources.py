@@ -1,7 +1,5 @@
 """Sources that are not PixieVerse: other properties, no classes, other grids, known frames."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """A store of PixieVerse as it is published is that of the unpacked folders."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 import shutil

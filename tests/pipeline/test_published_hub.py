@@ -1,7 +1,5 @@
 """A store of PixieVerse from the hub, which refuses, redirects, breaks off and changes."""
 
-from __future__ import annotations
-
 import shutil
 from collections.abc import Iterator
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Ranges by percentiles and of the objects to train on, against numpy over the raw grids."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """What decides an asset's key, and what is said when it has another one."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

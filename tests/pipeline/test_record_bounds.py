@@ -1,7 +1,5 @@
 """What a source can say is never more than the readers of a store take back."""
 
-from __future__ import annotations
-
 import os
 from dataclasses import replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Several annotations of one object: merged, one taken, or an asset each."""
 
-from __future__ import annotations
-
 import shutil
 from dataclasses import replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """What a build says of itself at the end."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from slatprep.parameters import BuildParameters, PixieverseSource, SlatSource

@@ -1,7 +1,5 @@
 """What did not change is taken over: files, chunks and rows, checked, and only then."""
 
-from __future__ import annotations
-
 import json
 import os
 import pickle

@@ -1,7 +1,5 @@
 """Two sources of one object, merged: each in its own form and frame, with what it knows."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 from pathlib import Path

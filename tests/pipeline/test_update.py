@@ -1,7 +1,5 @@
 """A second build does what is new and nothing else, and writes what a first one would."""
 
-from __future__ import annotations
-
 import json
 import shutil
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """A build's pass that compares labels with latents, which carry material or nothing."""
 
-from __future__ import annotations
-
 import shutil
 from dataclasses import replace
 from pathlib import Path

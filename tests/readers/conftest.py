@@ -1,7 +1,5 @@
 """Small sources whose content is written down by hand."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Which encoder made latents, and whether they look standardised."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Adapters of other packages: whatever they raise or return is named as theirs."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path

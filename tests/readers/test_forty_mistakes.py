@@ -1,7 +1,5 @@
 """Forty mistakes of units, layout, names and links: what is said of each; none is silent."""
 
-from __future__ import annotations
-
 import shutil
 from collections.abc import Callable
 from pathlib import Path

@@ -1,7 +1,5 @@
 """What joins names of the two sides: nothing of it is settled by which comes last."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

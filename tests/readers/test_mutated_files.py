@@ -1,7 +1,5 @@
 """Damaged files either read to something valid or raise InputError, and nothing else."""
 
-from __future__ import annotations
-
 import io
 import zipfile
 from collections.abc import Callable

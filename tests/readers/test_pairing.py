@@ -1,7 +1,5 @@
 """Finding pairs by name; the files themselves are never opened, so they may be empty."""
 
-from __future__ import annotations
-
 import re
 from itertools import product
 from pathlib import Path

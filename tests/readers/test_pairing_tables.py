@@ -1,7 +1,5 @@
 """Tables beside the sources: maps of ids, TRELLIS's metadata, categories."""
 
-from __future__ import annotations
-
 import json
 import os
 

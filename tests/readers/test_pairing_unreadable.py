@@ -1,7 +1,5 @@
 """Folders that cannot be listed and names that are no files cost their asset alone."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager

@@ -1,7 +1,5 @@
 """Objects of parts, in the form that PhysX-Anything's code reads, become fields of voxels."""
 
-from __future__ import annotations
-
 import json
 import time
 from functools import partial

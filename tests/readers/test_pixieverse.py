@@ -1,7 +1,5 @@
 """Every form of a PixieVerse field, and every fault of one."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 

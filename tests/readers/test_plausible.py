@@ -1,7 +1,5 @@
 """Values that no material has: each mistake is named, and nothing that exists is refused."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 from itertools import product

@@ -1,7 +1,5 @@
 """Whoever points at the wrong folder is told what lies there, and what to point at."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

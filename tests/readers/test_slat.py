@@ -1,7 +1,5 @@
 """Every form of a SLAT, and every fault of one."""
 
-from __future__ import annotations
-
 import hashlib
 import os
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """Files as such: paths that leave, headers that lie, archives that explode."""
 
-from __future__ import annotations
-
 import io
 import os
 import struct

@@ -1,7 +1,5 @@
 """Splits by rules and by files of ids."""
 
-from __future__ import annotations
-
 import json
 import math
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Forms of annotated voxels: each is read as it was written, and what cannot be read is said."""
 
-from __future__ import annotations
-
 import json
 import os
 import shutil

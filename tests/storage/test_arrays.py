@@ -1,7 +1,5 @@
 """Arrays in one file come back as they were, or not at all."""
 
-from __future__ import annotations
-
 import struct
 from pathlib import Path
 

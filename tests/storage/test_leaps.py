@@ -1,7 +1,5 @@
 """Leaps over frames: no needed member is missed, whatever their sizes, and requests stay few."""
 
-from __future__ import annotations
-
 import random
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """In a folder where others may write: no link is followed, no file of theirs touched."""
 
-from __future__ import annotations
-
 import errno
 import os
 import subprocess

@@ -1,7 +1,5 @@
 """A store's table of assets, and each asset, against the arrays that zarr wrote."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

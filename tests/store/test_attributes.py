@@ -1,7 +1,5 @@
 """What the attributes of a root must say: good ones are read, each fault is told by its name."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import pytest

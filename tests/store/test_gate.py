@@ -1,7 +1,5 @@
 """What a stranger's store may name: nothing that runs code, nothing that waits, nothing huge."""
 
-from __future__ import annotations
-
 import json
 import os
 import pickle

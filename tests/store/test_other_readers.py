@@ -1,7 +1,5 @@
 """What others' readers make of a store: xarray, tensorstore, zarr-python."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

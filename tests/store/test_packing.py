@@ -1,7 +1,5 @@
 """A shard in rows, in fill values, in packed chunks: one file, and one that zarr reads."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 from itertools import pairwise

@@ -1,7 +1,5 @@
 """Rows of one array, whatever its cut: against zarr, and against the index at a shard's end."""
 
-from __future__ import annotations
-
 import errno
 import json
 import os

@@ -1,7 +1,5 @@
 """Which chunks and shards of older stores are those of a new one, against the bytes of all."""
 
-from __future__ import annotations
-
 from itertools import pairwise
 
 import numpy as np

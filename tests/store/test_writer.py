@@ -1,7 +1,5 @@
 """How a new store is cut and packed, which assets have rows in which shard, and how it is ended."""
 
-from __future__ import annotations
-
 import hashlib
 import warnings
 from pathlib import Path

@@ -1,7 +1,5 @@
 """A build in a process of its own, with a fault in it."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Dask's scheduler and workers as processes of their own, which fail where they are told to."""
 
-from __future__ import annotations
-
 import json
 import os
 import signal

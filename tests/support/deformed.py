@@ -1,7 +1,5 @@
 """A solid without any symmetry, and the same bent or stretched: where each voxel lies is known."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import numpy as np

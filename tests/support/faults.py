@@ -1,7 +1,5 @@
 """Faults injected into builds, through the seam of `slatprep.storage.faults`."""
 
-from __future__ import annotations
-
 import os
 import signal
 from collections.abc import Callable

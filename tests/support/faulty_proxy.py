@@ -5,8 +5,6 @@ how often both were asked for, so that a run can be repeated whatever the
 order in which requests come.
 """
 
-from __future__ import annotations
-
 import http.client
 import random
 import re
@@ -113,7 +111,7 @@ class Faults:
 class _Handler(BaseHTTPRequestHandler):
     protocol_version = "HTTP/1.1"
     disable_nagle_algorithm = True  # A body would wait 40 ms for the ACK of its head.
-    server: _Server
+    server: "_Server"
 
     def handle_one_request(self) -> None:
         try:

@@ -1,7 +1,5 @@
 """What a build that knows of no other writes: made once for the same sources and parameters."""
 
-from __future__ import annotations
-
 import hashlib
 import tempfile
 from pathlib import Path

@@ -5,8 +5,6 @@ standard input ends. Each ``OWNER/NAME`` below the folder is a dataset with the
 one revision ``main``.
 """
 
-from __future__ import annotations
-
 import hashlib
 import json
 import sys

@@ -1,7 +1,5 @@
 """A small store of values drawn at random, written by zarr in no time, with all of them at hand."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import asdict
 from itertools import accumulate

@@ -1,7 +1,5 @@
 """A page taken apart, and strings that try to break it."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import dataclass
 from html.parser import HTMLParser

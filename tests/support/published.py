@@ -1,7 +1,5 @@
 """PixieVerse as it is published: archives by class, each object's files as Pixie writes them."""
 
-from __future__ import annotations
-
 import io
 import json
 import tarfile

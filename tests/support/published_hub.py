@@ -4,8 +4,6 @@ Run as ``python published_hub.py OWNER/NAME=FOLDER``: prints the address, serves
 standard input ends, and prints what it served as JSON.
 """
 
-from __future__ import annotations
-
 import hashlib
 import json
 import sys

@@ -1,7 +1,5 @@
 """Small sources whose content is written down by hand."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

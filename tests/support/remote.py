@@ -1,7 +1,5 @@
 """Stores put on S3, and what is in sight there."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """What the search makes small, as the docstring of `slatprep.align.solver` has it, by scipy."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates

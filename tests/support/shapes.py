@@ -1,7 +1,5 @@
 """Shapes of which everything is known by construction."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from slatprep.geometry.voxels import boundary, occupancy_of, voxels_of

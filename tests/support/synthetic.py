@@ -1,7 +1,5 @@
 """Small assets made of numpy alone, with everything about them known by construction."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path

@@ -1,7 +1,5 @@
 """What lies in a directory or on an object store, and what a build's records say."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 from pathlib import Path

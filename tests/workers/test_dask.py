@@ -1,7 +1,5 @@
 """Builds on a real Dask cluster: a scheduler and three workers, processes of their own."""
 
-from __future__ import annotations
-
 import os
 import re
 import shutil

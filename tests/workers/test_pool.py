@@ -1,7 +1,5 @@
 """The bookkeeping of batches, on a pool whose workers do as a test asks."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable
 from concurrent.futures import Future
 from typing import Any

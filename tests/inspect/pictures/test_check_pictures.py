@@ -1,7 +1,5 @@
 """`slatprep check-alignment` draws what the store holds, of the assets that were meant."""
 
-from __future__ import annotations
-
 import json
 import os
 import shutil

@@ -1,7 +1,5 @@
 """The colours are what their module says: apart for everyone."""
 
-from __future__ import annotations
-
 import itertools
 
 import numpy as np

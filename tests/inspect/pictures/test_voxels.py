@@ -1,7 +1,5 @@
 """The drawing of voxels, against what geometry says must be seen."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from support.synthetic import QUARTER_TURN

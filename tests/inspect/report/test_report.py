@@ -1,7 +1,5 @@
 """What a page says, held against the store by numpy, zlib and an HTML parser alone."""
 
-from __future__ import annotations
-
 import base64
 import hashlib
 import io

@@ -1,7 +1,5 @@
 """The short version of ``benchmarks/damage.py``: no flipped bit and no gross damage does harm."""
 
-from __future__ import annotations
-
 import json
 import subprocess
 import sys

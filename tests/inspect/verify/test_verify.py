@@ -1,7 +1,5 @@
 """Whatever is wrong with a store is found, and named."""
 
-from __future__ import annotations
-
 import json
 import os
 import shutil

@@ -1,7 +1,5 @@
 """A real S3 server on loopback, a bucket a test, and made assets to put there."""
 
-from __future__ import annotations
-
 import uuid
 from collections.abc import Callable, Iterator
 from pathlib import Path

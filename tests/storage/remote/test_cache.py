@@ -1,7 +1,5 @@
 """Local copies of objects: made once, made again when the object is another one."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

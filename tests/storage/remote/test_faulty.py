@@ -1,7 +1,5 @@
 """The short version of ``benchmarks/faulty_s3.py``: spoiled answers of a server do no harm."""
 
-from __future__ import annotations
-
 import json
 import subprocess
 import sys

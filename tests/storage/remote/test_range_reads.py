@@ -1,7 +1,5 @@
 """Reading by obstore gives what reading by s3fs gives, and leaves to s3fs what it cannot do."""
 
-from __future__ import annotations
-
 import multiprocessing
 import os
 from typing import Any

@@ -1,7 +1,5 @@
 """Places on object stores, which stand where paths of the local disk stand."""
 
-from __future__ import annotations
-
 import os
 import pickle
 import subprocess

@@ -1,7 +1,5 @@
 """A cluster whose workers have a disk each writes a store on S3: its bytes, and after kills."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys

@@ -1,7 +1,5 @@
 """Builds on S3 that are killed, overtaken or left without an answer."""
 
-from __future__ import annotations
-
 import multiprocessing
 import os
 import signal

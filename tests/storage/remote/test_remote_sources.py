@@ -1,7 +1,5 @@
 """Builds whose sources lie on S3."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Stores that lie on S3: made, replaced in one step, interrupted, read and verified."""
 
-from __future__ import annotations
-
 import errno
 import multiprocessing
 import shutil

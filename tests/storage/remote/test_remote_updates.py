@@ -1,7 +1,5 @@
 """An update of a store on S3: what did not change is copied by the server, and not read."""
 
-from __future__ import annotations
-
 import shutil
 from pathlib import Path
 from typing import Any
