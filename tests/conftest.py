@@ -1,6 +1,7 @@
 """Datasets of small made assets, and a build of one."""
 
 import os
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -69,6 +70,13 @@ def mixed_build(mixed: Dataset, tmp_path_factory: pytest.TempPathFactory) -> Bui
     """Build `mixed` on one core; nobody may change the store."""
     out = tmp_path_factory.mktemp("built") / "mixed.zarr"
     return build_store(mixed.parameters(), out)
+
+
+@pytest.fixture
+def copy(mixed_build: BuildSummary, tmp_path: Path) -> Path:
+    """Return a copy of the store that may be changed, its records beside it."""
+    shutil.copytree(mixed_build.records.parent, tmp_path / "copy.manifests")
+    return Path(shutil.copytree(str(mixed_build.store), tmp_path / "copy.zarr"))
 
 
 @pytest.fixture(scope="session")

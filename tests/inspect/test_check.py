@@ -1,4 +1,3 @@
-import shutil
 from pathlib import Path
 
 import numpy as np
@@ -12,13 +11,6 @@ from slatprep.pipeline.dataset import BuildSummary, build_store
 from slatprep.records import Verdict
 from slatprep.store import open_store
 from slatprep.store.records import StoredRecords
-
-
-@pytest.fixture
-def copy(mixed_build: BuildSummary, tmp_path: Path) -> Path:
-    """Return a store that may be damaged."""
-    assert mixed_build.store is not None
-    return Path(shutil.copytree(mixed_build.store, tmp_path / "copy.zarr"))
 
 
 def wrong(check: AlignmentCheck) -> set[str]:

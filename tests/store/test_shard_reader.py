@@ -31,11 +31,6 @@ def store(mixed_build: BuildSummary) -> Store:
     return open_store(mixed_build.store)
 
 
-@pytest.fixture
-def copy(mixed_build: BuildSummary, tmp_path: Path) -> Path:
-    return Path(shutil.copytree(mixed_build.store, tmp_path / "s.zarr"))
-
-
 @settings(max_examples=60, derandomize=True, database=None)
 @given(data=st.data())
 def test_any_rows_are_those_that_zarr_reads(store: Store, data: st.DataObject) -> None:

@@ -2,7 +2,6 @@
 
 import json
 import os
-import shutil
 import subprocess
 import sys
 from dataclasses import replace
@@ -47,14 +46,6 @@ from slatprep.store.records import StoredRecords
 
 def run(*arguments: str | Path) -> Result:
     return CliRunner().invoke(slatprep, ["check-alignment", *map(str, arguments)])
-
-
-@pytest.fixture
-def copy(mixed_build: BuildSummary, tmp_path: Path) -> Path:
-    """Return a store that may be damaged, with its records."""
-    assert mixed_build.store is not None
-    shutil.copytree(mixed_build.records.parent, tmp_path / "copy.manifests")
-    return Path(shutil.copytree(mixed_build.store, tmp_path / "copy.zarr"))
 
 
 def misplace(path: Path, row: int, shift: float) -> None:

@@ -5,7 +5,6 @@ import os
 import shutil
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -25,13 +24,8 @@ from slatprep.store import open_store
 
 
 @pytest.fixture
-def store(mixed_build: BuildSummary, tmp_path: Path) -> Path:
-    """Copy the mixed store, and its records beside it, to damage them."""
-    original = mixed_build.store
-    assert original is not None
-    shutil.copytree(original, tmp_path / "s.zarr")
-    shutil.copytree(original.with_suffix(".manifests"), tmp_path / "s.manifests")
-    return tmp_path / "s.zarr"
+def store(copy: Path) -> Path:
+    return copy
 
 
 def found(store: Path, **options: object) -> tuple[Finding, ...]:
@@ -86,40 +80,49 @@ SHARDS = [
 ]
 
 
-@pytest.mark.parametrize("name", SHARDS)
-def test_a_flipped_bit_names_the_file_and_the_assets(store: Path, name: str) -> None:
-    def flip(data: bytearray) -> None:
-        data[20] ^= 8
-
-    change(store, name, flip)
-    findings = of_file(found(store), name)
-    assert any("its bytes changed" in finding.what for finding in findings)
-    assert any(finding.asset and "chunk 0 is damaged" in finding.what for finding in findings)
+def flip(data: bytearray, byte: int, bit: int) -> None:
+    data[byte] ^= bit
 
 
-@pytest.mark.parametrize("name", SHARDS)
-def test_a_flipped_bit_of_an_index_is_found(store: Path, name: str) -> None:
-    def flip(data: bytearray) -> None:
-        data[-6] ^= 1
-
-    change(store, name, flip)
-    findings = of_file(found(store), name)
-    assert any(finding.asset and "no sound index" in finding.what for finding in findings)
-
-
-@pytest.mark.parametrize("name", SHARDS)
-def test_a_truncated_shard_is_found(store: Path, name: str) -> None:
-    size = (store / name).stat().st_size
-    change(store, name, lambda data: data.__delitem__(slice(-7, None)))
-    findings = of_file(found(store), name)
-    assert f"was cut short: it has {size - 7} of {size} bytes" in [f.what for f in findings]
+def test_flipped_bits_name_their_files_and_assets(store: Path) -> None:
+    for name in SHARDS:
+        change(store, name, lambda data: flip(data, 20, 8))
+    all_found = found(store)
+    for name in SHARDS:
+        findings = of_file(all_found, name)
+        assert any("its bytes changed" in finding.what for finding in findings), name
+        assert any(one.asset and "chunk 0 is damaged" in one.what for one in findings), name
 
 
-@pytest.mark.parametrize("name", [*SHARDS, "asset/id/c/0", "asset/fitness/c/0", "asset/zarr.json"])
-def test_a_deleted_file_is_found(store: Path, name: str) -> None:
-    (store / name).unlink()
-    findings = of_file(found(store), name)
-    assert any(finding.what.startswith("is missing") for finding in findings)
+def test_a_flipped_bit_of_each_index_is_found(store: Path) -> None:
+    for name in SHARDS:
+        change(store, name, lambda data: flip(data, -6, 1))
+    all_found = found(store)
+    for name in SHARDS:
+        findings = of_file(all_found, name)
+        assert any(one.asset and "no sound index" in one.what for one in findings), name
+
+
+def test_truncated_shards_are_found(store: Path) -> None:
+    sizes = {name: (store / name).stat().st_size for name in SHARDS}
+    for name in SHARDS:
+        change(store, name, lambda data: data.__delitem__(slice(-7, None)))
+    all_found = found(store)
+    for name, size in sizes.items():
+        said = [finding.what for finding in of_file(all_found, name)]
+        assert f"was cut short: it has {size - 7} of {size} bytes" in said
+
+
+@pytest.mark.parametrize(
+    "names", [SHARDS, ["asset/id/c/0"], ["asset/fitness/c/0"], ["asset/zarr.json"]]
+)
+def test_deleted_files_are_found(store: Path, names: list[str]) -> None:
+    for name in names:
+        (store / name).unlink()
+    all_found = found(store)
+    for name in names:
+        findings = of_file(all_found, name)
+        assert any(finding.what.startswith("is missing") for finding in findings), name
 
 
 def test_swapped_shards_are_named_as_such(store: Path) -> None:
@@ -362,38 +365,35 @@ def test_edited_manifests_are_found(store: Path) -> None:
     ]
 
 
-@pytest.mark.parametrize(
-    ("entry", "value"),
-    [
-        ("id", "0" * 64),
-        ("name", "another"),
-        ("verdicts/good", 9),
-        ("statuses/ok", 1),
-        ("counts/voxels", 1),
-        ("counts/valid", 1),
-        ("counts/unphysical", 1),
-        ("counts/clipped/density", 1),
-        ("normalization/ranges/0/lo", 1.0),
-        ("versions/numpy", "0"),
-        ("parameters/align/radius", 2.0),
-        ("parameters/store/voxel_chunk", 1),
-    ],
-)
-def test_what_build_json_says_of_the_store_is_compared(
-    store: Path, entry: str, value: object
-) -> None:
-    build = store.with_suffix(".manifests") / "build.json"
+OF_THE_STORE: list[tuple[str, object]] = [
+    ("id", "0" * 64),
+    ("name", "another"),
+    ("verdicts/good", 9),
+    ("statuses/ok", 1),
+    ("counts/voxels", 1),
+    ("counts/valid", 1),
+    ("counts/unphysical", 1),
+    ("counts/clipped/density", 1),
+    ("normalization/ranges/0/lo", 1.0),
+    ("versions/numpy", "0"),
+    ("parameters/align/radius", 2.0),
+    ("parameters/store/voxel_chunk", 1),
+]
+"""Entries of build.json that the store says as well, and others."""
 
-    def change(document: Any) -> None:
+
+def test_what_build_json_says_of_the_store_is_compared(store: Path) -> None:
+    build, opened = store.with_suffix(".manifests") / "build.json", open_store(store)
+    sound = build.read_text()
+    for entry, value in OF_THE_STORE:
         *steps, last = (int(step) if step.isdigit() else step for step in entry.split("/"))
+        document = whole = json.loads(sound)
         for step in steps:
             document = document[step]
         assert document[last] != value
         document[last] = value
-
-    edit_json(build, change)
-    (one,) = manifest_findings(open_store(store), build.parent)
-    assert one.file == str(build)
+        build.write_text(json.dumps(whole))
+        assert [one.file for one in manifest_findings(opened, build.parent)] == [str(build)], entry
 
 
 def test_changed_and_missing_sources_are_found(store: Path, mixed: Dataset, tmp_path: Path) -> None:
