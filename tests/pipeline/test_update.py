@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from support.faults import inject
 from support.first_builds import tree_from_nothing
-from support.synthetic import Made, MakeDataset, make_asset
+from support.synthetic import Dataset, Made, MakeDataset, make_asset
 from support.trees import tree
 
 from slatprep.parameters import AlignParameters, BuildParameters, SampleParameters
@@ -26,11 +26,21 @@ def aligned(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     return seen
 
 
+@pytest.fixture(scope="module")
+def first(tmp_path_factory: pytest.TempPathFactory) -> Made:
+    folder = tmp_path_factory.mktemp("first")
+    dataset = Dataset(folder / "sources")
+    for seed, object_id in enumerate("abc"):
+        dataset.add(object_id, seed)
+    build_store(dataset.parameters(), folder / "s.zarr")
+    return dataset, folder / "s.zarr"
+
+
 @pytest.fixture
-def built(make_dataset: MakeDataset, tmp_path: Path) -> Made:
-    dataset, out = make_dataset("a", "b", "c"), tmp_path / "s.zarr"
-    build_store(dataset.parameters(), out)
-    return dataset, out
+def built(first: Made, tmp_path: Path) -> Made:
+    """Three assets and the store of them, copied: a build knows no file of it by its state."""
+    shutil.copytree(first[1].parent, tmp_path, dirs_exist_ok=True)
+    return Dataset(tmp_path / "sources", dict(first[0].assets)), tmp_path / "s.zarr"
 
 
 def reasons(parameters: BuildParameters, out: Path) -> dict[str, tuple[str, str]]:
@@ -40,6 +50,7 @@ def reasons(parameters: BuildParameters, out: Path) -> dict[str, tuple[str, str]
 
 def test_nothing_changed_writes_nothing(built: Made, aligned: list[str]) -> None:
     dataset, out = built
+    build_store(dataset.parameters(), out)  # and knows the states of files
     inodes = {path: path.stat().st_ino for path in out.parent.rglob("*") if path.is_file()}
     summary = build_store(dataset.parameters(), out)
     assert aligned == []
@@ -83,6 +94,7 @@ def test_a_change_that_keeps_size_and_times_is_seen(built: Made) -> None:
     import os
 
     dataset, out = built
+    build_store(dataset.parameters(), out)  # and knows the states of files
     path = dataset.root / "slat" / "a.npz"
     before = path.stat()
     made = make_asset(0)

@@ -84,23 +84,19 @@ def flip(data: bytearray, byte: int, bit: int) -> None:
     data[byte] ^= bit
 
 
-def test_flipped_bits_name_their_files_and_assets(store: Path) -> None:
-    for name in SHARDS:
-        change(store, name, lambda data: flip(data, 20, 8))
-    all_found = found(store)
-    for name in SHARDS:
-        findings = of_file(all_found, name)
-        assert any("its bytes changed" in finding.what for finding in findings), name
-        assert any(one.asset and "chunk 0 is damaged" in one.what for one in findings), name
+@pytest.mark.parametrize("name", SHARDS)
+def test_a_flipped_bit_names_the_file_and_the_assets(store: Path, name: str) -> None:
+    change(store, name, lambda data: flip(data, 20, 8))
+    findings = of_file(found(store), name)
+    assert any("its bytes changed" in finding.what for finding in findings)
+    assert any(finding.asset and "chunk 0 is damaged" in finding.what for finding in findings)
 
 
-def test_a_flipped_bit_of_each_index_is_found(store: Path) -> None:
-    for name in SHARDS:
-        change(store, name, lambda data: flip(data, -6, 1))
-    all_found = found(store)
-    for name in SHARDS:
-        findings = of_file(all_found, name)
-        assert any(one.asset and "no sound index" in one.what for one in findings), name
+@pytest.mark.parametrize("name", SHARDS)
+def test_a_flipped_bit_of_an_index_is_found(store: Path, name: str) -> None:
+    change(store, name, lambda data: flip(data, -6, 1))
+    findings = of_file(found(store), name)
+    assert any(finding.asset and "no sound index" in finding.what for finding in findings)
 
 
 def test_truncated_shards_are_found(store: Path) -> None:
