@@ -117,7 +117,9 @@ const Table = (() => {
 
   function render() {
     const first = Math.max(Math.floor(box.scrollTop / ROW) - SPARE, 0);
-    const last = Math.min(Math.ceil((box.scrollTop + box.clientHeight) / ROW) + SPARE, order.length);
+    // Before its rows are there, the box is as high as its head.
+    const height = Math.max(box.clientHeight, innerHeight);
+    const last = Math.min(Math.ceil((box.scrollTop + height) / ROW) + SPARE, order.length);
     above.firstChild.style.height = `${first * ROW}px`;
     below.firstChild.style.height = `${(order.length - last) * ROW}px`;
     for (const [at, row] of pool) {
