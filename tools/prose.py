@@ -1,6 +1,6 @@
 """Measure the prose of README, docs, help texts and messages: `python tools/prose.py`.
 
-A sentence has at most 30 words. Code blocks, tables, headings, pictures and equations do not
+A sentence has at most 30 words, and the median one at most 14. Code blocks, tables, headings, pictures and equations do not
 count as sentences; a piece of inline code counts as one word. Design notes (docs/design) are for
 those who change the code: their sentences are held to the limit, their words to no budget.
 """
@@ -16,7 +16,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
-LONGEST = 30
+LONGEST, MEDIAN = 30, 14
 BUDGET = 22_600
 """Words of README and docs, with their tables; without design notes and made pages."""
 
@@ -81,12 +81,15 @@ def main() -> None:
             lengths += own
     for place, text in messages():
         faults += too_long(place, text)
+    median = statistics.median(lengths)
+    if median > MEDIAN:
+        faults.append(f"the median sentence has {median:.0f} words; at most {MEDIAN} are allowed")
     if words > BUDGET:
         faults.append(f"README and docs have {words:,} words; at most {BUDGET:,} are allowed")
     print("\n".join(faults), file=sys.stderr)
     print(
         f"README and docs: {words:,} words, {len(lengths):,} sentences, "
-        f"median {statistics.median(lengths):.0f} words; {len(faults)} findings"
+        f"median {median:.0f} words; {len(faults)} findings"
     )
     sys.exit(bool(faults))
 

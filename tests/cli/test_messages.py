@@ -4,6 +4,7 @@ import json
 import shutil
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +16,7 @@ from support.synthetic import Dataset
 
 from slatprep import open_store
 from slatprep.cli.commands import slatprep
+from slatprep.learn.runs import EpochRecord
 from slatprep.pipeline.dataset import BuildSummary, build_store
 
 
@@ -244,3 +246,29 @@ def test_a_single_asset_is_counted_in_the_singular(store: Path, tmp_path: Path) 
     assert run("subset", store, "--asset", "0", "--out", out, "-q").exit_code == 0
     told = run("verify", out)
     assert told.exit_code == 0 and "1 asset," in told.stderr and "0 sources" not in told.stderr
+
+
+def test_ctrl_c_says_what_is_kept_and_how_to_go_on(
+    store: Path, mixed: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def built(*_: object, progress: Callable[[int, int], None], **__: object) -> None:
+        progress(2, 3)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("slatprep.pipeline.dataset.build_store", built)
+    parts = mixed.parameters()
+    sources = ("--pixieverse", parts.pixieverse.root, "--slat", parts.slat.root)
+    stopped = run("build-store", *sources, "--out", tmp_path / "new.zarr")
+    assert stopped.exit_code == 130
+    assert "2 of 3 assets are done and kept; the same command goes on from there" in stopped.stderr
+
+    def trained(*_: object, progress: Callable[[EpochRecord], None], **__: object) -> None:
+        progress(EpochRecord(4, 1e-3, 0.5, 0.6, 0.7, 0.8))
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("slatprep.learn.train.train", trained)
+    stopped = run("train", store, "--out", tmp_path / "run", "--keep", "last")
+    assert stopped.exit_code == 130, stopped.output
+    assert (
+        "epochs up to 4 are kept, and the steps of epoch 5 but for the last 30 s" in stopped.stderr
+    )
