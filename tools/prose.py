@@ -1,8 +1,9 @@
 """Measure the prose of README, docs, help texts and messages: `python tools/prose.py`.
 
-A sentence has at most 30 words, and the median one at most 14. Code blocks, tables, headings, pictures and equations do not
-count as sentences; a piece of inline code counts as one word. Design notes (docs/design) are for
-those who change the code: their sentences are held to the limit, their words to no budget.
+A sentence has at most 30 words, and the median one at most 14. Code blocks, tables, headings,
+pictures and equations do not count as sentences; a piece of inline code counts as one word. Design
+notes (docs/design) are for those who change the code: their sentences are held to the limit, their
+words to no budget.
 """
 
 from __future__ import annotations
