@@ -120,9 +120,9 @@ class LazyGroup(click.Group):
                 raise
             say(f"slatprep: error: {error.filename}: {error.strerror}; run again", err=True)
             ctx.exit(EXIT_INCOMPLETE)
-        except KeyboardInterrupt:
+        except KeyboardInterrupt as stop:
             kept = getattr(ctx.obj, "if_stopped", "") or "run it again to start anew"
-            say(f"\nslatprep: stopped; nothing was replaced; {kept}", err=True)
+            say(f"\nslatprep: stopped; {str(stop) or f'nothing was replaced; {kept}'}", err=True)
             ctx.exit(EXIT_INTERRUPTED)
         if lost():
             self._fail_unprinted(ctx)

@@ -33,7 +33,7 @@ EXIT_CODES = {
     EXIT_INCOMPLETE: "something did not go in, a check failed, or a file cannot be read or written",
     EXIT_USAGE: "wrong use: an option, a dataset definition, a name, or an extra that is missing",
     EXIT_UNPRINTED: "the work is done, but its result could not be printed",
-    EXIT_INTERRUPTED: "stopped with Ctrl-C or SIGTERM; nothing was replaced",
+    EXIT_INTERRUPTED: "stopped with Ctrl-C or SIGTERM; a store is the old or the new one",
 }
 """What the exit code of every command says."""
 

@@ -130,9 +130,12 @@ def build_store(
     crew = Crew(jobs, assets_per_job, progress, note)
     place, wanted = Destination(out, manifests), Wanted.of(parameters, compact)
     elsewhere = not isinstance(jobs, int)
-    with work_beside(
-        place.store, fresh=fresh, keep=keep_work, look=place.look, private_disks=elsewhere
-    ) as work:
+    with (
+        place.telling_if_stopped(),
+        work_beside(
+            place.store, fresh=fresh, keep=keep_work, look=place.look, private_disks=elsewhere
+        ) as work,
+    ):
         pairs = _discover(parameters, jobs, work.shared(), note=note)
         recipe = recipe_of(parameters)
         every = rehash >= 1

@@ -10,7 +10,7 @@ from __future__ import annotations
 import os
 import platform
 from collections.abc import Collection, Iterable, Iterator
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
@@ -77,6 +77,23 @@ class Destination:
         """See, on an object store, what is published; raise `StoreError` if none may be there."""
         if self._remote is not None:
             self._before = published_state(self._remote)
+
+    @contextmanager
+    def telling_if_stopped(self) -> Iterator[None]:
+        """Have a KeyboardInterrupt say so if the new store is in place by then, or may be."""
+        before = self._folder()
+        try:
+            yield
+        except KeyboardInterrupt:
+            if self._upload is None and self._folder() == before:
+                raise
+            told = f"{self.out} is the old store or the new one, whole; run it again"
+            raise KeyboardInterrupt(told) from None
+
+    def _folder(self) -> int:
+        """Return the inode of a local store; 0 if there is none."""
+        path = storage_of(self.store).local
+        return path.stat().st_ino if path is not None and path.exists() else 0
 
     def replace(self, new: Path, staged: Staged | None = None) -> None:
         """Put a finished store in place; on an object store it is not published yet.

@@ -1,0 +1,68 @@
+"""A build that is stopped with a signal at any step leaves the older store and nothing else."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import signal
+import sys
+from pathlib import Path
+
+import pytest
+from support.faults import inject
+from support.synthetic import Dataset
+from support.trees import tree
+
+from slatprep.cli.commands import slatprep
+from slatprep.pipeline.dataset import build_store
+
+BEFORE = (
+    "work folder made", "work folder locked", "asset compared", "asset begun", "asset read",
+    "asset aligned", "asset spooled", "store created", "shard begun", "shard filled",
+    "shard written", "records written", "directory flushed",
+)  # fmt: skip
+AFTER = ("directory exchanged", "store replaced", "manifests written", "manifests published")
+
+
+def _run(step: str, number: signal.Signals, line: list[str], said: Path) -> None:
+    sys.stderr = said.open("w", buffering=1)
+
+    def reached(now: str, _: str) -> None:
+        if now == step:
+            os.kill(os.getpid(), number)
+
+    for one in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(one, signal.default_int_handler)
+    inject(pytest.MonkeyPatch(), reached)
+    slatprep(line, prog_name="slatprep")
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("step", [*BEFORE, *AFTER])
+def test_a_signal_at_a_step(
+    step: str, number: signal.Signals, undisturbed: tuple[Dataset, Path], tmp_path: Path
+) -> None:
+    dataset, _ = undisturbed
+    old = Dataset(tmp_path / "old")
+    old.add("z", seed=3)
+    folder = tmp_path / "stores"
+    out = folder / "s.zarr"
+    build_store(old.parameters("pixie"), out)
+    before, there = tree(out), set(folder.iterdir())
+    said = tmp_path / "said"
+    line = [
+        "build-store", "--pixieverse", str(dataset.root / "pixieverse"),
+        "--slat", str(dataset.root / "slat"), "--ranges", "pixie", "--out", str(out),
+    ]  # fmt: skip
+    forked = multiprocessing.get_context("fork").Process(
+        target=_run, args=(step, number, line, said)
+    )
+    forked.start()
+    forked.join()
+    assert forked.exitcode == 130
+    assert (tree(out) == before) == (step in BEFORE)
+    assert ("nothing was replaced" in said.read_text()) == (step in BEFORE)
+    # Finished assets are kept in the work folder for the next build, which removes it.
+    assert set(folder.iterdir()) - {folder / ".s.zarr.work"} == there
+    build_store(dataset.parameters("pixie"), out)
+    assert set(folder.iterdir()) == there
