@@ -6,6 +6,7 @@ slatprep's own, stop other assets, or get into a store.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -29,11 +30,15 @@ from slatprep.records import (
     SourceFile,
     StructuredLatents,
 )
+from slatprep.records.sources import ROLES
 from slatprep.records.tables import CLASS_NAME, MAX_PROPERTIES
 from slatprep.storage.listing import Listing
 
-_MOST_LETTERS, _MOST_COUNT = 4096, 2**53
-"""What a record takes of a text, and the largest number that every reader of JSON keeps."""
+_MOST_LETTERS, _MOST_COUNT, _MOST_TOLD = 4096, 2**53, 1000
+"""What a record takes of a text, the largest number that every reader of JSON keeps, and what an
+error tells of what an adapter gave."""
+
+_DIGEST = re.compile("[0-9a-f]{64}")
 
 
 def _is_text(value: object) -> bool:
@@ -67,7 +72,9 @@ class _Foreign:
 
     def _fault(self, what: str) -> InputError:
         who = f"adapter {self.name!r} of {self.package}"
-        return InputError(who, what, "what slatprep asks of an adapter; tell its makers")
+        # It may have given a text without end, or one that no terminal can show.
+        told = what.encode("utf-8", "backslashreplace")[:_MOST_TOLD].decode("utf-8", "ignore")
+        return InputError(who, told, "what slatprep asks of an adapter; tell its makers")
 
     def _require(self, holds: object, what: str) -> None:
         if not holds:
@@ -88,6 +95,10 @@ class _Foreign:
         for one in of.sources:
             self._require(_is_text(one.path), f"{one.path!r} as the path of a file")
             self._require(_is_count(one.size), f"{one.size!r} as the size of a file")
+            self._require(one.role in ROLES, f"{one.role!r} as the role of a file")
+            self._require(_is_count(one.source), f"{one.source!r} as the number of a source")
+            is_digest = isinstance(one.sha256, str) and _DIGEST.fullmatch(one.sha256)
+            self._require(is_digest, f"{one.sha256!r} as the SHA-256 of a file")
         self._require(all(map(_is_text, of.warnings)), "warnings that are no text")
 
 
@@ -204,6 +215,8 @@ class ForeignLatents(_Foreign):
             once = len(np.unique(flat_index(read.coords, side))) == rows
             self._require(once, "a coordinate twice")
             self._require(np.isfinite(read.feats).all(), "feats that are not finite")
+            told = f"{read.standardised!r} for whether they are standardised"
+            self._require(type(read.standardised) is bool, told)
             self._require_told(read)
             return read
 

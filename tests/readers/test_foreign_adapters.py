@@ -85,7 +85,17 @@ SLATS: dict[str, Callable[[Any], Any]] = {
     "another type": lambda slat: replace(slat, coords=slat.coords.astype(np.int64)),
     "no files": lambda slat: replace(slat, sources=()),
     "warnings of surrogates": lambda slat: replace(slat, warnings=("\udc80",)),
+    "a digest of bytes": lambda slat: of_file(slat, sha256=b"0" * 64),
+    "a digest of surrogates": lambda slat: of_file(slat, sha256="\udcff" * 64),
+    "a role that is none": lambda slat: of_file(slat, role="script"),
+    "a source that is none": lambda slat: of_file(slat, source=-1),
+    "standardised perhaps": lambda slat: replace(slat, standardised="no"),
+    "a grid without end": lambda slat: replace(slat, resolution="x" * 10**6),
 }
+
+
+def of_file(slat: Any, **changes: object) -> Any:
+    return replace(slat, sources=(replace(slat.sources[0], **changes),))
 
 
 @pytest.mark.parametrize("case", SLATS)
@@ -93,8 +103,9 @@ def test_latents_that_are_none_are_refused(make_pair: MakePair, case: str) -> No
     pair = make_pair()
     sound = read_latents(pair)
     adapter = SimpleNamespace(read=lambda *_: SLATS[case](sound))
-    with pytest.raises(InputError, match=THEIRS):
+    with pytest.raises(InputError, match=THEIRS) as refused:
         guarded("slatprep.latents", adapter, "mine", "theirs 1.0").read("a", "b", "", TRELLIS)
+    assert len(str(refused.value).encode()) < 2000
 
 
 def _raising(*_: object) -> Any:
