@@ -72,6 +72,7 @@ class Destination:
             _require_own(self._manifests or Path(str(manifests_of(path))), path)
         self._before: PublishedState | None = None
         self._upload: Upload | None = None
+        self._replacing = False
 
     def look(self) -> None:
         """See, on an object store, what is published; raise `StoreError` if none may be there."""
@@ -80,26 +81,21 @@ class Destination:
 
     @contextmanager
     def telling_if_stopped(self) -> Iterator[None]:
-        """Have a KeyboardInterrupt say so if the new store is in place by then, or may be."""
-        before = self._folder()
+        """Have a KeyboardInterrupt say so if the new store may be in place by then."""
         try:
             yield
         except KeyboardInterrupt:
-            if self._upload is None and self._folder() == before:
+            if not self._replacing:
                 raise
             told = f"{self.out} is the old store or the new one, whole; run it again"
             raise KeyboardInterrupt(told) from None
-
-    def _folder(self) -> int:
-        """Return the inode of a local store; 0 if there is none."""
-        path = storage_of(self.store).local
-        return path.stat().st_ino if path is not None and path.exists() else 0
 
     def replace(self, new: Path, staged: Staged | None = None) -> None:
         """Put a finished store in place; on an object store it is not published yet.
 
         `staged` is what of it is on the object store already.
         """
+        self._replacing = True
         if self._before is not None:
             self._upload = upload_store(new, self._before, staged)
         elif (path := storage_of(self.store).local) is not None:
