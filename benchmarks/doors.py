@@ -5,7 +5,7 @@
 
 cluster: a worker, then the scheduler, of a Dask cluster is killed at each step of a build to S3.
 multipart: a store with files of 40 and 112 MiB goes to S3 in parts of 16 MiB; requests fail.
-slow: every connection to S3 carries 1,000 bytes a second, then none.
+slow: every connection to S3 carries 1,000 bytes a second; stalled: S3 takes calls and says nothing.
 swapped: S3 answers for one file of a store with the same file of another store of equal shape.
 clock: sources change, and the clock is set an hour back, or forth, between two builds.
 
@@ -216,7 +216,11 @@ def killed_upload(store: Path, seconds: float) -> str:
     return "killed" if running.returncode == -signal.SIGKILL else "as without faults"
 
 
-def try_slow(folder: Path, told: Told) -> None:
+def try_stalled(folder: Path, told: Told) -> None:
+    try_slow(folder, told, rate=-1.0, only=("first build", "read"))
+
+
+def try_slow(folder: Path, told: Told, rate: float = 1000.0, only: tuple[str, ...] = ()) -> None:
     dataset, faults = made(folder / "data", "a"), Faults()
     local = dataset.root / "s.zarr"
     build(dataset, local)
@@ -232,29 +236,30 @@ def try_slow(folder: Path, told: Told) -> None:
             "copy": lambda: tree(Path(str(open_store(URL, copy=True).path))),
         }
         wanted = {"read": values(local), "verify": (), "copy": expected}
-        for rate in (1000.0, 1e-9):
-            for name, work in works.items():
-                # A first build over nothing, and without what another has read before.
-                shutil.rmtree(folder / "cache", ignore_errors=True)
-                if name == "first build" and s3.exists(URL):
-                    s3.rm(URL, recursive=True)
-                faults.rate, begin = rate, time.monotonic()
-                try:
-                    came = work()
-                    outcome = "as at full speed"
-                    if came != wanted.get(name):
-                        told.harm(f"{name} at {rate} B/s gives something else")
-                except SlatprepError as error:
-                    outcome = "refused"
-                    print(error, flush=True)
-                took = time.monotonic() - begin
-                faults.rate = 0.0
-                print(f"{name}, {rate:.0f} B/s: {outcome} after {took:.0f} s", flush=True)
-                told[f"{name}, {rate:.0f} B/s: {outcome} after {took:.0f} s"] += 1
-                if not s3.exists(f"{URL}/current.json"):
-                    build(dataset, URL)
-                if current(s3, URL) != expected:
-                    told.harm(f"{name} at {rate} B/s spoils the store")
+        for name, work in works.items():
+            if only and name not in only:
+                continue
+            # A first build over nothing, and without what another has read before.
+            shutil.rmtree(folder / "cache", ignore_errors=True)
+            if name == "first build" and s3.exists(URL):
+                s3.rm(URL, recursive=True)
+            faults.rate, begin = rate, time.monotonic()
+            try:
+                came = work()
+                outcome = "as at full speed"
+                if came != wanted.get(name):
+                    told.harm(f"{name} at {rate} B/s gives something else")
+            except SlatprepError as error:
+                outcome = "refused"
+                print(error, flush=True)
+            took = time.monotonic() - begin
+            faults.rate = 0.0
+            print(f"{name}, {rate:.0f} B/s: {outcome} after {took:.0f} s", flush=True)
+            told[f"{name}, {rate:.0f} B/s: {outcome} after {took:.0f} s"] += 1
+            if not s3.exists(f"{URL}/current.json"):
+                build(dataset, URL)
+            if current(s3, URL) != expected:
+                told.harm(f"{name} at {rate} B/s spoils the store")
 
 
 def values(path: object) -> list[str]:
@@ -347,7 +352,7 @@ def try_clock(folder: Path, told: Told, faketime: str) -> None:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     ways = {"cluster": try_cluster, "multipart": try_multipart, "slow": try_slow,
-            "swapped": try_swapped}  # fmt: skip
+            "stalled": try_stalled, "swapped": try_swapped}  # fmt: skip
     parser.add_argument("door", choices=[*ways, "clock"])
     parser.add_argument("--faketime", default="", help="the library of libfaketime, for the clock")
     given = parser.parse_args()

@@ -72,7 +72,7 @@ class Faults:
     only : str
         A pattern of the addresses that something may happen to.
     rate : float
-        Bytes a second of every connection; 0 for as many as there may be.
+        Bytes a second of every connection; 0 for as many as there may be, below 0 for no answer.
     told : Counter
         What happened, and how often.
     """
@@ -123,7 +123,7 @@ class _Handler(BaseHTTPRequestHandler):
         """Pass a request on, with or without a fault."""
         body = self._body()
         if self.server.faults.rate:
-            time.sleep(len(body) / self.server.faults.rate)
+            time.sleep(600 if self.server.faults.rate < 0 else len(body) / self.server.faults.rate)
         conditional = bool(self.headers.get("If-Match") or self.headers.get("If-None-Match"))
         kind, chance = self.server.faults.draw(self.command, self.path, conditional)
         if kind == "delay":
@@ -214,7 +214,7 @@ class _Handler(BaseHTTPRequestHandler):
             self.send_header(name, value)
         self.send_header("Content-Length", str(length))
         self.end_headers()
-        rate = int(self.server.faults.rate)
+        rate = max(int(self.server.faults.rate), 0)
         for start in range(0, len(content), rate or max(len(content), 1)):
             self.wfile.write(content[start : start + rate] if rate else content)
             self.wfile.flush()
