@@ -111,15 +111,15 @@ def config_of(dataset: Dataset) -> Path:
     return path
 
 
-def try_cluster(folder: Path, told: Told) -> None:
+def try_cluster(folder: Path, told: Told, whose: tuple[str, ...], only: list[str]) -> None:
     new, old = made(folder / "new", "abc"), made(folder / "old", "ab")
     for dataset in (new, old):
         build(dataset, dataset.root / "s.zarr")
     old_tree, new_tree = tree(old.root / "s.zarr"), tree(new.root / "s.zarr")
     config = config_of(new)
     with s3_server(folder, Faults()) as s3:
-        for whom in ("worker", "scheduler"):
-            for number, step in enumerate(IN_WORKERS if whom == "worker" else STEPS):
+        for whom in whose:
+            for number, step in enumerate(only or (IN_WORKERS if whom == "worker" else STEPS)):
                 with suppress(FileNotFoundError):
                     s3.rm(URL, recursive=True)
                 shutil.rmtree(folder / "cache", ignore_errors=True)
@@ -351,9 +351,11 @@ def try_clock(folder: Path, told: Told, faketime: str) -> None:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    ways = {"cluster": try_cluster, "multipart": try_multipart, "slow": try_slow,
+    ways = {"multipart": try_multipart, "slow": try_slow,
             "stalled": try_stalled, "swapped": try_swapped}  # fmt: skip
-    parser.add_argument("door", choices=[*ways, "clock"])
+    parser.add_argument("door", choices=[*ways, "clock", "cluster"])
+    parser.add_argument("--whom", action="append", choices=("worker", "scheduler"))
+    parser.add_argument("--step", action="append", choices=STEPS, help="kill at these alone")
     parser.add_argument("--faketime", default="", help="the library of libfaketime, for the clock")
     given = parser.parse_args()
     os.environ |= checkout.environment()
@@ -361,6 +363,9 @@ def main() -> None:
     with tempfile.TemporaryDirectory(prefix="doors-") as folder:
         if given.door == "clock":
             try_clock(Path(folder), told, given.faketime)
+        elif given.door == "cluster":
+            whose = tuple(given.whom or ("worker", "scheduler"))
+            try_cluster(Path(folder), told, whose, given.step or [])
         else:
             ways[given.door](Path(folder), told)
     told["seconds"] = round(time.monotonic() - begin)
