@@ -38,12 +38,7 @@ MIN_ASSET_BYTES = 256
 of assets that a store claims is held against the bytes of its files."""
 
 _MAX_CHUNK_ROWS = {"asset": ASSET_CHUNK, "voxel": MAX_VOXEL_CHUNK, "grid": 16, FILE: MAX_FILES}
-_MAX_SHARD_ROWS = {
-    "asset": ASSET_CHUNK,
-    "voxel": MAX_VOXEL_SHARD,
-    "grid": MAX_GRID_SHARD,
-    FILE: MAX_FILES,
-}
+_MAX_SHARD_ROWS = {**_MAX_CHUNK_ROWS, "voxel": MAX_VOXEL_SHARD, "grid": MAX_GRID_SHARD}
 _ZARR_NAMES = {"str": "string"}
 
 
