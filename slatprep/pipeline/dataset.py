@@ -21,10 +21,9 @@ from slatprep.pipeline.finish import Crew, Note, Progress, finish
 from slatprep.pipeline.pack import Packed, pack_store
 from slatprep.pipeline.plan import Action, BuildContext, BuildPlan, PlannedAsset, plan_assets
 from slatprep.pipeline.publish import Destination, publish_manifests, require_records_file
-from slatprep.pipeline.ranges import check_objects
 from slatprep.pipeline.recipe import recipe_of
 from slatprep.pipeline.rows import NextStore, Row
-from slatprep.pipeline.settle import Wanted, settle_rows
+from slatprep.pipeline.settle import Wanted, check_objects, settle_rows
 from slatprep.pipeline.spool import Spool
 from slatprep.pipeline.summary import (
     BuildSummary,

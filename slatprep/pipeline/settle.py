@@ -2,27 +2,39 @@
 
 from __future__ import annotations
 
+import hashlib
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
-from slatprep.errors import StoreError
-from slatprep.normalize import ranges_from_extents
-from slatprep.parameters import BuildParameters, percentiles_of
+from slatprep.errors import ConfigError, StoreError
+from slatprep.normalize import ranges_from_bounds, ranges_from_extents, to_mapped
+from slatprep.parameters import BuildParameters, NormalizeParameters, is_split_file, percentiles_of
 from slatprep.pipeline.before import Before
 from slatprep.pipeline.finish import Crew, finish
 from slatprep.pipeline.plan import BuildContext, PlannedAsset
 from slatprep.pipeline.previous import SourceStore
-from slatprep.pipeline.ranges import dataset_ranges, given_ranges, source_of
 from slatprep.pipeline.recipe import build_of
 from slatprep.pipeline.rows import NextStore, Row, column, in_order, moments_of
+from slatprep.pipeline.spool import Spool
 from slatprep.pipeline.summary import nothing_usable
 from slatprep.readers import contents_of
 from slatprep.readers.encoders import resolve_latents
-from slatprep.records import AssetPair, Contents, Normalization
+from slatprep.readers.ranges import pixie_ranges, read_ranges
+from slatprep.readers.splits import Shares, assign_splits, read_id_file
+from slatprep.records import PROPERTIES, AssetPair, Contents, Normalization, Property
+from slatprep.storage.place import place_of
 from slatprep.store import Store
 from slatprep.store.record import FailedRecord
+from slatprep.workers.local import Jobs, run_unordered
+
+_SIGN = np.uint32(1 << 31)
+
+_HALF = 16
+"""Bits that the first pass over the fields counts by."""
 
 
 @dataclass(frozen=True)
@@ -165,3 +177,158 @@ def resolved_contents(
         for row, mean, std in zip(rows, means, stds, strict=True)
     ]
     return replace(declared, latents=resolve_latents(declared.latents, standardised, moments))
+
+
+def given_ranges(
+    parameters: NormalizeParameters, table: Sequence[Property] = PROPERTIES
+) -> Normalization | None:
+    """Return ranges that do not depend on the dataset, or None; read first, to fail early."""
+    if parameters.ranges == "dataset" or percentiles_of(parameters.ranges):
+        return None
+    if parameters.ranges == "pixie":
+        return pixie_ranges(table)
+    return read_ranges(place_of(parameters.ranges), table)
+
+
+def source_of(parameters: NormalizeParameters) -> str:
+    """Return where ranges of the dataset come from, in a word that changes when they would.
+
+    InputError if a file of ids cannot be used.
+    """
+    if parameters.objects == "all":
+        return parameters.ranges
+    by = parameters.split_by
+    if is_split_file(by):
+        digest = hashlib.sha256(read_id_file(place_of(by))).hexdigest()
+        by = f"{place_of(by).name}, sha256 {digest[:12]}"
+    return f"{parameters.ranges} of train by {by}"
+
+
+def check_objects(pairs: Sequence[AssetPair], parameters: NormalizeParameters) -> None:
+    """Raise what `dataset_ranges` would of a split that cannot be made, before hours of work."""
+    if parameters.objects == "train":
+        objects = {pair.object_id: pair.category for pair in pairs}
+        _trained(objects, parameters, {pair.asset_id: pair.object_id for pair in pairs})
+
+
+def dataset_ranges(
+    usable: Sequence[Row],
+    spool: Spool,
+    parameters: NormalizeParameters,
+    jobs: Jobs,
+    table: Sequence[Property] = PROPERTIES,
+) -> Normalization:
+    """Return the ranges of the usable assets' fields: their extent, or percentiles.
+
+    Percentiles are over the annotated voxels of all fields together, each alike and each field
+    once, and interpolated in mapped units, as numpy and Pixie (``inspect_ranges.py``, which draws
+    2,000,000 of them) do; of annotations that are merged, the first counts. ConfigError if no
+    object is trained on or a split cannot be made, InputError if a file of ids cannot be used.
+    """
+    chosen, source = _chosen(usable, parameters), source_of(parameters)
+    percentiles = percentiles_of(parameters.ranges)
+    if percentiles is None:
+        return ranges_from_extents([asset.columns["extent"] for asset in chosen], source, table)
+    keys = list({_field_of(asset): asset.key for asset in reversed(chosen)}.values())
+    coarse = _counted(spool, keys, jobs, len(table))
+    place = (sum(coarse[0].values()) - 1) * np.array(percentiles) / 100
+    ranks = np.concatenate([np.floor(place), np.ceil(place)]).astype(int).tolist()
+    halves = [[_at(counts, rank) for rank in ranks] for counts in coarse]
+    fine = _counted(spool, keys, jobs, len(table), [{h for h, _ in own} for own in halves])
+    bits = [
+        [
+            _at({value: n for value, n in counts.items() if value >> _HALF == half}, rank)[0]
+            for half, rank in own
+        ]
+        for counts, own in zip(fine, halves, strict=True)
+    ]
+    below, above = np.split(to_mapped(_of_ranks(np.array(bits, dtype=np.uint32)).T, table), 2)
+    lo, hi = below + (place % 1)[:, None] * (above - below)
+    return ranges_from_bounds(lo, hi, source, table)
+
+
+def _chosen(usable: Sequence[Row], parameters: NormalizeParameters) -> Sequence[Row]:
+    """Return the assets of the objects that count."""
+    if parameters.objects != "train":
+        return usable
+    valid = [asset for asset in usable if asset.columns["n_valid"]]
+    trained = _trained(
+        {str(asset.columns["object_id"]): str(asset.columns["category"]) for asset in valid},
+        parameters,
+        {asset.asset_id: str(asset.columns["object_id"]) for asset in valid},
+    )
+    return [asset for asset in usable if str(asset.columns["object_id"]) in trained]
+
+
+def _field_of(asset: Row) -> tuple[str, str]:
+    """Return what tells an asset's field from others: views of an object have it in common."""
+    object_id, view = str(asset.columns["object_id"]), str(asset.columns["view"])
+    return object_id, asset.asset_id.removeprefix(object_id).removeprefix(f".{view}")
+
+
+def _trained(
+    objects: Mapping[str, str], parameters: NormalizeParameters, assets: Mapping[str, str]
+) -> set[str]:
+    shares = Shares(*parameters.shares)
+    splits = assign_splits(parameters.split_by, objects, shares, assets).splits
+    trained = {object_id for object_id, split in splits.items() if split == "train"}
+    if not trained:
+        raise ConfigError(
+            "normalize.objects: no object is trained on, of which ranges could be taken; "
+            "expected a share or a list of train"
+        )
+    return trained
+
+
+def _counted(
+    spool: Spool,
+    keys: Sequence[str],
+    jobs: Jobs,
+    columns: int,
+    halves: Sequence[set[int]] | None = None,
+) -> list[Counter[int]]:
+    totals: list[Counter[int]] = [Counter() for _ in range(columns)]
+    for counts in run_unordered(count_bits, ((spool, key, halves) for key in keys), jobs):
+        for total, (bits, numbers) in zip(totals, counts, strict=True):
+            total.update(dict(zip(bits.tolist(), numbers.tolist(), strict=True)))
+    return totals
+
+
+def count_bits(
+    spool: Spool, key: str, halves: Sequence[set[int]] | None = None
+) -> list[tuple[NDArray[np.uint32], NDArray[np.int64]]]:
+    """Count a field's values by their bits, brought to an order that is that of the values.
+
+    Returns of each property the bits, sorted, and how often they occur: the upper 16 bits of all
+    values, or, with `halves`, all 32 bits of the values whose upper 16 are among a property's. So
+    two passes find any value by its rank in a memory that does not grow with their number.
+    """
+    bits = _in_order(spool.field(key).properties)
+    if halves is None:
+        return [np.unique(column >> _HALF, return_counts=True) for column in bits.T]
+    return [
+        np.unique(column[np.isin(column >> _HALF, list(own))], return_counts=True)
+        for column, own in zip(bits.T, halves, strict=True)
+    ]
+
+
+def _in_order(values: NDArray[np.float32]) -> NDArray[np.uint32]:
+    """Return the bits of floats so changed that they have the floats' order."""
+    # Minus zero is no less than zero.
+    bits = np.ascontiguousarray(values + np.float32(0)).view(np.uint32)
+    ordered: NDArray[np.uint32] = np.where(bits >> 31, ~bits, bits | _SIGN)
+    return ordered
+
+
+def _of_ranks(ordered: NDArray[np.uint32]) -> NDArray[np.float32]:
+    """Return the floats of bits that `_in_order` made."""
+    return np.where(ordered >> 31, ordered ^ _SIGN, ~ordered).view(np.float32)
+
+
+def _at(counts: Mapping[int, int], rank: int) -> tuple[int, int]:
+    """Return the value of a rank, and its rank among equal ones."""
+    for value in sorted(counts):
+        if rank < counts[value]:
+            return value, rank
+        rank -= counts[value]
+    raise IndexError(rank)
