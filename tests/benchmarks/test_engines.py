@@ -4,11 +4,11 @@ import importlib.util
 from importlib.machinery import ModuleSpec
 from pathlib import Path
 
+import cpd
 import engines as bench
 import numpy as np
 import pytest
 from click.testing import CliRunner
-from cpd import cpd_places
 from support.deformed import MOVES, occupancy
 from support.shapes import field_of, surface_latents
 
@@ -56,13 +56,16 @@ def test_an_engine_that_is_asked_for_and_not_installed_says_what_to_install(
         bench.bench_align(demo, engines=["cpd-affine"])
 
 
-def test_drift_finds_a_stretched_shape_and_bends_one() -> None:
+def test_drift_finds_a_stretched_shape_and_bends_one(monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("pycpd")
+    for name, fewer in (("START", (100, 15)), ("FINAL", (400, 30))):
+        monkeypatch.setattr(cpd, f"{name}_POINTS", fewer[0])
+        monkeypatch.setattr(cpd, f"{name}_STEPS", fewer[1])
     off = {}
     field = field_of(occupancy(lambda points: points))
     for name, deformable in (("long", False), ("bent", False), ("bent", True)):
         latents = surface_latents(occupancy(MOVES[name]))
-        places = cpd_places(field, latents, deformable)
+        places = cpd.cpd_places(field, latents, deformable)
         true_places = MOVES[name](voxel_centres(latents.coords))
         apart = np.linalg.norm(places - true_places, axis=1) / VOXEL_SIZE
         off[name, deformable] = float(np.median(apart))
