@@ -94,9 +94,7 @@ def main() -> None:
             print("no disk can be mounted here (that needs root): nothing was tried")
             return
         subprocess.run(["umount", str(disk)], check=True)
-        dataset = Dataset(folder / "sources")
-        for seed, object_id in enumerate("abc"):
-            dataset.add(object_id, seed)
+        dataset = Dataset(folder / "sources").having(*"abc")
         root = dataset.root
         sources = ["--pixieverse", str(root / "pixieverse"), "--slat", str(root / "slat")]
         run("build-store", *sources, "--out", folder / "sound.zarr", "-q")

@@ -27,14 +27,7 @@ states.FINE_NS = 20_000_000
 @pytest.fixture
 def make_dataset(tmp_path: Path) -> MakeDataset:
     """Make a dataset of good assets: ``make_dataset("a", "b")``."""
-
-    def make(*ids: str) -> Dataset:
-        dataset = Dataset(tmp_path / "sources")
-        for seed, object_id in enumerate(ids):
-            dataset.add(object_id, seed)
-        return dataset
-
-    return make
+    return lambda *ids: Dataset(tmp_path / "sources").having(*ids)
 
 
 @pytest.fixture
@@ -83,9 +76,7 @@ def copy(mixed_build: BuildSummary, tmp_path: Path) -> Path:
 def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> Made:
     """Return three assets and the store of an undisturbed build; nobody may change them."""
     folder = tmp_path_factory.mktemp("undisturbed")
-    dataset = Dataset(folder / "sources")
-    for seed, object_id in enumerate("abc"):
-        dataset.add(object_id, seed)
+    dataset = Dataset(folder / "sources").having(*"abc")
     build_store(dataset.parameters("pixie"), folder / "s.zarr")
     return dataset, folder / "s.zarr"
 

@@ -132,9 +132,7 @@ def test_voxels_are_matched_wherever_they_lie(mixed_build: BuildSummary, copy: P
 
 
 def test_other_sources_ranges_and_assets(tmp_path: Path) -> None:
-    dataset = Dataset(tmp_path / "sources")
-    for seed, object_id in enumerate(("kept", "softer", "gone")):
-        dataset.add(object_id, seed)
+    dataset = Dataset(tmp_path / "sources").having("kept", "softer", "gone")
     build_store(dataset.parameters("pixie"), tmp_path / "a.zarr")
     shutil.rmtree(dataset.root / "pixieverse" / "gone")
     dataset.add("new", 3)

@@ -11,9 +11,7 @@ from slatprep.pipeline.dataset import build_store
 @pytest.fixture(scope="session")
 def learn_store(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Build a store of nine rows: eight objects, of which one has two views."""
-    dataset = Dataset(tmp_path_factory.mktemp("learn"))
-    for seed, object_id in enumerate("abcdefg"):
-        dataset.add(object_id, seed)
+    dataset = Dataset(tmp_path_factory.mktemp("learn")).having(*"abcdefg")
     dataset.add("h", 7, views=("front", "side"))
     out = tmp_path_factory.mktemp("learn_store") / "learn.zarr"
     build_store(dataset.parameters(), out)

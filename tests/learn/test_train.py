@@ -347,9 +347,7 @@ def test_a_run_goes_on_in_the_precision_it_began_with(
 
 
 def test_failed_assets_are_neither_trained_on_nor_exported_unless_asked_for(tmp_path: Path) -> None:
-    dataset = Dataset(tmp_path / "sources")
-    for seed, object_id in enumerate("abc"):
-        dataset.add(object_id, seed)
+    dataset = Dataset(tmp_path / "sources").having(*"abc")
     rng = np.random.default_rng(0)
     scattered = np.unique(rng.integers(0, 64, (400, 3)), axis=0).astype(np.uint8)
     dataset.write_grid("d", make_asset(3).grid)

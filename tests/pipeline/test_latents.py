@@ -24,9 +24,7 @@ MEAN, STD = np.array(FEATS_MEAN, np.float32), np.array(FEATS_STD, np.float32)
 
 @pytest.fixture
 def dataset(tmp_path: Path) -> Dataset:
-    made = Dataset(tmp_path / "sources")
-    for seed, name in enumerate("abcdef"):
-        made.add(name, seed)
+    made = Dataset(tmp_path / "sources").having(*"abcdef")
     return made
 
 

@@ -36,9 +36,7 @@ def test_ranges_that_pixie_publishes_are_no_surprise() -> None:
 
 @pytest.fixture
 def dataset(tmp_path: Path) -> Dataset:
-    made = Dataset(tmp_path / "data")
-    for seed, name in enumerate("abcdef"):
-        made.add(name, seed)
+    made = Dataset(tmp_path / "data").having(*"abcdef")
     return made
 
 

@@ -45,9 +45,7 @@ def sample_grid(seed: int, factor: float, metal: int = 1) -> np.ndarray:
 @pytest.fixture(scope="module")
 def several(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
     """Object ``a`` with three samples, of which the last calls the metal sand; ``b`` with one."""
-    dataset = Dataset(tmp_path_factory.mktemp("several"))
-    for seed, object_id in enumerate("ab"):
-        dataset.add(object_id, seed)
+    dataset = Dataset(tmp_path_factory.mktemp("several")).having(*"ab")
     for sample, factor in enumerate(FACTORS):
         write_sample(dataset, "a", sample, sample_grid(0, factor, metal=2 if sample == 2 else 1))
     return dataset

@@ -29,9 +29,7 @@ def aligned(monkeypatch: pytest.MonkeyPatch) -> list[str]:
 @pytest.fixture(scope="module")
 def first(tmp_path_factory: pytest.TempPathFactory) -> Made:
     folder = tmp_path_factory.mktemp("first")
-    dataset = Dataset(folder / "sources")
-    for seed, object_id in enumerate("abc"):
-        dataset.add(object_id, seed)
+    dataset = Dataset(folder / "sources").having(*"abc")
     build_store(dataset.parameters(), folder / "s.zarr")
     return dataset, folder / "s.zarr"
 

@@ -21,16 +21,9 @@ class Dataset(synthetic.Dataset):
 Made = tuple[Dataset, Path]
 
 
-def made(folder: Path, *ids: str, seed: int = 0) -> Dataset:
-    dataset = Dataset(folder)
-    for number, object_id in enumerate(ids, seed):
-        dataset.add(object_id, number)
-    return dataset
-
-
 def built(folder: Path, *ids: str, seed: int = 0) -> Made:
     """Make assets, and a store of them."""
-    dataset = made(folder / "sources", *ids, seed=seed)
+    dataset = Dataset(folder / "sources").having(*ids, seed=seed)
     build_store(dataset.parameters("pixie"), folder / "s.zarr")
     return dataset, folder / "s.zarr"
 

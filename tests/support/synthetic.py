@@ -3,7 +3,7 @@
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import ClassVar
+from typing import ClassVar, Self
 
 import numpy as np
 
@@ -86,6 +86,12 @@ class Dataset:
             name = f"{object_id}/{view}.npz" if view else f"{object_id}.npz"
             self.write_slat(name, asset.coords, asset.feats)
             self.assets[f"{object_id}.{view}" if view else object_id] = asset
+
+    def having(self, *ids: str, seed: int = 0) -> Self:
+        """Add objects, each with the next seed."""
+        for number, object_id in enumerate(ids, seed):
+            self.add(object_id, number)
+        return self
 
     def write_grid(self, object_id: str, grid: np.ndarray) -> None:
         """Write a grid as PixieVerse lays it out."""

@@ -61,9 +61,7 @@ def address(shared: tuple[Processes, str]) -> str:
 def local(tmp_path_factory: pytest.TempPathFactory) -> Made:
     """Six assets, and the store that one process makes of them."""
     folder = tmp_path_factory.mktemp("local")
-    dataset = Dataset(folder / "sources")
-    for seed, object_id in enumerate("abcdef"):
-        dataset.add(object_id, seed)
+    dataset = Dataset(folder / "sources").having(*"abcdef")
     build_store(dataset.parameters("pixie"), folder / "s.zarr", jobs=1)
     return dataset, folder / "s.zarr"
 

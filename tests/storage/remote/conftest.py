@@ -10,7 +10,7 @@ import pytest
 from joblib.externals.loky import get_reusable_executor
 from s3fs.core import S3FileSystem
 from support import object_store
-from support.remote import Made, built, made
+from support.remote import Dataset, Made, built
 from support.synthetic import MakeDataset
 
 
@@ -75,7 +75,7 @@ def another(tmp_path_factory: pytest.TempPathFactory) -> Made:
 
 @pytest.fixture
 def make_dataset(tmp_path: Path) -> MakeDataset:
-    return lambda *ids: made(tmp_path / "sources", *ids)
+    return lambda *ids: Dataset(tmp_path / "sources").having(*ids)
 
 
 class Requests:
