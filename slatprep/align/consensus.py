@@ -22,7 +22,14 @@ from slatprep.align.settle import take
 from slatprep.align.starts import distinct_starts
 from slatprep.geometry.frames import split_transform
 from slatprep.parameters import AlignParameters
-from slatprep.records import Alignment, Consensus, Engine, MaterialField, StructuredLatents
+from slatprep.records import (
+    Alignment,
+    Consensus,
+    Engine,
+    MaterialField,
+    Placement,
+    StructuredLatents,
+)
 
 LEAST_WINNERS = 5
 LEAST_SHARE = 0.5
@@ -65,16 +72,24 @@ def find_consensus(transforms: Iterable[ArrayLike]) -> Consensus | None:
 def settle(alignment: Alignment, latents: StructuredLatents, consensus: Consensus) -> Alignment:
     """Choose, among tied placements, the one nearest to the common rotation.
 
-    Returns the same object where nothing is tied or the choice stands.
+    Returns the same object where nothing is tied, or none of them is turned as the dataset is.
     """
     if not alignment.placements:
         return alignment
-    choices = [alignment.transform, *(placement.transform for placement in alignment.placements)]
-    angles = [degrees_between(split_transform(c)[0], consensus.rotation) for c in choices]
+    ties = [Placement(alignment.transform, alignment.score, 0.0), *alignment.placements]
+    angles = [degrees_between(split_transform(t.transform)[0], consensus.rotation) for t in ties]
     chosen = int(np.argmin(angles))
-    if chosen == 0:
+    if angles[chosen] > NEAR_DEGREES:
         return alignment
-    return take(alignment, chosen - 1, latents, consensus)
+    prior, rare = _shares_of(consensus)
+    odds = [prior if angle <= NEAR_DEGREES else rare for angle in angles]
+    scores = np.array([tie.score for tie in ties])
+    # An engine that ranks by fitness alone has no scores: NaN.
+    likely = odds * np.exp(np.nan_to_num(scores - scores[chosen]) / TEMPERATURE)
+    by = replace(consensus, probability=float(odds[chosen] / likely.sum()))
+    if chosen == 0:
+        return replace(alignment, settled_by=by)
+    return take(alignment, chosen - 1, latents, by)
 
 
 def turn_if_likelier(
@@ -116,10 +131,15 @@ def probability_of_common(consensus: Consensus, gain: float) -> float:
 
     `gain` is how much higher the asset scores in the common rotation, once deformed.
     """
+    common, other = _shares_of(consensus)
+    return 1.0 / (1.0 + other / common * math.exp(min(-gain / TEMPERATURE, 700.0)))
+
+
+def _shares_of(consensus: Consensus) -> tuple[float, float]:
+    """Return how frequent the common rotation is in the dataset, and any other quarter turn."""
     # One more that disagrees, so that no other rotation is impossible.
     common = consensus.agreeing / (consensus.winners + 1)
-    other = (1.0 - common) / (len(distinct_starts()) - 1)
-    return 1.0 / (1.0 + other / common * math.exp(min(-gain / TEMPERATURE, 700.0)))
+    return common, (1.0 - common) / (len(distinct_starts()) - 1)
 
 
 def degrees_between(rotation: ArrayLike, other: ArrayLike) -> float:

@@ -28,6 +28,7 @@ def info(
     slatprep info data/demo.zarr
     """
     from slatprep.inspect.overview import overview_of
+    from slatprep.pipeline.decoys import told_of
     from slatprep.store import open_store
 
     opened = open_store(store)
@@ -57,7 +58,7 @@ def info(
             ],
         )
 
-    output.result(overview, show)
+    output.result(vars(overview) | {"errors": told_of(opened)}, show)
 
 
 def show_quality(output: Output, overview: StoreOverview, *, advise: bool = True) -> None:

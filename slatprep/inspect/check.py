@@ -49,27 +49,31 @@ AT_MOST = {"ambiguity": THRESHOLDS.good_ambiguity}
 class Figure:
     """One number of a check: the `value` computed now and the `stored` one.
 
-    `limit` is their largest allowed difference.
+    `limit` is their largest allowed difference. One that is `settled` has no threshold: something
+    chose among the ties.
     """
 
     name: str
     value: float
     stored: float
     limit: float
+    settled: bool = False
 
     @property
     def passes(self) -> bool | None:
         """Whether the value is that of a good alignment; None if it has no threshold."""
         if self.name in AT_LEAST:
             return self.value >= AT_LEAST[self.name]
-        return self.value <= AT_MOST[self.name] if self.name in AT_MOST else None
+        limited = self.name in AT_MOST and not self.settled
+        return self.value <= AT_MOST[self.name] if limited else None
 
     @property
     def threshold_text(self) -> str:
         """The threshold in words, like ``>= 0.8``; empty if there is none."""
         if self.name in AT_LEAST:
             return f">= {AT_LEAST[self.name]:g}"
-        return f"<= {AT_MOST[self.name]:g}" if self.name in AT_MOST else ""
+        limited = self.name in AT_MOST and not self.settled
+        return f"<= {AT_MOST[self.name]:g}" if limited else ""
 
     @property
     def ok(self) -> bool:

@@ -111,6 +111,10 @@ def judge(
     around = surroundings_of(field, latents, alignment, annotation)
     evidence = evidence_of(field, latents, alignment, annotation, around, ambiguity.material_share)
     same, placed = same_object(evidence), right_placement(evidence)
+    by = alignment.settled_by
+    if by is not None and ambiguity.material_share > THRESHOLDS.good_ambiguity:
+        # One of those that tie is right as likely as without a tie, and this is that one.
+        placed *= by.probability
     valid = annotation.valid
     likely = class_confidence(around, same * placed, valid)
     expected = float(likely[valid].mean(dtype=np.float64)) if valid.any() else 0.0
@@ -275,10 +279,10 @@ def verdict_of(
             f"only {valid_share:.1%} of the SLAT voxels found an annotation "
             f"(good needs {limits.good_valid_share:.0%})"
         )
-    if ambiguity > limits.good_ambiguity:
-        others = "another placement fits" if ties == 1 else f"{ties or ''} other placements fit"
+    if ties and ambiguity > limits.good_ambiguity:
+        others = "another placement fits" if ties == 1 else f"{ties} other placements fit"
         reasons.append(
-            f"{others.lstrip()} about as well and would change the class of {ambiguity:.1%} of the "
+            f"{others} about as well and would change the class of {ambiguity:.1%} of the "
             f"voxels (good needs {limits.good_ambiguity:.0%})"
         )
     if mirrored > limits.good_mirrored:

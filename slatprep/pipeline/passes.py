@@ -12,6 +12,8 @@ import hashlib
 from collections.abc import Iterable
 from dataclasses import replace
 
+import numpy as np
+
 from slatprep.align.consensus import find_consensus, is_common, settle, turn_if_likelier
 from slatprep.align.settle import refit, take
 from slatprep.geometry.deformation import map_of
@@ -126,7 +128,11 @@ def apply_consensus(assets: list[Row], context: BuildContext, crew: Crew) -> lis
     settled = run_unordered(settle_asset, tasks, crew.of(len(assets)))
     changed = {asset.asset_id: asset for asset in settled}
     moved, righted = (
-        sum(changed[asset.asset_id] is not asset for asset in some) for some in (tied, turned)
+        sum(
+            not np.array_equal(changed[one.asset_id].columns["transform"], one.columns["transform"])
+            for one in some
+        )
+        for some in (tied, turned)
     )
     crew.tell(
         f"consensus: {consensus.agreeing:,} of {consensus.winners:,} assets without a tie share a "

@@ -110,8 +110,7 @@ class Judgement:
 class Consensus:
     """The rotation (3, 3) that `agreeing` of `winners` assets without a tie have in common.
 
-    `probability` is that of this rotation where an asset that was turned otherwise, without a tie,
-    took it; NaN where it chose among ties.
+    `probability` is that of this rotation for the asset that has it by the consensus.
     """
 
     rotation: Rotation
@@ -323,8 +322,8 @@ class Alignment:
     score : float
         The engine's rank of placements, 1 for a perfect fit; NaN if it ranks by fitness alone.
     settled_by : Consensus, LatentChoice or None
-        What chose among tied placements: the dataset's common rotation if it moved the asset
-        to another one, or the latents.
+        What chose among tied placements, the dataset's common rotation or the latents, with
+        the probability of the choice.
     deformation : Deformation or None
         On the way from the SLAT frame to the PixieVerse frame it comes before the inverse of
         `transform`; None if the model is ``rigid`` or ``similarity``.

@@ -99,8 +99,9 @@ def test_a_tie_goes_to_the_common_rotation_and_can_be_undone() -> None:
     choices = [before.transform, *(p.transform for p in before.placements)]
     others = [after.transform, *(p.transform for p in after.placements)]
     assert {c.tobytes() for c in choices} == {c.tobytes() for c in others}
-    if after is not before:
-        assert after.settled_by is consensus
+    assert isinstance(after.settled_by, Consensus)
+    assert 0.95 < after.settled_by.probability < 1.0, "six agree, of four that fit as well"
+    if after.transform is not before.transform:
         np.testing.assert_array_equal(after.placements[0].transform, before.transform)
 
 
