@@ -62,6 +62,13 @@ def test_an_asset_on_every_limit_is_good_for_no_reason() -> None:
     assert verdict_of(ROUGH, 1.0, same_object=0.96, right_placement=0.95) == (Verdict.GOOD, ())
 
 
+def test_a_tie_that_something_settled_is_as_good_as_its_probability() -> None:
+    settled = verdict_of(FINE, 1.0, 0.4, 0, same_object=0.99, right_placement=0.97)
+    assert settled == (Verdict.GOOD, ())
+    still_open, _ = verdict_of(FINE, 1.0, 0.4, 1, same_object=0.99, right_placement=0.97)
+    assert still_open is Verdict.DOUBTFUL
+
+
 def test_every_reason_is_named_once() -> None:
     verdict, reasons = verdict_of(ROUGH, 0.7, 0.4, 2, 0.6, 0.8, 0.7, "roughness", contradicted=True)
     assert verdict is Verdict.DOUBTFUL
@@ -98,12 +105,10 @@ def test_a_mirrored_annotation_is_doubtful_however_sure_its_placement_is(
     [
         (1, "another placement fits about"),
         (2, "2 other placements fit about"),
-        (0, "other placements fit about"),  # of a record that does not say how many
     ],
 )
 def test_ties_are_counted(ties: int, start: str) -> None:
-    given = {"ties": ties} if ties else {}
-    verdict, (reason,) = verdict_of(FINE, 1.0, 0.06, **given)
+    verdict, (reason,) = verdict_of(FINE, 1.0, 0.06, ties)
     assert verdict is Verdict.DOUBTFUL
     assert reason.startswith(start)
 

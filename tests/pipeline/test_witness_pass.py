@@ -87,7 +87,12 @@ def test_ties_that_change_labels_are_settled_right_and_recorded(
         assert entry["settled_by"]["probability"] >= 0.95
         assert after[asset_id] > 0.95
         assert heard[asset_id]["first_pass"]["alignment"] == alone[asset_id]["alignment"]
-        assert heard[asset_id]["judgement"]["confidence"] >= 0.9
+        judgement = heard[asset_id]["judgement"]
+        assert judgement["confidence"] >= 0.9
+        if asset_id in differing:
+            assert judgement["right_placement"] <= entry["settled_by"]["probability"]
+            assert judgement["verdict"] == "good"
+            assert alone[asset_id]["judgement"]["verdict"] == "doubtful"
     assert any(before[asset_id] < 0.9 for asset_id in settled)
     moved = sum(heard[k]["alignment"]["transform"] != alone[k]["alignment"]["transform"]
                 for k in settled)  # fmt: skip
