@@ -15,13 +15,14 @@ import tempfile
 from collections.abc import Iterable
 from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
+from shutil import copytree
 
 import numpy as np
 
 from slatprep.demo.asset import make_asset
 from slatprep.demo.catalogue import CATALOGUE
 from slatprep.demo.write import write_annotated, write_slat
-from slatprep.parameters import BuildParameters, PairingParameters, PixieverseSource, SlatSource
+from slatprep.parameters import BuildParameters, PixieverseSource, SlatSource
 from slatprep.pipeline.dataset import build_store
 from slatprep.pipeline.decoys import measure_errors, told_of
 from slatprep.records import RESOLUTION
@@ -77,13 +78,12 @@ def make_one(root: Path, seed: int, number: int, levels: tuple[int, ...]) -> str
 
 def row(name: str, source: Path, slat_of: dict[str, str], out: Path, jobs: int) -> str:
     """Pair grids with SLATs as told, build, measure; return a row of the table."""
-    out.mkdir()
-    lines = ["object_id,slat_id", *(f"{one},{slat}" for one, slat in slat_of.items())]
-    (out / "map.csv").write_text("\n".join(lines) + "\n")
+    (out / "slat").mkdir(parents=True)
+    for asset_id, slat in slat_of.items():
+        (out / "slat" / f"{asset_id}.npz").hardlink_to(source / "slat" / f"{slat}.npz")
+        copytree(source / "pixieverse" / asset_id, out / "pixieverse" / asset_id)
     parameters = BuildParameters(
-        pixieverse=PixieverseSource(root=source / "pixieverse"),
-        slat=SlatSource(root=source / "slat"),
-        pairing=PairingParameters(map=out / "map.csv"),
+        pixieverse=PixieverseSource(root=out / "pixieverse"), slat=SlatSource(root=out / "slat")
     )
     build_store(parameters, out / "s.zarr", jobs=jobs)
     store = open_store(out / "s.zarr")
