@@ -4,8 +4,8 @@
 
 Datasets of demo objects: one asset, ten, all, all with a fifth of the SLATs shuffled among
 themselves, all with all SLATs shuffled, and as many balls. Printed of each: the assets, how many
-pairs are wrong, how many assets are good and failed, how many wrong ones are good, and what the
-decoys say.
+pairs are wrong, how many assets are good and failed, how many wrong ones are good and in how many
+of these both objects are of one category, and what the decoys say.
 """
 
 from __future__ import annotations
@@ -36,13 +36,17 @@ def main() -> None:
     parser.add_argument("--assets", type=int, default=126)
     parser.add_argument("--seed", type=int, default=61)
     parser.add_argument("--levels", type=int, nargs="+", default=[5, 6, 7])
+    parser.add_argument("--only", nargs="+", default=[], help="names of datasets")
     parser.add_argument("--jobs", type=int, default=2)
     options = parser.parse_args()
     with tempfile.TemporaryDirectory() as scratch:
         mixed, balls = Path(scratch, "mixed"), Path(scratch, "balls")
         ids = make(mixed, range(options.assets), options)
+        made = dict(zip(ids, order(options), strict=True))
         numbers = range(BALL, BALL + len(CATALOGUE) * options.assets, len(CATALOGUE))
-        ball_ids = make(balls, numbers, options)
+        all_wanted = not options.only
+        wants_balls = all_wanted or "balls alone" in options.only
+        ball_ids = make(balls, numbers, options) if wants_balls else []
         rng = np.random.default_rng(options.seed)
         fifth = sorted(rng.choice(ids, len(ids) // 5, replace=False).tolist())
         print("| dataset | assets | wrong pairs | good | failed | wrong ones good | decoys say |")
@@ -55,10 +59,17 @@ def main() -> None:
             ("all pairs shuffled", mixed, ids, ids),
             ("balls alone", balls, ball_ids, []),
         ):
+            if not (all_wanted or name in options.only):
+                continue
             shuffled = dict(zip(wrong, [*wrong[1:], *wrong[:1]], strict=True))
             out = Path(scratch, name.replace(" ", "-"))
-            print(row(name, source, {one: shuffled.get(one, one) for one in chosen}, out,
-                      options.jobs), flush=True)  # fmt: skip
+            pairs = {one: shuffled.get(one, one) for one in chosen}
+            alike = {
+                one
+                for one, slat in shuffled.items()
+                if (made[one] - made[slat]) % len(CATALOGUE) == 0
+            }
+            print(row(name, source, pairs, alike, out, options.jobs), flush=True)
 
 
 def make(root: Path, numbers: Iterable[int], options: argparse.Namespace) -> list[str]:
@@ -66,7 +77,13 @@ def make(root: Path, numbers: Iterable[int], options: argparse.Namespace) -> lis
     tasks = [(root, options.seed, number, tuple(options.levels)) for number in numbers]
     with ProcessPoolExecutor(options.jobs) as pool:
         ids = list(pool.map(make_one, *zip(*tasks, strict=True)))
-    return [ids[k] for k in np.random.default_rng(options.seed).permutation(len(ids))]
+    return [ids[k] for k in order(options)]
+
+
+def order(options: argparse.Namespace) -> list[int]:
+    """Return the order in which assets are chosen."""
+    order: list[int] = np.random.default_rng(options.seed).permutation(options.assets).tolist()
+    return order
 
 
 def make_one(root: Path, seed: int, number: int, levels: tuple[int, ...]) -> str:
@@ -76,7 +93,9 @@ def make_one(root: Path, seed: int, number: int, levels: tuple[int, ...]) -> str
     return asset.object_id
 
 
-def row(name: str, source: Path, slat_of: dict[str, str], out: Path, jobs: int) -> str:
+def row(
+    name: str, source: Path, slat_of: dict[str, str], alike: set[str], out: Path, jobs: int
+) -> str:
     """Pair grids with SLATs as told, build, measure; return a row of the table."""
     (out / "slat").mkdir(parents=True)
     for asset_id, slat in slat_of.items():
@@ -92,10 +111,10 @@ def row(name: str, source: Path, slat_of: dict[str, str], out: Path, jobs: int) 
     verdicts = dict(zip(store.ids, map(str, store.column("verdict")), strict=True))
     wrong = [one for one, slat in slat_of.items() if one != slat]
     count = list(verdicts.values()).count
-    good = sum(verdicts.get(one) == "good" for one in wrong)
+    good = [one for one in wrong if verdicts.get(one) == "good"]
     told = "; ".join(told_of(store))
     return (f"| {name} | {len(store)} | {len(wrong)} | {count('good')} | {count('failed')} "
-            f"| {good} | {told} |")  # fmt: skip
+            f"| {len(good)} ({len(alike & set(good))}) | {told} |")  # fmt: skip
 
 
 if __name__ == "__main__":

@@ -124,7 +124,7 @@ def test_an_asset_plots_itself_as_the_command_draws_it(copy: Path, tmp_path: Pat
 
 def test_no_words_are_cut_or_written_over_others(copy: Path) -> None:
     group = zarr.open_group(copy, mode="r+")
-    for name, value in (("confidence", 0.4), ("expected_accuracy", 0.5), ("ambiguity", 0.9)):
+    for name, value in (("confidence", 0.4), ("expected_accuracy", 0.5), ("contradicted", True)):
         group[f"asset/{name}"][0] = value
     misplace(copy, 0, 0.06)
     store = open_store(copy)

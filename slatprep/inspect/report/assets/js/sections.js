@@ -114,8 +114,10 @@ const Sections = (() => {
     byId("errors").textContent = told.map(sentence).join(" ");
     if (!edges) return;
     const domain = [edges[0], edges.at(-1)];
-    const share = (odds) => Number((1 / (1 + Math.exp(-odds))).toPrecision(3));
-    const ticks = [-9.21, -4.6, 0, 4.6, 9.21].filter((at) => at >= domain[0] && at <= domain[1]).map((at) => ({ at, text: String(share(at)) }));
+    const share = (odds) => (1 / (1 + Math.exp(-odds))).toFixed(4);
+    const ticks = [1e-4, 0.01, 0.5, 0.99, 0.9999]
+      .map((text) => ({ at: Math.log(text / (1 - text)), text: String(text) }))
+      .filter(({ at }) => at >= domain[0] && at <= domain[1]);
     const [, most, least] = kept.find(([rate]) => rate === 0.01);
     const marks = least === null ? [] : [{ at: least, text: `1 % wrong: ${Format.count(most)} kept` }];
     const one = (title, counts, colour) =>
