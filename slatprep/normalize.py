@@ -8,6 +8,7 @@ A property is mapped to log10 of its SI value (Young's modulus, density) or stay
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -129,7 +130,7 @@ def normalize_and_count(
     properties: ArrayLike, normalization: Normalization
 ) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
     """Normalise as `normalize_properties`, and count the clipped values per property (P,)."""
-    given = np.asarray(properties)
+    given = _in_columns(properties, normalization)
     values = np.empty(given.shape, dtype=np.float32)
     clipped = np.zeros(len(normalization.ranges), dtype=np.int64)
     for column, span in enumerate(normalization.ranges):
@@ -160,12 +161,22 @@ def denormalize_properties(
     ndarray of float32, shape (N, P)
         In SI units. Clipped values come back as the end of their range.
     """
-    given = np.asarray(values)
+    given = _in_columns(values, normalization)
     properties = np.empty(given.shape, dtype=np.float32)
     for column, span in enumerate(normalization.ranges):
         mapped = (given[..., column].astype(np.float64) + 1.0) * 0.5 * (span.hi - span.lo) + span.lo
         properties[..., column] = 10.0**mapped if span.log10 else mapped
     return properties
+
+
+def _in_columns(values: ArrayLike, normalization: Normalization) -> NDArray[Any]:
+    given, names = np.asarray(values), [span.name for span in normalization.ranges]
+    if given.shape[-1:] != (len(names),):
+        raise ValueError(
+            f"properties have shape {given.shape}; expected (N, {len(names)}), a column each of "
+            f"{', '.join(names)}"
+        )
+    return given
 
 
 def change_ranges(values: ArrayLike, old: Normalization, new: Normalization) -> NDArray[np.float64]:

@@ -3,6 +3,7 @@
 import json
 import math
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -88,6 +89,13 @@ def test_what_is_normalised_alone_is_what_is_counted_too() -> None:
     np.testing.assert_array_equal(
         normalize_properties(rows, DECADES), normalize_and_count(rows, DECADES)[0]
     )
+
+
+@pytest.mark.parametrize("way", [normalize_properties, denormalize_properties])
+@pytest.mark.parametrize("shape", [(2, 2), (2, 4), (3, 7), ()])
+def test_columns_without_a_range_are_refused(way: Any, shape: tuple[int, ...]) -> None:
+    with pytest.raises(ValueError, match=r"expected \(N, 3\), a column each of youngs_modulus"):
+        way(np.ones(shape))
 
 
 def test_nan_passes_through_uncounted() -> None:

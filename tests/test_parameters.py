@@ -59,6 +59,11 @@ def test_paths_are_relative_to_the_file_and_not_to_the_working_directory(
     assert parameters.normalize.ranges == str(folder / "ranges.toml")
 
 
+def test_a_path_may_be_a_text(folder: Path) -> None:
+    config = write(folder, MINIMAL)
+    assert load_parameters(str(config)) == load_parameters(config)
+
+
 def test_options_win_over_the_file(folder: Path) -> None:
     (folder / "other").mkdir()
     path = write(folder, MINIMAL + '[normalize]\nranges = "dataset"\n')

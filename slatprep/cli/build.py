@@ -236,7 +236,9 @@ def report(output: Output, summary: BuildSummary) -> None:
             # What a dataset definition may say is of no use to `subset` and `concat`.
             show_quality(output, overview_of(store), advise=built)
             show_errors(store)
-        others = ", ".join(f"{count:,} {status}" for status, count in summary.statuses.items())
+        # "failed" beside the verdicts would be read as one of them.
+        words = {"failed": "not built"} if output.command == "build-store" else {}
+        others = ", ".join(f"{n:,} {words.get(key, key)}" for key, n in summary.statuses.items())
         say(f"assets:  {total:,} ({others}) in {summary.seconds:,.1f} s")
         if summary.store is not None:
             say(f"store:   {summary.store}")

@@ -60,13 +60,13 @@ _PATHS = (
 
 
 def load_parameters(
-    config: Path | None, overrides: Overrides | None = None, preset: str | None = None
+    config: Path | str | None, overrides: Overrides | None = None, preset: str | None = None
 ) -> BuildParameters:
     """Return the parameters of a build from a dataset definition and options.
 
     Parameters
     ----------
-    config : Path or None
+    config : Path, str or None
         The TOML file; None if options give everything.
     overrides : mapping, optional
         Values that win over the file, nested as the file is. Their paths are
@@ -89,6 +89,7 @@ def load_parameters(
     # Late: pydantic takes a third of a second that `slatprep --help` does not have.
     from pydantic import TypeAdapter, ValidationError
 
+    config = None if config is None else Path(config)
     data = {} if config is None else _read(config)
     if preset is not None:
         if preset not in PRESETS:

@@ -65,7 +65,7 @@ def _known_mistakes(parts: Sequence[Part], units: Units) -> Iterator[Mistake]:
         chosen = dict(zip(named, pair, strict=True))
         given = ", ".join(f'{name} = "{unit}"' for name, unit in chosen.items() if unit)
         words = " and ".join(unit for unit in pair if unit)
-        setting = f"or say what they are, such as units = {{ {given} }} in its source"
+        setting = f"or say units = {{ {given} }} in [pixieverse] of the dataset definition"
         yield Mistake(words, setting, _scaled(*pair))
     if {part.name for part in parts} & LIGHTEST.keys():
         yield Mistake(

@@ -97,10 +97,14 @@ def require_plausible(
         others = [one.words for one in likely[1:4]]
         guess = likely[0].words + (f" (or {', or '.join(others)})" if others else "")
         what = f"the values look like {guess}: {what}"
-        advice = f"SI units, a channel each as documented; {likely[0].setting}"
+        advice = f"SI units, in the documented order; {likely[0].setting}"
     if roots.plausibility == "warn":
         return [f'{TOLD}{what}; taken as they are (plausibility = "warn")']
-    raise InputError(where, what, f'{advice}. plausibility = "warn" takes them as they are')
+    raise InputError(
+        where,
+        what,
+        f'{advice}; or set plausibility = "warn" in [pixieverse] to take them as they are',
+    )
 
 
 def require_prediction(

@@ -184,13 +184,16 @@ class AssetTable:
             If there is no such array, or it cannot be read.
         """
         if f"asset/{name}" not in NAMES:
-            columns = ("id", "offset", "transform", *ASSET_COLUMNS)
-            close = difflib.get_close_matches(name, columns, n=1)
-            hint = f"did you mean {close[0]}?" if close else f"expected one of {', '.join(columns)}"
-            raise StoreError(f"{self.path} has no column {name!r}; {hint}")
+            raise self.no_column(name, ("id", "offset", "transform", *ASSET_COLUMNS))
         # Offsets are always written: that they are there bounds what the others may claim.
         rows = self.shape("asset/offset")[0] if name == "offset" else len(self)
         return self.read_rows(f"asset/{name}", 0, rows)
+
+    def no_column(self, name: str, columns: Sequence[str]) -> StoreError:
+        """Return what to raise for a name that is none of the columns."""
+        close = difflib.get_close_matches(name, columns, n=1)
+        hint = f"did you mean {close[0]}?" if close else f"expected one of {', '.join(columns)}"
+        return StoreError(f"{self.path} has no column {name!r}; {hint}")
 
     def find(self, asset_id: str) -> int:
         """Return the index of the asset with this id, and no other.

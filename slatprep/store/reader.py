@@ -196,14 +196,14 @@ class Store(AssetTable):
         return self.asset(name)
 
     def read(
-        self, index: int, columns: Sequence[str] = TRAINING_COLUMNS
+        self, index: str | int, columns: Sequence[str] = TRAINING_COLUMNS
     ) -> dict[str, NDArray[Any]]:
         """Read rows of ``voxel/*`` of one asset: the fast way, made for training.
 
         Parameters
         ----------
-        index : int
-            Which asset, 0 to ``len(store) - 1``.
+        index : str or int
+            Which asset, 0 to ``len(store) - 1``, or its id; see `match`.
         columns : sequence of str
             Last names of ``voxel/*`` arrays: ``coords``, ``feats``,
             ``properties``, ``material``, ``valid``, ``distance``, ``place``,
@@ -219,7 +219,7 @@ class Store(AssetTable):
         StoreError
             If there is no such asset or array, or a file is missing or damaged.
         """
-        start, stop = self.rows(index)
+        start, stop = self.rows(self.match(index) if isinstance(index, str) else index)
         if storage_of(self.path).local is not None:
             return {name: self._voxel_rows(name, start, stop) for name in columns}
         # Each array is an object of its own, and an answer takes long to come. Threads that were
@@ -282,6 +282,8 @@ class Store(AssetTable):
         )
 
     def _voxel_rows(self, name: str, start: int, stop: int) -> NDArray[Any]:
+        if name not in VOXEL_COLUMNS:
+            raise self.no_column(name, VOXEL_COLUMNS)
         if name in MERGED_COLUMNS and not self.merges:
             columns = [len(self.about.property_columns)] if name == "spread" else []
             return np.full([stop - start, *columns], np.nan, dtype=np.float32)

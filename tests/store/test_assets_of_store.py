@@ -169,6 +169,14 @@ def test_a_column_that_is_not_there_is_answered_by_those_that_are(made: Made) ->
         store.column("nope")
 
 
+def test_rows_are_read_by_whatever_names_an_asset(made: Made) -> None:
+    store, _ = made
+    expected = store.read(0)["coords"]
+    assert np.array_equal(store.read(store.ids[0])["coords"], expected)
+    with pytest.raises(StoreError, match=r"has no column 'coordz'; did you mean coords\?"):
+        store.read(0, columns=("coordz",))
+
+
 def test_a_notebook_shows_the_store_as_a_table(made: Made) -> None:
     store, _ = made
     shown = store._repr_html_()
