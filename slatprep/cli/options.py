@@ -398,8 +398,8 @@ def note_split(output: Output, assignment: Assignment, how: str) -> None:
     output.note(f"split:   {how}: {counts}")
     if how.endswith("by hash") and len(assignment.splits) < _FEW_OBJECTS:
         output.note(
-            "note:    a hash of its id draws each object's split; of few objects the shares are "
-            "rough. --split-by FILE takes lists of your own"
+            "note:    a hash of an object's id decides its split, so the shares are rough in a "
+            "small dataset; --split-by FILE takes lists of your own"
         )
     for ids, what in (
         (assignment.unknown, "are of no object of the store that has a valid voxel"),

@@ -116,6 +116,7 @@ def train(
     require_torch(device)
     import torch
 
+    from slatprep.learn.runs import LAST
     from slatprep.learn.splits import assign_store
     from slatprep.learn.train import TrainParameters
     from slatprep.learn.train import train as run
@@ -154,7 +155,11 @@ def train(
     runs = {name: out / name for name in _SIZES} if all_sizes else {size: out}
     summaries = {}
     for name, directory in runs.items():
-        output.keeps("the same command goes on with the last step that was kept")
+        output.keeps(
+            "the same command goes on from the last checkpoint, at most 30 s and a step ago"
+        )
+        if (directory / LAST).exists():
+            output.note(f"resumed: from {directory / LAST}; steps are counted from there")
         with (
             writing(str(directory), directory.parent),
             output.progress(f"train {name}", "steps") as steps,

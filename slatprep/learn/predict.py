@@ -111,7 +111,7 @@ def load_checkpoint(path: Path, device: str = "cpu") -> Checkpoint:
     if path.is_dir():
         path = path / "best.pt"
     if not path.is_file():
-        raise InputError(path, "does not exist", "best.pt of a run of `slatprep train`")
+        raise InputError(path, "does not exist", "best.pt, which a training writes with its epochs")
     state = read_state(path)
     wanted = "best.pt of a run of `slatprep train`; one without ranges is trained anew"
     with refusing(path, "holds no decoder with its ranges", wanted):

@@ -210,13 +210,16 @@ def test_baselines_are_what_numpy_finds(learn_store: Path) -> None:
 
 def test_commands_train_and_evaluate(learn_store: Path, tmp_path: Path) -> None:
     shares = ("--shares", "0.4,0.3,0.3")
-    trained = CliRunner().invoke(
-        slatprep,
-        ["train", str(learn_store), "--out", str(tmp_path / "run"), "--size", "small", "--epochs",
-         "2", "--learning-rate", "0.002", "--threads", "1", *shares, "--json"],
-    )  # fmt: skip
+    command = [
+        "train", str(learn_store), "--out", str(tmp_path / "run"), "--size", "small", "--epochs",
+        "2", "--learning-rate", "0.002", "--threads", "1", *shares, "--json",
+    ]  # fmt: skip
+    trained = CliRunner().invoke(slatprep, command)
     assert trained.exit_code == 0, trained.output
-    assert "of few objects the shares are rough" in trained.stderr
+    assert "resumed" not in trained.stderr
+    again = CliRunner().invoke(slatprep, command)
+    assert f"resumed: from {tmp_path / 'run' / 'last.pt'}" in again.stderr
+    assert "the shares are rough in a small dataset" in trained.stderr
     history = json.loads(trained.stdout)["runs"]["small"]["history"]
     assert history[1]["train_loss"] < history[0]["train_loss"]
     predictions = tmp_path / "run" / "predictions"
