@@ -100,11 +100,7 @@ def require_plausible(
         advice = f"SI units, in the documented order; {likely[0].setting}"
     if roots.plausibility == "warn":
         return [f'{TOLD}{what}; taken as they are (plausibility = "warn")']
-    raise InputError(
-        where,
-        what,
-        f'{advice}; or set plausibility = "warn" in [pixieverse] to take them as they are',
-    )
+    raise InputError(where, what, f'{advice}; or set plausibility = "warn" in [pixieverse]')
 
 
 def require_prediction(

@@ -153,8 +153,7 @@ def physical_rows(
             raise InputError(
                 where,
                 f"{bad} of {len(keep)} annotated voxels are unphysical, the first by {what}",
-                f"{expected}, in all but {100 * max_unphysical:.4g}% of them "
-                "(sample.max_unphysical)",
+                f"{expected}, in all but {100 * max_unphysical:.4g}% (sample.max_unphysical)",
             )
         notes.append(f"{bad} voxels are unphysical, the first by {what}; not annotated")
     return keep

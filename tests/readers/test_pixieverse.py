@@ -253,7 +253,7 @@ BAD_GRIDS = {
     "predicted nan": (
         _with((2, 1, 2), 3, np.nan, lambda: prediction_of(raw_grid(), scores=True)),
         "ratio nan at annotated voxel (1, 2, 3)",
-        "ratio in [0, 0.5], in all but 10% of them (sample.max_unphysical)",
+        "ratio in [0, 0.5], in all but 10% (sample.max_unphysical)",
     ),
     "predicted class": (
         _with((3, 1, 2), 3, 9, lambda: prediction_of(raw_grid(), scores=False)),
