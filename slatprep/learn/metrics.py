@@ -210,7 +210,7 @@ def evaluate_store(
         raise InputError(
             predictions,
             f"has no prediction of an asset of split {split or 'all'}",
-            f"asset ids as names, such as {', '.join(missing[:3]) or 'none: the split is empty'}",
+            f"ids of that split, such as {', '.join(missing[:3]) or 'none: the split is empty'}",
         )
     average = partial(
         average_objects,
