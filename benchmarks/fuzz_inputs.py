@@ -168,14 +168,14 @@ def isolated(
         changed = replace(parameters, pairing=replace(parameters.pairing, **{key: file}))
         return Local(file, lambda *_: check_pairs(changed))
     file = scratch / f"{kind.role}{target.suffix}"
-    root = {"slat_root": scratch} if kind.role == "slat" else {"pixieverse_root": scratch}
+    root = {"slat": scratch} if kind.role == "slat" else {"pixieverse": scratch}
     files = {kind.role: file}
     if kind.role != "slat":
         for role in ("grid", "mask", "bounds"):
             source = getattr(pair, role)
             if role != kind.role and source is not None:
                 files[role] = Path(shutil.copy(source, scratch / f"{role}{source.suffix}"))
-    moved = replace(pair, **root, **files)
+    moved = replace(pair, roots=replace(pair.roots, **root), **files)
     if kind.role == "slat":
         return Local(file, lambda whole, form: check_latents(moved, whole, form))
     return Local(file, lambda *_: check_field(moved))
