@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from operator import attrgetter
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from slatprep.cli.options import LastStore
@@ -69,6 +70,7 @@ def show_quality(output: Output, overview: StoreOverview, *, advise: bool = True
     """
     from slatprep.inspect.overview import UNKNOWN
     from slatprep.judge import THRESHOLDS
+    from slatprep.storage.versions import is_version
 
     medians = attrgetter("confidence", "expected_accuracy", "fitness", "valid_share")
     total = overview.total
@@ -92,16 +94,19 @@ def show_quality(output: Output, overview: StoreOverview, *, advise: bool = True
                 "gives it"
             )
         )
+    store = overview.store
+    if not isinstance(store, Path) and is_version(store):  # It is gone two builds later.
+        store = store.parent.parent
     doubted = [name for name, count in total.verdicts.items() if count and name != "good"]
     if doubted:
         options = " ".join(f"--verdict {name}" for name in doubted)
-        say(f"why:     slatprep list {overview.store} {options}")
+        say(f"why:     slatprep list {store} {options}")
     if total.ambiguous:
         say(
             f"tied:    {total.ambiguous:,} of {total.assets:,}: other placements fit about as "
             f"well, and change more than {THRESHOLDS.good_ambiguity:.0%} of the classes"
         )
-        say(f"look:    slatprep check-alignment --ambiguous --store {overview.store}")
+        say(f"look:    slatprep check-alignment --ambiguous --store {store}")
 
 
 def show_errors(store: Store) -> None:

@@ -2,9 +2,10 @@
 
 Below the store's URL lie
 
-- ``current.json``, the pointer, which is replaced in one step; - ``versions/NAME/``, a store as on
-a disk, which never changes; - ``manifests/NAME/``, the records of the build that made it; -
-``spool/``, the finished assets of the next one while a cluster builds it.
+- ``current.json``, the pointer, which is replaced in one step;
+- ``versions/NAME/``, a store as on a disk, which never changes;
+- ``manifests/NAME/``, the records of the build that made it;
+- ``spool/``, the finished assets of the next one while a cluster builds it.
 
 Plain zarr opens a version's own URL.
 """

@@ -5,6 +5,7 @@ import shutil
 import subprocess
 import sys
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -16,8 +17,12 @@ from support.synthetic import Dataset
 
 from slatprep import open_store
 from slatprep.cli.commands import slatprep
+from slatprep.cli.info import show_quality
+from slatprep.cli.output import Output
+from slatprep.inspect.overview import overview_of
 from slatprep.learn.runs import EpochRecord
 from slatprep.pipeline.dataset import BuildSummary, build_store
+from slatprep.storage.place import place_of
 
 
 def run(*words: object) -> Result:
@@ -140,6 +145,25 @@ def test_info_and_verify_count_the_same_files(store: Path) -> None:
     told = (run(command, store, "--json") for command in ("info", "verify"))
     one, other = (json.loads(result.stdout)["files"] for result in told)
     assert one == other == sum(file.is_file() for file in store.rglob("*"))
+
+
+@pytest.mark.parametrize(
+    ("place", "named"),
+    [
+        ("s3://b/x.zarr/versions/0123456789abcdef", "s3://b/x.zarr"),
+        ("/d/versions/0123456789abcdef", "/d/versions/0123456789abcdef"),
+    ],
+)
+def test_advice_names_the_store_and_not_a_version_that_is_removed_later(
+    store: Path, place: str, named: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    overview = overview_of(open_store(store))
+    total = replace(overview.total, verdicts={"good": 0, "doubtful": 1, "failed": 0}, ambiguous=1)
+    show_quality(Output(), replace(overview, store=place_of(place), total=total), advise=False)
+    lines = capsys.readouterr().out.splitlines()
+    advice = {line.partition(":")[0]: line.split()[1:] for line in lines if " slatprep " in line}
+    assert advice["why"] == ["slatprep", "list", named, "--verdict", "doubtful"]
+    assert advice["look"] == ["slatprep", "check-alignment", "--ambiguous", "--store", named]
 
 
 @pytest.mark.parametrize("command", ["build-store", "align"])
