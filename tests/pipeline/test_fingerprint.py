@@ -8,6 +8,7 @@ import pytest
 
 from slatprep.pipeline import fingerprint
 from slatprep.pipeline.fingerprint import code_fingerprint, numeric_modules
+from slatprep.readers.adapters import LATENTS, SOURCES
 
 
 def fingerprint_of(monkeypatch: pytest.MonkeyPatch, path: Path) -> str:
@@ -25,6 +26,11 @@ def test_statements_count_and_words_do_not(tmp_path: Path, monkeypatch: pytest.M
     first = of('"""Words."""\n\n\ndef f(x):\n    """More."""\n    return x + 1  # why\n')
     assert of("def f(x):\n    return (x +\n            1)\n") == first
     assert of("def f(x):\n    return x + 2\n") != first
+
+
+def test_every_reader_counts() -> None:
+    readers = {name.partition(":")[0] for name in [*SOURCES.values(), *LATENTS.values()]}
+    assert readers <= set(numeric_modules())
 
 
 def test_it_is_the_same_in_another_process() -> None:
