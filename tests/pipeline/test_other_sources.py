@@ -28,7 +28,6 @@ from slatprep.parameters import (
     SlatSource,
 )
 from slatprep.particles.fields import stored_field
-from slatprep.pipeline import before
 from slatprep.records import Engine
 
 TABLE = [
@@ -323,11 +322,8 @@ def test_a_frame_that_is_known_is_checked(tmp_path: Path, suffix: str) -> None:
     assert build_store(parameters, out).verdicts == {"good": 2}
 
 
-def test_every_file_that_decides_an_asset_is_looked_at_again(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    # States of files are trusted however shortly ago they were written.
-    monkeypatch.setattr(before, "FINE_NS", 0)
+@pytest.mark.usefixtures("files_are_old")
+def test_every_file_that_decides_an_asset_is_looked_at_again(tmp_path: Path) -> None:
     write(tmp_path, "ab")
     frame = tmp_path / "voxels" / "frame.json"
     frame.write_text(json.dumps(QUARTER_TURN.tolist()))

@@ -289,12 +289,8 @@ def test_a_ply_that_claims_more_than_it_has_is_refused(root: Path) -> None:
         field_at(root)
 
 
-def test_changed_voxels_of_a_zarr_group_are_looked_up_anew(
-    root: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    from slatprep.pipeline import before
-
-    monkeypatch.setattr(before, "FINE_NS", 0)
+@pytest.mark.usefixtures("files_are_old")
+def test_changed_voxels_of_a_zarr_group_are_looked_up_anew(root: Path) -> None:
     box = np.argwhere(np.ones((20, 14, 9))) + 22
     rows = {"voxels": box, "density": np.full(len(box), 500.0), "damping": np.full(len(box), 0.5)}
     rows["material"] = np.zeros(len(box), np.uint8)
