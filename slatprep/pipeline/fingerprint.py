@@ -15,13 +15,7 @@ from functools import lru_cache
 from pathlib import Path
 
 STAGES = (
-    "slatprep.readers.pixieverse",
-    "slatprep.readers.voxels",
-    "slatprep.readers.vomp",
-    "slatprep.readers.physxnet",
-    "slatprep.readers.parts",
-    "slatprep.readers.transforms",
-    "slatprep.readers.slat",
+    "slatprep.readers",
     "slatprep.align",
     "slatprep.sample",
     "slatprep.judge",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -97,18 +98,24 @@ def texture_of(path: Place, space: LatentSpace) -> Place | None:
     """
     if not space.encoder.startswith("trellis2-shape-pbr"):
         return None
-    model, home = path.parent.name, path.parent.parent
+    return _textures_of(path.parent) / path.name
+
+
+@lru_cache(maxsize=64)
+def _textures_of(shapes: Place) -> Place:
+    """Return the folder of texture latents beside one of shape latents; listed once a process."""
+    model, home = shapes.name, shapes.parent
     textures = home.parent / "pbr_latents"
-    like = model[model.rfind("_") :]
+    like = "".join(model.rpartition("_")[1:])  # such as _1024
     folders = storage_of(textures).names()[1] if home.name == "shape_latents" else []
     found = [name for name in folders if name.endswith(like)]
     if len(found) != 1:
         raise InputError(
-            path,
+            shapes,
             f"{len(found)} folders of texture latents go with it",
             f"shape_latents/MODEL{like}/ID.npz and one pbr_latents/MODEL{like}/ below slat.root",
         )
-    return textures / found[0] / path.name
+    return textures / found[0]
 
 
 _COORDS = ArraySpec(shapes=((None, 3), (None, 4)), kinds="iu")
