@@ -1,6 +1,7 @@
 """Scores against truth, on stores whose figures can be worked out by hand."""
 
 import json
+from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +15,7 @@ from slatprep.errors import InputError
 from slatprep.geometry.frames import make_transform
 from slatprep.inspect.score import TruthScore, score_against_truth, summarise
 from slatprep.parameters import BuildParameters, PixieverseSource, SlatSource
+from slatprep.records import TRELLIS
 from slatprep.store.layout import ARRAYS
 
 # A rod of two materials along x in the PixieVerse frame.
@@ -49,6 +51,8 @@ def write_store(path: Path, assets: dict[str, dict[str, np.ndarray]]) -> None:
             "material_classes": ["jelly", "metal", "sand", "visplas", "fluid", "snow",
                                  "stationary", "background"],
             "property_columns": properties,
+            "property_units": ["Pa", "kg/m3", "1"],
+            "latents": asdict(TRELLIS),
             "normalization": dict.fromkeys(properties, span),
             "manifest": "0" * 64,
             "build": {"parameters": {"align": {"radius": 1.0}, "sample": {}}, "versions": {}},

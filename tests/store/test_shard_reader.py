@@ -53,7 +53,7 @@ def test_rows_that_are_not_there_are_refused(store: Store) -> None:
         store.read_rows("asset/fitness", 3, 6)
     with pytest.raises(StoreError, match="has no asset 5"):
         store.read(5)
-    with pytest.raises(StoreError, match="lacks the array voxel/colour"):
+    with pytest.raises(StoreError, match=r"has no column 'colour'; did you mean coords\?"):
         store.read(0, ("colour",))
 
 
