@@ -14,7 +14,7 @@ from slatprep.align import align
 from slatprep.errors import InputError
 from slatprep.geometry.deformation import map_of
 from slatprep.judge import judge, merged, voxel_confidence
-from slatprep.parameters import BuildParameters
+from slatprep.parameters import BuildParameters, SampleParameters
 from slatprep.readers import read_field, read_latents
 from slatprep.readers.identity import hash_sources, source_digests
 from slatprep.records import (
@@ -61,13 +61,25 @@ def annotate(
     if alignment is None:
         alignment = align(field, latents, parameters.align)
     reached("asset reused" if reused else "asset aligned", pair.asset_id)
-    annotation = sample(field, map_of(alignment).to_pixieverse(latents.centres), parameters.sample)
+    annotation, judgement = look_up(field, latents, alignment, parameters.sample, judgement)
+    return Annotated(pair, field, alignment, judgement, annotation)
+
+
+def look_up(
+    field: MaterialField,
+    latents: StructuredLatents,
+    alignment: Alignment,
+    parameters: SampleParameters,
+    judgement: Judgement | None = None,
+) -> tuple[Annotation, Judgement]:
+    """Look a field up at the SLAT's voxels, and judge both; a judgement that is known stands."""
+    annotation = sample(field, map_of(alignment).to_pixieverse(latents.centres), parameters)
     if judgement is None:
-        judgement, likely = judge(field, latents, alignment, annotation, parameters.sample)
+        judgement, likely = judge(field, latents, alignment, annotation, parameters)
     else:
         confidence = judgement.confidence
         likely = voxel_confidence(field, latents, alignment, annotation, confidence)
-    return Annotated(pair, field, alignment, judgement, replace(annotation, confidence=likely))
+    return replace(annotation, confidence=likely), judgement
 
 
 def process_several(

@@ -168,7 +168,7 @@ def measure_errors(
     progress: Progress | None = None,
     *,
     most_new: int | None = None,
-    before: Place | None = None,
+    before: MeasuredErrors | None = None,
 ) -> MeasuredErrors:
     """Count the errors of a store's alignments on decoys; none of its assets is aligned again.
 
@@ -186,8 +186,8 @@ def measure_errors(
         Called with the decoys done and the decoys to align.
     most_new : int, optional
         How many decoys to align at most; the others are those that were aligned before.
-    before : Place, optional
-        The store that this one replaces, if it lies elsewhere; its decoys are taken over.
+    before : MeasuredErrors, optional
+        Whose decoys are taken over; by default what was measured of this store.
 
     Returns
     -------
@@ -206,7 +206,7 @@ def measure_errors(
         raise StoreError(f"{store.path}: {reason}")
     keys, evidence = _evidence_of(store)
     wanted = draw_decoys(store, keys, decoys, seed)
-    measured = measured_errors(store.path) or (before and measured_errors(before))
+    measured = before or measured_errors(store.path)
     known = {(one.grid, one.slat, one.keys): one for one in measured.decoys} if measured else {}
     found = [known.get((one.grid, one.slat, one.keys), one) for one in wanted]
     missing = [number for number, one in enumerate(found) if not one.evidence][:most_new]
@@ -267,7 +267,7 @@ def measure_build(
     store that it replaces. Where these allow no decoy, what was measured before stands, and
     `told_of` says that it is of before.
     """
-    measured = measured_errors(store.path) or (before and measured_errors(before))
+    measured = measured_errors(store.path) or (measured_errors(before) if before else None)
     new = min(aligned // EVERY, most)
     if new == 0 or len(store) < LEAST_TARGETS or _no_decoys(store):
         if measured:
@@ -278,7 +278,7 @@ def measure_build(
     # As many as were asked for by hand are kept.
     count = max(min(len(store) // EVERY, most), len(measured.decoys) if measured else 0)
     seed = measured.seed if measured else 0
-    measure_errors(store, count, seed, jobs, most_new=new, before=before)
+    measure_errors(store, count, seed, jobs, most_new=new, before=measured)
 
 
 def _no_decoys(store: Store) -> str:
@@ -321,9 +321,10 @@ def draw_decoys(store: Store, keys: Mapping[str, str], count: int, seed: int) ->
     drawn = []
     for row in by_hash[:count]:
         at, own = place[row], objects[row]
-        larger = next((k for k in by_size[at + 1 :] if objects[k] != own), None)
-        smaller = next((k for k in reversed(by_size[:at]) if objects[k] != own), None)
-        near = [k for k in (smaller, larger) if k is not None]
+        smaller = (by_size[k] for k in range(at - 1, -1, -1))
+        larger = (by_size[k] for k in range(at + 1, len(by_size)))
+        firsts = (next((k for k in side if objects[k] != own), None) for side in (smaller, larger))
+        near = [k for k in firsts if k is not None]
         if near:
             other = min(near, key=lambda k: abs(sizes[k] - sizes[row]))
             drawn.append(Decoy(ids[row], ids[other], (keys[ids[row]], keys[ids[other]])))
@@ -346,16 +347,12 @@ def align_decoy(
 ) -> tuple[int, Decoy]:
     """Align a decoy as its grid was; return it, judged, with its number."""
     from slatprep.align import align
-    from slatprep.geometry.deformation import map_of
-    from slatprep.judge import judge
-    from slatprep.sample import sample
+    from slatprep.pipeline.annotate import look_up
 
     store = open_store(path)
     field, latents = store.asset(decoy.grid).field, store.asset(decoy.slat).latents
     alignment = align(field, latents, parameters.align)
-    places = map_of(alignment).to_pixieverse(latents.centres)
-    annotation = sample(field, places, parameters.sample)
-    judgement, _ = judge(field, latents, alignment, annotation, parameters.sample)
+    _, judgement = look_up(field, latents, alignment, parameters.sample)
     return number, replace(decoy, verdict=str(judgement.verdict), evidence=judgement.evidence)
 
 

@@ -16,8 +16,7 @@ import numpy as np
 
 from slatprep.align.consensus import find_consensus, is_common, settle, turn_if_likelier
 from slatprep.align.settle import refit, take
-from slatprep.geometry.deformation import map_of
-from slatprep.judge import contradicted, judge
+from slatprep.judge import contradicted
 from slatprep.judge.witness import (
     LatentEvidence,
     LatentModel,
@@ -31,6 +30,7 @@ from slatprep.judge.witness import (
     weigh,
 )
 from slatprep.parameters import BuildParameters
+from slatprep.pipeline.annotate import look_up
 from slatprep.pipeline.finish import Crew
 from slatprep.pipeline.plan import BuildContext
 from slatprep.pipeline.rows import Row
@@ -45,7 +45,6 @@ from slatprep.records import (
     StructuredLatents,
     Verdict,
 )
-from slatprep.sample import sample
 from slatprep.store.record import AssetRecord, FailedRecord, FirstPass
 from slatprep.store.record_json import to_json
 from slatprep.workers.local import run_unordered
@@ -82,12 +81,7 @@ class Reopened:
         """Look up and judge under another alignment; fit it first if its placement is another."""
         if alignment.transform is not self.record.alignment.transform:
             alignment = refit(alignment, self.field, self.latents, parameters.align)
-        places = map_of(alignment).to_pixieverse(self.latents.centres)
-        annotation = sample(self.field, places, parameters.sample)
-        judgement, likely = judge(
-            self.field, self.latents, alignment, annotation, parameters.sample
-        )
-        return alignment, replace(annotation, confidence=likely), judgement
+        return alignment, *look_up(self.field, self.latents, alignment, parameters.sample)
 
     def put(self, alignment: Alignment, annotation: Annotation, judgement: Judgement) -> Row:
         """Write the asset with these beside itself; return what the parent keeps."""
