@@ -37,10 +37,10 @@ class Leaps:
 
         `data` is where the file's content begins.
         """
-        if folder != self._folder:
+        other = folder != self._folder
+        if other:
             self._folder, self._first = folder, data
-            self._files = self._bytes = self._reach = self._beyond = 0
-        if self._beyond and self._beyond <= end:  # It was within a larger file.
+        if other or 0 < self._beyond <= end:  # It was within a larger file.
             self._files = self._bytes = self._reach = self._beyond = 0
         self._files, self._bytes = self._files + 1, self._bytes + end - data
         size, name = self._bytes // self._files, folder.rpartition("/")[2]

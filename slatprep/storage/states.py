@@ -77,7 +77,7 @@ class States:
 
         The file may have been written just now, and be open for writing.
         """
-        found = _statx(file, _BASIC | _MOUNT | _UNIQUE_MOUNT)
+        found = _statx(file)
         if found is None:
             return None
         if found.mount not in self._counts:
@@ -150,7 +150,7 @@ def reading(descriptor: int, name: str) -> Iterator[None]:
         return
     before = lasting_state(descriptor)
     yield
-    note(name, before if before == States().of(descriptor) else None)
+    note(name, before if before == _statx(descriptor) else None)
 
 
 def note(name: str, state: Noted) -> None:
@@ -180,7 +180,7 @@ def _nobody_writes(descriptor: int) -> bool:
     return True
 
 
-def _statx(file: str | int, mask: int) -> State | None:
+def _statx(file: str | int, mask: int = _BASIC | _MOUNT | _UNIQUE_MOUNT) -> State | None:
     """Ask for the state of a regular file; None where the system does not tell it."""
     call, buffer = _statx_call(), ctypes.create_string_buffer(_STATX_BYTES)
     name = b"" if isinstance(file, int) else os.fsencode(file)
