@@ -33,9 +33,7 @@ def demo(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return root
 
 
-def test_engines_that_are_not_installed_are_left_out_and_named(
-    demo: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_engines_that_are_not_installed_are_left_out_and_named(demo, monkeypatch):
     without(monkeypatch, "pycpd", "small_gicp", "open3d")
     assert bench.installed_engines() == ("field",)
     # It compiles all kernels anew, twice: `make bench` does that.
@@ -48,15 +46,13 @@ def test_engines_that_are_not_installed_are_left_out_and_named(
         assert f"{engine}: not installed, left out (pip install 'slatprep[" in result.stderr
 
 
-def test_an_engine_that_is_asked_for_and_not_installed_says_what_to_install(
-    demo: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_an_engine_that_is_asked_for_and_not_installed_says_what_to_install(demo, monkeypatch):
     without(monkeypatch, "pycpd")
     with pytest.raises(SlatprepError, match=r"pycpd.*pip install 'slatprep\[bench\]'"):
         bench.bench_align(demo, engines=["cpd-affine"])
 
 
-def test_drift_finds_a_stretched_shape_and_bends_one(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_drift_finds_a_stretched_shape_and_bends_one(monkeypatch):
     pytest.importorskip("pycpd")
     for name, fewer in (("START", (100, 15)), ("FINAL", (400, 30))):
         monkeypatch.setattr(cpd, f"{name}_POINTS", fewer[0])

@@ -9,11 +9,10 @@ import reading as read
 from click.testing import CliRunner
 
 from slatprep.errors import StoreError
-from slatprep.pipeline.dataset import BuildSummary
 from slatprep.store import open_store
 
 
-def test_every_way_reads_every_asset_alike(mixed_build: BuildSummary, tmp_path: Path) -> None:
+def test_every_way_reads_every_asset_alike(mixed_build, tmp_path):
     store = open_store(mixed_build.store)
     read.write_forms(store.path, tmp_path, len(store))
     (tmp_path / "store").symlink_to(store.path)
@@ -26,9 +25,7 @@ def test_every_way_reads_every_asset_alike(mixed_build: BuildSummary, tmp_path: 
             assert np.array_equal(arrays["properties"], asset.properties, equal_nan=True)
 
 
-def test_a_way_that_reads_something_else_is_not_measured(
-    mixed_build: BuildSummary, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_way_that_reads_something_else_is_not_measured(mixed_build, tmp_path, monkeypatch):
     right = next(way for way in read.WAYS if way.name == "npz")
 
     def others(directory: Path) -> read.Reader:
@@ -40,7 +37,7 @@ def test_a_way_that_reads_something_else_is_not_measured(
         read.bench_read(mixed_build.store, tmp_path, repeats=1)
 
 
-def test_the_command_gives_a_figure_for_every_way(mixed_build: BuildSummary) -> None:
+def test_the_command_gives_a_figure_for_every_way(mixed_build):
     call = [str(mixed_build.store), "--assets", "2", "--repeats", "1", "--json"]
     result = CliRunner().invoke(read.main, [*call, "-q"], catch_exceptions=False)
     ways = {way["name"]: way for way in json.loads(result.stdout)["ways"]}

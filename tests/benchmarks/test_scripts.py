@@ -22,7 +22,7 @@ def bench(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
     return bench
 
 
-def test_tables_of_the_page_are_two_cells_wide_and_none_is_empty(bench: ModuleType) -> None:
+def test_tables_of_the_page_are_two_cells_wide_and_none_is_empty(bench):
     one = {"wall [s]": 1.5, "files": None, "runs": [1, [2, 3]], "at": [{"cpu": 4}, {"cpu": 5}]}
     assert list(bench.shown(one))[2:] == [
         "| wall [s] | 1.5 |", "| files | - |", "| runs | 1, 2, 3 |", "| at | cpu 4; cpu 5 |",
@@ -35,14 +35,14 @@ def test_tables_of_the_page_are_two_cells_wide_and_none_is_empty(bench: ModuleTy
     assert "null" not in text
 
 
-def test_every_measurement_names_a_script_and_a_page_that_are_there(bench: ModuleType) -> None:
+def test_every_measurement_names_a_script_and_a_page_that_are_there(bench):
     for one in bench.MEASUREMENTS:
         program, script, *_ = one.command.split()
         assert program == "python" and (ROOT / script).is_file(), one.name
         assert (ROOT / "docs" / f"{one.page}.md").is_file(), one.name
 
 
-def test_what_scripts_import_of_each_other_and_of_the_tests_is_there() -> None:
+def test_what_scripts_import_of_each_other_and_of_the_tests_is_there():
     """Read, not run: a script takes seconds to start, and there are two dozen."""
     folders = {"": ROOT / "benchmarks", "support": ROOT / "tests" / "support"}
     names = {

@@ -40,7 +40,7 @@ def installed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]
 
 
 @pytest.mark.usefixtures("installed")
-def test_the_adapter_of_the_page_builds_a_store(tmp_path: Path) -> None:
+def test_the_adapter_of_the_page_builds_a_store(tmp_path):
     assert len(blocks("python")[0].splitlines()) <= 45
     (tmp_path / "points").mkdir()
     (tmp_path / "slat").mkdir()
@@ -69,7 +69,7 @@ def test_the_adapter_of_the_page_builds_a_store(tmp_path: Path) -> None:
     np.testing.assert_allclose(stored.properties_si[:, 1], conductivity[used], rtol=1e-5)
 
 
-def test_the_dataset_definition_and_the_description_of_the_page_are_valid(tmp_path: Path) -> None:
+def test_the_dataset_definition_and_the_description_of_the_page_are_valid(tmp_path):
     for folder in ("gvm", "latents"):
         (tmp_path / folder).mkdir()
     (tmp_path / "dataset.toml").write_text(blocks("toml")[0])
@@ -79,6 +79,6 @@ def test_the_dataset_definition_and_the_description_of_the_page_are_valid(tmp_pa
     assert [one.name for one in said.table] == [p["name"] for p in json.loads(text)["properties"]]
 
 
-def test_the_page_names_every_source_adapter() -> None:
+def test_the_page_names_every_source_adapter():
     for name in adapters.SOURCES:
         assert f"| `{name}` |" in PAGE

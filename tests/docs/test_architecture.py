@@ -22,12 +22,12 @@ NAMES = sorted(set(re.findall(r"`(slatprep(?:\.\w+)+)`", PAGE)))
 PATHS = sorted(set(re.findall(r"`((?:slatprep|tests|docs)/[\w/.]*|[\w.]+\.(?:toml|yml))`", PAGE)))
 
 
-def test_the_page_names_modules_and_paths() -> None:
+def test_the_page_names_modules_and_paths():
     assert len(NAMES) > 30 and len(PATHS) > 20
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_every_name_exists(name: str) -> None:
+def test_every_name_exists(name):
     parts = name.split(".")
     found = importlib.import_module(parts[0])
     for index, part in enumerate(parts[1:], 2):
@@ -37,17 +37,17 @@ def test_every_name_exists(name: str) -> None:
 
 
 @pytest.mark.parametrize("path", PATHS)
-def test_every_path_exists(path: str) -> None:
+def test_every_path_exists(path):
     assert (ROOT / path).exists()
 
 
-def test_every_room_has_its_line() -> None:
+def test_every_room_has_its_line():
     section = PAGE.split("## The rooms")[1].split("\n## ")[0]
     told = set(re.findall(r"`slatprep/(\w+)(?:/|\.py)`", section))
     assert told == set().union(*LAYERS)
 
 
-def test_the_picture_has_the_floors_that_are_checked() -> None:
+def test_the_picture_has_the_floors_that_are_checked():
     svg = "{http://www.w3.org/2000/svg}"
     picture = ET.parse(ROOT / "docs" / "images" / "house.svg")
     floors = [
@@ -58,14 +58,14 @@ def test_the_picture_has_the_floors_that_are_checked() -> None:
     assert floors == LAYERS
 
 
-def test_the_index_lists_every_page() -> None:
+def test_the_index_lists_every_page():
     index = (ROOT / "docs" / "index.md").read_text("utf-8")
     docs = ROOT / "docs"
     pages = {path.relative_to(docs).as_posix() for path in docs.rglob("*.md")} - {"index.md"}
     assert pages <= set(re.findall(r"\]\(([\w./]+)\)", index))
 
 
-def test_what_changes_code_for_the_tests_names_what_there_is() -> None:
+def test_what_changes_code_for_the_tests_names_what_there_is():
     runner = runpy.run_path(str(ROOT / "tools" / "mutants.py"))
     for module, tests in runner["TESTS"].items():
         assert (ROOT / "slatprep" / f"{module}.py").exists(), module

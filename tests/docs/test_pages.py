@@ -19,7 +19,6 @@ from click.testing import CliRunner
 from nbclient import NotebookClient
 
 from slatprep.cli.commands import COMMANDS, slatprep
-from slatprep.pipeline.dataset import BuildSummary
 
 ROOT = Path(__file__).parents[2]
 DOCS = ROOT / "docs"
@@ -30,9 +29,7 @@ def blocks(page: str) -> list[tuple[str, str]]:
     return re.findall(r"^```(\w+)\n(.*?)^```$", (DOCS / page).read_text("utf-8"), re.S | re.M)
 
 
-def test_tutorial_runs_and_prints_what_it_shows(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_tutorial_runs_and_prints_what_it_shows(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     namespace: dict[str, object] = {}
     printed, compared = "", 0
@@ -54,14 +51,14 @@ def test_tutorial_runs_and_prints_what_it_shows(
     assert (tmp_path / "shards" / "shard-000001.tar").exists()
 
 
-def test_the_page_on_security_says_what_each_command_does_with_files() -> None:
+def test_the_page_on_security_says_what_each_command_does_with_files():
     text = (ROOT / "SECURITY.md").read_text("utf-8")
     _, _, table = text.partition("| command | reads | writes |")
     rows = [row.split("|")[1] for row in table.partition("\n\n")[0].splitlines()[2:]]
     assert set(re.findall(r"`([a-z-]+)`", " ".join(rows))) == COMMANDS.keys()
 
 
-def test_the_notebook_is_the_tutorial_with_its_outputs(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_notebook_is_the_tutorial_with_its_outputs(monkeypatch):
     monkeypatch.syspath_prepend(str(ROOT / "tools"))
     notebook = importlib.import_module("notebook")
     written = json.loads((ROOT / "examples" / "tutorial.ipynb").read_text("utf-8"))
@@ -83,9 +80,7 @@ def test_the_notebook_is_the_tutorial_with_its_outputs(monkeypatch: pytest.Monke
     assert (ROOT / "examples" / "tutorial.ipynb").stat().st_size < 300_000
 
 
-def test_the_notebook_runs_in_jupyter_and_prints_what_the_tutorial_shows(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_notebook_runs_in_jupyter_and_prints_what_the_tutorial_shows(tmp_path, monkeypatch):
     monkeypatch.setenv("PATH", f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}")
     for folder in ("IPYTHONDIR", "JUPYTER_RUNTIME_DIR", "JUPYTER_CONFIG_DIR"):
         monkeypatch.setenv(folder, str(tmp_path / "jupyter"))
@@ -135,13 +130,13 @@ MESSAGES = [
 ]
 
 
-def test_troubleshooting_lists_messages() -> None:
+def test_troubleshooting_lists_messages():
     assert len(MESSAGES) >= 30
     assert len(set(MESSAGES)) == len(MESSAGES)
 
 
 @pytest.mark.parametrize("message", MESSAGES)
-def test_message_is_one_of_the_source(message: str) -> None:
+def test_message_is_one_of_the_source(message):
     pattern = re.compile(".*".join(map(re.escape, message.split("…"))), re.S)
     assert any(pattern.search(template) for template in TEMPLATES), message
 
@@ -163,28 +158,28 @@ def complete(words: str, shell: str = "bash_complete", cwd: Path | None = None) 
     return done.stdout
 
 
-def test_completion_is_documented_for_every_shell_click_knows() -> None:
+def test_completion_is_documented_for_every_shell_click_knows():
     text = (DOCS / "shell.md").read_text("utf-8")
     for shell in ("bash", "zsh", "fish"):
         assert f"_SLATPREP_COMPLETE={shell}_source slatprep" in text
 
 
 @pytest.mark.parametrize("shell", ["zsh", "fish", "bash"])
-def test_completion_script_is_made(shell: str) -> None:
+def test_completion_script_is_made(shell):
     if shell == "bash" and shutil.which("bash") is None:
         pytest.skip("click asks bash for its version")
     script = complete("slatprep", f"{shell}_source")
     assert "_SLATPREP_COMPLETE" in script and "slatprep" in script
 
 
-def test_commands_options_and_values_complete() -> None:
+def test_commands_options_and_values_complete():
     assert complete("slatprep exp").splitlines() == ["plain,export"]
     offered = complete("slatprep export x --format w").splitlines()
     assert offered == ["plain,webdataset"]
     assert "plain,--verdict" in complete("slatprep export x --verd").splitlines()
 
 
-def test_asset_ids_complete_from_the_store(mixed_build: BuildSummary) -> None:
+def test_asset_ids_complete_from_the_store(mixed_build):
     store = mixed_build.store
     assert store is not None
     offered = complete(f"slatprep export {store.name} --asset bear", cwd=store.parent)
@@ -203,11 +198,8 @@ def test_asset_ids_complete_from_the_store(mixed_build: BuildSummary) -> None:
     ids=lambda arguments: arguments[0],
 )
 def test_wrong_asset_is_answered_with_the_one_it_might_be(
-    arguments: tuple[str, ...],
-    mixed_build: BuildSummary,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+    arguments, mixed_build, tmp_path, monkeypatch
+):
     monkeypatch.chdir(tmp_path)
     words = [str(mixed_build.store) if word == "STORE" else word for word in arguments]
     result = CliRunner().invoke(slatprep, words)
@@ -227,15 +219,13 @@ def test_wrong_asset_is_answered_with_the_one_it_might_be(
         (("--format", "ply", "--shard-size", "3"), "--shard-size is for --format webdataset"),
     ],
 )
-def test_option_without_effect_is_refused(
-    options: tuple[str, ...], said: str, mixed_build: BuildSummary, tmp_path: Path
-) -> None:
+def test_option_without_effect_is_refused(options, said, mixed_build, tmp_path):
     words = ["export", str(mixed_build.store), "--out", str(tmp_path / "x"), *options]
     result = CliRunner().invoke(slatprep, words)
     assert result.exit_code == 2 and said in result.stderr
 
 
-def test_quiet_export_prints_nothing(mixed_build: BuildSummary, tmp_path: Path) -> None:
+def test_quiet_export_prints_nothing(mixed_build, tmp_path):
     words = ["export", str(mixed_build.store), "--format", "ply", "--frame", "pixieverse"]
     loud = CliRunner().invoke(slatprep, [*words, "--out", str(tmp_path / "a")])
     assert "have no world bounds" in loud.stderr and "Exported to" in loud.stdout

@@ -9,7 +9,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 from click.testing import CliRunner
-from support.synthetic import MakeDataset
 from support.trees import records_of
 
 from slatprep.cli.commands import slatprep
@@ -41,9 +40,7 @@ BAD_NAMES = {"SLAT": slat_name, "grid": grid_folder, "sample": sample_folder}
 
 @pytest.mark.parametrize("case", BAD_NAMES)
 @pytest.mark.parametrize("jobs", [1, 2])
-def test_a_name_that_is_not_utf_8_costs_its_asset_alone(
-    make_dataset: MakeDataset, tmp_path: Path, case: str, jobs: int
-) -> None:
+def test_a_name_that_is_not_utf_8_costs_its_asset_alone(make_dataset, tmp_path, case, jobs):
     dataset = make_dataset("a", "c")
     BAD_NAMES[case](dataset.root)
     summary = build_store(dataset.parameters(), tmp_path / "s.zarr", jobs=jobs)
@@ -56,8 +53,8 @@ def test_a_name_that_is_not_utf_8_costs_its_asset_alone(
 
 
 def test_a_sample_whose_name_is_not_utf_8_is_left_out_of_those_that_are_merged(
-    make_dataset: MakeDataset, tmp_path: Path
-) -> None:
+    make_dataset, tmp_path
+):
     dataset = make_dataset("a")
     samples = dataset.root / "pixieverse/a"
     shutil.copytree(samples / "sample_0", samples / f"sample_{BAD}")
@@ -71,9 +68,7 @@ def test_a_sample_whose_name_is_not_utf_8_is_left_out_of_those_that_are_merged(
     assert verify_store(summary.store).ok
 
 
-def test_a_category_that_is_no_text_is_written_out(
-    make_dataset: MakeDataset, tmp_path: Path
-) -> None:
+def test_a_category_that_is_no_text_is_written_out(make_dataset, tmp_path):
     dataset = make_dataset("a")
     categories = tmp_path / "categories.json"
     categories.write_text('{"a": {"obj_class": "x\\ud800y"}}')
@@ -89,9 +84,7 @@ BOUNDS = {
 
 
 @pytest.mark.parametrize("case", BOUNDS)
-def test_bounds_that_are_no_text_are_left_out(
-    make_dataset: MakeDataset, tmp_path: Path, case: str
-) -> None:
+def test_bounds_that_are_no_text_are_left_out(make_dataset, tmp_path, case):
     dataset = make_dataset("a")
     np.savez(
         dataset.root / "pixieverse/a/clip_features.npz",
@@ -105,9 +98,7 @@ def test_bounds_that_are_no_text_are_left_out(
     assert "[model] is no text; left out" in record["warnings"][0]
 
 
-def test_a_store_cannot_have_a_name_that_is_not_utf_8(
-    make_dataset: MakeDataset, tmp_path: Path
-) -> None:
+def test_a_store_cannot_have_a_name_that_is_not_utf_8(make_dataset, tmp_path):
     dataset = make_dataset("a")
     with pytest.raises(StoreError, match=r"b\\udcff: .*UTF-8"):
         build_store(dataset.parameters(), tmp_path / BAD)
@@ -120,7 +111,7 @@ def test_a_store_cannot_have_a_name_that_is_not_utf_8(
     assert not [path for path in tmp_path.iterdir() if path != dataset.root]
 
 
-def test_a_root_that_is_not_utf_8_is_named(tmp_path: Path) -> None:
+def test_a_root_that_is_not_utf_8_is_named(tmp_path):
     folder = tmp_path / BAD
     (folder / "slat").mkdir(parents=True)
     config = folder / "d.toml"

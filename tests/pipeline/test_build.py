@@ -1,22 +1,21 @@
 import json
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 from support.faults import inject
-from support.synthetic import JELLY, METAL, Dataset, MakeDataset, make_asset
+from support.synthetic import JELLY, METAL, make_asset
 from support.trees import records_of, tree
 
 from slatprep.errors import ConfigError, InputError, MissingPartnerError, StoreError
 from slatprep.inspect.verify import verify_store
 from slatprep.parameters import PairingParameters, SampleParameters
-from slatprep.pipeline.dataset import BuildSummary, align_pairs, build_store
+from slatprep.pipeline.dataset import align_pairs, build_store
 from slatprep.store import open_store
 from slatprep.store.manifests import manifests_of
 
 
-def test_bad_assets_are_told_and_the_others_go_in(mixed_build: BuildSummary) -> None:
+def test_bad_assets_are_told_and_the_others_go_in(mixed_build):
     assert mixed_build.statuses == {"ok": 5, "failed": 1, "skipped": 1}
     assert mixed_build.verdicts == {"good": 5}
     assert not mixed_build.complete
@@ -30,16 +29,14 @@ def test_bad_assets_are_told_and_the_others_go_in(mixed_build: BuildSummary) -> 
     assert [line["asset_id"] for line in lines] == open_store(mixed_build.store).ids
 
 
-def test_two_jobs_write_the_same_bytes_as_one(
-    mixed: Dataset, mixed_build: BuildSummary, tmp_path: Path
-) -> None:
+def test_two_jobs_write_the_same_bytes_as_one(mixed, mixed_build, tmp_path):
     again = build_store(mixed.parameters(), tmp_path / "two.zarr", jobs=2)
     assert again.build_id == mixed_build.build_id
     assert tree(again.store) == tree(mixed_build.store)
     assert records_of(mixed_build.records) == records_of(again.records)
 
 
-def test_the_dataset_can_lie_elsewhere(make_dataset: MakeDataset, tmp_path: Path) -> None:
+def test_the_dataset_can_lie_elsewhere(make_dataset, tmp_path):
     dataset = make_dataset("a")
     first = build_store(dataset.parameters(), tmp_path / "first.zarr")
     dataset.root = dataset.root.rename(tmp_path / "moved")
@@ -47,13 +44,13 @@ def test_the_dataset_can_lie_elsewhere(make_dataset: MakeDataset, tmp_path: Path
     assert tree(second.store) == tree(first.store)
 
 
-def test_progress_counts_every_asset(mixed: Dataset, tmp_path: Path) -> None:
+def test_progress_counts_every_asset(mixed, tmp_path):
     seen: list[tuple[int, int]] = []
     align_pairs(mixed.parameters(), tmp_path / "a.jsonl", progress=lambda *done: seen.append(done))
     assert seen == [(k, 7) for k in range(8)]
 
 
-def test_strict_stops_at_the_first(make_dataset: MakeDataset, tmp_path: Path) -> None:
+def test_strict_stops_at_the_first(make_dataset, tmp_path):
     dataset = make_dataset("a", "c")
     dataset.write_grid("b", np.zeros((64, 64, 63, 4), np.float32))
     with pytest.raises(MissingPartnerError, match="no SLAT for id 'b'"):
@@ -66,9 +63,7 @@ def test_strict_stops_at_the_first(make_dataset: MakeDataset, tmp_path: Path) ->
     assert left == {"sources", ".s.zarr.work", ".a.jsonl.work"}
 
 
-def test_an_error_of_our_own_is_marked_and_costs_one_asset(
-    make_dataset: MakeDataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_an_error_of_our_own_is_marked_and_costs_one_asset(make_dataset, tmp_path, monkeypatch):
     def fails_for_b(step: str, name: str) -> None:
         if (step, name) == ("asset read", "b"):
             raise ZeroDivisionError("division\nby zero")
@@ -81,9 +76,7 @@ def test_an_error_of_our_own_is_marked_and_costs_one_asset(
     assert "fails_for_b" in records_of(summary.records)["b"]["traceback"]
 
 
-def test_no_usable_asset_is_an_error_and_keeps_the_old_store(
-    make_dataset: MakeDataset, tmp_path: Path
-) -> None:
+def test_no_usable_asset_is_an_error_and_keeps_the_old_store(make_dataset, tmp_path):
     dataset = make_dataset("a")
     summary = build_store(dataset.parameters(), tmp_path / "s.zarr")
     before = tree(tmp_path / "s.zarr"), tree(tmp_path / "s.manifests")
@@ -94,9 +87,7 @@ def test_no_usable_asset_is_an_error_and_keeps_the_old_store(
     assert len(open_store(summary.store)) == 1
 
 
-def test_a_build_that_is_stopped_midway_leaves_the_old_store(
-    make_dataset: MakeDataset, tmp_path: Path
-) -> None:
+def test_a_build_that_is_stopped_midway_leaves_the_old_store(make_dataset, tmp_path):
     dataset = make_dataset("a", "b")
     build_store(dataset.parameters(), tmp_path / "s.zarr")
     before = tree(tmp_path)
@@ -110,12 +101,12 @@ def test_a_build_that_is_stopped_midway_leaves_the_old_store(
     assert {name: after[name] for name in before} == before
 
 
-def test_folders_instead_of_parameters_are_answered_with_what_to_give(tmp_path: Path) -> None:
+def test_folders_instead_of_parameters_are_answered_with_what_to_give(tmp_path):
     with pytest.raises(ConfigError, match="parameters are 'grids'; expected those of load_param"):
         build_store("grids", tmp_path / "s.zarr")  # type: ignore[arg-type]
 
 
-def test_what_is_not_a_store_is_never_replaced(make_dataset: MakeDataset, tmp_path: Path) -> None:
+def test_what_is_not_a_store_is_never_replaced(make_dataset, tmp_path):
     (tmp_path / "thesis").mkdir()
     (tmp_path / "thesis" / "chapter.tex").write_text("years of work")
     with pytest.raises(ConfigError, match="is not a slatprep store"):
@@ -125,9 +116,7 @@ def test_what_is_not_a_store_is_never_replaced(make_dataset: MakeDataset, tmp_pa
     assert build_store(make_dataset("a").parameters(), tmp_path / "empty").complete
 
 
-def test_an_asset_without_a_partner_costs_no_file(
-    make_dataset: MakeDataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_an_asset_without_a_partner_costs_no_file(make_dataset, tmp_path, monkeypatch):
     """Of 200,000 unmatched grids each would take the time of a file that is written and read."""
     dataset, spooled = make_dataset("a"), list[str]()
     for k in range(30):
@@ -140,7 +129,7 @@ def test_an_asset_without_a_partner_costs_no_file(
     assert list(records) == ["a", *sorted(f"lone{k}" for k in range(30))]
 
 
-def test_a_link_stays_a_link(make_dataset: MakeDataset, tmp_path: Path) -> None:
+def test_a_link_stays_a_link(make_dataset, tmp_path):
     parameters, link = make_dataset("a").parameters(), tmp_path / "link.zarr"
     (tmp_path / "disk").mkdir()
     link.symlink_to(tmp_path / "disk" / "real.zarr")
@@ -153,13 +142,13 @@ def test_a_link_stays_a_link(make_dataset: MakeDataset, tmp_path: Path) -> None:
         assert open_store(link).ids == ["a"]
 
 
-def test_a_place_that_cannot_be_written_is_named(make_dataset: MakeDataset, tmp_path: Path) -> None:
+def test_a_place_that_cannot_be_written_is_named(make_dataset, tmp_path):
     (tmp_path / "file").touch()
     with pytest.raises(StoreError, match=r"file: cannot write there \("):
         build_store(make_dataset("a").parameters(), tmp_path / "file" / "s.zarr")
 
 
-def test_ranges_by_name_clip_and_count(make_dataset: MakeDataset, tmp_path: Path) -> None:
+def test_ranges_by_name_clip_and_count(make_dataset, tmp_path):
     dataset = make_dataset("a")
     summary = build_store(dataset.parameters("pixie"), tmp_path / "s.zarr")
     # Pixie's ranges: log10 E to 10.88 (metal has 11.3), log10 density to 3.87 (metal has 3.90).
@@ -182,7 +171,7 @@ def test_ranges_by_name_clip_and_count(make_dataset: MakeDataset, tmp_path: Path
     assert store.column("clipped_grid").tolist() == [[in_grid, in_grid, 0]]
 
 
-def test_ranges_from_a_file(make_dataset: MakeDataset, tmp_path: Path) -> None:
+def test_ranges_from_a_file(make_dataset, tmp_path):
     ranges = tmp_path / "ranges.toml"
     ranges.write_text(
         "[youngs_modulus]\nlo = 3.0\nhi = 13.0\n[density]\nlo = 1.0\nhi = 5.0\n"
@@ -198,9 +187,7 @@ def test_ranges_from_a_file(make_dataset: MakeDataset, tmp_path: Path) -> None:
     assert open_store(summary.store).normalization.source == "ranges.toml"
 
 
-def test_ranges_that_cannot_be_read_are_told_before_any_work(
-    make_dataset: MakeDataset, tmp_path: Path
-) -> None:
+def test_ranges_that_cannot_be_read_are_told_before_any_work(make_dataset, tmp_path):
     def never(done: int, total: int) -> None:
         raise AssertionError("an asset was aligned first")
 
@@ -209,9 +196,7 @@ def test_ranges_that_cannot_be_read_are_told_before_any_work(
         build_store(parameters, tmp_path / "s.zarr", progress=never)
 
 
-def test_islands_without_annotation_stay_occupied(
-    make_dataset: MakeDataset, tmp_path: Path
-) -> None:
+def test_islands_without_annotation_stay_occupied(make_dataset, tmp_path):
     dataset = make_dataset("a")
     grid = dataset.assets["a"].grid
     grid[30, 25:28, 28, 3] = -1
@@ -226,9 +211,7 @@ def test_islands_without_annotation_stay_occupied(
     assert counts["occupied"] == counts["annotated"] + 3 == (grid[..., 3] != 7).sum()
 
 
-def test_names_without_anything_in_common_are_told_in_one_line(
-    make_dataset: MakeDataset, tmp_path: Path
-) -> None:
+def test_names_without_anything_in_common_are_told_in_one_line(make_dataset, tmp_path):
     dataset = make_dataset("uid1", "uid2")
     for number, path in enumerate(sorted((dataset.root / "slat").iterdir())):
         path.rename(path.with_name(f"chair_{number}.npz"))
@@ -252,9 +235,7 @@ def test_names_without_anything_in_common_are_told_in_one_line(
     assert build_store(parameters, tmp_path / "s.zarr").statuses["ok"] == 1
 
 
-def test_no_asset_is_lost_to_one_unphysical_voxel(
-    make_dataset: MakeDataset, tmp_path: Path
-) -> None:
+def test_no_asset_is_lost_to_one_unphysical_voxel(make_dataset, tmp_path):
     dataset = make_dataset("a", "b")
     grid = dataset.assets["a"].grid
     grid[30, 25:28, 28, 2] = 0.546
@@ -283,9 +264,7 @@ def test_no_asset_is_lost_to_one_unphysical_voxel(
     assert [asset_id for asset_id, _ in refused.problems] == ["a"]
 
 
-def test_voxels_too_far_from_an_annotation_are_not_valid(
-    make_dataset: MakeDataset, tmp_path: Path
-) -> None:
+def test_voxels_too_far_from_an_annotation_are_not_valid(make_dataset, tmp_path):
     dataset = make_dataset("a")
     made = dataset.assets["a"]
     far = np.array([[1, 1, 1], [2, 1, 1]], np.uint8)
@@ -300,7 +279,7 @@ def test_voxels_too_far_from_an_annotation_are_not_valid(
     assert summary.n_valid == summary.n_voxels - 2
 
 
-def test_manifests_go_where_asked(make_dataset: MakeDataset, tmp_path: Path) -> None:
+def test_manifests_go_where_asked(make_dataset, tmp_path):
     parameters = make_dataset("a").parameters()
     build_store(parameters, tmp_path / "s.zarr", manifests=tmp_path / "elsewhere" / "records")
     names = {path.name for path in (tmp_path / "elsewhere" / "records").iterdir()}
@@ -308,9 +287,7 @@ def test_manifests_go_where_asked(make_dataset: MakeDataset, tmp_path: Path) -> 
     assert not manifests_of(tmp_path / "s.zarr").exists()
 
 
-def test_alignment_alone_gives_the_stores_transforms(
-    mixed: Dataset, mixed_build: BuildSummary, tmp_path: Path
-) -> None:
+def test_alignment_alone_gives_the_stores_transforms(mixed, mixed_build, tmp_path):
     summary = align_pairs(mixed.parameters(), tmp_path / "out" / "mixed.jsonl")
     assert summary.store is None
     assert summary.statuses == mixed_build.statuses
@@ -322,7 +299,7 @@ def test_alignment_alone_gives_the_stores_transforms(
     assert [path.name for path in (tmp_path / "out").iterdir()] == ["mixed.jsonl"]
 
 
-def test_other_parameters_make_another_build_id(make_dataset: MakeDataset, tmp_path: Path) -> None:
+def test_other_parameters_make_another_build_id(make_dataset, tmp_path):
     parameters = make_dataset("a").parameters()
     first = align_pairs(parameters, tmp_path / "1.jsonl").build_id
     assert align_pairs(parameters, tmp_path / "2.jsonl").build_id == first
@@ -330,7 +307,7 @@ def test_other_parameters_make_another_build_id(make_dataset: MakeDataset, tmp_p
     assert align_pairs(nearer, tmp_path / "3.jsonl").build_id != first
 
 
-def test_no_store_is_built_inside_another(make_dataset: MakeDataset, tmp_path: Path) -> None:
+def test_no_store_is_built_inside_another(make_dataset, tmp_path):
     """The next build of the outer one would remove it as a stray."""
     data = make_dataset("a")
     outer = tmp_path / "outer.zarr"
@@ -344,8 +321,8 @@ def test_no_store_is_built_inside_another(make_dataset: MakeDataset, tmp_path: P
 
 @pytest.mark.parametrize("step", ["work folder made", "work folder locked"])
 def test_a_build_that_is_stopped_as_it_begins_leaves_nothing(
-    make_dataset: MakeDataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, step: str
-) -> None:
+    make_dataset, tmp_path, monkeypatch, step
+):
     def stop(reached: str, name: str) -> None:
         if reached == step:
             raise KeyboardInterrupt

@@ -5,7 +5,6 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-from support.synthetic import Made, MakeDataset
 
 from slatprep.pipeline import decoys
 from slatprep.pipeline.dataset import build_store
@@ -29,9 +28,7 @@ def files_of(folder: Path) -> dict[str, bytes]:
 
 
 @pytest.mark.usefixtures("few_suffice")
-def test_a_build_measures_errors_the_same_for_any_number_of_jobs(
-    make_dataset: MakeDataset, tmp_path: Path
-) -> None:
+def test_a_build_measures_errors_the_same_for_any_number_of_jobs(make_dataset, tmp_path):
     parameters = make_dataset(*OBJECTS).parameters()
     one, two, none = (tmp_path / f"{name}.zarr" for name in ("one", "two", "none"))
     build_store(parameters, one)
@@ -47,9 +44,7 @@ def test_a_build_measures_errors_the_same_for_any_number_of_jobs(
 
 
 @pytest.mark.usefixtures("few_suffice", "few_are_new")
-def test_a_small_update_measures_nothing_and_says_so(
-    make_dataset: MakeDataset, tmp_path: Path
-) -> None:
+def test_a_small_update_measures_nothing_and_says_so(make_dataset, tmp_path):
     out = tmp_path / "s.zarr"
     dataset = make_dataset(*OBJECTS)
     build_store(dataset.parameters(), out)
@@ -66,9 +61,7 @@ def test_a_small_update_measures_nothing_and_says_so(
 
 
 @pytest.mark.usefixtures("few_suffice", "few_are_new")
-def test_a_larger_update_takes_the_decoys_of_before_over(
-    make_dataset: MakeDataset, tmp_path: Path
-) -> None:
+def test_a_larger_update_takes_the_decoys_of_before_over(make_dataset, tmp_path):
     out = tmp_path / "s.zarr"
     dataset = make_dataset(*OBJECTS)
     build_store(dataset.parameters(), out)
@@ -85,9 +78,7 @@ def test_a_larger_update_takes_the_decoys_of_before_over(
     assert len(after.decoys) - len(new) >= 1
 
 
-def test_of_few_assets_there_are_no_decoys_and_that_is_said(
-    undisturbed: Made,
-) -> None:
+def test_of_few_assets_there_are_no_decoys_and_that_is_said(undisturbed):
     _, out = undisturbed
     assert measured_errors(out) is None
     assert told_of(open_store(out)) == ["not measured; decoys need 50 assets"]

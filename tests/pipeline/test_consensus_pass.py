@@ -40,9 +40,7 @@ def records_beside(store: Path) -> dict[str, dict[str, Any]]:
     return records_of(store.with_suffix(".manifests") / "assets.jsonl")
 
 
-def test_more_symmetric_assets_are_placed_right_and_no_other_changes(
-    habitual: tuple[Path, BuildParameters], stores: tuple[Path, Path]
-) -> None:
+def test_more_symmetric_assets_are_placed_right_and_no_other_changes(habitual, stores):
     truth = habitual[0] / "truth"
     before, after = (score_against_truth(store, truth).assets for store in stores)
     symmetric = [k for k, score in enumerate(before) if score.symmetric]
@@ -69,7 +67,7 @@ def test_more_symmetric_assets_are_placed_right_and_no_other_changes(
                 )
 
 
-def test_what_was_settled_is_recorded_and_can_be_undone(stores: tuple[Path, Path]) -> None:
+def test_what_was_settled_is_recorded_and_can_be_undone(stores):
     alone, together = (
         records_of(store.with_suffix(".manifests") / "assets.jsonl") for store in stores
     )
@@ -86,7 +84,7 @@ def test_what_was_settled_is_recorded_and_can_be_undone(stores: tuple[Path, Path
     assert not any(record["alignment"]["settled_by"] for record in alone.values())
 
 
-def test_the_store_alone_gives_the_verdicts_on_ties(stores: tuple[Path, Path]) -> None:
+def test_the_store_alone_gives_the_verdicts_on_ties(stores):
     for path in stores:
         store = open_store(path)
         assert (store.column("ambiguity") > THRESHOLDS.good_ambiguity).any()
@@ -95,9 +93,7 @@ def test_the_store_alone_gives_the_verdicts_on_ties(stores: tuple[Path, Path]) -
             assert check.consistent and check.verdict == given
 
 
-def test_building_without_it_brings_the_first_placements_back(
-    habitual: tuple[Path, BuildParameters], stores: tuple[Path, Path], tmp_path: Path
-) -> None:
+def test_building_without_it_brings_the_first_placements_back(habitual, stores, tmp_path):
     _, parameters = habitual
     with_it = replace(parameters, consensus=ConsensusParameters(settle=True))
     store = tmp_path / "store.zarr"
@@ -111,9 +107,7 @@ def test_building_without_it_brings_the_first_placements_back(
     assert tree(store) == tree(stores[1])
 
 
-def test_a_settled_store_that_is_built_again_is_found_unchanged(
-    habitual: tuple[Path, BuildParameters], stores: tuple[Path, Path]
-) -> None:
+def test_a_settled_store_that_is_built_again_is_found_unchanged(habitual, stores):
     with_it = replace(habitual[1], consensus=ConsensusParameters(settle=True))
     times = {path: path.stat().st_mtime_ns for path in stores[1].rglob("*")}
     build_store(with_it, stores[1])

@@ -59,15 +59,13 @@ def rebuilt(built: Made, undisturbed: Made) -> BuildSummary:
     return summary
 
 
-def test_a_sound_store_is_taken_over(built: Made, undisturbed: Made, aligned: list[str]) -> None:
+def test_a_sound_store_is_taken_over(built, undisturbed, aligned):
     assert rebuilt(built, undisturbed).damaged == ()
     assert aligned == []
 
 
 @pytest.mark.parametrize("share", [0.1, 0.7])
-def test_a_flipped_bit_of_a_record_is_never_inherited(
-    built: Made, undisturbed: Made, aligned: list[str], share: float
-) -> None:
+def test_a_flipped_bit_of_a_record_is_never_inherited(built, undisturbed, aligned, share):
     dataset, out = built
     flip(out / RECORDS, int(share * (out / RECORDS).stat().st_size))
     assert RECORDS in {finding.file for finding in verify_store(out).findings}
@@ -80,7 +78,7 @@ def test_a_flipped_bit_of_a_record_is_never_inherited(
 
 
 @pytest.mark.parametrize("text", ["", "[]", "{}", "[" * 100_000])
-def test_a_record_that_is_none_is_made_anew(built: Made, undisturbed: Made, text: str) -> None:
+def test_a_record_that_is_none_is_made_anew(built, undisturbed, text):
     _, out = built
     zarr.open_group(out, mode="r+", use_consolidated=False)["asset/record"][1] = text
     assert rebuilt(built, undisturbed).damaged
@@ -96,9 +94,7 @@ def test_a_record_that_is_none_is_made_anew(built: Made, undisturbed: Made, text
         ("file/sha256/c/0", 3),
     ],
 )
-def test_a_store_that_is_damaged_is_not_current(
-    built: Made, aligned: list[str], name: str, aligned_again: int
-) -> None:
+def test_a_store_that_is_damaged_is_not_current(built, aligned, name, aligned_again):
     dataset, out = built
     before = tree(out)
     flip(out / name, (out / name).stat().st_size // 2)
@@ -109,7 +105,7 @@ def test_a_store_that_is_damaged_is_not_current(
     assert build_store(dataset.parameters(), out).damaged == ()
 
 
-def test_rows_that_are_gone_are_written_again(built: Made) -> None:
+def test_rows_that_are_gone_are_written_again(built):
     dataset, out = built
     before = tree(out)
     (out / "voxel/feats/c/1/0").unlink()
@@ -129,8 +125,8 @@ def rewritten(out: Path, change: Callable[[zarr.Group], None]) -> None:
 
 @pytest.mark.filterwarnings("ignore:Consolidated metadata")
 def test_a_transform_that_does_not_give_the_stored_labels_is_found_anew(
-    built: Made, undisturbed: Made, aligned: list[str]
-) -> None:
+    built, undisturbed, aligned
+):
     """Every checksum and digest is right, and yet the record is not of these rows."""
     _, out = built
 
@@ -155,9 +151,7 @@ def test_a_transform_that_does_not_give_the_stored_labels_is_found_anew(
         ("assets.jsonl", b"{"),
     ],
 )
-def test_records_beside_a_store_that_are_damaged_are_written_again(
-    built: Made, file: str, text: bytes
-) -> None:
+def test_records_beside_a_store_that_are_damaged_are_written_again(built, file, text):
     dataset, out = built
     path = out.with_name("s.manifests") / file
     path.write_bytes(text)
@@ -167,7 +161,7 @@ def test_records_beside_a_store_that_are_damaged_are_written_again(
 
 
 @pytest.mark.parametrize("file", ["build.json", "assets.jsonl"])
-def test_one_changed_digit_beside_a_store_is_mended(built: Made, file: str) -> None:
+def test_one_changed_digit_beside_a_store_is_mended(built, file):
     dataset, out = built
     path = out.with_name("s.manifests") / file
     sound = path.read_text()

@@ -2,7 +2,6 @@
 
 import json
 import shutil
-from pathlib import Path
 
 import jsonschema
 import numpy as np
@@ -36,7 +35,7 @@ def off(places: np.ndarray, true_places: np.ndarray) -> np.ndarray:
     return np.linalg.norm(places - true_places, axis=1) / VOXEL_SIZE
 
 
-def test_each_voxel_was_looked_up_where_it_lies(store: Store) -> None:
+def test_each_voxel_was_looked_up_where_it_lies(store):
     assert [str(model) for model in store.column("model")] == ["deformable", "affine"]
     for asset in store:
         true_places = MOVES[asset.asset_id](voxel_centres(asset.coords))
@@ -52,7 +51,7 @@ def test_each_voxel_was_looked_up_where_it_lies(store: Store) -> None:
         assert same[asset.valid & (farther < 1e-5)].all()
 
 
-def test_the_record_holds_the_map_to_the_last_bit(store: Store) -> None:
+def test_the_record_holds_the_map_to_the_last_bit(store):
     schema = json.loads((FOLDER / "asset_record.schema.json").read_text())
     records = StoredRecords(store)
     for asset in store:
@@ -64,14 +63,14 @@ def test_the_record_holds_the_map_to_the_last_bit(store: Store) -> None:
         assert way.places(asset.coords).astype(np.float32).tobytes() == asset.place.tobytes()
 
 
-def test_a_sound_store_verifies_and_checks(store: Store) -> None:
+def test_a_sound_store_verifies_and_checks(store):
     assert verify_store(store.path).findings == ()
     for asset_id in store.ids:
         assert check_alignment(store, asset_id).consistent
 
 
 @pytest.mark.parametrize("what", ["place", "coefficients", "model"])
-def test_another_map_than_the_places_is_found(store: Store, what: str, tmp_path: Path) -> None:
+def test_another_map_than_the_places_is_found(store, what, tmp_path):
     shutil.copytree(store.path, tmp_path / "s.zarr")  # type: ignore[type-var]
     root = zarr.open_group(tmp_path / "s.zarr", mode="r+", use_consolidated=False)
     if what == "place":
@@ -90,7 +89,7 @@ def test_another_map_than_the_places_is_found(store: Store, what: str, tmp_path:
     assert any("without a deformation" in f.what for f in findings) == (what == "model")
 
 
-def test_particles_are_carried_by_the_same_map(store: Store) -> None:
+def test_particles_are_carried_by_the_same_map(store):
     for asset in store:
         field = stored_field(store, asset.asset_id, "grid")
         points = voxel_centres(asset.coords)
@@ -102,7 +101,7 @@ def test_particles_are_carried_by_the_same_map(store: Store) -> None:
         assert (found.material == truth)[clear].mean() > 0.99
 
 
-def test_the_grid_is_written_where_the_slat_has_it(store: Store, tmp_path: Path) -> None:
+def test_the_grid_is_written_where_the_slat_has_it(store, tmp_path):
     export_store(store.path, tmp_path / "ply", "ply", options=ExportOptions(points="grid"))
     for asset in store:
         vertex = plyfile.PlyData.read(tmp_path / "ply" / f"{asset.asset_id}.ply")["vertex"]
@@ -111,7 +110,7 @@ def test_the_grid_is_written_where_the_slat_has_it(store: Store, tmp_path: Path)
         assert np.median(off(MOVES[asset.asset_id](positions), centres)) < 0.7
 
 
-def test_what_is_exported_says_where_voxels_were_looked_up(store: Store, tmp_path: Path) -> None:
+def test_what_is_exported_says_where_voxels_were_looked_up(store, tmp_path):
     import h5py
 
     export_store(store.path, tmp_path / "all.h5", "hdf5")

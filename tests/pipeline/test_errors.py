@@ -26,7 +26,7 @@ def store(mixed_build: BuildSummary, tmp_path_factory: pytest.TempPathFactory) -
     return open_store(path)
 
 
-def test_decoys_are_of_other_objects_and_are_aligned_once(store: Store) -> None:
+def test_decoys_are_of_other_objects_and_are_aligned_once(store):
     aligned: list[tuple[int, int]] = []
 
     def progress(done: int, most: int) -> None:
@@ -44,7 +44,7 @@ def test_decoys_are_of_other_objects_and_are_aligned_once(store: Store) -> None:
     assert told_of(store) == first.sentences()
 
 
-def test_more_decoys_take_over_those_there_are_and_another_seed_draws_others(store: Store) -> None:
+def test_more_decoys_take_over_those_there_are_and_another_seed_draws_others(store):
     keys = {asset_id: asset_id for asset_id in store.ids}
     few, more = (draw_decoys(store, keys, count, 1) for count in (2, 4))
     assert more[:2] == few
@@ -53,7 +53,7 @@ def test_more_decoys_take_over_those_there_are_and_another_seed_draws_others(sto
     ]
 
 
-def test_the_slat_is_of_the_size_that_is_nearest(store: Store) -> None:
+def test_the_slat_is_of_the_size_that_is_nearest(store):
     sizes = dict(zip(store.ids, np.diff(store.offsets).tolist(), strict=True))
     objects = dict(zip(store.ids, map(str, store.column("object_id")), strict=True))
     for one in draw_decoys(store, dict.fromkeys(store.ids, ""), 100, 0):
@@ -62,7 +62,7 @@ def test_the_slat_is_of_the_size_that_is_nearest(store: Store) -> None:
         assert abs(sizes[one.slat] - sizes[one.grid]) == nearest
 
 
-def test_few_assets_are_said_to_be_few_and_the_picture_is_drawn(store: Store) -> None:
+def test_few_assets_are_said_to_be_few_and_the_picture_is_drawn(store):
     found = measure_errors(store, decoys=3, seed=1)
     assert "3 of 3 decoys are called good, too" in found.sentences()[0], "all are the same L"
     others = tuple(replace(one, verdict="failed") for one in found.decoys)
@@ -74,7 +74,7 @@ def test_few_assets_are_said_to_be_few_and_the_picture_is_drawn(store: Store) ->
     assert picture == draw_errors(found, store.name)
 
 
-def test_info_repeats_what_was_measured_and_says_where_that_is_of_before(store: Store) -> None:
+def test_info_repeats_what_was_measured_and_says_where_that_is_of_before(store):
     measured = measure_errors(store, decoys=3, seed=1)
     shown = CliRunner().invoke(slatprep, ["info", str(store.path)])
     assert shown.exit_code == 0
@@ -89,7 +89,7 @@ def test_info_repeats_what_was_measured_and_says_where_that_is_of_before(store: 
     assert told_of(store) == ["not measured; decoys need 50 assets"]
 
 
-def test_the_command_says_how_many_are_wrong(store: Store, tmp_path: Path) -> None:
+def test_the_command_says_how_many_are_wrong(store, tmp_path):
     picture = tmp_path / "errors.svg"
     options = ["--decoys", "3", "--seed", "1", "--picture", str(picture)]
     shown = CliRunner().invoke(slatprep, ["measure-errors", str(store.path), *options, "--json"])
@@ -100,7 +100,7 @@ def test_the_command_says_how_many_are_wrong(store: Store, tmp_path: Path) -> No
     assert picture.read_text().startswith("<?xml")
 
 
-def test_an_asset_is_told_its_probability_of_an_error(store: Store) -> None:
+def test_an_asset_is_told_its_probability_of_an_error(store):
     measured = measure_errors(store, decoys=3, seed=1)
     asset_id = store.ids[0]
     options = ["check-alignment", "--asset", asset_id, "--store", str(store.path)]

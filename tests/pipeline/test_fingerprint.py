@@ -16,7 +16,7 @@ def fingerprint_of(monkeypatch: pytest.MonkeyPatch, path: Path) -> str:
     return code_fingerprint.__wrapped__()
 
 
-def test_statements_count_and_words_do_not(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_statements_count_and_words_do_not(tmp_path, monkeypatch):
     module = tmp_path / "m.py"
 
     def of(text: str) -> str:
@@ -28,18 +28,18 @@ def test_statements_count_and_words_do_not(tmp_path: Path, monkeypatch: pytest.M
     assert of("def f(x):\n    return x + 2\n") != first
 
 
-def test_every_reader_counts() -> None:
+def test_every_reader_counts():
     readers = {name.partition(":")[0] for name in [*SOURCES.values(), *LATENTS.values()]}
     assert readers <= set(numeric_modules())
 
 
-def test_it_is_the_same_in_another_process() -> None:
+def test_it_is_the_same_in_another_process():
     code = "from slatprep.pipeline.fingerprint import code_fingerprint; print(code_fingerprint())"
     told = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert told.stdout.strip() == code_fingerprint()
 
 
-def test_a_tree_is_written_alike_under_every_python() -> None:
+def test_a_tree_is_written_alike_under_every_python():
     text = "class C[T]: x: int = None" if sys.version_info >= (3, 12) else "class C: x: int = None"
     tree = ast.parse("def f(a, *, b=[]): return f'{a!r:>{b}}' 'x'")
     assert fingerprint._dump(tree) == (
@@ -57,7 +57,7 @@ def answers(python: str) -> bool:
 
 
 @pytest.mark.parametrize("minor", [11, 12, 13, 14])
-def test_it_is_the_same_under_another_python(minor: int) -> None:
+def test_it_is_the_same_under_another_python(minor):
     python = shutil.which(f"python3.{minor}")
     if minor == sys.version_info[1] or python is None or not answers(python):
         pytest.skip("this Python, or none")
@@ -67,7 +67,7 @@ def test_it_is_the_same_under_another_python(minor: int) -> None:
     assert told.stdout.strip() == code_fingerprint()
 
 
-def test_it_covers_every_module_that_an_asset_runs_through() -> None:
+def test_it_covers_every_module_that_an_asset_runs_through():
     """Trace what is loaded for one asset, in a process that has loaded nothing else."""
     code = (
         "import sys; from slatprep.readers.pixieverse import read_grid; "
@@ -94,11 +94,11 @@ def test_it_covers_every_module_that_an_asset_runs_through() -> None:
 
 
 @pytest.mark.parametrize("name", ["pipeline.annotate", "storage.chunks", "storage.codecs"])
-def test_what_merges_annotations_and_unpacks_values_is_in_it(name: str) -> None:
+def test_what_merges_annotations_and_unpacks_values_is_in_it(name):
     assert f"slatprep.{name}" in numeric_modules()
 
 
-def test_what_makes_no_numbers_is_not_in_it() -> None:
+def test_what_makes_no_numbers_is_not_in_it():
     names = set(numeric_modules())
     assert not {n for n in names if n.startswith("slatprep.storage.pl")}
     assert not {n for n in names if n.startswith(("slatprep.cli", "slatprep.store"))}
@@ -107,9 +107,7 @@ def test_what_makes_no_numbers_is_not_in_it() -> None:
         ast.parse(path.read_text())
 
 
-def test_what_packs_rows_makes_columns_and_records_is_in_the_other(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
+def test_what_packs_rows_makes_columns_and_records_is_in_the_other(monkeypatch, tmp_path):
     """Code that is in no key, and still decides bytes."""
     wanted = {"normalize", "pipeline.pack", "pipeline.recipe", "store.columns",
               "store.shard_writer", "store.layout"}  # fmt: skip

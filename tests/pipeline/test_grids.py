@@ -57,7 +57,7 @@ def centres_of(coords: np.ndarray, side: int) -> np.ndarray:
     return (2.0 * coords.astype(float) + 1.0) / (2.0 * side) - 0.5
 
 
-def test_sides_are_placed_and_labels_are_right(demo: Path) -> None:
+def test_sides_are_placed_and_labels_are_right(demo):
     store = open_store(demo / "s.zarr")
     assert side_of(demo) in (32, 128)
     assert store.column("verdict").tolist() == ["good"] * len(store)
@@ -71,7 +71,7 @@ def test_sides_are_placed_and_labels_are_right(demo: Path) -> None:
         assert score.symmetric or score.displacement < allowed
 
 
-def test_each_voxel_is_looked_up_at_its_own_centre(demo: Path) -> None:
+def test_each_voxel_is_looked_up_at_its_own_centre(demo):
     side = side_of(demo)
     for asset in open_store(demo / "s.zarr"):
         centres = centres_of(asset.coords, side)
@@ -86,7 +86,7 @@ def test_each_voxel_is_looked_up_at_its_own_centre(demo: Path) -> None:
         assert np.isclose(asset.distance, distance * 64, atol=1e-4).mean() > 0.8
 
 
-def test_a_store_of_another_grid_is_sound_and_can_be_shown(demo: Path, tmp_path: Path) -> None:
+def test_a_store_of_another_grid_is_sound_and_can_be_shown(demo, tmp_path):
     store = open_store(demo / "s.zarr")
     report = verify_store(demo / "s.zarr", sources=True)
     assert not report.findings
@@ -116,7 +116,7 @@ def test_a_store_of_another_grid_is_sound_and_can_be_shown(demo: Path, tmp_path:
     assert result.exit_code == 0, result.output
 
 
-def test_its_points_are_the_voxels_centres(demo: Path, tmp_path: Path) -> None:
+def test_its_points_are_the_voxels_centres(demo, tmp_path):
     store, side = open_store(demo / "s.zarr"), side_of(demo)
     asset = next(iter(store))
     export_store(demo / "s.zarr", tmp_path / "npz", format="npz")
@@ -136,7 +136,7 @@ def test_its_points_are_the_voxels_centres(demo: Path, tmp_path: Path) -> None:
     assert all(field.material[k] in material[some] for k, some in enumerate(near))
 
 
-def test_the_passes_over_a_dataset_know_the_grid(demo: Path, tmp_path: Path) -> None:
+def test_the_passes_over_a_dataset_know_the_grid(demo, tmp_path):
     parameters = load_parameters(demo / "demo" / "dataset.toml")
     parameters = replace(
         parameters,
@@ -150,9 +150,7 @@ def test_the_passes_over_a_dataset_know_the_grid(demo: Path, tmp_path: Path) -> 
     assert (tmp_path / "s.zarr" / "zarr.json").read_bytes() == before
 
 
-def test_stores_of_other_grids_are_not_joined_and_have_no_voxel_in_common(
-    demo: Path, tmp_path: Path
-) -> None:
+def test_stores_of_other_grids_are_not_joined_and_have_no_voxel_in_common(demo, tmp_path):
     side = side_of(demo)
     store = open_store(demo / "s.zarr")
     space = store.contents.latents
@@ -176,7 +174,7 @@ def test_stores_of_other_grids_are_not_joined_and_have_no_voxel_in_common(
         assert one.unmatched == 2 * len(store.asset(one.asset_id).coords)
 
 
-def test_a_decoder_is_trained_and_used_on_its_grid(demo: Path, tmp_path: Path) -> None:
+def test_a_decoder_is_trained_and_used_on_its_grid(demo, tmp_path):
     run = tmp_path / "run"
     chosen = TrainParameters(epochs=1, size="small", keep="last", shares=Shares(0.5, 0.0, 0.5))
     train(demo / "s.zarr", run, chosen)
@@ -195,7 +193,7 @@ def test_a_decoder_is_trained_and_used_on_its_grid(demo: Path, tmp_path: Path) -
 
 
 @pytest.mark.parametrize("side", [32, 96])
-def test_voxels_of_any_grid_turn_about_its_centre(side: int) -> None:
+def test_voxels_of_any_grid_turn_about_its_centre(side):
     coords = np.random.default_rng(0).integers(0, side, (50, 3)).astype(np.int32)
     for matrix in lattice_symmetries("all"):
         moved = move(coords, matrix, side)
@@ -203,7 +201,7 @@ def test_voxels_of_any_grid_turn_about_its_centre(side: int) -> None:
         np.testing.assert_allclose(centres_of(moved, side), expected, atol=1e-12)
 
 
-def test_merged_annotations_of_a_coarse_slat_are_sound(tmp_path: Path) -> None:
+def test_merged_annotations_of_a_coarse_slat_are_sound(tmp_path):
     made = make_demo(tmp_path / "demo", 1, 0, levels=(0,), encoder="trellis2-512", samples=2)
     build_store(load_parameters(made.config), tmp_path / "s.zarr")
     assert next(iter(open_store(tmp_path / "s.zarr"))).merged

@@ -77,14 +77,7 @@ def ends_well(dataset: Dataset, out: Path, expected: dict[str, str]) -> None:
         ("manifests written", 0),
     ],
 )
-def test_killed_at_every_step(
-    reference: tuple[Dataset, dict[str, str]],
-    old_store: Path,
-    script: Path,
-    tmp_path: Path,
-    step: str,
-    calls: int,
-) -> None:
+def test_killed_at_every_step(reference, old_store, script, tmp_path, step, calls):
     dataset, expected = reference
     out = tmp_path / "s.zarr"
     shutil.copytree(old_store, out)
@@ -97,9 +90,7 @@ def test_killed_at_every_step(
     ends_well(dataset, out, expected)
 
 
-def test_what_was_finished_is_not_done_again(
-    reference: tuple[Dataset, dict[str, str]], script: Path, tmp_path: Path
-) -> None:
+def test_what_was_finished_is_not_done_again(reference, script, tmp_path):
     dataset, expected = reference
     killed = run(script, dataset, tmp_path / "s.zarr", kill_at("asset begun", 2))
     assert killed.returncode == -signal.SIGKILL
@@ -112,9 +103,7 @@ def test_what_was_finished_is_not_done_again(
     assert tree(tmp_path / "s.zarr") == expected
 
 
-def test_a_kill_between_two_renames_is_mended(
-    reference: tuple[Dataset, dict[str, str]], tmp_path: Path
-) -> None:
+def test_a_kill_between_two_renames_is_mended(reference, tmp_path):
     """Where directories cannot be exchanged, there is a moment without a store."""
     dataset, expected = reference
     out = tmp_path / "s.zarr"
@@ -128,9 +117,7 @@ def test_a_kill_between_two_renames_is_mended(
     assert not work.exists()
 
 
-def test_a_worker_that_dies_costs_nothing(
-    reference: tuple[Dataset, dict[str, str]], script: Path, tmp_path: Path
-) -> None:
+def test_a_worker_that_dies_costs_nothing(reference, script, tmp_path):
     dataset, expected = reference
     died = str(tmp_path / "died")
     fault = f"""
@@ -144,9 +131,7 @@ if (step, name) == ("asset begun", "b") and not os.path.exists({died!r}):
     assert tree(tmp_path / "s.zarr") == expected
 
 
-def test_a_worker_that_dies_with_a_shard_open_leaves_nothing_of_it(
-    reference: tuple[Dataset, dict[str, str]], script: Path, tmp_path: Path
-) -> None:
+def test_a_worker_that_dies_with_a_shard_open_leaves_nothing_of_it(reference, script, tmp_path):
     dataset, expected = reference
     out, died = tmp_path / "s.zarr", str(tmp_path / "died")
     fault = f"""
@@ -167,9 +152,7 @@ if (step, name) == ("asset begun", "b"):
 """
 
 
-def test_an_asset_that_kills_its_worker_is_named_and_the_others_go_in(
-    reference: tuple[Dataset, dict[str, str]], script: Path, tmp_path: Path
-) -> None:
+def test_an_asset_that_kills_its_worker_is_named_and_the_others_go_in(reference, script, tmp_path):
     dataset, expected = reference
     done = run(script, dataset, tmp_path / "s.zarr", DIES_OF_B, jobs=2)
     assert done.returncode == 0, done.stderr
@@ -180,9 +163,7 @@ def test_an_asset_that_kills_its_worker_is_named_and_the_others_go_in(
     ends_well(dataset, tmp_path / "s.zarr", expected)
 
 
-def test_memory_that_runs_out_is_told_of_the_asset(
-    reference: tuple[Dataset, dict[str, str]], script: Path, tmp_path: Path
-) -> None:
+def test_memory_that_runs_out_is_told_of_the_asset(reference, script, tmp_path):
     dataset, expected = reference
     fault = """
 import numpy, resource
@@ -203,9 +184,7 @@ if (step, name) == ("asset read", "b"):
 
 
 @pytest.mark.parametrize("step", ["asset aligned", "shard begun"])
-def test_a_disk_that_takes_no_more(
-    reference: tuple[Dataset, dict[str, str]], script: Path, tmp_path: Path, step: str
-) -> None:
+def test_a_disk_that_takes_no_more(reference, script, tmp_path, step):
     """A limit on the size of files stands in for a full disk: the same error at a write."""
     dataset, expected = reference
     out = tmp_path / "s.zarr"
@@ -225,9 +204,7 @@ if step == {step!r}:
     ends_well(dataset, out, expected)
 
 
-def test_a_source_that_vanishes_midway(
-    reference: tuple[Dataset, dict[str, str]], script: Path, tmp_path: Path
-) -> None:
+def test_a_source_that_vanishes_midway(reference, script, tmp_path):
     dataset, expected = reference
     slat = str(dataset.root / "slat" / "b.npz")
     fault = f"""
@@ -250,9 +227,7 @@ if (step, name) == ("asset begun", "b"):
         (0o000, "s.zarr: cannot be looked at (Permission denied)"),
     ],
 )
-def test_a_target_that_permissions_keep(
-    reference: tuple[Dataset, dict[str, str]], script: Path, tmp_path: Path, mode: int, told: str
-) -> None:
+def test_a_target_that_permissions_keep(reference, script, tmp_path, mode, told):
     dataset, expected = reference
     folder = tmp_path / "locked"
     folder.mkdir()
@@ -264,9 +239,7 @@ def test_a_target_that_permissions_keep(
     ends_well(dataset, folder / "s.zarr", expected)
 
 
-def test_the_second_of_two_builds_is_refused_and_told_of_the_first(
-    reference: tuple[Dataset, dict[str, str]], script: Path, tmp_path: Path
-) -> None:
+def test_the_second_of_two_builds_is_refused_and_told_of_the_first(reference, script, tmp_path):
     dataset, expected = reference
     out = tmp_path / "s.zarr"
     sleeping = """
@@ -290,9 +263,7 @@ if step == "store created":
     ends_well(dataset, out, expected)
 
 
-def test_workers_do_not_outlive_a_killed_build(
-    reference: tuple[Dataset, dict[str, str]], script: Path, tmp_path: Path
-) -> None:
+def test_workers_do_not_outlive_a_killed_build(reference, script, tmp_path):
     dataset, _ = reference
     pids = tmp_path / "pids"
     pids.mkdir()
@@ -314,9 +285,7 @@ if step == "asset begun":
         time.sleep(0.1)
 
 
-def test_a_few_kills_at_random_times(
-    reference: tuple[Dataset, dict[str, str]], script: Path, tmp_path: Path
-) -> None:
+def test_a_few_kills_at_random_times(reference, script, tmp_path):
     """The short version of ``benchmarks/soak_kills.py``."""
     dataset, expected = reference
     out = tmp_path / "s.zarr"

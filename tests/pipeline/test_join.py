@@ -3,19 +3,18 @@
 import json
 import shutil
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 from click.testing import CliRunner
-from support.synthetic import Dataset, Made, MakeDataset
+from support.synthetic import Dataset, Made
 from support.trees import records_of, tree
 
 from slatprep.cli.commands import slatprep
 from slatprep.errors import ConfigError, StoreError
 from slatprep.inspect.verify import verify_store
 from slatprep.parameters import AlignParameters
-from slatprep.pipeline.dataset import BuildSummary, build_store
+from slatprep.pipeline.dataset import build_store
 from slatprep.pipeline.join import concat_stores, subset_store
 from slatprep.store import open_store
 
@@ -39,7 +38,7 @@ def parts(tmp_path_factory: pytest.TempPathFactory) -> Made:
     return whole, folder
 
 
-def test_a_subset_is_the_build_of_its_assets(parts: Made, tmp_path: Path) -> None:
+def test_a_subset_is_the_build_of_its_assets(parts, tmp_path):
     _, folder = parts
     summary = subset_store(folder / "whole.zarr", tmp_path / "s.zarr", ["d", "b.s", "b.front"])
     assert summary.statuses == {"ok": 3, "failed": 0, "skipped": 0}
@@ -49,16 +48,14 @@ def test_a_subset_is_the_build_of_its_assets(parts: Made, tmp_path: Path) -> Non
     assert records_of(tmp_path / "s.manifests" / "assets.jsonl") == built
 
 
-def test_joined_stores_are_the_build_of_all_their_assets(parts: Made, tmp_path: Path) -> None:
+def test_joined_stores_are_the_build_of_all_their_assets(parts, tmp_path):
     _, folder = parts
     concat_stores([folder / "bd.zarr", folder / "ac.zarr"], tmp_path / "all.zarr")
     assert tree(tmp_path / "all.zarr") == tree(folder / "whole.zarr")
     assert verify_store(tmp_path / "all.zarr").ok
 
 
-def test_stores_with_ranges_of_their_own_get_those_of_all(
-    make_dataset: MakeDataset, tmp_path: Path
-) -> None:
+def test_stores_with_ranges_of_their_own_get_those_of_all(make_dataset, tmp_path):
     whole = make_dataset("a", "b")
     build_store(whole.parameters(), tmp_path / "whole.zarr")
     for number, object_id in enumerate("ab"):
@@ -85,9 +82,7 @@ def test_stores_with_ranges_of_their_own_get_those_of_all(
             np.testing.assert_allclose(getattr(one, name), getattr(other, name), atol=1e-6)
 
 
-def test_what_does_not_go_together_is_refused(
-    parts: Made, make_dataset: MakeDataset, tmp_path: Path
-) -> None:
+def test_what_does_not_go_together_is_refused(parts, make_dataset, tmp_path):
     _, folder = parts
     out = tmp_path / "out.zarr"
     with pytest.raises(ConfigError, match=r"2 ids are in more than one store, such as a, c"):
@@ -111,7 +106,7 @@ def test_what_does_not_go_together_is_refused(
     assert not out.exists()
 
 
-def test_commands_choose_and_join(mixed_build: BuildSummary, tmp_path: Path) -> None:
+def test_commands_choose_and_join(mixed_build, tmp_path):
     store = tmp_path / "mixed.zarr"
     shutil.copytree(str(mixed_build.store), store)  # without the records beside it
     parts = []
@@ -135,9 +130,7 @@ def test_commands_choose_and_join(mixed_build: BuildSummary, tmp_path: Path) -> 
     assert CliRunner().invoke(slatprep, ["subset", str(store), "--out", "x.zarr"]).exit_code == 2
 
 
-def test_a_source_is_never_replaced_whatever_path_leads_there(
-    parts: Made, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_source_is_never_replaced_whatever_path_leads_there(parts, tmp_path, monkeypatch):
     _, folder = parts
     shutil.copytree(folder / "ac.zarr", tmp_path / "own.zarr")
     before = tree(tmp_path / "own.zarr")
@@ -157,9 +150,7 @@ def test_a_source_is_never_replaced_whatever_path_leads_there(
     assert tree(tmp_path / "own.zarr") == before
 
 
-def test_records_beside_a_store_are_taken_only_if_they_are_of_its_build(
-    parts: Made, tmp_path: Path
-) -> None:
+def test_records_beside_a_store_are_taken_only_if_they_are_of_its_build(parts, tmp_path):
     _, folder = parts
     for name, change in (
         ("none", lambda file: file.unlink()),
@@ -174,9 +165,7 @@ def test_records_beside_a_store_are_taken_only_if_they_are_of_its_build(
         assert told["parameters"]["pixieverse"]["root"] == "unknown"
 
 
-def test_a_store_whose_attributes_do_not_say_how_it_was_built_is_refused(
-    parts: Made, tmp_path: Path
-) -> None:
+def test_a_store_whose_attributes_do_not_say_how_it_was_built_is_refused(parts, tmp_path):
     _, folder = parts
     shutil.copytree(folder / "ac.zarr", tmp_path / "odd.zarr")
     file = tmp_path / "odd.zarr" / "zarr.json"

@@ -3,10 +3,6 @@
 import os
 import subprocess
 import sys
-from pathlib import Path
-
-import pytest
-from support.synthetic import MakeDataset
 
 from slatprep.pipeline.dataset import build_store
 from slatprep.workers import local
@@ -74,7 +70,7 @@ with event.install_listener("numba:compile", Listener()):
 """
 
 
-def test_a_build_compiles_nothing_that_was_not_compiled_before_it(tmp_path: Path) -> None:
+def test_a_build_compiles_nothing_that_was_not_compiled_before_it(tmp_path):
     command = [sys.executable, "-c", SCRIPT, str(tmp_path)]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
@@ -97,7 +93,7 @@ assert "NUMBA_CACHE_DIR" in kernels.WHEN
 """
 
 
-def test_where_no_folder_can_be_written_to_kernels_are_compiled_anew() -> None:
+def test_where_no_folder_can_be_written_to_kernels_are_compiled_anew():
     done = subprocess.run(
         [sys.executable, "-c", UNKEPT],
         capture_output=True, text=True, check=False, env=os.environ | NOWHERE,
@@ -105,15 +101,13 @@ def test_where_no_folder_can_be_written_to_kernels_are_compiled_anew() -> None:
     assert done.returncode == 0, done.stderr
 
 
-def test_jobs_are_no_more_than_there_is_work_for() -> None:
+def test_jobs_are_no_more_than_there_is_work_for():
     assert [at_most(assets // 20, 8) for assets in (0, 19, 40, 159, 1000)] == [1, 1, 2, 7, 8]
     cluster = object()
     assert at_most(1, cluster) is cluster  # type: ignore[arg-type]
 
 
-def test_few_assets_start_no_process(
-    make_dataset: MakeDataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_few_assets_start_no_process(make_dataset, tmp_path, monkeypatch):
     def refuse(number: int) -> None:
         raise AssertionError(f"{number} processes for two assets")
 

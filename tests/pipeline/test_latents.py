@@ -44,7 +44,7 @@ def of_latents(warnings: tuple[str, ...]) -> list[str]:
     return [text for text in warnings if "latents" in text]
 
 
-def test_a_store_says_which_encoder_made_its_latents(dataset: Dataset, tmp_path: Path) -> None:
+def test_a_store_says_which_encoder_made_its_latents(dataset, tmp_path):
     summary = build_store(dataset.parameters(), tmp_path / "s.zarr")
     assert of_latents(summary.warnings) == []
     held = open_store(tmp_path / "s.zarr").attributes["latents"]
@@ -58,9 +58,7 @@ def test_a_store_says_which_encoder_made_its_latents(dataset: Dataset, tmp_path:
     }
 
 
-def test_standardised_latents_are_named_and_never_standardised_twice(
-    dataset: Dataset, tmp_path: Path
-) -> None:
+def test_standardised_latents_are_named_and_never_standardised_twice(dataset, tmp_path):
     raw = {name: asset.feats.copy() for name, asset in dataset.assets.items()}
     rewrite(dataset, lambda feats: (feats - MEAN) / STD)
     out = tmp_path / "s.zarr"
@@ -88,7 +86,7 @@ def test_standardised_latents_are_named_and_never_standardised_twice(
     assert not open_store(out).contents.latents.standardised
 
 
-def test_one_asset_unlike_the_others_is_named(dataset: Dataset, tmp_path: Path) -> None:
+def test_one_asset_unlike_the_others_is_named(dataset, tmp_path):
     asset = dataset.assets["c"]
     dataset.write_slat("c.npz", asset.coords, (asset.feats - MEAN) / STD)
     summary = build_store(of(dataset), tmp_path / "s.zarr")
@@ -100,9 +98,7 @@ def test_one_asset_unlike_the_others_is_named(dataset: Dataset, tmp_path: Path) 
     assert warned == ["c"]
 
 
-def test_other_widths_are_stored_trained_on_and_predicted_from(
-    dataset: Dataset, tmp_path: Path
-) -> None:
+def test_other_widths_are_stored_trained_on_and_predicted_from(dataset, tmp_path):
     rewrite(dataset, lambda feats: np.tile(3 * feats + 1, 4)[:, :20])
     description = tmp_path / "mine.json"
     description.write_text(json.dumps({"encoder": "mine", "channels": 20, "resolution": 64}))
@@ -151,8 +147,8 @@ def test_other_widths_are_stored_trained_on_and_predicted_from(
     ],
 )
 def test_attributes_that_do_not_fit_the_arrays_are_refused(
-    dataset: Dataset, tmp_path: Path, attribute: str, value: object, said: str
-) -> None:
+    dataset, tmp_path, attribute, value, said
+):
     out = tmp_path / "s.zarr"
     build_store(dataset.parameters(), out)
     document = json.loads((out / "zarr.json").read_text())
@@ -188,7 +184,7 @@ def of_both(dataset: Dataset) -> BuildParameters:
     return of(dataset, root=root, encoder="trellis2-shape-pbr", standardised="no")
 
 
-def test_texture_latents_stand_behind_those_of_the_shape(dataset: Dataset, tmp_path: Path) -> None:
+def test_texture_latents_stand_behind_those_of_the_shape(dataset, tmp_path):
     both, out = write_both(dataset), tmp_path / "s.zarr"
     assert build_store(of_both(dataset), out).statuses["ok"] == 6
     store = open_store(out)
@@ -212,7 +208,7 @@ def test_texture_latents_stand_behind_those_of_the_shape(dataset: Dataset, tmp_p
     assert changed.statuses["ok"] == 6
 
 
-def test_changed_texture_alone_is_noticed(dataset: Dataset, tmp_path: Path) -> None:
+def test_changed_texture_alone_is_noticed(dataset, tmp_path):
     write_both(dataset)
     build_store(of_both(dataset), tmp_path / "s.zarr")
     path = dataset.root / "trellis2/pbr_latents/tex_enc_1024/a.npz"
@@ -235,9 +231,7 @@ def test_changed_texture_alone_is_noticed(dataset: Dataset, tmp_path: Path) -> N
         ),
     ],
 )
-def test_texture_latents_that_do_not_belong_are_refused(
-    dataset: Dataset, change, words: str
-) -> None:
+def test_texture_latents_that_do_not_belong_are_refused(dataset, change, words):
     write_both(dataset)
     change(dataset.root / "trellis2/pbr_latents/tex_enc_1024/a.npz")
     with pytest.raises(InputError, match=words):

@@ -27,9 +27,7 @@ def built(make_dataset: MakeDataset, tmp_path: Path) -> Made:
     return dataset, tmp_path / "s.manifests" / "assets.jsonl"
 
 
-def test_a_build_through_a_link_leaves_the_records_where_the_store_lies(
-    built: Made, tmp_path: Path
-) -> None:
+def test_a_build_through_a_link_leaves_the_records_where_the_store_lies(built, tmp_path):
     dataset, lines = built
     (tmp_path / "elsewhere").mkdir()
     real, links = tmp_path / "s.zarr", [tmp_path / "other.zarr", tmp_path / "elsewhere" / "s.zarr"]
@@ -53,7 +51,7 @@ def update(dataset: Dataset, lines: Path) -> list[str]:
     return list(records_of(lines))
 
 
-def test_an_update_writes_what_is_new_and_the_last_shards(built: Made) -> None:
+def test_an_update_writes_what_is_new_and_the_last_shards(built):
     dataset, lines = built
     out = lines.parent.with_name("s.zarr")
     before = {path: path.stat().st_ino for path in out.rglob("*") if path.is_file()}
@@ -91,9 +89,7 @@ def two_a_shard(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.usefixtures("two_a_shard")
-def test_lines_are_those_of_shards_and_stay_where_their_shard_does(
-    make_dataset: MakeDataset, tmp_path: Path
-) -> None:
+def test_lines_are_those_of_shards_and_stay_where_their_shard_does(make_dataset, tmp_path):
     dataset, out = make_dataset("a", "c"), tmp_path / "s.zarr"
     folder = tmp_path / "s.manifests"
     assert build_store(dataset.parameters(), out).records == folder / "assets.jsonl"
@@ -127,9 +123,7 @@ def test_lines_are_those_of_shards_and_stay_where_their_shard_does(
 
 
 @pytest.mark.parametrize("how", ["cut", "longer", "another line", "gone", "named twice"])
-def test_lines_that_are_not_those_of_the_store_are_found_and_mended(
-    built: Made, tmp_path: Path, how: str
-) -> None:
+def test_lines_that_are_not_those_of_the_store_are_found_and_mended(built, tmp_path, how):
     dataset, lines = built
     sound = lines.read_bytes()
     if how == "gone":
@@ -152,7 +146,7 @@ def test_lines_that_are_not_those_of_the_store_are_found_and_mended(
         assert lines.read_bytes().startswith(sound)
 
 
-def test_an_asset_that_cannot_go_in_costs_build_json_alone(built: Made) -> None:
+def test_an_asset_that_cannot_go_in_costs_build_json_alone(built):
     dataset, lines = built
     out = lines.parent.with_name("s.zarr")
     before, inode = tree(out), lines.stat().st_ino
@@ -165,9 +159,7 @@ def test_an_asset_that_cannot_go_in_costs_build_json_alone(built: Made) -> None:
     assert update(dataset, lines) == ["a", "c", "e"]
 
 
-def test_the_store_and_its_id_do_not_depend_on_the_order_of_lines(
-    built: Made, tmp_path: Path
-) -> None:
+def test_the_store_and_its_id_do_not_depend_on_the_order_of_lines(built, tmp_path):
     dataset, lines = built
     dataset.add("b", seed=1)
     update(dataset, lines)

@@ -63,7 +63,7 @@ def write(root: Path, names: str, count: int) -> BuildParameters:
     )
 
 
-def test_as_many_as_a_byte_holds_are_looked_up_and_counted(tmp_path: Path) -> None:
+def test_as_many_as_a_byte_holds_are_looked_up_and_counted(tmp_path):
     out = tmp_path / "s.zarr"
     build_store(write(tmp_path, "ab", 254), out)
     store = open_store(out)
@@ -94,7 +94,7 @@ def test_as_many_as_a_byte_holds_are_looked_up_and_counted(tmp_path: Path) -> No
     assert named < 20 and b"<!-- and %d more -->" % (np.count_nonzero(counts) - named) in picture
 
 
-def test_nine_classes_go_all_the_way_to_scores(tmp_path: Path) -> None:
+def test_nine_classes_go_all_the_way_to_scores(tmp_path):
     out, run = tmp_path / "s.zarr", tmp_path / "run"
     parameters = write(tmp_path, "abcdefgh", 9)
     passes = replace(
@@ -129,7 +129,7 @@ def test_nine_classes_go_all_the_way_to_scores(tmp_path: Path) -> None:
         assert result.exit_code == 0, result.output
 
 
-def test_scores_of_many_classes_are_read(tmp_path: Path) -> None:
+def test_scores_of_many_classes_are_read(tmp_path):
     logits = np.zeros((5, 254), np.float32)
     np.savez(tmp_path / "a.npz", properties=np.zeros((5, 2), np.float32), logits=logits)
     np.savez(tmp_path / "b.npz", properties=np.zeros((5, 2)), logits=np.zeros((5, 255)))
@@ -140,7 +140,7 @@ def test_scores_of_many_classes_are_read(tmp_path: Path) -> None:
             read("b")
 
 
-def test_of_a_finer_grid_the_class_of_most_voxels_is_taken_and_the_lowest_of_equal_ones() -> None:
+def test_of_a_finer_grid_the_class_of_most_voxels_is_taken_and_the_lowest_of_equal_ones():
     rng = np.random.default_rng(0)
     voxels = np.unique(rng.integers(0, 24, (9000, 3)), axis=0)
     material = rng.integers(0, 254, 6)[rng.integers(0, 6, len(voxels))]
@@ -157,13 +157,13 @@ def test_of_a_finer_grid_the_class_of_most_voxels_is_taken_and_the_lowest_of_equ
         np.testing.assert_allclose(properties, expected, rtol=1e-5)
 
 
-def test_more_than_a_byte_holds_are_refused_in_words(tmp_path: Path) -> None:
+def test_more_than_a_byte_holds_are_refused_in_words(tmp_path):
     parameters = write(tmp_path, "a", 255)
     with pytest.raises(ConfigError, match="there are 255 classes, not 1 to 254"):
         build_store(parameters, tmp_path / "s.zarr")
 
 
-def test_each_class_has_a_colour_of_its_own() -> None:
+def test_each_class_has_a_colour_of_its_own():
     assert set(MATERIAL_COLOURS) == {*range(254), 255}
     assert len(set(MATERIAL_COLOURS.values())) == 255
     assert Contents(classes=tuple("abcdefg")).background == 7

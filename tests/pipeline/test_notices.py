@@ -20,7 +20,7 @@ def told(*rows: tuple[tuple[float, float], ...]) -> list[str]:
     return list(wild_ranges("abcdefgh"[: len(rows)], extents, ranges_from_extents(extents)))
 
 
-def test_an_asset_that_alone_widens_a_range_is_named() -> None:
+def test_an_asset_that_alone_widens_a_range_is_named():
     wild = ((3.2, 10.8), (1.8, 9.7), (0.21, 0.45))
     (text,) = told(USUAL, wild, USUAL)
     assert text.startswith("b alone makes the range of density 7.94e+05 times wider")
@@ -28,7 +28,7 @@ def test_an_asset_that_alone_widens_a_range_is_named() -> None:
     assert text.startswith("c alone makes the range of youngs_modulus")
 
 
-def test_ranges_that_pixie_publishes_are_no_surprise() -> None:
+def test_ranges_that_pixie_publishes_are_no_surprise():
     soft, steel = ((3.2, 4.0), (3.0, 3.0), (0.4, 0.4)), ((11.3, 11.3), (3.9, 3.9), (0.3, 0.3))
     assert told(soft, soft, soft, steel) == []
     assert told(USUAL, ((3.2, 10.8), (1.8, 9.7), (0.21, 0.45))) == []  # which of two?
@@ -40,7 +40,7 @@ def dataset(tmp_path: Path) -> Dataset:
     return made
 
 
-def test_objects_with_one_slat_or_one_grid_are_named(dataset: Dataset, tmp_path: Path) -> None:
+def test_objects_with_one_slat_or_one_grid_are_named(dataset, tmp_path):
     asset = dataset.assets["a"]
     dataset.write_slat("c.npz", asset.coords, asset.feats)
     warnings = build_store(dataset.parameters(), tmp_path / "s.zarr").warnings
@@ -48,7 +48,7 @@ def test_objects_with_one_slat_or_one_grid_are_named(dataset: Dataset, tmp_path:
     assert any("have one grid (a = e" in text for text in warnings)
 
 
-def test_unusual_values_are_told_once_and_recorded(dataset: Dataset, tmp_path: Path) -> None:
+def test_unusual_values_are_told_once_and_recorded(dataset, tmp_path):
     parameters = dataset.parameters()
     warn = replace(parameters.pixieverse, plausibility="warn")
     for name in ("a", "b"):
@@ -68,7 +68,7 @@ def test_unusual_values_are_told_once_and_recorded(dataset: Dataset, tmp_path: P
     assert sum("plausibility: " in line for line in lines) == 2
 
 
-def test_one_asset_alone_does_not_tell_whether_it_is_standardised(tmp_path: Path) -> None:
+def test_one_asset_alone_does_not_tell_whether_it_is_standardised(tmp_path):
     dataset = Dataset(tmp_path / "data")
     dataset.add("a", 0)
     asset = dataset.assets["a"]

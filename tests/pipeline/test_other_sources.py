@@ -95,9 +95,7 @@ def parameters_of(root: Path, adapter: str = "voxels", **groups: object) -> Buil
 
 
 @pytest.mark.parametrize(("form", "classes"), [("npz", True), ("hdf5", False)])
-def test_properties_of_any_table_are_those_of_the_nearest_voxels(
-    tmp_path: Path, form: str, classes: bool
-) -> None:
+def test_properties_of_any_table_are_those_of_the_nearest_voxels(tmp_path, form, classes):
     write(tmp_path, "abc", form=form, classes=classes)
     out = tmp_path / "s.zarr"
     summary = build_store(parameters_of(tmp_path), out)
@@ -140,7 +138,7 @@ def test_properties_of_any_table_are_those_of_the_nearest_voxels(
     assert build_store(strict, out).n_unphysical > 0
 
 
-def test_an_extra_property_goes_all_the_way_to_scores(tmp_path: Path) -> None:
+def test_an_extra_property_goes_all_the_way_to_scores(tmp_path):
     from click.testing import CliRunner
 
     write(tmp_path, "abcdefgh")
@@ -162,7 +160,7 @@ def test_an_extra_property_goes_all_the_way_to_scores(tmp_path: Path) -> None:
         assert result.exit_code == 0, result.output
 
 
-def test_without_classes_no_accuracy_is_claimed(tmp_path: Path) -> None:
+def test_without_classes_no_accuracy_is_claimed(tmp_path):
     write(tmp_path, "abcdefgh", classes=False)
     out, run = tmp_path / "s.zarr", tmp_path / "run"
     build_store(parameters_of(tmp_path), out)
@@ -174,7 +172,7 @@ def test_without_classes_no_accuracy_is_claimed(tmp_path: Path) -> None:
     assert np.isfinite(means["mean"])
 
 
-def test_classes_of_a_source_s_own_go_all_the_way_to_scores(tmp_path: Path) -> None:
+def test_classes_of_a_source_s_own_go_all_the_way_to_scores(tmp_path):
     from click.testing import CliRunner
 
     own = ["soft wood", "steel"]
@@ -216,7 +214,7 @@ def test_classes_of_a_source_s_own_go_all_the_way_to_scores(tmp_path: Path) -> N
     assert open_store(out).attributes["material_classes"] == ["a", "b"]
 
 
-def test_particles_and_points_take_their_properties_by_name(tmp_path: Path) -> None:
+def test_particles_and_points_take_their_properties_by_name(tmp_path):
     from plyfile import PlyData
 
     write(tmp_path, "a", properties=SOLID)
@@ -234,7 +232,7 @@ def test_particles_and_points_take_their_properties_by_name(tmp_path: Path) -> N
 
 
 @pytest.mark.parametrize("side", [32, 128])
-def test_other_grids_lie_where_they_should(tmp_path: Path, side: int) -> None:
+def test_other_grids_lie_where_they_should(tmp_path, side):
     write(tmp_path, "a", resolution=side)
     voxels, columns, material = voxels_of(0)
     if side == 32:
@@ -259,7 +257,7 @@ def test_other_grids_lie_where_they_should(tmp_path: Path, side: int) -> None:
     assert right.mean() > 0.95
 
 
-def test_vomp_s_voxels_are_read_and_share_the_frame_of_their_latents(tmp_path: Path) -> None:
+def test_vomp_s_voxels_are_read_and_share_the_frame_of_their_latents(tmp_path):
     (tmp_path / "slat").mkdir()
     folder = tmp_path / "voxels" / "voxels"
     folder.mkdir(parents=True)
@@ -292,7 +290,7 @@ def test_vomp_s_voxels_are_read_and_share_the_frame_of_their_latents(tmp_path: P
 
 
 @pytest.mark.parametrize("suffix", ["json", "npy"])
-def test_a_frame_that_is_known_is_checked(tmp_path: Path, suffix: str) -> None:
+def test_a_frame_that_is_known_is_checked(tmp_path, suffix):
     write(tmp_path, "ab")
     frames = {"a": QUARTER_TURN, "b": QUARTER_TURN.T}  # of b, turned the wrong way
     for name, frame in frames.items():
@@ -323,7 +321,7 @@ def test_a_frame_that_is_known_is_checked(tmp_path: Path, suffix: str) -> None:
 
 
 @pytest.mark.usefixtures("files_are_old")
-def test_every_file_that_decides_an_asset_is_looked_at_again(tmp_path: Path) -> None:
+def test_every_file_that_decides_an_asset_is_looked_at_again(tmp_path):
     write(tmp_path, "ab")
     frame = tmp_path / "voxels" / "frame.json"
     frame.write_text(json.dumps(QUARTER_TURN.tolist()))
@@ -342,7 +340,7 @@ def test_every_file_that_decides_an_asset_is_looked_at_again(tmp_path: Path) -> 
     assert build_store(strict, out).n_unphysical == 0
 
 
-def test_a_frame_that_is_no_similarity_fails_its_asset_alone(tmp_path: Path) -> None:
+def test_a_frame_that_is_no_similarity_fails_its_asset_alone(tmp_path):
     wrong = {
         "b": (np.eye(3), "4x4"),
         "c": (np.diag([1.0, 1, -1, 1]), "mirror"),
@@ -362,7 +360,7 @@ def test_a_frame_that_is_no_similarity_fails_its_asset_alone(tmp_path: Path) -> 
     assert [name for name, (_, said) in wrong.items() if said not in problems[name]] == []
 
 
-def test_what_is_not_there_or_does_not_fit_is_said(tmp_path: Path) -> None:
+def test_what_is_not_there_or_does_not_fit_is_said(tmp_path):
     write(tmp_path, "a")
     with pytest.raises(ConfigError, match="no adapter 'gvm'; expected pixieverse, voxels, vomp"):
         build_store(parameters_of(tmp_path, "gvm"), tmp_path / "s.zarr")
@@ -380,14 +378,14 @@ def test_what_is_not_there_or_does_not_fit_is_said(tmp_path: Path) -> None:
         build_store(parameters_of(tmp_path), tmp_path / "s.zarr")
 
 
-def test_pixie_s_grids_are_not_measured_against_other_properties(tmp_path: Path) -> None:
+def test_pixie_s_grids_are_not_measured_against_other_properties(tmp_path):
     write(tmp_path, "a")
     build_store(parameters_of(tmp_path), tmp_path / "s.zarr")
     with pytest.raises(ConfigError, match="holds density, yield_stress, friction_angle"):
         compare_methods(None, {"m": tmp_path / "slat"}, tmp_path / "s.zarr", None, splits={})
 
 
-def test_properties_next_to_the_border_of_two_labels_are_verified(tmp_path: Path) -> None:
+def test_properties_next_to_the_border_of_two_labels_are_verified(tmp_path):
     """Without classes labels are rounded properties, and a store rounds them once more."""
     write(tmp_path, "a", classes=False)
     voxels, columns, _ = voxels_of(0)

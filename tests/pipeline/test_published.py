@@ -28,18 +28,14 @@ def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 @pytest.mark.parametrize("root", ["tar", "tar/archives", "gz/archives/render_outputs"])
-def test_store_of_archives_is_that_of_the_unpacked_folder(
-    made: Path, tmp_path: Path, unpacked: dict[str, bytes], root: str
-) -> None:
+def test_store_of_archives_is_that_of_the_unpacked_folder(made, tmp_path, unpacked, root):
     summary = build_store(parameters(made, root), tmp_path / "s.zarr")
     assert summary.statuses == {"ok": 4, "failed": 0, "skipped": 1}
     assert files(tmp_path / "s.zarr") == unpacked
     assert verify_store(tmp_path / "s.zarr", sources=True).ok
 
 
-def test_unpacked_root_is_read_where_its_grids_lie(
-    made: Path, tmp_path: Path, unpacked: dict[str, bytes]
-) -> None:
+def test_unpacked_root_is_read_where_its_grids_lie(made, tmp_path, unpacked):
     for other in ("data", "outputs"):
         (made / "pixieverse" / other / IDS[0]).mkdir(parents=True, exist_ok=True)
     build_store(parameters(made, "pixieverse", categories=True), tmp_path / "s.zarr")
@@ -47,7 +43,7 @@ def test_unpacked_root_is_read_where_its_grids_lie(
 
 
 @pytest.mark.parametrize("root", ["tar", "gz"])
-def test_one_archive_holds_its_class(made: Path, tmp_path: Path, root: str) -> None:
+def test_one_archive_holds_its_class(made, tmp_path, root):
     name = "tree.tar" if root == "tar" else "tree.tar.gz"
     chosen = parameters(made, f"{root}/archives/render_outputs/{name}")
     build_store(chosen, tmp_path / "s.zarr")
@@ -75,8 +71,8 @@ class Reads:
 
 
 def test_headers_and_needed_members_alone_are_read_and_an_index_but_once(
-    made: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, files_are_old: None
-) -> None:
+    made, tmp_path, monkeypatch, files_are_old
+):
     reads = Reads(monkeypatch)
     build_store(parameters(made, "tar"), tmp_path / "s.zarr")
     needed = sum(
@@ -94,9 +90,7 @@ def test_headers_and_needed_members_alone_are_read_and_an_index_but_once(
     assert reads.of_archives() == 0
 
 
-def test_index_goes_on_where_it_was_stopped(
-    made: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_index_goes_on_where_it_was_stopped(made, tmp_path, monkeypatch):
     path = made / "tar" / "archives" / "render_outputs" / "tree.tar"
     archive = archives.Archive.on_disk(path, ("*/sample_*/material_grid.npy",))
     whole, passed = archive.index(), []
@@ -115,7 +109,7 @@ def test_index_goes_on_where_it_was_stopped(
     assert not passed
 
 
-def test_stopped_reading_of_an_archive_with_gzip_begins_again_and_is_told(made: Path) -> None:
+def test_stopped_reading_of_an_archive_with_gzip_begins_again_and_is_told(made):
     path = made / "gz" / "archives" / "render_outputs" / "tree.tar.gz"
     archive = archives.Archive.on_disk(path, ("*/sample_*/material_grid.npy",))
     whole, passed = archive.index(), list[int]()
@@ -134,7 +128,7 @@ def test_stopped_reading_of_an_archive_with_gzip_begins_again_and_is_told(made: 
     assert passed == sorted(passed) and passed[-1] == path.stat().st_size
 
 
-def test_what_changed_in_an_archive_is_built_again_alone(made: Path, tmp_path: Path) -> None:
+def test_what_changed_in_an_archive_is_built_again_alone(made, tmp_path):
     folder = shutil.copytree(made / "tar", tmp_path / "tar")
     build_store(parameters(made, folder), tmp_path / "s.zarr")
     shutil.copytree(made / "pixieverse" / "render_outputs" / IDS[0], tmp_path / "new" / IDS[0])
@@ -163,9 +157,7 @@ def grid_of(made: Path, number: int) -> Path:
     return made / "pixieverse" / "render_outputs" / IDS[number] / "sample_0" / "material_grid.npy"
 
 
-def test_last_of_two_members_counts_and_links_lead_within_the_archive(
-    made: Path, strange: Path, tmp_path: Path
-) -> None:
+def test_last_of_two_members_counts_and_links_lead_within_the_archive(made, strange, tmp_path):
     name = f"{IDS[0]}/sample_0/material_grid.npy"
     with tarfile.open(strange / "tree.tar", "w") as archive:
         archive.add(grid_of(made, 1), arcname=f"./{name}")
@@ -194,9 +186,7 @@ def test_last_of_two_members_counts_and_links_lead_within_the_archive(
     assert "is a device or a pipe" in problems[IDS[3]]
 
 
-def test_object_in_two_archives_is_not_taken_from_either(
-    made: Path, strange: Path, tmp_path: Path
-) -> None:
+def test_object_in_two_archives_is_not_taken_from_either(made, strange, tmp_path):
     objects = made / "pixieverse" / "render_outputs"
     pack(strange / "sand.tar", [objects / IDS[0], objects / IDS[1]])
     pack(strange / "tree.tar", [objects / IDS[0]])
@@ -215,9 +205,7 @@ def damaged(data: bytes) -> bytes:
 
 
 @pytest.mark.parametrize("suffix", [".tar", ".tar.gz"])
-def test_truncated_archive_is_named_and_the_rest_of_it_built(
-    made: Path, strange: Path, tmp_path: Path, suffix: str
-) -> None:
+def test_truncated_archive_is_named_and_the_rest_of_it_built(made, strange, tmp_path, suffix):
     objects = made / "pixieverse" / "render_outputs"
     path = strange / f"tree{suffix}"
     pack(path, [objects / IDS[0], objects / IDS[1]])
@@ -228,9 +216,7 @@ def test_truncated_archive_is_named_and_the_rest_of_it_built(
     assert list(open_store(tmp_path / "s.zarr").ids) == [IDS[0]]
 
 
-def test_damaged_header_is_named_and_what_lies_before_it_built(
-    made: Path, strange: Path, tmp_path: Path
-) -> None:
+def test_damaged_header_is_named_and_what_lies_before_it_built(made, strange, tmp_path):
     objects = made / "pixieverse" / "render_outputs"
     path = strange / "tree.tar"
     pack(path, [objects / IDS[0], objects / IDS[1]])
@@ -241,7 +227,7 @@ def test_damaged_header_is_named_and_what_lies_before_it_built(
     assert list(open_store(tmp_path / "s.zarr").ids) == [IDS[0]]
 
 
-def test_archive_replaced_during_a_build_is_noticed(made: Path, strange: Path) -> None:
+def test_archive_replaced_during_a_build_is_noticed(made, strange):
     objects = made / "pixieverse" / "render_outputs"
     path = strange / "tree.tar"
     pack(path, [objects / IDS[0]])
@@ -253,7 +239,7 @@ def test_archive_replaced_during_a_build_is_noticed(made: Path, strange: Path) -
         archive.read(entry)
 
 
-def test_header_that_claims_much_is_not_believed(strange: Path) -> None:
+def test_header_that_claims_much_is_not_believed(strange):
     path = strange / "tree.tar"
     header = tarfile.TarInfo("long")
     header.type, header.size = tarfile.GNUTYPE_LONGNAME, 2**40
@@ -262,7 +248,7 @@ def test_header_that_claims_much_is_not_believed(strange: Path) -> None:
     assert "is no intact tar archive (a header claims" in index.fault
 
 
-def test_long_names_are_read_in_both_forms(strange: Path) -> None:
+def test_long_names_are_read_in_both_forms(strange):
     name = "/".join(["a" * 90] * 4) + "/material_grid.npy"
     for number, form in enumerate([tarfile.GNU_FORMAT, tarfile.PAX_FORMAT]):
         path = strange / f"{number}.tar"
@@ -277,9 +263,7 @@ def test_long_names_are_read_in_both_forms(strange: Path) -> None:
 
 
 @pytest.mark.parametrize("suffix", [".tar", ".tar.gz"])
-def test_member_that_no_reader_takes_is_not_read(
-    made: Path, strange: Path, tmp_path: Path, suffix: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_member_that_no_reader_takes_is_not_read(made, strange, tmp_path, suffix, monkeypatch):
     monkeypatch.setattr("slatprep.storage.tar.MAX_KEPT", 2**20)
     monkeypatch.setattr("slatprep.readers.files.MAX_FILE_BYTES", 2**20)
     objects = made / "pixieverse" / "render_outputs"

@@ -39,17 +39,13 @@ def hub(made: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator
 
 
 @pytest.mark.parametrize("root", ["", "/archives/render_outputs", "@main"])
-def test_store_of_the_hub_is_that_of_the_unpacked_folder(
-    hub: PublishedHub, made: Path, tmp_path: Path, unpacked: dict[str, bytes], root: str
-) -> None:
+def test_store_of_the_hub_is_that_of_the_unpacked_folder(hub, made, tmp_path, unpacked, root):
     build_store(parameters(made, URL + root), tmp_path / "s.zarr")
     assert files(tmp_path / "s.zarr") == unpacked
     assert verify_store(tmp_path / "s.zarr", sources=True).ok
 
 
-def test_one_archive_of_the_hub_and_one_with_gzip(
-    hub: PublishedHub, made: Path, tmp_path: Path
-) -> None:
+def test_one_archive_of_the_hub_and_one_with_gzip(hub, made, tmp_path):
     for number, root in enumerate(("tar", "gz")):
         hub.publish(NAME, made / root)
         name = f"tree.{root}".replace("gz", "tar.gz")
@@ -59,8 +55,8 @@ def test_one_archive_of_the_hub_and_one_with_gzip(
 
 
 def test_second_look_reads_nothing_of_the_archives_and_another_commit_what_changed(
-    hub: PublishedHub, made: Path, tmp_path: Path
-) -> None:
+    hub, made, tmp_path
+):
     build_store(parameters(made, URL), tmp_path / "s.zarr")
     hub.requests.clear()
     assert build_store(parameters(made, URL), tmp_path / "s.zarr").statuses["ok"] == 4
@@ -77,17 +73,15 @@ def test_second_look_reads_nothing_of_the_archives_and_another_commit_what_chang
     assert IDS[3] not in open_store(tmp_path / "s.zarr").ids
 
 
-def test_members_without_slat_are_not_fetched(
-    hub: PublishedHub, made: Path, tmp_path: Path
-) -> None:
+def test_members_without_slat_are_not_fetched(hub, made, tmp_path):
     build_store(parameters(made, URL), tmp_path / "s.zarr")
     kept = list((tmp_path / "cache").rglob("*.z"))
     assert len([path for path in kept if path.name != "index.z"]) == 4 * 3
 
 
 def test_bytes_are_told_and_what_was_fetched_is_kept_when_a_build_stops(
-    hub: PublishedHub, made: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+    hub, made, tmp_path, monkeypatch
+):
     lines: list[str] = []
     monkeypatch.setattr("slatprep.readers.published._EVERY_S", 0.0)
     monkeypatch.setattr("slatprep.storage.fetch._AT_ONCE", 1)
@@ -109,7 +103,7 @@ def test_bytes_are_told_and_what_was_fetched_is_kept_when_a_build_stops(
     assert not any(line.startswith("archives") for line in lines)
 
 
-def test_neighbours_come_with_one_request(hub: PublishedHub, made: Path, tmp_path: Path) -> None:
+def test_neighbours_come_with_one_request(hub, made, tmp_path):
     pairs = [pair for pair in discover(parameters(made, URL)) if not pair.problem]
     hub.requests.clear()
     fetch_members(pairs, None)
@@ -123,9 +117,7 @@ def test_neighbours_come_with_one_request(hub: PublishedHub, made: Path, tmp_pat
     assert hub.ranges() == 0
 
 
-def test_token_is_sent_to_the_hub_alone(
-    hub: PublishedHub, made: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_token_is_sent_to_the_hub_alone(hub, made, tmp_path, monkeypatch):
     hub.token = "hf_secret"
     with pytest.raises(ConfigError, match="HF_TOKEN"):
         discover(parameters(made, URL))
@@ -140,9 +132,7 @@ def test_token_is_sent_to_the_hub_alone(
     assert set(elsewhere.tokens) == {""}
 
 
-def test_too_many_requests_are_waited_for_as_told(
-    hub: PublishedHub, made: Path, tmp_path: Path, unpacked: dict[str, bytes]
-) -> None:
+def test_too_many_requests_are_waited_for_as_told(hub, made, tmp_path, unpacked):
     pairs = discover(parameters(made, URL))
     hub.refused, hub.wait = 1, 2
     assert pairs[0].grid is not None
@@ -151,16 +141,14 @@ def test_too_many_requests_are_waited_for_as_told(
     assert hub.served() - when >= 2
 
 
-def test_connection_that_ends_in_the_middle_is_made_again(
-    hub: PublishedHub, made: Path, tmp_path: Path, unpacked: dict[str, bytes]
-) -> None:
+def test_connection_that_ends_in_the_middle_is_made_again(hub, made, tmp_path, unpacked):
     hub.cut = 2
     build_store(parameters(made, URL), tmp_path / "s.zarr")
     assert hub.cut == 0
     assert files(tmp_path / "s.zarr") == unpacked
 
 
-def test_build_stays_with_the_commit_that_it_began_with(hub: PublishedHub, made: Path) -> None:
+def test_build_stays_with_the_commit_that_it_began_with(hub, made):
     pairs = discover(parameters(made, URL))
     hub.publish(NAME, made / "gz")
     grid = pairs[0].grid
@@ -169,9 +157,7 @@ def test_build_stays_with_the_commit_that_it_began_with(hub: PublishedHub, made:
     assert grid.read_bytes() == own.read_bytes()
 
 
-def test_archive_that_changes_within_a_commit_is_named(
-    hub: PublishedHub, made: Path, tmp_path: Path
-) -> None:
+def test_archive_that_changes_within_a_commit_is_named(hub, made, tmp_path):
     root = shutil.copytree(made / "tar", tmp_path / "own")
     hub.publish(NAME, root)
     pairs = discover(parameters(made, URL))
@@ -182,9 +168,7 @@ def test_archive_that_changes_within_a_commit_is_named(
         pairs[0].grid.read_bytes()
 
 
-def test_truncated_archive_of_the_hub_is_named(
-    hub: PublishedHub, made: Path, tmp_path: Path
-) -> None:
+def test_truncated_archive_of_the_hub_is_named(hub, made, tmp_path):
     root = shutil.copytree(made / "tar", tmp_path / "own")
     path = root / "archives/render_outputs/tree.tar"
     path.write_bytes(path.read_bytes()[: path.stat().st_size * 2 // 3])
@@ -194,6 +178,6 @@ def test_truncated_archive_of_the_hub_is_named(
     assert IDS[0] in open_store(tmp_path / "s.zarr").ids
 
 
-def test_dataset_that_is_not_there_is_named(hub: PublishedHub, made: Path) -> None:
+def test_dataset_that_is_not_there_is_named(hub, made):
     with pytest.raises(ConfigError, match="nobody/nothing"):
         discover(parameters(made, "hf://datasets/nobody/nothing"))

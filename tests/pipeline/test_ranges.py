@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from support.faults import inject
-from support.synthetic import Dataset, MakeDataset
+from support.synthetic import Dataset
 from support.trees import tree
 
 from slatprep import ConfigError, InputError
@@ -48,9 +48,7 @@ def of(dataset: Dataset, **normalize: object) -> BuildParameters:
     return replace(dataset.parameters(), normalize=NormalizeParameters(**normalize))  # type: ignore[arg-type, no-any-return]
 
 
-def test_percentiles_are_numpy_s_whatever_the_jobs_and_what_was_there(
-    make_dataset: MakeDataset, tmp_path: Path
-) -> None:
+def test_percentiles_are_numpy_s_whatever_the_jobs_and_what_was_there(make_dataset, tmp_path):
     dataset, out = noisy(make_dataset("a", "b", "c"), "a", "b", "c"), tmp_path / "s.zarr"
     for lo, hi in ((0, 100), (0.5, 97.25), (50, 51), (1, 99)):
         build_store(of(dataset, ranges=f"p{lo}-p{hi}"), out)
@@ -60,7 +58,7 @@ def test_percentiles_are_numpy_s_whatever_the_jobs_and_what_was_there(
     assert tree(out) == tree(tmp_path / "two.zarr")
 
 
-def test_an_object_of_several_views_counts_once(make_dataset: MakeDataset, tmp_path: Path) -> None:
+def test_an_object_of_several_views_counts_once(make_dataset, tmp_path):
     dataset, out = noisy(make_dataset("a", "b"), "a", "b"), tmp_path / "s.zarr"
     shape = dataset.assets["b"]
     for view in ("front", "side"):
@@ -72,9 +70,7 @@ def test_an_object_of_several_views_counts_once(make_dataset: MakeDataset, tmp_p
 
 
 @pytest.mark.parametrize(("ranges", "bounds"), [("p1-p99", (1, 99)), ("dataset", (0, 100))])
-def test_ranges_of_the_objects_to_train_on(
-    make_dataset: MakeDataset, tmp_path: Path, ranges: str, bounds: tuple[float, float]
-) -> None:
+def test_ranges_of_the_objects_to_train_on(make_dataset, tmp_path, ranges, bounds):
     dataset, out = noisy(make_dataset("a", "b", "c"), "a", "b", "c"), tmp_path / "s.zarr"
     lists = tmp_path / "lists.json"
     lists.write_text(json.dumps({"train": ["a", "b"], "test": ["c"]}))
@@ -97,9 +93,7 @@ def test_ranges_of_the_objects_to_train_on(
     np.testing.assert_allclose(ranges_of(out), expected(dataset, "ac", *bounds), rtol=1e-12)
 
 
-def test_by_hash_the_training_s_own_objects_count(
-    make_dataset: MakeDataset, tmp_path: Path
-) -> None:
+def test_by_hash_the_training_s_own_objects_count(make_dataset, tmp_path):
     from slatprep.learn.splits import assign_store
     from slatprep.readers.splits import Shares
 
@@ -115,7 +109,7 @@ def test_by_hash_the_training_s_own_objects_count(
     assert open_store(out).normalization.source == "p1-p99 of train by hash"
 
 
-def test_a_single_value_gets_a_width(make_dataset: MakeDataset, tmp_path: Path) -> None:
+def test_a_single_value_gets_a_width(make_dataset, tmp_path):
     dataset, out = make_dataset("a"), tmp_path / "s.zarr"
     grid = dataset.assets["a"].grid
     grid[grid[..., 3] != 7, :3] = (1000, 1e6, 0.25)
@@ -128,13 +122,7 @@ def test_a_single_value_gets_a_width(make_dataset: MakeDataset, tmp_path: Path) 
     ("text", "message"),
     [('{"train": ["a"]', "cannot be read"), ('{"train": ["nobody"]}', "none of the dataset's")],
 )
-def test_lists_that_cannot_be_used_are_named(
-    make_dataset: MakeDataset,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    text: str,
-    message: str,
-) -> None:
+def test_lists_that_cannot_be_used_are_named(make_dataset, tmp_path, monkeypatch, text, message):
     def fail_at_assets(step: str, name: str) -> None:
         assert step.startswith("work folder"), f"{step} {name}"
 
@@ -147,7 +135,7 @@ def test_lists_that_cannot_be_used_are_named(
     assert not out.exists()
 
 
-def test_nobody_to_train_on_is_an_error(make_dataset: MakeDataset, tmp_path: Path) -> None:
+def test_nobody_to_train_on_is_an_error(make_dataset, tmp_path):
     (tmp_path / "lists.json").write_text('{"test": ["a"], "val": ["b"]}')
     chosen = of(make_dataset("a", "b"), objects="train", split_by=str(tmp_path / "lists.json"))
     with pytest.raises(ConfigError, match="no object is trained on"):

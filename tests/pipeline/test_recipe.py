@@ -25,7 +25,7 @@ def record(mixed_build: BuildSummary) -> AssetRecord:
     return read_asset_record(first, "its first line")
 
 
-def test_all_that_touches_the_numbers_is_in_the_key_and_no_order() -> None:
+def test_all_that_touches_the_numbers_is_in_the_key_and_no_order():
     others = (
         RECIPE.key("b", DIGESTS),
         RECIPE.key("a", {**DIGESTS, "slat": "2" * 64}),
@@ -43,7 +43,7 @@ def test_all_that_touches_the_numbers_is_in_the_key_and_no_order() -> None:
     assert turned.key("a", dict(reversed(DIGESTS.items()))) == key
 
 
-def test_what_changed_is_said(record: AssetRecord) -> None:
+def test_what_changed_is_said(record):
     same = Recipe(record.parameters, dict(record.versions), record.code)
     assert same.difference(record, record.sources) == "sources changed: "
     grid, slat = record.sources

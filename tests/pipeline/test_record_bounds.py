@@ -2,11 +2,8 @@
 
 import os
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
-import pytest
-from support.synthetic import MakeDataset
 from support.trees import tree
 
 from slatprep.inspect.verify import verify_store
@@ -16,9 +13,7 @@ from slatprep.store.record import MAX_WARNINGS
 from slatprep.store.records import StoredRecords
 
 
-def test_more_annotations_than_a_record_holds_cost_their_asset_alone(
-    make_dataset: MakeDataset, tmp_path: Path
-) -> None:
+def test_more_annotations_than_a_record_holds_cost_their_asset_alone(make_dataset, tmp_path):
     dataset = make_dataset("a", "b")
     folder = dataset.root / "pixieverse" / "a"
     for sample in range(1, 256):
@@ -33,9 +28,7 @@ def test_more_annotations_than_a_record_holds_cost_their_asset_alone(
     assert verify_store(tmp_path / "s.zarr").ok
 
 
-def test_more_warnings_than_a_record_holds_are_counted(
-    make_dataset: MakeDataset, tmp_path: Path
-) -> None:
+def test_more_warnings_than_a_record_holds_are_counted(make_dataset, tmp_path):
     dataset = make_dataset("a")
     folder = dataset.root / "pixieverse/a"
     grid = np.load(folder / "sample_0/material_grid.npy")
@@ -53,9 +46,7 @@ def test_more_warnings_than_a_record_holds_are_counted(
     assert tree(out) == before
 
 
-def test_a_record_that_nobody_could_read_costs_its_asset_alone(
-    make_dataset: MakeDataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_record_that_nobody_could_read_costs_its_asset_alone(make_dataset, tmp_path, monkeypatch):
     """Texts of the bounds are taken into the record as they are."""
     dataset = make_dataset("a", "b")
     beside = dataset.root / "pixieverse/a/clip_features.npz"

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from support.faults import inject
-from support.synthetic import Dataset, MakeDataset, make_asset
+from support.synthetic import Dataset, make_asset
 from support.trees import records_of, tree
 
 from slatprep.errors import StoreError
@@ -65,9 +65,7 @@ def own(several: Dataset, tmp_path: Path) -> Dataset:
     return Dataset(tmp_path / "own", several.assets)
 
 
-def test_labels_are_the_mean_and_the_vote_of_all(
-    several: Dataset, merged: BuildSummary, tmp_path: Path
-) -> None:
+def test_labels_are_the_mean_and_the_vote_of_all(several, merged, tmp_path):
     store = open_store(str(merged.store))
     asset, other = store.asset("a"), store.asset("b")
     one = build_store(asked(several, "first"), tmp_path / "first.zarr")
@@ -94,7 +92,7 @@ def test_labels_are_the_mean_and_the_vote_of_all(
     assert np.isnan(other.votes).all()
 
 
-def test_the_record_has_every_annotation(merged: BuildSummary) -> None:
+def test_the_record_has_every_annotation(merged):
     records = records_of(merged.records)
     entries = records["a"]["merged"]
     sources = records["a"]["sources"]
@@ -111,7 +109,7 @@ def test_the_record_has_every_annotation(merged: BuildSummary) -> None:
     assert "its annotations differ" in records["a"]["judgement"]["reasons"][0]
 
 
-def test_a_store_of_merged_labels_is_sound(merged: BuildSummary) -> None:
+def test_a_store_of_merged_labels_is_sound(merged):
     assert verify_store(str(merged.store), sources=True).findings == ()
     store = open_store(str(merged.store))
     check = check_alignment(store, "a")
@@ -123,9 +121,7 @@ def test_a_store_of_merged_labels_is_sound(merged: BuildSummary) -> None:
     )
 
 
-def test_without_several_a_merge_is_the_build_it_was(
-    make_dataset: MakeDataset, tmp_path: Path
-) -> None:
+def test_without_several_a_merge_is_the_build_it_was(make_dataset, tmp_path):
     dataset = make_dataset("a", "b")
     plain = build_store(dataset.parameters(), tmp_path / "plain.zarr")
     for samples in ("first", "all", "merge"):
@@ -134,14 +130,12 @@ def test_without_several_a_merge_is_the_build_it_was(
     assert not (tmp_path / "plain.zarr/voxel/spread").exists()
 
 
-def test_any_number_of_jobs_writes_the_same_bytes(
-    several: Dataset, merged: BuildSummary, tmp_path: Path
-) -> None:
+def test_any_number_of_jobs_writes_the_same_bytes(several, merged, tmp_path):
     two = build_store(asked(several, "merge"), tmp_path / "two.zarr", jobs=2)
     assert tree(two.store) == tree(merged.store)
 
 
-def test_each_sample_may_be_an_asset(several: Dataset, tmp_path: Path) -> None:
+def test_each_sample_may_be_an_asset(several, tmp_path):
     store = open_store(str(build_store(asked(several, "all"), tmp_path / "all.zarr").store))
     assert store.ids == ["a.sample_0", "a.sample_1", "a.sample_2", "b"]
     assert set(store.column("object_id")) == {"a", "b"}
@@ -153,7 +147,7 @@ def test_each_sample_may_be_an_asset(several: Dataset, tmp_path: Path) -> None:
     assert not store.merges
 
 
-def test_what_fails_is_left_out_and_named(own: Dataset, tmp_path: Path) -> None:
+def test_what_fails_is_left_out_and_named(own, tmp_path):
     path = own.root / "pixieverse/a/sample_0/material_grid.npy"
     path.write_bytes(path.read_bytes()[:1000])
     summary = build_store(asked(own, "merge"), tmp_path / "s.zarr")
@@ -173,7 +167,7 @@ def test_what_fails_is_left_out_and_named(own: Dataset, tmp_path: Path) -> None:
     }
 
 
-def test_an_asset_fails_when_none_is_left(own: Dataset, tmp_path: Path) -> None:
+def test_an_asset_fails_when_none_is_left(own, tmp_path):
     for sample in range(len(FACTORS)):
         write_sample(own, "a", sample, np.zeros((64, 64, 63, 4), np.float32))
     summary = build_store(asked(own, "merge"), tmp_path / "s.zarr")
@@ -183,9 +177,7 @@ def test_an_asset_fails_when_none_is_left(own: Dataset, tmp_path: Path) -> None:
     assert "sample 2:" in problem[1]
 
 
-def test_a_sample_more_redoes_that_object_alone(
-    own: Dataset, merged: BuildSummary, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_sample_more_redoes_that_object_alone(own, merged, tmp_path, monkeypatch):
     out = Path(shutil.copytree(str(merged.store), tmp_path / "s.zarr"))
     shutil.copytree(merged.records.parent, tmp_path / "s.manifests")
     write_sample(own, "b", 1, sample_grid(1, 2.0))
@@ -200,8 +192,8 @@ def test_a_sample_more_redoes_that_object_alone(
 
 @pytest.mark.parametrize(("sample", "ok"), [(0, 2), (1, 1)])
 def test_a_grid_replaced_during_the_build_never_gets_the_key_of_other_labels(
-    own: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, sample: int, ok: int
-) -> None:
+    own, tmp_path, monkeypatch, sample, ok
+):
     """Sample 0 has been read when it is replaced, sample 1 has been hashed alone."""
     new = sample_grid(0, 20.0)
 
@@ -220,9 +212,7 @@ def test_a_grid_replaced_during_the_build_never_gets_the_key_of_other_labels(
     assert tree(again.store) == tree(fresh.store)
 
 
-def test_a_store_gains_and_loses_its_spread(
-    several: Dataset, make_dataset: MakeDataset, tmp_path: Path
-) -> None:
+def test_a_store_gains_and_loses_its_spread(several, make_dataset, tmp_path):
     out = tmp_path / "s.zarr"
     build_store(asked(several, "first"), out)
     for samples, merges in (("merge", True), ("first", False)):
@@ -232,12 +222,12 @@ def test_a_store_gains_and_loses_its_spread(
         assert open_store(out).merges is merges
 
 
-def test_passes_that_place_anew_are_refused(several: Dataset) -> None:
+def test_passes_that_place_anew_are_refused(several):
     with pytest.raises(ValueError, match="--consensus or --witness"):
         replace(asked(several, "merge"), consensus=ConsensusParameters(settle=True))
 
 
-def test_by_default_several_are_a_fault(own: Dataset, tmp_path: Path) -> None:
+def test_by_default_several_are_a_fault(own, tmp_path):
     summary = build_store(own.parameters(), tmp_path / "s.zarr")
     assert dict(summary.problems)["a"].endswith("expected one grid and one SLAT per id")
     assert "--samples" in dict(summary.problems)["a"]
@@ -247,9 +237,7 @@ def test_by_default_several_are_a_fault(own: Dataset, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("name", ["spread", "votes", "confidence", "properties", "material"])
-def test_labels_that_the_sources_do_not_give_are_found(
-    several: Dataset, tmp_path: Path, name: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_labels_that_the_sources_do_not_give_are_found(several, tmp_path, name, monkeypatch):
     """The file is written with its digest, as a faulty build would have done."""
     from slatprep.pipeline import annotate as stage
 
@@ -272,7 +260,7 @@ def test_labels_that_the_sources_do_not_give_are_found(
     assert all("1 of" in finding.what for finding in found)
 
 
-def test_exports_carry_spread_and_votes(merged: BuildSummary, tmp_path: Path) -> None:
+def test_exports_carry_spread_and_votes(merged, tmp_path):
     import h5py
 
     asset = open_store(str(merged.store)).asset("a")
@@ -285,9 +273,7 @@ def test_exports_carry_spread_and_votes(merged: BuildSummary, tmp_path: Path) ->
             np.testing.assert_array_equal(file["a"][name][:], getattr(asset, name))
 
 
-def test_joined_and_chosen_stores_keep_their_spread(
-    several: Dataset, merged: BuildSummary, tmp_path: Path
-) -> None:
+def test_joined_and_chosen_stores_keep_their_spread(several, merged, tmp_path):
     """Ranges of the joined store are wider, so that spreads in its units are smaller."""
     subset_store(str(merged.store), tmp_path / "b.zarr", ["b"])
     assert not open_store(tmp_path / "b.zarr").merges

@@ -22,7 +22,7 @@ def finished(name: str, verdict: str) -> Row:
     return Row(name, 10, columns=columns)
 
 
-def test_assets_are_counted_and_the_first_hundred_problems_listed() -> None:
+def test_assets_are_counted_and_the_first_hundred_problems_listed():
     usable = [finished("x", "good"), finished("y", "doubtful"), finished("z", "good")]
     without = [*map(failed, range(120)), failed(120, Status.SKIPPED)]
     summary = summarise(counts_of(usable), without, Path("r"), "id", 1.0)
@@ -38,7 +38,7 @@ def test_assets_are_counted_and_the_first_hundred_problems_listed() -> None:
     assert clean.complete
 
 
-def test_nothing_usable_names_five_and_counts_the_rest() -> None:
+def test_nothing_usable_names_five_and_counts_the_rest():
     five = nothing_usable([failed(n) for n in range(5)], PARAMETERS)
     assert "none of 5 assets can be used" in five
     assert five.splitlines()[1:] == [f"  a00{n}: reason {n}" for n in range(5)]

@@ -60,9 +60,7 @@ def names(steps: list[tuple[str, str]], step: str) -> list[str]:
     return [name for found, name in steps if found == step]
 
 
-def test_new_assets_come_behind_and_the_rest_stays_where_it_is(
-    built: Made, steps: list[tuple[str, str]]
-) -> None:
+def test_new_assets_come_behind_and_the_rest_stays_where_it_is(built, steps):
     dataset, out = built
     before, files = inodes(out), tree(out)
     dataset.add("d", seed=1)
@@ -92,7 +90,7 @@ def test_new_assets_come_behind_and_the_rest_stays_where_it_is(
     assert files.keys() <= built_anew.keys()
 
 
-def test_what_is_new_and_sorts_last_gives_the_bytes_of_a_first_build(built: Made) -> None:
+def test_what_is_new_and_sorts_last_gives_the_bytes_of_a_first_build(built):
     dataset, out = built
     dataset.add("h", seed=1)
     build_store(dataset.parameters(), out, jobs=2)
@@ -100,11 +98,8 @@ def test_what_is_new_and_sorts_last_gives_the_bytes_of_a_first_build(built: Made
 
 
 def test_shards_that_a_larger_store_has_larger_are_made_of_chunks_as_they_are(
-    make_dataset: MakeDataset,
-    monkeypatch: pytest.MonkeyPatch,
-    steps: list[tuple[str, str]],
-    tmp_path: Path,
-) -> None:
+    make_dataset, monkeypatch, steps, tmp_path
+):
     monkeypatch.setattr(layout, "MOST_SHARDS", 4)
     monkeypatch.setattr(layout, "_CHUNKS_IN_SHARD", (1, 4096))
     dataset, out = make_dataset("a", "c"), tmp_path / "s.zarr"
@@ -119,9 +114,7 @@ def test_shards_that_a_larger_store_has_larger_are_made_of_chunks_as_they_are(
     assert tree(out) == tree_from_nothing(by_size, "few shards")
 
 
-def test_where_much_is_new_all_rows_are_ordered_by_id(
-    built: Made, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_where_much_is_new_all_rows_are_ordered_by_id(built, monkeypatch):
     dataset, out = built
     monkeypatch.setattr(rows, "MOST_BEHIND", 0.2)
     dataset.add("b", seed=2)
@@ -129,7 +122,7 @@ def test_where_much_is_new_all_rows_are_ordered_by_id(
     assert tree(out) == tree_from_nothing(dataset.parameters())
 
 
-def test_every_asset_has_the_rows_of_a_first_build(built: Made, tmp_path: Path) -> None:
+def test_every_asset_has_the_rows_of_a_first_build(built, tmp_path):
     dataset, out = built
     dataset.add("b", seed=2)
     build_store(dataset.parameters(), out)
@@ -145,9 +138,7 @@ def test_every_asset_has_the_rows_of_a_first_build(built: Made, tmp_path: Path) 
     assert one.attributes["manifest"] == other.attributes["manifest"]
 
 
-def test_a_change_of_latents_alone_costs_its_own_chunks(
-    built: Made, steps: list[tuple[str, str]]
-) -> None:
+def test_a_change_of_latents_alone_costs_its_own_chunks(built, steps):
     dataset, out = built
     before = inodes(out)
     made = make_asset(1)
@@ -161,9 +152,7 @@ def test_a_change_of_latents_alone_costs_its_own_chunks(
     assert tree(out) == tree_from_nothing(dataset.parameters())
 
 
-def test_what_is_removed_moves_the_rows_behind_it(
-    built: Made, steps: list[tuple[str, str]]
-) -> None:
+def test_what_is_removed_moves_the_rows_behind_it(built, steps):
     dataset, out = built
     before = inodes(out)
     shutil.rmtree(dataset.root / "pixieverse" / "e")
@@ -175,7 +164,7 @@ def test_what_is_removed_moves_the_rows_behind_it(
     assert tree(out) == tree_from_nothing(dataset.parameters())
 
 
-def test_grids_that_move_are_not_unpacked(built: Made, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_grids_that_move_are_not_unpacked(built, monkeypatch):
     dataset, out = built
     shutil.rmtree(dataset.root / "pixieverse" / "a")
     (dataset.root / "slat" / "a.npz").unlink()
@@ -194,9 +183,7 @@ def test_grids_that_move_are_not_unpacked(built: Made, monkeypatch: pytest.Monke
     assert tree(out) == tree_from_nothing(dataset.parameters())
 
 
-def test_another_name_costs_a_record(
-    built: Made, steps: list[tuple[str, str]], tmp_path: Path
-) -> None:
+def test_another_name_costs_a_record(built, steps, tmp_path):
     dataset, out = built
     before = inodes(out)
     categories = tmp_path / "categories.json"
@@ -212,9 +199,7 @@ def test_another_name_costs_a_record(
     assert tree(out) == tree_from_nothing(named)
 
 
-def test_any_sequence_of_updates_comes_to_the_same_when_compacted(
-    make_dataset: MakeDataset, tmp_path: Path
-) -> None:
+def test_any_sequence_of_updates_comes_to_the_same_when_compacted(make_dataset, tmp_path):
     rng = random.Random(5)
     dataset, out = make_dataset("m", "n"), tmp_path / "s.zarr"
     there = ["m", "n"]
@@ -239,9 +224,7 @@ def test_any_sequence_of_updates_comes_to_the_same_when_compacted(
     assert tree(out) == tree_from_nothing(dataset.parameters())
 
 
-def test_ranges_that_change_take_no_rows_over_and_align_nothing(
-    built: Made, steps: list[tuple[str, str]]
-) -> None:
+def test_ranges_that_change_take_no_rows_over_and_align_nothing(built, steps):
     dataset, out = built
     made = make_asset(2)
     made.grid[..., 1] *= 10
@@ -257,7 +240,7 @@ def test_ranges_that_change_take_no_rows_over_and_align_nothing(
 @pytest.mark.parametrize(
     "name", ["voxel/feats/c/0/0", "grid/material/c/1/0/0/0", "asset/fitness/c/0"]
 )
-def test_a_flipped_bit_is_not_taken_over(built: Made, name: str) -> None:
+def test_a_flipped_bit_is_not_taken_over(built, name):
     dataset, out = built
     data = bytearray((out / name).read_bytes())
     data[len(data) // 3] ^= 4
@@ -271,9 +254,7 @@ def test_a_flipped_bit_is_not_taken_over(built: Made, name: str) -> None:
 @pytest.mark.parametrize(
     "step", ["shard filled", "directory flushed", "store replaced", "manifests written"]
 )
-def test_an_update_that_fails_leaves_one_whole_store(
-    built: Made, monkeypatch: pytest.MonkeyPatch, step: str
-) -> None:
+def test_an_update_that_fails_leaves_one_whole_store(built, monkeypatch, step):
     dataset, out = built
     before = tree(out)
     dataset.add("h", seed=1)
@@ -298,7 +279,7 @@ def test_an_update_that_fails_leaves_one_whole_store(
     assert tree(out) == tree_from_nothing(dataset.parameters())
 
 
-def test_a_store_with_other_names_shares_no_file_with_the_next(built: Made, tmp_path: Path) -> None:
+def test_a_store_with_other_names_shares_no_file_with_the_next(built, tmp_path):
     """Whoever writes into a snapshot made of hard links must not change the store."""
     dataset, out = built
     shutil.copytree(out, tmp_path / "snapshot", copy_function=os.link)
@@ -309,9 +290,7 @@ def test_a_store_with_other_names_shares_no_file_with_the_next(built: Made, tmp_
     assert tree(out) == tree_from_nothing(dataset.parameters())
 
 
-def test_sources_that_are_as_they_were_are_not_read(
-    built: Made, steps: list[tuple[str, str]]
-) -> None:
+def test_sources_that_are_as_they_were_are_not_read(built, steps):
     dataset, out = built
     build_store(dataset.parameters(), out)
     assert steps == []
@@ -331,13 +310,7 @@ def test_sources_that_are_as_they_were_are_not_read(
 
 
 @pytest.mark.parametrize("how", ["gone", "flipped", "cut", "empty", "link", "machine", "young"])
-def test_what_was_seen_is_not_trusted_without_reason(
-    built: Made,
-    steps: list[tuple[str, str]],
-    monkeypatch: pytest.MonkeyPatch,
-    tmp_path: Path,
-    how: str,
-) -> None:
+def test_what_was_seen_is_not_trusted_without_reason(built, steps, monkeypatch, tmp_path, how):
     dataset, out = built
     path = out.with_name("s.manifests") / "sources.seen"
     data = path.read_bytes()
@@ -367,9 +340,7 @@ def test_what_was_seen_is_not_trusted_without_reason(
         assert (tmp_path / "theirs").read_bytes() == b"theirs"
 
 
-def test_what_was_seen_of_one_store_is_nothing_to_another(
-    built: Made, tmp_path: Path, steps: list[tuple[str, str]]
-) -> None:
+def test_what_was_seen_of_one_store_is_nothing_to_another(built, tmp_path, steps):
     dataset, out = built
     shutil.copytree(out, tmp_path / "kept")
     dataset.write_slat("c.npz", make_asset(1).coords, make_asset(1).feats + 1)
@@ -383,7 +354,7 @@ def test_what_was_seen_of_one_store_is_nothing_to_another(
 
 
 @pytest.mark.parametrize("file", ["s.zarr/voxel/feats/c/0/0", "s.manifests/assets.jsonl"])
-def test_a_file_that_changed_under_an_unchanged_dataset_is_found(built: Made, file: str) -> None:
+def test_a_file_that_changed_under_an_unchanged_dataset_is_found(built, file):
     dataset, out = built
     path = out.parent / file
     data = bytearray(path.read_bytes())
@@ -394,9 +365,7 @@ def test_a_file_that_changed_under_an_unchanged_dataset_is_found(built: Made, fi
     assert verify_store(out).ok
 
 
-def test_rows_that_other_code_packed_are_packed_anew_and_not_aligned(
-    built: Made, steps: list[tuple[str, str]], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_rows_that_other_code_packed_are_packed_anew_and_not_aligned(built, steps, monkeypatch):
     dataset, out = built
     dataset.add("h", seed=1)
     with monkeypatch.context() as context:
@@ -412,7 +381,7 @@ def test_rows_that_other_code_packed_are_packed_anew_and_not_aligned(
     assert tree(out) == tree_from_nothing(dataset.parameters())
 
 
-def test_a_worker_that_lives_on_reads_the_store_of_today(built: Made) -> None:
+def test_a_worker_that_lives_on_reads_the_store_of_today(built):
     """A cluster's workers outlive builds, and rows in another order have the same build id."""
     dataset, out = built
     dataset.add("b", seed=5)

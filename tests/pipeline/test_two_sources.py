@@ -72,7 +72,7 @@ def asked(dataset: Dataset) -> BuildParameters:
     )
 
 
-def test_each_says_what_it_knows(sources: Dataset, tmp_path: Path) -> None:
+def test_each_says_what_it_knows(sources, tmp_path):
     plain = build_store(sources.parameters(), tmp_path / "plain.zarr")
     alone = open_store(str(plain.store)).asset("a")
     made = build_store(asked(sources), tmp_path / "s.zarr")
@@ -98,7 +98,7 @@ def test_each_says_what_it_knows(sources: Dataset, tmp_path: Path) -> None:
     assert not store.asset("b").merged
 
 
-def test_the_record_names_each_file_and_its_source(sources: Dataset, tmp_path: Path) -> None:
+def test_the_record_names_each_file_and_its_source(sources, tmp_path):
     made = build_store(asked(sources), tmp_path / "s.zarr")
     record = records_of(made.records)["a"]
     files = record["sources"]
@@ -118,7 +118,7 @@ def test_the_record_names_each_file_and_its_source(sources: Dataset, tmp_path: P
     assert all("source" not in file for file in records_of(made.records)["b"]["sources"])
 
 
-def test_the_labels_are_made_again_of_the_sources(sources: Dataset, tmp_path: Path) -> None:
+def test_the_labels_are_made_again_of_the_sources(sources, tmp_path):
     made = build_store(asked(sources), tmp_path / "s.zarr")
     out = str(made.store)
     assert verify_store(out, sources=True).findings == ()
@@ -137,9 +137,7 @@ def test_the_labels_are_made_again_of_the_sources(sources: Dataset, tmp_path: Pa
     assert "[[also]] 2, whose root is not known" in finding.what
 
 
-def test_a_change_in_a_further_source_redoes_that_object_alone(
-    sources: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_change_in_a_further_source_redoes_that_object_alone(sources, tmp_path, monkeypatch):
     write_third(sources.root, "b", 1)
     out = tmp_path / "s.zarr"
     build_store(asked(sources), out)
@@ -153,7 +151,7 @@ def test_a_change_in_a_further_source_redoes_that_object_alone(
     assert tree(out) == tree(fresh.store)
 
 
-def test_what_is_left_must_have_all_that_the_store_holds(sources: Dataset, tmp_path: Path) -> None:
+def test_what_is_left_must_have_all_that_the_store_holds(sources, tmp_path):
     (sources.root / "pixieverse/a/sample_0/material_grid.npy").write_bytes(b"torn")
     made = build_store(asked(sources), tmp_path / "s.zarr")
     asset = open_store(str(made.store)).asset("a")
@@ -175,16 +173,14 @@ def test_what_is_left_must_have_all_that_the_store_holds(sources: Dataset, tmp_p
         ({"classes": ["wood", "steel"]}, "the classes wood, steel"),
     ],
 )
-def test_tables_that_disagree_are_refused(
-    sources: Dataset, tmp_path: Path, changes: dict[str, object], words: str
-) -> None:
+def test_tables_that_disagree_are_refused(sources, tmp_path, changes, words):
     describe(sources.root, **changes)
     with pytest.raises(ConfigError, match=r"\[\[also\]\] 1") as error:
         build_store(asked(sources), tmp_path / "s.zarr")
     assert words in str(error.value)
 
 
-def test_a_dataset_definition_names_further_sources(sources: Dataset) -> None:
+def test_a_dataset_definition_names_further_sources(sources):
     path = sources.root / "dataset.toml"
     text = """
         [pixieverse]

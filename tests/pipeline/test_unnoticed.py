@@ -43,7 +43,7 @@ def other_slat(dataset: Dataset, name: str = "a.npz") -> None:
 
 
 @pytest.mark.parametrize("closed", [False, True])
-def test_a_mapping_that_is_held_open(tmp_path: Path, closed: bool) -> None:
+def test_a_mapping_that_is_held_open(tmp_path, closed):
     dataset = Dataset(tmp_path / "d")
     dataset.add("a", seed=0)
     path = dataset.root / "pixieverse" / "a" / "sample_0" / "material_grid.npy"
@@ -64,8 +64,8 @@ def test_a_mapping_that_is_held_open(tmp_path: Path, closed: bool) -> None:
 @pytest.mark.parametrize("of", ["first build", "update"])
 @pytest.mark.parametrize("what", ["folder", "file", "link", "root that is a link"])
 def test_sources_that_are_exchanged_while_they_are_read_and_put_back(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, what: str, of: str
-) -> None:
+    tmp_path, monkeypatch, what, of
+):
     dataset, other = Dataset(tmp_path / "d"), Dataset(tmp_path / "other")
     for one in (dataset, other):
         one.add("a", seed=0)
@@ -126,7 +126,7 @@ def mounted(image: Path, place: Path) -> Iterator[None]:
     os.geteuid() != 0 or not (shutil.which("mkfs.ext4") and shutil.which("mount")),
     reason="only root mounts images; tests/storage/test_states.py has what is asked of mounts",
 )
-def test_images_that_are_mounted_in_turn(tmp_path: Path) -> None:
+def test_images_that_are_mounted_in_turn(tmp_path):
     dataset = Dataset(tmp_path / "made")
     dataset.add("a", seed=0)
     images = [tmp_path / name for name in ("a.img", "b.img")]
@@ -192,9 +192,7 @@ def unnoticed(
     return change
 
 
-def test_a_share_is_hashed_at_each_build_and_finds_all(
-    unnoticed: Callable[[], Dataset], tmp_path: Path
-) -> None:
+def test_a_share_is_hashed_at_each_build_and_finds_all(unnoticed, tmp_path):
     first, dataset = tree(tmp_path / "s.zarr"), unnoticed()
     assert built(dataset, tmp_path, rehash=0) == first
     for seed in range(100):
@@ -211,8 +209,8 @@ def test_a_share_is_hashed_at_each_build_and_finds_all(
 
 
 def test_at_least_one_is_hashed_by_default_and_none_if_so_asked(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, files_are_old: None
-) -> None:
+    tmp_path, monkeypatch, files_are_old
+):
     from slatprep.pipeline import plan
 
     dataset, hashed = Dataset(tmp_path / "d"), list[str]()
@@ -229,7 +227,7 @@ def test_at_least_one_is_hashed_by_default_and_none_if_so_asked(
     assert len(hashed) == 3
 
 
-def test_nothing_is_seen_of_an_asset_whose_reader_reads_what_is_not_known() -> None:
+def test_nothing_is_seen_of_an_asset_whose_reader_reads_what_is_not_known():
     roots = SourceRoots(Path(), Path())
     pair = AssetPair("a", "a", "", "", roots, Path("/g"), None, None, Path("/s"))
     files = {"/s": (1,), "/g": (2,)}

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from support.faults import inject
 from support.first_builds import tree_from_nothing
-from support.synthetic import Dataset, Made, MakeDataset, make_asset
+from support.synthetic import Dataset, Made, make_asset
 from support.trees import tree
 
 from slatprep.parameters import AlignParameters, BuildParameters, SampleParameters
@@ -46,7 +46,7 @@ def reasons(parameters: BuildParameters, out: Path) -> dict[str, tuple[str, str]
     return {asset.asset_id: (str(asset.action), asset.reason) for asset in plan.assets}
 
 
-def test_nothing_changed_writes_nothing(built: Made, aligned: list[str]) -> None:
+def test_nothing_changed_writes_nothing(built, aligned):
     dataset, out = built
     build_store(dataset.parameters(), out)  # and knows the states of files
     inodes = {path: path.stat().st_ino for path in out.parent.rglob("*") if path.is_file()}
@@ -65,7 +65,7 @@ def test_nothing_changed_writes_nothing(built: Made, aligned: list[str]) -> None
     }
 
 
-def test_new_changed_and_removed(built: Made, aligned: list[str]) -> None:
+def test_new_changed_and_removed(built, aligned):
     dataset, out = built
     dataset.add("d", seed=3)
     made = make_asset(seed=6)
@@ -88,7 +88,7 @@ def test_new_changed_and_removed(built: Made, aligned: list[str]) -> None:
     assert tree(out) == tree_from_nothing(dataset.parameters())
 
 
-def test_a_change_that_keeps_size_and_times_is_seen(built: Made) -> None:
+def test_a_change_that_keeps_size_and_times_is_seen(built):
     import os
 
     dataset, out = built
@@ -104,7 +104,7 @@ def test_a_change_that_keeps_size_and_times_is_seen(built: Made) -> None:
     assert reasons(dataset.parameters(), out)["a"] == ("align", "sources changed: slat")
 
 
-def test_moved_ranges_renormalise_without_aligning(built: Made, aligned: list[str]) -> None:
+def test_moved_ranges_renormalise_without_aligning(built, aligned):
     dataset, out = built
     pixie = dataset.parameters("pixie")
     assert {action for action, _ in reasons(pixie, out).values()} == {"reuse"}
@@ -113,7 +113,7 @@ def test_moved_ranges_renormalise_without_aligning(built: Made, aligned: list[st
     assert tree(out) == tree_from_nothing(pixie)
 
 
-def test_other_shards_need_no_alignment(built: Made, aligned: list[str]) -> None:
+def test_other_shards_need_no_alignment(built, aligned):
     dataset, out = built
     parameters = dataset.parameters()
     wider = replace(parameters, store=replace(parameters.store, voxel_chunk=256))
@@ -122,7 +122,7 @@ def test_other_shards_need_no_alignment(built: Made, aligned: list[str]) -> None
     assert tree(out) == tree_from_nothing(wider)
 
 
-def test_parameters_that_touch_an_asset_redo_it(built: Made, aligned: list[str]) -> None:
+def test_parameters_that_touch_an_asset_redo_it(built, aligned):
     dataset, out = built
     nearer = replace(dataset.parameters(), sample=SampleParameters(max_distance=2.0))
     why = "parameters changed: sample.max_distance was 3.0, is 2.0"
@@ -134,7 +134,7 @@ def test_parameters_that_touch_an_asset_redo_it(built: Made, aligned: list[str])
     assert reasons(rigid, out)["a"][1] == "parameters changed: align.model was auto, is rigid"
 
 
-def test_other_code_redoes_an_asset(built: Made, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_other_code_redoes_an_asset(built, monkeypatch):
     from slatprep.pipeline import recipe as reuse
 
     dataset, out = built
@@ -142,7 +142,7 @@ def test_other_code_redoes_an_asset(built: Made, monkeypatch: pytest.MonkeyPatch
     assert reasons(dataset.parameters(), out)["a"] == ("align", "code changed")
 
 
-def test_a_category_is_no_part_of_the_work(built: Made, aligned: list[str], tmp_path: Path) -> None:
+def test_a_category_is_no_part_of_the_work(built, aligned, tmp_path):
     dataset, out = built
     categories = tmp_path / "categories.json"
     categories.write_text(json.dumps({"a": {"obj_class": "tree"}}))
@@ -153,9 +153,7 @@ def test_a_category_is_no_part_of_the_work(built: Made, aligned: list[str], tmp_
     assert open_store(out).column("category").tolist() == ["tree", "", ""]
 
 
-def test_one_file_of_all_slats_may_grow(
-    make_dataset: MakeDataset, aligned: list[str], tmp_path: Path
-) -> None:
+def test_one_file_of_all_slats_may_grow(make_dataset, aligned, tmp_path):
     dataset = make_dataset("a", "b")
     dataset.write_grid("c", make_asset(2).grid)
     file = tmp_path / "all.h5"
@@ -180,9 +178,7 @@ def test_one_file_of_all_slats_may_grow(
     assert tree(tmp_path / "s.zarr") == tree_from_nothing(parameters)
 
 
-def test_an_asset_that_cannot_go_in_does_not_make_the_store_old(
-    built: Made, aligned: list[str]
-) -> None:
+def test_an_asset_that_cannot_go_in_does_not_make_the_store_old(built, aligned):
     dataset, out = built
     dataset.write_grid("lone", make_asset(4).grid)
     assert reasons(dataset.parameters(), out)["lone"][0] == "refuse"
@@ -195,7 +191,7 @@ def test_an_asset_that_cannot_go_in_does_not_make_the_store_old(
     assert aligned == []
 
 
-def test_missing_or_older_manifests_are_written_again(built: Made) -> None:
+def test_missing_or_older_manifests_are_written_again(built):
     dataset, out = built
     manifests = out.with_name("s.manifests")
     before = (manifests / "assets.jsonl").read_text().splitlines()
@@ -208,7 +204,7 @@ def test_missing_or_older_manifests_are_written_again(built: Made) -> None:
         assert old == new
 
 
-def test_fresh_does_everything(built: Made, aligned: list[str]) -> None:
+def test_fresh_does_everything(built, aligned):
     dataset, out = built
     before = tree(out)
     build_store(dataset.parameters(), out, fresh=True)
@@ -216,9 +212,7 @@ def test_fresh_does_everything(built: Made, aligned: list[str]) -> None:
     assert tree(out) == before
 
 
-def test_kept_work_is_used_and_holds_no_more_than_the_store(
-    built: Made, aligned: list[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_kept_work_is_used_and_holds_no_more_than_the_store(built, aligned, monkeypatch):
     dataset, out = built
     build_store(dataset.parameters("pixie"), out, keep_work=True)
     kept = out.with_name(".s.zarr.work") / "spool"
@@ -235,7 +229,7 @@ def test_kept_work_is_used_and_holds_no_more_than_the_store(
     assert aligned == read == []
 
 
-def test_a_dry_run_writes_nothing(built: Made) -> None:
+def test_a_dry_run_writes_nothing(built):
     dataset, out = built
     before = tree(out.parent)
     dataset.add("d", seed=3)
@@ -247,7 +241,7 @@ def test_a_dry_run_writes_nothing(built: Made) -> None:
     assert np.all([not path.name.startswith(".") for path in out.parent.iterdir()])
 
 
-def test_a_dry_run_at_the_shell(built: Made) -> None:
+def test_a_dry_run_at_the_shell(built):
     from click.testing import CliRunner
 
     from slatprep.cli.commands import slatprep

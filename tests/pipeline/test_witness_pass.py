@@ -72,9 +72,7 @@ def mislabelled(root: Path) -> str:
     return sorted(path.name for path in (root / "pixieverse").iterdir())[0]
 
 
-def test_ties_that_change_labels_are_settled_right_and_recorded(
-    telling: tuple[Path, BuildParameters], stores: tuple[Path, Path]
-) -> None:
+def test_ties_that_change_labels_are_settled_right_and_recorded(telling, stores):
     root = telling[0]
     alone, heard = (records_beside(store) for store in stores)
     before, after = (right_labels(root, store) for store in stores)
@@ -101,9 +99,7 @@ def test_ties_that_change_labels_are_settled_right_and_recorded(
     assert told.endswith("contradict the labels of 1 assets")
 
 
-def test_assets_without_a_tie_keep_every_byte_but_those_that_are_contradicted(
-    telling: tuple[Path, BuildParameters], stores: tuple[Path, Path]
-) -> None:
+def test_assets_without_a_tie_keep_every_byte_but_those_that_are_contradicted(telling, stores):
     alone, heard = (records_beside(store) for store in stores)
     wrong = mislabelled(telling[0])
     assert [key for key, record in heard.items() if record["judgement"]["contradicted"]] == [wrong]
@@ -121,24 +117,20 @@ def test_assets_without_a_tie_keep_every_byte_but_those_that_are_contradicted(
                 np.testing.assert_array_equal(ours, theirs)
 
 
-def test_the_summary_names_assets_whose_labels_are_contradicted(
-    telling: tuple[Path, BuildParameters], stores: tuple[Path, Path]
-) -> None:
+def test_the_summary_names_assets_whose_labels_are_contradicted(telling, stores):
     root, parameters = telling
     again = build_store(replace(parameters, witness=HEARD), stores[1])  # nothing to do
     assert again.contradicted == (mislabelled(root),)
     assert build_store(parameters, stores[0]).contradicted == ()
 
 
-def test_a_store_that_heard_latents_is_sound(stores: tuple[Path, Path]) -> None:
+def test_a_store_that_heard_latents_is_sound(stores):
     assert verify_store(stores[1]).findings == ()
     store = open_store(stores[1])
     assert all(check_alignment(store, asset_id).consistent for asset_id in store.ids)
 
 
-def test_it_is_undone_by_building_without_it_and_the_same_for_any_jobs(
-    telling: tuple[Path, BuildParameters], stores: tuple[Path, Path], tmp_path: Path
-) -> None:
+def test_it_is_undone_by_building_without_it_and_the_same_for_any_jobs(telling, stores, tmp_path):
     _, parameters = telling
     store = tmp_path / "store.zarr"
     build_store(replace(parameters, witness=HEARD), store, jobs=2)
@@ -150,8 +142,8 @@ def test_it_is_undone_by_building_without_it_and_the_same_for_any_jobs(
 
 
 def test_with_a_consensus_before_it_the_record_goes_back_to_the_first_pass(
-    telling: tuple[Path, BuildParameters], stores: tuple[Path, Path], tmp_path: Path
-) -> None:
+    telling, stores, tmp_path
+):
     both = replace(telling[1], witness=HEARD, consensus=ConsensusParameters(settle=True))
     store = copied(stores[0], tmp_path / "store.zarr")
     build_store(both, store)
@@ -162,7 +154,7 @@ def test_with_a_consensus_before_it_the_record_goes_back_to_the_first_pass(
             assert record["first_pass"]["key"] == alone[asset_id]["key"]
 
 
-def test_latents_that_carry_nothing_change_nothing(tmp_path: Path) -> None:
+def test_latents_that_carry_nothing_change_nothing(tmp_path):
     make_demo(tmp_path, assets=28, seed=3, levels=(0,), latents="placeholder")
     parameters = load_parameters(tmp_path / "dataset.toml", {})
     alone, heard = tmp_path / "alone.zarr", tmp_path / "heard.zarr"

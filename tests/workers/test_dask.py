@@ -79,9 +79,7 @@ def threads_for_workers(workers: int, threads: int = 1) -> Iterator[LocalCluster
 # -- a build ----------------------------------------------------------------
 
 
-def test_a_build_whose_worker_is_killed_gives_the_same_bytes(
-    shared: tuple[Processes, str], address: str, local: Made, tmp_path: Path
-) -> None:
+def test_a_build_whose_worker_is_killed_gives_the_same_bytes(shared, address, local, tmp_path):
     dataset, expected = local
     faults = shared[0].folder
     (faults / "hold-c").touch()
@@ -111,8 +109,8 @@ def test_a_build_whose_worker_is_killed_gives_the_same_bytes(
 
 
 def test_a_worker_that_is_killed_with_a_shard_open_leaves_nothing_of_it(
-    shared: tuple[Processes, str], address: str, local: Made, tmp_path: Path
-) -> None:
+    shared, address, local, tmp_path
+):
     dataset, expected = local
     once = shared[0].folder / "kill at shard filled"
     once.touch()
@@ -125,8 +123,8 @@ def test_a_worker_that_is_killed_with_a_shard_open_leaves_nothing_of_it(
 
 
 def test_an_asset_that_kills_every_worker_is_named_and_the_others_go_in(
-    shared: tuple[Processes, str], address: str, local: Made, tmp_path: Path
-) -> None:
+    shared, address, local, tmp_path
+):
     dataset, expected = local
     deadly = shared[0].folder / "deadly-b"
     deadly.touch()
@@ -142,7 +140,7 @@ def test_an_asset_that_kills_every_worker_is_named_and_the_others_go_in(
     assert tree(tmp_path / "s.zarr") == tree(expected)
 
 
-def test_the_other_commands_find_the_same(address: str, local: Made, tmp_path: Path) -> None:
+def test_the_other_commands_find_the_same(address, local, tmp_path):
     dataset, store = local
     parameters = dataset.parameters("pixie")
     damaged = tmp_path / "damaged.zarr"
@@ -165,9 +163,7 @@ def test_the_other_commands_find_the_same(address: str, local: Made, tmp_path: P
 # -- what a worker must have ------------------------------------------------
 
 
-def test_workers_that_do_not_see_the_sources_are_named(
-    address: str, local: Made, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_workers_that_do_not_see_the_sources_are_named(address, local, tmp_path, monkeypatch):
     """The folder of this process is not that of a worker, though both have the same path."""
     dataset, _ = local
     monkeypatch.chdir(dataset.root)
@@ -180,9 +176,7 @@ def test_workers_that_do_not_see_the_sources_are_named(
     assert not list(tmp_path.iterdir())
 
 
-def test_workers_that_do_not_see_the_folder_of_the_work_are_named(
-    address: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_workers_that_do_not_see_the_folder_of_the_work_are_named(address, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "build-1").mkdir()
     with Cluster(address) as cluster:
@@ -193,9 +187,7 @@ def test_workers_that_do_not_see_the_folder_of_the_work_are_named(
             cluster.require_shared([Path("build-1")])
 
 
-def test_a_worker_that_is_not_fit_is_refused_even_when_it_joins_late(
-    shared: tuple[Processes, str], address: str
-) -> None:
+def test_a_worker_that_is_not_fit_is_refused_even_when_it_joins_late(shared, address):
     with Cluster(address) as cluster:
         results = cluster.run_unordered(time.sleep, ((0.2,) for _ in range(10**6)))
         next(results)
@@ -209,7 +201,7 @@ def test_a_worker_that_is_not_fit_is_refused_even_when_it_joins_late(
             end(unfit)
 
 
-def test_a_worker_with_other_code_is_refused(processes: Processes, tmp_path: Path) -> None:
+def test_a_worker_with_other_code_is_refused(processes, tmp_path):
     copy = tmp_path / "other" / "slatprep"
     shutil.copytree(Path(slatprep.__file__).parent, copy)
     with (copy / "sample.py").open("a") as file:
@@ -224,7 +216,7 @@ def test_a_worker_with_other_code_is_refused(processes: Processes, tmp_path: Pat
 # -- a scheduler that fails -------------------------------------------------
 
 
-def test_a_scheduler_that_nobody_reaches(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_scheduler_that_nobody_reaches(monkeypatch):
     monkeypatch.setattr(module, "ANSWER_SECONDS", 1.5)
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
@@ -239,9 +231,7 @@ def test_a_scheduler_that_nobody_reaches(monkeypatch: pytest.MonkeyPatch) -> Non
             Cluster(wrong).__enter__()
 
 
-def test_a_scheduler_that_is_killed_ends_the_run_and_nothing_hangs(
-    processes: Processes, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_scheduler_that_is_killed_ends_the_run_and_nothing_hangs(processes, monkeypatch):
     scheduler = processes.scheduler()
     processes.worker(scheduler, "--no-nanny")
     with Cluster(scheduler) as cluster:
@@ -256,7 +246,7 @@ def test_a_scheduler_that_is_killed_ends_the_run_and_nothing_hangs(
             list(cluster.run_unordered(time.sleep, [(0,)]))
 
 
-def test_the_first_worker_is_waited_for() -> None:
+def test_the_first_worker_is_waited_for():
     with threads_for_workers(0) as started:
         lines: list[str] = []
 
@@ -270,7 +260,7 @@ def test_the_first_worker_is_waited_for() -> None:
     assert lines == [f"{address}: has no worker yet; waiting for the first", f"{address}: 1 worker"]
 
 
-def test_jobs_and_scheduler_exclude_each_other() -> None:
+def test_jobs_and_scheduler_exclude_each_other():
     options = ["--jobs", "2", "--scheduler", "tcp://127.0.0.1:1", "--out", "s.zarr"]
     result = CliRunner().invoke(command, ["build-store", *options])
     assert result.exit_code == 2
@@ -280,7 +270,7 @@ def test_jobs_and_scheduler_exclude_each_other() -> None:
 # -- tasks ------------------------------------------------------------------
 
 
-def test_one_worker_computes_and_not_this_thread() -> None:
+def test_one_worker_computes_and_not_this_thread():
     with threads_for_workers(1) as started, Cluster(started.scheduler_address) as cluster:
         idents = set(cluster.run_unordered(threading.get_ident, [()] * 5))
         assert threading.get_ident() not in idents
@@ -288,7 +278,7 @@ def test_one_worker_computes_and_not_this_thread() -> None:
         assert list(cluster.run_unordered(os.getenv, variables)) == ["1", "1"]
 
 
-def test_tasks_are_taken_as_workers_come_free() -> None:
+def test_tasks_are_taken_as_workers_come_free():
     taken = 0
 
     def tasks() -> Iterator[tuple[float]]:
@@ -304,13 +294,13 @@ def test_tasks_are_taken_as_workers_come_free() -> None:
         assert taken < 100
 
 
-def test_short_tasks_travel_together_and_each_is_done_once() -> None:
+def test_short_tasks_travel_together_and_each_is_done_once():
     with threads_for_workers(2) as started, Cluster(started.scheduler_address) as cluster:
         results = list(cluster.run_unordered(divmod, ((n, 7) for n in range(20_000))))
     assert sorted(results) == sorted(divmod(n, 7) for n in range(20_000))
 
 
-def test_an_error_of_a_task_arrives_as_it_is() -> None:
+def test_an_error_of_a_task_arrives_as_it_is():
     with threads_for_workers(2) as started, Cluster(started.scheduler_address) as cluster:
         with pytest.raises(ZeroDivisionError):
             list(cluster.run_unordered(divmod, [(1, 1), (1, 0)]))

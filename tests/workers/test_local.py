@@ -10,14 +10,14 @@ from slatprep.workers.local import run_unordered, single_threaded
 
 
 @pytest.mark.parametrize("jobs", [1, 2])
-def test_every_task_is_done_once(jobs: int) -> None:
+def test_every_task_is_done_once(jobs):
     results = run_unordered(divmod, ((n, 7) for n in range(100)), jobs)
     assert sorted(results) == sorted(divmod(n, 7) for n in range(100))
 
 
 @pytest.mark.filterwarnings("error::pytest.PytestUnhandledThreadExceptionWarning")
 @pytest.mark.parametrize("jobs", [1, 2])
-def test_tasks_are_taken_as_workers_come_free(jobs: int) -> None:
+def test_tasks_are_taken_as_workers_come_free(jobs):
     taken = 0
 
     def tasks() -> Iterator[tuple[float]]:
@@ -35,32 +35,30 @@ def test_tasks_are_taken_as_workers_come_free(jobs: int) -> None:
 
 
 @pytest.mark.parametrize("jobs", [1, 2])
-def test_an_error_of_a_task_arrives(jobs: int) -> None:
+def test_an_error_of_a_task_arrives(jobs):
     with pytest.raises(ZeroDivisionError):
         list(run_unordered(divmod, [(1, 1), (1, 0)], jobs))
 
 
-def test_a_killed_worker_is_an_error_in_words() -> None:
+def test_a_killed_worker_is_an_error_in_words():
     with pytest.raises(SlatprepError, match="memory ran out"):
         list(run_unordered(os._exit, [(9,), (9,)], jobs=2))
 
 
-def test_workers_are_told_to_use_one_thread() -> None:
+def test_workers_are_told_to_use_one_thread():
     assert set(run_unordered(os.getenv, [("OMP_NUM_THREADS",)] * 4, jobs=2)) == {"1"}
     assert set(run_unordered(os.getenv, [("OMP_NUM_THREADS",)] * 4, jobs=1)) == {"1"}
 
 
 @pytest.mark.parametrize("jobs", [1, 2])
-def test_whoever_takes_results_keeps_the_own_environment(
-    jobs: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_whoever_takes_results_keeps_the_own_environment(jobs, monkeypatch):
     monkeypatch.setenv("OMP_NUM_THREADS", "2")
     for seen in run_unordered(os.getenv, [("OMP_NUM_THREADS",)] * 3, jobs):
         assert seen == "1"
         assert os.environ["OMP_NUM_THREADS"] == "2"
 
 
-def test_single_threaded_holds_and_gives_back(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_single_threaded_holds_and_gives_back(monkeypatch):
     from threadpoolctl import threadpool_info, threadpool_limits
 
     def threads() -> set[int]:
@@ -84,13 +82,13 @@ def die_at(number: int, deadly: int) -> int:
     return number
 
 
-def test_a_task_that_kills_its_worker_even_alone_is_answered_for() -> None:
+def test_a_task_that_kills_its_worker_even_alone_is_answered_for():
     tasks = [(number, 5) for number in range(20)]
     results = run_unordered(die_at, tasks, 2, died=lambda number, deadly: -number)
     assert sorted(results) == sorted(-n if n == 5 else n for n in range(20))
 
 
-def test_workers_stay_if_the_caller_drops_the_iterator_after_the_last_result() -> None:
+def test_workers_stay_if_the_caller_drops_the_iterator_after_the_last_result():
     results = run_unordered(os.getpid, [()] * 4, jobs=2)
     pids = {next(results) for _ in range(4)}
     results.close()

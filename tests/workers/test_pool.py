@@ -30,7 +30,7 @@ class StoppedPool(Pool):
         self.abandoned += 1
 
 
-def test_stopped_while_a_call_is_handed_over() -> None:
+def test_stopped_while_a_call_is_handed_over():
     """Its future was never returned, so the pool is abandoned although nothing is known of."""
     pool = StoppedPool()
     with pytest.raises(KeyboardInterrupt):
@@ -48,7 +48,7 @@ class QuickPool(StoppedPool):
         return done
 
 
-def test_pool_that_ends_is_not_abandoned() -> None:
+def test_pool_that_ends_is_not_abandoned():
     """Its workers stay for whoever comes next."""
     pool = QuickPool()
     assert list(run_in_pools(pool, pool, abs, [(-1,), (2,)], None)) == [1, 2]
