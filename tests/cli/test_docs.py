@@ -6,7 +6,6 @@ import re
 import shutil
 import subprocess
 import tomllib
-from collections.abc import Callable
 from pathlib import Path
 from typing import get_type_hints
 
@@ -36,7 +35,7 @@ COMMANDS_SHOWN = [(page, line) for page, line in code_lines("sh") if line.starts
 TARGETS_SHOWN = [(page, line) for page, line in code_lines("sh") if line.startswith("make ")]
 
 
-def test_the_readme_shows_commands() -> None:
+def test_the_readme_shows_commands():
     shown = {line.split()[1] for page, line in COMMANDS_SHOWN if page == "README.md"}
     assert {"make-demo", "build-store", "info", "check-alignment", "align"} <= shown
     assert {line for page, line in TARGETS_SHOWN if page == "README.md"} >= {
@@ -46,27 +45,25 @@ def test_the_readme_shows_commands() -> None:
 
 
 @pytest.mark.parametrize(("page", "line"), COMMANDS_SHOWN)
-def test_command_shown_parses(page: str, line: str, parse_command: Callable[[str], None]) -> None:
+def test_command_shown_parses(page, line, parse_command):
     parse_command(line)
 
 
 @pytest.mark.skipif(shutil.which("make") is None, reason="make is not installed")
-@pytest.mark.parametrize("line", sorted({line for _, line in TARGETS_SHOWN}))
-def test_make_target_shown_exists(line: str) -> None:
-    done = subprocess.run(
-        ["make", "--dry-run", *line.split()[1:]], cwd=ROOT, capture_output=True, text=True
-    )
+def test_make_targets_shown_exist():
+    words = sorted({word for _, line in TARGETS_SHOWN for word in line.split()[1:]})
+    done = subprocess.run(["make", "--dry-run", *words], cwd=ROOT, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
-def test_links_between_files_lead_somewhere(page: Path) -> None:
+def test_links_between_files_lead_somewhere(page):
     for target in re.findall(r"\]\(([^)#]+)[^)]*\)", page.read_text("utf-8")):
         if "://" not in target:
             assert (page.parent / target).exists(), f"{page.name}: {target}"
 
 
-def test_configuration_lists_every_key_with_its_default() -> None:
+def test_configuration_lists_every_key_with_its_default():
     text = (ROOT / "docs" / "configuration.md").read_text("utf-8")
     rows = re.findall(r"^\| `(\w+)` \| (.+?) \| ", text, re.M)
     documented = iter(rows)
@@ -92,7 +89,7 @@ def default_of(field: dataclasses.Field[object]) -> str:
     return "none" if field.default is None else f"`{json.dumps(field.default)}`"
 
 
-def test_each_format_of_export_is_told_of_in_help_and_page() -> None:
+def test_each_format_of_export_is_told_of_in_help_and_page():
     page = (ROOT / "docs" / "export.md").read_text("utf-8")
     rows = re.findall(r"^\| `(\w+)` \| a f(?:ile|older)", page, re.M)
     commands = re.findall(r"^slatprep export .*--format (\w+)", page, re.M)
@@ -101,7 +98,7 @@ def test_each_format_of_export_is_told_of_in_help_and_page() -> None:
     assert set(re.findall(r"(\w+): ", getattr(kind, "help", ""))) == FORMATS.keys()
 
 
-def test_formats_describes_every_array() -> None:
+def test_formats_describes_every_array():
     text = (ROOT / "docs" / "formats.md").read_text("utf-8")
     rows = re.findall(r"^\| `((?:asset|voxel|grid)/\w+)` \| \(([^)]*)\) \| (\w+) \|", text, re.M)
     documented = {name: (len(re.findall(r"\w+", shape)), dtype) for name, shape, dtype in rows}
@@ -112,7 +109,7 @@ def test_formats_describes_every_array() -> None:
 
 
 @pytest.mark.parametrize("name", ["demo.toml", "mine.example.toml"])
-def test_example_definitions_are_valid(name: str, tmp_path: Path) -> None:
+def test_example_definitions_are_valid(name, tmp_path):
     text = (ROOT / "manifests" / name).read_text("utf-8")
     # Every example key that is commented out counts as well.
     full = re.sub(r"^# (?=\[|\w+ = )", "", text, flags=re.M)

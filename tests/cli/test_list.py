@@ -1,39 +1,30 @@
 """`slatprep list`, and ids given by their beginning."""
 
-import json
 import sys
 
 import pytest
-from click.testing import CliRunner
+from support.commands import document, run
 
 from slatprep import StoreError, open_store
 from slatprep.cli import output as module
-from slatprep.cli.commands import slatprep
 from slatprep.inspect.listing import list_assets
-from slatprep.pipeline.dataset import BuildSummary
 from slatprep.store.records import StoredRecords
 
 
-def listed(build: BuildSummary, *options: str) -> str:
-    result = CliRunner().invoke(slatprep, ["list", str(build.store), *options])
-    assert result.exit_code == 0, result.output
-    return result.stdout
-
-
-def test_every_asset_is_in_a_line_with_what_the_store_says(mixed_build: BuildSummary) -> None:
+def test_every_asset_is_in_a_line_with_what_the_store_says(mixed_build):
     store = open_store(mixed_build.store)
-    documents = json.loads(listed(mixed_build, "--json"))["assets"]
+    documents = document("list", store.path)["assets"]
     assert [one["asset_id"] for one in documents] == store.ids
     frame = store.to_pandas()
     for one in documents:
         for name in ("category", "verdict", "confidence", "fitness", "voxels"):
             assert one[name] == frame.loc[one["asset_id"], name]
-    lines = listed(mixed_build).splitlines()
+    lines = run("list", store.path).stdout.splitlines()
     assert lines[0] == "5 of 5 assets" and len(lines) == 8
-    assert listed(mixed_build, "--ids").split() == store.ids
+    assert run("list", store.path, "--ids").stdout.split() == store.ids
 
 
-def test_filters_leave_what_they_say(mixed_build: BuildSummary, tmp_path) -> None:
+def test_filters_leave_what_they_say(mixed_build):
     store = open_store(mixed_build.store)
     frame = store.to_pandas()
     limit = float(frame["confidence"].median())
@@ -42,7 +33,7 @@ def test_filters_leave_what_they_say(mixed_build: BuildSummary, tmp_path) -> Non
     assert list(list_assets(store, ("failed",))) == list(list_assets(store, (), ("boat",))) == []
 
 
-def test_why_is_what_the_record_says(deformed_build: BuildSummary) -> None:
+def test_why_is_what_the_record_says(deformed_build):
     store = open_store(deformed_build.store)
     records = StoredRecords(store)
     for one in list_assets(store):
@@ -50,7 +41,7 @@ def test_why_is_what_the_record_says(deformed_build: BuildSummary) -> None:
         assert (one.verdict == "good") is (one.reasons == ())
 
 
-def test_a_beginning_names_an_asset_where_no_other_has_it(mixed_build: BuildSummary) -> None:
+def test_a_beginning_names_an_asset_where_no_other_has_it(mixed_build):
     store = open_store(mixed_build.store)
     assert store.asset("bear.s").asset_id == "bear.side"
     assert store.asset("d").asset_id == "dog"
@@ -61,12 +52,11 @@ def test_a_beginning_names_an_asset_where_no_other_has_it(mixed_build: BuildSumm
         store.find("do")  # What looks one up by its id takes no other.
     with pytest.raises(StoreError, match="it has 5 assets"):
         store.match("")
-    arguments = ["check-alignment", "--store", str(mixed_build.store), "--picture", "none"]
-    result = CliRunner().invoke(slatprep, [*arguments, "--asset", "bear.s", "--json"])
-    assert json.loads(result.stdout)["assets"][0]["asset_id"] == "bear.side"
+    words = ("--store", store.path, "--picture", "none", "--asset", "bear.s")
+    assert document("check-alignment", *words)["assets"][0]["asset_id"] == "bear.side"
 
 
-def test_ids_on_a_terminal_are_as_long_as_tells_them_apart(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_ids_on_a_terminal_are_as_long_as_tells_them_apart(monkeypatch):
     ids = ["0123456789ab", "0123456789cd", "0123zzzzzzzz"]
     assert module.Output().id_length(ids) is None
     monkeypatch.setattr(sys.stdout, "isatty", lambda: True)

@@ -1,6 +1,8 @@
 """What commands say to somebody who meets them for the first time, and with which exit code."""
 
+import errno
 import json
+import os
 import shutil
 import subprocess
 import sys
@@ -11,30 +13,39 @@ from pathlib import Path
 import numpy as np
 import pytest
 import zarr
-from click.testing import CliRunner, Result
+from support.commands import document, refused, run
 from support.rights import BOUND_BY_PERMISSIONS
 from support.synthetic import Dataset
 
 from slatprep import open_store
-from slatprep.cli.commands import slatprep
 from slatprep.cli.info import show_quality
 from slatprep.cli.output import Output
 from slatprep.inspect.overview import overview_of
 from slatprep.learn.runs import EpochRecord
 from slatprep.pipeline.dataset import BuildSummary, build_store
+from slatprep.storage import atomic
 from slatprep.storage.place import place_of
 
-
-def run(*words: object) -> Result:
-    result = CliRunner().invoke(slatprep, [str(word) for word in words])
-    assert "Traceback" not in result.output
-    return result
+NOWHERE = Path("/proc/nobody-may-write-here")
 
 
 @pytest.fixture
 def store(mixed_build: BuildSummary) -> Path:
-    assert mixed_build.store is not None
     return Path(str(mixed_build.store))
+
+
+@pytest.fixture(scope="module")
+def of_kinds(mixed: Dataset, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Build `mixed` with a table that has the category of the cup alone."""
+    folder = tmp_path_factory.mktemp("kinds")
+    (folder / "kinds.json").write_text(json.dumps({"cup": {"obj_class": "vessels"}}))
+    (folder / "dataset.toml").write_text(
+        f'[pixieverse]\nroot = "{mixed.root}/pixieverse"\n[slat]\nroot = "{mixed.root}/slat"\n'
+        f'[pairing]\ncategories = "kinds.json"\n'
+    )
+    words = ("--config", folder / "dataset.toml", "--out", folder / "s.zarr")
+    assert "unknown: the category of 4" in run("build-store", *words, code=1).stdout
+    return folder / "s.zarr"
 
 
 @pytest.mark.parametrize(
@@ -46,104 +57,90 @@ def store(mixed_build: BuildSummary) -> Path:
         ("transfer", "POINTS", "--store", "STORE", "--asset", "NOBODY", "--out", "OUT"),
     ],
 )
-def test_a_name_that_no_asset_has_is_wrong_use_in_every_command(
-    words: tuple[str, ...], store: Path, tmp_path: Path
-) -> None:
+def test_a_name_that_no_asset_has_is_wrong_use_in_every_command(words, store, tmp_path):
     np.save(tmp_path / "p.npy", np.zeros((3, 3), np.float32))
     places = {"STORE": store, "OUT": tmp_path / "out", "POINTS": tmp_path / "p.npy"}
-    for name, said in (("nobody", "has no asset 'nobody'"), ("be", "2 ids begin with 'be'")):
-        result = run(*(places.get(word, name if word == "NOBODY" else word) for word in words))
-        assert result.exit_code == 2 and said in result.stderr
+    for name, said in (
+        ("nobody", "has no asset 'nobody'"), ("be", "2 ids begin with 'be'"),
+        ("BEAR.S", "did you mean bear.side?"),  # Capitals are forgiven in words.
+    ):  # fmt: skip
+        given = (places.get(word, name if word == "NOBODY" else word) for word in words)
+        assert said in refused(*given)
 
 
 @pytest.mark.parametrize(
     ("words", "number"),
     [
-        (("train", "STORE", "--out", "OUT", "--learning-rate"), "nan"),
-        (("train", "STORE", "--out", "OUT", "--learning-rate"), "inf"),
-        (("train", "STORE", "--out", "OUT", "--max-ambiguity"), "nan"),
-        (("make-demo", "OUT", "--habitual-share"), "nan"),
+        (("train", "--learning-rate"), "nan"),
+        (("train", "--learning-rate"), "inf"),
+        (("train", "--max-ambiguity"), "nan"),
+        (("make-demo", "--habitual-share"), "nan"),
     ],
 )
-def test_numbers_are_finite(
-    words: tuple[str, ...], number: str, store: Path, tmp_path: Path
-) -> None:
+def test_numbers_are_finite(words, number, store, tmp_path):
+    command, option = words
     out = tmp_path / "out"
-    places = {"STORE": store, "OUT": out}
-    result = run(*(places.get(word, word) for word in words), number)
-    assert result.exit_code == 2 and f"{number} is no finite number" in result.stderr
+    places = (out,) if command == "make-demo" else (store, "--out", out)
+    assert f"{number} is no finite number" in refused(command, *places, option, number)
     assert not out.exists()
 
 
 @pytest.mark.parametrize(
-    ("words", "said"),
+    ("words", "code", "said"),
     [
-        (("evaluate", "--store", "nothing-here", "--json"), "nothing-here"),
-        (("make-demo", "--json", "d", "--assets", "0"), "0 is not in the range"),
-        (("info", "--json", "--colour"), "--colour"),
+        ("evaluate --store nothing-here", 2, "nothing-here"),
+        ("make-demo d --assets 0", 2, "0 is not in the range"),
+        ("info --colour", 2, "--colour"),
+        ("info FOLDER", 1, "is not a slatprep store"),
+        ("check-alignment --asset cuo --store STORE", 2, "did you mean cup?"),
+        ("check-alignment --store STORE", 2, "say which assets"),
+        ("report STORE --out s3://nowhere/p.html", 2, "expected a path of the local"),
     ],
 )
-def test_wrong_use_is_told_as_json(words: tuple[str, ...], said: str) -> None:
-    result = run(*words)
-    document = json.loads(result.stdout)
-    assert result.exit_code == 2 and said in document["error"] and said in result.stderr
-    command = " ".join(word for word in words[:2] if word in ("evaluate", "make-demo", "info"))
-    assert (document["command"], document["ok"]) == (command, False)
+def test_what_ends_a_command_is_told_as_json(words, code, said, store, tmp_path):
+    command, *rest = words.replace("STORE", str(store)).replace("FOLDER", str(tmp_path)).split()
+    result = run(command, "--json", *rest, code=code)
+    told = json.loads(result.stdout)
+    assert said in told["error"] and said in result.stderr
+    assert (told["command"], told["ok"]) == (command, False)
 
 
-def test_a_misspelt_command_is_told_with_the_one_meant() -> None:
-    result = run("chek-alignment", "--worst", "3")
-    assert result.exit_code == 2 and "did you mean check-alignment?" in result.stderr
-    assert run("xyzzy").exit_code == 2
+def test_a_misspelt_command_is_told_with_the_one_meant():
+    assert "did you mean check-alignment?" in refused("chek-alignment", "--worst", "3")
+    refused("xyzzy")
 
 
-def test_what_catalogues_ask_for_is_named_where_it_is_not_stated(store: Path) -> None:
+def test_what_catalogues_ask_for_is_named_where_it_is_not_stated(store):
     told = run("describe", store, "--license", "https://spdx.org/licenses/MIT")
     assert "also ask for --cite-as, --date-published" in told.stderr
 
 
-def test_capitals_of_an_id_are_forgiven_in_words(store: Path) -> None:
-    result = run("check-alignment", "--store", store, "--asset", "BEAR.S", "--picture", "none")
-    assert result.exit_code == 2 and "did you mean bear.side?" in result.stderr
-
-
 @pytest.mark.parametrize("command", ["list", "subset"])
-def test_a_category_that_no_asset_has_is_told_with_the_one_meant(
-    command: str, mixed: Dataset, tmp_path: Path
-) -> None:
-    (tmp_path / "kinds.json").write_text(json.dumps({"cup": {"obj_class": "vessels"}}))
-    config = tmp_path / "dataset.toml"
-    config.write_text(
-        f'[pixieverse]\nroot = "{mixed.root}/pixieverse"\n[slat]\nroot = "{mixed.root}/slat"\n'
-        f'[pairing]\ncategories = "kinds.json"\n'
-    )
-    built = run("build-store", "--config", config, "--out", tmp_path / "s.zarr")
-    assert built.exit_code == 1 and "unknown: the category of 4" in built.stdout
+def test_a_category_that_no_asset_has_is_told_with_the_one_meant(command, of_kinds, tmp_path):
     out = ("--out", tmp_path / "x.zarr") if command == "subset" else ()
-    result = run(command, tmp_path / "s.zarr", "--category", "vessel", *out)
-    assert result.exit_code == 2 and "expected vessels" in result.stderr
-    assert run(command, tmp_path / "s.zarr", "--category", "vessels", *out).exit_code == 0
+    assert "expected vessels" in refused(command, of_kinds, "--category", "vessel", *out)
+    run(command, of_kinds, "--category", "vessels", *out)
 
 
-def test_no_category_is_known_where_no_table_is_named(store: Path) -> None:
-    assert "[pairing]" in run("info", store).stdout
-    result = run("list", store, "--category", "cup")
-    assert result.exit_code == 2 and "no category is known" in result.stderr
+def test_a_table_of_categories_is_asked_for_unless_it_was_given(store, of_kinds):
+    for path, given in ((store, False), (of_kinds, True)):
+        (line,) = (x for x in run("info", path).stdout.splitlines() if x.startswith("unknown:"))
+        assert ("does not have their ids" in line) == given
+        assert ("[pairing]" in line) != given
+    assert "no category is known" in refused("list", store, "--category", "cup")
 
 
-def test_ambiguous_means_the_same_wherever_it_is_counted(store: Path, tmp_path: Path) -> None:
+def test_ambiguous_means_the_same_wherever_it_is_counted(store, tmp_path):
     copied = tmp_path / "copy.zarr"
-    assert run("subset", store, "--verdict", "good", "--out", copied, "-q").exit_code == 0
+    run("subset", store, "--verdict", "good", "--out", copied, "-q")
     zarr.open_group(copied, mode="r+")["asset/ambiguity"][:] = [0.0, 0.2, 0.9, 0.05, 0.01]
     assert "2 of 5: other placements" in run("info", copied).stdout
-    drawn = run("check-alignment", "--store", copied, "--ambiguous", "--picture", "none", "--json")
-    told = [one["asset_id"] for one in json.loads(drawn.stdout)["assets"]]
-    assert told == ["bear.side", "bear.front"]
+    drawn = document("check-alignment", "--store", copied, "--ambiguous", "--picture", "none")
+    assert [one["asset_id"] for one in drawn["assets"]] == ["bear.side", "bear.front"]
 
 
-def test_info_and_verify_count_the_same_files(store: Path) -> None:
-    told = (run(command, store, "--json") for command in ("info", "verify"))
-    one, other = (json.loads(result.stdout)["files"] for result in told)
+def test_info_and_verify_count_the_same_files(store):
+    one, other = (document(command, store)["files"] for command in ("info", "verify"))
     assert one == other == sum(file.is_file() for file in store.rglob("*"))
 
 
@@ -155,8 +152,8 @@ def test_info_and_verify_count_the_same_files(store: Path) -> None:
     ],
 )
 def test_advice_names_the_store_and_not_a_version_that_is_removed_later(
-    store: Path, place: str, named: str, capsys: pytest.CaptureFixture[str]
-) -> None:
+    store, place, named, capsys
+):
     overview = overview_of(open_store(store))
     total = replace(overview.total, verdicts={"good": 0, "doubtful": 1, "failed": 0}, ambiguous=1)
     show_quality(Output(), replace(overview, store=place_of(place), total=total), advise=False)
@@ -167,88 +164,63 @@ def test_advice_names_the_store_and_not_a_version_that_is_removed_later(
 
 
 @pytest.mark.parametrize("command", ["build-store", "align"])
-def test_swapped_roots_are_recognised(command: str, mixed: Dataset, tmp_path: Path) -> None:
+def test_swapped_roots_are_recognised(command, mixed, tmp_path):
     words = (command, "--pixieverse", mixed.root / "slat", "--slat", mixed.root / "pixieverse")
-    result = run(*words, "--out", tmp_path / "out.zarr")
-    assert result.exit_code == 2
-    assert f"the roots are swapped: grids lie below {mixed.root}/pixieverse" in result.stderr
+    told = refused(*words, "--out", tmp_path / "out.zarr")
+    assert f"the roots are swapped: grids lie below {mixed.root}/pixieverse" in told
 
 
-def test_a_folder_that_is_no_store_is_called_so_by_every_command(tmp_path: Path) -> None:
+def test_a_folder_that_is_no_store_is_called_so_by_every_command(tmp_path):
     for command in ("info", "list", "verify", "report", "describe"):
-        result = run(command, tmp_path)
-        assert result.exit_code == 1 and f"{tmp_path} is not a slatprep store" in result.stderr
+        assert f"{tmp_path} is not a slatprep store" in refused(command, tmp_path, code=1)
 
 
-def test_quiet_commands_that_make_something_print_nothing(store: Path, tmp_path: Path) -> None:
+def test_quiet_commands_that_make_something_print_nothing(store, tmp_path):
     made = run("subset", store, "--asset", "cup", "--out", tmp_path / "cup.zarr", "-q")
     assert made.output == "" and len(open_store(tmp_path / "cup.zarr")) == 1
     assert run("report", tmp_path / "cup.zarr", "-q").output == ""
     assert "cup" in run("list", tmp_path / "cup.zarr", "-q").stdout
-    assert json.loads(run("export", store, "--format", "npz", "--out", tmp_path / "n", "-q",
-                          "--json").stdout)["assets"] == 5  # fmt: skip
+    words = ("export", store, "--format", "npz", "--out", tmp_path / "n", "-q")
+    assert document(*words)["assets"] == 5
+    told = run("verify", tmp_path / "cup.zarr").stderr
+    assert "1 asset," in told and "0 sources" not in told  # In the singular.
 
 
-def test_sources_of_a_joined_store_are_said_to_lie_apart(
-    store: Path, mixed: Dataset, tmp_path: Path
-) -> None:
+def test_sources_of_a_joined_store_are_said_to_lie_apart(store, mixed, tmp_path):
     other = Dataset(tmp_path / "other")
     other.add("elk", seed=8)
     pixieverse = other.root / "pixieverse"
     build_store(other.parameters(), tmp_path / "elk.zarr")
     both = tmp_path / "both.zarr"
-    assert run("concat", store, tmp_path / "elk.zarr", "--out", both).exit_code == 0
-    result = run("verify", both, "--sources")
-    assert result.exit_code == 1 and len(result.stderr.splitlines()) == 1
-    assert "sources lie apart" in result.stderr and str(pixieverse) in result.stderr
+    run("concat", store, tmp_path / "elk.zarr", "--out", both)
+    told = refused("verify", both, "--sources", code=1)
+    assert len(told.splitlines()) == 1
+    assert "sources lie apart" in told and str(pixieverse) in told
     pixieverse.rename(tmp_path / "moved")
-    moved = run("verify", tmp_path / "elk.zarr", "--sources").stderr
+    moved = refused("verify", tmp_path / "elk.zarr", "--sources", code=1)
     assert f"its sources are not at {pixieverse} any more; name the roots" in moved
 
 
-def test_our_own_cloud_in_the_frame_of_pixieverse_is_recognised(
-    store: Path, tmp_path: Path
-) -> None:
+def test_our_own_cloud_in_the_frame_of_pixieverse_is_recognised(store, tmp_path):
     pytest.importorskip("plyfile")
     for frame in ("pixieverse", "slat"):
         words = ("--format", "ply", "--frame", frame, "--points", "grid", "--asset", "cup")
-        assert run("export", store, *words, "--out", tmp_path / frame).exit_code == 0
+        run("export", store, *words, "--out", tmp_path / frame)
     words = ("--store", store, "--asset", "cup", "--out", tmp_path / "m.ply")
-    result = run("transfer", tmp_path / "pixieverse" / "cup.ply", *words)
-    assert result.exit_code == 1 and "slatprep export --frame slat" in result.stderr
-    assert run("transfer", tmp_path / "slat" / "cup.ply", *words).exit_code == 0
+    told = refused("transfer", tmp_path / "pixieverse" / "cup.ply", *words, code=1)
+    assert "slatprep export --frame slat" in told
+    run("transfer", tmp_path / "slat" / "cup.ply", *words)
 
 
 @pytest.mark.parametrize("command", ["info", "list", "verify", "stats", "check-alignment"])
-def test_documents_begin_alike_and_say_which_store(command: str, store: Path) -> None:
+def test_documents_begin_alike_and_say_which_store(command, store):
     words = ("--worst", "1", "--picture", "none", "--store") if command == "check-alignment" else ()
-    document = json.loads(run(command, *words, store, "--json").stdout)
-    assert list(document)[:3] == ["command", "version", "ok"]
-    assert (document["command"], document["ok"]) == (command, True)
-    assert document["store"] == str(store)
+    told = document(command, *words, store)
+    assert list(told)[:3] == ["command", "version", "ok"]
+    assert (told["command"], told["ok"], told["store"]) == (command, True, str(store))
 
 
-def test_what_ends_a_command_is_json_too(store: Path, tmp_path: Path) -> None:
-    for words, code, said in (
-        (("info", tmp_path, "--json"), 1, "is not a slatprep store"),
-        (("check-alignment", "--asset", "cuo", "--store", store, "--json"), 2, "did you mean cup?"),
-        (("check-alignment", "--store", store, "--json"), 2, "say which assets"),
-        (
-            ("report", store, "--out", "s3://nowhere/p.html", "--json"),
-            2,
-            "expected a path of the local",
-        ),
-    ):
-        result = run(*words)
-        assert result.exit_code == code
-        document = json.loads(result.stdout)
-        assert said in document["error"] and said in result.stderr and document["ok"] is False
-    assert document["command"] == "report"
-
-
-def test_a_store_that_may_not_be_read_is_no_other_kind_of_folder(
-    store: Path, tmp_path: Path
-) -> None:
+def test_a_store_that_may_not_be_read_is_no_other_kind_of_folder(store, tmp_path):
     own = tmp_path / "s.zarr"
     shutil.copytree(store, own)
     (own / "zarr.json").chmod(0)
@@ -260,39 +232,76 @@ def test_a_store_that_may_not_be_read_is_no_other_kind_of_folder(
     assert "is not a slatprep store" not in done.stderr
 
 
-def test_nothing_is_written_to_memory_that_goes_with_the_command(store: Path) -> None:
-    result = run("subset", store, "--verdict", "good", "--out", "memory://s.zarr")
-    assert result.exit_code == 2 and "gone when the command ends" in result.stderr
+def test_nothing_is_written_to_memory_that_goes_with_the_command(store):
+    told = refused("subset", store, "--verdict", "good", "--out", "memory://s.zarr")
+    assert "gone when the command ends" in told
 
 
-def test_a_single_asset_is_counted_in_the_singular(store: Path, tmp_path: Path) -> None:
-    out = tmp_path / "one.zarr"
-    assert run("subset", store, "--asset", "0", "--out", out, "-q").exit_code == 0
-    told = run("verify", out)
-    assert told.exit_code == 0 and "1 asset," in told.stderr and "0 sources" not in told.stderr
-
-
-def test_ctrl_c_says_what_is_kept_and_how_to_go_on(
-    store: Path, mixed: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_ctrl_c_says_what_is_kept_and_how_to_go_on(store, mixed, tmp_path, monkeypatch):
     def built(*_: object, progress: Callable[[int, int], None], **__: object) -> None:
         progress(2, 3)
         raise KeyboardInterrupt
-
-    monkeypatch.setattr("slatprep.pipeline.dataset.build_store", built)
-    parts = mixed.parameters()
-    sources = ("--pixieverse", parts.pixieverse.root, "--slat", parts.slat.root)
-    stopped = run("build-store", *sources, "--out", tmp_path / "new.zarr")
-    assert stopped.exit_code == 130
-    assert "2 of 3 assets are done and kept; the same command goes on from there" in stopped.stderr
 
     def trained(*_: object, progress: Callable[[EpochRecord], None], **__: object) -> None:
         progress(EpochRecord(4, 1e-3, 0.5, 0.6, 0.7, 0.8))
         raise KeyboardInterrupt
 
+    def made(*_: object, **__: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("slatprep.pipeline.dataset.build_store", built)
     monkeypatch.setattr("slatprep.learn.train.train", trained)
-    stopped = run("train", store, "--out", tmp_path / "run", "--keep", "last")
-    assert stopped.exit_code == 130, stopped.output
-    assert (
-        "epochs up to 4 are kept, and the steps of epoch 5 but for the last 30 s" in stopped.stderr
-    )
+    monkeypatch.setattr("slatprep.demo.make_demo", made)
+    parts = mixed.parameters()
+    sources = ("--pixieverse", parts.pixieverse.root, "--slat", parts.slat.root)
+    stopped = refused("build-store", *sources, "--out", tmp_path / "new.zarr", code=130)
+    assert "2 of 3 assets are done and kept; the same command goes on from there" in stopped
+    stopped = refused("train", store, "--out", tmp_path / "run", "--keep", "last", code=130)
+    assert "epochs up to 4 are kept, and the steps of epoch 5 but for the last 30 s" in stopped
+    assert "nothing was replaced" in refused("make-demo", tmp_path / "demo", code=130)
+
+
+# -- disks ----------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("command", ["report", "describe"])
+def test_a_full_disk_is_a_line(store, tmp_path, monkeypatch, command):
+    def full(path: Path) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(atomic, "flush", full)
+    line = refused(command, store, "--out", tmp_path / "result", code=1)
+    assert "cannot be written to" in line
+    assert "No space left on device" in line and "Make room" in line
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ("make-demo", NOWHERE, "--assets", 1),
+        ("report", "STORE", "--out", NOWHERE / "r.html"),
+        ("describe", "STORE", "--out", NOWHERE / "d.json"),
+        ("train", "STORE", "--out", NOWHERE, "--epochs", 1, "--size", "small"),
+    ],
+)
+def test_a_folder_that_takes_nothing_is_a_line(words, store):
+    if words[0] == "train":
+        pytest.importorskip("torch")
+    told = refused(*(store if word == "STORE" else word for word in words), code=1)
+    assert "cannot be written to" in told
+
+
+# -- where `verify` looks for records -------------------------------------------
+
+
+def test_the_records_that_make_left_are_found_and_those_of_another_build_are_not(
+    mixed_build, deformed_build, tmp_path, monkeypatch
+):
+    monkeypatch.chdir(tmp_path)
+    store = Path(shutil.copytree(str(mixed_build.store), "data/demo.zarr"))
+    shutil.copytree(mixed_build.records.parent, "manifests/build/demo")
+    assert "records: manifests/build/demo" in run("verify", store).output
+    shutil.rmtree("manifests")
+    shutil.copytree(deformed_build.records.parent, "manifests/build/demo")
+    assert "records: none beside the store" in run("verify", store).output

@@ -21,10 +21,20 @@ class Terminal(io.StringIO):
         return True
 
 
+def a_terminal(monkeypatch: pytest.MonkeyPatch) -> Terminal:
+    """Print to a terminal of many colours from now on."""
+    stream = Terminal()
+    monkeypatch.setenv("TERM", "xterm-256color")
+    monkeypatch.delenv("NO_COLOR", raising=False)
+    monkeypatch.setattr(sys, "stdout", stream)
+    monkeypatch.setattr(sys, "stderr", stream)
+    return stream
+
+
 ROWS = [("spot", 3, 0.98765, None), ("bunny [bold]", 12345, float("nan"), True)]
 
 
-def test_plain_table_is_aligned_and_has_no_ornament(capsys: pytest.CaptureFixture[str]) -> None:
+def test_plain_table_is_aligned_and_has_no_ornament(capsys):
     Output().table("Assets", ("name", "voxels", "fitness", "right"), ROWS)
     assert capsys.readouterr().out.splitlines() == [
         "Assets",
@@ -35,45 +45,34 @@ def test_plain_table_is_aligned_and_has_no_ornament(capsys: pytest.CaptureFixtur
     ]
 
 
-def test_table_on_a_terminal_is_drawn_and_keeps_square_brackets(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    monkeypatch.setenv("TERM", "xterm-256color")
-    monkeypatch.delenv("NO_COLOR", raising=False)
-    monkeypatch.setattr(sys, "stdout", Terminal())
+def test_table_on_a_terminal_is_drawn_and_keeps_square_brackets(monkeypatch):
+    terminal = a_terminal(monkeypatch)
     Output().table("Assets", ("name", "voxels", "fitness", "right"), ROWS)
-    text = sys.stdout.getvalue()  # type: ignore[attr-defined]
+    text = terminal.getvalue()
     assert "bunny [bold]" in text
     assert "─" in text and "\x1b[" in text
 
 
-def test_narrow_terminal_cuts_no_id_and_no_number(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("TERM", "xterm-256color")
+def test_narrow_terminal_cuts_no_id_and_no_number(monkeypatch):
+    terminal = a_terminal(monkeypatch)
     monkeypatch.setenv("COLUMNS", "30")
-    monkeypatch.setattr(sys, "stdout", Terminal())
     asset_id = "0123456789abcdef0123456789abcdef"
     Output().table("Assets", ("asset", "voxels"), [(asset_id, 12345)])
-    text = sys.stdout.getvalue()  # type: ignore[attr-defined]
-    assert asset_id in text and "12,345" in text
+    assert asset_id in terminal.getvalue() and "12,345" in terminal.getvalue()
 
 
 @pytest.mark.parametrize("no_color", [False, True])
-def test_verdicts_are_coloured_unless_no_color_says_otherwise(
-    monkeypatch: pytest.MonkeyPatch, no_color: bool
-) -> None:
-    monkeypatch.setenv("TERM", "xterm-256color")
-    monkeypatch.delenv("NO_COLOR", raising=False)
+def test_verdicts_are_coloured_unless_no_color_says_otherwise(monkeypatch, no_color):
+    terminal = a_terminal(monkeypatch)
     if no_color:
         monkeypatch.setenv("NO_COLOR", "1")
-    monkeypatch.setattr(sys, "stdout", Terminal())
     Output().table("Assets", ("name", "verdict"), [("spot", "good")])
-    text = sys.stdout.getvalue()  # type: ignore[attr-defined]
     green = "\x1b[32m"
-    assert "good" in text
-    assert (green in text) is not no_color
+    assert "good" in terminal.getvalue()
+    assert (green in terminal.getvalue()) is not no_color
 
 
-def test_json_is_the_only_thing_on_standard_output(capsys: pytest.CaptureFixture[str]) -> None:
+def test_json_is_the_only_thing_on_standard_output(capsys):
     printer = Output(as_json=True, command="look")
     printer.note("a note")
     printer.result({"value": float("nan"), "pair": (1, 2)}, lambda: pytest.fail("not for people"))
@@ -88,7 +87,7 @@ def test_json_is_the_only_thing_on_standard_output(capsys: pytest.CaptureFixture
     assert captured.err == "a note\n"
 
 
-def test_verbosity(capsys: pytest.CaptureFixture[str]) -> None:
+def test_verbosity(capsys):
     for verbosity in (-1, 0, 1):
         printer = Output(verbosity=verbosity)
         printer.note(f"note {verbosity}")
@@ -102,7 +101,7 @@ def test_verbosity(capsys: pytest.CaptureFixture[str]) -> None:
     ]
 
 
-def test_json_holds_all_that_results_do(tmp_path: Path) -> None:
+def test_json_holds_all_that_results_do(tmp_path):
     document = {
         "a": np.float32(0.5),
         "b": np.arange(2),
@@ -121,9 +120,7 @@ def test_json_holds_all_that_results_do(tmp_path: Path) -> None:
         as_json({"g": object()})
 
 
-def test_time_left_in_a_log_comes_from_all_assets_done(
-    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_time_left_in_a_log_comes_from_all_assets_done(capsys, monkeypatch):
     clock = iter([0.0, 10.0, 60.0, 61.0, 120.0])
     monkeypatch.setattr(module.time, "monotonic", lambda: next(clock))
     with Output().progress("build") as update:
@@ -137,9 +134,7 @@ def test_time_left_in_a_log_comes_from_all_assets_done(
     ]
 
 
-def test_no_time_is_told_from_one_asset_or_from_what_came_before_the_first(
-    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_no_time_is_told_from_one_asset_or_from_what_came_before_the_first(capsys, monkeypatch):
     clock = iter([0.0, 3600.0, 3640.0, 3680.0])
     monkeypatch.setattr(module.time, "monotonic", lambda: next(clock))
     with Output().progress("train", "steps") as update:
@@ -149,39 +144,26 @@ def test_no_time_is_told_from_one_asset_or_from_what_came_before_the_first(
     assert capsys.readouterr().err.splitlines() == ["train: 2 of 100 steps, 1:05:20 left"]
 
 
-def test_quiet_shows_no_progress(
-    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_quiet_shows_no_progress(capsys, monkeypatch):
     monkeypatch.setattr(module.time, "monotonic", iter(range(0, 1000, 100)).__next__)
     with Output(verbosity=-1).progress("build") as update:
         update(1, 2)
     assert capsys.readouterr().err == ""
 
 
-def test_bar_on_a_terminal_counts_assets(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("TERM", "xterm-256color")
-    monkeypatch.setattr(sys, "stderr", Terminal())
-    with Output().progress("build") as update:
-        update(3, 8)
-    shown = sys.stderr.getvalue()  # type: ignore[attr-defined]
-    assert "3/8 · 0:00 · 0:00 left" in shown
-
-
-@pytest.mark.parametrize("done", [None, 0, 1])
-def test_bar_tells_no_time_left_before_it_can(
-    monkeypatch: pytest.MonkeyPatch, done: int | None
-) -> None:
-    monkeypatch.setenv("TERM", "xterm-256color")
-    monkeypatch.setattr(sys, "stderr", Terminal())
+@pytest.mark.parametrize("done", [None, 0, 1, 3])
+def test_bar_on_a_terminal_counts_assets_and_tells_the_time_left_once_it_can(monkeypatch, done):
+    terminal = a_terminal(monkeypatch)
     with Output().progress("build") as update:
         if done is not None:
             update(done, 8)
-    shown = sys.stderr.getvalue()  # type: ignore[attr-defined]
-    assert "left" not in shown
-    assert ("starting" if done is None else f"{done}/8") in shown
+    shown = terminal.getvalue()
+    counted = "3/8 · 0:00 · 0:00 left" if done == 3 else f"{done}/8"
+    assert ("starting" if done is None else counted) in shown
+    assert ("left" in shown) is (done == 3)
 
 
-def test_commands_print_through_one_function() -> None:
+def test_commands_print_through_one_function():
     """Which escapes what a terminal would obey."""
     folder = Path(str(module.__file__)).parent
     printing = [p.name for p in folder.glob("*.py") if "click.echo(" in p.read_text("utf-8")]

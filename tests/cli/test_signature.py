@@ -58,12 +58,12 @@ def got(*words: str) -> Any:
     return json.loads(done.stdout)["got"]
 
 
-def test_function_gets_defaults() -> None:
+def test_function_gets_defaults():
     group = {"inner": {"deep": 0.5}, "wide": None}
     assert got("x", "--wanted", "4") == ["x", [], None, "a", [], False, group, 4]
 
 
-def test_function_gets_what_is_given() -> None:
+def test_function_gets_what_is_given():
     words = "x y z --few 2 --kind b --name m --name n --loud --deep 2 --wide w --wanted 4"
     group = {"inner": {"deep": 2.0}, "wide": "w"}
     assert got(*words.split()) == ["x", ["y", "z"], 2, "b", ["m", "n"], True, group, 4]
@@ -80,13 +80,13 @@ def test_function_gets_what_is_given() -> None:
         ("x --wanted 1 --names n", "No such option"),
     ],
 )
-def test_wrong_use_is_refused(words: str, told: str) -> None:
+def test_wrong_use_is_refused(words, told):
     done = CliRunner().invoke(probe, words.split())
     assert done.exit_code == 2
     assert told in done.output
 
 
-def test_help_has_texts_defaults_and_sections() -> None:
+def test_help_has_texts_defaults_and_sections():
     text = CliRunner().invoke(probe, ["--help"], terminal_width=90).output
     for words in ("[TARGETS]...", "Which.", "Called; may", "[required]", "Print what the function"):
         assert words in text
@@ -94,7 +94,7 @@ def test_help_has_texts_defaults_and_sections() -> None:
     assert "Example:\n    slatprep probe x" in text
 
 
-def test_option_without_help_is_a_mistake_of_ours() -> None:
+def test_option_without_help_is_a_mistake_of_ours():
     def silent(output: Output, *, few: Few = 1) -> None:
         """Do nothing."""
 

@@ -55,13 +55,7 @@ def stores(tmp_path_factory: pytest.TempPathFactory) -> Path:
         ("store replaced", signal.SIGINT),
     ],
 )
-def test_a_signal_at_a_step(
-    step: str,
-    number: signal.Signals,
-    stores: Path,
-    undisturbed: tuple[Dataset, Path],
-    tmp_path: Path,
-) -> None:
+def test_a_signal_at_a_step(step, number, stores, undisturbed, tmp_path):
     dataset, _ = undisturbed
     folder = Path(shutil.copytree(stores, tmp_path / "stores"))
     out = folder / "s.zarr"

@@ -2,7 +2,6 @@
 
 import csv
 import json
-import shutil
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -10,32 +9,15 @@ from typing import Any
 import numpy as np
 import pytest
 import zarr
-from click.testing import CliRunner, Result
+from click.testing import Result
+from support.commands import document, refused, run
 
-from slatprep.cli.commands import slatprep
-from slatprep.pipeline.dataset import BuildSummary
 from slatprep.store import open_store
 
 
-@pytest.fixture(scope="module")
-def original(mixed_build: BuildSummary, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    assert mixed_build.store is not None
-    folder = tmp_path_factory.mktemp("strangers")
-    shutil.copytree(mixed_build.store, folder / "s.zarr")
-    shutil.copytree(mixed_build.store.with_suffix(".manifests"), folder / "s.manifests")
-    return folder
-
-
 @pytest.fixture
-def store(original: Path, tmp_path: Path) -> Path:
-    return Path(shutil.copytree(original, tmp_path / "copy")) / "s.zarr"
-
-
-def run(*arguments: object) -> Result:
-    """Run a command; an error is a line and an exit code."""
-    done = CliRunner().invoke(slatprep, list(map(str, arguments)))
-    assert done.exception is None or isinstance(done.exception, SystemExit), arguments
-    return done
+def store(copy: Path) -> Path:
+    return copy
 
 
 def every_command(store: Path) -> dict[str, Result]:
@@ -51,7 +33,7 @@ def every_command(store: Path) -> dict[str, Result]:
             for name in ("ply", "npz", "hdf5")
         },
     }
-    return {name: run(*line) for name, line in lines.items()}
+    return {name: run(*line, code=None) for name, line in lines.items()}
 
 
 def edit(file: Path, change: Callable[[dict[str, Any]], object]) -> None:
@@ -99,16 +81,16 @@ ATTRIBUTES: dict[str, Callable[[dict[str, Any]], object]] = {
 
 
 @pytest.mark.parametrize("case", ATTRIBUTES)
-def test_attributes(store: Path, case: str) -> None:
+def test_attributes(store, case):
     edit(store / "zarr.json", lambda document: ATTRIBUTES[case](document["attributes"]))
     for name, done in every_command(store).items():
         assert done.exit_code == 1, name
         assert "slatprep: error" in done.stderr or name == "verify"
-    told = run("verify", store, "-q").stdout
+    told = run("verify", store, "-q", code=1).stdout
     assert "zarr.json: " in told and "0 findings" not in told
 
 
-def test_attributes_that_are_not_known_hinder_nobody(store: Path) -> None:
+def test_attributes_that_are_not_known_hinder_nobody(store):
     def change(document: dict[str, Any]) -> None:
         attributes = document["attributes"]
         attributes["mine"] = {"x": [1, None, "y"]}
@@ -141,7 +123,7 @@ READERS = {"build.json": ("report", "verify"), "assets.jsonl": ("verify",)}
 
 
 @pytest.mark.parametrize("case", RECORDS)
-def test_records_beside_a_store(store: Path, case: str) -> None:
+def test_records_beside_a_store(store, case):
     name, content = RECORDS[case]
     file = store.with_suffix(".manifests") / name
     if callable(content):
@@ -150,41 +132,39 @@ def test_records_beside_a_store(store: Path, case: str) -> None:
         file.write_bytes(content)
     for command in READERS[name]:
         out = ("--out", store.with_suffix(".html")) if command == "report" else ()
-        done = run(command, store, *out)
-        assert done.exit_code == 1
-        assert name in done.output
+        assert name in run(command, store, *out, code=1).output
 
 
 @pytest.mark.parametrize("name", ["build.json", "assets.jsonl"])
-def test_a_device_in_place_of_a_record(store: Path, name: str) -> None:
+def test_a_device_in_place_of_a_record(store, name):
     file = store.with_suffix(".manifests") / name
     file.unlink()
     file.symlink_to("/dev/zero")
     for command in READERS[name]:
         out = ("--out", store.with_suffix(".html")) if command == "report" else ()
-        assert "no regular file" in run(command, store, *out).output
+        assert "no regular file" in run(command, store, *out, code=None).output
 
 
 def rewrite(store: Path, array: str, row: int, value: object) -> None:
     zarr.open_group(store, mode="r+", use_consolidated=False)[array][row] = value
 
 
-def test_escape_sequences_do_not_reach_the_terminal(store: Path) -> None:
+def test_escape_sequences_do_not_reach_the_terminal(store):
     for row, text in enumerate(("\x1b]0;title\x07", "\x1b[2J", "\x9b31m\u202e", "a\r\nb")):
         rewrite(store, "asset/category", row, text)
     rewrite(store, "asset/verdict", 0, "\x1b[2J")
     for line in (["info"], ["list"], ["verify"], ["report"], ["info", "--json"]):
-        done = run(line[0], store, *line[1:])
+        done = run(line[0], store, *line[1:], code=None)
         assert not set("\x1b\x07\x9b\r\u202e") & set(done.output), line
-    categories = json.loads(run("info", store, "--json").stdout)["categories"]
+    categories = document("info", store)["categories"]
     assert {"\x1b[2J", "\x9b31m\u202e"} <= {group["name"] for group in categories}
 
 
 @pytest.mark.parametrize("name", ["verdict", "model", "engine"])
-def test_a_report_of_unknown_words_is_refused(store: Path, name: str) -> None:
+def test_a_report_of_unknown_words_is_refused(store, name):
     rewrite(store, f"asset/{name}", 0, "other")
-    done = run("report", store, "--out", store.with_suffix(".html"))
-    assert done.exit_code == 1 and "'other' is none of" in done.stderr
+    told = refused("report", store, "--out", store.with_suffix(".html"), code=1)
+    assert "'other' is none of" in told
 
 
 TRUTH: dict[str, dict[str, Any]] = {
@@ -199,22 +179,20 @@ TRUTH: dict[str, dict[str, Any]] = {
 
 
 @pytest.mark.parametrize("case", TRUTH)
-def test_truth_that_is_none(store: Path, tmp_path: Path, case: str) -> None:
+def test_truth_that_is_none(store, tmp_path, case):
     sound = {"transform": np.eye(4), "material": np.zeros(7, np.uint8), "name": "a", "level": 0}
     (tmp_path / "truth").mkdir()
     np.savez(tmp_path / "truth/cup.npz", **({**sound, "symmetric": False} | TRUTH[case]))
-    done = run("score", store, tmp_path / "truth")
-    assert done.exit_code == 1 and "cup.npz" in done.stderr
+    assert "cup.npz" in refused("score", store, tmp_path / "truth", code=1)
 
 
-def test_a_category_with_the_space_of_all_costs_no_memory(store: Path) -> None:
+def test_a_category_with_the_space_of_all_costs_no_memory(store):
     """One text of megabytes among few rows is refused by the reader."""
     rewrite(store, "asset/category", 0, "x" * 2**20)
-    done = run("info", store)
-    assert done.exit_code == 1 and "expected at most" in done.stderr
+    assert "expected at most" in refused("info", store, code=1)
 
 
-def test_a_table_of_scores_has_no_formulas(store: Path, tmp_path: Path) -> None:
+def test_a_table_of_scores_has_no_formulas(store, tmp_path):
     opened = open_store(store)
     (tmp_path / "p").mkdir()
     for row, asset_id in enumerate(opened.ids):
@@ -223,7 +201,8 @@ def test_a_table_of_scores_has_no_formulas(store: Path, tmp_path: Path) -> None:
     for row, category in enumerate(("=cmd|x", "+1", "-1", "@a\x1b[2J", " =b")):
         rewrite(store, "asset/category", row, category)
     table = tmp_path / "scores.csv"
-    run("evaluate", tmp_path / "p", "--store", store, "--split", "all", "--csv", table)
+    words = ("--store", store, "--split", "all", "--csv", table)
+    run("evaluate", tmp_path / "p", *words, code=None)
     with table.open(encoding="utf-8", newline="") as file:
         first = {row[0] for row in csv.reader(file)}
     # The bear's two views are one object, of the first one's category.

@@ -1,0 +1,27 @@
+"""Commands in this process, as a user types them."""
+
+import json
+from typing import Any
+
+from click.testing import CliRunner, Result
+
+from slatprep.cli.commands import slatprep
+
+
+def run(*words: object, code: int | None = 0) -> Result:
+    """Run a command that ends with this exit code, whichever where it is None, and in words."""
+    done = CliRunner().invoke(slatprep, [str(word) for word in words])
+    assert done.exception is None or isinstance(done.exception, SystemExit), (words, done.exception)
+    assert code is None or done.exit_code == code, (words, done.output)
+    assert "Traceback" not in done.output, words
+    return done
+
+
+def refused(*words: object, code: int = 2) -> str:
+    """Return what a command that ends with this exit code says on standard error."""
+    return run(*words, code=code).stderr
+
+
+def document(*words: object, code: int = 0) -> Any:
+    """Return what a command prints as JSON."""
+    return json.loads(run(*words, "--json", code=code).stdout)
