@@ -1,6 +1,5 @@
 """What `slatprep diff` says, of changes made by hand."""
 
-import json
 import math
 import shutil
 from collections.abc import Callable
@@ -10,24 +9,15 @@ from typing import Any
 import numpy as np
 import pytest
 import zarr
-from click.testing import CliRunner, Result
+from support.commands import document, run
 from support.synthetic import Dataset, make_asset
 
 from slatprep import compare_stores, open_store, subset_store
-from slatprep.cli.commands import slatprep
 from slatprep.cli.output import as_json
 from slatprep.geometry.frames import displacement
 from slatprep.inspect.difference import StoreDifference
 from slatprep.normalize import denormalize_properties
 from slatprep.pipeline.dataset import BuildSummary, build_store
-
-IDS = ["ant", "bear.front", "bear.side", "cup", "dog"]
-
-
-@pytest.fixture
-def copy(mixed_build: BuildSummary, tmp_path: Path) -> Path:
-    """Copy `mixed`, to be changed."""
-    return Path(shutil.copytree(str(mixed_build.store), tmp_path / "b.zarr"))
 
 
 def change(path: Path, name: str, edit: Callable[[Any], None]) -> None:
@@ -46,19 +36,14 @@ def compare(build: BuildSummary, copy: Path, **options: Any) -> StoreDifference:
     return compare_stores(open_store(str(build.store)), open_store(copy), **options)
 
 
-def run(*arguments: object) -> Result:
-    return CliRunner().invoke(slatprep, ["diff", *map(str, arguments)])
-
-
-def test_a_copy_is_the_same(mixed_build: BuildSummary, copy: Path) -> None:
+def test_a_copy_is_the_same(mixed_build, copy):
     found = compare(mixed_build, copy)
     assert found.same and (found.assets, found.changed, found.worst) == (5, 0, ())
     assert found.voxels == open_store(copy).offsets[-1] and math.isnan(found.moved)
-    result = run(mixed_build.store, copy)
-    assert result.exit_code == 0 and "hold the same" in result.stdout
+    assert "hold the same" in run("diff", mixed_build.store, copy).stdout
 
 
-def test_every_change_is_counted_where_it_was_made(mixed_build: BuildSummary, copy: Path) -> None:
+def test_every_change_is_counted_where_it_was_made(mixed_build, copy):
     before = open_store(str(mixed_build.store))
     ant, cup, dog = (rows(copy, asset) for asset in (0, 3, 4))
 
@@ -108,7 +93,7 @@ def test_every_change_is_counted_where_it_was_made(mixed_build: BuildSummary, co
     assert found.properties["density"].changed == 0
 
 
-def test_voxels_are_matched_wherever_they_lie(mixed_build: BuildSummary, copy: Path) -> None:
+def test_voxels_are_matched_wherever_they_lie(mixed_build, copy):
     """The same voxels in another order, and one voxel that is another."""
     before = open_store(str(mixed_build.store))
     ant, dog = rows(copy, 0), rows(copy, 4)
@@ -131,7 +116,7 @@ def test_voxels_are_matched_wherever_they_lie(mixed_build: BuildSummary, copy: P
     assert set(of["dog"].what) == {"voxels", "placement", "columns"}
 
 
-def test_other_sources_ranges_and_assets(tmp_path: Path) -> None:
+def test_other_sources_ranges_and_assets(tmp_path):
     dataset = Dataset(tmp_path / "sources").having("kept", "softer", "gone")
     build_store(dataset.parameters("pixie"), tmp_path / "a.zarr")
     shutil.rmtree(dataset.root / "pixieverse" / "gone")
@@ -163,37 +148,32 @@ def test_other_sources_ranges_and_assets(tmp_path: Path) -> None:
     nothing = compare_stores(open_store(tmp_path / "gone.zarr"), b)
     assert (nothing.assets, nothing.only_a) == (0, ("gone",))
     assert nothing.only_b == ("kept", "new", "softer") and not nothing.same
-    result = run(tmp_path / "gone.zarr", b.path)
-    assert result.exit_code == 1 and "only in A: gone" in result.stdout
+    assert "only in A: gone" in run("diff", tmp_path / "gone.zarr", b.path, code=1).stdout
 
 
-def test_the_command_tells_it_and_how_it_ended(mixed_build: BuildSummary, copy: Path) -> None:
+def test_the_command_tells_it_and_how_it_ended(mixed_build, copy):
     change(copy, "asset/verdict", lambda verdicts: verdicts.__setitem__(4, "failed"))
     change(copy, "asset/fitness", lambda fitness: fitness.__setitem__(slice(0, 4), 0.5))
-    result = run(mixed_build.store, copy)
-    assert result.exit_code == 1
-    assert "1 good > failed" in result.stdout and "good > failed" in result.stdout
-    document = run(mixed_build.store, copy, "--json")
-    assert document.exit_code == 1
-    found = json.loads(document.stdout)
+    words = ("diff", mixed_build.store, copy)
+    assert "1 good > failed" in run(*words, code=1).stdout
+    found = document(*words, code=1)
     assert found["what"] == {"columns": 4, "verdict": 1} and len(found["worst"]) == 5
     assert found["moved"] is None
-    worst = json.loads(run(mixed_build.store, copy, "--json", "--worst", 2).stdout)["worst"]
-    assert worst == found["worst"][:2]
+    assert document(*words, "--worst", 2, code=1)["worst"] == found["worst"][:2]
 
 
-def test_jobs_change_nothing(mixed_build: BuildSummary, copy: Path) -> None:
+def test_jobs_change_nothing(mixed_build, copy):
     change(copy, "voxel/place", lambda places: places.__iadd__(np.float32(0.001)))
     one, two = (as_json(compare(mixed_build, copy, jobs=jobs, worst=3)) for jobs in (1, 2))
     assert one == two
 
 
-def test_trouble_is_neither_the_same_nor_different(mixed_build: BuildSummary, copy: Path) -> None:
+def test_trouble_is_neither_the_same_nor_different(mixed_build, copy):
     damaged = next((copy / "voxel/place").rglob("c/*"))
     while damaged.is_dir():
         damaged = next(damaged.iterdir())
     damaged.write_bytes(damaged.read_bytes()[:50])
-    result = run(mixed_build.store, copy)
-    assert result.exit_code == 1 and "voxel/place" in result.stderr and not result.stdout
-    assert run(mixed_build.store, copy.parent / "nothing").exit_code == 2
-    assert run(mixed_build.store, copy.parent).exit_code == 1
+    result = run("diff", mixed_build.store, copy, code=1)
+    assert "voxel/place" in result.stderr and not result.stdout
+    run("diff", mixed_build.store, copy.parent / "nothing", code=2)
+    run("diff", mixed_build.store, copy.parent, code=1)

@@ -1,7 +1,6 @@
 """What `slatprep info` counts, against the arrays themselves."""
 
 import shutil
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -9,13 +8,10 @@ import zarr
 
 from slatprep.inspect.check import choose_assets
 from slatprep.inspect.overview import overview_of
-from slatprep.pipeline.dataset import BuildSummary
 from slatprep.store import open_store
 
 
-def test_figures_are_medians_over_assets_and_shares_over_voxels(
-    mixed_build: BuildSummary, tmp_path: Path
-) -> None:
+def test_figures_are_medians_over_assets_and_shares_over_voxels(mixed_build, tmp_path):
     path = tmp_path / "copy.zarr"
     shutil.copytree(str(mixed_build.store), path)
     group = zarr.open_group(path, mode="r+")

@@ -1,91 +1,49 @@
 """Scores against truth, on stores whose figures can be worked out by hand."""
 
-import json
-from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
 import pytest
 import zarr
-from click.testing import CliRunner
+from support.commands import document, run
+from support.synthetic import SMALL_SHARDS
 
 import slatprep
-from slatprep.cli.commands import slatprep as slatprep_command
 from slatprep.errors import InputError
 from slatprep.geometry.frames import make_transform
 from slatprep.inspect.score import TruthScore, score_against_truth, summarise
 from slatprep.parameters import BuildParameters, PixieverseSource, SlatSource
-from slatprep.records import TRELLIS
-from slatprep.store.layout import ARRAYS
+from slatprep.records import PIXIEVERSE, Normalization, PropertyRange
+from slatprep.store.writer import create_store, finish_store
 
 # A rod of two materials along x in the PixieVerse frame.
 ROD = np.array([[x, 32, 32] for x in range(20, 40)])
 ROD_MATERIAL = np.where(ROD[:, 0] < 30, 1, 5).astype(np.uint8)
 
 
-def add_array(root: zarr.Group, name: str, array: np.ndarray) -> None:
-    (dimensions,) = (layout.dimensions for layout in ARRAYS if layout.name == name)
-    root.create_array(
-        name,
-        data=array,
-        chunks=(1 if name.startswith("grid/") else len(array), *array.shape[1:]),
-        dimension_names=dimensions,
-        config={"write_empty_chunks": True},
-    )
-
-
 def write_store(path: Path, assets: dict[str, dict[str, np.ndarray]]) -> None:
-    """Write what a score reads, with zarr alone."""
-    ids = sorted(assets)
-    rows = [assets[asset_id] for asset_id in ids]
+    """Write what a score reads; all else is as in a store that nothing was written to."""
+    rows = [assets[asset_id] for asset_id in sorted(assets)]
     counts = [len(row["coords"]) for row in rows]
-    n = sum(counts)
-    root = zarr.create_group(path, zarr_format=3)
-    properties = ["youngs_modulus", "density", "poissons_ratio"]
-    span = {"log10": False, "lo": 0.0, "hi": 1.0, "source": "dataset"}
-    root.attrs.update(
-        {
-            "format": "slatprep-store",
-            "format_version": 1,
-            "resolution": 64,
-            "material_classes": ["jelly", "metal", "sand", "visplas", "fluid", "snow",
-                                 "stationary", "background"],
-            "property_columns": properties,
-            "property_units": ["Pa", "kg/m3", "1"],
-            "latents": asdict(TRELLIS),
-            "normalization": dict.fromkeys(properties, span),
-            "manifest": "0" * 64,
-            "build": {"parameters": {"align": {"radius": 1.0}, "sample": {}}, "versions": {}},
-        }
-    )  # fmt: skip
-    arrays: dict[str, np.ndarray] = {
-        "asset/offset": np.array([0, *np.cumsum(counts)], dtype=np.int64),
+    create_store(path, len(rows), sum(counts), SMALL_SHARDS)
+    root = zarr.open_group(path, mode="r+", use_consolidated=False)
+    values = {
+        "asset/id": np.array(sorted(assets), dtype=object),
+        "asset/offset": np.array([0, *np.cumsum(counts)]),
         "asset/transform": np.stack([row["transform"] for row in rows]),
-        "voxel/coords": np.concatenate([row["coords"] for row in rows]).astype(np.uint8),
-        "voxel/feats": np.zeros((n, 8), np.float32),
-        "voxel/properties": np.zeros((n, 3), np.float32),
-        "voxel/material": np.concatenate([row["material"] for row in rows]).astype(np.uint8),
+        "voxel/coords": np.concatenate([row["coords"] for row in rows]),
+        "voxel/material": np.concatenate([row["material"] for row in rows]),
         "voxel/valid": np.concatenate([row["valid"] for row in rows]),
-        "voxel/distance": np.zeros(n, np.float32),
-        "grid/properties": np.zeros((len(ids), 3, 64, 64, 64), np.float32),
+        "voxel/place": np.concatenate([places_of(row) for row in rows]),
         "grid/material": np.stack([row["grid"] for row in rows]),
     }
-    for name in ("fitness", "inlier_rmse", "fitness_backward", "inlier_rmse_backward", "overlap",
-                 "margin", "ambiguity", "valid_share", "confidence", "same_object",
-                 "right_placement", "expected_accuracy"):  # fmt: skip
-        arrays[f"asset/{name}"] = np.zeros(len(ids))
-    arrays["asset/unphysical"] = np.zeros(len(ids), np.int64)
-    arrays["asset/contradicted"] = np.zeros(len(ids), bool)
-    arrays["voxel/confidence"] = np.zeros(n, np.float32)
-    arrays["voxel/place"] = np.concatenate([places_of(row) for row in rows]).astype(np.float32)
-    arrays["asset/property_ambiguity"] = np.zeros((len(ids), 3))
-    for name, array in arrays.items():
-        add_array(root, name, array)
-    for name in ("id", "object_id", "view", "category", "engine", "model", "search", "verdict"):
-        strings = root.create_array(
-            f"asset/{name}", shape=(len(ids),), dtype=str, dimension_names=("asset",)
-        )
-        strings[:] = np.array(ids if name == "id" else [""] * len(ids), dtype=object)
+    with zarr.config.set({"array.write_empty_chunks": True}):
+        for name, array in root.members(max_depth=None):
+            if isinstance(array, zarr.Array):
+                array[...] = values.get(name, array.fill_value)
+    ranges = tuple(PropertyRange(one.name, False, 0.0, 1.0) for one in PIXIEVERSE.properties)
+    build = {"parameters": {"align": {"radius": 1.0}, "sample": {}}, "versions": {}}
+    finish_store(path, Normalization(ranges, "dataset"), "0" * 64, build)
 
 
 def places_of(row: dict[str, np.ndarray]) -> np.ndarray:
@@ -119,10 +77,18 @@ def write_truth(folder: Path, asset_id: str, **changes: object) -> None:
         "level": 1,
         "symmetric": False,
     }
-    np.savez(folder / f"{asset_id}.npz", **(truth | changes))  # type: ignore[arg-type]
+    np.savez(folder / f"{asset_id}.npz", **(truth | changes))
 
 
-def test_exact_alignment_scores_zero_and_one(tmp_path: Path) -> None:
+def scored(folder: Path, asset: dict[str, np.ndarray], **truth: object) -> TruthScore:
+    """Score a store of one asset against its truth."""
+    write_store(folder / "s.zarr", {"a": asset})
+    write_truth(folder / "truth", "a", **truth)
+    (score,) = score_against_truth(folder / "s.zarr", folder / "truth").assets
+    return score
+
+
+def test_exact_alignment_scores_zero_and_one(tmp_path):
     write_store(tmp_path / "s.zarr", {"a": rod_asset()})
     write_truth(tmp_path / "truth", "a")
     report = score_against_truth(tmp_path / "s.zarr", tmp_path / "truth")
@@ -130,59 +96,48 @@ def test_exact_alignment_scores_zero_and_one(tmp_path: Path) -> None:
     assert report.missing == ()
 
 
-def test_shift_by_two_voxels_is_a_displacement_of_two(tmp_path: Path) -> None:
+def test_shift_by_two_voxels_is_a_displacement_of_two(tmp_path):
     shift = np.eye(4)
     shift[0, 3] = 2 / 64
-    write_store(tmp_path / "s.zarr", {"a": rod_asset(transform=shift)})
-    write_truth(tmp_path / "truth", "a")
-    (score,) = score_against_truth(tmp_path / "s.zarr", tmp_path / "truth").assets
-    assert score.displacement == pytest.approx(2.0)
+    assert scored(tmp_path, rod_asset(transform=shift)).displacement == pytest.approx(2.0)
 
 
-def test_displacement_is_measured_in_the_pixieverse_frame(tmp_path: Path) -> None:
+def test_displacement_is_measured_in_the_pixieverse_frame(tmp_path):
     # The SLAT is twice as large, so a shift by two of its voxels is one of the grid's.
     double, shifted = np.diag([2.0, 2.0, 2.0, 1.0]), np.diag([2.0, 2.0, 2.0, 1.0])
     shifted[1, 3] = 2 / 64
-    write_store(tmp_path / "s.zarr", {"a": rod_asset(transform=shifted)})
-    write_truth(tmp_path / "truth", "a", transform=double)
-    (score,) = score_against_truth(tmp_path / "s.zarr", tmp_path / "truth").assets
+    score = scored(tmp_path, rod_asset(transform=shifted), transform=double)
     assert score.displacement == pytest.approx(1.0)
 
 
-def test_wrong_and_missing_labels_both_count(tmp_path: Path) -> None:
+def test_wrong_and_missing_labels_both_count(tmp_path):
     material, valid = ROD_MATERIAL.copy(), np.ones(len(ROD), dtype=bool)
     material[:3] = 6
     valid[3:5] = False
-    write_store(tmp_path / "s.zarr", {"a": rod_asset(material=material, valid=valid)})
-    write_truth(tmp_path / "truth", "a")
-    (score,) = score_against_truth(tmp_path / "s.zarr", tmp_path / "truth").assets
+    score = scored(tmp_path, rod_asset(material=material, valid=valid))
     assert score.label_accuracy == pytest.approx(15 / 20)
     assert score.truth_own == 1.0
     assert score.valid_share == pytest.approx(18 / 20)
 
 
-def test_voxels_without_an_answer_are_not_asked(tmp_path: Path) -> None:
+def test_voxels_without_an_answer_are_not_asked(tmp_path):
     # Four voxels more lie off the rod's end: two within 2 voxels, two beyond.
     longer = np.array([[x, 32, 32] for x in range(20, 44)])
     true_material = np.concatenate([ROD_MATERIAL, np.full(4, 5)]).astype(np.uint8)
     stored = np.concatenate([ROD_MATERIAL, [0, 5, 0, 0]]).astype(np.uint8)
     asset = rod_asset(coords=longer, material=stored, valid=np.ones(24, dtype=bool))
-    write_store(tmp_path / "s.zarr", {"a": asset})
-    write_truth(tmp_path / "truth", "a", material=true_material)
-    (score,) = score_against_truth(tmp_path / "s.zarr", tmp_path / "truth").assets
+    score = scored(tmp_path, asset, material=true_material)
     assert score.label_accuracy == pytest.approx(21 / 22)
 
 
-def test_unannotated_voxels_are_no_answer(tmp_path: Path) -> None:
+def test_unannotated_voxels_are_no_answer(tmp_path):
     grid = rod_asset()["grid"].copy()
     grid[20:26, 32, 32] = 255
-    write_store(tmp_path / "s.zarr", {"a": rod_asset(grid=grid)})
-    write_truth(tmp_path / "truth", "a")
-    (score,) = score_against_truth(tmp_path / "s.zarr", tmp_path / "truth").assets
+    score = scored(tmp_path, rod_asset(grid=grid))
     assert score.truth_own == 1.0  # x = 24, 25 ask their neighbour at 26; the rest is not asked
 
 
-def test_level_figures_leave_symmetric_assets_out() -> None:
+def test_level_figures_leave_symmetric_assets_out():
     scores = [
         TruthScore("a", "", 0, False, 0.1, 1.0, 1.0, 1.0, 0.0, 1.0),
         TruthScore("b", "", 0, False, 0.3, 0.8, 0.9, 0.5, 0.0, 0.9),
@@ -199,7 +154,7 @@ def test_level_figures_leave_symmetric_assets_out() -> None:
     assert level.valid_share == pytest.approx(0.7)
 
 
-def test_right_is_within_a_voxel_and_a_half_of_the_best_similarity() -> None:
+def test_right_is_within_a_voxel_and_a_half_of_the_best_similarity():
     scores = [
         TruthScore("a", "", 5, False, 3.4, 0.9, 1.0, 1.0, 2.0, 0.95),
         TruthScore("b", "", 5, False, 3.5, 0.9, 1.0, 1.0, 2.0, 0.85),
@@ -227,7 +182,7 @@ def long_asset(**changes: np.ndarray) -> dict[str, np.ndarray]:
     return rod_asset(**(looked_up | changes))
 
 
-def test_displacement_is_from_the_true_places(tmp_path: Path) -> None:
+def test_displacement_is_from_the_true_places(tmp_path):
     write_store(tmp_path / "s.zarr", {"a": long_asset()})
     write_long_truth(tmp_path / "truth")
     (score,) = score_against_truth(tmp_path / "s.zarr", tmp_path / "truth").assets
@@ -248,7 +203,7 @@ def test_displacement_is_from_the_true_places(tmp_path: Path) -> None:
     assert score.similarity_displacement == pytest.approx(moved.mean())
 
 
-def test_places_of_the_store_are_what_counts(tmp_path: Path) -> None:
+def test_places_of_the_store_are_what_counts(tmp_path):
     rod_places = (ROD + 0.5) / 64 - 0.5 + [0.0, 0.0, 3 / 64]
     aside = np.array([0.0, 1 / 64, 0.0])
     assets = {"a": long_asset() | {"place": LONG_PLACES + aside}}
@@ -261,7 +216,7 @@ def test_places_of_the_store_are_what_counts(tmp_path: Path) -> None:
     assert second.similarity_displacement == 0.0
 
 
-def test_places_that_do_not_fit_are_named(tmp_path: Path) -> None:
+def test_places_that_do_not_fit_are_named(tmp_path):
     write_store(tmp_path / "s.zarr", {"a": long_asset()})
     write_long_truth(tmp_path / "truth", places=LONG_PLACES[:-1])
     with pytest.raises(InputError, match=r"a\.npz: places has shape \(39, 3\)"):
@@ -308,7 +263,7 @@ def independent_score(store: Path, truth_path: Path) -> dict[str, float]:
     }
 
 
-def test_scores_of_a_built_demo_equal_an_independent_computation(tmp_path: Path) -> None:
+def test_scores_of_a_built_demo_equal_an_independent_computation(tmp_path):
     demo = slatprep.make_demo(tmp_path / "demo", assets=1, seed=5, levels=(7,))
     parameters = BuildParameters(
         pixieverse=PixieverseSource(root=demo.directory / "pixieverse"),
@@ -325,21 +280,19 @@ def test_scores_of_a_built_demo_equal_an_independent_computation(tmp_path: Path)
             assert getattr(score, name) == pytest.approx(value, abs=1e-6), name
 
 
-def test_a_printed_score_fits_a_terminal(tmp_path: Path) -> None:
+def test_a_printed_score_fits_a_terminal(tmp_path):
     write_store(tmp_path / "s.zarr", {"a": long_asset(), "b": rod_asset()})
     write_long_truth(tmp_path / "truth")
     write_truth(tmp_path / "truth", "b")
-    command = ["score", str(tmp_path / "s.zarr"), str(tmp_path / "truth")]
-    printed = CliRunner().invoke(slatprep_command, command)
-    assert printed.exit_code == 0
-    assert max(map(len, printed.output.splitlines())) <= 80
-    assert [line[:2] for line in printed.output.splitlines()].count("L5") == 2
-    document = json.loads(CliRunner().invoke(slatprep_command, [*command, "--json"]).output)
-    (level,) = [entry for entry in document["levels"] if entry["level"] == 5]
+    words = ("score", tmp_path / "s.zarr", tmp_path / "truth")
+    lines = run(*words).output.splitlines()
+    assert max(map(len, lines)) <= 80
+    assert [line[:2] for line in lines].count("L5") == 2
+    (level,) = [entry for entry in document(*words)["levels"] if entry["level"] == 5]
     assert level["similarity_displacement"] == pytest.approx(level["displacement_median"])
 
 
-def test_assets_without_row_or_truth(tmp_path: Path) -> None:
+def test_assets_without_row_or_truth(tmp_path):
     write_store(tmp_path / "s.zarr", {"a": rod_asset(), "b": rod_asset()})
     write_truth(tmp_path / "truth", "b")
     write_truth(tmp_path / "truth", "c")
@@ -348,7 +301,7 @@ def test_assets_without_row_or_truth(tmp_path: Path) -> None:
     assert report.missing == ("c",)
 
 
-def test_truth_that_does_not_fit_is_named(tmp_path: Path) -> None:
+def test_truth_that_does_not_fit_is_named(tmp_path):
     write_store(tmp_path / "s.zarr", {"a": rod_asset()})
     with pytest.raises(InputError, match="no truth"):
         score_against_truth(tmp_path / "s.zarr", tmp_path)

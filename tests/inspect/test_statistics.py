@@ -1,7 +1,6 @@
 """What `slatprep stats` counts, against numpy over the arrays themselves."""
 
 import csv
-import json
 import math
 import re
 import shutil
@@ -11,10 +10,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 import zarr
-from click.testing import CliRunner, Result
+from support.commands import document, refused, run
 
 from slatprep import open_store
-from slatprep.cli.commands import slatprep
 from slatprep.cli.output import as_json
 from slatprep.inspect.distributions import (
     QUANTILES,
@@ -132,7 +130,7 @@ def only_present(found: StoreStatistics) -> StoreStatistics:
 
 
 @pytest.mark.parametrize("weight", ["voxel", "asset"])
-def test_every_group_is_as_numpy_has_it(store: Path, weight) -> None:
+def test_every_group_is_as_numpy_has_it(store, weight):
     found = store_statistics(open_store(store), weight=weight)
     hold(store, only_present(found), weight)
     assert found.total.verdicts == {"good": 3, "doubtful": 1, "failed": 1}
@@ -141,7 +139,7 @@ def test_every_group_is_as_numpy_has_it(store: Path, weight) -> None:
     ]  # fmt: skip
 
 
-def test_histograms_add_up_and_the_joint_has_every_pair(store: Path) -> None:
+def test_histograms_add_up_and_the_joint_has_every_pair(store):
     found = store_statistics(open_store(store))
     for side in ("field", "slat"):
         _, material, values = arrays(store, side)
@@ -157,7 +155,7 @@ def test_histograms_add_up_and_the_joint_has_every_pair(store: Path) -> None:
     assert (found.joint.edges[0][0], found.joint.edges[0][-1]) == (span.lo, span.hi)
 
 
-def test_values_that_recur_have_exact_quantiles(mixed_build: BuildSummary) -> None:
+def test_values_that_recur_have_exact_quantiles(mixed_build):
     """Two materials, by hand: most voxels are jelly, of 1e5 Pa, the others metal, of 2e11."""
     found = store_statistics(open_store(mixed_build.store)).total.slat
     assert 0.05 < found.classes["metal"] < 0.45
@@ -169,7 +167,7 @@ def test_values_that_recur_have_exact_quantiles(mixed_build: BuildSummary) -> No
     )
 
 
-def test_filters_choose_assets_and_jobs_change_nothing(store: Path) -> None:
+def test_filters_choose_assets_and_jobs_change_nothing(store):
     opened = open_store(store)
     found = store_statistics(opened, verdicts=("good",), categories=("b",))
     assert (found.assets, found.assets_chosen) == (5, 2)
@@ -179,17 +177,11 @@ def test_filters_choose_assets_and_jobs_change_nothing(store: Path) -> None:
     assert one == two
 
 
-def run(*arguments: object) -> Result:
-    result = CliRunner().invoke(slatprep, ["stats", *map(str, arguments)])
-    assert result.exit_code == 0, result.output
-    return result
-
-
-def test_the_command_prints_and_writes_the_same(store: Path, tmp_path: Path) -> None:
+def test_the_command_prints_and_writes_the_same(store, tmp_path):
     table = tmp_path / "t.csv"
-    document = json.loads(run(store, "--json", "--csv", table).stdout)
-    assert document["total"]["slat"]["voxels"] == len(arrays(store, "slat")[0])
-    assert np.shape(document["joint"]["slat"]) == (64, 64)
+    printed = document("stats", store, "--csv", table)
+    assert printed["total"]["slat"]["voxels"] == len(arrays(store, "slat")[0])
+    assert np.shape(printed["joint"]["slat"]) == (64, 64)
     with table.open(encoding="utf-8", newline="") as file:
         rows = list(csv.DictReader(file))
     (row,) = (
@@ -197,33 +189,30 @@ def test_the_command_prints_and_writes_the_same(store: Path, tmp_path: Path) -> 
         if (row["by"], row["side"], row["property"], row["scale"])
         == ("all", "slat", "density", "log10")
     )  # fmt: skip
-    told = document["total"]["slat"]["properties"]["density"]["log10"]
+    told = printed["total"]["slat"]["properties"]["density"]["log10"]
     assert float(row["50%"]) == told["quantiles"]["50%"] and float(row["mean"]) == told["mean"]
     assert {row["name"] for row in rows if row["by"] == "category"} == {
         "a", "b", "'=b", "(unknown)",
     }  # fmt: skip
-    lines = run(store).stdout.splitlines()
+    lines = run("stats", store).stdout.splitlines()
     assert lines[0] == "5 of 5 assets, weighted by voxel"
     assert max(map(len, lines)) <= 80
 
 
 @pytest.mark.parametrize("kind", ["png", "svg", "pdf"])
-def test_a_picture_is_the_same_each_time_and_takes_any_name(
-    store: Path, tmp_path: Path, kind: str
-) -> None:
-    opened = open_store(store)
-    found = store_statistics(opened)
-    assert draw_statistics(opened, found, kind) == draw_statistics(opened, found, kind)
+def test_a_picture_is_the_same_each_time_and_takes_any_name(store, tmp_path, kind):
     copy = Path(shutil.copytree(store, tmp_path / "s.zarr"))
     group = zarr.open_group(copy, mode="r+")
     group["asset/category"][:] = np.array(["$\\frac", "$$", "b", "x" * 60, "b"], dtype=object)
     file = tmp_path / f"p.{kind}"
-    run(copy, "--picture", file)
+    run("stats", copy, "--picture", file)
     start = {"png": b"\x89PNG", "svg": b"<?xml", "pdf": b"%PDF"}[kind]
     assert file.read_bytes().startswith(start)
+    opened = open_store(copy)
+    assert draw_statistics(opened, store_statistics(opened), kind) == file.read_bytes()
 
 
-def test_axes_have_english_names_and_the_units_of_the_store(store: Path) -> None:
+def test_axes_have_english_names_and_the_units_of_the_store(store):
     opened = open_store(store)
     found = store_statistics(opened)
     own = ("GPa", "g/cm^3", "$1$")
@@ -241,18 +230,17 @@ def test_axes_have_english_names_and_the_units_of_the_store(store: Path) -> None
         assert {one for one in told if one.endswith(("]", "ratio"))} == set(names)
 
 
-def test_nothing_chosen_is_nothing_counted(store: Path, tmp_path: Path) -> None:
-    result = run(store, "--verdict", "failed", "--category", "b", "--picture", tmp_path / "p.png")
-    assert result.stdout.startswith("0 of 5 assets")
-    document = json.loads(run(store, "--verdict", "failed", "--category", "b", "--json").stdout)
-    assert document["total"]["slat"]["properties"]["density"]["si"]["mean"] is None
-    assert document["categories"] == []
+def test_nothing_chosen_is_nothing_counted(store, tmp_path):
+    words = ("stats", store, "--verdict", "failed", "--category", "b")
+    assert run(*words, "--picture", tmp_path / "p.png").stdout.startswith("0 of 5 assets")
+    printed = document(*words)
+    assert printed["total"]["slat"]["properties"]["density"]["si"]["mean"] is None
+    assert printed["categories"] == []
 
 
-def test_wrong_use_is_refused(store: Path) -> None:
+def test_wrong_use_is_refused(store):
     for option, value, told in (
         ("--picture", "p.gif", "none of .png, .svg, .pdf"),
         ("--category", "boat", "boat"),
     ):
-        result = CliRunner().invoke(slatprep, ["stats", str(store), option, value])
-        assert result.exit_code == 2 and told in result.output
+        assert told in refused("stats", store, option, value)

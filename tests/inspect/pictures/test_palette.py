@@ -33,25 +33,25 @@ def lab(colour: str, seen_by: str) -> np.ndarray:
     return np.array([116 * f[1] - 16, 500 * (f[0] - f[1]), 200 * (f[1] - f[2])])
 
 
-def test_every_class_has_a_colour() -> None:
+def test_every_class_has_a_colour():
     assert set(CLASS_COLOURS) == set(MATERIAL_CLASSES)
 
 
 @pytest.mark.parametrize("seen_by", SEEN_BY)
-def test_classes_differ_for_everyone(seen_by: str) -> None:
+def test_classes_differ_for_everyone(seen_by):
     seen = {name: lab(colour, seen_by) for name, colour in CLASS_COLOURS.items()}
     for one, other in itertools.combinations(seen, 2):
         assert np.linalg.norm(seen[one] - seen[other]) > 20, (one, other)
 
 
 @pytest.mark.parametrize("seen_by", SEEN_BY)
-def test_distances_only_darken(seen_by: str) -> None:
+def test_distances_only_darken(seen_by):
     lightness = [lab(colour, seen_by)[0] for colour in palette.DISTANCE_COLOURS]
     assert (np.diff(lightness) < -10).all()
 
 
 @pytest.mark.parametrize("colour", [palette.INK, palette.MUTED, *palette.VERDICT_COLOURS.values()])
-def test_text_stands_out_from_the_paper(colour: str) -> None:
+def test_text_stands_out_from_the_paper(colour):
     def luminance(name: str) -> float:
         value = rgb(name)
         linear = np.where(value <= 0.04045, value / 12.92, ((value + 0.055) / 1.055) ** 2.4)

@@ -16,7 +16,7 @@ def pixel_of(view: View, point: np.ndarray) -> tuple[int, int]:
     return int(np.floor(view.size / 2 - up)), int(np.floor(right + view.size / 2))
 
 
-def test_straight_on_a_voxel_is_one_pixel_where_it_should_be() -> None:
+def test_straight_on_a_voxel_is_one_pixel_where_it_should_be():
     voxel = np.array([[5, 30, 50]])
     cover = draw_voxels(voxel, np.array([RED]), np.eye(4), FRONT).cover
     # Seen from -y: x to the right, z upwards, and one voxel as wide as a pixel.
@@ -25,7 +25,7 @@ def test_straight_on_a_voxel_is_one_pixel_where_it_should_be() -> None:
     assert cover.sum() == 0
 
 
-def test_the_nearer_voxel_is_seen() -> None:
+def test_the_nearer_voxel_is_seen():
     voxels = np.array([[32, 10, 32], [32, 50, 32]])
     colours = np.array([RED, BLUE])
     row, column = pixel_of(FRONT, voxel_centres(voxels[0]))
@@ -40,7 +40,7 @@ def test_the_nearer_voxel_is_seen() -> None:
 
 @pytest.mark.parametrize("azimuth", [0, 37, 300])
 @pytest.mark.parametrize("elevation", [0, 22, 90])
-def test_the_area_covered_is_that_of_the_projected_box(azimuth: int, elevation: int) -> None:
+def test_the_area_covered_is_that_of_the_projected_box(azimuth, elevation):
     size = np.array([10, 20, 30])
     voxels = np.argwhere(np.ones(size)) + 20
     view = View(view_rotation(azimuth, elevation), np.zeros(3), 0.5, 400)
@@ -53,7 +53,7 @@ def test_the_area_covered_is_that_of_the_projected_box(azimuth: int, elevation: 
     assert (drawing.rgb[drawing.cover == 0] == 1).all()
 
 
-def test_a_moved_set_looks_like_the_set_that_was_moved() -> None:
+def test_a_moved_set_looks_like_the_set_that_was_moved():
     rng = np.random.default_rng(0)
     voxels = np.unique(rng.integers(16, 48, (400, 3)), axis=0)
     turned = np.stack([63 - voxels[:, 1], voxels[:, 0], voxels[:, 2]], axis=1)
@@ -65,7 +65,7 @@ def test_a_moved_set_looks_like_the_set_that_was_moved() -> None:
     assert np.abs(here.rgb - there.rgb).mean() < 0.003
 
 
-def test_what_lies_outside_the_picture_is_left_out() -> None:
+def test_what_lies_outside_the_picture_is_left_out():
     far = make_transform(np.eye(3), (3.0, 0.0, 0.0))
     drawing = draw_voxels(np.array([[0, 0, 0]]), np.array([RED]), far, FRONT)
     assert drawing.cover.sum() == 0

@@ -24,7 +24,6 @@ if TYPE_CHECKING:
 @pytest.fixture(scope="session")
 def hostile(mixed_build: BuildSummary, tmp_path_factory: pytest.TempPathFactory) -> Report:
     """Copy `mixed`, put `HOSTILE` wherever data can say anything, and write its page."""
-    assert mixed_build.store is not None
     folder = tmp_path_factory.mktemp("report")
     store = Path(shutil.copytree(mixed_build.store, folder / "mixed.zarr"))
     manifests = Path(shutil.copytree(mixed_build.records.parent, folder / "mixed.manifests"))

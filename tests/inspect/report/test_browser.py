@@ -17,7 +17,6 @@ from PIL import Image
 from support.pages import HOSTILE, Report
 
 from slatprep.inspect.report import write_report
-from slatprep.pipeline.dataset import BuildSummary
 from slatprep.store import open_store
 
 if TYPE_CHECKING:
@@ -68,7 +67,7 @@ def assert_quiet(browser: Chrome) -> None:
     assert [name for name in browser.execute_script(fetched) if name[:5] != "blob:"] == []
 
 
-def test_it_opens_sorts_and_filters(opened: Chrome) -> None:
+def test_it_opens_sorts_and_filters(opened):
     from selenium.webdriver.common.keys import Keys
 
     everything = {"ant", "bear.front", "bear.side", "cup", "dog", "lone", "torn"}
@@ -107,7 +106,7 @@ def test_it_opens_sorts_and_filters(opened: Chrome) -> None:
     assert_quiet(opened)
 
 
-def test_it_opens_an_asset_that_turns(opened: Chrome) -> None:
+def test_it_opens_an_asset_that_turns(opened):
     from selenium.webdriver.common.keys import Keys
 
     click(opened, "[data-sort=id]")
@@ -146,7 +145,7 @@ def test_it_opens_an_asset_that_turns(opened: Chrome) -> None:
     assert_quiet(opened)
 
 
-def test_an_address_may_name_an_asset_in_short(browser: Chrome, hostile: Report) -> None:
+def test_an_address_may_name_an_asset_in_short(browser, hostile):
     def opened_by(name: str) -> str:
         browser.get("about:blank")
         browser.get(f"{hostile.path.as_uri()}#asset={name}")
@@ -166,9 +165,7 @@ def test_an_address_may_name_an_asset_in_short(browser: Chrome, hostile: Report)
         assert told.is_displayed() and name in told.text
 
 
-def test_an_address_opens_an_asset_before_the_page_has_been_read(
-    browser: Chrome, hostile: Report, tmp_path: Path
-) -> None:
+def test_an_address_opens_an_asset_before_the_page_has_been_read(browser, hostile, tmp_path):
     # So much stands between the scripts and the library that the asset is asked for first.
     text = hostile.path.read_text("utf-8")
     assert text.count(LIBRARY) == 1
@@ -188,7 +185,7 @@ def test_an_address_opens_an_asset_before_the_page_has_been_read(
     assert_quiet(browser)
 
 
-def test_an_asset_without_a_picture_says_why_it_is_not_there(opened: Chrome) -> None:
+def test_an_asset_without_a_picture_says_why_it_is_not_there(opened):
     click(opened, "#state-chips [data-state='not built']")
     click(opened, "tbody tr:not(.space)")
     assert "no 3D view" in opened.find_element("id", "message").text
@@ -197,8 +194,8 @@ def test_an_asset_without_a_picture_says_why_it_is_not_there(opened: Chrome) -> 
 
 
 def test_a_deformed_asset_is_found_by_its_model_and_shown_through_its_map(
-    browser: Chrome, deformed_build: BuildSummary, tmp_path: Path
-) -> None:
+    browser, deformed_build, tmp_path
+):
     path = tmp_path / "page.html"
     records = deformed_build.records.parent
     write_report(open_store(deformed_build.store), path, manifests=records)
@@ -233,9 +230,7 @@ def test_a_deformed_asset_is_found_by_its_model_and_shown_through_its_map(
     assert_quiet(browser)
 
 
-def test_tied_placements_are_stepped_through(
-    browser: Chrome, mixed_build: BuildSummary, tmp_path: Path
-) -> None:
+def test_tied_placements_are_stepped_through(browser, mixed_build, tmp_path):
     store = Path(shutil.copytree(mixed_build.store, tmp_path / "mixed.zarr"))
     texts = (group := zarr.open_group(store, mode="r+"))["asset/record"][:]
     turned = np.eye(4)
@@ -274,7 +269,7 @@ def test_tied_placements_are_stepped_through(
 
 
 @pytest.mark.parametrize(("theme", "other"), [("dark", "light"), ("light", "dark")])
-def test_light_and_dark(browser: Chrome, hostile: Report, theme: str, other: str) -> None:
+def test_light_and_dark(browser, hostile, theme, other):
     feature = {"name": "prefers-color-scheme", "value": theme}
     browser.execute_cdp_cmd("Emulation.setEmulatedMedia", {"features": [feature]})
     open_page(browser, hostile)
@@ -290,7 +285,7 @@ def test_light_and_dark(browser: Chrome, hostile: Report, theme: str, other: str
     assert_quiet(browser)
 
 
-def test_a_phone_shows_whole_headings_and_numbers(browser: Chrome, hostile: Report) -> None:
+def test_a_phone_shows_whole_headings_and_numbers(browser, hostile):
     phone = {"width": 390, "height": 844, "deviceScaleFactor": 2, "mobile": True}
     browser.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", phone)
     try:

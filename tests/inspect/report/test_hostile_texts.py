@@ -23,7 +23,7 @@ from slatprep.pipeline.dataset import build_store
 from slatprep.store import open_store
 
 if TYPE_CHECKING:
-    from selenium.webdriver import Chrome
+    pass
 
 pytest.importorskip("selenium")
 
@@ -90,7 +90,7 @@ def page(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return out
 
 
-def test_no_text_of_a_store_that_verify_accepts_runs(browser: Chrome, page: Path) -> None:
+def test_no_text_of_a_store_that_verify_accepts_runs(browser, page):
     from selenium.webdriver.support.ui import WebDriverWait
 
     for end in ("", "#asset=0", f"#asset={IN_NAMES}", f"#{HOSTILE}", "#asset=${window.broken=1}"):

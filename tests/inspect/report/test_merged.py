@@ -16,7 +16,7 @@ from slatprep.pipeline.dataset import BuildSummary, build_store
 from slatprep.store import open_store
 
 if TYPE_CHECKING:
-    from selenium.webdriver import Chrome
+    pass
 
 FACTORS = {"a": (1.0, 2.0), "b": (1.0, 1.1, 1.0)}
 """What the samples of the objects make of Young's modulus."""
@@ -38,9 +38,7 @@ def merged(make_dataset: MakeDataset, tmp_path: Path) -> BuildSummary:
     return build_store(replace(parameters, pixieverse=source), tmp_path / "s.zarr")
 
 
-def test_assets_say_how_many_annotations_agree(
-    merged: BuildSummary, browser: Chrome, tmp_path: Path
-) -> None:
+def test_assets_say_how_many_annotations_agree(merged, browser, tmp_path):
     path = tmp_path / "page.html"
     store = open_store(str(merged.store))
     write_report(store, path, manifests=merged.records.parent)
@@ -72,9 +70,7 @@ def test_assets_say_how_many_annotations_agree(
     assert browser.get_log("browser") == []
 
 
-def test_a_page_without_merged_labels_has_no_such_columns(
-    make_dataset: MakeDataset, browser: Chrome, tmp_path: Path
-) -> None:
+def test_a_page_without_merged_labels_has_no_such_columns(make_dataset, browser, tmp_path):
     made = build_store(make_dataset("a").parameters(), tmp_path / "s.zarr")
     path = tmp_path / "page.html"
     write_report(open_store(str(made.store)), path, manifests=made.records.parent)

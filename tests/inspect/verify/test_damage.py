@@ -8,7 +8,7 @@ from pathlib import Path
 BENCHMARK = Path(__file__).parents[3] / "benchmarks" / "damage.py"
 
 
-def test_damage_is_found_healed_or_without_meaning() -> None:
+def test_damage_is_found_healed_or_without_meaning():
     command = [sys.executable, str(BENCHMARK), "--flips", "150", "--stores", "30", "--seed", "4"]
     done = subprocess.run(command, check=False, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr

@@ -9,12 +9,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 import zarr
-from click.testing import CliRunner
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from support.synthetic import Dataset
+from support.commands import document, refused, run
 
-from slatprep.cli.commands import slatprep
 from slatprep.errors import StoreError
 from slatprep.inspect.verify import Finding, SourceRoots, verify_store
 from slatprep.inspect.verify.manifests import manifest_findings
@@ -29,7 +27,7 @@ def store(copy: Path) -> Path:
 
 
 def found(store: Path, **options: object) -> tuple[Finding, ...]:
-    return verify_store(store, **options).findings  # type: ignore[arg-type]
+    return verify_store(store, **options).findings
 
 
 def of_file(findings: tuple[Finding, ...], file: str) -> list[Finding]:
@@ -47,7 +45,7 @@ def rewrite(store: Path, array: str, rows: object, values: object) -> None:
     zarr.open_group(store, mode="r+", use_consolidated=False)[array][rows] = values
 
 
-def test_a_sound_store_has_no_findings(mixed_build: BuildSummary) -> None:
+def test_a_sound_store_has_no_findings(mixed_build):
     one, two = (verify_store(mixed_build.store, jobs=jobs) for jobs in (1, 2))
     assert one.ok
     assert one == two
@@ -56,7 +54,7 @@ def test_a_sound_store_has_no_findings(mixed_build: BuildSummary) -> None:
     assert one.manifests == mixed_build.records.parent
 
 
-def test_a_sample_is_looked_at_and_nothing_else(store: Path) -> None:
+def test_a_sample_is_looked_at_and_nothing_else(store):
     assert verify_store(store, sample=2).assets == 2
     assert verify_store(store, sample=9).assets == 5
     ids = open_store(store).ids
@@ -85,21 +83,17 @@ def flip(data: bytearray, byte: int, bit: int) -> None:
 
 
 @pytest.mark.parametrize("name", SHARDS)
-def test_a_flipped_bit_names_the_file_and_the_assets(store: Path, name: str) -> None:
-    change(store, name, lambda data: flip(data, 20, 8))
+@pytest.mark.parametrize(
+    ("byte", "what"), [(20, "chunk 0 is damaged"), (-6, "no sound index")], ids=["chunk", "index"]
+)
+def test_a_flipped_bit_names_the_file_and_the_assets(store, name, byte, what):
+    change(store, name, lambda data: flip(data, byte, 8))
     findings = of_file(found(store), name)
     assert any("its bytes changed" in finding.what for finding in findings)
-    assert any(finding.asset and "chunk 0 is damaged" in finding.what for finding in findings)
+    assert any(finding.asset and what in finding.what for finding in findings)
 
 
-@pytest.mark.parametrize("name", SHARDS)
-def test_a_flipped_bit_of_an_index_is_found(store: Path, name: str) -> None:
-    change(store, name, lambda data: flip(data, -6, 1))
-    findings = of_file(found(store), name)
-    assert any(finding.asset and "no sound index" in finding.what for finding in findings)
-
-
-def test_truncated_shards_are_found(store: Path) -> None:
+def test_truncated_shards_are_found(store):
     sizes = {name: (store / name).stat().st_size for name in SHARDS}
     for name in SHARDS:
         change(store, name, lambda data: data.__delitem__(slice(-7, None)))
@@ -112,7 +106,7 @@ def test_truncated_shards_are_found(store: Path) -> None:
 @pytest.mark.parametrize(
     "names", [SHARDS, ["asset/id/c/0"], ["asset/fitness/c/0"], ["asset/zarr.json"]]
 )
-def test_deleted_files_are_found(store: Path, names: list[str]) -> None:
+def test_deleted_files_are_found(store, names):
     for name in names:
         (store / name).unlink()
     all_found = found(store)
@@ -121,7 +115,7 @@ def test_deleted_files_are_found(store: Path, names: list[str]) -> None:
         assert any(finding.what.startswith("is missing") for finding in findings), name
 
 
-def test_swapped_shards_are_named_as_such(store: Path) -> None:
+def test_swapped_shards_are_named_as_such(store):
     """Each is sound in itself: every checksum within is right."""
     first, second = store / "voxel/feats/c/0/0", store / "voxel/feats/c/1/0"
     first.rename(store / "aside")
@@ -134,14 +128,14 @@ def test_swapped_shards_are_named_as_such(store: Path) -> None:
         assert findings[0].what == "holds what belongs in voxel/feats/c/1/0"
 
 
-def test_an_extra_file_is_found(store: Path) -> None:
+def test_an_extra_file_is_found(store):
     shutil.copy(store / "voxel/feats/c/1/0", store / "voxel/feats/c/99")
     (finding,) = found(store)
     assert finding.file == "voxel/feats/c/99"
     assert finding.what == "belongs to no array"
 
 
-def test_a_link_in_place_of_a_file_is_found(store: Path, tmp_path: Path) -> None:
+def test_a_link_in_place_of_a_file_is_found(store, tmp_path):
     shard = store / "voxel/feats/c/1/0"
     shard.rename(tmp_path / "elsewhere")
     shard.symlink_to(tmp_path / "elsewhere")
@@ -179,22 +173,20 @@ def test_a_link_in_place_of_a_file_is_found(store: Path, tmp_path: Path) -> None
         ("asset/engine", 0, "other", "'other'"),
     ],
 )
-def test_values_out_of_the_contract_are_found(
-    store: Path, array: str, rows: object, value: object, what: str
-) -> None:
+def test_values_out_of_the_contract_are_found(store, array, rows, value, what):
     rewrite(store, "asset/model", 0, "similarity")
     rewrite(store, array, rows, value)
     findings = of_file(found(store), array)
     assert any(what in f.what and (f.asset or "offset" in array) for f in findings), findings
 
 
-def test_a_voxel_that_is_not_valid_but_labelled_is_found(store: Path) -> None:
+def test_a_voxel_that_is_not_valid_but_labelled_is_found(store):
     rewrite(store, "voxel/valid", 4, False)
     files = {finding.file for finding in found(store) if finding.asset == "ant"}
     assert {"voxel/material", "voxel/properties"} <= files
 
 
-def test_another_confidence_of_a_voxel_is_found(store: Path) -> None:
+def test_another_confidence_of_a_voxel_is_found(store):
     asset = open_store(store).asset("ant")
     assert asset.valid[7] and abs(asset.confidence[7] - 0.5) > 0.1
     rewrite(store, "voxel/confidence", 7, 0.5)
@@ -205,7 +197,7 @@ def test_another_confidence_of_a_voxel_is_found(store: Path) -> None:
     assert "today's code" not in findings[0].expected
 
 
-def test_a_confidence_that_other_code_made_is_told_as_such(store: Path) -> None:
+def test_a_confidence_that_other_code_made_is_told_as_such(store):
     """Each release may have weights of its own."""
     record = json.loads(str(open_store(store).read_rows("asset/record", 0, 1)[0]))
     rewrite(store, "asset/record", 0, json.dumps(record | {"code": "0" * 64}))
@@ -214,13 +206,13 @@ def test_a_confidence_that_other_code_made_is_told_as_such(store: Path) -> None:
     assert "by today's code; another made the store" in finding.expected
 
 
-def test_a_row_that_its_record_does_not_tell_of_is_found(store: Path) -> None:
+def test_a_row_that_its_record_does_not_tell_of_is_found(store):
     rewrite(store, "asset/fitness", 0, 0.123)
     findings = [f for f in found(store) if f.file == "asset/record"]
     assert [(f.asset, f.what.startswith("fitness is ")) for f in findings] == [("ant", True)]
 
 
-def test_a_record_that_breaks_its_schema_is_found(store: Path) -> None:
+def test_a_record_that_breaks_its_schema_is_found(store):
     record = json.loads(str(open_store(store).read_rows("asset/record", 1, 2)[0]))
     record["sources"][0]["sha256"] = "beef"
     rewrite(store, "asset/record", 1, json.dumps(record))
@@ -233,7 +225,7 @@ def test_a_record_that_breaks_its_schema_is_found(store: Path) -> None:
 @pytest.mark.parametrize(
     ("group", "key"), [("sources", "size"), ("candidates", "index"), ("counts", "valid")]
 )
-def test_a_number_beyond_counting_is_a_finding(store: Path, group: str, key: str) -> None:
+def test_a_number_beyond_counting_is_a_finding(store, group, key):
     record = json.loads(str(open_store(store).read_rows("asset/record", 0, 1)[0]))
     place = record["alignment"][group] if group == "candidates" else record[group]
     (place[0] if isinstance(place, list) else place)[key] = 10**30
@@ -241,17 +233,15 @@ def test_a_number_beyond_counting_is_a_finding(store: Path, group: str, key: str
     assert any(key in f.what for f in of_file(found(store), "asset/record"))
 
 
-def test_a_coordinate_beyond_the_grid_is_refused_wherever_an_asset_is_read(
-    store: Path, tmp_path: Path
-) -> None:
+def test_a_coordinate_beyond_the_grid_is_refused_wherever_an_asset_is_read(store, tmp_path):
     rewrite(store, "voxel/coords", 3, 70)
     with pytest.raises(StoreError, match=r"voxel/coords: a coordinate above 63; expected 0 to 63"):
         open_store(store).asset("ant")
-    check = ["check-alignment", "--store", str(store), "--asset", "ant", "--picture", "none"]
-    export = ["export", str(store), "--format", "ply", "--out", str(tmp_path / "x")]
-    for words in (check, export):
-        done = CliRunner().invoke(slatprep, words)
-        assert done.exit_code == 1 and "a coordinate above 63" in done.stderr, done.output
+    for words in (
+        ("check-alignment", "--store", store, "--asset", "ant", "--picture", "none"),
+        ("export", store, "--format", "ply", "--out", tmp_path / "x"),
+    ):
+        assert "a coordinate above 63" in refused(*words, code=1)
 
 
 def edit_json(path: Path, edit: Callable[[dict], object]) -> None:
@@ -268,19 +258,21 @@ def edit_json(path: Path, edit: Callable[[dict], object]) -> None:
         (lambda d: d["attributes"]["normalization"]["density"].update(lo=99), "normalization"),
         (lambda d: d["attributes"]["build"].update(name="other"), "the attributes changed"),
         (lambda d: d.pop("consolidated_metadata"), "has no consolidated metadata"),
+        *((lambda d, these=these: d["attributes"].update(segments=these), "segments")
+          for these in ([0, 4, 4], [0, 1], [], [0.0], [False], None, "0")),
     ],
-)
-def test_edited_root_metadata_are_found(store: Path, edit: Callable, what: str) -> None:
+)  # fmt: skip
+def test_edited_root_metadata_are_found(store, edit, what):
     edit_json(store / "zarr.json", edit)
     assert any(what in finding.what for finding in of_file(found(store), "zarr.json"))
 
 
-def test_a_root_that_is_no_json_is_a_finding(store: Path) -> None:
+def test_a_root_that_is_no_json_is_a_finding(store):
     (store / "zarr.json").write_text("{")
     assert [finding.file for finding in found(store)] == ["zarr.json"]
 
 
-def test_an_edited_repetition_within_the_consolidated_metadata_is_found(store: Path) -> None:
+def test_an_edited_repetition_within_the_consolidated_metadata_is_found(store):
     def edit(document: dict) -> None:
         copy = document["consolidated_metadata"]["metadata"]["voxel"]
         copy["consolidated_metadata"]["must_undurstand"] = False
@@ -294,7 +286,7 @@ def test_an_edited_repetition_within_the_consolidated_metadata_is_found(store: P
     ("key", "value"),
     [("shape", [7]), ("data_type", "float32"), ("dimension_names", ["row"]), ("fill_value", 1.0)],
 )
-def test_edited_metadata_of_an_array_are_found(store: Path, key: str, value: object) -> None:
+def test_edited_metadata_of_an_array_are_found(store, key, value):
     edit_json(store / "asset/fitness/zarr.json", lambda document: document.update({key: value}))
     findings = of_file(found(store), "asset/fitness/zarr.json")
     assert any("differs from its copy" in finding.what for finding in findings)
@@ -334,24 +326,12 @@ def the_codec(metadata: dict, name: str) -> dict:
         ("asset/property", lambda d: the_codec(d, "zstd").update(configuration={}), "zstd"),
     ],
 )
-def test_forged_metadata_of_an_array_are_found(
-    store: Path, array: str, edit: Callable, what: str
-) -> None:
+def test_forged_metadata_of_an_array_are_found(store, array, edit, what):
     findings = of_file(forged(store, array, edit), f"{array}/zarr.json")
     assert any(what in finding.what for finding in findings), findings
 
 
-@pytest.mark.parametrize("segments", [[0, 4, 4], [0, 1], [], [0.0], [False], None, "0"])
-def test_forged_segments_are_found(store: Path, segments: object) -> None:
-    def edit(document: dict) -> None:
-        document["attributes"]["segments"] = segments
-
-    edit_json(store / "zarr.json", edit)
-    findings = of_file(found(store), "zarr.json")
-    assert any("segments" in finding.what for finding in findings), findings
-
-
-def test_edited_manifests_are_found(store: Path) -> None:
+def test_edited_manifests_are_found(store):
     records = store.with_suffix(".manifests") / "assets.jsonl"
     lines = records.read_text().splitlines()
     records.write_text("\n".join(line.replace('"cup"', '"cop"') for line in lines) + "\n")
@@ -378,7 +358,7 @@ OF_THE_STORE: list[tuple[str, object]] = [
 """Entries of build.json that the store says as well, and others."""
 
 
-def test_what_build_json_says_of_the_store_is_compared(store: Path) -> None:
+def test_what_build_json_says_of_the_store_is_compared(store):
     build, opened = store.with_suffix(".manifests") / "build.json", open_store(store)
     sound = build.read_text()
     for entry, value in OF_THE_STORE:
@@ -392,7 +372,7 @@ def test_what_build_json_says_of_the_store_is_compared(store: Path) -> None:
         assert [one.file for one in manifest_findings(opened, build.parent)] == [str(build)], entry
 
 
-def test_changed_and_missing_sources_are_found(store: Path, mixed: Dataset, tmp_path: Path) -> None:
+def test_changed_and_missing_sources_are_found(store, mixed, tmp_path):
     parameters = mixed.parameters()
     roots = SourceRoots(tmp_path / "pixieverse", tmp_path / "slat")
     shutil.copytree(parameters.pixieverse.root, roots.pixieverse)
@@ -400,11 +380,8 @@ def test_changed_and_missing_sources_are_found(store: Path, mixed: Dataset, tmp_
     result = verify_store(store, sources=True, roots=roots)
     assert result.ok
     assert result.sources == 10
-    grid = next(path for path in roots.pixieverse.rglob("*.npy") if "ant" in str(path))
-    data = bytearray(grid.read_bytes())
-    data[1000] ^= 1
-    grid.write_bytes(data)
-    slat = next(path for path in roots.slat.rglob("*cup*") if path.is_file())
+    grid, slat = roots.pixieverse / "ant/sample_0/material_grid.npy", roots.slat / "cup.npz"
+    change(grid.parent, grid.name, lambda data: flip(data, 1000, 1))
     slat.unlink()
     findings = found(store, sources=True, roots=roots)
     assert [(f.file, f.asset, f.what) for f in findings] == [
@@ -413,18 +390,14 @@ def test_changed_and_missing_sources_are_found(store: Path, mixed: Dataset, tmp_
     ]
 
 
-def test_a_second_look_remembers_nothing_of_the_first(
-    store: Path, mixed: Dataset, tmp_path: Path
-) -> None:
+def test_a_second_look_remembers_nothing_of_the_first(store, mixed, tmp_path):
     parameters = mixed.parameters()
     roots = SourceRoots(parameters.pixieverse.root, tmp_path / "slat")
     shutil.copytree(parameters.slat.root, roots.slat)
     assert verify_store(store, roots=roots, sources=True).ok
     slat = roots.slat / "ant.npz"
     times = slat.stat().st_atime_ns, slat.stat().st_mtime_ns
-    data = bytearray(slat.read_bytes())
-    data[300] ^= 1
-    slat.write_bytes(data)
+    change(roots.slat, "ant.npz", lambda data: flip(data, 300, 1))
     os.utime(slat, ns=times)
     rewrite(store, "asset/id", 4, "zebra")
     findings = found(store, roots=roots, sources=True)
@@ -432,22 +405,19 @@ def test_a_second_look_remembers_nothing_of_the_first(
     assert any(finding.asset == "zebra" for finding in findings)
 
 
-def test_sources_that_nobody_knows_of_are_asked_for(store: Path) -> None:
+def test_sources_that_nobody_knows_of_are_asked_for(store):
     shutil.rmtree(store.with_suffix(".manifests"))
     assert verify_store(store).ok
     with pytest.raises(StoreError, match="--pixieverse and --slat"):
         verify_store(store, sources=True)
 
 
-def test_the_command_names_findings_and_sets_the_exit_code(store: Path) -> None:
-    good = CliRunner().invoke(slatprep, ["verify", str(store), "-q"])
-    assert (good.exit_code, good.stdout) == (0, f"{store}: nothing is wrong\n")
+def test_the_command_names_findings_and_sets_the_exit_code(store):
+    assert run("verify", store, "-q").stdout == f"{store}: nothing is wrong\n"
     (store / "voxel/feats/c/1/0").unlink()
-    bad = CliRunner().invoke(slatprep, ["verify", str(store), "--json", "-q"])
-    assert bad.exit_code == 1
-    document = json.loads(bad.stdout)
-    assert document["ok"] is False
-    assert {"voxel/feats/c/1/0"} == {finding["file"] for finding in document["findings"]}
+    told = document("verify", store, "-q", code=1)
+    assert told["ok"] is False
+    assert {"voxel/feats/c/1/0"} == {finding["file"] for finding in told["findings"]}
 
 
 def meaning(path: Path) -> object:
@@ -456,7 +426,6 @@ def meaning(path: Path) -> object:
 
 @pytest.fixture(scope="module")
 def shared(mixed_build: BuildSummary, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    assert mixed_build.store is not None
     return shutil.copytree(mixed_build.store, tmp_path_factory.mktemp("flipped") / "s.zarr")
 
 
@@ -467,7 +436,7 @@ def shared(mixed_build: BuildSummary, tmp_path_factory: pytest.TempPathFactory) 
     suppress_health_check=[HealthCheck.function_scoped_fixture],
 )
 @given(data=st.data())
-def test_any_changed_byte_is_found(shared: Path, data: st.DataObject) -> None:
+def test_any_changed_byte_is_found(shared, data):
     """Of the root's zarr.json only the layout may change: spaces between its words."""
     names = sorted(local_files(shared))
     name = data.draw(st.sampled_from(names))
