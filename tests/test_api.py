@@ -8,7 +8,6 @@ import pkgutil
 import re
 import subprocess
 import sys
-from pathlib import Path
 from types import ModuleType
 
 import numpy as np
@@ -33,7 +32,7 @@ def run(script: str) -> str:
     return done.stdout
 
 
-def test_import_is_light() -> None:
+def test_import_is_light():
     loaded = run(
         "import sys; before = set(sys.modules); import slatprep; dir(slatprep)\n"
         "print(*{name.partition('.')[0] for name in set(sys.modules) - before})"
@@ -43,7 +42,7 @@ def test_import_is_light() -> None:
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_every_name_is_there_and_documented(name: str) -> None:
+def test_every_name_is_there_and_documented(name):
     value = getattr(slatprep, name)
     assert name in dir(slatprep)
     if callable(value):
@@ -53,16 +52,16 @@ def test_every_name_is_there_and_documented(name: str) -> None:
         assert "Parameters\n---" in documented and "Returns\n---" in documented, name
 
 
-def test_the_version_is_that_of_the_package() -> None:
+def test_the_version_is_that_of_the_package():
     assert slatprep.__version__ == importlib.metadata.version("slatprep")
 
 
-def test_an_unknown_name_is_an_attribute_error() -> None:
+def test_an_unknown_name_is_an_attribute_error():
     with pytest.raises(AttributeError, match="open_stoer"):
         slatprep.open_stoer  # noqa: B018
 
 
-def test_names_stay_what_they_are_whatever_is_imported_first() -> None:
+def test_names_stay_what_they_are_whatever_is_imported_first():
     # A submodule of the same name would take a function's place.
     for name in NAMES:
         assert not isinstance(getattr(slatprep, name), ModuleType)
@@ -70,12 +69,12 @@ def test_names_stay_what_they_are_whatever_is_imported_first() -> None:
 
 
 @pytest.mark.parametrize("name", MODULES)
-def test_doctests_run(name: str) -> None:
+def test_doctests_run(name):
     failed, _ = doctest.testmod(importlib.import_module(name))
     assert failed == 0
 
 
-def test_there_are_doctests() -> None:
+def test_there_are_doctests():
     finder = doctest.DocTestFinder()
     examples = [
         test
@@ -89,7 +88,7 @@ def test_there_are_doctests() -> None:
 # -- two voxel sets ---------------------------------------------------------
 
 
-def test_two_voxel_sets_in_any_form_give_the_same_transform() -> None:
+def test_two_voxel_sets_in_any_form_give_the_same_transform():
     asset = make_asset(1)
     occupancy = asset.grid[..., 3] != 7
     batch = np.column_stack([np.zeros(len(asset.coords), int), asset.coords])
@@ -104,7 +103,7 @@ def test_two_voxel_sets_in_any_form_give_the_same_transform() -> None:
             np.testing.assert_allclose(again, first, atol=2e-3)
 
 
-def test_a_field_is_looked_up_at_slat_voxels() -> None:
+def test_a_field_is_looked_up_at_slat_voxels():
     asset = make_asset(2)
     material = asset.grid[..., 3]
     voxels = np.argwhere(material != 7).astype(np.uint8)
@@ -123,7 +122,7 @@ def test_a_field_is_looked_up_at_slat_voxels() -> None:
         np.testing.assert_allclose(found.properties[here], [stuff[1:]] * here.sum(), rtol=1e-6)
 
 
-def test_eight_voxels_of_a_finer_grid_are_placed_and_looked_up_as_the_one_they_fill() -> None:
+def test_eight_voxels_of_a_finer_grid_are_placed_and_looked_up_as_the_one_they_fill():
     asset = make_asset(3)
     material = asset.grid[..., 3]
     voxels = np.argwhere(material != 7).astype(np.uint8)
@@ -161,14 +160,14 @@ def test_eight_voxels_of_a_finer_grid_are_placed_and_looked_up_as_the_one_they_f
         ([[np.nan, 0, 0]], "whole numbers"),
     ],
 )
-def test_what_is_no_voxel_set_is_refused_in_words(voxels: np.ndarray, said: str) -> None:
+def test_what_is_no_voxel_set_is_refused_in_words(voxels, said):
     with pytest.raises(ValueError, match=said):
         slatprep.align_voxels(voxels, [[1, 2, 3]])
     with pytest.raises(ValueError, match=said):
         slatprep.align_voxels([[1, 2, 3]], voxels)
 
 
-def test_normalised_and_back() -> None:
+def test_normalised_and_back():
     rng = np.random.default_rng(0)
     properties = np.column_stack(
         [10 ** rng.uniform(4, 10, 50), 10 ** rng.uniform(2, 3.8, 50), rng.uniform(0.22, 0.44, 50)]
@@ -190,7 +189,7 @@ def test_normalised_and_back() -> None:
         np.testing.assert_allclose(back, properties, rtol=1e-4)
 
 
-def test_type_checkers_see_the_package_from_outside_the_checkout(tmp_path: Path) -> None:
+def test_type_checkers_see_the_package_from_outside_the_checkout(tmp_path):
     script = tmp_path / "script.py"
     script.write_text(
         "import slatprep\n"

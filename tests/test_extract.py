@@ -123,9 +123,7 @@ def run(session: work.Session, extractions: list[work.Extraction], **options: An
     return list(work.extract(session, extractions, **options))
 
 
-def test_latents_are_what_the_pipeline_returns(
-    session: work.Session, images: list[Path], tmp_path: Path
-) -> None:
+def test_latents_are_what_the_pipeline_returns(session, images, tmp_path):
     [result] = run(session, work.list_extractions(images[:1], tmp_path / "slat", [7], False))
     with np.load(tmp_path / "slat" / "cup.npz") as saved:
         coords, feats = saved["coords"], saved["feats"]
@@ -142,9 +140,7 @@ def test_latents_are_what_the_pipeline_returns(
     assert result.voxels == len(coords) and session.pipeline.seen == ["cropped", (518, 518)]
 
 
-def test_provenance_says_how_to_do_it_again(
-    session: work.Session, images: list[Path], tmp_path: Path
-) -> None:
+def test_provenance_says_how_to_do_it_again(session, images, tmp_path):
     import hashlib
 
     run(session, work.list_extractions(images[:1], tmp_path / "slat", [7], False))
@@ -157,9 +153,7 @@ def test_provenance_says_how_to_do_it_again(
     assert record["slat"]["sha256"] == hashlib.sha256(slat).hexdigest()
 
 
-def test_build_store_reads_what_is_extracted(
-    session: work.Session, images: list[Path], tmp_path: Path
-) -> None:
+def test_build_store_reads_what_is_extracted(session, images, tmp_path):
     assert len(run(session, work.list_extractions(images, tmp_path / "slat", [0, 1], False))) == 4
     for name in ("cup", "bear"):
         grid = tmp_path / "pixieverse" / name / "sample_0" / "material_grid.npy"
@@ -178,9 +172,7 @@ def test_build_store_reads_what_is_extracted(
         np.testing.assert_array_equal(store.asset("cup.seed-1").feats, saved["feats"])
 
 
-def test_same_seed_gives_the_same_bytes_and_is_not_drawn_twice(
-    session: work.Session, images: list[Path], tmp_path: Path
-) -> None:
+def test_same_seed_gives_the_same_bytes_and_is_not_drawn_twice(session, images, tmp_path):
     for folder in ("a", "b"):
         run(session, work.list_extractions(images, tmp_path / folder, [3], False))
     for path in (tmp_path / "a").iterdir():
@@ -193,7 +185,7 @@ def test_same_seed_gives_the_same_bytes_and_is_not_drawn_twice(
     assert (tmp_path / "a" / "cup.npz").read_bytes() == (tmp_path / "b" / "cup.npz").read_bytes()
 
 
-def test_names(tmp_path: Path) -> None:
+def test_names(tmp_path):
     images = [tmp_path / "bear" / "front.png", tmp_path / "bear" / "side.png"]
 
     def names(seeds: list[int], by_folder: bool) -> list[str]:
@@ -210,7 +202,7 @@ def test_names(tmp_path: Path) -> None:
         work.list_extractions([tmp_path / ".hidden.png"], tmp_path, [1], False)
 
 
-def test_a_bad_image_does_not_stop_the_others(images: list[Path], tmp_path: Path) -> None:
+def test_a_bad_image_does_not_stop_the_others(images, tmp_path):
     images[0].write_bytes(b"no image")
     torch = Torch()
     session = work.Session(Pipeline(torch), torch, {})
@@ -221,9 +213,7 @@ def test_a_bad_image_does_not_stop_the_others(images: list[Path], tmp_path: Path
     assert isinstance(nothing, InputError) and not (tmp_path / "none" / "bear.npz").exists()
 
 
-def test_an_image_that_trellis_cannot_process_does_not_stop_the_others(
-    images: list[Path], tmp_path: Path
-) -> None:
+def test_an_image_that_trellis_cannot_process_does_not_stop_the_others(images, tmp_path):
     class Failing(Pipeline):
         def sample_slat(self, cond: dict, coords: np.ndarray, *rest: Any) -> Any:
             if self.seen.count((518, 518)) == 1:
@@ -238,9 +228,7 @@ def test_an_image_that_trellis_cannot_process_does_not_stop_the_others(
     assert [path.name for path in (tmp_path / "slat").glob("*.npz")] == ["bear.npz"]
 
 
-def test_an_image_without_foreground_is_named_and_the_rest_are_done(
-    images: list[Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_an_image_without_foreground_is_named_and_the_rest_are_done(images, tmp_path, capsys):
     class Strict(Pipeline):
         """Prints, and finds the box of the foreground as TRELLIS's `preprocess_image` does."""
 
@@ -262,9 +250,7 @@ def test_an_image_without_foreground_is_named_and_the_rest_are_done(
 
 
 @pytest.mark.parametrize("command", ["extract-slat", "decode-slat"])
-def test_without_trellis_the_command_says_what_to_install(
-    command: str, images: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_without_trellis_the_command_says_what_to_install(command, images, tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "trellis.pipelines", None)
     asset = make_asset(0)
     np.savez(tmp_path / "cup.npz", coords=asset.coords, feats=asset.feats)
@@ -277,9 +263,7 @@ def test_without_trellis_the_command_says_what_to_install(
 
 
 @pytest.mark.parametrize("gpu", [True, False])
-def test_command_loads_one_commit_of_the_model(
-    gpu: bool, images: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_command_loads_one_commit_of_the_model(gpu, images, tmp_path, monkeypatch):
     torch, commit = Torch(), "0123abcd"
     torch.gpu = gpu
     pipeline, asked = Pipeline(torch), []

@@ -2,8 +2,6 @@
 
 import json
 import math
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -37,7 +35,7 @@ DECADES = Normalization(
 )
 
 
-def test_by_hand() -> None:
+def test_by_hand():
     # 10^4..10^12: 10^6 lies a quarter of the way, 2 * 0.25 - 1 = -0.5.
     values, clipped = normalize_and_count([[1e6, 1e3, 0.35]], DECADES)
     np.testing.assert_allclose(values, [[-0.5, 0.0, 0.5]], atol=1e-6)
@@ -45,7 +43,7 @@ def test_by_hand() -> None:
     assert values.dtype == np.float32
 
 
-def test_the_ends_are_not_clipped_and_what_lies_beyond_is_counted() -> None:
+def test_the_ends_are_not_clipped_and_what_lies_beyond_is_counted():
     values, clipped = normalize_and_count(
         [[1e4, 1e2, 0.2], [1e12, 1e4, 0.4], [1e3, 1e5, 0.3], [1e13, 1e3, 0.5]], DECADES
     )
@@ -54,13 +52,13 @@ def test_the_ends_are_not_clipped_and_what_lies_beyond_is_counted() -> None:
     assert clipped.tolist() == [2, 1, 1]
 
 
-def test_mapped_values_by_hand_are_not_clipped() -> None:
+def test_mapped_values_by_hand_are_not_clipped():
     # 13 lies a decade above 4..12, an eighth of its width: 1 + 2 / 8.
     values = normalize_mapped([[6.0, 3.0, 0.35], [13.0, 1.0, 0.5]], DECADES)
     np.testing.assert_allclose(values, [[-0.5, 0.0, 0.5], [1.25, -2.0, 2.0]], atol=1e-12)
 
 
-def test_properties_are_mapped_and_brought_back_by_hand() -> None:
+def test_properties_are_mapped_and_brought_back_by_hand():
     properties = [[1e6, 1e3, 0.35], [2e11, 7850.0, 0.28]]
     mapped = to_mapped(properties)
     by_hand = [[6.0, 3.0, 0.35], [11 + np.log10(2), np.log10(7850), 0.28]]
@@ -70,7 +68,7 @@ def test_properties_are_mapped_and_brought_back_by_hand() -> None:
     assert back.dtype == np.float32
 
 
-def test_values_of_other_ranges_by_hand_are_not_clipped() -> None:
+def test_values_of_other_ranges_by_hand_are_not_clipped():
     wide = Normalization(
         (
             PropertyRange("youngs_modulus", True, 0.0, 16.0),
@@ -84,7 +82,7 @@ def test_values_of_other_ranges_by_hand_are_not_clipped() -> None:
     np.testing.assert_allclose(values, [[-0.25, -0.75, -2.0], [0.5, 0.0, 1.0]], atol=1e-12)
 
 
-def test_what_is_normalised_alone_is_what_is_counted_too() -> None:
+def test_what_is_normalised_alone_is_what_is_counted_too():
     rows = [[1e6, 1e3, 0.35], [1e13, 1e5, 0.1]]
     np.testing.assert_array_equal(
         normalize_properties(rows, DECADES), normalize_and_count(rows, DECADES)[0]
@@ -93,12 +91,12 @@ def test_what_is_normalised_alone_is_what_is_counted_too() -> None:
 
 @pytest.mark.parametrize("way", [normalize_properties, denormalize_properties])
 @pytest.mark.parametrize("shape", [(2, 2), (2, 4), (3, 7), ()])
-def test_columns_without_a_range_are_refused(way: Any, shape: tuple[int, ...]) -> None:
+def test_columns_without_a_range_are_refused(way, shape):
     with pytest.raises(ValueError, match=r"expected \(N, 3\), a column each of youngs_modulus"):
         way(np.ones(shape))
 
 
-def test_nan_passes_through_uncounted() -> None:
+def test_nan_passes_through_uncounted():
     values, clipped = normalize_and_count([[np.nan, np.nan, np.nan]], DECADES)
     assert np.isnan(values).all()
     assert clipped.tolist() == [0, 0, 0]
@@ -111,7 +109,7 @@ def test_nan_passes_through_uncounted() -> None:
         max_size=20,
     )
 )
-def test_the_inverse_is_exact_to_float32(rows: list[tuple[float, float, float]]) -> None:
+def test_the_inverse_is_exact_to_float32(rows):
     properties = np.array(rows, dtype=np.float32)
     values, clipped = normalize_and_count(properties, PIXIE_RANGES)
     assert clipped.sum() == 0
@@ -121,13 +119,13 @@ def test_the_inverse_is_exact_to_float32(rows: list[tuple[float, float, float]])
 
 
 @given(st.lists(st.tuples(*[st.floats(-1, 1, width=32)] * 3), min_size=1, max_size=20))
-def test_the_other_way_round_too(rows: list[tuple[float, float, float]]) -> None:
+def test_the_other_way_round_too(rows):
     values = np.array(rows, dtype=np.float32)
     again, _ = normalize_and_count(denormalize_properties(values, DECADES), DECADES)
     np.testing.assert_allclose(again, values, atol=5e-7)
 
 
-def test_pixie_s_ranges_are_the_published_ones() -> None:
+def test_pixie_s_ranges_are_the_published_ones():
     assert [(r.lo, r.hi, r.log10) for r in PIXIE_RANGES.ranges] == [
         (3.0183002948760986, 10.881680488586426, True),
         (1.7031893730163574, 3.871432304382324, True),
@@ -146,7 +144,7 @@ def _field(properties: list[list[float]]) -> MaterialField:
     )
 
 
-def test_dataset_ranges_span_all_assets() -> None:
+def test_dataset_ranges_span_all_assets():
     here = property_extent(_field([[1e5, 100, 0.2], [1e7, 1000, 0.3]]))
     there = property_extent(_field([[1e9, 10, 0.25]]))
     np.testing.assert_allclose(here, [[5, 7], [2, 3], [0.2, 0.3]], atol=1e-7)
@@ -156,7 +154,7 @@ def test_dataset_ranges_span_all_assets() -> None:
                                [(5, 9), (1, 3), (0.2, 0.3)], atol=1e-7)  # fmt: skip
 
 
-def test_one_value_in_all_the_dataset_becomes_zero() -> None:
+def test_one_value_in_all_the_dataset_becomes_zero():
     field = _field([[1e5, 100, 0.3]])
     values, clipped = normalize_and_count(
         field.properties, ranges_from_extents([property_extent(field)])
@@ -166,16 +164,16 @@ def test_one_value_in_all_the_dataset_becomes_zero() -> None:
 
 
 @pytest.mark.parametrize("extents", [np.zeros((0, 3, 2)), np.full((1, 3, 2), np.nan)])
-def test_ranges_of_nothing_are_refused(extents: np.ndarray) -> None:
+def test_ranges_of_nothing_are_refused(extents):
     with pytest.raises(ValueError, match="at least one asset"):
         ranges_from_extents(extents)
 
 
-def test_a_change_is_scaled_as_the_values_are() -> None:
+def test_a_change_is_scaled_as_the_values_are():
     np.testing.assert_allclose(normalize_change([2.0, 1.0, 0.1], DECADES), [0.5, 1.0, 1.0])
 
 
-def test_ranges_are_read_from_toml_and_json(tmp_path: Path) -> None:
+def test_ranges_are_read_from_toml_and_json(tmp_path):
     table = {r.name: {"lo": r.lo, "hi": r.hi} for r in DECADES.ranges}
     (tmp_path / "ranges.json").write_text(json.dumps(table))
     (tmp_path / "ranges.toml").write_text(
@@ -195,7 +193,7 @@ PIXIE_S_FILE = {
 
 
 @pytest.mark.parametrize("form", ["json", "lines", "minima and maxima"])
-def test_pixie_s_own_file_gives_pixie_s_ranges(tmp_path: Path, form: str) -> None:
+def test_pixie_s_own_file_gives_pixie_s_ranges(tmp_path, form):
     percentiles = {
         name.replace("_min", "_p1").replace("_max", "_p99"): value
         for name, value in PIXIE_S_FILE.items()
@@ -229,14 +227,14 @@ def test_pixie_s_own_file_gives_pixie_s_ranges(tmp_path: Path, form: str) -> Non
         "{}",
     ],
 )
-def test_bad_files_of_pixie_s_form_are_named(tmp_path: Path, text: str) -> None:
+def test_bad_files_of_pixie_s_form_are_named(tmp_path, text):
     (tmp_path / "ranges.yaml").write_text(text)
     with pytest.raises(ConfigError, match=r"ranges\.yaml"):
         read_ranges(tmp_path / "ranges.yaml")
 
 
 @pytest.mark.parametrize("name", ["r.json", "r.yaml", "lines.yaml"])
-def test_a_number_that_is_there_twice_is_an_error(tmp_path: Path, name: str) -> None:
+def test_a_number_that_is_there_twice_is_an_error(tmp_path, name):
     numbers: dict[str, object] = {**PIXIE_S_FILE}
     if name == "r.json":
         numbers = {r.name: {"lo": r.lo, "hi": r.hi} for r in DECADES.ranges}
@@ -262,7 +260,7 @@ def test_a_number_that_is_there_twice_is_an_error(tmp_path: Path, name: str) -> 
         "youngs_modulus = 3\n",
     ],
 )
-def test_bad_ranges_name_the_file_and_what_is_expected(tmp_path: Path, text: str) -> None:
+def test_bad_ranges_name_the_file_and_what_is_expected(tmp_path, text):
     (tmp_path / "ranges.toml").write_text(text)
     with pytest.raises(ConfigError, match=r"ranges\.toml"):
         read_ranges(tmp_path / "ranges.toml")

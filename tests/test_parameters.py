@@ -33,11 +33,11 @@ def write(folder: Path, text: str) -> Path:
 
 def message_of(path: Path | None, **arguments: object) -> str:
     with pytest.raises(ConfigError) as caught:
-        load_parameters(path, **arguments)  # type: ignore[arg-type]
+        load_parameters(path, **arguments)
     return str(caught.value)
 
 
-def test_minimal_file_leaves_everything_else_at_its_default(folder: Path) -> None:
+def test_minimal_file_leaves_everything_else_at_its_default(folder):
     parameters = load_parameters(write(folder, MINIMAL))
     assert parameters.name == "mine"
     assert parameters.align == AlignParameters()
@@ -45,8 +45,8 @@ def test_minimal_file_leaves_everything_else_at_its_default(folder: Path) -> Non
 
 
 def test_paths_are_relative_to_the_file_and_not_to_the_working_directory(
-    folder: Path, tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch
-) -> None:
+    folder, tmp_path_factory, monkeypatch
+):
     (folder / "map.csv").touch()
     (folder / "ranges.toml").touch()
     path = write(
@@ -59,12 +59,12 @@ def test_paths_are_relative_to_the_file_and_not_to_the_working_directory(
     assert parameters.normalize.ranges == str(folder / "ranges.toml")
 
 
-def test_a_path_may_be_a_text(folder: Path) -> None:
+def test_a_path_may_be_a_text(folder):
     config = write(folder, MINIMAL)
     assert load_parameters(str(config)) == load_parameters(config)
 
 
-def test_options_win_over_the_file(folder: Path) -> None:
+def test_options_win_over_the_file(folder):
     (folder / "other").mkdir()
     path = write(folder, MINIMAL + '[normalize]\nranges = "dataset"\n')
     other = str(folder / "other")
@@ -76,7 +76,7 @@ def test_options_win_over_the_file(folder: Path) -> None:
     assert parameters.normalize.ranges == "pixie"
 
 
-def test_options_alone_are_enough(folder: Path) -> None:
+def test_options_alone_are_enough(folder):
     parameters = load_parameters(
         None,
         {"pixieverse": {"root": str(folder / "grids")}, "slat": {"root": str(folder / "latents")}},
@@ -84,7 +84,7 @@ def test_options_alone_are_enough(folder: Path) -> None:
     assert parameters.slat.root == folder / "latents"
 
 
-def test_preset_replaces_the_align_table(folder: Path) -> None:
+def test_preset_replaces_the_align_table(folder):
     path = write(folder, MINIMAL + '[align]\nengine = "small_gicp"\nradius = 2.5\n')
     assert load_parameters(path).align.radius == 2.5
     parameters = load_parameters(path, preset="paper")
@@ -92,7 +92,7 @@ def test_preset_replaces_the_align_table(folder: Path) -> None:
     assert parameters.sample == PRESETS["paper"].sample
 
 
-def test_preset_paper_takes_pixie_s_ranges_and_the_default_those_of_the_file(folder: Path) -> None:
+def test_preset_paper_takes_pixie_s_ranges_and_the_default_those_of_the_file(folder):
     path = write(folder, MINIMAL + '[normalize]\nranges = "p2-p98"\n')
     ranges = [load_parameters(path, preset=p).normalize.ranges for p in (None, "default", "paper")]
     assert ranges == ["p2-p98", "p2-p98", "pixie"]
@@ -100,7 +100,7 @@ def test_preset_paper_takes_pixie_s_ranges_and_the_default_those_of_the_file(fol
     assert given.normalize.ranges == "dataset"
 
 
-def test_lists_of_ids_lie_beside_the_definition(folder: Path) -> None:
+def test_lists_of_ids_lie_beside_the_definition(folder):
     (folder / "lists.json").write_text("{}")
     named = '[normalize]\nobjects = "train"\nshares = [1, 0, 0]\nsplit_by = '
     found = load_parameters(write(folder, MINIMAL + named + '"lists.json"\n')).normalize
@@ -110,7 +110,7 @@ def test_lists_of_ids_lie_beside_the_definition(folder: Path) -> None:
         assert load_parameters(path).normalize.split_by == rule
 
 
-def test_patterns_are_lists(folder: Path) -> None:
+def test_patterns_are_lists(folder):
     path = write(folder, MINIMAL + 'pattern = ["a/{id}.npz", "b/{id}.npz"]\n')
     assert load_parameters(path).slat.pattern == ("a/{id}.npz", "b/{id}.npz")
 
@@ -170,9 +170,7 @@ def test_patterns_are_lists(folder: Path) -> None:
         ('[pairing]\nmap = "~nobody-here/x"\n', ("pairing.map", "~nobody-here/x")),
     ],
 )
-def test_fault_is_reported_with_file_key_value_and_what_is_allowed(
-    folder: Path, addition: str, words: tuple[str, ...]
-) -> None:
+def test_fault_is_reported_with_file_key_value_and_what_is_allowed(folder, addition, words):
     path = write(folder, MINIMAL + addition)
     message = message_of(path)
     assert message.startswith(f"{path}: ")
@@ -181,7 +179,7 @@ def test_fault_is_reported_with_file_key_value_and_what_is_allowed(
         assert word in message
 
 
-def test_missing_root_says_both_ways_to_give_it(folder: Path) -> None:
+def test_missing_root_says_both_ways_to_give_it(folder):
     path = write(folder, '[pixieverse]\nroot = "grids"\n')
     message = message_of(path)
     assert "slat.root: not given" in message
@@ -189,37 +187,37 @@ def test_missing_root_says_both_ways_to_give_it(folder: Path) -> None:
     assert "--pixieverse" in message_of(None)
 
 
-def test_missing_root_inside_its_table_names_the_file(folder: Path) -> None:
+def test_missing_root_inside_its_table_names_the_file(folder):
     path = write(folder, '[pixieverse]\nsample = "0"\n[slat]\nroot = "latents"\n')
     assert message_of(path).startswith(f"{path}: pixieverse.root: not given")
 
 
-def test_fault_in_an_option_names_the_option(folder: Path) -> None:
+def test_fault_in_an_option_names_the_option(folder):
     path = write(folder, MINIMAL)
     message = message_of(path, overrides={"slat": {"root": str(folder / "nowhere")}})
     assert message.startswith("option --slat: slat.root: ")
     assert "nowhere does not exist" in message
 
 
-def test_group_that_is_no_table_is_named(folder: Path) -> None:
+def test_group_that_is_no_table_is_named(folder):
     path = write(folder, "slat = 3\n")
     message = message_of(path, overrides={"slat": {"root": "x"}})
     assert message.startswith(f"{path}: slat: ") and "table" in message
 
 
-def test_invalid_toml_names_file_and_line(folder: Path) -> None:
+def test_invalid_toml_names_file_and_line(folder):
     path = write(folder, MINIMAL + "[align\n")
     message = message_of(path)
     assert message.startswith(f"{path}: not valid TOML") and "line 8" in message
 
 
-def test_unreadable_file_is_a_config_error(folder: Path) -> None:
+def test_unreadable_file_is_a_config_error(folder):
     assert "absent.toml" in message_of(folder / "absent.toml")
     path = folder / "binary.toml"
     path.write_bytes(b"\xff\xfe\x00")
     assert "binary.toml" in message_of(path)
 
 
-def test_unknown_preset_lists_those_there_are(folder: Path) -> None:
+def test_unknown_preset_lists_those_there_are(folder):
     message = message_of(write(folder, MINIMAL), preset="papr")
     assert "papr" in message and "paper" in message

@@ -42,7 +42,7 @@ def locked(name: str) -> dict[str, list[Requirement]]:
 @pytest.mark.parametrize(
     ("file", "extras"), [("run.txt", ()), ("test.txt", ("dev",))], ids=["run", "test"]
 )
-def test_what_is_declared_is_locked_within_its_bounds(file: str, extras: tuple[str, ...]) -> None:
+def test_what_is_declared_is_locked_within_its_bounds(file, extras):
     pins = locked(file) | locked("torch.txt")
     for requirement in declared(*extras):
         assert canonicalize_name(requirement.name) in pins, f"{requirement}: run `make lock`"
@@ -57,12 +57,12 @@ def test_what_is_declared_is_locked_within_its_bounds(file: str, extras: tuple[s
             assert requirement.specifier.contains(version), f"{requirement}: run `make lock`"
 
 
-def test_a_run_has_the_versions_that_were_tested() -> None:
+def test_a_run_has_the_versions_that_were_tested():
     tested = locked("test.txt")
     for name, pins in locked("run.txt").items():
         assert list(map(str, pins)) == list(map(str, tested[name]))
 
 
-def test_nothing_for_graphics_cards_is_locked() -> None:
+def test_nothing_for_graphics_cards_is_locked():
     names = set(locked("test.txt"))
     assert not [name for name in names if re.match("nvidia|cuda|triton|torch$", name)]

@@ -28,7 +28,7 @@ def _field() -> MaterialField:
     )
 
 
-def test_values_come_from_the_nearest_voxel_and_end_at_the_limit() -> None:
+def test_values_come_from_the_nearest_voxel_and_end_at_the_limit():
     coords = np.array([[10, 10, 10], [13, 10, 10], [14, 10, 10], [18, 11, 10]], dtype=np.uint8)
     for parameters in (NEAREST, SampleParameters()):
         found = sample(_field(), voxel_centres(coords), parameters)
@@ -41,7 +41,7 @@ def test_values_come_from_the_nearest_voxel_and_end_at_the_limit() -> None:
         assert found.properties.dtype == found.distance.dtype == np.float32
 
 
-def test_voxels_are_carried_by_the_inverse_transform() -> None:
+def test_voxels_are_carried_by_the_inverse_transform():
     # (x, y, z) -> (-y, x, z): field voxel (20, 10, 10) lies at SLAT (53, 20, 10).
     turn = make_transform([[0, -1, 0], [1, 0, 0], [0, 0, 1]])
     found = sample(_field(), places_of(voxel_centres([[53, 20, 10]]), turn), NEAREST)
@@ -49,7 +49,7 @@ def test_voxels_are_carried_by_the_inverse_transform() -> None:
     assert found.distance.tolist() == [0.0]
 
 
-def test_distances_are_in_voxels_of_the_pixieverse_frame() -> None:
+def test_distances_are_in_voxels_of_the_pixieverse_frame():
     # Magnified twice about the cube's centre, SLAT voxel 31 looks at 31.25.
     voxels = np.array([[31, 31, 31]], dtype=np.uint8)
     occupancy = np.zeros((64, 64, 64), dtype=bool)
@@ -61,7 +61,7 @@ def test_distances_are_in_voxels_of_the_pixieverse_frame() -> None:
     np.testing.assert_allclose(found.distance, [np.sqrt(3) / 4], rtol=1e-6)
 
 
-def test_a_vote_changes_the_class_and_takes_that_class_s_nearest_values() -> None:
+def test_a_vote_changes_the_class_and_takes_that_class_s_nearest_values():
     # One voxel of class 0 in a block of class 3: looked at slightly off its
     # centre, its neighbours outvote it.
     block = np.argwhere(np.ones((5, 5, 5), dtype=bool)) + 30
@@ -82,7 +82,7 @@ def test_a_vote_changes_the_class_and_takes_that_class_s_nearest_values() -> Non
 
 
 @pytest.mark.parametrize("method", ["nearest", "vote"])
-def test_labels_alone_are_the_same_labels(method: str) -> None:
+def test_labels_alone_are_the_same_labels(method):
     rng = np.random.default_rng(3)
     voxels = np.unique(rng.integers(20, 40, (500, 3)), axis=0).astype(np.uint8)
     field = MaterialField(
@@ -112,7 +112,7 @@ def _said(material: list[int], modulus: list[float], ratio: list[float]) -> Anno
     return Annotation(values, classes, valid, nothing, np.zeros((len(classes), 3)), likely)
 
 
-def test_annotations_merge_to_mean_spread_and_votes() -> None:
+def test_annotations_merge_to_mean_spread_and_votes():
     """Four voxels: all agree; three differ; a tie of classes; one annotation alone reaches it."""
     one = _said([0, 1, 4, 255], [1e6, 1e5, 1e6, np.nan], [0.3, 0.3, 0.2, np.nan])
     two = _said([0, 1, 2, 255], [1e6, 1e6, 1e6, np.nan], [0.3, 0.3, 0.3, np.nan])
@@ -122,9 +122,6 @@ def test_annotations_merge_to_mean_spread_and_votes() -> None:
     np.testing.assert_allclose(made.properties[:, 2], [0.3, 0.3, 0.25, 0.4], rtol=1e-6)
     assert made.material.tolist() == [0, 1, 2, 5]
     assert made.valid.all()
-    assert made.spread is not None
-    assert made.votes is not None
-    assert made.confidence is not None
     np.testing.assert_allclose(made.spread[:3, 0], [0, np.std([5, 6, 7]), 0], rtol=1e-6)
     np.testing.assert_allclose(made.spread[:3, 2], [0, 0, 0.05], atol=1e-7)
     assert not made.spread[0].any()
@@ -136,7 +133,7 @@ def test_annotations_merge_to_mean_spread_and_votes() -> None:
     )
 
 
-def test_what_an_annotation_does_not_know_is_left_to_the_others() -> None:
+def test_what_an_annotation_does_not_know_is_left_to_the_others():
     """Two know all, the third one property and no class; the last voxel it reaches alone."""
     one = _said([0, 1, 255], [1e6, 1e5, np.nan], [0.3, 0.3, np.nan])
     two = _said([0, 1, 255], [1e6, 1e7, np.nan], [0.3, 0.3, np.nan])
@@ -150,9 +147,6 @@ def test_what_an_annotation_does_not_know_is_left_to_the_others() -> None:
     np.testing.assert_allclose(made.properties[:2, 0], [1e6, 1e6], rtol=1e-6)
     np.testing.assert_allclose(made.properties[:2, 1], 1e3 * 4 ** (1 / 3), rtol=1e-6)
     np.testing.assert_allclose(made.properties[:2, 2], 0.3, rtol=1e-6)
-    assert made.spread is not None
-    assert made.confidence is not None
-    assert made.votes is not None
     np.testing.assert_allclose(made.spread[:2, 0], [0, 1], atol=1e-7)
     np.testing.assert_allclose(made.spread[:2, 1], np.std(np.log10([1, 1, 4])), rtol=1e-6)
     assert np.isnan(made.spread[2]).all()
@@ -161,7 +155,7 @@ def test_what_an_annotation_does_not_know_is_left_to_the_others() -> None:
     np.testing.assert_allclose(made.confidence, 0.8 * np.array([2.5 / 3, 1.5 / 3, 0]), rtol=1e-6)
 
 
-def test_voxels_that_no_annotation_reaches_stay_without_labels() -> None:
+def test_voxels_that_no_annotation_reaches_stay_without_labels():
     nowhere = _said([255], [np.nan], [np.nan])
     made = merge([nowhere, nowhere], PROPERTIES)
     assert not made.valid.any()
@@ -171,7 +165,7 @@ def test_voxels_that_no_annotation_reaches_stay_without_labels() -> None:
     assert made.votes.tolist() == made.confidence.tolist() == [0.0]
 
 
-def test_a_voxel_with_a_class_and_without_one_of_the_properties_is_not_valid() -> None:
+def test_a_voxel_with_a_class_and_without_one_of_the_properties_is_not_valid():
     one = _said([2, 2], [1e6, 1e6], [0.3, 0.3])
     other = _said([2, 2], [1e6, 1e6], [0.3, 0.3])
     for said in (one, other):
@@ -180,11 +174,10 @@ def test_a_voxel_with_a_class_and_without_one_of_the_properties_is_not_valid() -
     assert made.valid.tolist() == [True, False]
     assert made.material.tolist() == [2, UNANNOTATED]
     assert np.isnan(made.properties[1]).all()
-    assert made.spread is not None
     assert np.isnan(made.spread[1]).all()
 
 
-def test_near_is_a_factor_of_two_and_a_fifth_of_the_mean() -> None:
+def test_near_is_a_factor_of_two_and_a_fifth_of_the_mean():
     """Poisson's ratio 0.2 and 0.3, mean 0.25, are off by a fifth; 0.199 and 0.301 by more."""
     likely = []
     for modulus, ratio in (
@@ -195,12 +188,11 @@ def test_near_is_a_factor_of_two_and_a_fifth_of_the_mean() -> None:
     ):
         said = [_said([1], [e], [nu]) for e, nu in zip(modulus, ratio, strict=True)]
         made = merge(said, PROPERTIES)
-        assert made.confidence is not None
         likely.append(float(made.confidence[0]))
     np.testing.assert_allclose(likely, [0.8, 0.4, 0.8, 0.4], rtol=1e-6)
 
 
-def test_columns_of_another_table_are_put_in_those_of_the_store() -> None:
+def test_columns_of_another_table_are_put_in_those_of_the_store():
     said = _said([1, 255], [1e6, np.nan], [0.3, np.nan])
     table = (PROPERTIES[2], PROPERTIES[0])
     said = replace(said, properties=said.properties[:, [2, 0]])

@@ -20,7 +20,7 @@ from slatprep.readers import discover, read_latents
 SOURCE = Path(trellis_latents.__file__)
 
 
-def test_it_is_python_3_10_and_imports_nothing_of_ours() -> None:
+def test_it_is_python_3_10_and_imports_nothing_of_ours():
     tree = ast.parse(SOURCE.read_text("utf-8"), feature_version=(3, 10))
     modules = {
         alias.name.partition(".")[0]
@@ -38,7 +38,7 @@ def test_it_is_python_3_10_and_imports_nothing_of_ours() -> None:
     assert "tomllib" not in modules and "StrEnum" not in SOURCE.read_text("utf-8")
 
 
-def test_it_runs_where_slatprep_lies_and_with_what_lies_where_it_is_run(tmp_path: Path) -> None:
+def test_it_runs_where_slatprep_lies_and_with_what_lies_where_it_is_run(tmp_path):
     # Beside it is slatprep's `inspect`, and a checkout of TRELLIS is not installed.
     (tmp_path / "trellis").mkdir()
     (tmp_path / "trellis" / "__init__.py").write_text("raise RuntimeError('TRELLIS of here')")
@@ -65,8 +65,8 @@ def torch(monkeypatch: pytest.MonkeyPatch) -> Torch:
 
 
 def test_it_writes_what_extract_slat_writes_and_build_store_reads(
-    images: list[Path], torch: Torch, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+    images, torch, tmp_path, monkeypatch
+):
     class Printing(Pipeline):
         def preprocess_image(self, input: Any) -> Any:
             print("[SPARSE] Backend: spconv")
@@ -104,14 +104,12 @@ def test_it_writes_what_extract_slat_writes_and_build_store_reads(
 
 
 @pytest.mark.parametrize(("kind", "side"), [("512", 32), ("1024", 64)])
-def test_trellis2_is_called_in_the_order_of_its_run(
-    kind: str, side: int, images: list[Path], torch: Torch
-) -> None:
+def test_trellis2_is_called_in_the_order_of_its_run(kind, side, images, torch):
     """As `Trellis2ImageTo3DPipeline.run`: preprocess, seed, conditions, voxels, shape latents."""
     calls: list[Any] = []
     coords = Tensor(np.zeros((5, 4), np.int64))
     monkey = torch.manual_seed
-    torch.manual_seed = lambda seed: (calls.append(("seed", seed)), monkey(seed))  # type: ignore[assignment]
+    torch.manual_seed = lambda seed: (calls.append(("seed", seed)), monkey(seed))
 
     class Pipeline2:
         device = "cpu"
@@ -153,9 +151,7 @@ def test_trellis2_is_called_in_the_order_of_its_run(
     assert set(seconds) == set(trellis_latents.STAGES)
 
 
-def test_latents_of_sam3d_are_what_it_hands_to_its_decoder(
-    images: list[Path], torch: Torch
-) -> None:
+def test_latents_of_sam3d_are_what_it_hands_to_its_decoder(images, torch):
     slat = SimpleNamespace(coords=Tensor(np.ones((4, 4))), feats=Tensor(np.full((4, 8), 2.0)))
     decoded: list[Any] = []
 

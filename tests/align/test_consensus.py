@@ -30,7 +30,7 @@ def _tilted(rotation: np.ndarray, seed: int) -> np.ndarray:
     return make_transform(tilt.as_matrix() @ rotation, [0.01, 0.0, 0.02])
 
 
-def test_the_common_rotation_is_found_among_others() -> None:
+def test_the_common_rotation_is_found_among_others():
     transforms = [_tilted(COMMON, seed) for seed in range(12)]
     transforms += [_tilted(start.rotation, 50) for start in distinct_starts()[:8]]
     consensus = find_consensus(transforms)
@@ -52,11 +52,11 @@ def test_the_common_rotation_is_found_among_others() -> None:
         [_tilted(start.rotation, 1) for start in distinct_starts()],  # all different
     ],
 )
-def test_no_rotation_is_common_where_few_agree(transforms: list[np.ndarray]) -> None:
+def test_no_rotation_is_common_where_few_agree(transforms):
     assert find_consensus(transforms) is None
 
 
-def test_just_enough_is_enough() -> None:
+def test_just_enough_is_enough():
     """Five at least, and half of all at least; within 30 degrees of a quarter turn."""
     others = [make_transform(start.rotation) for start in distinct_starts()]
     others = [one for one in others if degrees_between(one[:3, :3], COMMON) > 1]
@@ -73,7 +73,7 @@ def test_just_enough_is_enough() -> None:
         assert found.agreeing == agreeing
 
 
-def test_no_turn_and_half_a_turn_are_angles_too() -> None:
+def test_no_turn_and_half_a_turn_are_angles_too():
     # The trace of such a product may be rounded beyond 3, and beyond -1.
     for rotation in Rotation.random(200, random_state=1):
         turn = rotation.as_matrix()
@@ -89,7 +89,7 @@ def _box() -> np.ndarray:
     return box
 
 
-def test_a_tie_goes_to_the_common_rotation_and_can_be_undone() -> None:
+def test_a_tie_goes_to_the_common_rotation_and_can_be_undone():
     consensus = find_consensus([make_transform(COMMON)] * 6)
     assert consensus is not None
     latents = surface_latents(turned(_box(), COMMON))
@@ -105,7 +105,7 @@ def test_a_tie_goes_to_the_common_rotation_and_can_be_undone() -> None:
         np.testing.assert_array_equal(after.placements[0].transform, before.transform)
 
 
-def test_whichever_placement_came_first_the_same_one_is_chosen() -> None:
+def test_whichever_placement_came_first_the_same_one_is_chosen():
     consensus = find_consensus([make_transform(COMMON)] * 6)
     assert consensus is not None
     latents = surface_latents(turned(_box(), COMMON))
@@ -126,7 +126,7 @@ def test_whichever_placement_came_first_the_same_one_is_chosen() -> None:
     assert len(chosen) == 1
 
 
-def test_a_clear_winner_is_left_alone() -> None:
+def test_a_clear_winner_is_left_alone():
     consensus = find_consensus([make_transform(COMMON)] * 6)
     assert consensus is not None
     latents = surface_latents(chair())
@@ -135,7 +135,7 @@ def test_a_clear_winner_is_left_alone() -> None:
     assert settle(alignment, latents, consensus) is alignment
 
 
-def test_a_planted_rotation_raises_the_share_of_symmetric_assets_placed_right() -> None:
+def test_a_planted_rotation_raises_the_share_of_symmetric_assets_placed_right():
     rng = np.random.default_rng(3)
     right = {"before": 0, "after": 0}
     winners, ambiguous = [], []
@@ -164,7 +164,7 @@ def test_a_planted_rotation_raises_the_share_of_symmetric_assets_placed_right() 
     assert all(settle(a, latents, consensus) is a for a, latents in winners)
 
 
-def test_degrees_between_is_the_angle_of_the_turn() -> None:
+def test_degrees_between_is_the_angle_of_the_turn():
     turn = Rotation.from_rotvec([0, np.radians(33), 0]).as_matrix()
     assert degrees_between(COMMON, turn @ COMMON) == pytest.approx(33)
     assert GRID.shape == (64, 64, 64, 3)
@@ -180,9 +180,7 @@ def _agreeing(count: int, others: int = 0) -> Consensus:
 
 @pytest.mark.parametrize("gain", [-0.1, -0.02, 0.0, 0.03])
 @pytest.mark.parametrize(("agree", "others"), [(5, 5), (19, 1), (400, 0)])
-def test_the_odds_of_the_shapes_are_weighed_by_those_of_the_dataset(
-    agree: int, others: int, gain: float
-) -> None:
+def test_the_odds_of_the_shapes_are_weighed_by_those_of_the_dataset(agree, others, gain):
     """By Bayes' rule, counted over a dataset of the common rotation and of 23 other ones."""
     seen = agree + others + 1
     prior = np.array([agree / seen] + [(others + 1) / seen / 23] * 23)
@@ -192,7 +190,7 @@ def test_the_odds_of_the_shapes_are_weighed_by_those_of_the_dataset(
     assert probability_of_common(_agreeing(agree, others), gain) == pytest.approx(expected)
 
 
-def test_an_asset_that_is_clearly_turned_otherwise_stays() -> None:
+def test_an_asset_that_is_clearly_turned_otherwise_stays():
     """However many assets agree: the shapes say more than that."""
     turn = distinct_starts()[3].rotation
     assert degrees_between(turn, COMMON) > 60
@@ -201,7 +199,7 @@ def test_an_asset_that_is_clearly_turned_otherwise_stays() -> None:
     assert turn_if_likelier(found, field, latents, _agreeing(500), AlignParameters()) is found
 
 
-def test_an_asset_that_fits_as_well_is_turned_as_the_dataset_is() -> None:
+def test_an_asset_that_fits_as_well_is_turned_as_the_dataset_is():
     """A box has four placements; here only a wrong one was found."""
     field, latents = field_of(_box()), surface_latents(turned(_box(), COMMON))
     found = align(field, latents, AlignParameters())
@@ -215,7 +213,7 @@ def test_an_asset_that_fits_as_well_is_turned_as_the_dataset_is() -> None:
     assert after.placements[0].transform.tobytes() == wrong.tobytes()
 
 
-def test_an_asset_that_is_turned_as_the_dataset_is_keeps_its_placement() -> None:
+def test_an_asset_that_is_turned_as_the_dataset_is_keeps_its_placement():
     field, latents = field_of(chair()), surface_latents(turned(chair(), COMMON))
     found = align(field, latents, AlignParameters())
     assert turn_if_likelier(found, field, latents, _agreeing(5), AlignParameters()) is found

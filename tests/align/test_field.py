@@ -3,7 +3,6 @@
 import os
 import subprocess
 import sys
-from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
@@ -11,7 +10,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from support.shapes import GRID, Case, chair, field_of, latents_of, surface_latents, turned
+from support.shapes import GRID, chair, field_of, latents_of, surface_latents, turned
 
 from slatprep.align import align, engine_versions, solver
 from slatprep.align.pair import FINE_SAMPLES
@@ -28,7 +27,7 @@ DEFAULT = AlignParameters()
 
 
 @pytest.mark.parametrize("index", range(0, 24, 5))
-def test_a_quarter_turn_is_found_exactly(index: int) -> None:
+def test_a_quarter_turn_is_found_exactly(index):
     rotation = distinct_starts()[index].rotation
     solid = chair()
     latents = surface_latents(turned(solid, rotation))
@@ -40,7 +39,7 @@ def test_a_quarter_turn_is_found_exactly(index: int) -> None:
 
 
 @pytest.mark.parametrize("half", [(24, 12, 8), (22, 13, 6)])
-def test_the_ties_of_a_box_are_its_three_half_turns(half: tuple[int, int, int]) -> None:
+def test_the_ties_of_a_box_are_its_three_half_turns(half):
     def box(size: np.ndarray, at: tuple[float, float, float]) -> np.ndarray:
         return (abs(GRID - 31.5 - np.array(at)) < size).all(axis=-1)
 
@@ -70,7 +69,7 @@ ACCURACY = {
 
 
 @pytest.mark.parametrize("level", ACCURACY)
-def test_accuracy_on_demo_data(level: int, demo_cases: Callable[[int], list[Case]]) -> None:
+def test_accuracy_on_demo_data(level, demo_cases):
     from slatprep.inspect.score import compare_with_truth
 
     scores = []
@@ -99,7 +98,7 @@ def test_accuracy_on_demo_data(level: int, demo_cases: Callable[[int], list[Case
     assert accuracy > np.mean([score.truth_own for score in scores]) - loss
 
 
-def test_rigid_and_similarity_are_told_apart(demo_cases: Callable[[int], list[Case]]) -> None:
+def test_rigid_and_similarity_are_told_apart(demo_cases):
     for field, latents, _ in demo_cases(1)[:4]:
         assert align(field, latents, DEFAULT).model == "rigid"
     for field, latents, truth in demo_cases(2):
@@ -110,9 +109,7 @@ def test_rigid_and_similarity_are_told_apart(demo_cases: Callable[[int], list[Ca
             assert abs(split_transform(alignment.transform)[2] / scale - 1) < 0.02
 
 
-def test_a_rigid_alignment_has_no_scale_and_bounds_hold(
-    demo_cases: Callable[[int], list[Case]],
-) -> None:
+def test_a_rigid_alignment_has_no_scale_and_bounds_hold(demo_cases):
     field, latents, _ = demo_cases(3)[0]
     rigid = align(field, latents, AlignParameters(model="rigid"))
     assert split_transform(rigid.transform)[2] == pytest.approx(1.0, abs=1e-12)
@@ -120,7 +117,7 @@ def test_a_rigid_alignment_has_no_scale_and_bounds_hold(
     assert 0.98 - 1e-9 <= split_transform(bounded.transform)[2] <= 1.02 + 1e-9
 
 
-def test_a_poor_fit_widens_the_search_and_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_poor_fit_widens_the_search_and_says_so(monkeypatch):
     # All starts point the same wrong way, so only the wider search can help.
     rotation = distinct_starts()[13].rotation
     latents = surface_latents(turned(chair(), rotation))
@@ -131,7 +128,7 @@ def test_a_poor_fit_widens_the_search_and_says_so(monkeypatch: pytest.MonkeyPatc
     assert displacement(alignment.transform, make_transform(rotation), latents.centres) < 0.01
 
 
-def test_two_different_objects_fail_after_a_search_of_all_orientations() -> None:
+def test_two_different_objects_fail_after_a_search_of_all_orientations():
     field, latents = field_of(chair()), surface_latents(BALL)
     alignment = align(field, latents, DEFAULT)
     assert alignment.search == "so3"
@@ -140,7 +137,7 @@ def test_two_different_objects_fail_after_a_search_of_all_orientations() -> None
     assert judgement.verdict is Verdict.FAILED
 
 
-def test_a_missing_part_and_a_stray_part_do_not_pull() -> None:
+def test_a_missing_part_and_a_stray_part_do_not_pull():
     solid = chair()
     latents = surface_latents(solid)
     damaged = solid & (((GRID - np.array([42, 30, 24])) ** 2).sum(axis=-1) > 64)
@@ -149,9 +146,7 @@ def test_a_missing_part_and_a_stray_part_do_not_pull() -> None:
     assert displacement(alignment.transform, np.eye(4), latents.centres) < 0.05
 
 
-def test_the_search_looks_at_no_more_of_a_grid_full_of_voxels(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_the_search_looks_at_no_more_of_a_grid_full_of_voxels(monkeypatch):
     """Counted in samples of either side times poses times steps."""
     work: list[int] = []
     solve = solver.solve
@@ -189,7 +184,7 @@ DEGENERATE = {
 
 
 @pytest.mark.parametrize("name", DEGENERATE)
-def test_odd_shapes_get_a_finite_answer_and_a_verdict(name: str) -> None:
+def test_odd_shapes_get_a_finite_answer_and_a_verdict(name):
     occupancy = np.zeros((64, 64, 64), dtype=bool)
     occupancy[tuple(DEGENERATE[name].T)] = True
     field = field_of(occupancy)
@@ -224,9 +219,7 @@ def test_odd_shapes_get_a_finite_answer_and_a_verdict(name: str) -> None:
     voxels=st.sets(st.tuples(*[st.integers(0, 63)] * 3), min_size=1, max_size=40),
     other=st.sets(st.tuples(*[st.integers(0, 63)] * 3), min_size=1, max_size=40),
 )
-def test_any_two_small_sets_get_a_similarity(
-    voxels: set[tuple[int, int, int]], other: set[tuple[int, int, int]]
-) -> None:
+def test_any_two_small_sets_get_a_similarity(voxels, other):
     occupancy = np.zeros((64, 64, 64), dtype=bool)
     occupancy[tuple(np.array(sorted(voxels)).T)] = True
     alignment = align(field_of(occupancy), latents_of(np.array(sorted(other))), DEFAULT)
@@ -235,7 +228,7 @@ def test_any_two_small_sets_get_a_similarity(
     assert 0.0 <= alignment.quality.overlap <= 1.0
 
 
-def test_the_order_of_voxels_does_not_matter_and_repetition_gives_the_same_bits() -> None:
+def test_the_order_of_voxels_does_not_matter_and_repetition_gives_the_same_bits():
     solid = chair()
     latents = surface_latents(turned(solid, distinct_starts()[7].rotation))
     shuffled = np.random.default_rng(1).permutation(latents.coords)
@@ -246,7 +239,7 @@ def test_the_order_of_voxels_does_not_matter_and_repetition_gives_the_same_bits(
     assert once.candidates == again.candidates
 
 
-def test_threads_do_not_change_a_bit() -> None:
+def test_threads_do_not_change_a_bit():
     code = (
         "from support.shapes import *\n"
         "from slatprep.align import align\n"
@@ -274,7 +267,7 @@ def test_threads_do_not_change_a_bit() -> None:
     assert len(outputs) == 1
 
 
-def test_the_libraries_that_make_the_numbers_are_named() -> None:
+def test_the_libraries_that_make_the_numbers_are_named():
     assert {"numpy", "scipy", "numba"} <= set(engine_versions(DEFAULT))
     assert "small_gicp" in engine_versions(AlignParameters(engine="small_gicp"))
     assert any("open3d" in name for name in engine_versions(AlignParameters(engine="open3d")))

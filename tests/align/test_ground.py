@@ -47,9 +47,7 @@ def slab(thickness: float, degrees: float = 0.0, radius: float = np.inf) -> np.n
     ("thickness", "degrees", "radius", "scale"),
     [(1.0, 0.0, np.inf, 1.0), (3.0, 0.0, np.inf, 1.35), (3.0, 10.0, np.inf, 1.2), (4, 0, 26, 1.35)],
 )
-def test_an_object_on_ground_is_placed_as_without(
-    thickness: float, degrees: float, radius: float, scale: float
-) -> None:
+def test_an_object_on_ground_is_placed_as_without(thickness, degrees, radius, scale):
     latents = surface_latents(larger(chair(), scale))
     field = field_of(chair() | slab(thickness, degrees, radius))
     found = align(field, latents, DEFAULT)
@@ -63,7 +61,7 @@ def test_an_object_on_ground_is_placed_as_without(
     assert judgement.verdict is Verdict.GOOD
 
 
-def test_the_top_of_a_slab_is_found() -> None:
+def test_the_top_of_a_slab_is_found():
     ground = find_ground(surface_of(chair() | slab(3.0)))
     assert ground is not None
     np.testing.assert_allclose(ground.normal, [0, 0, 1], atol=0.01)
@@ -81,7 +79,7 @@ def board() -> np.ndarray:
 
 
 @pytest.mark.parametrize("radius", [np.inf, 30.0])
-def test_the_lid_of_a_low_object_is_not_taken_for_its_ground(radius: float) -> None:
+def test_the_lid_of_a_low_object_is_not_taken_for_its_ground(radius):
     """More voxels go away at the lid than at the slab's top, but nothing lies above it."""
     latents = surface_latents(larger(board(), 1.1))
     field = field_of(board() | slab(2.0, radius=radius))
@@ -92,7 +90,7 @@ def test_the_lid_of_a_low_object_is_not_taken_for_its_ground(radius: float) -> N
     assert displacement(found.transform, true, latents.centres) < 1.5
 
 
-def test_a_flat_part_that_both_sides_have_is_no_ground() -> None:
+def test_a_flat_part_that_both_sides_have_is_no_ground():
     """Where the SLAT shows the layer too, it is the object's, however badly the rest fits."""
     solid = chair() | slab(3.0)
     latents = surface_latents(solid)
@@ -106,7 +104,7 @@ def test_a_flat_part_that_both_sides_have_is_no_ground() -> None:
     assert displacement(found.transform, np.eye(4), latents.centres) < 2.0
 
 
-def test_where_the_sides_fit_no_ground_is_looked_for(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_where_the_sides_fit_no_ground_is_looked_for(monkeypatch):
     def looked(_: object) -> None:
         raise AssertionError("looked for ground")
 
@@ -115,22 +113,22 @@ def test_where_the_sides_fit_no_ground_is_looked_for(monkeypatch: pytest.MonkeyP
     assert found.ground is None
 
 
-def test_a_ball_has_no_layer() -> None:
+def test_a_ball_has_no_layer():
     assert find_ground(surface_of(((GRID - 31.5) ** 2).sum(axis=-1) < 400)) is None
 
 
-def test_nothing_but_a_slab_is_no_ground() -> None:
+def test_nothing_but_a_slab_is_no_ground():
     assert find_ground(surface_of(slab(3.0))) is None
 
 
 @pytest.mark.parametrize("count", [1, 2, 5])
-def test_a_few_voxels_have_no_ground(count: int) -> None:
+def test_a_few_voxels_have_no_ground(count):
     few = np.zeros((64, 64, 64), dtype=bool)
     few[10, 20, 30 : 30 + count] = True
     assert find_ground(surface_of(few)) is None
 
 
-def test_quality_does_not_count_the_ground() -> None:
+def test_quality_does_not_count_the_ground():
     field, latents = field_of(chair() | slab(3.0)), surface_latents(chair())
     found = align(field, latents, DEFAULT)
     assert found.quality.fitness > 0.9
@@ -138,7 +136,7 @@ def test_quality_does_not_count_the_ground() -> None:
     assert measure_quality(field, latents, found.transform, 1.0).fitness < 0.5
 
 
-def test_a_hollow_object_stays_closed_without_its_ground() -> None:
+def test_a_hollow_object_stays_closed_without_its_ground():
     bell = np.zeros((64, 64, 64), dtype=bool)
     bell[20:40, 20:40, 20:44] = True
     solid = bell.copy()
@@ -148,7 +146,7 @@ def test_a_hollow_object_stays_closed_without_its_ground() -> None:
     np.testing.assert_array_equal(above(bell, None), bell)
 
 
-def test_a_placement_that_is_taken_is_fitted_without_the_ground() -> None:
+def test_a_placement_that_is_taken_is_fitted_without_the_ground():
     field, latents = field_of(chair() | slab(3.0)), surface_latents(larger(chair(), 1.2))
     found = align(field, latents, DEFAULT)
     elsewhere = make_transform(Rotation.from_euler("x", 180, degrees=True).as_matrix())

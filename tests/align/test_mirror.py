@@ -47,7 +47,7 @@ def table() -> NDArray[np.bool_]:
 
 
 @pytest.mark.parametrize("axis", [0, 1, 2])
-def test_the_surface_of_a_mirrored_set_is_the_mirrored_surface(axis: int) -> None:
+def test_the_surface_of_a_mirrored_set_is_the_mirrored_surface(axis):
     solid = np.moveaxis(chair(), axis, 0)
     here, there = surface_of(solid).mirrored(), surface_of(solid[::-1])
     np.testing.assert_array_equal(here.distance, there.distance)
@@ -57,31 +57,31 @@ def test_the_surface_of_a_mirrored_set_is_the_mirrored_surface(axis: int) -> Non
 
 
 @pytest.mark.parametrize("seed", [None, 0, 1])
-def test_a_mirrored_annotation_is_told_in_any_rotation(seed: int | None) -> None:
+def test_a_mirrored_annotation_is_told_in_any_rotation(seed):
     solid, mirrored = bitten(chair(), (30, 24, 28)), chair()[::-1]
     other = mirrored if seed is None else turned(mirrored, seed)
     assert gain(solid, other) > 2 * LIMIT
 
 
 @pytest.mark.parametrize("seed", [None, 0, 1])
-def test_an_annotation_that_is_not_mirrored_is_not_told_to_be(seed: int | None) -> None:
+def test_an_annotation_that_is_not_mirrored_is_not_told_to_be(seed):
     solid, other = bitten(chair(), (30, 24, 28)), chair()
     found = gain(solid, other if seed is None else turned(other, seed))
     assert not found > 0.0
 
 
-def test_an_object_that_is_its_own_mirror_image_is_not_told_to_be_mirrored() -> None:
+def test_an_object_that_is_its_own_mirror_image_is_not_told_to_be_mirrored():
     """Bites on both sides, so that neither fits so well that no mirror is tried."""
     for at in ((14, 20, 43), (50, 40, 43)):
         found = gain(bitten(table(), at), table()[:, :, ::-1])
         assert abs(found) < LIMIT
 
 
-def test_what_fits_too_well_is_not_tried() -> None:
+def test_what_fits_too_well_is_not_tried():
     assert np.isnan(gain(chair(), chair()))
 
 
-def test_a_mirrored_annotation_is_not_good_and_is_told_as_what_it_is() -> None:
+def test_a_mirrored_annotation_is_not_good_and_is_told_as_what_it_is():
     """Nearly all of the labels are right: the solid is a mirror image but for a small fin."""
     solid = table()
     solid[44:50, 26:32, 16:40] = True

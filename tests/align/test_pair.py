@@ -100,7 +100,7 @@ def any_poses(seed: int, count: int) -> list[Pose]:
 
 
 @pytest.mark.parametrize("solid", ["a chair", "one voxel"])
-def test_poses_are_apart_by_the_rms_distance_of_the_places_they_look_up(solid: str) -> None:
+def test_poses_are_apart_by_the_rms_distance_of_the_places_they_look_up(solid):
     dot = np.zeros((64, 64, 64), dtype=bool)
     dot[50, 20, 30] = True
     pair = pair_of(dot if solid == "one voxel" else None)
@@ -109,7 +109,7 @@ def test_poses_are_apart_by_the_rms_distance_of_the_places_they_look_up(solid: s
     np.testing.assert_allclose(pair.apart(poses, other), expected, rtol=1e-9)
 
 
-def test_stretched_poses_are_apart_by_the_rms_distance_of_their_places() -> None:
+def test_stretched_poses_are_apart_by_the_rms_distance_of_their_places():
     pair = pair_of()
     poses = any_poses(1, 6)
     rng = np.random.default_rng(1)
@@ -125,7 +125,7 @@ def test_stretched_poses_are_apart_by_the_rms_distance_of_their_places() -> None
     np.testing.assert_allclose(apart, expected, rtol=1e-9, atol=1e-5)
 
 
-def test_a_repeated_placement_is_dropped_for_the_better_one() -> None:
+def test_a_repeated_placement_is_dropped_for_the_better_one():
     """Shifts are as far apart as they say; the second repeats the first, and the third the second.
 
     What is dropped drops no other: the third does not lie near to one that is kept.
@@ -139,7 +139,7 @@ def test_a_repeated_placement_is_dropped_for_the_better_one() -> None:
     assert pair.distinct([within, third, second, just, first]) == [first, third, just]
 
 
-def test_of_others_the_score_does_not_matter_and_the_distance_does() -> None:
+def test_of_others_the_score_does_not_matter_and_the_distance_does():
     pair = pair_of(ball(12.0))
     best = moved_by(0.0, 0.0, 0.0, score=0.5)
     better, near = moved_by(9.0, 0.0, 0.0, score=0.9), moved_by(1.0, 0.0, 0.0, score=0.8)
@@ -148,7 +148,7 @@ def test_of_others_the_score_does_not_matter_and_the_distance_does() -> None:
     assert pair.others(best, [near, best]) == []
 
 
-def test_a_start_lays_centroid_on_centroid() -> None:
+def test_a_start_lays_centroid_on_centroid():
     aside = np.roll(ball(9.0), (12, -8, 5), axis=(0, 1, 2))
     pair = pair_of(np.roll(ball(12.0), (-6, 10, 3), axis=(0, 1, 2)), aside)
     rotations = Rotation.random(5, random_state=2).as_matrix()
@@ -158,7 +158,7 @@ def test_a_start_lays_centroid_on_centroid() -> None:
         np.testing.assert_allclose(looked_up(pose, np.array([[-6.0, 10, 3]])), [[12, -8, 5]])
 
 
-def test_the_size_of_a_start_is_that_of_the_sides_within_its_bounds() -> None:
+def test_the_size_of_a_start_is_that_of_the_sides_within_its_bounds():
     def ratio(radius: float, parameters: AlignParameters) -> float:
         return pair_of(ball(radius), ball(16.0), parameters).size_ratio
 
@@ -169,7 +169,7 @@ def test_the_size_of_a_start_is_that_of_the_sides_within_its_bounds() -> None:
     assert ratio(20.0, AlignParameters(model="rigid")) == 1.0
 
 
-def test_scale_is_refined_only_where_it_is_free() -> None:
+def test_scale_is_refined_only_where_it_is_free():
     turn = Rotation.from_euler("x", 4, degrees=True).as_matrix()
     start = Pose(Similarity(turn, np.ones(3), 1.06))
     for model, free, held in (
@@ -186,7 +186,7 @@ def test_scale_is_refined_only_where_it_is_free() -> None:
             assert found.fitness == 1.0
 
 
-def test_the_score_is_the_mean_kernel_of_both_sides() -> None:
+def test_the_score_is_the_mean_kernel_of_both_sides():
     pair = pair_of(placed(0.8), placed(0.7))
     poses = [Pose(p.similarity._replace(offset=0.2)) for p in any_poses(5, 4)]
     for pose, scored in zip(poses, pair.refine(poses, 10**6, (), 0.01), strict=True):
@@ -197,14 +197,14 @@ def test_the_score_is_the_mean_kernel_of_both_sides() -> None:
         assert scored.fitness == pytest.approx(within.mean(), abs=1e-3)
 
 
-def test_marks_of_a_pose_outlive_its_refinement() -> None:
+def test_marks_of_a_pose_outlive_its_refinement():
     start = replace(moved_by(0.5, 0.0, 0.0), bonus=0.1, standing=0.01)
     (found,) = pair_of().refine([start], 100, (2.0,), 0.01)
     assert (found.bonus, found.standing) == (0.1, 0.01)
 
 
 @pytest.mark.parametrize("step", ["polish", "finish"])
-def test_a_pose_beside_the_truth_is_brought_to_it(step: str) -> None:
+def test_a_pose_beside_the_truth_is_brought_to_it(step):
     """Not only by as much as brings the next step below a voxel."""
     pair = pair_of()
     turn = Rotation.from_euler("xyz", [5, -4, 6], degrees=True).as_matrix()
@@ -218,7 +218,7 @@ def test_a_pose_beside_the_truth_is_brought_to_it(step: str) -> None:
     assert off(pair, found, moved_by(0, 0, 0)) < 0.02
 
 
-def test_a_scale_that_is_not_one_is_kept_and_one_that_is_nearly_one_is_not() -> None:
+def test_a_scale_that_is_not_one_is_kept_and_one_that_is_nearly_one_is_not():
     """Off the cube's centre, so that a scale of one means another shift."""
     aside = (8, -6, 8)
     solid, larger = placed(0.9, at=aside), placed(0.9 * 1.03, at=aside)
@@ -232,7 +232,7 @@ def test_a_scale_that_is_not_one_is_kept_and_one_that_is_nearly_one_is_not() -> 
     np.testing.assert_allclose(same.similarity.shift, 0.0, atol=0.02)
 
 
-def test_a_pose_whose_scale_is_set_to_one_looks_the_middle_up_where_it_did() -> None:
+def test_a_pose_whose_scale_is_set_to_one_looks_the_middle_up_where_it_did():
     pair = pair_of(np.roll(chair(), (10, -9, 4), axis=(0, 1, 2)))
     for pose in any_poses(3, 4):
         same = Pose(pair.at_scale_one(pose.similarity))
@@ -250,7 +250,7 @@ class _Watched(Pair):
     def refine(self, poses: Sequence[Pose], *given: object, **named: object) -> list[Pose]:
         self.refined.append(len(poses))
         self.scales.append({pose.similarity.scale for pose in poses})
-        return super().refine(poses, *given, **named)  # type: ignore[arg-type]
+        return super().refine(poses, *given, **named)
 
 
 def watched(pair: Pair) -> _Watched:
@@ -274,7 +274,7 @@ def scattered(scores: Array) -> list[Pose]:
         ([0.9, 0.2], 2),
     ],
 )
-def test_what_is_polished_is_likely_or_among_the_first(scores: list[float], survive: int) -> None:
+def test_what_is_polished_is_likely_or_among_the_first(scores, survive):
     """Six of the second are within twice `TIE` of its best one."""
     assert pytest.approx(0.03) == TIE
     pair = watched(pair_of())
@@ -282,7 +282,7 @@ def test_what_is_polished_is_likely_or_among_the_first(scores: list[float], surv
     assert pair.refined == [survive]
 
 
-def test_all_orientations_are_searched_and_the_likely_half_of_them_to_the_end() -> None:
+def test_all_orientations_are_searched_and_the_likely_half_of_them_to_the_end():
     turn = Rotation.from_euler("xyz", [40, 25, -70], degrees=True).as_matrix()
     pair = watched(pair_of(placed(0.8, turn), placed(0.8)))
     refined, halfway = search_all(pair)
@@ -294,7 +294,7 @@ def test_all_orientations_are_searched_and_the_likely_half_of_them_to_the_end() 
     assert off(pair, best, Pose(Similarity(turn, np.zeros(3), 1.0))) < 0.5
 
 
-def test_a_stray_part_that_makes_a_side_larger_does_not_hide_the_placement() -> None:
+def test_a_stray_part_that_makes_a_side_larger_does_not_hide_the_placement():
     """Sizes say another scale then; half as many starts are made at scale one beside them."""
     turn = Rotation.from_euler("xyz", [40, 25, -70], degrees=True).as_matrix()
     stray = placed(0.6)
@@ -312,13 +312,13 @@ def test_a_stray_part_that_makes_a_side_larger_does_not_hide_the_placement() -> 
     assert not {1.0} & {pose.similarity.scale for pose in halfway}
 
 
-def test_of_rigid_poses_none_gets_a_scale() -> None:
+def test_of_rigid_poses_none_gets_a_scale():
     pair = pair_of(placed(0.8), placed(1.0), parameters=AlignParameters(model="rigid"))
     refined, halfway = search_all(pair)
     assert {pose.similarity.scale for pose in [*refined, *halfway]} == {1.0}
 
 
-def test_deformed_places_are_apart_from_twice_the_usual_distance_on() -> None:
+def test_deformed_places_are_apart_from_twice_the_usual_distance_on():
     """As a root mean square: half of the points may lie where they did."""
     points = np.random.default_rng(0).normal(size=(40, 3), scale=9.0)
     half = np.arange(40)[:, None] % 2
@@ -353,9 +353,7 @@ def squashed() -> _Squashed:
     return _Squashed()
 
 
-def test_where_shapes_differ_the_order_is_by_what_a_trial_deformation_leaves(
-    squashed: _Squashed,
-) -> None:
+def test_where_shapes_differ_the_order_is_by_what_a_trial_deformation_leaves(squashed):
     pair, poses = squashed.pair, squashed.poses
     assert upright(poses[0]) > 60.0
     _, halfway = search_all(pair)
@@ -376,7 +374,7 @@ def test_where_shapes_differ_the_order_is_by_what_a_trial_deformation_leaves(
         assert pair.apart(found, pose).min() < DISTINCT
 
 
-def test_what_is_far_below_the_best_fit_is_not_tried(squashed: _Squashed) -> None:
+def test_what_is_far_below_the_best_fit_is_not_tried(squashed):
     pair = squashed.pair
     scores = (0.65, 0.56, 0.65 - RANK_WITHIN - 0.01)
     poses = [replace(p, score=s) for p, s in zip(squashed.poses[::2], scores, strict=False)]
@@ -385,9 +383,7 @@ def test_what_is_far_below_the_best_fit_is_not_tried(squashed: _Squashed) -> Non
     assert all(pose.bonus > 0.0 for pose in found[:-1])
 
 
-def test_what_fits_best_as_it_is_takes_part_if_stretching_finds_it_no_more(
-    squashed: _Squashed,
-) -> None:
+def test_what_fits_best_as_it_is_takes_part_if_stretching_finds_it_no_more(squashed):
     """Stretched, a neighbour of it fits better and stands for both."""
     pair, best = squashed.pair, squashed.poses[0]
     turns = Rotation.from_rotvec(0.04 * Rotation.random(20, random_state=6).as_rotvec()).as_matrix()
@@ -400,9 +396,7 @@ def test_what_fits_best_as_it_is_takes_part_if_stretching_finds_it_no_more(
     assert any(off(pair, pose, best) == 0.0 for pose in found)
 
 
-def test_of_contested_placements_the_one_that_fits_once_deformed_is_the_best(
-    squashed: _Squashed,
-) -> None:
+def test_of_contested_placements_the_one_that_fits_once_deformed_is_the_best(squashed):
     pair, poses = squashed.pair, squashed.poses
     chosen = [squashed.upright, *poses[:2]]
     (best, *others), deformed = finish(pair, chosen, rough=True)
@@ -416,9 +410,7 @@ def test_of_contested_placements_the_one_that_fits_once_deformed_is_the_best(
     assert {pose.standing for pose in [best, *others]} == {0.0}
 
 
-def test_of_many_placements_none_is_lost_or_doubled_where_few_are_contested(
-    squashed: _Squashed,
-) -> None:
+def test_of_many_placements_none_is_lost_or_doubled_where_few_are_contested(squashed):
     pair = squashed.pair
     fine = pair.refine(squashed.poses, FINE_SAMPLES, FINE_TAUS, 0.002, size_by_slat=True)
     many = pair.distinct(fine)

@@ -12,7 +12,7 @@ from slatprep.records import Quality, Verdict
 LINE = np.array([[i, 30, 30] for i in range(10)], dtype=np.uint8)
 
 
-def test_a_shift_along_a_line_by_hand() -> None:
+def test_a_shift_along_a_line_by_hand():
     # Ten voxels in a row, carried three and a half voxels along: six have a
     # partner half a voxel away, the seventh lies half a voxel past the end.
     transform = make_transform(np.eye(3), [3.5 / 64, 0, 0])
@@ -23,7 +23,7 @@ def test_a_shift_along_a_line_by_hand() -> None:
     assert quality.overlap == pytest.approx(0.7)
 
 
-def test_distances_are_in_voxels_of_the_slat_frame() -> None:
+def test_distances_are_in_voxels_of_the_slat_frame():
     # Twice as large about the cube's centre: neighbours stand two voxels apart,
     # so every second SLAT voxel is half a voxel from a carried one's centre.
     pixieverse = np.array([[i, 31, 31] for i in range(28, 36)], dtype=np.uint8)
@@ -37,7 +37,7 @@ def test_distances_are_in_voxels_of_the_slat_frame() -> None:
     assert quality.fitness == quality.fitness_backward == 1.0
 
 
-def test_the_radius_is_in_voxels_of_the_slat_frame_both_ways() -> None:
+def test_the_radius_is_in_voxels_of_the_slat_frame_both_ways():
     # One PixieVerse voxel off is half a SLAT voxel at this scale, and three are one and a half.
     pixieverse = np.array([[32, 32, 32]], dtype=np.uint8)
     for off, near in ((1, 1.0), (3, 0.0)):
@@ -50,12 +50,12 @@ def test_the_radius_is_in_voxels_of_the_slat_frame_both_ways() -> None:
         assert rmse == pytest.approx((0.5 * off * near,) * 2)
 
 
-def test_far_sets_have_no_inlier_and_no_nan() -> None:
+def test_far_sets_have_no_inlier_and_no_nan():
     quality = compare(LINE, LINE, make_transform(np.eye(3), [0, 0.4, 0]), radius=1.0)
     assert (quality.fitness, quality.inlier_rmse, quality.overlap) == (0.0, 0.0, 0.0)
 
 
-def test_voxels_inside_the_slat_do_not_count_against_it() -> None:
+def test_voxels_inside_the_slat_do_not_count_against_it():
     solid = chair()
     latents = surface_latents(solid)
     inner = np.array([[30, 30, 25]], dtype=np.uint8)  # a wall between two parts
@@ -86,9 +86,7 @@ def _quality(fitness: float, backward: float = 1.0) -> Quality:
         (_quality(1.0), 1.0, 0.3, Verdict.DOUBTFUL, "30.0%"),
     ],
 )
-def test_verdicts(
-    quality: Quality, valid: float, ambiguity: float, verdict: Verdict, word: str
-) -> None:
+def test_verdicts(quality, valid, ambiguity, verdict, word):
     given, reasons = verdict_of(quality, valid, ambiguity, ties=1)
     assert given is verdict
     assert word in " ".join(reasons)

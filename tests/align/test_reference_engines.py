@@ -1,7 +1,6 @@
 """The paper's protocol on Open3D, and GICP."""
 
 import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -19,7 +18,7 @@ ENGINES = {"open3d": PRESETS["paper"].align, "small_gicp": AlignParameters(engin
 
 @pytest.mark.parametrize("engine", ENGINES)
 @pytest.mark.parametrize("index", [0, 9, 17])
-def test_a_quarter_turn_is_found(engine: str, index: int) -> None:
+def test_a_quarter_turn_is_found(engine, index):
     rotation = distinct_starts()[index].rotation
     solid = chair()
     latents = surface_latents(turned(solid, rotation))
@@ -38,7 +37,7 @@ def test_a_quarter_turn_is_found(engine: str, index: int) -> None:
             assert (candidate.fitness, candidate.inlier_rmse) == (twin.fitness, twin.inlier_rmse)
 
 
-def test_the_paper_s_protocol_gives_the_same_bits_again() -> None:
+def test_the_paper_s_protocol_gives_the_same_bits_again():
     solid = chair()
     latents = surface_latents(np.roll(solid, 1, axis=0))
     once, again = (align(field_of(solid), latents, PRESETS["paper"].align) for _ in range(2))
@@ -49,9 +48,7 @@ def test_the_paper_s_protocol_gives_the_same_bits_again() -> None:
 @pytest.mark.parametrize(
     ("library", "package"), [("libX11.so.6", "libx11-6"), ("libusb-1.0.so.0", "libusb-1.0-0")]
 )
-def test_an_engine_whose_libraries_are_missing_names_them(
-    library: str, package: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
+def test_an_engine_whose_libraries_are_missing_names_them(library, package, monkeypatch, tmp_path):
     """As Open3D on a system without a desktop."""
     (tmp_path / "open3d").mkdir()
     fault = f"{library}: cannot open shared object file: No such file or directory"
@@ -63,9 +60,7 @@ def test_an_engine_whose_libraries_are_missing_names_them(
 
 
 @pytest.mark.parametrize(("engine", "extra"), [("open3d", "paper"), ("small_gicp", "bench")])
-def test_an_engine_that_is_not_installed_names_its_extra(
-    monkeypatch: pytest.MonkeyPatch, engine: str, extra: str
-) -> None:
+def test_an_engine_that_is_not_installed_names_its_extra(monkeypatch, engine, extra):
     monkeypatch.setitem(sys.modules, engine, None)  # as an import finds a package that is missing
     parameters = ENGINES[engine]
     for call in (

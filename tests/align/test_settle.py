@@ -44,9 +44,7 @@ def with_another_first(
 
 
 @pytest.mark.parametrize(("name", "model"), [("bent", Model.DEFORMABLE), ("long", Model.AFFINE)])
-def test_a_placement_that_is_taken_is_deformed_as_aligning_would_deform_it(
-    name: str, model: Model
-) -> None:
+def test_a_placement_that_is_taken_is_deformed_as_aligning_would_deform_it(name, model):
     field = field_of(occupancy(lambda points: points))
     latents = surface_latents(occupancy(MOVES[name]))
     parameters = AlignParameters()
@@ -64,12 +62,11 @@ def test_a_placement_that_is_taken_is_deformed_as_aligning_would_deform_it(
     # The search leaves the best placement slightly off where a new fit ends.
     apart = np.linalg.norm(places - map_of(found).places(latents.coords), axis=1) / VOXEL_SIZE
     assert apart.max() < 0.2
-    assert settled.figures is not None
     assert settled.figures.score_slat == pytest.approx(found.figures.score_slat, abs=0.01)
     assert settled.quality == measure_quality(field, latents, settled.transform, parameters.radius)
 
 
-def test_where_shapes_are_the_same_nothing_is_deformed() -> None:
+def test_where_shapes_are_the_same_nothing_is_deformed():
     field, latents = field_of(chair()), surface_latents(chair())
     found, other = with_another_first(field, latents, AlignParameters())
     settled = refit(take(other, 0, latents, BY), field, latents, AlignParameters())
@@ -79,7 +76,7 @@ def test_where_shapes_are_the_same_nothing_is_deformed() -> None:
 
 
 @pytest.mark.parametrize("model", ["rigid", "similarity"])
-def test_what_the_parameters_forbid_is_not_fitted(model: str) -> None:
+def test_what_the_parameters_forbid_is_not_fitted(model):
     field = field_of(occupancy(lambda points: points))
     latents = surface_latents(occupancy(MOVES["bent"]))
     parameters = AlignParameters(model=model)
@@ -89,7 +86,7 @@ def test_what_the_parameters_forbid_is_not_fitted(model: str) -> None:
     assert settled.deformation is None
 
 
-def test_taking_a_placement_leaves_the_others_and_the_model_of_a_rigid_fit() -> None:
+def test_taking_a_placement_leaves_the_others_and_the_model_of_a_rigid_fit():
     latents = surface_latents(chair())
     found = align(field_of(chair()), latents, AlignParameters())
     turns = [

@@ -6,7 +6,7 @@ from scipy.spatial.transform import Rotation
 from slatprep.align.starts import candidates_of, distinct_starts, euler_starts, so3_starts
 
 
-def test_starts_are_scipy_s_euler_rotations() -> None:
+def test_starts_are_scipy_s_euler_rotations():
     for start in euler_starts():
         expected = Rotation.from_euler("xyz", start.euler_degrees, degrees=True).as_matrix()
         np.testing.assert_allclose(start.rotation, expected, atol=1e-12)
@@ -15,7 +15,7 @@ def test_starts_are_scipy_s_euler_rotations() -> None:
     ]  # fmt: skip
 
 
-def test_of_64_starts_24_are_different_and_the_others_name_their_twin() -> None:
+def test_of_64_starts_24_are_different_and_the_others_name_their_twin():
     starts = euler_starts()
     assert len(starts) == 64
     assert len(distinct_starts()) == 24
@@ -26,7 +26,7 @@ def test_of_64_starts_24_are_different_and_the_others_name_their_twin() -> None:
             np.testing.assert_array_equal(start.rotation, starts[start.same_as].rotation)
 
 
-def test_the_distinct_starts_are_the_rotation_group_of_the_cube() -> None:
+def test_the_distinct_starts_are_the_rotation_group_of_the_cube():
     keys = {tuple(start.rotation.ravel()) for start in distinct_starts()}
     products = {
         tuple((a.rotation @ b.rotation).ravel())
@@ -37,7 +37,7 @@ def test_the_distinct_starts_are_the_rotation_group_of_the_cube() -> None:
     assert all(np.linalg.det(start.rotation) > 0 for start in distinct_starts())
 
 
-def test_repeated_candidates_carry_the_scores_of_their_twin() -> None:
+def test_repeated_candidates_carry_the_scores_of_their_twin():
     fits = {start.index: (start.index / 64, 0.5) for start in distinct_starts()}
     candidates = candidates_of(fits)
     assert [c.index for c in candidates] == list(range(64))
@@ -46,14 +46,14 @@ def test_repeated_candidates_carry_the_scores_of_their_twin() -> None:
         assert candidate.fitness == twin / 64
 
 
-def test_240_starts_leave_no_orientation_far_from_one() -> None:
+def test_240_starts_leave_no_orientation_far_from_one():
     starts = Rotation.from_matrix(so3_starts(240))
     anywhere = Rotation.random(2000, random_state=0).as_quat()
     dots = np.abs(anywhere @ starts.as_quat().T).max(axis=1)
     assert np.degrees(2 * np.arccos(dots.min())) < 40.0
 
 
-def test_the_spirals_advance_by_the_published_numbers() -> None:
+def test_the_spirals_advance_by_the_published_numbers():
     """Alexa 2022: by 1 / sqrt(2) and 1 / psi of a turn, where psi^4 = psi + 4."""
     psi = max(root.real for root in np.roots([1, 0, 0, -1, -4]) if abs(root.imag) < 1e-12)
     x, y, z, w = Rotation.from_matrix(so3_starts(50)).as_quat().T

@@ -46,7 +46,7 @@ def beside() -> tuple[Surface, Surface, Similarity, NDArray[np.float64]]:
 Beside = tuple[Surface, Surface, Similarity, NDArray[np.float64]]
 
 
-def test_without_a_step_the_score_is_the_mean_kernel_of_both_sides(beside: Beside) -> None:
+def test_without_a_step_the_score_is_the_mean_kernel_of_both_sides(beside):
     slat, pixie, pose, affine = beside
     forward, backward = residuals(slat, pixie, pose, affine)
     same, offset, score = stretched(slat, pixie, pose, affine)
@@ -56,9 +56,7 @@ def test_without_a_step_the_score_is_the_mean_kernel_of_both_sides(beside: Besid
 
 
 @pytest.mark.parametrize("tau", [1.5, 5.0])
-def test_a_step_is_that_of_least_squares_on_numerical_derivatives(
-    beside: Beside, tau: float
-) -> None:
+def test_a_step_is_that_of_least_squares_on_numerical_derivatives(beside, tau):
     """Of Gauss and Newton, with the weights of Geman and McClure and two small priors.
 
     Of samples within the other's box, as of others the search knows an approximate derivative.
@@ -98,7 +96,7 @@ def test_a_step_is_that_of_least_squares_on_numerical_derivatives(
     assert found_offset == pytest.approx(offset, abs=1e-4)
 
 
-def test_poses_are_stretched_each_by_itself(beside: Beside) -> None:
+def test_poses_are_stretched_each_by_itself(beside):
     slat, pixie, pose, affine = beside
     other = pose._replace(shift=pose.shift + 2.0, scale=1.1, offset=-0.1)
     affines, poses = np.stack([np.eye(3, 4), affine]), Poses.of([other, pose])
@@ -115,9 +113,7 @@ def test_poses_are_stretched_each_by_itself(beside: Beside) -> None:
 
 @pytest.mark.parametrize("factors", [(1.1, 1.1, 0.7), (1.15, 1.05, 0.75)])
 @pytest.mark.parametrize("seed", [0, 1, 3])
-def test_a_squashed_object_is_not_laid_on_its_side(
-    factors: tuple[float, float, float], seed: int
-) -> None:
+def test_a_squashed_object_is_not_laid_on_its_side(factors, seed):
     """As a similarity the lid fits best where a wall was, which is as near as the lid is now."""
     rotation = Rotation.random(random_state=seed).as_matrix()
     other = crate(CENTRES @ rotation / factors)
@@ -128,7 +124,7 @@ def test_a_squashed_object_is_not_laid_on_its_side(
     assert degrees_between(split_transform(as_similarity.transform)[0], rotation) > 60.0
 
 
-def test_a_known_affine_map_is_found_from_a_pose_beside_it() -> None:
+def test_a_known_affine_map_is_found_from_a_pose_beside_it():
     """The map that was applied brings the SLAT's samples back to a quarter of a voxel."""
     shape = chair()
     inside = np.argwhere(shape) - 31.5
@@ -153,7 +149,7 @@ def test_a_known_affine_map_is_found_from_a_pose_beside_it() -> None:
     assert scores[0] > 0.8
 
 
-def test_a_pose_that_would_be_squashed_flat_scores_nothing() -> None:
+def test_a_pose_that_would_be_squashed_flat_scores_nothing():
     """An eighth of the volume is another shape, whatever the fit."""
     block = np.zeros((64, 64, 64), dtype=bool)
     block[20:44, 20:44, 20:44] = True

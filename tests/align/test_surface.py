@@ -8,7 +8,7 @@ from slatprep.align.surface import BAND, CENTRE, DILATION, surface_of
 from slatprep.geometry.voxels import boundary, filled, voxels_of
 
 
-def test_a_shell_and_its_solid_have_the_same_surface() -> None:
+def test_a_shell_and_its_solid_have_the_same_surface():
     solid = chair()
     shell = boundary(solid)
     here, there = surface_of(shell), surface_of(solid)
@@ -17,7 +17,7 @@ def test_a_shell_and_its_solid_have_the_same_surface() -> None:
     np.testing.assert_array_equal(here.boundary, there.boundary)
 
 
-def test_filling_agrees_with_scipy_and_leaves_open_vessels_open() -> None:
+def test_filling_agrees_with_scipy_and_leaves_open_vessels_open():
     rng = np.random.default_rng(0)
     for _ in range(5):
         noise = rng.random((64, 64, 64)) < 0.6
@@ -30,7 +30,7 @@ def test_filling_agrees_with_scipy_and_leaves_open_vessels_open() -> None:
     np.testing.assert_array_equal(filled(box), box)
 
 
-def test_the_distance_is_that_to_the_faces_less_the_dilation() -> None:
+def test_the_distance_is_that_to_the_faces_less_the_dilation():
     slab = np.zeros((64, 64, 64), dtype=bool)
     slab[:, :, 20:40] = True  # faces at 19.5 and 39.5 in index units
     surface = surface_of(slab)
@@ -40,7 +40,7 @@ def test_the_distance_is_that_to_the_faces_less_the_dilation() -> None:
     np.testing.assert_allclose(surface.distance[middle], expected, atol=1e-6)
 
 
-def test_the_distance_is_euclidean() -> None:
+def test_the_distance_is_euclidean():
     dot = np.zeros((64, 64, 64), dtype=bool)
     dot[30, 30, 30] = True
     surface = surface_of(dot)
@@ -50,7 +50,7 @@ def test_the_distance_is_euclidean() -> None:
     np.testing.assert_allclose(surface.distance.ravel(), expected, atol=1e-5)
 
 
-def test_samples_lie_near_the_faces_on_both_sides() -> None:
+def test_samples_lie_near_the_faces_on_both_sides():
     ball = ((GRID - 31.5) ** 2).sum(axis=-1) < 20**2
     surface = surface_of(ball)
     radius = np.linalg.norm(surface.points, axis=1)
@@ -60,7 +60,7 @@ def test_samples_lie_near_the_faces_on_both_sides() -> None:
     assert abs(surface.size - 20) < 0.2
 
 
-def test_a_subset_is_even_and_repeatable() -> None:
+def test_a_subset_is_even_and_repeatable():
     surface = surface_of(chair())
     some = surface.subset(300)
     assert 250 <= len(some.points) <= 300
@@ -69,19 +69,19 @@ def test_a_subset_is_even_and_repeatable() -> None:
     assert len(surface.subset(10**9).points) == len(surface.points)
 
 
-def test_positions_are_counted_from_the_centre_of_the_cube() -> None:
+def test_positions_are_counted_from_the_centre_of_the_cube():
     middle = np.zeros((64, 64, 64), dtype=bool)
     middle[20:44, 22:42, 30:34] = True  # as far from either end, so its centre is the cube's
     np.testing.assert_allclose(surface_of(middle).centroid, 0.0, atol=1e-12)
 
 
-def test_the_boundary_is_that_of_the_filled_set() -> None:
+def test_the_boundary_is_that_of_the_filled_set():
     for solid in (chair(), boundary(chair())):
         rows = np.array(sorted(map(tuple, surface_of(solid).boundary.tolist())))
         np.testing.assert_array_equal(rows, voxels_of(boundary(filled(solid))))
 
 
-def test_samples_are_all_lattice_points_of_the_band_with_the_distance_there() -> None:
+def test_samples_are_all_lattice_points_of_the_band_with_the_distance_there():
     surface = surface_of(chair())
     index = np.rint(surface.points - surface.origin).astype(int)
     np.testing.assert_allclose(index + surface.origin, surface.points, atol=1e-12)
@@ -91,13 +91,13 @@ def test_samples_are_all_lattice_points_of_the_band_with_the_distance_there() ->
     assert len(index) == in_band.sum()
 
 
-def test_the_size_does_not_depend_on_where_it_is() -> None:
+def test_the_size_does_not_depend_on_where_it_is():
     ball = ((GRID - 31.5) ** 2).sum(axis=-1) < 10**2
     aside = np.roll(ball, (15, -12, 9), axis=(0, 1, 2))
     assert surface_of(aside).size == surface_of(ball).size
 
 
-def test_a_subset_has_no_sample_twice_and_others_from_another_start() -> None:
+def test_a_subset_has_no_sample_twice_and_others_from_another_start():
     surface = surface_of(chair())
     total = len(surface.points)
     assert len(surface.subset(total).points) == total

@@ -30,9 +30,7 @@ def store(mixed_build: BuildSummary) -> Path:
     return mixed_build.store
 
 
-def test_croissant_is_valid_without_a_warning(
-    store: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_croissant_is_valid_without_a_warning(store, tmp_path, caplog):
     path = tmp_path / "croissant.json"
     path.write_text(to_json(describe(open_store(store), Stated(**STATED))), encoding="utf-8")
     dataset = mlcroissant.Dataset(jsonld=path)  # raises where the description is invalid
@@ -43,7 +41,7 @@ def test_croissant_is_valid_without_a_warning(
     assert sets >= {layout.name for layout in ARRAYS}
 
 
-def test_croissant_s_records_are_the_store_s(store: Path, tmp_path: Path) -> None:
+def test_croissant_s_records_are_the_store_s(store, tmp_path):
     path = tmp_path / "croissant.json"
     path.write_text(to_json(describe(open_store(store))), encoding="utf-8")
     dataset = mlcroissant.Dataset(jsonld=path)
@@ -63,19 +61,19 @@ def test_croissant_s_records_are_the_store_s(store: Path, tmp_path: Path) -> Non
         assert (row["properties/lo"], row["properties/hi"]) == (stated["lo"], stated["hi"])
 
 
-def test_croissant_describes_figures_that_are_not_numbers(store: Path, tmp_path: Path) -> None:
+def test_croissant_describes_figures_that_are_not_numbers(store, tmp_path):
     opened = open_store(store)
     figures = opened.column("inlier_rmse").copy()
     figures[0] = np.nan
     read = opened.column
-    opened.column = lambda name: figures if name == "inlier_rmse" else read(name)  # type: ignore[method-assign]
+    opened.column = lambda name: figures if name == "inlier_rmse" else read(name)
     path = tmp_path / "croissant.json"
     path.write_text(to_json(describe(opened)), encoding="utf-8")
     rows = list(mlcroissant.Dataset(jsonld=path).records("assets"))
     assert np.isnan(rows[0]["assets/inlier_rmse"]) and rows[1]["assets/inlier_rmse"] == figures[1]
 
 
-def test_describe_writes_where_the_files_are_found(store: Path, tmp_path: Path) -> None:
+def test_describe_writes_where_the_files_are_found(store, tmp_path):
     out = store.parent / "description" / "croissant.json"
     arguments = ["describe", str(store), "--out", str(out), "--name", "mine", "-q"]
     result = CliRunner().invoke(slatprep, arguments)

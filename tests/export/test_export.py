@@ -7,8 +7,6 @@ import shutil
 import subprocess
 import sys
 import tarfile
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -16,7 +14,7 @@ from click.testing import CliRunner
 from hypothesis import given
 from hypothesis import strategies as st
 from support.exports import bytes_of, index_of
-from support.synthetic import JELLY, METAL, QUARTER_TURN, Dataset
+from support.synthetic import JELLY, METAL, QUARTER_TURN
 from support.trees import tree
 
 from slatprep.cli.commands import slatprep
@@ -36,7 +34,7 @@ TRUTH = {stuff[0]: stuff[1:] for stuff in (JELLY, METAL)}
 # -- HDF5, WebDataset --------------------------------------------------
 
 
-def test_hdf5_is_read_by_h5py(store: Path, mixed: Dataset, tmp_path: Path) -> None:
+def test_hdf5_is_read_by_h5py(store, mixed, tmp_path):
     import h5py
 
     out = tmp_path / "all.h5"
@@ -60,7 +58,7 @@ def test_hdf5_is_read_by_h5py(store: Path, mixed: Dataset, tmp_path: Path) -> No
             assert (np.abs(group["properties"][:]) <= 1).all()
 
 
-def test_hdf5_is_itself_a_source_of_latents(store: Path, mixed: Dataset, tmp_path: Path) -> None:
+def test_hdf5_is_itself_a_source_of_latents(store, mixed, tmp_path):
     export_store(store, tmp_path / "slat.h5", "hdf5", assets=["cup", "ant"])
     parameters = mixed.parameters()
     parameters = type(parameters)(
@@ -71,7 +69,7 @@ def test_hdf5_is_itself_a_source_of_latents(store: Path, mixed: Dataset, tmp_pat
     np.testing.assert_array_equal(read_latents(pairs["cup"]).feats, mixed.assets["cup"].feats)
 
 
-def test_shards_are_read_by_webdataset(store: Path, mixed: Dataset, tmp_path: Path) -> None:
+def test_shards_are_read_by_webdataset(store, mixed, tmp_path):
     import webdataset
 
     out = tmp_path / "shards"
@@ -94,7 +92,7 @@ def test_shards_are_read_by_webdataset(store: Path, mixed: Dataset, tmp_path: Pa
 
 
 @pytest.mark.parametrize("format", FORMATS)
-def test_bytes_repeat_whatever_the_jobs(format: Any, store: Path, tmp_path: Path) -> None:
+def test_bytes_repeat_whatever_the_jobs(format, store, tmp_path):
     options = ExportOptions(shard_size=2)
     progress: list[tuple[int, int]] = []
     for name, jobs in (("one", 1), ("two", 2)):
@@ -113,7 +111,7 @@ def test_bytes_repeat_whatever_the_jobs(format: Any, store: Path, tmp_path: Path
 
 
 @pytest.mark.parametrize("format", FORMATS)
-def test_what_is_no_export_is_never_replaced(format: Any, store: Path, tmp_path: Path) -> None:
+def test_what_is_no_export_is_never_replaced(format, store, tmp_path):
     folder, file = tmp_path / "mine", tmp_path / "mine.txt"
     folder.mkdir()
     (folder / "thesis.txt").write_text("years of work")
@@ -129,7 +127,7 @@ def test_what_is_no_export_is_never_replaced(format: Any, store: Path, tmp_path:
 
 
 @pytest.mark.parametrize("format", ["ply", "webdataset", "npz"])
-def test_what_lies_beside_an_export_stays(format: Any, store: Path, tmp_path: Path) -> None:
+def test_what_lies_beside_an_export_stays(format, store, tmp_path):
     out, fresh = tmp_path / "export", tmp_path / "fresh"
     export_store(store, out, format, assets=["cup", "dog"])
     shutil.copytree(store, out / "s.zarr")
@@ -155,7 +153,7 @@ def test_what_lies_beside_an_export_stays(format: Any, store: Path, tmp_path: Pa
         assert (out / name).read_bytes() == content
 
 
-def test_a_file_of_another_origin_is_not_replaced(store: Path, tmp_path: Path) -> None:
+def test_a_file_of_another_origin_is_not_replaced(store, tmp_path):
     out = tmp_path / "export"
     export_store(store, out, "npz", assets=["cup"])
     before = (out / "index.json").read_bytes()
@@ -170,9 +168,7 @@ def test_a_file_of_another_origin_is_not_replaced(store: Path, tmp_path: Path) -
 
 
 @pytest.mark.parametrize("bytes_allowed", [1, 3000, 40_000, 100_000])
-def test_a_disk_that_is_full_ends_no_process(
-    bytes_allowed: int, store: Path, tmp_path: Path
-) -> None:
+def test_a_disk_that_is_full_ends_no_process(bytes_allowed, store, tmp_path):
     """A limit on the size of files refuses writes as a full disk does; HDF5 crashes of either."""
     code = (
         "import resource, signal, sys\n"
@@ -189,7 +185,7 @@ def test_a_disk_that_is_full_ends_no_process(
 
 
 @pytest.mark.parametrize("format", FORMATS)
-def test_a_link_stays_and_the_store_is_left_alone(format: Any, store: Path, tmp_path: Path) -> None:
+def test_a_link_stays_and_the_store_is_left_alone(format, store, tmp_path):
     there, link = tmp_path / "disk" / "export", tmp_path / "link"
     export_store(store, there, format, assets=["cup"])
     link.symlink_to(there)
@@ -204,9 +200,7 @@ def test_a_link_stays_and_the_store_is_left_alone(format: Any, store: Path, tmp_
 
 
 @pytest.mark.parametrize("format", FORMATS)
-def test_a_failed_export_leaves_the_old_one(
-    format: Any, store: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_failed_export_leaves_the_old_one(format, store, tmp_path, monkeypatch):
     out = tmp_path / "export"
     export_store(store, out, format, assets=["cup"])
     before = bytes_of(out)
@@ -221,7 +215,7 @@ def test_a_failed_export_leaves_the_old_one(
     assert list(tmp_path.iterdir()) == [out]
 
 
-def test_assets_are_chosen_by_id_and_verdict(store: Path, tmp_path: Path) -> None:
+def test_assets_are_chosen_by_id_and_verdict(store, tmp_path):
     export_store(store, tmp_path / "two", "npz", assets=["dog", "cup", "dog"], verdicts=["good"])
     assert [entry["asset_id"] for entry in index_of(tmp_path / "two")] == ["cup", "dog"]
     for arguments, said in (
@@ -233,7 +227,7 @@ def test_assets_are_chosen_by_id_and_verdict(store: Path, tmp_path: Path) -> Non
             export_store(store, tmp_path / "none", "npz", **arguments)
 
 
-def test_splits_go_out_apart_and_together_they_are_all(store: Path, tmp_path: Path) -> None:
+def test_splits_go_out_apart_and_together_they_are_all(store, tmp_path):
     def export(*options: str, code: int = 0) -> str:
         words = ["export", str(store), "--format", "npz", *options]
         result = CliRunner().invoke(slatprep, words)
@@ -265,7 +259,7 @@ def test_splits_go_out_apart_and_together_they_are_all(store: Path, tmp_path: Pa
 HOSTILE = ["..", "../../etc/passwd", "a b", "-rf", "~", "__key__", "x" * 300, "häß", "a/b", "."]
 
 
-def test_hostile_ids_become_file_names(tmp_path: Path) -> None:
+def test_hostile_ids_become_file_names(tmp_path):
     for dots in (True, False):
         names = [file_name(asset_id, dots=dots) for asset_id in [*HOSTILE, "a.b", "a%2Eb"]]
         assert len({name.casefold() for name in names}) == len(names)
@@ -279,7 +273,7 @@ def test_hostile_ids_become_file_names(tmp_path: Path) -> None:
     ids=st.sets(st.text(st.characters(codec="utf-8"), min_size=1, max_size=300), max_size=8),
     dots=st.booleans(),
 )
-def test_any_ids_become_distinct_plain_names(ids: set[str], dots: bool) -> None:
+def test_any_ids_become_distinct_plain_names(ids, dots):
     names = {file_name(asset_id, dots=dots) for asset_id in ids}
     assert len(names) == len(ids)
     for name in names:
@@ -287,7 +281,7 @@ def test_any_ids_become_distinct_plain_names(ids: set[str], dots: bool) -> None:
 
 
 @pytest.mark.parametrize("format", FORMATS)
-def test_hostile_ids_stay_inside_every_export(format: Any, store: Path, tmp_path: Path) -> None:
+def test_hostile_ids_stay_inside_every_export(format, store, tmp_path):
     import zarr
 
     hostile = tmp_path / "hostile.zarr"
@@ -319,7 +313,7 @@ def test_hostile_ids_stay_inside_every_export(format: Any, store: Path, tmp_path
 # -- killed exports --------------------------------------------------------
 
 
-def test_an_export_removes_what_killed_ones_left_and_nothing_else(tmp_path: Path) -> None:
+def test_an_export_removes_what_killed_ones_left_and_nothing_else(tmp_path):
     out = tmp_path / "o.npz"
     killed = (
         "import os, pathlib\nfrom slatprep.export.target import directory\n"

@@ -2,7 +2,6 @@
 
 import json
 import shutil
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -27,9 +26,7 @@ PIXIE_VERTEX = [
 ]  # fmt: skip
 
 
-def test_ply_is_read_by_plyfile_as_pixie_writes_it(
-    store: Path, mixed: Dataset, tmp_path: Path
-) -> None:
+def test_ply_is_read_by_plyfile_as_pixie_writes_it(store, mixed, tmp_path):
     import plyfile
 
     export_store(store, tmp_path / "ply", "ply")
@@ -53,7 +50,7 @@ def test_ply_is_read_by_plyfile_as_pixie_writes_it(
         np.testing.assert_allclose(vertex["conf"], 1.0, atol=1e-3)
 
 
-def test_ply_passes_through_the_loader_of_physgaussian(store: Path, tmp_path: Path) -> None:
+def test_ply_passes_through_the_loader_of_physgaussian(store, tmp_path):
     import plyfile
 
     export_store(store, tmp_path / "ply", "ply", assets=["cup"])
@@ -66,7 +63,7 @@ def test_ply_passes_through_the_loader_of_physgaussian(store: Path, tmp_path: Pa
     assert set(vertex["material_id"].tolist()) <= set(range(7))
 
 
-def test_ply_is_read_by_open3d(store: Path, mixed: Dataset, tmp_path: Path) -> None:
+def test_ply_is_read_by_open3d(store, mixed, tmp_path):
     import open3d
 
     export_store(store, tmp_path / "ply", "ply", assets=["ant"])
@@ -76,9 +73,7 @@ def test_ply_is_read_by_open3d(store: Path, mixed: Dataset, tmp_path: Path) -> N
     np.testing.assert_allclose(modulus, np.log10([JELLY[1], METAL[1]]), atol=2e-3)
 
 
-def test_grid_points_are_the_field_itself_in_either_frame(
-    store: Path, mixed: Dataset, tmp_path: Path
-) -> None:
+def test_grid_points_are_the_field_itself_in_either_frame(store, mixed, tmp_path):
     import plyfile
 
     grid = mixed.assets["cup"].grid
@@ -105,7 +100,7 @@ def test_grid_points_are_the_field_itself_in_either_frame(
         np.testing.assert_allclose(vertex["density"], truth[:, 0], rtol=1e-4)
 
 
-def test_world_bounds_of_the_records_are_used(tmp_path: Path) -> None:
+def test_world_bounds_of_the_records_are_used(tmp_path):
     import plyfile
 
     dataset = Dataset(tmp_path / "sources")
@@ -127,7 +122,7 @@ def test_world_bounds_of_the_records_are_used(tmp_path: Path) -> None:
         np.testing.assert_allclose(vertex[name], expected, atol=1e-5)
 
 
-def test_a_field_without_bounds_is_told(store: Path, tmp_path: Path) -> None:
+def test_a_field_without_bounds_is_told(store, tmp_path):
     done = export_store(store, tmp_path / "ply", "ply", options=ExportOptions(frame="pixieverse"))
     assert "5 assets have no world bounds" in done.notes[0]
     assert json.loads((tmp_path / "ply" / "index.json").read_text())["notes"] == list(done.notes)
@@ -143,7 +138,7 @@ def test_a_field_without_bounds_is_told(store: Path, tmp_path: Path) -> None:
         [1, 2],
     ],
 )
-def test_bounds_that_make_no_sense_are_refused(bounds: object, store: Path, tmp_path: Path) -> None:
+def test_bounds_that_make_no_sense_are_refused(bounds, store, tmp_path):
     import zarr
 
     shutil.copytree(store, tmp_path / "s.zarr")

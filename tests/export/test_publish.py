@@ -42,9 +42,7 @@ def root(mixed_build: BuildSummary, tmp_path_factory: pytest.TempPathFactory) ->
     return folder.parent
 
 
-def test_every_file_has_its_checksum_and_the_store_is_the_same(
-    root: Path, mixed_build: BuildSummary
-) -> None:
+def test_every_file_has_its_checksum_and_the_store_is_the_same(root, mixed_build):
     for name in ("store", "shards"):
         folder = root / "me" / name
         lines = (folder / "SHA256SUMS").read_text().splitlines()
@@ -56,9 +54,7 @@ def test_every_file_has_its_checksum_and_the_store_is_the_same(
     assert tree(root / "me" / "store" / "mixed.zarr") == tree(Path(str(mixed_build.store)))
 
 
-def test_it_replaces_what_it_wrote_and_nothing_else(
-    root: Path, mixed_build: BuildSummary, tmp_path: Path
-) -> None:
+def test_it_replaces_what_it_wrote_and_nothing_else(root, mixed_build, tmp_path):
     words = (mixed_build.store, "--out", tmp_path / "out", "--pictures", 0, "-q")
     for _ in range(2):
         result = run(*words)
@@ -73,7 +69,7 @@ def test_it_replaces_what_it_wrote_and_nothing_else(
     assert verdict.exit_code == 2 and "slatprep subset" in verdict.stderr
 
 
-def test_the_card_is_read_by_the_hubs_library(root: Path) -> None:
+def test_the_card_is_read_by_the_hubs_library(root):
     hub = pytest.importorskip("huggingface_hub")
     card = hub.DatasetCard.load(root / "me" / "shards" / "README.md")
     assert card.data.license == "cc-by-4.0" and card.data.pretty_name == "A | B: <i>'c'"
@@ -85,7 +81,7 @@ def test_the_card_is_read_by_the_hubs_library(root: Path) -> None:
     assert document["distribution"][0]["contentUrl"] == "mixed.zarr/zarr.json"
 
 
-def test_a_damaged_store_is_not_published(mixed_build: BuildSummary, tmp_path: Path) -> None:
+def test_a_damaged_store_is_not_published(mixed_build, tmp_path):
     store = Path(shutil.copytree(str(mixed_build.store), tmp_path / "s.zarr"))
     assert run(store, "--out", tmp_path / "hub", "--pictures", 0).exit_code == 0
     before = tree(tmp_path / "hub")
@@ -104,9 +100,7 @@ def test_a_damaged_store_is_not_published(mixed_build: BuildSummary, tmp_path: P
     )
 
 
-def test_only_assets_that_went_into_shards_are_counted(
-    mixed_build: BuildSummary, tmp_path: Path
-) -> None:
+def test_only_assets_that_went_into_shards_are_counted(mixed_build, tmp_path):
     store = shutil.copytree(str(mixed_build.store), tmp_path / "s.zarr")
     zarr.open_group(store, mode="r+")["asset/verdict"][0] = "failed"
     words = (store, "--data", "webdataset", "--pictures", 0, "--json")
@@ -118,7 +112,7 @@ def test_only_assets_that_went_into_shards_are_counted(
     assert rows and all(row[5] == "0" for row in rows), table
 
 
-def test_a_card_says_what_is_not_known(mixed_build: BuildSummary) -> None:
+def test_a_card_says_what_is_not_known(mixed_build):
     store = open_store(mixed_build.store)
     assert "Not stated: ask" in card_of(store, Stated(), "s.zarr", [])
     linked = card_of(store, Stated(license="https://a.org/l", cite_as="```me"), "s.zarr", [])
@@ -151,7 +145,7 @@ def from_hub(hub: str, code: str, tmp_path: Path) -> Any:
     return json.loads(done.stdout.splitlines()[-1])
 
 
-def test_a_store_is_read_from_the_hub(hub: str, mixed_build: BuildSummary, tmp_path: Path) -> None:
+def test_a_store_is_read_from_the_hub(hub, mixed_build, tmp_path):
     code = (
         "import hashlib, json, slatprep\n"
         "from slatprep.inspect.verify import verify_store\n"
@@ -174,9 +168,7 @@ def test_a_store_is_read_from_the_hub(hub: str, mixed_build: BuildSummary, tmp_p
     assert len(faults) == 2 and all("is not a slatprep store" in fault for fault in faults)
 
 
-def test_shards_are_a_dataset_of_the_hubs_library(
-    root: Path, mixed_build: BuildSummary, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_shards_are_a_dataset_of_the_hubs_library(root, mixed_build, tmp_path, monkeypatch):
     """`make hub` installs the library `datasets`, and a job of continuous integration runs it."""
     why = "with pyarrow it is 190 MB, and tests' environment would be above 2.5 GB; see make hub"
     datasets = pytest.importorskip("datasets", reason=f"no library datasets: {why}")
@@ -190,7 +182,7 @@ def test_shards_are_a_dataset_of_the_hubs_library(
         np.testing.assert_array_equal(row["npz"]["properties"], asset.properties)
 
 
-def test_a_card_has_the_properties_that_the_store_holds(mixed_build: BuildSummary) -> None:
+def test_a_card_has_the_properties_that_the_store_holds(mixed_build):
     store = open_store(mixed_build.store)
     card = card_of(store, Stated(), "s.zarr", [])
     assert "| density | kg/m³ | log10 |" in card and "| youngs_modulus | Pa | log10 |" in card

@@ -8,7 +8,7 @@ import numpy as np
 import pandas
 import pytest
 from support.exports import index_of
-from support.synthetic import JELLY, METAL, Dataset
+from support.synthetic import JELLY, METAL
 
 from slatprep.errors import ConfigError
 from slatprep.export import ExportOptions, export_store
@@ -44,9 +44,7 @@ class StructuredLatents:
 
 
 @pytest.mark.parametrize("model", ["", "my_encoder.v2"])
-def test_an_npz_export_is_what_trellis_loads(
-    model: str, store: Path, mixed: Dataset, tmp_path: Path
-) -> None:
+def test_an_npz_export_is_what_trellis_loads(model, store, mixed, tmp_path):
     options = ExportOptions(latent_model=model) if model else ExportOptions()
     export_store(store, tmp_path / "root", "npz", options=options)
     loaded = StructuredLatents(tmp_path / "root", model or ENCODER)
@@ -62,7 +60,7 @@ def test_an_npz_export_is_what_trellis_loads(
     )
 
 
-def test_the_targets_lie_beside_the_latents(store: Path, mixed: Dataset, tmp_path: Path) -> None:
+def test_the_targets_lie_beside_the_latents(store, mixed, tmp_path):
     export_store(store, tmp_path / "root", "npz")
     for asset_id, asset in mixed.assets.items():
         with np.load(tmp_path / "root" / "latents" / ENCODER / f"{asset_id}.npz") as data:
@@ -76,9 +74,7 @@ def test_the_targets_lie_beside_the_latents(store: Path, mixed: Dataset, tmp_pat
                 np.testing.assert_allclose(data["properties"][here], [ends] * here.sum())
 
 
-def test_names_that_pandas_takes_for_numbers_or_nothing_are_found(
-    store: Path, tmp_path: Path
-) -> None:
+def test_names_that_pandas_takes_for_numbers_or_nothing_are_found(store, tmp_path):
     import zarr
 
     for number, names in enumerate(
@@ -98,9 +94,7 @@ def test_names_that_pandas_takes_for_numbers_or_nothing_are_found(
         assert all((root / file).is_file() for file in files.values())
 
 
-def test_an_npz_export_is_itself_a_source_of_latents(
-    store: Path, mixed: Dataset, tmp_path: Path
-) -> None:
+def test_an_npz_export_is_itself_a_source_of_latents(store, mixed, tmp_path):
     export_store(store, tmp_path / "root", "npz", assets=["cup", "ant"])
     parameters = mixed.parameters()
     parameters = type(parameters)(
@@ -111,7 +105,7 @@ def test_an_npz_export_is_itself_a_source_of_latents(
     np.testing.assert_array_equal(read_latents(pairs["cup"]).feats, mixed.assets["cup"].feats)
 
 
-def test_another_model_takes_the_place_of_the_first(store: Path, tmp_path: Path) -> None:
+def test_another_model_takes_the_place_of_the_first(store, tmp_path):
     root = tmp_path / "root"
     export_store(store, root, "npz")
     (root / "notes.txt").write_text("mine")
@@ -122,7 +116,7 @@ def test_another_model_takes_the_place_of_the_first(store: Path, tmp_path: Path)
 
 
 @pytest.mark.parametrize("name", ["", "..", "a/b", "../up", "a b", "-x"])
-def test_a_model_that_names_no_folder_is_refused(name: str, store: Path, tmp_path: Path) -> None:
+def test_a_model_that_names_no_folder_is_refused(name, store, tmp_path):
     with pytest.raises(ConfigError, match=r"latent_model is .* expected an encoder's name"):
         export_store(store, tmp_path / "root", "npz", options=ExportOptions(latent_model=name))
     assert not (tmp_path / "root").exists()

@@ -11,7 +11,7 @@ from click.testing import CliRunner
 from hypothesis import given
 from hypothesis import strategies as st
 from support.exports import bytes_of, index_of
-from support.synthetic import JELLY, METAL, QUARTER_TURN, Dataset, MakeDataset
+from support.synthetic import JELLY, METAL, QUARTER_TURN, Dataset
 
 from slatprep.cli.commands import slatprep
 from slatprep.errors import ConfigError
@@ -67,7 +67,7 @@ def materials_of(stage: Any, path: str) -> dict[str, np.ndarray]:
     return read
 
 
-def test_openusd_reads_back_places_masses_and_materials(exported: Path, mixed: Dataset) -> None:
+def test_openusd_reads_back_places_masses_and_materials(exported, mixed):
     from pxr import Usd, UsdGeom, UsdPhysics
 
     for entry in index_of(exported):
@@ -95,7 +95,7 @@ def test_openusd_reads_back_places_masses_and_materials(exported: Path, mixed: D
         assert abs(box.ComputeAlignedRange().GetMin()[2]) < 1e-6
 
 
-def test_openusd_s_validators_find_nothing(exported: Path) -> None:
+def test_openusd_s_validators_find_nothing(exported):
     from pxr import Usd, UsdValidation
 
     every = UsdValidation.ValidationRegistry().GetOrLoadAllValidators()
@@ -106,7 +106,7 @@ def test_openusd_s_validators_find_nothing(exported: Path) -> None:
         assert [found.GetMessage() for found in context.Validate(stage)] == []
 
 
-def test_the_scene_has_every_asset_apart_from_the_others(exported: Path) -> None:
+def test_the_scene_has_every_asset_apart_from_the_others(exported):
     from pxr import Usd, UsdGeom
 
     stage = Usd.Stage.Open(str(exported / "scene.usda"))
@@ -126,16 +126,14 @@ def test_the_scene_has_every_asset_apart_from_the_others(exported: Path) -> None
     assert json.loads((exported / "index.json").read_text())["files"] == ["scene.usda"]
 
 
-def test_bytes_do_not_depend_on_the_number_of_workers(
-    exported: Path, store: Path, tmp_path: Path
-) -> None:
+def test_bytes_do_not_depend_on_the_number_of_workers(exported, store, tmp_path):
     export_store(store, tmp_path / "usd", "usd", options=ExportOptions(size=SIZE), jobs=2)
     again, before = bytes_of(tmp_path / "usd"), bytes_of(exported)
     assert again == before
 
 
 @given(st.integers(0, 2**32 - 1), st.integers(7, 60))
-def test_bins_are_at_most_as_many_as_asked_and_say_their_error(seed: int, most: int) -> None:
+def test_bins_are_at_most_as_many_as_asked_and_say_their_error(seed, most):
     rng = np.random.default_rng(seed)
     material = rng.integers(0, 7, 400).astype(np.uint8)
     solid = np.column_stack(
@@ -150,7 +148,7 @@ def test_bins_are_at_most_as_many_as_asked_and_say_their_error(seed: int, most: 
     np.testing.assert_allclose(binned.ratio_error, errors.max())
 
 
-def test_more_materials_are_closer_and_few_values_are_exact() -> None:
+def test_more_materials_are_closer_and_few_values_are_exact():
     rng = np.random.default_rng(0)
     material = np.zeros(3000, np.uint8)
     solid = np.column_stack([10 ** rng.uniform(4, 6, 3000), np.ones(3000), np.full(3000, 0.3)])
@@ -163,7 +161,7 @@ def test_more_materials_are_closer_and_few_values_are_exact() -> None:
     assert len(binned.material) == 3 and binned.modulus_error < 1e-6
 
 
-def test_a_ratio_of_one_half_is_clipped_and_said(make_dataset: MakeDataset, tmp_path: Path) -> None:
+def test_a_ratio_of_one_half_is_clipped_and_said(make_dataset, tmp_path):
     dataset = make_dataset("a")
     grid = dataset.assets["a"].grid
     soft = grid[..., 3] == JELLY[0]
@@ -180,7 +178,7 @@ def test_a_ratio_of_one_half_is_clipped_and_said(make_dataset: MakeDataset, tmp_
     assert ratio.max() == pytest.approx(MAX_POISSON)
 
 
-def test_too_few_materials_are_refused(store: Path, tmp_path: Path) -> None:
+def test_too_few_materials_are_refused(store, tmp_path):
     with pytest.raises(ConfigError, match="materials is 3; expected 7 or more"):
         export_store(store, tmp_path / "usd", "usd", options=ExportOptions(materials=3))
 
@@ -189,9 +187,7 @@ def test_too_few_materials_are_refused(store: Path, tmp_path: Path) -> None:
 
 
 @NEWTON
-def test_newton_s_importer_gives_back_stiffness_ratio_and_mass(
-    exported: Path, mixed: Dataset
-) -> None:
+def test_newton_s_importer_gives_back_stiffness_ratio_and_mass(exported, mixed):
     import newton
 
     builder = newton.ModelBuilder()
@@ -220,7 +216,7 @@ def test_newton_s_importer_gives_back_stiffness_ratio_and_mass(
 
 
 @NEWTON
-def test_a_drop_runs_from_the_file(exported: Path) -> None:
+def test_a_drop_runs_from_the_file(exported):
     import newton
     from pxr import Usd, UsdGeom
 

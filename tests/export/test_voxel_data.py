@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 from support.exports import index_of
-from support.synthetic import JELLY, METAL, Dataset
+from support.synthetic import JELLY, METAL
 
 from slatprep.cli.commands import slatprep
 from slatprep.export import ExportOptions, export_store
@@ -39,9 +39,7 @@ def field_at(root: Path, name: str) -> MaterialField:
     return read_field(pair)
 
 
-def test_the_loader_of_vomp_finds_every_voxel_and_its_material(
-    store: Path, mixed: Dataset, tmp_path: Path
-) -> None:
+def test_the_loader_of_vomp_finds_every_voxel_and_its_material(store, mixed, tmp_path):
     from scipy.spatial import cKDTree
 
     export_store(store, tmp_path / "vomp", "voxel_data")
@@ -64,9 +62,7 @@ def test_the_loader_of_vomp_finds_every_voxel_and_its_material(
         np.testing.assert_array_equal(nearest, np.arange(len(own)))
 
 
-def test_the_solid_is_read_back_by_the_adapter_for_vomp_s_data(
-    store: Path, mixed: Dataset, tmp_path: Path
-) -> None:
+def test_the_solid_is_read_back_by_the_adapter_for_vomp_s_data(store, mixed, tmp_path):
     words = (store, "--format", "voxel_data", "--points", "grid", "--asset", "cup")
     done = CliRunner().invoke(
         slatprep, ["export", *map(str, words), "--out", str(tmp_path / "vomp")]
@@ -85,9 +81,7 @@ def test_the_solid_is_read_back_by_the_adapter_for_vomp_s_data(
 
 
 @pytest.mark.parametrize("offset", [0.0, 0.5])
-def test_the_adapter_takes_corners_of_the_dataset_and_centres_of_predictions(
-    offset: float, tmp_path: Path
-) -> None:
+def test_the_adapter_takes_corners_of_the_dataset_and_centres_of_predictions(offset, tmp_path):
     voxels = np.arange(64)[:, None] * np.ones(3, int)
     names = ("x", "y", "z", "youngs_modulus", "poissons_ratio", "density")
     rows = np.zeros(64, dtype=[(name, "<f4") for name in names])
@@ -100,9 +94,7 @@ def test_the_adapter_takes_corners_of_the_dataset_and_centres_of_predictions(
     np.testing.assert_allclose(field.properties[:, 1], 1000.0 + field.voxels[:, 0])
 
 
-def test_points_may_be_chosen_for_voxel_data_and_the_frame_may_not(
-    store: Path, tmp_path: Path
-) -> None:
+def test_points_may_be_chosen_for_voxel_data_and_the_frame_may_not(store, tmp_path):
     words = [str(store), "--format", "voxel_data", "--frame", "slat", "--out", str(tmp_path / "o")]
     done = CliRunner().invoke(slatprep, ["export", *words])
     assert done.exit_code == 2 and "--frame is for --format ply, not voxel_data" in done.output

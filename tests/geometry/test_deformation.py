@@ -38,7 +38,6 @@ def bent(
 ) -> Deformation:
     coefficients = np.random.default_rng(seed).normal(size=(*shape, 3)) * voxels / 64
     made = make_deformation(AFFINE, [-0.5] * 3, 0.25, coefficients, BOX, 16.0)
-    assert made is not None
     return made
 
 
@@ -46,7 +45,7 @@ def points(count: int = 500, reach: float = 0.55, seed: int = 1) -> np.ndarray:
     return np.random.default_rng(seed).uniform(-reach, reach, (count, 3))
 
 
-def test_a_spline_is_the_sum_of_its_basis_functions() -> None:
+def test_a_spline_is_the_sum_of_its_basis_functions():
     # Independent truth: scipy's B-splines, axis by axis.
     from scipy.interpolate import BSpline
 
@@ -61,7 +60,7 @@ def test_a_spline_is_the_sum_of_its_basis_functions() -> None:
     assert np.allclose(deform(made, x), expected, atol=1e-12)
 
 
-def test_a_point_goes_there_and_back() -> None:
+def test_a_point_goes_there_and_back():
     transform = make_transform([[0, -1, 0], [1, 0, 0], [0, 0, 1]], (0.02, -0.01, 0.03), 0.9)
     for deformation in (None, make_affine(), bent()):
         way = PlaceMap(transform, deformation)
@@ -72,13 +71,12 @@ def test_a_point_goes_there_and_back() -> None:
 
 def make_affine() -> Deformation:
     made = make_deformation(AFFINE, np.zeros(3), 1.0, np.zeros((0, 0, 0, 3)), BOX, 16.0)
-    assert made is not None
     return made
 
 
 @settings(max_examples=25)
 @given(seed=st.integers(0, 10_000), voxels=st.floats(0.1, 40.0))
-def test_nothing_folds_and_nothing_moves_too_far(seed: int, voxels: float) -> None:
+def test_nothing_folds_and_nothing_moves_too_far(seed, voxels):
     made = bent(seed, voxels, (6, 5, 7))
     assert is_proper(made)
     x = points(4_000, 0.5)
@@ -88,7 +86,7 @@ def test_nothing_folds_and_nothing_moves_too_far(seed: int, voxels: float) -> No
     assert np.abs(undeform(made, deform(made, x)) - x).max() * 64 < 1e-3
 
 
-def test_a_fold_is_seen() -> None:
+def test_a_fold_is_seen():
     coefficients = np.zeros((7, 7, 7, 3))
     coefficients[3, 3, 3, 0] = 1.0
     folded = Deformation(IDENTITY, np.full(3, -0.5), 0.25, coefficients)
@@ -96,7 +94,7 @@ def test_a_fold_is_seen() -> None:
     assert not is_proper(folded)
 
 
-def test_how_much_bending_is_certain_not_to_fold_by_hand() -> None:
+def test_how_much_bending_is_certain_not_to_fold_by_hand():
     """One coefficient h: its second differences are 2 h along an axis, and h along two.
 
     So the second derivatives' Frobenius norm is at most sqrt(3 * 4 + 6) h / spacing^2. No point
@@ -134,18 +132,17 @@ def test_how_much_bending_is_certain_not_to_fold_by_hand() -> None:
         assert is_proper(made) is proper
 
 
-def test_bending_is_shortened_to_the_bound_and_not_further() -> None:
+def test_bending_is_shortened_to_the_bound_and_not_further():
     for voxels, expected in ((10.0, 10.0), (20.0, 16.0)):
         coefficients = np.zeros((7, 7, 7, 3))
         coefficients[..., 2] = voxels / 64  # everything moves alike, so nothing bends
         made = make_deformation(IDENTITY, [-0.5] * 3, 0.25, coefficients, BOX, 16.0)
-        assert made is not None
         length = np.linalg.norm(made.coefficients, axis=-1) * 64
         np.testing.assert_allclose(length, expected, rtol=1e-5)
         assert length.max() <= expected + 64 * GRAIN
 
 
-def test_how_much_an_affine_part_may_stretch() -> None:
+def test_how_much_an_affine_part_may_stretch():
     nothing, middle = np.zeros((0, 0, 0, 3)), np.zeros((1, 3))
     for low, high, allowed in (
         (1.001 * LEAST_STRETCH, 0.999 * MOST_STRETCH, True),
@@ -157,14 +154,13 @@ def test_how_much_an_affine_part_may_stretch() -> None:
         assert (made is not None) is allowed
 
 
-def test_no_zero_is_negative() -> None:
+def test_no_zero_is_negative():
     coefficients = np.full((7, 7, 7, 3), -1e-15)
     made = make_deformation(IDENTITY, [-0.5] * 3, 0.25, coefficients, BOX, 16.0)
-    assert made is not None
     assert made.coefficients.tobytes() == np.zeros((7, 7, 7, 3)).tobytes()
 
 
-def test_an_affine_part_that_flattens_mirrors_or_moves_too_far_is_refused() -> None:
+def test_an_affine_part_that_flattens_mirrors_or_moves_too_far_is_refused():
     nothing = np.zeros((0, 0, 0, 3))
     for affine in (
         np.diag([1.0, 1.0, 0.3]) @ IDENTITY,
@@ -174,7 +170,7 @@ def test_an_affine_part_that_flattens_mirrors_or_moves_too_far_is_refused() -> N
         assert make_deformation(affine, np.zeros(3), 1.0, nothing, BOX, 16.0) is None
 
 
-def test_how_far_is_asked_of_the_points_and_not_of_corners_where_nothing_is() -> None:
+def test_how_far_is_asked_of_the_points_and_not_of_corners_where_nothing_is():
     grown, nothing = 1.5 * IDENTITY, np.zeros((0, 0, 0, 3))
     cross = np.concatenate([0.45 * np.eye(3), -0.45 * np.eye(3)])  # moved by 14.4 voxels
     corner = np.full((1, 3), 0.45)  # moved by 24.9
@@ -183,7 +179,7 @@ def test_how_far_is_asked_of_the_points_and_not_of_corners_where_nothing_is() ->
     assert make_deformation(grown, np.zeros(3), 1.0, nothing, corner, 16.0) is None
 
 
-def test_the_derivative_is_the_derivative() -> None:
+def test_the_derivative_is_the_derivative():
     made, x, step = bent(), points(200, 0.24), 1e-6
     for axis in range(3):
         aside = step * np.eye(3)[axis]
@@ -191,14 +187,14 @@ def test_the_derivative_is_the_derivative() -> None:
         assert np.allclose(jacobian(made, x)[:, :, axis], numeric, atol=1e-6)
 
 
-def test_half_the_spacing_is_the_same_displacement() -> None:
+def test_half_the_spacing_is_the_same_displacement():
     made = bent()
     fine = replace(made, spacing=made.spacing / 2, coefficients=refined(made.coefficients))
     x = points(500, 0.24)
     assert np.allclose(deform(made, x), deform(fine, x), atol=1e-12)
 
 
-def test_json_gives_back_the_same_bits() -> None:
+def test_json_gives_back_the_same_bits():
     for made in (bent(), make_affine()):
         text = orjson.dumps(made, option=orjson.OPT_SERIALIZE_NUMPY)
         again = adapter_of(Deformation).validate_json(text, strict=True)
@@ -210,7 +206,7 @@ def test_json_gives_back_the_same_bits() -> None:
         assert np.array_equal(grains, np.round(grains))
 
 
-def test_broken_numbers_are_named() -> None:
+def test_broken_numbers_are_named():
     made = bent()
     broken = {
         "spacing": 0.0,
@@ -223,7 +219,7 @@ def test_broken_numbers_are_named() -> None:
             replace(made, **{name: value})
 
 
-def test_only_bending_bends() -> None:
+def test_only_bending_bends():
     assert bending_of(replace(bent(), coefficients=np.full((6, 6, 6, 3), 0.1))) == 0.0
     # u = a x^2 / 2 has the second derivative a, here in 1 / voxel.
     index = np.arange(8.0)
@@ -237,7 +233,7 @@ def test_only_bending_bends() -> None:
     assert bending_of(replace(made, coefficients=twisted)) == pytest.approx(0.01 * np.sqrt(2))
 
 
-def test_the_lookup_goes_through_the_map() -> None:
+def test_the_lookup_goes_through_the_map():
     solid = chair()
     field, latents = field_of(solid), surface_latents(solid)
     way = PlaceMap(np.eye(4), bent(voxels=1.0))

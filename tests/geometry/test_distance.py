@@ -21,16 +21,14 @@ def _expected(solid: np.ndarray) -> np.ndarray:
     seed=st.integers(0, 2**32 - 1),
 )
 @settings(max_examples=60)
-def test_any_set_gets_the_exact_distance(
-    shape: tuple[int, int, int], share: float, seed: int
-) -> None:
+def test_any_set_gets_the_exact_distance(shape, share, seed):
     rng = np.random.default_rng(seed)
     solid = np.pad(rng.random(shape) < share, 4)
     solid[4, 4, 4] = True
     np.testing.assert_allclose(signed_distance(solid), _expected(solid), rtol=0, atol=1e-6)
 
 
-def test_the_farthest_corners_of_the_largest_box_fit_the_integers() -> None:
+def test_the_farthest_corners_of_the_largest_box_fit_the_integers():
     # The set touches all sides of its box and is as far from two corners as it can be.
     solid = np.zeros((64, 64, 64), dtype=bool)
     solid[0, 0, 0] = solid[63, 63, 63] = True
@@ -39,11 +37,11 @@ def test_the_farthest_corners_of_the_largest_box_fit_the_integers() -> None:
     np.testing.assert_allclose(signed_distance(padded), _expected(padded), rtol=0, atol=1e-5)
 
 
-def test_memory_order_does_not_matter() -> None:
+def test_memory_order_does_not_matter():
     solid = np.pad(np.random.default_rng(3).random((9, 7, 11)) < 0.4, 4)
     np.testing.assert_array_equal(signed_distance(np.asfortranarray(solid)), signed_distance(solid))
 
 
-def test_too_large_a_box_is_refused() -> None:
+def test_too_large_a_box_is_refused():
     with pytest.raises(ValueError, match="at most 72"):
         signed_distance(np.zeros((73, 4, 4), dtype=bool))

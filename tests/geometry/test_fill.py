@@ -20,12 +20,12 @@ def _expected(occupancy: np.ndarray) -> np.ndarray:
     seed=st.integers(0, 2**32 - 1),
 )
 @settings(max_examples=100)
-def test_any_set(shape: tuple[int, int, int], share: float, seed: int) -> None:
+def test_any_set(shape, share, seed):
     occupancy = np.random.default_rng(seed).random(shape) < share
     np.testing.assert_array_equal(outside_of(occupancy), _expected(occupancy))
 
 
-def test_a_flood_follows_a_winding_passage_back_and_forth() -> None:
+def test_a_flood_follows_a_winding_passage_back_and_forth():
     # Walls with gaps at alternating ends: the way in leads along every axis, both ways.
     occupancy = np.zeros((64, 64, 64), dtype=bool)
     occupancy[:, :, [0, 63]] = occupancy[:, [0, 63]] = occupancy[[0, 63]] = True
@@ -36,6 +36,6 @@ def test_a_flood_follows_a_winding_passage_back_and_forth() -> None:
     np.testing.assert_array_equal(outside_of(occupancy), ~occupancy)
 
 
-def test_longer_lines_than_a_word_are_refused() -> None:
+def test_longer_lines_than_a_word_are_refused():
     with pytest.raises(ValueError, match="at most 64"):
         outside_of(np.zeros((2, 2, 65), dtype=bool))

@@ -13,7 +13,7 @@ from slatprep.geometry.nearest import Lattice, _columns, _search_columns
 
 @settings(max_examples=40)
 @given(st.integers(1, 3000), st.integers(0, 2**32 - 1), st.floats(0.2, 1.5), st.integers(1, 64))
-def test_the_nearest_voxel_is_a_kd_tree_s(count: int, seed: int, spread: float, side: int) -> None:
+def test_the_nearest_voxel_is_a_kd_tree_s(count, seed, spread, side):
     rng = np.random.default_rng(seed)
     corner = rng.integers(0, 65 - side, 3)
     voxels = np.unique(corner + rng.integers(0, side, (count, 3)), axis=0).astype(np.uint8)
@@ -26,14 +26,14 @@ def test_the_nearest_voxel_is_a_kd_tree_s(count: int, seed: int, spread: float, 
     np.testing.assert_allclose(apart, distance, atol=1e-9)
 
 
-def test_of_equally_near_voxels_the_first_is_taken() -> None:
+def test_of_equally_near_voxels_the_first_is_taken():
     voxels = np.array([[11, 10, 10], [9, 10, 10], [10, 11, 10]], dtype=np.uint8)
     for order in ([0, 1, 2], [2, 0, 1], [1, 2, 0]):
         _, index = Lattice(voxels[order]).nearest(voxel_centres([[10, 10, 10]]))
         assert index.tolist() == [0]
 
 
-def test_of_two_voxels_as_near_as_the_searched_cells_reach_the_first_is_taken() -> None:
+def test_of_two_voxels_as_near_as_the_searched_cells_reach_the_first_is_taken():
     """One of them, 3.5 voxels off, lies among the cells around the point, the other beyond."""
     for first, second in ((14, 7), (7, 14)):
         voxels = np.array([[first, 30, 30], [second, 30, 30]], dtype=np.uint8)
@@ -42,7 +42,7 @@ def test_of_two_voxels_as_near_as_the_searched_cells_reach_the_first_is_taken() 
 
 
 @pytest.mark.parametrize("limit", [0.5, 1.5, 3.0, np.inf])
-def test_the_ends_of_the_grid_are_far_apart(limit: float) -> None:
+def test_the_ends_of_the_grid_are_far_apart(limit):
     """Against brute force around faces, edges and corners: no look-up runs over into another row.
 
     Of each pair of opposite ends one alone has voxels, along a line here and there.
@@ -63,7 +63,7 @@ def test_the_ends_of_the_grid_are_far_apart(limit: float) -> None:
 
 
 @pytest.mark.parametrize("limit", [0.5, 1.0, 3.0, 6.5, 9.0, np.inf])
-def test_every_cell_of_the_grid_finds_the_first_of_its_nearest_voxels(limit: float) -> None:
+def test_every_cell_of_the_grid_finds_the_first_of_its_nearest_voxels(limit):
     """Against all distances by brute force, in whole numbers: near, far, and often tied."""
     voxels = np.array(
         [[3, 3, 3], [3, 9, 3], [40, 40, 41], [40, 40, 40], [63, 0, 63], [3, 3, 15]], dtype=np.uint8
@@ -81,7 +81,7 @@ def test_every_cell_of_the_grid_finds_the_first_of_its_nearest_voxels(limit: flo
 
 
 @pytest.mark.parametrize("limit", [3.5, 9.0, np.inf])
-def test_half_way_between_voxels_the_first_of_the_nearest_is_found(limit: float) -> None:
+def test_half_way_between_voxels_the_first_of_the_nearest_is_found(limit):
     """Against brute force in doubled whole numbers, where every axis has ties."""
     rng = np.random.default_rng(3)
     corners = rng.integers(0, 63, (60, 3))
@@ -96,7 +96,7 @@ def test_half_way_between_voxels_the_first_of_the_nearest_is_found(limit: float)
     np.testing.assert_allclose(distance[within], np.sqrt(squares.min(axis=1)[within]) / 2)
 
 
-def test_beyond_the_limit_nothing_is_found() -> None:
+def test_beyond_the_limit_nothing_is_found():
     voxels = np.array([[0, 0, 0]], dtype=np.uint8)
     points = voxel_centres([[2, 0, 0], [3, 0, 0], [63, 63, 63]])
     distance, index = Lattice(voxels).nearest(points, limit=2.0)
@@ -105,7 +105,7 @@ def test_beyond_the_limit_nothing_is_found() -> None:
 
 
 @pytest.mark.parametrize("limit", [0.5, 1.0, 2.5, 3.5])
-def test_just_at_the_limit_a_voxel_is_found_wherever_it_lies(limit: float) -> None:
+def test_just_at_the_limit_a_voxel_is_found_wherever_it_lies(limit):
     """Along a whole line of the grid, from either side."""
     for last in range(4, 60):
         voxels = np.array([[last, 30, 30]], dtype=np.uint8)
@@ -126,7 +126,7 @@ class _Counted:
 
 
 @pytest.mark.parametrize("held", ["two voxels", "a cube", "a shell", "dust"])
-def test_a_point_that_is_far_off_costs_few_looks(held: str) -> None:
+def test_a_point_that_is_far_off_costs_few_looks(held):
     """A SLAT that fills the grid has mostly such points."""
     cells = np.argwhere(np.ones((64, 64, 64), dtype=bool))
     inner = (np.abs(cells - 31.5) < 12).all(axis=1)
@@ -147,12 +147,12 @@ def test_a_point_that_is_far_off_costs_few_looks(held: str) -> None:
     assert sum(array.looks for array in columns) < 400 * len(points)
 
 
-def test_an_empty_set_is_refused() -> None:
+def test_an_empty_set_is_refused():
     with pytest.raises(ValueError, match="empty"):
         Lattice(np.zeros((0, 3), dtype=np.uint8))
 
 
-def test_two_voters_outvote_a_nearer_one() -> None:
+def test_two_voters_outvote_a_nearer_one():
     # The point sits 0.4 of the way from voxel 30 to 31: class 2 is nearest, but
     # class 5 speaks from x = 31 and from both sides in y.
     voxels = np.array([[30, 20, 20], [31, 20, 20], [31, 21, 20], [31, 19, 20]], dtype=np.uint8)
@@ -164,14 +164,14 @@ def test_two_voters_outvote_a_nearer_one() -> None:
     assert Lattice(voxels).vote(point, labels, 1.0).tolist() == [1]  # with 1.0 it does not
 
 
-def test_a_vote_without_voters_is_empty() -> None:
+def test_a_vote_without_voters_is_empty():
     voxels = np.array([[0, 0, 0]], dtype=np.uint8)
     assert Lattice(voxels).vote(
         voxel_centres([[5, 5, 5]]), np.zeros(1, np.uint8), 0.5
     ).tolist() == [-1]
 
 
-def test_each_vote_is_of_its_own_labels() -> None:
+def test_each_vote_is_of_its_own_labels():
     """Of a lattice that has voted before, with labels that all agreed where these do not."""
     voxels = np.array([[30, 20, 20], [31, 20, 20], [31, 21, 20], [31, 19, 20]], dtype=np.uint8)
     point = voxel_centres([[30.4, 20, 20]])
@@ -182,7 +182,7 @@ def test_each_vote_is_of_its_own_labels() -> None:
     ]  # fmt: skip
 
 
-def test_of_a_drawn_vote_the_lower_label_wins() -> None:
+def test_of_a_drawn_vote_the_lower_label_wins():
     voxels = np.array([[31, 20, 20], [29, 20, 20]], dtype=np.uint8)
     point = voxel_centres([[30, 20, 20]])
     for labels, winner in (([4, 3], 1), ([3, 4], 0), ([3, 3], 0)):
@@ -191,7 +191,7 @@ def test_of_a_drawn_vote_the_lower_label_wins() -> None:
 
 @settings(max_examples=25)
 @given(st.integers(0, 2**32 - 1), st.floats(0.3, 1.0))
-def test_votes_are_those_of_a_plain_count(seed: int, width: float) -> None:
+def test_votes_are_those_of_a_plain_count(seed, width):
     rng = np.random.default_rng(seed)
     voxels = np.unique(rng.integers(20, 26, (80, 3)), axis=0).astype(np.uint8)
     labels = rng.integers(0, 7, len(voxels)).astype(np.uint8)

@@ -5,7 +5,7 @@ import numpy as np
 from slatprep.geometry.surroundings import DIRECTIONS, shares_around
 
 
-def test_a_flat_border_by_hand() -> None:
+def test_a_flat_border_by_hand():
     # Class 1 below z = 32, class 2 on it up to z = 40, empty above.
     grid = np.full((64, 64, 64), 7, dtype=np.uint8)
     grid[:, :, :32], grid[:, :, 32:40] = 1, 2
@@ -18,7 +18,7 @@ def test_a_flat_border_by_hand() -> None:
     np.testing.assert_allclose(solid[[0, 2]], 1.0)
 
 
-def test_random_cells_by_plain_numpy() -> None:
+def test_random_cells_by_plain_numpy():
     rng = np.random.default_rng(0)
     grid = rng.integers(5, 8, (64, 64, 64)).astype(np.uint8)
     points = rng.uniform(-0.6, 0.6, (200, 3))
@@ -38,7 +38,7 @@ def test_random_cells_by_plain_numpy() -> None:
     np.testing.assert_allclose(others[:, 0], expected, rtol=1e-6)
 
 
-def test_a_point_far_outside_sees_nothing() -> None:
+def test_a_point_far_outside_sees_nothing():
     grid = np.zeros((64, 64, 64), dtype=np.uint8)
     others, solid = shares_around(grid, np.array([[2.0, 0.0, 0.0]]), np.zeros(1, np.uint8), (1,), 7)
     assert others[0, 0] == solid[0, 0] == 0.0

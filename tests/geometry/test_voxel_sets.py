@@ -27,7 +27,7 @@ from slatprep.records import Ground
     side=st.integers(1, 7),
     share=st.sampled_from([0.1, 0.5, 0.8, 0.95, 1.0]),
 )
-def test_boundary_box_and_filling_are_those_of_scipy(seed: int, side: int, share: float) -> None:
+def test_boundary_box_and_filling_are_those_of_scipy(seed, side, share):
     solid = np.random.default_rng(seed).random((side, side, side)) < share
     faces = ndimage.generate_binary_structure(3, 1)
     np.testing.assert_array_equal(boundary(solid), solid & ~ndimage.binary_erosion(solid, faces))
@@ -40,7 +40,7 @@ def test_boundary_box_and_filling_are_those_of_scipy(seed: int, side: int, share
             bounding_box(solid)
 
 
-def test_the_outer_boundary_has_no_voxel_of_an_inner_wall() -> None:
+def test_the_outer_boundary_has_no_voxel_of_an_inner_wall():
     solid = np.zeros((64, 64, 64), dtype=bool)
     solid[10:20, 10:20, 10:20] = True
     expected = np.argwhere(boundary(solid))
@@ -50,7 +50,7 @@ def test_the_outer_boundary_has_no_voxel_of_an_inner_wall() -> None:
 
 
 @given(seed=st.integers(0, 2**32 - 1), side=st.integers(2, 200))
-def test_places_in_the_flattened_grid_are_those_of_numpy(seed: int, side: int) -> None:
+def test_places_in_the_flattened_grid_are_those_of_numpy(seed, side):
     voxels = np.random.default_rng(seed).integers(0, side, (20, 3)).astype(np.uint8)
     flat = flat_index(voxels, side)
     np.testing.assert_array_equal(flat, np.ravel_multi_index(tuple(voxels.T), (side,) * 3))
@@ -60,7 +60,7 @@ def test_places_in_the_flattened_grid_are_those_of_numpy(seed: int, side: int) -
     assert voxels_at(flat_index(small)).dtype == np.uint8
 
 
-def test_what_is_above_the_ground_by_hand() -> None:
+def test_what_is_above_the_ground_by_hand():
     """A hollow box from z = 10 to 19, on ground whose top is the upper face of layer 12."""
     hollow = np.zeros((64, 64, 64), dtype=bool)
     hollow[20:30, 25:35, 10:20] = True
@@ -76,7 +76,7 @@ def test_what_is_above_the_ground_by_hand() -> None:
     assert not at_centre[:, :, 13].any() and at_centre[20:30, 25:35, 14].all()
 
 
-def test_ground_may_slope_along_any_axis() -> None:
+def test_ground_may_slope_along_any_axis():
     full = np.ones((64, 64, 64), dtype=bool)
     normal = np.array([0.48, -0.6, 0.64])
     centres = (np.argwhere(full) + 0.5) / 64 - 0.5
@@ -84,7 +84,7 @@ def test_ground_may_slope_along_any_axis() -> None:
     np.testing.assert_array_equal(left.reshape(-1), centres @ normal > 0.1)
 
 
-def test_cells_of_a_coarser_and_of_a_finer_grid_by_hand() -> None:
+def test_cells_of_a_coarser_and_of_a_finer_grid_by_hand():
     # A voxel of 32 is eight cells; of 128 eight voxels are one, which shows the first of them.
     cells, row = shown_in_cells(np.array([[3, 0, 31], [0, 0, 0]], np.uint8), 32)
     corners = np.argwhere(np.ones((2, 2, 2), dtype=bool))

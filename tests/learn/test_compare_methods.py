@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from click.testing import CliRunner, Result
 from scipy.spatial import cKDTree
-from support.synthetic import Dataset, MakeDataset
+from support.synthetic import Dataset
 
 from slatprep import InputError, open_store
 from slatprep.cli.commands import slatprep
@@ -102,7 +102,7 @@ def pixie_s_scores(truth: np.ndarray, values: np.ndarray, classes: np.ndarray) -
 
 
 @pytest.mark.parametrize("form", ["eleven", "four"])
-def test_on_its_own_grid_a_method_scores_as_by_pixie_s_code(case: Case, form: str) -> None:
+def test_on_its_own_grid_a_method_scores_as_by_pixie_s_code(case, form):
     rows = np.array(
         [
             pixie_s_scores(case.grids[name], grid[..., :3], grid[..., 3])
@@ -120,7 +120,7 @@ def test_on_its_own_grid_a_method_scores_as_by_pixie_s_code(case: Case, form: st
     np.testing.assert_allclose(list(by_n.spreads.values()), expected, atol=1e-6)
 
 
-def test_at_slat_voxels_the_nearest_annotated_voxel_is_looked_up(case: Case) -> None:
+def test_at_slat_voxels_the_nearest_annotated_voxel_is_looked_up(case):
     store, rows = open_store(case.store), []
     for index, name in enumerate(NAMES):
         stored = store.read(index, ("place", "properties", "material", "valid"))
@@ -137,7 +137,7 @@ def test_at_slat_voxels_the_nearest_annotated_voxel_is_looked_up(case: Case) -> 
     np.testing.assert_allclose(list(found.means.values()), np.mean(rows, axis=0), atol=1e-6)
 
 
-def test_what_labels_are_of_scores_perfectly(case: Case, tmp_path: Path) -> None:
+def test_what_labels_are_of_scores_perfectly(case, tmp_path):
     for name, grid in case.grids.items():
         written(tmp_path / name / "sample_0" / "material_grid.npy", grid)
     found = compared(case, tmp_path)
@@ -146,9 +146,7 @@ def test_what_labels_are_of_scores_perfectly(case: Case, tmp_path: Path) -> None
     assert found.problems == [] and found.partly_annotated == 0
 
 
-def test_by_vote_what_labels_are_of_scores_perfectly(
-    make_dataset: MakeDataset, tmp_path: Path
-) -> None:
+def test_by_vote_what_labels_are_of_scores_perfectly(make_dataset, tmp_path):
     dataset = make_dataset("a", "b")
     build_store(dataset.parameters(), tmp_path / "s.zarr")
     one = Case(tmp_path / "s.zarr", {}, {}, dataset.root / "pixieverse")
@@ -156,9 +154,7 @@ def test_by_vote_what_labels_are_of_scores_perfectly(
         np.testing.assert_allclose(list(measured.means.values()), [0, 0, 0, 0, 1], atol=1e-9)
 
 
-def test_other_ranges_are_brought_to_the_store_s(
-    case: Case, make_dataset: MakeDataset, tmp_path: Path
-) -> None:
+def test_other_ranges_are_brought_to_the_store_s(case, make_dataset, tmp_path):
     dataset = make_dataset(*NAMES)
     for name, grid in case.grids.items():
         dataset.write_grid(name, grid)
@@ -213,7 +209,7 @@ BAD: dict[str, tuple[Callable[[Path], None], str]] = {
 
 
 @pytest.mark.parametrize("fault", BAD)
-def test_a_bad_grid_is_named_and_the_rest_goes_on(case: Case, tmp_path: Path, fault: str) -> None:
+def test_a_bad_grid_is_named_and_the_rest_goes_on(case, tmp_path, fault):
     results = tmp_path / "results"
     for path in case.results.rglob("*.npy"):
         written(results / path.relative_to(case.results), np.load(path))
@@ -227,7 +223,7 @@ def test_a_bad_grid_is_named_and_the_rest_goes_on(case: Case, tmp_path: Path, fa
     assert len(document["problems"]) == 1
 
 
-def test_side_by_side_on_the_same_objects(case: Case, tmp_path: Path) -> None:
+def test_side_by_side_on_the_same_objects(case, tmp_path):
     ours = tmp_path / "ours"
     store = open_store(case.store)
     ours.mkdir()
@@ -275,23 +271,19 @@ def test_side_by_side_on_the_same_objects(case: Case, tmp_path: Path) -> None:
         (("--grids", "{results}", "--picture", "x.gif"), "x.gif does not end in .png"),
     ],
 )
-def test_what_cannot_be_compared_is_said(
-    case: Case, arguments: tuple[str, ...], message: str
-) -> None:
+def test_what_cannot_be_compared_is_said(case, arguments, message):
     filled = (argument.format(results=case.results) for argument in arguments)
     done = run("evaluate", *filled, "--store", case.store)
     assert done.exit_code == 2 and message in done.stderr, done.output
 
 
-def test_nothing_in_common_is_an_error(case: Case, tmp_path: Path) -> None:
+def test_nothing_in_common_is_an_error(case, tmp_path):
     written(tmp_path / "other.npy", np.zeros((4, 64, 64, 64), np.float32))
     with pytest.raises(InputError, match="no grid for id 'a'"):
         compared(case, tmp_path)
 
 
-def test_occupied_voxels_without_a_class_are_counted(
-    make_dataset: MakeDataset, tmp_path: Path
-) -> None:
+def test_occupied_voxels_without_a_class_are_counted(make_dataset, tmp_path):
     dataset = make_dataset("a", "b")
     grid = dataset.assets["a"].grid
     grid[tuple(np.argwhere(grid[..., 3] == 0)[:5].T)] = (0, 0, 0, -1)
@@ -305,7 +297,7 @@ def test_occupied_voxels_without_a_class_are_counted(
     assert "have no annotation and are not scored: 1;" in done.stderr
 
 
-def test_spreads_by_hand() -> None:
+def test_spreads_by_hand():
     rows = np.array([[0.0] * 5, [1.0] * 5, [5.0] * 5])
     found = {spread: list(measure(rows, spread).spreads.values()) for spread in SPREADS}
     sd = np.sqrt((4 + 1 + 9) / 2)
@@ -316,7 +308,7 @@ def test_spreads_by_hand() -> None:
     assert found["pixie-std"] == pytest.approx([by_n] * 4 + [1.645 * by_n])
 
 
-def test_published_spreads_are_those_printed() -> None:
+def test_published_spreads_are_those_printed():
     by_name = {score.method: score for score in SLAT_PHYS_TABLE}
     assert by_name["SLAT-Phys"].spreads["accuracy"] == 0.112
     assert by_name["Pixie"].spreads["log10 density"] == 0.009
@@ -339,16 +331,12 @@ def stuffed(case: Case, root: Path, change: Callable[[np.ndarray], np.ndarray]) 
         (lambda grid: grid * [1, 1, 100, 1], "Poisson's ratio"),
     ],
 )
-def test_values_that_are_no_prediction_are_refused(
-    case: Case, tmp_path: Path, change: Callable[[np.ndarray], np.ndarray], words: str
-) -> None:
+def test_values_that_are_no_prediction_are_refused(case, tmp_path, change, words):
     with pytest.raises(InputError, match=words):
         stuffed(case, tmp_path, change)
 
 
-def test_a_method_that_predicts_what_no_material_has_is_measured(
-    case: Case, tmp_path: Path
-) -> None:
+def test_a_method_that_predicts_what_no_material_has_is_measured(case, tmp_path):
     wrong = stuffed(
         case, tmp_path, lambda grid: np.where(grid[..., 3:] == 7, grid, [7850, 2e6, 0.3, 1])
     )

@@ -36,13 +36,13 @@ def model() -> PhysicsDecoder:
 
 
 @pytest.mark.parametrize(("size", "millions"), [("small", 0.20), ("medium", 1.19), ("large", 6.32)])
-def test_parameters_are_as_many_as_the_paper_says(size: str, millions: float) -> None:
+def test_parameters_are_as_many_as_the_paper_says(size, millions):
     parameters = sum(p.numel() for p in make_decoder(size).parameters())
     assert parameters / 1e6 == pytest.approx(millions, abs=0.0051)
     assert set(SIZES) == {"small", "medium", "large"}
 
 
-def test_order_of_voxels_is_of_no_matter(model: PhysicsDecoder) -> None:
+def test_order_of_voxels_is_of_no_matter(model):
     coords, feats = voxels(400, 0, extent=20)
     order = torch.randperm(400)
     straight, shuffled = model(coords, feats), model(coords[order], feats[order])
@@ -50,7 +50,7 @@ def test_order_of_voxels_is_of_no_matter(model: PhysicsDecoder) -> None:
         torch.testing.assert_close(a[order], b, rtol=0, atol=1e-5)
 
 
-def test_other_assets_in_the_batch_are_of_no_matter(model: PhysicsDecoder) -> None:
+def test_other_assets_in_the_batch_are_of_no_matter(model):
     # The neighbour is denser, so windows are padded to other lengths.
     coords, feats = voxels(150, 1, batch=0, extent=20)
     other, more = voxels(3000, 2, batch=1, extent=20)
@@ -61,7 +61,7 @@ def test_other_assets_in_the_batch_are_of_no_matter(model: PhysicsDecoder) -> No
 
 
 @pytest.mark.parametrize("shift", [0, 4])
-def test_attention_equals_a_dense_reference(shift: int) -> None:
+def test_attention_equals_a_dense_reference(shift):
     torch.manual_seed(0)
     attention = WindowAttention(24, 2)
     coords, _ = voxels(300, 3, extent=24)
@@ -80,7 +80,7 @@ def test_attention_equals_a_dense_reference(shift: int) -> None:
     torch.testing.assert_close(sparse, attention.out(torch.cat(heads, dim=1)), rtol=0, atol=1e-5)
 
 
-def test_shifted_windows_carry_news_further(model: PhysicsDecoder) -> None:
+def test_shifted_windows_carry_news_further(model):
     # 7 and 8 are in different windows of the first block and share one of the second.
     coords = torch.tensor([[0, 7, 0, 0], [0, 8, 0, 0], [0, 40, 40, 40]], dtype=torch.int32)
     feats = torch.zeros(3, 8, requires_grad=True)
@@ -91,7 +91,7 @@ def test_shifted_windows_carry_news_further(model: PhysicsDecoder) -> None:
 
 
 @pytest.mark.parametrize("channels", [24, 64])
-def test_positions_are_told_apart(channels: int) -> None:
+def test_positions_are_told_apart(channels):
     axis = torch.arange(64)
     for k in range(3):
         coords = torch.zeros(64, 3, dtype=torch.int32)
@@ -101,7 +101,7 @@ def test_positions_are_told_apart(channels: int) -> None:
         assert (torch.cdist(waves, waves) + torch.eye(64)).min() > 0.1
 
 
-def test_gradients_are_finite_in_mixed_precision(model: PhysicsDecoder) -> None:
+def test_gradients_are_finite_in_mixed_precision(model):
     coords, feats = voxels(500, 4, extent=24)
     with torch.autocast("cpu", torch.bfloat16):
         prediction = model(coords, 30 * feats)

@@ -36,7 +36,7 @@ from slatprep.readers.splits import SPLITS, split_objects
 THIRDS = Shares(0.4, 0.3, 0.3)
 
 
-def test_without_pytorch_scores_work_and_the_loader_says_what_to_install() -> None:
+def test_without_pytorch_scores_work_and_the_loader_says_what_to_install():
     script = (
         "import sys; sys.modules['torch'] = None\n"
         "from slatprep.learn import Shares\nimport slatprep.learn.metrics\n"
@@ -49,7 +49,7 @@ def test_without_pytorch_scores_work_and_the_loader_says_what_to_install() -> No
 
 
 @given(st.text(), st.tuples(st.integers(0, 100), st.integers(1, 100), st.integers(1, 100)))
-def test_split_is_where_the_hash_falls(object_id: str, parts: tuple[int, int, int]) -> None:
+def test_split_is_where_the_hash_falls(object_id, parts):
     total = sum(parts)
     shares = Shares(parts[0] / total, parts[1] / total, 1 - (parts[0] + parts[1]) / total)
     position = int(hashlib.sha256(object_id.encode()).hexdigest()[:16], 16) / 2**64
@@ -59,14 +59,14 @@ def test_split_is_where_the_hash_falls(object_id: str, parts: tuple[int, int, in
         assert split_of(object_id, shares) == expected
 
 
-def test_shares_are_kept_on_many_objects() -> None:
+def test_shares_are_kept_on_many_objects():
     found = [split_of(f"{k:032x}") for k in range(20_000)]
     assert [found.count(s) / 20_000 for s in ("train", "val", "test")] == pytest.approx(
         [0.8, 0.1, 0.1], abs=0.01
     )
 
 
-def test_splits_part_the_store_and_keep_views_together(learn_store: Path) -> None:
+def test_splits_part_the_store_and_keep_views_together(learn_store):
     store = open_store(learn_store)
     parts = [select_assets(store, split, shares=THIRDS) for split in ("train", "val", "test")]
     assert sorted(np.concatenate(parts).tolist()) == list(range(len(store)))
@@ -74,14 +74,14 @@ def test_splits_part_the_store_and_keep_views_together(learn_store: Path) -> Non
     assert [len(views & set(part.tolist())) for part in parts].count(2) == 1
 
 
-def test_type_checkers_know_what_a_loader_yields() -> None:
+def test_type_checkers_know_what_a_loader_yields():
     # torch's own says Any; mypy --strict checks that the body agrees.
     names = {"Iterator": Iterator, "SparseBatch": SparseBatch}
     hints = get_type_hints(SlatLoader.__iter__, names)
     assert hints == {"return": Iterator[SparseBatch]}
 
 
-def test_filters(learn_store: Path) -> None:
+def test_filters(learn_store):
     store = open_store(learn_store)
     good = select_assets(store, verdicts=("good",))
     assert good.tolist() == np.flatnonzero(store.column("verdict").astype(str) == "good").tolist()
@@ -96,7 +96,7 @@ def test_filters(learn_store: Path) -> None:
         SlatDataset(store, "train", shares=Shares(0.0, 0.0, 1.0))
 
 
-def test_batch_is_what_zarr_reads(learn_store: Path) -> None:
+def test_batch_is_what_zarr_reads(learn_store):
     dataset = SlatDataset(learn_store)
     batch = collate([dataset[k] for k in range(3)])
     root = zarr.open_group(learn_store, mode="r")
@@ -129,7 +129,7 @@ def epochs(loader: SlatLoader) -> list[SparseBatch]:
 
 
 @pytest.mark.parametrize(("workers", "method"), [(2, "fork"), (1, "spawn")])
-def test_workers_change_nothing(learn_store: Path, workers: int, method: str) -> None:
+def test_workers_change_nothing(learn_store, workers, method):
     dataset = SlatDataset(learn_store, augmentation="all", seed=3)
     alone = epochs(SlatLoader(dataset, 2, shuffle=True))
     shared = epochs(SlatLoader(dataset, 2, shuffle=True, workers=workers, start_method=method))
@@ -142,7 +142,7 @@ def test_workers_change_nothing(learn_store: Path, workers: int, method: str) ->
     assert first != second
 
 
-def test_symmetries_are_the_groups_they_should_be() -> None:
+def test_symmetries_are_the_groups_they_should_be():
     for kind, size in (("none", 1), ("upright", 8), ("all", 48)):
         matrices = lattice_symmetries(kind)
         known = {m.tobytes() for m in matrices}
@@ -152,7 +152,7 @@ def test_symmetries_are_the_groups_they_should_be() -> None:
         assert all(np.array_equal(m @ m.T, np.eye(3)) for m in matrices)
 
 
-def test_moving_turns_the_centres() -> None:
+def test_moving_turns_the_centres():
     coords = np.random.default_rng(0).integers(0, 64, (50, 3)).astype(np.int32)
     for matrix in lattice_symmetries("all"):
         moved = move(coords, matrix)
@@ -163,7 +163,7 @@ def test_moving_turns_the_centres() -> None:
         )
 
 
-def test_augmentation_moves_coordinates_and_nothing_else(learn_store: Path) -> None:
+def test_augmentation_moves_coordinates_and_nothing_else(learn_store):
     plain, turned = SlatDataset(learn_store), SlatDataset(learn_store, augmentation="all", seed=1)
     moved = 0
     for k in range(len(plain)):
@@ -177,7 +177,7 @@ def test_augmentation_moves_coordinates_and_nothing_else(learn_store: Path) -> N
 
 
 @given(st.sets(st.text(min_size=1), min_size=1, max_size=12))
-def test_no_split_is_empty_where_there_are_as_many_objects(objects: set[str]) -> None:
+def test_no_split_is_empty_where_there_are_as_many_objects(objects):
     splits = split_objects(objects)
     assert splits.keys() == objects
     assert len(set(splits.values())) == min(len(objects), 3)
@@ -187,7 +187,7 @@ def test_no_split_is_empty_where_there_are_as_many_objects(objects: set[str]) ->
     assert "val" not in split_objects(objects, Shares(0.5, 0.0, 0.5)).values()
 
 
-def test_what_is_filtered_moves_no_object_to_another_split(learn_store: Path) -> None:
+def test_what_is_filtered_moves_no_object_to_another_split(learn_store):
     store = open_store(learn_store)
     ambiguity = np.sort(store.column("ambiguity"))
     for shares in (THIRDS, Shares(), Shares(0.02, 0.96, 0.02)):
@@ -199,13 +199,13 @@ def test_what_is_filtered_moves_no_object_to_another_split(learn_store: Path) ->
                 assert set(some) <= everything[split]
 
 
-def test_a_plain_loader_takes_collate(learn_store: Path) -> None:
+def test_a_plain_loader_takes_collate(learn_store):
     dataset = SlatDataset(learn_store)
     batches = list(DataLoader(dataset, batch_size=4, collate_fn=collate))
     assert [asset for batch in batches for asset in batch.asset_ids] == dataset.asset_ids
 
 
-def test_voxels_that_are_not_sure_enough_are_left_out(learn_store: Path, tmp_path: Path) -> None:
+def test_voxels_that_are_not_sure_enough_are_left_out(learn_store, tmp_path):
     doubtful = Path(shutil.copytree(learn_store, tmp_path / "doubtful.zarr"))
     array = zarr.open_group(doubtful, mode="r+", use_consolidated=False)["voxel/confidence"]
     array[:] = array[:] * np.random.default_rng(0).uniform(size=array.shape)

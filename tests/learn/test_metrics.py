@@ -17,7 +17,7 @@ from slatprep.learn.predictions import VoxelPrediction
 from slatprep.learn.published import PIXIE_TABLE, SLAT_PHYS_TABLE, read_scores
 
 
-def test_one_asset_by_hand() -> None:
+def test_one_asset_by_hand():
     truth = np.array([[0, 0, 0], [1, 1, 1], [np.nan] * 3], np.float32)
     predicted = VoxelPrediction(
         np.array([[0.5, 0, 1], [0.5, 1, 0], [9, 9, 9]]), np.array([2, 3, 4])
@@ -29,7 +29,7 @@ def test_one_asset_by_hand() -> None:
     assert score.tolist() == [0.25, 0.0, 1.0, pytest.approx(1.25 / 3), 0.5]
 
 
-def test_objects_count_alike_whatever_their_views() -> None:
+def test_objects_count_alike_whatever_their_views():
     scores = [np.full(5, value) for value in (0.0, 2.0, 4.0)]
     overall, groups = average_objects(scores, ["a", "a", "b"], ["x", "x", "y"], "sd")
     # a is (0 + 2) / 2 = 1, b is 4: mean 2.5, sample deviation 3 / sqrt(2).
@@ -40,7 +40,7 @@ def test_objects_count_alike_whatever_their_views() -> None:
     assert np.isnan(groups["x"].spreads["nu"])
 
 
-def test_standard_error_is_the_deviation_over_root_n() -> None:
+def test_standard_error_is_the_deviation_over_root_n():
     rows = np.random.default_rng(0).random((9, 5))
     sd, se = measure(rows, "sd").spreads, measure(rows, "se").spreads
     assert {k: v / 3 for k, v in sd.items()} == pytest.approx(se)
@@ -76,9 +76,7 @@ def predicted(learn_store: Path, tmp_path_factory: pytest.TempPathFactory) -> di
 
 
 @pytest.mark.parametrize("form", ["npz", "zarr", "hdf5"])
-def test_against_a_plain_computation(
-    learn_store: Path, predicted: dict[str, Path], form: str
-) -> None:
+def test_against_a_plain_computation(learn_store, predicted, form):
     root = zarr.open_group(learn_store, mode="r")
     offset, objects = np.asarray(root["asset/offset"]), np.asarray(root["asset/object_id"])
     truth, material = np.asarray(root["voxel/properties"]), np.asarray(root["voxel/material"])
@@ -106,7 +104,7 @@ def test_against_a_plain_computation(
     assert list(result.overall.spreads.values()) == pytest.approx(error.tolist())
 
 
-def test_perfect_predictions_score_perfectly(learn_store: Path, tmp_path: Path) -> None:
+def test_perfect_predictions_score_perfectly(learn_store, tmp_path):
     store = open_store(learn_store)
     for index, asset_id in enumerate(store.ids):
         rows = store.read(index, ("properties", "material"))
@@ -130,9 +128,7 @@ def test_perfect_predictions_score_perfectly(learn_store: Path, tmp_path: Path) 
         ({"properties": None, "coords": 1}, "other voxels"),
     ],
 )
-def test_bad_predictions_are_named(
-    learn_store: Path, tmp_path: Path, arrays: dict[str, object], message: str
-) -> None:
+def test_bad_predictions_are_named(learn_store, tmp_path, arrays, message):
     store = open_store(learn_store)
     count = store.rows(0)[1]
     shapes = {"properties": (count, 3), "material": (count,), "coords": (count, 3)}
@@ -146,7 +142,7 @@ def test_bad_predictions_are_named(
     assert store.ids[0] in str(caught.value)
 
 
-def test_command(learn_store: Path, predicted: dict[str, Path], tmp_path: Path) -> None:
+def test_command(learn_store, predicted, tmp_path):
     some = tmp_path / "some"
     shutil.copytree(predicted["npz"], some)
     (some / "a.npz").unlink()
@@ -165,16 +161,14 @@ def test_command(learn_store: Path, predicted: dict[str, Path], tmp_path: Path) 
     assert "log10 density" in table
 
 
-def test_published_rows_agree_with_themselves() -> None:
+def test_published_rows_agree_with_themselves():
     # The paper prints the mean of the three beside them, so a slip in copying shows.
     for score in (*PIXIE_TABLE, *SLAT_PHYS_TABLE):
         three = [score.means[name] for name in ("log10 E", "log10 density", "nu")]
         assert score.means["mean"] == pytest.approx(np.mean(three), abs=0.0011), score.method
 
 
-def test_table_is_printed_beside(
-    learn_store: Path, predicted: dict[str, Path], tmp_path: Path
-) -> None:
+def test_table_is_printed_beside(learn_store, predicted, tmp_path):
     arguments = ["evaluate", str(predicted["npz"]), "--store", str(learn_store), "--split", "all"]
     shown = CliRunner().invoke(slatprep, [*arguments, "--beside", "pixie"])
     assert shown.exit_code == 0, shown.output
@@ -206,7 +200,7 @@ def test_table_is_printed_beside(
         ("method,nu\nmine,0,1\n", "has 3 entries under 2 columns, for 'mine'"),
     ],
 )
-def test_own_tables(tmp_path: Path, text: str, message: str | None) -> None:
+def test_own_tables(tmp_path, text, message):
     path = tmp_path / "own.csv"
     path.write_text(text)
     if message is None:

@@ -62,10 +62,10 @@ def save(path: Path, latents: StructuredLatents) -> None:
 def run(*arguments: object, code: int = 0) -> dict[str, object]:
     result = CliRunner().invoke(slatprep, ["predict", *map(str, arguments), "--json"])
     assert result.exit_code == code, result.output
-    return json.loads(result.stdout)  # type: ignore[no-any-return]
+    return json.loads(result.stdout)
 
 
-def test_a_prediction_is_the_decoder_s_and_its_units_follow_by_hand(checkpoint: Path) -> None:
+def test_a_prediction_is_the_decoder_s_and_its_units_follow_by_hand(checkpoint):
     latents = random_latents(0)
     (field,) = predict(load_checkpoint(checkpoint), [latents])
     model = make_decoder("small")
@@ -85,7 +85,7 @@ def test_a_prediction_is_the_decoder_s_and_its_units_follow_by_hand(checkpoint: 
     np.testing.assert_allclose(field.properties_si, expected, rtol=1e-5)
 
 
-def test_what_is_in_a_batch_changes_no_more_than_the_last_bits(checkpoint: Path) -> None:
+def test_what_is_in_a_batch_changes_no_more_than_the_last_bits(checkpoint):
     assets = [random_latents(seed, 100 + 50 * seed) for seed in range(4)]
     decoder = load_checkpoint(checkpoint)
     alone = list(predict(decoder, assets, batch_voxels=1))
@@ -98,7 +98,7 @@ def test_what_is_in_a_batch_changes_no_more_than_the_last_bits(checkpoint: Path)
             assert field.seconds > 0
 
 
-def test_a_folder_of_slats_and_a_file_that_cannot_be_read(checkpoint: Path, tmp_path: Path) -> None:
+def test_a_folder_of_slats_and_a_file_that_cannot_be_read(checkpoint, tmp_path):
     slats, out = tmp_path / "slat", tmp_path / "out"
     save(slats / "a.npz", random_latents(1))
     save(slats / "b" / "front.npz", random_latents(2))
@@ -109,7 +109,7 @@ def test_a_folder_of_slats_and_a_file_that_cannot_be_read(checkpoint: Path, tmp_
     assert told["predicted"] == 2
     assert told["voxels"] == 600
     assert told["checkpoint"] == hashlib.sha256((checkpoint / "best.pt").read_bytes()).hexdigest()
-    one, other = told["problems"]  # type: ignore[misc]
+    one, other = told["problems"]
     assert "c.npz" in one
     assert other.startswith("d: what is predicted of its latents is not finite")
     assert sorted(path.name for path in out.iterdir()) == ["a.npz", "b.front.npz"]
@@ -127,9 +127,7 @@ def test_a_folder_of_slats_and_a_file_that_cannot_be_read(checkpoint: Path, tmp_
 
 
 @pytest.mark.parametrize("command", ["predict", "train"])
-def test_a_device_that_is_not_there_is_named(
-    checkpoint: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, command: str
-) -> None:
+def test_a_device_that_is_not_there_is_named(checkpoint, tmp_path, monkeypatch, command):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     weights = ["--checkpoint", str(checkpoint)] if command == "predict" else []
     source = tmp_path / "data"
@@ -140,7 +138,7 @@ def test_a_device_that_is_not_there_is_named(
     assert not (tmp_path / "out").exists()
 
 
-def test_one_file_of_either_kind(checkpoint: Path, tmp_path: Path) -> None:
+def test_one_file_of_either_kind(checkpoint, tmp_path):
     latents = random_latents(4)
     save(tmp_path / "one.npz", latents)
     with h5py.File(tmp_path / "two.h5", "w") as file:
@@ -164,7 +162,7 @@ def test_one_file_of_either_kind(checkpoint: Path, tmp_path: Path) -> None:
         )
 
 
-def test_a_store_of_other_ranges_measures_the_same(checkpoint: Path, tmp_path: Path) -> None:
+def test_a_store_of_other_ranges_measures_the_same(checkpoint, tmp_path):
     """The error of one prediction does not depend on who normalised it."""
     data = Dataset(tmp_path / "data")
     for k in range(2):
@@ -190,7 +188,7 @@ def test_a_store_of_other_ranges_measures_the_same(checkpoint: Path, tmp_path: P
         assert reports[-1].overall.means["mean"] == pytest.approx(np.mean(errors), rel=1e-4)
 
 
-def test_ranges_of_a_prediction_are_checked_and_equal_ones_change_nothing() -> None:
+def test_ranges_of_a_prediction_are_checked_and_equal_ones_change_nothing():
     coords = np.array([[1, 2, 3]], np.uint8)
     values = normalize_properties([[1e7, 1000.0, 0.3]])
     own = np.array([[span.lo, span.hi] for span in PIXIE_RANGES.ranges])
@@ -216,9 +214,9 @@ def test_ranges_of_a_prediction_are_checked_and_equal_ones_change_nothing() -> N
     ],
     ids=["no ranges", "ranges turned about", "size", "ranges without end", "weights", "no numbers"],
 )
-def test_a_checkpoint_that_says_too_little_is_refused(checkpoint: Path, change: object) -> None:
+def test_a_checkpoint_that_says_too_little_is_refused(checkpoint, change):
     state = torch.load(checkpoint / "best.pt", weights_only=True)
-    change(state)  # type: ignore[operator]
+    change(state)
     torch.save(state, checkpoint / "best.pt")
     with pytest.raises(InputError, match=r"best\.pt: holds no decoder with its ranges"):
         load_checkpoint(checkpoint)
@@ -293,17 +291,15 @@ def image(tmp_path: Path) -> Path:
     return tmp_path / "cup.png"
 
 
-def test_an_image_becomes_gaussians_with_materials(
-    checkpoint: Path, tmp_path: Path, trellis: Pipeline, image: Path
-) -> None:
+def test_an_image_becomes_gaussians_with_materials(checkpoint, tmp_path, trellis, image):
     from plyfile import PlyData
 
     out, ply = tmp_path / "out", tmp_path / "cup.ply"
     words = (image, "--checkpoint", checkpoint, "--out", out, "--gaussians", ply)
     stages = ["image", "sparse structure", "SLAT", "read", "decode", "write", "gaussians"]
-    assert list(run(*words)["seconds"]) == stages  # type: ignore[call-overload]
+    assert list(run(*words)["seconds"]) == stages
     # A second time the latents are there; what the decoder does is done again.
-    assert list(run(*words)["seconds"]) == stages[3:]  # type: ignore[call-overload]
+    assert list(run(*words)["seconds"]) == stages[3:]
     np.testing.assert_array_equal(trellis.feats, random_latents(9).feats)
     rows = PlyData.read(str(ply))["vertex"].data
     with np.load(out / "cup.npz") as held:
@@ -317,8 +313,8 @@ def test_an_image_becomes_gaussians_with_materials(
 
 @pytest.mark.parametrize(("far", "kept"), [("drop", 299), ("nearest", 300)])
 def test_far_gaussians_of_an_image_are_what_far_says(
-    far: str, kept: int, checkpoint: Path, tmp_path: Path, trellis: Pipeline, image: Path
-) -> None:
+    far, kept, checkpoint, tmp_path, trellis, image
+):
     from plyfile import PlyData
 
     trellis.shift = np.array([9.0, 0.0, 0.0])
@@ -341,9 +337,7 @@ def step(*words: object, code: int = 0) -> str:
     return result.output
 
 
-def test_each_step_alone_comes_to_what_the_one_line_does(
-    checkpoint: Path, tmp_path: Path, trellis: Pipeline, image: Path
-) -> None:
+def test_each_step_alone_comes_to_what_the_one_line_does(checkpoint, tmp_path, trellis, image):
     at_once = tmp_path / "at-once.ply"
     run(image, "--checkpoint", checkpoint, "--out", tmp_path / "out", "--gaussians", at_once)
     slats, predictions, gaussians = (tmp_path / name for name in ("slat", "p", "gaussians"))
@@ -359,9 +353,7 @@ def test_each_step_alone_comes_to_what_the_one_line_does(
     assert stepped.read_bytes() == at_once.read_bytes()
 
 
-def test_gaussians_of_stored_latents_and_of_standardised_ones(
-    tmp_path: Path, trellis: Pipeline
-) -> None:
+def test_gaussians_of_stored_latents_and_of_standardised_ones(tmp_path, trellis):
     """The decoder gets latents as TRELLIS draws them, whatever was done to those that are saved."""
     data = Dataset(tmp_path / "data")
     for k in range(2):
@@ -383,8 +375,8 @@ def test_gaussians_of_stored_latents_and_of_standardised_ones(
 
 
 def test_latents_that_trellis_cannot_decode_are_named_and_the_others_decoded(
-    tmp_path: Path, trellis: Pipeline, monkeypatch: pytest.MonkeyPatch
-) -> None:
+    tmp_path, trellis, monkeypatch
+):
     slats, out = tmp_path / "slat", tmp_path / "gaussians"
     for number, name in enumerate(("a", "b", "c")):
         save(slats / f"{name}.npz", random_latents(number, 200 + 100 * number))
@@ -406,7 +398,7 @@ def test_latents_that_trellis_cannot_decode_are_named_and_the_others_decoded(
     assert sorted(path.name for path in out.iterdir()) == ["a.ply", "c.ply"]
 
 
-def test_latents_of_another_encoder_are_no_input(checkpoint: Path, tmp_path: Path) -> None:
+def test_latents_of_another_encoder_are_no_input(checkpoint, tmp_path):
     data = Dataset(tmp_path / "data")
     data.add("a", seed=0)
     parameters = data.parameters()
@@ -419,13 +411,13 @@ def test_latents_of_another_encoder_are_no_input(checkpoint: Path, tmp_path: Pat
     assert "latents of trellis2 (32 channels); expected those of trellis" in step(*words, code=2)
 
 
-def test_a_checkpoint_that_would_set_memory_aside_is_not_unpickled(checkpoint: Path) -> None:
+def test_a_checkpoint_that_would_set_memory_aside_is_not_unpickled(checkpoint):
     torch.save({"size": "small", "extra": bytearray(10)}, checkpoint / "best.pt")
     with pytest.raises(InputError, match=r"it names '.* bytearray'"):
         load_checkpoint(checkpoint)
 
 
-def test_latents_of_a_store_are_held_to_what_a_file_s_are(checkpoint: Path, tmp_path: Path) -> None:
+def test_latents_of_a_store_are_held_to_what_a_file_s_are(checkpoint, tmp_path):
     data = Dataset(tmp_path / "data")
     for k in range(2):
         data.add(f"a{k}", seed=k)
@@ -435,11 +427,11 @@ def test_latents_of_a_store_are_held_to_what_a_file_s_are(checkpoint: Path, tmp_
     feats[5] = np.nan
     told = run(store, "--checkpoint", checkpoint, "--out", tmp_path / "p", code=1)
     assert told["predicted"] == 1
-    (problem,) = told["problems"]  # type: ignore[misc]
+    (problem,) = told["problems"]
     assert "[a0]" in problem
     assert "finite" in problem
     (tmp_path / "s.zarr/voxel/feats/c/0/0").write_bytes(b"")
     told = run(store, "--checkpoint", checkpoint, "--out", tmp_path / "p", code=1)
     assert told["predicted"] == 1  # the other asset's rows are in other shards
-    (problem,) = told["problems"]  # type: ignore[misc]
+    (problem,) = told["problems"]
     assert "has no sound index" in problem

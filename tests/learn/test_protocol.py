@@ -32,7 +32,7 @@ def lists(tmp_path: Path) -> Path:
     return path
 
 
-def test_a_store_is_parted_by_each_rule(learn_store: Path, lists: Path) -> None:
+def test_a_store_is_parted_by_each_rule(learn_store, lists):
     store = open_store(learn_store)
     found = assign_store(store, str(lists))
     assert found.lists() == {"train": ["a", "b", "c"], "val": ["d"], "test": ["e", "h"]}
@@ -44,9 +44,7 @@ def test_a_store_is_parted_by_each_rule(learn_store: Path, lists: Path) -> None:
     assert SlatDataset(store, "val", splits=found.splits).asset_ids == ["d"]
 
 
-def test_a_run_keeps_its_lists_and_evaluate_takes_them(
-    learn_store: Path, lists: Path, tmp_path: Path
-) -> None:
+def test_a_run_keeps_its_lists_and_evaluate_takes_them(learn_store, lists, tmp_path):
     out = tmp_path / "run"
     command = ("train", learn_store, "--out", out, *FAST, "--epochs", "1", "--split-by", lists)
     trained = run(*command)
@@ -73,9 +71,7 @@ def test_a_run_keeps_its_lists_and_evaluate_takes_them(
     assert other.exit_code == 2 and "splits" in other.stderr
 
 
-def test_evaluate_outside_a_run_says_which_split_it_takes(
-    learn_store: Path, tmp_path: Path
-) -> None:
+def test_evaluate_outside_a_run_says_which_split_it_takes(learn_store, tmp_path):
     store = open_store(learn_store)
     for index, asset_id in enumerate(store.ids):
         coords = store.read(index, ("coords",))["coords"]
@@ -92,7 +88,7 @@ def test_evaluate_outside_a_run_says_which_split_it_takes(
 
 
 @pytest.mark.parametrize("steps", [1, 3, 4])
-def test_steps_end_where_they_are_told_to(learn_store: Path, tmp_path: Path, steps: int) -> None:
+def test_steps_end_where_they_are_told_to(learn_store, tmp_path, steps):
     chosen = TrainParameters(
         size="small", steps=steps, epochs=1, batch_size=1, accumulate=2, learning_rate=2e-3,
         shares=Shares(0.4, 0.3, 0.3), keep="last",
@@ -113,7 +109,7 @@ def test_steps_end_where_they_are_told_to(learn_store: Path, tmp_path: Path, ste
     assert seen == [(k, done) for k in range(done + 1)]
 
 
-def test_a_run_of_steps_goes_on_to_the_bit(learn_store: Path, tmp_path: Path) -> None:
+def test_a_run_of_steps_goes_on_to_the_bit(learn_store, tmp_path):
     chosen = TrainParameters(
         size="small", steps=5, batch_size=2, learning_rate=2e-3, shares=Shares(0.4, 0.3, 0.3)
     )
@@ -127,7 +123,7 @@ def test_a_run_of_steps_goes_on_to_the_bit(learn_store: Path, tmp_path: Path) ->
     assert all(torch.equal(whole[key], parts[key]) for key in whole)
 
 
-def test_the_last_weights_need_no_validation(learn_store: Path, tmp_path: Path) -> None:
+def test_the_last_weights_need_no_validation(learn_store, tmp_path):
     shares = Shares(0.9, 0.0, 0.1)
     two = TrainParameters(size="small", epochs=2, learning_rate=2e-3, shares=shares, keep="last")
     summary = train(learn_store, tmp_path / "run", two)
@@ -146,7 +142,7 @@ def test_the_last_weights_need_no_validation(learn_store: Path, tmp_path: Path) 
     assert "loss nan" not in shown.output
 
 
-def test_epochs_and_steps_are_not_given_together(learn_store: Path, tmp_path: Path) -> None:
+def test_epochs_and_steps_are_not_given_together(learn_store, tmp_path):
     both = run("train", learn_store, "--out", tmp_path / "run", "--epochs", "2", "--steps", "3")
     assert both.exit_code == 2 and "give one of them" in both.stderr
 
@@ -156,13 +152,8 @@ def test_epochs_and_steps_are_not_given_together(learn_store: Path, tmp_path: Pa
     [(("--steps", "1"), 1, 4), (("--steps", "1", "--accumulate", "2"), 1, 2), ((), 2000, 4)],
 )
 def test_the_paper_s_preset_is_what_is_not_given(
-    words: tuple[str, ...],
-    steps: int,
-    accumulate: int,
-    learn_store: Path,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+    words, steps, accumulate, learn_store, tmp_path, monkeypatch
+):
     asked: list[TrainParameters] = []
 
     def stop(store: Path, out: Path, parameters: TrainParameters, **_: object) -> None:

@@ -72,16 +72,14 @@ def refused(path: Path, said: str) -> None:
 
 
 @pytest.mark.parametrize(("change", "said"), CHANGES.values(), ids=CHANGES)
-def test_a_checkpoint_is_refused_in_words(
-    change: Callable[[dict[str, Any]], object], said: str, tmp_path: Path
-) -> None:
+def test_a_checkpoint_is_refused_in_words(change, said, tmp_path):
     state = checkpoint_state(make_decoder("small"), "small", PIXIE_RANGES)
     change(state)
     torch.save(state, tmp_path / "best.pt")
     refused(tmp_path / "best.pt", said)
 
 
-def test_a_structure_of_millions_of_lists_is_not_unpickled(tmp_path: Path) -> None:
+def test_a_structure_of_millions_of_lists_is_not_unpickled(tmp_path):
     path = tmp_path / "best.pt"
     torch.save({"size": "small"}, path)
     with zipfile.ZipFile(path) as archive:
@@ -102,13 +100,13 @@ def _add(path: Path, name: str, content: bytes, times: int = 1) -> None:
             archive.writestr(name.format(number), content)
 
 
-def test_more_members_than_tensors_are_not_looked_at(tmp_path: Path) -> None:
+def test_more_members_than_tensors_are_not_looked_at(tmp_path):
     torch.save({"size": "small"}, tmp_path / "best.pt")
     _add(tmp_path / "best.pt", "best/data/x{}", b"", times=20_000)
     refused(tmp_path / "best.pt", "20,0.. members, and at most 10,000")
 
 
-def test_members_that_overlap_are_not_read(tmp_path: Path) -> None:
+def test_members_that_overlap_are_not_read(tmp_path):
     """A directory may name one member again and again, each time with all its bytes."""
     path = tmp_path / "best.pt"
     torch.save({"size": "small", "other": torch.zeros(1000)}, path)
@@ -122,16 +120,14 @@ def test_members_that_overlap_are_not_read(tmp_path: Path) -> None:
     refused(path, "its members overlap")
 
 
-def test_a_program_of_torchscript_is_refused_without_a_word_of_torch(
-    tmp_path: Path, recwarn: pytest.WarningsRecorder
-) -> None:
+def test_a_program_of_torchscript_is_refused_without_a_word_of_torch(tmp_path, recwarn):
     torch.save({"size": "small"}, tmp_path / "best.pt")
     _add(tmp_path / "best.pt", "best/constants.pkl", b"\x80\x02N.")
     refused(tmp_path / "best.pt", "it holds a program of TorchScript")
     assert not recwarn.list
 
 
-def test_the_largest_decoder_with_its_optimiser_is_no_stranger(tmp_path: Path) -> None:
+def test_the_largest_decoder_with_its_optimiser_is_no_stranger(tmp_path):
     model = make_decoder("large")
     optimizer = torch.optim.AdamW(model.parameters())
     sum(weight.sum() for weight in model.parameters()).backward()

@@ -41,7 +41,7 @@ def hostile(learn_store: Path, tmp_path: Path) -> Path:
     return store
 
 
-def test_training_writes_nothing_outside(hostile: Path, tmp_path: Path) -> None:
+def test_training_writes_nothing_outside(hostile, tmp_path):
     out = tmp_path / "deep" / "runs" / "x"
     summary = train(hostile, out, SHORT)
     written = list(summary.predictions.iterdir())
@@ -51,7 +51,7 @@ def test_training_writes_nothing_outside(hostile: Path, tmp_path: Path) -> None:
     assert found.missing == []
 
 
-def test_evaluation_reads_nothing_outside(hostile: Path, tmp_path: Path) -> None:
+def test_evaluation_reads_nothing_outside(hostile, tmp_path):
     store, folder = open_store(hostile), tmp_path / "predictions"
     folder.mkdir()
     count = store.rows(4)[1] - store.rows(4)[0]
@@ -81,9 +81,7 @@ def test_evaluation_reads_nothing_outside(hostile: Path, tmp_path: Path) -> None
     ],
 )
 @pytest.mark.parametrize("form", ["npz", "hdf5", "zarr"])
-def test_values_that_are_no_prediction_are_named(
-    learn_store: Path, tmp_path: Path, arrays: dict[str, Any], message: str, form: str
-) -> None:
+def test_values_that_are_no_prediction_are_named(learn_store, tmp_path, arrays, message, form):
     count = open_store(learn_store).rows(0)[1]
     shapes = {"properties": (count, 3), "material": (count,), "coords": (count, 3)}
     shapes |= {"logits": (count, 8)}
@@ -111,7 +109,7 @@ def test_values_that_are_no_prediction_are_named(
         evaluate_store(path, learn_store, None)
 
 
-def test_what_lies_beside_a_prediction_is_not_unpacked(learn_store: Path, tmp_path: Path) -> None:
+def test_what_lies_beside_a_prediction_is_not_unpacked(learn_store, tmp_path):
     store = open_store(learn_store)
     for row, asset_id in enumerate(store.ids):
         count = len(store.read(row, ("coords",))["coords"])
@@ -125,7 +123,7 @@ def test_what_lies_beside_a_prediction_is_not_unpacked(learn_store: Path, tmp_pa
     assert evaluate_store(tmp_path, learn_store, None).missing == []
 
 
-def test_zarr_predictions_of_any_cut_are_read(learn_store: Path, tmp_path: Path) -> None:
+def test_zarr_predictions_of_any_cut_are_read(learn_store, tmp_path):
     store = open_store(learn_store)
     root = zarr.open_group(tmp_path / "p.zarr", mode="w")
     cuts = [{}, {"chunks": (100, 2)}, {"chunks": (128, 3), "shards": (1024, 3)}]
@@ -161,8 +159,8 @@ def test_zarr_predictions_of_any_cut_are_read(learn_store: Path, tmp_path: Path)
     ],
 )
 def test_zarr_predictions_of_other_codecs_or_sizes_are_refused(
-    learn_store: Path, tmp_path: Path, change: dict[str, Any], message: str
-) -> None:
+    learn_store, tmp_path, change, message
+):
     count = open_store(learn_store).rows(0)[1]
     root = zarr.open_group(tmp_path / "p.zarr", mode="w")
     root.create_group("a").create_array("properties", data=np.ones((count, 3)))
@@ -183,9 +181,7 @@ def test_zarr_predictions_of_other_codecs_or_sizes_are_refused(
     ],
 )
 @pytest.mark.parametrize("shards", [None, (8, 3)])
-def test_metadata_of_arrays_are_taken_at_their_word(
-    tmp_path: Path, change: dict[str, Any], message: str, shards: tuple[int, ...] | None
-) -> None:
+def test_metadata_of_arrays_are_taken_at_their_word(tmp_path, change, message, shards):
     root, spec = zarr.open_group(tmp_path / "p.zarr", mode="w"), ArraySpec(((None, 3),), "u")
     array = root.create_array("a", shape=(8, 3), dtype="uint8", chunks=(4, 3), shards=shards)
     array[:] = 1
@@ -196,7 +192,7 @@ def test_metadata_of_arrays_are_taken_at_their_word(
         read_array(file.parent, file.parents[1], spec)
 
 
-def test_a_lost_chunk_of_a_prediction_is_refused(tmp_path: Path) -> None:
+def test_a_lost_chunk_of_a_prediction_is_refused(tmp_path):
     root, spec = zarr.open_group(tmp_path / "p.zarr", mode="w"), ArraySpec(((None, 3),), "u")
     root.create_array("a", shape=(8, 3), dtype="uint8", chunks=(4, 3))[:] = 1
     (tmp_path / "p.zarr/a/c/1/0").unlink()
@@ -204,7 +200,7 @@ def test_a_lost_chunk_of_a_prediction_is_refused(tmp_path: Path) -> None:
         read_array(tmp_path / "p.zarr/a", tmp_path / "p.zarr", spec)
 
 
-def test_a_lost_shard_of_a_prediction_is_refused(tmp_path: Path) -> None:
+def test_a_lost_shard_of_a_prediction_is_refused(tmp_path):
     root, spec = zarr.open_group(tmp_path / "p.zarr", mode="w"), ArraySpec(((None, 3),), "u")
     root.create_array("a", shape=(8, 3), dtype="uint8", chunks=(2, 3), shards=(4, 3))[:] = 1
     (tmp_path / "p.zarr/a/c/1/0").unlink()
@@ -212,7 +208,7 @@ def test_a_lost_shard_of_a_prediction_is_refused(tmp_path: Path) -> None:
         read_array(tmp_path / "p.zarr/a", tmp_path / "p.zarr", spec)
 
 
-def test_log10_is_no_prediction_and_a_bad_one_is() -> None:
+def test_log10_is_no_prediction_and_a_bad_one_is():
     coords = np.argwhere(np.ones((5, 5, 4))).astype(np.uint8)
     log10, bad = np.tile([6.3, 3.0, 0.4], (100, 1)), np.random.default_rng(0).normal(size=(100, 3))
     with pytest.raises(InputError, match=r"half of the values of a property are beyond 6\.3"):
@@ -221,7 +217,7 @@ def test_log10_is_no_prediction_and_a_bad_one_is() -> None:
 
 
 @pytest.mark.parametrize("sharded", [True, False])
-def test_a_chunk_of_few_rows_that_unpacks_to_much_is_refused(tmp_path: Path, sharded: bool) -> None:
+def test_a_chunk_of_few_rows_that_unpacks_to_much_is_refused(tmp_path, sharded):
     root, spec = zarr.open_group(tmp_path / "p.zarr", mode="w"), ArraySpec(((None, 3),), "u")
     cut = (2**25, 3)  # 96 MiB, of 3 kB packed
     array = root.create_array(
@@ -233,7 +229,7 @@ def test_a_chunk_of_few_rows_that_unpacks_to_much_is_refused(tmp_path: Path, sha
         read_array(tmp_path / "p.zarr/a", tmp_path / "p.zarr", spec)
 
 
-def test_a_pipe_is_not_waited_for(learn_store: Path, tmp_path: Path) -> None:
+def test_a_pipe_is_not_waited_for(learn_store, tmp_path):
     (tmp_path / "p").mkdir()
     os.mkfifo(tmp_path / "p/a.npz")
     os.mkfifo(tmp_path / "p.h5")
@@ -270,9 +266,7 @@ CHECKPOINTS: dict[str, Any] = {
 
 
 @pytest.mark.parametrize("case", CHECKPOINTS)
-def test_checkpoints_of_others_are_named(
-    learn_store: Path, trained: Path, tmp_path: Path, case: str
-) -> None:
+def test_checkpoints_of_others_are_named(learn_store, trained, tmp_path, case):
     run = Path(shutil.copytree(trained, tmp_path / "run"))
     state = torch.load(run / LAST, weights_only=True)
     CHECKPOINTS[case](state)
@@ -281,9 +275,7 @@ def test_checkpoints_of_others_are_named(
         train(learn_store, run, dataclasses.replace(SHORT, epochs=2))
 
 
-def test_compressed_foreign_and_best_checkpoints_are_named(
-    learn_store: Path, trained: Path, tmp_path: Path
-) -> None:
+def test_compressed_foreign_and_best_checkpoints_are_named(learn_store, trained, tmp_path):
     longer = dataclasses.replace(SHORT, epochs=2)
     run = Path(shutil.copytree(trained, tmp_path / "run"))
     with (
@@ -314,9 +306,7 @@ def test_compressed_foreign_and_best_checkpoints_are_named(
 
 
 @pytest.mark.parametrize("linked", ["group", "array", "metadata", "chunks"])
-def test_a_link_in_zarr_predictions_leads_nowhere_else(
-    learn_store: Path, tmp_path: Path, linked: str
-) -> None:
+def test_a_link_in_zarr_predictions_leads_nowhere_else(learn_store, tmp_path, linked):
     store = open_store(learn_store)
     root = zarr.open_group(tmp_path / "p", mode="w")
     for asset_id, (start, stop) in ((one, store.rows(k)) for k, one in enumerate(store.ids)):

@@ -38,7 +38,7 @@ def _default_torch() -> None:
     torch.use_deterministic_algorithms(False)
 
 
-def test_loss_by_hand() -> None:
+def test_loss_by_hand():
     batch = SparseBatch(
         ["a"],
         torch.zeros(3, 4, dtype=torch.int32),
@@ -66,7 +66,7 @@ def weights_of(path: Path) -> dict[str, torch.Tensor]:
     return model
 
 
-def test_resumed_run_has_the_same_bits(learn_store: Path, tmp_path: Path) -> None:
+def test_resumed_run_has_the_same_bits(learn_store, tmp_path):
     seen: list[tuple[int, int]] = []
     whole = train(learn_store, tmp_path / "whole", SHORT)
     for stop_after in (1, None):
@@ -103,9 +103,7 @@ def test_resumed_run_has_the_same_bits(learn_store: Path, tmp_path: Path) -> Non
         assert read == logged, name
 
 
-def test_a_stopped_run_goes_on_within_its_epoch(
-    learn_store: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_stopped_run_goes_on_within_its_epoch(learn_store, tmp_path, monkeypatch):
     single = dataclasses.replace(SHORT, epochs=2, batch_size=1, accumulate=2)
     whole = train(learn_store, tmp_path / "whole", single)
     monkeypatch.setattr(module, "SECONDS_BETWEEN_SAVES", 0.0)
@@ -141,7 +139,7 @@ def test_a_stopped_run_goes_on_within_its_epoch(
         train(learn_store, tmp_path / "parts", single)
 
 
-def test_wrong_runs_are_named(learn_store: Path, tmp_path: Path) -> None:
+def test_wrong_runs_are_named(learn_store, tmp_path):
     out = tmp_path / "run"
     one = dataclasses.replace(SHORT, epochs=1)
     train(learn_store, out, one)
@@ -154,7 +152,7 @@ def test_wrong_runs_are_named(learn_store: Path, tmp_path: Path) -> None:
         train(learn_store, tmp_path, one)
 
 
-def test_accumulation_is_the_gradient_of_the_mean(learn_store: Path, tmp_path: Path) -> None:
+def test_accumulation_is_the_gradient_of_the_mean(learn_store, tmp_path):
     # Equal batches by equal weights: all objects in one step, one at a time, in any order.
     base = dataclasses.replace(SHORT, epochs=1, batch_size=1, accumulate=100, precision="fp32")
     train(learn_store, tmp_path / "run", dataclasses.replace(base, augmentation="none"))
@@ -171,7 +169,7 @@ def test_accumulation_is_the_gradient_of_the_mean(learn_store: Path, tmp_path: P
         torch.testing.assert_close(moved[name], parameter.detach(), rtol=0, atol=2e-4)
 
 
-def test_stops_when_validation_gets_no_better(learn_store: Path, tmp_path: Path) -> None:
+def test_stops_when_validation_gets_no_better(learn_store, tmp_path):
     # At a rate this small nothing moves, so the first epoch stays the best.
     still = dataclasses.replace(SHORT, epochs=50, learning_rate=1e-30, patience=2)
     summary = train(learn_store, tmp_path / "still", still)
@@ -179,7 +177,7 @@ def test_stops_when_validation_gets_no_better(learn_store: Path, tmp_path: Path)
     assert len(summary.history) == 3
 
 
-def test_an_epoch_that_diverged_is_not_the_best(learn_store: Path, tmp_path: Path) -> None:
+def test_an_epoch_that_diverged_is_not_the_best(learn_store, tmp_path):
     out = tmp_path / "diverged"
     train(learn_store, out, SHORT, stop_after=1)
     state = torch.load(out / LAST, weights_only=True)
@@ -190,7 +188,7 @@ def test_an_epoch_that_diverged_is_not_the_best(learn_store: Path, tmp_path: Pat
     assert summary.best_epoch == 0
 
 
-def test_baselines_are_what_numpy_finds(learn_store: Path) -> None:
+def test_baselines_are_what_numpy_finds(learn_store):
     store = open_store(learn_store)
     columns = ("coords", "feats", "properties", "material", "valid")
     items = [store.read(k, columns) for k in range(len(store))]
@@ -208,7 +206,7 @@ def test_baselines_are_what_numpy_finds(learn_store: Path) -> None:
     assert (predicted.material == np.bincount(all_of["material"][valid]).argmax()).all()
 
 
-def test_commands_train_and_evaluate(learn_store: Path, tmp_path: Path) -> None:
+def test_commands_train_and_evaluate(learn_store, tmp_path):
     shares = ("--shares", "0.4,0.3,0.3")
     command = [
         "train", str(learn_store), "--out", str(tmp_path / "run"), "--size", "small", "--epochs",
@@ -257,7 +255,7 @@ def test_commands_train_and_evaluate(learn_store: Path, tmp_path: Path) -> None:
     assert wrong.exit_code == 2
 
 
-def test_the_command_weighs_voxels_by_their_confidence(learn_store: Path, tmp_path: Path) -> None:
+def test_the_command_weighs_voxels_by_their_confidence(learn_store, tmp_path):
     losses = []
     for number, weigh in enumerate(([], ["--weigh-by-confidence"], ["--weigh-by-confidence"])):
         run = tmp_path / str(number)
@@ -275,7 +273,7 @@ def test_the_command_weighs_voxels_by_their_confidence(learn_store: Path, tmp_pa
     assert losses[1] == losses[2] != losses[0]
 
 
-def test_a_run_is_trained_by_one_process_at_a_time(learn_store: Path, tmp_path: Path) -> None:
+def test_a_run_is_trained_by_one_process_at_a_time(learn_store, tmp_path):
     held = take_lock(tmp_path / "run" / ".lock", "by the test")
     with pytest.raises(StoreError, match=rf"another training .* \(process {os.getpid()} on"):
         train(learn_store, tmp_path / "run", SHORT)
@@ -284,7 +282,7 @@ def test_a_run_is_trained_by_one_process_at_a_time(learn_store: Path, tmp_path: 
     assert not (tmp_path / "run" / ".lock").exists()
 
 
-def test_an_empty_file_that_has_the_name_of_a_lock_stays_as_it_was(tmp_path: Path) -> None:
+def test_an_empty_file_that_has_the_name_of_a_lock_stays_as_it_was(tmp_path):
     (tmp_path / ".lock").touch()
     with Run(tmp_path):
         assert (tmp_path / ".lock").stat().st_size
@@ -295,9 +293,7 @@ def test_an_empty_file_that_has_the_name_of_a_lock_stays_as_it_was(tmp_path: Pat
         pass
 
 
-def test_a_run_that_another_training_wrote_before_the_lock_was_ours_is_read(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_run_that_another_training_wrote_before_the_lock_was_ours_is_read(tmp_path, monkeypatch):
     def late(path: Path, taken: str) -> int:
         path.parent.mkdir()
         (path.parent / "run.json").write_text('{"seed": 7}')
@@ -309,9 +305,7 @@ def test_a_run_that_another_training_wrote_before_the_lock_was_ours_is_read(
     assert not (tmp_path / "run/.lock").exists()
 
 
-def test_a_run_on_a_full_disk_leaves_no_half_of_its_parameters(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_run_on_a_full_disk_leaves_no_half_of_its_parameters(tmp_path, monkeypatch):
     def full(*_: object) -> None:
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
@@ -331,25 +325,21 @@ def test_a_run_on_a_full_disk_leaves_no_half_of_its_parameters(
     ("flags", "precision"),
     [("avx2 avx512f", "fp32"), ("avx512f avx512_bf16", "bf16"), ("amx_bf16", "bf16")],
 )
-def test_precision_is_that_of_the_processor(
-    flags: str, precision: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_precision_is_that_of_the_processor(flags, precision, monkeypatch):
     text = f"processor : 0\nmodel name : any\nflags : fpu {flags}\n"
     monkeypatch.setattr(Path, "read_text", lambda path, **_: text)
     assert precision_of("cpu") == precision
     assert precision_of("cuda") == "bf16"
 
 
-def test_a_run_goes_on_in_the_precision_it_began_with(
-    learn_store: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_run_goes_on_in_the_precision_it_began_with(learn_store, tmp_path, monkeypatch):
     for found in ("fp32", "bf16"):  # As if it were moved to another machine.
         monkeypatch.setattr(module, "precision_of", lambda device, found=found: found)
         train(learn_store, tmp_path / "run", SHORT, stop_after=1)
         assert json.loads((tmp_path / "run" / "run.json").read_text())["precision"] == "fp32"
 
 
-def test_failed_assets_are_neither_trained_on_nor_exported_unless_asked_for(tmp_path: Path) -> None:
+def test_failed_assets_are_neither_trained_on_nor_exported_unless_asked_for(tmp_path):
     dataset = Dataset(tmp_path / "sources").having(*"abc")
     rng = np.random.default_rng(0)
     scattered = np.unique(rng.integers(0, 64, (400, 3)), axis=0).astype(np.uint8)

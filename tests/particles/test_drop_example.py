@@ -21,9 +21,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, tuple[np.ndarr
     return folder, drop.particles(store, "drop", 32, folder)
 
 
-def test_particles_have_the_materials_that_were_made(
-    made: tuple[Path, tuple[np.ndarray, ...]],
-) -> None:
+def test_particles_have_the_materials_that_were_made(made):
     positions, material, properties = made[1]
     # The SLAT is a quarter turn from the grid: (x, y) there is (-y, x) here.
     x, y, z = positions[:, 1], -positions[:, 0], positions[:, 2]
@@ -37,9 +35,7 @@ def test_particles_have_the_materials_that_were_made(
         np.testing.assert_allclose(properties[here], expected, rtol=1e-4)
 
 
-def test_picture_shows_the_jelly_strained_and_the_steel_not(
-    made: tuple[Path, tuple[np.ndarray, ...]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_picture_shows_the_jelly_strained_and_the_steel_not(made, tmp_path, monkeypatch):
     from PIL import Image
 
     monkeypatch.setattr(drop_picture, "SIZE", (200, 200))
@@ -64,7 +60,7 @@ def test_picture_shows_the_jelly_strained_and_the_steel_not(
     assert reddish[0] == 0 and reddish[1] > 1000
 
 
-def test_a_short_run_is_drawn_within_its_frames() -> None:
+def test_a_short_run_is_drawn_within_its_frames():
     assert drop.chosen_frames(31, 0.25, 19) == (0, 13, 19, 30)
     assert drop.chosen_frames(7, 0.25, 6) == (0, 6)  # 0.1 s: over before the ground is reached
     assert drop.chosen_frames(2, 0.25, 0) == (0, 1)
@@ -79,13 +75,7 @@ def test_a_short_run_is_drawn_within_its_frames() -> None:
         (["--store", "nowhere.zarr", "--asset", "x"], "nowhere.zarr"),
     ],
 )
-def test_what_cannot_be_dropped_is_said_in_a_line(
-    arguments: list[str],
-    said: str,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
+def test_what_cannot_be_dropped_is_said_in_a_line(arguments, said, tmp_path, monkeypatch, capsys):
     if "{store}" in arguments:
         monkeypatch.setattr(drop, "JELLY", (2, *drop.JELLY[1:]))  # sand
         arguments = [str(drop.make_store(tmp_path)) if a == "{store}" else a for a in arguments]

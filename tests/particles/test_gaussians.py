@@ -25,7 +25,7 @@ from slatprep.particles.gaussians import (
     write_gaussians,
 )
 from slatprep.particles.picture import draw, write_picture
-from slatprep.particles.read import SAVED_AXES, Axes
+from slatprep.particles.read import SAVED_AXES
 
 H = 1 / 16
 REST = (np.indices((5, 6, 7)).reshape(3, -1).T - 3) * H
@@ -61,7 +61,7 @@ def covariances(rows: np.ndarray) -> np.ndarray:
 
 @pytest.mark.parametrize("axes", ["trellis", "glb", "slat"])
 @given(seed=st.integers(0, 2**32 - 1))
-def test_a_rigid_motion_moves_and_turns_each_gaussian_exactly(axes: Axes, seed: int) -> None:
+def test_a_rigid_motion_moves_and_turns_each_gaussian_exactly(axes, seed):
     rng = np.random.default_rng(seed)
     turn, shift = Rotation.random(rng=rng).as_matrix(), rng.normal(size=3)
     saved = random_gaussians(50, seed)
@@ -82,7 +82,7 @@ def test_a_rigid_motion_moves_and_turns_each_gaussian_exactly(axes: Axes, seed: 
 
 
 @given(seed=st.integers(0, 2**32 - 1))
-def test_an_affine_motion_deforms_covariances_where_asked(seed: int) -> None:
+def test_an_affine_motion_deforms_covariances_where_asked(seed):
     rng = np.random.default_rng(seed)
     affine = np.eye(3) + rng.uniform(-0.25, 0.25, (3, 3))
     saved = random_gaussians(40, seed)
@@ -99,14 +99,14 @@ def test_an_affine_motion_deforms_covariances_where_asked(seed: int) -> None:
     np.testing.assert_allclose(np.linalg.det(turned), 1.0)
 
 
-def test_files_of_gaussians_keep_every_field(tmp_path: Path) -> None:
+def test_files_of_gaussians_keep_every_field(tmp_path):
     saved = random_gaussians(30)
     write_gaussians(tmp_path / "g.ply", saved, "frame SLAT, unit cube -0.5..0.5, z up")
     vertex = plyfile.PlyData.read(tmp_path / "g.ply")["vertex"].data
     np.testing.assert_array_equal(vertex, saved)
 
 
-def test_the_nearest_gaussian_is_drawn_in_its_colour(tmp_path: Path) -> None:
+def test_the_nearest_gaussian_is_drawn_in_its_colour(tmp_path):
     # Seen from the front, y grows away from the eye.
     places = np.array([[0.0, -0.3, 0.0], [0.0, 0.3, 0.16], [0.3, 0.0, 0.3]])
     rows = gaussians_of(places, np.array([0, 1, 2], np.uint8), 0.4)
@@ -143,9 +143,7 @@ def invoke(*words: object) -> tuple[int, str, str]:
         (("--gaussians", "points.ply"), "expected a PLY of Gaussians"),
     ],
 )
-def test_what_cannot_be_simulated_is_said(
-    words: tuple[str, ...], said: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_what_cannot_be_simulated_is_said(words, said, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     coords = write_prediction(tmp_path / "p.npz")
     rows = np.zeros(len(coords), [(axis, "f4") for axis in "xyz"])
@@ -158,7 +156,7 @@ def test_what_cannot_be_simulated_is_said(
 
 
 @NEWTON
-def test_gaussians_of_trellis_fall_as_the_object_does(tmp_path: Path) -> None:
+def test_gaussians_of_trellis_fall_as_the_object_does(tmp_path):
     coords = write_prediction(tmp_path / "p.npz")
     places = (coords[::3] + 0.5) / 64 - 0.5
     saved = gaussians_of(places @ SAVED_AXES["trellis"].T, np.zeros(len(places), np.uint8), 1 / 64)

@@ -2,7 +2,6 @@
 
 import io
 import zipfile
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -13,7 +12,7 @@ from slatprep.particles.read import read_particles
 POSITIONS = np.arange(12, dtype=np.float32).reshape(4, 3) / 100
 
 
-def test_npy_and_npz_hold_the_same_particles(tmp_path: Path) -> None:
+def test_npy_and_npz_hold_the_same_particles(tmp_path):
     np.save(tmp_path / "a.npy", POSITIONS)
     np.savez(tmp_path / "b.npz", xyz=POSITIONS, weight=np.ones(4))
     for name in ("a.npy", "b.npz"):
@@ -22,7 +21,7 @@ def test_npy_and_npz_hold_the_same_particles(tmp_path: Path) -> None:
         assert (read.axes, read.foreign) == ("slat", "")
 
 
-def test_an_archive_that_claims_more_particles_than_there_can_be_is_refused(tmp_path: Path) -> None:
+def test_an_archive_that_claims_more_particles_than_there_can_be_is_refused(tmp_path):
     head = io.BytesIO()
     np.lib.format.write_array_header_1_0(
         head, {"descr": "<f8", "fortran_order": False, "shape": (10**10, 3)}
@@ -42,7 +41,7 @@ def test_an_archive_that_claims_more_particles_than_there_can_be_is_refused(tmp_
         ({"xyz": np.array([["a"] * 3])}, "has dtype <U1"),
     ],
 )
-def test_arrays_that_are_no_particles_are_named(tmp_path: Path, arrays: dict, what: str) -> None:
+def test_arrays_that_are_no_particles_are_named(tmp_path, arrays, what):
     np.savez(tmp_path / "p.npz", **arrays)
     with pytest.raises(InputError, match=what):
         read_particles(tmp_path / "p.npz")

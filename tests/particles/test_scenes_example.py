@@ -36,9 +36,7 @@ def command(monkeypatch: pytest.MonkeyPatch, *words: object) -> None:
     scenes.main()
 
 
-def test_objects_have_the_materials_of_their_source(
-    mixed_build: BuildSummary, prediction: Path
-) -> None:
+def test_objects_have_the_materials_of_their_source(mixed_build, prediction):
     found = scenes.objects(
         argparse.Namespace(
             store=mixed_build.store, asset=["cup"], prediction=[prediction], ranges=None
@@ -52,9 +50,7 @@ def test_objects_have_the_materials_of_their_source(
         assert set(given.material.tolist()) == expected
 
 
-def test_a_strip_shows_the_object_fall_and_a_gif_every_frame(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_strip_shows_the_object_fall_and_a_gif_every_frame(tmp_path, monkeypatch):
     monkeypatch.setattr(drop_picture, "SIZE", (160, 160))
     falls = np.linspace(0.9, 0.3, 5)[:, None, None] * np.array([0.0, 0.0, 1.0]) + BLOCK
     water = scenes.Scene("water", falls, np.full(len(BLOCK), 4))
@@ -89,9 +85,7 @@ def test_a_strip_shows_the_object_fall_and_a_gif_every_frame(
         (["--prediction", "nowhere.npz"], "nowhere.npz"),
     ],
 )
-def test_what_cannot_be_moved_is_said_in_a_line(
-    words: list[str], said: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_what_cannot_be_moved_is_said_in_a_line(words, said, monkeypatch, capsys):
     with pytest.raises(SystemExit) as caught:
         command(monkeypatch, *words)
     assert caught.value.code in (1, 2)
@@ -101,9 +95,7 @@ def test_what_cannot_be_moved_is_said_in_a_line(
 @pytest.mark.skipif(
     importlib.util.find_spec("newton") is None, reason="needs the extra `simulate`; make simulate"
 )
-def test_a_prediction_is_moved_and_drawn(
-    prediction: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_prediction_is_moved_and_drawn(prediction, tmp_path, monkeypatch):
     monkeypatch.setattr(drop_picture, "SIZE", (160, 160))
     command(
         monkeypatch, "--prediction", prediction, "--particles", COUNT, "--seconds", 0.2,

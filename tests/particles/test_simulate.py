@@ -20,7 +20,7 @@ STUFF = np.tile([1e5, 1e3, 0.3], (len(CUBE), 1))
 
 
 @given(st.integers(0, 2**32 - 1))
-def test_moving_and_turning_is_no_strain(seed: int) -> None:
+def test_moving_and_turning_is_no_strain(seed):
     rng = np.random.default_rng(seed)
     moved = Rotation.random(rng=rng).apply(CUBE) + rng.normal(size=3)
     assert strain(CUBE, moved, ONE_PART, SPACING).max() < 1e-9
@@ -28,7 +28,7 @@ def test_moving_and_turning_is_no_strain(seed: int) -> None:
 
 
 @pytest.mark.parametrize("stretch", [0.7, 1.2])
-def test_stretch_has_its_green_strain(stretch: float) -> None:
+def test_stretch_has_its_green_strain(stretch):
     moved = Rotation.from_euler("xyz", [1, 2, 3]).apply(CUBE * [1.0, 1.0, stretch])
     np.testing.assert_allclose(
         strain(CUBE, moved, ONE_PART, SPACING), abs(stretch**2 - 1) / 2, rtol=1e-9
@@ -39,14 +39,14 @@ def test_stretch_has_its_green_strain(stretch: float) -> None:
     np.testing.assert_allclose(rigid_deviation(CUBE, moved), expected, rtol=1e-9)
 
 
-def test_shear_has_its_green_strain() -> None:
+def test_shear_has_its_green_strain():
     gradient = np.array([[1.0, 0.3, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
     green = (gradient.T @ gradient - np.eye(3)) / 2
     expected = np.abs(np.linalg.eigvalsh(green)).max()
     np.testing.assert_allclose(strain(CUBE, CUBE @ gradient.T, ONE_PART, SPACING), expected)
 
 
-def test_parts_are_measured_apart() -> None:
+def test_parts_are_measured_apart():
     part = (CUBE[:, 2] > 0.15).astype(int)
     moved = np.where(part[:, None] == 0, CUBE * [1.1, 1.1, 1.1], CUBE + np.array([0.0, 0.0, 0.5]))
     measured = strain(CUBE, moved, part, SPACING)
@@ -54,12 +54,12 @@ def test_parts_are_measured_apart() -> None:
     np.testing.assert_allclose(measured[part == 1], 0.0, atol=1e-9)
 
 
-def test_lone_particles_have_no_strain() -> None:
+def test_lone_particles_have_no_strain():
     line = np.array([[0.0, 0.0, 0.0], [0.1, 0.0, 0.0], [0.2, 0.0, 0.0]])
     assert np.isnan(strain(line, line, np.zeros(3, dtype=int), SPACING)).all()
 
 
-def test_a_ratio_of_one_half_is_taken_and_told(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_ratio_of_one_half_is_taken_and_told(monkeypatch):
     stuff = STUFF.copy()
     stuff[:7, 2] = 0.5
     monkeypatch.setitem(sys.modules, "newton", None)  # It is told before the engine is loaded.
@@ -77,9 +77,7 @@ def test_a_ratio_of_one_half_is_taken_and_told(monkeypatch: pytest.MonkeyPatch) 
         (0, (2, 0, np.nan), "particle 2 has E = nan"),
     ],
 )
-def test_particles_that_cannot_be_simulated_are_named(
-    material: int, change: tuple[int, int, float] | None, said: str
-) -> None:
+def test_particles_that_cannot_be_simulated_are_named(material, change, said):
     stuff = STUFF.copy()
     if change:
         stuff[change[0], change[1]] = change[2]
@@ -87,14 +85,14 @@ def test_particles_that_cannot_be_simulated_are_named(
         simulate(CUBE, ONE_PART + material, stuff, SPACING)
 
 
-def test_without_newton_it_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_newton_it_says_what_to_install(monkeypatch):
     monkeypatch.setitem(sys.modules, "newton", None)
     with pytest.raises(SlatprepError, match=r"pip install 'slatprep\[simulate\]'"):
         simulate(CUBE, ONE_PART, STUFF, SPACING)
 
 
 @given(st.integers(0, 2**32 - 1))
-def test_the_wind_meets_the_shadow_of_what_is_convex(seed: int) -> None:
+def test_the_wind_meets_the_shadow_of_what_is_convex(seed):
     """Of a box in any wind, the free faces are together as large as its shadow."""
     rng = np.random.default_rng(seed)
     size, way = rng.integers(1, 5, 3), rng.normal(size=3)
@@ -115,7 +113,7 @@ needs_newton = pytest.mark.skipif(
 
 
 @needs_newton
-def test_water_runs_sand_slumps_snow_packs_and_jelly_stands() -> None:
+def test_water_runs_sand_slumps_snow_packs_and_jelly_stands():
     column = np.argwhere(np.ones((4, 4, 8))) * SPACING
     kinds = {4: (2e5, 1e3, 0.45), 2: (1e7, 1.6e3, 0.3), 5: (2e5, 3e2, 0.25), 0: (2e5, 1e3, 0.4)}
     positions = np.concatenate([column + np.array([3.0 * k, 0, 0]) for k in range(len(kinds))])
@@ -131,7 +129,7 @@ def test_water_runs_sand_slumps_snow_packs_and_jelly_stands() -> None:
 
 
 @needs_newton
-def test_steps_too_long_for_the_speed_are_said() -> None:
+def test_steps_too_long_for_the_speed_are_said():
     """A fall of 1 m ends at 4.4 m/s: 0.29 m in a step of 1/15 s, and cells are 0.2 m wide."""
     stuff = np.tile([1e5, 1e3, 0.3], (len(CUBE), 1))
     how = {"height": 1.0, "seconds": 0.6, "rate": 15}
@@ -143,7 +141,7 @@ def test_steps_too_long_for_the_speed_are_said() -> None:
 
 
 @needs_newton
-def test_wind_pushes_by_the_drag_equation() -> None:
+def test_wind_pushes_by_the_drag_equation():
     """m dv/dt = 1/2 rho A (U - v)^2, of which the way has a closed form."""
     wind, density, seconds, side = 10.0, 20.0, 0.25, 4 * SPACING
     stuff = np.tile([1e5, density, 0.3], (len(CUBE), 1))
@@ -156,7 +154,7 @@ def test_wind_pushes_by_the_drag_equation() -> None:
 
 
 @needs_newton
-def test_a_held_pole_sways_about_where_a_beam_would_rest() -> None:
+def test_a_held_pole_sways_about_where_a_beam_would_rest():
     """Euler and Bernoulli: a cantilever under an even load bends by q L^4 / (8 E I)."""
     pole, wind, modulus = np.argwhere(np.ones((3, 3, 12))) * SPACING, 20.0, 1e6
     foot = pole[:, 2] < SPACING / 2
@@ -175,7 +173,7 @@ def test_a_held_pole_sways_about_where_a_beam_would_rest() -> None:
 
 
 @needs_newton
-def test_steel_on_jelly_falls_as_galileo_says_and_the_jelly_gives_way() -> None:
+def test_steel_on_jelly_falls_as_galileo_says_and_the_jelly_gives_way():
     tower = np.argwhere(np.ones((6, 6, 9))) * SPACING
     top = tower[:, 2] > 5.5 * SPACING
     stuff = np.where(top[:, None], [6e10, 7e3, 0.3], [6e4, 1e3, 0.4])

@@ -19,14 +19,14 @@ def _ply(path: Path, elements: str, body: bytes, form: str = "binary_little_endi
     return path
 
 
-def test_a_list_in_place_of_a_coordinate_is_named(tmp_path: Path) -> None:
+def test_a_list_in_place_of_a_coordinate_is_named(tmp_path):
     elements = f"element vertex 1\n{XYZ.replace('float x', 'list uchar float x')}"
     file = _ply(tmp_path / "p.ply", elements, struct.pack("<B5f", 3, 1, 2, 3, 0, 0))
     with pytest.raises(InputError, match="list"):
         read_particles(file)
 
 
-def test_lists_beside_the_coordinates_are_no_fault(tmp_path: Path) -> None:
+def test_lists_beside_the_coordinates_are_no_fault(tmp_path):
     body = struct.pack("<3fB2f", 0.1, 0.2, 0.3, 2, 1, 1)
     elements = f"element vertex 1\n{XYZ}property list uchar float w\n"
     read = read_particles(_ply(tmp_path / "p.ply", elements, body))
@@ -37,8 +37,8 @@ def test_lists_beside_the_coordinates_are_no_fault(tmp_path: Path) -> None:
 @pytest.mark.parametrize("form", ["ascii", "binary_little_endian"])
 @pytest.mark.parametrize("element", ["vertex", "face"])
 def test_more_rows_than_bytes_are_refused_before_anything_is_set_aside(
-    element: str, form: str, rows: str, tmp_path: Path
-) -> None:
+    element, form, rows, tmp_path
+):
     elements = f"element {element} {rows}\n{XYZ}property list uchar double w\n"
     with pytest.raises(InputError, match="announces more rows than it has"):
         read_particles(_ply(tmp_path / "p.ply", elements, b"0 0 0 0\n", form))
@@ -57,9 +57,7 @@ def test_more_rows_than_bytes_are_refused_before_anything_is_set_aside(
     ],
     ids=["underscores", "a sign", "behind the vertices", "long comments", "wide rows", "below 0"],
 )
-def test_a_small_file_takes_little_memory_whatever_it_announces(
-    elements: str, tmp_path: Path
-) -> None:
+def test_a_small_file_takes_little_memory_whatever_it_announces(elements, tmp_path):
     file = _ply(tmp_path / "p.ply", elements + f"element vertex 1\n{XYZ}", b"\0" * 100)
     tracemalloc.start()
     try:
@@ -73,7 +71,7 @@ def test_a_small_file_takes_little_memory_whatever_it_announces(
 
 
 @pytest.mark.parametrize("form", ["ascii", "binary_little_endian"])
-def test_millions_of_short_rows_are_refused_before_they_are_read(form: str, tmp_path: Path) -> None:
+def test_millions_of_short_rows_are_refused_before_they_are_read(form, tmp_path):
     rows = 3_000_000
     body = b"0\n" * rows if form == "ascii" else b"\0" * rows
     elements = f"element junk {rows}\nproperty list uchar int q\nelement vertex 0\n{XYZ}"
@@ -97,9 +95,7 @@ def test_millions_of_short_rows_are_refused_before_they_are_read(form: str, tmp_
     ],
     ids=["a header behind a comment", "a line without end", "many short values"],
 )  # fmt: skip
-def test_text_costs_no_more_than_its_size(
-    elements: str, body: bytes, said: str, tmp_path: Path
-) -> None:
+def test_text_costs_no_more_than_its_size(elements, body, said, tmp_path):
     file = _ply(
         tmp_path / "p.ply", elements.replace("vertex 1\n", f"vertex 1\n{XYZ}"), body, "ascii"
     )
@@ -112,7 +108,7 @@ def test_text_costs_no_more_than_its_size(
         tracemalloc.stop()
 
 
-def test_a_large_file_is_refused_without_a_copy(tmp_path: Path) -> None:
+def test_a_large_file_is_refused_without_a_copy(tmp_path):
     rows = np.zeros((2_000_000, 3), dtype="<f4")
     rows[-1, 1] = np.nan
     file = _ply(tmp_path / "p.ply", f"element vertex {len(rows)}\n{XYZ}", rows.tobytes())
@@ -126,7 +122,7 @@ def test_a_large_file_is_refused_without_a_copy(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("form", ["binary_little_endian", "binary_big_endian"])
-def test_elements_before_the_vertices_are_stepped_over(form: str, tmp_path: Path) -> None:
+def test_elements_before_the_vertices_are_stepped_over(form, tmp_path):
     order = "<" if form == "binary_little_endian" else ">"
     body = struct.pack(f"{order}3h", 7, 8, 9) + struct.pack(f"{order}6f", *range(6))
     elements = f"element junk 3\nproperty short q\nelement vertex 2\n{XYZ}"
@@ -134,7 +130,7 @@ def test_elements_before_the_vertices_are_stepped_over(form: str, tmp_path: Path
     np.testing.assert_array_equal(read.positions, np.arange(6.0).reshape(2, 3))
 
 
-def test_faces_behind_the_vertices_are_counted_and_left_unread(tmp_path: Path) -> None:
+def test_faces_behind_the_vertices_are_counted_and_left_unread(tmp_path):
     faces = "element face 300000\nproperty list uchar int vertex_indices\n"
     row = struct.pack("<3f", 0.1, 0.2, 0.3)
     body = row + struct.pack("<B3i", 3, 0, 0, 0) * 300_000
@@ -146,21 +142,21 @@ def test_faces_behind_the_vertices_are_counted_and_left_unread(tmp_path: Path) -
 
 
 @pytest.mark.parametrize("content", [b"", b"ply\n", b"\0" * 2**21])
-def test_a_header_without_end_is_refused(content: bytes, tmp_path: Path) -> None:
+def test_a_header_without_end_is_refused(content, tmp_path):
     (tmp_path / "p.ply").write_bytes(content)
     with pytest.raises(InputError, match="is no readable PLY with vertices"):
         read_particles(tmp_path / "p.ply")
 
 
 @pytest.mark.parametrize("name", ["p.ply", "p.npy"])
-def test_a_pipe_is_not_waited_for(name: str, tmp_path: Path) -> None:
+def test_a_pipe_is_not_waited_for(name, tmp_path):
     os.mkfifo(tmp_path / name)
     with pytest.raises(InputError, match="no regular file"):
         read_particles(tmp_path / name)
 
 
 @pytest.mark.parametrize("shape", ["(10000000000000, 3)", "(-5, 3)", "(5, 3)"])
-def test_an_npy_that_claims_more_than_it_holds_is_refused(shape: str, tmp_path: Path) -> None:
+def test_an_npy_that_claims_more_than_it_holds_is_refused(shape, tmp_path):
     header = f"{{'descr': '<f8', 'fortran_order': False, 'shape': {shape}, }}".ljust(117) + "\n"
     content = b"\x93NUMPY\x01\x00" + struct.pack("<H", len(header)) + header.encode() + b"1234"
     (tmp_path / "p.npy").write_bytes(content)

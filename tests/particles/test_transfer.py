@@ -3,7 +3,6 @@
 import json
 import shutil
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import plyfile
@@ -70,9 +69,7 @@ def particles_near(coords: np.ndarray, count: int, reach: float) -> np.ndarray:
     return (chosen + 0.5 + rng.uniform(-reach, reach, (count, 3))) / 64 - 0.5
 
 
-def test_gaussians_get_the_material_of_their_voxel(
-    store: Path, true_parts: tuple[np.ndarray, np.ndarray], tmp_path: Path
-) -> None:
+def test_gaussians_get_the_material_of_their_voxel(store, true_parts, tmp_path):
     coords, material = true_parts
     positions = particles_near(coords, 3000, 0.45)
     saved = write_gaussians(tmp_path / "g.ply", positions)
@@ -99,9 +96,7 @@ def test_gaussians_get_the_material_of_their_voxel(
     ("glb", lambda x, y, z: (x, z, -y)),
     ("slat", lambda x, y, z: (x, y, z)),
 ])  # fmt: skip
-def test_wrong_axes_are_an_error_that_names_the_right_ones(
-    axes: str, turn: Any, store: Path, true_parts: tuple[np.ndarray, np.ndarray], tmp_path: Path
-) -> None:
+def test_wrong_axes_are_an_error_that_names_the_right_ones(axes, turn, store, true_parts, tmp_path):
     positions = particles_near(true_parts[0], 3000, 0.45)
     np.save(tmp_path / "p.npy", np.column_stack(turn(*positions.T)))
     words = (tmp_path / "p.npy", "--store", store, "--asset", "cup", "--out", tmp_path / "m.ply")
@@ -130,9 +125,7 @@ def as_sam3d(path: Path, slat_positions: np.ndarray) -> None:
 
 
 @pytest.mark.parametrize("tool", ["trellis", "sam3d"])
-def test_axes_of_sam3d_are_recognised(
-    tool: str, store: Path, true_parts: tuple[np.ndarray, np.ndarray], tmp_path: Path
-) -> None:
+def test_axes_of_sam3d_are_recognised(tool, store, true_parts, tmp_path):
     positions = particles_near(true_parts[0], 3000, 0.45).astype(np.float32)
     (write_gaussians if tool == "trellis" else as_sam3d)(tmp_path / "g.ply", positions)
     words = (tmp_path / "g.ply", "--store", store, "--asset", "cup", "--out", tmp_path / "m.ply")
@@ -147,7 +140,7 @@ def test_axes_of_sam3d_are_recognised(
 
 
 @pytest.mark.parametrize("shape", ["ball", "crate"])
-def test_axes_that_fit_alike_are_asked_for(shape: str, tmp_path: Path) -> None:
+def test_axes_that_fit_alike_are_asked_for(shape, tmp_path):
     there = np.indices((64, 64, 64)).reshape(3, -1).T
     centred = there - 31.5
     reach = np.linalg.norm(centred, axis=1) if shape == "ball" else np.abs(centred).max(axis=1)
@@ -173,9 +166,7 @@ def test_axes_that_fit_alike_are_asked_for(shape: str, tmp_path: Path) -> None:
         out.unlink()
 
 
-def test_particles_of_another_object_are_an_error_that_says_where_they_lie(
-    store: Path, tmp_path: Path
-) -> None:
+def test_particles_of_another_object_are_an_error_that_says_where_they_lie(store, tmp_path):
     np.save(tmp_path / "p.npy", np.random.default_rng(0).uniform(2, 3, (500, 3)))
     said = run_wrong(tmp_path / "p.npy", "--store", store, "--asset", "cup",
                      "--out", tmp_path / "m.ply")  # fmt: skip
@@ -183,9 +174,7 @@ def test_particles_of_another_object_are_an_error_that_says_where_they_lie(
     assert "no other --axes brings them nearer; they lie between 2" in said
 
 
-def test_a_third_of_the_particles_far_is_told(
-    store: Path, true_parts: tuple[np.ndarray, np.ndarray], tmp_path: Path
-) -> None:
+def test_a_third_of_the_particles_far_is_told(store, true_parts, tmp_path):
     positions = particles_near(true_parts[0], 900, 0.45)
     positions[::3] += 3.0
     np.save(tmp_path / "p.npy", positions)
@@ -205,13 +194,8 @@ def test_a_third_of_the_particles_far_is_told(
     ],
 )
 def test_gaussians_of_another_tool_are_not_taken_for_trellis(
-    names: list[str],
-    reach: float,
-    sign: str,
-    store: Path,
-    true_parts: tuple[np.ndarray, np.ndarray],
-    tmp_path: Path,
-) -> None:
+    names, reach, sign, store, true_parts, tmp_path
+):
     rows = np.zeros(400, dtype=[(name, "f4") for name in names])
     positions = particles_near(true_parts[0], len(rows), 0.45)
     positions *= reach / abs(positions).max()
@@ -232,9 +216,7 @@ def test_gaussians_of_another_tool_are_not_taken_for_trellis(
         assert told.exit_code != 0 and sign in told.stderr and "half of them" in told.stderr
 
 
-def test_what_slatprep_wrote_says_its_frame(
-    store: Path, true_parts: tuple[np.ndarray, np.ndarray], tmp_path: Path
-) -> None:
+def test_what_slatprep_wrote_says_its_frame(store, true_parts, tmp_path):
     write_gaussians(tmp_path / "g.ply", particles_near(true_parts[0], 200, 0.4))
     words = ("--store", store, "--asset", "cup", "--out")
     run("transfer", tmp_path / "g.ply", *words, tmp_path / "once.ply")
@@ -254,7 +236,7 @@ def test_what_slatprep_wrote_says_its_frame(
     run_wrong(tmp_path / "pixieverse" / "cup.ply", *words, tmp_path / "m.ply", "--axes", "slat")
 
 
-def test_a_solid_on_a_surface_is_told_of_points_grid(tmp_path: Path) -> None:
+def test_a_solid_on_a_surface_is_told_of_points_grid(tmp_path):
     cube = np.argwhere(np.ones((20, 20, 20))) + 20
     shell = cube[((cube == 20) | (cube == 39)).any(axis=1)]
     np.savez(
@@ -269,9 +251,7 @@ def test_a_solid_on_a_surface_is_told_of_points_grid(tmp_path: Path) -> None:
     assert "100% of them lie inside the object" in said and "--points grid" in said
 
 
-def test_open3d_reads_the_same_points(
-    store: Path, true_parts: tuple[np.ndarray, np.ndarray], tmp_path: Path
-) -> None:
+def test_open3d_reads_the_same_points(store, true_parts, tmp_path):
     import open3d
 
     positions = particles_near(true_parts[0], 200, 0.4)
@@ -286,7 +266,7 @@ def test_open3d_reads_the_same_points(
             np.testing.assert_array_equal(cloud.point[name].numpy()[:, 0], vertex[name])
 
 
-def test_nearest_is_nearest_by_brute_force() -> None:
+def test_nearest_is_nearest_by_brute_force():
     rng = np.random.default_rng(1)
     cells = rng.choice(64**3, size=400, replace=False)
     voxels = np.stack(np.unravel_index(cells, (64,) * 3), axis=1).astype(np.uint8)
@@ -310,7 +290,7 @@ def test_nearest_is_nearest_by_brute_force() -> None:
     np.testing.assert_array_equal(dropped.properties, result.properties[~far])
 
 
-def test_grid_reaches_inside_the_object(store: Path, mixed: Dataset, tmp_path: Path) -> None:
+def test_grid_reaches_inside_the_object(store, mixed, tmp_path):
     grid = mixed.assets["cup"].grid
     solid = np.argwhere(grid[..., 3] != 7)
     turned = np.stack([63 - solid[:, 1], solid[:, 0], solid[:, 2]], axis=1)  # the quarter turn
@@ -322,7 +302,7 @@ def test_grid_reaches_inside_the_object(store: Path, mixed: Dataset, tmp_path: P
     np.testing.assert_allclose(vertex["E"], grid[tuple(solid.T)][:, 1], rtol=1e-4)
 
 
-def test_prediction_is_transferred_as_the_store_is(store: Path, tmp_path: Path) -> None:
+def test_prediction_is_transferred_as_the_store_is(store, tmp_path):
     """What `export --format npz` writes has the form of a prediction."""
     export_store(store, tmp_path / "npz", "npz", assets=["cup"])
     (prediction,) = (tmp_path / "npz").glob("latents/*/cup.npz")
@@ -336,7 +316,7 @@ def test_prediction_is_transferred_as_the_store_is(store: Path, tmp_path: Path) 
     assert (tmp_path / "stored.ply").read_bytes() == (tmp_path / "predicted.ply").read_bytes()
 
 
-def test_prediction_in_si_needs_no_ranges(tmp_path: Path) -> None:
+def test_prediction_in_si_needs_no_ranges(tmp_path):
     coords = np.array([[0, 1, 2, 3], [0, 4, 5, 6]], np.int32)
     properties = np.array([[1e5, 1e3, 0.3], [np.nan] * 3], np.float32)
     np.savez(tmp_path / "p.npz", coords=coords, properties_si=properties,
@@ -352,7 +332,7 @@ def test_prediction_in_si_needs_no_ranges(tmp_path: Path) -> None:
         predicted_field(tmp_path / "w.npz", None)
 
 
-def test_plain_points_are_taken_as_they_lie(tmp_path: Path) -> None:
+def test_plain_points_are_taken_as_they_lie(tmp_path):
     positions = np.array([[0.1, 0.2, 0.3], [-0.1, 0.0, 0.4]])
     rows = np.array([tuple(p) for p in positions], dtype=[(a, "f8") for a in "xyz"])
     element = plyfile.PlyElement.describe(rows, "vertex")
@@ -368,7 +348,7 @@ def test_plain_points_are_taken_as_they_lie(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("fault", ["junk", "cut", "empty", "nan", "flat", "faces"])
-def test_particles_that_cannot_be_used_are_named(fault: str, tmp_path: Path) -> None:
+def test_particles_that_cannot_be_used_are_named(fault, tmp_path):
     path = tmp_path / "p.ply"
     write_gaussians(path, np.full((0 if fault == "empty" else 5, 3), 0.1))
     if fault == "junk":
@@ -386,7 +366,7 @@ def test_particles_that_cannot_be_used_are_named(fault: str, tmp_path: Path) -> 
         read_particles(path)
 
 
-def test_wrong_calls_are_refused_and_nothing_is_lost(store: Path, tmp_path: Path) -> None:
+def test_wrong_calls_are_refused_and_nothing_is_lost(store, tmp_path):
     particles = tmp_path / "g.ply"
     write_gaussians(particles, np.zeros((1, 3)))
     own = tmp_path / "own.ply"
