@@ -12,7 +12,7 @@ from types import ModuleType
 
 import numpy as np
 import pytest
-from support.synthetic import JELLY, METAL, QUARTER_TURN, make_asset
+from support.synthetic import JELLY, METAL, QUARTER_TURN, Asset, make_asset
 
 import slatprep
 from slatprep.parameters import AlignParameters, SampleParameters
@@ -88,6 +88,14 @@ def test_there_are_doctests():
 # -- two voxel sets ---------------------------------------------------------
 
 
+def field_of(asset: Asset) -> slatprep.MaterialField:
+    material = asset.grid[..., 3]
+    voxels = np.argwhere(material != 7).astype(np.uint8)
+    row = tuple(voxels.T)
+    properties = asset.grid[row][:, [1, 0, 2]]
+    return slatprep.MaterialField(material != 7, voxels, material[row].astype(np.uint8), properties)
+
+
 def test_two_voxel_sets_in_any_form_give_the_same_transform():
     asset = make_asset(1)
     occupancy = asset.grid[..., 3] != 7
@@ -105,16 +113,7 @@ def test_two_voxel_sets_in_any_form_give_the_same_transform():
 
 def test_a_field_is_looked_up_at_slat_voxels():
     asset = make_asset(2)
-    material = asset.grid[..., 3]
-    voxels = np.argwhere(material != 7).astype(np.uint8)
-    row = tuple(voxels.T)
-    field = slatprep.MaterialField(
-        occupancy=material != 7,
-        voxels=voxels,
-        material=material[row].astype(np.uint8),
-        properties=asset.grid[row][:, [1, 0, 2]],
-    )
-    found = slatprep.annotate_voxels(field, asset.coords, QUARTER_TURN)
+    found = slatprep.annotate_voxels(field_of(asset), asset.coords, QUARTER_TURN)
     assert found.valid.all() and found.distance.max() < 1e-6
     for stuff in (JELLY, METAL):
         here = found.material == stuff[0]
@@ -124,17 +123,12 @@ def test_a_field_is_looked_up_at_slat_voxels():
 
 def test_eight_voxels_of_a_finer_grid_are_placed_and_looked_up_as_the_one_they_fill():
     asset = make_asset(3)
-    material = asset.grid[..., 3]
-    voxels = np.argwhere(material != 7).astype(np.uint8)
-    row = tuple(voxels.T)
-    field = slatprep.MaterialField(
-        material != 7, voxels, material[row].astype(np.uint8), asset.grid[row][:, [1, 0, 2]]
-    )
+    field = field_of(asset)
     corners = np.indices((2, 2, 2)).reshape(3, -1).T
     fine = (2 * asset.coords[:, None].astype(int) + corners).reshape(-1, 3)
     for parameters in (None, AlignParameters(engine=Engine.KNOWN)):
-        coarse = slatprep.align_voxels(material != 7, asset.coords, parameters)
-        again = slatprep.align_voxels(material != 7, fine, parameters, resolution=128)
+        coarse = slatprep.align_voxels(field.occupancy, asset.coords, parameters)
+        again = slatprep.align_voxels(field.occupancy, fine, parameters, resolution=128)
         np.testing.assert_array_equal(again.transform, coarse.transform)
         assert again.quality == coarse.quality
     nearest = SampleParameters(method="nearest")
@@ -143,9 +137,9 @@ def test_eight_voxels_of_a_finer_grid_are_placed_and_looked_up_as_the_one_they_f
     np.testing.assert_array_equal(eight.material, np.repeat(one.material, 8))
     np.testing.assert_allclose(eight.distance, np.sqrt(3) / 4, atol=1e-5)
     with pytest.raises(ValueError, match=r"whole numbers in 0\.\.31"):
-        slatprep.align_voxels(material != 7, fine, resolution=32)
+        slatprep.align_voxels(field.occupancy, fine, resolution=32)
     with pytest.raises(ValueError, match="resolution is 512"):
-        slatprep.align_voxels(material != 7, fine, resolution=512)
+        slatprep.align_voxels(field.occupancy, fine, resolution=512)
 
 
 @pytest.mark.parametrize(

@@ -13,12 +13,11 @@ from typing import Any
 
 import numpy as np
 import pytest
-from click.testing import CliRunner
 from PIL import Image
+from support import commands
 from support.synthetic import make_asset
 
 from slatprep import extract as work
-from slatprep.cli.commands import slatprep
 from slatprep.errors import ConfigError, InputError
 from slatprep.parameters import BuildParameters, PixieverseSource, SlatSource
 from slatprep.pipeline.dataset import build_store
@@ -119,12 +118,12 @@ def images(tmp_path: Path) -> list[Path]:
     return paths
 
 
-def run(session: work.Session, extractions: list[work.Extraction], **options: Any) -> list[Any]:
-    return list(work.extract(session, extractions, **options))
+def run(session: work.Session, images: list[Path], out: Path, *seeds: int) -> list[Any]:
+    return list(work.extract(session, work.list_extractions(images, out, list(seeds), False)))
 
 
 def test_latents_are_what_the_pipeline_returns(session, images, tmp_path):
-    [result] = run(session, work.list_extractions(images[:1], tmp_path / "slat", [7], False))
+    [result] = run(session, images[:1], tmp_path / "slat", 7)
     with np.load(tmp_path / "slat" / "cup.npz") as saved:
         coords, feats = saved["coords"], saved["feats"]
     assert (coords.dtype, feats.dtype) == (np.int32, np.float32)
@@ -143,7 +142,7 @@ def test_latents_are_what_the_pipeline_returns(session, images, tmp_path):
 def test_provenance_says_how_to_do_it_again(session, images, tmp_path):
     import hashlib
 
-    run(session, work.list_extractions(images[:1], tmp_path / "slat", [7], False))
+    run(session, images[:1], tmp_path / "slat", 7)
     record = json.loads((tmp_path / "slat" / "cup.json").read_text("utf-8"))
     assert record["seed"] == 7 and record["model"] == {"name": "m", "revision": "abc"}
     assert record["image"]["sha256"] == hashlib.sha256(images[0].read_bytes()).hexdigest()
@@ -154,7 +153,7 @@ def test_provenance_says_how_to_do_it_again(session, images, tmp_path):
 
 
 def test_build_store_reads_what_is_extracted(session, images, tmp_path):
-    assert len(run(session, work.list_extractions(images, tmp_path / "slat", [0, 1], False))) == 4
+    assert len(run(session, images, tmp_path / "slat", 0, 1)) == 4
     for name in ("cup", "bear"):
         grid = tmp_path / "pixieverse" / name / "sample_0" / "material_grid.npy"
         grid.parent.mkdir(parents=True)
@@ -165,7 +164,6 @@ def test_build_store_reads_what_is_extracted(session, images, tmp_path):
     )
     from slatprep.store import open_store
 
-    assert summary.store is not None
     store = open_store(summary.store)
     assert store.ids == ["bear.seed-0", "bear.seed-1", "cup.seed-0", "cup.seed-1"]
     with np.load(tmp_path / "slat" / "cup" / "seed-1.npz") as saved:
@@ -174,13 +172,13 @@ def test_build_store_reads_what_is_extracted(session, images, tmp_path):
 
 def test_same_seed_gives_the_same_bytes_and_is_not_drawn_twice(session, images, tmp_path):
     for folder in ("a", "b"):
-        run(session, work.list_extractions(images, tmp_path / folder, [3], False))
+        run(session, images, tmp_path / folder, 3)
     for path in (tmp_path / "a").iterdir():
         assert path.read_bytes() == (tmp_path / "b" / path.name).read_bytes()
     calls = len(session.pipeline.seen)
-    again = run(session, work.list_extractions(images, tmp_path / "a", [3], False))
+    again = run(session, images, tmp_path / "a", 3)
     assert all(result.kept for result in again) and len(session.pipeline.seen) == calls
-    other = run(session, work.list_extractions(images, tmp_path / "a", [4], False))
+    other = run(session, images, tmp_path / "a", 4)
     assert all(isinstance(result, InputError) for result in other)
     assert (tmp_path / "a" / "cup.npz").read_bytes() == (tmp_path / "b" / "cup.npz").read_bytes()
 
@@ -206,10 +204,10 @@ def test_a_bad_image_does_not_stop_the_others(images, tmp_path):
     images[0].write_bytes(b"no image")
     torch = Torch()
     session = work.Session(Pipeline(torch), torch, {})
-    bad, good = run(session, work.list_extractions(images, tmp_path / "slat", [0], False))
+    bad, good = run(session, images, tmp_path / "slat", 0)
     assert isinstance(bad, InputError) and "cup.png" in str(bad) and good.voxels > 0
     empty = work.Session(Pipeline(torch, voxels=0), torch, {})
-    [nothing] = run(empty, work.list_extractions(images[1:], tmp_path / "none", [0], False))
+    [nothing] = run(empty, images[1:], tmp_path / "none", 0)
     assert isinstance(nothing, InputError) and not (tmp_path / "none" / "bear.npz").exists()
 
 
@@ -222,7 +220,7 @@ def test_an_image_that_trellis_cannot_process_does_not_stop_the_others(images, t
 
     torch = Torch()
     session = work.Session(Failing(torch), torch, {})
-    bad, good = run(session, work.list_extractions(images, tmp_path / "slat", [0], False))
+    bad, good = run(session, images, tmp_path / "slat", 0)
     assert isinstance(bad, InputError) and good.voxels > 0
     assert "cup.png: TRELLIS could not make latents of it (RuntimeError: CUDA out" in str(bad)
     assert [path.name for path in (tmp_path / "slat").glob("*.npz")] == ["bear.npz"]
@@ -240,7 +238,7 @@ def test_an_image_without_foreground_is_named_and_the_rest_are_done(images, tmp_
 
     torch = Torch()
     session = work.Session(Strict(torch), torch, {})
-    bad, good = run(session, work.list_extractions(images, tmp_path / "slat", [0], False))
+    bad, good = run(session, images, tmp_path / "slat", 0)
     assert isinstance(bad, InputError) and good.voxels > 0
     assert "cup.png: TRELLIS could not make latents of it (ValueError: zero-size" in str(bad)
     assert "an image with a foreground" in str(bad)
@@ -255,10 +253,9 @@ def test_without_trellis_the_command_says_what_to_install(command, images, tmp_p
     asset = make_asset(0)
     np.savez(tmp_path / "cup.npz", coords=asset.coords, feats=asset.feats)
     source = images[0] if command == "extract-slat" else tmp_path / "cup.npz"
-    words = [command, str(source), "--out", str(tmp_path / "slat")]
-    result = CliRunner().invoke(slatprep, words)
-    assert result.exit_code == 2 and len(result.stderr.splitlines()) == 1
-    assert "Install TRELLIS as https://github.com/microsoft/TRELLIS says" in result.stderr
+    told = commands.refused(command, source, "--out", tmp_path / "slat")
+    assert len(told.splitlines()) == 1
+    assert "Install TRELLIS as https://github.com/microsoft/TRELLIS says" in told
     assert not (tmp_path / "slat").exists()
 
 
@@ -287,10 +284,8 @@ def test_command_loads_one_commit_of_the_model(gpu, images, tmp_path, monkeypatc
     }
     for name, module in fakes.items():
         monkeypatch.setitem(sys.modules, name, module)
-    words = ["extract-slat", *map(str, images), "--out", str(tmp_path / "slat"), "--json",
-             "--revision", "v1", "--no-preprocess"]  # fmt: skip
-    result = CliRunner().invoke(slatprep, words)
-    assert result.exit_code == 0, result.output
+    words = ("--out", tmp_path / "slat", "--json", "--revision", "v1", "--no-preprocess")
+    result = commands.run("extract-slat", *images, *words)
     document = json.loads(result.stdout)
     assert document["model"]["revision"] == commit and document["extracted"] == 2
     assert asked == [("microsoft/TRELLIS-image-large", "v1"), str(tmp_path / commit)]

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from support.shapes import GRID, chair, field_of, latents_of, surface_latents, turned
+from support.shapes import GRID, chair, field_of, judged, latents_of, surface_latents, turned
 
 from slatprep.align import align, engine_versions, solver
 from slatprep.align.pair import FINE_SAMPLES
@@ -18,7 +18,6 @@ from slatprep.align.starts import distinct_starts
 from slatprep.geometry.deformation import map_of
 from slatprep.geometry.frames import displacement, make_transform, split_transform
 from slatprep.geometry.voxels import boundary, voxels_of
-from slatprep.judge import judge
 from slatprep.parameters import AlignParameters, SampleParameters
 from slatprep.records import Verdict
 from slatprep.sample import sample
@@ -132,9 +131,7 @@ def test_two_different_objects_fail_after_a_search_of_all_orientations():
     field, latents = field_of(chair()), surface_latents(BALL)
     alignment = align(field, latents, DEFAULT)
     assert alignment.search == "so3"
-    annotation = sample(field, map_of(alignment).places(latents.coords), SampleParameters())
-    judgement, _ = judge(field, latents, alignment, annotation, SampleParameters())
-    assert judgement.verdict is Verdict.FAILED
+    assert judged(field, latents, alignment).verdict is Verdict.FAILED
 
 
 def test_a_missing_part_and_a_stray_part_do_not_pull():
@@ -191,8 +188,7 @@ def test_odd_shapes_get_a_finite_answer_and_a_verdict(name):
     own = latents_of(DEGENERATE[name][:32768])
     for latents in (own, latents_of(DEGENERATE["a dozen"]), surface_latents(BALL)):
         alignment = align(field, latents, DEFAULT)
-        annotation = sample(field, map_of(alignment).places(latents.coords), SampleParameters())
-        judgement, _ = judge(field, latents, alignment, annotation, SampleParameters())
+        judgement = judged(field, latents, alignment)
         ambiguity = judgement.ambiguity
         numbers = [
             *alignment.transform.ravel(),

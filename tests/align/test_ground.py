@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.ndimage import map_coordinates
 from scipy.spatial.transform import Rotation
-from support.shapes import GRID, chair, field_of, surface_latents
+from support.shapes import GRID, chair, field_of, judged, surface_latents
 
 from slatprep.align import align
 from slatprep.align import field as engine
@@ -14,13 +14,10 @@ from slatprep.align.ground import find_ground
 from slatprep.align.quality import measure_quality
 from slatprep.align.settle import refit, take
 from slatprep.align.surface import surface_of
-from slatprep.geometry.deformation import map_of
 from slatprep.geometry.frames import displacement, make_transform
 from slatprep.geometry.voxels import above
-from slatprep.judge import judge
-from slatprep.parameters import AlignParameters, SampleParameters
+from slatprep.parameters import AlignParameters
 from slatprep.records import Ground, LatentChoice, Placement, Verdict
-from slatprep.sample import sample
 
 DEFAULT = AlignParameters()
 HEIGHTS = GRID[..., 2].astype(float)
@@ -53,17 +50,13 @@ def test_an_object_on_ground_is_placed_as_without(thickness, degrees, radius, sc
     found = align(field, latents, DEFAULT)
     true = make_transform(np.eye(3), scale=scale)
     assert displacement(found.transform, true, latents.centres) < 1.5
-    assert found.ground is not None
     normal = Rotation.from_euler("x", degrees, degrees=True).apply([0.0, 0.0, 1.0])
     assert np.degrees(np.arccos(found.ground.normal @ normal)) < 1.5
-    annotation = sample(field, map_of(found).places(latents.coords), SampleParameters())
-    judgement, _ = judge(field, latents, found, annotation, SampleParameters())
-    assert judgement.verdict is Verdict.GOOD
+    assert judged(field, latents, found).verdict is Verdict.GOOD
 
 
 def test_the_top_of_a_slab_is_found():
     ground = find_ground(surface_of(chair() | slab(3.0)))
-    assert ground is not None
     np.testing.assert_allclose(ground.normal, [0, 0, 1], atol=0.01)
     # The slab's highest voxels have the index FOOT - 1; centres are half a voxel off.
     assert ground.height * 64 + 31.5 == pytest.approx(FOOT - 0.5, abs=0.75)
@@ -84,7 +77,6 @@ def test_the_lid_of_a_low_object_is_not_taken_for_its_ground(radius):
     latents = surface_latents(larger(board(), 1.1))
     field = field_of(board() | slab(2.0, radius=radius))
     found = align(field, latents, DEFAULT)
-    assert found.ground is not None
     assert found.ground.height * 64 + 31.5 == pytest.approx(FOOT - 0.5, abs=1.5)
     true = make_transform(np.eye(3), scale=1.1)
     assert displacement(found.transform, true, latents.centres) < 1.5
@@ -113,19 +105,11 @@ def test_where_the_sides_fit_no_ground_is_looked_for(monkeypatch):
     assert found.ground is None
 
 
-def test_a_ball_has_no_layer():
-    assert find_ground(surface_of(((GRID - 31.5) ** 2).sum(axis=-1) < 400)) is None
-
-
-def test_nothing_but_a_slab_is_no_ground():
-    assert find_ground(surface_of(slab(3.0))) is None
-
-
-@pytest.mark.parametrize("count", [1, 2, 5])
-def test_a_few_voxels_have_no_ground(count):
-    few = np.zeros((64, 64, 64), dtype=bool)
-    few[10, 20, 30 : 30 + count] = True
-    assert find_ground(surface_of(few)) is None
+def test_a_ball_a_slab_alone_and_a_few_voxels_have_no_ground():
+    ball = ((GRID - 31.5) ** 2).sum(axis=-1) < 400
+    few = [(GRID >= [10, 20, 30]) & ([11, 21, 30 + count] > GRID) for count in (1, 2, 5)]
+    for solid in (ball, slab(3.0), *(one.all(axis=-1) for one in few)):
+        assert find_ground(surface_of(solid)) is None
 
 
 def test_quality_does_not_count_the_ground():

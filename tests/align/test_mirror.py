@@ -5,15 +5,13 @@ import pytest
 from numpy.typing import NDArray
 from scipy.ndimage import affine_transform
 from scipy.spatial.transform import Rotation
-from support.shapes import GRID, chair, field_of, surface_latents
+from support.shapes import GRID, chair, field_of, judged, surface_latents
 
 from slatprep.align import align
 from slatprep.align.surface import surface_of
-from slatprep.geometry.deformation import map_of
-from slatprep.judge import THRESHOLDS, judge
-from slatprep.parameters import AlignParameters, SampleParameters
+from slatprep.judge import THRESHOLDS
+from slatprep.parameters import AlignParameters
 from slatprep.records import Verdict
-from slatprep.sample import sample
 
 DEFAULT = AlignParameters()
 LIMIT = THRESHOLDS.good_mirrored
@@ -21,7 +19,6 @@ LIMIT = THRESHOLDS.good_mirrored
 
 def gain(solid: NDArray[np.bool_], other: NDArray[np.bool_]) -> float:
     found = align(field_of(solid), surface_latents(other), DEFAULT)
-    assert found.figures is not None
     return found.figures.mirrored
 
 
@@ -87,7 +84,6 @@ def test_a_mirrored_annotation_is_not_good_and_is_told_as_what_it_is():
     solid[44:50, 26:32, 16:40] = True
     field, latents = field_of(solid), surface_latents(solid[::-1])
     found = align(field, latents, DEFAULT)
-    annotation = sample(field, map_of(found).places(latents.coords), SampleParameters())
-    judgement, _ = judge(field, latents, found, annotation, SampleParameters())
+    judgement = judged(field, latents, found)
     assert judgement.verdict is not Verdict.GOOD
     assert any("mirror image of its object" in reason for reason in judgement.reasons)

@@ -9,5 +9,4 @@ from slatprep.pipeline.dataset import BuildSummary
 
 @pytest.fixture
 def store(mixed_build: BuildSummary) -> Path:
-    assert mixed_build.store is not None
     return mixed_build.store

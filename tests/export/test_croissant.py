@@ -6,13 +6,10 @@ from pathlib import Path
 
 import mlcroissant
 import numpy as np
-import pytest
 import zarr
-from click.testing import CliRunner
+from support.commands import run
 
-from slatprep.cli.commands import slatprep
 from slatprep.export.croissant import Stated, describe, to_json
-from slatprep.pipeline.dataset import BuildSummary
 from slatprep.store import open_store
 from slatprep.store.layout import ARRAYS
 
@@ -22,12 +19,6 @@ STATED = {
     "cite_as": "Someone (2026)",
     "date_published": "2026-01-31",
 }
-
-
-@pytest.fixture
-def store(mixed_build: BuildSummary) -> Path:
-    assert mixed_build.store is not None
-    return mixed_build.store
 
 
 def test_croissant_is_valid_without_a_warning(store, tmp_path, caplog):
@@ -75,9 +66,7 @@ def test_croissant_describes_figures_that_are_not_numbers(store, tmp_path):
 
 def test_describe_writes_where_the_files_are_found(store, tmp_path):
     out = store.parent / "description" / "croissant.json"
-    arguments = ["describe", str(store), "--out", str(out), "--name", "mine", "-q"]
-    result = CliRunner().invoke(slatprep, arguments)
-    assert result.exit_code == 0, result.output
+    run("describe", store, "--out", out, "--name", "mine", "-q")
     document = json.loads(out.read_text("utf-8"))
     assert document["name"] == "mine"
     for entry in document["distribution"]:
@@ -89,8 +78,6 @@ def test_describe_writes_where_the_files_are_found(store, tmp_path):
             assert any(path.name == "zarr.json" for path in files)
             # Of an array of one value alone, its fill value, Zarr writes no chunk.
             assert len(files) >= (2 if entry["@id"].startswith("voxel/") else 1)
-    printed = CliRunner().invoke(
-        slatprep, ["describe", str(store), "--location", "https://example.org/s.zarr/"]
-    )
+    printed = run("describe", store, "--location", "https://example.org/s.zarr/")
     (root, *_) = json.loads(printed.stdout)["distribution"]
     assert root["contentUrl"] == "https://example.org/s.zarr/zarr.json"

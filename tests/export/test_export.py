@@ -10,18 +10,17 @@ import tarfile
 
 import numpy as np
 import pytest
-from click.testing import CliRunner
 from hypothesis import given
 from hypothesis import strategies as st
+from support.commands import run
 from support.exports import bytes_of, index_of
 from support.synthetic import JELLY, METAL, QUARTER_TURN
 from support.trees import tree
 
-from slatprep.cli.commands import slatprep
 from slatprep.errors import ConfigError, SlatprepError
 from slatprep.export import FORMATS, ExportOptions, export_store
 from slatprep.export.target import directory
-from slatprep.parameters import PixieverseSource, SlatSource
+from slatprep.parameters import BuildParameters, PixieverseSource, SlatSource
 from slatprep.readers import discover, read_latents
 from slatprep.readers.splits import Shares, split_objects
 from slatprep.storage.names import file_name
@@ -58,13 +57,12 @@ def test_hdf5_is_read_by_h5py(store, mixed, tmp_path):
             assert (np.abs(group["properties"][:]) <= 1).all()
 
 
-def test_hdf5_is_itself_a_source_of_latents(store, mixed, tmp_path):
-    export_store(store, tmp_path / "slat.h5", "hdf5", assets=["cup", "ant"])
-    parameters = mixed.parameters()
-    parameters = type(parameters)(
-        PixieverseSource(parameters.pixieverse.root), SlatSource(tmp_path / "slat.h5")
-    )
-    pairs = {pair.asset_id: pair for pair in discover(parameters) if not pair.problem}
+@pytest.mark.parametrize(("format", "name"), [("hdf5", "slat.h5"), ("npz", "root")])
+def test_an_export_is_itself_a_source_of_latents(format, name, store, mixed, tmp_path):
+    export_store(store, tmp_path / name, format, assets=["cup", "ant"])
+    source = PixieverseSource(mixed.root / "pixieverse")
+    found = discover(BuildParameters(source, SlatSource(tmp_path / name)))
+    pairs = {pair.asset_id: pair for pair in found if not pair.problem}
     assert sorted(pairs) == ["ant", "cup"]
     np.testing.assert_array_equal(read_latents(pairs["cup"]).feats, mixed.assets["cup"].feats)
 
@@ -167,21 +165,26 @@ def test_a_file_of_another_origin_is_not_replaced(store, tmp_path):
     assert sorted(path.name for path in out.iterdir()) == ["index.json", "latents", "metadata.csv"]
 
 
-@pytest.mark.parametrize("bytes_allowed", [1, 3000, 40_000, 100_000])
-def test_a_disk_that_is_full_ends_no_process(bytes_allowed, store, tmp_path):
+def test_a_disk_that_is_full_ends_no_process(store, tmp_path):
     """A limit on the size of files refuses writes as a full disk does; HDF5 crashes of either."""
     code = (
-        "import resource, signal, sys\n"
+        "import os, resource, signal, sys\n"
+        "from slatprep.errors import SlatprepError\n"
         "from slatprep.export import export_store\n"
         "signal.signal(signal.SIGXFSZ, signal.SIG_IGN)\n"
-        "resource.setrlimit(resource.RLIMIT_FSIZE, (int(sys.argv[3]),) * 2)\n"
-        "export_store(sys.argv[1], sys.argv[2], 'hdf5')\n"
+        "hard = resource.getrlimit(resource.RLIMIT_FSIZE)[1]\n"
+        "for allowed in (1, 3000, 40_000, 100_000):\n"
+        "    resource.setrlimit(resource.RLIMIT_FSIZE, (allowed, hard))\n"
+        "    try: export_store(sys.argv[1], sys.argv[2] + '/e.h5', 'hdf5')\n"
+        "    except SlatprepError as error: print(error, os.listdir(sys.argv[2]))\n"
     )
-    command = [sys.executable, "-c", code, store, tmp_path / "e.h5", bytes_allowed]
-    told = subprocess.run([str(c) for c in command], capture_output=True, text=True, check=False)
-    assert told.returncode == 1
-    assert "cannot write there (File too large); nothing was replaced" in told.stderr
-    assert not list(tmp_path.iterdir())
+    command = [sys.executable, "-c", code, str(store), str(tmp_path)]
+    told = subprocess.run(command, capture_output=True, text=True, check=True)
+    lines = told.stdout.splitlines()
+    assert len(lines) == 4
+    for line in lines:
+        assert "cannot write there (File too large); nothing was replaced" in line
+        assert line.endswith(" []")
 
 
 @pytest.mark.parametrize("format", FORMATS)
@@ -228,17 +231,14 @@ def test_assets_are_chosen_by_id_and_verdict(store, tmp_path):
 
 
 def test_splits_go_out_apart_and_together_they_are_all(store, tmp_path):
-    def export(*options: str, code: int = 0) -> str:
-        words = ["export", str(store), "--format", "npz", *options]
-        result = CliRunner().invoke(slatprep, words)
-        assert result.exit_code == code, result.output
-        return result.output
+    def export(*options: object, code: int = 0) -> str:
+        return run("export", store, "--format", "npz", *options, code=code).output
 
     expected = split_objects(["ant", "bear", "cup", "dog"], Shares(0.4, 0.3, 0.3))
     ids = []
     for split in ("train", "val", "test"):
         out = tmp_path / split
-        told = export("--out", str(out), "--split", split, "--shares", "0.4,0.3,0.3")
+        told = export("--out", out, "--split", split, "--shares", "0.4,0.3,0.3")
         assert f"split:   {split}, by hash: " in told
         own = [entry["asset_id"] for entry in index_of(out)]
         assert {expected[one.partition(".")[0]] for one in own} == {split}
@@ -246,9 +246,9 @@ def test_splits_go_out_apart_and_together_they_are_all(store, tmp_path):
     assert sorted(ids) == ["ant", "bear.front", "bear.side", "cup", "dog"]
     listed = tmp_path / "test.txt"
     listed.write_text("bear.front\n")  # an object by one of its views
-    export("--out", str(tmp_path / "f"), "--split", "test", "--split-by", str(listed))
+    export("--out", tmp_path / "f", "--split", "test", "--split-by", listed)
     assert [entry["asset_id"] for entry in index_of(tmp_path / "f")] == ["bear.front", "bear.side"]
-    none = ("--out", str(tmp_path / "none"))
+    none = ("--out", tmp_path / "none")
     empty = export(*none, "--split", "test", "--shares", "1,0,0", code=2)
     assert "no asset is in the split test" in empty
     assert "both choose" in export(*none, "--split", "test", "--asset", "cup", code=2)

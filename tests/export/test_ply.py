@@ -4,7 +4,9 @@ import json
 import shutil
 
 import numpy as np
+import plyfile
 import pytest
+import zarr
 from support.exports import index_of
 from support.synthetic import JELLY, METAL, QUARTER_TURN, Dataset
 
@@ -27,8 +29,6 @@ PIXIE_VERTEX = [
 
 
 def test_ply_is_read_by_plyfile_as_pixie_writes_it(store, mixed, tmp_path):
-    import plyfile
-
     export_store(store, tmp_path / "ply", "ply")
     assert np.dtype(PIXIE_VERTEX).newbyteorder("<") == VERTEX
     for entry in index_of(tmp_path / "ply"):
@@ -50,19 +50,6 @@ def test_ply_is_read_by_plyfile_as_pixie_writes_it(store, mixed, tmp_path):
         np.testing.assert_allclose(vertex["conf"], 1.0, atol=1e-3)
 
 
-def test_ply_passes_through_the_loader_of_physgaussian(store, tmp_path):
-    import plyfile
-
-    export_store(store, tmp_path / "ply", "ply", assets=["cup"])
-    vertex = plyfile.PlyData.read(tmp_path / "ply" / "cup.ply")["vertex"]
-    # What `load_point_cloud` and `apply_material_field_to_simulation` ask of a file.
-    names = {one.name for one in vertex.properties}
-    assert {"x", "y", "z", "part_label", "density", "E", "nu", "material_id", "conf"} <= names
-    for name in ("density", "E", "nu", "conf"):
-        assert np.isfinite(vertex[name]).all() and (vertex[name] > 0).all()
-    assert set(vertex["material_id"].tolist()) <= set(range(7))
-
-
 def test_ply_is_read_by_open3d(store, mixed, tmp_path):
     import open3d
 
@@ -74,8 +61,6 @@ def test_ply_is_read_by_open3d(store, mixed, tmp_path):
 
 
 def test_grid_points_are_the_field_itself_in_either_frame(store, mixed, tmp_path):
-    import plyfile
-
     grid = mixed.assets["cup"].grid
     voxels = np.argwhere(grid[..., 3] != 7)
     for frame in ("slat", "pixieverse"):
@@ -101,8 +86,6 @@ def test_grid_points_are_the_field_itself_in_either_frame(store, mixed, tmp_path
 
 
 def test_world_bounds_of_the_records_are_used(tmp_path):
-    import plyfile
-
     dataset = Dataset(tmp_path / "sources")
     dataset.add("cup", seed=0)
     lo, hi = np.array([1.0, 2.0, 3.0]), np.array([2.0, 4.0, 7.0])
@@ -111,7 +94,6 @@ def test_world_bounds_of_the_records_are_used(tmp_path):
         min_bounds=lo, max_bounds=hi, grid_shape=(64, 64, 64),
     )  # fmt: skip
     summary = build_store(dataset.parameters(), tmp_path / "s.zarr")
-    assert summary.store is not None
     options = ExportOptions(points="grid", frame="pixieverse")
     done = export_store(summary.store, tmp_path / "ply", "ply", options=options)
     assert done.notes == ()
@@ -139,8 +121,6 @@ def test_a_field_without_bounds_is_told(store, tmp_path):
     ],
 )
 def test_bounds_that_make_no_sense_are_refused(bounds, store, tmp_path):
-    import zarr
-
     shutil.copytree(store, tmp_path / "s.zarr")
     records = zarr.open_group(tmp_path / "s.zarr", mode="r+", use_consolidated=False)[
         "asset/record"

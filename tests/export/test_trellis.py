@@ -12,8 +12,6 @@ from support.synthetic import JELLY, METAL
 
 from slatprep.errors import ConfigError
 from slatprep.export import ExportOptions, export_store
-from slatprep.parameters import PixieverseSource, SlatSource
-from slatprep.readers import discover, read_latents
 
 ENCODER = "dinov2_vitl14_reg_slat_enc_swin8_B_64l8_fp16"  # latent_model of TRELLIS's configurations
 
@@ -92,17 +90,6 @@ def test_names_that_pandas_takes_for_numbers_or_nothing_are_found(store, tmp_pat
         files = {entry["asset_id"]: entry["file"] for entry in index_of(root)}
         assert sorted(files) == sorted(names)
         assert all((root / file).is_file() for file in files.values())
-
-
-def test_an_npz_export_is_itself_a_source_of_latents(store, mixed, tmp_path):
-    export_store(store, tmp_path / "root", "npz", assets=["cup", "ant"])
-    parameters = mixed.parameters()
-    parameters = type(parameters)(
-        PixieverseSource(parameters.pixieverse.root), SlatSource(tmp_path / "root")
-    )
-    pairs = {pair.asset_id: pair for pair in discover(parameters) if not pair.problem}
-    assert sorted(pairs) == ["ant", "cup"]
-    np.testing.assert_array_equal(read_latents(pairs["cup"]).feats, mixed.assets["cup"].feats)
 
 
 def test_another_model_takes_the_place_of_the_first(store, tmp_path):

@@ -85,7 +85,6 @@ def test_shifted_windows_carry_news_further(model):
     coords = torch.tensor([[0, 7, 0, 0], [0, 8, 0, 0], [0, 40, 40, 40]], dtype=torch.int32)
     feats = torch.zeros(3, 8, requires_grad=True)
     model(coords, feats).properties[0].sum().backward()
-    assert feats.grad is not None
     reached = feats.grad.abs().sum(dim=1) > 0
     assert reached.tolist() == [True, True, False]
 

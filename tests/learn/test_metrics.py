@@ -1,6 +1,5 @@
 """Scores against cases done by hand and a second computation."""
 
-import json
 import shutil
 from pathlib import Path
 
@@ -8,11 +7,10 @@ import h5py
 import numpy as np
 import pytest
 import zarr
-from click.testing import CliRunner
+from support.commands import document, run
 
 from slatprep import InputError, open_store
-from slatprep.cli.commands import slatprep
-from slatprep.learn.metrics import METRICS, average_objects, evaluate_store, measure, score_asset
+from slatprep.learn.metrics import METRICS, average_objects, evaluate_store, score_asset
 from slatprep.learn.predictions import VoxelPrediction
 from slatprep.learn.published import PIXIE_TABLE, SLAT_PHYS_TABLE, read_scores
 
@@ -38,12 +36,6 @@ def test_objects_count_alike_whatever_their_views():
     assert overall.spreads["nu"] == pytest.approx(3 / np.sqrt(2))
     assert (groups["x"].means["nu"], groups["y"].means["nu"]) == (1.0, 4.0)
     assert np.isnan(groups["x"].spreads["nu"])
-
-
-def test_standard_error_is_the_deviation_over_root_n():
-    rows = np.random.default_rng(0).random((9, 5))
-    sd, se = measure(rows, "sd").spreads, measure(rows, "se").spreads
-    assert {k: v / 3 for k, v in sd.items()} == pytest.approx(se)
 
 
 @pytest.fixture(scope="module")
@@ -104,19 +96,6 @@ def test_against_a_plain_computation(learn_store, predicted, form):
     assert list(result.overall.spreads.values()) == pytest.approx(error.tolist())
 
 
-def test_perfect_predictions_score_perfectly(learn_store, tmp_path):
-    store = open_store(learn_store)
-    for index, asset_id in enumerate(store.ids):
-        rows = store.read(index, ("properties", "material"))
-        np.savez(
-            tmp_path / f"{asset_id}.npz",
-            properties=np.nan_to_num(rows["properties"]),
-            material=np.where(rows["material"] == 255, 0, rows["material"]),
-        )
-    means = evaluate_store(tmp_path, learn_store, None).overall.means
-    assert list(means.values()) == [0.0, 0.0, 0.0, 0.0, 1.0]
-
-
 @pytest.mark.parametrize(
     ("arrays", "message"),
     [
@@ -146,19 +125,16 @@ def test_command(learn_store, predicted, tmp_path):
     some = tmp_path / "some"
     shutil.copytree(predicted["npz"], some)
     (some / "a.npz").unlink()
-    arguments = ["evaluate", str(some), "--store", str(learn_store), "--split", "all"]
-    done = CliRunner().invoke(slatprep, [*arguments, "--json", "--csv", str(tmp_path / "s.csv")])
-    assert done.exit_code == 1
-    assert "no prediction of a" in done.stderr
-    document = json.loads(done.stdout)
-    assert document["missing"] == ["a"]
-    assert document["overall"]["objects"] == 7
-    assert list(document["overall"]["means"]) == list(METRICS)
+    words = ("evaluate", some, "--store", learn_store, "--split", "all")
+    told = document(*words, "--csv", tmp_path / "s.csv", code=1)
+    assert told["missing"] == ["a"]
+    assert told["overall"]["objects"] == 7
+    assert list(told["overall"]["means"]) == list(METRICS)
     last = (tmp_path / "s.csv").read_text().splitlines()[-1].split(",")
     assert last[:2] == ["all", "7"]
-    assert float(last[2]) == pytest.approx(document["overall"]["means"]["log10 E"])
-    table = CliRunner().invoke(slatprep, arguments).stdout
-    assert "log10 density" in table
+    assert float(last[2]) == pytest.approx(told["overall"]["means"]["log10 E"])
+    shown = run(*words, code=1)
+    assert "no prediction of a" in shown.stderr and "log10 density" in shown.stdout
 
 
 def test_published_rows_agree_with_themselves():
@@ -169,23 +145,16 @@ def test_published_rows_agree_with_themselves():
 
 
 def test_table_is_printed_beside(learn_store, predicted, tmp_path):
-    arguments = ["evaluate", str(predicted["npz"]), "--store", str(learn_store), "--split", "all"]
-    shown = CliRunner().invoke(slatprep, [*arguments, "--beside", "pixie"])
-    assert shown.exit_code == 0, shown.output
-    lines = shown.stdout.splitlines()
+    own = tmp_path / "scores.csv"
+    words = ("evaluate", predicted["npz"], "--store", learn_store, "--split", "all")
+    ours = document(*words, "--csv", own)["overall"]
+    lines = run(*words, "--beside", "pixie", "--beside", own).stdout.splitlines()
     start = next(k for k, line in enumerate(lines) if "2508.17437" in line)
-    ours = json.loads(CliRunner().invoke(slatprep, [*arguments, "--json"]).stdout)["overall"]
     assert lines[start + 2].split()[-5:] == [f"{v:.3f}" for v in ours["means"].values()]
     assert lines[start + 3].split() == ["NeRF2Physics", "1.115", "0.997", "0.462", "0.858", "0.274"]
-
-    own = tmp_path / "scores.csv"
-    CliRunner().invoke(slatprep, [*arguments, "--csv", str(own)])
-    beside = ["--beside", str(own), "--json"]
-    document = json.loads(CliRunner().invoke(slatprep, [*arguments, *beside]).stdout)
-    assert document["beside"][-1]["method"] == "all"
-    assert document["beside"][-1]["means"] == pytest.approx(ours["means"])
-    both = CliRunner().invoke(slatprep, [*arguments, "--beside", "pixie", "--beside", str(own)])
-    assert "2508.17437" in both.stdout and f"Beside {own}" in both.stdout
+    assert any(f"Beside {own}" in line for line in lines)
+    last = document(*words, "--beside", own)["beside"][-1]
+    assert last["method"] == "all" and last["means"] == pytest.approx(ours["means"])
 
 
 @pytest.mark.parametrize(

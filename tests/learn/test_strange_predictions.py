@@ -13,9 +13,8 @@ import numpy as np
 import pytest
 import torch
 import zarr
-from click.testing import CliRunner
+from support.commands import refused
 
-from slatprep.cli.commands import slatprep
 from slatprep.errors import InputError, StoreError
 from slatprep.learn.metrics import evaluate_store
 from slatprep.learn.predictions import check_prediction, selection_of_run
@@ -192,19 +191,18 @@ def test_metadata_of_arrays_are_taken_at_their_word(tmp_path, change, message, s
         read_array(file.parent, file.parents[1], spec)
 
 
-def test_a_lost_chunk_of_a_prediction_is_refused(tmp_path):
+@pytest.mark.parametrize(
+    ("cut", "said"),
+    [
+        ({"chunks": (4, 3)}, r"p\.zarr/a: its chunk c/1/0 is missing"),
+        ({"chunks": (2, 3), "shards": (4, 3)}, "its shard a/c/1/0 is missing; expected all chunks"),
+    ],
+)
+def test_a_lost_file_of_a_prediction_is_refused(tmp_path, cut, said):
     root, spec = zarr.open_group(tmp_path / "p.zarr", mode="w"), ArraySpec(((None, 3),), "u")
-    root.create_array("a", shape=(8, 3), dtype="uint8", chunks=(4, 3))[:] = 1
+    root.create_array("a", shape=(8, 3), dtype="uint8", **cut)[:] = 1
     (tmp_path / "p.zarr/a/c/1/0").unlink()
-    with pytest.raises(InputError, match=r"p\.zarr/a: its chunk c/1/0 is missing"):
-        read_array(tmp_path / "p.zarr/a", tmp_path / "p.zarr", spec)
-
-
-def test_a_lost_shard_of_a_prediction_is_refused(tmp_path):
-    root, spec = zarr.open_group(tmp_path / "p.zarr", mode="w"), ArraySpec(((None, 3),), "u")
-    root.create_array("a", shape=(8, 3), dtype="uint8", chunks=(2, 3), shards=(4, 3))[:] = 1
-    (tmp_path / "p.zarr/a/c/1/0").unlink()
-    with pytest.raises(InputError, match=r"its shard a/c/1/0 is missing; expected all chunks"):
+    with pytest.raises(InputError, match=said):
         read_array(tmp_path / "p.zarr/a", tmp_path / "p.zarr", spec)
 
 
@@ -234,11 +232,8 @@ def test_a_pipe_is_not_waited_for(learn_store, tmp_path):
     os.mkfifo(tmp_path / "p/a.npz")
     os.mkfifo(tmp_path / "p.h5")
     for path in ("p", "p.h5"):
-        done = CliRunner().invoke(
-            slatprep,
-            ["evaluate", str(tmp_path / path), "--store", str(learn_store), "--split", "all"],
-        )
-        assert done.exit_code == 1 and "regular file" in done.stderr
+        words = ("evaluate", tmp_path / path, "--store", learn_store, "--split", "all")
+        assert "regular file" in refused(*words, code=1)
 
 
 @pytest.fixture(scope="module")

@@ -11,11 +11,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from click.testing import CliRunner
+from support.commands import document, refused, run
 from support.synthetic import Dataset, make_asset
 
 from slatprep import ConfigError, InputError, StoreError, build_store, open_store
-from slatprep.cli.commands import slatprep
 from slatprep.learn import train as module
 from slatprep.learn.baselines import fit_baselines
 from slatprep.learn.dataset import IGNORED, SlatDataset, SlatLoader, SparseBatch, collate
@@ -31,6 +30,9 @@ SHORT = TrainParameters(
     size="small", epochs=3, batch_size=2, accumulate=2, learning_rate=2e-3, shares=SHARES,
     augmentation="upright", seed=1,
 )  # fmt: skip
+
+
+SMALL = ("--size", "small", "--threads", "1")
 
 
 @pytest.fixture(autouse=True)
@@ -202,30 +204,22 @@ def test_baselines_are_what_numpy_finds(learn_store):
     np.testing.assert_allclose(linear.weights[:, :3], solution, atol=1e-6)
     predicted = constant.predict(items[0])
     np.testing.assert_allclose(predicted.properties[0], targets.mean(axis=0), atol=1e-9)
-    assert predicted.material is not None
     assert (predicted.material == np.bincount(all_of["material"][valid]).argmax()).all()
 
 
 def test_commands_train_and_evaluate(learn_store, tmp_path):
     shares = ("--shares", "0.4,0.3,0.3")
-    command = [
-        "train", str(learn_store), "--out", str(tmp_path / "run"), "--size", "small", "--epochs",
-        "2", "--learning-rate", "0.002", "--threads", "1", *shares, "--json",
-    ]  # fmt: skip
-    trained = CliRunner().invoke(slatprep, command)
-    assert trained.exit_code == 0, trained.output
+    command = ("train", learn_store, "--out", tmp_path / "run", *SMALL, "--epochs", "2",
+               "--learning-rate", "0.002", *shares, "--json")  # fmt: skip
+    trained = run(*command)
     assert "resumed" not in trained.stderr
-    again = CliRunner().invoke(slatprep, command)
-    assert f"resumed: from {tmp_path / 'run' / 'last.pt'}" in again.stderr
+    assert f"resumed: from {tmp_path / 'run' / 'last.pt'}" in run(*command).stderr
     assert "the shares are rough in a small dataset" in trained.stderr
     history = json.loads(trained.stdout)["runs"]["small"]["history"]
     assert history[1]["train_loss"] < history[0]["train_loss"]
-    predictions = tmp_path / "run" / "predictions"
-    evaluate = ["evaluate", str(predictions), "--store", str(learn_store), "--json"]
-    measured = CliRunner().invoke(slatprep, [*evaluate, *shares])
-    assert measured.exit_code == 0, measured.output
-    document = json.loads(measured.stdout)
-    assert document["missing"] == []
+    evaluate = ("evaluate", tmp_path / "run/predictions", "--store", learn_store, "--json")
+    measured = run(*evaluate, *shares).stdout
+    assert json.loads(measured)["missing"] == []
     # The mean of the training voxels, by hand on the same test objects.
     store = open_store(learn_store)
     columns = ("properties", "material", "valid")
@@ -239,36 +233,28 @@ def test_commands_train_and_evaluate(learn_store, tmp_path):
         error = np.square(one["properties"] - mean)[one["valid"]].mean()
         errors.setdefault(str(one["object"]), []).append(error)
     expected = np.mean([np.mean(own) for own in errors.values()])
-    baselines = document["baselines"]
+    baselines = json.loads(measured)["baselines"]
     assert baselines["mean of the training voxels"]["means"]["mean"] == pytest.approx(expected)
     assert "linear in each voxel" in baselines
     # Without shares those of the run are taken, whose test objects alone were predicted.
-    again = CliRunner().invoke(slatprep, evaluate)
-    assert again.stdout == measured.stdout
+    again = run(*evaluate)
+    assert again.stdout == measured
     assert f"as {tmp_path / 'run' / 'run.json'} says" in again.stderr
     (tmp_path / "run" / "run.json").write_text("{}")
-    refused = CliRunner().invoke(slatprep, evaluate)
-    assert refused.exit_code == 1 and "run.json" in refused.stderr
-    wrong = CliRunner().invoke(
-        slatprep, ["train", str(learn_store), "--out", str(tmp_path), "--shares", "1,2"]
-    )
-    assert wrong.exit_code == 2
+    assert "run.json" in refused(*evaluate, code=1)
+    refused("train", learn_store, "--out", tmp_path, "--shares", "1,2")
 
 
 def test_the_command_weighs_voxels_by_their_confidence(learn_store, tmp_path):
     losses = []
     for number, weigh in enumerate(([], ["--weigh-by-confidence"], ["--weigh-by-confidence"])):
-        run = tmp_path / str(number)
-        result = CliRunner().invoke(
-            slatprep,
-            ["train", str(learn_store), "--out", str(run), "--size", "small", "--epochs", "1",
-             "--threads", "1", "--shares", "0.4,0.3,0.3", "--json", *weigh],
-        )  # fmt: skip
-        assert result.exit_code == 0, result.output
-        (epoch,) = json.loads(result.stdout)["runs"]["small"]["history"]
+        out = tmp_path / str(number)
+        words = (*SMALL, "--epochs", "1", "--shares", "0.4,0.3,0.3", *weigh)
+        told = document("train", learn_store, "--out", out, *words)
+        (epoch,) = told["runs"]["small"]["history"]
         losses.append(epoch["train_loss"])
-        told = json.loads((run / "run.json").read_text())
-        assert told["weigh_by_confidence"] is bool(weigh)
+        kept = json.loads((out / "run.json").read_text())
+        assert kept["weigh_by_confidence"] is bool(weigh)
     # Means with weights that sum to one: which is larger depends on where the doubtful voxels are.
     assert losses[1] == losses[2] != losses[0]
 
@@ -349,20 +335,12 @@ def test_failed_assets_are_neither_trained_on_nor_exported_unless_asked_for(tmp_
     build_store(dataset.parameters(), store)
     assert list(open_store(store).column("verdict")) == ["good"] * 3 + ["failed"]
 
-    arguments = ["export", str(store), "--format", "npz", "--json", "--out"]
     for options, count in (((), 3), (("--verdict", "all"), 4), (("--asset", "d"), 1)):
-        out = str(tmp_path / f"npz-{count}")
-        exported = CliRunner().invoke(slatprep, [*arguments, out, *options])
+        out = ("--out", tmp_path / f"npz-{count}")
+        exported = run("export", store, "--format", "npz", "--json", *out, *options)
         assert json.loads(exported.stdout)["assets"] == count
         assert ("left out: 1 failed" in exported.stderr) is (count == 3)
-    trained = CliRunner().invoke(
-        slatprep,
-        ["train", str(store), "--out", str(tmp_path / "run"), "--size", "small", "--epochs", "1",
-         "--threads", "1"],
-    )  # fmt: skip
-    assert trained.exit_code == 0, trained.output
+    trained = run("train", store, "--out", tmp_path / "run", *SMALL, "--epochs", "1")
     assert "left out: 1 failed (--verdict all takes them)" in trained.stderr
-    assert json.loads((tmp_path / "run" / "run.json").read_text())["verdicts"] == [
-        "good",
-        "doubtful",
-    ]
+    told = json.loads((tmp_path / "run" / "run.json").read_text())
+    assert told["verdicts"] == ["good", "doubtful"]

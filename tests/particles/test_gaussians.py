@@ -1,20 +1,18 @@
 """Gaussians follow the particles around them: rigid motions exactly, everything else kept."""
 
 import importlib.util
-import json
 from pathlib import Path
 
 import numpy as np
 import plyfile
 import pytest
-from click.testing import CliRunner
 from hypothesis import given
 from hypothesis import strategies as st
 from PIL import Image
 from scipy.spatial.transform import Rotation
+from support.commands import document, run
 from support.synthetic import JELLY, make_asset
 
-from slatprep.cli.commands import slatprep
 from slatprep.particles.gaussians import (
     bind,
     carry,
@@ -130,11 +128,6 @@ def write_prediction(path: Path) -> np.ndarray:
     return coords
 
 
-def invoke(*words: object) -> tuple[int, str, str]:
-    result = CliRunner().invoke(slatprep, ["simulate", *map(str, words)])
-    return result.exit_code, result.stdout, result.stderr
-
-
 @pytest.mark.parametrize(
     ("words", "said"),
     [
@@ -150,8 +143,8 @@ def test_what_cannot_be_simulated_is_said(words, said, tmp_path, monkeypatch):
     for axis, values in zip("xyz", ((coords + 0.5) / 64 - 0.5).T, strict=True):
         rows[axis] = values
     plyfile.PlyData([plyfile.PlyElement.describe(rows, "vertex")]).write("points.ply")
-    code, _, error = invoke("--prediction", "p.npz", "--out", "frames", *words)
-    assert code in (1, 2) and said in error, error
+    done = run("simulate", "--prediction", "p.npz", "--out", "frames", *words, code=None)
+    assert done.exit_code in (1, 2) and said in done.stderr, done.stderr
     assert not (tmp_path / "frames").exists()
 
 
@@ -163,14 +156,13 @@ def test_gaussians_of_trellis_fall_as_the_object_does(tmp_path):
     saved["nx"] = np.arange(len(saved))
     write_gaussians(tmp_path / "g.ply", saved, "by nobody")
     size, rate = 0.4, 40
-    code, printed, error = invoke(
-        "--gaussians", tmp_path / "g.ply", "--prediction", tmp_path / "p.npz", "--json",
+    told = document(
+        "simulate", "--gaussians", tmp_path / "g.ply", "--prediction", tmp_path / "p.npz",
         "--out", tmp_path / "frames", "--size", size, "--height", 0.2, "--seconds", 0.15,
         "--rate", rate, "--substeps", 4, "--particles", 16, "--device", "cpu",
         "--picture", tmp_path / "fall.gif",
     )  # fmt: skip
-    assert code == 0, error
-    assert json.loads(printed)["frames"] == 7  # What the engine prints is not between.
+    assert told["frames"] == 7  # What the engine prints is not between.
     frames = [
         plyfile.PlyData.read(tmp_path / "frames" / f"frame-{number:04d}.ply")["vertex"].data
         for number in range(7)

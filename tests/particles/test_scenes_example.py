@@ -24,7 +24,6 @@ BLOCK = np.argwhere(np.ones((4, 4, 4))) / COUNT - 0.25
 @pytest.fixture
 def prediction(mixed_build: BuildSummary, tmp_path: Path) -> Path:
     """A prediction that calls the asset `cup` water."""
-    assert mixed_build.store is not None
     coords = open_store(mixed_build.store).asset("cup").coords
     np.savez(tmp_path / "water.npz", coords=coords, material=np.full(len(coords), 4),
              properties_si=np.tile([2e5, 1e3, 0.45], (len(coords), 1)))  # fmt: skip

@@ -1,16 +1,15 @@
 """Materials reach particles: against brute force, and read back by other programs."""
 
-import json
 import shutil
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import plyfile
 import pytest
-from click.testing import CliRunner
+from support import commands
 from support.synthetic import JELLY, METAL, Dataset
 
-from slatprep.cli.commands import slatprep
 from slatprep.errors import ConfigError, InputError
 from slatprep.export import ExportOptions, export_store
 from slatprep.particles.fields import VoxelField, predicted_field
@@ -36,14 +35,12 @@ def write_gaussians(path: Path, slat_positions: np.ndarray) -> np.ndarray:
     return saved.astype(np.float32)
 
 
-def run(*words: object) -> dict[str, object]:
-    result = CliRunner().invoke(slatprep, [*map(str, words), "--json", "-q"])
-    assert result.exit_code == 0, result.output
-    return json.loads(result.stdout)
+def run(*words: object) -> dict[str, Any]:
+    return commands.document("transfer", *words, "-q")
 
 
 def run_wrong(*words: object) -> str:
-    result = CliRunner().invoke(slatprep, ["transfer", *map(str, words)])
+    result = commands.run("transfer", *words, code=None)
     assert result.exit_code in (1, 2), result.output
     assert len(result.stderr.splitlines()) == 1
     return result.stderr
@@ -51,7 +48,6 @@ def run_wrong(*words: object) -> str:
 
 @pytest.fixture
 def store(mixed_build: BuildSummary) -> Path:
-    assert mixed_build.store is not None
     return mixed_build.store
 
 
@@ -73,8 +69,8 @@ def test_gaussians_get_the_material_of_their_voxel(store, true_parts, tmp_path):
     coords, material = true_parts
     positions = particles_near(coords, 3000, 0.45)
     saved = write_gaussians(tmp_path / "g.ply", positions)
-    summary = run("transfer", tmp_path / "g.ply", "--store", store, "--asset", "cup",
-                  "--out", tmp_path / "m.ply")  # fmt: skip
+    words = ("--store", store, "--asset", "cup", "--out", tmp_path / "m.ply")
+    summary = run(tmp_path / "g.ply", *words)
     assert summary["axes"] == "trellis" and summary["far"] == 0
 
     vertex = plyfile.PlyData.read(tmp_path / "m.ply")["vertex"]
@@ -100,7 +96,7 @@ def test_wrong_axes_are_an_error_that_names_the_right_ones(axes, turn, store, tr
     positions = particles_near(true_parts[0], 3000, 0.45)
     np.save(tmp_path / "p.npy", np.column_stack(turn(*positions.T)))
     words = (tmp_path / "p.npy", "--store", store, "--asset", "cup", "--out", tmp_path / "m.ply")
-    assert run("transfer", *words, "--axes", axes)["far"] == 0
+    assert run(*words, "--axes", axes)["far"] == 0
     (tmp_path / "m.ply").unlink()
     for other in {"trellis", "glb", "slat"} - {axes}:
         said = run_wrong(*words, "--axes", other)
@@ -129,8 +125,7 @@ def test_axes_of_sam3d_are_recognised(tool, store, true_parts, tmp_path):
     positions = particles_near(true_parts[0], 3000, 0.45).astype(np.float32)
     (write_gaussians if tool == "trellis" else as_sam3d)(tmp_path / "g.ply", positions)
     words = (tmp_path / "g.ply", "--store", store, "--asset", "cup", "--out", tmp_path / "m.ply")
-    result = CliRunner().invoke(slatprep, ["transfer", *map(str, words)])
-    assert result.exit_code == 0, result.output
+    result = commands.run("transfer", *words)
     assert ("read as SAM 3D Objects saves them" in result.stderr) == (tool == "sam3d")
     vertex = plyfile.PlyData.read(tmp_path / "m.ply")["vertex"]
     coords, material = true_parts
@@ -156,11 +151,11 @@ def test_axes_that_fit_alike_are_asked_for(shape, tmp_path):
         assert "This object fits either" in said and "--axes slat for those of SAM 3D" in said
         assert not out.exists()
         # Of one material alone it does not matter.
-        run("transfer", tmp_path / "g.ply", "--prediction", tmp_path / "one.npz", "--out", out)
+        run(tmp_path / "g.ply", "--prediction", tmp_path / "one.npz", "--out", out)
         out.unlink()
         axes = "trellis" if write is write_gaussians else "slat"
         words = ("--prediction", tmp_path / "two.npz", "--out", out, "--axes", axes)
-        run("transfer", tmp_path / "g.ply", *words)
+        run(tmp_path / "g.ply", *words)
         vertex = plyfile.PlyData.read(out)["vertex"]
         np.testing.assert_array_equal(vertex["material_id"], positions[:, 2] > 0)
         out.unlink()
@@ -178,11 +173,10 @@ def test_a_third_of_the_particles_far_is_told(store, true_parts, tmp_path):
     positions = particles_near(true_parts[0], 900, 0.45)
     positions[::3] += 3.0
     np.save(tmp_path / "p.npy", positions)
-    command = ["transfer", tmp_path / "p.npy", "--store", store, "--asset", "cup", "-q"]
-    result = CliRunner().invoke(slatprep, [*map(str, command), "--out", str(tmp_path / "m.ply")])
-    assert result.exit_code == 0
-    assert "300 of 900 particles have no voxel" in result.stderr
-    assert "read with --axes slat" in result.stderr
+    words = ("--store", store, "--asset", "cup", "-q", "--out", tmp_path / "m.ply")
+    told = commands.run("transfer", tmp_path / "p.npy", *words).stderr
+    assert "300 of 900 particles have no voxel" in told
+    assert "read with --axes slat" in told
 
 
 @pytest.mark.parametrize(
@@ -206,21 +200,21 @@ def test_gaussians_of_another_tool_are_not_taken_for_trellis(
     assert read.axes == "slat"
     assert read_particles(tmp_path / "g.ply", "glb").axes == "glb"
 
-    words = ["transfer", tmp_path / "g.ply", "--store", store, "--asset", "cup", "--far", "drop",
-             "--max-distance", "64"]  # fmt: skip
-    told = CliRunner().invoke(slatprep, [*map(str, words), "--out", str(tmp_path / "m.ply")])
+    words = (tmp_path / "g.ply", "--store", store, "--asset", "cup", "--far", "drop",
+             "--max-distance", "64", "--out", tmp_path / "m.ply")  # fmt: skip
     if reach < 1:
-        assert told.exit_code == 0
-        assert f"another tool's than TRELLIS ({sign}): read as they are" in told.stderr
+        told = commands.run("transfer", *words).stderr
+        assert f"another tool's than TRELLIS ({sign}): read as they are" in told
     else:
-        assert told.exit_code != 0 and sign in told.stderr and "half of them" in told.stderr
+        told = run_wrong(*words)
+        assert sign in told and "half of them" in told
 
 
 def test_what_slatprep_wrote_says_its_frame(store, true_parts, tmp_path):
     write_gaussians(tmp_path / "g.ply", particles_near(true_parts[0], 200, 0.4))
     words = ("--store", store, "--asset", "cup", "--out")
-    run("transfer", tmp_path / "g.ply", *words, tmp_path / "once.ply")
-    again = run("transfer", tmp_path / "once.ply", *words, tmp_path / "twice.ply")
+    run(tmp_path / "g.ply", *words, tmp_path / "once.ply")
+    again = run(tmp_path / "once.ply", *words, tmp_path / "twice.ply")
     assert again["axes"] == "trellis"
     assert (tmp_path / "once.ply").read_bytes() == (tmp_path / "twice.ply").read_bytes()
 
@@ -228,9 +222,8 @@ def test_what_slatprep_wrote_says_its_frame(store, true_parts, tmp_path):
         options = ExportOptions(points=points, frame=frame)
         export_store(store, tmp_path / frame, "ply", assets=["cup"], options=options)
         if frame == "slat":
-            done = run("transfer", tmp_path / frame / "cup.ply", *words, tmp_path / "m.ply",
-                       "--points", points)  # fmt: skip
-            assert done["far"] == 0
+            cloud = tmp_path / frame / "cup.ply"
+            assert run(cloud, *words, tmp_path / "m.ply", "--points", points)["far"] == 0
     said = run_wrong(tmp_path / "pixieverse" / "cup.ply", *words, tmp_path / "m.ply")
     assert "in the PixieVerse frame; expected the SLAT frame: slatprep export --frame slat" in said
     run_wrong(tmp_path / "pixieverse" / "cup.ply", *words, tmp_path / "m.ply", "--axes", "slat")
@@ -257,8 +250,8 @@ def test_open3d_reads_the_same_points(store, true_parts, tmp_path):
     positions = particles_near(true_parts[0], 200, 0.4)
     saved = write_gaussians(tmp_path / "g.ply", positions)
     for frame, expected in (("file", saved), ("slat", positions)):
-        run("transfer", tmp_path / "g.ply", "--store", store, "--asset", "cup",
-            "--out", tmp_path / "m.ply", "--frame", frame)  # fmt: skip
+        words = ("--store", store, "--asset", "cup", "--out", tmp_path / "m.ply")
+        run(tmp_path / "g.ply", *words, "--frame", frame)
         cloud = open3d.t.io.read_point_cloud(str(tmp_path / "m.ply"))
         np.testing.assert_allclose(cloud.point.positions.numpy(), expected, atol=1e-7)
         vertex = plyfile.PlyData.read(tmp_path / "m.ply")["vertex"]
@@ -295,8 +288,8 @@ def test_grid_reaches_inside_the_object(store, mixed, tmp_path):
     solid = np.argwhere(grid[..., 3] != 7)
     turned = np.stack([63 - solid[:, 1], solid[:, 0], solid[:, 2]], axis=1)  # the quarter turn
     np.save(tmp_path / "solid.npy", (turned + 0.5) / 64 - 0.5)
-    run("transfer", tmp_path / "solid.npy", "--store", store, "--asset", "cup",
-        "--points", "grid", "--out", tmp_path / "m.ply")  # fmt: skip
+    words = ("--store", store, "--asset", "cup", "--points", "grid", "--out", tmp_path / "m.ply")
+    run(tmp_path / "solid.npy", *words)
     vertex = plyfile.PlyData.read(tmp_path / "m.ply")["vertex"]
     np.testing.assert_array_equal(vertex["material_id"], grid[tuple(solid.T)][:, 3])
     np.testing.assert_allclose(vertex["E"], grid[tuple(solid.T)][:, 1], rtol=1e-4)
@@ -312,7 +305,7 @@ def test_prediction_is_transferred_as_the_store_is(store, tmp_path):
         ("stored", ("--store", store, "--asset", "cup")),
         ("predicted", ("--store", store, "--prediction", prediction)),
     ):
-        run("transfer", tmp_path / "points.npz", *words, "--out", tmp_path / f"{name}.ply")
+        run(tmp_path / "points.npz", *words, "--out", tmp_path / f"{name}.ply")
     assert (tmp_path / "stored.ply").read_bytes() == (tmp_path / "predicted.ply").read_bytes()
 
 
@@ -374,9 +367,8 @@ def test_wrong_calls_are_refused_and_nothing_is_lost(store, tmp_path):
     before = particles.read_bytes()
     stored = ("--store", store, "--asset", "cup")
     assert "not an export" in run_wrong(particles, *stored, "--out", own)
-    itself = ["transfer", str(particles), *map(str, stored), "--out", str(particles)]
-    result = CliRunner().invoke(slatprep, itself)
-    assert (result.exit_code, "is what the command reads" in result.stderr) == (2, True)
+    told = commands.refused("transfer", particles, *stored, "--out", particles)
+    assert "is what the command reads" in told
     assert particles.read_bytes() == own.read_bytes() == before
     out = ("--out", tmp_path / "m.ply")
     assert "either --asset" in run_wrong(particles, "--store", store, *out)

@@ -4,7 +4,9 @@ import numpy as np
 
 from slatprep.geometry.voxels import boundary, occupancy_of, voxels_of
 from slatprep.inspect.score import Truth
-from slatprep.records import MaterialField, StructuredLatents
+from slatprep.parameters import SampleParameters
+from slatprep.pipeline.annotate import look_up
+from slatprep.records import Alignment, Judgement, MaterialField, StructuredLatents
 
 Case = tuple[MaterialField, StructuredLatents, Truth]
 
@@ -31,6 +33,11 @@ def latents_of(voxels: np.ndarray) -> StructuredLatents:
 
 def surface_latents(occupancy: np.ndarray) -> StructuredLatents:
     return latents_of(voxels_of(boundary(occupancy)))
+
+
+def judged(field: MaterialField, latents: StructuredLatents, alignment: Alignment) -> Judgement:
+    """Judge an alignment by the labels that are looked up under it."""
+    return look_up(field, latents, alignment, SampleParameters())[1]
 
 
 def chair() -> np.ndarray:
