@@ -46,7 +46,7 @@ not allowed to see; five of other objects."""
 EMPHASIS = {GROUND: 1.5, LUMPS: 2.0, REAL: 3.0}
 """Levels that count for more than one: the made-up ones from 0 to 8 are much alike."""
 
-PLACEMENT_FIGURES = ("margin", "ties", "alike")
+PLACEMENT_FIGURES = ("margin", "clear_by", "ties", "alike")
 """What the second question rests on: how far the next placement lies below, and what ties."""
 
 SAME_FIGURES = tuple(name for name in FIGURES if name not in PLACEMENT_FIGURES)
@@ -56,8 +56,8 @@ VOXEL_PRIOR = {"own": 0.95, "heading": 0.05}
 """The same for voxels: what is right at one of another object has no meaning."""
 
 GROWS = {"score_slat", "score_pixieverse", "score_similarity", "within_1", "within_2", "within_3",
-         "margin", "fitness", "fitness_backward", "valid_share", "blocks_near", "blocks_middle",
-         "blocks_far", "slat_within_half", "slat_within_1", "slat_within_15",
+         "margin", "clear_by", "fitness", "fitness_backward", "valid_share", "blocks_near",
+         "blocks_middle", "blocks_far", "slat_within_half", "slat_within_1", "slat_within_15",
          "pixieverse_within_half", "pixieverse_within_1", "pixieverse_within_15"}  # fmt: skip
 """Figures that speak for a placement; all others speak against, where they are large."""
 

@@ -248,22 +248,28 @@ def _rows_of(asset: Asset, other: Asset) -> list[Row]:
     return [*rows, _row("other", asset, other, found)]
 
 
+class _NothingLeftError(Exception):
+    """No placement is left that is not the right one."""
+
+
 def _align_blind(
     field: MaterialField, latents: StructuredLatents, truth: Truth
 ) -> Alignment | None:
     """Align with the right placement hidden; None where nothing else is left."""
     rotation, shift, scale = split_transform(truth.transform)
-    right = engine.Pose(rotation, shift / VOXEL_SIZE, scale)
+    right = engine.Pose(engine.Similarity(rotation, shift / VOXEL_SIZE, scale))
 
     class Blind(engine.Pair):
         def distinct(self, poses: Any) -> Any:
             far = self.apart(poses, right) >= HIDDEN
+            if not far.any():
+                raise _NothingLeftError
             return super().distinct([pose for pose, ok in zip(poses, far, strict=True) if ok])
 
     with patch.object(engine, "Pair", Blind):
         try:
             return engine.align(field, latents, AlignParameters())
-        except (IndexError, ValueError):  # Nothing survives that is not right.
+        except _NothingLeftError:
             return None
 
 

@@ -18,7 +18,6 @@ from slatprep.align.pose import Similarity
 from slatprep.align.residuals import Residuals
 from slatprep.align.surface import Surface
 from slatprep.align.warp import Warp, from_nearest, halved
-from slatprep.geometry.deformation import deform
 from slatprep.geometry.frames import VOXEL_SIZE
 from slatprep.parameters import AlignParameters
 from slatprep.records import Deformation, FitFigures, Model
@@ -77,18 +76,16 @@ def try_out(slat: Surface, pixie: Surface, pose: Similarity, samples: int = TRIA
 
 @dataclass(frozen=True)
 class Deformed:
-    """What came of it: the similarity, the model, the deformation (None without) and figures."""
+    """What came of it: the similarity, the model, the deformation (None without) and figures.
+
+    ``warp`` is the deformation as it is fitted, and leaves all where it is without one.
+    """
 
     pose: Similarity
     model: Model
     deformation: Deformation | None
     figures: FitFigures
-
-    def moved(self, points: Array) -> Array:
-        """Return points (N, 3) of the SLAT frame, in voxels, as the deformation moves them."""
-        if self.deformation is None:
-            return points
-        return deform(self.deformation, points * VOXEL_SIZE) / VOXEL_SIZE
+    warp: Warp
 
 
 def deform_if_earned(
@@ -125,7 +122,8 @@ def deform_if_earned(
                     residuals = Residuals(slat, pixie, pose, CHECK_SAMPLES, first=FIT_SAMPLES)
                 break
             warp = start
-    return Deformed(pose, model, kept, fit_figures(residuals, warp, before, evidence, kept))
+    figures = fit_figures(residuals, warp, before, evidence, kept)
+    return Deformed(pose, model, kept, figures, warp)
 
 
 def earned(trial: Trial) -> str:

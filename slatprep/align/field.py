@@ -20,6 +20,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from math import nan
 
 import numpy as np
 from numpy.typing import NDArray
@@ -61,6 +62,9 @@ WIDER_GAIN = 0.02
 CLOSE = 0.02
 """Deformed placements tie if they score less than this below the best, as scores tell more then."""
 
+CLEARLY = 2.5
+"""A placement that fits worse by so many standard errors does not tie, however close it scores."""
+
 
 def align(
     field: MaterialField, latents: StructuredLatents, parameters: AlignParameters
@@ -101,8 +105,8 @@ def _search(pair: Pair) -> Alignment:
     near = [pose for pose in poses if pose.merit > poses[0].merit - reach]
     tied, deformed = finish(pair, near, rough=poses[0].score < CLEAN)
     best = tied[0]
-    # A contest said more of them than the scores that they had before.
-    others = pair.others(best, [*tied[1:], *poses[len(near) if may_contest else 0 :]])
+    # What was found of those near says more than the scores that they had before.
+    others = pair.others(best, [*tied[1:], *poses[len(near) :]])
 
     fitted = {s.index: (fit.fitness, fit.rmse) for s, fit in zip(starts, fits, strict=True)}
     transform = best.similarity.transform
@@ -118,11 +122,16 @@ def _search(pair: Pair) -> Alignment:
         placements=tuple(
             Placement(pose.similarity.transform, pose.score, float(pair.apart([pose], best)[0]))
             for pose in others[:MOST_SURVIVORS]
-            if pose.merit > best.merit - (CLOSE if may_contest else TIE)
+            if pose.behind < CLEARLY and pose.merit > best.merit - (CLOSE if may_contest else TIE)
         ),
         score=best.score,
         deformation=deformed.deformation,
-        figures=_figures(pair, best, deformed),
+        figures=replace(
+            _figures(pair, best, deformed),
+            clear_by=min(
+                (pose.behind for pose in others if pose.merit > best.merit - TIE), default=nan
+            ),
+        ),
     )
 
 

@@ -10,22 +10,30 @@ from dataclasses import replace
 
 import numpy as np
 
+from slatprep.align.agreement import BLOCK
 from slatprep.align.deform import Deformed, deform_if_earned
 from slatprep.align.pair import (
     FINE_SAMPLES,
     FINE_TAUS,
     RANK_SAMPLES,
     RANK_STANDING,
+    TIE,
     Array,
     Pair,
     far_from_all,
     scale_penalty,
 )
 from slatprep.align.pose import Pose, Similarity
+from slatprep.align.residuals import Residuals
+from slatprep.align.warp import Warp, places_of
 from slatprep.records import FitFigures, Model
 
 MOST_CONTESTED = 4
 """Where the best placement is deformed, so many, of those within twice `TIE`, are deformed too."""
+
+CONTEST_SAMPLES, SHARP = 2_000, 0.5
+"""Samples a side on which placements are held against each other, and the kernel's width [voxel]:
+narrower than in a fit, as what tells a front from a back may be fine."""
 
 RIGID_IF_SCALE_WITHIN = 0.04
 RIGID_LOSS = 0.004
@@ -41,7 +49,11 @@ def finish(pair: Pair, poses: Sequence[Pose], rough: bool) -> tuple[list[Pose], 
     first, *others = pair.distinct(fine)
     best, deformed = _deformed(pair, first, rough)
     if deformed.deformation is None:
-        return [best, *others], deformed
+        near = [pose for pose in others if pose.merit > best.merit - TIE]
+        fits = [replace(deformed, pose=pose.similarity, warp=_unbent(pose)) for pose in near]
+        behind = standard_errors(pair, deformed, fits)
+        told = [replace(pose, behind=by) for pose, by in zip(near, behind, strict=True)]
+        return [best, *told, *others[len(near) :]], deformed
     few, rest = others[: MOST_CONTESTED - 1], others[MOST_CONTESTED - 1 :]
     contested = [(best, deformed), *(_deformed(pair, pose, rough) for pose in few)]
     ranks = np.array([rank_of(pose.similarity, bent.figures) for pose, bent in contested])
@@ -52,12 +64,45 @@ def finish(pair: Pair, poses: Sequence[Pose], rough: bool) -> tuple[list[Pose], 
     kept: list[tuple[Pose, Deformed, Array]] = []
     for k in order:
         pose, bent = contested[k]
-        places = pose.similarity.inverse(bent.moved(points))
+        places = places_of(pose.similarity, bent.warp, points)
         if far_from_all(places, (there for _, _, there in kept)):
             below = max(float(ranks[order[0]] - ranks[k]), 0.0)
             bonus = highest - below - pose.score
             kept.append((replace(pose, bonus=bonus, standing=0.0), bent, places))
-    return [*(pose for pose, _, _ in kept), *rest], kept[0][1]
+    behind = standard_errors(pair, kept[0][1], [bent for _, bent, _ in kept])
+    told = [replace(pose, behind=by) for (pose, _, _), by in zip(kept, behind, strict=True)]
+    return [*told, *rest], kept[0][1]
+
+
+def standard_errors(pair: Pair, best: Deformed, others: Sequence[Deformed]) -> list[float]:
+    """Say by how many standard errors the best fits better than each of some others.
+
+    All are looked at on the same samples, so what the two sides differ in anyway cancels out.
+    Samples of one block of space err together: blocks are counted, not samples.
+    """
+    if not others:
+        return []
+    kernels, places = _kernels(pair, best)
+    cells = np.floor(places / BLOCK).astype(np.intp)
+    blocks = np.unique(cells, axis=0, return_inverse=True)[1].reshape(-1)
+    found = []
+    for other in others:
+        gains = np.bincount(blocks, kernels - _kernels(pair, other)[0])
+        spread = float(np.sqrt((gains**2).sum()))
+        found.append(float(gains.sum()) / spread if spread else 0.0)
+    return found
+
+
+def _kernels(pair: Pair, fit: Deformed) -> tuple[Array, Array]:
+    """Return how well each sample fits, and where it lies in the SLAT frame."""
+    residuals = Residuals(pair.slat, pair.pixie, fit.pose, CONTEST_SAMPLES)
+    sides = residuals.at(fit.warp)
+    kernels = [0.5 / len(side) / (1.0 + (side / SHARP) ** 2) for side in sides]
+    return np.concatenate(kernels), residuals.places.copy()
+
+
+def _unbent(pose: Pose) -> Warp:
+    return Warp(np.eye(3, 4), pose.similarity.offset)
 
 
 def rank_of(similarity: Similarity, figures: FitFigures) -> float:

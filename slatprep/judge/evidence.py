@@ -36,6 +36,7 @@ FIGURES = (
     "scale",
     "offset",
     "margin",
+    "clear_by",
     "ties",
     "fitness",
     "fitness_backward",
@@ -206,14 +207,15 @@ def evidence_of(
     share of the voxels whose class depends on the choice among ties. The margin is NaN where it
     says nothing, and so are figures of the agreement that were not measured.
     """
-    count, margin = len(alignment.open_placements), min(alignment.margin, MARGIN_CAP)
-    if (count and ambiguity <= HARMLESS) or alignment.settled_by is not None:
-        count, margin = 0, math.nan
     fit = alignment.figures
     if fit is None:
         from slatprep.align.figures import measure_figures
 
         fit = measure_figures(field, latents, alignment)
+    count, margin = len(alignment.open_placements), min(alignment.margin, MARGIN_CAP)
+    clear_by = fit.clear_by
+    if (count and ambiguity <= HARMLESS) or alignment.settled_by is not None:
+        count, margin, clear_by = 0, math.nan, math.nan
     _, _, scale = split_transform(alignment.transform)
     return np.array(
         [
@@ -228,6 +230,7 @@ def evidence_of(
             abs(math.log(scale)),
             abs(fit.offset),
             margin,
+            clear_by,
             math.log1p(count),
             alignment.quality.fitness,
             alignment.quality.fitness_backward,

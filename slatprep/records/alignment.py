@@ -261,6 +261,9 @@ class FitFigures:
         Rise of the score once one side is mirrored: above 0.025 the annotation is a
         mirror image of its object. NaN where the fit is too good for that, or where
         another engine placed it.
+    clear_by : float
+        By how many standard errors it fits better, on the same samples, than any placement that
+        scores less than 0.03 below it; NaN where there is none, or where another engine placed it.
     agreement : Agreement or None
         How evenly the surfaces lie on each other; None where it was not measured.
     """
@@ -278,6 +281,7 @@ class FitFigures:
     stretch: tuple[float, float] = (1.0, 1.0)
     bending: float = 0.0
     mirrored: Number = float("nan")
+    clear_by: Number = float("nan")
     agreement: Agreement | None = None
 
 

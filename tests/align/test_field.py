@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from support.shapes import GRID, chair, field_of, judged, latents_of, surface_latents, turned
 
 from slatprep.align import align, engine_versions, solver
-from slatprep.align.pair import FINE_SAMPLES
+from slatprep.align.pair import FINE_SAMPLES, TIE
 from slatprep.align.starts import distinct_starts
 from slatprep.geometry.deformation import map_of
 from slatprep.geometry.frames import displacement, make_transform, split_transform
@@ -267,3 +267,38 @@ def test_the_libraries_that_make_the_numbers_are_named():
     assert {"numpy", "scipy", "numba"} <= set(engine_versions(DEFAULT))
     assert "small_gicp" in engine_versions(AlignParameters(engine="small_gicp"))
     assert any("open3d" in name for name in engine_versions(AlignParameters(engine="open3d")))
+
+
+def _house(sills: int, seed: int) -> np.ndarray:
+    """Return a house that but for its sills is its own half-turn, with lumps as the seed says."""
+    x, y, z = (GRID - 31.5).transpose(3, 0, 1, 2)
+    walls = (abs(x) < 14) & (abs(y) < 20) & (z > -16) & (z < 6)
+    roof = (abs(y) < 21) & (z >= 6) & (abs(x) < 16 - (z - 6))
+    solid = walls | roof
+    for k in range(sills):
+        across, up = -15.0 + 6.0 * (k % 6), (-8.0, 0.0)[k // 6]
+        solid |= (x >= 14) & (x < 16) & (abs(y - across) < 2) & (abs(z - up) < 1)
+    rng = np.random.default_rng(seed)
+    shell = voxels_of(boundary(solid))
+    for lump in shell[rng.choice(len(shell), 40, replace=False)]:
+        solid |= (abs(GRID - lump) <= 1).all(axis=-1)
+    return solid
+
+
+@pytest.mark.parametrize(("sills", "ties"), [(0, 1), (6, 0)])
+def test_a_half_turn_ties_unless_it_fits_clearly_worse_on_the_same_samples(
+    sills: int, ties: int
+) -> None:
+    """Sills of one wall take little from the score of the wrong one, and all of it in their place.
+
+    What differs by chance takes as much from either.
+    """
+    latents = surface_latents(_house(sills, 3))
+    alignment = align(field_of(_house(sills, 4)), latents, DEFAULT)
+    assert alignment.margin < TIE
+    assert len(alignment.placements) == ties
+    for placement in alignment.placements:
+        turn = split_transform(placement.transform)[0] @ split_transform(alignment.transform)[0].T
+        assert np.degrees(np.arccos((np.trace(turn) - 1) / 2)) == pytest.approx(180.0, abs=2.0)
+    if not ties:
+        assert displacement(alignment.transform, np.eye(4), latents.centres) < 1.0

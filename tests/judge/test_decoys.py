@@ -10,10 +10,12 @@ from slatprep.judge.decoys import FOLDS, ErrorRates, error_rates
 from slatprep.judge.evidence import FIGURES
 from slatprep.judge.verdict import LEAST_TARGETS, THRESHOLDS
 
+OF_PLACEMENT = ("margin", "clear_by", "ties", "alike")
+
 
 def _ends(name: str) -> tuple[float, float]:
     """Return a figure's value for usual right ones, and for the worst that the model knows."""
-    model = PLACEMENT if name in ("margin", "ties", "alike") else SAME_OBJECT
+    model = PLACEMENT if name in OF_PLACEMENT else SAME_OBJECT
     own = [figure for figure in model.figures if figure.name == name]
     usual = next((f.usual for f in own if f.low < f.usual < f.high), own[0].usual)
     low, high = own[0].low, own[-1].high
@@ -28,7 +30,7 @@ def made(count: int, towards: tuple[float, float], seed: int) -> np.ndarray:
     rng = np.random.default_rng(seed)
     part = rng.uniform(*towards, (count, 1)) + rng.normal(0, 0.05, (count, len(FIGURES)))
     figures = USUAL + part * (WORST - USUAL)
-    for name in ("margin", "ties", "alike"):
+    for name in OF_PLACEMENT:
         figures[:, FIGURES.index(name)] = USUAL[FIGURES.index(name)]
     return figures
 

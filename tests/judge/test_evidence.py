@@ -53,6 +53,7 @@ FIT = FitFigures(
     moved_most=4.0,
     stretch=(0.7, 1.2),
     bending=0.01,
+    clear_by=1.9,
     agreement=Agreement(0.2, 0.3, 0.4, 0.5, 0.6, 0.7, (0.1, 0.2, 0.3), (0.4, 0.5, 0.6)),
 )
 
@@ -127,6 +128,7 @@ def test_each_figure_by_hand() -> None:
             "scale": -math.log(0.8),
             "offset": 0.3,
             "margin": 0.2,
+            "clear_by": 1.9,
             "ties": math.log(3),
             "fitness": 0.9,
             "fitness_backward": 0.8,
@@ -165,7 +167,8 @@ def test_margin_and_ties_count_unless_ties_change_no_class_or_something_chose() 
     settled = replace(tied, settled_by=Consensus(np.eye(3), 5, 5))
     for alignment, ambiguity in ((tied, HARMLESS), (tied, 0.0), (settled, 1.0)):
         one = figures(alignment, ambiguity)
-        assert math.isnan(one["margin"]) and (one["ties"], one["alike"]) == (0.0, 1.0)
+        assert math.isnan(one["margin"]) and math.isnan(one["clear_by"])
+        assert (one["ties"], one["alike"]) == (0.0, 1.0)
     # Without ties the margin says how far behind the next placement is, up to a limit.
     assert figures(aligned(), 0.0)["margin"] == 0.2
     assert figures(replace(aligned(), margin=0.5), 0.0)["margin"] == 0.3
