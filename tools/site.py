@@ -72,7 +72,9 @@ def on_page_content(content: str, **_: object) -> str:
 
     def draw(match: re.Match[str]) -> str:
         display, latex = match["open"] == "[", html.unescape(match["latex"])
-        return convert(latex, display="block" if display else "inline")
+        drawn = convert(latex, display="block" if display else "inline")
+        # On a narrow screen a long equation scrolls by itself.
+        return f'<div style="overflow-x: auto">{drawn}</div>' if display else drawn
 
     opening = r'<(?P<tag>span|div) class="arithmatex">\\(?P<open>[(\[])'
     equation = opening + r"(?P<latex>.*?)\\[)\]]</(?P=tag)>"

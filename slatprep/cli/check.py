@@ -11,6 +11,7 @@ import click
 
 from slatprep.cli.options import (
     AssetIds,
+    FolderOrUrl,
     Jobs,
     NewFileOrFolder,
     Positive,
@@ -40,6 +41,7 @@ _COLUMNS = {
 @command("check-alignment")
 def check_alignment(
     output: Output,
+    store: FolderOrUrl | None = None,
     *,
     asset_ids: Annotated[AssetIds, "An asset; may be repeated."] = (),
     worst: Annotated[
@@ -49,7 +51,7 @@ def check_alignment(
     ambiguous: Annotated[
         bool, "Assets whose ties would change the class of more than 5 % of the voxels."
     ] = False,
-    store: StoreOption | None = None,
+    named: StoreOption | None = None,
     picture: Annotated[
         NewFileOrFolder | None,
         "A .png, .svg or .pdf for one asset, else a folder. [default: NAME.pictures beside the "
@@ -59,23 +61,26 @@ def check_alignment(
     show: Annotated[bool, "Open it in Open3D's viewer, if there is a screen."] = False,
     jobs: Jobs = 1,
 ) -> None:
-    """Check whether the alignment of an asset is good, and draw it.
+    """Check whether the alignment of an asset of STORE is good, and draw it.
 
     Its quality is recomputed from the stored arrays, and compared with the
     stored figures. A picture shows both sides before and after from three
     directions, the error of every voxel, the candidates and the verdict.
     --asset, --worst and --ambiguous may be combined. The exit code is 1 unless
-    all are good and the store agrees with itself.
+    all are good and the store agrees with itself. Without STORE, the one that
+    `make align` built last under data/ is taken.
 
     Example
     -------
-    slatprep check-alignment --asset 5f61cc --store data/demo.zarr
+    slatprep check-alignment data/demo.zarr --asset 5f61cc
     slatprep check-alignment --worst 12 --ambiguous --picture pictures
     slatprep check-alignment --asset 5f61cc --asset 803c1a --json --picture none
     """
     if not (asset_ids or worst or ambiguous):
         raise click.UsageError("say which assets: --asset ID, --worst N or --ambiguous")
-    path = chosen_store(store)
+    if store is not None and named is not None:
+        raise click.UsageError("STORE and --store both name the store; give one of them")
+    path = chosen_store(store or named)
     from slatprep.inspect import check
     from slatprep.pipeline.decoys import measured_errors
     from slatprep.store import open_store

@@ -70,13 +70,7 @@ class DemoOptions:
 
 
 @command("make-demo")
-def make_demo(
-    output: Output,
-    directory: NewFolder,
-    *,
-    demo: DemoOptions,
-    jobs: Jobs = 1,
-) -> None:
+def make_demo(output: Output, directory: NewFolder, *, demo: DemoOptions, jobs: Jobs = 1) -> None:
     """Make procedural assets with known truth in DIRECTORY.
 
     Writes pixieverse/ (or the folder of another source), slat/ and truth/ in the

@@ -45,14 +45,11 @@ def diff(
     slatprep diff old.zarr new.zarr --json --worst 100
     """
     from slatprep.inspect.compare import compare_stores
-    from slatprep.store import open_store
 
     if worst is None and not output.as_json:
         worst = _SHOWN
     with output.progress("diff") as progress:
-        found = compare_stores(
-            open_store(a), open_store(b), worst=worst, jobs=jobs, progress=progress
-        )
+        found = compare_stores(a, b, worst=worst, jobs=jobs, progress=progress)
     output.result(found, lambda: _show(output, found), complete=found.same)
 
 

@@ -165,11 +165,7 @@ def _show(
 
 
 def _selection(
-    output: Output,
-    predictions: Path | None,
-    store: Place,
-    split: str,
-    options: SplitOptions,
+    output: Output, predictions: Path | None, store: Place, split: str, options: SplitOptions
 ) -> dict[str, Any]:
     """Return the split of each object and which assets count, by the options or else by a run."""
     from slatprep.learn.predictions import RUN_FILE, selection_of_run
@@ -233,10 +229,7 @@ def _write_csv(file: Path, what: str, measures: Mapping[str, Measure], spread: s
 
 
 def _show_beside(
-    output: Output,
-    ours: Mapping[str, Measure],
-    others: tuple[PublishedScore, ...],
-    beside: str,
+    output: Output, ours: Mapping[str, Measure], others: tuple[PublishedScore, ...], beside: str
 ) -> None:
     from slatprep.learn.published import TABLES
 

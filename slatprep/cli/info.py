@@ -16,10 +16,7 @@ if TYPE_CHECKING:
 
 
 @command()
-def info(
-    output: Output,
-    store: LastStore,
-) -> None:
+def info(output: Output, store: LastStore) -> None:
     """Show what is in STORE, and how good its alignments are.
 
     Without STORE, the one that `make align` built last under data/ is taken.
@@ -84,16 +81,7 @@ def show_quality(output: Output, overview: StoreOverview, *, advise: bool = True
     )
     unknown = sum(group.assets for group in overview.categories if group.name == UNKNOWN)
     if unknown and advise:
-        table = _categories_of(overview)
-        say(
-            f"unknown: the category of {unknown:,}; "
-            + (
-                f"{table} does not have their ids"
-                if table
-                else 'categories = "obj_ids_metadata.json" under [pairing] of a --config FILE '
-                "gives it"
-            )
-        )
+        say(f"unknown: the category of {unknown:,}; {_source_of_categories(overview)}")
     store = overview.store
     if not isinstance(store, Path) and is_version(store):  # It is gone two builds later.
         store = store.parent.parent
@@ -117,15 +105,20 @@ def show_errors(store: Store) -> None:
         say(f"errors:  {sentence}")
 
 
-def _categories_of(overview: StoreOverview) -> str:
-    """Return the table of categories that a store was built with; empty if none is known."""
+def _source_of_categories(overview: StoreOverview) -> str:
+    """Say what gives a store the categories of its assets, as far as its records tell."""
     from slatprep.errors import StoreError
     from slatprep.storage.place import place_of
     from slatprep.store.manifests import build_in, manifests_beside
 
+    table, form = '"obj_ids_metadata.json"', ""
     try:
         folder = manifests_beside(place_of(overview.store))
-        table = None if folder is None else build_in(folder).parameters.pairing.categories
+        parameters = None if folder is None else build_in(folder).parameters
     except StoreError:
-        return ""
-    return "" if table is None else str(table)
+        parameters = None
+    if parameters and parameters.pairing.categories:
+        return f"{parameters.pairing.categories} does not have their ids"
+    if parameters and parameters.pixieverse.adapter != "pixieverse":
+        table, form = '"FILE.json"', ': {"ID": {"obj_class": "CATEGORY"}}'
+    return f"categories = {table} under [pairing] of a --config FILE gives it{form}"

@@ -7,14 +7,7 @@ from typing import Annotated
 import click
 
 from slatprep.cli.build import report
-from slatprep.cli.options import (
-    AssetIds,
-    ChosenOptions,
-    FolderOrUrl,
-    Jobs,
-    NewStore,
-    RecordsFolder,
-)
+from slatprep.cli.options import AssetIds, ChosenOptions, FolderOrUrl, Jobs, NewStore, RecordsFolder
 from slatprep.cli.output import Output
 from slatprep.cli.signature import command
 

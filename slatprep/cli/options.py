@@ -164,7 +164,7 @@ def complete_asset(
     from slatprep.store.reader import is_store
 
     # An option that still lacks its value leaves the arguments unparsed.
-    for word in (context.params.get("store"), *context.args):
+    for word in (*map(context.params.get, ("store", "named")), *context.args):
         if word is not None and is_store(Path(word)):
             return [known for known in open_store(word).ids if known.startswith(incomplete)]
     return []

@@ -10,11 +10,7 @@ from slatprep.cli.signature import command
 
 
 @command()
-def score(
-    output: Output,
-    store: FolderOrUrl,
-    truth_dir: Folder,
-) -> None:
+def score(output: Output, store: FolderOrUrl, truth_dir: Folder) -> None:
     """Score STORE against known truth.
 
     TRUTH_DIR holds an npz for each asset, as make-demo writes it. Figures of a

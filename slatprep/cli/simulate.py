@@ -10,14 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import click
 
-from slatprep.cli.options import (
-    ChoiceOf,
-    File,
-    FiniteRange,
-    NewFile,
-    NewFolder,
-    Positive,
-)
+from slatprep.cli.options import ChoiceOf, File, FiniteRange, NewFile, NewFolder, Positive
 from slatprep.cli.output import Output
 from slatprep.cli.signature import Click, command
 from slatprep.cli.transfer import MaterialOptions
@@ -31,10 +24,7 @@ class MotionOptions:
     """What moves the object, for how long, and how finely that is computed."""
 
     size: Annotated[
-        float,
-        FiniteRange(min=0, min_open=True),
-        "Width of the unit cube.",
-        Click(metavar="METRES"),
+        float, FiniteRange(min=0, min_open=True), "Width of the unit cube.", Click(metavar="METRES")
     ] = 0.4
     height: Annotated[float, FiniteRange(min=0), "Height of the fall.", Click(metavar="METRES")] = (
         0.1

@@ -182,8 +182,8 @@ def train(
 def _tell_epoch(output: Output, name: str, record: EpochRecord) -> None:
     output.note(f"{name}, {_line(record)}")
     output.keeps(
-        f"epochs up to {record.epoch} are kept, and the steps of epoch {record.epoch + 1} but for "
-        "the last 30 s; the same command goes on from there"
+        f"epochs up to {record.epoch} are kept, and the steps since then but for the last 30 s; "
+        "the same command goes on from there"
     )
 
 

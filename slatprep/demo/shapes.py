@@ -56,10 +56,7 @@ def _lengths(vectors: Points) -> Points:
 def sphere(centre: ArrayLike, radius: float) -> Shape:
     """Return a ball."""
     c = _vector(centre)
-    return Shape(
-        lambda p: _lengths(p - c) - radius,
-        lambda d: float(c @ d) + radius,
-    )
+    return Shape(lambda p: _lengths(p - c) - radius, lambda d: float(c @ d) + radius)
 
 
 def ellipsoid(centre: ArrayLike, radii: ArrayLike, rotation: ArrayLike | None = None) -> Shape:
@@ -171,10 +168,7 @@ def polytope(normals: ArrayLike, offsets: ArrayLike) -> Shape:
                 corners.append(corner)
     vertices = np.array(corners)
     # The greatest plane distance is no greater than the distance to the solid.
-    return Shape(
-        lambda p: (p @ n.T - o).max(axis=1),
-        lambda d: float((vertices @ d).max()),
-    )
+    return Shape(lambda p: (p @ n.T - o).max(axis=1), lambda d: float((vertices @ d).max()))
 
 
 def carve(solid: Shape, tool: Shape) -> Shape:
@@ -267,7 +261,6 @@ class Solid:
         """Return class (S,) uint8 and Young's modulus, density, Poisson's ratio (S, 3) float32."""
         material = np.array([s.material for s in self.stuffs], dtype=np.uint8)
         properties = np.array(
-            [(s.youngs_modulus, s.density, s.poissons_ratio) for s in self.stuffs],
-            dtype=np.float32,
+            [(s.youngs_modulus, s.density, s.poissons_ratio) for s in self.stuffs], dtype=np.float32
         )
         return material, properties

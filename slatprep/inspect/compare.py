@@ -33,8 +33,8 @@ _Rows = tuple[int, int]
 
 
 def compare_stores(
-    a: Store,
-    b: Store,
+    a: Store | str | Place,
+    b: Store | str | Place,
     *,
     worst: int | None = None,
     jobs: int = 1,
@@ -47,8 +47,8 @@ def compare_stores(
 
     Parameters
     ----------
-    a, b : Store
-        From `slatprep.open_store`.
+    a, b : Store, str or Place
+        Open stores, or their paths or URLs.
     worst : int, optional
         Number of changed assets to return, about 1 kB each; all by default.
     jobs : int
@@ -66,6 +66,7 @@ def compare_stores(
     StoreError
         If a store cannot be read.
     """
+    a, b = open_store(a), open_store(b)
     rows_b = {asset_id: row for row, asset_id in enumerate(b.ids)}
     rows = [(row, rows_b[name]) for row, name in enumerate(a.ids) if name in rows_b]
     settings = tuple(_settings(a.attributes, b.attributes))

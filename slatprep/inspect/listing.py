@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Collection, Iterator
 from dataclasses import dataclass
 
-from slatprep.records import Verdict
+from slatprep.records import Verdict, words_of
 from slatprep.store import Store
 from slatprep.store.records import StoredRecords
 
@@ -27,6 +27,7 @@ def rows_chosen(
     store: Store, verdicts: Collection[str] = (), categories: Collection[str] = ()
 ) -> list[int]:
     """Return the rows of assets with these verdicts and categories; empty takes all."""
+    verdicts, categories = words_of(verdicts), words_of(categories)
     named = zip(store.column("verdict"), store.column("category"), strict=True)
     return [
         row

@@ -19,12 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slatprep.errors import InputError
-from slatprep.geometry.frames import (
-    VOXEL_SIZE,
-    apply_transform,
-    invert_transform,
-    voxel_centres,
-)
+from slatprep.geometry.frames import VOXEL_SIZE, apply_transform, invert_transform, voxel_centres
 from slatprep.readers.files import ArraySpec, load_source, npz_arrays
 from slatprep.records import MAX_PROPERTIES, Place
 from slatprep.store import StoredAsset, open_store

@@ -41,7 +41,7 @@ _TASK_ASSETS = 32
 
 
 def store_statistics(
-    store: Store,
+    store: Store | str | Place,
     verdicts: Collection[str] = (),
     categories: Collection[str] = (),
     *,
@@ -56,9 +56,9 @@ def store_statistics(
 
     Parameters
     ----------
-    store : Store
-        From `slatprep.open_store`.
-    verdicts, categories : collection of str
+    store : Store, str or Place
+        An open store, or its path or URL.
+    verdicts, categories : str or collection of str
         Only assets with one of these; empty takes all.
     weight : str
         ``voxel``: each voxel has weight 1. ``asset``: the occupied voxels of a
@@ -80,6 +80,7 @@ def store_statistics(
     StoreError
         If the store cannot be read.
     """
+    store = open_store(store)
     rows = rows_chosen(store, verdicts, categories)
     column = [str(category) for category in store.column("category")]
     verdict_of = [str(verdict) for verdict in store.column("verdict")]

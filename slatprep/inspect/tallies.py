@@ -93,10 +93,7 @@ class Tally:
 
 
 def pooled(
-    weights: NDArray[np.float64],
-    mean: NDArray[np.float64],
-    squares: NDArray[np.float64],
-    axis: int,
+    weights: NDArray[np.float64], mean: NDArray[np.float64], squares: NDArray[np.float64], axis: int
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Merge means and sums of squared differences, shaped like `weights`, along an axis.
 

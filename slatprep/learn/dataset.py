@@ -122,7 +122,7 @@ class SlatDataset(Dataset[Item]):
     splits : mapping of str to {"train", "val", "test"}, optional
         Split of each object by id, such as from `slatprep.learn.splits.assign_store`;
         by default the split by hash.
-    verdicts : collection of str, optional
+    verdicts : str or collection of str, optional
         Only assets with one of these verdicts.
     max_ambiguity : float, optional
         Only assets with at most this ambiguity.
@@ -154,7 +154,7 @@ class SlatDataset(Dataset[Item]):
         augmentation: Augmentation = "none",
         seed: int = 0,
     ) -> None:
-        self.store = store if isinstance(store, Store) else open_store(store, copy=True)
+        self.store = open_store(store, copy=True)
         self.indices = select_assets(
             self.store,
             split,
@@ -259,8 +259,8 @@ class SlatLoader(DataLoader[Item]):
 
     Parameters
     ----------
-    dataset : SlatDataset
-        The assets to load.
+    dataset : SlatDataset, Store or path
+        The assets to load; all of a store.
     batch_size : int
         Assets in a batch; the last may have fewer.
     shuffle : bool
@@ -283,7 +283,7 @@ class SlatLoader(DataLoader[Item]):
 
     def __init__(
         self,
-        dataset: SlatDataset,
+        dataset: SlatDataset | Store | str | Place,
         batch_size: int = 1,
         *,
         shuffle: bool = False,
@@ -291,6 +291,8 @@ class SlatLoader(DataLoader[Item]):
         start_method: str | None = None,
         pin_memory: bool = False,
     ) -> None:
+        if not isinstance(dataset, SlatDataset):
+            dataset = SlatDataset(dataset)
         self.order = EpochSampler(len(dataset), shuffle=shuffle, seed=dataset.seed)
         super().__init__(
             dataset,

@@ -79,10 +79,7 @@ class PredictedField:
 
 
 def checkpoint_state(
-    model: PhysicsDecoder,
-    size: str,
-    normalization: Normalization,
-    contents: Contents = PIXIEVERSE,
+    model: PhysicsDecoder, size: str, normalization: Normalization, contents: Contents = PIXIEVERSE
 ) -> dict[str, Any]:
     """Return the state of a decoder for a checkpoint: tensors and plain values."""
     ranges = [[span.lo, span.hi] for span in normalization.ranges]
@@ -177,10 +174,7 @@ def _contents_in(state: dict[str, Any]) -> Contents:
 
 
 def predict(
-    checkpoint: Checkpoint,
-    assets: Iterable[StructuredLatents],
-    *,
-    batch_voxels: int = BATCH_VOXELS,
+    checkpoint: Checkpoint, assets: Iterable[StructuredLatents], *, batch_voxels: int = BATCH_VOXELS
 ) -> Iterator[PredictedField]:
     """Yield the predicted field of each asset, in order.
 

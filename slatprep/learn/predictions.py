@@ -224,10 +224,7 @@ def _checked_ranges(
 def _order(
     source: str, ours: NDArray[Any], theirs: NDArray[np.uint8], side: int
 ) -> NDArray[np.int64]:
-    keys = (
-        flat_index(_whole(source, "coordinate", ours, side), side),
-        flat_index(theirs, side),
-    )
+    keys = (flat_index(_whole(source, "coordinate", ours, side), side), flat_index(theirs, side))
     mine, stored = (np.argsort(key, kind="stable") for key in keys)
     if not np.array_equal(keys[0][mine], keys[1][stored]):
         raise InputError(source, "has other voxels than the store", "the store's voxel/coords")

@@ -11,7 +11,7 @@ from slatprep.errors import ConfigError
 from slatprep.readers.splits import HASH, SPLITS, Assignment, Split, assign_splits
 from slatprep.readers.splits import Shares as Shares
 from slatprep.readers.splits import split_of as split_of
-from slatprep.records import Verdict
+from slatprep.records import Verdict, words_of
 from slatprep.store import Store
 
 
@@ -50,6 +50,7 @@ def select_assets(
         raise ConfigError(f"there is no split {split!r}; expected one of {', '.join(SPLITS)}")
     chosen = store.column("valid_share") > 0
     if verdicts is not None:
+        verdicts = words_of(verdicts)
         unknown = sorted(set(verdicts) - set(Verdict))
         if unknown:
             raise ConfigError(f"verdict is {unknown[0]!r}; expected one of {', '.join(Verdict)}")

@@ -87,4 +87,5 @@ from slatprep.records.words import (
     Search,
     Status,
     Verdict,
+    words_of,
 )

@@ -11,14 +11,7 @@ Plausibility = Literal["refuse", "warn", "off"]
 LOG10 = "log10 "
 """What a unit begins with where a file holds the logarithm of the value."""
 
-FACTORS = {
-    "Pa": 1.0,
-    "kPa": 1e3,
-    "MPa": 1e6,
-    "GPa": 1e9,
-    "kg/m^3": 1.0,
-    "g/cm^3": 1e3,
-}
+FACTORS = {"Pa": 1.0, "kPa": 1e3, "MPa": 1e6, "GPa": 1e9, "kg/m^3": 1.0, "g/cm^3": 1e3}
 """What a value in a unit is multiplied by to be in SI units."""
 
 

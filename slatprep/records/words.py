@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from colorsys import hls_to_rgb
 from enum import StrEnum
 
@@ -87,6 +88,11 @@ MATERIAL_COLOURS = {
     UNANNOTATED: UNANNOTATED_COLOUR,
 }
 """The same by material id, as the store holds it; of more classes, the others' from 8 on."""
+
+
+def words_of(given: Collection[str]) -> Collection[str]:
+    """Return words of which one alone may be given as a text."""
+    return (given,) if isinstance(given, str) else given
 
 
 class Engine(StrEnum):

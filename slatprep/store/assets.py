@@ -203,6 +203,10 @@ class AssetTable:
         UnknownAssetError
             If the store has no such asset; the message names those it might be.
         """
+        if not isinstance(asset_id, str):
+            raise UnknownAssetError(
+                f"{asset_id!r} is no id; expected a text, or `match` where numbers are meant"
+            )
         if asset_id not in self._index:
             raise self._unknown(asset_id)
         return self._index[asset_id]

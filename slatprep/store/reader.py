@@ -290,14 +290,15 @@ class Store(AssetTable):
         return self.read_rows(f"voxel/{name}", start, stop)
 
 
-def open_store(path: str | Place, *, copy: bool = False) -> Store:
+def open_store(path: Store | str | Place, *, copy: bool = False) -> Store:
     """Open a store for reading.
 
     Parameters
     ----------
     path : str or Place
         The store's directory, or its URL on an object store. There the version
-        that is current now is opened, and stays open when it is replaced.
+        that is current now is opened, and stays open when it is replaced. A
+        store that is open is returned as it is.
     copy : bool
         Copy a store on an object store to the local disk first, if that has
         not been done before: for training, which reads it many times.
@@ -313,6 +314,8 @@ def open_store(path: str | Place, *, copy: bool = False) -> Store:
         If there is nothing, something else, a store of a newer format, or one
         whose attributes do not say what they must.
     """
+    if isinstance(path, Store):
+        return path
     path = storage_of(place_of(path)).current_version()
     if copy:
         path = storage_of(path).copied_version()

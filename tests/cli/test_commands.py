@@ -232,6 +232,14 @@ def test_store_built_last_is_the_default(demo, monkeypatch):
     run("check-alignment", "--asset", ids_of(demo / "demo.zarr")[0], "--picture", "none")
 
 
+def test_an_alignment_is_checked_in_the_store_that_either_way_names(demo):
+    store, words = demo / "demo.zarr", ("--asset", "0", "--picture", "none", "--json")
+    one = run("check-alignment", store, *words)
+    assert run("check-alignment", "--store", store, *words).stdout == one.stdout
+    both = refused("check-alignment", store, "--store", store, *words)
+    assert "STORE and --store both name the store" in both
+
+
 @pytest.mark.parametrize("signal_number", [signal.SIGINT, signal.SIGTERM])
 def test_stopped_build_leaves_the_older_store_and_nothing_else(demo, tmp_path, signal_number):
     store = tmp_path / "demo.zarr"

@@ -3,6 +3,7 @@
 import ast
 import contextlib
 import importlib
+import importlib.util
 import io
 import json
 import os
@@ -101,6 +102,16 @@ def test_the_notebook_runs_in_jupyter_and_prints_what_the_tutorial_shows(tmp_pat
             printed = "".join(out.text for out in outputs if out.get("name") == "stdout")
     assert compared >= 10
     assert (tmp_path / "shards" / "shard-000001.tar").exists()
+
+
+def test_a_long_equation_scrolls_by_itself() -> None:
+    spec = importlib.util.spec_from_file_location("pages_of_site", ROOT / "tools" / "site.py")
+    hooks = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(hooks)
+    kinds = r'<div class="arithmatex">\[E = mc^2\]</div>', r'<span class="arithmatex">\(m\)</span>'
+    block, inline = map(hooks.on_page_content, kinds)
+    assert block.startswith('<div style="overflow-x: auto"><math') and 'display="block"' in block
+    assert inline.startswith("<math")
 
 
 # -- messages ---------------------------------------------------------------

@@ -12,7 +12,7 @@ import zarr
 from support.commands import document, run
 from support.synthetic import Dataset, make_asset
 
-from slatprep import compare_stores, open_store, subset_store
+from slatprep import StoreError, compare_stores, open_store, subset_store
 from slatprep.cli.output import as_json
 from slatprep.geometry.frames import displacement
 from slatprep.inspect.difference import StoreDifference
@@ -126,7 +126,7 @@ def test_other_sources_ranges_and_assets(tmp_path):
     dataset.write_grid("softer", grid)
     build_store(dataset.parameters("dataset"), tmp_path / "b.zarr")
     a, b = open_store(tmp_path / "a.zarr"), open_store(tmp_path / "b.zarr")
-    found = compare_stores(a, b)
+    found = compare_stores(tmp_path / "a.zarr", str(tmp_path / "b.zarr"))
     assert (found.only_a, found.only_b, found.assets) == (("gone",), ("new",), 2)
     settings = {one.name: (one.a, one.b) for one in found.settings}
     span = b.normalization.ranges[1]
@@ -143,6 +143,8 @@ def test_other_sources_ranges_and_assets(tmp_path):
     assert kept["density"].changed == (a.asset("kept").material == 1).sum()  # 8,000 kg/m^3
     assert kept["poissons_ratio"].changed == 0
     assert "sources" not in of["kept"].what
+    with pytest.raises(StoreError, match="x is not a slatprep store"):
+        compare_stores("x", b)
 
     subset_store(a.path, tmp_path / "gone.zarr", ["gone"])
     nothing = compare_stores(open_store(tmp_path / "gone.zarr"), b)

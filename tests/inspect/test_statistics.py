@@ -12,7 +12,7 @@ import pytest
 import zarr
 from support.commands import document, refused, run
 
-from slatprep import open_store
+from slatprep import StoreError, open_store
 from slatprep.cli.output import as_json
 from slatprep.inspect.distributions import (
     QUANTILES,
@@ -173,6 +173,9 @@ def test_filters_choose_assets_and_jobs_change_nothing(store):
     assert (found.assets, found.assets_chosen) == (5, 2)
     (only,) = found.categories
     assert only.slat == found.total.slat and only.name == "b"
+    assert as_json(store_statistics(store, "good", "b")) == as_json(found)
+    with pytest.raises(StoreError, match="x is not a slatprep store"):
+        store_statistics("x")
     one, two = (as_json(store_statistics(opened, jobs=jobs)) for jobs in (1, 2))
     assert one == two
 

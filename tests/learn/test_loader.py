@@ -84,6 +84,9 @@ def test_type_checkers_know_what_a_loader_yields():
 def test_filters(learn_store):
     store = open_store(learn_store)
     good = select_assets(store, verdicts=("good",))
+    assert SlatDataset(learn_store, verdicts="good").indices.tolist() == good.tolist()
+    with pytest.raises(ConfigError, match="verdict is 'fine'; expected one of good"):
+        SlatDataset(store, verdicts="fine")
     assert good.tolist() == np.flatnonzero(store.column("verdict").astype(str) == "good").tolist()
     limit = float(np.median(store.column("ambiguity")))
     kept = select_assets(store, max_ambiguity=limit)
@@ -99,6 +102,7 @@ def test_filters(learn_store):
 def test_batch_is_what_zarr_reads(learn_store):
     dataset = SlatDataset(learn_store)
     batch = collate([dataset[k] for k in range(3)])
+    assert next(iter(SlatLoader(str(learn_store), 3))).asset_ids == batch.asset_ids
     root = zarr.open_group(learn_store, mode="r")
     offset = np.asarray(root["asset/offset"])
     rows = np.s_[: offset[3]]

@@ -7,6 +7,7 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
+from click.testing import CliRunner
 from scipy.spatial import cKDTree
 from support.synthetic import QUARTER_TURN, SMALL_SHARDS, make_asset
 
@@ -117,6 +118,8 @@ def test_properties_of_any_table_are_those_of_the_nearest_voxels(tmp_path, form,
             )
     verification = verify_store(out)
     assert not verification.findings
+    told = CliRunner().invoke(command, ["info", str(out)]).stdout
+    assert '"FILE.json" under [pairing]' in told and "obj_ids_metadata" not in told
 
     found = store_statistics(store)
     columns = [voxels_of(seed)[1] for seed in range(3)]
@@ -139,8 +142,6 @@ def test_properties_of_any_table_are_those_of_the_nearest_voxels(tmp_path, form,
 
 
 def test_an_extra_property_goes_all_the_way_to_scores(tmp_path):
-    from click.testing import CliRunner
-
     write(tmp_path, "abcdefgh")
     out, run = tmp_path / "s.zarr", tmp_path / "run"
     build_store(parameters_of(tmp_path), out)
@@ -173,8 +174,6 @@ def test_without_classes_no_accuracy_is_claimed(tmp_path):
 
 
 def test_classes_of_a_source_s_own_go_all_the_way_to_scores(tmp_path):
-    from click.testing import CliRunner
-
     own = ["soft wood", "steel"]
     write(tmp_path, "abcdefgh", classes=own, properties=SOLID)
     out, run = tmp_path / "s.zarr", tmp_path / "run"

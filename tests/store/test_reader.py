@@ -33,6 +33,8 @@ def test_an_unknown_asset_is_answered_with_those_it_might_be(mixed_build: BuildS
         store.asset("bear")
     with pytest.raises(StoreError, match="it has 5 assets"):
         store.find("zzzzzzzz")
+    with pytest.raises(StoreError, match="3 is no id; expected a text, or `match`"):
+        store.find(3)  # type: ignore[arg-type]
 
 
 def test_what_is_no_store_is_refused_in_words(tmp_path: Path) -> None:

@@ -21,12 +21,7 @@ from slatprep.inspect.pictures.scene import (
     rgb,
     views,
 )
-from slatprep.inspect.pictures.side import (
-    draw_candidates,
-    draw_figures,
-    draw_histogram,
-    side_of,
-)
+from slatprep.inspect.pictures.side import draw_candidates, draw_figures, draw_histogram, side_of
 from slatprep.inspect.pictures.voxels import Drawing, View, draw_voxels
 from slatprep.records import MATERIAL_CLASSES, MATERIAL_COLOURS, Alignment
 

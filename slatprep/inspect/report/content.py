@@ -18,12 +18,7 @@ from slatprep.inspect.tallies import Tally, no_tally
 from slatprep.judge import THRESHOLDS
 from slatprep.normalize import PIXIE_RANGES
 from slatprep.pipeline.decoys import measured_errors, told_of
-from slatprep.records import (
-    MATERIAL_COLOURS,
-    UNANNOTATED_COLOUR,
-    Contents,
-    Status,
-)
+from slatprep.records import MATERIAL_COLOURS, UNANNOTATED_COLOUR, Contents, Status
 from slatprep.store.reader import Store
 
 # Matplotlib's viridis (CC0) at even steps: its lightness rises with the value, so that
@@ -135,9 +130,7 @@ def _names_of(contents: Contents) -> tuple[str, ...]:
 
 
 def _properties(
-    store: Store,
-    outcomes: Outcomes | None,
-    tallies: Mapping[str, Tally],
+    store: Store, outcomes: Outcomes | None, tallies: Mapping[str, Tally]
 ) -> list[dict[str, Any]]:
     """Return the histograms of each property by class, and its ranges."""
     normalization, published = store.normalization, {one.name: one for one in PIXIE_RANGES.ranges}

@@ -14,11 +14,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from slatprep.records import (
-    MATERIAL_COLOURS,
-    RESOLUTION,
-    UNANNOTATED,
-)
+from slatprep.records import MATERIAL_COLOURS, RESOLUTION, UNANNOTATED
 from slatprep.store import StoredAsset
 
 VIEWS = 3
