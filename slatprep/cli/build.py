@@ -154,7 +154,7 @@ def _counting(output: Output, progress: Progress) -> Progress:
 
     def update(done: int, total: int) -> None:
         if done:
-            output.keeps(
+            output.if_stopped = (
                 f"{done:,} of {amount(total, 'asset')} are done and kept; the same command goes on "
                 "from there"
             )

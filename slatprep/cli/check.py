@@ -89,7 +89,7 @@ def check_alignment(
     opened = open_store(path)
     chosen = check.choose_assets(opened, asset_ids, worst or 0, ambiguous)
     target = _target(path, picture, len(chosen))
-    run = run_unordered(check.check_stored, ((opened.path, one) for one in chosen), jobs)
+    run = run_unordered(check.check_alignment, ((opened.path, one) for one in chosen), jobs)
     found = {one.asset_id: one for one in run}
     checks = [found[asset_id] for asset_id in chosen]
     pictures: list[Path] = []

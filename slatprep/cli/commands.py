@@ -9,14 +9,8 @@ from typing import Any, NoReturn
 
 import click
 
-from slatprep.cli.output import (
-    EXIT_CODES,
-    EXIT_INCOMPLETE,
-    EXIT_INTERRUPTED,
-    EXIT_UNPRINTED,
-    EXIT_USAGE,
-    say,
-)
+from slatprep.cli import output
+from slatprep.cli.output import say
 from slatprep.cli.streams import OutputLostError, lost
 from slatprep.errors import ConfigError, SlatprepError
 
@@ -113,17 +107,19 @@ class LazyGroup(click.Group):
             self._fail_unprinted(ctx)
         except SlatprepError as error:
             say(f"slatprep: error: {error}", err=True)
-            ctx.exit(EXIT_USAGE if isinstance(error, ConfigError) else EXIT_INCOMPLETE)
+            ctx.exit(
+                output.EXIT_USAGE if isinstance(error, ConfigError) else output.EXIT_INCOMPLETE
+            )
         except OSError as error:
             # A disk, or an object store, that fails where no room has words of its own for it.
             if error.filename is None:
                 raise
             say(f"slatprep: error: {error.filename}: {error.strerror}; run again", err=True)
-            ctx.exit(EXIT_INCOMPLETE)
+            ctx.exit(output.EXIT_INCOMPLETE)
         except KeyboardInterrupt as stop:
             kept = getattr(ctx.obj, "if_stopped", "") or "run it again to start anew"
             say(f"\nslatprep: stopped; {str(stop) or f'nothing was replaced; {kept}'}", err=True)
-            ctx.exit(EXIT_INTERRUPTED)
+            ctx.exit(output.EXIT_INTERRUPTED)
         if lost():
             self._fail_unprinted(ctx)
         return done
@@ -133,7 +129,7 @@ class LazyGroup(click.Group):
         if not lost().startswith("standard error") or "--json" not in sys.argv:
             told = f"slatprep: error: {lost()}; the work is done, run it again to see the result"
             say(told, err="standard output" in lost())
-        ctx.exit(EXIT_UNPRINTED)
+        ctx.exit(output.EXIT_UNPRINTED)
 
 
 @click.command(
@@ -144,7 +140,7 @@ class LazyGroup(click.Group):
         "show_default": True,
     },
     epilog="\b\nExit codes:\n"
-    + "".join(f"  {code:<4} {words}\n" for code, words in EXIT_CODES.items())
+    + "".join(f"  {code:<4} {words}\n" for code, words in output.EXIT_CODES.items())
     + """
 \b
 Example:

@@ -9,7 +9,7 @@ from slatprep.cli.output import Cell, Output, say
 from slatprep.cli.signature import Click, command
 
 if TYPE_CHECKING:
-    from slatprep.inspect.difference import AssetChange, PropertyChange, StoreDifference
+    from slatprep.inspect.difference import AssetChange, StoreDifference
 
 _SHOWN = 20
 _COLUMNS = 3
@@ -88,7 +88,7 @@ def _show(output: Output, found: StoreDifference) -> None:
         output.table(
             "Properties of voxels that are valid in both: absolute change",
             ("property", "voxels", "changed", "mean", "most", "mean of log10"),
-            [(name, *_cells(own)) for name, own in changed.items()],
+            [(name, *vars(own).values()) for name, own in changed.items()],
         )
     if found.worst:
         length = output.id_length([one.asset_id for one in found.worst])
@@ -108,10 +108,6 @@ def _how(found: StoreDifference, what: str) -> str:
     if what == "labels":
         return f"{found.labels:,} of {found.voxels:,} voxels ({found.labels / found.voxels:.2%})"
     return ""
-
-
-def _cells(own: PropertyChange) -> tuple[Cell, ...]:
-    return (own.voxels, own.changed, own.mean, own.most, own.log10)
 
 
 def _line(one: AssetChange, length: int | None) -> tuple[Cell, ...]:

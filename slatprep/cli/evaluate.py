@@ -221,10 +221,10 @@ def _note_methods(output: Output, result: Comparison) -> None:
 def _write_csv(file: Path, what: str, measures: Mapping[str, Measure], spread: str) -> None:
     metrics = next(iter(measures.values())).means
     names = (name for mean in metrics for name in (mean, f"{mean} {spread}"))
-    rows = [
+    rows = (
         (name, m.objects, *(s[key] for key in metrics for s in (m.means, m.spreads)))
         for name, m in measures.items()
-    ]
+    )
     write_csv(file, (what, "objects", *names), rows)
 
 
@@ -234,16 +234,14 @@ def _show_beside(
     from slatprep.learn.published import TABLES
 
     names = tuple(next(iter(ours.values())).means)
-    rows: list[tuple[str | float | None, ...]] = [
-        (name, *measure.means.values()) for name, measure in ours.items()
-    ]
-    rows += [(score.method, *(score.means.get(name) for name in names)) for score in others]
+    rows = (
+        *((name, *measure.means.values()) for name, measure in ours.items()),
+        *((score.method, *map(score.means.get, names)) for score in others),
+    )
     title = f"Beside {TABLES[beside][0] if beside in TABLES else beside}"
     output.table(title, ("method", *names), rows)
     spreads = [
-        (score.method, *(score.spreads.get(name) for name in names), score.spread)
-        for score in others
-        if score.spreads
+        (one.method, *map(one.spreads.get, names), one.spread) for one in others if one.spreads
     ]
     if spreads:
         output.table("Their spreads, as printed", ("method", *names, "kind"), spreads)
@@ -251,11 +249,11 @@ def _show_beside(
 
 def _in_short(measures: Mapping[str, Measure]) -> list[tuple[str | int, ...]]:
     """Return the rows of the printed table: each mean with its spread, if there is one."""
-    rows: list[tuple[str | int, ...]] = []
-    for name, m in measures.items():
-        cells = (
-            f"{mean:.3f}" if math.isnan(m.spreads[key]) else f"{mean:.3f}±{m.spreads[key]:.3f}"
-            for key, mean in m.means.items()
-        )
-        rows.append((name, m.objects, *cells))
-    return rows
+
+    def cell(mean: float, spread: float) -> str:
+        return f"{mean:.3f}" if math.isnan(spread) else f"{mean:.3f}±{spread:.3f}"
+
+    return [
+        (name, one.objects, *map(cell, one.means.values(), one.spreads.values()))
+        for name, one in measures.items()
+    ]

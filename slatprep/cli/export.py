@@ -7,9 +7,9 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated, Any
 
 from slatprep.cli.options import (
+    Above0,
     AssetIds,
     ChoiceOf,
-    FiniteRange,
     FolderOrUrl,
     Jobs,
     NewFileOrFolder,
@@ -60,10 +60,7 @@ class FormatOptions:
         Click(metavar="NAME"),
     ] = None
     size: Annotated[
-        float | None,
-        FiniteRange(min=0, min_open=True),
-        "usd: width of the unit cube. [default: 1]",
-        Click(metavar="METRES"),
+        Above0 | None, "usd: width of the unit cube. [default: 1]", Click(metavar="METRES")
     ] = None
     materials: Annotated[
         Positive | None,

@@ -7,7 +7,6 @@ aligned columns; with ``--json`` standard output is one JSON document.
 
 from __future__ import annotations
 
-import dataclasses
 import itertools
 import json
 import math
@@ -15,6 +14,7 @@ import sys
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import is_dataclass
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -54,7 +54,8 @@ class Output:
     """Prints the results of one command in the form that was asked for.
 
     With `as_json`, that is one JSON document on standard output instead of tables. `verbosity` -1
-    prints only errors and results, 1 prints more details.
+    prints only errors and results, 1 prints more details. `if_stopped` is printed if the command is
+    stopped: what is kept, how to go on.
     """
 
     def __init__(self, as_json: bool = False, verbosity: int = 0, command: str = "") -> None:
@@ -71,8 +72,7 @@ class Output:
         `EXIT_INCOMPLETE`.
         """
         if self.as_json:
-            fields = vars(document) if dataclasses.is_dataclass(document) else document
-            self._say_document(complete, fields)
+            self._say_document(complete, vars(document) if is_dataclass(document) else document)
         else:
             show()
         if not complete:
@@ -101,10 +101,6 @@ class Output:
     ) -> None:
         """Print counts of what was written as a table of one row; JSON has `more` beside them."""
         self.made({**more, **counts}, lambda: self.record(title, counts), complete)
-
-    def keeps(self, words: str) -> None:
-        """Set what is printed if the command is stopped from now on: what is kept, how to go on."""
-        self.if_stopped = words
 
     def note(self, message: str) -> None:
         """Print a line on standard error, unless quiet."""
@@ -213,11 +209,9 @@ class PrintingCommand(click.Command):
 
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
         """Parse the arguments, as click does."""
-        # Without the program; click takes parsed words out of the list.
-        output = Output(
-            "--json" in args and not ctx.resilient_parsing, 0, ctx.command_path.partition(" ")[2]
-        )
-        with output.failing():
+        # Asked before, since click takes parsed words out of the list.
+        as_json = "--json" in args and not ctx.resilient_parsing
+        with Output(as_json, 0, ctx.command_path.partition(" ")[2]).failing():
             return super().parse_args(ctx, args)
 
 
@@ -342,11 +336,10 @@ def _progress_bar(label: str) -> Iterator[Progress]:
         def render(self, task: rich.Task) -> Text:
             if task.total is None:
                 return Text("starting ...")
-            parts = [f"{task.completed:,.0f}/{task.total:,.0f}", _clock(task.elapsed or 0.0)]
+            spent = task.elapsed or 0.0
+            parts = [f"{task.completed:,.0f}/{task.total:,.0f}", _clock(spent)]
             if _LEAST_DONE <= task.completed < task.total:
-                parts.append(
-                    f"{_clock((task.elapsed or 0.0) * (task.total / task.completed - 1))} left"
-                )
+                parts.append(f"{_clock(spent * (task.total / task.completed - 1))} left")
             return Text(" · ".join(parts))
 
     console = Console(stderr=True)

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import click
 
-from slatprep.cli.options import ChoiceOf, File, FiniteRange, NewFile, NewFolder, Positive
+from slatprep.cli.options import Above0, ChoiceOf, File, FiniteRange, NewFile, NewFolder, Positive
 from slatprep.cli.output import Output
 from slatprep.cli.signature import Click, command
 from slatprep.cli.transfer import MaterialOptions
@@ -23,9 +23,7 @@ if TYPE_CHECKING:
 class MotionOptions:
     """What moves the object, for how long, and how finely that is computed."""
 
-    size: Annotated[
-        float, FiniteRange(min=0, min_open=True), "Width of the unit cube.", Click(metavar="METRES")
-    ] = 0.4
+    size: Annotated[Above0, "Width of the unit cube.", Click(metavar="METRES")] = 0.4
     height: Annotated[float, FiniteRange(min=0), "Height of the fall.", Click(metavar="METRES")] = (
         0.1
     )
@@ -35,7 +33,7 @@ class MotionOptions:
         "sand, without gravity.",
         Click(metavar="M/S"),
     ] = 0.0
-    seconds: Annotated[float, FiniteRange(min=0, min_open=True), "Length of the motion."] = 0.6
+    seconds: Annotated[Above0, "Length of the motion."] = 0.6
     rate: Annotated[Positive, "Frames a second."] = 30
     substeps: Annotated[Positive, "Time steps a frame."] = 4
     device: Annotated[
@@ -60,16 +58,10 @@ def simulate(
         "Take this class for the whole object.",
     ] = None,
     young: Annotated[
-        float | None,
-        FiniteRange(min=0, min_open=True),
-        "Take this Young's modulus for the whole object.",
-        Click(metavar="PA"),
+        Above0 | None, "Take this Young's modulus for the whole object.", Click(metavar="PA")
     ] = None,
     density: Annotated[
-        float | None,
-        FiniteRange(min=0, min_open=True),
-        "Take this density for the whole object.",
-        Click(metavar="KG/M3"),
+        Above0 | None, "Take this density for the whole object.", Click(metavar="KG/M3")
     ] = None,
     out: Annotated[NewFolder, "Folder of the frames, frame-0000.ply and so on."],
     picture: Annotated[

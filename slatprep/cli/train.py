@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import click
 
 from slatprep.cli.options import (
+    Above0,
     ChoiceOf,
     FiniteRange,
     FolderOrUrl,
@@ -47,9 +48,7 @@ class TrainingOptions:
     batch_size: Annotated[Positive, "Assets in a batch."] = 1
     accumulate: Annotated[Positive, "Batches per step of the optimiser."] = 1
     learning_rate: Annotated[
-        float,
-        FiniteRange(min=0, min_open=True),
-        "Initial learning rate of AdamW; a cosine schedule lowers it to 0.",
+        Above0, "Initial learning rate of AdamW; a cosine schedule lowers it to 0."
     ] = 0.0001
     precision: Annotated[
         Literal["auto", "fp32", "bf16"],
@@ -155,7 +154,7 @@ def train(
     runs = {name: out / name for name in _SIZES} if all_sizes else {size: out}
     summaries = {}
     for name, directory in runs.items():
-        output.keeps(
+        output.if_stopped = (
             "the same command goes on from the last checkpoint, at most 30 s and a step ago"
         )
         if (directory / LAST).exists():
@@ -181,7 +180,7 @@ def train(
 
 def _tell_epoch(output: Output, name: str, record: EpochRecord) -> None:
     output.note(f"{name}, {_line(record)}")
-    output.keeps(
+    output.if_stopped = (
         f"epochs up to {record.epoch} are kept, and the steps since then but for the last 30 s; "
         "the same command goes on from there"
     )

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-from slatprep.cli.options import AssetOption, ChoiceOf, File, FiniteRange, NewFile, StoreOption
+from slatprep.cli.options import Above0, AssetOption, ChoiceOf, File, NewFile, StoreOption
 from slatprep.cli.output import Output
 from slatprep.cli.signature import Click, command
 from slatprep.errors import ConfigError
@@ -84,8 +84,7 @@ def transfer(
         Literal["file", "slat"], "Write positions as in the particles' file, or in the SLAT frame."
     ] = "file",
     max_distance: Annotated[
-        float,
-        FiniteRange(min=0, min_open=True),
+        Above0,
         "Distance to the nearest voxel above which a particle is far.",
         Click(metavar="VOXELS"),
     ] = 2.0,

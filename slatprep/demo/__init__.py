@@ -14,24 +14,11 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+from slatprep.demo import write
 from slatprep.demo.asset import DemoAsset, make_asset
 from slatprep.demo.difficulty import LEVELS, SAME_SHAPE_LEVELS
 from slatprep.demo.latents import GRIDS, Encoder, LatentKind
 from slatprep.demo.sources import ONE_FRAME, TABLE, Source, classes_of, write_description
-from slatprep.demo.write import (
-    SlatForm,
-    SlatNames,
-    row_id,
-    sample_grids,
-    slat_name,
-    write_annotated,
-    write_categories,
-    write_results,
-    write_samples,
-    write_slat,
-    write_trellis_metadata,
-    write_truth,
-)
 from slatprep.errors import ConfigError
 from slatprep.workers.local import run_unordered
 
@@ -62,8 +49,8 @@ class _Recipe:
     habitual_share: float
     source: Source
     encoder: Encoder
-    slat_form: SlatForm
-    slat_names: SlatNames
+    slat_form: write.SlatForm
+    slat_names: write.SlatNames
     results: bool
     samples: int
 
@@ -85,8 +72,8 @@ def make_demo(
     habitual_share: float = 0.0,
     source: Source = "pixieverse",
     encoder: Encoder = "trellis",
-    slat_form: SlatForm = "npz",
-    slat_names: SlatNames = "id",
+    slat_form: write.SlatForm = "npz",
+    slat_names: write.SlatNames = "id",
     results: bool = False,
     samples: int = 1,
     jobs: int = 1,
@@ -243,24 +230,24 @@ def _make_one(root: Path, recipe: _Recipe, index: int) -> tuple[int, dict[str, A
         resolution=resolution,
         one_frame=recipe.source in ONE_FRAME,
     )
-    write_annotated(root / recipe.adapter, asset, recipe.source, resolution)
+    write.write_annotated(root / recipe.adapter, asset, recipe.source, resolution)
     if recipe.samples > 1:
-        grids = sample_grids(recipe.seed, index, asset, recipe.samples)
-        write_samples(root / recipe.adapter, asset, grids)
+        grids = write.sample_grids(recipe.seed, index, asset, recipe.samples)
+        write.write_samples(root / recipe.adapter, asset, grids)
     if recipe.results:
-        write_results(root / "results", asset)
-    write_slat(root / "slat", asset, recipe.slat_form, recipe.slat_names, recipe.encoder)
-    write_truth(root / "truth", asset, recipe.source)
+        write.write_results(root / "results", asset)
+    write.write_slat(root / "slat", asset, recipe.slat_form, recipe.slat_names, recipe.encoder)
+    write.write_truth(root / "truth", asset, recipe.source)
     return index, {
         "id": asset.object_id,
         "name": asset.name,
         "category": asset.category,
         "level": asset.level,
         "symmetric": asset.symmetric,
-        "slat": slat_name(asset, recipe.slat_names),
+        "slat": write.slat_name(asset, recipe.slat_names),
         "rows": [
             {
-                "id": row_id(asset, view),
+                "id": write.row_id(asset, view),
                 "voxels": len(view.coords),
                 "transform": view.transform.tolist(),
             }
@@ -270,7 +257,8 @@ def _make_one(root: Path, recipe: _Recipe, index: int) -> tuple[int, dict[str, A
 
 
 def _write_definition(root: Path, recipe: _Recipe, entries: list[dict[str, Any]]) -> None:
-    write_categories(root / "obj_ids_metadata.json", ((e["id"], e["category"]) for e in entries))
+    categories = ((entry["id"], entry["category"]) for entry in entries)
+    write.write_categories(root / "obj_ids_metadata.json", categories)
     slat_root = "slat/latents.h5" if recipe.slat_form == "hdf5-groups" else "slat"
     lines = [
         "# A demo dataset; roots are relative to this file.",
@@ -298,7 +286,7 @@ def _write_definition(root: Path, recipe: _Recipe, entries: list[dict[str, Any]]
     lines += ["", "[pairing]", 'categories = "obj_ids_metadata.json"']
     if recipe.slat_names == "sha256":
         rows = ((e["slat"], e["id"], e["rows"][0]["voxels"]) for e in entries)
-        write_trellis_metadata(root / "metadata.csv", rows)
+        write.write_trellis_metadata(root / "metadata.csv", rows)
         lines.append('map = "metadata.csv"')
     (root / "dataset.toml").write_text("\n".join(lines) + "\n", encoding="utf-8")
 

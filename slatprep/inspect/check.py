@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import math
+import operator
 from collections.abc import Iterable
 from dataclasses import dataclass
 
@@ -34,15 +35,13 @@ voxels.
 
 _QUALITY = ("fitness", "inlier_rmse", "fitness_backward", "inlier_rmse_backward", "overlap")
 
-AT_LEAST = {
-    "confidence": THRESHOLDS.good_confidence,
-    "expected_accuracy": THRESHOLDS.good_accuracy,
-    "valid_share": THRESHOLDS.good_valid_share,
+_LIMITS = {
+    "confidence": (">=", operator.ge, THRESHOLDS.good_confidence),
+    "expected_accuracy": (">=", operator.ge, THRESHOLDS.good_accuracy),
+    "valid_share": (">=", operator.ge, THRESHOLDS.good_valid_share),
+    "ambiguity": ("<=", operator.le, THRESHOLDS.good_ambiguity),
 }
-"""Least value of each figure in a good alignment."""
-
-AT_MOST = {"ambiguity": THRESHOLDS.good_ambiguity}
-"""Largest value of each figure in a good alignment."""
+"""What a figure is in a good alignment."""
 
 
 @dataclass(frozen=True)
@@ -62,18 +61,18 @@ class Figure:
     @property
     def passes(self) -> bool | None:
         """Whether the value is that of a good alignment; None if it has no threshold."""
-        if self.name in AT_LEAST:
-            return self.value >= AT_LEAST[self.name]
-        limited = self.name in AT_MOST and not self.settled
-        return self.value <= AT_MOST[self.name] if limited else None
+        if self.settled or self.name not in _LIMITS:
+            return None
+        _, compare, limit = _LIMITS[self.name]
+        return bool(compare(self.value, limit))
 
     @property
     def threshold_text(self) -> str:
         """The threshold in words, like ``>= 0.8``; empty if there is none."""
-        if self.name in AT_LEAST:
-            return f">= {AT_LEAST[self.name]:g}"
-        limited = self.name in AT_MOST and not self.settled
-        return f"<= {AT_MOST[self.name]:g}" if limited else ""
+        if self.passes is None:
+            return ""
+        sign, _, limit = _LIMITS[self.name]
+        return f"{sign} {limit:g}"
 
     @property
     def ok(self) -> bool:
@@ -146,20 +145,23 @@ class AlignmentCheck:
         return self.verdict is Verdict.GOOD and self.consistent
 
 
-def check_alignment(store: Store, name: str | int) -> AlignmentCheck:
+def check_alignment(store: Store | Place, name: str | int) -> AlignmentCheck:
     """Recompute an alignment's quality, and the annotation it gives, from the store alone.
 
     Raises StoreError if the store has no such asset, or lacks its build parameters.
     """
+    store = open_store(store)
     asset = store.asset(name)
     radius = store.about.build.parameters.align.radius
     valid_share, differs = recompute_annotation(asset)
     alignment = StoredRecords(store).read(asset.index).alignment
     quality = measure_quality(asset.field, asset.latents, asset.transform, radius, alignment.ground)
     columns = asset.columns
-    same_fit = all(
-        abs(getattr(quality, name) - float(columns[name])) <= QUALITY_TOLERANCE for name in _QUALITY
-    )
+    figures = [
+        Figure(name, getattr(quality, name), float(columns[name]), QUALITY_TOLERANCE)
+        for name in _QUALITY
+    ]
+    same_fit = all(figure.ok for figure in figures)
     verdict, reasons = verdict_of(
         quality,
         valid_share,
@@ -173,27 +175,21 @@ def check_alignment(store: Store, name: str | int) -> AlignmentCheck:
         mirrored=mirror_gain_of(alignment),
     )
 
-    def stored(name: str) -> Figure:
-        return Figure(name, float(columns[name]), float(columns[name]), 0)
+    def stored(name: str, settled: bool = False) -> Figure:
+        return Figure(name, float(columns[name]), float(columns[name]), 0, settled)
 
-    figures = [
-        Figure(name, getattr(quality, name), float(columns[name]), QUALITY_TOLERANCE)
-        for name in _QUALITY
-    ]
+    def largest(name: str, array: str) -> Figure:
+        most = float(differs[array].max(initial=0.0))
+        return Figure(f"largest difference of a {name}", most, 0, TOLERANCES[array])
+
     figures += [
         Figure("valid_share", valid_share, float(columns["valid_share"]), QUALITY_TOLERANCE),
-        *map(stored, ("ambiguity", "margin")),
+        stored("ambiguity", alignment.settled_by is not None),
+        stored("margin"),
         Figure("voxels with another valid", differs["voxel/valid"].sum(), 0, 0),
         Figure("voxels with another material", differs["voxel/material"].sum(), 0, 0),
-        *(
-            Figure(
-                f"largest difference of a {name}",
-                differs[array].max(initial=0.0),
-                0,
-                TOLERANCES[array],
-            )
-            for name, array in (("property", "voxel/properties"), ("distance", "voxel/distance"))
-        ),
+        largest("property", "voxel/properties"),
+        largest("distance", "voxel/distance"),
     ]
     figures += map(stored, ("confidence", "same_object", "right_placement", "expected_accuracy"))
     if asset.merged:
@@ -212,11 +208,6 @@ def check_alignment(store: Store, name: str | int) -> AlignmentCheck:
         asset.transform,
         radius,
     )
-
-
-def check_stored(path: Place, asset_id: str) -> AlignmentCheck:
-    """Check an alignment as `check_alignment` does, in a worker, which opens the store itself."""
-    return check_alignment(open_store(path), asset_id)
 
 
 def recompute_annotation(asset: StoredAsset) -> tuple[float, dict[str, NDArray[np.float64]]]:

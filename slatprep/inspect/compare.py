@@ -217,14 +217,13 @@ def _compare_some(path_a: Place, path_b: Place, rows: Sequence[_Rows]) -> list[A
     for pair in rows:
         here, there = (own.read(row) for own, row in zip(records, pair, strict=True))
         digests = [{(one.role, one.sha256) for one in own.sources} for own in (here, there)]
-        change = _compare(*stores, here.asset_id, pair)
         roles = tuple(sorted({role for role, _ in digests[0] ^ digests[1]}))
-        changes.append(replace(change, sources=roles))
+        changes.append(_compare(*stores, here.asset_id, pair, roles))
     return changes
 
 
-def _compare(a: Store, b: Store, asset_id: str, rows: _Rows) -> AssetChange:
-    """Compare the voxels of an asset."""
+def _compare(a: Store, b: Store, asset_id: str, rows: _Rows, roles: tuple[str, ...]) -> AssetChange:
+    """Compare the voxels of an asset, whose sources differ in some roles."""
     one, other = a.read(rows[0], VOXEL_COLUMNS), b.read(rows[1], VOXEL_COLUMNS)
     coords = one.pop("coords"), other.pop("coords")
     unmatched, moved = 0, 0.0
@@ -262,7 +261,7 @@ def _compare(a: Store, b: Store, asset_id: str, rows: _Rows) -> AssetChange:
         asset_id=asset_id,
         what=(),
         verdicts=("", ""),
-        sources=(),
+        sources=roles,
         columns=tuple(f"voxel/{name}" for name in differ),
         moved=moved,
         voxels=len(labels),

@@ -26,7 +26,7 @@ from slatprep.inspect.distributions import (
 from slatprep.inspect.listing import rows_chosen
 from slatprep.inspect.overview import UNKNOWN
 from slatprep.inspect.tallies import JOINT_BINS, SideTally, Tally, no_tally, pooled, tally
-from slatprep.records import Normalization, Place, Verdict
+from slatprep.records import Contents, Normalization, Place, Verdict
 from slatprep.store import Store, open_store
 from slatprep.workers import Progress
 from slatprep.workers.local import run_in_order
@@ -87,25 +87,21 @@ def store_statistics(
     # Ordered by category, so that only one category's tally is in memory at a time.
     rows.sort(key=lambda row: (column[row], row))
     of_category = [list(own) for _, own in groupby(rows, column.__getitem__)]
-    tasks = [
-        (store.path, some[start : start + _TASK_ASSETS], weight == "asset")
-        for some in of_category
-        for start in range(0, len(some), _TASK_ASSETS)
+    portions = [
+        [own[start : start + _TASK_ASSETS] for start in range(0, len(own), _TASK_ASSETS)]
+        for own in of_category
     ]
+    tasks = ((store.path, some, weight == "asset") for own in portions for some in own)
     tallies = run_in_order(_tally_some, tasks, jobs)
-    ranges = store.normalization.ranges
-    make = _Summariser(
-        store.normalization,
-        tuple(one.unit for one in store.contents.properties),
-        store.contents.labels,
-    )
-    total = nothing = no_tally(store.contents, BINS)
+    ranges, contents = store.normalization.ranges, store.contents
+    make = _Summariser(store.normalization, contents)
+    total = nothing = no_tally(store.normalization, BINS, contents=contents)
     done, groups = 0, []
-    for own in of_category:
+    for own, parts in zip(of_category, portions, strict=True):
         here = nothing
-        for start in range(0, len(own), _TASK_ASSETS):
+        for some in parts:
             here += next(tallies)
-            done += len(own[start : start + _TASK_ASSETS])
+            done += len(some)
             if progress:
                 progress(done, len(rows))
         total += here
@@ -113,7 +109,7 @@ def store_statistics(
         groups.append(make.group("category", name, here, Counter(verdict_of[r] for r in own)))
     everything = make.group("all", "all", total, Counter(verdict_of[row] for row in rows))
     classes = [
-        make.group("class", name, total, None, index) for index, name in enumerate(make.classes)
+        make.group("class", name, total, None, index) for index, name in enumerate(contents.labels)
     ]
     whole = everything.field.share, everything.slat.share
     return StoreStatistics(
@@ -133,22 +129,14 @@ def store_statistics(
 def _tally_some(path: Place, rows: Sequence[int], by_asset: bool) -> Tally:
     """Tally some assets of a store, in a worker."""
     store = open_store(path)
-    ranges = store.normalization
-    total = no_tally(store.contents, BINS)
+    ranges, contents = store.normalization, store.contents
+    total = no_tally(ranges, BINS, contents=contents)
     for row in rows:
         # Not `store.asset`: it reads all columns of asset/*, which takes long in a large store.
-        material, properties = (
-            store.read_rows(f"grid/{name}", row, row + 1)[0] for name in ("material", "properties")
-        )
-        slat = store.read(row, ("material", "properties"))
-        total += tally(
-            (material, properties),
-            (slat["material"], slat["properties"]),
-            ranges,
-            BINS,
-            contents=store.contents,
-            by_asset=by_asset,
-        )
+        names = ("material", "properties")
+        field = (store.read_rows(f"grid/{name}", row, row + 1)[0] for name in names)
+        slat = store.read(row, names).values()
+        total += tally(field, slat, ranges, BINS, contents=contents, by_asset=by_asset)
     return total
 
 
@@ -157,8 +145,7 @@ class _Summariser:
     """Turns tallies into statistics; `share` holds a weight until `_of_whole` divides it."""
 
     ranges: Normalization
-    units: tuple[str, ...]
-    classes: tuple[str, ...]
+    contents: Contents
 
     def group(
         self,
@@ -191,9 +178,9 @@ class _Summariser:
             share=whole,
             unannotated=_ratio(whole - part, whole),
             classes={
-                self.classes[k]: _ratio(float(counts.weights[k]), part)
+                self.contents.labels[k]: _ratio(float(counts.weights[k]), part)
                 for k in annotated
-                if k < len(self.classes)
+                if k < len(self.contents.labels)
             },
             properties={
                 span.name: self._property(counts, number, annotated)
@@ -205,13 +192,14 @@ class _Summariser:
         self, counts: SideTally, number: int, chosen: NDArray[np.int64]
     ) -> PropertyStatistics:
         span, weights = self.ranges.ranges[number], counts.weights[chosen]
+        unit = self.contents.properties[number].unit
         mean, squares = pooled(
             weights[None], counts.mean[:, number, chosen], counts.squares[:, number, chosen], axis=1
         )
         total = float(weights.sum())
         if not total:
             nothing = Distribution(*(np.nan,) * 4, dict.fromkeys(QUANTILE_NAMES, np.nan))
-            return PropertyStatistics(self.units[number], nothing, nothing if span.log10 else None)
+            return PropertyStatistics(unit, nothing, nothing if span.log10 else None)
         std = np.sqrt(squares / total)
         least, most = counts.ends[0, number, chosen].min(), counts.ends[1, number, chosen].max()
         inside = counts.histogram[number, chosen].sum(axis=0)
@@ -223,7 +211,7 @@ class _Summariser:
         si = 10.0**mapped if span.log10 else mapped
         spread = float(std[0]) * 0.5 * (span.hi - span.lo)
         return PropertyStatistics(
-            self.units[number],
+            unit,
             _distribution(float(mean[1]), float(std[1]), si),
             _distribution(float(mapped[0]), spread, mapped) if span.log10 else None,
         )
@@ -236,7 +224,8 @@ class _Summariser:
             for side in (counts.field, counts.slat)
         )
         edges = np.linspace(span.lo, span.hi, DRAWN_BINS + 1)
-        return Histogram(span.name, self.units[number], span.log10, edges, *sides)
+        unit = self.contents.properties[number].unit
+        return Histogram(span.name, unit, span.log10, edges, *sides)
 
     def joint(self, counts: Tally) -> JointHistogram | None:
         """Return the joint histogram of the first two properties."""

@@ -7,7 +7,9 @@ Variances", 1979), which loses no digits however many assets are added.
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,7 +20,7 @@ from slatprep.records import Contents, Normalization
 JOINT_BINS = 64
 """Bins of either axis of the joint histogram, over [-1, 1]."""
 
-Voxels = tuple[NDArray[np.uint8], NDArray[np.float32]]
+Voxels = Iterable[NDArray[Any]]
 """Classes and normalised properties of voxels."""
 
 
@@ -64,10 +66,7 @@ class SideTally:
             np.stack([self.squares, other.squares]),
             axis=0,
         )
-        least, most = (
-            np.minimum(self.ends[0], other.ends[0]),
-            np.maximum(self.ends[1], other.ends[1]),
-        )
+        least, most = np.minimum(self.ends, other.ends)[0], np.maximum(self.ends, other.ends)[1]
         return SideTally(
             self.assets + other.assets,
             self.voxels + other.voxels,
@@ -105,21 +104,10 @@ def pooled(
     return centre.squeeze(axis), merged
 
 
-def no_tally(contents: Contents, bins: int) -> Tally:
-    """Return an empty tally of what a store holds, for a number of bins."""
-    properties, labels = len(contents.properties), contents.n_labels
-    nothing = SideTally(
-        assets=np.zeros(labels + 1, np.int64),
-        voxels=np.zeros(labels + 1, np.int64),
-        weights=np.zeros(labels + 1),
-        histogram=np.zeros((properties, labels, bins)),
-        sums=np.zeros((properties, labels, bins)),
-        joint=np.zeros((JOINT_BINS, JOINT_BINS)),
-        mean=np.zeros((2, properties, labels)),
-        squares=np.zeros((2, properties, labels)),
-        ends=np.stack([np.full((properties, labels), end) for end in (np.inf, -np.inf)]),
-    )
-    return Tally(nothing, nothing)
+def no_tally(ranges: Normalization, bins: int, *, contents: Contents) -> Tally:
+    """Return the tally of no voxels, for a number of bins."""
+    material, properties = np.zeros(0, np.uint8), np.zeros((len(ranges.ranges), 0), np.float32)
+    return tally((material, properties), (material, properties.T), ranges, bins, contents=contents)
 
 
 def tally(
@@ -137,10 +125,10 @@ def tally(
     and (P, R, R, R)) and of ``voxel/*`` ((N,) and (N, P)). With `by_asset`, all voxels of a side
     have weight 1 together, otherwise 1 each.
     """
-    grid, values = field
+    (grid, values), (material, properties) = field, slat
     labels = contents.n_labels
     before = grid[grid != contents.background], values[:, grid < labels]
-    after = slat[0], slat[1][slat[0] < labels].T
+    after = material, properties[material < labels].T
     return Tally(
         _side(*before, ranges, bins, labels, by_asset),
         _side(*after, ranges, bins, labels, by_asset),

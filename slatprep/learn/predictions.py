@@ -184,14 +184,13 @@ def check_prediction(
         raise InputError(source, what, "normalised properties, -1 to 1 within the ranges")
     converted = False
     if "ranges" in arrays:
-        spans = _checked_ranges(source, arrays, columns).tolist()
-        ranges = Normalization(
-            tuple(
-                replace(r, lo=lo, hi=hi)
-                for r, (lo, hi) in zip(normalization.ranges, spans, strict=True)
-            ),
-            "prediction",
-        )
+        spans = _shaped(source, "ranges", arrays, (columns, 2)).astype(np.float64)
+        if not (np.isfinite(spans).all() and (spans[:, 0] < spans[:, 1]).all()):
+            what = f"ranges are {spans.tolist()}"
+            raise InputError(source, what, "lo below hi, a row a property")
+        pairs = zip(normalization.ranges, spans.tolist(), strict=True)
+        own = tuple(replace(one, lo=lo, hi=hi) for one, (lo, hi) in pairs)
+        ranges = Normalization(own, "prediction")
         converted = ranges.ranges != normalization.ranges
         if converted:
             properties = change_ranges(properties, ranges, normalization)
@@ -210,15 +209,6 @@ def check_prediction(
         properties = properties[order]
         material = None if material is None else material[order]
     return VoxelPrediction(properties, material, converted)
-
-
-def _checked_ranges(
-    source: str, arrays: Mapping[str, NDArray[Any]], columns: int
-) -> NDArray[np.float64]:
-    ranges = _shaped(source, "ranges", arrays, (columns, 2)).astype(np.float64)
-    if not (np.isfinite(ranges).all() and (ranges[:, 0] < ranges[:, 1]).all()):
-        raise InputError(source, f"ranges are {ranges.tolist()}", "lo below hi, a row a property")
-    return ranges
 
 
 def _order(

@@ -10,7 +10,6 @@ import os
 import pickletools
 import zipfile
 from collections.abc import Sequence
-from contextlib import AbstractContextManager
 from io import BytesIO
 from itertools import pairwise
 from pathlib import Path
@@ -187,10 +186,6 @@ class Run:
         """Read a checkpoint, None if there is none; InputError if the file is damaged."""
         return read_state(self.path / name) if (self.path / name).exists() else None
 
-    def reading(self, name: str) -> AbstractContextManager[None]:
-        """Turn errors from a damaged or foreign checkpoint into an `InputError` with its name."""
-        return refusing(self.path / name, "cannot be read", "a checkpoint of this run")
-
     def log(self, history: Sequence[EpochRecord]) -> None:
         """Write ``log.csv``, and events for TensorBoard if it is installed."""
         names = [field.name for field in dataclasses.fields(EpochRecord)]
@@ -219,9 +214,8 @@ class Run:
             axes.axhline(error, color=MUTED, linestyle=style)
         top = 1.08 * max(*errors, *references.values())
         named = {"decoder": errors[-1], **references}
-        for name, height in zip(
-            named, apart([error / top for error in named.values()]), strict=True
-        ):
+        heights = apart([error / top for error in named.values()])
+        for name, height in zip(named, heights, strict=True):
             axes.annotate(name, (1.0, height), (6, 0), va="center", textcoords="offset points",
                           xycoords="axes fraction", fontsize=9, color=INK)  # fmt: skip
         axes.set(xlabel="epoch (the first is 0)", ylabel="validation error (mean square)")

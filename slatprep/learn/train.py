@@ -29,6 +29,7 @@ from slatprep.learn.predict import (
 )
 from slatprep.learn.runs import BEST, LAST, EpochRecord, Run
 from slatprep.learn.splits import assign_store
+from slatprep.readers.files import refusing
 from slatprep.readers.splits import HASH, Assignment, Shares, Split
 from slatprep.records import USABLE, Place
 from slatprep.store import Store, open_store
@@ -168,7 +169,7 @@ def train(
         session = _Session(parameters, train_set, device, workers)
         state = run.load(LAST)
         if state is not None:
-            with run.reading(LAST):
+            with refusing(run.path / LAST, "cannot be read", "a checkpoint of this run"):
                 session.restore(state)
         while not session.finished and session.epoch != stop_after:
             train_loss, rate = session.run_epoch(steps, lambda: run.save(LAST, session.state()))

@@ -10,15 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slatprep.geometry.voxels import filled, occupancy_of, shown_in_cells
+from slatprep.particles import gaussians as splats
 from slatprep.particles.fields import VoxelField
-from slatprep.particles.gaussians import (
-    bind,
-    carry,
-    deform,
-    gaussians_of,
-    require_gaussians,
-    write_gaussians,
-)
 from slatprep.particles.read import FRAMES, Axes, Particles, read_particles
 from slatprep.particles.transfer import doubt_axes, recognise_axes, transfer
 from slatprep.records import BACKGROUND, MATERIAL_CLASSES, RESOLUTION, Place
@@ -101,15 +94,14 @@ def prepare(
         if value is not None:
             properties[:, column] = value
     if gaussians is None:
-        vertices = gaussians_of(positions, material, 1 / count)
+        vertices = splats.gaussians_of(positions, material, 1 / count)
         return Scene(positions, 1 / count, material, properties, vertices, positions, "slat", ())
-    surface = (
-        field
-        if cells is None
-        else VoxelField(cells, np.zeros(len(cells), np.uint8), np.ones((len(cells), 3), np.float32))
-    )
+    surface = field
+    if cells is not None:
+        nothing = np.zeros(len(cells), np.uint8), np.ones((len(cells), 3), np.float32)
+        surface = VoxelField(cells, *nothing)
     read, notes = _read(gaussians, axes, field, surface)
-    vertices = require_gaussians(read.vertices, gaussians)
+    vertices = splats.require_gaussians(read.vertices, gaussians)
     return Scene(
         positions, 1 / count, material, properties, vertices, read.in_slat(), read.axes, notes
     )
@@ -166,15 +158,15 @@ def write_frames(
     from slatprep.particles.picture import draw, write_picture
 
     out.mkdir(parents=True, exist_ok=True)
-    carrier = bind(scene.places, scene.positions, scene.spacing)
+    carrier = splats.bind(scene.places, scene.positions, scene.spacing)
     low = moved[0].min(axis=(0, 1)) - scene.spacing
     high = moved[0].max(axis=(0, 1)) + scene.spacing
     pictures = []
     frames = len(moved[0])
     for number, (positions, gradients) in enumerate(zip(*moved, strict=True)):
-        places, local = carry(carrier, positions, gradients)
-        rows = deform(scene.vertices, places, local, scene.axes, stretch=stretch)
-        write_gaussians(out / f"frame-{number:04d}.ply", rows, FRAMES[scene.axes])
+        places, local = splats.carry(carrier, positions, gradients)
+        rows = splats.deform(scene.vertices, places, local, scene.axes, stretch=stretch)
+        splats.write_gaussians(out / f"frame-{number:04d}.ply", rows, FRAMES[scene.axes])
         if picture is not None:
             pictures.append(draw(rows, places, low, high))
         progress(number + 1, frames)

@@ -20,6 +20,10 @@ from slatprep.records.yielding import MAX_POISSON, YIELDING
 AIR, DRAG = 1.2, 1.0
 """Density of air [kg/m^3], and the drag coefficient of a face."""
 
+_LIMITS = ("friction", "yield_pressure", "tensile_yield_ratio", "yield_stress", "hardening",
+           "dilatancy", "viscosity")  # fmt: skip
+"""The engine's arrays for the fields of `Yielding`."""
+
 
 class Motion(NamedTuple):
     """Positions (F, N, 3) [m] and deformation gradients (F, N, 3, 3) of particles by frame.
@@ -82,8 +86,8 @@ def simulate_motion(
     model.mpm.young_modulus.assign(modulus.astype(np.float32))
     model.mpm.poisson_ratio.assign(ratio.astype(np.float32))
     limits = np.array([YIELDING[number] for number in np.asarray(material).tolist()], np.float32)
-    for values, column in zip(_limits(model.mpm), limits.T, strict=True):
-        values.assign(column)
+    for name, column in zip(_LIMITS, limits.T, strict=True):
+        getattr(model.mpm, name).assign(column)
     solver = newton.solvers.SolverImplicitMPM(
         model,
         config=newton.solvers.SolverImplicitMPM.Config(
@@ -126,19 +130,6 @@ def simulate(
 ) -> NDArray[np.float64]:
     """Return the positions (F, N, 3) of `simulate_motion`, which takes the same."""
     return simulate_motion(positions, material, properties, spacing, **how).positions
-
-
-def _limits(mpm: Any) -> tuple[Any, ...]:
-    """Return the engine's arrays for the fields of `Yielding`."""
-    return (
-        mpm.friction,
-        mpm.yield_pressure,
-        mpm.tensile_yield_ratio,
-        mpm.yield_stress,
-        mpm.hardening,
-        mpm.dilatancy,
-        mpm.viscosity,
-    )
 
 
 def windward(positions: ArrayLike, wind: ArrayLike, spacing: float) -> NDArray[np.float64]:

@@ -73,10 +73,9 @@ def transfer(
         raise ConfigError(f"max_distance is {max_distance}; expected a number above 0")
     distance, used = Lattice(field.voxels).nearest(field.locate(points))
     near = distance <= max_distance
-    material = np.where(near | (far == "nearest"), field.material[used], np.uint8(BACKGROUND))
-    properties = np.where(
-        (near | (far == "nearest"))[:, None], field.properties[used], np.float32(0.0)
-    )
+    taken = near | (far == "nearest")
+    material = np.where(taken, field.material[used], np.uint8(BACKGROUND))
+    properties = np.where(taken[:, None], field.properties[used], np.float32(0.0))
     rows = np.flatnonzero(near) if far == "drop" else np.arange(len(near))
     return Transferred(
         rows, material[rows], properties[rows], distance[rows], int(np.count_nonzero(~near))
@@ -94,16 +93,11 @@ def recognise_axes(
     if not particles.guessed:
         return particles, ""
     some = particles.positions[:: max(1, len(particles.positions) // 20_000)]
-    tried = {
-        axes: transfer(
-            Particles(some, axes).in_slat(), field, max_distance=max_distance, far="nearest"
-        )
-        for axes in _GAUSSIAN_AXES
-    }
-    apart = {
-        axes: float(np.minimum(result.distance, 2 * max_distance).mean())
-        for axes, result in tried.items()
-    }
+    tried, apart = {}, {}
+    for axes in _GAUSSIAN_AXES:
+        points = Particles(some, axes).in_slat()
+        tried[axes] = transfer(points, field, max_distance=max_distance, far="nearest")
+        apart[axes] = float(np.minimum(tried[axes].distance, 2 * max_distance).mean())
     best, other = sorted(_GAUSSIAN_AXES, key=lambda axes: apart[axes])
     if apart[other] <= _ALIKE * apart[best] + _SLACK:
         one, two = tried[best], tried[other]

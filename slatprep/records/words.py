@@ -14,19 +14,6 @@ MAX_NAME_BYTES = 1024
 """Most bytes of an id, view, category or file name in UTF-8."""
 
 
-MATERIAL_CLASSES = (
-    "jelly",
-    "metal",
-    "sand",
-    "visplas",
-    "fluid",
-    "snow",
-    "stationary",
-    "background",
-)
-"""PhysGaussian's material classes, by id."""
-
-
 FEATS_MEAN = (
     -2.1687545776367188, -0.004347046371549368, -0.13352349400520325, -0.08418072760105133,
     -0.5271206498146057, 0.7238689064979553, -1.1414450407028198, 1.2039363384246826,
@@ -62,13 +49,17 @@ CLASS_COLOURS = {
     "stationary": "#544856",
     "background": "#EAEAEA",
 }
-"""Colour of each of PhysGaussian's material classes, by name.
+"""Colour of each of PhysGaussian's material classes, by name, in the order of their ids.
 
 They stay apart for people who do not tell red from green, or blue from green:
 simulated after Machado, Oliveira and Fernandes ("A Physiologically-based Model
 for Simulation of Color Vision Deficiency", IEEE TVCG 2009), any two of them
 differ by more than 20 in CIELAB.
 """
+
+
+MATERIAL_CLASSES = tuple(CLASS_COLOURS)
+"""PhysGaussian's material classes, by id."""
 
 
 UNANNOTATED_COLOUR = "#FFFFFF"

@@ -187,18 +187,10 @@ def _axes_triad(figure: Figure, view: View, x: float, y: float) -> None:
 
 def _head(figure: Figure, check: AlignmentCheck, title: str, subtitle: str) -> int:
     """Write title, verdict and reasons; return the height of the last reason."""
-    write(figure, _LEFT, 50, title, weight="bold", size=13)
+    colour, bold = palette.VERDICT_COLOURS[check.verdict], {"weight": "bold", "size": 13}
+    write(figure, _LEFT, 50, title, **bold)
     write(figure, _LEFT, 76, subtitle, size=7.5, color=palette.MUTED)
-    colour = palette.VERDICT_COLOURS[check.verdict]
-    write(
-        figure,
-        side_of(figure),
-        50,
-        f"alignment {check.verdict}",
-        weight="bold",
-        size=13,
-        color=colour,
-    )
+    write(figure, side_of(figure), 50, f"alignment {check.verdict}", color=colour, **bold)
     reasons = list(check.words)
     if not check.consistent:
         reasons.append("the store's figures do not all agree with its voxels")

@@ -168,11 +168,9 @@ def views(scene: Scene, size: int) -> tuple[View, ...]:
     """Return the three views, at one scale at which the sets fit before and after."""
     here = voxel_centres(scene.pixieverse)
     voxels, _, transform = scene.placed
-    after = (
-        apply_transform(scene.transform, here),
-        apply_transform(transform, voxel_centres(voxels)),
-    )
-    points = np.concatenate([here, *after, voxel_centres(scene.slat)])
+    moved = apply_transform(scene.transform, here)
+    after = apply_transform(transform, voxel_centres(voxels))
+    points = np.concatenate([here, moved, after, voxel_centres(scene.slat)])
     placed = []
     for azimuth, elevation in VIEWPOINTS:
         rotation = view_rotation(azimuth, elevation)

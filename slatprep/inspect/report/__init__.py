@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import base64
+from base64 import b64encode
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from operator import attrgetter
@@ -151,7 +151,7 @@ def write_report(
                 str(content["title"]),
                 content,
                 sheets=(sheet([one.thumbnail for one in own]) for own in sheets),
-                packs=([_base64(one.voxels[side]) for one in own] for own in sheets),
+                packs=([b64encode(one.voxels[side]).decode() for one in own] for own in sheets),
             )
         size = temporary.stat().st_size
     total, in_table = content["all"]["assets"], len(content["assets"]["id"])
@@ -192,10 +192,8 @@ def _draw(path: Path, indices: Sequence[int]) -> tuple[list[Drawn], dict[str, Ta
         way = records.place_map(asset)
         voxels = {side: encode_asset(asset, way, max_distance, side) for side in (FULL, COARSE)}
         drawn.append(Drawn(index, thumbnail(asset), voxels, *_agreement(asset)))
-        field, slat = (
-            (asset.grid_material, asset.grid_properties),
-            (asset.material, asset.properties),
-        )
+        field = asset.grid_material, asset.grid_properties
+        slat = asset.material, asset.properties
         counts = tally(field, slat, store.normalization, BINS, contents=store.contents)
         _add(tallies, {str(asset.columns["category"]): counts})
     return drawn, tallies
@@ -213,7 +211,3 @@ def _agreement(asset: StoredAsset) -> tuple[float, tuple[float, ...]]:
 def _add(tallies: dict[str, Tally], more: Mapping[str, Tally]) -> None:
     for category, counts in more.items():
         tallies[category] = tallies[category] + counts if category in tallies else counts
-
-
-def _base64(content: bytes) -> str:
-    return base64.b64encode(content).decode("ascii")

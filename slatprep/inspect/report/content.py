@@ -18,7 +18,7 @@ from slatprep.inspect.tallies import Tally, no_tally
 from slatprep.judge import THRESHOLDS
 from slatprep.normalize import PIXIE_RANGES
 from slatprep.pipeline.decoys import measured_errors, told_of
-from slatprep.records import MATERIAL_COLOURS, UNANNOTATED_COLOUR, Contents, Status
+from slatprep.records import MATERIAL_COLOURS, UNANNOTATED_COLOUR, Status
 from slatprep.store.reader import Store
 
 # Matplotlib's viridis (CC0) at even steps: its lightness rises with the value, so that
@@ -54,7 +54,7 @@ def page_content(
     both ascend. `agreement` has mean votes and mean spreads of merged labels by row. Columns of the
     table are lists over assets, those of the store first; ``all`` counts also assets outside it.
     """
-    build = store.about.build
+    build, labels = store.about.build, store.contents.labels
     states = Counter(map(str, store.column("verdict")))
     for status, count in (outcomes.absent if outcomes else Counter[Status]()).items():
         states[_ABSENT[status]] += count
@@ -80,7 +80,8 @@ def page_content(
         },
         "classes": [
             {"name": name, "colour": MATERIAL_COLOURS[index]}
-            for index, name in enumerate(_names_of(store.contents))
+            # Unused numbers have an empty name.
+            for index, name in enumerate([*labels, *[""] * (store.contents.n_labels - len(labels))])
         ],
         "scales": {
             "none": UNANNOTATED_COLOUR,
@@ -124,17 +125,12 @@ def _errors(store: Store) -> dict[str, Any]:
     }
 
 
-def _names_of(contents: Contents) -> tuple[str, ...]:
-    """Return the name of each class that a voxel may have, empty for unused numbers."""
-    return (*contents.labels, *[""] * (contents.n_labels - len(contents.labels)))
-
-
 def _properties(
     store: Store, outcomes: Outcomes | None, tallies: Mapping[str, Tally]
 ) -> list[dict[str, Any]]:
     """Return the histograms of each property by class, and its ranges."""
     normalization, published = store.normalization, {one.name: one for one in PIXIE_RANGES.ranges}
-    total = sum(tallies.values(), start=no_tally(store.contents, BINS))
+    total = sum(tallies.values(), start=no_tally(normalization, BINS, contents=store.contents))
     clipped = outcomes.clipped if outcomes else [0] * len(normalization.ranges)
     return [
         {

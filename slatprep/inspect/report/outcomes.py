@@ -14,7 +14,7 @@ from slatprep.errors import StoreError
 from slatprep.records import Place, Status
 from slatprep.store.manifests import build_in
 from slatprep.store.reader import Store
-from slatprep.store.record import AssetRecord, FailedRecord
+from slatprep.store.record import AssetRecord
 from slatprep.store.records import StoredRecords
 
 MOST_TIES = 8
@@ -88,7 +88,10 @@ def gather_outcomes(
             f"{manifests} holds the records of build {build.id[:12]!r}, the store was written by "
             f"{store.about.manifest[:12]!r}; name the folder of its own records with --manifests"
         )
-    known = {record.asset_id: _failed(record) for record in build.failed[:most_absent]}
+    known = {
+        one.asset_id: Outcome(one.asset_id, one.category, one.status, (one.reason,), 0, None)
+        for one in build.failed[:most_absent]
+    }
     for record in StoredRecords(store):
         if record.asset_id in listed:
             known[record.asset_id] = _outcome(record)
@@ -127,11 +130,6 @@ def kinds_of(reasons: Iterable[str]) -> dict[str, str]:
 
 def _fault_of(reason: str) -> str:
     return re.sub(r"^\S*[/\\.]\S*: ", "", reason.partition("; expected")[0])
-
-
-def _failed(record: FailedRecord) -> Outcome:
-    reasons = (record.reason,)
-    return Outcome(record.asset_id, record.category, record.status, reasons, 0, None)
 
 
 def _outcome(record: AssetRecord) -> Outcome:

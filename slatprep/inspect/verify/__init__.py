@@ -7,7 +7,7 @@ asset's values and record, and finally the source files that the records name.
 from __future__ import annotations
 
 import uuid
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 from slatprep.errors import StoreError
@@ -131,7 +131,10 @@ def verify_store(
         findings.add(Finding("asset", "", str(error), "readable ids and offsets"))
         rows = []
     hashed, total = 0, len(rows)
-    for done, (own, count) in enumerate(_assets(store, roots if sources else None, rows, jobs), 1):
+    run, compared = uuid.uuid4().hex, roots if sources else None
+    starts = range(0, total, ASSETS_IN_TASK)
+    tasks = ((store.path, rows[k : k + ASSETS_IN_TASK], compared, run) for k in starts)
+    for done, (own, count) in enumerate(run_unordered(asset_findings, tasks, jobs), 1):
         findings |= set(own)
         hashed += count
         if progress:
@@ -156,14 +159,3 @@ def _is_file(path: Place) -> bool:
         return path.is_file()
     except OSError:  # An object store that does not answer.
         return False
-
-
-def _assets(
-    store: Store, roots: SourceRoots | None, rows: Sequence[int], jobs: Jobs
-) -> Iterator[tuple[list[Finding], int]]:
-    run = uuid.uuid4().hex
-    tasks = (
-        (store.path, rows[first : first + ASSETS_IN_TASK], roots, run)
-        for first in range(0, len(rows), ASSETS_IN_TASK)
-    )
-    return run_unordered(asset_findings, tasks, jobs)

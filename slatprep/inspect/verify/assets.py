@@ -162,12 +162,9 @@ def lookup_findings(asset: StoredAsset) -> Iterator[Finding]:
         # Not `difference > TOLERANCES[where]`, which is false for NaN.
         wrong = np.count_nonzero(~(difference <= TOLERANCES[where]))
         if wrong:
-            yield Finding(
-                where,
-                asset.asset_id,
-                f"{wrong} of {len(difference)} voxels differ",
-                "what the grid, the places and the parameters give",
-            )
+            what = f"{wrong} of {len(difference)} voxels differ"
+            expected = "what the grid, the places and the parameters give"
+            yield Finding(where, asset.asset_id, what, expected)
 
 
 def fault_findings(where: str, asset_id: str, error: RecordError) -> list[Finding]:
@@ -266,9 +263,8 @@ def roundings(normalization: Normalization) -> NDArray[np.float64]:
     """
     spans = normalization.ranges
     own = [0.5 if span.log10 else max(abs(span.lo), abs(span.hi)) for span in spans]
-    return np.array([0.5 * (span.hi - span.lo) + o for span, o in zip(spans, own, strict=True)]) * (
-        2.0**-24
-    )
+    wide = [0.5 * (span.hi - span.lo) for span in spans]
+    return np.add(wide, own) * 2.0**-24
 
 
 def _is_spread(asset: StoredAsset) -> bool:

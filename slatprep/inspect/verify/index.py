@@ -14,23 +14,15 @@ from slatprep.store.attributes import segments_of
 from slatprep.store.contract import MAX_VOXELS, Finding
 from slatprep.store.reader import Store
 
-SHARES = ("fitness", "fitness_backward", "overlap", "ambiguity", "valid_share")
-"""Columns of shares, 0 to 1."""
-
-PROBABILITIES = ("confidence", "expected_accuracy")
-"""Columns of probabilities, 0 to 1."""
+SHARES = ("fitness", "fitness_backward", "overlap", "ambiguity", "valid_share", "confidence",
+          "expected_accuracy")  # fmt: skip
+"""Columns of shares and probabilities, 0 to 1."""
 
 DISTANCES = ("inlier_rmse", "inlier_rmse_backward", "margin")
 """Columns of numbers of at least 0, or NaN where they are not defined."""
 
 WORDS = {
-    name: tuple(map(str, words))
-    for name, words in (
-        ("engine", Engine),
-        ("model", Model),
-        ("search", Search),
-        ("verdict", Verdict),
-    )
+    words.__name__.lower(): tuple(map(str, words)) for words in (Engine, Model, Search, Verdict)
 }
 """Allowed words by column."""
 
@@ -61,8 +53,6 @@ def index_findings(store: Store) -> Iterator[Finding]:
                 )
     yield from _offset_findings(store)
     for name in SHARES:
-        yield from _outside(store, name, 0.0, 1.0)
-    for name in PROBABILITIES:
         yield from _outside(store, name, 0.0, 1.0)
     for name in DISTANCES:
         yield from _outside(store, name, 0.0, np.inf, nan=True)
@@ -104,14 +94,11 @@ def _transform_findings(store: Store) -> Iterator[Finding]:
         square = abs(determinant) ** (2 / 3)
         kind = "rigid" if model == "rigid" else "similarity"
         unit = abs(determinant - 1) <= _TOLERANCE if model == "rigid" else True
-        if determinant <= 0 or not unit or not _is_multiple_of_unit(linear.T @ linear, square):
+        rest = np.abs(linear.T @ linear - square * np.eye(3)).max() if similar else np.inf
+        if determinant <= 0 or not unit or rest > _TOLERANCE * max(square, 1.0):
             yield Finding(
                 "asset/transform",
                 asset_id,
                 f"{transform.tolist()} is no {kind} transform",
                 "a rotation (scaled by one factor unless rigid) and a shift, finite",
             )
-
-
-def _is_multiple_of_unit(matrix: np.ndarray, factor: float) -> bool:
-    return bool(np.abs(matrix - factor * np.eye(3)).max() <= _TOLERANCE * max(factor, 1.0))
