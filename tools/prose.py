@@ -53,10 +53,16 @@ def messages() -> Iterator[tuple[str, str]]:
         place = path.relative_to(ROOT).as_posix()
         tree = ast.parse(path.read_text("utf-8"))
         for node in ast.walk(tree):
-            if isinstance(node, ast.FunctionDef) and place.startswith("slatprep/cli/"):
-                # The sections behind it, such as the example, are no sentences.
-                text = re.split(r"\n\w[\w ]*\n-+\n", ast.get_docstring(node) or "")[0]
+            if isinstance(node, ast.FunctionDef | ast.ClassDef) and place.startswith(
+                "slatprep/cli/"
+            ):
+                # Of the sections behind it, examples and the names of options are no sentences.
+                text, *sections = re.split(r"\n(\w[\w ]*)\n-+\n", ast.get_docstring(node) or "")
+                helps = dict(zip(sections[::2], sections[1::2], strict=True))
+                entries = helps.get("Parameters", helps.get("Attributes", ""))
                 yield f"{place}:{node.lineno}", text
+                for entry in re.split(r"^\w.*$|(?=\[default)", entries, flags=re.M):
+                    yield f"{place}:{node.lineno}", entry
             if isinstance(node, ast.JoinedStr):
                 parts = [p.value if isinstance(p, ast.Constant) else "X" for p in node.values]
                 yield f"{place}:{node.lineno}", "".join(map(str, parts))

@@ -39,34 +39,19 @@ def build_store(
     sources: SourceOptions,
     out: NewStore,
     manifests: RecordsFolder | None = None,
-    strict: Annotated[bool, "Stop at the first asset that cannot be built."] = False,
-    consensus: Annotated[bool, "Settle ties by the rotation that most assets share."] = False,
-    witness: Annotated[
-        bool, "Settle ties by comparing latents, and name assets whose labels they contradict."
-    ] = False,
-    fresh: Annotated[bool, "Reuse nothing from an earlier build."] = False,
+    strict: bool = False,
+    consensus: bool = False,
+    witness: bool = False,
+    fresh: bool = False,
     rehash: Annotated[
         float,
         click.FloatRange(0, 1),
-        "Share of the sources whose files look unchanged to hash, drawn at random; without a "
-        "number, all.",
-        Click(is_flag=False, flag_value="1", metavar="[SHARE]", show_default=True),
+        Click(is_flag=False, flag_value="1", show_default=True),
     ] = 0.01,
-    compact: Annotated[
-        bool, "Order rows by id, as a first build does; an update appends new assets."
-    ] = False,
-    keep_work: Annotated[
-        bool,
-        "Keep all assets' arrays beside the store, about 1 MB each, so that an update that packs "
-        "all assets again does not read their sources.",
-    ] = False,
-    decoys: Annotated[
-        Seed,
-        "Measure errors on at most N decoys: grids aligned with SLATs of other objects, one for "
-        "every 20 assets that are aligned. 0: none.",
-        Click(metavar="N"),
-    ] = 200,
-    dry_run: Annotated[bool, "Print what would be done, and why; write nothing."] = False,
+    compact: bool = False,
+    keep_work: bool = False,
+    decoys: Seed = 200,
+    dry_run: bool = False,
     workers: WorkersOptions,
 ) -> None:
     """Build one store of aligned, normalised supervision, or bring it up to date.
@@ -78,6 +63,30 @@ def build_store(
 
     Assets whose sources, parameters and code did not change are not aligned
     again: their rows are reused. An interrupted build is resumed.
+
+    Parameters
+    ----------
+    strict
+        Stop at the first asset that cannot be built.
+    consensus
+        Settle ties by the rotation that most assets share.
+    witness
+        Settle ties by comparing latents, and name assets whose labels they contradict.
+    fresh
+        Reuse nothing from an earlier build.
+    rehash : [SHARE]
+        Share of the sources whose files look unchanged to hash, drawn at random; without a number,
+        all.
+    compact
+        Order rows by id, as a first build does; an update appends new assets.
+    keep_work
+        Keep all assets' arrays beside the store, about 1 MB each, so that an update that packs all
+        assets again does not read their sources.
+    decoys : N
+        Measure errors on at most N decoys: grids aligned with SLATs of other objects, one for every
+        20 assets that are aligned. 0: none.
+    dry_run
+        Print what would be done, and why; write nothing.
 
     Example
     -------
@@ -121,14 +130,21 @@ def align(
     output: Output,
     *,
     sources: SourceOptions,
-    out: Annotated[NewFile, "The file, with a record on each line.", Click(metavar="FILE.jsonl")],
-    strict: Annotated[bool, "Stop at the first asset that cannot be aligned."] = False,
+    out: NewFile,
+    strict: bool = False,
     workers: WorkersOptions,
 ) -> None:
     """Align without building a store.
 
     Writes a JSON record for each asset: the transform, its quality, and the
     score of every candidate.
+
+    Parameters
+    ----------
+    out : FILE.jsonl
+        The file, with a record on each line.
+    strict
+        Stop at the first asset that cannot be aligned.
 
     Example
     -------

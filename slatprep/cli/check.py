@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 from itertools import zip_longest
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -20,7 +20,7 @@ from slatprep.cli.options import (
     chosen_store,
 )
 from slatprep.cli.output import Output, say
-from slatprep.cli.signature import Click, command
+from slatprep.cli.signature import command
 
 if TYPE_CHECKING:
     from slatprep.inspect.check import AlignmentCheck
@@ -43,22 +43,12 @@ def check_alignment(
     output: Output,
     store: FolderOrUrl | None = None,
     *,
-    asset_ids: Annotated[AssetIds, "An asset; may be repeated."] = (),
-    worst: Annotated[
-        Positive | None,
-        "The N worst assets: failed ones first, then doubtful ones, each by confidence.",
-    ] = None,
-    ambiguous: Annotated[
-        bool, "Assets whose ties would change the class of more than 5 % of the voxels."
-    ] = False,
+    asset_ids: AssetIds = (),
+    worst: Positive | None = None,
+    ambiguous: bool = False,
     named: StoreOption | None = None,
-    picture: Annotated[
-        NewFileOrFolder | None,
-        "A .png, .svg or .pdf for one asset, else a folder. [default: NAME.pictures beside the "
-        "store]",
-        Click(metavar="PATH|none"),
-    ] = None,
-    show: Annotated[bool, "Open it in Open3D's viewer, if there is a screen."] = False,
+    picture: NewFileOrFolder | None = None,
+    show: bool = False,
     jobs: Jobs = 1,
 ) -> None:
     """Check whether the alignment of an asset of STORE is good, and draw it.
@@ -69,6 +59,19 @@ def check_alignment(
     --asset, --worst and --ambiguous may be combined. The exit code is 1 unless
     all are good and the store agrees with itself. Without STORE, the one that
     `make align` built last under data/ is taken.
+
+    Parameters
+    ----------
+    asset_ids
+        An asset; may be repeated.
+    worst
+        The N worst assets: failed ones first, then doubtful ones, each by confidence.
+    ambiguous
+        Assets whose ties would change the class of more than 5 % of the voxels.
+    picture : PATH|none
+        A .png, .svg or .pdf for one asset, else a folder. [default: NAME.pictures beside the store]
+    show
+        Open it in Open3D's viewer, if there is a screen.
 
     Example
     -------

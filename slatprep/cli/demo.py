@@ -14,59 +14,54 @@ from slatprep.cli.signature import Click, command
 
 @dataclass(frozen=True, kw_only=True)
 class DemoOptions:
-    """What `slatprep.demo.make_demo` makes."""
+    """What `slatprep.demo.make_demo` makes.
 
-    assets: Annotated[Positive, "Number of objects; fourteen have every category once."] = 25
-    seed: Annotated[Seed, "The same seed gives the same bytes."] = 0
-    levels: Annotated[
-        tuple[int, ...],
-        click.IntRange(0, 7),
-        "Difficulty, 0 (quarter turns) to 4 (warped), 5 (a generated shape), 6 (a NeRF's field), "
-        "7 (both); may be repeated: assets take the levels in turn. [default: 0 to 4, or 0 where "
-        "both sides share a frame]",
-        Click("--level"),
-    ] = ()
-    views: Annotated[Positive, "SLATs per object."] = 1
-    habitual_share: Annotated[
-        float, FiniteRange(0, 1), "Share of the objects that have one quarter turn in common."
-    ] = 0.0
-    latents: Annotated[
-        Any,
-        ChoiceOf("slatprep.demo.latents:LatentKind"),
-        "Noise with TRELLIS's statistics (placeholder), or latents that depend on the material.",
-    ] = "placeholder"
-    source: Annotated[
-        Any,
-        ChoiceOf("slatprep.demo.sources:Source"),
-        "PixieVerse's grids, predictions of 11 or 4 channels, VoMP's or PhysXNet's voxels, or "
-        "plain voxels with ten properties (in HDF5 without classes).",
-    ] = "pixieverse"
-    encoder: Annotated[
-        Any,
-        ChoiceOf("slatprep.demo.latents:Encoder"),
-        "Latents of TRELLIS, SAM 3D Objects, TRELLIS.2 (-512: on a grid of 32^3), or others with "
-        "16 channels (-128: on a grid of 128^3).",
-    ] = "trellis"
-    slat_form: Annotated[
-        Any,
-        ChoiceOf("slatprep.demo.write:SlatForm"),
-        "Files of (N,3) or (N,4) coordinates, HDF5, or one HDF5 for all.",
-    ] = "npz"
-    slat_names: Annotated[
-        Any,
-        ChoiceOf("slatprep.demo.write:SlatNames"),
-        "Name SLATs by object, or by sha256 with a metadata.csv.",
-    ] = "id"
-    results: Annotated[
-        bool,
-        "Also write results/: grids as predicted by a method with errors, 12 MB each, for "
-        "`slatprep evaluate --grids`.",
-    ] = False
-    samples: Annotated[
-        Positive,
-        "Annotations of each object; several have errors, part by part, and dataset.toml asks for "
-        "a merge.",
-    ] = 1
+    Attributes
+    ----------
+    assets
+        Number of objects; fourteen have every category once.
+    seed
+        The same seed gives the same bytes.
+    levels
+        Difficulty, 0 (quarter turns) to 4 (warped), 5 (a generated shape), 6 (a NeRF's field), 7
+        (both); may be repeated: assets take the levels in turn. [default: 0 to 4, or 0 where both
+        sides share a frame]
+    views
+        SLATs per object.
+    habitual_share
+        Share of the objects that have one quarter turn in common.
+    latents
+        Noise with TRELLIS's statistics (placeholder), or latents that depend on the material.
+    source
+        PixieVerse's grids, predictions of 11 or 4 channels, VoMP's or PhysXNet's voxels, or plain
+        voxels with ten properties (in HDF5 without classes).
+    encoder
+        Latents of TRELLIS, SAM 3D Objects, TRELLIS.2 (-512: on a grid of 32^3), or others with 16
+        channels (-128: on a grid of 128^3).
+    slat_form
+        Files of (N,3) or (N,4) coordinates, HDF5, or one HDF5 for all.
+    slat_names
+        Name SLATs by object, or by sha256 with a metadata.csv.
+    results
+        Also write results/: grids as predicted by a method with errors, 12 MB each, for `slatprep
+        evaluate --grids`.
+    samples
+        Annotations of each object; several have errors, part by part, and dataset.toml asks for a
+        merge.
+    """
+
+    assets: Positive = 25
+    seed: Seed = 0
+    levels: Annotated[tuple[int, ...], click.IntRange(0, 7), Click("--level")] = ()
+    views: Positive = 1
+    habitual_share: Annotated[float, FiniteRange(0, 1)] = 0.0
+    latents: Annotated[Any, ChoiceOf("slatprep.demo.latents:LatentKind")] = "placeholder"
+    source: Annotated[Any, ChoiceOf("slatprep.demo.sources:Source")] = "pixieverse"
+    encoder: Annotated[Any, ChoiceOf("slatprep.demo.latents:Encoder")] = "trellis"
+    slat_form: Annotated[Any, ChoiceOf("slatprep.demo.write:SlatForm")] = "npz"
+    slat_names: Annotated[Any, ChoiceOf("slatprep.demo.write:SlatNames")] = "id"
+    results: bool = False
+    samples: Positive = 1
 
 
 @command("make-demo")

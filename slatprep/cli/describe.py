@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
-from typing import Annotated
 
 from slatprep.cli.options import FolderOrUrl, NewFile, StatedOptions
 from slatprep.cli.output import Output, say
-from slatprep.cli.signature import Click, command
+from slatprep.cli.signature import command
 from slatprep.storage.place import storage_of
 
 _ASKED_FOR = ("license", "cite_as", "date_published")
@@ -20,14 +19,8 @@ def describe(
     output: Output,
     store: FolderOrUrl,
     *,
-    out: Annotated[
-        NewFile | None, "The file. [default: standard output]", Click(metavar="FILE.json")
-    ] = None,
-    location: Annotated[
-        str,
-        "Where its readers will find the store. [default: its path, as seen from the description]",
-        Click(metavar="URL"),
-    ] = "",
+    out: NewFile | None = None,
+    location: str = "",
     stated: StatedOptions,
 ) -> None:
     """Describe STORE in Croissant, MLCommons' vocabulary for datasets.
@@ -35,6 +28,13 @@ def describe(
     The description is JSON-LD: the files of every array, their shapes and
     meaning, the classes, the ranges of the properties, and the table of
     assets. Catalogues of datasets and the mlcroissant package read it.
+
+    Parameters
+    ----------
+    out : FILE.json
+        The file. [default: standard output]
+    location : URL
+        Where its readers will find the store. [default: its path, as seen from the description]
 
     Example
     -------

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING
 
 from slatprep.cli.options import FolderOrUrl, Jobs, Positive
 from slatprep.cli.output import Cell, Output, say
-from slatprep.cli.signature import Click, command
+from slatprep.cli.signature import command
 
 if TYPE_CHECKING:
     from slatprep.inspect.difference import AssetChange, StoreDifference
@@ -21,23 +21,19 @@ _VALUE = 20
 
 @command()
 def diff(
-    output: Output,
-    a: FolderOrUrl,
-    b: FolderOrUrl,
-    *,
-    worst: Annotated[
-        Positive | None,
-        "Number of changed assets to list, those with most changed labels first. [default: 20; "
-        "with --json all]",
-        Click(metavar="N"),
-    ] = None,
-    jobs: Jobs = 1,
+    output: Output, a: FolderOrUrl, b: FolderOrUrl, *, worst: Positive | None = None, jobs: Jobs = 1
 ) -> None:
     """Show what changed from store A to store B, in total and by asset.
 
     Lists assets in only one of the stores; changed sources, verdicts, placements, labels,
     properties in SI units and latents of assets in both; and different ranges, parameters
     and versions. The exit code is 1 where the stores differ.
+
+    Parameters
+    ----------
+    worst : N
+        Number of changed assets to list, those with most changed labels first. [default: 20; with
+        --json all]
 
     Example
     -------

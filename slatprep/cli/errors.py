@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from functools import partial
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING
 
 from slatprep.cli.options import DrawnFile, Jobs, LastStore, Positive, draw_to
 from slatprep.cli.output import Output
-from slatprep.cli.signature import Click, command
+from slatprep.cli.signature import command
 
 if TYPE_CHECKING:
     from slatprep.pipeline.decoys import MeasuredErrors
@@ -18,13 +18,9 @@ def measure_errors(
     output: Output,
     store: LastStore,
     *,
-    decoys: Annotated[
-        Positive, "Align at most N grids with other SLATs.", Click(metavar="N")
-    ] = 200,
-    seed: Annotated[int, "Seed of the draw of decoys."] = 0,
-    picture: Annotated[
-        DrawnFile | None, "Also draw alignments and decoys as two histograms."
-    ] = None,
+    decoys: Positive = 200,
+    seed: int = 0,
+    picture: DrawnFile | None = None,
     jobs: Jobs = 1,
 ) -> None:
     """Measure on decoys how many alignments of STORE show another object.
@@ -33,6 +29,15 @@ def measure_errors(
     Decoys show how wrong pairs of this dataset score. No asset of the store is
     aligned again, and no verdict is changed. What decoys gave is kept in decoys.json beside
     the store, and taken over after an update. A build does the same with fewer decoys.
+
+    Parameters
+    ----------
+    decoys : N
+        Align at most N grids with other SLATs.
+    seed
+        Seed of the draw of decoys.
+    picture
+        Also draw alignments and decoys as two histograms.
 
     Example
     -------

@@ -35,33 +35,14 @@ def evaluate(
     output: Output,
     predictions: FileOrFolder | None = None,
     *,
-    store: Annotated[FolderOrUrl, "The store with the labels.", Click(metavar="STORE.zarr")],
-    grids: Annotated[
-        tuple[str, ...],
-        "Grids predicted by Pixie or another method: DIR/ID/sample_0_pred.npy, of 11 or 4 "
-        "channels; may be repeated. They are measured on their own voxels and looked up at the "
-        "SLAT's, on the same objects as PREDICTIONS, which may be left out.",
-        Click(metavar="[NAME=]DIR"),
-    ] = (),
-    split: Annotated[
-        Any, ChoiceOf("slatprep.readers.splits:SPLITS", "all"), "Only objects of this split."
-    ] = "test",
+    store: FolderOrUrl,
+    grids: tuple[str, ...] = (),
+    split: Annotated[Any, ChoiceOf("slatprep.readers.splits:SPLITS", "all")] = "test",
     splits: SplitOptions,
-    spread: Annotated[
-        Any,
-        ChoiceOf("slatprep.learn.metrics:SPREADS"),
-        "Standard error or standard deviation over objects, or what Pixie prints.",
-    ] = "se",
-    csv_file: Annotated[
-        NewFile | None, "Also write the table to this file.", Click("--csv")
-    ] = None,
-    picture: Annotated[NewFile | None, "With --grids, also draw the table as a PNG."] = None,
-    beside: Annotated[
-        tuple[str, ...],
-        "Also print the published scores of Pixie (with NeRF2Physics) or of SLAT-Phys, or a CSV "
-        "with names in the first column and columns named as here; may be repeated.",
-        Click(metavar="pixie|slat-phys|FILE.csv"),
-    ] = (),
+    spread: Annotated[Any, ChoiceOf("slatprep.learn.metrics:SPREADS")] = "se",
+    csv_file: Annotated[NewFile | None, Click("--csv")] = None,
+    picture: NewFile | None = None,
+    beside: tuple[str, ...] = (),
 ) -> None:
     """Measure PREDICTIONS by Pixie's protocol.
 
@@ -72,6 +53,26 @@ def evaluate(
     over valid voxels, then over objects. The exit code is 1 if an asset of
     the split has no prediction. Beside the run.json of a training, the split
     is that of the run, unless --split-by or --shares is given.
+
+    Parameters
+    ----------
+    store : STORE.zarr
+        The store with the labels.
+    grids : [NAME=]DIR
+        Grids predicted by Pixie or another method: DIR/ID/sample_0_pred.npy, of 11 or 4 channels;
+        may be repeated. They are measured on their own voxels and looked up at the SLAT's, on the
+        same objects as PREDICTIONS, which may be left out.
+    split
+        Only objects of this split.
+    spread
+        Standard error or standard deviation over objects, or what Pixie prints.
+    csv_file
+        Also write the table to this file.
+    picture
+        With --grids, also draw the table as a PNG.
+    beside : pixie|slat-phys|FILE.csv
+        Also print the published scores of Pixie (with NeRF2Physics) or of SLAT-Phys, or a CSV with
+        names in the first column and columns named as here; may be repeated.
 
     Example
     -------

@@ -39,33 +39,32 @@ _ONLY_FOR = {
 
 @dataclass(frozen=True, kw_only=True)
 class FormatOptions:
-    """Options of some formats; None where the format's own default counts."""
+    """Options of some formats; None where the format's own default counts.
 
-    points: Annotated[
-        Any | None,
-        ChoiceOf("slatprep.export.formats:Points"),
-        "ply, voxel_data, usd: SLAT voxels, or the voxels of the PixieVerse field. [default: grid "
-        "for usd, else slat]",
-    ] = None
-    frame: Annotated[
-        Any | None,
-        ChoiceOf("slatprep.export.formats:Frame"),
-        "ply: the SLAT's unit cube, or PixieVerse's world coordinates. [default: slat]",
-    ] = None
-    shard_size: Annotated[Positive | None, "webdataset: assets a shard. [default: 256]"] = None
-    latent_model: Annotated[
-        str | None,
-        "npz: the encoder's name, latent_model in TRELLIS's configurations. [default: that of "
-        "TRELLIS's published configurations]",
-        Click(metavar="NAME"),
-    ] = None
-    size: Annotated[
-        Above0 | None, "usd: width of the unit cube. [default: 1]", Click(metavar="METRES")
-    ] = None
-    materials: Annotated[
-        Positive | None,
-        "usd: the most materials that E and nu of an asset are binned into. [default: 64]",
-    ] = None
+    Attributes
+    ----------
+    points
+        ply, voxel_data, usd: SLAT voxels, or the voxels of the PixieVerse field. [default: grid for
+        usd, else slat]
+    frame
+        ply: the SLAT's unit cube, or PixieVerse's world coordinates. [default: slat]
+    shard_size
+        webdataset: assets a shard. [default: 256]
+    latent_model : NAME
+        npz: the encoder's name, latent_model in TRELLIS's configurations. [default: that of
+        TRELLIS's published configurations]
+    size : METRES
+        usd: width of the unit cube. [default: 1]
+    materials
+        usd: the most materials that E and nu of an asset are binned into. [default: 64]
+    """
+
+    points: Annotated[Any | None, ChoiceOf("slatprep.export.formats:Points")] = None
+    frame: Annotated[Any | None, ChoiceOf("slatprep.export.formats:Frame")] = None
+    shard_size: Positive | None = None
+    latent_model: str | None = None
+    size: Above0 | None = None
+    materials: Positive | None = None
 
     def of(self, kind: str) -> dict[str, Any]:
         """Return those that were given; refuse one of another format."""
@@ -83,27 +82,11 @@ def export(
     output: Output,
     store: FolderOrUrl,
     *,
-    kind: Annotated[
-        Any,
-        ChoiceOf("slatprep.export:FORMATS"),
-        "ply: point clouds with Pixie's fields. hdf5: one file. webdataset: tar shards. npz: the "
-        "files of TRELLIS's dataset with the targets added. voxel_data: the npz of VoMP's scripts. "
-        "usd: for Newton and Isaac Lab.",
-        Click("--format"),
-    ],
-    out: Annotated[
-        NewFileOrFolder,
-        "The file (hdf5) or folder (all others); an existing export is replaced when the new one "
-        "is complete.",
-        Click(metavar="PATH"),
-    ],
-    assets: Annotated[AssetIds, "An asset; may be repeated. [default: all]"] = (),
+    kind: Annotated[Any, ChoiceOf("slatprep.export:FORMATS"), Click("--format")],
+    out: NewFileOrFolder,
+    assets: AssetIds = (),
     verdicts: UsableVerdicts = None,
-    split: Annotated[
-        Any,
-        ChoiceOf("slatprep.readers.splits:SPLITS", "all"),
-        "Only objects of this split, as `slatprep train` splits them.",
-    ] = "all",
+    split: Annotated[Any, ChoiceOf("slatprep.readers.splits:SPLITS", "all")] = "all",
     splits: SplitOptions,
     format_options: FormatOptions,
     jobs: Jobs = 1,
@@ -112,6 +95,19 @@ def export(
 
     Properties are in SI units in PLY, voxel_data and USD, normalised in WebDataset
     and npz, and both in HDF5. Every folder gets an index.json of its contents.
+
+    Parameters
+    ----------
+    kind
+        ply: point clouds with Pixie's fields. hdf5: one file. webdataset: tar shards. npz:
+        TRELLIS's files and the targets. voxel_data: VoMP's npz. usd: for Newton and Isaac Lab.
+    out : PATH
+        The file (hdf5) or folder (all others); an existing export is replaced when the new one is
+        complete.
+    assets
+        An asset; may be repeated. [default: all]
+    split
+        Only objects of this split, as `slatprep train` splits them.
 
     Example
     -------

@@ -20,15 +20,21 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, kw_only=True)
 class ModelOptions:
-    """TRELLIS's model, and where it runs."""
+    """TRELLIS's model, and where it runs.
 
-    model: Annotated[str, "Repository of the model, or its folder."] = (
-        "microsoft/TRELLIS-image-large"
-    )
-    revision: Annotated[
-        str | None, "Revision of the model. [default: newest]", Click(metavar="COMMIT")
-    ] = None
-    device: Annotated[str | None, "Where to run it. [default: the GPU if there is one]"] = None
+    Attributes
+    ----------
+    model
+        Repository of the model, or its folder.
+    revision : COMMIT
+        Revision of the model. [default: newest]
+    device
+        Where to run it. [default: the GPU if there is one]
+    """
+
+    model: str = "microsoft/TRELLIS-image-large"
+    revision: str | None = None
+    device: str | None = None
 
     def load(self, output: Output) -> Session:
         """Load the model, and say on which device if none was asked for."""
@@ -45,18 +51,11 @@ def extract_slat(
     output: Output,
     images: tuple[File, ...],
     *,
-    out: Annotated[NewFolder, "Folder of the latents, which build-store takes as --slat."],
-    seeds: Annotated[
-        tuple[int, ...],
-        click.IntRange(min=0),
-        "Seed of the sampling; may be repeated, each seed gives a view.",
-        Click("--seed"),
-    ] = (42,),
-    by_folder: Annotated[bool, "Images are named <id>/<view>, not <id>."] = False,
+    out: NewFolder,
+    seeds: Annotated[tuple[int, ...], click.IntRange(min=0), Click("--seed")] = (42,),
+    by_folder: bool = False,
     model: ModelOptions,
-    no_preprocess: Annotated[
-        bool, "The background is removed already, and the images are cropped."
-    ] = False,
+    no_preprocess: bool = False,
 ) -> None:
     """Turn IMAGES into structured latents with TRELLIS's image pipeline.
 
@@ -64,6 +63,17 @@ def extract_slat(
     views, in the form that build-store reads, and a JSON beside it with
     image, seed, model and revision. Existing files are kept, so that a stopped
     run can be continued. TRELLIS itself must be installed.
+
+    Parameters
+    ----------
+    out
+        Folder of the latents, which build-store takes as --slat.
+    seeds
+        Seed of the sampling; may be repeated, each seed gives a view.
+    by_folder
+        Images are named <id>/<view>, not <id>.
+    no_preprocess
+        The background is removed already, and the images are cropped.
 
     Example
     -------
@@ -99,8 +109,8 @@ def decode_slat(
     output: Output,
     source: FileOrUrl,
     *,
-    out: Annotated[NewFolder, "Folder of the Gaussians; files of other assets are kept."],
-    assets: Annotated[AssetIds, "Decode only this asset; may be repeated."] = (),
+    out: NewFolder,
+    assets: AssetIds = (),
     standardised: Standardised = "auto",
     model: ModelOptions,
 ) -> None:
@@ -109,6 +119,13 @@ def decode_slat(
     SOURCE is a SLAT (npz or HDF5), a folder of them, or a store. Each asset
     gives <id>.ply, as TRELLIS saves Gaussians, to which `slatprep transfer`
     gives materials. TRELLIS itself must be installed.
+
+    Parameters
+    ----------
+    out
+        Folder of the Gaussians; files of other assets are kept.
+    assets
+        Decode only this asset; may be repeated.
 
     Example
     -------

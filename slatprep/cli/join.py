@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Annotated
-
 import click
 
 from slatprep.cli.build import report
@@ -18,7 +16,7 @@ def subset(
     store: FolderOrUrl,
     *,
     out: NewStore,
-    assets: Annotated[AssetIds, "An asset; may be repeated."] = (),
+    assets: AssetIds = (),
     chosen: ChosenOptions,
     manifests: RecordsFolder | None = None,
     jobs: Jobs = 1,
@@ -27,6 +25,11 @@ def subset(
 
     Rows, records and ranges are copied unchanged. Assets must have one of the verdicts and
     one of the categories; assets named by --asset are taken as well.
+
+    Parameters
+    ----------
+    assets
+        An asset; may be repeated.
 
     Example
     -------

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Annotated
-
 from slatprep.cli.info import show_errors
 from slatprep.cli.options import ChosenOptions, LastStore
 from slatprep.cli.output import Output, say
@@ -16,13 +14,20 @@ def list_assets(
     store: LastStore,
     *,
     chosen: ChosenOptions,
-    max_confidence: Annotated[float | None, "Only assets with at most this confidence."] = None,
-    ids: Annotated[bool, "Print only the full ids, one on each line."] = False,
+    max_confidence: float | None = None,
+    ids: bool = False,
 ) -> None:
     """List the assets of STORE, with the reasons of their verdicts.
 
     On a terminal ids are shortened to prefixes that no other id has; all commands accept
     such prefixes. Without STORE, the one that `make align` built last under data/ is taken.
+
+    Parameters
+    ----------
+    max_confidence
+        Only assets with at most this confidence.
+    ids
+        Print only the full ids, one on each line.
 
     Example
     -------

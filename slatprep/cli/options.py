@@ -198,17 +198,20 @@ UsableVerdicts = Annotated[
 
 @dataclass(frozen=True, kw_only=True)
 class ChosenOptions:
-    """Which assets of a store are wanted."""
+    """Which assets of a store are wanted.
+
+    Attributes
+    ----------
+    verdicts
+        Only assets with this verdict; may be repeated.
+    categories
+        Only assets of this category; may be repeated.
+    """
 
     verdicts: Annotated[
-        tuple[str, ...],
-        ChoiceOf("slatprep.records:Verdict"),
-        "Only assets with this verdict; may be repeated.",
-        Click("--verdict"),
+        tuple[str, ...], ChoiceOf("slatprep.records:Verdict"), Click("--verdict")
     ] = ()
-    categories: Annotated[
-        tuple[str, ...], "Only assets of this category; may be repeated.", Click("--category")
-    ] = ()
+    categories: Annotated[tuple[str, ...], Click("--category")] = ()
 
     def of(self, store: Store) -> tuple[tuple[str, ...], tuple[str, ...]]:
         """Return both; refuse a category that no asset has, and suggest a similar one."""
@@ -250,14 +253,16 @@ Jobs = Annotated[
 
 @dataclass(frozen=True, kw_only=True)
 class WorkersOptions:
-    """Where a command computes: in processes of this machine, or on a cluster."""
+    """Where a command computes: in processes of this machine, or on a cluster.
+
+    Attributes
+    ----------
+    scheduler : ADDRESS
+        Compute on the Dask cluster of this scheduler, as tcp://host:8786, instead of here.
+    """
 
     jobs: Jobs = 1
-    scheduler: Annotated[
-        str | None,
-        "Compute on the Dask cluster of this scheduler, as tcp://host:8786, instead of here.",
-        Click(metavar="ADDRESS"),
-    ] = None
+    scheduler: str | None = None
 
     def __post_init__(self) -> None:
         given = click.get_current_context().get_parameter_source("jobs")
@@ -281,21 +286,21 @@ class WorkersOptions:
 
 @dataclass(frozen=True, kw_only=True)
 class SplitOptions:
-    """How objects are split."""
+    """How objects are split.
 
-    split_by: Annotated[
-        str | None,
-        "How objects are split: by a hash of their ids; by Pixie's rule; one category for testing; "
-        "or by a file of ids: a list for testing, or a JSON object with the lists train, val and "
-        "test. [default: hash]",
-        Click(metavar="hash|pixie|category:NAME|FILE"),
-    ] = None
-    shares: Annotated[
-        str | None,
-        "Shares of the split by hash, which also divides objects that another rule does not test "
-        "on into train and val. [default: 0.8,0.1,0.1]",
-        Click(metavar="TRAIN,VAL,TEST"),
-    ] = None
+    Attributes
+    ----------
+    split_by : hash|pixie|category:NAME|FILE
+        How objects are split: by a hash of their ids, by Pixie's rule, one category for testing, or
+        by a file of ids. A file has a list for testing, or a JSON object with the lists train, val
+        and test. [default: hash]
+    shares : TRAIN,VAL,TEST
+        Shares of the split by hash, which also divides objects that another rule does not test on
+        into train and val. [default: 0.8,0.1,0.1]
+    """
+
+    split_by: str | None = None
+    shares: str | None = None
 
     @property
     def given(self) -> bool:
@@ -315,58 +320,69 @@ class SplitOptions:
 
 @dataclass(frozen=True, kw_only=True)
 class StatedOptions:
-    """What a store cannot know of itself as a dataset."""
+    """What a store cannot know of itself as a dataset.
 
-    name: Annotated[str, "Name of the dataset. [default: the store's]"] = ""
-    license: Annotated[str, "Its licence, such as CC-BY-4.0.", Click(metavar="SPDX|URL")] = ""
-    url: Annotated[str, "Its home page."] = ""
-    cite_as: Annotated[str, "How to cite it.", Click(metavar="TEXT")] = ""
-    version: Annotated[
-        str, "Its version.", Click("--dataset-version", metavar="X.Y.Z", show_default=True)
-    ] = "1.0.0"
-    date_published: Annotated[str, "When it was published.", Click(metavar="YYYY-MM-DD")] = ""
+    Attributes
+    ----------
+    name
+        Name of the dataset. [default: the store's]
+    license : SPDX|URL
+        Its licence, such as CC-BY-4.0.
+    url
+        Its home page.
+    cite_as : TEXT
+        How to cite it.
+    version : X.Y.Z
+        Its version.
+    date_published : YYYY-MM-DD
+        When it was published.
+    """
+
+    name: str = ""
+    license: str = ""
+    url: str = ""
+    cite_as: str = ""
+    version: Annotated[str, Click("--dataset-version", show_default=True)] = "1.0.0"
+    date_published: str = ""
 
 
 @dataclass(frozen=True, kw_only=True)
 class SourceOptions:
-    """What decides the parameters of a build."""
+    """What decides the parameters of a build.
 
-    config: Annotated[File | None, "Dataset definition (TOML); options override it."] = None
-    pixieverse: Annotated[
-        PathOrUrl | None, "Root of the PixieVerse grids or predictions, a folder or a URL."
-    ] = None
-    slat: Annotated[
-        PathOrUrl | None, "Root of the TRELLIS latents, or one HDF5 file, or a URL."
-    ] = None
-    samples: Annotated[
-        str | None,
-        ChoiceOf("slatprep.parameters:Samples"),
-        "Where an object has several annotations: refuse it, take the first, make an asset of "
-        "each, or merge their labels in one asset. [default: one]",
-    ] = None
-    encoder: Annotated[
-        str | None,
-        "The encoder of the latents. [default: trellis]",
-        Click(metavar="NAME|FILE.json"),
-    ] = None
-    map: Annotated[
-        PathOrUrl | None, "CSV that joins the ids of the two sides, or TRELLIS's metadata.csv."
-    ] = None
-    ranges: Annotated[
-        str | None,
-        "Where the normalisation ranges come from; p1-p99: percentiles. [default: dataset]",
-        Click(metavar="dataset|pLO-pHI|pixie|FILE"),
-    ] = None
-    ranges_of: Annotated[
-        Literal["all", "train"] | None,
-        "Objects that ranges of the dataset are computed from. [default: all]",
-    ] = None
+    Attributes
+    ----------
+    config
+        Dataset definition (TOML); options override it.
+    pixieverse
+        Root of the PixieVerse grids or predictions, a folder or a URL.
+    slat
+        Root of the TRELLIS latents, or one HDF5 file, or a URL.
+    samples
+        Where an object has several annotations: refuse it, take the first, make an asset of each,
+        or merge their labels in one asset. [default: one]
+    encoder : NAME|FILE.json
+        The encoder of the latents. [default: trellis]
+    map
+        CSV that joins the ids of the two sides, or TRELLIS's metadata.csv.
+    ranges : dataset|pLO-pHI|pixie|FILE
+        Where the normalisation ranges come from; p1-p99: percentiles. [default: dataset]
+    ranges_of
+        Objects that ranges of the dataset are computed from. [default: all]
+    preset
+        Named parameters; 'paper' is the protocol of SLAT-Phys, in Pixie's ranges.
+    """
+
+    config: File | None = None
+    pixieverse: PathOrUrl | None = None
+    slat: PathOrUrl | None = None
+    samples: Annotated[str | None, ChoiceOf("slatprep.parameters:Samples")] = None
+    encoder: str | None = None
+    map: PathOrUrl | None = None
+    ranges: str | None = None
+    ranges_of: Literal["all", "train"] | None = None
     splits: SplitOptions
-    preset: Annotated[
-        str | None,
-        ChoiceOf("slatprep.parameters:PRESETS"),
-        "Named parameters; 'paper' is the protocol of SLAT-Phys, in Pixie's ranges.",
-    ] = None
+    preset: Annotated[str | None, ChoiceOf("slatprep.parameters:PRESETS")] = None
 
     def parameters(self, **passes: bool) -> BuildParameters:
         """Return the parameters of a build; `passes` are ``consensus`` and ``witness``."""

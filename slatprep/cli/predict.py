@@ -20,7 +20,7 @@ from slatprep.cli.options import (
     Seed,
 )
 from slatprep.cli.output import Output
-from slatprep.cli.signature import Click, command
+from slatprep.cli.signature import command
 from slatprep.errors import ConfigError, InputError
 
 if TYPE_CHECKING:
@@ -35,30 +35,14 @@ def predict(
     output: Output,
     source: FileOrUrl,
     *,
-    checkpoint: Annotated[
-        FileOrFolder, "best.pt of a run of `slatprep train`, or the folder of the run."
-    ],
-    out: Annotated[NewFolder, "Folder of the predictions; files of other assets are kept."],
-    assets: Annotated[AssetIds, "Predict only this asset; may be repeated."] = (),
-    gaussians: Annotated[
-        NewFile | None,
-        "Also decode an image's latents to Gaussians, and write those with their materials.",
-        Click(metavar="FILE.ply"),
-    ] = None,
-    seed: Annotated[Seed, "Seed of an image's latents."] = 42,
-    far: Annotated[
-        Any,
-        ChoiceOf("slatprep.particles.transfer:Far"),
-        "With --gaussians: give far Gaussians class 7 and properties 0, leave them out, or give "
-        "them the nearest material.",
-    ] = "background",
-    device: Annotated[
-        Literal["cpu", "cuda"] | None,
-        "Where to compute. [default: cpu; for an image the GPU if there is one]",
-    ] = None,
-    batch_voxels: Annotated[
-        Positive, "Number of voxels up to which assets are decoded together."
-    ] = 65536,
+    checkpoint: FileOrFolder,
+    out: NewFolder,
+    assets: AssetIds = (),
+    gaussians: NewFile | None = None,
+    seed: Seed = 42,
+    far: Annotated[Any, ChoiceOf("slatprep.particles.transfer:Far")] = "background",
+    device: Literal["cpu", "cuda"] | None = None,
+    batch_voxels: Positive = 65536,
     standardised: Standardised = "auto",
 ) -> None:
     """Predict material fields of SOURCE with a trained decoder.
@@ -70,6 +54,26 @@ def predict(
     checkpoint's SHA-256 and the seconds of its decoding. `slatprep evaluate`
     and `slatprep transfer --prediction` read these files.
     Needs PyTorch: pip install 'slatprep[train]'.
+
+    Parameters
+    ----------
+    checkpoint
+        best.pt of a run of `slatprep train`, or the folder of the run.
+    out
+        Folder of the predictions; files of other assets are kept.
+    assets
+        Predict only this asset; may be repeated.
+    gaussians : FILE.ply
+        Also decode an image's latents to Gaussians, and write those with their materials.
+    seed
+        Seed of an image's latents.
+    far
+        With --gaussians: give far Gaussians class 7 and properties 0, leave them out, or give them
+        the nearest material.
+    device
+        Where to compute. [default: cpu; for an image the GPU if there is one]
+    batch_voxels
+        Number of voxels up to which assets are decoded together.
 
     Example
     -------

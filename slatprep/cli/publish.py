@@ -8,7 +8,7 @@ import click
 
 from slatprep.cli.options import ChoiceOf, FolderOrUrl, NewFolder, StatedOptions, UsableVerdicts
 from slatprep.cli.output import Output
-from slatprep.cli.signature import Click, command
+from slatprep.cli.signature import command
 
 if TYPE_CHECKING:
     from slatprep.store import Store
@@ -19,19 +19,10 @@ def publish(
     output: Output,
     store: FolderOrUrl,
     *,
-    out: Annotated[
-        NewFolder, "The folder; an earlier result is replaced when the new one is complete."
-    ],
-    data: Annotated[
-        Any,
-        ChoiceOf("slatprep.export.publish:Data"),
-        'The store itself, which `slatprep.open_store("hf://datasets/...")` reads, or shards '
-        "for `datasets.load_dataset`.",
-    ] = "store",
+    out: NewFolder,
+    data: Annotated[Any, ChoiceOf("slatprep.export.publish:Data")] = "store",
     verdicts: UsableVerdicts = None,
-    pictures: Annotated[
-        int, click.IntRange(0, 60), "Number of assets in the card's picture.", Click(metavar="N")
-    ] = 12,
+    pictures: Annotated[int, click.IntRange(0, 60)] = 12,
     stated: StatedOptions,
 ) -> None:
     """Write STORE as a dataset for a hub, such as Hugging Face's.
@@ -39,6 +30,16 @@ def publish(
     Writes a folder with the card (README.md, with statistics and a picture), the data, the
     checksum of every file and, beside a store, the description that catalogues read
     (croissant.json). Nothing is uploaded: the hub's own tool does that.
+
+    Parameters
+    ----------
+    out
+        The folder; an earlier result is replaced when the new one is complete.
+    data
+        The store itself, which `slatprep.open_store("hf://datasets/...")` reads, or shards for
+        `datasets.load_dataset`.
+    pictures : N
+        Number of assets in the card's picture.
 
     Example
     -------

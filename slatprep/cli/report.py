@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING
 
 from slatprep.cli.options import Folder, Jobs, LastStore, NewFile, beside
 from slatprep.cli.output import Output, say
-from slatprep.cli.signature import Click, command
+from slatprep.cli.signature import command
 
 if TYPE_CHECKING:
     from slatprep.records import Place
@@ -18,13 +18,8 @@ def report(
     output: Output,
     store: LastStore,
     *,
-    out: Annotated[
-        NewFile | None, "The page. [default: beside the store]", Click(metavar="FILE.html")
-    ] = None,
-    manifests: Annotated[
-        Folder | None,
-        "Folder of the build's records. [default: beside the store, or manifests/build/NAME]",
-    ] = None,
+    out: NewFile | None = None,
+    manifests: Folder | None = None,
     jobs: Jobs = 1,
 ) -> None:
     """Write a page about STORE that opens in a browser.
@@ -33,6 +28,13 @@ def report(
     state with reasons, histograms, orientations, classes and properties, and a
     table that shows each asset in 3D. Without STORE, it takes the one that
     `make align` built last under data/.
+
+    Parameters
+    ----------
+    out : FILE.html
+        The page. [default: beside the store]
+    manifests
+        Folder of the build's records. [default: beside the store, or manifests/build/NAME]
 
     Example
     -------

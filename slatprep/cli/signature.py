@@ -1,11 +1,13 @@
 """Commands made of functions: a signature declares each argument and option once.
 
 A parameter that may be given by position is an argument of the command, a keyword-only one an
-option. Its annotation ``Annotated[type, ...]`` holds what the command line needs to know: a
-`click.ParamType` where the type alone does not say what is allowed, the help as a string, and a
-`Click` with any other setting. A parameter without a default is required, a ``bool`` is a flag, a
-``tuple[X, ...]`` may be repeated, a ``Literal`` is a choice. A dataclass is a group of options,
-which several commands may share.
+option. Its help, and after a colon its metavar, are its entry under ``Parameters`` in the
+docstring. Its annotation ``Annotated[type, ...]`` holds what else the command line needs to know: a
+`click.ParamType` where the type alone does not say what is allowed, and a `Click` with any other
+setting; a type that several commands share has its help there, as a string. A parameter without a
+default is required, a ``bool`` is a flag, a ``tuple[X, ...]`` may be repeated, a ``Literal`` is a
+choice. A dataclass is a group of options, which several commands may share, with their help under
+``Attributes``.
 """
 
 from __future__ import annotations
@@ -27,6 +29,7 @@ from slatprep.cli.targets import require_apart
 _Function = TypeVar("_Function", bound=Callable[..., object])
 
 _SECTION = re.compile(r"^(\w[\w ]*)\n-+\n", re.M)
+_ENTRY = re.compile(r"^(\w+)(?: : (.+))?\n((?: +.+\n?)+)", re.M)
 
 _PLAIN = (int, float, str)
 
@@ -42,23 +45,34 @@ class Click:
 def command(name: str | None = None, **settings: Any) -> Callable[[_Function], click.Command]:
     """Make a command of a function; its docstring is the help.
 
-    Sections of the docstring, such as ``Example``, are printed below the options. The function
-    gets an `Output` as its first argument.
+    Other sections of the docstring, such as ``Example``, are printed below the options. The
+    function gets an `Output` as its first argument.
     """
 
     def declare(function: _Function) -> click.Command:
-        text, *sections = _SECTION.split(inspect.getdoc(function) or "")
-        pairs = zip(sections[::2], sections[1::2], strict=True)
-        below = [f"\b\n{title}:\n{indent(body, '  ')}" for title, body in pairs]
+        text, sections = _taken_from_docstring(function)
+        entries = _entries(sections.pop("Parameters", ""))
+        below = [f"\b\n{title}:\n{indent(body, '  ')}" for title, body in sections.items()]
         made = click.command(
             name, PrintingCommand, help=text, epilog="\n\n".join(below), **settings
         )(_runner(function))
         # The first parameter is the `Output`.
         declared = list(inspect.signature(function).parameters.values())[1:]
-        made.params = [*_parameters(declared, _hints(function)), *OUTPUT_OPTIONS]
+        made.params = [*_parameters(declared, _hints(function), entries), *OUTPUT_OPTIONS]
         return made
 
     return declare
+
+
+def _taken_from_docstring(documented: Any) -> tuple[str, dict[str, str]]:
+    """Return the text of a docstring, and its sections by their titles."""
+    text, *sections = _SECTION.split(inspect.getdoc(documented) or "")
+    return text, dict(zip(sections[::2], sections[1::2], strict=True))
+
+
+def _entries(section: str) -> dict[str, tuple[str, str]]:
+    """Return the metavar and the help of each name that a section describes."""
+    return {name: (metavar, text) for name, metavar, text in _ENTRY.findall(section)}
 
 
 def _runner(function: _Function) -> Callable[..., object]:
@@ -94,26 +108,31 @@ def _group(hints: dict[str, Any], given: dict[str, Any]) -> None:
 
 
 def _parameters(
-    declared: list[inspect.Parameter], hints: dict[str, Any]
+    declared: list[inspect.Parameter], hints: dict[str, Any], entries: dict[str, tuple[str, str]]
 ) -> Iterator[click.Argument | click.Option]:
+    if unknown := entries.keys() - {parameter.name for parameter in declared}:
+        raise TypeError(f"{', '.join(unknown)}: help for what is no parameter")
     for parameter in declared:
         hint = hints[parameter.name]
         if dataclasses.is_dataclass(hint):
             fields = list(inspect.signature(hint).parameters.values())  # type: ignore[arg-type]
-            yield from _parameters(fields, _hints(hint))
+            section = _taken_from_docstring(hint)[1].get("Attributes", "")
+            yield from _parameters(fields, _hints(hint), _entries(section))
         else:
-            yield _declared(parameter, hint)
+            yield _declared(parameter, hint, *entries.get(parameter.name, ("", "")))
 
 
-def _declared(parameter: inspect.Parameter, hint: Any) -> click.Argument | click.Option:
+def _declared(
+    parameter: inspect.Parameter, hint: Any, metavar: str, text: str
+) -> click.Argument | click.Option:
     kind, repeated, told = _taken_apart(hint)
     settings: dict[str, Any] = {"required": parameter.default is parameter.empty}
     if parameter.default not in (parameter.empty, None, ()):
         settings["default"] = parameter.default
-    flag, text = f"--{parameter.name.replace('_', '-')}", ""
+    flag = f"--{parameter.name.replace('_', '-')}"
     for entry in told:
         if isinstance(entry, str):
-            text = " ".join(entry.split()).replace(" [default:", "  [default:")
+            text = text or entry
         elif isinstance(entry, click.ParamType):
             kind = entry
         elif isinstance(entry, Click):
@@ -121,6 +140,9 @@ def _declared(parameter: inspect.Parameter, hint: Any) -> click.Argument | click
             flag = entry.flag or flag
         else:
             raise TypeError(f"{parameter.name}: {entry!r} says nothing to the command line")
+    text = " ".join(text.split()).replace(" [default:", "  [default:")
+    if metavar:
+        settings["metavar"] = metavar
     if get_origin(kind) is Literal:
         kind = click.Choice(get_args(kind))
     if not (isinstance(kind, click.ParamType) or kind in (bool, *_PLAIN)):

@@ -12,7 +12,7 @@ import click
 
 from slatprep.cli.options import Above0, ChoiceOf, File, FiniteRange, NewFile, NewFolder, Positive
 from slatprep.cli.output import Output
-from slatprep.cli.signature import Click, command
+from slatprep.cli.signature import command
 from slatprep.cli.transfer import MaterialOptions
 
 if TYPE_CHECKING:
@@ -21,63 +21,50 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, kw_only=True)
 class MotionOptions:
-    """What moves the object, for how long, and how finely that is computed."""
+    """What moves the object, for how long, and how finely that is computed.
 
-    size: Annotated[Above0, "Width of the unit cube.", Click(metavar="METRES")] = 0.4
-    height: Annotated[float, FiniteRange(min=0), "Height of the fall.", Click(metavar="METRES")] = (
-        0.1
-    )
-    wind: Annotated[
-        float,
-        "Wind along x. The object then stands, held at its foot and where it is stationary or "
-        "sand, without gravity.",
-        Click(metavar="M/S"),
-    ] = 0.0
-    seconds: Annotated[Above0, "Length of the motion."] = 0.6
-    rate: Annotated[Positive, "Frames a second."] = 30
-    substeps: Annotated[Positive, "Time steps a frame."] = 4
-    device: Annotated[
-        str | None, "Where to compute: cpu, cuda:0. [default: the GPU if there is one]"
-    ] = None
+    Attributes
+    ----------
+    size : METRES
+        Width of the unit cube.
+    height : METRES
+        Height of the fall.
+    wind : M/S
+        Wind along x. The object then stands, held at its foot and where it is stationary or sand,
+        without gravity.
+    seconds
+        Length of the motion.
+    rate
+        Frames a second.
+    substeps
+        Time steps a frame.
+    device
+        Where to compute: cpu, cuda:0. [default: the GPU if there is one]
+    """
+
+    size: Above0 = 0.4
+    height: Annotated[float, FiniteRange(min=0)] = 0.1
+    wind: float = 0.0
+    seconds: Above0 = 0.6
+    rate: Positive = 30
+    substeps: Positive = 4
+    device: str | None = None
 
 
 @command()
 def simulate(
     output: Output,
     *,
-    gaussians: Annotated[
-        File | None,
-        "PLY of Gaussians of the object, as TRELLIS, SAM 3D Objects or PhysGaussian save them. "
-        "[default: a Gaussian for each particle, in the colour of its class]",
-        Click(metavar="FILE.ply"),
-    ] = None,
+    gaussians: File | None = None,
     source: MaterialOptions,
-    material: Annotated[
-        Any | None,
-        ChoiceOf("slatprep.particles.motion:CLASSES"),
-        "Take this class for the whole object.",
-    ] = None,
-    young: Annotated[
-        Above0 | None, "Take this Young's modulus for the whole object.", Click(metavar="PA")
-    ] = None,
-    density: Annotated[
-        Above0 | None, "Take this density for the whole object.", Click(metavar="KG/M3")
-    ] = None,
-    out: Annotated[NewFolder, "Folder of the frames, frame-0000.ply and so on."],
-    picture: Annotated[
-        NewFile | None,
-        "Also draw the frames: an animation (gif, webp) or a strip of five (png).",
-        Click(metavar="FILE"),
-    ] = None,
-    axes: Annotated[
-        Any | None,
-        ChoiceOf("slatprep.particles.read:Axes"),
-        "Axes of the Gaussians. [default: those that fit]",
-    ] = None,
-    stretch: Annotated[bool, "Let the scales of Gaussians follow the deformation too."] = False,
-    particles: Annotated[
-        int, click.IntRange(min=4, max=256), "Particles along each axis of the cube."
-    ] = 32,
+    material: Annotated[Any | None, ChoiceOf("slatprep.particles.motion:CLASSES")] = None,
+    young: Above0 | None = None,
+    density: Above0 | None = None,
+    out: NewFolder,
+    picture: NewFile | None = None,
+    axes: Annotated[Any | None, ChoiceOf("slatprep.particles.read:Axes")] = None,
+    stretch: bool = False,
+    particles: Annotated[int, click.IntRange(min=4, max=256)] = 32,
     motion: MotionOptions,
 ) -> None:
     """Simulate an object of a store, or a predicted one, and move its Gaussians.
@@ -86,6 +73,28 @@ def simulate(
     material point method moves them on a CPU or a GPU. Gaussians are carried by
     the particles around them: positions and rotations follow, all other
     attributes stay. Needs Newton: pip install 'slatprep[simulate]'.
+
+    Parameters
+    ----------
+    gaussians : FILE.ply
+        PLY of Gaussians of the object, as TRELLIS, SAM 3D Objects or PhysGaussian save them.
+        [default: a Gaussian for each particle, in the colour of its class]
+    material
+        Take this class for the whole object.
+    young : PA
+        Take this Young's modulus for the whole object.
+    density : KG/M3
+        Take this density for the whole object.
+    out
+        Folder of the frames, frame-0000.ply and so on.
+    picture : FILE
+        Also draw the frames: an animation (gif, webp) or a strip of five (png).
+    axes
+        Axes of the Gaussians. [default: those that fit]
+    stretch
+        Let the scales of Gaussians follow the deformation too.
+    particles
+        Particles along each axis of the cube.
 
     Example
     -------

@@ -30,17 +30,9 @@ def stats(
     store: LastStore,
     *,
     chosen: ChosenOptions,
-    weight: Annotated[
-        Any,
-        ChoiceOf("slatprep.inspect.distributions:Weight"),
-        "Give each voxel the same weight, or each asset.",
-    ] = "voxel",
-    csv_file: Annotated[
-        NewFile | None,
-        "Also write a table to this file: a line for each group, side, property and scale.",
-        Click("--csv"),
-    ] = None,
-    picture: Annotated[DrawnFile | None, "Also draw them to this file."] = None,
+    weight: Annotated[Any, ChoiceOf("slatprep.inspect.distributions:Weight")] = "voxel",
+    csv_file: Annotated[NewFile | None, Click("--csv")] = None,
+    picture: DrawnFile | None = None,
     jobs: Jobs = 1,
 ) -> None:
     """Show statistics of the voxels of STORE: classes and properties, by category and in total.
@@ -48,6 +40,15 @@ def stats(
     Both before the lookup (the annotated voxels of the PixieVerse fields) and after it
     (the valid SLAT voxels). Without STORE, the one that `make align` built last under
     data/ is taken.
+
+    Parameters
+    ----------
+    weight
+        Give each voxel the same weight, or each asset.
+    csv_file
+        Also write a table to this file: a line for each group, side, property and scale.
+    picture
+        Also draw them to this file.
 
     Example
     -------

@@ -38,42 +38,50 @@ _PAPER: dict[str, Any] = {"steps": 2000, "accumulate": 4}
 
 @dataclass(frozen=True, kw_only=True)
 class TrainingOptions:
-    """What `TrainParameters` takes as it is given."""
+    """What `TrainParameters` takes as it is given.
 
-    epochs: Annotated[Positive, "Passes over the training objects."] = 100
-    steps: Annotated[
-        Positive | None,
-        "Steps of the optimiser, instead of --epochs; the last pass may be incomplete.",
-    ] = None
-    batch_size: Annotated[Positive, "Assets in a batch."] = 1
-    accumulate: Annotated[Positive, "Batches per step of the optimiser."] = 1
-    learning_rate: Annotated[
-        Above0, "Initial learning rate of AdamW; a cosine schedule lowers it to 0."
-    ] = 0.0001
-    precision: Annotated[
-        Literal["auto", "fp32", "bf16"],
-        "bf16: mixed precision; auto: bf16 if the processor has instructions for it, else fp32.",
-    ] = "auto"
-    keep: Annotated[
-        Literal["best", "last"],
-        "Weights of the epoch with the least validation loss, or of the last epoch.",
-    ] = "best"
-    patience: Annotated[
-        Positive, "Stop after this number of epochs without a better validation loss."
-    ] = 10
+    Attributes
+    ----------
+    epochs
+        Passes over the training objects.
+    steps
+        Steps of the optimiser, instead of --epochs; the last pass may be incomplete.
+    batch_size
+        Assets in a batch.
+    accumulate
+        Batches per step of the optimiser.
+    learning_rate
+        Initial learning rate of AdamW; a cosine schedule lowers it to 0.
+    precision
+        bf16: mixed precision; auto: bf16 if the processor has instructions for it, else fp32.
+    keep
+        Weights of the epoch with the least validation loss, or of the last epoch.
+    patience
+        Stop after this number of epochs without a better validation loss.
+    augmentation
+        Symmetries to draw from: 8 that keep z up, or all 48 of the cube.
+    max_ambiguity
+        Leave out assets that are more ambiguous.
+    weigh_by_confidence
+        Weight voxels by the probability that their class is right.
+    seed
+        Seed of initial weights, order and augmentation.
+    """
+
+    epochs: Positive = 100
+    steps: Positive | None = None
+    batch_size: Positive = 1
+    accumulate: Positive = 1
+    learning_rate: Above0 = 0.0001
+    precision: Literal["auto", "fp32", "bf16"] = "auto"
+    keep: Literal["best", "last"] = "best"
+    patience: Positive = 10
     augmentation: Annotated[
-        Any,
-        ChoiceOf("slatprep.learn.augment:Augmentation"),
-        "Symmetries to draw from: 8 that keep z up, or all 48 of the cube.",
-        Click("--augment"),
+        Any, ChoiceOf("slatprep.learn.augment:Augmentation"), Click("--augment")
     ] = "none"
-    max_ambiguity: Annotated[
-        float | None, FiniteRange(min=0), "Leave out assets that are more ambiguous."
-    ] = None
-    weigh_by_confidence: Annotated[
-        bool, "Weight voxels by the probability that their class is right."
-    ] = False
-    seed: Annotated[int, "Seed of initial weights, order and augmentation."] = 0
+    max_ambiguity: Annotated[float | None, FiniteRange(min=0)] = None
+    weigh_by_confidence: bool = False
+    seed: int = 0
 
 
 @command()
@@ -81,28 +89,40 @@ def train(
     output: Output,
     store: FolderOrUrl,
     *,
-    out: Annotated[NewFolder, "Folder of the run; a stopped run is resumed."],
-    size: Annotated[
-        Literal["small", "medium", "large"], "0.20, 1.19 or 6.32 million weights."
-    ] = "large",
-    all_sizes: Annotated[bool, "Train all three, each in a folder of its own."] = False,
-    preset: Annotated[
-        Literal["default", "paper"],
-        "paper: 2,000 steps, and 4 accumulated batches a step, whose number the paper does not "
-        "give. Options that are given count more.",
-    ] = "default",
+    out: NewFolder,
+    size: Literal["small", "medium", "large"] = "large",
+    all_sizes: bool = False,
+    preset: Literal["default", "paper"] = "default",
     training: TrainingOptions,
     verdicts: UsableVerdicts = None,
     splits: SplitOptions,
-    device: Annotated[Literal["cpu", "cuda"], "Where to compute."] = "cpu",
-    workers: Annotated[int, click.IntRange(min=0), "Processes that read ahead."] = 0,
-    threads: Annotated[Positive | None, "Threads to compute with. [default: all cores]"] = None,
+    device: Literal["cpu", "cuda"] = "cpu",
+    workers: Annotated[int, click.IntRange(min=0)] = 0,
+    threads: Positive | None = None,
 ) -> None:
     """Train SLAT-Phys's decoder on STORE.
 
     Writes run.json, log.csv, curve.png, checkpoints and the predictions of
     the test objects, which `slatprep evaluate` measures. Needs PyTorch:
     pip install 'slatprep[train]'.
+
+    Parameters
+    ----------
+    out
+        Folder of the run; a stopped run is resumed.
+    size
+        0.20, 1.19 or 6.32 million weights.
+    all_sizes
+        Train all three, each in a folder of its own.
+    preset
+        paper: 2,000 steps, and 4 accumulated batches a step, whose number the paper does not give.
+        Options that are given count more.
+    device
+        Where to compute.
+    workers
+        Processes that read ahead.
+    threads
+        Threads to compute with. [default: all cores]
 
     Example
     -------

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from slatprep.cli.options import Above0, AssetOption, ChoiceOf, File, NewFile, StoreOption
 from slatprep.cli.output import Output
-from slatprep.cli.signature import Click, command
+from slatprep.cli.signature import command
 from slatprep.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -17,19 +17,21 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, kw_only=True)
 class MaterialOptions:
-    """Where materials come from: an asset of a store, or a prediction."""
+    """Where materials come from: an asset of a store, or a prediction.
+
+    Attributes
+    ----------
+    prediction : FILE.npz
+        Predicted materials instead of an asset: coords, material, and properties (normalised as
+        --store or --ranges says) or properties_si.
+    ranges : pixie|FILE
+        Ranges of a prediction's properties.
+    """
 
     store: StoreOption | None = None
     asset: AssetOption | None = None
-    prediction: Annotated[
-        File | None,
-        "Predicted materials instead of an asset: coords, material, and properties (normalised as "
-        "--store or --ranges says) or properties_si.",
-        Click(metavar="FILE.npz"),
-    ] = None
-    ranges: Annotated[
-        str | None, "Ranges of a prediction's properties.", Click(metavar="pixie|FILE")
-    ] = None
+    prediction: File | None = None
+    ranges: str | None = None
 
     def field(self, points: Points) -> VoxelField:
         """Return the materials of a stored asset or of a prediction, one of which is given."""
@@ -64,42 +66,37 @@ def transfer(
     particles: File,
     *,
     material: MaterialOptions,
-    out: Annotated[
-        NewFile, "Where to write the particles with their materials.", Click(metavar="FILE.ply")
-    ],
-    points: Annotated[
-        Any,
-        ChoiceOf("slatprep.particles.fields:Points"),
-        "Take an asset's materials from its SLAT voxels, a surface, or from its PixieVerse field, "
-        "a solid.",
-    ] = "slat",
-    axes: Annotated[
-        Any | None,
-        ChoiceOf("slatprep.particles.read:Axes"),
-        "Axes of the particles: those of TRELLIS's Gaussians, of its meshes, or of the SLAT "
-        "frame. [default: as a PLY of slatprep states; for Gaussians of TRELLIS and SAM 3D those "
-        "that fit; else slat]",
-    ] = None,
-    frame: Annotated[
-        Literal["file", "slat"], "Write positions as in the particles' file, or in the SLAT frame."
-    ] = "file",
-    max_distance: Annotated[
-        Above0,
-        "Distance to the nearest voxel above which a particle is far.",
-        Click(metavar="VOXELS"),
-    ] = 2.0,
-    far: Annotated[
-        Any,
-        ChoiceOf("slatprep.particles.transfer:Far"),
-        "Give far particles class 7 and properties 0, leave them out, or give them the nearest "
-        "material.",
-    ] = "background",
+    out: NewFile,
+    points: Annotated[Any, ChoiceOf("slatprep.particles.fields:Points")] = "slat",
+    axes: Annotated[Any | None, ChoiceOf("slatprep.particles.read:Axes")] = None,
+    frame: Literal["file", "slat"] = "file",
+    max_distance: Above0 = 2.0,
+    far: Annotated[Any, ChoiceOf("slatprep.particles.transfer:Far")] = "background",
 ) -> None:
     """Give each particle of PARTICLES the material of the nearest voxel.
 
     PARTICLES is a PLY of Gaussians as TRELLIS saves it, any other PLY with
     x, y and z, or an npy or npz of positions. The result is a PLY with the
     fields of Pixie's material fields, in SI units, for PhysGaussian.
+
+    Parameters
+    ----------
+    out : FILE.ply
+        Where to write the particles with their materials.
+    points
+        Take an asset's materials from its SLAT voxels, a surface, or from its PixieVerse field, a
+        solid.
+    axes
+        Axes of the particles: those of TRELLIS's Gaussians, of its meshes, or of the SLAT frame.
+        [default: as a PLY of slatprep states; for Gaussians of TRELLIS and SAM 3D those that fit;
+        else slat]
+    frame
+        Write positions as in the particles' file, or in the SLAT frame.
+    max_distance : VOXELS
+        Distance to the nearest voxel above which a particle is far.
+    far
+        Give far particles class 7 and properties 0, leave them out, or give them the nearest
+        material.
 
     Example
     -------

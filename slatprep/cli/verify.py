@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING
 
 import click
 
 from slatprep.cli.options import FolderOrUrl, LastStore, Positive, WorkersOptions
 from slatprep.cli.output import Output, say
-from slatprep.cli.signature import Click, command
+from slatprep.cli.signature import command
 from slatprep.errors import StoreError, amount
 
 if TYPE_CHECKING:
@@ -21,28 +21,12 @@ def verify(
     output: Output,
     store: LastStore,
     *,
-    manifests: Annotated[
-        FolderOrUrl | None,
-        "Folder of the records. [default: beside the store, or manifests/build/NAME]",
-    ] = None,
-    sources: Annotated[bool, "Compare the source files with the records, too."] = False,
-    pixieverse: Annotated[
-        FolderOrUrl | None, "Root of the PixieVerse files now. [default: as at the build]"
-    ] = None,
-    slat: Annotated[
-        FolderOrUrl | None,
-        "Folder of the latents, or of their one HDF5 file, now. [default: as at the build]",
-    ] = None,
-    also: Annotated[
-        tuple[FolderOrUrl, ...],
-        "With both: root of a further source now; once for each, in the order of [[also]].",
-    ] = (),
-    sample: Annotated[
-        Positive | None,
-        "Compare values, records and sources of N assets, evenly chosen, not of all. Files and "
-        "the columns of all assets are compared whole nevertheless.",
-        Click(metavar="N"),
-    ] = None,
+    manifests: FolderOrUrl | None = None,
+    sources: bool = False,
+    pixieverse: FolderOrUrl | None = None,
+    slat: FolderOrUrl | None = None,
+    also: tuple[FolderOrUrl, ...] = (),
+    sample: Positive | None = None,
     workers: WorkersOptions,
 ) -> None:
     """Check that STORE is whole, unchanged and consistent.
@@ -51,6 +35,22 @@ def verify(
     their checksums. Compares values with their ranges, annotations with the
     stored grid and transform, and records with their schema and the rows. Every
     fault is named, and the exit code is then 1.
+
+    Parameters
+    ----------
+    manifests
+        Folder of the records. [default: beside the store, or manifests/build/NAME]
+    sources
+        Compare the source files with the records, too.
+    pixieverse
+        Root of the PixieVerse files now. [default: as at the build]
+    slat
+        Folder of the latents, or of their one HDF5 file, now. [default: as at the build]
+    also
+        With both: root of a further source now; once for each, in the order of [[also]].
+    sample : N
+        Compare values, records and sources of N assets, evenly chosen, not of all. Files and the
+        columns of all assets are compared whole nevertheless.
 
     Example
     -------

@@ -24,10 +24,17 @@ class Inner:
 
 @dataclass(frozen=True, kw_only=True)
 class Grouped:
-    """Options that several commands share."""
+    """Options that several commands share.
+
+    Attributes
+    ----------
+    wide : METRES
+        How wide.
+        [default: as wide as it is]
+    """
 
     inner: Inner
-    wide: Annotated[str | None, "How wide. [default: as wide as it is]"] = None
+    wide: str | None = None
 
 
 @command("probe")
@@ -37,13 +44,20 @@ def probe(
     targets: tuple[str, ...] = (),
     *,
     few: Annotated[Few | None, "How many."] = None,
-    kind: Annotated[Literal["a", "b"], "Which."] = "a",
-    names: Annotated[tuple[str, ...], "Called; may be repeated.", Click("--name")] = (),
+    kind: Literal["a", "b"] = "a",
+    names: Annotated[tuple[str, ...], Click("--name")] = (),
     loud: Annotated[bool, "Aloud."] = False,
     grouped: Grouped,
     wanted: Annotated[int, "Needed."],
 ) -> None:
     """Print what the function gets.
+
+    Parameters
+    ----------
+    kind
+        Which.
+    names : NAME
+        Called; may be repeated.
 
     Example
     -------
@@ -88,10 +102,12 @@ def test_wrong_use_is_refused(words, told):
 
 def test_help_has_texts_defaults_and_sections():
     text = CliRunner().invoke(probe, ["--help"], terminal_width=90).output
-    for words in ("[TARGETS]...", "Which.", "Called; may", "[required]", "Print what the function"):
+    for words in ("[TARGETS]...", "Which.", "Called; may", "[required]", "Print what the function",
+                  "--name NAME", "--wide METRES", "How many."):  # fmt: skip
         assert words in text
     assert "How wide.  [default: as wide as it is]" in text
     assert "Example:\n    slatprep probe x" in text
+    assert "Parameters" not in text and "Attributes" not in text
 
 
 def test_option_without_help_is_a_mistake_of_ours():
@@ -100,3 +116,17 @@ def test_option_without_help_is_a_mistake_of_ours():
 
     with pytest.raises(TypeError, match="few: an option without help"):
         command()(silent)
+
+
+def test_help_for_what_is_no_parameter_is_a_mistake_of_ours() -> None:
+    def changed(output: Output, *, few: Annotated[Few, "How many."] = 1) -> None:
+        """Do nothing.
+
+        Parameters
+        ----------
+        many
+            What was here before.
+        """
+
+    with pytest.raises(TypeError, match="many: help for what is no parameter"):
+        command()(changed)
