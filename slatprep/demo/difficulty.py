@@ -109,13 +109,11 @@ class Pose:
 
     def to_object(self, points: Array) -> Array:
         """Map points (P, 3) of the frame to the object."""
-        mapped: Array = (points - self.shift) / self.scale @ self.rotation + self.centre
-        return mapped
+        return np.asarray((points - self.shift) / self.scale @ self.rotation + self.centre)
 
     def from_object(self, points: Array) -> Array:
         """Map points (P, 3) of the object to the frame."""
-        mapped: Array = self.scale * (points - self.centre) @ self.rotation.T + self.shift
-        return mapped
+        return np.asarray(self.scale * (points - self.centre) @ self.rotation.T + self.shift)
 
 
 @dataclass(frozen=True)
@@ -212,8 +210,7 @@ def _tilt(rng: Rng, degrees: float) -> Array:
     x, y, z = direction(rng)
     angle = np.radians(rng.uniform(0.0, degrees))
     cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-    tilt: Array = np.eye(3) + np.sin(angle) * cross + (1.0 - np.cos(angle)) * cross @ cross
-    return tilt
+    return np.asarray(np.eye(3) + np.sin(angle) * cross + (1.0 - np.cos(angle)) * cross @ cross)
 
 
 def _any_rotation(rng: Rng) -> Array:

@@ -50,8 +50,7 @@ class Warp:
 
     def displacement(self, points: Array) -> Array:
         """Return the displacements of points (P, 3)."""
-        moved: Array = np.sin(points @ self.wave.T + self.phase) @ self.amplitude
-        return moved
+        return np.asarray(np.sin(points @ self.wave.T + self.phase) @ self.amplitude)
 
     def __call__(self, points: Array) -> Array:
         """Return the displaced points."""
@@ -108,8 +107,7 @@ class Distortion:
     def __call__(self, points: Array) -> Array:
         """Map points (P, 3) of the generated shape to the object."""
         q = (points - self.middle) / self.size
-        moved: Array = self.middle + self.size * (q + self.bend(q)) / self.proportions
-        return moved
+        return np.asarray(self.middle + self.size * (q + self.bend(q)) / self.proportions)
 
     def inverse(self, points: Array, iterations: int = 40) -> Array:
         """Map points (P, 3) of the object to the generated shape by fixed-point iteration.
@@ -121,8 +119,7 @@ class Distortion:
         q = target
         for _ in range(iterations):
             q = target - self.bend(q)
-        mapped: Array = self.middle + self.size * q
-        return mapped
+        return np.asarray(self.middle + self.size * q)
 
     @property
     def stretch(self) -> float:

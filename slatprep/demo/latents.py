@@ -60,8 +60,7 @@ def make_latents(
     mean, std = np.resize(MEAN, channels), np.resize(STD, channels)
     if channels == len(SHAPE_MEAN):
         mean, std = np.array(SHAPE_MEAN), np.array(SHAPE_STD)
-    feats: NDArray[np.float32] = (mean + std * z).astype(np.float32)
-    return feats
+    return np.asarray((mean + std * z).astype(np.float32))
 
 
 def clean_latents(
@@ -79,7 +78,4 @@ def clean_latents(
     mapped[:, :2] = np.log10(mapped[:, :2])
     mapped = (mapped - _PROPERTY_CENTRE) / _PROPERTY_SPREAD
     place = np.sin(np.pi * centres)
-    z: NDArray[np.float64] = (
-        2.0 * _CODES[material] + mapped @ _CODES[:3] + 0.5 * place @ _CODES[3:6]
-    )
-    return z
+    return np.asarray(2.0 * _CODES[material] + mapped @ _CODES[:3] + 0.5 * place @ _CODES[3:6])

@@ -53,15 +53,13 @@ def orient(angle: float, tilt: float = 0.0) -> Array:
     """Return a rotation (3, 3) about z by `angle` after tilting about y by `tilt` (radians)."""
     c, s, ct, st = np.cos(angle), np.sin(angle), np.cos(tilt), np.sin(tilt)
     heading = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
-    lean: Array = heading @ np.array([[ct, 0, st], [0, 1, 0], [-st, 0, ct]])
-    return lean
+    return np.asarray(heading @ np.array([[ct, 0, st], [0, 1, 0], [-st, 0, ct]]))
 
 
 def direction(rng: Rng) -> Array:
     """Draw a unit vector uniformly."""
     vector = rng.normal(size=3)
-    unit: Array = vector / np.linalg.norm(vector)
-    return unit
+    return np.asarray(vector / np.linalg.norm(vector))
 
 
 def curve(points: Sequence[Array] | Array, radii: Sequence[float] | Array) -> list[Shape]:

@@ -56,8 +56,7 @@ def nerf_field(
 def _smooth_noise(rng: Rng, sigma: float) -> NDArray[np.float64]:
     """Return noise (64, 64, 64) of mean 0 and deviation 1, smooth over `sigma` voxels."""
     noise = ndimage.gaussian_filter(rng.normal(size=(RESOLUTION,) * 3), sigma)
-    scaled: NDArray[np.float64] = (noise - noise.mean()) / noise.std()
-    return scaled
+    return np.asarray((noise - noise.mean()) / noise.std())
 
 
 def _without_thin_parts(rng: Rng, occupied: NDArray[np.bool_]) -> NDArray[np.bool_]:
@@ -70,15 +69,13 @@ def _without_thin_parts(rng: Rng, occupied: NDArray[np.bool_]) -> NDArray[np.boo
     order = rng.permutation(count)
     # An object of mostly thin parts, such as grass, must not lose most of them.
     lost = order[np.cumsum(sizes[order]) <= _MOST_LOST * occupied.sum()]
-    left: NDArray[np.bool_] = occupied & ~np.isin(pieces, lost + 1)
-    return left
+    return np.asarray(occupied & ~np.isin(pieces, lost + 1))
 
 
 def _ball(centre: NDArray[np.integer], radii: NDArray[np.float64]) -> NDArray[np.bool_]:
     """Return the voxels (64, 64, 64) of an ellipsoid with axes along the grid's, in voxels."""
     x, y, z = (((np.arange(RESOLUTION) - c) / r) ** 2 for c, r in zip(centre, radii, strict=True))
-    inside: NDArray[np.bool_] = x[:, None, None] + y[:, None] + z < 1.0
-    return inside
+    return np.asarray(x[:, None, None] + y[:, None] + z < 1.0)
 
 
 def _hollow(rng: Rng, field: NDArray[np.int16], depth: NDArray[np.float64]) -> None:

@@ -49,8 +49,7 @@ def _vector(value: ArrayLike) -> Points:
 
 
 def _lengths(vectors: Points) -> Points:
-    lengths: Points = np.sqrt(np.einsum("ij,ij->i", vectors, vectors))
-    return lengths
+    return np.asarray(np.sqrt(np.einsum("ij,ij->i", vectors, vectors)))
 
 
 def sphere(centre: ArrayLike, radius: float) -> Shape:
@@ -103,8 +102,7 @@ def cone(start: ArrayLike, end: ArrayLike, radius: float, end_radius: float) -> 
         along = (p - a) @ axis
         around = _lengths(p - a - along[:, None] * axis)
         side = (around - radius - slope * along) / np.hypot(1.0, slope)
-        bound: Points = np.maximum(side, np.maximum(-along, along - length))
-        return bound
+        return np.asarray(np.maximum(side, np.maximum(-along, along - length)))
 
     def support(d: Points) -> float:
         across = float(np.sin(np.arccos(np.clip(axis @ d, -1.0, 1.0))))
@@ -128,8 +126,7 @@ def box(
     def distance(p: Points) -> Points:
         beyond = np.abs((p - c) @ axes) - h
         outside = _lengths(np.maximum(beyond, 0.0))
-        bound: Points = outside + np.minimum(beyond.max(axis=1), 0.0) - rounding
-        return bound
+        return np.asarray(outside + np.minimum(beyond.max(axis=1), 0.0) - rounding)
 
     return Shape(distance, lambda d: float(c @ d + h @ np.abs(d @ axes)) + rounding)
 
@@ -142,8 +139,7 @@ def torus(centre: ArrayLike, axis: ArrayLike, radius: float, thickness: float) -
     def distance(p: Points) -> Points:
         along = (p - c) @ n
         around = _lengths(p - c - along[:, None] * n)
-        bound: Points = np.hypot(around - radius, along) - thickness
-        return bound
+        return np.asarray(np.hypot(around - radius, along) - thickness)
 
     def support(d: Points) -> float:
         across = float(np.sin(np.arccos(np.clip(n @ d, -1.0, 1.0))))

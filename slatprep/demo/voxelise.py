@@ -75,8 +75,7 @@ def _changes_sign(
     lattice[tuple(needed.T)] = distance(points) <= 0
     at_corners = lattice[tuple(np.moveaxis(corners, -1, 0))]
     differs: NDArray[np.bool_] = at_corners != inside[tuple(voxels.T)][:, None]
-    met: NDArray[np.bool_] = np.any(differs, axis=1)
-    return met
+    return np.asarray(np.any(differs, axis=1))
 
 
 def _subdivide(

@@ -65,8 +65,7 @@ def rotations(gradients: NDArray[np.floating]) -> NDArray[np.float64]:
     left, _, right = np.linalg.svd(gradients)
     mirrored = np.linalg.det(left @ right) < 0
     left[mirrored, :, 2] *= -1
-    turned: NDArray[np.float64] = left @ right
-    return turned
+    return np.asarray(left @ right)
 
 
 def deform(
@@ -145,8 +144,7 @@ def _matrices(vertices: NDArray[Any]) -> NDArray[np.float64]:
     from scipy.spatial.transform import Rotation
 
     w, x, y, z = (np.asarray(vertices[name], dtype=np.float64) for name in _ROTATION)
-    matrices: NDArray[np.float64] = Rotation.from_quat(np.stack([x, y, z, w], 1)).as_matrix()
-    return matrices
+    return np.asarray(Rotation.from_quat(np.stack([x, y, z, w], 1)).as_matrix())
 
 
 def _set_rotations(vertices: NDArray[Any], matrices: NDArray[np.float64]) -> None:

@@ -148,16 +148,14 @@ class LatentSpace:
         if self.standardised:
             return feats
         mean, std = np.array(self.mean, np.float32), np.array(self.std, np.float32)
-        changed: NDArray[np.float32] = (feats - mean) / std
-        return changed
+        return np.asarray((feats - mean) / std)
 
     def as_encoded(self, feats: NDArray[np.float32]) -> NDArray[np.float32]:
         """Return latents (N, channels) as the encoder gives them, where its moments are known."""
         if not self.standardised or not self.mean:
             return feats
         mean, std = np.array(self.mean, np.float32), np.array(self.std, np.float32)
-        restored: NDArray[np.float32] = feats * std + mean
-        return restored
+        return np.asarray(feats * std + mean)
 
 
 TRELLIS = LatentSpace("trellis", 8, RESOLUTION, FEATS_MEAN, FEATS_STD)

@@ -146,8 +146,7 @@ def _outline(drawing: Drawing) -> NDArray[np.float64]:
     n = len(drawing.cover)
     disc = [(1, 2), (2, 1), (2, 3), (3, 2), (2, 2), (1, 1), (1, 3), (3, 1), (3, 3)]
     shifted = np.stack([cover[y : y + n, x : x + n] for y, x in disc])
-    line: NDArray[np.float64] = np.clip(shifted.max(axis=0) - shifted.min(axis=0), 0, 1)
-    return line
+    return np.asarray(np.clip(shifted.max(axis=0) - shifted.min(axis=0), 0, 1))
 
 
 def _panels(figure: Figure, scene: Scene, finer: int) -> None:

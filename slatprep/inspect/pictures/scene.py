@@ -160,8 +160,7 @@ def surface_distance(
     points = voxel_centres(slat)
     points = places_of(points, transform) if way is None else way.to_pixieverse(points)
     distance, _ = Lattice(pixieverse).nearest(points)
-    scaled: NDArray[np.float64] = distance * scale
-    return scaled
+    return np.asarray(distance * scale)
 
 
 def views(scene: Scene, size: int) -> tuple[View, ...]:

@@ -51,8 +51,7 @@ class View:
 
     def to_view(self, points: ArrayLike) -> NDArray[np.float64]:
         """Return points (N, 3) in the axes right, up and towards the viewer."""
-        rotated: NDArray[np.float64] = (np.asarray(points) - self.centre) @ self.rotation.T
-        return rotated
+        return np.asarray((np.asarray(points) - self.centre) @ self.rotation.T)
 
 
 @dataclass(frozen=True)
