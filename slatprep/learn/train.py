@@ -12,13 +12,14 @@ from typing import Any, Literal
 
 import numpy as np
 import torch
+from torch import Tensor
+from torch.nn import functional
 
 from slatprep.errors import ConfigError
 from slatprep.learn.augment import Augmentation
 from slatprep.learn.baselines import COLUMNS, VoxelBaseline, fit_baselines
-from slatprep.learn.dataset import SlatDataset, SlatLoader, SparseBatch
+from slatprep.learn.dataset import IGNORED, SlatDataset, SlatLoader, SparseBatch
 from slatprep.learn.decoder import SIZES, Prediction, make_decoder
-from slatprep.learn.loss import loss_of
 from slatprep.learn.metrics import score_asset
 from slatprep.learn.predict import (
     Checkpoint,
@@ -37,6 +38,10 @@ from slatprep.workers import Progress
 
 PRECISIONS = ("auto", "fp32", "bf16")
 KEEPS = ("best", "last")
+
+PROPERTY_WEIGHT = 1.0
+CLASS_WEIGHT = 0.5
+"""Weights of SLAT-Phys for the MSE of each property and the cross-entropy of the classes."""
 
 SECONDS_BETWEEN_SAVES = 30.0
 """How much of an unfinished epoch a stopped training loses at most, beside a step."""
@@ -212,6 +217,26 @@ def precision_of(device: str) -> str:
     except OSError:
         return "fp32"  # Not Linux: the instructions are not known.
     return "bf16" if flags & {"amx_bf16", "avx512_bf16"} else "fp32"
+
+
+def loss_of(prediction: Prediction, batch: SparseBatch, weigh: bool = False) -> Tensor:
+    """Return SLAT-Phys's loss over the valid voxels of a batch, a scalar.
+
+    It is the sum of the properties' mean squared errors and half the cross-entropy. With `weigh`,
+    confidence weights the means over voxels.
+    """
+    if not bool(batch.valid.any()):
+        return prediction.properties.sum() * 0.0 + prediction.logits.sum() * 0.0
+    squared = (prediction.properties - batch.properties)[batch.valid].square()
+    if weigh:
+        weights = batch.confidence[batch.valid]
+        weights = weights / weights.sum()
+        entropies = functional.cross_entropy(
+            prediction.logits[batch.valid], batch.material[batch.valid], reduction="none"
+        )
+        return PROPERTY_WEIGHT * (weights @ squared).sum() + CLASS_WEIGHT * weights @ entropies
+    entropy = functional.cross_entropy(prediction.logits, batch.material, ignore_index=IGNORED)
+    return PROPERTY_WEIGHT * squared.mean(dim=0).sum() + CLASS_WEIGHT * entropy
 
 
 class _Session:

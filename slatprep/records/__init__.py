@@ -43,13 +43,17 @@ from slatprep.records.results import (
     PropertyRange,
 )
 from slatprep.records.sources import (
+    FACTORS,
     LATENT_ROLES,
+    LOG10,
     AssetPair,
     MaterialField,
     Place,
+    Plausibility,
     SourceFile,
     SourceRoots,
     StructuredLatents,
+    Units,
 )
 from slatprep.records.tables import (
     CLASS_NAME,
@@ -68,7 +72,6 @@ from slatprep.records.tables import (
     PropertyName,
     labels_of,
 )
-from slatprep.records.units import FACTORS, LOG10, Plausibility, Units
 from slatprep.records.words import (
     BACKGROUND,
     CLASS_COLOURS,

@@ -5,14 +5,13 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import IO, Annotated, Any, Protocol, Self
+from typing import IO, Annotated, Any, ClassVar, Literal, Protocol, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
 from slatprep.records.json_types import Count, Digest, _one_of
 from slatprep.records.tables import PIXIEVERSE, PROPERTIES, Contents, LatentMoments, Property
-from slatprep.records.units import Plausibility, Units
 from slatprep.records.words import RESOLUTION
 
 
@@ -85,6 +84,36 @@ class SourceFile:
     size: Count
     sha256: Digest
     source: Count = 0
+
+
+Plausibility = Literal["refuse", "warn", "off"]
+"""What becomes of values that no material has, see `slatprep.readers.plausible`."""
+
+LOG10 = "log10 "
+"""What a unit begins with where a file holds the logarithm of the value."""
+
+FACTORS = {"Pa": 1.0, "kPa": 1e3, "MPa": 1e6, "GPa": 1e9, "kg/m^3": 1.0, "g/cm^3": 1e3}
+"""What a value in a unit is multiplied by to be in SI units."""
+
+
+@dataclass(frozen=True)
+class Units:
+    """Units of the values in the files of a source; empty where nobody stated them.
+
+    Attributes
+    ----------
+    youngs_modulus, density : str
+        Unit of each. What is stated is not asked about.
+    """
+
+    __pydantic_config__: ClassVar[dict[str, object]] = {"extra": "forbid"}
+
+    youngs_modulus: Literal["", "Pa", "kPa", "MPa", "GPa", "log10 Pa"] = ""
+    density: Literal["", "kg/m^3", "g/cm^3", "log10 kg/m^3"] = ""
+
+    def of(self, name: str) -> str:
+        """Return the stated unit of a property; empty where there is none."""
+        return str(getattr(self, name, ""))
 
 
 @dataclass(frozen=True)

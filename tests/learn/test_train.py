@@ -19,9 +19,8 @@ from slatprep.learn import train as module
 from slatprep.learn.baselines import fit_baselines
 from slatprep.learn.dataset import IGNORED, SlatDataset, SlatLoader, SparseBatch, collate
 from slatprep.learn.decoder import Prediction, make_decoder
-from slatprep.learn.loss import loss_of
 from slatprep.learn.runs import BEST, LAST, Run
-from slatprep.learn.train import TrainParameters, precision_of, train
+from slatprep.learn.train import TrainParameters, loss_of, precision_of, train
 from slatprep.readers.splits import Shares, split_of
 from slatprep.storage.lock import take_lock
 

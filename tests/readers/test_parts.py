@@ -14,8 +14,7 @@ from slatprep.parameters import BuildParameters, PixieverseSource, SlatSource
 from slatprep.pipeline.dataset import build_store, plan_build
 from slatprep.pipeline.summary import BuildSummary
 from slatprep.readers import discover, read_field
-from slatprep.records import MaterialField
-from slatprep.records.units import Units
+from slatprep.records import MaterialField, Units
 from slatprep.store import open_store
 
 trimesh = pytest.importorskip("trimesh")

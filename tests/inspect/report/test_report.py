@@ -24,7 +24,7 @@ from slatprep.geometry.frames import apply_transform, voxel_centres
 from slatprep.inspect import report
 from slatprep.inspect.overview import overview_of
 from slatprep.inspect.report import write_report
-from slatprep.inspect.report.orientations import nearest_quarter_turn, quarter_turns
+from slatprep.inspect.report.content import nearest_quarter_turn, quarter_turns
 from slatprep.inspect.report.outcomes import kind_of, kinds_of
 from slatprep.store import open_store
 
