@@ -213,13 +213,7 @@ def _show_plan(output: Output, plan: BuildPlan) -> None:
         {"asset_id": asset.asset_id, "action": str(asset.action), "reason": asset.reason}
         for asset in plan.assets
     ]
-    document = {
-        "store": plan.store,
-        "actions": plan.actions,
-        "assets": assets,
-        "damaged": plan.damaged,
-    }
-    output.result(document, show)
+    output.result(vars(plan) | {"actions": plan.actions, "assets": assets}, show)
 
 
 def report(output: Output, summary: BuildSummary) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import dataclasses
+from dataclasses import asdict
 from itertools import zip_longest
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -144,20 +144,12 @@ def _print(output: Output, checks: list[AlignmentCheck]) -> None:
     if not checks:
         say("no asset is ambiguous")
     if len(checks) > 1:
-        length = output.id_length(one.asset_id for one in checks)
-        output.table(
-            "Alignments",
-            ("asset", "verdict", *_COLUMNS, "as stored"),
-            [
-                (
-                    one.asset_id[:length],
-                    one.verdict,
-                    *(one.value(name) for name in _COLUMNS.values()),
-                    one.consistent,
-                )
-                for one in checks
-            ],
+        length, names = output.id_length(one.asset_id for one in checks), _COLUMNS.values()
+        rows = (
+            (one.asset_id[:length], one.verdict, *map(one.value, names), one.consistent)
+            for one in checks
         )
+        output.table("Alignments", ("asset", "verdict", *_COLUMNS, "as stored"), rows)
     for one in checks:
         if len(checks) == 1 or output.verbosity > 0:
             output.table(
@@ -186,24 +178,15 @@ def _print(output: Output, checks: list[AlignmentCheck]) -> None:
 
 
 def _documents(checks: list[AlignmentCheck], pictures: list[Path]) -> list[dict[str, Any]]:
-    return [
-        {
-            **dataclasses.asdict(one),
-            "figures": [
-                {
-                    **dataclasses.asdict(figure),
-                    "ok": figure.ok,
-                    "good": figure.threshold_text,
-                    "passes": figure.passes,
-                }
-                for figure in one.figures
-            ],
-            "consistent": one.consistent,
-            "ok": one.ok,
-            "picture": file,
-        }
-        for one, file in zip_longest(checks, pictures)
-    ]
+    documents = []
+    for one, file in zip_longest(checks, pictures):
+        figures = [
+            asdict(own) | {"ok": own.ok, "good": own.threshold_text, "passes": own.passes}
+            for own in one.figures
+        ]
+        found = {"figures": figures, "consistent": one.consistent, "ok": one.ok, "picture": file}
+        documents.append(asdict(one) | found)
+    return documents
 
 
 def _show(output: Output, store: Store, asset_ids: list[str], file: Path | None) -> None:

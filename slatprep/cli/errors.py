@@ -57,19 +57,11 @@ def measure_errors(
 
 
 def _summary(found: MeasuredErrors) -> dict[str, object]:
-    return {
-        "assets": found.assets,
-        "decoys": len(found.decoys),
-        "seed": found.seed,
-        "refitted": found.refitted,
-        "wrong_share": found.wrong_share,
-        "wrong_share_range": found.wrong_share_range,
-        "good": found.good,
-        "good_wrong": found.good_wrong,
-        "good_wrong_range": found.good_wrong_range,
-        "kept": {f"{kept.rate:g}": kept.assets for kept in found.kept},
-        "errors": found.errors,
-    }
+    names = ("assets", "seed", "refitted", "wrong_share", "wrong_share_range", "good",
+             "good_wrong", "good_wrong_range", "errors")  # fmt: skip
+    kept = {f"{kept.rate:g}": kept.assets for kept in found.kept}
+    own = {name: getattr(found, name) for name in names}
+    return own | {"decoys": len(found.decoys), "kept": kept}
 
 
 def _show(output: Output, found: MeasuredErrors) -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from operator import attrgetter
+
 from slatprep.cli.info import show_errors
 from slatprep.cli.options import ChosenOptions, LastStore
 from slatprep.cli.output import Output, say
@@ -47,21 +49,11 @@ def list_assets(
                 say(asset.asset_id)
             return
         length = output.id_length(opened.ids)
-        output.table(
-            f"{len(listed):,} of {len(opened):,} assets",
-            ("id", "category", "verdict", "confidence", "fitness", "why"),
-            [
-                (
-                    asset.asset_id[:length],
-                    asset.category,
-                    asset.verdict,
-                    asset.confidence,
-                    asset.fitness,
-                    _in_short(asset.reasons) if length else "; ".join(asset.reasons),
-                )
-                for asset in listed
-            ],
-        )
+        columns = ("category", "verdict", "confidence", "fitness")
+        why = _in_short if length else "; ".join
+        rows = ((a.asset_id[:length], *attrgetter(*columns)(a), why(a.reasons)) for a in listed)
+        title = f"{len(listed):,} of {len(opened):,} assets"
+        output.table(title, ("id", *columns, "why"), rows)
         if measured_errors(opened.path):
             show_errors(opened)
 

@@ -150,14 +150,10 @@ def train(
     if training.steps and given["epochs"]:
         raise click.UsageError("--epochs and --steps both say when to end; give one of them")
     if preset == "paper":
-        training = dataclasses.replace(
-            training,
-            **{
-                name: value
-                for name, value in _PAPER.items()
-                if not given[name] and not (name == "steps" and given["epochs"])
-            },
-        )
+        own = {name: value for name, value in _PAPER.items() if not given[name]}
+        if given["epochs"]:
+            own.pop("steps", None)
+        training = dataclasses.replace(training, **own)
     torch.set_num_threads(threads or os.cpu_count() or 1)
     opened, rule = open_store(store), splits.rule
     note_split(output, assign_store(opened, **rule), f"by {rule['by']}")

@@ -219,17 +219,11 @@ def _recipe_in(mark: Path) -> object:
 def _make_one(root: Path, recipe: _Recipe, index: int) -> tuple[int, dict[str, Any]]:
     """Make and write an asset; return its number and its entry in the definition."""
     channels, resolution = GRIDS[recipe.encoder]
-    asset = make_asset(
-        recipe.seed,
-        index,
-        levels=recipe.levels,
-        views=recipe.views,
-        latents=recipe.latents,
-        habitual_share=recipe.habitual_share,
-        channels=channels,
-        resolution=resolution,
-        one_frame=recipe.source in ONE_FRAME,
-    )
+    names = ("levels", "views", "latents", "habitual_share")
+    own = {name: getattr(recipe, name) for name in names} | {
+        "one_frame": recipe.source in ONE_FRAME
+    }
+    asset = make_asset(recipe.seed, index, channels=channels, resolution=resolution, **own)
     write.write_annotated(root / recipe.adapter, asset, recipe.source, resolution)
     if recipe.samples > 1:
         grids = write.sample_grids(recipe.seed, index, asset, recipe.samples)

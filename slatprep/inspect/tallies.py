@@ -67,17 +67,9 @@ class SideTally:
             axis=0,
         )
         least, most = np.minimum(self.ends, other.ends)[0], np.maximum(self.ends, other.ends)[1]
-        return SideTally(
-            self.assets + other.assets,
-            self.voxels + other.voxels,
-            weights.sum(axis=0),
-            self.histogram + other.histogram,
-            self.sums + other.sums,
-            self.joint + other.joint,
-            mean,
-            squares,
-            np.stack([least, most]),
-        )
+        names = ("assets", "voxels", "weights", "histogram", "sums", "joint")
+        sums = (getattr(self, name) + getattr(other, name) for name in names)
+        return SideTally(*sums, mean, squares, np.stack([least, most]))
 
 
 @dataclass(frozen=True, eq=False)

@@ -136,10 +136,7 @@ def _properties(
     clipped = outcomes.clipped if outcomes else [0] * len(normalization.ranges)
     return [
         {
-            "name": span.name,
-            "log10": span.log10,
-            "lo": span.lo,
-            "hi": span.hi,
+            **vars(span),
             "source": normalization.source,
             "title": one.title,
             "unit": one.sign,

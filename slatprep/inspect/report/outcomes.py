@@ -133,7 +133,7 @@ def _fault_of(reason: str) -> str:
 
 
 def _outcome(record: AssetRecord) -> Outcome:
-    placements = record.alignment.placements
+    placements, merged = record.alignment.placements, record.merged
     return Outcome(
         record.asset_id,
         record.category,
@@ -144,7 +144,5 @@ def _outcome(record: AssetRecord) -> Outcome:
         ties=tuple(
             tuple(placement.transform[:3].ravel().tolist()) for placement in placements[:MOST_TIES]
         ),
-        annotations=(sum(not one.left_out for one in record.merged), len(record.merged))
-        if record.merged
-        else (),
+        annotations=(sum(not one.left_out for one in merged), len(merged)) if merged else (),
     )

@@ -46,19 +46,11 @@ def merged_findings(
     made = merge(parts, contents.properties)
     ranges = asset.store.normalization
     spread = None if made.spread is None else normalize_change(made.spread, ranges)
-    for name, values, limit in (
-        ("valid", made.valid, TOLERANCES["voxel/valid"]),
-        ("material", made.material, TOLERANCES["voxel/material"]),
-        (
-            "properties",
-            normalize_properties(made.properties, ranges),
-            TOLERANCES["voxel/properties"],
-        ),
-        ("confidence", made.confidence, TOLERANCE),
-        ("spread", spread, TOLERANCE),
-        ("votes", made.votes, TOLERANCE),
-    ):
-        held, given = getattr(asset, name), np.asarray(values, dtype=np.float64)
+    properties = normalize_properties(made.properties, ranges)
+    now = vars(made) | {"properties": properties, "spread": spread}
+    for name in ("valid", "material", "properties", "confidence", "spread", "votes"):
+        limit = TOLERANCES.get(f"voxel/{name}", TOLERANCE)
+        held, given = getattr(asset, name), np.asarray(now[name], dtype=np.float64)
         same = np.isclose(held, given, rtol=0.0, atol=limit, equal_nan=True)
         wrong = int(np.count_nonzero(~same.reshape(len(same), -1).all(axis=1)))
         if wrong:
