@@ -7,15 +7,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import click
 
+from slatprep.cli import options
 from slatprep.cli.info import show_errors, show_quality
-from slatprep.cli.options import (
-    NewFile,
-    NewStore,
-    RecordsFolder,
-    Seed,
-    SourceOptions,
-    WorkersOptions,
-)
 from slatprep.cli.output import Output, say
 from slatprep.cli.signature import Click, command
 from slatprep.errors import amount
@@ -36,9 +29,9 @@ DAMAGES_LISTED = 10
 def build_store(
     output: Output,
     *,
-    sources: SourceOptions,
-    out: NewStore,
-    manifests: RecordsFolder | None = None,
+    sources: options.SourceOptions,
+    out: options.NewStore,
+    manifests: options.RecordsFolder | None = None,
     strict: bool = False,
     consensus: bool = False,
     witness: bool = False,
@@ -50,9 +43,9 @@ def build_store(
     ] = 0.01,
     compact: bool = False,
     keep_work: bool = False,
-    decoys: Seed = 200,
+    decoys: options.Seed = 200,
     dry_run: bool = False,
-    workers: WorkersOptions,
+    workers: options.WorkersOptions,
 ) -> None:
     """Build one store of aligned, normalised supervision, or bring it up to date.
 
@@ -129,10 +122,10 @@ def build_store(
 def align(
     output: Output,
     *,
-    sources: SourceOptions,
-    out: NewFile,
+    sources: options.SourceOptions,
+    out: options.NewFile,
     strict: bool = False,
-    workers: WorkersOptions,
+    workers: options.WorkersOptions,
 ) -> None:
     """Align without building a store.
 

@@ -9,16 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from slatprep.cli.options import (
-    AssetIds,
-    FolderOrUrl,
-    Jobs,
-    NewFileOrFolder,
-    Positive,
-    StoreOption,
-    beside,
-    chosen_store,
-)
+from slatprep.cli import options
 from slatprep.cli.output import Output, say
 from slatprep.cli.signature import command
 
@@ -41,15 +32,15 @@ _COLUMNS = {
 @command("check-alignment")
 def check_alignment(
     output: Output,
-    store: FolderOrUrl | None = None,
+    store: options.FolderOrUrl | None = None,
     *,
-    asset_ids: AssetIds = (),
-    worst: Positive | None = None,
+    asset_ids: options.AssetIds = (),
+    worst: options.Positive | None = None,
     ambiguous: bool = False,
-    named: StoreOption | None = None,
-    picture: NewFileOrFolder | None = None,
+    named: options.StoreOption | None = None,
+    picture: options.NewFileOrFolder | None = None,
     show: bool = False,
-    jobs: Jobs = 1,
+    jobs: options.Jobs = 1,
 ) -> None:
     """Check whether the alignment of an asset of STORE is good, and draw it.
 
@@ -83,7 +74,7 @@ def check_alignment(
         raise click.UsageError("say which assets: --asset ID, --worst N or --ambiguous")
     if store is not None and named is not None:
         raise click.UsageError("STORE and --store both name the store; give one of them")
-    path = chosen_store(store or named)
+    path = options.chosen_store(store or named)
     from slatprep.inspect import check
     from slatprep.pipeline.decoys import measured_errors
     from slatprep.store import open_store
@@ -130,7 +121,7 @@ def check_alignment(
 
 def _target(store: Place, picture: Path | None, assets: int) -> Path | None:
     if picture is None:
-        return beside(store, ".pictures")
+        return options.beside(store, ".pictures")
     if picture == Path("none"):
         return None
     from slatprep.inspect.pictures.canvas import FORMATS

@@ -9,14 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, cast
 
 import click
 
-from slatprep.cli.options import (
-    ChoiceOf,
-    FileOrFolder,
-    FolderOrUrl,
-    NewFile,
-    SplitOptions,
-    note_split,
-)
+from slatprep.cli import options
 from slatprep.cli.output import Output, write_csv
 from slatprep.cli.signature import Click, command
 
@@ -33,15 +26,15 @@ _LISTED = 10
 @command()
 def evaluate(
     output: Output,
-    predictions: FileOrFolder | None = None,
+    predictions: options.FileOrFolder | None = None,
     *,
-    store: FolderOrUrl,
+    store: options.FolderOrUrl,
     grids: tuple[str, ...] = (),
-    split: Annotated[Any, ChoiceOf("slatprep.readers.splits:SPLITS", "all")] = "test",
-    splits: SplitOptions,
-    spread: Annotated[Any, ChoiceOf("slatprep.learn.metrics:SPREADS")] = "se",
-    csv_file: Annotated[NewFile | None, Click("--csv")] = None,
-    picture: NewFile | None = None,
+    split: Annotated[Any, options.ChoiceOf("slatprep.readers.splits:SPLITS", "all")] = "test",
+    splits: options.SplitOptions,
+    spread: Annotated[Any, options.ChoiceOf("slatprep.learn.metrics:SPREADS")] = "se",
+    csv_file: Annotated[options.NewFile | None, Click("--csv")] = None,
+    picture: options.NewFile | None = None,
     beside: tuple[str, ...] = (),
 ) -> None:
     """Measure PREDICTIONS by Pixie's protocol.
@@ -166,24 +159,24 @@ def _show(
 
 
 def _selection(
-    output: Output, predictions: Path | None, store: Place, split: str, options: SplitOptions
+    output: Output, predictions: Path | None, store: Place, split: str, splits: options.SplitOptions
 ) -> dict[str, Any]:
     """Return the split of each object and which assets count, by the options or else by a run."""
     from slatprep.learn.predictions import RUN_FILE, selection_of_run
     from slatprep.learn.splits import assign_store
     from slatprep.store import open_store
 
-    rule, how = options.rule, f"by {options.rule['by']}"
+    rule, how = splits.rule, f"by {splits.rule['by']}"
     selection: dict[str, Any] | None = None
-    if predictions is not None and not options.given:
+    if predictions is not None and not splits.given:
         selection = selection_of_run(predictions)
     if predictions is not None and selection is not None:
         rule |= {name: selection.pop(name) for name in ("by", "shares") if name in selection}
         how = f"as {predictions.absolute().parent / RUN_FILE} says"
-    elif not options.given:
+    elif not splits.given:
         how += ", as no run lies beside the predictions (others: --split-by, --split all)"
     assignment = assign_store(open_store(store), **rule)
-    note_split(output, assignment, f"{split}, {how}")
+    options.note_split(output, assignment, f"{split}, {how}")
     return {"splits": assignment.splits, **(selection or {})}
 
 
@@ -235,10 +228,10 @@ def _show_beside(
     from slatprep.learn.published import TABLES
 
     names = tuple(next(iter(ours.values())).means)
-    rows = (
+    rows: list[tuple[str | float | None, ...]] = [
         *((name, *measure.means.values()) for name, measure in ours.items()),
         *((score.method, *map(score.means.get, names)) for score in others),
-    )
+    ]
     title = f"Beside {TABLES[beside][0] if beside in TABLES else beside}"
     output.table(title, ("method", *names), rows)
     spreads = [

@@ -6,19 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated, Any
 
-from slatprep.cli.options import (
-    Above0,
-    AssetIds,
-    ChoiceOf,
-    FolderOrUrl,
-    Jobs,
-    NewFileOrFolder,
-    Positive,
-    SplitOptions,
-    UsableVerdicts,
-    note_left_out,
-    note_split,
-)
+from slatprep.cli import options
 from slatprep.cli.output import Output
 from slatprep.cli.signature import Click, command
 from slatprep.errors import ConfigError
@@ -59,12 +47,12 @@ class FormatOptions:
         usd: the most materials that E and nu of an asset are binned into. [default: 64]
     """
 
-    points: Annotated[Any | None, ChoiceOf("slatprep.export.formats:Points")] = None
-    frame: Annotated[Any | None, ChoiceOf("slatprep.export.formats:Frame")] = None
-    shard_size: Positive | None = None
+    points: Annotated[Any | None, options.ChoiceOf("slatprep.export.formats:Points")] = None
+    frame: Annotated[Any | None, options.ChoiceOf("slatprep.export.formats:Frame")] = None
+    shard_size: options.Positive | None = None
     latent_model: str | None = None
-    size: Above0 | None = None
-    materials: Positive | None = None
+    size: options.Above0 | None = None
+    materials: options.Positive | None = None
 
     def of(self, kind: str) -> dict[str, Any]:
         """Return those that were given; refuse one of another format."""
@@ -80,16 +68,16 @@ class FormatOptions:
 @command()
 def export(
     output: Output,
-    store: FolderOrUrl,
+    store: options.FolderOrUrl,
     *,
-    kind: Annotated[Any, ChoiceOf("slatprep.export:FORMATS"), Click("--format")],
-    out: NewFileOrFolder,
-    assets: AssetIds = (),
-    verdicts: UsableVerdicts = None,
-    split: Annotated[Any, ChoiceOf("slatprep.readers.splits:SPLITS", "all")] = "all",
-    splits: SplitOptions,
+    kind: Annotated[Any, options.ChoiceOf("slatprep.export:FORMATS"), Click("--format")],
+    out: options.NewFileOrFolder,
+    assets: options.AssetIds = (),
+    verdicts: options.UsableVerdicts = None,
+    split: Annotated[Any, options.ChoiceOf("slatprep.readers.splits:SPLITS", "all")] = "all",
+    splits: options.SplitOptions,
     format_options: FormatOptions,
-    jobs: Jobs = 1,
+    jobs: options.Jobs = 1,
 ) -> None:
     """Write assets of STORE in a format of other tools.
 
@@ -120,12 +108,12 @@ def export(
     slatprep export data/demo.zarr --format usd --out usd --size 0.3 --asset 5f61cc
     slatprep export data/demo.zarr --format webdataset --out train --split train --split-by pixie
     """
-    options = format_options.of(kind)
+    given = format_options.of(kind)
     from slatprep.export import ExportOptions, export_store
     from slatprep.store import open_store
 
     if verdicts is None and not assets:
-        note_left_out(output, open_store(store))
+        options.note_left_out(output, open_store(store))
     chosen: tuple[Sequence[str], Sequence[str] | None] = (assets, verdicts)
     if split != "all":
         chosen = _of_split(output, store, split, splits.rule, assets, verdicts)
@@ -138,7 +126,7 @@ def export(
             kind,
             assets=chosen[0],
             verdicts=chosen[1],
-            options=ExportOptions(**options),
+            options=ExportOptions(**given),
             jobs=jobs,
             progress=progress,
         )
@@ -167,7 +155,7 @@ def _of_split(
         raise ConfigError("--asset and --split both choose; give one of them")
     store = open_store(place)
     assignment = assign_store(store, **rule)
-    note_split(output, assignment, f"{split}, by {rule['by']}")
+    options.note_split(output, assignment, f"{split}, by {rule['by']}")
     rows = select_assets(store, split, splits=assignment.splits)
     if not len(rows):
         raise ConfigError(f"{store.path}: no asset is in the split {split}, by {rule['by']}")

@@ -79,40 +79,35 @@ class LatentsReader:
 
     def _of_file(self, latents: StructuredLatents) -> StructuredLatents:
         """Return the latents of a file with `standardised` set."""
-        from slatprep.readers.encoders import in_words
+        from slatprep.readers import encoders
 
         if self.standardised != "auto":
             return replace(latents, standardised=self.standardised == "yes")
         if not self._look_standardised(latents):
             return latents
+        how = encoders.in_words(latents.moments)
         self.output.note(
-            f"{latents.sources[0].path}: its latents look standardised already "
-            f"({in_words(latents.moments)}) and are taken so; --standardised says otherwise"
+            f"{latents.sources[0].path}: its latents look standardised already ({how}) and are "
+            "taken so; --standardised says otherwise"
         )
         return replace(latents, standardised=True)
 
     def _look_standardised(self, latents: StructuredLatents) -> bool:
         """Whether latents look standardised; asks the other files where they alone do not tell."""
-        from slatprep.readers.encoders import (
-            ENOUGH,
-            in_words,
-            look_standardised,
-            pooled_moments,
-            tell_alone,
-        )
+        from slatprep.readers import encoders
 
         moments = latents.moments
-        if len(latents.coords) < ENOUGH or tell_alone(moments, self.space):
-            return look_standardised(moments, self.space)
+        if len(latents.coords) < encoders.ENOUGH or encoders.tell_alone(moments, self.space):
+            return encoders.look_standardised(moments, self.space)
         known = list(self._moments_of_files())
         if len(known) < 2:
             raise InputError(
                 latents.sources[0].path,
                 "one file alone does not tell whether its latents have been standardised "
-                f"({in_words(moments)})",
+                f"({encoders.in_words(moments)})",
                 "--standardised yes or no",
             )
-        return look_standardised(pooled_moments(known), self.space)
+        return encoders.look_standardised(encoders.pooled_moments(known), self.space)
 
     def _moments_of_files(self) -> Iterator[tuple[int, LatentMoments]]:
         """Yield voxels and moments of the first files that can be read."""

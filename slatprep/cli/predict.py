@@ -8,17 +8,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
+from slatprep.cli import options
 from slatprep.cli.latents import LatentsReader, Standardised
-from slatprep.cli.options import (
-    AssetIds,
-    ChoiceOf,
-    FileOrFolder,
-    FileOrUrl,
-    NewFile,
-    NewFolder,
-    Positive,
-    Seed,
-)
 from slatprep.cli.output import Output
 from slatprep.cli.signature import command
 from slatprep.errors import ConfigError, InputError
@@ -33,16 +24,16 @@ _IMAGES = (".png", ".jpg", ".jpeg", ".webp", ".bmp")
 @command()
 def predict(
     output: Output,
-    source: FileOrUrl,
+    source: options.FileOrUrl,
     *,
-    checkpoint: FileOrFolder,
-    out: NewFolder,
-    assets: AssetIds = (),
-    gaussians: NewFile | None = None,
-    seed: Seed = 42,
-    far: Annotated[Any, ChoiceOf("slatprep.particles.transfer:Far")] = "background",
+    checkpoint: options.FileOrFolder,
+    out: options.NewFolder,
+    assets: options.AssetIds = (),
+    gaussians: options.NewFile | None = None,
+    seed: options.Seed = 42,
+    far: Annotated[Any, options.ChoiceOf("slatprep.particles.transfer:Far")] = "background",
     device: Literal["cpu", "cuda"] | None = None,
-    batch_voxels: Positive = 65536,
+    batch_voxels: options.Positive = 65536,
     standardised: Standardised = "auto",
 ) -> None:
     """Predict material fields of SOURCE with a trained decoder.

@@ -5,15 +5,7 @@ from __future__ import annotations
 from functools import partial
 from typing import TYPE_CHECKING, Annotated, Any
 
-from slatprep.cli.options import (
-    ChoiceOf,
-    ChosenOptions,
-    DrawnFile,
-    Jobs,
-    LastStore,
-    NewFile,
-    draw_to,
-)
+from slatprep.cli import options
 from slatprep.cli.output import Cell, Output, write_csv
 from slatprep.cli.signature import Click, command
 
@@ -27,13 +19,13 @@ _CATEGORIES = 20
 @command()
 def stats(
     output: Output,
-    store: LastStore,
+    store: options.LastStore,
     *,
-    chosen: ChosenOptions,
-    weight: Annotated[Any, ChoiceOf("slatprep.inspect.distributions:Weight")] = "voxel",
-    csv_file: Annotated[NewFile | None, Click("--csv")] = None,
-    picture: DrawnFile | None = None,
-    jobs: Jobs = 1,
+    chosen: options.ChosenOptions,
+    weight: Annotated[Any, options.ChoiceOf("slatprep.inspect.distributions:Weight")] = "voxel",
+    csv_file: Annotated[options.NewFile | None, Click("--csv")] = None,
+    picture: options.DrawnFile | None = None,
+    jobs: options.Jobs = 1,
 ) -> None:
     """Show statistics of the voxels of STORE: classes and properties, by category and in total.
 
@@ -69,7 +61,7 @@ def stats(
     if picture is not None:
         from slatprep.inspect.pictures.statistics import draw_statistics
 
-        draw_to(output, picture, partial(draw_statistics, opened, found))
+        options.draw_to(output, picture, partial(draw_statistics, opened, found))
     output.result(found, lambda: _show(output, found))
 
 

@@ -11,18 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import click
 
-from slatprep.cli.options import (
-    Above0,
-    ChoiceOf,
-    FiniteRange,
-    FolderOrUrl,
-    NewFolder,
-    Positive,
-    SplitOptions,
-    UsableVerdicts,
-    note_left_out,
-    note_split,
-)
+from slatprep.cli import options
 from slatprep.cli.output import Output
 from slatprep.cli.signature import Click, command
 
@@ -68,18 +57,18 @@ class TrainingOptions:
         Seed of initial weights, order and augmentation.
     """
 
-    epochs: Positive = 100
-    steps: Positive | None = None
-    batch_size: Positive = 1
-    accumulate: Positive = 1
-    learning_rate: Above0 = 0.0001
+    epochs: options.Positive = 100
+    steps: options.Positive | None = None
+    batch_size: options.Positive = 1
+    accumulate: options.Positive = 1
+    learning_rate: options.Above0 = 0.0001
     precision: Literal["auto", "fp32", "bf16"] = "auto"
     keep: Literal["best", "last"] = "best"
-    patience: Positive = 10
+    patience: options.Positive = 10
     augmentation: Annotated[
-        Any, ChoiceOf("slatprep.learn.augment:Augmentation"), Click("--augment")
+        Any, options.ChoiceOf("slatprep.learn.augment:Augmentation"), Click("--augment")
     ] = "none"
-    max_ambiguity: Annotated[float | None, FiniteRange(min=0)] = None
+    max_ambiguity: Annotated[float | None, options.FiniteRange(min=0)] = None
     weigh_by_confidence: bool = False
     seed: int = 0
 
@@ -87,18 +76,18 @@ class TrainingOptions:
 @command()
 def train(
     output: Output,
-    store: FolderOrUrl,
+    store: options.FolderOrUrl,
     *,
-    out: NewFolder,
+    out: options.NewFolder,
     size: Literal["small", "medium", "large"] = "large",
     all_sizes: bool = False,
     preset: Literal["default", "paper"] = "default",
     training: TrainingOptions,
-    verdicts: UsableVerdicts = None,
-    splits: SplitOptions,
+    verdicts: options.UsableVerdicts = None,
+    splits: options.SplitOptions,
     device: Literal["cpu", "cuda"] = "cpu",
     workers: Annotated[int, click.IntRange(min=0)] = 0,
-    threads: Positive | None = None,
+    threads: options.Positive | None = None,
 ) -> None:
     """Train SLAT-Phys's decoder on STORE.
 
@@ -156,10 +145,10 @@ def train(
         training = dataclasses.replace(training, **own)
     torch.set_num_threads(threads or os.cpu_count() or 1)
     opened, rule = open_store(store), splits.rule
-    note_split(output, assign_store(opened, **rule), f"by {rule['by']}")
+    options.note_split(output, assign_store(opened, **rule), f"by {rule['by']}")
     if verdicts is None:
         verdicts = USABLE
-        note_left_out(output, opened)
+        options.note_left_out(output, opened)
     chosen = TrainParameters(
         size=size,
         split_by=rule["by"],

@@ -8,15 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slatprep.inspect.distributions import Histogram, JointHistogram, StoreStatistics
-from slatprep.inspect.pictures import palette
-from slatprep.inspect.pictures.canvas import (
-    STYLE,
-    draw_legend,
-    in_format,
-    new_figure,
-    size_of,
-    write,
-)
+from slatprep.inspect.pictures import canvas, palette
 from slatprep.records import MATERIAL_CLASSES, MATERIAL_COLOURS, Property
 from slatprep.store.reader import Store
 
@@ -46,8 +38,8 @@ def draw_statistics(store: Store, statistics: StoreStatistics, kind: str = "png"
     joint = (_JOINT + _BETWEEN) * (statistics.joint is not None)
     rows = len(statistics.histograms) * (_HISTOGRAM + _BETWEEN)
     height = _HEAD + rows + joint + _BAR * max(len(shown), 1) + _BETWEEN + _FOOT
-    with matplotlib.style.context(["default", STYLE]):
-        figure = new_figure(_WIDTH, height)
+    with matplotlib.style.context(["default", canvas.STYLE]):
+        figure = canvas.new_figure(_WIDTH, height)
         _head(figure, store, statistics)
         for column, (side, _) in enumerate(_SIDES):
             top = _HEAD
@@ -63,11 +55,11 @@ def draw_statistics(store: Store, statistics: StoreStatistics, kind: str = "png"
             names = [f"{_cut(group.name)} ({group.slat.assets:,})" for group in shown]
             names = names if column == 0 else [""] * len(names)
             _bars(_axes(figure, column, top, _BAR * max(len(bars), 1)), names, bars)
-        return in_format(figure, kind)
+        return canvas.in_format(figure, kind)
 
 
 def _head(figure: Figure, store: Store, statistics: StoreStatistics) -> None:
-    write(figure, 40, 48, f"Statistics of {store.name}", weight="bold", size=12)
+    canvas.write(figure, 40, 48, f"Statistics of {store.name}", weight="bold", size=12)
     counts = ", ".join(f"{count:,} {name}" for name, count in statistics.total.verdicts.items())
     what = "voxel weighs" if statistics.weight == "voxel" else "asset's voxels together weigh"
     words = (
@@ -75,20 +67,20 @@ def _head(figure: Figure, store: Store, statistics: StoreStatistics) -> None:
         f"every {what} one; not annotated: {_percent(statistics.total.field.unannotated)} before, "
         f"{_percent(statistics.total.slat.unannotated)} after"
     )
-    write(figure, 40, 74, words, size=7, color=palette.MUTED)
+    canvas.write(figure, 40, 74, words, size=7, color=palette.MUTED)
     entries = [
         (group.name, colour)
         for group, colour in zip(statistics.classes, _COLOURS, strict=False)
         if len(statistics.classes) <= len(MATERIAL_CLASSES) or group.field.voxels
     ]
-    draw_legend(figure, entries, (40, 103, _WIDTH - 40))
+    canvas.draw_legend(figure, entries, (40, 103, _WIDTH - 40))
     for column, (_, title) in enumerate(_SIDES):
         left = _LEFT + column * (_PLOT + _GAP)
-        write(figure, left, _HEAD - 14, title, size=8, weight="bold")
+        canvas.write(figure, left, _HEAD - 14, title, size=8, weight="bold")
 
 
 def _axes(figure: Figure, column: int, top: float, tall: float) -> Axes:
-    width, height = size_of(figure)
+    width, height = canvas.size_of(figure)
     left = _LEFT + column * (_PLOT + _GAP)
     return figure.add_axes((left / width, 1 - (top + tall) / height, _PLOT / width, tall / height))
 
