@@ -136,11 +136,14 @@ def _print(output: Output, checks: list[AlignmentCheck]) -> None:
         say("no asset is ambiguous")
     if len(checks) > 1:
         length, names = output.id_length(one.asset_id for one in checks), _COLUMNS.values()
-        rows = (
-            (one.asset_id[:length], one.verdict, *map(one.value, names), one.consistent)
-            for one in checks
+        output.table(
+            "Alignments",
+            ("asset", "verdict", *_COLUMNS, "as stored"),
+            [
+                (one.asset_id[:length], one.verdict, *map(one.value, names), one.consistent)
+                for one in checks
+            ],
         )
-        output.table("Alignments", ("asset", "verdict", *_COLUMNS, "as stored"), rows)
     for one in checks:
         if len(checks) == 1 or output.verbosity > 0:
             output.table(

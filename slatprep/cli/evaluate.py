@@ -229,9 +229,9 @@ def _show_beside(
 
     names = tuple(next(iter(ours.values())).means)
     rows: list[tuple[str | float | None, ...]] = [
-        *((name, *measure.means.values()) for name, measure in ours.items()),
-        *((score.method, *map(score.means.get, names)) for score in others),
+        (name, *measure.means.values()) for name, measure in ours.items()
     ]
+    rows += [(score.method, *map(score.means.get, names)) for score in others]
     title = f"Beside {TABLES[beside][0] if beside in TABLES else beside}"
     output.table(title, ("method", *names), rows)
     spreads = [

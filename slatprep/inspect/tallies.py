@@ -68,8 +68,8 @@ class SideTally:
         )
         least, most = np.minimum(self.ends, other.ends)[0], np.maximum(self.ends, other.ends)[1]
         names = ("assets", "voxels", "weights", "histogram", "sums", "joint")
-        sums = (getattr(self, name) + getattr(other, name) for name in names)
-        return SideTally(*sums, mean, squares, np.stack([least, most]))
+        sums = {name: getattr(self, name) + getattr(other, name) for name in names}
+        return SideTally(**sums, mean=mean, squares=squares, ends=np.stack([least, most]))
 
 
 @dataclass(frozen=True, eq=False)
