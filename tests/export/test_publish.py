@@ -16,14 +16,13 @@ import pytest
 import zarr
 from click.testing import Result
 from support import commands
+from support.published_hub import PublishedHub
 from support.trees import tree
 
 from slatprep.export.card import card_of
 from slatprep.export.croissant import Stated
 from slatprep.pipeline.dataset import BuildSummary
 from slatprep.store import open_store
-
-HUB = Path(__file__).parents[1] / "support" / "hub.py"
 
 
 def run(*words: object, code: int = 0) -> Result:
@@ -120,12 +119,11 @@ def test_a_card_says_what_is_not_known(mixed_build):
 def hub(root: Path) -> Iterator[str]:
     """Serve the datasets as the hub does; return the address."""
     pytest.importorskip("huggingface_hub")
-    with subprocess.Popen(
-        [sys.executable, str(HUB), str(root)],
-        stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
-    ) as process:  # fmt: skip
-        yield process.stdout.readline().strip()
-        process.kill()
+    with PublishedHub() as server:
+        for folder in (root / "me").iterdir():
+            server.publish(f"me/{folder.name}", folder)
+        yield server.address
+        server.shutdown()
 
 
 def from_hub(hub: str, code: str, tmp_path: Path) -> Any:

@@ -1,18 +1,13 @@
-"""A hub that serves datasets of any size by ranges, commit by commit, and misbehaves on request.
-
-Run as ``python published_hub.py OWNER/NAME=FOLDER``: prints the address, serves until its
-standard input ends, and prints what it served as JSON.
-"""
+"""A hub that serves datasets of any size by ranges, commit by commit, and misbehaves on request."""
 
 import hashlib
 import json
-import sys
 import threading
 import time
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import BinaryIO
-from urllib.parse import unquote, urlsplit
+from urllib.parse import parse_qs, unquote, urlsplit
 
 _PIECE = 2**20
 
@@ -94,7 +89,8 @@ class _Handler(BaseHTTPRequestHandler):
         self.do_GET()
 
     def do_POST(self) -> None:
-        body = json.loads(self.rfile.read(int(self.headers["Content-Length"])))
+        text = self.rfile.read(int(self.headers["Content-Length"])).decode()
+        body = json.loads(text) if text.startswith("{") else parse_qs(text)
         parts = unquote(urlsplit(self.path).path).strip("/").split("/")
         _, folder = self._commit("/".join(parts[2:4]), parts[5])
         paths = [folder / name for name in body["paths"]]
@@ -200,14 +196,3 @@ class _Handler(BaseHTTPRequestHandler):
 def _tag(file: Path) -> str:
     state = file.stat()
     return hashlib.sha256(f"{file.name} {state.st_size} {state.st_mtime_ns}".encode()).hexdigest()
-
-
-if __name__ == "__main__":
-    hub = PublishedHub()
-    for one in sys.argv[1:]:
-        dataset, _, where = one.partition("=")
-        hub.publish(dataset, Path(where))
-    print(hub.address, flush=True)
-    sys.stdin.read()
-    ranges = [path for _, path in hub.requests if "/resolve/" in path]
-    print(json.dumps({"requests": len(hub.requests), "ranges": len(ranges), "bytes": hub.bytes}))
