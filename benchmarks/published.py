@@ -24,8 +24,9 @@ from pathlib import Path
 
 import checkout  # noqa: F401 - says where the tests' support lies
 import numpy as np
-from support.published import CLASSES, SparseArchive, files, npy
+from support.published import CLASSES, SparseArchive, files
 from support.published_hub import PublishedHub
+from support.raw_sources import npy
 from support.synthetic import Dataset, make_asset
 
 from slatprep.parameters import PixieverseSource

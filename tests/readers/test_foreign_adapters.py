@@ -60,7 +60,7 @@ FIELDS: dict[str, Callable[[Any], Any]] = {
 
 
 @pytest.mark.parametrize("case", FIELDS)
-def test_a_field_that_is_none_is_refused(make_pair: MakePair, case: str) -> None:
+def test_a_field_that_is_none_is_refused(make_pair, case):
     pair = make_pair()
     sound = PixieVerse().read(pair, 0.1)
     adapter = SimpleNamespace(read=lambda *_: FIELDS[case](sound))
@@ -68,7 +68,7 @@ def test_a_field_that_is_none_is_refused(make_pair: MakePair, case: str) -> None
         guarded("slatprep.sources", adapter, "mine", "theirs 1.0").read(pair, 0.1)
 
 
-def test_a_sound_field_passes(make_pair: MakePair) -> None:
+def test_a_sound_field_passes(make_pair):
     pair = make_pair()
     field = guarded("slatprep.sources", PixieVerse(), "mine", "theirs 1.0").read(pair, 0.1)
     np.testing.assert_array_equal(field.voxels, PixieVerse().read(pair, 0.1).voxels)
@@ -99,7 +99,7 @@ def of_file(slat: Any, **changes: object) -> Any:
 
 
 @pytest.mark.parametrize("case", SLATS)
-def test_latents_that_are_none_are_refused(make_pair: MakePair, case: str) -> None:
+def test_latents_that_are_none_are_refused(make_pair, case):
     pair = make_pair()
     sound = read_latents(pair)
     adapter = SimpleNamespace(read=lambda *_: SLATS[case](sound))
@@ -126,7 +126,7 @@ def _closing(*_: object) -> Any:
 
 
 @pytest.mark.parametrize("raising", [_raising, _leaving, _closing, None])
-def test_whatever_is_raised_is_theirs(make_pair: MakePair, raising: Any) -> None:
+def test_whatever_is_raised_is_theirs(make_pair, raising):
     told = SimpleNamespace(describe=raising, read=raising, find=raising)
     adapter: Any = guarded("slatprep.sources", told, "mine", "theirs 1.0")
     for call in (
@@ -151,14 +151,14 @@ def test_whatever_is_raised_is_theirs(make_pair: MakePair, raising: Any) -> None
         Holding(classes=tuple(f"c{k}" for k in range(255))),
     ],
 )
-def test_what_a_source_cannot_hold_is_refused(held: Any) -> None:
+def test_what_a_source_cannot_hold_is_refused(held):
     told = SimpleNamespace(describe=lambda _: held)
     with pytest.raises(InputError, match=THEIRS):
         guarded("slatprep.sources", told, "mine", "theirs 1.0").describe(None)  # type: ignore
 
 
 @pytest.mark.parametrize("found", [_half_found, lambda *_: None, lambda *_: [5]])
-def test_what_is_no_field_is_not_found(found: Any) -> None:
+def test_what_is_no_field_is_not_found(found):
     adapter: Any = guarded("slatprep.sources", SimpleNamespace(find=found), "mine", "theirs 1.0")
     with pytest.raises(InputError, match=THEIRS):
         list(adapter.find(None, None))
@@ -191,13 +191,13 @@ def installed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]
 
 @pytest.mark.usefixtures("installed")
 @pytest.mark.parametrize("name", ["torn", "boom", "leave", "gone"])
-def test_an_adapter_that_cannot_be_loaded_is_named(name: str) -> None:
+def test_an_adapter_that_cannot_be_loaded_is_named(name):
     with pytest.raises(ConfigError, match=rf"adapter '{name}' .* cannot be loaded"):
         source_adapter(name)
 
 
 @pytest.mark.usefixtures("installed")
-def test_latents_have_the_name_of_their_adapter(tmp_path: Path) -> None:
+def test_latents_have_the_name_of_their_adapter(tmp_path):
     """By another name they would be read by that one's adapter."""
     with pytest.raises(InputError, match="gives latents of 'trellis'; expected its own name"):
         latent_space(SlatSource(tmp_path, encoder="borrowed"))

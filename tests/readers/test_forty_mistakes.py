@@ -207,23 +207,23 @@ NAMES = {
 MISTAKES = {**UNITS, **LAYOUT, **NAMES}
 
 
-def test_there_are_forty() -> None:
+def test_there_are_forty():
     assert len(MISTAKES) >= 40
 
 
-def test_without_a_mistake_nothing_is_said(dataset: Dataset) -> None:
+def test_without_a_mistake_nothing_is_said(dataset):
     assert said(dataset.parameters()) == ""
 
 
 @pytest.mark.parametrize("name", MISTAKES)
-def test_a_mistake_is_told(dataset: Dataset, name: str) -> None:
+def test_a_mistake_is_told(dataset, name):
     change, words = MISTAKES[name]
     change(dataset)
     text = said(dataset.parameters())
     assert any(word in text for word in words.split("|")), text
 
 
-def test_the_page_lists_them_with_what_is_said() -> None:
+def test_the_page_lists_them_with_what_is_said():
     page = (Path(__file__).parents[2] / "docs" / "design" / "mistakes.md").read_text("utf-8")
     rows = page.splitlines()
     listed = [tuple(row.strip("| ").split(" | ")) for row in rows if row.startswith("| ")][2:]

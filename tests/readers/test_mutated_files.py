@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from support.raw_sources import COORDS, FEATS, raw_grid
+from support.raw_sources import COORDS, FEATS, npy, raw_grid
 
 from slatprep.errors import InputError
 from slatprep.readers import read_field, read_latents
@@ -51,12 +51,6 @@ def hdf5(libver: str, **options: object) -> bytes:
     with h5py.File(file, "w", libver=libver) as holder:
         holder.create_dataset("coords", data=COORDS, **options)
         holder.create_dataset("feats", data=FEATS, **options)
-    return file.getvalue()
-
-
-def npy(array: np.ndarray) -> bytes:
-    file = io.BytesIO()
-    np.save(file, array)
     return file.getvalue()
 
 

@@ -43,7 +43,8 @@ def test_the_root_of_trellis_s_toolkit(find, tmp_path):
     (root / "metadata.csv").write_text(
         f"sha256,file_identifier\n{SHA},https://example.org/3d-models/a-chair-{UID}\n"
     )
-    (pair,) = find([grid(UID)], [f"latents/dino/{SHA}.npz"], map=root / "metadata.csv")
+    shown = [f"latents/dino/{SHA}.npz", f"ss_latents/enc/{SHA}.npz"]
+    (pair,) = find([grid(UID)], shown, map=root / "metadata.csv")
     assert not pair.problem
     assert pair.slat == root / "latents/dino" / f"{SHA}.npz"
     (pair,) = find(slats=[f"latents/other/{SHA}.npz"], map=root / "metadata.csv")
@@ -243,13 +244,6 @@ def test_patterns_of_deeper_layouts(find):
     )
     assert pair.problem == ""
     assert pair.slat.parts[-3:] == ("latents", "model", "a.npz")
-
-
-def test_the_folder_of_trellis_s_own_toolkit_is_found_as_it_is(find):
-    (pair,) = find(
-        [grid("a")], ["latents/dinov2_enc/a.npz", "ss_latents/enc/a.npz", "metadata.csv"]
-    )
-    assert pair.slat is not None and pair.slat.parent.name == "dinov2_enc"
 
 
 @pytest.mark.parametrize("pattern", ["/{id}.npz", "../{id}.npz", "a//{id}.npz", "{name}.npz"])

@@ -75,6 +75,10 @@ def test_ids_in_a_map_cannot_leave_the_folder(find, tmp_path):
         ("", "columns none"),
         ("object_id,slat_id\na,\n", "line 2: empty"),
         ("object_id,slat_id\n\x80", "cannot be read"),
+        ("object_id,slat_id,object_id\na,b,c\n", "has two columns"),
+        ("object_id,slat_id,view,view\na,b,c,d\n", "has two columns"),
+        ("object_id;slat_id\na;1\n", "save it with commas between the columns"),
+        ("\xff\xfeo\0b\0", "save it as CSV in UTF-8"),
     ],
 )
 def test_bad_maps(find, tmp_path, text, message):
@@ -109,7 +113,14 @@ def test_categories(find, tmp_path):
     pairs = find([grid("a"), grid("b")], ["a.npz", "b.npz"], categories=table)
     assert [pair.category for pair in pairs] == ["soda_cans", ""]
 
-    for text, message in (("{", "JSON"), ("[]", "expected an object"), ('{"a": 1}', "'a' has no")):
+    for text, message in (
+        ("{", "JSON"),
+        ("[]", "expected an object"),
+        ('{"a": 1}', "'a' has no"),
+        ('{"a": {"obj_class": "x"}, "a": {"obj_class": "y"}}', "the key 'a' occurs twice"),
+        ('{"a": {"obj_class": "x", "obj_class": "y"}}', "the key 'obj_class' occurs twice"),
+        ('{"a": {"obj_class": "%s"}}' % ("x" * 257), "has 257 letters; expected at most 256"),
+    ):
         table.write_text(text)
         with pytest.raises(ConfigError, match=message):
             find(categories=table)

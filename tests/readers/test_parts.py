@@ -8,13 +8,12 @@ from typing import Any
 
 import numpy as np
 import pytest
+from support.raw_sources import field_at
 
 from slatprep.errors import InputError
 from slatprep.parameters import BuildParameters, PixieverseSource, SlatSource
 from slatprep.pipeline.dataset import build_store, plan_build
 from slatprep.pipeline.summary import BuildSummary
-from slatprep.readers import discover, read_field
-from slatprep.records import MaterialField, Units
 from slatprep.store import open_store
 
 trimesh = pytest.importorskip("trimesh")
@@ -47,21 +46,12 @@ def box(low: tuple[float, ...], high: tuple[float, ...]) -> Any:
     return made
 
 
-def field_at(root: Path, **units: str) -> MaterialField:
-    slat = root.parent / "slat"
-    slat.mkdir(exist_ok=True)
-    np.savez(slat / "a.npz", coords=np.zeros((1, 3), np.uint8), feats=np.ones((1, 8), np.float32))
-    source = PixieverseSource(root, adapter="parts", units=Units(**units))  # type: ignore[arg-type]
-    (pair,) = discover(BuildParameters(source, SlatSource(slat)))
-    return read_field(pair)
-
-
 @pytest.mark.parametrize("nested", [False, True])
-def test_parts_are_filled_and_have_their_own_materials(nested: bool, tmp_path: Path) -> None:
+def test_parts_are_filled_and_have_their_own_materials(nested, tmp_path):
     # A hammer along x, of any scale and place: head for x in 24..32, handle for 0..24, of 32.
     handle, head = box((100, 0, 0), (124, 4, 4)), box((124, -6, -2), (132, 10, 6))
     write_object(tmp_path / "p", "a", [(HANDLE, handle), (HEAD, head)], nested)
-    field = field_at(tmp_path / "p")
+    field = field_at(tmp_path / "p", "parts")
     x = field.voxels[:, 0].astype(int)
     assert x.min() == 0 and x.max() == 63
     is_head = x > 48
@@ -74,20 +64,20 @@ def test_parts_are_filled_and_have_their_own_materials(nested: bool, tmp_path: P
     assert field.table[0].name == "youngs_modulus" and not field.classified
 
 
-def test_what_lies_inside_another_part_keeps_its_own(tmp_path: Path) -> None:
+def test_what_lies_inside_another_part_keeps_its_own(tmp_path):
     inside, outside = box((-4, -4, -4), (4, 4, 4)), box((-16, -16, -16), (16, 16, 16))
     write_object(tmp_path / "p", "a", [(HANDLE, inside), (HEAD, outside)])
-    field = field_at(tmp_path / "p")
+    field = field_at(tmp_path / "p", "parts")
     assert len(field.voxels) == 64**3
     centre = np.abs(field.voxels.astype(int) - 31.5).max(axis=1) < 8
     assert (field.properties[centre, 1] == 7800).all()
     assert (field.properties[~centre, 1] == 1100).mean() > 0.98
 
 
-def test_units_may_be_stated_in_the_definition(tmp_path: Path) -> None:
+def test_units_may_be_stated_in_the_definition(tmp_path):
     stuff = {"density": 7800, "Young's Modulus (GPa)": 200_000, "Poisson's Ratio": 0.29}
     write_object(tmp_path / "p", "a", [(stuff, box((0, 0, 0), (1, 1, 1)))])
-    field = field_at(tmp_path / "p", youngs_modulus="MPa", density="kg/m^3")
+    field = field_at(tmp_path / "p", "parts", youngs_modulus="MPa", density="kg/m^3")
     np.testing.assert_allclose(field.properties[0], [2e11, 7800, 0.29])
 
 
@@ -99,25 +89,25 @@ def test_units_may_be_stated_in_the_definition(tmp_path: Path) -> None:
         ({**HEAD, "Poisson's Ratio": None}, "part 0 has Poisson's Ratio None; expected a number"),
     ],
 )
-def test_what_is_no_number_is_named(stuff: dict[str, Any], said: str, tmp_path: Path) -> None:
+def test_what_is_no_number_is_named(stuff, said, tmp_path):
     write_object(tmp_path / "p", "a", [(stuff, box((0, 0, 0), (1, 1, 1)))])
     with pytest.raises(InputError) as refused:
-        field_at(tmp_path / "p")
+        field_at(tmp_path / "p", "parts")
     assert said in str(refused.value)
 
 
-def test_missing_and_broken_meshes_are_named(tmp_path: Path) -> None:
+def test_missing_and_broken_meshes_are_named(tmp_path):
     write_object(tmp_path / "p", "a", [(HEAD, box((0, 0, 0), (1, 1, 1)))])
     mesh = tmp_path / "p" / "partseg" / "a" / "objs" / "0.obj"
     mesh.write_text("v 0 0 0\n")
     with pytest.raises(InputError, match="is no mesh"):
-        field_at(tmp_path / "p")
+        field_at(tmp_path / "p", "parts")
     mesh.unlink()
     with pytest.raises(InputError, match="part 0 has no mesh"):
-        field_at(tmp_path / "p")
+        field_at(tmp_path / "p", "parts")
     (tmp_path / "p" / "finaljson" / "a.json").write_text('{"parts": [{"label": "x"}]}')
     with pytest.raises(InputError, match="is no annotation of parts"):
-        field_at(tmp_path / "p")
+        field_at(tmp_path / "p", "parts")
 
 
 @pytest.fixture
@@ -129,7 +119,7 @@ def built(tmp_path: Path) -> partial[BuildSummary]:
         (HANDLE, box((2, 1, 0), (5, 3, 12))),
     ]
     write_object(tmp_path / "p", "a", parts)
-    field = field_at(tmp_path / "p")
+    field = field_at(tmp_path / "p", "parts")
     solid = np.zeros((66,) * 3, bool)
     solid[tuple(field.voxels.T.astype(int) + 1)] = True
     buried = np.all([np.roll(solid, s, a) for s in (-1, 1) for a in range(3)], axis=0)
@@ -142,31 +132,25 @@ def built(tmp_path: Path) -> partial[BuildSummary]:
     return partial(build_store, parameters, tmp_path / "s.zarr")
 
 
-def test_a_store_is_built_of_parts_and_knows_every_file(
-    built: partial[BuildSummary], tmp_path: Path
-) -> None:
+@pytest.mark.parametrize("rehash", [False, True])
+def test_a_store_of_parts_follows_every_mesh(rehash, built, tmp_path):
+    plan = partial(plan_build, *built.args, rehash=rehash)
     assert built().verdicts == {"good": 1}
-    asset = open_store(tmp_path / "s.zarr").asset("a")
-    heavy = asset.properties_si[:, 1] > 5000
+    heavy = heavy_in(tmp_path / "s.zarr")
     assert 0.05 < heavy.mean() < 0.9
     record = json.loads((tmp_path / "s.manifests" / "assets.jsonl").read_text().splitlines()[0])
     names = {file["path"] for file in record["sources"]}
     assert {f"partseg/a/objs/{k}.obj" for k in range(3)} <= names
+    for part, half in ((2, ((2, 1, 0), (5, 3, 7))), (0, ((0, 0, 0), (12, 4, 4)))):
+        time.sleep(0.2)  # A file as young as the build that read it is hashed in any case.
+        assert plan().assets[0].reason == "unchanged"
+        box(*half).export(tmp_path / "p" / "partseg" / "a" / "objs" / f"{part}.obj")
+        assert plan().assets[0].reason == "sources changed: description"
+        built(rehash=rehash)
+        before, heavy = heavy, heavy_in(tmp_path / "s.zarr")
+        assert heavy.sum() < 0.95 * before.sum()
 
 
-@pytest.mark.parametrize("rehash", [False, True])
-@pytest.mark.parametrize("part", [0, 2])
-def test_a_changed_mesh_changes_the_asset(
-    part: int, rehash: bool, built: partial[BuildSummary], tmp_path: Path
-) -> None:
-    plan = partial(plan_build, *built.args, rehash=rehash)
-    built()
-    heavy = (open_store(tmp_path / "s.zarr").asset("a").properties_si[:, 1] > 5000).sum()
-    time.sleep(0.2)  # A file as young as the build that read it is hashed in any case.
-    assert plan().assets[0].reason == "unchanged"
-    half = {0: ((0, 0, 0), (12, 4, 4)), 2: ((2, 1, 0), (5, 3, 7))}[part]
-    box(*half).export(tmp_path / "p" / "partseg" / "a" / "objs" / f"{part}.obj")
-    assert plan().assets[0].reason == "sources changed: description"
-    built(rehash=rehash)
-    now = (open_store(tmp_path / "s.zarr").asset("a").properties_si[:, 1] > 5000).sum()
-    assert now < 0.95 * heavy
+def heavy_in(store: Path) -> np.ndarray:
+    """Say which voxels of the asset are of the handle's material."""
+    return open_store(store).asset("a").properties_si[:, 1] > 5000

@@ -101,14 +101,6 @@ def test_sources(make_pair):
         assert source.sha256 == hashlib.sha256(data).hexdigest()
 
 
-def test_shared_file_is_hashed_again_when_it_changed(make_pair):
-    pair = hdf5_pair(make_pair(), "a", coords=COORDS, feats=FEATS)
-    before = read_latents(pair).sources[0].sha256
-    hdf5_pair(pair, "b", coords=COORDS, feats=FEATS)
-    after = read_latents(pair).sources[0].sha256
-    assert before != after == hashlib.sha256(pair.slat.read_bytes()).hexdigest()
-
-
 def test_shared_file_is_hashed_again_when_it_changed_in_the_same_tick(make_pair):
     pair = hdf5_pair(make_pair(), "a", coords=COORDS, feats=FEATS)
     before, state = read_latents(pair).sources[0].sha256, pair.slat.stat()

@@ -6,12 +6,13 @@ import struct
 import tracemalloc
 import zipfile
 import zlib
+from collections.abc import Callable
 from dataclasses import replace
 
 import h5py
 import numpy as np
 import pytest
-from support.raw_sources import COORDS, FEATS, raw_grid
+from support.raw_sources import COORDS, FEATS, npy
 
 from slatprep.errors import InputError
 from slatprep.readers import read_field, read_latents
@@ -26,12 +27,6 @@ def npy_header(text: str, version: int = 1) -> bytes:
     return b"\x93NUMPY" + bytes([version, 0]) + length + text.encode("latin-1")
 
 
-def npy_bytes(array: np.ndarray) -> bytes:
-    file = io.BytesIO()
-    np.save(file, array)
-    return file.getvalue()
-
-
 def npz_bytes(compression: int = zipfile.ZIP_DEFLATED, **members: bytes) -> bytes:
     file = io.BytesIO()
     with zipfile.ZipFile(file, "w", compression) as archive:
@@ -40,11 +35,13 @@ def npz_bytes(compression: int = zipfile.ZIP_DEFLATED, **members: bytes) -> byte
     return file.getvalue()
 
 
-def peak_megabytes(action) -> float:
+def refused(match: str, read: Callable[..., object], *arguments: object, below: int = 8) -> None:
+    """Have `read` raise an error that matches, at less than so many MiB of memory."""
     tracemalloc.start()
     try:
-        action()
-        return tracemalloc.get_traced_memory()[1] / 2**20
+        with pytest.raises(InputError, match=match):
+            read(*arguments)
+        assert tracemalloc.get_traced_memory()[1] < below * 2**20
     finally:
         tracemalloc.stop()
 
@@ -135,24 +132,14 @@ def test_bytes_after_the_array_are_a_fault(make_pair):
 @pytest.mark.parametrize("version", [1, 2])
 def test_npy_headers_that_lie(text, version):
     data = npy_header(text, version) + FEATS.tobytes()
-
-    def read():
-        with pytest.raises(InputError, match=r"^x\.npy: "):
-            npy_array(data, "x.npy", ROWS["feats"])
-
-    assert peak_megabytes(read) < 8
+    refused(r"^x\.npy: ", npy_array, data, "x.npy", ROWS["feats"])
 
 
 def test_npy_header_that_claims_four_gigabytes():
     header = b"\x93NUMPY\x02\x00" + struct.pack("<I", 2**32 - 1) + b" " * 100
     bomb = npz_bytes(feats=header + b" " * 2**26)
     assert len(bomb) < 2**20
-
-    def read():
-        with pytest.raises(InputError, match=r"x\.npz \[feats\]"):
-            npz_arrays(bomb, "x.npz", ROWS)
-
-    assert peak_megabytes(read) < 8
+    refused(r"x\.npz \[feats\]", npz_arrays, bomb, "x.npz", ROWS)
 
 
 def test_npz_that_claims_ten_gigabytes_costs_nothing():
@@ -162,40 +149,22 @@ def test_npz_that_claims_ten_gigabytes_costs_nothing():
     size = struct.pack("<I", len(header) + 1000)
     claimed = honest.replace(size, struct.pack("<I", 2**32 - 2))
     for data in (honest, claimed):
-
-        def read(data=data):
-            with pytest.raises(InputError, match=r"x\.npz \[feats\].*335544320, 8"):
-                npz_arrays(data, "x.npz", ROWS)
-
-        assert peak_megabytes(read) < 4
+        refused(r"x\.npz \[feats\].*335544320, 8", npz_arrays, data, "x.npz", ROWS, below=4)
 
 
-def test_npz_bomb_is_not_inflated():
+def test_npz_bomb_is_not_inflated_whatever_its_directory_says():
     # 64 MiB of zeros behind the header of a small array.
-    bomb = npz_bytes(feats=npy_bytes(FEATS) + b"\0" * 2**26)
-
-    def read():
-        with pytest.raises(InputError, match="announces 96 bytes of data"):
-            npz_arrays(bomb, "x.npz", ROWS)
-
-    assert peak_megabytes(read) < 4
-
-
-def test_npz_whose_directory_understates_a_bomb():
-    bomb = npz_bytes(feats=npy_bytes(FEATS) + b"\0" * 2**26)
-    real = struct.pack("<I", len(npy_bytes(FEATS)) + 2**26)
-    lie = bomb.replace(real, struct.pack("<I", len(npy_bytes(FEATS))))
+    bomb = npz_bytes(feats=npy(FEATS) + b"\0" * 2**26)
+    refused("announces 96 bytes of data", npz_arrays, bomb, "x.npz", ROWS, below=4)
+    real = struct.pack("<I", len(npy(FEATS)) + 2**26)
+    lie = bomb.replace(real, struct.pack("<I", len(npy(FEATS))))
     assert lie != bomb
-
-    def read():
-        with pytest.raises(InputError, match=r"x\.npz \[feats\]: is damaged \(Bad CRC"):
-            npz_arrays(lie, "x.npz", ROWS)
-
-    assert peak_megabytes(read) < 4
+    told = r"x\.npz \[feats\]: is damaged \(Bad CRC"
+    refused(told, npz_arrays, lie, "x.npz", ROWS, below=4)
 
 
 def test_npz_with_flipped_data_fails_its_checksum():
-    data = bytearray(npz_bytes(zipfile.ZIP_STORED, feats=npy_bytes(FEATS)))
+    data = bytearray(npz_bytes(zipfile.ZIP_STORED, feats=npy(FEATS)))
     at = data.index(FEATS.tobytes())
     data[at] ^= 1
     with pytest.raises(InputError, match=r"x\.npz \[feats\]: is damaged \(Bad CRC"):
@@ -205,14 +174,14 @@ def test_npz_with_flipped_data_fails_its_checksum():
 @pytest.mark.parametrize("compression", [zipfile.ZIP_BZIP2, zipfile.ZIP_LZMA])
 def test_npz_of_other_compression_is_refused(compression):
     with pytest.raises(InputError, match="uses zip compression"):
-        npz_arrays(npz_bytes(compression, feats=npy_bytes(FEATS)), "x.npz", ROWS)
+        npz_arrays(npz_bytes(compression, feats=npy(FEATS)), "x.npz", ROWS)
 
 
 def test_npz_with_two_arrays_of_one_name():
     file = io.BytesIO()
     with zipfile.ZipFile(file, "w") as archive, pytest.warns(UserWarning, match="Duplicate"):
-        archive.writestr("feats.npy", npy_bytes(FEATS))
-        archive.writestr("feats.npy", npy_bytes(FEATS))
+        archive.writestr("feats.npy", npy(FEATS))
+        archive.writestr("feats.npy", npy(FEATS))
     with pytest.raises(InputError, match="has 2 arrays named 'feats'"):
         npz_arrays(file.getvalue(), "x.npz", ROWS)
 
@@ -223,43 +192,23 @@ def test_npz_with_very_many_members():
         npz_arrays(many, "x.npz", ROWS)
 
 
-def test_hdf5_chunk_that_inflates_beyond_its_size(make_pair):
+def test_hdf5_that_claims_or_inflates_to_gigabytes_costs_nothing(make_pair):
     pair = make_pair()
-    path = pair.slat.with_name("a.h5")
-    with h5py.File(path, "w") as file:
-        file["coords"] = COORDS
-        feats = file.create_dataset("feats", (3, 8), "<f4", chunks=(3, 8), compression="gzip")
-        feats.id.write_direct_chunk((0, 0), zlib.compress(b"\0" * 2**24))
-    with pytest.raises(InputError, match="does not unpack to 96 bytes"):
-        read_latents(replace(pair, slat=path))
+    for name, fault, options in (
+        ("a.h5", "does not unpack to 96 bytes", {"shape": (3, 8), "chunks": (3, 8)}),
+        ("b.h5", "has shape", {"shape": (2**28, 8), "chunks": (2**20, 8)}),
+    ):
+        path = pair.slat.with_name(name)
+        with h5py.File(path, "w") as file:
+            file["coords"] = COORDS
+            feats = file.create_dataset("feats", dtype="<f4", compression="gzip", **options)
+            if name == "a.h5":
+                feats.id.write_direct_chunk((0, 0), zlib.compress(b"\0" * 2**24))
+        refused(fault, read_latents, replace(pair, slat=path))
 
 
-def test_hdf5_that_claims_gigabytes_costs_nothing(make_pair):
-    pair = make_pair()
-    path = pair.slat.with_name("a.h5")
-    with h5py.File(path, "w") as file:
-        file["coords"] = COORDS
-        file.create_dataset("feats", (2**28, 8), "<f4", chunks=(2**20, 8), compression="gzip")
-
-    def read():
-        with pytest.raises(InputError, match="has shape"):
-            read_latents(replace(pair, slat=path))
-
-    assert peak_megabytes(read) < 8
-
-
-def test_fortran_and_big_endian_arrays_read_alike(make_pair):
-    spec = ArraySpec(shapes=((64, 64, 64, 4),), kinds="f")
-    grid = raw_grid()
-    for variant in (np.asfortranarray(grid), grid.astype(">f4"), grid.astype("<f4")):
-        array = npy_array(npy_bytes(variant), "x.npy", spec)
-        assert array.dtype == np.float32
-        assert array.dtype.isnative
-        np.testing.assert_array_equal(array, grid)
-
-
-def test_a_shape_of_truth_values_is_refused() -> None:
+def test_a_shape_of_truth_values_is_refused():
     """Python takes True for 1, and numpy makes an array of it that cannot be shaped again."""
-    data = npy_bytes(np.zeros((1, 3), np.float32)).replace(b"(1, 3), }   ", b"(True, 3), }", 1)
+    data = npy(np.zeros((1, 3), np.float32)).replace(b"(1, 3), }   ", b"(True, 3), }", 1)
     with pytest.raises(InputError, match=r"has shape \(True, 3\)"):
         npy_array(data, "x.npy", ArraySpec(((None, 3),), "f"))

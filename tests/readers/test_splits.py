@@ -23,7 +23,7 @@ SOME = sorted(OBJECTS)[:6]
 
 
 @pytest.mark.parametrize("count", [1, 2, 9, 10, 11, 157, 1577])
-def test_pixie_s_rule_is_torch_s_random_split(count: int) -> None:
+def test_pixie_s_rule_is_torch_s_random_split(count):
     torch = pytest.importorskip("torch")
     ids = [f"{k:032x}" for k in range(count)]
     permutation = torch.randperm(count, generator=torch.Generator().manual_seed(42)).tolist()
@@ -31,7 +31,7 @@ def test_pixie_s_rule_is_torch_s_random_split(count: int) -> None:
     assert pixie_test_objects(reversed(ids)) == expected
 
 
-def test_pixie_s_rule_without_torch() -> None:
+def test_pixie_s_rule_without_torch():
     # The last 3 of torch.randperm(30, generator=torch.Generator().manual_seed(42)), torch 2.13.
     letters = [f"{k:02d}" for k in range(30)]
     assert pixie_test_objects(letters) == ["05", "24", "03"]
@@ -39,7 +39,7 @@ def test_pixie_s_rule_without_torch() -> None:
 
 
 @pytest.mark.parametrize("shares", [Shares(), Shares(0.5, 0.25, 0.25), Shares(1.0, 0.0, 0.0)])
-def test_what_no_rule_tests_on_is_parted_by_the_hash(shares: Shares) -> None:
+def test_what_no_rule_tests_on_is_parted_by_the_hash(shares):
     for by, test in (
         ("pixie", set(pixie_test_objects(OBJECTS))),
         ("category:tree", {name for name, category in OBJECTS.items() if category == "tree"}),
@@ -52,12 +52,12 @@ def test_what_no_rule_tests_on_is_parted_by_the_hash(shares: Shares) -> None:
         assert {name: split for name, split in splits.items() if split != "test"} == rest
 
 
-def test_a_category_that_is_not_there_is_named() -> None:
+def test_a_category_that_is_not_there_is_named():
     with pytest.raises(ConfigError, match="'cars'; expected one of: rocks, tree"):
         assign_splits("category:cars", OBJECTS)
 
 
-def test_shares_without_training_are_refused() -> None:
+def test_shares_without_training_are_refused():
     with pytest.raises(ConfigError, match="nothing to train"):
         assign_splits("pixie", OBJECTS, Shares(0.0, 0.0, 1.0))
     with pytest.raises(ConfigError, match="add up to 1"):
@@ -84,14 +84,14 @@ def written(path: Path, ids: Any) -> str:
         ("windows.txt", b"\xef\xbb\xbf" + "\r\n\r\n  ".join(SOME).encode() + b"\r\n"),
     ],
 )
-def test_a_single_list_is_what_is_tested_on(tmp_path: Path, name: str, ids: Any) -> None:
+def test_a_single_list_is_what_is_tested_on(tmp_path, name, ids):
     found = assign_splits(written(tmp_path / name, ids), OBJECTS)
     assert found.lists()["test"] == SOME
     assert found.splits.keys() == OBJECTS.keys()
     assert (found.unknown, found.unlisted) == ((), ())
 
 
-def test_lists_are_taken_as_they_are(tmp_path: Path) -> None:
+def test_lists_are_taken_as_they_are(tmp_path):
     lists = {"train": [SOME[0], "nobody", "nobody"], "test": [SOME[1], SOME[1], "view"]}
     path = written(tmp_path / "splits.json", lists)
     found = assign_splits(path, OBJECTS, assets={"view": SOME[2]})
@@ -103,7 +103,7 @@ def test_lists_are_taken_as_they_are(tmp_path: Path) -> None:
     assert assign_splits(kept, OBJECTS) == Assignment(found.splits, (), found.unlisted)
 
 
-def test_an_object_in_two_lists_is_an_error(tmp_path: Path) -> None:
+def test_an_object_in_two_lists_is_an_error(tmp_path):
     path = written(tmp_path / "two.json", {"train": SOME, "test": ["view"]})
     with pytest.raises(ConfigError, match="'view' is in the lists train and test"):
         assign_splits(path, OBJECTS, assets={"view": SOME[4]})
@@ -132,9 +132,7 @@ def test_an_object_in_two_lists_is_an_error(tmp_path: Path) -> None:
         ("a.json", None, "cannot be read"),
     ],
 )
-def test_files_that_are_no_lists_are_named(
-    tmp_path: Path, name: str, ids: Any, message: str
-) -> None:
+def test_files_that_are_no_lists_are_named(tmp_path, name, ids, message):
     path = tmp_path / name
     if ids is not None:
         written(path, ids)
@@ -145,7 +143,7 @@ def test_files_that_are_no_lists_are_named(
     assert str(path) in str(caught.value)
 
 
-def test_no_pickle_is_read(tmp_path: Path) -> None:
+def test_no_pickle_is_read(tmp_path):
     class Bomb:
         def __reduce__(self) -> tuple[Any, ...]:
             return (Path.touch, (tmp_path / "harmed",))
@@ -156,7 +154,7 @@ def test_no_pickle_is_read(tmp_path: Path) -> None:
     assert not (tmp_path / "harmed").exists()
 
 
-def test_a_file_without_an_end_is_not_read_to_it(tmp_path: Path) -> None:
+def test_a_file_without_an_end_is_not_read_to_it(tmp_path):
     path = tmp_path / "large.txt"
     with path.open("wb") as file:
         file.truncate(2**40)

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import zarr
+from support.raw_sources import field_at
 
 from slatprep.demo.sources import (
     write_description,
@@ -20,9 +21,8 @@ from slatprep.errors import ConfigError, InputError
 from slatprep.inspect.verify import verify_store
 from slatprep.parameters import AlignParameters, BuildParameters, PixieverseSource, SlatSource
 from slatprep.pipeline.dataset import build_store
-from slatprep.readers import discover, read_field
 from slatprep.readers.files import load_source
-from slatprep.records import Engine, MaterialField
+from slatprep.records import Engine
 
 TABLE = (
     {"name": "density", "unit": "kg/m^3", "scale": "log10"},
@@ -46,16 +46,6 @@ def rows_of(count: int, side: int = 64, seed: int = 0) -> dict[str, np.ndarray]:
     }
 
 
-def field_at(root: Path, adapter: str = "voxels") -> MaterialField:
-    """Read the one field below a root, for which a SLAT is made."""
-    slat = root.parent / "slat"
-    slat.mkdir(exist_ok=True)
-    np.savez(slat / "a.npz", coords=np.zeros((1, 3), np.uint8), feats=np.ones((1, 8), np.float32))
-    source = PixieverseSource(root, adapter=adapter)
-    (pair,) = discover(BuildParameters(source, SlatSource(slat)))
-    return read_field(pair)
-
-
 def in_order(rows: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
     """Return rows in C order of the grid, as a field has them."""
     order = np.lexsort(rows["voxels"].T[::-1])
@@ -69,7 +59,7 @@ def root(tmp_path: Path) -> Path:
 
 
 @pytest.mark.parametrize("form", FORMS)
-def test_every_form_holds_the_same_72_000_voxels(root: Path, form: str) -> None:
+def test_every_form_holds_the_same_72_000_voxels(root, form):
     rows = rows_of(72_000)
     if form == "ply":
         del rows["segment"]
@@ -85,7 +75,7 @@ def test_every_form_holds_the_same_72_000_voxels(root: Path, form: str) -> None:
     assert field.sources[0].path.startswith("a.")
 
 
-def test_a_grid_of_128_may_be_fuller_than_all_of_64(root: Path) -> None:
+def test_a_grid_of_128_may_be_fuller_than_all_of_64(root):
     write_description(root, TABLE, CLASSES, resolution=128)
     rows = rows_of(300_000, side=128)
     write_voxels(root, "a", "npz", rows)
@@ -94,7 +84,7 @@ def test_a_grid_of_128_may_be_fuller_than_all_of_64(root: Path) -> None:
     np.testing.assert_array_equal(field.voxels, cells)
 
 
-def test_a_structured_array_of_72_000_voxels_is_read(tmp_path: Path) -> None:
+def test_a_structured_array_of_72_000_voxels_is_read(tmp_path):
     rows = rows_of(72_000)
     columns = {
         "youngs_modulus": rows["density"] * np.float32(1000),
@@ -110,7 +100,7 @@ def test_a_structured_array_of_72_000_voxels_is_read(tmp_path: Path) -> None:
         np.testing.assert_array_equal(field.properties[:, column], expected[name])
 
 
-def test_physxnet_gives_the_density_of_the_voxels_beside_it(tmp_path: Path) -> None:
+def test_physxnet_gives_the_density_of_the_voxels_beside_it(tmp_path):
     rows, root = rows_of(500), tmp_path / "physx"
     write_physxnet(root, "a", rows["voxels"], rows["density"])
     field = field_at(root, "physxnet")
@@ -125,7 +115,7 @@ def test_physxnet_gives_the_density_of_the_voxels_beside_it(tmp_path: Path) -> N
         field_at(root, "physxnet")
 
 
-def test_physxnet_without_voxels_says_what_is_lacking(tmp_path: Path) -> None:
+def test_physxnet_without_voxels_says_what_is_lacking(tmp_path):
     rows, root = rows_of(50), tmp_path / "physx"
     write_physxnet(root, "a", rows["voxels"], rows["density"])
     (root / "voxels" / "a.ply").unlink()
@@ -146,9 +136,7 @@ def test_physxnet_without_voxels_says_what_is_lacking(tmp_path: Path) -> None:
         (["Wood"], "the names of classes are Wood"),
     ],
 )
-def test_class_tables_that_no_store_can_have_are_refused(
-    root: Path, classes: list[str], said: str
-) -> None:
+def test_class_tables_that_no_store_can_have_are_refused(root, classes, said):
     about = json.loads((root / "source.json").read_text()) | {"classes": classes}
     (root / "source.json").write_text(json.dumps(about))
     write_voxels(root, "a", "npz", rows_of(10))
@@ -156,7 +144,7 @@ def test_class_tables_that_no_store_can_have_are_refused(
         field_at(root)
 
 
-def test_a_class_that_the_table_does_not_have_is_refused(root: Path) -> None:
+def test_a_class_that_the_table_does_not_have_is_refused(root):
     for material in (3, -1, 0.5):
         rows = rows_of(10)
         rows["material"] = np.full(10, material, np.float32)
@@ -210,14 +198,14 @@ def damaged(root: Path, how: str) -> None:
         ("torn", "cannot be unpacked|it holds"),
     ],
 )
-def test_zarr_that_cannot_be_read_is_said(root: Path, how: str, said: str) -> None:
+def test_zarr_that_cannot_be_read_is_said(root, how, said):
     damaged(root, how)
     with pytest.raises(InputError, match=rf"a\.zarr \[density\].*({said})"):
         field_at(root)
 
 
 @pytest.mark.parametrize("name", ["voxels", "material", "density", "damping"])
-def test_a_lost_chunk_of_zarr_is_refused_unless_it_may_be_empty(root: Path, name: str) -> None:
+def test_a_lost_chunk_of_zarr_is_refused_unless_it_may_be_empty(root, name):
     rows = rows_of(3000) | {"material": np.zeros(3000, np.uint8)}
     write_voxels(root, "a", "zarr", rows)
     assert len(field_at(root).voxels) == 3000
@@ -235,7 +223,7 @@ def test_a_lost_chunk_of_zarr_is_refused_unless_it_may_be_empty(root: Path, name
     assert np.unique(field_at(root).material).tolist() == [0]
 
 
-def test_any_file_of_a_zarr_group_decides_what_it_is(root: Path) -> None:
+def test_any_file_of_a_zarr_group_decides_what_it_is(root):
     rows = rows_of(100)
     write_voxels(root, "a", "zarr", rows)
     before = field_at(root).sources[0]
@@ -247,9 +235,7 @@ def test_any_file_of_a_zarr_group_decides_what_it_is(root: Path) -> None:
     assert field_at(root).sources[0].sha256 != before.sha256
 
 
-def test_the_hash_of_a_zarr_group_does_not_tell_the_system(
-    root: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_hash_of_a_zarr_group_does_not_tell_the_system(root, monkeypatch):
     write_voxels(root, "a", "zarr", rows_of(100))
     before = load_source(root / "a.zarr", root, "grid")
     monkeypatch.setattr("zipfile.sys.platform", "win32")
@@ -257,7 +243,7 @@ def test_the_hash_of_a_zarr_group_does_not_tell_the_system(
 
 
 @pytest.mark.parametrize("name", ["a.zarr", "a.ZARR"])
-def test_a_zarr_group_that_cannot_be_listed_is_its_own_fault_alone(root: Path, name: str) -> None:
+def test_a_zarr_group_that_cannot_be_listed_is_its_own_fault_alone(root, name):
     """A path longer than the system takes cannot be asked for its size, whoever asks."""
     group = root / name
     group.mkdir()
@@ -277,7 +263,7 @@ def test_a_zarr_group_that_cannot_be_listed_is_its_own_fault_alone(root: Path, n
         load_source(group, root, "grid")
 
 
-def test_a_ply_that_claims_more_than_it_has_is_refused(root: Path) -> None:
+def test_a_ply_that_claims_more_than_it_has_is_refused(root):
     columns = {axis: np.zeros(3, np.float32) for axis in "xyz"}
     rest = {"density": np.ones(3, np.float32), "damping": np.ones(3, np.float32)}
     write_points(root / "a.ply", columns | rest)
@@ -290,7 +276,7 @@ def test_a_ply_that_claims_more_than_it_has_is_refused(root: Path) -> None:
 
 
 @pytest.mark.usefixtures("files_are_old")
-def test_changed_voxels_of_a_zarr_group_are_looked_up_anew(root: Path) -> None:
+def test_changed_voxels_of_a_zarr_group_are_looked_up_anew(root):
     box = np.argwhere(np.ones((20, 14, 9))) + 22
     rows = {"voxels": box, "density": np.full(len(box), 500.0), "damping": np.full(len(box), 0.5)}
     rows["material"] = np.zeros(len(box), np.uint8)

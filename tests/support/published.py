@@ -26,13 +26,6 @@ def add(archive: tarfile.TarFile, name: str, data: bytes) -> None:
     archive.addfile(member, io.BytesIO(data))
 
 
-def npy(array: np.ndarray) -> bytes:
-    """Return an array as `numpy.save` writes it."""
-    file = io.BytesIO()
-    np.save(file, array)
-    return file.getvalue()
-
-
 def write_object(folder: Path, grid: np.ndarray, seed: int = 0) -> None:
     """Write the files of an object that lie beside its grid, small ones in place of large."""
     rng = np.random.default_rng(seed)

@@ -1,8 +1,13 @@
 """Small sources whose content is written down by hand."""
 
+import io
 from pathlib import Path
 
 import numpy as np
+
+from slatprep.parameters import BuildParameters, PixieverseSource, SlatSource
+from slatprep.readers import discover, read_field
+from slatprep.records import MaterialField, Units
 
 COORDS = np.array([[0, 0, 0], [63, 1, 2], [5, 63, 63]], dtype=np.uint8)
 FEATS = np.arange(24, dtype=np.float32).reshape(3, 8) / 8 - 1
@@ -29,3 +34,20 @@ def touch(root: Path, *names: str) -> None:
 
 def grid(name: str) -> str:
     return f"{name}/sample_0/material_grid.npy"
+
+
+def npy(array: np.ndarray) -> bytes:
+    """Return an array as `numpy.save` writes it."""
+    file = io.BytesIO()
+    np.save(file, array)
+    return file.getvalue()
+
+
+def field_at(root: Path, adapter: str = "voxels", **units: str) -> MaterialField:
+    """Read the one field below a root, for which a SLAT is made."""
+    slat = root.parent / "slat"
+    slat.mkdir(exist_ok=True)
+    np.savez(slat / "a.npz", coords=np.zeros((1, 3), np.uint8), feats=np.ones((1, 8), np.float32))
+    source = PixieverseSource(root, adapter=adapter, units=Units(**units))
+    (pair,) = discover(BuildParameters(source, SlatSource(slat)))
+    return read_field(pair)
