@@ -1,7 +1,8 @@
 """A store's table of assets, and each asset, against the arrays that zarr wrote."""
 
+import shutil
+import sys
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -33,10 +34,9 @@ def merged(tmp_path_factory: pytest.TempPathFactory) -> Made:
 
 
 @pytest.fixture
-def own(tmp_path: Path) -> Path:
+def own(made: Made, tmp_path: Path) -> Path:
     """A store that a test may change."""
-    make_store(tmp_path / "s.zarr")
-    return tmp_path / "s.zarr"
+    return Path(shutil.copytree(str(made[0].path), tmp_path / "s.zarr"))
 
 
 def rows_of(arrays: dict[str, np.ndarray], name: str, row: int) -> np.ndarray:
@@ -51,7 +51,7 @@ def same(found: object, wanted: object) -> bool:
 VOXELS = ("coords", "feats", "properties", "material", "valid", "distance", "place", "confidence")
 
 
-def test_each_asset_has_its_own_rows(made: Made) -> None:
+def test_each_asset_has_its_own_rows(made):
     store, arrays = made
     assert len(store) == 4
     for row, asset_id in enumerate(IDS):
@@ -69,7 +69,7 @@ def test_each_asset_has_its_own_rows(made: Made) -> None:
     assert store.read(0, ()) == {}
 
 
-def test_an_asset_without_several_annotations_says_nothing_of_how_they_differ(made: Made) -> None:
+def test_an_asset_without_several_annotations_says_nothing_of_how_they_differ(made):
     store, _ = made
     for row, size in enumerate(SIZES):
         read = store.read(row, ["spread", "votes"])
@@ -81,7 +81,7 @@ def test_an_asset_without_several_annotations_says_nothing_of_how_they_differ(ma
     assert not store.asset("ant").merged
 
 
-def test_an_asset_of_several_annotations_says_how_they_differ(merged: Made) -> None:
+def test_an_asset_of_several_annotations_says_how_they_differ(merged):
     store, arrays = merged
     assert store.merges
     for row, asset_id in enumerate(IDS):
@@ -92,24 +92,29 @@ def test_an_asset_of_several_annotations_says_how_they_differ(merged: Made) -> N
         assert asset.merged == (SIZES[row] > 0)
 
 
-def test_columns_are_those_of_the_arrays(made: Made) -> None:
+def test_columns_are_those_of_the_arrays(made):
     store, arrays = made
     for name in (*NEWER, "fitness", "verdict", "transform", "property_ambiguity"):
         assert same(store.column(name), arrays[f"asset/{name}"]), name
     assert store.offsets.tolist() == [0, 5, 5, 16, 23]
     assert store.ids == list(IDS)
-    table = store.table()
+    table, frame = store.table(), store.to_pandas()
+    assert list(frame.index) == list(table["id"]) == list(IDS)
+    for name in frame:
+        assert same(frame[name], table[name]), name
     assert table["voxels"].tolist() == list(SIZES)
     assert same(table["confidence"], arrays["asset/confidence"])
     for column, name in enumerate(("youngs_modulus", "density", "poissons_ratio")):
         change = arrays["asset/property_ambiguity"][:, column]
         assert same(table[f"property_ambiguity_{name}"], change)
     assert "property_ambiguity" not in table
-    with pytest.raises(StoreError, match="has no column 'colour'; expected one of id, offset"):
+    with pytest.raises(StoreError, match=r"no column 'colour'; expected one of id, offset.*categ"):
         store.column("colour")
+    with pytest.raises(StoreError, match=r"has no column 'verdikt'; did you mean verdict\?"):
+        store.column("verdikt")
 
 
-def test_properties_are_found_by_name(made: Made) -> None:
+def test_properties_are_found_by_name(made):
     store, _ = made
     assert store.columns_of(["poissons_ratio", "youngs_modulus"]) == [2, 0]
     with pytest.raises(StoreError) as raised:
@@ -120,9 +125,14 @@ def test_properties_are_found_by_name(made: Made) -> None:
     )
 
 
-def test_an_asset_is_found_by_a_beginning_that_no_other_has(made: Made) -> None:
+def test_an_asset_is_found_by_a_beginning_that_no_other_has(made):
     store, _ = made
     assert [store.match(name) for name in ("ant", "a", "cu", "bear.s", "bear.f")] == [0, 0, 3, 2, 1]
+    assert store.asset("cu").index == 3
+    with pytest.raises(UnknownAssetError, match=r"'cu'; did you mean cup\?"):
+        store.find("cu")
+    with pytest.raises(StoreError, match="3 is no id; expected a text, or `match`"):
+        store.find(3)
     assert [store.find(one) for one in IDS] == [0, 1, 2, 3]
     assert "cup" in store
     assert "cu" not in store
@@ -143,15 +153,13 @@ def test_an_asset_is_found_by_a_beginning_that_no_other_has(made: Made) -> None:
         (-5, "has no asset -5"),
     ],
 )
-def test_a_name_that_none_or_several_have_is_answered(
-    made: Made, name: str | int, hint: str
-) -> None:
+def test_a_name_that_none_or_several_have_is_answered(made, name, hint):
     store, _ = made
     with pytest.raises(UnknownAssetError, match=hint):
         store.match(name)
 
 
-def test_assets_are_taken_by_number_id_beginning_and_slice(made: Made) -> None:
+def test_assets_are_taken_by_number_id_beginning_and_slice(made):
     store, _ = made
     names = (0, "0", np.int64(-4), "a", IDS[0])
     assert {store[name].asset_id for name in names} == {IDS[0]}
@@ -161,15 +169,7 @@ def test_assets_are_taken_by_number_id_beginning_and_slice(made: Made) -> None:
     assert [asset.asset_id for asset in store] == list(IDS)
 
 
-def test_a_column_that_is_not_there_is_answered_by_those_that_are(made: Made) -> None:
-    store, _ = made
-    with pytest.raises(StoreError, match=r"has no column 'verdikt'; did you mean verdict\?"):
-        store.column("verdikt")
-    with pytest.raises(StoreError, match=r"has no column 'nope'; expected one of .*category, "):
-        store.column("nope")
-
-
-def test_rows_are_read_by_whatever_names_an_asset(made: Made) -> None:
+def test_rows_are_read_by_whatever_names_an_asset(made):
     store, _ = made
     expected = store.read(0)["coords"]
     assert np.array_equal(store.read(store.ids[0])["coords"], expected)
@@ -177,7 +177,7 @@ def test_rows_are_read_by_whatever_names_an_asset(made: Made) -> None:
         store.read(0, columns=("coordz",))
 
 
-def test_a_notebook_shows_the_store_as_a_table(made: Made) -> None:
+def test_a_notebook_shows_the_store_as_a_table(made):
     store, _ = made
     shown = store._repr_html_()
     for name, value in (
@@ -190,10 +190,25 @@ def test_a_notebook_shows_the_store_as_a_table(made: Made) -> None:
         ("build", BUILD_ID[:12]),
     ):
         assert f"<tr><th>{name}</th><td>{value}</td></tr>" in shown
-    assert repr(store).endswith(": 4 assets (3 good, 1 failed), 23 voxels>")
+    assert repr(store) == f"<Store {store.path}: 4 assets (3 good, 1 failed), 23 voxels>"
+    assert str(store.path) in shown
+    assert repr(store[2]) == "<StoredAsset bear.side: category unknown, good, 11 voxels>"
 
 
-def test_a_field_has_the_annotated_cells_in_si_units(made: Made) -> None:
+def test_a_store_that_cannot_be_read_says_so(own):
+    (own / "asset" / "verdict" / "c" / "0").write_bytes(b"torn")
+    damaged = open_store(own)
+    assert "cannot be read" in repr(damaged)
+    assert "cannot be read" in damaged._repr_html_()
+
+
+def test_without_pandas_the_table_is_offered(made, monkeypatch):
+    monkeypatch.setitem(sys.modules, "pandas", None)
+    with pytest.raises(StoreError, match=r"pip install pandas, or take `Store.table\(\)`"):
+        made[0].to_pandas()
+
+
+def test_a_field_has_the_annotated_cells_in_si_units(made):
     store, arrays = made
     field = store.asset("bear.side").field
     material, properties = arrays["grid/material"][2], arrays["grid/properties"][2]
@@ -216,7 +231,7 @@ def test_a_field_has_the_annotated_cells_in_si_units(made: Made) -> None:
     assert [one.name for one in field.table] == ["youngs_modulus", "density", "poissons_ratio"]
 
 
-def test_a_store_of_other_contents_is_read_by_its_own_tables(tmp_path: Path) -> None:
+def test_a_store_of_other_contents_is_read_by_its_own_tables(tmp_path):
     contents = Contents(
         (Property("density", "kg/m^3", True), Property("hue", "1", False)),
         tuple(f"class {n}" for n in range(20)),
@@ -238,14 +253,14 @@ def test_a_store_of_other_contents_is_read_by_its_own_tables(tmp_path: Path) -> 
     assert field.material.tolist() == arrays["grid/material"][3, 3:9, 5:7, 23].ravel().tolist()
 
 
-def test_a_store_without_classes_has_fields_without(tmp_path: Path) -> None:
+def test_a_store_without_classes_has_fields_without(tmp_path):
     make_store(tmp_path / "s.zarr", Contents(classes=()))
     store = open_store(tmp_path / "s.zarr")
     assert not store.asset("ant").field.classified
     assert "background" not in store.attributes
 
 
-def test_rows_beyond_what_an_asset_may_have_are_refused(own: Path) -> None:
+def test_rows_beyond_what_an_asset_may_have_are_refused(own):
     offsets = zarr.open_group(own, mode="r+", use_consolidated=False)["asset/offset"]
     offsets[:] = np.cumsum([0, MOST_VOXELS, 0, MOST_VOXELS + 1, -1])
     store = open_store(own)
@@ -262,31 +277,36 @@ def test_rows_beyond_what_an_asset_may_have_are_refused(own: Path) -> None:
         open_store(own).rows(0)
 
 
-def test_what_is_no_store_is_told_from_nothing(own: Path) -> None:
-    with pytest.raises(StoreError, match=r"not a slatprep store: .*none/zarr\.json does not"):
+def test_what_is_no_store_is_told_from_nothing(own):
+    told = r"not a slatprep store: .*none/zarr\.json does not exist; build a store"
+    with pytest.raises(StoreError, match=told):
         open_store(own.parent / "none")
     for other in (own / "voxel", own / "voxel" / "feats"):
         with pytest.raises(StoreError, match="is not a slatprep store; expected a directory that"):
             open_store(other)
         assert not is_store(other)
+    for content in ("", "[]", '{"attributes": {"format": "other"}}', '{"attributes": 3}'):
+        (own / "zarr.json").write_text(content)
+        with pytest.raises(StoreError, match="is not a slatprep store"):
+            open_store(own)
 
 
 @pytest.mark.parametrize("version", [None, "1", True, 1.0, 0, 2])
-def test_formats_that_are_not_read_are_refused(own: Path, version: Any) -> None:
+def test_formats_that_are_not_read_are_refused(own, version):
     edit_attributes(own, format_version=version)
     with pytest.raises(StoreError, match=f"has format version {version!r}; this slatprep reads"):
         open_store(own)
     assert is_store(own)
 
 
-def test_a_table_of_other_width_than_attributes_say_is_refused(own: Path) -> None:
+def test_a_table_of_other_width_than_attributes_say_is_refused(own):
     latents = open_store(own).attributes["latents"]
     edit_attributes(own, latents={**latents, "channels": 7, "mean": [], "std": []})
     with pytest.raises(StoreError, match="latents says 7 columns of voxel/feats; expected 8"):
         open_store(own)
 
 
-def test_nothing_is_written_into_a_store(own: Path) -> None:
+def test_nothing_is_written_into_a_store(own):
     require_outside(own.parent / "other")
     require_outside(own.parent)
     with pytest.raises(ConfigError, match=r"s\.zarr is a store; expected a path outside"):

@@ -45,7 +45,7 @@ def read(attributes: dict[str, Any]) -> RootAttributes:
     return found
 
 
-def test_ranges_and_tables_are_in_the_order_of_the_columns() -> None:
+def test_ranges_and_tables_are_in_the_order_of_the_columns():
     found = read(said())
     spans = [(one.name, one.log10, one.lo, one.hi) for one in found.ranges.ranges]
     assert spans == [("density", True, 2.0, 5.0), ("hue", False, -1.0, 1.0)]
@@ -58,7 +58,7 @@ def test_ranges_and_tables_are_in_the_order_of_the_columns() -> None:
     assert found.build.parameters.sample.method == "nearest"
 
 
-def test_a_store_may_have_a_single_property() -> None:
+def test_a_store_may_have_a_single_property():
     attributes = said()
     attributes["property_columns"], attributes["property_units"] = ["hue"], ["1"]
     del attributes["normalization"]["density"]
@@ -67,7 +67,7 @@ def test_a_store_may_have_a_single_property() -> None:
     assert found.ranges.source == "pixie"
 
 
-def test_what_newer_versions_add_is_left_alone() -> None:
+def test_what_newer_versions_add_is_left_alone():
     attributes = said()
     attributes["colour"] = "new"
     attributes["build"]["parameters"]["sample"]["colour"] = "new"
@@ -113,7 +113,7 @@ FAULTS = {
 
 
 @pytest.mark.parametrize("case", FAULTS)
-def test_what_is_wrong_is_told_by_its_name(case: str) -> None:
+def test_what_is_wrong_is_told_by_its_name(case):
     place, value, what, expected = FAULTS[case]
     attributes = at = said()
     for key in place[:-1]:
@@ -128,7 +128,7 @@ def test_what_is_wrong_is_told_by_its_name(case: str) -> None:
     assert finding.expected.startswith(expected)
 
 
-def test_what_is_missing_is_said_to_be_and_every_fault_is_told() -> None:
+def test_what_is_missing_is_said_to_be_and_every_fault_is_told():
     attributes = said()
     del attributes["manifest"], attributes["build"]["versions"]
     attributes["resolution"] = 32
@@ -142,7 +142,7 @@ def test_what_is_missing_is_said_to_be_and_every_fault_is_told() -> None:
 
 
 @pytest.mark.parametrize("parameters", [None, 5, {"sample": 5}, {"sample": None}])
-def test_parameters_that_are_no_tables_are_told(parameters: object) -> None:
+def test_parameters_that_are_no_tables_are_told(parameters):
     attributes = said()
     attributes["build"]["parameters"] = parameters
     found = read_attributes(attributes)
@@ -150,7 +150,7 @@ def test_parameters_that_are_no_tables_are_told(parameters: object) -> None:
     assert all(one.what.startswith("attribute build/parameters") for one in found)
 
 
-def test_arrays_of_another_width_are_told_and_others_left_to_those_who_check_shapes() -> None:
+def test_arrays_of_another_width_are_told_and_others_left_to_those_who_check_shapes():
     found = read(said())
     fine = {"voxel/feats": {"shape": [9, 8]}, "voxel/properties": {"shape": [9, 2]}}
     assert list(width_findings(found, fine)) == []
@@ -166,7 +166,7 @@ def test_arrays_of_another_width_are_told_and_others_left_to_those_who_check_sha
     assert list(width_findings(found, {})) == []
 
 
-def test_segments_begin_where_ids_begin_anew() -> None:
+def test_segments_begin_where_ids_begin_anew():
     assert segments_of([]) == [0]
     assert segments_of(["b"]) == [0]
     assert segments_of(["a", "b", "c"]) == [0]
@@ -174,9 +174,7 @@ def test_segments_begin_where_ids_begin_anew() -> None:
 
 
 @pytest.mark.parametrize(("classes", "background"), [(7, None), (8, 254)])
-def test_the_background_is_said_where_it_is_not_the_usual_one(
-    classes: int, background: int | None
-) -> None:
+def test_the_background_is_said_where_it_is_not_the_usual_one(classes, background):
     contents = Contents(PIXIEVERSE.properties, tuple(f"class {n}" for n in range(classes)))
     ranges = read(said()).ranges
     attributes = root_attributes(ranges, BUILD_ID, {}, contents, ["b", "a"])

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import zarr
-from support.synthetic import JELLY, METAL, QUARTER_TURN, SMALL_SHARDS, Dataset
+from support.synthetic import JELLY, METAL, QUARTER_TURN, SMALL_SHARDS
 
 from slatprep.pipeline.dataset import BuildSummary
 
@@ -32,13 +32,13 @@ def by_hand(stuff: tuple[float, ...]) -> list[float]:
     return values
 
 
-def test_ids_and_what_belongs_to_them(root: zarr.Group) -> None:
+def test_ids_and_what_belongs_to_them(root):
     assert [str(i) for i in root["asset/id"][:]] == IDS
     assert [str(i) for i in root["asset/object_id"][:]] == ["ant", "bear", "bear", "cup", "dog"]
     assert [str(i) for i in root["asset/view"][:]] == ["", "front", "side", "", ""]
 
 
-def test_offsets_and_voxels_are_the_source_files(root: zarr.Group, mixed: Dataset) -> None:
+def test_offsets_and_voxels_are_the_source_files(root, mixed):
     offset = root["asset/offset"][:]
     assert offset.dtype == np.int64
     assert offset[0] == 0
@@ -49,9 +49,7 @@ def test_offsets_and_voxels_are_the_source_files(root: zarr.Group, mixed: Datase
         assert np.array_equal(root["voxel/feats"][rows], mixed.assets[asset_id].feats)
 
 
-def test_supervision_is_the_material_at_the_place_the_voxel_was_turned_from(
-    root: zarr.Group, mixed: Dataset
-) -> None:
+def test_supervision_is_the_material_at_the_place_the_voxel_was_turned_from(root, mixed):
     offset = root["asset/offset"][:]
     for row, asset_id in enumerate(IDS):
         assert np.allclose(root["asset/transform"][row], QUARTER_TURN, atol=1e-3)
@@ -67,7 +65,7 @@ def test_supervision_is_the_material_at_the_place_the_voxel_was_turned_from(
         assert np.allclose(root["voxel/properties"][rows], expected, atol=1e-6)
 
 
-def test_grid_is_the_normalised_field(root: zarr.Group, mixed: Dataset) -> None:
+def test_grid_is_the_normalised_field(root, mixed):
     for row, asset_id in enumerate(IDS):
         material = mixed.assets[asset_id].grid[..., 3]
         stored = root["grid/properties"][row]
@@ -77,7 +75,7 @@ def test_grid_is_the_normalised_field(root: zarr.Group, mixed: Dataset) -> None:
         assert np.allclose(stored[:, material == 1].T, by_hand(METAL), atol=1e-6)
 
 
-def test_attributes_explain_the_store(root: zarr.Group, mixed_build: BuildSummary) -> None:
+def test_attributes_explain_the_store(root, mixed_build):
     attributes = dict(root.attrs)
     assert attributes["format"] == "slatprep-store"
     assert attributes["format_version"] == 1
@@ -93,7 +91,7 @@ def test_attributes_explain_the_store(root: zarr.Group, mixed_build: BuildSummar
     assert attributes["normalization"]["poissons_ratio"]["log10"] is False
 
 
-def test_arrays_have_the_contracts_types_and_names_of_dimensions(root: zarr.Group) -> None:
+def test_arrays_have_the_contracts_types_and_names_of_dimensions(root):
     dtypes = {
         "asset/transform": "float64",
         "voxel/coords": "uint8",
@@ -115,7 +113,7 @@ def test_arrays_have_the_contracts_types_and_names_of_dimensions(root: zarr.Grou
     assert root["grid/material"].metadata.dimension_names == ("asset", "x", "y", "z")
 
 
-def test_every_chunk_of_every_array_ends_with_a_checksum(root: zarr.Group) -> None:
+def test_every_chunk_of_every_array_ends_with_a_checksum(root):
     arrays = [part for _, part in root.members(max_depth=None) if isinstance(part, zarr.Array)]
     assert {array.name for array in arrays} >= {"/asset/record", "/asset/property", "/grid/x"}
     for array in arrays:
@@ -125,7 +123,7 @@ def test_every_chunk_of_every_array_ends_with_a_checksum(root: zarr.Group) -> No
         assert codecs[-1]["name"] == "crc32c", array.name
 
 
-def test_one_file_a_shard_and_one_read_to_open(root: zarr.Group, mixed_build: BuildSummary) -> None:
+def test_one_file_a_shard_and_one_read_to_open(root, mixed_build):
     store = mixed_build.store
     assert store is not None
     n_voxels = root["voxel/coords"].shape[0]

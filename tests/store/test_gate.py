@@ -14,27 +14,38 @@ import numpy as np
 import pytest
 import zarr
 from click.testing import CliRunner
-from support.synthetic import MakeDataset
 
 from slatprep.cli.commands import slatprep
 from slatprep.errors import StoreError
 from slatprep.inspect.verify import verify_store
 from slatprep.parameters import MAX_GRID_SHARD, MAX_VOXEL_CHUNK, MAX_VOXEL_SHARD, StoreParameters
-from slatprep.pipeline.dataset import BuildSummary, build_store
+from slatprep.pipeline.dataset import build_store
 from slatprep.store import open_store
 from slatprep.store.gate import gate_findings
 
 
 @pytest.fixture
-def store(mixed_build: BuildSummary, tmp_path: Path) -> Path:
-    assert mixed_build.store is not None
-    return Path(shutil.copytree(mixed_build.store, tmp_path / "s.zarr"))
+def store(copy: Path) -> Path:
+    return copy
 
 
 def edit_root(store: Path, edit: Callable[[dict[str, Any]], object]) -> None:
     document = json.loads((store / "zarr.json").read_text())
     edit(document)
     (store / "zarr.json").write_text(json.dumps(document))
+
+
+def commands_refuse(store: Path, folder: Path) -> None:
+    """Run commands that read all of a store; each must end in words."""
+    for line in (
+        ["check-alignment", "--asset", "cup", "--store", str(store)],
+        ["export", str(store), "--format", "ply", "--frame", "pixieverse", "--out", f"{folder}/e"],
+        ["describe", str(store), "--out", str(folder / "d.json")],
+        ["verify", str(store)],
+    ):
+        done = CliRunner().invoke(slatprep, line)
+        assert done.exit_code == 1, (line, done.output)
+        assert isinstance(done.exception, SystemExit), (line, done.exception)
 
 
 class Touch:
@@ -71,30 +82,18 @@ def hide_a_pickle(store: Path, ran: Path) -> None:
     )
 
 
-def test_a_pickle_in_format_two_is_never_read(
-    store: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_pickle_in_format_two_is_never_read(store, tmp_path, monkeypatch):
     # As numcodecs had it up to 0.16.5, which unpickles.
     monkeypatch.setattr(numcodecs.Pickle, "decode", lambda self, data, out=None: pickle.loads(data))
     ran = tmp_path / "ran"
     hide_a_pickle(store, ran)
-    for line in (
-        ["check-alignment", "--asset", "cup", "--store", str(store)],
-        ["export", str(store), "--format", "ply", "--frame", "pixieverse", "--out", f"{ran}.e"],
-        ["describe", str(store), "--out", str(tmp_path / "d.json")],
-        ["verify", str(store)],
-    ):
-        done = CliRunner().invoke(slatprep, line)
-        assert not ran.exists(), line
-        assert done.exit_code == 1, (line, done.output)
-        assert isinstance(done.exception, SystemExit), line
+    commands_refuse(store, tmp_path)
+    assert not ran.exists()
     with pytest.raises(StoreError, match="zarr_format is 2; expected 3"):
         open_store(store).group  # noqa: B018
 
 
-def test_the_largest_chunks_and_shards_that_may_be_asked_for_are_read(
-    make_dataset: MakeDataset, tmp_path: Path
-) -> None:
+def test_the_largest_chunks_and_shards_that_may_be_asked_for_are_read(make_dataset, tmp_path):
     largest = StoreParameters(
         voxel_chunk=MAX_VOXEL_CHUNK,
         voxel_chunks_per_shard=MAX_VOXEL_SHARD // MAX_VOXEL_CHUNK,
@@ -105,7 +104,7 @@ def test_the_largest_chunks_and_shards_that_may_be_asked_for_are_read(
     assert verify_store(tmp_path / "large.zarr").ok
 
 
-def test_what_is_built_goes_through_the_gate(store: Path) -> None:
+def test_what_is_built_goes_through_the_gate(store):
     group = open_store(store).group
     assert {name for name, _ in group.members(max_depth=None)} >= {
         "asset/id",
@@ -137,7 +136,7 @@ EDITS: dict[str, tuple[dict[str, Any], str]] = {
 
 
 @pytest.mark.parametrize("case", EDITS)
-def test_what_is_not_on_the_lists_is_refused_and_found(store: Path, case: str) -> None:
+def test_what_is_not_on_the_lists_is_refused_and_found(store, case):
     change, what = EDITS[case]
     name = "asset/property"  # A coordinate, which the contract says nothing of.
     edit_root(store, lambda d: d[META]["metadata"][name].update(change))
@@ -147,7 +146,7 @@ def test_what_is_not_on_the_lists_is_refused_and_found(store: Path, case: str) -
     assert any(f.file == f"{name}/zarr.json" and what in f.what for f in findings)
 
 
-def test_a_group_has_no_consolidated_metadata_of_its_own() -> None:
+def test_a_group_has_no_consolidated_metadata_of_its_own():
     group: dict[str, Any] = {"zarr_format": 3, "node_type": "group", "attributes": {}}
     frame = {"kind": "inline", "must_understand": False}
     for allowed in (None, {**frame, "metadata": {}}):
@@ -157,21 +156,12 @@ def test_a_group_has_no_consolidated_metadata_of_its_own() -> None:
         assert finding.what == "has consolidated metadata of its own"
 
 
-def test_a_fill_value_beyond_its_data_type_is_told(store: Path, tmp_path: Path) -> None:
+def test_a_fill_value_beyond_its_data_type_is_told(store, tmp_path):
     edit_root(store, lambda d: d[META]["metadata"]["voxel/material"].update(fill_value=300))
-    for line in (
-        ["check-alignment", "--asset", "cup", "--store", str(store)],
-        ["export", str(store), "--format", "ply", "--frame", "pixieverse",
-         "--out", str(tmp_path / "e")],
-        ["describe", str(store), "--out", str(tmp_path / "d.json")],
-        ["verify", str(store)],
-    ):  # fmt: skip
-        done = CliRunner().invoke(slatprep, line)
-        assert done.exit_code == 1, (line, done.output)
-        assert isinstance(done.exception, SystemExit), (line, done.exception)
+    commands_refuse(store, tmp_path)
 
 
-def test_an_array_of_another_name_is_refused(store: Path) -> None:
+def test_an_array_of_another_name_is_refused(store):
     edit_root(
         store, lambda d: d[META]["metadata"].update({"voxel/../../x": {"node_type": "array"}})
     )
@@ -184,7 +174,7 @@ def test_an_array_of_another_name_is_refused(store: Path) -> None:
 @pytest.mark.parametrize(
     "pipe", ["zarr.json", "asset/id/zarr.json", "asset/record/c/0", "voxel/feats/c/0/0"]
 )
-def test_no_command_waits_for_a_pipe(store: Path, tmp_path: Path, pipe: str) -> None:
+def test_no_command_waits_for_a_pipe(store, tmp_path, pipe):
     (store / pipe).unlink()
     os.mkfifo(store / pipe)
     for line in (["info"], ["verify"], ["report", "--out", str(tmp_path / "r.html")]):
@@ -198,7 +188,7 @@ def test_no_command_waits_for_a_pipe(store: Path, tmp_path: Path, pipe: str) -> 
         assert any(f.file == pipe and "no regular file" in f.what for f in findings)
 
 
-def test_metadata_are_bounded_in_depth_and_are_unicode(store: Path) -> None:
+def test_metadata_are_bounded_in_depth_and_are_unicode(store):
     good = (store / "zarr.json").read_text()
     for value in ("[" * 100_000, "[" * 500 + "]" * 500, '"\\ud800"'):
         (store / "zarr.json").write_text(
@@ -209,7 +199,7 @@ def test_metadata_are_bounded_in_depth_and_are_unicode(store: Path) -> None:
         assert [finding.file for finding in verify_store(store).findings] == ["zarr.json"]
 
 
-def test_strings_are_bounded_by_how_many_there_are(store: Path) -> None:
+def test_strings_are_bounded_by_how_many_there_are(store):
     """Chunks of one row each, every one of which unpacks to megabytes."""
     root = zarr.open_group(store, mode="r+", use_consolidated=False)
     for name, size in (("asset/category", 10_000), ("asset/record", 2**21)):
@@ -231,7 +221,7 @@ def test_strings_are_bounded_by_how_many_there_are(store: Path) -> None:
             opened.read_rows(name, 0, 5)
 
 
-def test_many_assets_must_have_bytes(store: Path) -> None:
+def test_many_assets_must_have_bytes(store):
     claimed = 2**24
 
     def claim(document: dict[str, Any]) -> None:

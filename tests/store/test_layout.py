@@ -11,9 +11,7 @@ from slatprep.store.shard_reader import OPEN_SHARDS
 
 
 @given(sizes=st.lists(st.integers(0, 40), min_size=1, max_size=30), per_shard=st.integers(1, 50))
-def test_shards_take_every_row_of_every_asset_once_and_in_place(
-    sizes: list[int], per_shard: int
-) -> None:
+def test_shards_take_every_row_of_every_asset_once_and_in_place(sizes, per_shard):
     offsets = [0, *accumulate(sizes)]
     owner = np.repeat(np.arange(len(sizes)), sizes)
     within = np.concatenate([np.arange(size) for size in sizes])
@@ -37,7 +35,7 @@ def test_shards_take_every_row_of_every_asset_once_and_in_place(
 
 
 @pytest.mark.parametrize("chunk", [4_096, 128, 2**20])
-def test_shards_are_few_and_small_beside_the_store(chunk: int) -> None:
+def test_shards_are_few_and_small_beside_the_store(chunk):
     parameters = StoreParameters(voxel_chunk=chunk)
     sizes = [rows_per_shard(parameters, rows) for rows in (0, 1, 10**6, 10**8, 10**9, 10**10)]
     assert sizes == sorted(sizes)
@@ -61,5 +59,5 @@ def test_shards_are_few_and_small_beside_the_store(chunk: int) -> None:
         (10**12, 4096),  # 16.8 million rows at most
     ],
 )
-def test_a_shard_holds_the_least_power_of_two_of_chunks(rows: int, chunks: int) -> None:
+def test_a_shard_holds_the_least_power_of_two_of_chunks(rows, chunks):
     assert rows_per_shard(StoreParameters(), rows) == 4096 * chunks

@@ -1,3 +1,4 @@
+import hashlib
 import json
 from dataclasses import replace
 from math import nan
@@ -5,7 +6,6 @@ from math import nan
 import jsonschema
 import numpy as np
 import pytest
-from support.synthetic import Dataset
 
 from slatprep.pipeline.dataset import BuildSummary
 from slatprep.store import open_store
@@ -33,7 +33,7 @@ def no_constants(name: str) -> None:
     raise AssertionError(f"{name} is not JSON")
 
 
-def test_every_record_follows_the_published_schema(mixed_build: BuildSummary) -> None:
+def test_every_record_follows_the_published_schema(mixed_build):
     published = {path.name: json.loads(path.read_text()) for path in FOLDER.iterdir()}
     for schema in published.values():
         jsonschema.Draft202012Validator.check_schema(schema)
@@ -50,12 +50,12 @@ def test_every_record_follows_the_published_schema(mixed_build: BuildSummary) ->
     assert build["statuses"] == mixed_build.statuses
 
 
-def test_the_published_schemas_are_those_of_the_classes() -> None:
+def test_the_published_schemas_are_those_of_the_classes():
     """Made anew by ``python -m slatprep.store.schemas``."""
     assert json_schemas() == {path.name: json.loads(path.read_text()) for path in FOLDER.iterdir()}
 
 
-def test_what_is_written_is_read_again_bit_for_bit(mixed_build: BuildSummary) -> None:
+def test_what_is_written_is_read_again_bit_for_bit(mixed_build):
     for line in lines_of(mixed_build):
         again = read_record(line, "here")
         assert to_json(again) == line
@@ -115,9 +115,7 @@ def place(document: dict, path: str, value: object) -> dict:
         ("surplus", 1),
     ],
 )
-def test_what_is_no_record_is_refused_and_named(
-    record: AssetRecord, path: str, value: object
-) -> None:
+def test_what_is_no_record_is_refused_and_named(record, path, value):
     document = json.loads(to_json(record))
     changed = place(document, path, value)
     with pytest.raises(RecordError, match=r"^a\.jsonl, line 3: not a record") as refused:
@@ -129,7 +127,7 @@ def test_what_is_no_record_is_refused_and_named(
         assert not jsonschema.Draft202012Validator(schema).is_valid(changed)
 
 
-def test_a_failed_asset_has_a_reason(mixed_build: BuildSummary) -> None:
+def test_a_failed_asset_has_a_reason(mixed_build):
     build = json.loads((mixed_build.records.parent / "build.json").read_text())
     (skipped,) = (json.dumps(one) for one in build["failed"] if one["asset_id"] == "lone")
     assert isinstance(read_record(skipped, "here"), FailedRecord)
@@ -139,13 +137,13 @@ def test_a_failed_asset_has_a_reason(mixed_build: BuildSummary) -> None:
         read_asset_record(skipped, "here")
 
 
-def test_text_that_is_no_json_is_refused() -> None:
+def test_text_that_is_no_json_is_refused():
     for text in ("", "{", "[]", "null", '{"status": NaN}', b"\xff"):
         with pytest.raises(RecordError):
             read_record(text, "here")
 
 
-def test_nan_is_null(record: AssetRecord) -> None:
+def test_nan_is_null(record):
     unknown = replace(record, alignment=replace(record.alignment, score=nan))
     assert json.loads(to_json(unknown))["alignment"]["score"] is None
     again = read_asset_record(to_json(unknown), "here")
@@ -153,11 +151,7 @@ def test_nan_is_null(record: AssetRecord) -> None:
     assert to_json(again) == to_json(unknown)
 
 
-def test_a_record_names_what_the_row_was_made_from(
-    mixed: Dataset, mixed_build: BuildSummary
-) -> None:
-    import hashlib
-
+def test_a_record_names_what_the_row_was_made_from(mixed, mixed_build):
     records = [json.loads(line) for line in mixed_build.records.read_text().splitlines()]
     record = next(record for record in records if record["asset_id"] == "bear.side")
     assert (record["object_id"], record["view"]) == ("bear", "side")
@@ -176,11 +170,7 @@ def test_a_record_names_what_the_row_was_made_from(
     assert record["versions"]["numpy"] == np.__version__
 
 
-def test_the_id_is_of_the_records_and_of_what_the_store_says_of_itself(
-    mixed_build: BuildSummary,
-) -> None:
-    import hashlib
-
+def test_the_id_is_of_the_records_and_of_what_the_store_says_of_itself(mixed_build):
     store = open_store(mixed_build.store)
     said = {n: v for n, v in store.attributes.items() if n not in ("manifest", "segments")}
     digest = hashlib.sha256(json.dumps(said, sort_keys=True, separators=(",", ":")).encode())

@@ -54,7 +54,8 @@ def metadata_of(folder: Path, name: str) -> dict[str, Any]:
     return document
 
 
-def reader_of(folder: LocalFolder, name: str) -> RowReader:
+def reader_of(place: Path | LocalFolder, name: str) -> RowReader:
+    folder = LocalFolder(place) if isinstance(place, Path) else place
     return RowReader.of(folder, name, metadata_of(Path(folder.path), name))
 
 
@@ -72,11 +73,6 @@ def write_index(shard: Path, index: list[tuple[int, int]]) -> None:
     shard.write_bytes(content + packed + struct.pack("<I", crc32c(packed)))
 
 
-@pytest.fixture
-def folder(tmp_path: Path) -> LocalFolder:
-    return LocalFolder(tmp_path)
-
-
 RNG = np.random.default_rng(5)
 CUTS: dict[str, tuple[np.ndarray, int, int | None]] = {
     "voxel/material": (RNG.integers(1, 9, 23).astype(np.uint8), 3, 6),
@@ -90,10 +86,10 @@ CUTS: dict[str, tuple[np.ndarray, int, int | None]] = {
 
 
 @pytest.mark.parametrize("name", CUTS)
-def test_every_range_of_rows_is_the_one_that_was_written(folder: LocalFolder, name: str) -> None:
+def test_every_range_of_rows_is_the_one_that_was_written(tmp_path, name):
     values, chunk, shard = CUTS[name]
-    make(Path(folder.path), name, values, chunk, shard, "" if values.dtype.hasobject else 0)
-    reader = reader_of(folder, name)
+    make(tmp_path, name, values, chunk, shard, "" if values.dtype.hasobject else 0)
+    reader = reader_of(tmp_path, name)
     assert reader.shape == values.shape
     for start in range(len(values) + 1):
         for stop in range(start, len(values) + 1):
@@ -106,31 +102,29 @@ def test_every_range_of_rows_is_the_one_that_was_written(folder: LocalFolder, na
             reader.read(start, stop)
 
 
-def test_a_chunk_that_was_never_written_holds_the_fill_value(folder: LocalFolder) -> None:
+def test_a_chunk_that_was_never_written_holds_the_fill_value(tmp_path):
     values = np.arange(24, dtype=np.float32)
     values[3:9] = -2.5  # the second chunk of the first shard, and the first of the next
-    make(Path(folder.path), "voxel/distance", values, 3, 6, -2.5)
-    index = index_of(Path(folder.path) / "voxel/distance/c/0", 2)
+    make(tmp_path, "voxel/distance", values, 3, 6, -2.5)
+    index = index_of(tmp_path / "voxel/distance/c/0", 2)
     assert index[1] == (NOT_THERE, NOT_THERE)
-    reader = reader_of(folder, "voxel/distance")
+    reader = reader_of(tmp_path, "voxel/distance")
     assert reader.read(0, 24).tolist() == values.tolist()
     assert reader.read(5, 10).tolist() == values[5:10].tolist()
 
 
 @pytest.mark.parametrize("shard", [None, 6])
-def test_a_column_of_fill_values_alone_needs_no_file(
-    folder: LocalFolder, shard: int | None
-) -> None:
+def test_a_column_of_fill_values_alone_needs_no_file(tmp_path, shard):
     """As zarr leaves out what nobody wrote, of assets alone; where rows begin is always written."""
     for name in ("asset/category", "asset/offset", "voxel/valid"):
         fill = "" if name == "asset/category" else 0
         values = np.array([""] * 9, object) if fill == "" else np.zeros(9, np.int64)
-        make(Path(folder.path), name, values, 3, shard, fill)
-        assert not (Path(folder.path) / name / "c").exists()
-    assert reader_of(folder, "asset/category").read(1, 9).tolist() == [""] * 8
+        make(tmp_path, name, values, 3, shard, fill)
+        assert not (tmp_path / name / "c").exists()
+    assert reader_of(tmp_path, "asset/category").read(1, 9).tolist() == [""] * 8
     for name in ("asset/offset", "voxel/valid"):
         with pytest.raises(StoreError, match=f"{name}/c/0: is missing"):
-            reader_of(folder, name).read(0, 2)
+            reader_of(tmp_path, name).read(0, 2)
 
 
 EDITS: dict[str, Callable[[dict[str, Any]], object]] = {
@@ -163,18 +157,19 @@ def outer(metadata: dict[str, Any]) -> dict[str, Any]:
 
 
 @pytest.mark.parametrize("case", EDITS)
-def test_arrays_cut_in_another_way_are_refused(folder: LocalFolder, case: str) -> None:
-    make(Path(folder.path), "voxel/feats", CUTS["voxel/feats"][0], 3, 9)
-    metadata = metadata_of(Path(folder.path), "voxel/feats")
+def test_arrays_cut_in_another_way_are_refused(tmp_path, case):
+    make(tmp_path, "voxel/feats", CUTS["voxel/feats"][0], 3, 9)
+    metadata = metadata_of(tmp_path, "voxel/feats")
     EDITS[case](metadata)
     with pytest.raises(StoreError, match="voxel/feats: bad metadata"):
-        RowReader.of(folder, "voxel/feats", metadata)
+        RowReader.of(LocalFolder(tmp_path), "voxel/feats", metadata)
 
 
-def test_the_largest_chunks_and_the_most_of_a_shard_are_taken(folder: LocalFolder) -> None:
-    make(Path(folder.path), "voxel/feats", CUTS["voxel/feats"][0], 3, 9)
-    metadata = metadata_of(Path(folder.path), "voxel/feats")
+def test_the_largest_chunks_and_the_most_of_a_shard_are_taken(tmp_path):
+    make(tmp_path, "voxel/feats", CUTS["voxel/feats"][0], 3, 9)
+    metadata = metadata_of(tmp_path, "voxel/feats")
     outer(metadata)["chunk_shape"] = [3 * MAX_SHARD_CHUNKS, 2]
+    folder = LocalFolder(tmp_path)
     assert RowReader.of(folder, "voxel/feats", metadata).chunks_per_shard == MAX_SHARD_CHUNKS
     rows = MAX_CHUNK_BYTES // 8
     outer(metadata)["chunk_shape"] = sharding(metadata)["chunk_shape"] = [rows, 2]
@@ -182,57 +177,55 @@ def test_the_largest_chunks_and_the_most_of_a_shard_are_taken(folder: LocalFolde
 
 
 @pytest.fixture
-def shard(folder: LocalFolder) -> Path:
+def shard(tmp_path: Path) -> Path:
     """The one shard of an array of four chunks of eight bytes that do not repeat."""
     values = np.random.default_rng(1).integers(1, 256, 32).astype(np.uint8)
-    make(Path(folder.path), "voxel/material", values, 8, 32)
-    return Path(folder.path) / "voxel/material/c/0"
+    make(tmp_path, "voxel/material", values, 8, 32)
+    return tmp_path / "voxel/material/c/0"
 
 
-def test_an_index_that_leads_out_of_its_file_is_refused(folder: LocalFolder, shard: Path) -> None:
+def test_an_index_that_leads_out_of_its_file_is_refused(tmp_path, shard):
     index, end = index_of(shard, 4), shard.stat().st_size - 68
     assert sum(index[-1]) == end  # The index itself begins there.
     for wrong in ((end + 1, 1), (0, end + 1), (NOT_THERE, 1), (0, NOT_THERE)):
         write_index(shard, [*index[:3], wrong])
         with pytest.raises(StoreError, match="c/0: its index leads out of it"):
-            reader_of(folder, "voxel/material").read(0, 8)
+            reader_of(tmp_path, "voxel/material").read(0, 8)
 
 
-def test_an_entry_much_longer_than_its_chunk_is_refused(folder: LocalFolder, shard: Path) -> None:
+def test_an_entry_much_longer_than_its_chunk_is_refused(tmp_path, shard):
     """Nobody reads a file of any length for eight bytes."""
     index = index_of(shard, 4)
     shard.write_bytes(bytes(70_000) + shard.read_bytes())
     moved = [(70_000 + offset, length) for offset, length in index]
     write_index(shard, moved)
-    assert len(reader_of(folder, "voxel/material").read(0, 32)) == 32
+    assert len(reader_of(tmp_path, "voxel/material").read(0, 32)) == 32
     write_index(shard, [(0, 65_536 + 17), *moved[1:]])
     with pytest.raises(StoreError, match="its index leads out of it"):
-        reader_of(folder, "voxel/material").read(8, 16)
+        reader_of(tmp_path, "voxel/material").read(8, 16)
 
 
-def test_a_file_without_a_whole_index_is_refused(folder: LocalFolder, shard: Path) -> None:
+def test_a_file_without_a_whole_index_is_refused(tmp_path, shard):
     content = shard.read_bytes()
     for torn in (b"", content[-67:], content[:-1]):
         shard.write_bytes(torn)
         with pytest.raises(StoreError, match="has no sound index; it is damaged or cut short"):
-            reader_of(folder, "voxel/material").read(0, 8)
+            reader_of(tmp_path, "voxel/material").read(0, 8)
     shard.write_bytes(content[-68:])  # an index of chunks that are not there
     with pytest.raises(StoreError, match="its index leads out of it"):
-        reader_of(folder, "voxel/material").read(0, 8)
+        reader_of(tmp_path, "voxel/material").read(0, 8)
 
 
-def test_an_index_of_fill_values_alone_is_a_shard(folder: LocalFolder, shard: Path) -> None:
+def test_an_index_of_fill_values_alone_is_a_shard(tmp_path, shard):
     """Shorter than it is no file, and as long one is."""
     shard.write_bytes(bytes(68))
     write_index(shard, [(NOT_THERE, NOT_THERE)] * 4)
     assert shard.stat().st_size == 68
-    assert reader_of(folder, "voxel/material").read(0, 32).tolist() == [0] * 32
+    assert reader_of(tmp_path, "voxel/material").read(0, 32).tolist() == [0] * 32
 
 
-def test_a_file_that_is_cut_short_while_it_is_read_is_refused(
-    folder: LocalFolder, shard: Path
-) -> None:
-    reader = reader_of(folder, "voxel/material")
+def test_a_file_that_is_cut_short_while_it_is_read_is_refused(tmp_path, shard):
+    reader = reader_of(tmp_path, "voxel/material")
     reader.read(0, 8)
     os.truncate(shard, sum(index_of(shard, 4)[2]) - 1)
     assert len(reader.read(8, 16)) == 8
@@ -267,7 +260,7 @@ class WatchedFolder(LocalFolder):
         return file
 
 
-def test_chunks_that_lie_side_by_side_are_asked_for_at_once(tmp_path: Path) -> None:
+def test_chunks_that_lie_side_by_side_are_asked_for_at_once(tmp_path):
     values = np.random.default_rng(2).integers(1, 256, (60, 40)).astype(np.uint8)
     values[[*range(12, 16), *range(44, 48)]] = 0  # chunks 3 and 11, which are not there
     make(tmp_path, "voxel/feats", values, 4, 24)
@@ -296,7 +289,7 @@ def test_chunks_that_lie_side_by_side_are_asked_for_at_once(tmp_path: Path) -> N
     assert asked(28, 36) == []
 
 
-def test_a_column_without_a_file_has_nothing_to_fetch(tmp_path: Path) -> None:
+def test_a_column_without_a_file_has_nothing_to_fetch(tmp_path):
     make(tmp_path, "asset/category", np.array([""] * 9, object), 3, 9, "")
     make(tmp_path, "asset/view", np.array([""] * 9, object), 3, None, "")
     folder = WatchedFolder(tmp_path)
@@ -305,7 +298,7 @@ def test_a_column_without_a_file_has_nothing_to_fetch(tmp_path: Path) -> None:
     assert folder.asked == []
 
 
-def test_the_shards_read_last_stay_open_and_no_others(tmp_path: Path) -> None:
+def test_the_shards_read_last_stay_open_and_no_others(tmp_path):
     values = np.arange(1, OPEN_SHARDS + 9, dtype=np.uint8)
     make(tmp_path, "voxel/material", values, 1, 1)
     folder = WatchedFolder(tmp_path)
@@ -333,9 +326,7 @@ class Failing(LocalFile):
 
 
 @pytest.mark.parametrize("prefetch_bytes", [0, 2**20])
-def test_a_chunk_that_cannot_be_read_names_its_file(
-    shard: Path, tmp_path: Path, prefetch_bytes: int
-) -> None:
+def test_a_chunk_that_cannot_be_read_names_its_file(shard, tmp_path, prefetch_bytes):
     class Folder(LocalFolder):
         def open(self, name: str) -> LocalFile:
             return Failing(f"{self.path}/{name}")
@@ -350,9 +341,7 @@ def test_a_chunk_that_cannot_be_read_names_its_file(
         list(reader.packed(0, 4))
 
 
-def test_packed_chunks_are_the_bytes_of_the_files_a_few_at_a_time(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_packed_chunks_are_the_bytes_of_the_files_a_few_at_a_time(tmp_path, monkeypatch):
     values = np.random.default_rng(3).integers(1, 256, (70, 100)).astype(np.uint8)
     make(tmp_path, "voxel/feats", values, 4, 40)  # 10 chunks of 400 bytes, and 8
     monkeypatch.setattr(shard_reader, "_COPIED_BYTES", 1000)
@@ -374,32 +363,30 @@ def test_packed_chunks_are_the_bytes_of_the_files_a_few_at_a_time(
         assert found == chunks[first:last]
 
 
-def test_packed_chunks_that_are_not_side_by_side_or_damaged_are_refused(
-    folder: LocalFolder, shard: Path
-) -> None:
+def test_packed_chunks_that_are_not_side_by_side_or_damaged_are_refused(tmp_path, shard):
     index, content = index_of(shard, 4), shard.read_bytes()
     no_order = [index[0], index[2], index[1], index[3]]
     write_index(shard, no_order)
-    reader = reader_of(folder, "voxel/material")
+    reader = reader_of(tmp_path, "voxel/material")
     (one,) = reader.packed(1, 2)
     assert one == (content[index[2][0] : sum(index[2])], [index[2][1]])
     for first, last in ((0, 2), (1, 3), (0, 4), (2, 4)):
         with pytest.raises(StoreError, match="its chunks do not follow one another"):
-            list(reader_of(folder, "voxel/material").packed(first, last))
+            list(reader_of(tmp_path, "voxel/material").packed(first, last))
     write_index(shard, [*index[:3], (NOT_THERE, NOT_THERE)])
     with pytest.raises(StoreError, match="its chunks do not follow one another"):
-        list(reader_of(folder, "voxel/material").packed(2, 4))
+        list(reader_of(tmp_path, "voxel/material").packed(2, 4))
     for at in (index[2][0], sum(index[2]) - 1):
         flipped = bytearray(content)
         flipped[at] ^= 1
         shard.write_bytes(flipped)
-        reader = reader_of(folder, "voxel/material")
+        reader = reader_of(tmp_path, "voxel/material")
         assert sum(lengths == [n for _, n in index[:2]] for _, lengths in reader.packed(0, 2)) == 1
         with pytest.raises(StoreError, match="c/0: a chunk is damaged"):
             list(reader.packed(0, 4))
 
 
-def test_a_column_without_a_file_has_no_packed_chunks(tmp_path: Path) -> None:
+def test_a_column_without_a_file_has_no_packed_chunks(tmp_path):
     make(tmp_path, "asset/category", np.array([""] * 9, object), 3, 9, "")
     with pytest.raises(StoreError, match="do not follow one another"):
         list(reader_of(LocalFolder(tmp_path), "asset/category").packed(0, 1))

@@ -42,7 +42,7 @@ def chunk_of(rows: np.ndarray, start: int, size: int) -> list[int]:
 
 
 @given(drawn=arrays_and_runs(), size=st.integers(1, 9))
-def test_chunks_are_held_that_have_the_same_bytes(drawn: Arrays, size: int) -> None:
+def test_chunks_are_held_that_have_the_same_bytes(drawn, size):
     old, new, runs = drawn
     for start in range(0, len(new), size):
         wanted = chunk_of(new, start, size)
@@ -59,9 +59,7 @@ def test_chunks_are_held_that_have_the_same_bytes(drawn: Arrays, size: int) -> N
 
 
 @given(drawn=arrays_and_runs(), chunk=st.integers(1, 4), chunks=st.integers(1, 4))
-def test_shards_are_pieced_together_from_what_is_the_same(
-    drawn: Arrays, chunk: int, chunks: int
-) -> None:
+def test_shards_are_pieced_together_from_what_is_the_same(drawn, chunk, chunks):
     old, new, runs = drawn
     parameters = StoreParameters(
         voxel_chunk=chunk, voxel_chunks_per_shard=chunks, grid_assets_per_shard=1
@@ -88,7 +86,7 @@ def test_shards_are_pieced_together_from_what_is_the_same(
                     assert chunk_of(rows, begin + run.shift, chunk) == chunk_of(new, begin, chunk)
 
 
-def test_shards_of_assets_name_where_their_arrays_lie() -> None:
+def test_shards_of_assets_name_where_their_arrays_lie():
     parameters = StoreParameters(voxel_chunk=4, voxel_chunks_per_shard=1, grid_assets_per_shard=2)
     where, runs = ["a", (0, 0), (0, 1), "b", (1, 7)], [Run(1, 3, 0, -1), Run(4, 5, 1, 3)]
     grids = runs_of(runs, 5, (2, 8))
