@@ -29,7 +29,7 @@ def path(tmp_path: Path) -> Path:
     return tmp_path / "a.arrays"
 
 
-def test_arrays_come_back_as_they_were(path: Path) -> None:
+def test_arrays_come_back_as_they_were(path):
     with path.open("rb") as file:
         read = ArrayFile(file)
         assert list(read) == list(ARRAYS)
@@ -41,7 +41,7 @@ def test_arrays_come_back_as_they_were(path: Path) -> None:
             read["another"]
 
 
-def test_no_flipped_bit_and_no_lost_end_is_passed_over(path: Path) -> None:
+def test_no_flipped_bit_and_no_lost_end_is_passed_over(path):
     whole = path.read_bytes()
     for place in range(len(whole)):
         path.write_bytes(whole[:place] + bytes([whole[place] ^ 4]) + whole[place + 1 :])
@@ -81,7 +81,7 @@ def test_no_flipped_bit_and_no_lost_end_is_passed_over(path: Path) -> None:
         b"\xff",
     ],
 )
-def test_headers_that_nobody_wrote_are_refused(tmp_path: Path, header: object) -> None:
+def test_headers_that_nobody_wrote_are_refused(tmp_path, header):
     text = header if isinstance(header, bytes) else orjson.dumps(header)
     start = struct.pack("<8sII", b"SLATARR1", len(text), google_crc32c.value(text))
     path = tmp_path / "a.arrays"

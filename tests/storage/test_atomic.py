@@ -12,9 +12,7 @@ def directory(path: Path, content: str) -> Path:
 
 
 @pytest.mark.parametrize("exchange", [True, False], ids=["exchanged", "renamed twice"])
-def test_the_new_takes_the_olds_place(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, exchange: bool
-) -> None:
+def test_the_new_takes_the_olds_place(tmp_path, monkeypatch, exchange):
     if not exchange:
         monkeypatch.setattr(atomic, "_exchange", lambda new, target: False)
     target = directory(tmp_path / "store", "old")
@@ -23,12 +21,12 @@ def test_the_new_takes_the_olds_place(
     assert [path.name for path in tmp_path.iterdir()] == ["store"]
 
 
-def test_nothing_there_before(tmp_path: Path) -> None:
+def test_nothing_there_before(tmp_path):
     atomic.replace_directory(directory(tmp_path / "new", "new"), tmp_path / "store")
     assert (tmp_path / "store" / "file").read_text() == "new"
 
 
-def test_a_new_that_does_not_exist_leaves_the_old(tmp_path: Path) -> None:
+def test_a_new_that_does_not_exist_leaves_the_old(tmp_path):
     target = directory(tmp_path / "store", "old")
     with pytest.raises(OSError):
         atomic.replace_directory(tmp_path / "absent", target)

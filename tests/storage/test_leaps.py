@@ -53,7 +53,7 @@ def index(files: list[tuple[str, int]]) -> tuple[list[str], SparseArchive]:
     ("count", "frame"),
     [(0, 1), (2, 9_000), (25, 20_000), (100, 60_000), (125, 120_000), (600, 30_000), (60, 900_000)],
 )
-def test_all_that_is_needed_is_found(count: int, frame: int, spread: float, seed: int) -> None:
+def test_all_that_is_needed_is_found(count, frame, spread, seed):
     files = objects(count, frame, spread, random.Random(seed))
     names, archive = index(files)
     assert [n for n in names if ARCHIVE.is_wanted(n)] == [
@@ -64,7 +64,7 @@ def test_all_that_is_needed_is_found(count: int, frame: int, spread: float, seed
         assert archive.requests < 12 * 25
 
 
-def test_folder_that_may_hold_what_is_needed_is_read_file_by_file() -> None:
+def test_folder_that_may_hold_what_is_needed_is_read_file_by_file():
     files = [(f"a/sample_{k // 50}/{k}.png", 120_000) for k in range(200)]
     files += [(f"a/{k}.png", 120_000) for k in range(100)]
     files.insert(130, ("a/sample_2/material_grid.npy", 4_194_432))
@@ -72,7 +72,7 @@ def test_folder_that_may_hold_what_is_needed_is_read_file_by_file() -> None:
     assert names == [name for name, _ in files]
 
 
-def test_a_copy_of_the_folder_further_on_hides_nothing() -> None:
+def test_a_copy_of_the_folder_further_on_hides_nothing():
     first = [(f"a/sample_0/frames/{k:04d}.png", 50_000) for k in range(100)]
     files = [("big.bin", 10**9), *first, ("a/clip_features_mask.npy", 1_048_704)]
     files += [("big.bin", 402_653_312), ("a/sample_0/material_grid.npy", 4_194_432), *first]

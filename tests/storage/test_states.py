@@ -56,17 +56,17 @@ def written(path: Path, content: bytes = b"content") -> Path:
 
 
 @pytest.mark.parametrize("line", MOUNTS.splitlines())
-def test_only_disks_that_can_be_written_keep_times(line: str) -> None:
+def test_only_disks_that_can_be_written_keep_times(line):
     number = int(line.split()[0])
     assert keeps_times(MOUNTS, number) is (number in COUNTS)
 
 
-def test_what_is_not_listed_keeps_no_times() -> None:
+def test_what_is_not_listed_keeps_no_times():
     assert not keeps_times(MOUNTS, 2)
     assert not keeps_times("", 27)
 
 
-def test_a_state_is_what_the_system_says(on_a_disk: Path) -> None:
+def test_a_state_is_what_the_system_says(on_a_disk):
     path = written(on_a_disk / "a")
     state, told = States().of(str(path)), path.stat()
     assert state is not None
@@ -77,20 +77,20 @@ def test_a_state_is_what_the_system_says(on_a_disk: Path) -> None:
 
 
 @pytest.mark.parametrize("what", ["folder", "pipe", "nothing", "device", "with NUL"])
-def test_what_is_no_file_has_no_state(on_a_disk: Path, what: str) -> None:
+def test_what_is_no_file_has_no_state(on_a_disk, what):
     os.mkfifo(on_a_disk / "pipe")
     path = {"folder": str(on_a_disk), "device": "/dev/null", "with NUL": f"{on_a_disk}/probe\0"}
     assert States().of(path.get(what, str(on_a_disk / what))) is None
 
 
-def test_a_file_that_was_written_just_now_has_no_lasting_state(on_a_disk: Path) -> None:
+def test_a_file_that_was_written_just_now_has_no_lasting_state(on_a_disk):
     (on_a_disk / "a").write_bytes(b"content")
     assert lasting(on_a_disk / "a") is None
     assert States().of(str(on_a_disk / "a")) is not None
 
 
 @pytest.mark.parametrize("how", ["open", "appending", "mapped", "mapped and closed", "hard link"])
-def test_a_file_that_somebody_may_write_has_no_lasting_state(on_a_disk: Path, how: str) -> None:
+def test_a_file_that_somebody_may_write_has_no_lasting_state(on_a_disk, how):
     path = written(on_a_disk / "a")
     os.link(path, on_a_disk / "b")
     time.sleep(2 * states.FINE_NS / 1e9)
@@ -108,7 +108,7 @@ def test_a_file_that_somebody_may_write_has_no_lasting_state(on_a_disk: Path, ho
         assert lasting(path) is not None
 
 
-def test_a_mapping_that_is_made_later_changes_the_state(on_a_disk: Path) -> None:
+def test_a_mapping_that_is_made_later_changes_the_state(on_a_disk):
     path = written(on_a_disk / "a")
     before = lasting(path)
     with path.open("r+b") as file, mmap.mmap(file.fileno(), 0) as held:
@@ -117,9 +117,7 @@ def test_a_mapping_that_is_made_later_changes_the_state(on_a_disk: Path) -> None
 
 
 @pytest.mark.parametrize("how", ["written", "renamed over", "link", "folder"])
-def test_what_is_exchanged_while_it_is_read_is_noted_as_it_was_read(
-    on_a_disk: Path, how: str
-) -> None:
+def test_what_is_exchanged_while_it_is_read_is_noted_as_it_was_read(on_a_disk, how):
     folders = [on_a_disk / name for name in ("one", "two")]
     for folder in folders:
         folder.mkdir()
@@ -142,7 +140,7 @@ def test_what_is_exchanged_while_it_is_read_is_noted_as_it_was_read(
     assert list(noted) == ["a"]
 
 
-def test_what_was_read_twice_must_have_been_the_same() -> None:
+def test_what_was_read_twice_must_have_been_the_same():
     state = states.State(1, (1, 1), 1, 1, 1, 1)
     with noting() as noted:
         note("same", state)

@@ -1,10 +1,9 @@
 """In a folder where others may write: no link is followed, no file of theirs touched."""
 
 import errno
+import multiprocessing
 import os
-import subprocess
-import sys
-from collections.abc import Callable
+import shutil
 from pathlib import Path
 
 import pytest
@@ -35,13 +34,13 @@ def refused(target: Path, fresh: bool = False) -> str:
     return str(error.value)
 
 
-def test_a_work_folder_that_is_a_link_is_refused(tmp_path: Path, theirs: Path) -> None:
+def test_a_work_folder_that_is_a_link_is_refused(tmp_path, theirs):
     (tmp_path / ".s.zarr.work").symlink_to(theirs.parent)
     assert ".s.zarr.work: is no folder" in refused(tmp_path / "s.zarr")
     assert theirs.read_text() == MINE
 
 
-def test_a_folder_that_no_build_made_is_refused(tmp_path: Path) -> None:
+def test_a_folder_that_no_build_made_is_refused(tmp_path):
     folder = tmp_path / ".s.zarr.work"
     folder.mkdir()
     (folder / "notes.txt").write_text(MINE)
@@ -50,14 +49,14 @@ def test_a_folder_that_no_build_made_is_refused(tmp_path: Path) -> None:
 
 
 @pytest.mark.skipif(os.geteuid() != 0, reason="gives a folder away")
-def test_a_work_folder_of_another_user_is_refused(tmp_path: Path) -> None:
+def test_a_work_folder_of_another_user_is_refused(tmp_path):
     folder = tmp_path / ".s.zarr.work"
     folder.mkdir()
     os.chown(folder, 12345, 12345)
     assert "belongs to user 12345" in refused(tmp_path / "s.zarr")
 
 
-def test_what_is_not_a_builds_own_stays_in_its_folder(tmp_path: Path) -> None:
+def test_what_is_not_a_builds_own_stays_in_its_folder(tmp_path):
     folder = tmp_path / ".s.zarr.work"
     (folder / "build-1").mkdir(parents=True)
     (folder / "lock").touch()
@@ -67,7 +66,7 @@ def test_what_is_not_a_builds_own_stays_in_its_folder(tmp_path: Path) -> None:
     assert [path.name for path in folder.iterdir()] == ["notes.txt"]
 
 
-def test_nobody_else_may_enter_the_work_folder(tmp_path: Path) -> None:
+def test_nobody_else_may_enter_the_work_folder(tmp_path):
     with work_beside(tmp_path / "s.zarr") as work:
         assert work.scratch.parent.stat().st_mode & 0o077 == 0
 
@@ -81,9 +80,7 @@ def as_file(place: Path, theirs: Path) -> None:
 
 
 @pytest.mark.parametrize("put", [as_link, as_file])
-def test_a_spool_that_is_none_is_refused(
-    tmp_path: Path, theirs: Path, put: Callable[[Path, Path], None]
-) -> None:
+def test_a_spool_that_is_none_is_refused(tmp_path, theirs, put):
     folder = tmp_path / ".s.zarr.work"
     folder.mkdir()
     (folder / "lock").touch()
@@ -92,9 +89,7 @@ def test_a_spool_that_is_none_is_refused(
     assert theirs.read_text() == MINE
 
 
-def test_a_lock_that_is_a_link_or_holds_something_else_is_left_alone(
-    tmp_path: Path, theirs: Path
-) -> None:
+def test_a_lock_that_is_a_link_or_holds_something_else_is_left_alone(tmp_path, theirs):
     (tmp_path / "lock").symlink_to(theirs)
     with pytest.raises(OSError, match="symbolic links"):
         take_lock(tmp_path / "lock", "taken")
@@ -103,14 +98,12 @@ def test_a_lock_that_is_a_link_or_holds_something_else_is_left_alone(
     assert theirs.read_text() == MINE
 
 
-def test_a_lock_that_a_killed_process_left_is_taken(tmp_path: Path) -> None:
+def test_a_lock_that_a_killed_process_left_is_taken(tmp_path):
     for _ in range(2):
         os.close(take_lock(tmp_path / "lock", "taken"))
 
 
-def test_a_lock_in_a_folder_that_is_gone_is_not_looked_for_without_end(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_lock_in_a_folder_that_is_gone_is_not_looked_for_without_end(tmp_path, monkeypatch):
     (tmp_path / "gone").mkdir()
     monkeypatch.chdir(tmp_path / "gone")
     (tmp_path / "gone").rmdir()
@@ -118,9 +111,7 @@ def test_a_lock_in_a_folder_that_is_gone_is_not_looked_for_without_end(
         take_lock(Path("lock"), "taken")
 
 
-def test_a_lock_that_cannot_be_taken_leaves_nothing_open(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_lock_that_cannot_be_taken_leaves_nothing_open(tmp_path, monkeypatch):
     def full(*_: object) -> int:
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
@@ -134,55 +125,51 @@ def test_a_lock_that_cannot_be_taken_leaves_nothing_open(
     assert len(list(Path("/dev/fd").iterdir())) == before
 
 
-def test_a_link_in_place_of_a_partial_file_is_left_alone(tmp_path: Path, theirs: Path) -> None:
+def write_report(folder: Path) -> None:
+    with staged(folder / "r.html") as file:
+        file.write_text("report")
+    assert (folder / "r.html").read_text() == "report"
+
+
+def test_a_link_in_place_of_a_partial_file_is_left_alone(tmp_path, theirs):
     link = tmp_path / ".r.html.partial"
     link.symlink_to(theirs)
-    with staged(tmp_path / "r.html") as file:
-        file.write_text("report")
+    write_report(tmp_path)
     assert link.is_symlink()
     assert not (tmp_path / "r.html").is_symlink()
-    assert (tmp_path / "r.html").read_text() == "report"
     assert theirs.read_text() == MINE
 
 
 @pytest.mark.skipif(os.geteuid() != 0, reason="gives a file away")
-def test_another_users_partial_file_is_left_alone(tmp_path: Path) -> None:
+def test_another_users_partial_file_is_left_alone(tmp_path):
     other = tmp_path / ".r.html.partial"
     other.write_text(MINE)
     os.chown(other, 12345, 12345)
-    with staged(tmp_path / "r.html") as file:
-        file.write_text("report")
+    write_report(tmp_path)
     assert other.read_text() == MINE
 
 
-def test_a_staged_file_has_the_permissions_of_any_other(tmp_path: Path) -> None:
+def test_what_a_killed_process_left_of_a_file_is_replaced(tmp_path):
+    (tmp_path / ".r.html.partial").write_text("a longer report, half of")
+    write_report(tmp_path)
+    assert [path.name for path in tmp_path.iterdir()] == ["r.html"]
     (tmp_path / "any").touch()
-    with staged(tmp_path / "r.html") as file:
-        file.write_text("report")
     assert (tmp_path / "r.html").stat().st_mode == (tmp_path / "any").stat().st_mode
 
 
-def test_what_a_killed_process_left_of_a_file_is_replaced(tmp_path: Path) -> None:
-    (tmp_path / ".r.html.partial").write_text("a longer report, half of")
-    with staged(tmp_path / "r.html") as file:
-        file.write_text("report")
-    assert (tmp_path / "r.html").read_text() == "report"
-    assert [path.name for path in tmp_path.iterdir()] == ["r.html"]
-
-
-def test_two_processes_that_write_one_file_each_write_it_whole(tmp_path: Path) -> None:
-    code = (
-        "import sys\n"
-        "from pathlib import Path\n"
-        "from slatprep.storage.atomic import staged\n"
-        "with staged(Path(sys.argv[1])) as file:\n"
-        "    file.write_text('theirs')\n"
-    )
+def test_two_processes_that_write_one_file_each_write_it_whole(tmp_path):
     report = tmp_path / "r.html"
+
+    def write_theirs() -> None:
+        with staged(report) as file:
+            file.write_text("theirs")
+
     with staged(report) as file, file.open("w") as ours:
         ours.write("ou")
-        subprocess.run([sys.executable, "-c", code, str(report)], check=True)
-        assert report.read_text() == "theirs"
+        other = multiprocessing.get_context("fork").Process(target=write_theirs)
+        other.start()
+        other.join()
+        assert (other.exitcode, report.read_text()) == (0, "theirs")
         ours.write("rs")
     assert report.read_text() == "ours"
     assert [path.name for path in tmp_path.iterdir()] == ["r.html"]
@@ -191,14 +178,12 @@ def test_two_processes_that_write_one_file_each_write_it_whole(tmp_path: Path) -
 @pytest.mark.parametrize(
     ("code", "advice"), [(errno.ENOSPC, "Make room there"), (errno.EACCES, "may be written")]
 )
-def test_what_to_do_about_a_disk_depends_on_what_it_says(code: int, advice: str) -> None:
+def test_what_to_do_about_a_disk_depends_on_what_it_says(code, advice):
     with pytest.raises(StoreError, match=advice), writing("s.zarr", Path("/data")):
         raise OSError(code, os.strerror(code))
 
 
-def test_a_full_disk_before_anything_is_written_is_told(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_full_disk_before_anything_is_written_is_told(tmp_path, monkeypatch):
     """Inodes may run out between the lock and the next folder."""
 
     def none_left(*_: object, **__: object) -> str:
@@ -209,9 +194,7 @@ def test_a_full_disk_before_anything_is_written_is_told(
 
 
 @pytest.mark.parametrize("file", ["build.json", "assets.jsonl"])
-def test_a_folder_for_records_that_holds_others_is_refused(
-    undisturbed: Made, tmp_path: Path, file: str
-) -> None:
+def test_a_folder_for_records_that_holds_others_is_refused(undisturbed, tmp_path, file):
     (tmp_path / "records").mkdir()
     (tmp_path / "records" / file).write_text('{"mine": 1}\n')
     with pytest.raises(StoreError, match=f"records: holds a {file} that is not slatprep's"):
@@ -221,50 +204,41 @@ def test_a_folder_for_records_that_holds_others_is_refused(
     assert (tmp_path / "records" / file).read_text() == '{"mine": 1}\n'
 
 
-def test_a_folder_for_records_within_the_store_is_refused(
-    undisturbed: Made, tmp_path: Path
-) -> None:
+def test_a_folder_for_records_within_the_store_is_refused(undisturbed, tmp_path):
     out = tmp_path / "s.zarr"
     with pytest.raises(StoreError, match="lies in the store"):
         build_store(undisturbed[0].parameters(), out, manifests=out / "records")
 
 
-def test_two_stores_in_a_folder_do_not_share_records(undisturbed: Made, tmp_path: Path) -> None:
-    """``demo`` and ``demo.zarr`` both have ``demo.manifests`` by default."""
-    parameters = undisturbed[0].parameters()
-    first, second = tmp_path / "demo.zarr", tmp_path / "demo"
-    build_store(parameters, first)
-    records = (tmp_path / "demo.manifests" / "build.json").read_bytes()
-    told = r"demo\.manifests: holds the records of .*demo\.zarr; expected --manifests FOLDER"
-    for named in (None, tmp_path / "demo.manifests"):
+def copied(undisturbed: Made, folder: Path, name: str) -> Path:
+    """Copy a store and its records, which call it ``s.zarr``, to another name."""
+    for suffix in (".zarr", ".manifests"):
+        shutil.copytree(undisturbed[1].with_suffix(suffix), folder / f"{name}{suffix}")
+    return folder / f"{name}.zarr"
+
+
+def test_two_stores_in_a_folder_do_not_share_records(undisturbed, tmp_path):
+    """``s`` and ``s.zarr`` both have ``s.manifests`` by default."""
+    parameters = undisturbed[0].parameters("pixie")
+    first, second = copied(undisturbed, tmp_path, "s"), tmp_path / "s"
+    records = (tmp_path / "s.manifests" / "build.json").read_bytes()
+    told = r"s\.manifests: holds the records of .*s\.zarr; expected --manifests FOLDER"
+    for named in (None, tmp_path / "s.manifests"):
         with pytest.raises(StoreError, match=told):
             build_store(parameters, second, manifests=named)
     with pytest.raises(StoreError, match=told):
         subset_store(first, second, ["a"])
     assert not second.exists()
-    assert (tmp_path / "demo.manifests" / "build.json").read_bytes() == records
+    assert (tmp_path / "s.manifests" / "build.json").read_bytes() == records
     build_store(parameters, second, manifests=tmp_path / "other")
     build_store(parameters, first)
 
 
-def test_records_of_a_store_that_was_renamed_with_them_stay_its_own(
-    undisturbed: Made, tmp_path: Path
-) -> None:
-    build_store(undisturbed[0].parameters(), tmp_path / "demo.zarr")
-    for suffix in ("zarr", "manifests"):
-        (tmp_path / f"demo.{suffix}").rename(tmp_path / f"new.{suffix}")
-    build_store(undisturbed[0].parameters("pixie"), tmp_path / "new.zarr")
+@pytest.mark.parametrize("beside", [False, True], ids=["alone", "beside one of its old name"])
+def test_records_of_a_store_that_was_renamed_with_them_stay_its_own(undisturbed, tmp_path, beside):
+    renamed = copied(undisturbed, tmp_path, "new")
+    if beside:
+        copied(undisturbed, tmp_path, "s")
+    build_store(undisturbed[0].parameters(), renamed)
     assert b'"new.zarr"' in (tmp_path / "new.manifests" / "build.json").read_bytes()
-
-
-def test_a_renamed_store_is_built_on_beside_a_new_one_of_its_old_name(
-    undisturbed: Made, tmp_path: Path
-) -> None:
-    parameters = undisturbed[0].parameters()
-    build_store(parameters, tmp_path / "demo.zarr")
-    for suffix in ("zarr", "manifests"):
-        (tmp_path / f"demo.{suffix}").rename(tmp_path / f"old.{suffix}")
-    build_store(parameters, tmp_path / "demo.zarr")
-    build_store(undisturbed[0].parameters("pixie"), tmp_path / "old.zarr")
-    assert b'"old.zarr"' in (tmp_path / "old.manifests" / "build.json").read_bytes()
-    assert b'"demo.zarr"' in (tmp_path / "demo.manifests" / "build.json").read_bytes()
+    assert not beside or b'"s.zarr"' in (tmp_path / "s.manifests" / "build.json").read_bytes()

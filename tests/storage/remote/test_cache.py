@@ -1,8 +1,5 @@
 """Local copies of objects: made once, made again when the object is another one."""
 
-from pathlib import Path
-from typing import Any
-
 import pytest
 
 from slatprep.storage.cache import VARIABLE, cache_folder, cached_file, folder_for
@@ -10,7 +7,7 @@ from slatprep.storage.place import place_of
 from slatprep.storage.remote import RemotePlace
 
 
-def test_a_copy_serves_while_the_object_is_the_same(s3: Any, bucket: str) -> None:
+def test_a_copy_serves_while_the_object_is_the_same(s3, bucket):
     place = place_of(f"s3://{bucket}/latents.h5")
     assert isinstance(place, RemotePlace)
     s3.pipe_file(f"{bucket}/latents.h5", b"first")
@@ -25,7 +22,7 @@ def test_a_copy_serves_while_the_object_is_the_same(s3: Any, bucket: str) -> Non
     assert list(folder_for(place).iterdir()) == [other]
 
 
-def test_an_object_that_is_not_there_leaves_no_copy(bucket: str) -> None:
+def test_an_object_that_is_not_there_leaves_no_copy(bucket):
     place = place_of(f"s3://{bucket}/nothing.h5")
     assert isinstance(place, RemotePlace)
     with pytest.raises(FileNotFoundError):
@@ -33,7 +30,7 @@ def test_an_object_that_is_not_there_leaves_no_copy(bucket: str) -> None:
     assert not folder_for(place).exists()
 
 
-def test_where_the_folder_is(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_where_the_folder_is(monkeypatch, tmp_path):
     monkeypatch.setenv(VARIABLE, str(tmp_path / "own"))
     assert cache_folder() == tmp_path / "own"
     monkeypatch.delenv(VARIABLE)

@@ -52,9 +52,7 @@ def denying(monkeypatch: pytest.MonkeyPatch, new_clients: Callable[[], None]) ->
 
 @pytest.mark.parametrize("client", ["obstore", "s3fs"])
 @pytest.mark.parametrize("command", ["info", "verify", "describe"])
-def test_a_store_that_may_not_be_read_is_no_other_thing(
-    denying: None, monkeypatch: pytest.MonkeyPatch, client: str, command: str
-) -> None:
+def test_a_store_that_may_not_be_read_is_no_other_thing(denying, monkeypatch, client, command):
     monkeypatch.setenv("SLATPREP_OBSTORE", "no" if client == "s3fs" else "yes")
     done = CliRunner().invoke(slatprep, [command, "s3://bucket/s.zarr"])
     assert done.exit_code == 1

@@ -21,9 +21,7 @@ def obstore(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.usefixtures("obstore")
-def test_a_store_reads_as_by_s3fs(
-    url: str, s3: Any, undisturbed: Any, requests: Any, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_store_reads_as_by_s3fs(url, s3, undisturbed, requests, monkeypatch):
     s3.put(str(undisturbed[1]), url, recursive=True)
     requests.made.clear()
     by_obstore = [asset.feats for asset in open_store(url)]
@@ -35,7 +33,7 @@ def test_a_store_reads_as_by_s3fs(
 
 
 @pytest.mark.usefixtures("obstore")
-def test_ranges_and_faults_are_those_of_a_file(bucket: str, s3: Any) -> None:
+def test_ranges_and_faults_are_those_of_a_file(bucket, s3):
     s3.pipe_file(f"{bucket}/a", b"0123456789")
     file = RemoteFile(place_of(f"s3://{bucket}/a"))  # type: ignore[arg-type]
     assert file.pread(4, 3) == b"3456"
@@ -55,7 +53,7 @@ def _a(bucket: str) -> Any:
 
 @pytest.mark.usefixtures("obstore")
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="needs a fork")
-def test_a_forked_process_reads_by_s3fs(bucket: str, s3: Any) -> None:
+def test_a_forked_process_reads_by_s3fs(bucket, s3):
     s3.pipe_file(f"{bucket}/a", b"0123456789")
     assert RemoteFile(_a(bucket)).pread(4, 3) == b"3456"
     forked = multiprocessing.get_context("fork")
@@ -71,8 +69,6 @@ def test_a_forked_process_reads_by_s3fs(bucket: str, s3: Any) -> None:
     ("name", "value"),
     [("AWS_SECRET_ACCESS_KEY", ""), ("AWS_PROFILE", "mine"), ("SLATPREP_OBSTORE", "no")],
 )
-def test_without_known_credentials_s3fs_reads(
-    name: str, value: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_without_known_credentials_s3fs_reads(name, value, monkeypatch):
     monkeypatch.setenv(name, value)
     assert range_reader("bucket") is None

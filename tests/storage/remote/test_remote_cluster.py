@@ -4,7 +4,6 @@ import os
 import subprocess
 import sys
 from collections.abc import Iterator
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -61,8 +60,8 @@ def left_behind(s3: Any, url: str) -> set[str]:
 
 
 def test_killed_workers_with_disks_of_their_own_write_the_bytes_of_one_machine(
-    s3: Any, url: str, sources: str, undisturbed: Made, shared: Any, address: str, tmp_path: Path
-) -> None:
+    s3, url, sources, undisturbed, shared, address, tmp_path
+):
     kills = [shared[0].folder / f"kill at {step}"
              for step in ("asset spooled", "shard filled", "shard written")]  # fmt: skip
     for kill in kills:
@@ -81,15 +80,8 @@ def test_killed_workers_with_disks_of_their_own_write_the_bytes_of_one_machine(
 
 
 def test_a_command_that_is_killed_again_and_again_goes_on_where_it_was(
-    s3: Any,
-    url: str,
-    sources: str,
-    undisturbed: Made,
-    another: Made,
-    shared: Any,
-    address: str,
-    tmp_path: Path,
-) -> None:
+    s3, url, sources, undisturbed, another, shared, address, tmp_path
+):
     faults = shared[0].folder
     put(another[1], url)
     (tmp_path / "dataset.toml").write_text(
@@ -133,8 +125,8 @@ def spooled(s3: Any, url: str) -> list[str]:
 
 
 def test_a_worker_that_does_not_reach_the_store_is_named_before_any_work(
-    url: str, sources: str, shared: Any, address: str, tmp_path_factory: Any
-) -> None:
+    url, sources, shared, address, tmp_path_factory
+):
     lost = shared[0].worker_elsewhere(
         address, tmp_path_factory.getbasetemp(), AWS_ACCESS_KEY_ID="", AWS_SECRET_ACCESS_KEY=""
     )
@@ -147,9 +139,7 @@ def test_a_worker_that_does_not_reach_the_store_is_named_before_any_work(
         end(lost)
 
 
-def test_what_others_keep_beside_a_spool_is_refused_and_stays(
-    s3: Any, url: str, undisturbed: Made, address: str
-) -> None:
+def test_what_others_keep_beside_a_spool_is_refused_and_stays(s3, url, undisturbed, address):
     s3.pipe_file(f"{url}/spool/notes.txt", b"keep")
     with Cluster(address) as cluster, pytest.raises(SlatprepError, match="holds spool/notes"):
         build_store(undisturbed[0].parameters("pixie"), url, jobs=cluster, fresh=True)
@@ -160,8 +150,8 @@ ASSET = f"ab/ab{'0' * 30}.arrays"
 
 
 def test_a_build_elsewhere_keeps_its_finished_assets_until_it_has_ended(
-    s3: Any, url: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+    s3, url, tmp_path, monkeypatch
+):
     place = place_of(url)
     with work_beside(place, private_disks=True) as running:
         running.shared()
@@ -184,7 +174,7 @@ def test_a_build_elsewhere_keeps_its_finished_assets_until_it_has_ended(
     assert not [path for path in tmp_path.rglob("cache*/**/*") if path.is_file()]
 
 
-def test_a_build_that_failed_leaves_finished_assets_but_no_mark(s3: Any, url: str) -> None:
+def test_a_build_that_failed_leaves_finished_assets_but_no_mark(s3, url):
     with pytest.raises(RuntimeError), work_beside(place_of(url), private_disks=True) as work:
         work.shared()
         s3.pipe_file(f"{url}/spool/{ASSET}", b"done")
@@ -193,8 +183,8 @@ def test_a_build_that_failed_leaves_finished_assets_but_no_mark(s3: Any, url: st
 
 
 def test_a_spool_that_cannot_be_emptied_does_not_fail_a_build_that_succeeded(
-    s3: Any, url: str, change_client: Any, tmp_path: Path
-) -> None:
+    s3, url, change_client, tmp_path
+):
     listing, refused = S3FileSystem._lsdir, [True]
 
     async def listed(*arguments: Any, **options: Any) -> Any:
@@ -217,9 +207,7 @@ def test_a_spool_that_cannot_be_emptied_does_not_fail_a_build_that_succeeded(
     assert not [path for path in (tmp_path / "cache").rglob("*") if path.is_file()]
 
 
-def test_a_dry_run_on_a_cluster_finds_what_its_build_would(
-    s3: Any, url: str, undisturbed: Made, sources: str, address: str
-) -> None:
+def test_a_dry_run_on_a_cluster_finds_what_its_build_would(s3, url, undisturbed, sources, address):
     parameters = Dataset(place_of(sources)).parameters("pixie")
     with Cluster(address) as cluster:
         build_store(parameters, url, jobs=cluster, keep_work=True)

@@ -4,13 +4,12 @@ import multiprocessing
 import os
 import signal
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import pytest
 from s3fs.core import S3FileSystem
 from support.faults import inject, kill_self
-from support.remote import Dataset, Made, current, put, versions
+from support.remote import Dataset, current, put, versions
 from support.trees import contents, tree
 
 from slatprep.errors import StoreError
@@ -64,8 +63,8 @@ def build_and_be_killed(fault: Callable[[], Fault], dataset: Dataset, url: str) 
     ids=["while it uploads", "before the pointer", "after the pointer"],
 )
 def test_a_build_that_is_killed_leaves_a_whole_store_and_the_next_one_completes(
-    s3: Any, url: str, undisturbed: Made, another: Made, fault: Any, shown: bool, requests: Any
-) -> None:
+    s3, url, undisturbed, another, fault, shown, requests
+):
     (_, old), (dataset, new) = undisturbed, another
     put(old, url)
     build_and_be_killed(fault, dataset, url)
@@ -83,8 +82,8 @@ def test_a_build_that_is_killed_leaves_a_whole_store_and_the_next_one_completes(
 
 
 def test_what_a_killed_build_uploaded_goes_when_the_sources_changed_since(
-    s3: Any, url: str, undisturbed: Made, another: Made
-) -> None:
+    s3, url, undisturbed, another
+):
     (_, expected), (dataset, _) = undisturbed, another
     build_and_be_killed(kill_midway, dataset, url)
     assert 0 < len(contents(s3, url)) < 30
@@ -97,13 +96,8 @@ def test_what_a_killed_build_uploaded_goes_when_the_sources_changed_since(
 
 
 def test_a_build_is_refused_that_another_has_overtaken(
-    s3: Any,
-    url: str,
-    undisturbed: Made,
-    another: Made,
-    monkeypatch: pytest.MonkeyPatch,
-    tmp_path: Path,
-) -> None:
+    s3, url, undisturbed, another, monkeypatch, tmp_path
+):
     """The other runs on another machine: no lock of this one's disk keeps it out."""
     elsewhere = str(tmp_path / "elsewhere")
 
@@ -119,9 +113,7 @@ def test_a_build_is_refused_that_another_has_overtaken(
     assert current(s3, url) == tree(another[1])
 
 
-def test_the_second_build_on_one_machine_is_refused_at_once(
-    url: str, undisturbed: Made, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_second_build_on_one_machine_is_refused_at_once(url, undisturbed, monkeypatch):
     parameters = undisturbed[0].parameters("pixie")
 
     def twice(step: str, name: str) -> None:
@@ -135,14 +127,8 @@ def test_the_second_build_on_one_machine_is_refused_at_once(
 
 @pytest.mark.parametrize("first", [True, False], ids=["none before", "one before"])
 def test_the_server_itself_refuses_a_pointer_that_moved_at_the_last_moment(
-    s3: Any,
-    url: str,
-    undisturbed: Made,
-    another: Made,
-    change_client: Any,
-    first: bool,
-    tmp_path: Path,
-) -> None:
+    s3, url, undisturbed, another, change_client, first, tmp_path
+):
     if not first:
         (tmp_path / "old.zarr").mkdir()
         (tmp_path / "old.zarr" / "zarr.json").write_text("{}")
@@ -162,8 +148,8 @@ def test_the_server_itself_refuses_a_pointer_that_moved_at_the_last_moment(
 
 
 def test_an_answer_that_is_lost_does_not_make_a_failure_of_a_success(
-    s3: Any, url: str, undisturbed: Made, another: Made, change_client: Any
-) -> None:
+    s3, url, undisturbed, another, change_client
+):
     put(another[1], url)
     made = upload_store(undisturbed[1], published_state(place_of(url)))
     pipe, lost = S3FileSystem._pipe_file, []
@@ -179,8 +165,8 @@ def test_an_answer_that_is_lost_does_not_make_a_failure_of_a_success(
 
 
 def test_without_any_answer_nobody_says_that_nothing_was_replaced(
-    s3: Any, url: str, undisturbed: Made, another: Made, change_client: Any
-) -> None:
+    s3, url, undisturbed, another, change_client
+):
     put(another[1], url)
     made = upload_store(undisturbed[1], published_state(place_of(url)))
     pipe, cat, lost = S3FileSystem._pipe_file, S3FileSystem._cat_file, []

@@ -2,7 +2,6 @@
 
 import json
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import h5py
@@ -31,9 +30,7 @@ def uploaded(s3: Any, bucket: str, undisturbed: Made) -> BuildParameters:
     )
 
 
-def test_the_store_is_the_one_that_local_sources_give(
-    uploaded: BuildParameters, undisturbed: Made, tmp_path: Path
-) -> None:
+def test_the_store_is_the_one_that_local_sources_give(uploaded, undisturbed, tmp_path):
     summary = build_store(uploaded, tmp_path / "s.zarr")
     assert tree(tmp_path / "s.zarr") == tree(undisturbed[1])
     build = json.loads(summary.records.with_name("build.json").read_text())
@@ -41,9 +38,7 @@ def test_the_store_is_the_one_that_local_sources_give(
     assert plan_build(uploaded, tmp_path / "s.zarr").actions["reuse"] == 3
 
 
-def test_each_place_is_listed_once_and_each_file_fetched_once(
-    uploaded: BuildParameters, tmp_path: Path, requests: Any
-) -> None:
+def test_each_place_is_listed_once_and_each_file_fetched_once(uploaded, tmp_path, requests):
     build_store(uploaded, tmp_path / "s.zarr", progress=lambda done, total: None)
     fetched = requests.of("get_object")
     assert len(fetched) == len(set(fetched)) == 6
@@ -52,9 +47,7 @@ def test_each_place_is_listed_once_and_each_file_fetched_once(
     assert len(requests.made) < 6 + 2 + 20  # and some to see what the roots are
 
 
-def test_a_definition_may_name_urls(
-    uploaded: BuildParameters, s3: Any, bucket: str, tmp_path: Path
-) -> None:
+def test_a_definition_may_name_urls(uploaded, s3, bucket, tmp_path):
     s3.pipe_file(f"{bucket}/map.csv", b"object_id,slat_id\na,b\n")
     categories = {name: {"obj_class": "cup"} for name in "abc"}
     s3.pipe_file(f"{bucket}/categories.json", json.dumps(categories).encode())
@@ -76,9 +69,7 @@ def test_a_definition_may_name_urls(
 
 
 @pytest.mark.parametrize("place", ["s3://no-such-bucket/x", "s3://{bucket}/none"])
-def test_a_root_that_is_not_there_is_named(
-    uploaded: BuildParameters, bucket: str, place: str, tmp_path: Path
-) -> None:
+def test_a_root_that_is_not_there_is_named(uploaded, bucket, place, tmp_path):
     place = place.format(bucket=bucket)
     parameters = replace(uploaded, slat=SlatSource(place))
     with pytest.raises(ConfigError, match=f"^{place}: does not exist"):
@@ -90,8 +81,8 @@ def test_a_root_that_is_not_there_is_named(
 
 
 def test_objects_that_are_torn_or_gone_are_named_and_the_others_go_in(
-    uploaded: BuildParameters, s3: Any, bucket: str, tmp_path: Path, monkeypatch: Any
-) -> None:
+    uploaded, s3, bucket, tmp_path, monkeypatch
+):
     torn = s3.cat_file(f"{bucket}/data/slat/b.npz")[:1000]
     s3.pipe_file(f"{bucket}/data/slat/b.npz", torn)
     grid = f"s3://{bucket}/data/pixieverse/c/sample_0/material_grid.npy"
@@ -104,13 +95,8 @@ def test_objects_that_are_torn_or_gone_are_named_and_the_others_go_in(
 
 
 def test_one_hdf5_file_of_many_assets_is_copied_once(
-    uploaded: BuildParameters,
-    undisturbed: Made,
-    s3: Any,
-    bucket: str,
-    tmp_path: Path,
-    requests: Any,
-) -> None:
+    uploaded, undisturbed, s3, bucket, tmp_path, requests
+):
     dataset, expected = undisturbed
     with h5py.File(tmp_path / "all.h5", "w") as file:
         for asset_id, asset in dataset.assets.items():
@@ -128,9 +114,7 @@ def test_one_hdf5_file_of_many_assets_is_copied_once(
     assert plan_build(parameters, tmp_path / "s.zarr").actions["reuse"] == 3
 
 
-def test_a_pairing_may_lie_elsewhere_than_its_sources(
-    undisturbed: Made, s3: Any, bucket: str
-) -> None:
+def test_a_pairing_may_lie_elsewhere_than_its_sources(undisturbed, s3, bucket):
     s3.pipe_file(f"{bucket}/map.csv", b"object_id,slat_id\na,b\n")
     parameters = replace(
         undisturbed[0].parameters(), pairing=PairingParameters(map=f"s3://{bucket}/map.csv")

@@ -17,7 +17,7 @@ from click.testing import CliRunner
 from s3fs.core import S3FileSystem
 from support.faults import inject
 from support.faulty_proxy import Faults, faulty
-from support.remote import Dataset, Made, current, put, versions
+from support.remote import Dataset, current, put, versions
 from support.trees import contents, tree
 
 from slatprep.cli.commands import slatprep
@@ -33,8 +33,8 @@ from slatprep.store import Store, open_store
 
 
 def test_a_store_is_built_from_s3_to_s3_and_equals_the_local_one(
-    s3: Any, bucket: str, url: str, undisturbed: Made, tmp_path: Path
-) -> None:
+    s3, bucket, url, undisturbed, tmp_path
+):
     dataset, expected = undisturbed
     s3.put(f"{dataset.root}/", f"{bucket}/data/", recursive=True)
     parameters = Dataset(place_of(f"s3://{bucket}/data")).parameters("pixie")
@@ -63,9 +63,7 @@ def assert_same(left: Store, right: Store) -> None:
         )
 
 
-def test_opening_costs_the_pointer_and_one_more_read(
-    url: str, undisturbed: Made, requests: Any, tmp_path: Path
-) -> None:
+def test_opening_costs_the_pointer_and_one_more_read(url, undisturbed, requests, tmp_path):
     shards = StoreParameters(voxel_chunk=128)  # One of each array, a dozen chunks an asset.
     build_store(replace(undisturbed[0].parameters("pixie"), store=shards), tmp_path / "s.zarr")
     put(tmp_path / "s.zarr", url)
@@ -80,8 +78,8 @@ def test_opening_costs_the_pointer_and_one_more_read(
 
 
 def test_what_did_not_change_is_neither_aligned_nor_uploaded_again(
-    s3: Any, url: str, make_dataset: Any, requests: Any, tmp_path: Path
-) -> None:
+    s3, url, make_dataset, requests, tmp_path
+):
     dataset = make_dataset("a", "b")
     build_store(dataset.parameters("pixie"), url)
     first = contents(s3, url)
@@ -102,9 +100,7 @@ def test_what_did_not_change_is_neither_aligned_nor_uploaded_again(
     assert current(s3, url) == tree(tmp_path / "local.zarr")
 
 
-def test_one_older_version_is_kept_for_who_reads_it(
-    s3: Any, url: str, undisturbed: Made, another: Made
-) -> None:
+def test_one_older_version_is_kept_for_who_reads_it(s3, url, undisturbed, another):
     first = put(another[1], url)
     reader, known = open_store(url), open_store(another[1])
     put(undisturbed[1], url)
@@ -119,9 +115,7 @@ def test_one_older_version_is_kept_for_who_reads_it(
     assert_same(open_store(url), known)
 
 
-def test_who_opens_it_while_it_is_replaced_finds_one_or_the_other_whole(
-    url: str, undisturbed: Made, another: Made
-) -> None:
+def test_who_opens_it_while_it_is_replaced_finds_one_or_the_other_whole(url, undisturbed, another):
     stores = {tuple(open_store(path).ids): open_store(path) for _, path in (undisturbed, another)}
     put(undisturbed[1], url)
     seen: list[tuple[str, ...]] = []
@@ -152,8 +146,8 @@ def test_who_opens_it_while_it_is_replaced_finds_one_or_the_other_whole(
 
 
 def test_older_versions_that_must_not_be_removed_are_told(
-    url: str, undisturbed: Made, another: Made, change_client: Any, s3: Any
-) -> None:
+    url, undisturbed, another, change_client, s3
+):
     put(another[1], url)
     put(undisturbed[1], url)
     made = upload_store(another[1], published_state(place_of(url)))
@@ -167,7 +161,7 @@ def test_older_versions_that_must_not_be_removed_are_told(
     assert current(s3, url) == tree(another[1])
 
 
-def test_each_fault_of_a_store_is_named(s3: Any, url: str, undisturbed: Made) -> None:
+def test_each_fault_of_a_store_is_named(s3, url, undisturbed):
     version = put(undisturbed[1], url)
     s3.rm(f"{version}/voxel/coords/c/0/0")
     shard = bytearray(s3.cat_file(f"{version}/voxel/feats/c/0/0"))
@@ -202,9 +196,7 @@ def test_each_fault_of_a_store_is_named(s3: Any, url: str, undisturbed: Made) ->
         b"[" * 100_000,
     ],
 )
-def test_a_pointer_that_is_none_is_refused(
-    s3: Any, url: str, text: bytes, undisturbed: Made
-) -> None:
+def test_a_pointer_that_is_none_is_refused(s3, url, text, undisturbed):
     s3.pipe_file(f"{url}/current.json", text)
     for refused in (
         lambda: open_store(url),
@@ -216,8 +208,8 @@ def test_a_pointer_that_is_none_is_refused(
 
 
 def test_places_that_cannot_be_written_are_told_before_the_work(
-    s3: Any, bucket: str, undisturbed: Made, monkeypatch: pytest.MonkeyPatch, new_clients: Any
-) -> None:
+    s3, bucket, undisturbed, monkeypatch, new_clients
+):
     parameters = undisturbed[0].parameters("pixie")
     begun: list[str] = []
     inject(monkeypatch, lambda step, name: step == "asset begun" and begun.append(name))
@@ -244,9 +236,7 @@ def test_places_that_cannot_be_written_are_told_before_the_work(
 
 
 @pytest.mark.parametrize("use", ["build", "verify", "info"])
-def test_a_store_that_cannot_be_listed_is_refused_in_words(
-    url: str, another: Made, change_client: Any, use: str
-) -> None:
+def test_a_store_that_cannot_be_listed_is_refused_in_words(url, another, change_client, use):
     put(another[1], url)
 
     async def deaf(*args: Any, **options: Any) -> Any:
@@ -262,9 +252,7 @@ def test_a_store_that_cannot_be_listed_is_refused_in_words(
             overview_of(open_store(url))
 
 
-def test_an_answer_that_zarr_cannot_use_ends_a_command_in_words(
-    url: str, another: Made, change_client: Any
-) -> None:
+def test_an_answer_that_zarr_cannot_use_ends_a_command_in_words(url, another, change_client):
     put(another[1], url)
     whole = S3FileSystem._cat_file
 
@@ -280,8 +268,8 @@ def test_an_answer_that_zarr_cannot_use_ends_a_command_in_words(
 
 
 def test_records_that_cannot_be_asked_for_end_a_command_in_words(
-    url: str, another: Made, change_client: Any, tmp_path: Path
-) -> None:
+    url, another, change_client, tmp_path
+):
     put(another[1], url)
     head = S3FileSystem._info
 
@@ -299,9 +287,7 @@ def test_records_that_cannot_be_asked_for_end_a_command_in_words(
     assert not (tmp_path / "s.zarr").exists()
 
 
-def test_an_error_that_no_room_has_words_for_is_one_line(
-    another: Made, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_an_error_that_no_room_has_words_for_is_one_line(another, monkeypatch):
     def lost(*args: Any) -> None:
         raise OSError(errno.EIO, "connection lost", "s3://bucket/x")
 
@@ -311,9 +297,7 @@ def test_an_error_that_no_room_has_words_for_is_one_line(
     assert done.stderr == "slatprep: error: s3://bucket/x: connection lost; run again\n"
 
 
-def test_records_may_be_kept_on_the_local_disk(
-    s3: Any, url: str, make_dataset: Any, tmp_path: Path
-) -> None:
+def test_records_may_be_kept_on_the_local_disk(s3, url, make_dataset, tmp_path):
     parameters = make_dataset("a").parameters("pixie")
     summary = build_store(parameters, url, manifests=tmp_path / "records")
     assert summary.records == tmp_path / "records" / "assets.jsonl"
@@ -325,7 +309,7 @@ def test_records_may_be_kept_on_the_local_disk(
     assert again.records.read_text().count("\n") == 1
 
 
-def test_a_forked_process_reads_on(url: str, undisturbed: Made) -> None:
+def test_a_forked_process_reads_on(url, undisturbed):
     put(undisturbed[1], url)
     store = open_store(url)
     store.read(0)
@@ -339,8 +323,8 @@ def test_a_forked_process_reads_on(url: str, undisturbed: Made) -> None:
 
 
 def test_a_copy_is_made_once_and_holds_no_name_that_leads_out(
-    s3: Any, url: str, undisturbed: Made, requests: Any, tmp_path: Path
-) -> None:
+    s3, url, undisturbed, requests, tmp_path
+):
     version = put(undisturbed[1], url)
     for name in ("../../../../escaped", "../escaped", "a/../../escaped"):
         s3.pipe_file(f"{version}/{name}", b"x")
@@ -355,9 +339,7 @@ def test_a_copy_is_made_once_and_holds_no_name_that_leads_out(
     assert storage_of(undisturbed[1]).copied_version() == undisturbed[1]
 
 
-def test_a_copy_that_differs_from_what_was_published_is_none(
-    s3: Any, url: str, undisturbed: Made, tmp_path: Path
-) -> None:
+def test_a_copy_that_differs_from_what_was_published_is_none(s3, url, undisturbed, tmp_path):
     version = put(undisturbed[1], url)
     shard = bytearray(s3.cat_file(f"{version}/voxel/feats/c/0/0"))
     shard[100] ^= 1
@@ -369,15 +351,8 @@ def test_a_copy_that_differs_from_what_was_published_is_none(
 
 @pytest.mark.parametrize("part_bytes", [None, 5 * 2**20])
 def test_an_upload_that_arrives_with_another_bit_is_not_published(
-    part_bytes: int | None,
-    s3: Any,
-    url: str,
-    server: str,
-    undisturbed: Made,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    new_clients: Any,
-) -> None:
+    part_bytes, s3, url, server, undisturbed, tmp_path, monkeypatch, new_clients
+):
     store = Path(shutil.copytree(undisturbed[1], tmp_path / "s.zarr"))
     spoiled = "voxel/feats/c/0/0"
     if part_bytes is not None:  # Large enough for several parts.
@@ -400,9 +375,7 @@ def test_an_upload_that_arrives_with_another_bit_is_not_published(
     assert current(s3, url) == tree(store)
 
 
-def test_a_store_that_was_copied_there_as_it_is_can_be_read(
-    s3: Any, bucket: str, undisturbed: Made
-) -> None:
+def test_a_store_that_was_copied_there_as_it_is_can_be_read(s3, bucket, undisturbed):
     s3.put(f"{undisturbed[1]}/", f"{bucket}/plain.zarr/", recursive=True)
     assert_same(open_store(f"s3://{bucket}/plain.zarr"), open_store(undisturbed[1]))
     with pytest.raises(StoreError, match="lies there without versions"):
@@ -411,7 +384,7 @@ def test_a_store_that_was_copied_there_as_it_is_can_be_read(
         build_store(undisturbed[0].parameters("pixie"), f"s3://{bucket}/plain.zarr")
 
 
-def test_other_file_systems_of_fsspec_do_as_well(make_dataset: Any, tmp_path: Path) -> None:
+def test_other_file_systems_of_fsspec_do_as_well(make_dataset, tmp_path):
     dataset = make_dataset("a")
     place = "memory://stores/demo.zarr"
     fsspec.filesystem("memory").rm("/", recursive=True)

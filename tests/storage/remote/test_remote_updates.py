@@ -32,9 +32,7 @@ def below(names: list[str], version: str) -> set[str]:
     return {name.partition(f"{version}/")[2] for name in names} - {""}
 
 
-def test_shards_that_did_not_change_are_copied_by_the_server(
-    s3: Any, url: str, built: Made, requests: Any, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_shards_that_did_not_change_are_copied_by_the_server(s3, url, built, requests, monkeypatch):
     dataset, beside = built
     before = tree(beside)
     dataset.add("b", seed=1)
@@ -65,7 +63,7 @@ def test_shards_that_did_not_change_are_copied_by_the_server(
     assert verify_store(url, sources=True).ok
 
 
-def test_a_shard_that_is_gone_from_the_server_is_made_again(s3: Any, url: str, built: Made) -> None:
+def test_a_shard_that_is_gone_from_the_server_is_made_again(s3, url, built):
     dataset, beside = built
     s3.rm(f"{open_store(url).path}/voxel/feats/c/0/0")
     dataset.add("b", seed=1)
@@ -75,7 +73,7 @@ def test_a_shard_that_is_gone_from_the_server_is_made_again(s3: Any, url: str, b
     assert current(s3, url) == tree(beside)
 
 
-def test_where_the_server_does_not_copy_the_old_store_stays(s3: Any, url: str, built: Made) -> None:
+def test_where_the_server_does_not_copy_the_old_store_stays(s3, url, built):
     dataset, beside = built
     dataset.add("b", seed=1)
 
@@ -92,9 +90,7 @@ def test_where_the_server_does_not_copy_the_old_store_stays(s3: Any, url: str, b
     assert current(s3, url) == tree(beside)
 
 
-def test_another_machine_takes_over_what_did_not_change(
-    s3: Any, url: str, built: Made, tmp_path: Path, requests: Any
-) -> None:
+def test_another_machine_takes_over_what_did_not_change(s3, url, built, tmp_path, requests):
     dataset, beside = built
     shutil.rmtree(tmp_path / "cache")
     dataset.add("h", seed=1)
