@@ -14,16 +14,22 @@ from types import MappingProxyType
 
 from slatprep.errors import ConfigError
 from slatprep.parameters import BuildParameters
-from slatprep.pipeline.asset import process_asset
 from slatprep.pipeline.before import SHARE, Before, look_back
 from slatprep.pipeline.decoys import DECOYS, EVERY, measure_build
-from slatprep.pipeline.finish import Crew, Note, Progress, finish
 from slatprep.pipeline.pack import Packed, pack_store
-from slatprep.pipeline.plan import Action, BuildContext, BuildPlan, PlannedAsset, plan_assets
+from slatprep.pipeline.plan import (
+    Action,
+    BuildContext,
+    BuildPlan,
+    Crew,
+    Note,
+    PlannedAsset,
+    plan_assets,
+)
 from slatprep.pipeline.publish import Destination, publish_manifests, require_records_file
 from slatprep.pipeline.recipe import recipe_of
 from slatprep.pipeline.rows import NextStore, Row
-from slatprep.pipeline.settle import Wanted, check_objects, settle_rows
+from slatprep.pipeline.settle import Wanted, check_objects, kept_rows, settle_rows
 from slatprep.pipeline.spool import Spool
 from slatprep.pipeline.summary import (
     BuildSummary,
@@ -32,14 +38,16 @@ from slatprep.pipeline.summary import (
     summarise,
     summarise_store,
 )
-from slatprep.pipeline.work import spool_of, work_beside, work_directory
+from slatprep.pipeline.work import Work, spool_of, work_beside, work_directory
 from slatprep.readers import discover
+from slatprep.readers.published import fetch_members
 from slatprep.records import AssetPair, Place
 from slatprep.storage.atomic import staged, writing
 from slatprep.store import open_store
 from slatprep.store.record import FailedRecord
 from slatprep.store.record_json import build_id_of, digest_of, to_json
-from slatprep.workers.local import Jobs, require_shared
+from slatprep.workers import Progress
+from slatprep.workers.local import Jobs, require_shared, run_unordered, start_early
 
 __all__ = [
     "BuildPlan",
@@ -48,7 +56,6 @@ __all__ = [
     "align_pairs",
     "build_store",
     "plan_build",
-    "process_asset",
 ]
 
 
@@ -146,23 +153,65 @@ def build_store(
         context = BuildContext(parameters, recipe, work.spool, before.previous, strict)
         plan = _plan(pairs, context, crew, before.known)
         new, unchanged = _split(pairs, plan)
-        finished = finish(new, plan, context, crew)
-        following, failed = settle_rows(
-            finished, unchanged, plan, before, context, wanted, crew, keep_work
-        )
-        packed = None
-        if not before.holds(following):
-            with writing(str(place.out), work_directory(place.store).parent):
-                jobs = crew.of(sum(row.spooled for row in following.rows))
-                packed = pack_store(work.scratch, following, work.spool, jobs, work.shards)
-                place.replace(packed.store, packed.staged)
+        made = finish(new, plan, context, crew)
+        kept = []
+        if not keep_work:
+            kept = kept_rows(made, unchanged, plan, before, parameters, wanted)
+        finished = made if kept else [*made, *finish(unchanged, plan, context, crew)]
+        following, failed = settle_rows(finished, kept, before, context, wanted, crew)
+        packed = _pack(before, following, work, crew)
         summary = _publish(before, parameters, begin, following, packed, failed, crew.seen)
         if keep_work:
             work.keep_only({row.key for row in following.rows if row.spooled})
         if packed is not None:
-            aligned = sum(isinstance(asset, Row) for asset in finished)
+            aligned = sum(isinstance(asset, Row) for asset in made)
             _measure(before, aligned, decoys, crew)
     return summary
+
+
+def finish(
+    pairs: Sequence[AssetPair],
+    plan: Mapping[str, PlannedAsset],
+    context: BuildContext,
+    crew: Crew,
+) -> list[Row | FailedRecord]:
+    """Bring assets into the spool; return what is kept of each, in no order.
+
+    `plan` says what is to be done by id; of those that it does not have, everything.
+    """
+    if not pairs:
+        return []
+    # Late: a run that finds nothing changed needs neither numba nor scipy.
+    from slatprep.pipeline.asset import compile_kernels, fail_asset, finish_asset
+
+    jobs = crew.of(len(pairs))
+    read = [p for p in pairs if p.asset_id not in plan or plan[p.asset_id].action is Action.ALIGN]
+    if isinstance(jobs, int) and read:
+        start_early(finish_asset, jobs)
+        fetch_members(read, crew.note)
+        compile_kernels(crew.note)  # Before workers of this machine work, each to compile all.
+    tasks = ((pair, plan.get(pair.asset_id), context) for pair in pairs)
+    assets: list[Row | FailedRecord] = []
+    if crew.progress:
+        crew.progress(0, len(pairs))
+    for asset in run_unordered(finish_asset, tasks, jobs, fail_asset):
+        assets.append(asset)
+        if isinstance(asset, Row) and asset.seen:
+            crew.seen[asset.asset_id] = asset.seen
+        if crew.progress:
+            crew.progress(len(assets), len(pairs))
+    return assets
+
+
+def _pack(before: Before, following: NextStore, work: Work, crew: Crew) -> Packed | None:
+    """Write the next store and put it in place, unless the one that is there is the same."""
+    if before.holds(following):
+        return None
+    place, jobs = before.place, crew.of(sum(row.spooled for row in following.rows))
+    with writing(str(place.out), work_directory(place.store).parent):
+        packed = pack_store(work.scratch, following, work.spool, jobs, work.shards)
+        place.replace(packed.store, packed.staged)
+    return packed
 
 
 def _measure(before: Before, aligned: int, most: int, crew: Crew) -> None:
@@ -189,7 +238,7 @@ def plan_build(
     pairs, recipe = _discover(parameters, jobs), recipe_of(parameters)
     before = look_back(place, pairs, parameters, recipe, declared, fresh, rehash).checked(jobs)
     context = BuildContext(parameters, recipe, spool, before.previous, strict=False)
-    plan = plan_assets(pairs, context, jobs, progress, before.known)
+    plan = plan_assets(pairs, context, Crew(jobs, progress=progress), before.known)
     return BuildPlan(place.out, tuple(plan), before.damaged)
 
 
@@ -254,10 +303,7 @@ def _plan(
     """Return what is to be done by asset id; nothing where nothing was done before."""
     if context.previous is None and not context.spool.holds_any():
         return {}
-    jobs = crew.of(len(pairs) - len(known))
-    plan = plan_assets(pairs, context, jobs, crew.progress, known)
-    crew.seen.update((asset.asset_id, asset.seen) for asset in plan if asset.seen)
-    return {asset.asset_id: asset for asset in plan}
+    return {asset.asset_id: asset for asset in plan_assets(pairs, context, crew, known)}
 
 
 def _split(

@@ -31,8 +31,7 @@ from slatprep.judge.witness import (
 )
 from slatprep.parameters import BuildParameters
 from slatprep.pipeline.annotate import look_up
-from slatprep.pipeline.finish import Crew
-from slatprep.pipeline.plan import BuildContext
+from slatprep.pipeline.plan import BuildContext, Crew
 from slatprep.pipeline.rows import Row
 from slatprep.pipeline.spool import Spool
 from slatprep.records import (

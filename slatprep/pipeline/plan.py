@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from enum import StrEnum
 from types import MappingProxyType
 
@@ -24,7 +24,45 @@ from slatprep.records import AssetPair, Place, SourceFile
 from slatprep.storage.faults import reached
 from slatprep.storage.states import noting
 from slatprep.store.record_json import RecordError
-from slatprep.workers.local import Jobs, run_unordered
+from slatprep.workers import Progress
+from slatprep.workers.local import Jobs, at_most, run_unordered
+
+Note = Callable[[str], None]
+"""Called with a line for the user."""
+
+
+@dataclass(frozen=True)
+class Crew:
+    """Who works on a build, and who is told of it.
+
+    Attributes
+    ----------
+    jobs : int or Workers
+        Worker processes, or a cluster's.
+    assets_per_job : int
+        No more processes are started than there are so many assets for.
+    progress : callable or None
+        Called with the assets done and the assets in all; at the beginning with none done.
+    note : callable or None
+        See `Note`.
+    seen : dict of str to bytes
+        States of the sources of assets as they were read, by id.
+    """
+
+    jobs: Jobs
+    assets_per_job: int = 1
+    progress: Progress | None = None
+    note: Note | None = None
+    seen: dict[str, bytes] = field(default_factory=dict)
+
+    def of(self, assets: int) -> Jobs:
+        """Return who works on so many assets."""
+        return at_most(assets // self.assets_per_job, self.jobs)
+
+    def tell(self, line: str) -> None:
+        """Give a line for the user to whoever listens."""
+        if self.note:
+            self.note(line)
 
 
 @dataclass(frozen=True)
@@ -121,14 +159,12 @@ class BuildPlan:
 def plan_assets(
     pairs: Sequence[AssetPair],
     context: BuildContext,
-    jobs: Jobs,
-    progress: Callable[[int, int], None] | None = None,
+    crew: Crew,
     known: Mapping[str, str] = MappingProxyType({}),
 ) -> list[PlannedAsset]:
     """Say what will be done with each asset, and why, by id; those to be removed as well.
 
-    `known` has the keys of assets whose sources need not be hashed again, by id. `progress` gets
-    the assets done and the assets in all.
+    `known` has the keys of assets whose sources need not be hashed again, by id.
     """
     plan = []
     other = []
@@ -140,10 +176,12 @@ def plan_assets(
         else:
             plan.append(PlannedAsset(pair.asset_id, Action.REUSE, "unchanged", key))
     tasks = ((pair, context) for pair in other)
-    for planned in run_unordered(plan_asset, tasks, jobs):
+    for planned in run_unordered(plan_asset, tasks, crew.of(len(pairs) - len(known))):
         plan.append(planned)
-        if progress:
-            progress(len(plan), len(pairs))
+        if planned.seen:
+            crew.seen[planned.asset_id] = planned.seen
+        if crew.progress:
+            crew.progress(len(plan), len(pairs))
     gone = context.previous.ids - {pair.asset_id for pair in pairs} if context.previous else ()
     why = "no longer among the sources"
     plan += [PlannedAsset(asset_id, Action.REMOVE, why) for asset_id in gone]

@@ -14,8 +14,7 @@ from slatprep.errors import ConfigError, StoreError
 from slatprep.normalize import ranges_from_bounds, ranges_from_extents, to_mapped
 from slatprep.parameters import BuildParameters, NormalizeParameters, is_split_file, percentiles_of
 from slatprep.pipeline.before import Before
-from slatprep.pipeline.finish import Crew, finish
-from slatprep.pipeline.plan import BuildContext, PlannedAsset
+from slatprep.pipeline.plan import BuildContext, Crew, PlannedAsset
 from slatprep.pipeline.previous import SourceStore
 from slatprep.pipeline.recipe import build_of
 from slatprep.pipeline.rows import NextStore, Row, column, in_order, moments_of
@@ -83,27 +82,17 @@ class Wanted:
 
 def settle_rows(
     finished: Sequence[Row | FailedRecord],
-    unchanged: Sequence[AssetPair],
-    plan: Mapping[str, PlannedAsset],
+    kept: Sequence[Row],
     before: Before,
     context: BuildContext,
     wanted: Wanted,
     crew: Crew,
-    keep_work: bool = False,
 ) -> tuple[NextStore, list[FailedRecord]]:
-    """Return the next store, and the assets that cannot go in by id.
+    """Return the next store of `finished` assets, and those that cannot go in, by id.
 
-    `finished` are the assets that are new or changed. Rows of the `unchanged` are taken over from
-    the existing store, or finished too where that cannot be, or with `keep_work`. StoreError if no
-    asset can be used.
+    Rows that are `kept` are taken over from the existing store. StoreError if no asset can be used.
     """
     parameters, spool, previous = context.parameters, context.spool, before.previous
-    kept: list[Row] = []
-    if not (before.damaged or keep_work):
-        made = [asset for asset in finished if isinstance(asset, Row)]
-        kept = _kept_rows(made, unchanged, plan, before, parameters, wanted)
-    if not kept:
-        finished = [*finished, *finish(unchanged, plan, context, crew)]
     rows = sorted((a for a in finished if isinstance(a, Row)), key=lambda row: row.asset_id)
     failed = [asset for asset in finished if isinstance(asset, FailedRecord)]
     failed.sort(key=lambda asset: asset.asset_id)
@@ -127,8 +116,8 @@ def settle_rows(
     return NextStore(rows, stores, normalization, contents, *how), failed
 
 
-def _kept_rows(
-    made: Sequence[Row],
+def kept_rows(
+    finished: Sequence[Row | FailedRecord],
     unchanged: Sequence[AssetPair],
     plan: Mapping[str, PlannedAsset],
     before: Before,
@@ -141,8 +130,9 @@ def _kept_rows(
     change them, and the rest of what decides a store's bytes is the same.
     """
     previous, normalize = before.previous, parameters.normalize
-    if previous is None:
+    if previous is None or before.damaged:
         return []
+    made = [asset for asset in finished if isinstance(asset, Row)]
     store, declared = previous.store, wanted.declared
     tables = [(one.properties, one.classes) for one in (store.contents, declared)]
     if tables[0] != tables[1] or {**previous.build, "name": ""} != {**wanted.build, "name": ""}:
