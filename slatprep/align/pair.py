@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from slatprep.align.pose import Pose, Poses, Similarity
 from slatprep.align.solver import solve
 from slatprep.align.surface import Surface
+from slatprep.geometry.kernel import kernel
 from slatprep.parameters import AlignParameters
 
 Array = NDArray[np.float64]
@@ -58,15 +59,17 @@ def far_from_all(places: Array, others: Iterable[Array]) -> bool:
     return all(distance >= 2.0 * DISTINCT for distance in apart)
 
 
-def first_of_each(places: Array, distance: float, most: int | None = None) -> NDArray[np.intp]:
+@kernel()
+def first_of_each(places, distance, most):  # type: ignore[no-untyped-def]
     """Choose at most so many of places (n, 12), best first, none near to a better one."""
-    left = np.arange(len(places))
-    kept: list[np.intp] = []
-    while len(left) and len(kept) != most:
-        best, left = left[0], left[1:]
-        kept.append(best)
-        left = left[((places[left] - places[best]) ** 2).sum(axis=1) >= distance**2]
-    return np.array(kept, dtype=np.intp)
+    kept = np.empty(min(most, len(places)), np.intp)
+    found = 0
+    for k in range(len(places)):
+        apart = ((places[kept[:found]] - places[k]) ** 2).sum(axis=1)
+        if found < most and (apart >= distance**2).all():
+            kept[found] = k
+            found += 1
+    return kept[:found]
 
 
 class Pair:
@@ -75,7 +78,6 @@ class Pair:
     def __init__(self, slat: Surface, pixie: Surface, parameters: AlignParameters) -> None:
         self.slat, self.pixie = slat, pixie
         self.parameters = parameters
-        self._cache: dict[int, tuple[Surface, Surface]] = {}
         self.free_scale = parameters.model != "rigid"
         self.may_deform = parameters.model in ("auto", "affine", "deformable")
 
@@ -105,14 +107,13 @@ class Pair:
 
     def subsets(self, samples: int) -> tuple[Surface, Surface]:
         """Return the SLAT's and the PixieVerse surface with at most so many samples."""
-        if samples not in self._cache:
-            self._cache[samples] = self.slat.subset(samples), self.pixie.subset(samples)
-        return self._cache[samples]
+        return self.slat.subset(samples), self.pixie.subset(samples)
 
     def starts(self, rotations: Iterable[Array], scale: float) -> list[Pose]:
         """Return poses that lay centroid on centroid."""
-        here, there = self.slat.centroid, self.pixie.centroid
-        return [Pose(Similarity(r, here - scale * (r @ there), scale)) for r in rotations]
+        turns = np.array([*rotations])
+        shifts = self.slat.centroid - scale * (turns @ self.pixie.centroid)
+        return [Pose(Similarity(*pose, scale)) for pose in zip(turns, shifts, strict=True)]
 
     def refine(
         self,
@@ -176,7 +177,7 @@ class Pair:
     def distinct(self, poses: Sequence[Pose]) -> list[Pose]:
         """Return the poses best first, without those that repeat a better one."""
         rest = sorted(poses, key=lambda pose: -pose.rank)
-        return [rest[k] for k in first_of_each(self.places(rest), DISTINCT)]
+        return [rest[k] for k in first_of_each(self.places(rest), DISTINCT, len(rest))]
 
     def at_scale_one(self, similarity: Similarity) -> Similarity:
         """Return a similarity of scale one that looks the middle of the SLAT up where this does."""

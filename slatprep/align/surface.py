@@ -8,7 +8,7 @@ thickness pulls the alignment to one side.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property, lru_cache
 from typing import NamedTuple
 
@@ -68,6 +68,7 @@ class Surface:
     points: NDArray[np.float64]
     values: NDArray[np.float64]
     boundary: NDArray[np.uint8]
+    _subsets: dict[tuple[int, int], Surface] = field(init=False, default_factory=dict)
 
     @property
     def samples(self) -> Samples:
@@ -100,15 +101,17 @@ class Surface:
         """Return the same surface with at most `count` evenly chosen samples.
 
         Those from the number `first` on are others than the first ones, unless
-        there are too few.
+        there are too few. They are chosen once, as many fits ask for the same.
         """
-        if len(self.points) <= count:
-            # Laid out in memory as a choice is, or the kernels are compiled once more.
-            return replace(self, points=np.ascontiguousarray(self.points))
-        # In order, so each is compared with the one before it: numpy.unique would sort once more.
-        chosen = even_choice(len(self.points), count, first)
-        chosen = chosen[np.diff(chosen, prepend=-1) > 0]
-        return replace(self, points=self.points[chosen], values=self.values[chosen])
+        if (count, first) not in self._subsets:
+            chosen = np.arange(len(self.points))
+            if len(chosen) > count:
+                chosen = even_choice(len(chosen), count, first)
+                # In order, so each is compared with the one before it: no sorting once more.
+                chosen = chosen[np.diff(chosen, prepend=-1) > 0]
+            some = replace(self, points=self.points[chosen], values=self.values[chosen])
+            self._subsets[count, first] = some
+        return self._subsets[count, first]
 
 
 def even_choice(total: int, count: int, first: int = 0) -> NDArray[np.intp]:

@@ -39,6 +39,7 @@ class Lattice:
         self._alike: tuple[NDArray[np.uint8], NDArray[np.bool_]] | None = None
         self._blocks = np.zeros((RESOLUTION // _BLOCK,) * 3, dtype=bool)
         self._blocks[tuple((voxels // _BLOCK).T)] = True
+        self._near: dict[float, NDArray[np.bool_]] = {}
 
     def nearest(
         self, points: NDArray[np.float64], limit: float = np.inf
@@ -66,14 +67,15 @@ class Lattice:
 
         A set that fills the grid, looked up in one that does not, has mostly such points.
         """
-        near = self._blocks.copy()
-        for axis in range(3):
-            own = np.moveaxis(near, axis, 0)
-            before = own.copy()
-            for step in range(1, math.ceil((reach + 0.5) / _BLOCK) + 1):
-                own[step:] |= before[:-step]
-                own[:-step] |= before[step:]
-        return near
+        if reach not in self._near:
+            near = self._near[reach] = self._blocks.copy()
+            for axis in range(3):
+                own = np.moveaxis(near, axis, 0)
+                before = own.copy()
+                for step in range(1, math.ceil((reach + 0.5) / _BLOCK) + 1):
+                    own[step:] |= before[:-step]
+                    own[:-step] |= before[step:]
+        return self._near[reach]
 
     def vote(
         self,

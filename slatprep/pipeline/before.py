@@ -133,10 +133,8 @@ class Before:
 
         `read` has the states of the sources that were read, as they were then.
         """
-        bound, state = bound_to(store.about.manifest, self.asked), b""
-        folder, path = storage_of(manifests).local, storage_of(self.place.store).local
-        if folder is not None and path is not None:
-            state = store_state(path, _files_beside(folder, len(store)), wait=True)
+        bound = bound_to(store.about.manifest, self.asked)
+        state = _state_of(self.place, manifests, len(store), wait=True)
         keys = zip(store.ids, (bytes(key).hex() for key in store.column("key")), strict=True)
         states = {asset_id: self.states[asset_id] for asset_id in self.known} | dict(read)
         write_seen(_seen_folder(self.place), bound, state, states, dict(keys))
@@ -176,17 +174,21 @@ def look_back(
 
 
 def _is_as_left(previous: SourceStore, place: Destination, state: bytes) -> bool:
-    folder, path = storage_of(place.manifests()).local, storage_of(place.store).local
-    if folder is None or path is None or state in (b"", bytes(32)):
+    if state in (b"", bytes(32)):
         return False
     try:
-        return store_state(path, _files_beside(folder, len(previous.store))) == state
+        return _state_of(place, place.manifests(), len(previous.store)) == state
     except StoreError:  # Damaged: how many rows there are is not known.
         return False
 
 
-def _files_beside(folder: Path, assets: int) -> list[Path]:
-    return [folder / name for name in (*file_names(assets), BUILD)]
+def _state_of(place: Destination, manifests: Place, assets: int, wait: bool = False) -> bytes:
+    """Return the state of a store of so many assets and of its records; empty if not trusted."""
+    folder, path = storage_of(manifests).local, storage_of(place.store).local
+    if folder is None or path is None:
+        return b""
+    names = (*file_names(assets), BUILD)
+    return store_state(path, [folder / name for name in names], wait=wait)
 
 
 def _seen_folder(place: Destination) -> Path:

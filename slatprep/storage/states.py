@@ -63,14 +63,13 @@ class State(NamedTuple):
 Noted = tuple[object, ...] | None
 """What is noted of a file that was read: its state, or what tells a member of an archive."""
 
-_noted: ContextVar[dict[str, Noted] | None] = ContextVar("noted", default=None)
-
 
 class States:
     """Looks at states of files; whether those of a mount count is asked once."""
 
     def __init__(self) -> None:
         self._counts: dict[int, bool] = {}
+        self.noted: dict[str, Noted] = {}
 
     def of(self, file: str | int) -> State | None:
         """Return the state of a file, by path or descriptor; None where it does not count.
@@ -122,30 +121,32 @@ def settle() -> None:
     time.sleep(FINE_NS / 1e9)
 
 
+_noting: ContextVar[States | None] = ContextVar("noting", default=None)
+
+
 def lasting_state(descriptor: int) -> State | None:
     """Return the state of an open file that every later change will change; None if none will."""
     if not _nobody_writes(descriptor):
         return None
-    state = States().of(descriptor)
+    state = (_noting.get() or States()).of(descriptor)
     return state if state and is_settled(state.modified, state.changed) else None
 
 
 @contextmanager
 def noting() -> Iterator[dict[str, Noted]]:
     """Collect the states of files as they are read meanwhile, by name; None where none counts."""
-    noted: dict[str, Noted] = {}
-    token = _noted.set(noted)
+    states = States()
+    token = _noting.set(states)
     try:
-        yield noted
+        yield states.noted
     finally:
-        _noted.reset(token)
+        _noting.reset(token)
 
 
 @contextmanager
 def reading(descriptor: int, name: str) -> Iterator[None]:
     """Note under a name the state of an open file, unless it is another when it has been read."""
-    noted = _noted.get()
-    if noted is None:
+    if _noting.get() is None:
         yield
         return
     before = lasting_state(descriptor)
@@ -155,9 +156,8 @@ def reading(descriptor: int, name: str) -> Iterator[None]:
 
 def note(name: str, state: Noted) -> None:
     """Note the state of what was read; of what was read twice, if it is the same."""
-    noted = _noted.get()
-    if noted is not None:
-        noted[name] = state if noted.get(name, state) == state else None
+    if states := _noting.get():
+        states.noted[name] = state if states.noted.get(name, state) == state else None
 
 
 def _nobody_writes(descriptor: int) -> bool:
