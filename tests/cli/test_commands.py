@@ -75,19 +75,22 @@ def test_a_command_imports_no_more_than_it_needs(demo):
         "    print(sorted({name.partition('.')[0] for name in sys.modules}), file=sys.stderr)\n"
     )
     store = str(demo / "demo.zarr")
-    lines = (["--help"], ["check-alignment", "--help"], ["info", store], ["list", store])
+    unchanged = ["build-store", "--config", str(demo / "demo" / "dataset.toml"), "--out", store]
+    lines = (["--help"], ["check-alignment", "--help"], ["info", store], ["list", store], unchanged)
     command = [sys.executable, "-c", script, json.dumps(lines)]
     done = subprocess.run(command, capture_output=True, text=True, check=True)
     for word, printed in zip(
-        ("build-store", "The exit code is 1 unless", "good", "good"),
-        done.stdout.split("#" * 9)[:4], strict=True,
+        ("build-store", "The exit code is 1 unless", "good", "good", "3 ok"),
+        done.stdout.split("#" * 9)[:5], strict=True,
     ):  # fmt: skip
         assert word in printed
     slow = ("scipy", "open3d", "numba")
     heavy = (*slow, "numpy", "zarr", "h5py", "joblib", "pydantic", "rich", "matplotlib")
-    *helped, info, listed = done.stderr.splitlines()
+    *helped, info, listed, built = (m for m in done.stderr.splitlines() if m.startswith("['"))
     assert len(helped) == 2
-    for modules, absent in ((helped[0], heavy), (helped[1], heavy), (info, slow), (listed, slow)):
+    for modules, absent in (
+        (helped[0], heavy), (helped[1], heavy), (info, slow), (listed, slow), (built, slow),
+    ):  # fmt: skip
         assert not [name for name in absent if f"'{name}'" in modules]
     assert "'numpy'" in info
 
