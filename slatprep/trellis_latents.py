@@ -201,9 +201,7 @@ def load(options: argparse.Namespace) -> Callable[[Any, int], Sampled]:
             loaded = Inference(options.model or "checkpoints/hf/pipeline.yaml", compile=False)
             return lambda image, seed: sample_sam3d(loaded, torch, image, seed)
         if options.generator == "trellis2":
-            from trellis2.pipelines import (
-                Trellis2ImageTo3DPipeline as Pipeline,
-            )
+            from trellis2.pipelines import Trellis2ImageTo3DPipeline as Pipeline
         else:
             from trellis.pipelines import TrellisImageTo3DPipeline as Pipeline
         pipeline = Pipeline.from_pretrained(options.model or MODELS[options.generator])

@@ -43,11 +43,7 @@ Each sample is an asset: `json` describes it, `npz` holds its arrays."""
 
 
 def card_of(
-    store: Store,
-    stated: Stated,
-    data: str,
-    pictures: Sequence[str],
-    verdicts: Sequence[str] = (),
+    store: Store, stated: Stated, data: str, pictures: Sequence[str], verdicts: Sequence[str] = ()
 ) -> str:
     """Return the card as Hugging Face expects it: Markdown with metadata in YAML.
 

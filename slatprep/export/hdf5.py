@@ -20,19 +20,13 @@ if TYPE_CHECKING:
 _DATASETS: dict[str, dict[str, Any]] = {
     "coords": {"description": "SLAT coordinate, x, y, z", "units": "voxel"},
     "feats": {"description": "SLAT latents"},
-    "properties": {
-        "description": "normalised properties in [-1, 1], NaN where not valid",
-    },
-    "properties_si": {
-        "description": "properties, NaN where not valid",
-    },
+    "properties": {"description": "normalised properties in [-1, 1], NaN where not valid"},
+    "properties_si": {"description": "properties, NaN where not valid"},
     "material": {"description": "class, 255 where not valid"},
     "valid": {"description": "an annotation was found near enough"},
     "distance": {"description": "distance to the annotation used", "units": "voxel"},
     "place": {"description": "where it was looked up, PixieVerse frame, [-0.5, 0.5]^3"},
-    "spread": {
-        "description": "standard deviation of normalised properties over the annotations",
-    },
+    "spread": {"description": "standard deviation of normalised properties over the annotations"},
     "votes": {"description": "share of the annotations that give the class"},
     "transform": {
         "description": "PixieVerse frame to SLAT frame, both the unit cube [-0.5, 0.5]^3"

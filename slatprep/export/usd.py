@@ -163,12 +163,7 @@ def _write_asset(
 
 
 def _add_material(
-    stage: Any,
-    binding: Any,
-    number: int,
-    material: int,
-    solid: NDArray[np.float64],
-    binned: Binned,
+    stage: Any, binding: Any, number: int, material: int, solid: NDArray[np.float64], binned: Binned
 ) -> None:
     """Add a material, and the subset of the points that it is bound to."""
     geom, sdf, vt, shade = _pxr("UsdGeom"), _pxr("Sdf"), _pxr("Vt"), _pxr("UsdShade")

@@ -61,9 +61,7 @@ def _read_space(path: Place) -> LatentSpace:
 
 
 def resolve_latents(
-    declared: LatentSpace,
-    standardised: str,
-    moments: Sequence[tuple[int, LatentMoments | None]],
+    declared: LatentSpace, standardised: str, moments: Sequence[tuple[int, LatentMoments | None]]
 ) -> LatentSpace:
     """Return the space of a dataset's latents, now that all assets have been read.
 

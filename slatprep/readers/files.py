@@ -283,11 +283,7 @@ def _open_zip(data: bytes, where: str | Place) -> zipfile.ZipFile:
 
 
 def _read_member(
-    archive: zipfile.ZipFile,
-    info: zipfile.ZipInfo,
-    where: str | Place,
-    name: str,
-    spec: ArraySpec,
+    archive: zipfile.ZipFile, info: zipfile.ZipInfo, where: str | Place, name: str, spec: ArraySpec
 ) -> NDArray[Any]:
     member = f"{where} [{name}]"
     # zipfile bounds its output for these two alone.

@@ -205,9 +205,7 @@ class ForeignLatents(_Foreign):
             read: StructuredLatents = self.adapter.read(path, root, group, space)
             rows = len(read.coords)
             self._require_arrays(
-                read,
-                ("coords", np.uint8, (rows, 3)),
-                ("feats", np.float32, (rows, space.channels)),
+                read, ("coords", np.uint8, (rows, 3)), ("feats", np.float32, (rows, space.channels))
             )
             side = space.resolution
             self._require(read.resolution == side, f"latents of a grid of {read.resolution}^3")

@@ -357,11 +357,7 @@ def _no_slat(row: _Row, source: SlatSource, one_file: bool) -> str:
 
 
 def _find_one(
-    there: _Found,
-    patterns: Iterable[str],
-    known: Mapping[str, str],
-    role: str,
-    problems: list[str],
+    there: _Found, patterns: Iterable[str], known: Mapping[str, str], role: str, problems: list[str]
 ) -> Place | None:
     """Return the file that the first matching pattern finds; add a problem if it finds several."""
     for pattern in patterns:

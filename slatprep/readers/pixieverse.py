@@ -236,10 +236,7 @@ def _classes_of_ids(ids: NDArray[Any], path: Place) -> NDArray[np.int8]:
 
 
 def _classes_of_scores(
-    scores: NDArray[Any],
-    mask: NDArray[np.bool_] | None,
-    path: Place,
-    warnings: list[str],
+    scores: NDArray[Any], mask: NDArray[np.bool_] | None, path: Place, warnings: list[str]
 ) -> NDArray[np.int8]:
     """Return the class of the highest score; voxels outside the mask do not matter."""
     where = np.ones(_CUBE, dtype=bool) if mask is None else mask
@@ -264,10 +261,7 @@ def _classes_of_scores(
 
 
 def _annotated(
-    occupancy: NDArray[np.bool_],
-    material: NDArray[np.int8],
-    path: Place,
-    warnings: list[str],
+    occupancy: NDArray[np.bool_], material: NDArray[np.int8], path: Place, warnings: list[str]
 ) -> NDArray[np.bool_]:
     background = material == BACKGROUND
     unlabelled = occupancy & (material == UNLABELLED)

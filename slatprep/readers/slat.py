@@ -15,14 +15,7 @@ from slatprep.parameters import SlatSource
 from slatprep.readers.encoders import ENOUGH, in_words, look_standardised
 from slatprep.readers.files import ArraySpec, load_source, npz_arrays
 from slatprep.readers.hdf5 import SUFFIXES, load_datasets
-from slatprep.records import (
-    RESOLUTION,
-    TRELLIS,
-    LatentSpace,
-    Place,
-    SourceFile,
-    StructuredLatents,
-)
+from slatprep.records import RESOLUTION, TRELLIS, LatentSpace, Place, SourceFile, StructuredLatents
 from slatprep.records.trellis2 import PBR_MEAN, PBR_STD, SHAPE_MEAN, SHAPE_STD
 from slatprep.storage.place import storage_of
 

@@ -28,10 +28,7 @@ _WHOLE = (
 
 
 def group_arrays(
-    data: bytes,
-    where: str | Place,
-    specs: Mapping[str, ArraySpec],
-    empty: Collection[str] = (),
+    data: bytes, where: str | Place, specs: Mapping[str, ArraySpec], empty: Collection[str] = ()
 ) -> dict[str, NDArray[Any]]:
     """Read the named arrays of a group from the archive of `slatprep.readers.files.load_source`.
 

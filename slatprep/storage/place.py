@@ -183,10 +183,7 @@ class Storage:
 
         Its state is noted under what was `asked` for, see `slatprep.storage.states`.
         """
-        with (
-            open_regular(self._path) as file,
-            reading(file.fileno(), str(asked or self._path)),
-        ):
+        with open_regular(self._path) as file, reading(file.fileno(), str(asked or self._path)):
             # read() would allocate all that it is allowed to return.
             return file.pread(min(file.size(), limit + 1), 0)
 

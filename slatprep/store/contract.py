@@ -14,13 +14,7 @@ from slatprep.errors import StoreError
 from slatprep.parameters import MAX_GRID_SHARD, MAX_VOXEL_CHUNK, MAX_VOXEL_SHARD
 from slatprep.records import MAX_CHANNELS, MAX_PROPERTIES, RESOLUTION, Place
 from slatprep.storage.documents import read_document
-from slatprep.store.layout import (
-    ASSET_CHUNK,
-    FILE,
-    FIXED_SIZES,
-    LAYOUTS,
-    ArrayLayout,
-)
+from slatprep.store.layout import ASSET_CHUNK, FILE, FIXED_SIZES, LAYOUTS, ArrayLayout
 
 MAX_METADATA_BYTES = 16 * 2**20
 """No zarr.json is larger: all metadata of a store take about 50 kB."""

@@ -11,12 +11,7 @@ from slatprep.records import Place
 from slatprep.storage.files import LINK, file_digest
 from slatprep.storage.place import storage_of
 from slatprep.store.attributes import read_attributes, width_findings
-from slatprep.store.contract import (
-    Finding,
-    array_findings,
-    dimension_sizes,
-    read_metadata,
-)
+from slatprep.store.contract import Finding, array_findings, dimension_sizes, read_metadata
 from slatprep.store.digests import ATTRIBUTES, attributes_digest, is_own
 from slatprep.store.gate import GROUPS, form_findings, gate_findings
 from slatprep.store.layout import ARRAYS, MERGED

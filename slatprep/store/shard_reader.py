@@ -284,7 +284,4 @@ class RowReader:
         return DamagedFileError(self.folder.path, self.key(number), fault, "the file as written")
 
 
-_KEYS = (
-    {"name": "default"},
-    {"name": "default", "configuration": {"separator": "/"}},
-)
+_KEYS = ({"name": "default"}, {"name": "default", "configuration": {"separator": "/"}})

@@ -154,10 +154,7 @@ def _encoder(codecs: list[Mapping[str, Any]]) -> Callable[[NDArray[Any]], bytes]
         return lambda chunk: _with_checksum(zstd.encode(chunk))
     single_threaded_blosc()
     blosc = Blosc(
-        settings["cname"],
-        settings["clevel"],
-        _SHUFFLES[settings["shuffle"]],
-        settings["blocksize"],
+        settings["cname"], settings["clevel"], _SHUFFLES[settings["shuffle"]], settings["blocksize"]
     )
     # Blosc shuffles by the size of an item; that of a row of three bytes is three.
     item = np.dtype(f"V{settings['typesize']}")
