@@ -9,7 +9,7 @@ import math
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from itertools import groupby
+from itertools import chain, groupby
 
 from slatprep.errors import ConfigError, in_unicode
 from slatprep.parameters import BuildParameters, PixieverseSource, SlatSource
@@ -21,7 +21,7 @@ from slatprep.readers.patterns import NAME, fill, find_files, list_below, tried_
 from slatprep.readers.published import category_of, hint_of, locate_grids
 from slatprep.readers.slat_files import NamedSlat, encoded, find_slats, ordered
 from slatprep.readers.unmatched import by_case
-from slatprep.records import AssetPair, Contents, Place, SourceRoots
+from slatprep.records import AssetPair, Place, SourceRoots
 from slatprep.storage.archives import is_archive
 from slatprep.storage.listing import Listing
 from slatprep.storage.place import storage_of
@@ -41,12 +41,10 @@ class _Row:
 
 @dataclass(frozen=True, slots=True)
 class _Found:
-    """The names of a dataset's files; `listing` lists the PixieVerse root.
+    """The names of a source's files; `listing` lists its root."""
 
-    `also` holds the further sources, each as if it were the first.
-    """
-
-    parameters: BuildParameters
+    source: PixieverseSource
+    slat: SlatSource
     roots: SourceRoots
     listing: Listing
     one_file: bool
@@ -54,7 +52,6 @@ class _Found:
     categories: Mapping[str, str]
     cases: Mapping[str, str]
     """What the other side calls an id that it has in other letters' case."""
-    also: tuple[_Found, ...] = ()
 
 
 def discover(
@@ -103,10 +100,8 @@ def discover(
         raise ConfigError(f"{error.filename}: cannot be looked at ({error.strerror})") from None
     places = [locate_grids(source, note) for source in sources]
     listings = [list_below(place) for place in places]
-    grids, *further = [
-        _grids_of(*both, slat, one_file) for both in zip(sources, listings, strict=True)
-    ]
-    slats = find_slats(slat, one_file)
+    each = [_grids_of(*both, slat, one_file) for both in zip(sources, listings, strict=True)]
+    grids, slats = each[0], find_slats(slat, one_file)
     claims = {} if pairing.map is None else read_map(pairing.map, grids, slats)
     categories = {} if pairing.categories is None else read_categories(pairing.categories)
     rows = list(_rows(grids, slats, claims))
@@ -114,37 +109,14 @@ def discover(
         rows = [own for row in rows for own in _rows_by_sample(row, grids)]
     rows.sort(key=lambda row: (row.asset_id, row.object_id))
     folder = slat.root.parent if one_file else slat.root
-    contents = contents_of(parameters)
-    roots = _roots_of(pixieverse, places[0], folder, contents)
-    there = _Found(
-        parameters, roots, listings[0], one_file, grids, categories, by_case(grids, slats)
-    )
-    also = tuple(
-        replace(
-            there,
-            parameters=replace(parameters, pixieverse=source, also=()),
-            roots=_roots_of(source, places[number], folder, contents, number),
-            listing=listings[number],
-            grids=further[number - 1],
+    contents, cases = contents_of(parameters), by_case(grids, slats)
+    found = []
+    for k, source in enumerate(sources):
+        roots = SourceRoots(
+            places[k], folder, contents, source.adapter, k, (), source.units, source.plausibility
         )
-        for number, source in enumerate(parameters.also, 1)
-    )
-    return list(_pairs(rows, replace(there, also=also)))
-
-
-def _roots_of(
-    source: PixieverseSource, place: Place, slat: Place, contents: Contents, number: int = 0
-) -> SourceRoots:
-    """Return where a source and the latents lie, and how the source is read."""
-    return SourceRoots(
-        place,
-        slat,
-        contents,
-        source.adapter,
-        number,
-        units=source.units,
-        plausibility=source.plausibility,
-    )
+        found.append(_Found(source, slat, roots, listings[k], one_file, each[k], categories, cases))
+    return list(_pairs(rows, found))
 
 
 def _grids_of(
@@ -216,7 +188,7 @@ def _slats_of(
             yield view or ".".join(part for part in parts if part), slat
 
 
-def _pairs(rows: list[_Row], there: _Found) -> Iterator[AssetPair]:
+def _pairs(rows: list[_Row], found: Sequence[_Found]) -> Iterator[AssetPair]:
     for asset_id, group in groupby(rows, key=lambda row: row.asset_id):
         same = list(group)
         shared = ""
@@ -226,39 +198,28 @@ def _pairs(rows: list[_Row], there: _Found) -> Iterator[AssetPair]:
                 for row in same
             )
             shared = f"asset id {asset_id!r} would stand for {names}; rename one"
-        yield _pair(same[0], there, shared)
+        yield _pair(same[0], found, shared)
 
 
-def _pair(row: _Row, there: _Found, shared: str) -> AssetPair:
-    samples = there.parameters.pixieverse.samples
-    annotations = _annotations(row.object_id, there)
+def _pair(row: _Row, found: Sequence[_Found], shared: str) -> AssetPair:
+    samples = found[0].source.samples
+    annotations = _annotations(row, found[0])
     if samples == "merge" and annotations:
         first, *others = [
             _pair_of(row, source, shared, grids)
-            for source in (there, *there.also)
-            for grids in _annotations(row.object_id, source)
+            for source in found
+            for grids in _annotations(row, source)
         ]
         return replace(first, others=tuple(others))
-    if samples == "first":
-        annotations = annotations[:1]
-    grids = [
-        grid
-        for sample in annotations
-        for grid in sample
-        if row.sample is None or grid.sample == row.sample
-    ]
-    return _pair_of(row, there, shared, grids)
+    chosen = annotations[:1] if samples == "first" else annotations
+    return _pair_of(row, found[0], shared, list(chain.from_iterable(chosen)))
 
 
-def _annotations(object_id: str, there: _Found) -> list[list[FoundField]]:
-    """Return the grids of an object by sample; two grids of a sample are an error."""
-    grids = sorted(there.grids.get(object_id, ()), key=_order_of)
-    return [list(group) for _, group in groupby(grids, key=lambda grid: grid.sample)]
-
-
-def _label(number: int, sample: str) -> str:
-    """Return the label that is unique among the object's annotations: its sample and its source."""
-    return ".".join(filter(None, (f"also_{number}" if number else "", sample)))
+def _annotations(row: _Row, there: _Found) -> list[list[FoundField]]:
+    """Return the grids of a row by sample; two grids of a sample are an error."""
+    grids = sorted(there.grids.get(row.object_id, ()), key=_order_of)
+    groups = groupby(grids, key=lambda grid: grid.sample)
+    return [list(group) for sample, group in groups if row.sample in (None, sample)]
 
 
 def _order_of(found: FoundField) -> tuple[float, str, str]:
@@ -268,7 +229,7 @@ def _order_of(found: FoundField) -> tuple[float, str, str]:
 
 
 def _pair_of(row: _Row, there: _Found, shared: str, grids: Sequence[FoundField]) -> AssetPair:
-    source, slat_source = there.parameters.pixieverse, there.parameters.slat
+    source = there.source
     problems = [shared, *_name_problems(row)]
     sides: tuple[FoundField | NamedSlat, ...] = (*grids, *row.slats)
     for side in sides:
@@ -297,7 +258,7 @@ def _pair_of(row: _Row, there: _Found, shared: str, grids: Sequence[FoundField])
         problems.append(_case(row, there, "grid"))
     found = [slat for slat in row.slats if slat.path]
     if not found and not any(grid.problem for grid in grids):
-        problems.append(_no_slat(row, slat_source, there.one_file))
+        problems.append(_no_slat(row, there))
         problems.append(_case(row, there, "SLAT"))
     elif len(found) > 1:
         files = ", ".join(slat.path + (f" [{slat.group}]" if slat.group else "") for slat in found)
@@ -305,6 +266,9 @@ def _pair_of(row: _Row, there: _Found, shared: str, grids: Sequence[FoundField])
             f"{len(found)} SLATs for one id {row.asset_id!r} ({files}); expected one, "
             "or a pattern with {view}"
         )
+    number, sample = there.roots.number, in_unicode(grids[0].sample) if grids else ""
+    # Unique among the object's annotations.
+    label = filter(None, (f"also_{number}" if number else "", sample))
     return AssetPair(
         asset_id=row.asset_id,
         object_id=encoded(row.object_id),
@@ -319,7 +283,7 @@ def _pair_of(row: _Row, there: _Found, shared: str, grids: Sequence[FoundField])
         problem="; ".join(dict.fromkeys(filter(None, problems))),
         transform=transform,
         beside=beside,
-        sample=_label(there.roots.number, in_unicode(grids[0].sample) if grids else ""),
+        sample=".".join(label),
     )
 
 
@@ -346,13 +310,13 @@ def _unrecordable(path: str) -> str:
     return f"{path}: its name is no UTF-8, so that no record can hold it; rename it"
 
 
-def _no_slat(row: _Row, source: SlatSource, one_file: bool) -> str:
-    names = {slat.slat_id for slat in row.slats} - {row.object_id} or {"{id}"}
-    if one_file:
-        groups = " or ".join(f"group {fill(source.group, {'id': name})}" for name in sorted(names))
-        tried = f"{groups} in {source.root}"
+def _no_slat(row: _Row, there: _Found) -> str:
+    names = sorted({slat.slat_id for slat in row.slats} - {row.object_id}) or ["{id}"]
+    if there.one_file:
+        groups = " or ".join(f"group {fill(there.slat.group, {'id': name})}" for name in names)
+        tried = f"{groups} in {there.slat.root}"
     else:
-        tried = "; ".join(tried_names(source.pattern, {"id": name}) for name in sorted(names))
+        tried = "; ".join(tried_names(there.slat.pattern, {"id": name}) for name in names)
     return f"no SLAT for id {row.object_id!r}; looked for {tried}"
 
 

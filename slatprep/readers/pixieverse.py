@@ -50,10 +50,8 @@ from slatprep.storage.listing import Listing
 
 _CUBE = (RESOLUTION,) * 3
 _RAW_SHAPE = (*_CUBE, 4)
-_SCORES_SHAPE = (3 + len(MATERIAL_CLASSES), *_CUBE)
-_IDS_SHAPE = (4, *_CUBE)
 
-GRID = ArraySpec(shapes=(_RAW_SHAPE, _SCORES_SHAPE, _IDS_SHAPE), kinds="f")
+GRID = ArraySpec((_RAW_SHAPE, (3 + len(MATERIAL_CLASSES), *_CUBE), (4, *_CUBE)), kinds="f")
 MASK = ArraySpec(shapes=(_CUBE,), kinds="bfiu")
 BOUND = ArraySpec(shapes=(), kinds="biufU")
 
@@ -65,12 +63,6 @@ _NO_LOG_OF_ZERO = 1e-6
 
 # Source channel of each of PROPERTY_COLUMNS; the files begin with density.
 _CHANNEL_ORDER = (1, 0, 2)
-
-_PHYSICAL = (
-    ("Young's modulus", "a finite Young's modulus above 0 Pa"),
-    ("density", "a finite density above 0 kg/m^3"),
-    ("Poisson's ratio", "a Poisson's ratio in [0, 0.5]"),
-)
 
 
 class PixieVerse:
@@ -120,10 +112,7 @@ def read_grid(
 
     raw = grid.shape == _RAW_SHAPE
     channels = np.moveaxis(grid, -1, 0) if raw else grid
-    if grid.shape == _SCORES_SHAPE:
-        material = _classes_of_scores(channels[3:], mask, path, warnings)
-    else:
-        material = _classes_of_ids(channels[3], path)
+    material = _classes_of(channels, mask, path, warnings)
     occupancy = material != BACKGROUND if mask is None else mask
     if not occupancy.any():
         raise InputError(path, "no voxel is occupied: all are background", "an occupied voxel")
@@ -139,12 +128,15 @@ def read_grid(
         warnings += require_prediction(path, properties, classes, pair.roots.plausibility)
 
     def told(row: int, column: int) -> tuple[str, str]:
-        at = tuple(map(int, voxels[row]))
-        name, expected = _PHYSICAL[column]
+        at, one = tuple(map(int, voxels[row])), PROPERTIES[column]
         value = channels[_CHANNEL_ORDER[column]][at]
-        return f"{name} {value:g} at annotated voxel {at}{half_overflow(value)}", expected
+        return f"{one.title} {value:g} at annotated voxel {at}{half_overflow(value)}", one.allowed
 
-    keep = physical_rows(path, _physical(properties, raw), told, max_unphysical, warnings)
+    fine = np.isfinite(properties)
+    if raw:
+        columns = zip(PROPERTIES, properties.T, strict=True)
+        fine = np.stack([one.physical(values) for one, values in columns]).T
+    keep = physical_rows(path, fine, told, max_unphysical, warnings)
     unphysical = int(np.count_nonzero(~keep))
     if unphysical:
         voxels, properties = voxels[keep], properties[keep]
@@ -181,10 +173,7 @@ def read_prediction(
     grid = npy_array(data, path, GRID)
     raw = grid.shape == _RAW_SHAPE
     channels = np.moveaxis(grid, -1, 0) if raw else grid
-    if grid.shape == _SCORES_SHAPE:
-        classes = _classes_of_scores(channels[3:], where, path, [])
-    else:
-        classes = _classes_of_ids(channels[3], path)
+    classes = _classes_of(channels, where, path, [])
     material = np.where(classes == UNLABELLED, BACKGROUND, classes)[where].astype(np.uint8)
     values = _gather(channels, where).astype(np.float64)
     bad = ~np.isfinite(values)
@@ -220,6 +209,15 @@ def _read_mask(values: NDArray[Any], path: Place, warnings: list[str]) -> NDArra
     if between:
         warnings.append(f"mask: {between} voxels lie between 0 and 1; above 0.5 is occupied")
     return mask
+
+
+def _classes_of(
+    channels: NDArray[Any], mask: NDArray[np.bool_] | None, path: Place, warnings: list[str]
+) -> NDArray[np.int8]:
+    """Return the class of each voxel from the channels behind the properties: an id, or scores."""
+    if len(channels) == 4:
+        return _classes_of_ids(channels[3], path)
+    return _classes_of_scores(channels[3:], mask, path, warnings)
 
 
 def _classes_of_ids(ids: NDArray[Any], path: Place) -> NDArray[np.int8]:
@@ -293,16 +291,6 @@ def _gather(channels: NDArray[Any], where: NDArray[np.bool_]) -> NDArray[np.floa
     with np.errstate(over="ignore"):  # what float32 cannot hold becomes infinite, and a fault
         columns = [channels[k][where].astype(np.float32) for k in _CHANNEL_ORDER]
     return np.stack(columns).T
-
-
-def _physical(properties: NDArray[np.float32], raw: bool) -> NDArray[np.bool_]:
-    """Return which properties (K, 3) are physical; normalised ones need only be finite."""
-    good = np.isfinite(properties)
-    if raw:
-        ratio = properties[:, 2]
-        good[:, :2] &= properties[:, :2] > 0
-        good[:, 2] &= (ratio >= 0) & (ratio <= 0.5)
-    return good
 
 
 def _to_si(values: NDArray[np.float32], warnings: list[str]) -> NDArray[np.float32]:

@@ -3,41 +3,21 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from typing import NamedTuple
 
-from slatprep.records import Units
+from slatprep.records import PROPERTIES, Units
 
-
-@dataclass(frozen=True)
-class Extent:
-    """What a property of any material lies within, and who says so."""
-
-    name: str
-    least: float
-    most: float
-    source: str
-
-
-EXTENTS = (
-    Extent(
-        "youngs_modulus",
-        1.0,
-        2e12,
-        "the softest gels have some Pa; diamond has 1.05 to 1.22 TPa (CRC Handbook of Chemistry "
-        "and Physics)",
-    ),
-    Extent(
-        "density",
-        1.0,
-        25_000.0,
-        "silica aerogels have 3 kg/m^3 and more (Soleimani Dorcheh and Abbasi, Journal of "
-        "Materials Processing Technology 199, 2008); osmium has 22,590 (CRC Handbook)",
-    ),
-    Extent("poissons_ratio", 0.0, 0.5, "isotropic and not auxetic (Greaves et al., Nature "
-           "Materials 10, 2011)"),
-)  # fmt: skip
-"""What the properties of all materials lie within."""
+_EXTENTS = (
+    # The softest gels have some Pa; diamond has 1.05 to 1.22 TPa (CRC Handbook of Chemistry and
+    # Physics).
+    (1.0, 2e12),
+    # Silica aerogels have 3 kg/m^3 and more (Soleimani Dorcheh and Abbasi, Journal of Materials
+    # Processing Technology 199, 2008); osmium has 22,590 (CRC Handbook).
+    (1.0, 25_000.0),
+    # Isotropic and not auxetic (Greaves et al., Nature Materials 10, 2011).
+    (0.0, 0.5),
+)
+"""Least and most that any material has of each of `PROPERTIES`."""
 
 TOLD = "plausibility: "
 """What a warning about values begins with."""
@@ -77,8 +57,6 @@ _USUAL_MODULUS, _USUAL_DENSITY = (3e2, 3e11), (15.0, 9_000.0)
 
 _UNSTATED = Units()
 
-_SYMBOLS = {"youngs_modulus": " Pa", "density": " kg/m^3"}
-
 
 class Part(NamedTuple):
     """The medians of a class: of the modulus, the density and the ratio; NaN where it lacks one."""
@@ -97,10 +75,11 @@ class Part(NamedTuple):
 
 def beyond_all(part: Part) -> str:
     """Say which value of a part is beyond those of all materials; empty where none is."""
-    for extent, value in zip(EXTENTS, part.values, strict=True):
-        if value < extent.least or value > extent.most:
-            bounds = f"{extent.least:g} to {extent.most:g}{_SYMBOLS.get(extent.name, '')}"
-            return f"{title_of(extent.name)} {value:.3g}, and all materials have {bounds}"
+    for one, (least, most), value in zip(PROPERTIES, _EXTENTS, part.values, strict=True):
+        if value < least or value > most:
+            unit = "" if one.unit == "1" else f" {one.unit}"
+            known = f"{least:g} to {most:g}{unit}"
+            return f"{one.title} {value:.3g}, and all materials have {known}"
     return ""
 
 
@@ -158,10 +137,3 @@ def is_physical(part: Part) -> bool:
     """Whether the reader takes such values at all; see `slatprep.records.Property.physical`."""
     above = all(math.isnan(one) or 0 < one < math.inf for one in (part.modulus, part.density))
     return above and not (part.ratio < 0 or part.ratio > 0.5)
-
-
-def title_of(name: str) -> str:
-    """Return the name of a property in plain English."""
-    return {"youngs_modulus": "Young's modulus", "poissons_ratio": "Poisson's ratio"}.get(
-        name, name
-    )

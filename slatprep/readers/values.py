@@ -14,16 +14,7 @@ from numpy.typing import NDArray
 
 from slatprep.errors import InputError
 from slatprep.readers.mistakes import mistakes_of, raw_grid
-from slatprep.readers.plausible import (
-    EXTENTS,
-    TOLD,
-    Part,
-    beyond_all,
-    fault_of,
-    is_physical,
-    oddity_of,
-    title_of,
-)
+from slatprep.readers.plausible import TOLD, Part, beyond_all, fault_of, is_physical, oddity_of
 from slatprep.records import (
     BACKGROUND,
     FACTORS,
@@ -119,13 +110,14 @@ def require_prediction(
     if not (medians > _PREDICTED).any():
         return []
     parts = _parts(values, material, PROPERTIES, MATERIAL_CLASSES)
-    found = [raw_grid(parts), *mistakes_of(parts, Units())] if all(map(_is_positive, parts)) else []
+    positive = all(part.modulus > 0 and part.density > 0 for part in parts)
+    found = [raw_grid(parts), *mistakes_of(parts, Units())] if positive else []
     guess = next((one.words for one in found if one), "")
-    low, high = np.percentile(sample, (5, 95), axis=0).T[int(np.argmax(medians))].tolist()
-    name = title_of(PROPERTIES[int(np.argmax(medians))].name)
+    worst = int(np.argmax(medians))
+    low, high = np.percentile(sample[:, worst], (5, 95)).tolist()
     what = (
-        f"has {name} from {low:.4g} to {high:.4g}, and a prediction, channels first, is "
-        f"normalised to [-1, 1]"
+        f"has {PROPERTIES[worst].title} from {low:.4g} to {high:.4g}, and a prediction, channels "
+        "first, is normalised to [-1, 1]"
     )
     if guess:
         what = f"{what}; the values look like {guess}"
@@ -151,10 +143,6 @@ def require_possible(where: str | Place, values: NDArray[Any], material: NDArray
     raise InputError(where, f"{guess}{_named(part)} has {fault}", "values in SI units")
 
 
-def _is_positive(part: Part) -> bool:
-    return part.modulus > 0 and part.density > 0
-
-
 def _parts(
     values: NDArray[np.float32],
     material: NDArray[Any] | None,
@@ -165,9 +153,9 @@ def _parts(
     step = max(1, len(values) // _SAMPLE)
     sample = values[::step].astype(np.float64)
     columns = {one.name: (k, one.unit) for k, one in enumerate(table)}
-    own = np.full((len(sample), len(EXTENTS)), np.nan)
-    for k, extent in enumerate(EXTENTS):
-        column, unit = columns.get(extent.name, (-1, ""))
+    own = np.full((len(sample), len(PROPERTIES)), np.nan)
+    for k, known in enumerate(PROPERTIES):
+        column, unit = columns.get(known.name, (-1, ""))
         if column >= 0 and unit in ("1", *FACTORS):
             own[:, k] = sample[:, column] * FACTORS.get(unit, 1.0)
     ids = np.zeros(len(own), int) if material is None else material[::step].astype(int)
