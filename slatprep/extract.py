@@ -15,7 +15,7 @@ from contextlib import contextmanager, redirect_stdout
 from dataclasses import dataclass, field, replace
 from importlib import metadata
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import orjson
@@ -40,42 +40,14 @@ _LATENTS = (
 )
 
 
-class Pipeline(Protocol):
-    """The used part of ``trellis.pipelines.TrellisImageTo3DPipeline``."""
-
-    sparse_structure_sampler_params: dict[str, Any]
-    slat_sampler_params: dict[str, Any]
-    slat_normalization: dict[str, Any]
-
-    def preprocess_image(self, input: Image) -> Image:
-        """Remove the background, and crop."""
-
-    def get_cond(self, image: list[Image]) -> dict[str, Any]:
-        """Encode images."""
-
-    def sample_sparse_structure(
-        self, cond: dict[str, Any], num_samples: int = 1, sampler_params: dict[str, Any] = ...
-    ) -> Any:
-        """Sample occupied voxels, (N, 4) with the batch column first."""
-
-    def sample_slat(
-        self, cond: dict[str, Any], coords: Any, sampler_params: dict[str, Any] = ...
-    ) -> Any:
-        """Sample their latents: a sparse tensor with ``coords`` and ``feats``."""
-
-    @property
-    def device(self) -> Any:
-        """The torch device it runs on."""
-
-    def decode_slat(self, slat: Any, formats: list[str]) -> dict[str, list[Any]]:
-        """Decode latents, to ``gaussian`` and others."""
-
-
 @dataclass(frozen=True)
 class Session:
-    """A loaded pipeline, its torch module, the description of both for the records, its device."""
+    """A loaded pipeline, its torch module, the description of both for the records, its device.
 
-    pipeline: Pipeline
+    The pipeline is a ``trellis.pipelines.TrellisImageTo3DPipeline``.
+    """
+
+    pipeline: Any
     torch: Any
     model: dict[str, str]
     device: str = ""

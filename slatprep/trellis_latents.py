@@ -74,8 +74,7 @@ def sample_trellis(pipeline: Any, torch: Any, image: Any, seed: int, preprocess:
         stages.end()
         slat = pipeline.sample_slat(cond, voxels)
         stages.end()
-    coords, feats = arrays_of(slat)
-    return coords, feats, stages.seconds()
+    return *arrays_of(slat), stages.seconds()
 
 
 def sample_trellis2(
@@ -99,8 +98,7 @@ def sample_trellis2(
         model = pipeline.models["shape_slat_flow_model_" + kind]
         slat = pipeline.sample_shape_slat(cond, model, voxels)
         stages.end()
-    coords, feats = arrays_of(slat)
-    return coords, feats, stages.seconds()
+    return *arrays_of(slat), stages.seconds()
 
 
 def sample_sam3d(inference: Any, torch: Any, image: Any, seed: int) -> Sampled:
@@ -124,8 +122,7 @@ def sample_sam3d(inference: Any, torch: Any, image: Any, seed: int) -> Sampled:
         pipeline.decode_slat = decode
     if len(seen) != 1:
         raise ValueError(f"decode_slat was called {len(seen)} times; expected once")
-    coords, feats = seen[0]
-    return coords, feats, {"all": time.perf_counter() - begin}
+    return *seen[0], {"all": time.perf_counter() - begin}
 
 
 def arrays_of(slat: Any) -> tuple[np.ndarray, np.ndarray]:

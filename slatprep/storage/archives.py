@@ -85,7 +85,9 @@ class Archive:
     def on_disk(cls, path: Path, wanted: tuple[str, ...]) -> Archive:
         """Look at an archive on the disk; OSError if that cannot be."""
         with open_regular(path) as file:
-            more = lasting_state(file.fileno()) or _digest_of_packed(file, path.name)
+            # Of one with gzip the members are kept, so that its digest is worth its time.
+            packed = _is_packed(path.name)
+            more = lasting_state(file.fileno()) or (open_digest(file) if packed else "")
             stamp = f"{_stamp_of(file)};{boot_id()} {more}"
             return cls(path, stamp, file.size(), bool(more), wanted)
 
@@ -352,8 +354,3 @@ def _stamp_of(file: LocalFile) -> str:
 
 def _is_packed(name: str) -> bool:
     return not name.lower().endswith(".tar")
-
-
-def _digest_of_packed(file: LocalFile, name: str) -> str:
-    """Return the digest of an archive with gzip, as its members are kept; else nothing."""
-    return open_digest(file) if _is_packed(name) else ""

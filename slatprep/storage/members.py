@@ -8,12 +8,12 @@ from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import cached_property
 from pathlib import PurePosixPath
-from typing import IO, Any, Self
+from typing import IO, Self
 
 from slatprep.errors import InputError
 from slatprep.storage.archives import Archive, Index, shown
 from slatprep.storage.listing import RemoteListing
-from slatprep.storage.remote import RemotePlace
+from slatprep.storage.remote import PlaceByText, RemotePlace
 from slatprep.storage.states import Noted
 from slatprep.storage.tar import Entry
 
@@ -82,13 +82,12 @@ class ArchiveTree:
         return MemberListing(self.members, faults)
 
 
-class ArchivePlace:
+class ArchivePlace(PlaceByText):
     """The tree of archives, with an empty `path`, or a file in it.
 
     `archive` and `entry` tell where it lies; without them there is no such file.
     """
 
-    # No dataclass, as `slatprep.storage.remote.RemotePlace` is none.
     def __init__(
         self,
         tree: ArchiveTree,
@@ -98,16 +97,12 @@ class ArchivePlace:
     ) -> None:
         self.tree, self.path, self.archive, self.entry = tree, path, archive, entry
 
-    def __repr__(self) -> str:
-        return f"ArchivePlace({str(self)!r})"
-
     def __eq__(self, other: object) -> bool:
         if type(other) is not ArchivePlace:
             return False
         return (self.tree.archives, self.path) == (other.tree.archives, other.path)
 
-    def __hash__(self) -> int:
-        return hash(str(self))
+    __hash__ = PlaceByText.__hash__
 
     def __str__(self) -> str:
         base = self.tree.text if self.archive is None else shown(self.archive.place)
@@ -136,10 +131,6 @@ class ArchivePlace:
     def __truediv__(self, key: str) -> Self:
         return self._below(f"{self.path}/{key}" if self.path else key)
 
-    def absolute(self) -> Self:
-        """Return the same."""
-        return self
-
     def exists(self) -> bool:
         """Whether there is a file, or this is the tree."""
         return self.is_dir() or self.is_file()
@@ -152,14 +143,8 @@ class ArchivePlace:
         """Whether there is a file."""
         return self.entry is not None
 
-    def open(
-        self, mode: str = "r", *, encoding: str | None = None, newline: str | None = None
-    ) -> IO[Any]:
-        """Open a file for reading; it is read whole."""
-        if mode not in ("r", "rt", "rb"):
-            raise io.UnsupportedOperation(f"{self}: mode {mode!r}; expected 'r' or 'rb'")
-        file = io.BytesIO(self.read_bytes())
-        return file if mode == "rb" else io.TextIOWrapper(file, encoding, newline=newline)
+    def _opened(self) -> IO[bytes]:
+        return io.BytesIO(self.read_bytes())
 
     def read_bytes(self) -> bytes:
         """Read a file whole.
@@ -172,10 +157,6 @@ class ArchivePlace:
         if self.entry.problem:
             raise InputError(self, self.entry.problem, "a plain file that lies there once")
         return self.archive.read(self.entry)
-
-    def read_text(self, encoding: str | None = None) -> str:
-        """Read a file whole, as text."""
-        return self.read_bytes().decode(encoding or "utf-8")
 
     def state(self) -> Noted:
         """Return what tells whether it was changed since; None where that cannot be told."""

@@ -15,7 +15,7 @@ from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from functools import cached_property
 from pathlib import Path, PurePosixPath
-from typing import IO, Any
+from typing import IO, Any, Self
 
 from slatprep.errors import ConfigError
 from slatprep.storage.ranges import range_reader
@@ -27,7 +27,39 @@ BUFFER_BYTES = 8 * 2**20
 """Bytes per request when a file is read from its beginning."""
 
 
-class RemotePlace:
+class PlaceByText:
+    """What places share that are no paths: they are what their text says."""
+
+    # Not a dataclass: JSON writers would write that as a table of its fields.
+    def __repr__(self) -> str:
+        return f"{type(self).__name__}({str(self)!r})"
+
+    def __hash__(self) -> int:
+        return hash(str(self))
+
+    def absolute(self) -> Self:
+        """Return the same."""
+        return self
+
+    def open(
+        self, mode: str = "r", *, encoding: str | None = None, newline: str | None = None
+    ) -> IO[Any]:
+        """Open a file for reading."""
+        if mode not in ("r", "rt", "rb"):
+            raise io.UnsupportedOperation(f"{self}: mode {mode!r}; expected 'r' or 'rb'")
+        file = self._opened()
+        return file if mode == "rb" else io.TextIOWrapper(file, encoding, newline=newline)
+
+    def read_text(self, encoding: str | None = None) -> str:
+        """Read a whole file as text."""
+        with self.open("r", encoding=encoding) as file:
+            return str(file.read())
+
+    def _opened(self) -> IO[bytes]:
+        raise NotImplementedError
+
+
+class RemotePlace(PlaceByText):
     """The URL of an object or of all objects below it; see `slatprep.storage.place.place_of`.
 
     `protocol` is such as ``s3``, `path` is bucket and key. Names join as in a path. Every method
@@ -35,18 +67,13 @@ class RemotePlace:
     library is missing or the protocol is unknown.
     """
 
-    # Not a dataclass: JSON writers would write that as a table of its fields.
     def __init__(self, protocol: str, path: PurePosixPath) -> None:
         self.protocol, self.path = protocol, path
-
-    def __repr__(self) -> str:
-        return f"RemotePlace({str(self)!r})"
 
     def __eq__(self, other: object) -> bool:
         return type(other) is RemotePlace and str(self) == str(other)
 
-    def __hash__(self) -> int:
-        return hash(str(self))
+    __hash__ = PlaceByText.__hash__
 
     def __str__(self) -> str:
         return f"{self.protocol}://{'/'.join(self.path.parts)}"
@@ -70,10 +97,6 @@ class RemotePlace:
         # Unlike in pathlib, a key with a leading slash must not replace the path.
         return RemotePlace(self.protocol, PurePosixPath(f"{self.path}/{key}"))
 
-    def absolute(self) -> RemotePlace:
-        """Return the same."""
-        return self
-
     def exists(self) -> bool:
         """Whether it is an object, or there are objects below it."""
         return self._kind() != ""
@@ -86,24 +109,13 @@ class RemotePlace:
         """Whether it is an object."""
         return self._kind() == "file"
 
-    def open(
-        self, mode: str = "r", *, encoding: str | None = None, newline: str | None = None
-    ) -> IO[Any]:
-        """Open an object for reading, from its beginning."""
-        if mode not in ("r", "rt", "rb"):
-            raise io.UnsupportedOperation(f"{self}: mode {mode!r}; expected 'r' or 'rb'")
-        file = io.BufferedReader(RemoteFile(self), BUFFER_BYTES)
-        return file if mode == "rb" else io.TextIOWrapper(file, encoding, newline=newline)
+    def _opened(self) -> IO[bytes]:
+        return io.BufferedReader(RemoteFile(self), BUFFER_BYTES)
 
     def read_bytes(self) -> bytes:
         """Read a whole object."""
         with self.open("rb") as file:
             return bytes(file.read())
-
-    def read_text(self, encoding: str | None = None) -> str:
-        """Read a whole object as text."""
-        with self.open("r", encoding=encoding) as file:
-            return str(file.read())
 
     def upload(self, local: Path) -> None:
         """Put a file of the local disk here; readers see it complete or not at all."""

@@ -43,11 +43,7 @@ def columns_of(record: AssetRecord) -> dict[str, Column]:
         "expected_accuracy": judgement.expected_accuracy,
         "contradicted": judgement.contradicted,
         "merged": bool(record.merged),
-        "key": _bytes(record.of_first_pass().key),
+        "key": np.frombuffer(bytes.fromhex(record.of_first_pass().key), np.uint8),
         "latent_mean": np.nan if moments is None else moments.mean,
         "latent_std": np.nan if moments is None else moments.std,
     }
-
-
-def _bytes(digest: str) -> NDArray[np.generic]:
-    return np.frombuffer(bytes.fromhex(digest), np.uint8)

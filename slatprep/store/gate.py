@@ -94,8 +94,9 @@ def gate_findings(name: str, metadata: object) -> Iterator[Finding]:
     if not isinstance(axes, list) or not all(isinstance(axis, str) for axis in axes):
         yield Finding(where, "", f"dimension_names is {axes!r}", "a name for each dimension")
     for codec in _codecs(metadata.get("codecs")):
-        if codec not in CODECS:
-            yield Finding(where, "", f"has the codec {codec!r}", f"some of {', '.join(CODECS)}")
+        name = codec.get("name")
+        if name not in CODECS:
+            yield Finding(where, "", f"has the codec {name!r}", f"some of {', '.join(CODECS)}")
 
 
 def form_findings(name: str, metadata: Mapping[str, Any]) -> Iterator[Finding]:
@@ -108,11 +109,11 @@ def form_findings(name: str, metadata: Mapping[str, Any]) -> Iterator[Finding]:
     for key, form in _FORMS.items():
         if not _has_form(metadata.get(key), form):
             yield Finding(where, "", f"{key} is {metadata.get(key)!r}", _in_words(form))
-    for codec in _every_codec(metadata.get("codecs")):
-        wanted = _SETTINGS.get(codec["name"], {})
-        settings = codec.get("configuration", {})
-        if not (_has_form(settings, wanted) or (codec["name"] == "bytes" and settings == {})):
-            what = f"the codec {codec['name']} has the configuration {settings!r}"
+    for codec in _codecs(metadata.get("codecs")):
+        name, settings = str(codec.get("name")), codec.get("configuration", {})
+        wanted = _SETTINGS.get(name, {})
+        if not (_has_form(settings, wanted) or (name == "bytes" and settings == {})):
+            what = f"the codec {name} has the configuration {settings!r}"
             yield Finding(where, "", what, _in_words(wanted))
 
 
@@ -134,21 +135,11 @@ def _in_words(form: Any) -> str:
     return form.__name__ if isinstance(form, type) else " or ".join(map(repr, form))
 
 
-def _every_codec(codecs: Any) -> Iterator[dict[str, Any]]:
-    """Yield codecs that have names, and those within them."""
-    for codec in codecs if isinstance(codecs, list) else ():
-        if isinstance(codec, dict) and isinstance(codec.get("name"), str):
-            yield codec
-            inner = codec.get("configuration")
-            for key in ("codecs", "index_codecs"):
-                yield from _every_codec(inner.get(key) if isinstance(inner, dict) else None)
-
-
-def _codecs(codecs: Any) -> Iterator[object]:
-    """Yield the names of codecs and of those within them; None where there is no name."""
+def _codecs(codecs: Any) -> Iterator[Mapping[str, Any]]:
+    """Yield codecs and those within them; an empty one where there is none."""
     for codec in codecs if isinstance(codecs, list) else [None]:
         known = codec if isinstance(codec, Mapping) else {}
-        yield known.get("name")
+        yield known
         if known.get("name") == "sharding_indexed":
             inner = known.get("configuration")
             for key in ("codecs", "index_codecs"):

@@ -10,6 +10,7 @@ from __future__ import annotations
 from bisect import bisect_right
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 from slatprep.parameters import MAX_VOXEL_SHARD, StoreParameters
@@ -61,46 +62,35 @@ class ArrayLayout:
 
 _XYZ = ("x", "y", "z")
 
-_EMPTY: dict[str, float | bool | str] = {
-    "str": "",
-    "float64": NAN,
-    "float32": NAN,
-    "int64": 0,
-    "uint8": 0,
-    "bool": False,
-}
-"""What an array of a type has where nothing is written, if it does not say otherwise."""
+_EMPTY: dict[str, Any] = {"str": "", "float64": NAN, "float32": NAN, "bool": False}
+"""What an array of a type has where nothing is written, if it is not 0 or the array's own."""
 
 
-def _asset(
-    name: str, description: str, dtype: str = "float64", of: str = "", **more: Any
-) -> ArrayLayout:
+def _asset(name: str, dtype: str, description: str, of: str = "", **more: Any) -> ArrayLayout:
     """Return an array of ``asset/*``; `of` are its dimensions behind the first."""
     dimensions = ("asset", *of.split())
-    return ArrayLayout(f"asset/{name}", dtype, dimensions, _EMPTY[dtype], description, **more)
-
-
-def _voxel(
-    name: str,
-    packing: str,
-    description: str,
-    dtype: str = "float32",
-    of: str = "",
-    fill_value: float | None = None,
-    unit: str = "",
-) -> ArrayLayout:
-    """Return an array of ``voxel/*``; `of` are its dimensions behind the first."""
-    empty = _EMPTY[dtype] if fill_value is None else fill_value
     return ArrayLayout(
-        f"voxel/{name}", dtype, ("voxel", *of.split()), empty, description, unit, packing
+        f"asset/{name}", dtype, dimensions, _EMPTY.get(dtype, 0), description, **more
     )
 
 
+_kept = partial(_asset, internal=True)
+
+
+def _voxel(
+    name: str, packing: str, dtype: str, description: str, of: str = "", **more: Any
+) -> ArrayLayout:
+    """Return an array of ``voxel/*``; `of` are its dimensions behind the first."""
+    more = {"fill_value": _EMPTY.get(dtype, 0), "packing": packing, **more}
+    dimensions = ("voxel", *of.split())
+    return ArrayLayout(f"voxel/{name}", dtype, dimensions, description=description, **more)
+
+
 ARRAYS = (
-    _asset("id", "id of the row, ascending within a segment", dtype="str"),
-    _asset("object_id", "PixieVerse id of the object", dtype="str"),
-    _asset("view", "image or seed the SLAT was made from", dtype="str"),
-    _asset("category", "PixieVerse category, empty if unknown", dtype="str"),
+    _asset("id", "str", "id of the row, ascending within a segment"),
+    _asset("object_id", "str", "PixieVerse id of the object"),
+    _asset("view", "str", "image or seed the SLAT was made from"),
+    _asset("category", "str", "PixieVerse category, empty if unknown"),
     ArrayLayout(
         "asset/offset",
         "int64",
@@ -110,107 +100,99 @@ ARRAYS = (
     ),
     _asset(
         "transform",
+        "float64",
         "PixieVerse frame to SLAT frame, both the unit cube [-0.5, 0.5]^3",
-        of="row column",
+        "row column",
     ),
-    _asset("engine", "alignment engine", dtype="str"),
-    _asset("model", "rigid, similarity, affine or deformable", dtype="str"),
-    _asset("search", "starts that were needed", dtype="str"),
-    _asset("fitness", "share of PixieVerse boundary voxels with a SLAT voxel within the radius"),
-    _asset("inlier_rmse", "rms distance of those", unit="voxel"),
+    _asset("engine", "str", "alignment engine"),
+    _asset("model", "str", "rigid, similarity, affine or deformable"),
+    _asset("search", "str", "starts that were needed"),
+    _asset(
+        "fitness",
+        "float64",
+        "share of PixieVerse boundary voxels with a SLAT voxel within the radius",
+    ),
+    _asset("inlier_rmse", "float64", "rms distance of those", unit="voxel"),
     _asset(
         "fitness_backward",
+        "float64",
         "share of SLAT voxels with a PixieVerse boundary voxel within the radius",
     ),
-    _asset("inlier_rmse_backward", "rms distance of those", unit="voxel"),
-    _asset("overlap", "overlap of the two voxel surfaces"),
-    _asset("margin", "score above the next distinct placement"),
+    _asset("inlier_rmse_backward", "float64", "rms distance of those", unit="voxel"),
+    _asset("overlap", "float64", "overlap of the two voxel surfaces"),
+    _asset("margin", "float64", "score above the next distinct placement"),
     _asset(
         "ambiguity",
+        "float64",
         "share of SLAT voxels whose class differs between placements that fit about as well",
     ),
     _asset(
         "property_ambiguity",
+        "float64",
         "mean change of each normalised property between placements that fit about as well",
-        of="property",
+        "property",
     ),
-    _asset("valid_share", "share of valid SLAT voxels"),
+    _asset("valid_share", "float64", "share of valid SLAT voxels"),
     _asset(
-        "unphysical",
-        "PixieVerse voxels left out, as no material has their properties",
-        dtype="int64",
+        "unphysical", "int64", "PixieVerse voxels left out, as no material has their properties"
     ),
-    _asset("verdict", "good, doubtful or failed", dtype="str"),
-    _asset("confidence", "same_object times right_placement"),
-    _asset("same_object", "calibrated probability that both sides show the same object"),
+    _asset("verdict", "str", "good, doubtful or failed"),
+    _asset("confidence", "float64", "same_object times right_placement"),
+    _asset("same_object", "float64", "calibrated probability that both sides show the same object"),
     _asset(
         "right_placement",
+        "float64",
         "calibrated probability that the placement is right if the object is the same",
     ),
-    _asset("expected_accuracy", "share of right classes to be expected among valid voxels"),
+    _asset(
+        "expected_accuracy", "float64", "share of right classes to be expected among valid voxels"
+    ),
     _asset(
         "contradicted",
+        "bool",
         "the latents contradict the labels, where latents were compared with them",
-        dtype="bool",
     ),
-    _asset("merged", "labels are merged of several annotations", dtype="bool", internal=True),
-    _asset(
+    _kept("merged", "bool", "labels are merged of several annotations"),
+    _kept(
         "key",
+        "uint8",
         "what decides the row, as one hash: sources, parameters, libraries and code",
-        dtype="uint8",
-        of="byte",
-        internal=True,
+        "byte",
     ),
-    _asset("record_sha256", "SHA-256 of asset/record", dtype="uint8", of="byte", internal=True),
-    _asset(
+    _kept("record_sha256", "uint8", "SHA-256 of asset/record", "byte"),
+    _kept(
         "extent",
+        "float64",
         "least and most of each property of its fields, log10 where the property is mapped so",
-        of="property bound",
-        internal=True,
+        "property bound",
     ),
-    _asset(
-        "clipped",
-        "values of voxel/properties outside the range",
-        dtype="int64",
-        of="property",
-        internal=True,
-    ),
-    _asset(
-        "clipped_grid",
-        "values of grid/properties outside the range",
-        dtype="int64",
-        of="property",
-        internal=True,
-    ),
-    _asset("latent_mean", "mean of each channel of its latents", of="latent", internal=True),
-    _asset(
-        "latent_std",
-        "standard deviation of each channel of its latents",
-        of="latent",
-        internal=True,
-    ),
-    _voxel("coords", "columns", "SLAT coordinate, source order", dtype="uint8", of="axis"),
-    _voxel("feats", "exponents", "SLAT latents, unchanged", of="latent", fill_value=0.0),
+    _kept("clipped", "int64", "values of voxel/properties outside the range", "property"),
+    _kept("clipped_grid", "int64", "values of grid/properties outside the range", "property"),
+    _kept("latent_mean", "float64", "mean of each channel of its latents", "latent"),
+    _kept("latent_std", "float64", "standard deviation of each channel of its latents", "latent"),
+    _voxel("coords", "columns", "uint8", "SLAT coordinate, source order", "axis"),
+    _voxel("feats", "exponents", "float32", "SLAT latents, unchanged", "latent", fill_value=0.0),
     _voxel(
         "properties",
         "repeats",
+        "float32",
         "normalised properties in [-1, 1], NaN where not valid",
-        of="property",
+        "property",
     ),
-    _voxel(
-        "material", "repeats", "class, 255 where not valid", dtype="uint8", fill_value=UNANNOTATED
-    ),
-    _voxel("valid", "repeats", "an annotation was found near enough", dtype="bool"),
-    _voxel("distance", "exponents", "distance to the annotation used", unit="voxel"),
+    _voxel("material", "repeats", "uint8", "class, 255 where not valid", fill_value=UNANNOTATED),
+    _voxel("valid", "repeats", "bool", "an annotation was found near enough"),
+    _voxel("distance", "exponents", "float32", "distance to the annotation used", unit="voxel"),
     _voxel(
         "place",
         "exponents",
+        "float32",
         "where it was looked up, in the PixieVerse frame's unit cube [-0.5, 0.5]^3",
-        of="axis",
+        "axis",
     ),
     _voxel(
         "confidence",
         "exponents",
+        "float32",
         "calibrated probability that the class is right, 0 where not valid",
     ),
     ArrayLayout(
@@ -234,12 +216,14 @@ MERGED = (
     _voxel(
         "spread",
         "exponents",
+        "float32",
         "standard deviation of normalised properties over the annotations, NaN where not several",
-        of="property",
+        "property",
     ),
     _voxel(
         "votes",
         "repeats",
+        "float32",
         "share of the annotations that give the class, 0 where not valid, NaN where not several",
     ),
 )

@@ -21,10 +21,9 @@ from dataclasses import dataclass, replace
 from functools import lru_cache
 from importlib import metadata
 from pathlib import Path
-from types import TracebackType
 from typing import TYPE_CHECKING, Any, TypeVar
 
-from slatprep.errors import ConfigError, SlatprepError
+from slatprep.errors import ConfigError, SlatprepError, amount
 from slatprep.storage.place import place_of, storage_of
 from slatprep.workers.local import single_threaded
 from slatprep.workers.pool import Pool, run_in_pools
@@ -94,15 +93,10 @@ class Cluster:
         except BaseException:
             self._client.close()
             raise
-        self._note(f"{self.scheduler}: {workers} {'worker' if workers == 1 else 'workers'}")
+        self._note(f"{self.scheduler}: {amount(workers, 'worker')}")
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *error: object) -> None:
         self._client.close()
 
     def run_unordered(
