@@ -26,21 +26,14 @@ from slatprep.readers.voxel_sets import field_of_voxels
 from slatprep.records import PROPERTIES, RESOLUTION, AssetPair, MaterialField, Place
 from slatprep.storage.listing import Listing
 
-_KEYS = {
-    "youngs_modulus": "Young's Modulus (GPa)",
-    "density": "density",
-    "poissons_ratio": "Poisson's Ratio",
+_KEYS: dict[str, tuple[str, float, dict[str, float]]] = {
+    "youngs_modulus": ("Young's Modulus (GPa)", 1e9, {"gpa": 1e9}),
+    "density": ("density", 1e3, {"g/cm^3": 1e3, "g/cm³": 1e3, "kg/m^3": 1.0, "kg/m³": 1.0}),
+    "poissons_ratio": ("Poisson's Ratio", 1.0, {}),
 }
-_SI = {"youngs_modulus": 1e9, "density": 1e3, "poissons_ratio": 1.0}
-"""What a number of each key is in SI units: GPa, g/cm^3 and 1."""
+"""The key of each property, and in SI units: a bare number of it, units behind a number."""
 
 _NUMBER = re.compile(r"\s*([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*(.*)", re.S)
-_UNITS = {
-    "youngs_modulus": {"gpa": 1e9},
-    "density": {"g/cm^3": 1e3, "g/cm³": 1e3, "kg/m^3": 1.0, "kg/m³": 1.0},
-    "poissons_ratio": {},
-}
-"""What units that stand behind a number are in SI units."""
 _MAX_PARTS = 1000
 
 
@@ -65,8 +58,8 @@ class Parts:
         root, units = pair.roots.pixieverse, pair.roots.units
         data, file = load_source(path, root, "grid")
         rows = _parts_of(data, path)
-        stated = {name for name in _SI if units.of(name)}
-        values = [[_number(part, name, name in stated, path) for name in _SI] for part in rows]
+        stated = {name for name in _KEYS if units.of(name)}
+        values = [[_number(part, name, name in stated, path) for name in _KEYS] for part in rows]
         read = {one.name[:-4]: (one, *load_source(one, root, "description")) for one in pair.beside}
         meshes = []
         for label in (str(part["label"]) for part in rows):
@@ -104,13 +97,13 @@ def _parts_of(data: bytes, path: Place) -> list[dict[str, Any]]:
 
 def _number(part: dict[str, Any], name: str, stated: bool, path: Place) -> float:
     """Return a property of a part in SI units, or as it is where the definition states a unit."""
-    key = _KEYS[name]
+    key, bare, units = _KEYS[name]
     given = part.get(key)
     match = _NUMBER.fullmatch(str(given))
     unit = match[2].strip().lower() if match else "?"
-    known = {"": _SI[name], **_UNITS[name]}
+    known = {"": bare, **units}
     if match is None or unit not in known:
-        expected = " or ".join(["a number", *_UNITS[name]])
+        expected = " or ".join(["a number", *units])
         raise InputError(path, f"part {part['label']} has {key} {given!r}", expected)
     return float(match[1]) * (1.0 if stated else known[unit])
 

@@ -100,11 +100,13 @@ def _telling(what: str, note: Callable[[str], None] | None) -> Callable[[int, in
 def hint_of(source: PixieverseSource) -> str:
     """Say what lies where no grid was found, and what to point at; empty where nothing helps."""
     root, adapter = source.root, source_adapter(source.adapter)
-    named = _other_directory(root)
+    named = next((place.name for place in (root, root.parent) if place.name in OTHERS), "")
     try:
         place = locate_grids(source)
         if named:
-            beside = next((p for p in _beside(root, named) if p.is_dir()), GRIDS)
+            folder = (root if root.name == named else root.parent).parent
+            near = (folder / GRIDS, folder / ARCHIVES / GRIDS)
+            beside = next((place for place in near if place.is_dir()), GRIDS)
             return f"it holds Pixie's {OTHERS[named]}; grids are in {beside}"
         if isinstance(place, ArchivePlace):
             return _held_in_archives(place)
@@ -127,17 +129,6 @@ def hint_of(source: PixieverseSource) -> str:
         return ""
     held = ", ".join(sorted([*folders, *files])[:3]) or "nothing"
     return f"it holds {held}{' and more' if len(files) + len(folders) > 3 else ''}"
-
-
-def _other_directory(root: Place) -> str:
-    """Return which of Pixie's other directories a path leads into; empty if none."""
-    return next((place.name for place in (root, root.parent) if place.name in OTHERS), "")
-
-
-def _beside(root: Place, named: str) -> tuple[Place, ...]:
-    """Return where the grids' directory may lie, beside one of the others."""
-    folder = root if root.name == named else root.parent
-    return (folder.parent / GRIDS, folder.parent / ARCHIVES / GRIDS)
 
 
 def _held_in_archives(place: ArchivePlace) -> str:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import lru_cache
+from functools import lru_cache, partial
 from typing import Any
 
 import numpy as np
@@ -32,56 +32,33 @@ class _Slat:
         return read_slat(path, root, group, space)
 
 
-def trellis() -> _Slat:
-    """Return the reader of TRELLIS's latents."""
-    return _Slat(TRELLIS)
+def _trellis2(
+    kind: str,
+    moments: tuple[tuple[float, ...], tuple[float, ...]],
+    folder: str = "shape_latents",
+    resolution: int = 1024,
+) -> partial[_Slat]:
+    """Return what makes a reader of latents that TRELLIS.2's toolkit puts into such a folder.
+
+    The encoder's grid is a sixteenth as fine as the `resolution` of the object.
+    """
+    space = LatentSpace(f"trellis2{kind}", len(moments[0]), resolution // 16, *moments)
+    ours, default = f"{folder}/*_{resolution}/", "shape_latents/*_1024/"
+    return partial(_Slat, space, tuple(one.replace(default, ours) for one in SlatSource.pattern))
 
 
-def sam3d() -> _Slat:
-    """Return the reader of SAM 3D Objects' latents, which are TRELLIS's."""
-    return _Slat(replace(TRELLIS, encoder="sam3d"))
+_SHAPE, _PBR = (SHAPE_MEAN, SHAPE_STD), (PBR_MEAN, PBR_STD)
+_BOTH = (*SHAPE_MEAN, *PBR_MEAN), (*SHAPE_STD, *PBR_STD)
+"""Of shape latents with the texture latents of the same voxels behind."""
 
-
-def trellis2() -> _Slat:
-    """Return what reads TRELLIS.2's shape latents of resolution 1024."""
-    return _Slat(LatentSpace("trellis2", 32, RESOLUTION, SHAPE_MEAN, SHAPE_STD))
-
-
-def trellis2_512() -> _Slat:
-    """Return the reader of resolution 512, which TRELLIS.2's toolkit puts beside the others."""
-    space = LatentSpace("trellis2-512", 32, RESOLUTION // 2, SHAPE_MEAN, SHAPE_STD)
-    return _Slat(space, _below("shape_latents", 512))
-
-
-def trellis2_pbr() -> _Slat:
-    """Return the reader of TRELLIS.2's texture latents, which lie beside those of the shape."""
-    space = LatentSpace("trellis2-pbr", 32, RESOLUTION, PBR_MEAN, PBR_STD)
-    return _Slat(space, _below("pbr_latents", 1024))
-
-
-def trellis2_pbr_512() -> _Slat:
-    """Return the reader of texture latents of resolution 512."""
-    space = LatentSpace("trellis2-pbr-512", 32, RESOLUTION // 2, PBR_MEAN, PBR_STD)
-    return _Slat(space, _below("pbr_latents", 512))
-
-
-def trellis2_shape_pbr() -> _Slat:
-    """Return the reader of shape latents with the texture latents of the same voxels behind."""
-    moments = (*SHAPE_MEAN, *PBR_MEAN), (*SHAPE_STD, *PBR_STD)
-    return _Slat(LatentSpace("trellis2-shape-pbr", 64, RESOLUTION, *moments))
-
-
-def trellis2_shape_pbr_512() -> _Slat:
-    """Return the reader of both of resolution 512."""
-    space = trellis2_shape_pbr().space
-    space = replace(space, encoder="trellis2-shape-pbr-512", resolution=RESOLUTION // 2)
-    return _Slat(space, _below("shape_latents", 512))
-
-
-def _below(folder: str, resolution: int) -> tuple[str, ...]:
-    """Return patterns of a folder of TRELLIS.2's toolkit instead of the default's."""
-    default = "shape_latents/*_1024/"
-    return tuple(one.replace(default, f"{folder}/*_{resolution}/") for one in SlatSource.pattern)
+trellis = partial(_Slat, TRELLIS)
+sam3d = partial(_Slat, replace(TRELLIS, encoder="sam3d"))
+trellis2 = _trellis2("", _SHAPE)
+trellis2_512 = _trellis2("-512", _SHAPE, resolution=512)
+trellis2_pbr = _trellis2("-pbr", _PBR, "pbr_latents")
+trellis2_pbr_512 = _trellis2("-pbr-512", _PBR, "pbr_latents", 512)
+trellis2_shape_pbr = _trellis2("-shape-pbr", _BOTH)
+trellis2_shape_pbr_512 = _trellis2("-shape-pbr-512", _BOTH, resolution=512)
 
 
 def texture_of(path: Place, space: LatentSpace) -> Place | None:
