@@ -18,15 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slatprep.errors import ConfigError
+from slatprep.export import formats
 from slatprep.export.bins import Binned, bin_materials
-from slatprep.export.formats import (
-    Exported,
-    ExportOptions,
-    Points,
-    Writer,
-    annotated_points,
-    require_solver_classes,
-)
 from slatprep.records import MATERIAL_CLASSES, MATERIAL_COLOURS, RESOLUTION
 from slatprep.records.yielding import MAX_POISSON, YIELDING
 from slatprep.storage.names import file_name
@@ -49,7 +42,7 @@ _PITCH = 1.25
 """Distance between neighbours in the scene, in sizes of the unit cube."""
 
 
-def writer(store: Store, ids: Sequence[str], options: ExportOptions) -> Writer:
+def writer(store: Store, ids: Sequence[str], options: formats.ExportOptions) -> formats.Writer:
     """Return the writer of a USD file for each asset; see `slatprep.export.FORMATS`.
 
     ConfigError if `options.materials` is less than the number of classes, or usd-core is missing.
@@ -59,12 +52,12 @@ def writer(store: Store, ids: Sequence[str], options: ExportOptions) -> Writer:
         raise ConfigError(f"materials is {options.materials}; expected {least} or more")
     if not options.size > 0:
         raise ConfigError(f"size is {options.size}; expected a length above 0 m")
-    require_solver_classes(store)
+    formats.require_solver_classes(store)
     _pxr("Usd")
     one = partial(
         write, points=options.points or "grid", size=options.size, materials=options.materials
     )
-    return Writer(one, finish=partial(write_scene, options.size), remarks=_remarks)
+    return formats.Writer(one, finish=partial(write_scene, options.size), remarks=_remarks)
 
 
 def write(
@@ -72,13 +65,13 @@ def write(
     number: int,
     assets: Iterable[StoredAsset],
     *,
-    points: Points,
+    points: formats.Points,
     size: float,
     materials: int,
-) -> Iterator[Exported]:
+) -> Iterator[formats.Exported]:
     """Write ``<id>.usdc`` of each asset, its unit cube `size` metres wide."""
     for asset in assets:
-        there = annotated_points(asset, points)
+        there = formats.annotated_points(asset, points)
         solid = there.solid(asset).astype(np.float64)
         clipped = int(np.count_nonzero(solid[:, 2] > MAX_POISSON))
         solid[:, 2] = np.minimum(solid[:, 2], MAX_POISSON)
@@ -94,7 +87,7 @@ def write(
             "nu_error": binned.ratio_error,
             "nu_clipped": clipped,
         }
-        yield Exported(asset, name, len(there.material), figures)
+        yield formats.Exported(asset, name, len(there.material), figures)
 
 
 def write_scene(size: float, directory: Path, entries: Sequence[dict[str, Any]]) -> list[str]:
@@ -223,7 +216,7 @@ def _stage(path: Path) -> Any:
     return stage
 
 
-def _edge(asset: StoredAsset, points: Points) -> float:
+def _edge(asset: StoredAsset, points: formats.Points) -> float:
     """Return the edge of a voxel in the unit cube of the SLAT, such that its volume is right."""
     if points == "slat":
         return 1.0 / asset.store.contents.latents.resolution

@@ -10,24 +10,19 @@ from pathlib import Path
 import numpy as np
 import orjson
 
-from slatprep.export.formats import (
-    TARGETS,
-    Exported,
-    ExportOptions,
-    Writer,
-    describe_columns,
-    with_merged,
-)
+from slatprep.export import formats
 from slatprep.storage.names import file_name
 from slatprep.store import Store, StoredAsset
 
 
-def writer(store: Store, ids: Sequence[str], options: ExportOptions) -> Writer:
+def writer(store: Store, ids: Sequence[str], options: formats.ExportOptions) -> formats.Writer:
     """Return the writer of shards of `options.shard_size` assets; see `slatprep.export.FORMATS`."""
-    return Writer(write, batch=options.shard_size)
+    return formats.Writer(write, batch=options.shard_size)
 
 
-def write(directory: Path, number: int, assets: Iterable[StoredAsset]) -> Iterator[Exported]:
+def write(
+    directory: Path, number: int, assets: Iterable[StoredAsset]
+) -> Iterator[formats.Exported]:
     """Write shard `number` with ``<key>.json`` and ``<key>.npz`` for each asset.
 
     The key is the asset's id with dots encoded: for WebDataset a key ends at the first dot.
@@ -36,14 +31,16 @@ def write(directory: Path, number: int, assets: Iterable[StoredAsset]) -> Iterat
     with tarfile.open(directory / shard, "w") as tar:
         for asset in assets:
             key = file_name(asset.asset_id, dots=False)
-            about = {**describe_columns(asset), "transform": asset.transform.tolist()}
+            about = {**formats.describe_columns(asset), "transform": asset.transform.tolist()}
             _add(tar, f"{key}.json", orjson.dumps(about))
-            names = with_merged(asset.store, "coords", "feats", *TARGETS, "distance", "place")
+            names = formats.with_merged(
+                asset.store, "coords", "feats", *formats.TARGETS, "distance", "place"
+            )
             # Not compressed, since a training loop reads it repeatedly.
             packed = io.BytesIO()
             np.savez(packed, **{name: getattr(asset, name) for name in names})
             _add(tar, f"{key}.npz", packed.getvalue())
-            yield Exported(asset, shard, len(asset.coords))
+            yield formats.Exported(asset, shard, len(asset.coords))
 
 
 def _add(tar: tarfile.TarFile, name: str, content: bytes) -> None:

@@ -15,20 +15,11 @@ from functools import lru_cache
 from importlib.metadata import entry_points
 from typing import Any, Protocol
 
+from slatprep import records
 from slatprep.errors import ConfigError
 from slatprep.parameters import PixieverseSource
 from slatprep.readers.foreign import guarded
 from slatprep.readers.patterns import find_files
-from slatprep.records import (
-    MATERIAL_CLASSES,
-    PROPERTIES,
-    AssetPair,
-    LatentSpace,
-    MaterialField,
-    Place,
-    Property,
-    StructuredLatents,
-)
 from slatprep.storage.listing import Listing
 
 
@@ -50,8 +41,8 @@ class FoundField:
 class Holding:
     """What all fields of a source hold: properties, and classes or none."""
 
-    properties: tuple[Property, ...] = PROPERTIES
-    classes: tuple[str, ...] = MATERIAL_CLASSES
+    properties: tuple[records.Property, ...] = records.PROPERTIES
+    classes: tuple[str, ...] = records.MATERIAL_CLASSES
 
 
 class SourceAdapter(Protocol):
@@ -67,7 +58,7 @@ class SourceAdapter(Protocol):
     def find(self, source: PixieverseSource, listing: Listing) -> Iterator[FoundField]:
         """Yield its fields; `find_by_pattern` is enough where only names matter."""
 
-    def read(self, pair: AssetPair, max_unphysical: float) -> MaterialField:
+    def read(self, pair: records.AssetPair, max_unphysical: float) -> records.MaterialField:
         """Read the field at ``pair.grid`` in SI units; raise `InputError` if that fails."""
 
 
@@ -75,10 +66,12 @@ class LatentAdapter(Protocol):
     """What reads the latents of an encoder."""
 
     @property
-    def space(self) -> LatentSpace:
+    def space(self) -> records.LatentSpace:
         """Their width, grid and moments."""
 
-    def read(self, path: Place, root: Place, group: str, space: LatentSpace) -> StructuredLatents:
+    def read(
+        self, path: records.Place, root: records.Place, group: str, space: records.LatentSpace
+    ) -> records.StructuredLatents:
         """Read one SLAT; `space` says whether it has been standardised."""
 
     # An adapter may also have `patterns`, where its files lie below the root unless the dataset

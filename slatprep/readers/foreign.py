@@ -15,21 +15,10 @@ from typing import Any
 import numpy as np
 import orjson
 
+from slatprep import records
 from slatprep.errors import InputError, SlatprepError
 from slatprep.geometry.voxels import flat_index
 from slatprep.parameters import PixieverseSource
-from slatprep.records import (
-    MANY_BACKGROUND,
-    MATERIAL_CLASSES,
-    RESOLUTION,
-    AssetPair,
-    LatentSpace,
-    MaterialField,
-    Place,
-    Property,
-    SourceFile,
-    StructuredLatents,
-)
 from slatprep.records.sources import ROLES
 from slatprep.records.tables import CLASS_NAME, MAX_PROPERTIES
 from slatprep.storage.listing import Listing
@@ -88,9 +77,9 @@ class _Foreign:
                 f"{name} as {got.dtype} {got.shape}; expected {dtype.__name__} {shape}, not empty",
             )
 
-    def _require_told(self, of: MaterialField | StructuredLatents) -> None:
+    def _require_told(self, of: records.MaterialField | records.StructuredLatents) -> None:
         """Require that files and notes have types that a record can hold."""
-        known = all(isinstance(one, SourceFile) for one in of.sources)
+        known = all(isinstance(one, records.SourceFile) for one in of.sources)
         self._require(known and of.sources, "no `sources`, the files that it read")
         for one in of.sources:
             self._require(_is_text(one.path), f"{one.path!r} as the path of a file")
@@ -115,16 +104,17 @@ class ForeignSource(_Foreign):
         """Return what the source holds."""
         with self._blamed():
             held = self.adapter.describe(source)
-            tables = held.properties, held.classes
-            names = [one.name for one in held.properties if isinstance(one, Property)]
+            classes = held.classes
+            tables = held.properties, classes
+            names = [one.name for one in held.properties if isinstance(one, records.Property)]
             self._require(all(isinstance(one, tuple) for one in tables), "lists, not tuples")
             self._require(
                 0 < len(set(names)) == len(held.properties) <= MAX_PROPERTIES,
                 f"{len(names)} properties; expected 1 to {MAX_PROPERTIES}, of a name each",
             )
-            named = all(CLASS_NAME.fullmatch(one) for one in held.classes)
-            few = held.classes == MATERIAL_CLASSES or len(held.classes) <= MANY_BACKGROUND
-            self._require(named and few, f"classes {held.classes!r}")
+            named = all(CLASS_NAME.fullmatch(one) for one in classes)
+            few = classes == records.MATERIAL_CLASSES or len(classes) <= records.MANY_BACKGROUND
+            self._require(named and few, f"classes {classes!r}")
             return held
 
     def find(self, source: PixieverseSource, listing: Listing) -> Iterator[Any]:
@@ -143,15 +133,17 @@ class ForeignSource(_Foreign):
                 self._require(named, f"{found!r} as a field that it found")
             yield found
 
-    def read(self, pair: AssetPair, max_unphysical: float) -> MaterialField:
+    def read(self, pair: records.AssetPair, max_unphysical: float) -> records.MaterialField:
         """Read a field and check it."""
         with self._blamed():
-            field: MaterialField = self.adapter.read(pair, max_unphysical)
-            self._require(isinstance(field, MaterialField), f"{type(field).__name__} as a field")
-            rows, side, table = len(field.voxels), (RESOLUTION,) * 3, field.table
+            field: records.MaterialField = self.adapter.read(pair, max_unphysical)
+            self._require(
+                isinstance(field, records.MaterialField), f"{type(field).__name__} as a field"
+            )
+            rows, side, table = len(field.voxels), records.RESOLUTION, field.table
             self._require_arrays(
                 field,
-                ("occupancy", np.bool_, side),
+                ("occupancy", np.bool_, (side,) * 3),
                 ("voxels", np.uint8, (rows, 3)),
                 ("material", np.uint8, (rows,)),
                 ("properties", np.float32, (rows, len(table))),
@@ -163,7 +155,7 @@ class ForeignSource(_Foreign):
                 table == (contents.properties if whole else known),
                 "a table of properties other than it described",
             )
-            self._require(field.voxels.max() < RESOLUTION, f"voxels above {RESOLUTION - 1}")
+            self._require(field.voxels.max() < side, f"voxels above {side - 1}")
             cells = flat_index(field.voxels)
             self._require((np.diff(cells) > 0).all(), "voxels not each once in C order")
             there = field.occupancy.reshape(-1)[cells]
@@ -190,19 +182,21 @@ class ForeignLatents(_Foreign):
             return tuple(map(str, getattr(self.adapter, "patterns", ())))
 
     @property
-    def space(self) -> LatentSpace:
+    def space(self) -> records.LatentSpace:
         """Return the space of its latents."""
         with self._blamed():
-            space: LatentSpace = self.adapter.space
-            self._require(isinstance(space, LatentSpace), f"{space!r} as its space")
+            space: records.LatentSpace = self.adapter.space
+            self._require(isinstance(space, records.LatentSpace), f"{space!r} as its space")
             named = space.encoder == self.name
             self._require(named, f"latents of {space.encoder!r}; expected its own name")
             return space
 
-    def read(self, path: Place, root: Place, group: str, space: LatentSpace) -> StructuredLatents:
+    def read(
+        self, path: records.Place, root: records.Place, group: str, space: records.LatentSpace
+    ) -> records.StructuredLatents:
         """Read a SLAT and check it."""
         with self._blamed():
-            read: StructuredLatents = self.adapter.read(path, root, group, space)
+            read: records.StructuredLatents = self.adapter.read(path, root, group, space)
             rows = len(read.coords)
             self._require_arrays(
                 read, ("coords", np.uint8, (rows, 3)), ("feats", np.float32, (rows, space.channels))

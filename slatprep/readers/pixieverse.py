@@ -13,25 +13,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from slatprep import normalize
 from slatprep.errors import InputError
 from slatprep.geometry.voxels import voxels_of
-from slatprep.normalize import (
-    PIXIE_RANGES,
-    change_ranges,
-    denormalize_properties,
-    normalize_mapped,
-    to_mapped,
-)
 from slatprep.parameters import PixieverseSource, SampleParameters
+from slatprep.readers import files
 from slatprep.readers.adapters import FoundField, Holding, find_by_pattern
-from slatprep.readers.files import (
-    ArraySpec,
-    is_text,
-    load_source,
-    npy_array,
-    npz_small_arrays,
-    require_complete,
-)
 from slatprep.readers.values import in_si, require_plausible, require_possible, require_prediction
 from slatprep.readers.voxel_sets import half_overflow, physical_rows
 from slatprep.records import (
@@ -51,9 +38,9 @@ from slatprep.storage.listing import Listing
 _CUBE = (RESOLUTION,) * 3
 _RAW_SHAPE = (*_CUBE, 4)
 
-GRID = ArraySpec((_RAW_SHAPE, (3 + len(MATERIAL_CLASSES), *_CUBE), (4, *_CUBE)), kinds="f")
-MASK = ArraySpec(shapes=(_CUBE,), kinds="bfiu")
-BOUND = ArraySpec(shapes=(), kinds="biufU")
+GRID = files.ArraySpec((_RAW_SHAPE, (3 + len(MATERIAL_CLASSES), *_CUBE), (4, *_CUBE)), kinds="f")
+MASK = files.ArraySpec(shapes=(_CUBE,), kinds="bfiu")
+BOUND = files.ArraySpec(shapes=(), kinds="biufU")
 
 UNLABELLED = -1
 """Class id of an occupied voxel that Pixie's labelling set aside."""
@@ -98,17 +85,17 @@ def read_grid(
     are finite and positive, and its Poisson's ratio is in [0, 0.5]. Of a prediction, the
     properties need only be finite. InputError names file, value and voxel.
     """
-    path, _ = require_complete(pair)
-    data, source = load_source(path, pair.roots.pixieverse, "grid")
-    grid = npy_array(data, path, GRID)
+    path, _ = files.require_complete(pair)
+    data, source = files.load_source(path, pair.roots.pixieverse, "grid")
+    grid = files.npy_array(data, path, GRID)
     sources = [source]
     warnings: list[str] = []
 
     mask = None
     if pair.mask is not None:
-        data, source = load_source(pair.mask, pair.roots.pixieverse, "mask")
+        data, source = files.load_source(pair.mask, pair.roots.pixieverse, "mask")
         sources.append(source)
-        mask = _read_mask(npy_array(data, pair.mask, MASK), pair.mask, warnings)
+        mask = _read_mask(files.npy_array(data, pair.mask, MASK), pair.mask, warnings)
 
     raw = grid.shape == _RAW_SHAPE
     channels = np.moveaxis(grid, -1, 0) if raw else grid
@@ -169,8 +156,8 @@ def read_prediction(
     where no score is the highest, or the id is -1. InputError if the grid has another form or a
     value at one of the voxels cannot be measured.
     """
-    data, _ = load_source(path, root, "grid")
-    grid = npy_array(data, path, GRID)
+    data, _ = files.load_source(path, root, "grid")
+    grid = files.npy_array(data, path, GRID)
     raw = grid.shape == _RAW_SHAPE
     channels = np.moveaxis(grid, -1, 0) if raw else grid
     classes = _classes_of(channels, where, path, [])
@@ -189,10 +176,11 @@ def read_prediction(
         )
     if not raw:
         require_prediction(path, values, material)
-        return change_ranges(values, PIXIE_RANGES, normalization), material
+        return normalize.change_ranges(values, normalize.PIXIE_RANGES, normalization), material
     require_possible(path, values, material)
     values[:, :2] += _NO_LOG_OF_ZERO
-    return np.clip(normalize_mapped(to_mapped(values), normalization), -1, 1), material
+    mapped = normalize.to_mapped(values)
+    return np.clip(normalize.normalize_mapped(mapped, normalization), -1, 1), material
 
 
 def _read_mask(values: NDArray[Any], path: Place, warnings: list[str]) -> NDArray[np.bool_]:
@@ -298,7 +286,7 @@ def _to_si(values: NDArray[np.float32], warnings: list[str]) -> NDArray[np.float
     for name, count in zip(PROPERTY_COLUMNS, outside, strict=True):
         if count:
             warnings.append(f"prediction: {count} values of {name} clipped to [-1, 1]")
-    return denormalize_properties(np.clip(values, -1, 1), PIXIE_RANGES)
+    return normalize.denormalize_properties(np.clip(values, -1, 1), normalize.PIXIE_RANGES)
 
 
 def _read_bounds(
@@ -309,9 +297,9 @@ def _read_bounds(
     Only exports to world coordinates need the bounds.
     """
     try:
-        data, source = load_source(path, root, "bounds")
+        data, source = files.load_source(path, root, "bounds")
         sources.append(source)
-        arrays, faults = npz_small_arrays(data, path, BOUND)
+        arrays, faults = files.npz_small_arrays(data, path, BOUND)
     except InputError as error:
         warnings.append(f"bounds not read: {error}")
         return None
@@ -322,7 +310,7 @@ def _read_bounds(
         plain = value.astype(np.float64) if value.dtype.kind == "f" else value
         if plain.dtype.kind == "f" and not np.isfinite(plain).all():
             warnings.append(f"bounds: {path} [{name}] is not finite; left out")
-        elif plain.dtype.kind == "U" and not is_text(plain):
+        elif plain.dtype.kind == "U" and not files.is_text(plain):
             warnings.append(f"bounds: {path} [{name}] is no text; left out")
         else:
             bounds[name] = plain.tolist()

@@ -8,39 +8,30 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from slatprep import records
 from slatprep.errors import InputError
 from slatprep.geometry.voxels import voxels_of
 from slatprep.normalize import from_mapped, to_mapped
 from slatprep.readers.values import in_si, require_plausible
-from slatprep.records import (
-    BACKGROUND,
-    PROPERTIES,
-    RESOLUTION,
-    MaterialField,
-    Place,
-    Property,
-    SourceFile,
-    SourceRoots,
-)
 
 MAX_RESOLUTION = 512
 
 
 def field_of_voxels(
-    where: str | Place,
+    where: str | records.Place,
     voxels: NDArray[Any],
     properties: NDArray[Any],
     *,
-    resolution: int = RESOLUTION,
+    resolution: int = records.RESOLUTION,
     material: NDArray[Any] | None = None,
-    classes: int = BACKGROUND,
-    table: Sequence[Property] = PROPERTIES,
+    classes: int = records.BACKGROUND,
+    table: Sequence[records.Property] = records.PROPERTIES,
     max_unphysical: float = 0.0,
-    sources: Sequence[SourceFile] = (),
+    sources: Sequence[records.SourceFile] = (),
     frame: NDArray[np.float64] | None = None,
     names: Sequence[str] = (),
-    roots: SourceRoots | None = None,
-) -> MaterialField:
+    roots: records.SourceRoots | None = None,
+) -> records.MaterialField:
     """Make a field of annotated voxels (K, 3): integers in 0..resolution - 1, or float points.
 
     Points lie in the unit cube [-0.5, 0.5]^3. `properties` (K, P) are SI values with a column
@@ -78,9 +69,9 @@ def field_of_voxels(
 
     keep = physical_rows(where, fine, told, max_unphysical, notes)
 
-    side = min(resolution, RESOLUTION)
-    if resolution > RESOLUTION:
-        cells = (2 * cells + 1) * RESOLUTION // (2 * resolution)
+    side = min(resolution, records.RESOLUTION)
+    if resolution > records.RESOLUTION:
+        cells = (2 * cells + 1) * records.RESOLUTION // (2 * resolution)
     flat = (cells[:, 0] * side + cells[:, 1]) * side + cells[:, 2]
     cell, labels, means = _merged(flat[keep], own[keep], values[keep], table)
     if len(cell) < np.count_nonzero(keep):
@@ -89,10 +80,10 @@ def field_of_voxels(
     there[flat] = len(cell)  # occupied at least
     there[cell] = np.arange(len(cell))
     # A cell of the 64^3 grid takes what the source has at its centre.
-    steps = (2 * np.arange(RESOLUTION) + 1) * side // (2 * RESOLUTION)
+    steps = (2 * np.arange(records.RESOLUTION) + 1) * side // (2 * records.RESOLUTION)
     rows = there.reshape((side,) * 3)[np.ix_(steps, steps, steps)]
     annotated = (rows >= 0) & (rows < len(cell))
-    return MaterialField(
+    return records.MaterialField(
         occupancy=rows >= 0,
         voxels=voxels_of(annotated),
         material=labels[rows[annotated]].astype(np.uint8),
@@ -107,7 +98,7 @@ def field_of_voxels(
 
 
 def _cells_of(
-    where: str | Place, voxels: NDArray[Any], resolution: int
+    where: str | records.Place, voxels: NDArray[Any], resolution: int
 ) -> tuple[NDArray[np.int64], int]:
     """Return the cells (K, 3) of voxels or points, and the number of cells along each axis."""
     if voxels.ndim != 2 or voxels.shape[1] != 3 or len(voxels) == 0:
@@ -116,7 +107,7 @@ def _cells_of(
         raise InputError(where, f"has a grid of {resolution}^3", f"2 to {MAX_RESOLUTION} a side")
     index, expected = voxels.astype(np.float64), f"0..{resolution - 1}"
     if voxels.dtype.kind == "f":
-        resolution, expected = max(resolution, RESOLUTION), "points of [-0.5, 0.5]^3"
+        resolution, expected = max(resolution, records.RESOLUTION), "points of [-0.5, 0.5]^3"
         index = np.where(voxels == 0.5, resolution - 1, np.floor((index + 0.5) * resolution))
     inside = ((index >= 0) & (index < resolution)).all(axis=1)
     if not inside.all():
@@ -133,7 +124,7 @@ def half_overflow(value: Any) -> str:
 
 
 def physical_rows(
-    where: str | Place,
+    where: str | records.Place,
     fine: NDArray[np.bool_],
     told: Callable[[int, int], tuple[str, str]],
     max_unphysical: float,
@@ -163,7 +154,7 @@ def _merged(
     flat: NDArray[np.int64],
     classes: NDArray[np.int64],
     values: NDArray[np.float32],
-    table: Sequence[Property],
+    table: Sequence[records.Property],
 ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float32]]:
     """Return the cells that hold voxels, sorted, each with a class and a row of values."""
     cells, first, cell = np.unique(flat, return_index=True, return_inverse=True)

@@ -17,33 +17,15 @@ import numpy as np
 from annotated_types import Ge, Le, MaxLen, MinLen
 from numpy.typing import NDArray
 
+from slatprep import records
 from slatprep.errors import ConfigError, InputError
 from slatprep.parameters import PixieverseSource
+from slatprep.readers import files
 from slatprep.readers.adapters import FoundField, Holding, find_by_pattern, patterns_of
-from slatprep.readers.files import (
-    ArraySpec,
-    is_hierarchy,
-    load_source,
-    npz_arrays,
-    require_complete,
-)
 from slatprep.readers.hdf5 import SUFFIXES, load_datasets
 from slatprep.readers.points import ply_points
 from slatprep.readers.voxel_sets import MAX_RESOLUTION, field_of_voxels
 from slatprep.readers.zarr_groups import group_arrays
-from slatprep.records import (
-    BACKGROUND,
-    CLASS_NAME,
-    MANY_BACKGROUND,
-    MATERIAL_CLASSES,
-    MAX_PROPERTIES,
-    AssetPair,
-    MaterialField,
-    Place,
-    Property,
-    PropertyName,
-    labels_of,
-)
 from slatprep.storage.documents import read_bounded
 from slatprep.storage.listing import Listing
 
@@ -53,8 +35,8 @@ _MAX_BYTES = 2**16
 _MAX_VOXELS = 2**21
 """Of one object; all of a grid of 128^3."""
 
-_COLUMN = ArraySpec(shapes=((None,),), kinds="fiu", max_rows=_MAX_VOXELS)
-_VOXELS = ArraySpec(shapes=((None, 3),), kinds="fiu", max_rows=_MAX_VOXELS)
+_COLUMN = files.ArraySpec(shapes=((None,),), kinds="fiu", max_rows=_MAX_VOXELS)
+_VOXELS = files.ArraySpec(shapes=((None, 3),), kinds="fiu", max_rows=_MAX_VOXELS)
 _GROUP = "/zarr.json"
 
 
@@ -62,7 +44,7 @@ _GROUP = "/zarr.json"
 class _Column:
     """A property in ``source.json``."""
 
-    name: PropertyName
+    name: records.PropertyName
     unit: str
     scale: Literal["log10", "linear"]
     least: float = -np.inf
@@ -75,26 +57,27 @@ class _Description:
 
     __pydantic_config__: ClassVar[dict[str, object]] = {"extra": "forbid"}
 
-    properties: Annotated[tuple[_Column, ...], MinLen(1), MaxLen(MAX_PROPERTIES)]
+    properties: Annotated[tuple[_Column, ...], MinLen(1), MaxLen(records.MAX_PROPERTIES)]
     classes: bool | tuple[str, ...] = True
     resolution: Annotated[int, Ge(2), Le(MAX_RESOLUTION)] = 64
     aligned: bool = False
     empty_chunks: tuple[str, ...] = ()
 
     @property
-    def table(self) -> tuple[Property, ...]:
+    def table(self) -> tuple[records.Property, ...]:
         """The properties as records have them."""
         return tuple(
-            Property(one.name, one.unit, one.scale == "log10", one.least, one.most)
+            records.Property(one.name, one.unit, one.scale == "log10", one.least, one.most)
             for one in self.properties
         )
 
     @property
     def names(self) -> tuple[str, ...]:
         """The names of the classes; PhysGaussian's include the background."""
+        known = records.MATERIAL_CLASSES
         if isinstance(self.classes, bool):
-            return MATERIAL_CLASSES if self.classes else ()
-        return MATERIAL_CLASSES if self.classes == MATERIAL_CLASSES[:BACKGROUND] else self.classes
+            return known if self.classes else ()
+        return known if self.classes == known[: records.BACKGROUND] else self.classes
 
 
 class PlainVoxels:
@@ -116,22 +99,22 @@ class PlainVoxels:
             path = found.path.removesuffix(_GROUP)
             yield replace(found, path=path, beside=(DESCRIPTION,))
 
-    def read(self, pair: AssetPair, max_unphysical: float) -> MaterialField:
+    def read(self, pair: records.AssetPair, max_unphysical: float) -> records.MaterialField:
         """Read a field; see `slatprep.readers.adapters.SourceAdapter`."""
-        path, _ = require_complete(pair)
+        path, _ = files.require_complete(pair)
         root = pair.roots.pixieverse
-        text, about = load_source(root / DESCRIPTION, root, "description")
+        text, about = files.load_source(root / DESCRIPTION, root, "description")
         said = _parsed(text, str(root / DESCRIPTION))
         specs = {"voxels": _VOXELS, **{one.name: _COLUMN for one in said.properties}}
         specs |= {"material": _COLUMN} if said.classes else {}
         if path.suffix.lower() in SUFFIXES:
             arrays, file = load_datasets(path, root, "", specs, role="grid")
         else:
-            data, file = load_source(path, root, "grid")
-            if is_hierarchy(path):
+            data, file = files.load_source(path, root, "grid")
+            if files.is_hierarchy(path):
                 arrays = group_arrays(data, path, specs, said.empty_chunks)
             else:
-                read = _ply_arrays if path.suffix.lower() == ".ply" else npz_arrays
+                read = _ply_arrays if path.suffix.lower() == ".ply" else files.npz_arrays
                 arrays = read(data, path, specs)
         columns: list[Any] = [arrays[one.name] for one in said.properties]
         lengths = {len(column) for column in arrays.values()}
@@ -143,7 +126,7 @@ class PlainVoxels:
             np.stack(columns, axis=1),
             resolution=said.resolution,
             material=arrays.get("material"),
-            classes=len(labels_of(said.names)) or 1,
+            classes=len(records.labels_of(said.names)) or 1,
             table=said.table,
             max_unphysical=max_unphysical,
             sources=(file, about),
@@ -154,7 +137,7 @@ class PlainVoxels:
 
 
 def _ply_arrays(
-    data: bytes, where: str | Place, specs: Mapping[str, ArraySpec]
+    data: bytes, where: str | records.Place, specs: Mapping[str, files.ArraySpec]
 ) -> dict[str, NDArray[Any]]:
     vertices, _ = ply_points(data, where)
     names = set(vertices.dtype.names or ())
@@ -177,11 +160,11 @@ def _parsed(text: bytes, where: str) -> _Description:
         if len({one.name for one in read.properties}) < len(read.properties):
             raise ValueError("a property has two columns")
         named = read.classes if isinstance(read.classes, tuple) else ("any",)
-        if not all(map(CLASS_NAME.fullmatch, named)) or "background" in named:
+        if not all(map(records.CLASS_NAME.fullmatch, named)) or "background" in named:
             raise ValueError(f"the names of classes are {', '.join(named)}")
-        if not 1 <= len(set(named)) == len(named) <= MANY_BACKGROUND:
+        if not 1 <= len(set(named)) == len(named) <= records.MANY_BACKGROUND:
             raise ValueError(
-                f"there are {len(named)} classes, not 1 to {MANY_BACKGROUND} of a name each"
+                f"there are {len(named)} classes, not 1 to {records.MANY_BACKGROUND} of a name each"
             )
     except ValueError as error:
         reason = " ".join(str(error).split())[:300]
@@ -192,7 +175,7 @@ def _parsed(text: bytes, where: str) -> _Description:
     return read
 
 
-def _description(root: Place) -> _Description:
+def _description(root: records.Place) -> _Description:
     path = root / DESCRIPTION
     try:
         text = read_bounded(path, _MAX_BYTES)

@@ -24,6 +24,7 @@ from pathlib import Path
 from typing import Any
 
 from slatprep.errors import StoreError
+from slatprep.storage import versions
 from slatprep.storage.faults import reached
 from slatprep.storage.files import file_digest, local_files
 from slatprep.storage.remote import (
@@ -34,18 +35,6 @@ from slatprep.storage.remote import (
     list_objects,
     put_objects,
     remove_objects,
-)
-from slatprep.storage.versions import (
-    MANIFESTS,
-    POINTER,
-    SPOOL,
-    VERSIONS,
-    Pointer,
-    content_of,
-    is_spooled,
-    is_version,
-    is_version_name,
-    read_pointer,
 )
 
 # A small file is held in memory whole while it is uploaded.
@@ -95,7 +84,7 @@ class PublishedState:
     """
 
     target: RemotePlace
-    pointer: Pointer | None
+    pointer: versions.Pointer | None
     tag: str = ""
 
 
@@ -104,12 +93,12 @@ def published_state(target: RemotePlace) -> PublishedState:
 
     Raises StoreError if the place cannot be reached, or holds something other than a store.
     """
-    if is_version(target):
+    if versions.is_version(target):
         raise StoreError(f"{target} is one version of a store; expected {target.parent.parent}")
     try:
         # The tag first: if the pointer moves in between, the tag is the old one and will not match.
-        tag = _tag(target / POINTER)
-        pointer = read_pointer(target)
+        tag = _tag(target / versions.POINTER)
+        pointer = versions.read_pointer(target)
         others = [] if pointer else [name for name in list_objects(target) if not _is_ours(name)]
     except OSError as error:
         raise StoreError(
@@ -132,7 +121,7 @@ class Upload:
     """
 
     before: PublishedState
-    pointer: Pointer
+    pointer: versions.Pointer
 
     @property
     def target(self) -> RemotePlace:
@@ -142,7 +131,7 @@ class Upload:
     @property
     def version(self) -> RemotePlace:
         """The place of its files."""
-        return self.target / VERSIONS / self.pointer.version
+        return self.target / versions.VERSIONS / self.pointer.version
 
     def publish(self) -> None:
         """Replace the pointer, and remove the versions that nobody needs any more.
@@ -169,8 +158,8 @@ class Upload:
 
     def _replace_pointer(self) -> None:
         try:
-            if read_pointer(self.target) == self.before.pointer:
-                with connected(self.target / POINTER) as (system, name):
+            if versions.read_pointer(self.target) == self.before.pointer:
+                with connected(self.target / versions.POINTER) as (system, name):
                     condition: dict[str, Any] = {}
                     if self.before.pointer is None:
                         condition["mode"] = "create"
@@ -180,7 +169,7 @@ class Upload:
                     return
         except OSError as error:
             try:
-                now = read_pointer(self.target)
+                now = versions.read_pointer(self.target)
             except OSError:
                 raise StoreError(
                     f"{self.target}: no answer came when its pointer was written "
@@ -188,7 +177,7 @@ class Upload:
                 ) from None
             if now == self.before.pointer:
                 raise
-        now = read_pointer(self.target)
+        now = versions.read_pointer(self.target)
         # Ours, if the server's first answer was lost; or another build published the same content.
         if now is None or now.version != self.pointer.version:
             raise StoreError(
@@ -215,14 +204,14 @@ def upload_store(new: Path, before: PublishedState, staged: Staged | None = None
     if staged is not None:
         digests |= staged.digests
         sizes |= staged.sizes
-    content = content_of(digests)
+    content = versions.content_of(digests)
     place = staged.version if staged else None
     if before.pointer is not None and before.pointer.content == content:
         if place is not None:
             _remove_version(place)
         return Upload(before, before.pointer)
     previous = before.pointer.version if before.pointer else ""
-    pointer = Pointer(
+    pointer = versions.Pointer(
         version=place.name
         if place
         else hashlib.sha256(f"{previous}{content}".encode()).hexdigest()[:16],
@@ -294,14 +283,14 @@ def _tag_in(entry: Mapping[str, Any]) -> str:
 def _is_ours(name: str) -> bool:
     """Whether an object below a store is part of a version, its records or the spool."""
     kind, _, rest = name.partition("/")
-    return _is_of_version(name) or (kind == SPOOL and is_spooled(rest))
+    return _is_of_version(name) or (kind == versions.SPOOL and versions.is_spooled(rest))
 
 
 def _is_of_version(name: str, but: Iterable[str] = ()) -> bool:
     """Whether an object below a store is part of a version or its records."""
     kind, _, rest = name.partition("/")
-    version = rest.partition("/")[0]
-    return kind in (VERSIONS, MANIFESTS) and is_version_name(version) and version not in but
+    own, kinds = rest.partition("/")[0], (versions.VERSIONS, versions.MANIFESTS)
+    return kind in kinds and versions.is_version_name(own) and own not in but
 
 
 def _tag(place: RemotePlace) -> str:

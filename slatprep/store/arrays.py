@@ -11,14 +11,7 @@ from slatprep.errors import StoreError
 from slatprep.records import Place
 from slatprep.storage.place import storage_of
 from slatprep.storage.remote import connected
-from slatprep.store.contract import (
-    DEFINING,
-    MIN_ASSET_BYTES,
-    Finding,
-    dimension_sizes,
-    read_metadata,
-    size_findings,
-)
+from slatprep.store import contract
 from slatprep.store.gate import NAMES, gate_findings
 from slatprep.store.layout import ASSET_CHUNK, FILE
 from slatprep.store.shard_reader import BAD_METADATA, RowReader
@@ -70,21 +63,21 @@ class Arrays:
 
     def _checked(self, name: str) -> RowReader:
         of_files = (f"{FILE}/name",) if name.startswith(f"{FILE}/") else ()
-        for needed in (*DEFINING, *of_files, name):
+        for needed in (*contract.DEFINING, *of_files, name):
             if needed not in self._metadata:
                 self._metadata[needed] = self._read(needed)
         try:
-            sizes = dimension_sizes(self._metadata)
+            sizes = contract.dimension_sizes(self._metadata)
         except StoreError as error:
             raise StoreError(f"{self.path}/{error}") from None
         own = self._metadata[name]
-        self._refuse(size_findings(name, own, sizes))
+        self._refuse(contract.size_findings(name, own, sizes))
         self._refuse(gate_findings(name, own))
         # So many assets cost memory by themselves.
-        if sizes["asset"] > ASSET_CHUNK and sizes["asset"] * MIN_ASSET_BYTES > self._bytes:
+        if sizes["asset"] > ASSET_CHUNK and sizes["asset"] * contract.MIN_ASSET_BYTES > self._bytes:
             raise StoreError(
                 f"{self.path} has {sizes['asset']} assets in {self._bytes} bytes; expected at "
-                f"least {MIN_ASSET_BYTES} bytes an asset; run `slatprep verify`"
+                f"least {contract.MIN_ASSET_BYTES} bytes an asset; run `slatprep verify`"
             )
         return RowReader.of(self._folder, name, own)
 
@@ -92,9 +85,9 @@ class Arrays:
         file = self.path / name / "zarr.json"
         if name not in NAMES or not file.exists():
             raise StoreError(f"{self.path} lacks the array {name}; build it again")
-        return read_metadata(file)
+        return contract.read_metadata(file)
 
-    def _refuse(self, findings: Iterable[Finding]) -> None:
+    def _refuse(self, findings: Iterable[contract.Finding]) -> None:
         for finding in findings:
             raise StoreError(f"{self.path}/{finding}; run `slatprep verify`")
 

@@ -11,22 +11,8 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 import orjson
 from annotated_types import MaxLen, MinLen
 
+from slatprep import records
 from slatprep.parameters import Length, SampleParameters
-from slatprep.records import (
-    BACKGROUND,
-    MAX_PROPERTIES,
-    RESOLUTION,
-    ClassName,
-    Contents,
-    Digest,
-    InJson,
-    LatentSpace,
-    Normalization,
-    Property,
-    PropertyName,
-    PropertyRange,
-    labels_of,
-)
 from slatprep.store.contract import Finding
 from slatprep.store.layout import FORMAT, FORMAT_VERSION
 
@@ -34,8 +20,8 @@ if TYPE_CHECKING:
     from pydantic import TypeAdapter
 
 
-def _one_of(*values: object) -> InJson:
-    return InJson({"type": "literal", "expected": list(values)})
+def _one_of(*values: object) -> records.InJson:
+    return records.InJson({"type": "literal", "expected": list(values)})
 
 
 @dataclass(frozen=True)
@@ -87,17 +73,19 @@ class RootAttributes:
 
     format: Annotated[str, _one_of(FORMAT)]
     format_version: Annotated[int, _one_of(FORMAT_VERSION)]
-    resolution: Annotated[int, _one_of(RESOLUTION)]
-    material_classes: tuple[ClassName, ...]
-    property_columns: Annotated[tuple[PropertyName, ...], MinLen(1), MaxLen(MAX_PROPERTIES)]
+    resolution: Annotated[int, _one_of(records.RESOLUTION)]
+    material_classes: tuple[records.ClassName, ...]
+    property_columns: Annotated[
+        tuple[records.PropertyName, ...], MinLen(1), MaxLen(records.MAX_PROPERTIES)
+    ]
     normalization: dict[str, StoredRange]
-    manifest: Digest
+    manifest: records.Digest
     build: StoredBuild
     property_units: tuple[str, ...]
-    latents: LatentSpace
+    latents: records.LatentSpace
 
     def __post_init__(self) -> None:
-        labels_of(self.material_classes)
+        records.labels_of(self.material_classes)
         columns = set(self.property_columns)
         if not columns == self.normalization.keys() or len(columns) < len(self.property_columns):
             raise ValueError("property_columns and normalization must name the same properties")
@@ -105,20 +93,20 @@ class RootAttributes:
             raise ValueError("property_units must have a unit for each of property_columns")
 
     @property
-    def ranges(self) -> Normalization:
+    def ranges(self) -> records.Normalization:
         """The ranges as other stages have them."""
         entries = [(name, self.normalization[name]) for name in self.property_columns]
-        ranges = tuple(PropertyRange(name, e.log10, e.lo, e.hi) for name, e in entries)
-        return Normalization(ranges, entries[0][1].source)
+        ranges = tuple(records.PropertyRange(name, e.log10, e.lo, e.hi) for name, e in entries)
+        return records.Normalization(ranges, entries[0][1].source)
 
     @property
-    def contents(self) -> Contents:
+    def contents(self) -> records.Contents:
         """What the store holds, as other stages have it."""
         properties = (
-            Property(name, unit, self.normalization[name].log10)
+            records.Property(name, unit, self.normalization[name].log10)
             for name, unit in zip(self.property_columns, self.property_units, strict=True)
         )
-        return Contents(tuple(properties), self.material_classes, self.latents)
+        return records.Contents(tuple(properties), self.material_classes, self.latents)
 
 
 def read_attributes(attributes: Mapping[str, Any]) -> RootAttributes | tuple[Finding, ...]:
@@ -165,10 +153,10 @@ def segments_of(ids: Sequence[str]) -> list[int]:
 
 
 def root_attributes(
-    normalization: Normalization,
+    normalization: records.Normalization,
     manifest: str,
     build: Mapping[str, object],
-    contents: Contents,
+    contents: records.Contents,
     ids: Sequence[str],
 ) -> dict[str, Any]:
     """Return the attributes of the store's root: `store_attributes`, and what its rows tell."""
@@ -180,19 +168,20 @@ def root_attributes(
 
 
 def store_attributes(
-    normalization: Normalization, build: Mapping[str, object], contents: Contents
+    normalization: records.Normalization, build: Mapping[str, object], contents: records.Contents
 ) -> dict[str, Any]:
     """Return the attributes of a store's root that decide its bytes, whatever its rows.
 
     `build` holds the parameters and versions that made the content, so that
     a store is understood without its manifests.
     """
+    empty = contents.background
     return {
         "format": FORMAT,
         "format_version": FORMAT_VERSION,
-        "resolution": RESOLUTION,
+        "resolution": records.RESOLUTION,
         "material_classes": list(contents.classes),
-        **({} if contents.background == BACKGROUND else {"background": contents.background}),
+        **({} if empty == records.BACKGROUND else {"background": empty}),
         "property_columns": [one.name for one in contents.properties],
         "property_units": [one.unit for one in contents.properties],
         "latents": asdict(contents.latents),
