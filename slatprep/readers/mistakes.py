@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Sequence
+from functools import partial
 from itertools import permutations, product
 from typing import NamedTuple
 
@@ -40,13 +41,6 @@ def mistakes_of(parts: Sequence[Part], units: Units) -> list[Mistake]:
     return [mistake for usual, _, mistake in found if usual <= best + 0.25]
 
 
-def raw_grid(parts: Sequence[Part]) -> Mistake | None:
-    """Return that a raw grid was taken for a prediction, if its values are plausible."""
-    if any(map(fault_of, parts)):
-        return None
-    return Mistake("a raw grid in SI units, channels first", "", lambda part: part)
-
-
 def _known_mistakes(parts: Sequence[Part], units: Units) -> Iterator[Mistake]:
     """Yield what people mistake: units of one or both columns, ids of classes, and columns."""
     named = {"youngs_modulus": ("GPa", "MPa", "kPa", f"{LOG10}Pa"),
@@ -66,7 +60,7 @@ def _known_mistakes(parts: Sequence[Part], units: Units) -> Iterator[Mistake]:
         given = ", ".join(f'{name} = "{unit}"' for name, unit in chosen.items() if unit)
         words = " and ".join(unit for unit in pair if unit)
         setting = f"or say units = {{ {given} }} in [pixieverse] of the dataset definition"
-        yield Mistake(words, setting, _scaled(*pair))
+        yield Mistake(words, setting, partial(_scaled, pair))
     if {part.name for part in parts} & LIGHTEST.keys():
         yield Mistake(
             "classes of PhysGaussian's table, where 3 is foam, 4 is snow and 5 is plasticine",
@@ -78,14 +72,15 @@ def _known_mistakes(parts: Sequence[Part], units: Units) -> Iterator[Mistake]:
         if any(math.isnan(part.values[k]) for part in parts for k in range(3)):
             break
         moved = [f"{names[k]} where {names[at]} belongs" for at, k in enumerate(order) if at != k]
-        yield Mistake(f"swapped columns, {' and '.join(moved)}", "look at the order", _moved(order))
+        yield Mistake(
+            f"swapped columns, {' and '.join(moved)}", "look at the order", partial(_moved, order)
+        )
 
 
-def _scaled(modulus: str, density: str) -> Callable[[Part], Part]:
-    def undo(part: Part) -> Part:
-        return part._replace(modulus=_si(part.modulus, modulus), density=_si(part.density, density))
-
-    return undo
+def _scaled(units: tuple[str, str], part: Part) -> Part:
+    """Bring modulus and density from these units to SI units."""
+    modulus, density = units
+    return part._replace(modulus=_si(part.modulus, modulus), density=_si(part.density, density))
 
 
 def _si(value: float, unit: str) -> float:
@@ -96,16 +91,12 @@ def _si(value: float, unit: str) -> float:
     return value * FACTORS[unit]
 
 
-def _moved(order: Sequence[int]) -> Callable[[Part], Part]:
+def _moved(order: Sequence[int], part: Part) -> Part:
     """Undo that column `order[at]` lies where column `at` belongs."""
-
-    def undo(part: Part) -> Part:
-        values = [0.0, 0.0, 0.0]
-        for at, k in enumerate(order):
-            values[k] = part.values[at]
-        return Part(part.name, part.share, *values)
-
-    return undo
+    values = [0.0, 0.0, 0.0]
+    for at, k in enumerate(order):
+        values[k] = part.values[at]
+    return Part(part.name, part.share, *values)
 
 
 def _look_normalised(parts: Sequence[Part]) -> bool:

@@ -36,25 +36,29 @@ def ply_points(data: bytes, where: str | Place) -> tuple[NDArray[Any], tuple[str
             "reading a PLY needs the package plyfile; install it with "
             "`pip install 'slatprep[simulate]'`"
         ) from error
+
+    def read(ply: bytes) -> Any:
+        try:
+            return plyfile.PlyData.read(io.BytesIO(ply))
+        except plyfile.PlyParseError as error:
+            raise ValueError(str(error)) from None
+
     with refusing(where, "is no readable PLY with vertices", "a PLY of Gaussians or points"):
         header, start, counts = _header(data)
         if max(counts, default=0) > len(data) - start:
             raise ValueError("announces more rows than it has")
-        try:
-            # Without rows: plyfile reserves memory for what a header claims.
-            described = plyfile.PlyData.read(io.BytesIO(_with_counts(header, [0] * len(counts))))
-        except plyfile.PlyParseError as error:
-            raise ValueError(str(error)) from None
+        # Without rows: plyfile reserves memory for what a header claims.
+        described = read(_with_counts(header, [0] * len(counts)))
         names = [element.name for element in described.elements]
         if "vertex" not in names:
             raise ValueError(f"its elements are {', '.join(names) or 'none'}")
         last = names.index("vertex")
         fields = described.elements[last].dtype(described.byte_order)
-    if not set(_AXES) <= set(fields.names or ()):
-        raise InputError(where, f"has vertices of {', '.join(fields.names)}", "fields x, y and z")
-    if any(fields[axis].kind not in "fiu" for axis in _AXES):
-        raise InputError(where, "has x, y, z that are lists", "a number each")
-    with refusing(where, "is no readable PLY with vertices", "a PLY of Gaussians or points"):
+        if not set(_AXES) <= set(fields.names or ()):
+            there = ", ".join(fields.names)
+            raise InputError(where, f"has vertices of {there}", "fields x, y and z")
+        if any(fields[axis].kind not in "fiu" for axis in _AXES):
+            raise InputError(where, "has x, y, z that are lists", "a number each")
         if len(names) != len(counts):
             raise ValueError("its elements cannot be counted")
         least = slow = 0
@@ -69,12 +73,8 @@ def ply_points(data: bytes, where: str | Place) -> tuple[NDArray[Any], tuple[str
                 start += rows * element.dtype(described.byte_order).itemsize
             return np.frombuffer(data, fields, counts[last], start), tuple(described.comments)
         _require_small(data, start, slow, described.text)
-        kept = _with_counts(header, counts[: last + 1])
-        try:
-            read = plyfile.PlyData.read(io.BytesIO(kept + data[start:]))
-        except plyfile.PlyParseError as error:
-            raise ValueError(str(error)) from None
-        return np.asarray(read["vertex"].data), tuple(read.comments)
+        kept = read(_with_counts(header, counts[: last + 1]) + data[start:])
+        return np.asarray(kept["vertex"].data), tuple(kept.comments)
 
 
 def _header(data: bytes) -> tuple[list[bytes], int, list[int]]:

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slatprep.errors import InputError
-from slatprep.readers.mistakes import mistakes_of, raw_grid
+from slatprep.readers.mistakes import mistakes_of
 from slatprep.readers.plausible import TOLD, Part, beyond_all, fault_of, is_physical, oddity_of
 from slatprep.records import (
     BACKGROUND,
@@ -110,17 +110,19 @@ def require_prediction(
     if not (medians > _PREDICTED).any():
         return []
     parts = _parts(values, material, PROPERTIES, MATERIAL_CLASSES)
-    positive = all(part.modulus > 0 and part.density > 0 for part in parts)
-    found = [raw_grid(parts), *mistakes_of(parts, Units())] if positive else []
-    guess = next((one.words for one in found if one), "")
+    guesses: list[str] = []
+    if all(part.modulus > 0 and part.density > 0 for part in parts):
+        guesses = [one.words for one in mistakes_of(parts, Units())]
+        if not any(map(fault_of, parts)):
+            guesses.insert(0, "a raw grid in SI units, channels first")
     worst = int(np.argmax(medians))
     low, high = np.percentile(sample[:, worst], (5, 95)).tolist()
     what = (
         f"has {PROPERTIES[worst].title} from {low:.4g} to {high:.4g}, and a prediction, channels "
         "first, is normalised to [-1, 1]"
     )
-    if guess:
-        what = f"{what}; the values look like {guess}"
+    if guesses:
+        what = f"{what}; the values look like {guesses[0]}"
     if plausibility == "warn":
         return [f'{TOLD}{what}; clipped (plausibility = "warn")']
     advice = "a grid in SI units, channels last (numpy.moveaxis(grid, 0, -1)), or a prediction"

@@ -113,10 +113,8 @@ class ShardWriter:
         self._size += len(data)
 
     def _flush(self, chunk: NDArray[Any]) -> None:
-        data = self._encode(chunk)
-        self._write(data)
-        self._index[self._chunks] = self._bytes, len(data)
-        self._chunks, self._bytes, self._rows = self._chunks + 1, self._bytes + len(data), 0
+        data, self._rows = self._encode(chunk), 0
+        self.append_packed(data, [len(data)])
 
 
 @contextmanager

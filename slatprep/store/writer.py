@@ -14,26 +14,15 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
+import numpy as np
+
+from slatprep.geometry.frames import voxel_centres
 from slatprep.parameters import StoreParameters
-from slatprep.records import PIXIEVERSE, Contents, Normalization, Place
+from slatprep.records import PIXIEVERSE, RESOLUTION, Contents, Normalization, Place
+from slatprep.store import layout
 from slatprep.store.attributes import root_attributes
 from slatprep.store.contract import read_metadata
-from slatprep.store.coordinates import write_coordinates
-from slatprep.store.digests import write_digests
-from slatprep.store.layout import (
-    ASSET_CHUNK,
-    FIXED_SIZES,
-    MERGED,
-    RECORD_ARRAY,
-    RECORDS,
-    RECORDS_IN_CHUNK,
-    RECORDS_IN_SHARD,
-    ArrayLayout,
-    arrays_with,
-    overlaps,
-    row_ranges,
-    rows_per_shard,
-)
+from slatprep.store.digests import add_array, write_digests
 from slatprep.store.runs import Piece, Runs
 
 GROUPS = ("voxel", "grid", "record")
@@ -92,37 +81,37 @@ def create_store(
         "voxel": n_voxels,
         "property": len(contents.properties),
         "latent": contents.latents.channels,
-        **FIXED_SIZES,
+        **layout.FIXED_SIZES,
     }
     chunk_and_shard = {
-        "asset": (ASSET_CHUNK, None),
-        "voxel": (parameters.voxel_chunk, rows_per_shard(parameters, n_voxels)),
+        "asset": (layout.ASSET_CHUNK, None),
+        "voxel": (parameters.voxel_chunk, layout.rows_per_shard(parameters, n_voxels)),
         "grid": (1, parameters.grid_assets_per_shard),
-        RECORD_ARRAY: (RECORDS_IN_CHUNK, RECORDS_IN_SHARD),
+        layout.RECORD_ARRAY: (layout.RECORDS_IN_CHUNK, layout.RECORDS_IN_SHARD),
     }
-    for layout in (*arrays_with(merged), RECORDS):
-        shape = tuple(sizes[dimension] for dimension in layout.dimensions)
-        group = layout.name.partition("/")[0]
-        chunk, shard = chunk_and_shard.get(layout.name, chunk_and_shard[group])
+    for array in (*layout.arrays_with(merged), layout.RECORDS):
+        shape = tuple(sizes[dimension] for dimension in array.dimensions)
+        group = array.name.partition("/")[0]
+        chunk, shard = chunk_and_shard.get(array.name, chunk_and_shard[group])
         if shard is None:
             chunk = min(chunk, shape[0])
-        attributes: dict[str, Any] = {"description": layout.description}
-        if layout.unit:
-            attributes["units"] = layout.unit
+        attributes: dict[str, Any] = {"description": array.description}
+        if array.unit:
+            attributes["units"] = array.unit
         root.create_array(
-            layout.name,
+            array.name,
             shape=shape,
-            dtype=str if layout.dtype == "str" else layout.dtype,
+            dtype=str if array.dtype == "str" else array.dtype,
             chunks=(chunk, *shape[1:]),
             shards=None if shard is None else (shard, *shape[1:]),
-            **_codecs(layout, parameters.compression_level),
-            fill_value=layout.fill_value,
-            dimension_names=layout.dimensions,
+            **_codecs(array, parameters.compression_level),
+            fill_value=array.fill_value,
+            dimension_names=array.dimensions,
             attributes=attributes,
         )
 
 
-def _codecs(layout: ArrayLayout, level: int) -> dict[str, Any]:
+def _codecs(array: layout.ArrayLayout, level: int) -> dict[str, Any]:
     """Return the codecs of an array, chosen by measurement; each chunk ends with a checksum."""
     from zarr.codecs import BloscCodec, Crc32cCodec, ZstdCodec
 
@@ -132,12 +121,12 @@ def _codecs(layout: ArrayLayout, level: int) -> dict[str, Any]:
         "columns": BloscCodec(typesize=3, cname="lz4hc", clevel=5, shuffle="shuffle"),
         "exponents": BloscCodec(typesize=4, cname="lz4hc", clevel=1, shuffle="shuffle"),
     }
-    return {"compressors": (compressors[layout.packing], Crc32cCodec())}
+    return {"compressors": (compressors[array.packing], Crc32cCodec())}
 
 
 def merges(path: Place) -> bool:
     """Whether a store that `create_store` made has arrays of merged labels."""
-    return all((path / layout.name).is_dir() for layout in MERGED)
+    return all((path / array.name).is_dir() for array in layout.MERGED)
 
 
 def packing_of(array: Place) -> object:
@@ -151,11 +140,10 @@ def packing_of(array: Place) -> object:
 
 def shard_rows(parameters: StoreParameters, n_voxels: int) -> dict[str, int]:
     """Return how many rows one shard of each group holds."""
-    grids = parameters.grid_assets_per_shard
     return {
-        "voxel": rows_per_shard(parameters, n_voxels),
-        "grid": grids,
-        "record": RECORDS_IN_SHARD,
+        "voxel": layout.rows_per_shard(parameters, n_voxels),
+        "grid": parameters.grid_assets_per_shard,
+        "record": layout.RECORDS_IN_SHARD,
     }
 
 
@@ -171,17 +159,17 @@ def shards(
     `rows` say where the arrays of each asset lie, `runs` by group which rows older stores have in
     chunks of the same bytes, and `taken` which shards, by group and number, are left out.
     """
-    chunks = {"voxel": parameters.voxel_chunk, "grid": 1, "record": RECORDS_IN_CHUNK}
+    chunks = {"voxel": parameters.voxel_chunk, "grid": 1, "record": layout.RECORDS_IN_CHUNK}
     for group, per_shard in shard_rows(parameters, offsets[-1]).items():
         own, total = runs.get(group, Runs()), offsets[-1] if group == "voxel" else len(rows)
-        for number, (start, stop) in enumerate(row_ranges(total, per_shard)):
+        for number, (start, stop) in enumerate(layout.row_ranges(total, per_shard)):
             if (group, number) in taken:
                 continue
             pieces = tuple(own.pieces(start, stop, chunks[group]))
             first, last = start, stop
             begins: Sequence[int] = ()
             if group == "voxel":
-                owners = [asset for asset, _ in overlaps(offsets, start, stop)]
+                owners = [asset for asset, _ in layout.overlaps(offsets, start, stop)]
                 first, last = owners[0], owners[-1] + 1
                 begins = tuple(offsets[first : last + 1])
             yield Shard(group, start, stop, first, rows[first:last], begins, pieces)
@@ -206,13 +194,35 @@ def finish_store(
     root = open_for_writing(path)
     ids = root["asset/id"][:]
     root.attrs.update(root_attributes(normalization, build_id, build, contents, ids))
-    write_coordinates(path, [one.name for one in contents.properties])
+    _write_coordinates(root, [one.name for one in contents.properties])
     write_digests(path, known, elsewhere)
     with warnings.catch_warnings():
         # Zarr says that consolidated metadata are not in format 3's text yet.
         # They only save reads: a reader that ignores them finds every array.
         warnings.filterwarnings("ignore", message="Consolidated metadata", category=UserWarning)
         zarr.consolidate_metadata(str(path), zarr_format=3)
+
+
+def _write_coordinates(root: Any, properties: Sequence[str]) -> None:
+    """Write coordinates of dimensions, so that xarray can name rows, columns and places.
+
+    An array that is named as its dimension becomes an index in xarray: after
+    ``xarray.open_zarr(store, group="voxel")`` one may write ``.sel(property="density")``. Zarr
+    itself gives such an array no meaning.
+    """
+    centres = voxel_centres(np.repeat(np.arange(RESOLUTION)[:, None], 3, axis=1))[:, 0]
+    texts = {"property": properties, "axis": list("xyz")}
+    for group, dimensions in (
+        ("asset", ("property",)),
+        ("voxel", ("axis", "property")),
+        ("grid", ("property", *"xyz")),
+    ):
+        for dimension in dimensions:
+            values = np.array(texts[dimension], object) if dimension in texts else centres
+            description = f"coordinate of the dimension {dimension}"
+            add_array(root[group], dimension, values, dimension, description)
+    # The arrays that name the rows of ``asset``; the attribute is CF's.
+    root["asset"].attrs["coordinates"] = "id object_id view category"
 
 
 def open_for_writing(path: Path) -> Any:

@@ -42,11 +42,9 @@ class Workers(Protocol):
         died: Callable[..., Result] | None = None,
     ) -> Iterator[Result]:
         """Run tasks as the function `run_unordered` does."""
-        ...
 
     def require_shared(self, paths: Iterable[Place]) -> None:
         """Raise `SlatprepError` unless every worker sees the same files and folders as we do."""
-        ...
 
 
 Jobs = int | Workers
