@@ -23,8 +23,7 @@ from slatprep.learn.predictions import (
 from slatprep.learn.splits import select_assets
 from slatprep.learn.style import INK, MUTED
 from slatprep.parameters import PixieverseSource
-from slatprep.readers.adapters import FoundField
-from slatprep.readers.grids import find_grids, one_grid
+from slatprep.readers.adapters import FoundField, find_grids, one_grid
 from slatprep.readers.pixieverse import read_prediction
 from slatprep.readers.splits import Split
 from slatprep.records import (

@@ -9,17 +9,17 @@ theirs as entry points of the groups ``slatprep.sources`` and ``slatprep.latents
 from __future__ import annotations
 
 import pkgutil
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from importlib.metadata import entry_points
 from typing import Any, Protocol
 
 from slatprep import records
-from slatprep.errors import ConfigError
+from slatprep.errors import ConfigError, InputError
 from slatprep.parameters import PixieverseSource
 from slatprep.readers.foreign import guarded
-from slatprep.readers.patterns import find_files
+from slatprep.readers.patterns import find_files, list_below, tried_names
 from slatprep.storage.listing import Listing
 
 
@@ -176,3 +176,43 @@ def find_by_pattern(
         ]
         done |= dict.fromkeys(one.object_id for one in found)
         yield from found
+
+
+def find_grids(
+    source: PixieverseSource, listing: Listing | None = None
+) -> dict[str, list[FoundField]]:
+    """Return the grids of each object, as the source's adapter finds them.
+
+    Raises ConfigError if the folder cannot be listed or a pattern makes no sense.
+    """
+    grids: dict[str, list[FoundField]] = {}
+    found = source_adapter(source.adapter).find(source, listing or list_below(source.root))
+    for grid in found:
+        grids.setdefault(grid.object_id, []).append(grid)
+    return grids
+
+
+def one_grid(
+    root: records.Place, found: Sequence[FoundField], object_id: str, tried: Iterable[str]
+) -> records.Place:
+    """Return the only grid of an object from `find_grids`; InputError if it has none or several."""
+    if not found:
+        looked = tried_names(tried, {"id": object_id})
+        raise InputError(root, f"no grid for id {object_id!r}", f"one of {looked}")
+    if len(found) > 1:
+        raise InputError(root, several_grids(object_id, list(found)), "one grid of every object")
+    if found[0].problem:
+        raise InputError(root, found[0].problem, "a grid")
+    return root / found[0].path
+
+
+def several_grids(object_id: str, grids: Sequence[FoundField]) -> str:
+    """Say that an object has several grids, and what to do."""
+    files = ", ".join(grid.path for grid in grids)
+    if len({grid.sample for grid in grids}) > 1:
+        return (
+            f"id {object_id!r} has {len(grids)} samples ({files}); choose one with `sample` in the "
+            "table [pixieverse] of the dataset definition, or say with --samples what becomes of "
+            "them: first, all or merge"
+        )
+    return f"{len(grids)} grids for one id {object_id!r} ({files}); expected one"

@@ -13,9 +13,8 @@ from itertools import chain, groupby
 
 from slatprep.errors import ConfigError, in_unicode
 from slatprep.parameters import BuildParameters, PixieverseSource, SlatSource
-from slatprep.readers.adapters import FoundField, patterns_of, source_adapter
+from slatprep.readers import adapters
 from slatprep.readers.contents import contents_of
-from slatprep.readers.grids import find_grids, several_grids
 from slatprep.readers.joins import read_categories, read_map
 from slatprep.readers.patterns import NAME, fill, find_files, list_below, tried_names
 from slatprep.readers.published import category_of, hint_of, locate_grids
@@ -48,7 +47,7 @@ class _Found:
     roots: SourceRoots
     listing: Listing
     one_file: bool
-    grids: Mapping[str, list[FoundField]]
+    grids: Mapping[str, list[adapters.FoundField]]
     categories: Mapping[str, str]
     cases: Mapping[str, str]
     """What the other side calls an id that it has in other letters' case."""
@@ -121,24 +120,24 @@ def discover(
 
 def _grids_of(
     source: PixieverseSource, listing: Listing, slat: SlatSource, one_file: bool
-) -> dict[str, list[FoundField]]:
+) -> dict[str, list[adapters.FoundField]]:
     """Return the grids by `find_grids`; ConfigError if there are none."""
-    grids = find_grids(source, listing)
+    grids = adapters.find_grids(source, listing)
     if grids:
         return grids
-    patterns = patterns_of(source_adapter(source.adapter), source)
+    patterns = adapters.patterns_of(adapters.source_adapter(source.adapter), source)
     tried = tried_names(patterns, _known(sample=source.sample))
     # Plain voxels have the names that SLATs have.
     ours = source.adapter == PixieverseSource.adapter and not one_file
     other = replace(source, root=slat.root)
-    swapped = ours and find_grids(other, list_below(locate_grids(other)))
+    swapped = ours and adapters.find_grids(other, list_below(locate_grids(other)))
     hint = f"the roots are swapped: grids lie below {slat.root}" if swapped else hint_of(source)
     more = f"; {hint}" if hint else ""
     raise ConfigError(f"{source.root}: no grid found; looked for {tried}{more}")
 
 
 def _rows(
-    grids: Mapping[str, list[FoundField]],
+    grids: Mapping[str, list[adapters.FoundField]],
     slats: Mapping[str, list[NamedSlat]],
     claims: Mapping[str, list[tuple[str, str]]],
 ) -> Iterator[_Row]:
@@ -155,7 +154,7 @@ def _rows(
             yield _Row(encoded(asset_id), object_id, label, ordered(group))
 
 
-def _rows_by_sample(row: _Row, grids: Mapping[str, list[FoundField]]) -> Iterator[_Row]:
+def _rows_by_sample(row: _Row, grids: Mapping[str, list[adapters.FoundField]]) -> Iterator[_Row]:
     """Yield a row for each sample of an object that has several."""
     samples = {grid.sample for grid in grids.get(row.object_id, ())}
     if len(samples) < 2:
@@ -215,23 +214,25 @@ def _pair(row: _Row, found: Sequence[_Found], shared: str) -> AssetPair:
     return _pair_of(row, found[0], shared, list(chain.from_iterable(chosen)))
 
 
-def _annotations(row: _Row, there: _Found) -> list[list[FoundField]]:
+def _annotations(row: _Row, there: _Found) -> list[list[adapters.FoundField]]:
     """Return the grids of a row by sample; two grids of a sample are an error."""
     grids = sorted(there.grids.get(row.object_id, ()), key=_order_of)
     groups = groupby(grids, key=lambda grid: grid.sample)
     return [list(group) for sample, group in groups if row.sample in (None, sample)]
 
 
-def _order_of(found: FoundField) -> tuple[float, str, str]:
+def _order_of(found: adapters.FoundField) -> tuple[float, str, str]:
     """Order samples by number where they have one: 10 comes behind 2."""
     number = float(found.sample) if found.sample.isdecimal() else math.inf
     return number, found.sample, found.path
 
 
-def _pair_of(row: _Row, there: _Found, shared: str, grids: Sequence[FoundField]) -> AssetPair:
+def _pair_of(
+    row: _Row, there: _Found, shared: str, grids: Sequence[adapters.FoundField]
+) -> AssetPair:
     source = there.source
     problems = [shared, *_name_problems(row)]
-    sides: tuple[FoundField | NamedSlat, ...] = (*grids, *row.slats)
+    sides: tuple[adapters.FoundField | NamedSlat, ...] = (*grids, *row.slats)
     for side in sides:
         problems += [side.problem, _unrecordable(side.path)]
     grid = mask = bounds = transform = None
@@ -239,7 +240,7 @@ def _pair_of(row: _Row, there: _Found, shared: str, grids: Sequence[FoundField])
     if grids:
         grid = there.roots.pixieverse / grids[0].path
         if len(grids) > 1:
-            problems.append(several_grids(row.object_id, grids))
+            problems.append(adapters.several_grids(row.object_id, grids))
         if NAME.fullmatch(row.object_id):
             known = _known(id=row.object_id, sample=grids[0].sample or source.sample)
             if source.adapter == "pixieverse":

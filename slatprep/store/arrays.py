@@ -21,22 +21,31 @@ if TYPE_CHECKING:
 
 
 class Arrays:
-    """What is below the root of a store, by the root's ``zarr.json``."""
+    """What is below the root of a store, by the root's ``zarr.json``.
+
+    `metadata` are those of its arrays that the root repeats, or that have been read.
+    """
 
     def __init__(self, path: Place, document: Mapping[str, Any]) -> None:
         self.path = path
         self._folder = storage_of(path).folder()
         gathered = document.get("consolidated_metadata")
         metadata = gathered.get("metadata") if isinstance(gathered, dict) else None
-        self._metadata: dict[str, Any] = dict(metadata) if isinstance(metadata, dict) else {}
+        self.metadata: dict[str, Any] = dict(metadata) if isinstance(metadata, dict) else {}
         self._readers: dict[str, RowReader] = {}
 
     @cached_property
     def group(self) -> zarr.Group:
-        """The root as zarr-python has it; StoreError where `slatprep.store.gate` refuses it."""
+        """The root as zarr-python has it, for everything this class does not offer.
+
+        Raises
+        ------
+        StoreError
+            If its metadata name anything that `slatprep.store.gate` does not allow.
+        """
         import zarr
 
-        self._refuse(f for entry in self._metadata.items() for f in gate_findings(*entry))
+        self._refuse(f for entry in self.metadata.items() for f in gate_findings(*entry))
         remote = storage_of(self.path).remote
         try:
             # Consolidated, so that zarr-python reads no metadata but those just looked at.
@@ -48,11 +57,11 @@ class Arrays:
             raise StoreError(f"{self.path}: bad metadata ({error!r})") from None
 
     def holds(self, name: str) -> bool:
-        """Whether the root's metadata have an array, by its full name."""
-        return name in self._metadata
+        """Whether the store has an array, by its full name."""
+        return name in self.metadata
 
     def reader(self, name: str) -> RowReader:
-        """Return the reader of an array, by its full name.
+        """Return what reads the rows of an array, by its full name.
 
         StoreError if there is no such array, or its metadata claim another size than the contract
         has, unreasonably large chunks, or codecs that slatprep does not use.
@@ -64,13 +73,13 @@ class Arrays:
     def _checked(self, name: str) -> RowReader:
         of_files = (f"{FILE}/name",) if name.startswith(f"{FILE}/") else ()
         for needed in (*contract.DEFINING, *of_files, name):
-            if needed not in self._metadata:
-                self._metadata[needed] = self._read(needed)
+            if needed not in self.metadata:
+                self.metadata[needed] = self._read(needed)
         try:
-            sizes = contract.dimension_sizes(self._metadata)
+            sizes = contract.dimension_sizes(self.metadata)
         except StoreError as error:
             raise StoreError(f"{self.path}/{error}") from None
-        own = self._metadata[name]
+        own = self.metadata[name]
         self._refuse(contract.size_findings(name, own, sizes))
         self._refuse(gate_findings(name, own))
         # So many assets cost memory by themselves.

@@ -20,11 +20,9 @@ from slatprep.store.arrays import Arrays
 from slatprep.store.attributes import RootAttributes, read_attributes
 from slatprep.store.gate import NAMES
 from slatprep.store.layout import ARRAYS, MERGED
-from slatprep.store.shard_reader import RowReader
 
 if TYPE_CHECKING:
     import pandas
-    import zarr
 
 ASSET_COLUMNS = [
     name
@@ -39,7 +37,7 @@ class AttributesError(StoreError):
     """A store whose attributes do not say what readers rely on."""
 
 
-class AssetTable:
+class AssetTable(Arrays):
     """The assets of a store as a table, which `slatprep.store.Store` adds their voxels to.
 
     Parameters
@@ -51,9 +49,8 @@ class AssetTable:
     """
 
     def __init__(self, path: Place, document: dict[str, Any]) -> None:
-        self.path = path
+        super().__init__(path, document)
         self.attributes: dict[str, Any] = document["attributes"]
-        self._arrays = Arrays(path, document)
         self._columns: dict[str, NDArray[Any]] = {}
 
     def __len__(self) -> int:
@@ -118,17 +115,6 @@ class AssetTable:
         return found
 
     @property
-    def group(self) -> zarr.Group:
-        """The root as zarr-python has it, for everything this class does not offer.
-
-        Raises
-        ------
-        StoreError
-            If its metadata name anything that `slatprep.store.gate` does not allow.
-        """
-        return self._arrays.group
-
-    @property
     def contents(self) -> Contents:
         """The tables of its properties and classes, and what its latents are."""
         return self.about.contents
@@ -156,14 +142,10 @@ class AssetTable:
         """The ranges that properties were normalised with."""
         return self.about.ranges
 
-    def holds(self, name: str) -> bool:
-        """Whether the store has an array, by its full name."""
-        return self._arrays.holds(name)
-
     @property
     def merges(self) -> bool:
         """Whether labels of any asset are merged of several annotations."""
-        return all(self._arrays.holds(layout.name) for layout in MERGED)
+        return all(self.holds(layout.name) for layout in MERGED)
 
     @cached_property
     def ids(self) -> list[str]:
@@ -312,12 +294,8 @@ class AssetTable:
         StoreError
             If there is no such array or row, or a file is missing or damaged.
         """
-        return self._arrays.reader(name).read(start, stop)
-
-    def reader(self, name: str) -> RowReader:
-        """Return what reads the rows of an array, by its full name; see `read_rows`."""
-        return self._arrays.reader(name)
+        return self.reader(name).read(start, stop)
 
     def shape(self, name: str) -> tuple[int, ...]:
         """Return the shape of an array, from its metadata alone."""
-        return self._arrays.reader(name).shape
+        return self.reader(name).shape

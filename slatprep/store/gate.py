@@ -94,9 +94,9 @@ def gate_findings(name: str, metadata: object) -> Iterator[Finding]:
     if not isinstance(axes, list) or not all(isinstance(axis, str) for axis in axes):
         yield Finding(where, "", f"dimension_names is {axes!r}", "a name for each dimension")
     for codec in _codecs(metadata.get("codecs")):
-        name = codec.get("name")
-        if name not in CODECS:
-            yield Finding(where, "", f"has the codec {name!r}", f"some of {', '.join(CODECS)}")
+        used = codec.get("name")
+        if used not in CODECS:
+            yield Finding(where, "", f"has the codec {used!r}", f"some of {', '.join(CODECS)}")
 
 
 def form_findings(name: str, metadata: Mapping[str, Any]) -> Iterator[Finding]:

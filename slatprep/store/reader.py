@@ -336,9 +336,7 @@ def open_store(path: Store | str | Place, *, copy: bool = False) -> Store:
         )
     store = Store(path, document)
     # Refused when opened, not halfway through a command.
-    gathered = document.get("consolidated_metadata")
-    metadata = gathered.get("metadata") if isinstance(gathered, dict) else None
-    for finding in width_findings(store.about, metadata if isinstance(metadata, dict) else {}):
+    for finding in width_findings(store.about, store.metadata):
         raise AttributesError(f"{path}/{finding}; run `slatprep verify`")
     return store
 
