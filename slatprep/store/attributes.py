@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass
 from functools import cache
 from itertools import pairwise
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar
@@ -46,11 +46,18 @@ class StoredAlign:
 
 
 @dataclass(frozen=True)
+class StoredSample(SampleParameters):
+    """The parameters of the lookup, but for those that only newer versions know."""
+
+    __pydantic_config__: ClassVar[dict[str, object]] = {"extra": "ignore", "allow_inf_nan": False}
+
+
+@dataclass(frozen=True)
 class StoredParameters:
     """What readers ask of the parameters of a build."""
 
     align: StoredAlign
-    sample: SampleParameters
+    sample: StoredSample
 
 
 @dataclass(frozen=True)
@@ -114,9 +121,7 @@ def read_attributes(attributes: Mapping[str, Any]) -> RootAttributes | tuple[Fin
     from pydantic import ValidationError
 
     try:
-        read: RootAttributes = _adapter().validate_json(
-            orjson.dumps(_without_news(attributes)), strict=True
-        )
+        read: RootAttributes = _adapter().validate_json(orjson.dumps(attributes), strict=True)
         return read
     except ValidationError as error:
         return tuple(
@@ -198,18 +203,6 @@ _FAULTS = 64
 
 def _shown(fault: Mapping[str, Any]) -> str:
     return "missing" if fault["type"] == "missing" else repr(fault["input"])[:100]
-
-
-def _without_news(attributes: Mapping[str, Any]) -> dict[str, Any]:
-    """Leave out parameters of the lookup that only newer versions know."""
-    document: dict[str, Any] = orjson.loads(orjson.dumps(attributes))
-    at: Any = document
-    for key in ("build", "parameters", "sample"):
-        at = at.get(key) if isinstance(at, dict) else None
-    if isinstance(at, dict):
-        for name in at.keys() - {field.name for field in fields(SampleParameters)}:
-            del at[name]
-    return document
 
 
 @cache
