@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from slatprep.errors import StoreError
 from slatprep.storage.files import file_digest, local_files
-from slatprep.store.layout import FILE, FILES
+from slatprep.store.layout import FILES
 
 ATTRIBUTES = "zarr.json#attributes"
 """Name under which the digest of the root's attributes is kept."""
@@ -66,11 +66,6 @@ def write_digests(
 def attributes_digest(attributes: Mapping[str, Any]) -> str:
     """Return the SHA-256 of attributes, in hex, however their JSON is laid out."""
     return hashlib.sha256(_canonical(attributes)).hexdigest()
-
-
-def is_own(name: str) -> bool:
-    """Whether a file belongs to the arrays of digests."""
-    return name.startswith(f"{FILE}/")
 
 
 def _files_of(root: Any) -> Iterator[tuple[str, bool]]:

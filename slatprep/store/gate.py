@@ -11,19 +11,13 @@ from collections.abc import Iterator, Mapping
 from typing import Any
 
 from slatprep.store.contract import Finding
-from slatprep.store.layout import FILE, LAYOUTS
+from slatprep.store.layout import COORDINATES, FILE, LAYOUTS
 
 GROUPS = ("asset", "voxel", "grid", FILE)
 
-COORDINATES = (
-    "asset/property",
-    "voxel/axis",
-    "voxel/property",
-    "grid/property",
-    *(f"grid/{axis}" for axis in "xyz"),
+NAMES = frozenset(
+    (*LAYOUTS, *(f"{group}/{name}" for group, names in COORDINATES.items() for name in names))
 )
-
-NAMES = frozenset((*LAYOUTS, *COORDINATES))
 """Every array that a store may have."""
 
 DATA_TYPES = ("bool", "uint8", "int64", "float32", "float64", "string")

@@ -12,9 +12,9 @@ from slatprep.storage.files import LINK, file_digest
 from slatprep.storage.place import storage_of
 from slatprep.store.attributes import read_attributes, width_findings
 from slatprep.store.contract import Finding, array_findings, dimension_sizes, read_metadata
-from slatprep.store.digests import ATTRIBUTES, attributes_digest, is_own
+from slatprep.store.digests import ATTRIBUTES, attributes_digest
 from slatprep.store.gate import GROUPS, form_findings, gate_findings
-from slatprep.store.layout import ARRAYS, MERGED
+from slatprep.store.layout import ARRAYS, FILE, MERGED
 from slatprep.store.reader import Store
 from slatprep.workers.local import Jobs, run_unordered
 
@@ -37,7 +37,7 @@ def metadata_findings(path: Place) -> Iterator[Finding]:
         yield from width_findings(said, copies)
     arrays: dict[str, Any] = {}
     files = storage_of(path).files()
-    present = {name.removesuffix("/zarr.json") for name in files if _is_metadata(name)}
+    present = {name.removesuffix("/zarr.json") for name in files if name.endswith("/zarr.json")}
     for name, copy in copies.items():
         yield from gate_findings(name, copy)
     for name in sorted({*present, *copies, *(layout.name for layout in ARRAYS), *GROUPS}):
@@ -87,7 +87,8 @@ def file_findings(store: Store, jobs: Jobs, below: str = "") -> tuple[int, set[F
     if attributes_digest(store.attributes) != attributes[1]:
         findings.add(Finding("zarr.json", "", "the attributes changed", f"SHA-256 {attributes[1]}"))
     files = storage_of(store.path).files()
-    present = {name for name in files if name != "zarr.json" and not is_own(name)}
+    # The root's metadata and the arrays of digests have no digest themselves.
+    present = {name for name in files if name != "zarr.json" and not name.startswith(f"{FILE}/")}
     for name in present - expected.keys():
         findings.add(Finding(name, "", "belongs to no array", "no such file"))
     for name in expected.keys() - present:
@@ -130,10 +131,6 @@ def _compare(path: Place, name: str, found: int, size: int, digest: str) -> tupl
 
 
 _CONSOLIDATED = {"kind": "inline", "must_understand": False, "metadata": 0}
-
-
-def _is_metadata(name: str) -> bool:
-    return name.endswith("/zarr.json")
 
 
 def _same(own: Mapping[str, Any], copy: object) -> bool:

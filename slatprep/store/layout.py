@@ -251,6 +251,9 @@ def arrays_with(merged: bool) -> tuple[ArrayLayout, ...]:
     return (*ARRAYS, *MERGED) if merged else ARRAYS
 
 
+COORDINATES = {"asset": ("property",), "voxel": ("axis", "property"), "grid": ("property", *_XYZ)}
+"""Dimensions of each group that an array of their name gives coordinates, such as for xarray."""
+
 FIXED_SIZES = {
     "row": 4,
     "column": 4,

@@ -212,11 +212,7 @@ def _write_coordinates(root: Any, properties: Sequence[str]) -> None:
     """
     centres = voxel_centres(np.repeat(np.arange(RESOLUTION)[:, None], 3, axis=1))[:, 0]
     texts = {"property": properties, "axis": list("xyz")}
-    for group, dimensions in (
-        ("asset", ("property",)),
-        ("voxel", ("axis", "property")),
-        ("grid", ("property", *"xyz")),
-    ):
+    for group, dimensions in layout.COORDINATES.items():
         for dimension in dimensions:
             values = np.array(texts[dimension], object) if dimension in texts else centres
             description = f"coordinate of the dimension {dimension}"
