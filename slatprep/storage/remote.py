@@ -161,7 +161,9 @@ class RemoteFile(io.RawIOBase):
                     bucket, _, key = name.partition("/")
                     if read := range_reader(bucket):
                         return read(key, offset, offset + length)
-                options = self._exact if "hf" in system.protocol else {}
+                options: dict[str, Any] = {}
+                if "hf" in system.protocol:  # It would read ahead, and ask for the size.
+                    options = {"cache_type": "none", "size": self._size}
                 return bytes(system.cat_file(name, start=offset, end=offset + length, **options))
         except (FileNotFoundError, PermissionError):
             raise
@@ -195,11 +197,6 @@ class RemoteFile(io.RawIOBase):
         self._position += len(data)
         self._ended = len(data) < len(buffer)
         return len(data)
-
-    @property
-    def _exact(self) -> dict[str, object]:
-        """What keeps the hub's file system from reading ahead, and from asking for the size."""
-        return {"cache_type": "none", "size": self._size}
 
     @cached_property
     def _size(self) -> int:
@@ -271,33 +268,25 @@ def pinned(place: RemotePlace) -> RemotePlace:
 
 def put_objects(folder: Path, place: RemotePlace, names: Iterable[str], at_once: int = 16) -> None:
     """Put files of a folder below a place, under the same names, several at a time."""
-    names = list(names)
-    if not names:
-        return
-    with connected(place) as (system, root):
-        options = multipart_options(system, files_at_once=at_once)
-        system.put(
-            [str(folder / name) for name in names], [f"{root}/{n}" for n in names], **options
-        )
+    if names := list(names):
+        with connected(place) as (system, root):
+            options, files = multipart_options(system, at_once), [str(folder / n) for n in names]
+            system.put(files, [f"{root}/{name}" for name in names], **options)
 
 
 def copy_objects(source: RemotePlace, target: RemotePlace, names: Iterable[str]) -> None:
     """Have the server copy objects below a place to another, under the same names."""
-    names = list(names)
-    if not names:
-        return
-    with connected(source) as (system, root), connected(target) as (_, other):
-        options = {"batch_size": 16} if system.async_impl else {}
-        system.copy([f"{root}/{n}" for n in names], [f"{other}/{n}" for n in names], **options)
+    if names := list(names):
+        with connected(source) as (system, root), connected(target) as (_, other):
+            options = {"batch_size": 16} if system.async_impl else {}
+            system.copy([f"{root}/{n}" for n in names], [f"{other}/{n}" for n in names], **options)
 
 
 def remove_objects(place: RemotePlace, names: Iterable[str]) -> None:
     """Remove objects below a place by their names; missing ones are no error."""
-    names = list(names)
-    if not names:
-        return
-    with connected(place) as (system, root):
-        system.rm([f"{root}/{name}" for name in names])
+    if names := list(names):
+        with connected(place) as (system, root):
+            system.rm([f"{root}/{name}" for name in names])
 
 
 _CREDENTIALS = "set AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY, or AWS_PROFILE"

@@ -16,7 +16,8 @@ from __future__ import annotations
 import hashlib
 import re
 import warnings
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from functools import partial
@@ -140,12 +141,11 @@ class Upload:
         """
         if self.pointer == self.before.pointer:
             return
-        try:
+        keep = {self.pointer.version, self.pointer.previous}
+        with _refusing(self.target):
             # Before the pointer moves, so that builds which begin after that are not listed.
-            old = self._unneeded()
+            old = [name for name in list_objects(self.target) if _is_of_version(name, but=keep)]
             self._replace_pointer()
-        except OSError as error:
-            raise StoreError(_refused(self.target, error)) from None
         reached("pointer replaced", str(self.target))
         try:
             remove_objects(self.target, old)
@@ -186,10 +186,6 @@ class Upload:
                 "to bring it up to date"
             )
 
-    def _unneeded(self) -> list[str]:
-        keep = {self.pointer.version, self.pointer.previous}
-        return [name for name in list_objects(self.target) if _is_of_version(name, but=keep)]
-
 
 def upload_store(new: Path, before: PublishedState, staged: Staged | None = None) -> Upload:
     """Upload all files of a finished local store as a new version, and check that they are there.
@@ -198,36 +194,28 @@ def upload_store(new: Path, before: PublishedState, staged: Staged | None = None
     Nothing is uploaded if `before`, the state at the beginning of the build, has the same content.
     StoreError if a file cannot be uploaded.
     """
-    files = local_files(new)
-    digests = {name: file_digest(new / name) for name in files}
-    sizes = dict(files)
-    if staged is not None:
-        digests |= staged.digests
-        sizes |= staged.sizes
-    content = versions.content_of(digests)
-    place = staged.version if staged else None
+    staged = staged or Staged({}, {})
+    files, place = local_files(new), staged.version
+    digests = {**{name: file_digest(new / name) for name in files}, **staged.digests}
+    sizes, content = {**files, **staged.sizes}, versions.content_of(digests)
     if before.pointer is not None and before.pointer.content == content:
         if place is not None:
-            _remove_version(place)
+            with _refusing(before.target):
+                remove_objects(place, list_objects(place))
         return Upload(before, before.pointer)
     previous = before.pointer.version if before.pointer else ""
-    pointer = versions.Pointer(
-        version=place.name
-        if place
-        else hashlib.sha256(f"{previous}{content}".encode()).hexdigest()[:16],
-        previous=previous,
-        content=content,
-        published=datetime.now(UTC).isoformat(timespec="seconds"),
-    )
-    upload = Upload(before, pointer)
-    try:
+    own = hashlib.sha256(f"{previous}{content}".encode()).hexdigest()[:16]
+    now = datetime.now(UTC).isoformat(timespec="seconds")
+    version = place.name if place else own
+    upload = Upload(before, versions.Pointer(version, previous, content, now))
+    with _refusing(before.target):
         there = list_objects(upload.version)
         missing = {name for name in files if not _is_same(there.get(name), new / name)}
         small = [name for name in sorted(missing) if files[name] <= _SMALL_BYTES]
         large = [name for name in sorted(missing) if files[name] > _SMALL_BYTES]
         put_objects(new, upload.version, small)
         put_objects(new, upload.version, large, at_once=1)
-        if staged is not None and staged.before is not None:
+        if staged.before is not None:
             # An upload may have left it already: a version's name implies its content.
             others = [n for n in staged.copied if there.get(n, {}).get("size") != sizes[n]]
             copy_objects(staged.before, upload.version, sorted(others))
@@ -241,16 +229,7 @@ def upload_store(new: Path, before: PublishedState, staged: Staged | None = None
                     f"{upload.version / name}: is not there as it was uploaded; nothing was "
                     "replaced. If another build has just replaced the store, run again"
                 )
-    except OSError as error:
-        raise StoreError(_refused(before.target, error)) from None
     return upload
-
-
-def _remove_version(version: RemotePlace) -> None:
-    try:
-        remove_objects(version, list_objects(version))
-    except OSError as error:
-        raise StoreError(_refused(version.parent.parent, error)) from None
 
 
 def _is_same(entry: Mapping[str, Any] | None, file: Path) -> bool:
@@ -301,8 +280,12 @@ def _tag(place: RemotePlace) -> str:
         return ""
 
 
-def _refused(target: RemotePlace, error: OSError) -> str:
-    return (
-        f"{target}: cannot be written ({error.strerror}); nothing was replaced. Run again when it "
-        "can: what is finished is kept"
-    )
+@contextmanager
+def _refusing(target: RemotePlace) -> Iterator[None]:
+    try:
+        yield
+    except OSError as error:
+        raise StoreError(
+            f"{target}: cannot be written ({error.strerror}); nothing was replaced. Run again when "
+            "it can: what is finished is kept"
+        ) from None
