@@ -20,6 +20,7 @@ from slatprep.records import USABLE, Place
 from slatprep.storage.place import place_of
 from slatprep.store import Store, open_store
 from slatprep.store.reader import require_outside
+from slatprep.workers import Progress
 from slatprep.workers.local import run_unordered
 
 __all__ = ["FORMATS", "ExportOptions", "ExportSummary", "export_store"]
@@ -37,9 +38,6 @@ FORMATS = {
 The module's ``writer`` takes the open store, the ids of the exported assets and the
 `ExportOptions`, and returns a `Writer`.
 """
-
-Progress = Callable[[int, int], None]
-"""Called with the number of assets done and the number of all assets."""
 
 _Entry = dict[str, Any]
 """The entry of an asset in the index of an export: id, columns, file, number of points."""
@@ -91,7 +89,7 @@ def export_store(
     jobs : int
         Worker processes; the bytes do not depend on it. One process writes HDF5.
     progress : callable, optional
-        See `Progress`.
+        See `slatprep.workers.Progress`.
 
     Returns
     -------
