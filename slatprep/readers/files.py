@@ -225,7 +225,8 @@ def npz_arrays(
     InputError if the archive is damaged, or an array is missing or not as specified.
     """
     with _open_zip(data, where) as archive:
-        present = [info.filename.removesuffix(".npy") for info in archive.infolist()]
+        infos = archive.infolist()
+        present = [info.filename.removesuffix(".npy") for info in infos]
         wanted = [name for name in specs if not partial or name in present]
         for name in wanted:
             if present.count(name) != 1:
@@ -238,9 +239,7 @@ def npz_arrays(
                     f"one array each of {', '.join(specs)}",
                 )
         return {
-            name: _read_member(
-                archive, archive.infolist()[present.index(name)], where, name, specs[name]
-            )
+            name: _read_member(archive, infos[present.index(name)], where, specs[name])
             for name in wanted
         }
 
@@ -257,7 +256,7 @@ def npz_small_arrays(
         for info in archive.infolist():
             name = info.filename.removesuffix(".npy")
             try:
-                arrays[name] = _read_member(archive, info, where, name, spec)
+                arrays[name] = _read_member(archive, info, where, spec)
             except InputError as error:
                 faults.append(error)
     return arrays, faults
@@ -272,9 +271,9 @@ def _open_zip(data: bytes, where: str | Place) -> zipfile.ZipFile:
 
 
 def _read_member(
-    archive: zipfile.ZipFile, info: zipfile.ZipInfo, where: str | Place, name: str, spec: ArraySpec
+    archive: zipfile.ZipFile, info: zipfile.ZipInfo, where: str | Place, spec: ArraySpec
 ) -> NDArray[Any]:
-    member = f"{where} [{name}]"
+    member = f"{where} [{info.filename.removesuffix('.npy')}]"
     # zipfile bounds its output for these two alone.
     if info.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
         raise InputError(
