@@ -3,9 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import Any
-
-from numpy.typing import NDArray
 
 from slatprep.geometry.deformation import PlaceMap
 from slatprep.records import Model
@@ -40,10 +37,6 @@ class StoredRecords:
         if asset.columns["model"] in (Model.RIGID, Model.SIMILARITY):
             return PlaceMap(asset.transform)
         return PlaceMap(asset.transform, self.read(asset.index).alignment.deformation)
-
-    def rows(self, name: str, start: int, stop: int) -> NDArray[Any]:
-        """Return rows ``start:stop`` of an array of the store; see `Store.read_rows`."""
-        return self.store.read_rows(name, start, stop)
 
     def read(self, row: int) -> AssetRecord:
         """Return the record of a row; StoreError if it cannot be read."""

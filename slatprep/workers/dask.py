@@ -21,15 +21,13 @@ from dataclasses import dataclass, replace
 from functools import lru_cache
 from importlib import metadata
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import Any, TypeVar
 
 from slatprep.errors import ConfigError, SlatprepError, amount
+from slatprep.records import Place
 from slatprep.storage.place import place_of, storage_of
 from slatprep.workers.local import single_threaded
 from slatprep.workers.pool import Pool, run_in_pools
-
-if TYPE_CHECKING:
-    from slatprep.records import Place
 
 try:
     import distributed
