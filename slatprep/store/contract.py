@@ -80,18 +80,14 @@ def array_findings(name: str, metadata: object, sizes: Mapping[str, int]) -> Ite
         return
     yield from size_findings(name, metadata, sizes)
     if isinstance(metadata, dict):
-        dtype = _ZARR_NAMES.get(layout.dtype, layout.dtype)
         empty = layout.fill_value
-        yield from _differences(
-            f"{name}/zarr.json",
-            metadata,
-            {
-                "data_type": dtype,
-                "dimension_names": list(layout.dimensions),
-                "zarr_format": 3,
-                "fill_value": empty if empty == empty else "NaN",  # which differs from itself
-            },
-        )
+        wanted = {
+            "data_type": _ZARR_NAMES.get(layout.dtype, layout.dtype),
+            "dimension_names": list(layout.dimensions),
+            "zarr_format": 3,
+            "fill_value": empty if empty == empty else "NaN",  # which differs from itself
+        }
+        yield from _differences(f"{name}/zarr.json", metadata, wanted)
 
 
 def size_findings(name: str, metadata: object, sizes: Mapping[str, int]) -> Iterator[Finding]:
