@@ -1,11 +1,52 @@
-"""The published dataset, in archives and unpacked, and the store of it."""
+"""Builds whose steps are noted, a store to copy, and the published dataset with the store of it."""
 
+import shutil
 from pathlib import Path
 
 import pytest
+from support.faults import inject
 from support.published import files, make_published, parameters
+from support.synthetic import Dataset, Made
 
 from slatprep.pipeline.dataset import build_store
+
+
+@pytest.fixture
+def steps(monkeypatch: pytest.MonkeyPatch) -> list[tuple[str, str]]:
+    """Collect what builds reach, but for the folder that each makes and locks."""
+    found: list[tuple[str, str]] = []
+
+    def collect(step: str, name: str) -> None:
+        if not step.startswith("work folder"):
+            found.append((step, name))
+
+    inject(monkeypatch, collect)
+    return found
+
+
+@pytest.fixture
+def aligned(monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """Note the assets that are aligned."""
+    seen: list[str] = []
+    inject(monkeypatch, lambda step, name: step == "asset aligned" and seen.append(name))
+    return seen
+
+
+@pytest.fixture(scope="session")
+def three(undisturbed: Made, tmp_path_factory: pytest.TempPathFactory) -> Made:
+    """Return the assets of `undisturbed` and a store with their own ranges, not to be changed."""
+    folder = tmp_path_factory.mktemp("three")
+    build_store(undisturbed[0].parameters(), folder / "s.zarr")
+    return undisturbed[0], folder / "s.zarr"
+
+
+@pytest.fixture
+def built(three: Made, tmp_path: Path) -> Made:
+    """Return copies of three assets and of their store: a build knows no file by its state."""
+    dataset, out = three
+    shutil.copytree(dataset.root, tmp_path / "sources")
+    shutil.copytree(out.parent, tmp_path, dirs_exist_ok=True)
+    return Dataset(tmp_path / "sources", dict(dataset.assets)), tmp_path / out.name
 
 
 @pytest.fixture(scope="session")

@@ -10,10 +10,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from support.faults import inject
+from support.faults import flip, inject
 from support.first_builds import tree_from_nothing
-from support.synthetic import Made, MakeDataset, make_asset
-from support.trees import records_of, tree
+from support.synthetic import Dataset, Made, make_asset
+from support.trees import inodes, records_of, tree
 
 from slatprep.inspect.verify import verify_store
 from slatprep.parameters import StoreParameters
@@ -27,29 +27,28 @@ from slatprep.store.shard_reader import RowReader
 pytestmark = pytest.mark.usefixtures("files_are_old", "few_are_new")
 
 
-@pytest.fixture
-def steps(monkeypatch: pytest.MonkeyPatch) -> list[tuple[str, str]]:
-    """Collect what builds reach, but for the folder that each makes and locks."""
-    found: list[tuple[str, str]] = []
-
-    def collect(step: str, name: str) -> None:
-        if not step.startswith("work folder"):
-            found.append((step, name))
-
-    inject(monkeypatch, collect)
-    return found
+@pytest.fixture(scope="module")
+def four(tmp_path_factory: pytest.TempPathFactory) -> Made:
+    """Four assets, and a store of them in some ten shards an array; nobody may change them."""
+    folder = tmp_path_factory.mktemp("four")
+    dataset = Dataset(folder / "sources").having(*"aceg")
+    build_store(dataset.parameters(), folder / "s.zarr")
+    return dataset, folder / "s.zarr"
 
 
 @pytest.fixture
-def built(make_dataset: MakeDataset, tmp_path: Path) -> Made:
-    """Four assets, and a store of them in some ten shards an array."""
-    dataset, out = make_dataset("a", "c", "e", "g"), tmp_path / "s.zarr"
+def built(four: Made, tmp_path: Path) -> Made:
+    """Return copies of both, of which a build knows every file by its state."""
+    shutil.copytree(four[1].parent, tmp_path, dirs_exist_ok=True)
+    dataset, out = Dataset(tmp_path / "sources", dict(four[0].assets)), tmp_path / "s.zarr"
     build_store(dataset.parameters(), out)
     return dataset, out
 
 
-def inodes(out: Path) -> dict[str, int]:
-    return {p.relative_to(out).as_posix(): p.stat().st_ino for p in out.rglob("*") if p.is_file()}
+OF_ROWS = (
+    "coords", "feats", "properties", "material", "valid", "distance", "place", "confidence",
+    "grid_properties", "grid_material",
+)  # fmt: skip
 
 
 def same_files(before: dict[str, int], after: dict[str, int], below: str) -> int:
@@ -71,6 +70,8 @@ def test_new_assets_come_behind_and_the_rest_stays_where_it_is(built, steps):
     store = open_store(out)
     assert store.ids == ["a", "c", "e", "g", "b", "d"]
     assert store.attributes["segments"] == [0, 4]
+    table = store.to_pandas()
+    held = {one.asset_id: {name: getattr(one, name) for name in OF_ROWS} for one in store}
     assert verify_store(out, sources=True).ok
     # Of the shards of each array the last alone had room.
     shards = {name for name in before if name.startswith("voxel/feats/c/")}
@@ -88,6 +89,12 @@ def test_new_assets_come_behind_and_the_rest_stays_where_it_is(built, steps):
     assert compacted.build_id == summary.build_id
     assert tree(out) == built_anew
     assert files.keys() <= built_anew.keys()
+    # Each asset had the rows of a first build before, too.
+    reference = open_store(out)
+    assert table.loc[reference.ids].equals(reference.to_pandas())
+    for asset in reference:
+        for name, values in held[asset.asset_id].items():
+            np.testing.assert_array_equal(values, getattr(asset, name))
 
 
 def test_what_is_new_and_sorts_last_gives_the_bytes_of_a_first_build(built):
@@ -120,22 +127,6 @@ def test_where_much_is_new_all_rows_are_ordered_by_id(built, monkeypatch):
     dataset.add("b", seed=2)
     build_store(dataset.parameters(), out)
     assert tree(out) == tree_from_nothing(dataset.parameters())
-
-
-def test_every_asset_has_the_rows_of_a_first_build(built, tmp_path):
-    dataset, out = built
-    dataset.add("b", seed=2)
-    build_store(dataset.parameters(), out)
-    build_store(dataset.parameters(), tmp_path / "reference.zarr")
-    one, other = open_store(out), open_store(tmp_path / "reference.zarr")
-    table, reference = one.to_pandas(), other.to_pandas()
-    assert table.loc[reference.index].equals(reference)
-    for asset in other:
-        mine = one.asset(asset.asset_id)
-        for name in ("coords", "feats", "properties", "material", "valid", "distance", "place",
-                     "confidence", "grid_properties", "grid_material"):  # fmt: skip
-            np.testing.assert_array_equal(getattr(mine, name), getattr(asset, name))
-    assert one.attributes["manifest"] == other.attributes["manifest"]
 
 
 def test_a_change_of_latents_alone_costs_its_own_chunks(built, steps):
@@ -196,6 +187,7 @@ def test_another_name_costs_a_record(built, steps, tmp_path):
     after = inodes(out)
     for group in ("voxel/feats/c/", "grid/material/c/"):
         assert same_files(before, after, group) == sum(name.startswith(group) for name in before)
+    assert open_store(out).column("category").tolist() == ["", "tree", "", ""]
     assert tree(out) == tree_from_nothing(named)
 
 
@@ -242,9 +234,7 @@ def test_ranges_that_change_take_no_rows_over_and_align_nothing(built, steps):
 )
 def test_a_flipped_bit_is_not_taken_over(built, name):
     dataset, out = built
-    data = bytearray((out / name).read_bytes())
-    data[len(data) // 3] ^= 4
-    (out / name).write_bytes(data)
+    flip(out / name, (out / name).stat().st_size // 3, 2)
     dataset.add("h", seed=1)
     (told,) = build_store(dataset.parameters(), out).damaged
     assert told.startswith(f"{name}: its bytes changed")
@@ -356,10 +346,7 @@ def test_what_was_seen_of_one_store_is_nothing_to_another(built, tmp_path, steps
 @pytest.mark.parametrize("file", ["s.zarr/voxel/feats/c/0/0", "s.manifests/assets.jsonl"])
 def test_a_file_that_changed_under_an_unchanged_dataset_is_found(built, file):
     dataset, out = built
-    path = out.parent / file
-    data = bytearray(path.read_bytes())
-    data[100] ^= 1
-    path.write_bytes(data)
+    flip(out.parent / file, 100)
     assert not verify_store(out).ok
     build_store(dataset.parameters(), out)
     assert verify_store(out).ok

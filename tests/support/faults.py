@@ -26,6 +26,13 @@ def inject(monkeypatch: pytest.MonkeyPatch, fault: Fault) -> None:
     monkeypatch.setenv(VARIABLE, f"{__name__}:call")
 
 
+def flip(path: Path, at: int, bit: int = 0) -> None:
+    """Change one bit of a file."""
+    data = bytearray(path.read_bytes())
+    data[at] ^= 1 << bit
+    path.write_bytes(data)
+
+
 def kill_self() -> None:
     """End this process as the kernel would."""
     os.kill(os.getpid(), signal.SIGKILL)

@@ -16,6 +16,12 @@ def tree(directory: Path | None) -> dict[str, str]:
     }
 
 
+def inodes(directory: Path) -> dict[str, int]:
+    """Return the inode of every file below a directory."""
+    files = (path for path in directory.rglob("*") if path.is_file())
+    return {path.relative_to(directory).as_posix(): path.stat().st_ino for path in files}
+
+
 def contents(s3: Any, place: str) -> dict[str, str]:
     """Return the hash of every object below a place, by its name relative to that.
 
